@@ -1,0 +1,1 @@
+//! The compiled control loop that a robosuite worker loads.

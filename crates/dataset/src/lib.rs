@@ -1,0 +1,1 @@
+//! Demonstrations: robomimic-family HDF5 in, LeRobot-ready Parquet out, windows for training.

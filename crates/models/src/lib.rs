@@ -1,0 +1,1 @@
+//! ACT, ACTRM, TRM and baselines, their losses, optimisers and training step, on candle.

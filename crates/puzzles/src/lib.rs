@@ -1,0 +1,1 @@
+//! Maze and Sudoku tasks: generators, exact solvers, environments.

@@ -1,0 +1,1 @@
+//! Experiments, training runs, entries, rollouts, results, leaderboard.

@@ -1,0 +1,3 @@
+//! Command line for demonstrations and data sets.
+
+fn main() {}

@@ -1,0 +1,3 @@
+//! Command line for training, evaluation and the leaderboard.
+
+fn main() {}
