@@ -1,0 +1,81 @@
+# One command to do each thing. `make help` lists them.
+#
+# Everything that has to be installed goes into .venv (and .venv-peers for the comparisons), everything that is
+# built into target/. Paths are relative, so a checkout may live in a folder with a space in its name.
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+# The interpreter that .venv is made of: the first one of these that is 3.11, 3.12 or 3.13 (MuJoCo 3.3.7 has no
+# wheel for later ones) and can make virtual environments. `make PYTHON=/path/to/python3 ...` decides otherwise.
+PYTHON ?= $(shell tools/find-python 3.11 3.13)
+# LeRobot 0.6.1 wants 3.12 or later.
+PEER_PYTHON ?= $(shell tools/find-python 3.12 3.13)
+
+CARGO := cargo
+CARGO_FLAGS := --release --locked
+# cmake (HDF5 is built from source) comes from .venv; pip must not look outside the lock file's hashes.
+export PATH := $(CURDIR)/.venv/bin:$(PATH)
+PIP := pip install --disable-pip-version-check --no-input --quiet --require-hashes --no-deps
+
+.PHONY: help
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
+
+# ---- what has to be there -------------------------------------------------------------------------------------
+
+.venv/.complete: tools/harness/requirements.lock
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.11, 3.12 or 3.13 with venv found; name one: make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
+	@echo "Python: making .venv from $< (about a minute)"
+	@rm -rf .venv && "$(PYTHON)" -m venv .venv
+	@.venv/bin/python -m $(PIP) -r $<
+	@touch $@
+
+.venv-peers/.complete: benches/peers/requirements.lock
+	@test -n "$(PEER_PYTHON)" || { echo "error: LeRobot 0.6.1 needs Python 3.12 or 3.13 and none was found; name one: make PEER_PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
+	@echo "Python: making .venv-peers from $< (torch and LeRobot: some minutes, several GB)"
+	@rm -rf .venv-peers && "$(PEER_PYTHON)" -m venv .venv-peers
+	@.venv-peers/bin/python -m $(PIP) -r $<
+	@touch $@
+
+.PHONY: venv
+venv: .venv/.complete ## Python with robosuite, in .venv
+
+.PHONY: build
+build: .venv/.complete ## the programs, in target/release
+	@$(CARGO) build $(CARGO_FLAGS) --workspace
+
+# ---- the main job ---------------------------------------------------------------------------------------------
+
+.PHONY: demo
+demo: build ## the whole line: demonstrations, data set, training, evaluation, leaderboard (in out/demo)
+	@tools/demo.sh
+
+.PHONY: test
+test: build ## every test: Rust, Python and end to end
+	@$(CARGO) test $(CARGO_FLAGS) --workspace
+	@.venv/bin/python -m pytest -q tools/harness/tests
+
+.PHONY: lint
+lint: .venv/.complete ## formatting and lints, Rust and Python
+	@$(CARGO) fmt --all --check
+	@$(CARGO) clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings
+	@.venv/bin/python -m ruff check tools benches
+	@.venv/bin/python -m ruff format --check tools benches
+	@.venv/bin/python -m pyright --project tools/harness
+
+# ---- beside the others ----------------------------------------------------------------------------------------
+
+.PHONY: bench
+bench: build .venv-peers/.complete ## our speed beside the peers', measured in one run (table, target/bench/*.json)
+	@tools/bench.sh
+
+.PHONY: interop
+interop: build .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round
+	@.venv-peers/bin/python tests/interop/run.py
+
+.PHONY: clean
+clean: ## remove what was built and installed (target, .venv, .venv-peers, out)
+	@rm -rf target .venv .venv-peers out

@@ -1,0 +1,83 @@
+//! The directions of the dependencies, as ARCHITECTURE.md draws them: `dataset`, `puzzles` and `models` know nothing
+//! of each other's users, nothing knows the tools, and only the rooms named for it know HDF5, candle or a terminal.
+
+use std::collections::BTreeMap;
+use std::process::Command;
+
+/// For each of our packages, the packages (ours and others) that it depends on, test dependencies left out.
+fn dependencies() -> BTreeMap<String, Vec<String>> {
+    let output = Command::new(env!("CARGO"))
+        .args(["metadata", "--format-version=1", "--no-deps", "--offline", "--manifest-path"])
+        .arg(concat!(env!("CARGO_MANIFEST_DIR"), "/../Cargo.toml"))
+        .output()
+        .expect("cargo runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).expect("cargo prints JSON");
+    metadata["packages"]
+        .as_array()
+        .expect("a list of packages")
+        .iter()
+        .map(|package| {
+            let names = package["dependencies"]
+                .as_array()
+                .expect("a list of dependencies")
+                .iter()
+                .filter(|dependency| dependency["kind"] != "dev")
+                .map(|dependency| dependency["name"].as_str().expect("a name").to_owned())
+                .collect();
+            (package["name"].as_str().expect("a name").to_owned(), names)
+        })
+        .collect()
+}
+
+/// Our packages, lowest first: each may depend on those before it, as far as `ALLOWED` says.
+const ALLOWED: &[(&str, &[&str])] = &[
+    ("dataset", &[]),
+    ("puzzles", &[]),
+    ("control", &[]),
+    ("models", &["dataset"]),
+    ("zoo", &["dataset", "models", "puzzles"]),
+    ("actrm-data", &["dataset", "puzzles", "zoo"]),
+    ("actrm-zoo", &["dataset", "models", "puzzles", "zoo"]),
+    ("e2e", &[]),
+];
+
+#[test]
+fn dependencies_go_one_way() {
+    let dependencies = dependencies();
+    let ours: Vec<&str> = ALLOWED.iter().map(|(name, _)| *name).collect();
+    assert_eq!(
+        dependencies.keys().map(String::as_str).collect::<std::collections::BTreeSet<_>>(),
+        ours.iter().copied().collect(),
+        "every package of the workspace stands in this test"
+    );
+    for (package, allowed) in ALLOWED {
+        for name in &dependencies[*package] {
+            assert!(
+                !ours.contains(&name.as_str()) || allowed.contains(&name.as_str()),
+                "{package} must not depend on {name}"
+            );
+        }
+    }
+}
+
+#[test]
+fn each_heavy_dependency_has_one_room() {
+    let rooms: &[(&str, &[&str])] = &[
+        ("hdf5-metno", &["dataset", "e2e"]),
+        ("polars", &["dataset"]),
+        ("candle-core", &["models", "zoo"]),
+        ("candle-nn", &["models"]),
+        ("clap", &["actrm-data", "actrm-zoo"]),
+        ("anyhow", &["actrm-data", "actrm-zoo"]),
+        ("indicatif", &["actrm-data", "actrm-zoo"]),
+    ];
+    for (package, names) in dependencies() {
+        for (dependency, allowed) in rooms {
+            assert!(
+                !names.iter().any(|name| name == dependency) || allowed.contains(&package.as_str()),
+                "{package} must not depend on {dependency}; it belongs to {allowed:?}"
+            );
+        }
+    }
+}
