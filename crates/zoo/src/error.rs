@@ -1,0 +1,224 @@
+//! Everything that can go wrong in this crate, one variant an operation and its object.
+
+use std::path::PathBuf;
+
+/// Writes names the way every message lists them: `a, b, c`, or `none`.
+pub(crate) fn list(names: &[String]) -> String {
+    if names.is_empty() {
+        "none".to_owned()
+    } else {
+        names.join(", ")
+    }
+}
+
+/// ` (did you mean `x`?)`, or nothing.
+fn hint(nearest: &Option<String>) -> String {
+    nearest
+        .as_ref()
+        .map(|n| format!(" (did you mean `{n}`?)"))
+        .unwrap_or_default()
+}
+
+/// An operation of this crate that failed.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ZooError {
+    // ---- files -------------------------------------------------------------------------------
+    /// The operating system refused a file operation.
+    #[error("cannot {operation} {}", path.display())]
+    Io {
+        /// What was tried: `read`, `write`, `create folder`, …
+        operation: &'static str,
+        /// On which file or folder.
+        path: PathBuf,
+        /// Why it failed.
+        #[source]
+        source: std::io::Error,
+    },
+    /// A file that this crate wrote does not have the form it was written in.
+    #[error("{}: {reason}", path.display())]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+
+    // ---- experiments -------------------------------------------------------------------------
+    /// No experiment of that name.
+    #[error(
+        "unknown experiment `{name}`{}; experiments: {}",
+        hint(nearest),
+        list(available)
+    )]
+    UnknownExperiment {
+        /// The name asked for.
+        name: String,
+        /// The most similar name, where one is similar at all.
+        nearest: Option<String>,
+        /// Every experiment there is.
+        available: Vec<String>,
+    },
+    /// An experiment file is not TOML.
+    #[error("experiment `{experiment}` is not valid TOML")]
+    ExperimentSyntax {
+        /// The experiment.
+        experiment: String,
+        /// Line and column.
+        #[source]
+        source: Box<toml::de::Error>,
+    },
+    /// `extends` leads back to where it came from.
+    #[error("experiment `{}` extends itself: {}", chain.first().map_or("", String::as_str), chain.join(" -> "))]
+    ExtendsCycle {
+        /// The experiments in order of extension.
+        chain: Vec<String>,
+    },
+    /// A key that no part of an experiment has.
+    #[error(
+        "unknown key `{key}`{}; keys here: {}",
+        hint(nearest),
+        list(alternatives)
+    )]
+    UnknownKey {
+        /// Dotted path of the key.
+        key: String,
+        /// The most similar key, where one is similar at all.
+        nearest: Option<String>,
+        /// Keys allowed at this place.
+        alternatives: Vec<String>,
+    },
+    /// A key that has to be there is not.
+    #[error("key `{key}` is missing")]
+    MissingKey {
+        /// Dotted path of the key.
+        key: String,
+    },
+    /// A key holds something that it cannot.
+    #[error("key `{key}`: expected {expected}, found {found}")]
+    InvalidValue {
+        /// Dotted path of the key.
+        key: String,
+        /// What would be allowed.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+    /// An override is not of the form `section.key=value`.
+    #[error("override `{text}`: {reason}")]
+    Override {
+        /// The override as given.
+        text: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The demonstrations are nowhere.
+    #[error("data `{}` not found; looked at {}", path.display(), list(tried))]
+    DataNotFound {
+        /// The path as the experiment or the command line gives it.
+        path: PathBuf,
+        /// Every place looked at.
+        tried: Vec<String>,
+    },
+    /// The data set cannot serve this experiment.
+    #[error("data set {}: {reason}", path.display())]
+    UnfitData {
+        /// Folder of the data set.
+        path: PathBuf,
+        /// What does not fit: expected and found.
+        reason: String,
+    },
+
+    // ---- training runs -----------------------------------------------------------------------
+    /// Another process trains in this folder.
+    #[error("run folder {} is in use by another training (lock file {})", folder.display(), folder.join("lock").display())]
+    RunLocked {
+        /// The run's folder.
+        folder: PathBuf,
+    },
+    /// A fresh training was asked for where one already is.
+    #[error("run folder {} already holds a run; use --resume to go on with it, or another folder", folder.display())]
+    RunExists {
+        /// The run's folder.
+        folder: PathBuf,
+    },
+    /// Nothing to resume.
+    #[error("nothing to resume in {}: {reason}", folder.display())]
+    NothingToResume {
+        /// Folder that was looked at.
+        folder: PathBuf,
+        /// What is there instead.
+        reason: String,
+    },
+    /// A run can only go on with what it began with.
+    #[error("cannot resume {}: {what} differs: the run has {expected}, asked for {found}", folder.display())]
+    ResumeMismatch {
+        /// The run's folder.
+        folder: PathBuf,
+        /// Dotted key, or `data set`.
+        what: String,
+        /// What the run was started with.
+        expected: String,
+        /// What is asked for now.
+        found: String,
+    },
+    /// The loss or a tensor stopped being a finite number.
+    #[error("step {step}: {tensor} is {value}; training stopped, last good checkpoint: {}", checkpoint.as_ref().map_or("none yet".to_owned(), |p| p.display().to_string()))]
+    NotFinite {
+        /// Optimiser step, from 1.
+        step: u64,
+        /// Loss part, gradient or parameter by name.
+        tensor: String,
+        /// NaN or an infinity.
+        value: f64,
+        /// Where training can go on from.
+        checkpoint: Option<PathBuf>,
+    },
+
+    // ---- entries -----------------------------------------------------------------------------
+    /// No entry of that name in the zoo.
+    #[error("unknown entry `{name}` in zoo {}{}; entries: {}", zoo.display(), hint(nearest), list(available))]
+    UnknownEntry {
+        /// The entry asked for, `name` or `name@version`.
+        name: String,
+        /// The zoo's folder.
+        zoo: PathBuf,
+        /// The most similar name, where one is similar at all.
+        nearest: Option<String>,
+        /// Every `name@version` there is.
+        available: Vec<String>,
+    },
+    /// Not a name an entry can have.
+    #[error("entry name `{name}`: {reason}")]
+    EntryName {
+        /// The name.
+        name: String,
+        /// The rule it breaks.
+        reason: &'static str,
+    },
+    /// A file of an entry is not the one that was written.
+    #[error("{}: sha256 does not match: expected {expected}, found {found}", path.display())]
+    Tampered {
+        /// The file.
+        path: PathBuf,
+        /// The recorded hash.
+        expected: String,
+        /// The hash of what is there, or `no such file`.
+        found: String,
+    },
+}
+
+impl ZooError {
+    /// Builds the closure that `map_err` wants around a file operation.
+    pub(crate) fn io(
+        operation: &'static str,
+        path: impl Into<PathBuf>,
+    ) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::Io {
+            operation,
+            path,
+            source,
+        }
+    }
+}

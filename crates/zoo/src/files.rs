@@ -1,0 +1,107 @@
+//! Files that are either whole or not there, and their hashes.
+
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use crate::ZooError;
+
+/// Lower-case hexadecimal SHA-256 of `bytes`.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
+}
+
+/// Lower-case hexadecimal SHA-256 of a file's content.
+///
+/// # Errors
+/// When the file cannot be read.
+pub fn sha256_file(path: &Path) -> Result<String, ZooError> {
+    let mut file = File::open(path).map_err(ZooError::io("read", path))?;
+    let mut hasher = Sha256::new();
+    let mut buffer = vec![0_u8; 1 << 16];
+    loop {
+        let n = file.read(&mut buffer).map_err(ZooError::io("read", path))?;
+        if n == 0 {
+            return Ok(hex(&hasher.finalize()));
+        }
+        hasher.update(&buffer[..n]);
+    }
+}
+
+fn hex(digest: &[u8]) -> String {
+    use std::fmt::Write as _;
+    digest.iter().fold(String::new(), |mut text, byte| {
+        write!(text, "{byte:02x}").expect("writing into a String cannot fail");
+        text
+    })
+}
+
+/// Replaces `path` by `bytes`: a temporary name beside it, fsync, rename, fsync of the folder.
+///
+/// A reader sees the old content or the new, never a part; a killed writer leaves the old.
+///
+/// # Errors
+/// When the folder is not there or cannot be written to.
+pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), ZooError> {
+    let folder = path
+        .parent()
+        .filter(|p| !p.as_os_str().is_empty())
+        .unwrap_or_else(|| Path::new("."));
+    let mut file = tempfile::Builder::new()
+        .prefix(".tmp-")
+        .permissions(mode(0o644))
+        .tempfile_in(folder)
+        .map_err(ZooError::io("create a temporary file in", folder))?;
+    file.write_all(bytes)
+        .and_then(|()| file.as_file().sync_all())
+        .map_err(ZooError::io("write", path))?;
+    file.persist(path)
+        .map_err(|e| ZooError::io("write", path)(e.error))?;
+    sync_folder(folder)
+}
+
+fn mode(bits: u32) -> fs::Permissions {
+    std::os::unix::fs::PermissionsExt::from_mode(bits)
+}
+
+/// Makes renames inside `folder` survive a power cut.
+pub(crate) fn sync_folder(folder: &Path) -> Result<(), ZooError> {
+    File::open(folder)
+        .and_then(|f| f.sync_all())
+        .map_err(ZooError::io("sync folder", folder))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn hashes_agree_with_the_published_vector() {
+        // FIPS 180-2, "abc"
+        let expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+        assert_eq!(sha256_hex(b"abc"), expected);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("abc");
+        write_atomic(&path, b"abc").unwrap();
+        assert_eq!(sha256_file(&path).unwrap(), expected);
+    }
+
+    #[test]
+    fn a_replaced_file_leaves_nothing_else_behind() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x");
+        write_atomic(&path, b"one").unwrap();
+        write_atomic(&path, b"two").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"two");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_folder_that_is_not_there_is_named() {
+        let error = write_atomic(Path::new("/nonexistent-folder/x"), b"").unwrap_err();
+        assert!(error.to_string().contains("/nonexistent-folder"));
+    }
+}
