@@ -1,0 +1,288 @@
+//! What can go wrong: one enum for the library, one for everything that is wrong with an input file.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+/// Why an operation on a data set failed.
+#[derive(Debug, thiserror::Error)]
+pub enum DatasetError {
+    /// The demonstrations file that was given cannot be used; the text says what is wrong and where.
+    #[error(transparent)]
+    Input(#[from] InputError),
+
+    /// The output path exists; nothing is ever overwritten.
+    #[error("{path}: exists already; choose another path or remove it first", path = path.display())]
+    OutputExists {
+        /// The path that exists.
+        path: PathBuf,
+    },
+
+    /// A file operation failed.
+    #[error("{path}: cannot {operation}", path = path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// What was attempted, as a verb phrase.
+        operation: &'static str,
+        /// The system's answer.
+        source: std::io::Error,
+    },
+
+    /// libhdf5 refused to write an object.
+    #[error("{path}: cannot write {object}", path = path.display())]
+    Hdf5Write {
+        /// The file being written.
+        path: PathBuf,
+        /// The group, dataset or attribute inside it.
+        object: String,
+        /// The library's answer.
+        source: ::hdf5::Error,
+    },
+
+    /// A tree that was handed over for writing contradicts itself.
+    #[error("{path}: {object} cannot be written: {reason}", path = path.display())]
+    BadTree {
+        /// The file being written.
+        path: PathBuf,
+        /// The group, dataset or attribute inside it.
+        object: String,
+        /// What does not fit, with the expected and the found value.
+        reason: String,
+    },
+}
+
+/// What is wrong with an input file. Plain data, so that it crosses from the reading process unchanged.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
+pub enum InputError {
+    /// There is nothing at the path.
+    #[error("{path}: no such file or folder", path = path.display())]
+    NotFound {
+        /// The path that was given.
+        path: PathBuf,
+    },
+
+    /// The system would not let us read.
+    #[error("{path}: cannot read: {reason}", path = path.display())]
+    Unreadable {
+        /// The path that was given.
+        path: PathBuf,
+        /// The system's words.
+        reason: String,
+    },
+
+    /// The file has no HDF5 signature.
+    #[error("{path}: not an HDF5 file: expected the HDF5 signature, found {found}", path = path.display())]
+    NotHdf5 {
+        /// The file.
+        path: PathBuf,
+        /// Its first bytes, or that it is empty.
+        found: String,
+    },
+
+    /// The file ends before the length that its own header states.
+    #[error("{path}: truncated: its header states {expected} bytes, the file has {found}", path = path.display())]
+    Truncated {
+        /// The file.
+        path: PathBuf,
+        /// Bytes that the header states.
+        expected: u64,
+        /// Bytes that there are.
+        found: u64,
+    },
+
+    /// The HDF5 library could not make sense of an object.
+    #[error("{path}: damaged: cannot {operation} {object}: {reason}", path = path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// The group, dataset or attribute.
+        object: String,
+        /// What was attempted.
+        operation: String,
+        /// The library's words.
+        reason: String,
+    },
+
+    /// HDF5, but of no layout that is known here.
+    #[error("{path}: no known layout of demonstrations: expected {expected}; found {found}", path = path.display())]
+    UnknownLayout {
+        /// The file or folder.
+        path: PathBuf,
+        /// What would have been recognised.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+
+    /// The group `data` holds no demonstration.
+    #[error("{path}: group data holds no demo_<number>; found {found}", path = path.display())]
+    NoDemos {
+        /// The file.
+        path: PathBuf,
+        /// What is there.
+        found: String,
+    },
+
+    /// A demo lacks a dataset or a group.
+    #[error("{path}: {demo}: no {key}; found {found}", path = path.display())]
+    MissingKey {
+        /// The file.
+        path: PathBuf,
+        /// The demo's id.
+        demo: String,
+        /// The missing key.
+        key: String,
+        /// The keys that are there.
+        found: String,
+    },
+
+    /// A dataset of a demo has another length than the demo.
+    #[error("{path}: {demo}: {key}: expected {expected} steps, found {found}", path = path.display())]
+    WrongLength {
+        /// The file.
+        path: PathBuf,
+        /// The demo's id.
+        demo: String,
+        /// The dataset.
+        key: String,
+        /// The demo's length, and where it was read.
+        expected: String,
+        /// The dataset's shape.
+        found: String,
+    },
+
+    /// A dataset has an unexpected rank or element type.
+    #[error("{path}: {demo}: {key}: expected {expected}, found {found}", path = path.display())]
+    WrongShape {
+        /// The file.
+        path: PathBuf,
+        /// The demo's id.
+        demo: String,
+        /// The dataset.
+        key: String,
+        /// What is needed.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+
+    /// An action is NaN or infinite.
+    #[error("{path}: {demo}: {key}: step {step}, dimension {dimension}: expected a finite number, found {found}", path = path.display())]
+    NotFinite {
+        /// The file.
+        path: PathBuf,
+        /// The demo's id.
+        demo: String,
+        /// The dataset.
+        key: String,
+        /// The step, from 0.
+        step: usize,
+        /// The dimension, from 0.
+        dimension: usize,
+        /// The value.
+        found: String,
+    },
+
+    /// An attribute is missing or has a value that cannot be used.
+    #[error("{path}: {object}: attribute {attribute}: expected {expected}, found {found}", path = path.display())]
+    BadAttribute {
+        /// The file.
+        path: PathBuf,
+        /// The group or dataset.
+        object: String,
+        /// The attribute.
+        attribute: String,
+        /// What is needed.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+
+    /// A mask names a demo that the file does not have.
+    #[error("{path}: mask/{mask}: names {demo}, which is not in the file", path = path.display())]
+    UnknownMaskDemo {
+        /// The file.
+        path: PathBuf,
+        /// The mask.
+        mask: String,
+        /// The demo that is not there.
+        demo: String,
+    },
+
+    /// An element type, link or storage that is not read.
+    #[error("{path}: {object}: {what} is not supported", path = path.display())]
+    Unsupported {
+        /// The file.
+        path: PathBuf,
+        /// The group, dataset or attribute.
+        object: String,
+        /// The type, link or storage in words.
+        what: String,
+    },
+
+    /// A size that cannot be right, or that is beyond what one call may return.
+    #[error("{path}: {object}: {bytes} bytes stated, at most {limit} can be right", path = path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// The group, dataset or attribute.
+        object: String,
+        /// Bytes that the file states.
+        bytes: u64,
+        /// The bound.
+        limit: u64,
+    },
+
+    /// A demo, key or range that was asked for does not exist.
+    #[error("{path}: no {wanted}; there is {found}", path = path.display())]
+    NoSuch {
+        /// The file.
+        path: PathBuf,
+        /// What was asked for.
+        wanted: String,
+        /// What there is.
+        found: String,
+    },
+
+    /// The file holds states only; observations have to be rendered first.
+    #[error("{path}: a raw robosuite recording without observations: run `actrm-data extract` on it first", path = path.display())]
+    NeedsExtraction {
+        /// The file.
+        path: PathBuf,
+    },
+
+    /// The reading process ended without an answer: the file crashed the HDF5 library.
+    #[error("{path}: damaged: the HDF5 library {how} while it was to {during}", path = path.display())]
+    ReaderDied {
+        /// The file.
+        path: PathBuf,
+        /// What it was doing.
+        during: String,
+        /// Its exit code or signal in words.
+        how: String,
+    },
+
+    /// The reading process gave no answer in time.
+    #[error("{path}: damaged or on a device that does not answer: no answer in {seconds} s while it was to {during}", path = path.display())]
+    ReaderSilent {
+        /// The file.
+        path: PathBuf,
+        /// What it was doing.
+        during: String,
+        /// How long was waited.
+        seconds: u64,
+    },
+
+    /// The reading process could not be started, or it is not ours.
+    #[error("{path}: cannot start the reading process: {reason}", path = path.display())]
+    ReaderStart {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+}
+
+/// Result of this library.
+pub type Result<T, E = DatasetError> = std::result::Result<T, E>;

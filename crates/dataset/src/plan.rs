@@ -1,0 +1,155 @@
+//! What is in a file or folder of demonstrations, before any of it is read.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::tree::Dtype;
+
+/// Whose layout a file follows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum Dialect {
+    /// robomimic of any generation, and everything that writes the same tree.
+    Robomimic,
+    /// robosuite's own recordings: states and actions, no observations.
+    RobosuiteRaw,
+    /// LIBERO.
+    Libero,
+    /// robocasa.
+    Robocasa,
+    /// MimicGen and Isaac Lab Mimic.
+    Mimicgen,
+    /// D4RL: one run of steps, cut into episodes at terminals and timeouts.
+    D4rl,
+    /// ALOHA and ACT: one file per episode.
+    Aloha,
+}
+
+impl Dialect {
+    /// The name for people.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Robomimic => "robomimic",
+            Self::RobosuiteRaw => "raw robosuite",
+            Self::Libero => "LIBERO",
+            Self::Robocasa => "robocasa",
+            Self::Mimicgen => "MimicGen",
+            Self::D4rl => "D4RL",
+            Self::Aloha => "ALOHA",
+        }
+    }
+
+    /// Whether observations have to be made by replaying the states first.
+    pub fn needs_extraction(self) -> bool {
+        self == Self::RobosuiteRaw
+    }
+}
+
+/// What a file or folder holds.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Plan {
+    /// The file or folder.
+    pub path: PathBuf,
+    /// Every file that is read, with its size in bytes; one unless the source is a folder.
+    pub files: Vec<(PathBuf, u64)>,
+    /// Whose layout it is.
+    pub dialect: Dialect,
+    /// The demos in numeric order.
+    pub demos: Vec<DemoPlan>,
+    /// `env_args` as JSON, where the file has it and it parses.
+    pub env_args: Option<serde_json::Value>,
+    /// Environment name, from `env_args` or the dialect's own place.
+    pub env_name: Option<String>,
+    /// Simulator generation, where the file states it.
+    pub env_version: Option<String>,
+    /// Filter keys: mask name to demo ids, in stored order.
+    pub masks: BTreeMap<String, Vec<String>>,
+    /// Text attributes of the file and of its data group (`/date`, `data/env_args`), as stored.
+    pub texts: BTreeMap<String, String>,
+    /// Facts worth knowing that are no fault: camera orientation, a dropped tail.
+    pub notes: Vec<String>,
+    /// Everything that is wrong. A demo with a problem is refused by `read_demo`.
+    pub problems: Vec<Problem>,
+}
+
+impl Plan {
+    /// Steps of all demos together.
+    pub fn frames(&self) -> usize {
+        self.demos.iter().map(|d| d.length).sum()
+    }
+
+    /// Position of the demo with this id.
+    pub fn position(&self, id: &str) -> Option<usize> {
+        self.demos.iter().position(|d| d.id == id)
+    }
+}
+
+/// One demo, unread.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DemoPlan {
+    /// `demo_12`; kept as stored.
+    pub id: String,
+    /// The number in the id, which gives the order.
+    pub number: u64,
+    /// Steps.
+    pub length: usize,
+    /// Datasets by path below the demo.
+    pub keys: BTreeMap<String, KeyPlan>,
+    /// Names of the attributes of the demo's group.
+    pub attr_names: Vec<String>,
+    /// The instruction in words, where the file has one for this demo.
+    pub task: Option<String>,
+}
+
+/// One dataset of a demo, unread.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct KeyPlan {
+    /// Element type.
+    pub dtype: Dtype,
+    /// Shape as the demo sees it: the first axis is time for everything that has the demo's length.
+    pub shape: Vec<usize>,
+    /// Reading rows in multiples of this many avoids decoding a stored block twice; 1 if it does not matter.
+    pub block_rows: usize,
+    /// Where the elements are.
+    pub place: Place,
+}
+
+impl KeyPlan {
+    /// Bytes once read; `None` where the size is not known beforehand.
+    pub fn bytes(&self) -> Option<u64> {
+        let size = self.dtype.size()? as u64;
+        self.shape
+            .iter()
+            .try_fold(size, |n, &extent| n.checked_mul(extent as u64))
+    }
+
+    /// Whether each step is an image: 8-bit, height x width x channels.
+    pub fn is_image(&self) -> bool {
+        self.dtype == Dtype::U8 && self.shape.len() == 4 && matches!(self.shape[3], 1 | 3 | 4)
+    }
+}
+
+/// Where the elements of a dataset are.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Place {
+    /// Index into [`Plan::files`].
+    pub file: usize,
+    /// Absolute path of the dataset in that file.
+    pub path: String,
+    /// First row that belongs to the demo (0 unless several demos share a dataset).
+    pub first_row: usize,
+    /// Position in the file of the demo's first element, where they lie there as they are in memory.
+    pub offset: Option<u64>,
+}
+
+/// Something wrong with a source.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Problem {
+    /// The demo it concerns, if one.
+    pub demo: Option<String>,
+    /// Whether reading the demo (or the source, if no demo is named) is refused because of it.
+    pub fatal: bool,
+    /// What, where, expected, found.
+    pub message: String,
+}
