@@ -1,1 +1,22 @@
-//! Maze and Sudoku tasks: generators, exact solvers, environments.
+//! Maze and Sudoku tasks for recursive reasoning: seeded generators, exact solvers and a walking environment.
+//!
+//! Each task is either one of the published small-TRM study's, with its rules to the letter (`maze8-original`,
+//! `maze10-original`, `maze5-rl`), or a repaired one in which something has to be found out (`open8`, `dfs10`, `dfs16`,
+//! `dfs20`, `maze5-walls`, `sudoku4`, `sudoku6`, `sudoku9`). Every puzzle comes with its exact answer, and belongs to the
+//! training, validation or test split by its content, so that no maze and no solution is ever in two of them.
+//!
+//! This crate knows nothing of tensors, models, files or training.
+
+mod grid;
+mod maze;
+mod rng;
+mod split;
+mod sudoku;
+mod walker;
+
+pub use grid::{Grid, RIGHT_DOWN_LEFT_UP};
+pub use maze::{Maze, MazeTask};
+pub use rng::Rng;
+pub use split::{Split, fingerprint};
+pub use sudoku::{Sudoku, SudokuTask};
+pub use walker::{MAX_MOVES, MOVES, Moved, Walker};
