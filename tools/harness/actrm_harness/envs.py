@@ -1,0 +1,187 @@
+"""Environments: what tasks there are, and how one is made, seeded, stepped and observed.
+
+An episode depends on (task, seed, actions) only, whatever ran before in the process: `reset` writes the seed's bit
+generator state into the environment's own generator (a new generator would not reach robosuite's placement samplers)
+and then resets. Where `Task.soft_reset` is set, the model is kept between episodes, which is bit-identical to loading
+it again for every task but Lift (its cube's size is drawn when the model is loaded).
+"""
+
+import hashlib
+import json
+import os
+import re
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from actrm_harness import suite
+from actrm_harness.protocol import RequestError
+from actrm_harness.suite import Env
+from actrm_harness.wire import Array, Tensors
+
+CONTROL_FREQ = 20
+DEFAULT_MAX_STEPS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What this package knows about an environment beyond its name."""
+
+    name: str
+    soft_reset: bool = False
+    max_steps: int = DEFAULT_MAX_STEPS
+
+
+TASKS = {task.name: task for task in (Task("Lift"),)}
+
+
+class Control(Protocol):
+    """The inner loop of a control step, in place of robosuite's."""
+
+    def step(self, env: Env, action: Array) -> tuple[dict[str, Array], float]:
+        """Advance one control step; the observations and the reward after it."""
+        ...
+
+    def reset(self, env: Env) -> None:
+        """Called after every reset of the environment."""
+        ...
+
+
+@dataclass(slots=True)
+class Session:
+    """One environment, its task and its control loop (None: robosuite's own)."""
+
+    env: Env
+    task: Task
+    env_args: dict[str, Any]
+    cameras: tuple[str, ...] = ()
+    control: Control | None = None
+    foreign_model: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """What one control step led to."""
+
+    observation: Tensors
+    reward: float
+    success: bool
+
+
+def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Session:
+    """Make the environment of a task; RequestError("unknown_task") where there is none of that name."""
+    known = suite.known_environments()
+    if task_name not in known:
+        raise RequestError("unknown_task", f"unknown task {task_name!r}; known: {', '.join(known)}")
+    task = TASKS.get(task_name, Task(task_name))
+    kwargs: dict[str, Any] = {
+        "robots": "Panda",
+        "controller_configs": suite.panda_controller(),
+        "reward_shaping": False,
+        "has_renderer": False,
+        "has_offscreen_renderer": bool(cameras),
+        "ignore_done": True,
+        "use_object_obs": True,
+        "use_camera_obs": bool(cameras),
+        "camera_depths": False,
+    }
+    if cameras:
+        kwargs |= {"camera_names": list(cameras), "camera_heights": size, "camera_widths": size}
+    env_args: dict[str, Any] = {
+        "env_name": task_name,
+        "env_version": suite.robosuite().__version__,
+        "type": 1,
+        "env_kwargs": json.loads(json.dumps(kwargs)),
+    }
+    env = cast(
+        Env,
+        suite.robosuite().make(
+            task_name, **kwargs, control_freq=CONTROL_FREQ, hard_reset=not task.soft_reset, renderer="mujoco", seed=0
+        ),
+    )
+    return Session(env=env, task=task, env_args=env_args, cameras=cameras)
+
+
+def reset(session: Session, seed: int) -> Tensors:
+    """Begin the episode of `seed` and give its first observation."""
+    env = session.env
+    env.hard_reset = not session.task.soft_reset or session.foreign_model
+    session.foreign_model = False
+    env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
+    raw = env.reset()
+    env.hard_reset = not session.task.soft_reset
+    if session.control is not None:
+        session.control.reset(env)
+    return observation(raw)
+
+
+def step(env: Env, action: Array, control: Control | None) -> StepResult:
+    """One control step, through robosuite's loop or through `control`."""
+    if control is None:
+        raw, reward, _, _ = env.step(action)
+    else:
+        raw, reward = control.step(env, action)
+    return StepResult(observation(raw), float(reward), success(env))
+
+
+def success(env: Env) -> bool:
+    """Whether the task is solved in the current state."""
+    return bool(env._check_success())  # pyright: ignore[reportPrivateUsage]
+
+
+def check_action(env: Env, action: Array) -> Array:
+    """The action as float64; RequestError where its shape, type or values are not an action."""
+    low, _ = env.action_spec
+    if action.dtype != np.float64 or action.shape != low.shape:
+        raise RequestError("bad_action", f"action must be F64 of shape {low.shape}, got {action.dtype} {action.shape}")
+    if not np.all(np.isfinite(action)):
+        raise RequestError("bad_action", f"action has values that are not finite: {action.tolist()}")
+    return np.array(action)
+
+
+def observation(raw: dict[str, Array]) -> Tensors:
+    """robosuite's observations under robomimic's names.
+
+    "object-state" becomes "object"; the robot's own values keep their names; images are turned upright; the separate
+    values that "object-state" joins and the joined robot state are left out.
+    """
+    kept: Tensors = {}
+    for name, value in raw.items():
+        if name == "object-state":
+            kept["object"] = np.asarray(value, dtype=np.float64)
+        elif name.endswith("_image"):
+            kept[name] = np.ascontiguousarray(value[::-1])
+        elif re.match(r"robot\d+_", name) and not name.endswith("-state"):
+            kept[name] = np.asarray(value, dtype=np.float64)
+    return kept
+
+
+def state(env: Env) -> Array:
+    """The simulator's flattened state, as robomimic stores it."""
+    return np.asarray(env.sim.get_state().flatten(), dtype=np.float64)
+
+
+def fingerprint(env: Env) -> str:
+    """SHA-256 of the simulation's state with the parts of the model that a reset may change."""
+    digest = hashlib.sha256()
+    model, data = env.sim.model, env.sim.data
+    for owner, names in (
+        (data, ("time", "qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")),
+        (model, ("body_pos", "body_quat", "body_mass", "body_inertia", "geom_size", "geom_pos", "geom_rgba")),
+    ):
+        for name in names:
+            value = np.ascontiguousarray(getattr(owner, name))
+            digest.update(f"{name} {value.dtype.str} {value.shape}\n".encode())
+            digest.update(value.tobytes())
+    return digest.hexdigest()
+
+
+def model_xml(env: Env) -> str:
+    """The model as MJCF, without indentation and with asset paths that begin at "robosuite/".
+
+    robosuite finds the last "robosuite" in a path and puts its own folder there when it loads the text again.
+    """
+    text = cast(str, env.sim.model.get_xml())
+    text = text.replace(os.path.dirname(suite.package_dir()) + "/", "")
+    return re.sub(r"\n\s*", "\n", text)

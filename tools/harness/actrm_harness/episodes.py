@@ -1,0 +1,138 @@
+"""Whole episodes in robomimic's arrays: what an expert did, and what stored states look like.
+
+States, actions (as executed), rewards r(s') and dones are those of robomimic: states[t] and obs[t] are what was there
+before actions[t]; rewards[t], dones[t] and next_obs[t] are what it led to. dones follow done_mode 2: 1 where the task
+is solved, and in the last step.
+"""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from actrm_harness import envs
+from actrm_harness.envs import Session
+from actrm_harness.experts import Scene, make_expert
+from actrm_harness.protocol import RequestError
+from actrm_harness.wire import Array, Tensors
+
+# A demonstration ends this many steps after the task is solved, so that its last actions show how to stay there.
+STEPS_AFTER_SUCCESS = 10
+
+# What a demonstration keeps of the observations: sines, cosines and accelerations of joints follow from the rest.
+LEFT_OUT = ("_joint_pos_cos", "_joint_pos_sin", "_joint_acc", "_eef_quat_site")
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One recorded episode and the attributes of its demo."""
+
+    success: bool
+    steps: int
+    attrs: dict[str, str]
+    tensors: Tensors
+
+
+class _Recorder:
+    def __init__(self, first: Tensors) -> None:
+        self.observations = [_kept(first)]
+        self.states: list[Array] = []
+        self.actions: list[Array] = []
+        self.rewards: list[float] = []
+        self.successes: list[bool] = []
+
+    def add(self, state: Array, action: Array, result: envs.StepResult) -> None:
+        self.states.append(state)
+        self.actions.append(action)
+        self.rewards.append(result.reward)
+        self.successes.append(result.success)
+        self.observations.append(_kept(result.observation))
+
+    def tensors(self) -> Tensors:
+        dones = np.array(self.successes, dtype=np.int64)
+        dones[-1] = 1
+        tensors: Tensors = {
+            "states": np.array(self.states),
+            "actions": np.array(self.actions),
+            "rewards": np.array(self.rewards, dtype=np.float64),
+            "dones": dones,
+        }
+        for name in self.observations[0]:
+            values = np.array([observation[name] for observation in self.observations])
+            tensors[f"obs/{name}"] = values[:-1]
+            tensors[f"next_obs/{name}"] = values[1:]
+        return tensors
+
+
+def _kept(observation: Tensors) -> Tensors:
+    return {name: value for name, value in observation.items() if not name.endswith(LEFT_OUT)}
+
+
+def expert_episode(session: Session, seed: int) -> Episode:
+    """One episode of the task's expert; its noise has a generator of its own, drawn from the same seed."""
+    env = session.env
+    recorder = _Recorder(envs.reset(session, seed))
+    attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
+    try:
+        expert = make_expert(session.task.name, Scene(env), np.random.default_rng([seed, 1]))
+    except KeyError as error:
+        raise RequestError("no_expert", f"task {session.task.name!r} has no scripted expert") from error
+    held = 0
+    for _ in range(session.task.max_steps):
+        before = envs.state(env)
+        action = np.clip(expert.act(), -1.0, 1.0)
+        result = envs.step(env, action, session.control)
+        recorder.add(before, action, result)
+        held = held + 1 if result.success else 0
+        if held > STEPS_AFTER_SUCCESS:
+            break
+    return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors())
+
+
+def extract(session: Session, states: Array, actions: Array, model_file: str) -> Episode:
+    """Observations, rewards and dones of stored states, in the way of robomimic's dataset_states_to_obs.
+
+    Every state is put into the simulator and looked at; only what follows the last action is simulated. The model is
+    the demonstration's own, so the next reset loads the task's again.
+    """
+    env = session.env
+    steps, width = _matrix("states", states)
+    action_steps, _ = _matrix("actions", actions)
+    if steps == 0 or action_steps != steps:
+        raise RequestError("bad_request", f"extract: {steps} states and {action_steps} actions")
+    for row in actions:
+        envs.check_action(env, row)
+    session.foreign_model = True
+    if model_file:
+        env.reset()
+        env.reset_from_xml_string(env.edit_model_xml(model_file))
+    else:
+        env.reset()
+    expected = envs.state(env).shape[0]
+    if width != expected:
+        raise RequestError("bad_request", f"extract: states have {width} values, the model has {expected}")
+    env.sim.reset()
+    recorder = _Recorder(_put(env, states[0]))
+    for index in range(steps):
+        if index + 1 < steps:
+            seen = _put(env, states[index + 1])
+            result = envs.StepResult(seen, float(env.reward(actions[index])), envs.success(env))
+        else:
+            result = envs.step(env, actions[index], None)
+        recorder.add(states[index], actions[index], result)
+    attrs = {"model_file": model_file or envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
+    return Episode(any(recorder.successes), steps, attrs, recorder.tensors())
+
+
+def _put(env: envs.Env, flat: Array) -> Tensors:
+    env.sim.set_state_from_flattened(flat)
+    env.sim.forward()
+    return envs.observation(env._get_observations(force_update=True))  # pyright: ignore[reportPrivateUsage]
+
+
+def _matrix(name: str, array: Array) -> tuple[int, int]:
+    if array.ndim != 2 or array.dtype != np.float64:
+        raise RequestError("bad_request", f"extract: {name} must be F64 of two dimensions, got {array.dtype} {array.shape}")
+    if not np.all(np.isfinite(array)):
+        raise RequestError("bad_request", f"extract: {name} has values that are not finite")
+    return array.shape[0], array.shape[1]

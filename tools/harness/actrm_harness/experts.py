@@ -1,0 +1,200 @@
+"""What the scripted experts share: the view of the scene, the servo, the variety, and the table of experts.
+
+An expert is closed-loop: every action follows from what can be observed now, so that it recovers from a push, and so
+that a policy which sees the same observations can learn it. Episodes differ by a `Style` drawn once (speed, height and
+side of the approach), by correlated noise on the command, and by pushes of a few steps that it has to make up for.
+"""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from actrm_harness.suite import Env
+from actrm_harness.wire import Array
+
+# OSC_POSE: an action of 1 asks for 5 cm or 0.5 rad.
+METRES_PER_UNIT = 0.05
+RADIANS_PER_UNIT = 0.5
+
+OPEN, CLOSE = -1.0, 1.0
+
+
+class Expert(Protocol):
+    """A scripted controller for one episode."""
+
+    def act(self) -> Array:
+        """The action for the current state, before it is clipped to +-1."""
+        ...
+
+
+ExpertFactory = Callable[["Scene", np.random.Generator], Expert]
+
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """How this episode's expert moves."""
+
+    gain: float
+    speed: float
+    hover: float
+    side: Array
+    noise: float
+
+    @staticmethod
+    def draw(rng: np.random.Generator) -> "Style":
+        """A style near the middle of what still works well."""
+        return Style(
+            gain=rng.uniform(0.8, 1.1),
+            speed=rng.uniform(0.5, 0.85),
+            hover=rng.uniform(0.05, 0.10),
+            side=rng.uniform(-0.012, 0.012, size=2),
+            noise=rng.uniform(0.01, 0.05),
+        )
+
+
+class Scene:
+    """What an expert may look at: gripper, fingers and named bodies, in world coordinates."""
+
+    def __init__(self, env: Env) -> None:
+        self.env = env
+        self._robot: Any = env.robots[0]
+        self._site = int(self._robot.eef_site_id["right"])
+        self._fingers: list[int] = list(self._robot._ref_gripper_joint_pos_indexes["right"])
+        self._finger_speeds: list[int] = list(self._robot._ref_gripper_joint_vel_indexes["right"])
+
+    @property
+    def hand(self) -> Array:
+        """Position of the grip site."""
+        return np.array(self.env.sim.data.site_xpos[self._site])
+
+    @property
+    def hand_rotation(self) -> Array:
+        """Rotation matrix of the grip site."""
+        return np.array(self.env.sim.data.site_xmat[self._site]).reshape(3, 3)
+
+    @property
+    def gap(self) -> float:
+        """Distance between the finger tips in metres (0.08 when open)."""
+        left, right = self.env.sim.data.qpos[self._fingers]
+        return float(left - right)
+
+    @property
+    def gap_speed(self) -> float:
+        """How fast the fingers open (positive) or close, in metres a second."""
+        left, right = self.env.sim.data.qvel[self._finger_speeds]
+        return float(left - right)
+
+    def body(self, name: str) -> Array:
+        """Position of a body."""
+        return np.array(self.env.sim.data.body_xpos[self.env.sim.model.body_name2id(name)])
+
+    def body_rotation(self, name: str) -> Array:
+        """Rotation matrix of a body."""
+        return np.array(self.env.sim.data.body_xmat[self.env.sim.model.body_name2id(name)]).reshape(3, 3)
+
+
+class Servo:
+    """Turns a target pose of the hand into an action, with this episode's style, noise and pushes."""
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.scene = scene
+        self.style = Style.draw(rng)
+        self.upright = scene.hand_rotation
+        self._rng = rng
+        self._noise = np.zeros(6)
+        self._time = 0
+        self._push_at = int(rng.integers(3, 40))
+        self._push = rng.normal(size=3)
+        self._push *= rng.uniform(0.2, 0.6) / np.linalg.norm(self._push)
+
+    def move(self, target: Array, grip: float, rotation: Array | None = None, gentle: float = 1.0) -> Array:
+        """A step towards `target` (and `rotation`, else as the hand was at the start), at `gentle` times the speed."""
+        style = self.style
+        wanted = limit((target - self.scene.hand) / METRES_PER_UNIT * style.gain, style.speed * gentle)
+        goal = self.upright if rotation is None else rotation
+        turn = limit(rotation_vector(goal @ self.scene.hand_rotation.T) / RADIANS_PER_UNIT, 0.5)
+        self._noise = 0.7 * self._noise + self._rng.normal(size=6) * style.noise * np.repeat([1.0, 0.3], 3)
+        if self._push_at <= self._time < self._push_at + 3:
+            wanted = wanted + self._push
+        self._time += 1
+        return np.concatenate([np.concatenate([wanted, turn]) + self._noise, [grip]])
+
+
+def limit(vector: Array, length: float) -> Array:
+    """The vector, shortened to `length` where it is longer."""
+    norm = float(np.linalg.norm(vector))
+    return vector if norm <= length else vector * (length / norm)
+
+
+def rotation_vector(matrix: Array) -> Array:
+    """Axis times angle of a rotation matrix (of any angle below pi)."""
+    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    sine = float(np.linalg.norm(axis)) / 2
+    cosine = (float(np.trace(matrix)) - 1) / 2
+    if sine < 1e-9:
+        return axis / 2
+    return axis / (2 * sine) * float(np.arctan2(sine, cosine))
+
+
+def about_z(angle: float) -> Array:
+    """Rotation matrix about the vertical."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def funnel(distance: float, near: float, far: float) -> float:
+    """0 within `near`, 1 beyond `far`, straight in between."""
+    return float(np.clip((distance - near) / (far - near), 0.0, 1.0))
+
+
+class Grasp:
+    """Reaching for a thing and holding it: where to go, and what the fingers do.
+
+    `held` is read off the fingers: they were told to close, have stopped, and stopped before they met.
+    """
+
+    def __init__(self, scene: Scene, style: Style, thinnest: float = 0.01, widest: float = 0.07) -> None:
+        self.scene = scene
+        self.style = style
+        self.thinnest = thinnest
+        self.widest = widest
+        self.closing = False
+        self.held = False
+
+    def reach(self, point: Array) -> tuple[Array, float]:
+        """Where the hand should go now to have `point` between its fingers, and what the fingers do."""
+        hand = self.scene.hand
+        offset = point - hand
+        flat, height = float(np.linalg.norm(offset[:2])), abs(float(offset[2]))
+        if not self.closing and flat < 0.01 and height < 0.012:
+            self.closing = True
+        elif self.closing and (flat > 0.035 or height > 0.035 or self.scene.gap < self.thinnest):
+            self.closing = self.held = False
+        gap = self.scene.gap
+        if self.closing and self.thinnest < gap < self.widest and abs(self.scene.gap_speed) < 0.01:
+            self.held = True
+        target = np.array(point)
+        if not self.closing:
+            lift = funnel(flat, 0.012, 0.05)
+            target[2] += self.style.hover * lift
+            target[:2] += self.style.side * lift
+        return target, CLOSE if self.closing else OPEN
+
+
+def make_expert(task: str, scene: Scene, rng: np.random.Generator) -> Expert:
+    """The expert of a task; KeyError where it has none."""
+    return EXPERTS[task](scene, rng)
+
+
+def _from(module: str, name: str) -> ExpertFactory:
+    def build(scene: Scene, rng: np.random.Generator) -> Expert:
+        factory: object = getattr(importlib.import_module(f"actrm_harness.{module}"), name)
+        return cast(ExpertFactory, factory)(scene, rng)
+
+    return build
+
+
+EXPERTS: dict[str, ExpertFactory] = {"Lift": _from("experts_cubes", "LiftExpert")}

@@ -1,0 +1,134 @@
+"""The messages of worker protocol 1, as dataclasses. They travel as JSON beside the tensors of a frame (`wire`)."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from actrm_harness.wire import Message
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """Sent unasked after start: what this worker is and what its environment takes and gives."""
+
+    protocol: int
+    robosuite: str
+    mujoco: str
+    python: str
+    numpy: str
+    task: str
+    env_name: str
+    control: str
+    control_freq: int
+    max_steps: int
+    action_dim: int
+    action_low: list[float]
+    action_high: list[float]
+    observations: dict[str, list[int]]
+    env_args: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """Begin the episode of `seed`."""
+
+    id: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One control step; the action is the tensor "action"."""
+
+    id: int
+
+
+@dataclass(frozen=True, slots=True)
+class Expert:
+    """One whole episode of the task's scripted expert."""
+
+    id: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Extract:
+    """Observations, rewards and dones of stored states; tensors "states" and "actions"."""
+
+    id: int
+    model_file: str
+
+
+@dataclass(frozen=True, slots=True)
+class Render:
+    """An image of the current state, `size` is [height, width]."""
+
+    id: int
+    camera: str
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Close:
+    """End the worker."""
+
+    id: int
+
+
+Request = Reset | Step | Expert | Extract | Render | Close
+
+_REQUESTS: dict[str, type[Request]] = {
+    "reset": Reset,
+    "step": Step,
+    "expert": Expert,
+    "extract": Extract,
+    "render": Render,
+    "close": Close,
+}
+
+
+class RequestError(Exception):
+    """A request that cannot be answered; `kind` is a stable word, the text says what was wrong."""
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+def parse_request(message: Message) -> Request:
+    """The request a message stands for; RequestError where a field is missing, unknown or of another type."""
+    kind = message.get("type")
+    if not isinstance(kind, str) or kind not in _REQUESTS:
+        raise RequestError("unknown_request", f"unknown request {kind!r}; known: {', '.join(_REQUESTS)}")
+    fields = {name: value for name, value in message.items() if name != "type"}
+    cls = _REQUESTS[kind]
+    expected = set(cls.__dataclass_fields__)
+    if set(fields) != expected:
+        raise RequestError("bad_request", f"{kind} takes {sorted(expected)}, got {sorted(fields)}")
+    for name in ("id", "seed"):
+        if name in fields and not _is_count(fields[name]):
+            raise RequestError("bad_request", f"{kind}: {name} must be a non-negative integer, got {fields[name]!r}")
+    for name in ("camera", "model_file"):
+        if name in fields and not isinstance(fields[name], str):
+            raise RequestError("bad_request", f"{kind}: {name} must be text, got {fields[name]!r}")
+    if "size" in fields:
+        size: Any = fields["size"]
+        if not isinstance(size, list) or len(size) != 2 or not all(_is_count(n) and 1 <= n <= 4096 for n in size):
+            raise RequestError("bad_request", f"{kind}: size must be [height, width] from 1 to 4096, got {size!r}")
+        fields["size"] = (size[0], size[1])
+    return cls(**fields)
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def ready_message(ready: Ready) -> Message:
+    """The handshake as a message."""
+    return {"type": "ready", **asdict(ready)}
+
+
+def error_message(kind: str, text: str, request: int | None = None) -> Message:
+    """An error reply, its text folded into one line; without `request` it ends the worker's start."""
+    line = " ".join(text.split())
+    message: Message = {"type": "error", "kind": kind, "message": line}
+    return message if request is None else {**message, "id": request}

@@ -1,0 +1,106 @@
+"""robosuite and mujoco behind types: the few attributes that this package uses, and nothing else of them.
+
+robosuite has no type hints, so it is imported by name here and seen through protocols everywhere else. Importing this
+module imports the simulator; `prepare` must have run before (it sets what they read from the environment).
+"""
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from actrm_harness.wire import Array
+
+
+class State(Protocol):
+    """A flattened simulator state: time, qpos, qvel."""
+
+    def flatten(self) -> Array: ...
+
+
+class Sim(Protocol):
+    """robosuite's MjSim; `model` and `data` delegate to mujoco's structs."""
+
+    model: Any
+    data: Any
+    _render_context_offscreen: Any
+
+    def get_state(self) -> State: ...
+    def set_state_from_flattened(self, value: Array) -> None: ...
+    def forward(self) -> None: ...
+    def reset(self) -> None: ...
+    def render(self, width: int, height: int, *, camera_name: str) -> Array: ...
+
+
+class Env(Protocol):
+    """A robosuite environment."""
+
+    sim: Sim
+    rng: np.random.Generator
+    robots: list[Any]
+    model: Any
+    hard_reset: bool
+    control_freq: float
+    action_spec: tuple[Array, Array]
+    timestep: int
+    done: bool
+    cur_time: float
+
+    def reset(self) -> dict[str, Array]: ...
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, dict[str, Any]]: ...
+    def reward(self, action: Array) -> float: ...
+    def close(self) -> None: ...
+    def edit_model_xml(self, xml_str: str) -> str: ...
+    def reset_from_xml_string(self, xml_string: str) -> None: ...
+    def get_ep_meta(self) -> dict[str, Any]: ...
+    def _check_success(self) -> bool: ...
+    def _get_observations(self, force_update: bool = False) -> dict[str, Array]: ...
+
+
+def cache_dir() -> Path:
+    """Where compiled numba functions are kept, shared by all workers of a user."""
+    base = os.environ.get("ACTRM_CACHE")
+    if base:
+        return Path(base)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "actrm"
+
+
+def prepare() -> None:
+    """Set what mujoco and robosuite read from the environment when they are imported.
+
+    MUJOCO_GL is "disable" for the import, because mujoco would load the OpenGL library at once and fail where there is
+    none; an environment without cameras needs none. `render` picks one when an image is asked for.
+    """
+    os.environ["MUJOCO_GL"] = "disable"
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        folder = cache_dir() / "numba"
+        folder.mkdir(parents=True, exist_ok=True)
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)
+
+
+def robosuite() -> Any:
+    """The robosuite module."""
+    return importlib.import_module("robosuite")
+
+
+def mujoco() -> Any:
+    """The mujoco module."""
+    return importlib.import_module("mujoco")
+
+
+def known_environments() -> list[str]:
+    """Every environment name that robosuite would make now, our own and users' included."""
+    return sorted(cast("dict[str, Any]", importlib.import_module("robosuite.environments.base").REGISTERED_ENVS))
+
+
+def panda_controller() -> dict[str, Any]:
+    """robosuite's default controller configuration of the Panda: BASIC with OSC_POSE and the gripper."""
+    controllers = importlib.import_module("robosuite.controllers")
+    return cast("dict[str, Any]", controllers.load_composite_controller_config(controller=None, robot="Panda"))
+
+
+def package_dir() -> str:
+    """The folder that robosuite is installed in, where its assets' paths begin."""
+    return str(Path(cast(str, robosuite().__file__)).parent)

@@ -1,0 +1,123 @@
+"""Frames: a little-endian u64 byte length, then that many bytes in safetensors layout.
+
+The safetensors header carries one metadata key, "actrm", holding a JSON message; the tensors ride behind it. The
+header is parsed here because the safetensors package does not give metadata back from bytes.
+"""
+
+import json
+import struct
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+Tensors = dict[str, Array]
+Message = dict[str, Any]
+
+METADATA_KEY = "actrm"
+MAX_FRAME_BYTES = 256 * 1024 * 1024
+
+_DTYPES = {"F64": "<f8", "F32": "<f4", "I64": "<i8", "U8": "|u1"}
+_NAMES = {np.dtype(layout): name for name, layout in _DTYPES.items()}
+
+
+class WireError(Exception):
+    """A frame that is not what the protocol says; the text says where and how."""
+
+
+def encode(message: Message, tensors: Tensors | None = None) -> bytes:
+    """One frame's payload: the message and its tensors in safetensors layout."""
+    header: dict[str, Any] = {"__metadata__": {METADATA_KEY: json.dumps(message, allow_nan=False)}}
+    bodies: list[bytes] = []
+    end = 0
+    for name in sorted(tensors or {}):
+        array = np.asarray((tensors or {})[name])
+        kind = _NAMES.get(array.dtype.newbyteorder("<"))
+        if kind is None:
+            known = ", ".join(_DTYPES)
+            raise WireError(f"tensor {name!r} has dtype {array.dtype}; a frame carries {known}")
+        body = array.astype(_DTYPES[kind], copy=False).tobytes()
+        header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [end, end + len(body)]}
+        bodies.append(body)
+        end += len(body)
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return b"".join([struct.pack("<Q", len(text)), text, *bodies])
+
+
+def decode(payload: bytes) -> tuple[Message, Tensors]:
+    """The message and the tensors of one frame's payload."""
+    if len(payload) < 8:
+        raise WireError(f"a payload of {len(payload)} bytes has no safetensors header")
+    (size,) = struct.unpack_from("<Q", payload)
+    if size > len(payload) - 8:
+        raise WireError(f"safetensors header of {size} bytes in a payload of {len(payload)} bytes")
+    header = _json_object(payload[8 : 8 + size], "safetensors header")
+    metadata = header.pop("__metadata__", None)
+    if not isinstance(metadata, dict) or not isinstance(cast(Message, metadata).get(METADATA_KEY), str):
+        raise WireError(f"safetensors metadata has no text under {METADATA_KEY!r}")
+    message = _json_object(cast(Message, metadata)[METADATA_KEY].encode(), "message")
+    body = memoryview(payload)[8 + size :]
+    return message, {name: _tensor(name, entry, body) for name, entry in header.items()}
+
+
+def _json_object(text: bytes, what: str) -> Message:
+    try:
+        value: object = json.loads(text)
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise WireError(f"{what} is not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise WireError(f"{what} is not a JSON object")
+    return cast(Message, value)
+
+
+def _tensor(name: str, entry: object, body: memoryview) -> Array:
+    try:
+        fields = cast(Message, entry)
+        dtype = np.dtype(_DTYPES[fields["dtype"]])
+        shape = tuple(int(size) for size in fields["shape"])
+        begin, end = (int(offset) for offset in fields["data_offsets"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise WireError(f"tensor {name!r} has a bad header entry: {entry!r}") from error
+    count = int(np.prod(shape, dtype=np.int64)) if all(size >= 0 for size in shape) else -1
+    if count < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * dtype.itemsize:
+        raise WireError(f"tensor {name!r}: shape {shape} of {dtype} does not fit bytes {begin}..{end} of {len(body)}")
+    return np.frombuffer(body, dtype=dtype, count=count, offset=begin).reshape(shape)
+
+
+def write_frame(stream: BinaryIO, message: Message, tensors: Tensors | None = None) -> None:
+    """Write one frame and flush it."""
+    payload = encode(message, tensors)
+    if len(payload) > MAX_FRAME_BYTES:
+        raise WireError(f"a frame of {len(payload)} bytes; at most {MAX_FRAME_BYTES} are allowed")
+    stream.write(struct.pack("<Q", len(payload)) + payload)
+    stream.flush()
+
+
+def read_frame(stream: BinaryIO) -> tuple[Message, Tensors] | None:
+    """Read one frame; None when the stream ended before a frame began."""
+    head = _read_exactly(stream, 8)
+    if not head:
+        return None
+    if len(head) < 8:
+        raise WireError(f"the stream ended {len(head)} bytes into a frame length")
+    (size,) = struct.unpack("<Q", head)
+    if size > MAX_FRAME_BYTES:
+        raise WireError(f"a frame of {size} bytes is announced; at most {MAX_FRAME_BYTES} are allowed")
+    payload = _read_exactly(stream, size)
+    if len(payload) < size:
+        raise WireError(f"the stream ended {len(payload)} bytes into a frame of {size}")
+    return decode(payload)
+
+
+def _read_exactly(stream: BinaryIO, size: int) -> bytes:
+    parts: list[bytes] = []
+    left = size
+    while left > 0:
+        part = stream.read(left)
+        if not part:
+            break
+        parts.append(part)
+        left -= len(part)
+    return b"".join(parts)
