@@ -10,8 +10,8 @@ import hashlib
 import json
 import os
 import re
-from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from actrm_harness import suite
 from actrm_harness.protocol import RequestError
 from actrm_harness.suite import Env
 from actrm_harness.wire import Array, Tensors
+
+if TYPE_CHECKING:
+    from actrm_harness.render import Renderer
 
 CONTROL_FREQ = 20
 DEFAULT_MAX_STEPS = 400
@@ -56,7 +59,9 @@ class Session:
     task: Task
     env_args: dict[str, Any]
     cameras: tuple[str, ...] = ()
+    image_size: int = 84
     control: Control | None = None
+    renderer: "Renderer | None" = None
     foreign_model: bool = False
 
 
@@ -94,13 +99,15 @@ def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Sessi
         "type": 1,
         "env_kwargs": json.loads(json.dumps(kwargs)),
     }
+    # Images are drawn by `render`, so that an episode is the same with cameras and without.
+    kwargs |= {"has_offscreen_renderer": False, "use_camera_obs": False}
     env = cast(
         Env,
         suite.robosuite().make(
             task_name, **kwargs, control_freq=CONTROL_FREQ, hard_reset=not task.soft_reset, renderer="mujoco", seed=0
         ),
     )
-    return Session(env=env, task=task, env_args=env_args, cameras=cameras)
+    return Session(env=env, task=task, env_args=env_args, cameras=cameras, image_size=size)
 
 
 def reset(session: Session, seed: int) -> Tensors:
@@ -113,7 +120,28 @@ def reset(session: Session, seed: int) -> Tensors:
     env.hard_reset = not session.task.soft_reset
     if session.control is not None:
         session.control.reset(env)
-    return observation(raw)
+    return {**observation(raw), **images(session)}
+
+
+def step_session(session: Session, action: Array) -> StepResult:
+    """One control step with the session's control loop, images included."""
+    result = step(session.env, action, session.control)
+    return replace(result, observation={**result.observation, **images(session)})
+
+
+def image(session: Session, camera: str, height: int, width: int) -> Array:
+    """What a camera sees now; the OpenGL context is made when the first image is asked for."""
+    if session.renderer is None:
+        from actrm_harness.render import Renderer
+
+        session.renderer = Renderer()
+    return session.renderer.image(session.env.sim, camera, height, width)
+
+
+def images(session: Session) -> Tensors:
+    """What the session's cameras see now, under robomimic's names."""
+    size = session.image_size
+    return {f"{camera}_image": image(session, camera, size, size) for camera in session.cameras}
 
 
 def step(env: Env, action: Array, control: Control | None) -> StepResult:
@@ -141,17 +169,15 @@ def check_action(env: Env, action: Array) -> Array:
 
 
 def observation(raw: dict[str, Array]) -> Tensors:
-    """robosuite's observations under robomimic's names.
+    """Robosuite's observations under robomimic's names.
 
-    "object-state" becomes "object"; the robot's own values keep their names; images are turned upright; the separate
-    values that "object-state" joins and the joined robot state are left out.
+    "object-state" becomes "object"; the robot's own values keep their names; the separate values that "object-state"
+    joins and the joined robot state are left out.
     """
     kept: Tensors = {}
     for name, value in raw.items():
         if name == "object-state":
             kept["object"] = np.asarray(value, dtype=np.float64)
-        elif name.endswith("_image"):
-            kept[name] = np.ascontiguousarray(value[::-1])
         elif re.match(r"robot\d+_", name) and not name.endswith("-state"):
             kept[name] = np.asarray(value, dtype=np.float64)
     return kept

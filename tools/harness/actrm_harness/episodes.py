@@ -81,7 +81,7 @@ def expert_episode(session: Session, seed: int) -> Episode:
     for _ in range(session.task.max_steps):
         before = envs.state(env)
         action = np.clip(expert.act(), -1.0, 1.0)
-        result = envs.step(env, action, session.control)
+        result = envs.step_session(session, action)
         recorder.add(before, action, result)
         held = held + 1 if result.success else 0
         if held > STEPS_AFTER_SUCCESS:
@@ -112,27 +112,31 @@ def extract(session: Session, states: Array, actions: Array, model_file: str) ->
     if width != expected:
         raise RequestError("bad_request", f"extract: states have {width} values, the model has {expected}")
     env.sim.reset()
-    recorder = _Recorder(_put(env, states[0]))
+    recorder = _Recorder(_put(session, states[0]))
     for index in range(steps):
         if index + 1 < steps:
-            seen = _put(env, states[index + 1])
+            seen = _put(session, states[index + 1])
             result = envs.StepResult(seen, float(env.reward(actions[index])), envs.success(env))
         else:
-            result = envs.step(env, actions[index], None)
+            result = envs.step_session(session, actions[index])
         recorder.add(states[index], actions[index], result)
     attrs = {"model_file": model_file or envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
     return Episode(any(recorder.successes), steps, attrs, recorder.tensors())
 
 
-def _put(env: envs.Env, flat: Array) -> Tensors:
+def _put(session: Session, flat: Array) -> Tensors:
+    env = session.env
     env.sim.set_state_from_flattened(flat)
     env.sim.forward()
-    return envs.observation(env._get_observations(force_update=True))  # pyright: ignore[reportPrivateUsage]
+    seen = envs.observation(env._get_observations(force_update=True))  # pyright: ignore[reportPrivateUsage]
+    return {**seen, **envs.images(session)}
 
 
 def _matrix(name: str, array: Array) -> tuple[int, int]:
     if array.ndim != 2 or array.dtype != np.float64:
-        raise RequestError("bad_request", f"extract: {name} must be F64 of two dimensions, got {array.dtype} {array.shape}")
+        raise RequestError(
+            "bad_request", f"extract: {name} must be F64 of two dimensions, got {array.dtype} {array.shape}"
+        )
     if not np.all(np.isfinite(array)):
         raise RequestError("bad_request", f"extract: {name} has values that are not finite")
     return array.shape[0], array.shape[1]

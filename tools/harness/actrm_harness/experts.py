@@ -47,8 +47,8 @@ class Style:
     def draw(rng: np.random.Generator) -> "Style":
         """A style near the middle of what still works well."""
         return Style(
-            gain=rng.uniform(0.8, 1.1),
-            speed=rng.uniform(0.5, 0.85),
+            gain=rng.uniform(0.75, 1.0),
+            speed=rng.uniform(0.45, 0.75),
             hover=rng.uniform(0.05, 0.10),
             side=rng.uniform(-0.012, 0.012, size=2),
             noise=rng.uniform(0.01, 0.05),
@@ -106,7 +106,7 @@ class Servo:
         self._rng = rng
         self._noise = np.zeros(6)
         self._time = 0
-        self._push_at = int(rng.integers(3, 40))
+        self._push_at = 3 + int(37 * rng.random())
         self._push = rng.normal(size=3)
         self._push *= rng.uniform(0.2, 0.6) / np.linalg.norm(self._push)
 

@@ -1,7 +1,7 @@
 """The messages of worker protocol 1, as dataclasses. They travel as JSON beside the tensors of a frame (`wire`)."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, cast
 
 from actrm_harness.wire import Message
 
@@ -111,11 +111,16 @@ def parse_request(message: Message) -> Request:
         if name in fields and not isinstance(fields[name], str):
             raise RequestError("bad_request", f"{kind}: {name} must be text, got {fields[name]!r}")
     if "size" in fields:
-        size: Any = fields["size"]
-        if not isinstance(size, list) or len(size) != 2 or not all(_is_count(n) and 1 <= n <= 4096 for n in size):
-            raise RequestError("bad_request", f"{kind}: size must be [height, width] from 1 to 4096, got {size!r}")
-        fields["size"] = (size[0], size[1])
+        fields["size"] = _image_size(fields["size"])
     return cls(**fields)
+
+
+def _image_size(value: object) -> tuple[int, int]:
+    items = cast("list[object]", value) if isinstance(value, list) else []
+    sizes = [item for item in items if isinstance(item, int) and not isinstance(item, bool) and 1 <= item <= 4096]
+    if len(items) != 2 or len(sizes) != 2:
+        raise RequestError("bad_request", f"render: size must be [height, width] from 1 to 4096, got {value!r}")
+    return sizes[0], sizes[1]
 
 
 def _is_count(value: object) -> bool:

@@ -13,6 +13,9 @@ import numpy as np
 
 from actrm_harness.wire import Array
 
+# What the user asked for; `prepare` hides it from the imports, `render` follows it.
+WANTED_GL = os.environ.get("MUJOCO_GL", "").lower()
+
 
 class State(Protocol):
     """A flattened simulator state: time, qpos, qvel."""
@@ -25,13 +28,11 @@ class Sim(Protocol):
 
     model: Any
     data: Any
-    _render_context_offscreen: Any
 
     def get_state(self) -> State: ...
     def set_state_from_flattened(self, value: Array) -> None: ...
     def forward(self) -> None: ...
     def reset(self) -> None: ...
-    def render(self, width: int, height: int, *, camera_name: str) -> Array: ...
 
 
 class Env(Protocol):
@@ -96,7 +97,7 @@ def known_environments() -> list[str]:
 
 
 def panda_controller() -> dict[str, Any]:
-    """robosuite's default controller configuration of the Panda: BASIC with OSC_POSE and the gripper."""
+    """Robosuite's default controller configuration of the Panda: BASIC with OSC_POSE and the gripper."""
     controllers = importlib.import_module("robosuite.controllers")
     return cast("dict[str, Any]", controllers.load_composite_controller_config(controller=None, robot="Panda"))
 

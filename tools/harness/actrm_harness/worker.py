@@ -80,7 +80,9 @@ def start(args: argparse.Namespace) -> "Session":
         try:
             importlib.import_module(args.env_module)
         except ImportError as error:
-            raise RequestError("env_module", f"cannot import environment module {args.env_module!r}: {error}") from error
+            raise RequestError(
+                "env_module", f"cannot import environment module {args.env_module!r}: {error}"
+            ) from error
     cameras = tuple(name for name in args.cameras.split(",") if name)
     return envs.make(args.task, cameras, args.size)
 
@@ -149,7 +151,7 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
         return reply, {f"obs/{name}": value for name, value in first.items()}
     if isinstance(request, protocol.Step):
         action = envs.check_action(session.env, tensor(tensors, "action"))
-        result = envs.step(session.env, action, session.control)
+        result = envs.step_session(session, action)
         reply = {"type": "step", "id": request.id, "reward": result.reward, "success": result.success}
         return reply, {f"obs/{name}": value for name, value in result.observation.items()}
     if isinstance(request, protocol.Expert):
@@ -160,9 +162,7 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
         episode = episodes.extract(session, states, actions, request.model_file)
         return episode_reply("extract", request.id, episode), episode.tensors
     if isinstance(request, protocol.Render):
-        from actrm_harness import render
-
-        image = render.image(session.env, request.camera, *request.size)
+        image = envs.image(session, request.camera, *request.size)
         return {"type": "render", "id": request.id}, {"image": image}
     raise RequestError("unknown_request", f"request {request!r} cannot be answered")
 

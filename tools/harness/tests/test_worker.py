@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from actrm_harness import wire
 from conftest import Client, WorkerError, walk
+
+from actrm_harness import wire
 
 
 def test_the_handshake_says_what_the_worker_is(lift: Client) -> None:

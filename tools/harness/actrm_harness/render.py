@@ -1,0 +1,117 @@
+"""Images of the simulation, drawn without touching it.
+
+robosuite's own render contexts are not used, for two reasons. They return garbage, silently, once an older one has been
+collected: freeing it leaves no context, or another one, current. And making one runs the solver, which changes the
+episode that follows by a few bits. Here a process has one OpenGL context, made current before anything is done with
+it, and drawing only reads the simulation's data: what it shows is what the last control step left.
+"""
+
+import ctypes
+import ctypes.util
+import importlib
+import os
+from typing import Any
+
+import numpy as np
+
+from actrm_harness import suite
+from actrm_harness.protocol import RequestError
+from actrm_harness.suite import Sim
+from actrm_harness.wire import Array
+
+_MAX_GEOMS = 10_000
+_EGL_PLATFORM_DEVICE = 0x313F
+
+
+class Renderer:
+    """Draws a simulation's cameras; the model's textures and meshes are loaded again when the model changes."""
+
+    def __init__(self) -> None:
+        self._gl: Any = _gl_context()
+        self._model: Any = None
+        self._context: Any = None
+        self._scene: Any = None
+        mujoco = suite.mujoco()
+        self._camera: Any = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._options: Any = mujoco.MjvOption()
+        # robosuite keeps collision geometry in group 0 and what is to be seen in group 1.
+        self._options.geomgroup[0] = 0
+        self._options.geomgroup[1] = 1
+
+    def make_current(self) -> None:
+        """Make this the OpenGL context that mujoco draws with."""
+        self._gl.make_current()
+
+    def image(self, sim: Sim, camera: str, height: int, width: int) -> Array:
+        """Draw what `camera` sees: uint8 of (height, width, 3), upright."""
+        mujoco = suite.mujoco()
+        cameras: tuple[str, ...] = sim.model.camera_names
+        if camera not in cameras:
+            raise RequestError("unknown_camera", f"unknown camera {camera!r}; known: {', '.join(sorted(cameras))}")
+        self.make_current()
+        self._load(sim.model._model, height, width)
+        self._camera.fixedcamid = sim.model.camera_name2id(camera)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(
+            self._model, sim.data._data, self._options, mujoco.MjvPerturb(), self._camera, everything, self._scene
+        )
+        viewport = mujoco.MjrRect(0, 0, width, height)
+        pixels = np.empty((height, width, 3), dtype=np.uint8)
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, viewport, self._context)
+        return np.ascontiguousarray(pixels[::-1])
+
+    def _load(self, model: Any, height: int, width: int) -> None:
+        fits = self._context is not None and width <= self._context.offWidth and height <= self._context.offHeight
+        if model is self._model and fits:
+            return
+        mujoco = suite.mujoco()
+        if self._context is not None:
+            self._context.free()
+        view = model.vis.global_
+        view.offwidth, view.offheight = max(width, view.offwidth), max(height, view.offheight)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        if model is not self._model:
+            self._scene = mujoco.MjvScene(model, maxgeom=_MAX_GEOMS)
+        self._model = model
+
+
+def _gl_context() -> Any:
+    """An OpenGL context of the first of EGL and OSMesa that works here, or of the one MUJOCO_GL names."""
+    wanted = suite.WANTED_GL
+    if wanted not in ("", "egl", "osmesa"):
+        raise RequestError("no_renderer", f"MUJOCO_GL is {wanted!r}; images are drawn with egl or osmesa")
+    if wanted != "osmesa" and (wanted == "egl" or _egl_works()):
+        os.environ["PYOPENGL_PLATFORM"] = "egl"
+        return importlib.import_module("robosuite.renderers.context.egl_context").EGLGLContext(0, 0, device_id=-1)
+    if wanted == "osmesa" or ctypes.util.find_library("OSMesa"):
+        os.environ["PYOPENGL_PLATFORM"] = "osmesa"
+        return importlib.import_module("robosuite.renderers.context.osmesa_context").OSMesaGLContext(640, 480)
+    raise RequestError(
+        "no_renderer",
+        "images need EGL or OSMesa, and neither works here; "
+        "Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6",
+    )
+
+
+def _egl_works() -> bool:
+    """Whether the first EGL device can be initialised; asked before OpenGL is imported, which binds to one platform."""
+    try:
+        egl = ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    lookup = egl.eglGetProcAddress
+    lookup.restype, lookup.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    query, display_of = lookup(b"eglQueryDevicesEXT"), lookup(b"eglGetPlatformDisplayEXT")
+    if not query or not display_of:
+        return False
+    device, count = ctypes.c_void_p(), ctypes.c_int()
+    query_devices = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(query)
+    if not query_devices(1, ctypes.byref(device), ctypes.byref(count)) or count.value < 1:
+        return False
+    platform_display = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p)(display_of)
+    display = platform_display(_EGL_PLATFORM_DEVICE, device, None)
+    egl.eglInitialize.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
+    return bool(display) and bool(egl.eglInitialize(display, None, None))

@@ -1,0 +1,126 @@
+"""Images: as robosuite draws them, whatever other contexts do, and without a trace in the episode."""
+
+import gc
+import importlib
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Client, WorkerError, walk
+
+from actrm_harness import envs, render, suite
+
+suite.prepare()
+
+
+def do_nothing(*_: object) -> None:
+    """Stand in for something that is switched off."""
+
+
+def play(session: envs.Session, steps: int = 3) -> None:
+    envs.reset(session, 5)
+    for action in walk(1, steps):
+        envs.step_session(session, action)
+
+
+@pytest.fixture(scope="module")
+def session() -> envs.Session:
+    return envs.make("Lift")
+
+
+def test_an_image_is_what_robosuite_draws(session: envs.Session) -> None:
+    play(session)
+    ours = envs.image(session, "agentview", 84, 96)
+    binding: Any = importlib.import_module("robosuite.utils.binding_utils")
+    sim: Any = session.env.sim
+    context = binding.MjRenderContextOffscreen(sim, device_id=-1)
+    context.vopt.geomgroup[0], context.vopt.geomgroup[1] = 0, 1
+    # robosuite's constructor ran mj_forward: draw both from the state that it left.
+    ours_after = envs.image(session, "agentview", 84, 96)
+    context.gl_ctx.make_current()
+    theirs = sim.render(96, 84, camera_name="agentview")[::-1]
+    assert ours.shape == (84, 96, 3) and ours.std() > 10
+    assert np.array_equal(ours_after, theirs)
+    sim._render_context_offscreen = None
+
+
+def test_a_collected_context_does_not_corrupt_a_live_one(
+    session: envs.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The corruption is provoked first, with the cure switched off, and then does not happen with it."""
+    play(session)
+    before = envs.image(session, "agentview", 84, 84)
+
+    def disturb() -> None:
+        other = render.Renderer()
+        other.image(session.env.sim, "frontview", 84, 84)
+        del other
+        gc.collect()
+
+    with monkeypatch.context() as patch:
+        disturb()
+        patch.setattr(render.Renderer, "make_current", do_nothing)
+        corrupted = envs.image(session, "agentview", 84, 84)
+    assert not np.array_equal(corrupted, before)
+    disturb()
+    assert np.array_equal(envs.image(session, "agentview", 84, 84), before)
+
+
+def test_images_follow_the_model_after_a_hard_reset(session: envs.Session) -> None:
+    envs.reset(session, 1)
+    first = envs.image(session, "agentview", 64, 64)
+    envs.reset(session, 2)
+    second = envs.image(session, "agentview", 64, 64)
+    envs.reset(session, 1)
+    assert not np.array_equal(first, second)
+    assert np.array_equal(envs.image(session, "agentview", 64, 64), first)
+
+
+def test_a_larger_image_than_before_is_drawn(session: envs.Session) -> None:
+    envs.reset(session, 1)
+    small = envs.image(session, "agentview", 64, 64)
+    large = envs.image(session, "agentview", 720, 960)
+    assert large.shape == (720, 960, 3) and large.std() > 10
+    assert np.array_equal(envs.image(session, "agentview", 64, 64), small)
+
+
+def test_drawing_leaves_the_episode_as_it_was(session: envs.Session) -> None:
+    def outcome(draw: bool) -> list[bytes]:
+        envs.reset(session, 9)
+        seen: list[bytes] = []
+        for action in walk(2, 25):
+            if draw:
+                envs.image(session, "agentview", 32, 32)
+            result = envs.step_session(session, action)
+            seen += [result.observation["object"].tobytes(), envs.state(session.env).tobytes()]
+        return seen
+
+    assert outcome(draw=False) == outcome(draw=True)
+
+
+def test_the_worker_renders_and_observes_cameras() -> None:
+    client = Client("--task", "Lift", "--cameras", "agentview,robot0_eye_in_hand", "--size", "32")
+    assert client.ready["observations"]["agentview_image"] == [32, 32, 3]
+    assert client.ready["env_args"]["env_kwargs"]["camera_names"] == ["agentview", "robot0_eye_in_hand"]
+    _, seen = client.ask("reset", seed=3)
+    _, drawn = client.ask("render", camera="agentview", size=[32, 32])
+    assert drawn["image"].dtype == np.uint8
+    assert np.array_equal(seen["obs/agentview_image"], drawn["image"])
+    assert not np.array_equal(seen["obs/agentview_image"], seen["obs/robot0_eye_in_hand_image"])
+    with pytest.raises(WorkerError, match="agentview") as caught:
+        client.ask("render", camera="nowhere", size=[32, 32])
+    assert caught.value.message["kind"] == "unknown_camera"
+    with pytest.raises(WorkerError, match="size"):
+        client.ask("render", camera="agentview", size=[32, 0])
+    client.close()
+
+
+def test_where_nothing_can_draw_the_error_names_a_package(
+    session: envs.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(render, "_egl_works", do_nothing)
+    monkeypatch.setattr(render.ctypes.util, "find_library", do_nothing)
+    monkeypatch.setattr(session, "renderer", None)
+    with pytest.raises(envs.RequestError, match="libosmesa6") as caught:
+        envs.image(session, "agentview", 32, 32)
+    assert caught.value.kind == "no_renderer"
