@@ -7,10 +7,9 @@
 //! What this crate is not: it reads no HDF5 (that is `dataset`), contains no model and no optimiser
 //! (`models`), and neither reads the command line nor prints (`tools`).
 
+pub mod config;
 mod error;
 mod files;
-
-// experiments, training, entries
 
 // rollouts, evaluations, leaderboard
 

@@ -1,0 +1,226 @@
+//! Experiment files: TOML, composed by `extends`, changed by dotted overrides.
+//!
+//! The experiments of `configs/` are built into the binary; a folder given by the user comes first. A name
+//! that starts with `_` is a part that others extend, not an experiment to train.
+
+mod embedded;
+mod overrides;
+mod value;
+
+use std::path::{Path, PathBuf};
+
+use toml::Table;
+
+use crate::ZooError;
+
+pub use overrides::apply_overrides;
+pub use value::from_value;
+
+/// The name most like `name`, if one is like it: at most a third of its letters differ.
+pub fn nearest(name: &str, names: &[String]) -> Option<String> {
+    names
+        .iter()
+        .map(|n| {
+            (
+                strsim::damerau_levenshtein(&name.to_lowercase(), &n.to_lowercase()),
+                n,
+            )
+        })
+        .filter(|(distance, n)| *distance <= (name.len().max(n.len()) / 3).max(1))
+        .min()
+        .map(|(_, n)| n.clone())
+}
+
+/// Where experiments come from: a folder, if the user has one, and then those built in.
+#[derive(Debug, Clone, Default)]
+pub struct Library {
+    folder: Option<PathBuf>,
+}
+
+impl Library {
+    /// The experiments built into the binary.
+    pub fn built_in() -> Self {
+        Self::default()
+    }
+
+    /// Files of `folder` first, then the experiments built in.
+    ///
+    /// # Errors
+    /// When `folder` is not a folder.
+    pub fn with_folder(folder: &Path) -> Result<Self, ZooError> {
+        std::fs::read_dir(folder).map_err(ZooError::io("open experiment folder", folder))?;
+        Ok(Self {
+            folder: Some(folder.to_owned()),
+        })
+    }
+
+    /// Names of every experiment that can be trained, sorted.
+    ///
+    /// # Errors
+    /// When the folder cannot be read.
+    pub fn names(&self) -> Result<Vec<String>, ZooError> {
+        let mut names: Vec<String> = embedded::FILES
+            .iter()
+            .map(|(n, _)| (*n).to_owned())
+            .collect();
+        if let Some(folder) = &self.folder {
+            for item in std::fs::read_dir(folder).map_err(ZooError::io("read folder", folder))? {
+                let path = item.map_err(ZooError::io("read folder", folder))?.path();
+                let stem = path.file_stem().and_then(|s| s.to_str());
+                if let (Some(stem), Some("toml")) =
+                    (stem, path.extension().and_then(|e| e.to_str()))
+                {
+                    names.push(stem.to_owned());
+                }
+            }
+        }
+        names.retain(|n| !n.starts_with('_'));
+        names.sort();
+        names.dedup();
+        Ok(names)
+    }
+
+    /// The table of experiment `name` with everything it extends merged beneath it.
+    ///
+    /// Tables merge key by key; anything else is replaced by the extending file.
+    ///
+    /// # Errors
+    /// When a file is unknown, not TOML, or extends itself.
+    pub fn resolve(&self, name: &str) -> Result<Table, ZooError> {
+        let mut chain = vec![name.to_owned()];
+        let mut table = self.read(name)?;
+        while let Some(parent) = table.remove("extends") {
+            let Some(parent) = parent.as_str() else {
+                return Err(ZooError::InvalidValue {
+                    key: "extends".to_owned(),
+                    expected: "the name of an experiment".to_owned(),
+                    found: parent.to_string(),
+                });
+            };
+            let cycle = chain.iter().any(|seen| seen == parent);
+            chain.push(parent.to_owned());
+            if cycle {
+                return Err(ZooError::ExtendsCycle { chain });
+            }
+            let mut merged = self.read(parent)?;
+            merge(&mut merged, table);
+            table = merged;
+        }
+        Ok(table)
+    }
+
+    fn read(&self, name: &str) -> Result<Table, ZooError> {
+        let text = match self.folder.as_ref().map(|f| f.join(format!("{name}.toml"))) {
+            Some(path) if path.is_file() => {
+                std::fs::read_to_string(&path).map_err(ZooError::io("read", path))?
+            }
+            _ => match embedded::FILES.iter().find(|(n, _)| *n == name) {
+                Some((_, text)) => (*text).to_owned(),
+                None => {
+                    let available = self.names()?;
+                    return Err(ZooError::UnknownExperiment {
+                        name: name.to_owned(),
+                        nearest: nearest(name, &available),
+                        available,
+                    });
+                }
+            },
+        };
+        toml::from_str(&text).map_err(|source| ZooError::ExperimentSyntax {
+            experiment: name.to_owned(),
+            source: Box::new(source),
+        })
+    }
+}
+
+/// Lays `above` over `below`. An `extends` of `below` survives only where `above` has none left.
+fn merge(below: &mut Table, above: Table) {
+    for (key, value) in above {
+        match (below.get_mut(&key), value) {
+            (Some(toml::Value::Table(inner)), toml::Value::Table(outer)) => merge(inner, outer),
+            (_, value) => {
+                below.insert(key, value);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn library(files: &[(&str, &str)]) -> (tempfile::TempDir, Library) {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, text) in files {
+            std::fs::write(folder.path().join(format!("{name}.toml")), text).unwrap();
+        }
+        let library = Library::with_folder(folder.path()).unwrap();
+        (folder, library)
+    }
+
+    #[test]
+    fn extending_files_win_key_by_key() {
+        let (_folder, library) = library(&[
+            ("_a", "x = 1\n[train]\nsteps = 10\nlr = 0.1\nkeys = [1, 2]"),
+            ("_b", "extends = '_a'\n[train]\nsteps = 20"),
+            ("c", "extends = '_b'\ny = 2\n[train]\nkeys = [3]"),
+        ]);
+        let table = library.resolve("c").unwrap();
+        let expected: Table =
+            toml::from_str("x = 1\ny = 2\n[train]\nsteps = 20\nlr = 0.1\nkeys = [3]").unwrap();
+        assert_eq!(table, expected);
+        let names = library.names().unwrap();
+        assert!(names.contains(&"c".to_owned()) && !names.contains(&"_a".to_owned()));
+    }
+
+    #[test]
+    fn a_file_that_extends_itself_is_named() {
+        let (_folder, library) = library(&[("p", "extends = 'q'"), ("q", "extends = 'p'")]);
+        assert_eq!(
+            library.resolve("p").unwrap_err().to_string(),
+            "experiment `p` extends itself: p -> q -> p"
+        );
+    }
+
+    #[test]
+    fn an_unknown_experiment_lists_what_there_is() {
+        let message = Library::built_in()
+            .resolve("act_lfit")
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.starts_with(
+                "unknown experiment `act_lfit` (did you mean `act_lift`?); experiments: "
+            ),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn every_file_of_configs_is_built_in() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
+        let mut on_disk: Vec<(String, String)> = std::fs::read_dir(folder)
+            .unwrap()
+            .map(|item| item.unwrap().path())
+            .filter(|path| path.extension().is_some_and(|e| e == "toml"))
+            .map(|path| {
+                let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+                (name, std::fs::read_to_string(path).unwrap())
+            })
+            .collect();
+        on_disk.sort();
+        let built_in: Vec<(String, String)> = embedded::FILES
+            .iter()
+            .map(|(n, t)| ((*n).to_owned(), (*t).to_owned()))
+            .collect();
+        assert_eq!(on_disk, built_in);
+    }
+
+    #[test]
+    fn far_away_names_are_not_suggested() {
+        let names = ["steps".to_owned(), "lr".to_owned()];
+        assert_eq!(nearest("stpes", &names), Some("steps".to_owned()));
+        assert_eq!(nearest("batch_size", &names), None);
+    }
+}
