@@ -8,8 +8,12 @@
 //! (`models`), and neither reads the command line nor prints (`tools`).
 
 pub mod config;
+pub mod entry;
 mod error;
 mod files;
+pub mod registry;
+pub mod run;
+mod tensors;
 
 // rollouts, evaluations, leaderboard
 

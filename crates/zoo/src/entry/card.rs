@@ -1,0 +1,123 @@
+//! The model card: what `entry.json` says, for people.
+
+use std::fmt::Write;
+
+use super::EntryMeta;
+
+/// Renders the README.md of an entry.
+pub(super) fn render(meta: &EntryMeta) -> String {
+    let mut card = String::new();
+    render_into(meta, &mut card).expect("writing into a String cannot fail");
+    card
+}
+
+fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
+    writeln!(card, "# {}\n", meta.id())?;
+    if !meta.description.is_empty() {
+        writeln!(card, "{}\n", meta.description)?;
+    }
+    writeln!(card, "| | |\n|---|---|")?;
+    let mut row = |what: &str, value: String| writeln!(card, "| {what} | {value} |");
+    row("policy", meta.policy.clone())?;
+    row("task", meta.task.clone())?;
+    row("experiment", meta.experiment.clone())?;
+    row("parameters", grouped(meta.parameters))?;
+    row("observation.state", keys(&meta.state_keys))?;
+    row("observation.environment_state", keys(&meta.env_keys))?;
+    let data = &meta.data;
+    row(
+        "demonstrations",
+        format!(
+            "{}: {} episodes, {} frames trained on, {} episodes held out",
+            data.name,
+            data.train_episodes,
+            grouped(data.train_frames),
+            data.valid_episodes
+        ),
+    )?;
+    row("data set", format!("`{}`", data.fingerprint))?;
+    if let Some(env) = &meta.env_name {
+        let version = meta.env_version.as_deref().unwrap_or("unknown version");
+        row("recorded in", format!("{env}, {version}"))?;
+    }
+    if let Some(training) = &meta.training {
+        row(
+            "training",
+            format!(
+                "{} steps of {} windows, seed {}, {:.1} minutes on {} threads",
+                grouped(training.steps),
+                training.batch_size,
+                training.seed,
+                training.minutes,
+                training.threads
+            ),
+        )?;
+        if let Some(last) = training.curve.last() {
+            row("last training loss", format!("{:.5}", last.loss))?;
+        }
+        let valid = training
+            .curve
+            .iter()
+            .rev()
+            .find_map(|point| point.valid_loss);
+        if let Some(valid) = valid {
+            row("last validation loss", format!("{valid:.5}"))?;
+        }
+    }
+    let versions: Vec<String> = meta
+        .versions
+        .iter()
+        .map(|(n, v)| format!("{n} {v}"))
+        .collect();
+    row("made with", versions.join(", "))?;
+    writeln!(
+        card,
+        "\nUse: `actrm-zoo eval {id} --episodes 50`. Provenance and the hash of every file: `entry.json`; \
+         the whole experiment: `config.toml`.\n\n\
+         Intended for the task above in simulation, in the observation and action spaces that it was trained in; \
+         nothing is known about it elsewhere.",
+        id = meta.id()
+    )
+}
+
+fn keys(names: &[String]) -> String {
+    match names.is_empty() {
+        true => "none".to_owned(),
+        false => names.join(", "),
+    }
+}
+
+/// 1503751 as `1,503,751`.
+fn grouped(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i) % 3 == 0 {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_card_says_what_it_is() {
+        let mut meta = super::super::test_draft("lift-act").meta;
+        meta.version = 3;
+        meta.parameters = 1_503_751;
+        let card = render(&meta);
+        for expected in [
+            "# lift-act@3",
+            "| parameters | 1,503,751 |",
+            "| demonstrations | lift.hdf5: 45 episodes, 2,000 frames trained on, 5 episodes held out |",
+            "| training | 3 steps of 64 windows, seed 1, 1.2 minutes on 2 threads |",
+            "| last validation loss | 0.50000 |",
+        ] {
+            assert!(card.contains(expected), "{expected} in\n{card}");
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! `entry.json`: where an entry comes from and what its files are.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::sha256_hex;
+
+use super::EntryId;
+
+/// Version of the form of `entry.json`.
+pub(super) const FORMAT: u32 = 1;
+
+/// Everything recorded about an entry.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EntryMeta {
+    /// Form of this file.
+    pub format: u32,
+    /// The entry's name.
+    pub name: String,
+    /// The entry's version.
+    pub version: u32,
+    /// One sentence on what it is.
+    pub description: String,
+    /// The experiment it was trained by, or where it was imported from.
+    pub experiment: String,
+    /// Kind of policy: `act`, `actrm`, …
+    pub policy: String,
+    /// Task it was trained for, by the name the worker knows.
+    pub task: String,
+    /// Environment of the demonstrations, as the data set names it.
+    pub env_name: Option<String>,
+    /// Version of the simulator that recorded the demonstrations.
+    pub env_version: Option<String>,
+    /// Number of weights.
+    pub parameters: u64,
+    /// Observation keys that make `observation.state`, in order.
+    pub state_keys: Vec<String>,
+    /// Observation keys that make `observation.environment_state`, in order.
+    pub env_keys: Vec<String>,
+    /// Lengths: `state`, `environment_state`, `action`.
+    pub dims: BTreeMap<String, usize>,
+    /// The demonstrations.
+    pub data: DataMeta,
+    /// How it was trained; `None` for an imported entry.
+    pub training: Option<TrainingMeta>,
+    /// Versions of the software that made it.
+    pub versions: BTreeMap<String, String>,
+    /// Every other file of the entry.
+    pub files: BTreeMap<String, FileMeta>,
+}
+
+/// The demonstrations behind an entry.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DataMeta {
+    /// File or folder name, without the path.
+    pub name: String,
+    /// SHA-256 of the data set's content.
+    pub fingerprint: String,
+    /// Episodes trained on.
+    pub train_episodes: u64,
+    /// Frames trained on.
+    pub train_frames: u64,
+    /// Episodes held out for validation.
+    pub valid_episodes: u64,
+}
+
+/// How an entry was trained.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TrainingMeta {
+    /// Optimiser steps.
+    pub steps: u64,
+    /// Windows a step.
+    pub batch_size: u64,
+    /// Seed of weights, latents, dropout and batch order.
+    pub seed: u64,
+    /// Minutes of training, over all sessions of the run.
+    pub minutes: f64,
+    /// Threads it ran on.
+    pub threads: u64,
+    /// The loss on the way, thinned.
+    pub curve: Vec<CurvePoint>,
+}
+
+/// One point of a training curve.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct CurvePoint {
+    /// Optimiser steps done.
+    pub step: u64,
+    /// Training loss.
+    pub loss: f64,
+    /// Validation loss, where it was computed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub valid_loss: Option<f64>,
+}
+
+/// One file of an entry.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileMeta {
+    /// Length in bytes.
+    pub bytes: u64,
+    /// SHA-256, lower-case hexadecimal.
+    pub sha256: String,
+}
+
+impl EntryMeta {
+    /// `name@version`.
+    pub fn id(&self) -> EntryId {
+        EntryId {
+            name: self.name.clone(),
+            version: self.version,
+        }
+    }
+
+    /// One hash for what an evaluation depends on: weights, config and normaliser.
+    ///
+    /// Two trainings with the same seed have the same; minutes and model card do not enter.
+    pub fn content_sha256(&self) -> String {
+        let mut text = String::new();
+        for name in [
+            super::CONFIG_FILE,
+            super::MODEL_FILE,
+            super::NORMALISER_FILE,
+        ] {
+            let sha256 = self.files.get(name).map_or("", |f| f.sha256.as_str());
+            text.push_str(&format!("{sha256}  {name}\n"));
+        }
+        sha256_hex(text.as_bytes())
+    }
+}
+
+/// Key in `entry.json` of the hash of the file itself.
+const SELF_KEY: &str = "\"sha256_of_this_file_with_64_zeros_here\": \"";
+
+/// The text of `entry.json`: the metadata and, last, the hash of the text itself.
+pub(super) fn seal_text(meta: &EntryMeta) -> String {
+    let body = serde_json::to_string_pretty(meta).expect("strings and numbers become JSON");
+    let body = body.trim_end_matches(['}', '\n']);
+    let zeros = "0".repeat(64);
+    let text = format!("{body},\n  {SELF_KEY}{zeros}\"\n}}\n");
+    let digest = sha256_hex(text.as_bytes());
+    text.replace(
+        &format!("{SELF_KEY}{zeros}"),
+        &format!("{SELF_KEY}{digest}"),
+    )
+}
+
+/// The hash that `entry.json` records of itself and the one it has; `None` where none is recorded.
+pub(super) fn self_hashes(text: &[u8]) -> Option<(String, String)> {
+    let key = SELF_KEY.as_bytes();
+    let start = text.windows(key.len()).rposition(|w| w == key)? + key.len();
+    let recorded = text.get(start..start + 64)?;
+    let mut zeroed = text.to_vec();
+    zeroed[start..start + 64].fill(b'0');
+    Some((
+        String::from_utf8_lossy(recorded).into_owned(),
+        sha256_hex(&zeroed),
+    ))
+}

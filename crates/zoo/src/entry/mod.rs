@@ -1,0 +1,29 @@
+//! Entries: `name@version`, a trained policy sealed with everything needed to run and to trust it.
+//!
+//! An entry is a folder `<zoo>/<name>/<version>/` of five files: `model.safetensors`, `config.toml` (the
+//! resolved experiment), `normaliser.safetensors`, `README.md` (the model card) and `entry.json`, which
+//! holds the SHA-256 of the other four and of itself. A version is never rewritten.
+
+mod card;
+mod id;
+mod meta;
+mod open;
+mod seal;
+
+pub use id::{EntryId, EntryRequest};
+pub use meta::{CurvePoint, DataMeta, EntryMeta, FileMeta, TrainingMeta};
+pub use open::Entry;
+pub use seal::EntryDraft;
+#[cfg(test)]
+pub(crate) use seal::tests::draft as test_draft;
+
+/// The weights.
+pub const MODEL_FILE: &str = "model.safetensors";
+/// The resolved experiment.
+pub const CONFIG_FILE: &str = "config.toml";
+/// Statistics that inputs and outputs are normalised with.
+pub const NORMALISER_FILE: &str = "normaliser.safetensors";
+/// The model card.
+pub const CARD_FILE: &str = "README.md";
+/// Provenance and the hashes of the other files.
+pub const ENTRY_FILE: &str = "entry.json";

@@ -1,0 +1,190 @@
+//! The folder of a run: `runs/<experiment>/<number>/`, one training at a time.
+
+use std::fs::{self, File, TryLockError};
+use std::path::{Path, PathBuf};
+
+use crate::ZooError;
+
+/// A run's folder, locked for as long as this value lives.
+#[derive(Debug)]
+pub struct RunFolder {
+    path: PathBuf,
+    _lock: File,
+}
+
+impl RunFolder {
+    /// Makes the next numbered folder under `runs/<experiment>/`; concurrent callers get different ones.
+    ///
+    /// # Errors
+    /// When the folder cannot be made.
+    pub fn next(runs: &Path, experiment: &str) -> Result<Self, ZooError> {
+        let parent = runs.join(experiment);
+        fs::create_dir_all(&parent).map_err(ZooError::io("create folder", &parent))?;
+        loop {
+            let number = numbers(&parent)?.last().map_or(1, |n| n + 1);
+            let path = parent.join(format!("{number:03}"));
+            match fs::create_dir(&path) {
+                Ok(()) => return Self::lock(path),
+                Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}
+                Err(e) => return Err(ZooError::io("create folder", path)(e)),
+            }
+        }
+    }
+
+    /// Begins a run in exactly this folder, which must be new or hold no run.
+    ///
+    /// # Errors
+    /// [`ZooError::RunLocked`] while another training works there, [`ZooError::RunExists`] after one did.
+    pub fn fresh(path: &Path) -> Result<Self, ZooError> {
+        fs::create_dir_all(path).map_err(ZooError::io("create folder", path))?;
+        let folder = Self::lock(path.to_owned())?;
+        if folder.config_path().exists() {
+            return Err(ZooError::RunExists {
+                folder: path.to_owned(),
+            });
+        }
+        Ok(folder)
+    }
+
+    /// Takes up the run in exactly this folder.
+    ///
+    /// # Errors
+    /// [`ZooError::RunLocked`] while another training works there, [`ZooError::NothingToResume`] where no
+    /// run was begun or it is finished.
+    pub fn resume(path: &Path) -> Result<Self, ZooError> {
+        let nothing = |reason: &str| ZooError::NothingToResume {
+            folder: path.to_owned(),
+            reason: reason.to_owned(),
+        };
+        if !path.is_dir() {
+            return Err(nothing("there is no such folder"));
+        }
+        let folder = Self::lock(path.to_owned())?;
+        if !folder.config_path().exists() {
+            return Err(nothing("no run was begun there"));
+        }
+        if folder.finished_path().exists() {
+            return Err(nothing("the run is finished"));
+        }
+        Ok(folder)
+    }
+
+    /// Takes up the latest run of `experiment`.
+    ///
+    /// # Errors
+    /// As [`RunFolder::resume`].
+    pub fn resume_latest(runs: &Path, experiment: &str) -> Result<Self, ZooError> {
+        let parent = runs.join(experiment);
+        let latest = match parent.is_dir() {
+            true => numbers(&parent)?.pop(),
+            false => None,
+        };
+        match latest {
+            Some(number) => Self::resume(&parent.join(format!("{number:03}"))),
+            None => Err(ZooError::NothingToResume {
+                folder: parent,
+                reason: "no run was begun there".to_owned(),
+            }),
+        }
+    }
+
+    fn lock(path: PathBuf) -> Result<Self, ZooError> {
+        let file_path = path.join("lock");
+        let file = File::create(&file_path).map_err(ZooError::io("create", &file_path))?;
+        match file.try_lock() {
+            Ok(()) => Ok(Self { path, _lock: file }),
+            Err(TryLockError::WouldBlock) => Err(ZooError::RunLocked { folder: path }),
+            Err(TryLockError::Error(e)) => Err(ZooError::io("lock", file_path)(e)),
+        }
+    }
+
+    /// The folder itself.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The resolved experiment; its presence says that a run was begun.
+    pub fn config_path(&self) -> PathBuf {
+        self.path.join("config.toml")
+    }
+
+    /// Written last; its presence says that the run is finished.
+    pub fn finished_path(&self) -> PathBuf {
+        self.path.join("finished.json")
+    }
+
+    /// Where checkpoints go.
+    pub fn checkpoints(&self) -> PathBuf {
+        self.path.join("checkpoints")
+    }
+}
+
+fn numbers(parent: &Path) -> Result<Vec<u32>, ZooError> {
+    let mut found = Vec::new();
+    for item in fs::read_dir(parent).map_err(ZooError::io("read folder", parent))? {
+        let item = item.map_err(ZooError::io("read folder", parent))?;
+        found.extend(
+            item.file_name()
+                .to_str()
+                .and_then(|n| n.parse::<u32>().ok()),
+        );
+    }
+    found.sort_unstable();
+    Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn one_training_at_a_time() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("r");
+        let first = RunFolder::fresh(&path).unwrap();
+        let error = RunFolder::fresh(&path).unwrap_err();
+        assert!(
+            error.to_string().contains("in use by another training"),
+            "{error}"
+        );
+        assert!(matches!(
+            RunFolder::resume(&path),
+            Err(ZooError::RunLocked { .. })
+        ));
+        drop(first);
+        RunFolder::fresh(&path).unwrap();
+    }
+
+    #[test]
+    fn fresh_and_resume_tell_runs_apart() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("r");
+        let reason = |r: Result<RunFolder, ZooError>| r.unwrap_err().to_string();
+        assert!(reason(RunFolder::resume(&path)).ends_with("no such folder"));
+        let folder = RunFolder::fresh(&path).unwrap();
+        let (config, finished) = (folder.config_path(), folder.finished_path());
+        drop(folder);
+        assert!(reason(RunFolder::resume(&path)).ends_with("no run was begun there"));
+        fs::write(config, "").unwrap();
+        assert!(reason(RunFolder::fresh(&path)).contains("already holds a run"));
+        RunFolder::resume(&path).unwrap();
+        fs::write(finished, "{}").unwrap();
+        assert!(reason(RunFolder::resume(&path)).ends_with("the run is finished"));
+    }
+
+    #[test]
+    fn numbers_go_up_and_the_latest_is_resumed() {
+        let root = tempfile::tempdir().unwrap();
+        let reason = RunFolder::resume_latest(root.path(), "e").unwrap_err();
+        assert!(matches!(reason, ZooError::NothingToResume { .. }));
+        let names: Vec<_> = (0..3)
+            .map(|_| RunFolder::next(root.path(), "e").unwrap())
+            .map(|f| f.path().file_name().unwrap().to_owned())
+            .collect();
+        assert_eq!(names, ["001", "002", "003"]);
+        fs::write(root.path().join("e/003/config.toml"), "").unwrap();
+        let folder = RunFolder::resume_latest(root.path(), "e").unwrap();
+        assert!(folder.path().ends_with("e/003"));
+    }
+}

@@ -1,0 +1,169 @@
+//! Named tensors to safetensors bytes and back, the same bytes for the same tensors.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
+
+use candle_core::{DType, Device, Tensor};
+use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, TensorView, serialize};
+
+use crate::ZooError;
+
+/// The one metadata key: safetensors keeps metadata in a hash map, and one key has one order.
+const METADATA_KEY: &str = "actrm";
+
+/// Tensors and the JSON stored beside them.
+pub(crate) type Contents = (BTreeMap<String, Tensor>, serde_json::Value);
+
+/// Serialises `tensors` with `metadata` (whose keys `serde_json` keeps sorted).
+pub(crate) fn to_bytes(
+    path: &Path,
+    tensors: &BTreeMap<String, Tensor>,
+    metadata: &serde_json::Value,
+) -> Result<Vec<u8>, ZooError> {
+    let failed = |reason: String| ZooError::Malformed {
+        path: path.to_owned(),
+        reason,
+    };
+    let mut parts: Vec<(&String, Dtype, Vec<usize>, Vec<u8>)> = Vec::with_capacity(tensors.len());
+    for (name, tensor) in tensors {
+        let (dtype, bytes) =
+            raw(tensor).map_err(|e| failed(format!("tensor `{name}` cannot be stored: {e}")))?;
+        parts.push((name, dtype, tensor.dims().to_vec(), bytes));
+    }
+    let mut views = Vec::with_capacity(parts.len());
+    for (name, dtype, shape, bytes) in &parts {
+        let view = TensorView::new(*dtype, shape.clone(), bytes)
+            .map_err(|e| failed(format!("tensor `{name}` cannot be stored: {e}")))?;
+        views.push(((*name).clone(), view));
+    }
+    let info = HashMap::from([(METADATA_KEY.to_owned(), metadata.to_string())]);
+    serialize(views, Some(info)).map_err(|e| failed(format!("cannot be serialised: {e}")))
+}
+
+fn raw(tensor: &Tensor) -> candle_core::Result<(Dtype, Vec<u8>)> {
+    macro_rules! bytes {
+        ($t:ty) => {
+            tensor
+                .flatten_all()?
+                .to_vec1::<$t>()?
+                .into_iter()
+                .flat_map(<$t>::to_le_bytes)
+                .collect()
+        };
+    }
+    let bytes = match tensor.dtype() {
+        DType::F32 => bytes!(f32),
+        DType::F64 => bytes!(f64),
+        DType::I64 => bytes!(i64),
+        DType::U32 => bytes!(u32),
+        DType::U8 => bytes!(u8),
+        other => candle_core::bail!("dtype {other:?} is not one of f32, f64, i64, u32, u8"),
+    };
+    Ok((tensor.dtype().into(), bytes))
+}
+
+/// Parses the bytes of `path`; the metadata is `null` where there is none of ours.
+pub(crate) fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Contents, ZooError> {
+    let failed = |reason: String| ZooError::Malformed {
+        path: path.to_owned(),
+        reason,
+    };
+    let not_ours = |e: safetensors::SafeTensorError| failed(format!("not a safetensors file: {e}"));
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(not_ours)?;
+    let parsed = SafeTensors::deserialize(bytes).map_err(not_ours)?;
+    let metadata = match header.metadata().as_ref().and_then(|m| m.get(METADATA_KEY)) {
+        Some(text) => serde_json::from_str(text)
+            .map_err(|e| failed(format!("metadata `{METADATA_KEY}` is not JSON: {e}")))?,
+        None => serde_json::Value::Null,
+    };
+    let mut tensors = BTreeMap::new();
+    for (name, view) in parsed.iter() {
+        let tensor = tensor(&view).map_err(|e| failed(format!("tensor `{name}`: {e}")))?;
+        tensors.insert(name.to_owned(), tensor);
+    }
+    Ok((tensors, metadata))
+}
+
+fn tensor(view: &TensorView<'_>) -> candle_core::Result<Tensor> {
+    macro_rules! values {
+        ($t:ty) => {{
+            let values: Vec<$t> = view
+                .data()
+                .as_chunks()
+                .0
+                .iter()
+                .map(|bytes| <$t>::from_le_bytes(*bytes))
+                .collect();
+            Tensor::from_vec(values, view.shape(), &Device::Cpu)
+        }};
+    }
+    match view.dtype() {
+        Dtype::F32 => values!(f32),
+        Dtype::F64 => values!(f64),
+        Dtype::I64 => values!(i64),
+        Dtype::U32 => values!(u32),
+        Dtype::U8 => values!(u8),
+        other => candle_core::bail!("dtype {other:?} is not one of f32, f64, i64, u32, u8"),
+    }
+}
+
+/// Reads a safetensors file.
+pub(crate) fn read(path: &Path) -> Result<Contents, ZooError> {
+    let bytes = std::fs::read(path).map_err(ZooError::io("read", path))?;
+    from_bytes(path, &bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn tensors_come_back_and_bytes_repeat() {
+        let device = &Device::Cpu;
+        let tensors = BTreeMap::from([
+            (
+                "b.weight".to_owned(),
+                Tensor::from_vec(vec![1.5_f32, -0.0, f32::MIN_POSITIVE], (3, 1), device).unwrap(),
+            ),
+            (
+                "a".to_owned(),
+                Tensor::from_vec(vec![7_i64, -1], 2, device).unwrap(),
+            ),
+            ("s".to_owned(), Tensor::new(2.5_f64, device).unwrap()),
+            (
+                "r".to_owned(),
+                Tensor::from_vec(vec![1_u8, 2, 255], 3, device).unwrap(),
+            ),
+        ]);
+        let metadata = serde_json::json!({"z": 1, "a": [1.5, "x"]});
+        let path = Path::new("x.safetensors");
+        let bytes = to_bytes(path, &tensors, &metadata).unwrap();
+        assert_eq!(bytes, to_bytes(path, &tensors, &metadata).unwrap());
+        let (back, meta) = from_bytes(path, &bytes).unwrap();
+        assert_eq!(meta, metadata);
+        assert_eq!(back.len(), tensors.len());
+        for (name, tensor) in &tensors {
+            assert_eq!(raw(tensor).unwrap(), raw(&back[name]).unwrap(), "{name}");
+            assert_eq!(tensor.dims(), back[name].dims());
+        }
+    }
+
+    #[test]
+    fn a_truncated_file_is_an_error_that_names_it() {
+        let tensors = BTreeMap::from([(
+            "a".to_owned(),
+            Tensor::zeros(100, DType::F32, &Device::Cpu).unwrap(),
+        )]);
+        let path = Path::new("some/model.safetensors");
+        let bytes = to_bytes(path, &tensors, &serde_json::Value::Null).unwrap();
+        for cut in [0, 5, 40, bytes.len() - 1] {
+            let error = from_bytes(path, &bytes[..cut]).unwrap_err().to_string();
+            assert!(
+                error.starts_with("some/model.safetensors: not a safetensors file"),
+                "{error}"
+            );
+        }
+    }
+}
