@@ -4,19 +4,12 @@ use std::path::PathBuf;
 
 /// Writes names the way every message lists them: `a, b, c`, or `none`.
 pub(crate) fn list(names: &[String]) -> String {
-    if names.is_empty() {
-        "none".to_owned()
-    } else {
-        names.join(", ")
-    }
+    if names.is_empty() { "none".to_owned() } else { names.join(", ") }
 }
 
 /// ` (did you mean `x`?)`, or nothing.
 fn hint(nearest: &Option<String>) -> String {
-    nearest
-        .as_ref()
-        .map(|n| format!(" (did you mean `{n}`?)"))
-        .unwrap_or_default()
+    nearest.as_ref().map(|n| format!(" (did you mean `{n}`?)")).unwrap_or_default()
 }
 
 /// An operation of this crate that failed.
@@ -46,11 +39,7 @@ pub enum ZooError {
 
     // ---- experiments -------------------------------------------------------------------------
     /// No experiment of that name.
-    #[error(
-        "unknown experiment `{name}`{}; experiments: {}",
-        hint(nearest),
-        list(available)
-    )]
+    #[error("unknown experiment `{name}`{}; experiments: {}", hint(nearest), list(available))]
     UnknownExperiment {
         /// The name asked for.
         name: String,
@@ -75,11 +64,7 @@ pub enum ZooError {
         chain: Vec<String>,
     },
     /// A key that no part of an experiment has.
-    #[error(
-        "unknown key `{key}`{}; keys here: {}",
-        hint(nearest),
-        list(alternatives)
-    )]
+    #[error("unknown key `{key}`{}; keys here: {}", hint(nearest), list(alternatives))]
     UnknownKey {
         /// Dotted path of the key.
         key: String,
@@ -210,15 +195,8 @@ pub enum ZooError {
 
 impl ZooError {
     /// Builds the closure that `map_err` wants around a file operation.
-    pub(crate) fn io(
-        operation: &'static str,
-        path: impl Into<PathBuf>,
-    ) -> impl FnOnce(std::io::Error) -> Self {
+    pub(crate) fn io(operation: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
-        move |source| Self::Io {
-            operation,
-            path,
-            source,
-        }
+        move |source| Self::Io { operation, path, source }
     }
 }

@@ -45,20 +45,14 @@ fn hex(digest: &[u8]) -> String {
 /// # Errors
 /// When the folder is not there or cannot be written to.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), ZooError> {
-    let folder = path
-        .parent()
-        .filter(|p| !p.as_os_str().is_empty())
-        .unwrap_or_else(|| Path::new("."));
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
     let mut file = tempfile::Builder::new()
         .prefix(".tmp-")
         .permissions(mode(0o644))
         .tempfile_in(folder)
         .map_err(ZooError::io("create a temporary file in", folder))?;
-    file.write_all(bytes)
-        .and_then(|()| file.as_file().sync_all())
-        .map_err(ZooError::io("write", path))?;
-    file.persist(path)
-        .map_err(|e| ZooError::io("write", path)(e.error))?;
+    file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(ZooError::io("write", path))?;
+    file.persist(path).map_err(|e| ZooError::io("write", path)(e.error))?;
     sync_folder(folder)
 }
 
@@ -68,9 +62,7 @@ fn mode(bits: u32) -> fs::Permissions {
 
 /// Makes renames inside `folder` survive a power cut.
 pub(crate) fn sync_folder(folder: &Path) -> Result<(), ZooError> {
-    File::open(folder)
-        .and_then(|f| f.sync_all())
-        .map_err(ZooError::io("sync folder", folder))
+    File::open(folder).and_then(|f| f.sync_all()).map_err(ZooError::io("sync folder", folder))
 }
 
 #[cfg(test)]

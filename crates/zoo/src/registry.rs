@@ -16,9 +16,7 @@ pub struct Registry {
 impl Registry {
     /// The zoo in `folder`.
     pub fn open(folder: &Path) -> Self {
-        Self {
-            folder: folder.to_owned(),
-        }
+        Self { folder: folder.to_owned() }
     }
 
     /// The zoo's folder.
@@ -44,10 +42,7 @@ impl Registry {
                 if let Ok(number) = version.parse::<u32>()
                     && parent.join(&version).join(ENTRY_FILE).is_file()
                 {
-                    ids.push(EntryId {
-                        name: name.clone(),
-                        version: number,
-                    });
+                    ids.push(EntryId { name: name.clone(), version: number });
                 }
             }
         }
@@ -136,12 +131,7 @@ mod tests {
         assert_eq!(registry.ids().unwrap().len(), 12);
         assert_eq!(registry.resolve("b").unwrap().to_string(), "b@10");
         assert_eq!(registry.resolve("a@1").unwrap().to_string(), "a@1");
-        let newest: Vec<String> = registry
-            .newest()
-            .unwrap()
-            .iter()
-            .map(EntryId::to_string)
-            .collect();
+        let newest: Vec<String> = registry.newest().unwrap().iter().map(EntryId::to_string).collect();
         assert_eq!(newest, ["a@2", "b@10"]);
     }
 
@@ -154,14 +144,9 @@ mod tests {
         let place = zoo.path().display();
         assert_eq!(
             message("lfit-act"),
-            format!(
-                "unknown entry `lfit-act` in zoo {place} (did you mean `lift-act`?); entries: lift-act@1"
-            )
+            format!("unknown entry `lfit-act` in zoo {place} (did you mean `lift-act`?); entries: lift-act@1")
         );
-        assert_eq!(
-            message("lift-act@2"),
-            format!("unknown entry `lift-act@2` in zoo {place}; entries: lift-act@1")
-        );
+        assert_eq!(message("lift-act@2"), format!("unknown entry `lift-act@2` in zoo {place}; entries: lift-act@1"));
     }
 
     #[test]

@@ -21,14 +21,10 @@ pub(crate) fn to_bytes(
     tensors: &BTreeMap<String, Tensor>,
     metadata: &serde_json::Value,
 ) -> Result<Vec<u8>, ZooError> {
-    let failed = |reason: String| ZooError::Malformed {
-        path: path.to_owned(),
-        reason,
-    };
+    let failed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
     let mut parts: Vec<(&String, Dtype, Vec<usize>, Vec<u8>)> = Vec::with_capacity(tensors.len());
     for (name, tensor) in tensors {
-        let (dtype, bytes) =
-            raw(tensor).map_err(|e| failed(format!("tensor `{name}` cannot be stored: {e}")))?;
+        let (dtype, bytes) = raw(tensor).map_err(|e| failed(format!("tensor `{name}` cannot be stored: {e}")))?;
         parts.push((name, dtype, tensor.dims().to_vec(), bytes));
     }
     let mut views = Vec::with_capacity(parts.len());
@@ -44,12 +40,7 @@ pub(crate) fn to_bytes(
 fn raw(tensor: &Tensor) -> candle_core::Result<(Dtype, Vec<u8>)> {
     macro_rules! bytes {
         ($t:ty) => {
-            tensor
-                .flatten_all()?
-                .to_vec1::<$t>()?
-                .into_iter()
-                .flat_map(<$t>::to_le_bytes)
-                .collect()
+            tensor.flatten_all()?.to_vec1::<$t>()?.into_iter().flat_map(<$t>::to_le_bytes).collect()
         };
     }
     let bytes = match tensor.dtype() {
@@ -65,16 +56,14 @@ fn raw(tensor: &Tensor) -> candle_core::Result<(Dtype, Vec<u8>)> {
 
 /// Parses the bytes of `path`; the metadata is `null` where there is none of ours.
 pub(crate) fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Contents, ZooError> {
-    let failed = |reason: String| ZooError::Malformed {
-        path: path.to_owned(),
-        reason,
-    };
+    let failed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
     let not_ours = |e: safetensors::SafeTensorError| failed(format!("not a safetensors file: {e}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(not_ours)?;
     let parsed = SafeTensors::deserialize(bytes).map_err(not_ours)?;
     let metadata = match header.metadata().as_ref().and_then(|m| m.get(METADATA_KEY)) {
-        Some(text) => serde_json::from_str(text)
-            .map_err(|e| failed(format!("metadata `{METADATA_KEY}` is not JSON: {e}")))?,
+        Some(text) => {
+            serde_json::from_str(text).map_err(|e| failed(format!("metadata `{METADATA_KEY}` is not JSON: {e}")))?
+        }
         None => serde_json::Value::Null,
     };
     let mut tensors = BTreeMap::new();
@@ -88,13 +77,7 @@ pub(crate) fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Contents, ZooError
 fn tensor(view: &TensorView<'_>) -> candle_core::Result<Tensor> {
     macro_rules! values {
         ($t:ty) => {{
-            let values: Vec<$t> = view
-                .data()
-                .as_chunks()
-                .0
-                .iter()
-                .map(|bytes| <$t>::from_le_bytes(*bytes))
-                .collect();
+            let values: Vec<$t> = view.data().as_chunks().0.iter().map(|bytes| <$t>::from_le_bytes(*bytes)).collect();
             Tensor::from_vec(values, view.shape(), &Device::Cpu)
         }};
     }
@@ -123,19 +106,10 @@ mod tests {
     fn tensors_come_back_and_bytes_repeat() {
         let device = &Device::Cpu;
         let tensors = BTreeMap::from([
-            (
-                "b.weight".to_owned(),
-                Tensor::from_vec(vec![1.5_f32, -0.0, f32::MIN_POSITIVE], (3, 1), device).unwrap(),
-            ),
-            (
-                "a".to_owned(),
-                Tensor::from_vec(vec![7_i64, -1], 2, device).unwrap(),
-            ),
+            ("b.weight".to_owned(), Tensor::from_vec(vec![1.5_f32, -0.0, f32::MIN_POSITIVE], (3, 1), device).unwrap()),
+            ("a".to_owned(), Tensor::from_vec(vec![7_i64, -1], 2, device).unwrap()),
             ("s".to_owned(), Tensor::new(2.5_f64, device).unwrap()),
-            (
-                "r".to_owned(),
-                Tensor::from_vec(vec![1_u8, 2, 255], 3, device).unwrap(),
-            ),
+            ("r".to_owned(), Tensor::from_vec(vec![1_u8, 2, 255], 3, device).unwrap()),
         ]);
         let metadata = serde_json::json!({"z": 1, "a": [1.5, "x"]});
         let path = Path::new("x.safetensors");
@@ -152,18 +126,12 @@ mod tests {
 
     #[test]
     fn a_truncated_file_is_an_error_that_names_it() {
-        let tensors = BTreeMap::from([(
-            "a".to_owned(),
-            Tensor::zeros(100, DType::F32, &Device::Cpu).unwrap(),
-        )]);
+        let tensors = BTreeMap::from([("a".to_owned(), Tensor::zeros(100, DType::F32, &Device::Cpu).unwrap())]);
         let path = Path::new("some/model.safetensors");
         let bytes = to_bytes(path, &tensors, &serde_json::Value::Null).unwrap();
         for cut in [0, 5, 40, bytes.len() - 1] {
             let error = from_bytes(path, &bytes[..cut]).unwrap_err().to_string();
-            assert!(
-                error.starts_with("some/model.safetensors: not a safetensors file"),
-                "{error}"
-            );
+            assert!(error.starts_with("some/model.safetensors: not a safetensors file"), "{error}");
         }
     }
 }

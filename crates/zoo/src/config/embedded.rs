@@ -4,8 +4,5 @@
 pub(super) const FILES: &[(&str, &str)] = &[
     ("_act", include_str!("../../../../configs/_act.toml")),
     ("_base", include_str!("../../../../configs/_base.toml")),
-    (
-        "act_lift",
-        include_str!("../../../../configs/act_lift.toml"),
-    ),
+    ("act_lift", include_str!("../../../../configs/act_lift.toml")),
 ];

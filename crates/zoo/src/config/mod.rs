@@ -20,12 +20,7 @@ pub use value::from_value;
 pub fn nearest(name: &str, names: &[String]) -> Option<String> {
     names
         .iter()
-        .map(|n| {
-            (
-                strsim::damerau_levenshtein(&name.to_lowercase(), &n.to_lowercase()),
-                n,
-            )
-        })
+        .map(|n| (strsim::damerau_levenshtein(&name.to_lowercase(), &n.to_lowercase()), n))
         .filter(|(distance, n)| *distance <= (name.len().max(n.len()) / 3).max(1))
         .min()
         .map(|(_, n)| n.clone())
@@ -49,9 +44,7 @@ impl Library {
     /// When `folder` is not a folder.
     pub fn with_folder(folder: &Path) -> Result<Self, ZooError> {
         std::fs::read_dir(folder).map_err(ZooError::io("open experiment folder", folder))?;
-        Ok(Self {
-            folder: Some(folder.to_owned()),
-        })
+        Ok(Self { folder: Some(folder.to_owned()) })
     }
 
     /// Names of every experiment that can be trained, sorted.
@@ -59,17 +52,12 @@ impl Library {
     /// # Errors
     /// When the folder cannot be read.
     pub fn names(&self) -> Result<Vec<String>, ZooError> {
-        let mut names: Vec<String> = embedded::FILES
-            .iter()
-            .map(|(n, _)| (*n).to_owned())
-            .collect();
+        let mut names: Vec<String> = embedded::FILES.iter().map(|(n, _)| (*n).to_owned()).collect();
         if let Some(folder) = &self.folder {
             for item in std::fs::read_dir(folder).map_err(ZooError::io("read folder", folder))? {
                 let path = item.map_err(ZooError::io("read folder", folder))?.path();
                 let stem = path.file_stem().and_then(|s| s.to_str());
-                if let (Some(stem), Some("toml")) =
-                    (stem, path.extension().and_then(|e| e.to_str()))
-                {
+                if let (Some(stem), Some("toml")) = (stem, path.extension().and_then(|e| e.to_str())) {
                     names.push(stem.to_owned());
                 }
             }
@@ -111,9 +99,7 @@ impl Library {
 
     fn read(&self, name: &str) -> Result<Table, ZooError> {
         let text = match self.folder.as_ref().map(|f| f.join(format!("{name}.toml"))) {
-            Some(path) if path.is_file() => {
-                std::fs::read_to_string(&path).map_err(ZooError::io("read", path))?
-            }
+            Some(path) if path.is_file() => std::fs::read_to_string(&path).map_err(ZooError::io("read", path))?,
             _ => match embedded::FILES.iter().find(|(n, _)| *n == name) {
                 Some((_, text)) => (*text).to_owned(),
                 None => {
@@ -126,10 +112,8 @@ impl Library {
                 }
             },
         };
-        toml::from_str(&text).map_err(|source| ZooError::ExperimentSyntax {
-            experiment: name.to_owned(),
-            source: Box::new(source),
-        })
+        toml::from_str(&text)
+            .map_err(|source| ZooError::ExperimentSyntax { experiment: name.to_owned(), source: Box::new(source) })
     }
 }
 
@@ -167,8 +151,7 @@ mod tests {
             ("c", "extends = '_b'\ny = 2\n[train]\nkeys = [3]"),
         ]);
         let table = library.resolve("c").unwrap();
-        let expected: Table =
-            toml::from_str("x = 1\ny = 2\n[train]\nsteps = 20\nlr = 0.1\nkeys = [3]").unwrap();
+        let expected: Table = toml::from_str("x = 1\ny = 2\n[train]\nsteps = 20\nlr = 0.1\nkeys = [3]").unwrap();
         assert_eq!(table, expected);
         let names = library.names().unwrap();
         assert!(names.contains(&"c".to_owned()) && !names.contains(&"_a".to_owned()));
@@ -177,22 +160,14 @@ mod tests {
     #[test]
     fn a_file_that_extends_itself_is_named() {
         let (_folder, library) = library(&[("p", "extends = 'q'"), ("q", "extends = 'p'")]);
-        assert_eq!(
-            library.resolve("p").unwrap_err().to_string(),
-            "experiment `p` extends itself: p -> q -> p"
-        );
+        assert_eq!(library.resolve("p").unwrap_err().to_string(), "experiment `p` extends itself: p -> q -> p");
     }
 
     #[test]
     fn an_unknown_experiment_lists_what_there_is() {
-        let message = Library::built_in()
-            .resolve("act_lfit")
-            .unwrap_err()
-            .to_string();
+        let message = Library::built_in().resolve("act_lfit").unwrap_err().to_string();
         assert!(
-            message.starts_with(
-                "unknown experiment `act_lfit` (did you mean `act_lift`?); experiments: "
-            ),
+            message.starts_with("unknown experiment `act_lfit` (did you mean `act_lift`?); experiments: "),
             "{message}"
         );
     }
@@ -210,10 +185,8 @@ mod tests {
             })
             .collect();
         on_disk.sort();
-        let built_in: Vec<(String, String)> = embedded::FILES
-            .iter()
-            .map(|(n, t)| ((*n).to_owned(), (*t).to_owned()))
-            .collect();
+        let built_in: Vec<(String, String)> =
+            embedded::FILES.iter().map(|(n, t)| ((*n).to_owned(), (*t).to_owned())).collect();
         assert_eq!(on_disk, built_in);
     }
 

@@ -13,18 +13,13 @@ use crate::ZooError;
 /// When an override is not `dotted.key=value`, or goes through a key that is not a table.
 pub fn apply_overrides(table: &mut Table, overrides: &[String]) -> Result<(), ZooError> {
     for text in overrides {
-        apply(table, text).map_err(|reason| ZooError::Override {
-            text: text.clone(),
-            reason,
-        })?;
+        apply(table, text).map_err(|reason| ZooError::Override { text: text.clone(), reason })?;
     }
     Ok(())
 }
 
 fn apply(table: &mut Table, text: &str) -> Result<(), String> {
-    let (path, value) = text
-        .split_once('=')
-        .ok_or_else(|| "expected `section.key=value`".to_owned())?;
+    let (path, value) = text.split_once('=').ok_or_else(|| "expected `section.key=value`".to_owned())?;
     let keys: Vec<&str> = path.split('.').collect();
     if keys.iter().any(|key| key.trim() != *key || key.is_empty()) {
         return Err(format!("`{path}` is not a dotted key"));
@@ -59,12 +54,9 @@ mod tests {
     use super::*;
 
     fn with(overrides: &[&str]) -> Result<Table, String> {
-        let mut table: Table =
-            toml::from_str("name = 'x'\n[train]\nsteps = 1\n[train.lr]\nmax = 0.5").unwrap();
+        let mut table: Table = toml::from_str("name = 'x'\n[train]\nsteps = 1\n[train.lr]\nmax = 0.5").unwrap();
         let overrides: Vec<String> = overrides.iter().map(|o| (*o).to_owned()).collect();
-        apply_overrides(&mut table, &overrides)
-            .map(|()| table)
-            .map_err(|e| e.to_string())
+        apply_overrides(&mut table, &overrides).map(|()| table).map_err(|e| e.to_string())
     }
 
     #[test]
@@ -96,10 +88,7 @@ mod tests {
 
     #[test]
     fn what_is_not_an_override_is_refused() {
-        assert_eq!(
-            with(&["train"]).unwrap_err(),
-            "override `train`: expected `section.key=value`"
-        );
+        assert_eq!(with(&["train"]).unwrap_err(), "override `train`: expected `section.key=value`");
         assert_eq!(
             with(&["train..steps=1"]).unwrap_err(),
             "override `train..steps=1`: `train..steps` is not a dotted key"
@@ -108,9 +97,6 @@ mod tests {
             with(&["train.steps.x=1"]).unwrap_err(),
             "override `train.steps.x=1`: `train.steps` is a value, not a section"
         );
-        assert_eq!(
-            with(&["train.lr=1"]).unwrap_err(),
-            "override `train.lr=1`: `train.lr` is a section, not a value"
-        );
+        assert_eq!(with(&["train.lr=1"]).unwrap_err(), "override `train.lr=1`: `train.lr` is a section, not a value");
     }
 }

@@ -22,26 +22,15 @@ struct Refusal {
 
 #[derive(Debug)]
 enum Kind {
-    UnknownKey {
-        key: String,
-        alternatives: Vec<String>,
-    },
-    MissingKey {
-        key: String,
-    },
-    Invalid {
-        expected: String,
-        found: String,
-    },
+    UnknownKey { key: String, alternatives: Vec<String> },
+    MissingKey { key: String },
+    Invalid { expected: String, found: String },
     Other(String),
 }
 
 impl Refusal {
     fn new(kind: Kind) -> Self {
-        Self {
-            path: Vec::new(),
-            kind,
-        }
+        Self { path: Vec::new(), kind }
     }
 
     fn under(mut self, key: &str) -> Self {
@@ -57,24 +46,14 @@ impl Refusal {
         };
         let keys = std::mem::take(&mut self.path);
         match self.kind {
-            Kind::UnknownKey { key, alternatives } => ZooError::UnknownKey {
-                nearest: nearest(&key, &alternatives),
-                key: path(keys, Some(key)),
-                alternatives,
-            },
-            Kind::MissingKey { key } => ZooError::MissingKey {
-                key: path(keys, Some(key)),
-            },
-            Kind::Invalid { expected, found } => ZooError::InvalidValue {
-                key: path(keys, None),
-                expected,
-                found,
-            },
-            Kind::Other(text) => ZooError::InvalidValue {
-                key: path(keys, None),
-                expected: "a valid value".to_owned(),
-                found: text,
-            },
+            Kind::UnknownKey { key, alternatives } => {
+                ZooError::UnknownKey { nearest: nearest(&key, &alternatives), key: path(keys, Some(key)), alternatives }
+            }
+            Kind::MissingKey { key } => ZooError::MissingKey { key: path(keys, Some(key)) },
+            Kind::Invalid { expected, found } => ZooError::InvalidValue { key: path(keys, None), expected, found },
+            Kind::Other(text) => {
+                ZooError::InvalidValue { key: path(keys, None), expected: "a valid value".to_owned(), found: text }
+            }
         }
     }
 }
@@ -99,10 +78,7 @@ impl de::Error for Refusal {
     }
 
     fn invalid_type(found: Unexpected<'_>, expected: &dyn de::Expected) -> Self {
-        Self::new(Kind::Invalid {
-            expected: expected.to_string(),
-            found: found.to_string(),
-        })
+        Self::new(Kind::Invalid { expected: expected.to_string(), found: found.to_string() })
     }
 
     fn invalid_value(found: Unexpected<'_>, expected: &dyn de::Expected) -> Self {
@@ -110,17 +86,11 @@ impl de::Error for Refusal {
     }
 
     fn invalid_length(found: usize, expected: &dyn de::Expected) -> Self {
-        Self::new(Kind::Invalid {
-            expected: expected.to_string(),
-            found: format!("{found} items"),
-        })
+        Self::new(Kind::Invalid { expected: expected.to_string(), found: format!("{found} items") })
     }
 
     fn unknown_field(field: &str, expected: &'static [&'static str]) -> Self {
-        Self::new(Kind::UnknownKey {
-            key: field.to_owned(),
-            alternatives: owned(expected),
-        })
+        Self::new(Kind::UnknownKey { key: field.to_owned(), alternatives: owned(expected) })
     }
 
     fn unknown_variant(variant: &str, expected: &'static [&'static str]) -> Self {
@@ -131,9 +101,7 @@ impl de::Error for Refusal {
     }
 
     fn missing_field(field: &'static str) -> Self {
-        Self::new(Kind::MissingKey {
-            key: field.to_owned(),
-        })
+        Self::new(Kind::MissingKey { key: field.to_owned() })
     }
 }
 
@@ -161,10 +129,7 @@ impl<'de> de::Deserializer<'de> for ValueDeserializer<'_> {
             Value::Boolean(b) => visitor.visit_bool(*b),
             Value::Datetime(d) => visitor.visit_str(&d.to_string()),
             Value::Array(items) => visitor.visit_seq(Items(items.iter().enumerate())),
-            Value::Table(table) => visitor.visit_map(Entries {
-                rest: table.iter(),
-                current: None,
-            }),
+            Value::Table(table) => visitor.visit_map(Entries { rest: table.iter(), current: None }),
         }
     }
 
@@ -206,16 +171,11 @@ struct Items<'a>(std::iter::Enumerate<std::slice::Iter<'a, Value>>);
 impl<'de> de::SeqAccess<'de> for Items<'_> {
     type Error = Refusal;
 
-    fn next_element_seed<T: de::DeserializeSeed<'de>>(
-        &mut self,
-        seed: T,
-    ) -> Result<Option<T::Value>, Refusal> {
+    fn next_element_seed<T: de::DeserializeSeed<'de>>(&mut self, seed: T) -> Result<Option<T::Value>, Refusal> {
         let Some((index, value)) = self.0.next() else {
             return Ok(None);
         };
-        seed.deserialize(ValueDeserializer(value))
-            .map(Some)
-            .map_err(|refusal| refusal.under(&index.to_string()))
+        seed.deserialize(ValueDeserializer(value)).map(Some).map_err(|refusal| refusal.under(&index.to_string()))
     }
 }
 
@@ -227,10 +187,7 @@ struct Entries<'a> {
 impl<'de> de::MapAccess<'de> for Entries<'_> {
     type Error = Refusal;
 
-    fn next_key_seed<K: de::DeserializeSeed<'de>>(
-        &mut self,
-        seed: K,
-    ) -> Result<Option<K::Value>, Refusal> {
+    fn next_key_seed<K: de::DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, Refusal> {
         self.current = self.rest.next();
         match self.current {
             Some((key, _)) => seed.deserialize(key.as_str().into_deserializer()).map(Some),
@@ -238,16 +195,9 @@ impl<'de> de::MapAccess<'de> for Entries<'_> {
         }
     }
 
-    fn next_value_seed<T: de::DeserializeSeed<'de>>(
-        &mut self,
-        seed: T,
-    ) -> Result<T::Value, Refusal> {
-        let (key, value) = self
-            .current
-            .take()
-            .expect("serde asks for a value only after a key");
-        seed.deserialize(ValueDeserializer(value))
-            .map_err(|refusal| refusal.under(key))
+    fn next_value_seed<T: de::DeserializeSeed<'de>>(&mut self, seed: T) -> Result<T::Value, Refusal> {
+        let (key, value) = self.current.take().expect("serde asks for a value only after a key");
+        seed.deserialize(ValueDeserializer(value)).map_err(|refusal| refusal.under(key))
     }
 }
 
@@ -301,18 +251,9 @@ mod tests {
             message("[inner]\nstesp = 5\nrate = 1.0"),
             "unknown key `inner.stesp` (did you mean `steps`?); keys here: keys, rate, steps"
         );
-        assert_eq!(
-            message("[inner]\nrate = 1.0"),
-            "key `inner.steps` is missing"
-        );
-        assert_eq!(
-            message("[inner]\nrate = 1.0\nsteps = -1"),
-            "key `inner.steps`: expected u64, found integer `-1`"
-        );
-        assert_eq!(
-            message("[inner]\nrate = 1.0\nsteps = 'x'"),
-            "key `inner.steps`: expected u64, found string \"x\""
-        );
+        assert_eq!(message("[inner]\nrate = 1.0"), "key `inner.steps` is missing");
+        assert_eq!(message("[inner]\nrate = 1.0\nsteps = -1"), "key `inner.steps`: expected u64, found integer `-1`");
+        assert_eq!(message("[inner]\nrate = 1.0\nsteps = 'x'"), "key `inner.steps`: expected u64, found string \"x\"");
         assert_eq!(
             message("[inner]\nrate = 1.0\nsteps = 1\nkeys = ['a', 3]"),
             "key `inner.keys.1`: expected a string, found integer `3`"

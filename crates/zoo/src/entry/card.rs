@@ -55,20 +55,12 @@ fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
         if let Some(last) = training.curve.last() {
             row("last training loss", format!("{:.5}", last.loss))?;
         }
-        let valid = training
-            .curve
-            .iter()
-            .rev()
-            .find_map(|point| point.valid_loss);
+        let valid = training.curve.iter().rev().find_map(|point| point.valid_loss);
         if let Some(valid) = valid {
             row("last validation loss", format!("{valid:.5}"))?;
         }
     }
-    let versions: Vec<String> = meta
-        .versions
-        .iter()
-        .map(|(n, v)| format!("{n} {v}"))
-        .collect();
+    let versions: Vec<String> = meta.versions.iter().map(|(n, v)| format!("{n} {v}")).collect();
     row("made with", versions.join(", "))?;
     writeln!(
         card,

@@ -56,31 +56,19 @@ impl FromStr for EntryRequest {
             },
         };
         check_name(name)?;
-        Ok(Self {
-            name: name.to_owned(),
-            version,
-        })
+        Ok(Self { name: name.to_owned(), version })
     }
 }
 
 /// Refuses names that cannot be a folder's, or that the zoo uses itself.
 pub(super) fn check_name(name: &str) -> Result<(), ZooError> {
-    let refuse = |reason| {
-        Err(ZooError::EntryName {
-            name: name.to_owned(),
-            reason,
-        })
-    };
+    let refuse = |reason| Err(ZooError::EntryName { name: name.to_owned(), reason });
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-_.".contains(c);
     if RESERVED.contains(&name) {
         return refuse("the zoo uses this name itself");
     }
-    if !name.starts_with(|c: char| c.is_ascii_lowercase() || c.is_ascii_digit())
-        || !name.chars().all(allowed)
-    {
-        return refuse(
-            "lower-case letters, digits, `-`, `_` and `.` only, beginning with a letter or digit",
-        );
+    if !name.starts_with(|c: char| c.is_ascii_lowercase() || c.is_ascii_digit()) || !name.chars().all(allowed) {
+        return refuse("lower-case letters, digits, `-`, `_` and `.` only, beginning with a letter or digit");
     }
     Ok(())
 }
@@ -99,9 +87,7 @@ mod tests {
 
     #[test]
     fn what_is_not_a_name_is_refused() {
-        for text in [
-            "", "@1", "a@", "a@0", "a@x", "a@-1", "../x", "A", "a/b", ".hidden", "results", "a b",
-        ] {
+        for text in ["", "@1", "a@", "a@0", "a@x", "a@-1", "../x", "A", "a/b", ".hidden", "results", "a b"] {
             assert!(text.parse::<EntryRequest>().is_err(), "{text}");
         }
     }

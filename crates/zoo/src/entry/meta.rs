@@ -106,10 +106,7 @@ pub struct FileMeta {
 impl EntryMeta {
     /// `name@version`.
     pub fn id(&self) -> EntryId {
-        EntryId {
-            name: self.name.clone(),
-            version: self.version,
-        }
+        EntryId { name: self.name.clone(), version: self.version }
     }
 
     /// One hash for what an evaluation depends on: weights, config and normaliser.
@@ -117,11 +114,7 @@ impl EntryMeta {
     /// Two trainings with the same seed have the same; minutes and model card do not enter.
     pub fn content_sha256(&self) -> String {
         let mut text = String::new();
-        for name in [
-            super::CONFIG_FILE,
-            super::MODEL_FILE,
-            super::NORMALISER_FILE,
-        ] {
+        for name in [super::CONFIG_FILE, super::MODEL_FILE, super::NORMALISER_FILE] {
             let sha256 = self.files.get(name).map_or("", |f| f.sha256.as_str());
             text.push_str(&format!("{sha256}  {name}\n"));
         }
@@ -130,19 +123,16 @@ impl EntryMeta {
 }
 
 /// Key in `entry.json` of the hash of the file itself.
-const SELF_KEY: &str = "\"sha256_of_this_file_with_64_zeros_here\": \"";
+const SELF_KEY: &str = "\"sha256_of_this_file_with_zeros_here\": \"";
 
 /// The text of `entry.json`: the metadata and, last, the hash of the text itself.
 pub(super) fn seal_text(meta: &EntryMeta) -> String {
     let body = serde_json::to_string_pretty(meta).expect("strings and numbers become JSON");
-    let body = body.trim_end_matches(['}', '\n']);
+    let body = body.strip_suffix("\n}").expect("a pretty-printed object ends so");
     let zeros = "0".repeat(64);
     let text = format!("{body},\n  {SELF_KEY}{zeros}\"\n}}\n");
     let digest = sha256_hex(text.as_bytes());
-    text.replace(
-        &format!("{SELF_KEY}{zeros}"),
-        &format!("{SELF_KEY}{digest}"),
-    )
+    text.replace(&format!("{SELF_KEY}{zeros}"), &format!("{SELF_KEY}{digest}"))
 }
 
 /// The hash that `entry.json` records of itself and the one it has; `None` where none is recorded.
@@ -152,8 +142,5 @@ pub(super) fn self_hashes(text: &[u8]) -> Option<(String, String)> {
     let recorded = text.get(start..start + 64)?;
     let mut zeroed = text.to_vec();
     zeroed[start..start + 64].fill(b'0');
-    Some((
-        String::from_utf8_lossy(recorded).into_owned(),
-        sha256_hex(&zeroed),
-    ))
+    Some((String::from_utf8_lossy(recorded).into_owned(), sha256_hex(&zeroed)))
 }

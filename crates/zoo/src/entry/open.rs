@@ -29,11 +29,7 @@ impl Entry {
                 false => "no such file".to_owned(),
             };
             if found != file.sha256 {
-                return Err(ZooError::Tampered {
-                    path,
-                    expected: file.sha256.clone(),
-                    found,
-                });
+                return Err(ZooError::Tampered { path, expected: file.sha256.clone(), found });
             }
         }
         Ok(entry)
@@ -47,32 +43,18 @@ impl Entry {
         let folder = zoo.join(&id.name).join(id.version.to_string());
         let path = folder.join(ENTRY_FILE);
         let text = fs::read(&path).map_err(ZooError::io("read", &path))?;
-        let malformed = |reason: String| ZooError::Malformed {
-            path: path.clone(),
-            reason,
-        };
-        let (expected, found) = self_hashes(&text)
-            .ok_or_else(|| malformed("the hash of the file itself is missing".to_owned()))?;
+        let malformed = |reason: String| ZooError::Malformed { path: path.clone(), reason };
+        let (expected, found) =
+            self_hashes(&text).ok_or_else(|| malformed("the hash of the file itself is missing".to_owned()))?;
         if expected != found {
-            return Err(ZooError::Tampered {
-                path,
-                expected,
-                found,
-            });
+            return Err(ZooError::Tampered { path, expected, found });
         }
-        let meta: EntryMeta =
-            serde_json::from_slice(&text).map_err(|e| malformed(format!("not an entry: {e}")))?;
+        let meta: EntryMeta = serde_json::from_slice(&text).map_err(|e| malformed(format!("not an entry: {e}")))?;
         if meta.format != FORMAT {
-            return Err(malformed(format!(
-                "format: expected {FORMAT}, found {}",
-                meta.format
-            )));
+            return Err(malformed(format!("format: expected {FORMAT}, found {}", meta.format)));
         }
         if meta.id() != *id {
-            return Err(malformed(format!(
-                "expected entry {id}, found {}",
-                meta.id()
-            )));
+            return Err(malformed(format!("expected entry {id}, found {}", meta.id())));
         }
         for name in [MODEL_FILE, CONFIG_FILE, NORMALISER_FILE, CARD_FILE] {
             if !meta.files.contains_key(name) {
@@ -142,13 +124,7 @@ mod tests {
         let zoo = tempfile::tempdir().unwrap();
         let id = draft("lift-act").seal(zoo.path()).unwrap();
         let folder = zoo.path().join("lift-act/1");
-        for name in [
-            MODEL_FILE,
-            CONFIG_FILE,
-            NORMALISER_FILE,
-            CARD_FILE,
-            ENTRY_FILE,
-        ] {
+        for name in [MODEL_FILE, CONFIG_FILE, NORMALISER_FILE, CARD_FILE, ENTRY_FILE] {
             let path = folder.join(name);
             let original = fs::read(&path).unwrap();
             for position in (0..original.len()).step_by(7) {
@@ -172,13 +148,7 @@ mod tests {
         let error = Entry::open(zoo.path(), &id).unwrap_err().to_string();
         let expected = crate::sha256_hex(b"weights");
         let found = crate::sha256_hex(b"weightz");
-        assert_eq!(
-            error,
-            format!(
-                "{}: sha256 does not match: expected {expected}, found {found}",
-                path.display()
-            )
-        );
+        assert_eq!(error, format!("{}: sha256 does not match: expected {expected}, found {found}", path.display()));
         fs::remove_file(&path).unwrap();
         let error = Entry::open(zoo.path(), &id).unwrap_err().to_string();
         assert!(error.ends_with("found no such file"), "{error}");
@@ -189,10 +159,7 @@ mod tests {
         let zoo = tempfile::tempdir().unwrap();
         draft("a").seal(zoo.path()).unwrap();
         fs::rename(zoo.path().join("a/1"), zoo.path().join("a/2")).unwrap();
-        let id = EntryId {
-            name: "a".to_owned(),
-            version: 2,
-        };
+        let id = EntryId { name: "a".to_owned(), version: 2 };
         let error = Entry::open(zoo.path(), &id).unwrap_err().to_string();
         assert!(error.ends_with("expected entry a@2, found a@1"), "{error}");
     }

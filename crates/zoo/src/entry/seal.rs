@@ -10,10 +10,7 @@ use crate::files::sync_folder;
 use crate::{ZooError, sha256_hex};
 
 use super::meta::{FORMAT, seal_text};
-use super::{
-    CARD_FILE, CONFIG_FILE, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE, NORMALISER_FILE,
-    card, id,
-};
+use super::{CARD_FILE, CONFIG_FILE, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE, NORMALISER_FILE, card, id};
 
 /// An entry before it has a version.
 #[derive(Debug, Clone)]
@@ -62,18 +59,9 @@ impl EntryDraft {
             .map_err(ZooError::io("create a temporary folder in", &parent))?;
         for (name, bytes) in contents {
             write_synced(&staging.path().join(name), bytes)?;
-            self.meta.files.insert(
-                name.to_owned(),
-                FileMeta {
-                    bytes: bytes.len() as u64,
-                    sha256: sha256_hex(bytes),
-                },
-            );
+            self.meta.files.insert(name.to_owned(), FileMeta { bytes: bytes.len() as u64, sha256: sha256_hex(bytes) });
         }
-        write_synced(
-            &staging.path().join(ENTRY_FILE),
-            seal_text(&self.meta).as_bytes(),
-        )?;
+        write_synced(&staging.path().join(ENTRY_FILE), seal_text(&self.meta).as_bytes())?;
         sync_folder(staging.path())?;
         let target = parent.join(self.meta.version.to_string());
         renameat_with(CWD, staging.path(), CWD, &target, RenameFlags::NOREPLACE)
@@ -119,11 +107,8 @@ pub(crate) mod tests {
     use crate::registry::Registry;
 
     pub(crate) fn draft(name: &str) -> EntryDraft {
-        let curve = (1..=3).map(|step| CurvePoint {
-            step,
-            loss: 1.0 / step as f64,
-            valid_loss: (step == 3).then_some(0.5),
-        });
+        let curve =
+            (1..=3).map(|step| CurvePoint { step, loss: 1.0 / step as f64, valid_loss: (step == 3).then_some(0.5) });
         EntryDraft {
             meta: EntryMeta {
                 format: 0,
@@ -166,9 +151,7 @@ pub(crate) mod tests {
     #[test]
     fn versions_count_up_and_are_never_rewritten() {
         let zoo = tempfile::tempdir().unwrap();
-        let ids: Vec<String> = (0..3)
-            .map(|_| draft("lift-act").seal(zoo.path()).unwrap().to_string())
-            .collect();
+        let ids: Vec<String> = (0..3).map(|_| draft("lift-act").seal(zoo.path()).unwrap().to_string()).collect();
         assert_eq!(ids, ["lift-act@1", "lift-act@2", "lift-act@3"]);
         fs::remove_dir_all(zoo.path().join("lift-act/2")).unwrap();
         assert_eq!(draft("lift-act").seal(zoo.path()).unwrap().version, 4);
@@ -178,9 +161,8 @@ pub(crate) mod tests {
     fn concurrent_writers_get_different_versions() {
         let zoo = tempfile::tempdir().unwrap();
         let mut versions: Vec<u32> = std::thread::scope(|scope| {
-            let threads: Vec<_> = (0..8)
-                .map(|_| scope.spawn(|| draft("x").seal(zoo.path()).unwrap().version))
-                .collect();
+            let threads: Vec<_> =
+                (0..8).map(|_| scope.spawn(|| draft("x").seal(zoo.path()).unwrap().version)).collect();
             threads.into_iter().map(|t| t.join().unwrap()).collect()
         });
         versions.sort_unstable();
@@ -205,10 +187,7 @@ pub(crate) mod tests {
     fn names_outside_the_rule_are_refused() {
         let zoo = tempfile::tempdir().unwrap();
         for name in ["../x", "Results", "results", ""] {
-            assert!(matches!(
-                draft(name).seal(zoo.path()),
-                Err(ZooError::EntryName { .. })
-            ));
+            assert!(matches!(draft(name).seal(zoo.path()), Err(ZooError::EntryName { .. })));
         }
         assert_eq!(fs::read_dir(zoo.path()).unwrap().count(), 0);
     }

@@ -55,19 +55,11 @@ impl Checkpoint {
         let file = format!("{:08}.safetensors", self.step);
         let path = folder.join(&file);
         let latest_path = folder.join("latest.json");
-        let meta = Meta {
-            step: self.step,
-            seconds: self.seconds,
-            trainer: self.trainer.clone(),
-        };
+        let meta = Meta { step: self.step, seconds: self.seconds, trainer: self.trainer.clone() };
         let meta = serde_json::to_value(meta).expect("numbers and JSON become JSON");
         let bytes = tensors::to_bytes(&path, &self.tensors, &meta)?;
         write_atomic(&path, &bytes)?;
-        let latest = Latest {
-            sha256: sha256_hex(&bytes),
-            step: self.step,
-            file,
-        };
+        let latest = Latest { sha256: sha256_hex(&bytes), step: self.step, file };
         let text = serde_json::to_string_pretty(&latest).expect("strings become JSON") + "\n";
         write_atomic(&latest_path, text.as_bytes())?;
         prune(folder)?;
@@ -92,23 +84,12 @@ impl Checkpoint {
         let bytes = fs::read(&path).map_err(ZooError::io("read", &path))?;
         let found = sha256_hex(&bytes);
         if found != latest.sha256 {
-            return Err(ZooError::Tampered {
-                path,
-                expected: latest.sha256,
-                found,
-            });
+            return Err(ZooError::Tampered { path, expected: latest.sha256, found });
         }
         let (tensors, meta) = tensors::from_bytes(&path, &bytes)?;
-        let meta: Meta = serde_json::from_value(meta).map_err(|e| ZooError::Malformed {
-            path: path.clone(),
-            reason: format!("not a checkpoint: {e}"),
-        })?;
-        Ok(Some(Self {
-            step: meta.step,
-            seconds: meta.seconds,
-            tensors,
-            trainer: meta.trainer,
-        }))
+        let meta: Meta = serde_json::from_value(meta)
+            .map_err(|e| ZooError::Malformed { path: path.clone(), reason: format!("not a checkpoint: {e}") })?;
+        Ok(Some(Self { step: meta.step, seconds: meta.seconds, tensors, trainer: meta.trainer }))
     }
 }
 
@@ -116,10 +97,7 @@ fn prune(folder: &Path) -> Result<(), ZooError> {
     let mut paths = Vec::new();
     for item in fs::read_dir(folder).map_err(ZooError::io("read folder", folder))? {
         let path = item.map_err(ZooError::io("read folder", folder))?.path();
-        let is_step = path
-            .file_stem()
-            .and_then(|s| s.to_str())
-            .is_some_and(|s| s.parse::<u64>().is_ok());
+        let is_step = path.file_stem().and_then(|s| s.to_str()).is_some_and(|s| s.parse::<u64>().is_ok());
         if is_step {
             paths.push(path);
         }
@@ -160,10 +138,7 @@ mod tests {
         let back = Checkpoint::latest(&folder).unwrap().unwrap();
         assert_eq!((back.step, back.seconds), (200, 1.5));
         assert_eq!(back.trainer["rng"][2], u64::MAX);
-        assert_eq!(
-            back.tensors["model/w"].to_vec1::<f32>().unwrap(),
-            [200.0, 0.1]
-        );
+        assert_eq!(back.tensors["model/w"].to_vec1::<f32>().unwrap(), [200.0, 0.1]);
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 3);
     }
 
@@ -185,9 +160,6 @@ mod tests {
         *bytes.last_mut().unwrap() ^= 1;
         fs::write(&path, bytes).unwrap();
         let error = Checkpoint::latest(folder.path()).unwrap_err().to_string();
-        assert!(
-            error.contains("00000005.safetensors: sha256 does not match"),
-            "{error}"
-        );
+        assert!(error.contains("00000005.safetensors: sha256 does not match"), "{error}");
     }
 }

@@ -39,9 +39,7 @@ impl RunFolder {
         fs::create_dir_all(path).map_err(ZooError::io("create folder", path))?;
         let folder = Self::lock(path.to_owned())?;
         if folder.config_path().exists() {
-            return Err(ZooError::RunExists {
-                folder: path.to_owned(),
-            });
+            return Err(ZooError::RunExists { folder: path.to_owned() });
         }
         Ok(folder)
     }
@@ -52,10 +50,7 @@ impl RunFolder {
     /// [`ZooError::RunLocked`] while another training works there, [`ZooError::NothingToResume`] where no
     /// run was begun or it is finished.
     pub fn resume(path: &Path) -> Result<Self, ZooError> {
-        let nothing = |reason: &str| ZooError::NothingToResume {
-            folder: path.to_owned(),
-            reason: reason.to_owned(),
-        };
+        let nothing = |reason: &str| ZooError::NothingToResume { folder: path.to_owned(), reason: reason.to_owned() };
         if !path.is_dir() {
             return Err(nothing("there is no such folder"));
         }
@@ -81,10 +76,7 @@ impl RunFolder {
         };
         match latest {
             Some(number) => Self::resume(&parent.join(format!("{number:03}"))),
-            None => Err(ZooError::NothingToResume {
-                folder: parent,
-                reason: "no run was begun there".to_owned(),
-            }),
+            None => Err(ZooError::NothingToResume { folder: parent, reason: "no run was begun there".to_owned() }),
         }
     }
 
@@ -123,11 +115,7 @@ fn numbers(parent: &Path) -> Result<Vec<u32>, ZooError> {
     let mut found = Vec::new();
     for item in fs::read_dir(parent).map_err(ZooError::io("read folder", parent))? {
         let item = item.map_err(ZooError::io("read folder", parent))?;
-        found.extend(
-            item.file_name()
-                .to_str()
-                .and_then(|n| n.parse::<u32>().ok()),
-        );
+        found.extend(item.file_name().to_str().and_then(|n| n.parse::<u32>().ok()));
     }
     found.sort_unstable();
     Ok(found)
@@ -144,14 +132,8 @@ mod tests {
         let path = root.path().join("r");
         let first = RunFolder::fresh(&path).unwrap();
         let error = RunFolder::fresh(&path).unwrap_err();
-        assert!(
-            error.to_string().contains("in use by another training"),
-            "{error}"
-        );
-        assert!(matches!(
-            RunFolder::resume(&path),
-            Err(ZooError::RunLocked { .. })
-        ));
+        assert!(error.to_string().contains("in use by another training"), "{error}");
+        assert!(matches!(RunFolder::resume(&path), Err(ZooError::RunLocked { .. })));
         drop(first);
         RunFolder::fresh(&path).unwrap();
     }

@@ -37,11 +37,7 @@ impl Metrics {
     /// # Errors
     /// When the file is not one of ours.
     pub fn open(csv: PathBuf, keep: u64) -> Result<Self, ZooError> {
-        let mut metrics = Self {
-            csv,
-            columns: Vec::new(),
-            rows: Vec::new(),
-        };
+        let mut metrics = Self { csv, columns: Vec::new(), rows: Vec::new() };
         if keep > 0 && metrics.csv.exists() {
             metrics.rows = read_csv(&metrics.csv)?;
             metrics.rows.retain(|row| row.step <= keep);
@@ -105,30 +101,19 @@ impl Metrics {
     /// # Errors
     /// When the file cannot be written.
     pub fn write_parquet(&self, path: &Path) -> Result<(), ZooError> {
-        let failed = |reason: String| ZooError::Malformed {
-            path: path.to_owned(),
-            reason,
-        };
+        let failed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
         let steps = UInt64Array::from_iter_values(self.rows.iter().map(|r| r.step));
         let mut columns: Vec<(&str, ArrayRef)> = vec![("step", Arc::new(steps))];
         for name in &self.columns {
-            let values: Float64Array = self
-                .rows
-                .iter()
-                .map(|r| r.values.get(name))
-                .map(|v| v.copied())
-                .collect();
+            let values: Float64Array = self.rows.iter().map(|r| r.values.get(name)).map(|v| v.copied()).collect();
             columns.push((name, Arc::new(values)));
         }
         let batch = RecordBatch::try_from_iter_with_nullable(
-            columns
-                .into_iter()
-                .map(|(name, array)| (name, array, name != "step")),
+            columns.into_iter().map(|(name, array)| (name, array, name != "step")),
         )
         .map_err(|e| failed(e.to_string()))?;
         let mut bytes = Vec::new();
-        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), None)
-            .map_err(|e| failed(e.to_string()))?;
+        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), None).map_err(|e| failed(e.to_string()))?;
         writer.write(&batch).map_err(|e| failed(e.to_string()))?;
         writer.close().map_err(|e| failed(e.to_string()))?;
         write_atomic(path, &bytes)
@@ -158,10 +143,7 @@ fn read_csv(path: &Path) -> Result<Vec<MetricsRow>, ZooError> {
     lines
         .map(|(number, line)| {
             let mut cells = line.split(',');
-            let step = cells
-                .next()
-                .and_then(|c| c.parse().ok())
-                .ok_or_else(|| malformed(number))?;
+            let step = cells.next().and_then(|c| c.parse().ok()).ok_or_else(|| malformed(number))?;
             let mut values = BTreeMap::new();
             for name in &names {
                 match cells.next() {
@@ -184,10 +166,7 @@ mod tests {
     use super::*;
 
     fn row(step: u64, values: &[(&str, f64)]) -> MetricsRow {
-        MetricsRow {
-            step,
-            values: values.iter().map(|(n, v)| ((*n).to_owned(), *v)).collect(),
-        }
+        MetricsRow { step, values: values.iter().map(|(n, v)| ((*n).to_owned(), *v)).collect() }
     }
 
     #[test]
@@ -197,10 +176,7 @@ mod tests {
         let mut metrics = Metrics::open(csv.clone(), 0).unwrap();
         let rows = [
             row(10, &[("loss", 0.1), ("lr", 1e-3)]),
-            row(
-                20,
-                &[("loss", 1.0 / 3.0), ("lr", 1e-3), ("valid_loss", 0.25)],
-            ),
+            row(20, &[("loss", 1.0 / 3.0), ("lr", 1e-3), ("valid_loss", 0.25)]),
             row(30, &[("loss", 0.5), ("lr", 2e-3)]),
         ];
         for r in &rows {
@@ -221,17 +197,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut metrics = Metrics::open(folder.path().join("m.csv"), 0).unwrap();
         metrics.push(row(1, &[("loss", 0.1)])).unwrap();
-        metrics
-            .push(row(2, &[("loss", 0.2), ("valid_loss", 0.7)]))
-            .unwrap();
+        metrics.push(row(2, &[("loss", 0.2), ("valid_loss", 0.7)])).unwrap();
         let path = folder.path().join("m.parquet");
         metrics.write_parquet(&path).unwrap();
         let reader = SerializedFileReader::new(std::fs::File::open(path).unwrap()).unwrap();
-        let rows: Vec<_> = reader
-            .get_row_iter(None)
-            .unwrap()
-            .map(|r| r.unwrap())
-            .collect();
+        let rows: Vec<_> = reader.get_row_iter(None).unwrap().map(|r| r.unwrap()).collect();
         assert_eq!(rows.len(), 2);
         assert_eq!(rows[1].get_ulong(0).unwrap(), 2);
         assert_eq!(rows[1].get_double(1).unwrap(), 0.2);

@@ -33,14 +33,8 @@ impl EventWriter {
             content.extend(record(&scalars(row, wall_time)));
         }
         crate::write_atomic(path, &content)?;
-        let file = OpenOptions::new()
-            .append(true)
-            .open(path)
-            .map_err(ZooError::io("open", path))?;
-        Ok(Self {
-            path: path.to_owned(),
-            file,
-        })
+        let file = OpenOptions::new().append(true).open(path).map_err(ZooError::io("open", path))?;
+        Ok(Self { path: path.to_owned(), file })
     }
 
     /// Appends one row.
@@ -48,9 +42,7 @@ impl EventWriter {
     /// # Errors
     /// When the file cannot be written.
     pub fn push(&mut self, row: &MetricsRow, wall_time: f64) -> Result<(), ZooError> {
-        self.file
-            .write_all(&record(&scalars(row, wall_time)))
-            .map_err(ZooError::io("write", &self.path))
+        self.file.write_all(&record(&scalars(row, wall_time))).map_err(ZooError::io("write", &self.path))
     }
 }
 
@@ -88,9 +80,7 @@ fn masked(crc: u32) -> u32 {
 /// CRC-32C (Castagnoli), bit by bit: a few hundred bytes a step.
 fn crc32c(data: &[u8]) -> u32 {
     !data.iter().fold(!0_u32, |crc, byte| {
-        (0..8).fold(crc ^ u32::from(*byte), |crc, _| {
-            (crc >> 1) ^ (0x82f6_3b78 & (crc & 1).wrapping_neg())
-        })
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| (crc >> 1) ^ (0x82f6_3b78 & (crc & 1).wrapping_neg()))
     })
 }
 
@@ -129,10 +119,7 @@ mod tests {
     fn records_frame_the_messages() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("events.out.tfevents.1.actrm");
-        let row = |step| MetricsRow {
-            step,
-            values: [("loss".to_owned(), 0.5)].into(),
-        };
+        let row = |step| MetricsRow { step, values: [("loss".to_owned(), 0.5)].into() };
         let mut writer = EventWriter::create(&path, &[row(1)], 1.5).unwrap();
         writer.push(&row(300), 2.5).unwrap();
         let content = std::fs::read(&path).unwrap();
@@ -141,19 +128,14 @@ mod tests {
             let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
             assert_eq!(rest[8..12], masked(crc32c(&rest[..8])).to_le_bytes());
             let data = &rest[12..12 + length];
-            assert_eq!(
-                rest[12 + length..16 + length],
-                masked(crc32c(data)).to_le_bytes()
-            );
+            assert_eq!(rest[12 + length..16 + length], masked(crc32c(data)).to_le_bytes());
             records.push(data.to_vec());
             rest = &rest[16 + length..];
         }
         assert_eq!(records.len(), 3);
         assert!(records[0].ends_with(b"brain.Event:2"));
         // wall_time 2.5, step 300 (two varint bytes), summary { value { tag "loss" simple_value 0.5 } }
-        let mut expected = vec![
-            0x09, 0, 0, 0, 0, 0, 0, 0x04, 0x40, 0x10, 0xac, 0x02, 0x2a, 13, 0x0a, 11,
-        ];
+        let mut expected = vec![0x09, 0, 0, 0, 0, 0, 0, 0x04, 0x40, 0x10, 0xac, 0x02, 0x2a, 13, 0x0a, 11];
         expected.extend([0x0a, 4, b'l', b'o', b's', b's', 0x15, 0, 0, 0, 0x3f]);
         assert_eq!(records[2], expected);
     }
