@@ -1,1 +1,26 @@
-//! ACT, ACTRM, TRM and baselines, their losses, optimisers and training step, on candle.
+//! Models of actrm: what a policy is, the layers, ACT and its relatives, their losses, the optimisers and the training
+//! step, on candle and on plain slices.
+//!
+//! This crate knows tensors and numbers only. It opens no file, starts no process and prints nothing: data comes in as
+//! slices (`Batch`), weights come in and go out as named tensors (`Params`), progress is returned as numbers. All
+//! randomness is drawn from `Rng`.
+
+pub mod act;
+mod batch;
+mod error;
+mod gradients;
+pub mod layers;
+mod model;
+mod normaliser;
+mod params;
+mod policy;
+mod rng;
+
+pub use batch::{Batch, Dims};
+pub use error::{ModelError, Result};
+pub use gradients::{Gradients, ParamLayout};
+pub use model::{LossParts, LossValues, PolicyConfig, PolicyModel};
+pub use normaliser::{ACTION, ENVIRONMENT_STATE, Guarded, NormMode, Normaliser, STATE};
+pub use params::{Init, Params};
+pub use policy::{ActionChunk, Actor, Observation, Policy, RecedingHorizon, TemporalEnsemble};
+pub use rng::Rng;

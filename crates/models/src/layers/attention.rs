@@ -1,0 +1,99 @@
+//! Multi-head attention with torch's tensor names.
+
+use super::{Dropout, Linear, Mode};
+use crate::error::{ModelError, Result};
+use crate::params::{Init, Params};
+use crate::rng::Rng;
+use candle_core::{D, Tensor};
+
+/// `torch.nn.MultiheadAttention`: rows 0..D, D..2D and 2D..3D of `in_proj_weight` are the query, key and value
+/// projections; scores are scaled by 1/sqrt(D/heads); dropout acts on the attention weights.
+#[derive(Debug, Clone)]
+pub struct MultiHeadAttention {
+    /// (3D, D)
+    pub in_proj_weight: Tensor,
+    /// (3D)
+    pub in_proj_bias: Tensor,
+    /// (D, D)
+    pub out_proj: Linear,
+    /// number of heads
+    pub n_heads: usize,
+    /// of the attention weights
+    pub dropout: Dropout,
+}
+
+impl MultiHeadAttention {
+    /// Creates the projections below `prefix`: xavier-uniform `in_proj`, `out_proj` as given, zero biases.
+    ///
+    /// # Errors
+    /// If `n_heads` does not divide `dim`.
+    pub fn new(
+        params: &mut Params,
+        prefix: &str,
+        dim: usize,
+        n_heads: usize,
+        p: f64,
+        out_proj: Init,
+        rng: &mut Rng,
+    ) -> Result<Self> {
+        if n_heads == 0 || !dim.is_multiple_of(n_heads) {
+            return Err(ModelError::Config {
+                model: "attention",
+                field: "n_heads",
+                found: n_heads.to_string(),
+                expected: format!("a divisor of {dim}"),
+            });
+        }
+        let (weight, bias) = (format!("{prefix}.in_proj_weight"), format!("{prefix}.in_proj_bias"));
+        let name = format!("{prefix}.out_proj");
+        Ok(Self {
+            in_proj_weight: params.create(&weight, &[3 * dim, dim], Init::XavierUniform, rng)?,
+            in_proj_bias: params.create(&bias, &[3 * dim], Init::Zeros, rng)?,
+            out_proj: Linear::with_init(params, &name, (dim, dim), out_proj, Some(Init::Zeros), rng)?,
+            n_heads,
+            dropout: Dropout { p },
+        })
+    }
+
+    /// q: (b, t, D), k and v: (b, s, D), key_pad: (b, s) of 0/1 in f32, 1 = not attended to -> (b, t, D)
+    pub fn forward(
+        &self,
+        q: &Tensor,
+        k: &Tensor,
+        v: &Tensor,
+        key_pad: Option<&Tensor>,
+        mode: &mut Mode<'_>,
+    ) -> Result<Tensor> {
+        let (b, t, dim) = q.dims3()?;
+        let s = k.dim(1)?;
+        let head = dim / self.n_heads;
+        let project = |x: &Tensor, part: usize, len: usize| -> Result<Tensor> {
+            let layer = Linear {
+                weight: self.in_proj_weight.narrow(0, part * dim, dim)?,
+                bias: Some(self.in_proj_bias.narrow(0, part * dim, dim)?),
+            };
+            let y = layer.forward(x)?.reshape((b, len, self.n_heads, head))?;
+            Ok(y.transpose(1, 2)?.contiguous()?)
+        };
+        let (q, k, v) = (project(q, 0, t)?, project(k, 1, s)?, project(v, 2, s)?);
+        let scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (head as f64).sqrt()))?;
+        let weights = self.dropout.forward(&masked_softmax(&scores, key_pad)?, mode)?;
+        let mixed = weights.matmul(&v)?.transpose(1, 2)?.reshape((b, t, dim))?;
+        self.out_proj.forward(&mixed)
+    }
+}
+
+/// scores: (b, h, t, s), key_pad: (b, s) of 0/1 -> softmax over s, padded keys exactly 0
+pub fn masked_softmax(scores: &Tensor, key_pad: Option<&Tensor>) -> Result<Tensor> {
+    let scores = match key_pad {
+        Some(pad) => {
+            let (b, s) = pad.dims2()?;
+            // -1e30 underflows to exactly 0 after the exponential; -inf would make NaN gradients of (-inf) - (-inf)
+            scores.broadcast_add(&(pad.reshape((b, 1, 1, s))? * -1e30)?)?
+        }
+        None => scores.clone(),
+    };
+    let max = scores.max_keepdim(D::Minus1)?.detach();
+    let exp = scores.broadcast_sub(&max)?.exp()?;
+    Ok(exp.broadcast_div(&exp.sum_keepdim(D::Minus1)?)?)
+}

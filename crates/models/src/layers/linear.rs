@@ -1,0 +1,58 @@
+//! `y = x Wᵀ + b`.
+
+use crate::error::Result;
+use crate::params::{Init, Params};
+use crate::rng::Rng;
+use candle_core::{D, Tensor};
+
+/// A dense layer with torch's layout: weight `(out, in)`, bias `(out)`.
+#[derive(Debug, Clone)]
+pub struct Linear {
+    /// (out, in)
+    pub weight: Tensor,
+    /// (out)
+    pub bias: Option<Tensor>,
+}
+
+impl Linear {
+    /// Creates `{prefix}.weight` and `{prefix}.bias` as `torch.nn.Linear` does: both uniform in ±1/sqrt(in).
+    pub fn new(params: &mut Params, prefix: &str, input: usize, output: usize, rng: &mut Rng) -> Result<Self> {
+        let bound = 1.0 / (input as f64).sqrt();
+        let bias = Init::Uniform { bound };
+        Self::with_init(params, prefix, (input, output), Init::KaimingUniform, Some(bias), rng)
+    }
+
+    /// Creates the layer with the given initial values; `bias: None` leaves it out. `shape` is (in, out).
+    pub fn with_init(
+        params: &mut Params,
+        prefix: &str,
+        (input, output): (usize, usize),
+        weight: Init,
+        bias: Option<Init>,
+        rng: &mut Rng,
+    ) -> Result<Self> {
+        let weight = params.create(&format!("{prefix}.weight"), &[output, input], weight, rng)?;
+        let bias = match bias {
+            Some(init) => Some(params.create(&format!("{prefix}.bias"), &[output], init, rng)?),
+            None => None,
+        };
+        Ok(Self { weight, bias })
+    }
+
+    /// x: (…, in) -> (…, out)
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let mut shape = x.dims().to_vec();
+        let (output, input) = self.weight.dims2()?;
+        let rows = x.elem_count() / input.max(1);
+        let x = if x.dim(D::Minus1)? == input { x.reshape((rows, input))? } else { x.clone() };
+        let y = x.matmul(&self.weight.t()?)?;
+        let y = match &self.bias {
+            Some(bias) => y.broadcast_add(bias)?,
+            None => y,
+        };
+        if let Some(last) = shape.last_mut() {
+            *last = output;
+        }
+        Ok(y.reshape(shape)?)
+    }
+}

@@ -1,0 +1,19 @@
+//! Layers shared by the models. The Rust field is the checkpoint key.
+//!
+//! Everything here has a gradient: candle-nn's `LayerNorm` and `softmax_last_dim` drop it in silence and are not used.
+
+mod attention;
+mod dropout;
+mod embedding;
+mod feed_forward;
+mod layer_norm;
+mod linear;
+mod position;
+
+pub use attention::{MultiHeadAttention, masked_softmax};
+pub use dropout::{Dropout, DropoutMask, Mode};
+pub use embedding::Embedding;
+pub use feed_forward::{Activation, FeedForward};
+pub use layer_norm::LayerNorm;
+pub use linear::Linear;
+pub use position::sinusoid_table;

@@ -1,0 +1,111 @@
+//! What the trainer, the zoo and the policies need of a model.
+
+use crate::act::{self, Act};
+use crate::batch::{Batch, Dims};
+use crate::error::{ModelError, Result};
+use crate::gradients::Gradients;
+use crate::params::Params;
+use crate::rng::Rng;
+use candle_core::Tensor;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// A loss and the parts it is made of, each averaged over the whole batch.
+#[derive(Debug, Clone)]
+pub struct LossParts {
+    /// scalar, differentiable
+    pub total: Tensor,
+    /// scalars for the metrics, for example `l1_loss`
+    pub parts: BTreeMap<String, Tensor>,
+}
+
+/// A loss as numbers.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct LossValues {
+    /// what is minimised
+    pub total: f32,
+    /// the parts
+    pub parts: BTreeMap<String, f32>,
+}
+
+impl LossValues {
+    /// Reads the scalars.
+    pub fn from_parts(parts: &LossParts) -> Result<Self> {
+        let mut values = BTreeMap::new();
+        for (name, tensor) in &parts.parts {
+            values.insert(name.clone(), tensor.to_scalar::<f32>()?);
+        }
+        Ok(Self { total: parts.total.to_scalar::<f32>()?, parts: values })
+    }
+
+    /// Adds another shard's.
+    pub fn add(&mut self, other: &Self) {
+        self.total += other.total;
+        for (name, value) in &other.parts {
+            *self.parts.entry(name.clone()).or_default() += value;
+        }
+    }
+
+    /// Divides by `n`.
+    pub fn scale(&mut self, factor: f32) {
+        self.total *= factor;
+        self.parts.values_mut().for_each(|v| *v *= factor);
+    }
+}
+
+/// A model that maps observations to action chunks and can be trained on windows.
+pub trait PolicyModel: Send + Sync {
+    /// Its parameters.
+    fn params(&self) -> &Params;
+
+    /// Training forward pass. Sums over the rows of `batch` are divided by `batch.total_rows` or
+    /// `batch.total_valid_steps`, so that the losses of shards add up.
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts>;
+
+    /// Loss, and its gradient added to `into`. The default runs candle's backward pass over `loss`.
+    ///
+    /// # Errors
+    /// `NoGradient` if the loss does not reach a parameter.
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        let loss = self.loss(batch, rng)?;
+        let grads = loss.total.backward()?;
+        for (name, var) in self.params().iter() {
+            let grad = grads.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() })?;
+            into.add_tensor(name, grad)?;
+        }
+        LossValues::from_parts(&loss)
+    }
+
+    /// state: (b, S), environment_state: (b, E) -> (b, action_horizon, A), all in network units
+    fn predict(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor>;
+
+    /// Number of actions in a predicted chunk.
+    fn action_horizon(&self) -> usize;
+}
+
+/// The configuration of any policy model: `type = "act"` and so on, with the model's own keys beside it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub enum PolicyConfig {
+    /// Action Chunking with Transformers
+    Act(act::Config),
+}
+
+impl PolicyConfig {
+    /// A model with initial weights drawn from `seed`.
+    ///
+    /// # Errors
+    /// A configuration that describes no possible model.
+    pub fn build(&self, dims: &Dims, seed: u64) -> Result<Box<dyn PolicyModel>> {
+        match self {
+            Self::Act(config) => Ok(Box::new(Act::new(config, dims, seed)?)),
+        }
+    }
+
+    /// Number of actions in a predicted chunk.
+    pub fn action_horizon(&self) -> usize {
+        match self {
+            Self::Act(config) => config.action_horizon,
+        }
+    }
+}

@@ -1,0 +1,200 @@
+//! Named parameters of a model: created from our own generator, iterated in the order of their names.
+
+use crate::error::{ModelError, Result, some_names};
+use crate::rng::Rng;
+use candle_core::{DType, Device, Tensor, Var};
+use std::collections::BTreeMap;
+
+/// How a new parameter is filled. Fans are those of a `(out, in)` matrix.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Init {
+    /// all 0
+    Zeros,
+    /// all 1
+    Ones,
+    /// normal with mean 0
+    Normal {
+        /// standard deviation
+        std: f64,
+    },
+    /// normal with mean 0, drawn again beyond two standard deviations
+    TruncatedNormal {
+        /// standard deviation before truncation
+        std: f64,
+    },
+    /// uniform in ±`bound`
+    Uniform {
+        /// largest magnitude
+        bound: f64,
+    },
+    /// uniform in ±sqrt(6 / (fan_in + fan_out))
+    XavierUniform,
+    /// uniform in ±1 / sqrt(fan_in): `torch.nn.Linear`'s default weight
+    KaimingUniform,
+}
+
+/// A model's parameters by name. Cloning shares the storage.
+#[derive(Debug, Clone, Default)]
+pub struct Params {
+    vars: BTreeMap<String, Var>,
+}
+
+impl Params {
+    /// No parameters yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Creates `name` and returns its tensor, which shares the storage: later updates are seen through it.
+    ///
+    /// # Errors
+    /// If the name is taken, or the tensor library fails.
+    pub fn create(&mut self, name: &str, shape: &[usize], init: Init, rng: &mut Rng) -> Result<Tensor> {
+        let n: usize = shape.iter().product();
+        let (fan_out, fan_in) = match *shape {
+            [out, input] => (out as f64, input as f64),
+            [len] => (len as f64, len as f64),
+            _ => {
+                let per = shape.iter().skip(2).product::<usize>();
+                let at = |i: usize| shape.get(i).copied().unwrap_or(1) * per;
+                (at(0) as f64, at(1) as f64)
+            }
+        };
+        let mut uniform = |bound: f64| -> Vec<f32> {
+            (0..n).map(|_| ((2.0 * f64::from(rng.uniform()) - 1.0) * bound) as f32).collect()
+        };
+        let values: Vec<f32> = match init {
+            Init::Zeros => vec![0.0; n],
+            Init::Ones => vec![1.0; n],
+            Init::Uniform { bound } => uniform(bound),
+            Init::XavierUniform => uniform((6.0 / (fan_in + fan_out)).sqrt()),
+            Init::KaimingUniform => uniform(1.0 / fan_in.sqrt()),
+            Init::Normal { std } => (0..n).map(|_| rng.normal_f32() * std as f32).collect(),
+            Init::TruncatedNormal { std } => (0..n)
+                .map(|_| {
+                    loop {
+                        let x = rng.normal_f32();
+                        if x.abs() <= 2.0 {
+                            break x * std as f32;
+                        }
+                    }
+                })
+                .collect(),
+        };
+        self.insert(name, Tensor::from_vec(values, shape, &Device::Cpu)?)
+    }
+
+    /// Adds `name` with the given values.
+    ///
+    /// # Errors
+    /// If the name is taken.
+    pub fn insert(&mut self, name: &str, values: Tensor) -> Result<Tensor> {
+        if self.vars.contains_key(name) {
+            return Err(ModelError::State { object: "parameters", detail: format!("{name} exists already") });
+        }
+        let var = Var::from_tensor(&values.contiguous()?)?;
+        let tensor = var.as_tensor().clone();
+        self.vars.insert(name.to_string(), var);
+        Ok(tensor)
+    }
+
+    /// Names in order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.vars.keys().map(String::as_str)
+    }
+
+    /// Names and variables in order.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &Var)> {
+        self.vars.iter().map(|(k, v)| (k.as_str(), v))
+    }
+
+    /// One variable.
+    pub fn get(&self, name: &str) -> Option<&Var> {
+        self.vars.get(name)
+    }
+
+    /// Number of scalar parameters.
+    pub fn count(&self) -> usize {
+        self.vars.values().map(|v| v.elem_count()).sum()
+    }
+
+    /// The current values, sharing the storage: copy them before the next update if they must stay.
+    pub fn tensors(&self) -> BTreeMap<String, Tensor> {
+        self.vars.iter().map(|(k, v)| (k.clone(), v.as_detached_tensor())).collect()
+    }
+
+    /// Takes all values from `tensors`, whose names and shapes must be exactly those of the model.
+    /// Nothing is changed unless everything fits.
+    ///
+    /// # Errors
+    /// The first name that is missing, extra or misshapen.
+    pub fn load(&self, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
+        for (name, var) in &self.vars {
+            let given = tensors
+                .get(name)
+                .ok_or_else(|| ModelError::MissingTensor { name: name.clone(), given: some_names(tensors.keys()) })?;
+            if given.dims() != var.dims() {
+                return Err(ModelError::MisshapenTensor {
+                    name: name.clone(),
+                    expected: var.dims().to_vec(),
+                    found: given.dims().to_vec(),
+                });
+            }
+        }
+        if let Some(name) = tensors.keys().find(|k| !self.vars.contains_key(*k)) {
+            return Err(ModelError::ExtraTensor { name: name.clone(), known: some_names(self.vars.keys()) });
+        }
+        for (name, var) in &self.vars {
+            var.set(&tensors[name].to_dtype(DType::F32)?.contiguous()?)?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn two() -> Params {
+        let mut rng = Rng::new(0, "init");
+        let mut params = Params::new();
+        params.create("b", &[3], Init::Ones, &mut rng).unwrap();
+        params.create("a", &[2, 3], Init::XavierUniform, &mut rng).unwrap();
+        params
+    }
+
+    #[test]
+    fn load_names_what_does_not_fit() {
+        let params = two();
+        let good = two().tensors();
+        params.load(&good).unwrap();
+        let mut missing = good.clone();
+        missing.remove("b");
+        assert!(matches!(params.load(&missing), Err(ModelError::MissingTensor { name, .. }) if name == "b"));
+        let mut extra = good.clone();
+        extra.insert("c".into(), good["b"].clone());
+        assert!(matches!(params.load(&extra), Err(ModelError::ExtraTensor { name, .. }) if name == "c"));
+        let mut bent = good.clone();
+        bent.insert("a".into(), good["a"].t().unwrap());
+        assert!(matches!(params.load(&bent), Err(ModelError::MisshapenTensor { name, .. }) if name == "a"));
+    }
+
+    #[test]
+    fn names_come_sorted_and_once() {
+        let mut params = two();
+        assert_eq!(params.names().collect::<Vec<_>>(), ["a", "b"]);
+        assert_eq!(params.count(), 9);
+        let mut rng = Rng::new(0, "init");
+        assert!(params.create("a", &[1], Init::Zeros, &mut rng).is_err());
+    }
+
+    #[test]
+    fn an_update_is_seen_through_the_layers_tensor() {
+        let mut rng = Rng::new(0, "init");
+        let mut params = Params::new();
+        let held = params.create("w", &[2], Init::Zeros, &mut rng).unwrap();
+        params.get("w").unwrap().set(&Tensor::new(&[1f32, 2.0], &Device::Cpu).unwrap()).unwrap();
+        assert_eq!(held.to_vec1::<f32>().unwrap(), [1.0, 2.0]);
+    }
+}
