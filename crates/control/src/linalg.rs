@@ -109,7 +109,7 @@ pub fn pseudo_inverse<const N: usize>(a: &[[f64; N]; N]) -> [[f64; N]; N] {
             }
         }
         // a NaN ends the sweeps and spreads into the result
-        if !(off > 1e-36 * on) {
+        if off <= 1e-36 * on || off.is_nan() {
             break;
         }
         for p in 0..N {
