@@ -31,7 +31,8 @@ pub fn delta_rotation(vec: [f64; 3]) -> Mat3 {
 
 /// The matrix of a single-precision quaternion (w, x, y, z), in robosuite's mixture of precisions.
 fn quaternion_matrix(q: [f32; 4]) -> Mat3 {
-    let n = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+    // OpenBLAS' sdot, which numba calls: single products, summed in doubles, rounded once
+    let n = q.iter().map(|c| f64::from(c * c)).sum::<f64>() as f32;
     if f64::from(n) < EPS {
         return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     }

@@ -24,6 +24,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import robosuite
+import robosuite.macros as macros
 from robosuite.controllers.composite.composite_controller import CompositeController
 from robosuite.controllers.parts.arm.osc import OperationalSpaceController
 from robosuite.controllers.parts.gripper.simple_grip import SimpleGripController
@@ -32,6 +33,9 @@ from robosuite.environments.robot_env import RobotEnv
 from robosuite.models.grippers.panda_gripper import PandaGripper
 from robosuite.robots.fixed_base_robot import FixedBaseRobot
 from robosuite.utils.binding_utils import MjSim
+from robosuite.utils.observables import NO_CORRUPTION, NO_DELAY, NO_FILTER
+
+from actrm_harness.control_sensors import ContactTest, Sensor, cheaper
 
 LIBRARY_VARIABLE = "ACTRM_CONTROL_LIB"
 """The environment variable that names the library; the binaries set it for their workers."""
@@ -306,6 +310,8 @@ class CompiledControl:
         self._action = np.zeros(_DOF)
         self._action_address = self._action.ctypes.data
         self._handle: int | None = None
+        self._clocks: dict[tuple[float, bool, float, float], tuple[float, bool] | None] = {}
+        self._sensors: dict[str, tuple[Any, Sensor | None]] = {}
         self._views = {name: self._state[name] for name in _STATE.names or ()}
         self._bind()
 
@@ -349,8 +355,12 @@ class CompiledControl:
         self._fingers = self._composite.part_controllers["right_gripper"]
         self._gripper = robot.gripper["right"]
         self._substeps = int(env.control_timestep / env.model_timestep)
+        self._clocks.clear()
+        self._sensors.clear()
         self._open()
         self._share()
+        if type(env).check_contact is MujocoEnv.check_contact:
+            env.check_contact = ContactTest(env.sim)
 
     def _open(self) -> None:
         model, data = self._sim.model._model, self._sim.data._data
@@ -457,12 +467,17 @@ class CompiledControl:
             )
         self._action[:] = action
         env.timestep += 1
-        for substep in range(self._substeps):
-            self._run(1, substep == 0)
-            env._update_observables()
+        clock = self._clock()
+        if clock is None:
+            for substep in range(self._substeps):
+                self._run(1, substep == 0)
+                env._update_observables()
+        else:
+            self._run(self._substeps, True)
+            self._observe(*clock)
         env.cur_time += env.control_timestep
         reward, done, info = env._post_action(action)
-        return env._get_observations(), reward, done, info
+        return self._observations(), reward, done, info
 
     def _run(self, substeps: int, policy_step: bool) -> None:
         status = self._library.run(
@@ -472,6 +487,102 @@ class CompiledControl:
             raise ControlError("the simulation has diverged: the arm's inertia is not positive")
         self._arm.new_update = True
         self._fingers.new_update = True
+
+    def _clock(self) -> tuple[float, bool] | None:
+        """The observables' clock after this step, if all of them sample in its last substep only.
+
+        None where one is due earlier, or delayed: then they are updated after each substep.
+        """
+        start: tuple[float, bool, float, float] | None = None
+        for observable in self.env._observables.values():
+            if not observable._enabled:
+                continue
+            mine = (
+                observable._time_since_last_sample,
+                observable._sampled,
+                observable._sampling_timestep,
+                observable._current_delay,
+            )
+            if start is None:
+                start = mine
+            if mine != start or observable._delayer is not NO_DELAY:
+                return None
+        if start is None:
+            return None
+        if start not in self._clocks:
+            self._clocks[start] = _advance(*start, self.env.model_timestep, self._substeps)
+        return self._clocks[start]
+
+    def _observe(self, time: float, sampled: bool) -> None:
+        """`env._update_observables` in the substep in which all sample."""
+        cache = self.env._obs_cache
+        sensors = self._sensors
+        for name, observable in self.env._observables.items():
+            if not observable._enabled:
+                continue
+            sensor = observable._sensor
+            known = sensors.get(name)
+            if known is None or known[0] is not sensor:
+                known = (sensor, cheaper(sensor, self.env))
+                sensors[name] = known
+            quick = known[1]
+            if (
+                quick is not None
+                and observable._corrupter is NO_CORRUPTION
+                and observable._filter is NO_FILTER
+            ):
+                value = quick(cache)
+            else:
+                value = np.array(observable._filter(observable._corrupter(sensor(cache))))
+            if value.shape == (1,):
+                value = value[0]
+            observable._current_observed_value = value
+            cache[name] = np.array(value)
+            observable._time_since_last_sample = time
+            observable._sampled = sampled
+
+    def _observations(self) -> OrderedDict[str, Any]:
+        """`env._get_observations()`."""
+        observations: OrderedDict[str, Any] = OrderedDict()
+        modalities: dict[str, list[Any]] = {}
+        for name, observable in self.env._observables.items():
+            if not (observable._enabled and observable._active):
+                continue
+            value = observable._current_observed_value
+            observations[name] = value
+            modality = observable._sensor.__modality__
+            values = modalities.get(modality)
+            if values is None:
+                values = modalities[modality] = []
+            single = type(value) in (int, float) or not value.shape
+            values.append(np.array([value]) if single else value)
+        for modality, values in modalities.items():
+            if modality == "image" and not macros.CONCATENATE_IMAGES:
+                continue
+            observations[modality + "-state"] = np.concatenate(values, axis=-1)
+        return observations
+
+
+def _advance(
+    time: float, sampled: bool, period: float, delay: float, timestep: float, substeps: int
+) -> tuple[float, bool] | None:
+    """`Observable.update`'s clock over a control step; None if it samples before the last substep.
+
+    The sums are robosuite's, rounding included: after a reset the clock is one timestep ahead, and
+    that is what moves sampling to the end of a step.
+    """
+    due = []
+    for substep in range(substeps):
+        time += timestep
+        if not sampled and period - delay >= time:
+            due.append(substep)
+            sampled = True
+        if time >= period:
+            if not sampled:
+                return None
+            time %= period
+            sampled = False
+    return (time, sampled) if due == [substeps - 1] else None
 
 
 def attach(env: Any) -> CompiledControl | None:
