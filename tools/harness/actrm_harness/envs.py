@@ -42,12 +42,12 @@ TASKS = {task.name: task for task in (Task("Lift"),)}
 class Control(Protocol):
     """The inner loop of a control step, in place of robosuite's."""
 
-    def step(self, env: Env, action: Array) -> tuple[dict[str, Array], float]:
-        """Advance one control step; the observations and the reward after it."""
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, dict[str, Any]]:
+        """Do and return what `Env.step` does and returns."""
         ...
 
-    def reset(self, env: Env) -> None:
-        """Called after every reset of the environment."""
+    def release(self) -> None:
+        """Let go of the simulation, because the environment is about to be reset."""
         ...
 
 
@@ -116,10 +116,10 @@ def reset(session: Session, seed: int) -> Tensors:
     env.hard_reset = not session.task.soft_reset or session.foreign_model
     session.foreign_model = False
     env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
+    if session.control is not None:
+        session.control.release()
     raw = env.reset()
     env.hard_reset = not session.task.soft_reset
-    if session.control is not None:
-        session.control.reset(env)
     return {**observation(raw), **images(session)}
 
 
@@ -146,10 +146,7 @@ def images(session: Session) -> Tensors:
 
 def step(env: Env, action: Array, control: Control | None) -> StepResult:
     """One control step, through robosuite's loop or through `control`."""
-    if control is None:
-        raw, reward, _, _ = env.step(action)
-    else:
-        raw, reward = control.step(env, action)
+    raw, reward, _, _ = env.step(action) if control is None else control.step(action)
     return StepResult(observation(raw), float(reward), success(env))
 
 

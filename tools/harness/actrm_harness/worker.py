@@ -39,7 +39,7 @@ def run(requests: BinaryIO, replies: BinaryIO) -> int:
     args = arguments()
     try:
         session = start(args)
-        wire.write_frame(replies, protocol.ready_message(describe(session, args.control)))
+        wire.write_frame(replies, protocol.ready_message(describe(session)))
     except RequestError as error:
         wire.write_frame(replies, error_message(error.kind, str(error)))
         return 1
@@ -61,7 +61,9 @@ def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="actrm_harness.worker", description=__doc__)
     parser.add_argument("--task", required=True, help="environment name, as robosuite knows it")
-    parser.add_argument("--control", default="robosuite", choices=["robosuite", "compiled"])
+    parser.add_argument(
+        "--control", default="compiled", choices=["robosuite", "compiled"], help="the inner loop (default: %(default)s)"
+    )
     parser.add_argument("--env-module", help="Python module to import first: it registers further environments")
     parser.add_argument("--cameras", default="", help="cameras to observe, separated by commas")
     parser.add_argument("--size", type=int, default=84, help="height and width of camera images")
@@ -84,10 +86,15 @@ def start(args: argparse.Namespace) -> "Session":
                 "env_module", f"cannot import environment module {args.env_module!r}: {error}"
             ) from error
     cameras = tuple(name for name in args.cameras.split(",") if name)
-    return envs.make(args.task, cameras, args.size)
+    session = envs.make(args.task, cameras, args.size)
+    if args.control == "compiled":
+        from actrm_harness import control
+
+        session.control = control.attach(session.env)
+    return session
 
 
-def describe(session: "Session", control: str) -> protocol.Ready:
+def describe(session: "Session") -> protocol.Ready:
     """The handshake: versions, shapes and the environment's arguments."""
     import numpy as np
 
@@ -103,7 +110,7 @@ def describe(session: "Session", control: str) -> protocol.Ready:
         numpy=np.__version__,
         task=session.task.name,
         env_name=session.task.name,
-        control=control,
+        control="robosuite" if session.control is None else "compiled",
         control_freq=int(session.env.control_freq),
         max_steps=session.task.max_steps,
         action_dim=int(low.shape[0]),

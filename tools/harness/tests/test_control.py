@@ -1,0 +1,336 @@
+"""The compiled control loop beside robosuite's own, on the same seeds and actions."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Client
+
+from actrm_harness import suite
+
+suite.prepare()
+
+from actrm_harness import control, envs  # noqa: E402
+from actrm_harness.control import CompiledControl  # noqa: E402
+from actrm_harness.control_abi import Library  # noqa: E402
+from actrm_harness.wire import Array  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[3]
+TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+LIBRARY = Path(os.environ.get(control.LIBRARY) or TARGET / "release" / "libcontrol.so")
+
+TASKS = ["Lift", "Stack", "PickPlaceCan", "NutAssemblySquare", "Door"]
+
+
+@pytest.fixture(autouse=True)
+def library(monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The library, where the worker looks for it."""
+    assert LIBRARY.is_file(), f"{LIBRARY} is missing: cargo build --release -p control"
+    monkeypatch.setenv(control.LIBRARY, str(LIBRARY))
+    return LIBRARY
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def pair(request: pytest.FixtureRequest) -> Iterator[tuple[Any, Any]]:
+    """Two environments of one task: one for each loop."""
+    plain, ours = envs.make(request.param).env, envs.make(request.param).env
+    yield plain, ours
+    plain.close()
+    ours.close()
+
+
+@pytest.fixture
+def lift() -> Any:
+    """A Lift environment of the test's own."""
+    return envs.make("Lift").env
+
+
+def seeded(env: Any, seed: int) -> Any:
+    """Reset as the worker does."""
+    env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
+    return env.reset()
+
+
+def attached(env: Any) -> CompiledControl:
+    compiled = control.attach(env)
+    assert compiled is not None
+    return compiled
+
+
+def smooth(seed: int, steps: int) -> Iterator[Array]:
+    """Actions that wander, in all seven directions and now and then beyond the limits."""
+    rng = np.random.default_rng(seed)
+    action = np.zeros(7)
+    for _ in range(steps):
+        action = 0.9 * action + rng.normal(size=7) * [0.15, 0.15, 0.15, 0.1, 0.1, 0.1, 1.0]
+        yield np.clip(action, -1.1, 1.1)
+
+
+def distance(plain: Any, ours: Any) -> float:
+    return float(np.abs(plain.sim.data.qpos - ours.sim.data.qpos).max())
+
+
+def assert_same_bits(left: dict[str, Any], right: dict[str, Any]) -> None:
+    assert list(left) == list(right)
+    for name, value in left.items():
+        assert np.shape(value) == np.shape(right[name]), name
+        assert np.asarray(value).tobytes() == np.asarray(right[name]).tobytes(), name
+
+
+@pytest.mark.parametrize("hard", [True, False])
+def test_a_step_is_robosuites(pair: tuple[Any, Any], hard: bool) -> None:
+    """Positions to 1e-14 after one control step and 1e-12 after twenty; observations, rewards and counters with them.
+
+    After a reset the first substep uses the snapshot that the controller took before the objects were placed, hence
+    several seeds, and resets that keep the model as well as those that load it anew.
+    """
+    plain, ours = pair
+    plain.hard_reset = ours.hard_reset = hard
+    compiled = attached(ours)
+    for seed in (1, 2):
+        assert_same_bits(seeded(plain, seed), seeded(ours, seed))
+        for index, action in enumerate(smooth(seed, 20)):
+            expected = plain.step(action)
+            found = compiled.step(action)
+            if index == 0:
+                assert distance(plain, ours) <= 1e-14
+            assert list(found[0]) == list(expected[0])
+            for name, value in expected[0].items():
+                assert np.shape(found[0][name]) == np.shape(value)
+                # accelerations (of the order of 10) carry the differences of 2 ms undivided
+                assert np.abs(found[0][name] - value).max() < 1e-8, name
+            assert found[1:] == expected[1:]
+            assert (ours.timestep, ours.cur_time, ours.done) == (plain.timestep, plain.cur_time, plain.done)
+        assert distance(plain, ours) <= 1e-12
+        assert ours.sim.data.time == plain.sim.data.time
+        same_controllers(plain, ours)
+        same_recent(plain, ours)
+
+
+def same_controllers(plain: Any, ours: Any) -> None:
+    for part, names in {
+        "right": [
+            *("ref_pos", "ref_ori_mat", "ref_pos_vel", "ref_ori_vel", "J_pos", "J_ori", "J_full", "mass_matrix"),
+            *("joint_pos", "joint_vel", "goal_pos", "goal_ori", "origin_pos", "origin_ori", "torques", "initial_joint"),
+        ],
+        "right_gripper": ["goal_qvel"],
+    }.items():
+        expected, found = (env.robots[0].composite_controller.part_controllers[part] for env in (plain, ours))
+        for name in names:
+            assert getattr(found, name) == pytest.approx(getattr(expected, name), abs=1e-9), name
+        assert found.new_update is expected.new_update is True
+    expected, found = (env.robots[0].gripper["right"].current_action for env in (plain, ours))
+    assert np.array_equal(expected, found)
+    assert plain.sim.data.ctrl == pytest.approx(ours.sim.data.ctrl, abs=1e-9)
+
+
+def same_recent(plain: Any, ours: Any) -> None:
+    """The robot's buffers of recent values are filled as robosuite fills them."""
+    expected, found = plain.robots[0], ours.robots[0]
+    assert np.array_equal(found.recent_actions.current, expected.recent_actions.current)
+    assert np.array_equal(found.recent_actions.last, expected.recent_actions.last)
+    assert found.recent_qpos.delta == pytest.approx(expected.recent_qpos.delta, abs=1e-12)
+    assert found.recent_torques.current.dtype == expected.recent_torques.current.dtype
+    for name in ("recent_ee_forcetorques", "recent_ee_pose", "recent_ee_vel", "recent_ee_acc"):
+        for value in ("last", "current"):
+            theirs, mine = (
+                getattr(getattr(expected, name)["right"], value),
+                getattr(getattr(found, name)["right"], value),
+            )
+            # forces and accelerations are of the order of 10
+            assert mine == pytest.approx(theirs, abs=1e-7), (name, value)
+    theirs, mine = expected.recent_ee_vel_buffer["right"], found.recent_ee_vel_buffer["right"]
+    assert mine.buf == pytest.approx(theirs.buf, abs=1e-10)
+    assert mine.ptr == theirs.ptr
+
+
+def test_observing_once_a_step_gives_the_bits_of_observing_at_every_substep(pair: tuple[Any, Any]) -> None:
+    """Sensors, cache, clocks, rewards and the contact test: the cheap way beside robosuite's, on the same physics."""
+    slow, fast = pair
+    careful, compiled = attached(slow), attached(fast)
+    seeded(slow, 5)
+    seeded(fast, 5)
+    with without_shortcuts(careful):
+        for action in smooth(5, 25):
+            expected, found = careful.step(action), compiled.step(action)
+            assert compiled._clock() is not None, "the cheap way was not taken"  # pyright: ignore[reportPrivateUsage]
+            assert_same_bits(expected[0], found[0])
+            assert_same_bits(slow._get_observations(), fast._get_observations())
+            assert_same_bits(slow._obs_cache, fast._obs_cache)
+            assert expected[1:] == found[1:]
+            assert slow._check_success() == fast._check_success()
+            for robot in (slow, fast):
+                assert robot.sim.data.ncon == slow.sim.data.ncon
+            fingers = slow.robots[0].gripper["right"].important_geoms["left_finger"]
+            for geoms in (fingers, fingers[0], slow.robots[0].gripper["right"]):
+                assert slow.check_contact(geoms) == fast.check_contact(geoms)
+            for name, observable in slow._observables.items():
+                other = fast._observables[name]
+                assert (observable._time_since_last_sample, observable._sampled) == (
+                    other._time_since_last_sample,
+                    other._sampled,
+                )
+
+
+@contextmanager
+def without_shortcuts(compiled: CompiledControl) -> Iterator[None]:
+    """Robosuite's own observing, and its own contact test, around the compiled physics."""
+    env = compiled.env
+
+    def no_clock() -> None:
+        env.__dict__.pop("check_contact", None)
+
+    own = compiled.__dict__
+    own |= {"_clock": no_clock, "_observations": env._get_observations}
+    yield
+    del own["_clock"], own["_observations"]
+
+
+def test_far_along_the_loops_differ_as_robosuite_differs_from_itself(lift: Any) -> None:
+    """After 5,000 substeps with contacts: beside robosuite against itself, one coordinate moved by 1 ulp."""
+    other = envs.make("Lift").env
+    compiled = attached(other)
+
+    def ending(start: int | None, step: Any, env: Any) -> Array:
+        seeded(env, 3)
+        if start is not None:
+            env.sim.data.qpos[start] = np.nextafter(env.sim.data.qpos[start], 9.0)
+        for index, action in enumerate(smooth(3, 200)):
+            # down to the table and along it, so that there is contact
+            step(action + [0, 0, -0.5 if index < 60 else 0.0, 0, 0, 0, 0])
+        return np.array(env.sim.data.qpos)
+
+    plain = ending(None, lift.step, lift)
+    ours = float(np.abs(ending(None, compiled.step, other) - plain).max())
+    moved = [float(np.abs(ending(joint, lift.step, lift) - plain).max()) for joint in (0, 3)]
+    assert ours <= 100 * max(moved), (ours, moved)
+
+
+def test_an_episode_is_the_same_bits_every_time(lift: Any) -> None:
+    compiled = attached(lift)
+    other = envs.make("Lift").env
+    again = attached(other)
+    for seed in (8, 9):
+        seeded(other, seed)
+        again.step(np.ones(7))
+    seen: list[list[bytes]] = []
+    for env, loop in ((lift, compiled), (other, again)):
+        seeded(env, 7)
+        seen.append([loop.step(action)[0]["object-state"].tobytes() for action in smooth(7, 40)])
+    assert seen[0] == seen[1]
+
+
+def test_both_loops_may_take_turns(lift: Any) -> None:
+    """A plain step in between finds the compiled loop's state and leaves its own."""
+    plain = envs.make("Lift").env
+    compiled = attached(lift)
+    seeded(plain, 4)
+    seeded(lift, 4)
+    for index, action in enumerate(smooth(4, 20)):
+        plain.step(action)
+        (compiled.step if index % 3 else lift.step)(action)
+        assert distance(plain, lift) <= 1e-12, index
+    same_controllers(plain, lift)
+
+
+def test_observables_with_clocks_of_their_own_are_sampled_when_they_are_due(lift: Any) -> None:
+    plain = envs.make("Lift").env
+    compiled = attached(lift)
+    for env in (plain, lift):
+        env.modify_observable("cube_pos", "sampling_rate", 10)
+        env.modify_observable("robot0_eef_pos", "delayer", lambda: 0.012)
+        env.modify_observable("robot0_joint_pos", "corrupter", lambda value: value + 1.0)
+        seeded(env, 6)
+    for action in smooth(6, 12):
+        expected, found = plain.step(action)[0], compiled.step(action)[0]
+        for name, value in expected.items():
+            assert found[name] == pytest.approx(value, abs=1e-8), name
+
+
+def test_the_rotation_of_an_action_is_rounded_as_robosuite_rounds_it() -> None:
+    """Through single precision, bit by bit: a different last bit there is 1e-8 in the goal."""
+    import robosuite.utils.transform_utils as transform
+
+    rng = np.random.default_rng(0)
+    lib = Library(LIBRARY)
+    for index in range(2000):
+        axis = rng.uniform(-0.5, 0.5, size=3) * 10.0 ** rng.integers(-6, 1)
+        if index % 10 == 0:
+            axis[rng.integers(3)] = 0.0
+        if index == 0:
+            axis[:] = 0.0
+        assert np.array_equal(transform.quat2mat(transform.axisangle2quat(axis)), lib.delta_rotation(axis)), axis
+
+
+def test_what_env_step_refuses_is_refused(lift: Any) -> None:
+    compiled = attached(lift)
+    seeded(lift, 1)
+    with pytest.raises(control.ControlError, match="7 numbers, got 6"):
+        compiled.step(np.zeros(6))
+    assert lift.timestep == 0
+    lift.done = True
+    with pytest.raises(ValueError, match="terminated"):
+        compiled.step(np.zeros(7))
+
+
+def test_other_controllers_keep_robosuites_loop_and_are_named_once(capfd: pytest.CaptureFixture[str]) -> None:
+    robosuite = suite.robosuite()
+    config = suite.panda_controller()
+    config["body_parts"]["right"] |= {"type": "JOINT_POSITION", "output_max": 0.05, "output_min": -0.05}
+    absolute = suite.panda_controller()
+    absolute["body_parts"]["right"]["input_type"] = "absolute"
+    plain = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False}
+    for kwargs, reason in (
+        ({"robots": "Panda", "controller_configs": config}, "parts of an action"),
+        ({"robots": "Panda", "controller_configs": absolute}, "input_type is 'absolute'"),
+        ({"robots": "Sawyer"}, "gripper"),
+        ({"robots": "Panda", "lite_physics": False}, "lite_physics"),
+    ):
+        env = robosuite.make("Lift", **plain, **kwargs)
+        capfd.readouterr()
+        assert control.attach(env) is None
+        lines = capfd.readouterr().err.splitlines()
+        assert len(lines) == 1, lines
+        assert reason in lines[0]
+        env.step(np.zeros(env.action_dim))
+
+
+def test_a_missing_or_foreign_library_is_one_line(
+    lift: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    text = tmp_path / "libcontrol.so"
+    text.write_text("not a library")
+    mujoco = next(Path(str(suite.mujoco().__file__)).parent.glob("libmujoco.so*"))
+    for path, word in ((None, "not set"), (text, str(text)), (mujoco, "control_abi")):
+        if path is None:
+            monkeypatch.delenv(control.LIBRARY)
+        else:
+            monkeypatch.setenv(control.LIBRARY, str(path))
+        capfd.readouterr()
+        assert control.attach(lift) is None
+        lines = capfd.readouterr().err.splitlines()
+        assert len(lines) == 1, lines
+        assert word in lines[0]
+
+
+def test_the_worker_says_which_loop_it_runs_and_both_tell_the_same_episode() -> None:
+    found: dict[str, Any] = {}
+    for loop in ("compiled", "robosuite"):
+        client = Client("--task", "Lift", "--control", loop)
+        assert client.ready["control"] == loop
+        message, data = client.ask("expert", seed=1_000_000)
+        found[loop] = (message["success"], message["steps"], data["states"])
+        assert client.close() == 0
+    assert found["compiled"][:2] == found["robosuite"][:2]
+    assert found["compiled"][2] == pytest.approx(found["robosuite"][2], abs=1e-6)
+
+
+def test_a_worker_without_the_library_runs_robosuites_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(control.LIBRARY)
+    client = Client("--task", "Lift")
+    assert client.ready["control"] == "robosuite"
+    assert client.close() == 0
