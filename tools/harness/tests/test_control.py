@@ -1,7 +1,8 @@
 """The compiled control loop beside robosuite's own, on the same seeds and actions."""
 
+import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -177,7 +178,7 @@ def test_observing_once_a_step_gives_the_bits_of_observing_at_every_substep(pair
 
 
 @contextmanager
-def without_shortcuts(compiled: CompiledControl) -> Iterator[None]:
+def without_shortcuts(compiled: CompiledControl) -> Generator[None, None, None]:
     """Robosuite's own observing, and its own contact test, around the compiled physics."""
     env = compiled.env
 
@@ -201,7 +202,8 @@ def test_far_along_the_loops_differ_as_robosuite_differs_from_itself(lift: Any) 
             env.sim.data.qpos[start] = np.nextafter(env.sim.data.qpos[start], 9.0)
         for index, action in enumerate(smooth(3, 200)):
             # down to the table and along it, so that there is contact
-            step(action + [0, 0, -0.5 if index < 60 else 0.0, 0, 0, 0, 0])
+            action[2] -= 0.5 if index < 60 else 0.0
+            step(action)
         return np.array(env.sim.data.qpos)
 
     plain = ending(None, lift.step, lift)
@@ -238,12 +240,16 @@ def test_both_loops_may_take_turns(lift: Any) -> None:
 
 
 def test_observables_with_clocks_of_their_own_are_sampled_when_they_are_due(lift: Any) -> None:
-    plain = envs.make("Lift").env
+    plain: Any = envs.make("Lift").env
     compiled = attached(lift)
+
+    def shifted(value: Array) -> Array:
+        return value + 1.0
+
     for env in (plain, lift):
         env.modify_observable("cube_pos", "sampling_rate", 10)
         env.modify_observable("robot0_eef_pos", "delayer", lambda: 0.012)
-        env.modify_observable("robot0_joint_pos", "corrupter", lambda value: value + 1.0)
+        env.modify_observable("robot0_joint_pos", "corrupter", shifted)
         seeded(env, 6)
     for action in smooth(6, 12):
         expected, found = plain.step(action)[0], compiled.step(action)[0]
@@ -253,9 +259,8 @@ def test_observables_with_clocks_of_their_own_are_sampled_when_they_are_due(lift
 
 def test_the_rotation_of_an_action_is_rounded_as_robosuite_rounds_it() -> None:
     """Through single precision, bit by bit: a different last bit there is 1e-8 in the goal."""
-    import robosuite.utils.transform_utils as transform
-
-    rng = np.random.default_rng(0)
+    transform: Any = importlib.import_module("robosuite.utils.transform_utils")
+    rng: Any = np.random.default_rng(0)
     lib = Library(LIBRARY)
     for index in range(2000):
         axis = rng.uniform(-0.5, 0.5, size=3) * 10.0 ** rng.integers(-6, 1)
