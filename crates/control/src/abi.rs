@@ -156,11 +156,7 @@ impl Binding {
             && within(&self.arm_actuator, self.nu)
             && within(&self.gripper_actuator, self.nu)
             && within(&[self.grip_site, self.origin_site], self.nsite);
-        if good {
-            Ok(())
-        } else {
-            Err(Status::BadArgument)
-        }
+        if good { Ok(()) } else { Err(Status::BadArgument) }
     }
 
     /// The arm's block of the inertia matrix: what `mj_fullM` gives on its rows and columns.
@@ -196,10 +192,7 @@ impl Binding {
         let actuator = actuator as usize;
         // SAFETY: the caller vouches for the index
         unsafe {
-            let (low, high) = (
-                *self.ctrlrange.add(2 * actuator),
-                *self.ctrlrange.add(2 * actuator + 1),
-            );
+            let (low, high) = (*self.ctrlrange.add(2 * actuator), *self.ctrlrange.add(2 * actuator + 1));
             *self.ctrl.add(actuator) = clip(value, low, high);
         }
     }

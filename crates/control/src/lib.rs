@@ -19,10 +19,7 @@ mod osc;
 mod rotation;
 mod substeps;
 
-pub use abi::{
-    Binding, Gripper, State, control_abi, control_close, control_delta_rotation, control_open,
-    control_run,
-};
+pub use abi::{Binding, Gripper, State, control_abi, control_close, control_delta_rotation, control_open, control_run};
 pub use osc::{Arm, Gains, Pose};
 pub use rotation::Mat3;
 pub use substeps::{JacSiteFunction, Loop, PolicyArm, Status, StepFunction};

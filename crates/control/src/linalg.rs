@@ -44,10 +44,7 @@ impl<const N: usize> Cholesky<N> {
                 lower[i][j] = sum * inverse_diagonal[j];
             }
         }
-        Some(Self {
-            lower,
-            inverse_diagonal,
-        })
+        Some(Self { lower, inverse_diagonal })
     }
 
     /// `L^-1 b`.
@@ -163,10 +160,7 @@ mod tests {
     pub struct Lcg(pub u64);
     impl Lcg {
         pub fn next(&mut self) -> f64 {
-            self.0 = self
-                .0
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1_442_695_040_888_963_407);
+            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
             (self.0 >> 11) as f64 / (1u64 << 53) as f64 * 2.0 - 1.0
         }
     }
@@ -194,10 +188,7 @@ mod tests {
     }
 
     fn worst<const N: usize>(a: &[[f64; N]; N], b: &[[f64; N]; N]) -> f64 {
-        a.iter()
-            .flatten()
-            .zip(b.iter().flatten())
-            .fold(0.0, |m, (x, y)| m.max((x - y).abs()))
+        a.iter().flatten().zip(b.iter().flatten()).fold(0.0, |m, (x, y)| m.max((x - y).abs()))
     }
 
     #[test]
@@ -207,9 +198,7 @@ mod tests {
             let a = gram::<6, 9>(&mut rng);
             let x: [f64; 6] = std::array::from_fn(|_| rng.next());
             let b: [f64; 6] = std::array::from_fn(|i| (0..6).map(|k| a[i][k] * x[k]).sum());
-            let solved = Cholesky::new(&a)
-                .expect("a Gram matrix of full rank")
-                .solve(&b);
+            let solved = Cholesky::new(&a).expect("a Gram matrix of full rank").solve(&b);
             for i in 0..6 {
                 // the worst of these matrices has a condition number of about 1e4
                 assert!((solved[i] - x[i]).abs() < 1e-10, "{solved:?} {x:?}");

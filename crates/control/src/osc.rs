@@ -94,13 +94,7 @@ pub fn goal(gains: &Gains, action: &[f64; 6], arm: &Arm, origin: &Pose) -> Pose 
 
 /// Joint torques that drive the arm to `goal`, before clipping; `bias` is the arm's part of
 /// `qfrc_bias`. `None` where the inertia matrix is no inertia matrix: the simulation has diverged.
-pub fn torques(
-    gains: &Gains,
-    arm: &Arm,
-    origin: &Pose,
-    goal: &Pose,
-    bias: &[f64; DOF],
-) -> Option<[f64; DOF]> {
+pub fn torques(gains: &Gains, arm: &Arm, origin: &Pose, goal: &Pose, bias: &[f64; DOF]) -> Option<[f64; DOF]> {
     let turned = apply(&origin.ori, &goal.pos);
     let desired_ori = multiply(&origin.ori, &goal.ori);
     let ori_error = orientation_error(&desired_ori, &arm.ref_ori);
@@ -108,8 +102,7 @@ pub fn torques(
         let error = (origin.pos[i] + turned[i]) - arm.ref_pos[i];
         error * gains.kp[i] - arm.ref_pos_vel[i] * gains.kd[i]
     });
-    let torque =
-        [0, 1, 2].map(|i| ori_error[i] * gains.kp[3 + i] - arm.ref_ori_vel[i] * gains.kd[3 + i]);
+    let torque = [0, 1, 2].map(|i| ori_error[i] * gains.kp[3 + i] - arm.ref_ori_vel[i] * gains.kd[3 + i]);
 
     // J M^-1 J^T as W^T W with W = G^-1 J^T, where M = G G^T
     let factor = Cholesky::new(&arm.mass)?;
@@ -125,9 +118,7 @@ pub fn torques(
             inertia_inv[j][i] = sum;
         }
     }
-    let block = |o: usize| -> [[f64; 3]; 3] {
-        [0, 1, 2].map(|i| [0, 1, 2].map(|j| inertia_inv[o + i][o + j]))
-    };
+    let block = |o: usize| -> [[f64; 3]; 3] { [0, 1, 2].map(|i| [0, 1, 2].map(|j| inertia_inv[o + i][o + j])) };
     let f = pinv_solve(&block(0), &force);
     let t = pinv_solve(&block(3), &torque);
     let wrench = [f[0], f[1], f[2], t[0], t[1], t[2]];
@@ -135,9 +126,8 @@ pub fn torques(
     // N^T M a with N = I - M^-1 J^T L J is M a - J^T L J a
     const JOINT_KP: f64 = 10.0;
     let joint_kv = JOINT_KP.sqrt() * 2.0;
-    let rest: [f64; DOF] = std::array::from_fn(|i| {
-        JOINT_KP * (gains.initial_joint[i] - arm.joint_pos[i]) - joint_kv * arm.joint_vel[i]
-    });
+    let rest: [f64; DOF] =
+        std::array::from_fn(|i| JOINT_KP * (gains.initial_joint[i] - arm.joint_pos[i]) - joint_kv * arm.joint_vel[i]);
     let mut pull = [0.0; 6];
     for i in 0..6 {
         for k in 0..DOF {
@@ -182,9 +172,7 @@ mod tests {
     }
 
     fn t(a: &Matrix) -> Matrix {
-        (0..a[0].len())
-            .map(|j| a.iter().map(|row| row[j]).collect())
-            .collect()
+        (0..a[0].len()).map(|j| a.iter().map(|row| row[j]).collect()).collect()
     }
 
     /// Gauss-Jordan with full row pivoting.
@@ -198,9 +186,7 @@ mod tests {
             })
             .collect();
         for c in 0..n {
-            let p = (c..n)
-                .max_by(|&x, &y| m[x][c].abs().total_cmp(&m[y][c].abs()))
-                .expect("rows");
+            let p = (c..n).max_by(|&x, &y| m[x][c].abs().total_cmp(&m[y][c].abs())).expect("rows");
             m.swap(c, p);
             let pivot = m[c][c];
             m[c].iter_mut().for_each(|x| *x /= pivot);
@@ -217,13 +203,7 @@ mod tests {
     }
 
     /// The controller as its Python source spells it, with explicit inverses and null space matrix.
-    fn literal(
-        gains: &Gains,
-        arm: &Arm,
-        origin: &Pose,
-        goal: &Pose,
-        bias: &[f64; DOF],
-    ) -> Vec<f64> {
+    fn literal(gains: &Gains, arm: &Arm, origin: &Pose, goal: &Pose, bias: &[f64; DOF]) -> Vec<f64> {
         let column = |v: &[f64]| -> Matrix { v.iter().map(|&x| vec![x]).collect() };
         let m: Matrix = arm.mass.iter().map(|r| r.to_vec()).collect();
         let j: Matrix = arm.jacobian.iter().map(|r| r.to_vec()).collect();
@@ -235,14 +215,10 @@ mod tests {
         let turned = apply(&origin.ori, &goal.pos);
         let error = orientation_error(&multiply(&origin.ori, &goal.ori), &arm.ref_ori);
         let force: Vec<f64> = (0..3)
-            .map(|i| {
-                (origin.pos[i] + turned[i] - arm.ref_pos[i]) * gains.kp[i]
-                    + -arm.ref_pos_vel[i] * gains.kd[i]
-            })
+            .map(|i| (origin.pos[i] + turned[i] - arm.ref_pos[i]) * gains.kp[i] + -arm.ref_pos_vel[i] * gains.kd[i])
             .collect();
-        let torque: Vec<f64> = (0..3)
-            .map(|i| error[i] * gains.kp[3 + i] + -arm.ref_ori_vel[i] * gains.kd[3 + i])
-            .collect();
+        let torque: Vec<f64> =
+            (0..3).map(|i| error[i] * gains.kp[3 + i] + -arm.ref_ori_vel[i] * gains.kd[3 + i]).collect();
         let mut wrench = dot(&pos, &column(&force));
         wrench.extend(dot(&ori, &column(&torque)));
         let jbar = dot(&dot(&m_inv, &t(&j)), &full);
@@ -254,16 +230,11 @@ mod tests {
             }
         }
         let rest: Vec<f64> = (0..7)
-            .map(|i| {
-                10.0 * (gains.initial_joint[i] - arm.joint_pos[i])
-                    - 2.0 * 10.0_f64.sqrt() * arm.joint_vel[i]
-            })
+            .map(|i| 10.0 * (gains.initial_joint[i] - arm.joint_pos[i]) - 2.0 * 10.0_f64.sqrt() * arm.joint_vel[i])
             .collect();
         let posture = dot(&t(&null), &dot(&m, &column(&rest)));
         let task = dot(&t(&j), &wrench);
-        (0..7)
-            .map(|i| task[i][0] + bias[i] + posture[i][0])
-            .collect()
+        (0..7).map(|i| task[i][0] + bias[i] + posture[i][0]).collect()
     }
 
     fn sample(seed: u64) -> (Gains, Arm, Pose, Pose, [f64; DOF]) {
@@ -302,19 +273,11 @@ mod tests {
             mass,
             jacobian: std::array::from_fn(|_| std::array::from_fn(|_| next())),
         };
-        let origin = Pose {
-            pos: std::array::from_fn(|_| next()),
-            ori: delta_rotation(std::array::from_fn(|_| next())),
-        };
+        let origin =
+            Pose { pos: std::array::from_fn(|_| next()), ori: delta_rotation(std::array::from_fn(|_| next())) };
         let action = std::array::from_fn(|_| 1.5 * next());
         let goal = goal(&gains, &action, &arm, &origin);
-        (
-            gains,
-            arm,
-            origin,
-            goal,
-            std::array::from_fn(|_| 5.0 * next()),
-        )
+        (gains, arm, origin, goal, std::array::from_fn(|_| 5.0 * next()))
     }
 
     #[test]
@@ -327,10 +290,7 @@ mod tests {
             let size = naive.iter().fold(1.0_f64, |m, x| m.max(x.abs()));
             for i in 0..DOF {
                 // random Jacobians are worse conditioned than an arm's: relative to the largest
-                assert!(
-                    (ours[i] - naive[i]).abs() < 1e-8 * size,
-                    "seed {seed}: {ours:?} {naive:?}"
-                );
+                assert!((ours[i] - naive[i]).abs() < 1e-8 * size, "seed {seed}: {ours:?} {naive:?}");
                 compared += 1;
             }
         }

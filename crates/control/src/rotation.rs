@@ -19,12 +19,7 @@ pub fn delta_rotation(vec: [f64; 3]) -> Mat3 {
         [0.0, 0.0, 0.0, 1.0]
     } else {
         let (sin, cos) = ((angle / 2.0).sin(), (angle / 2.0).cos());
-        [
-            vec[0] / angle * sin,
-            vec[1] / angle * sin,
-            vec[2] / angle * sin,
-            cos,
-        ]
+        [vec[0] / angle * sin, vec[1] / angle * sin, vec[2] / angle * sin, cos]
     };
     quaternion_matrix([w as f32, x as f32, y as f32, z as f32])
 }
@@ -41,21 +36,9 @@ fn quaternion_matrix(q: [f32; 4]) -> Mat3 {
     let p = |i: usize, j: usize| q[i] * q[j];
     let diagonal = |i: usize, j: usize| 1.0 - f64::from(p(i, i)) - f64::from(p(j, j));
     [
-        [
-            diagonal(2, 3),
-            f64::from(p(1, 2) - p(3, 0)),
-            f64::from(p(1, 3) + p(2, 0)),
-        ],
-        [
-            f64::from(p(1, 2) + p(3, 0)),
-            diagonal(1, 3),
-            f64::from(p(2, 3) - p(1, 0)),
-        ],
-        [
-            f64::from(p(1, 3) - p(2, 0)),
-            f64::from(p(2, 3) + p(1, 0)),
-            diagonal(1, 2),
-        ],
+        [diagonal(2, 3), f64::from(p(1, 2) - p(3, 0)), f64::from(p(1, 3) + p(2, 0))],
+        [f64::from(p(1, 2) + p(3, 0)), diagonal(1, 3), f64::from(p(2, 3) - p(1, 0))],
+        [f64::from(p(1, 3) - p(2, 0)), f64::from(p(2, 3) + p(1, 0)), diagonal(1, 2)],
     ]
 }
 
@@ -63,13 +46,8 @@ fn quaternion_matrix(q: [f32; 4]) -> Mat3 {
 /// `control_utils.orientation_error`, in radians for small angles.
 pub fn orientation_error(desired: &Mat3, current: &Mat3) -> [f64; 3] {
     let column = |m: &Mat3, c: usize| [m[0][c], m[1][c], m[2][c]];
-    let cross = |a: [f64; 3], b: [f64; 3]| {
-        [
-            a[1] * b[2] - a[2] * b[1],
-            a[2] * b[0] - a[0] * b[2],
-            a[0] * b[1] - a[1] * b[0],
-        ]
-    };
+    let cross =
+        |a: [f64; 3], b: [f64; 3]| [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
     let [a, b, c] = [0, 1, 2].map(|k| cross(column(current, k), column(desired, k)));
     [0, 1, 2].map(|i| 0.5 * (a[i] + b[i] + c[i]))
 }

@@ -29,11 +29,7 @@ impl Loop {
     pub fn new(binding: Binding) -> Result<Self, Status> {
         binding.check()?;
         let room = 3 * binding.nv as usize;
-        Ok(Self {
-            binding,
-            jacp: vec![0.0; room],
-            jacr: vec![0.0; room],
-        })
+        Ok(Self { binding, jacp: vec![0.0; room], jacr: vec![0.0; room] })
     }
 
     /// Takes `substeps` substeps. With `policy_step` the first of them sets the goals from
@@ -42,13 +38,7 @@ impl Loop {
     /// # Safety
     /// The binding's model, data, arrays and functions must be those of one live simulation
     /// that nobody else touches during the call.
-    pub unsafe fn run(
-        &mut self,
-        state: &mut State,
-        action: &[f64; 7],
-        substeps: u32,
-        policy_step: bool,
-    ) -> Status {
+    pub unsafe fn run(&mut self, state: &mut State, action: &[f64; 7], substeps: u32, policy_step: bool) -> Status {
         let (model, data) = (self.binding.model, self.binding.data);
         let (Some(step1), Some(step2)) = (self.binding.step1, self.binding.step2) else {
             return Status::BadArgument;
@@ -70,12 +60,7 @@ impl Loop {
     ///
     /// # Safety
     /// As for [`Loop::run`].
-    unsafe fn control(
-        &mut self,
-        state: &mut State,
-        action: &[f64; 7],
-        set_goal: bool,
-    ) -> Option<()> {
+    unsafe fn control(&mut self, state: &mut State, action: &[f64; 7], set_goal: bool) -> Option<()> {
         let b = &self.binding;
         let origin = b.origin_site as usize;
         // SAFETY: site indices were checked against nsite, whose arrays these are
@@ -100,9 +85,7 @@ impl Loop {
             state.policy_arm = PolicyArm::of(state);
         }
         // SAFETY: indices of degrees of freedom were checked against nv
-        let bias = b
-            .arm_dof
-            .map(|dof| unsafe { *b.qfrc_bias.add(dof as usize) });
+        let bias = b.arm_dof.map(|dof| unsafe { *b.qfrc_bias.add(dof as usize) });
         state.torques = osc::torques(&b.gains, &state.arm, &state.origin, &state.goal, &bias)?;
         for i in 0..DOF {
             // SAFETY: indices of actuators were checked against nu
@@ -132,13 +115,7 @@ impl Loop {
             arm.ref_pos = std::array::from_fn(|i| *b.site_xpos.add(3 * site + i));
             arm.ref_ori = read_mat3(b.site_xmat.add(9 * site));
             if let Some(jac_site) = b.jac_site {
-                jac_site(
-                    b.model,
-                    b.data,
-                    self.jacp.as_mut_ptr(),
-                    self.jacr.as_mut_ptr(),
-                    b.grip_site,
-                );
+                jac_site(b.model, b.data, self.jacp.as_mut_ptr(), self.jacr.as_mut_ptr(), b.grip_site);
             }
             let qvel = std::slice::from_raw_parts(b.qvel, nv);
             for i in 0..3 {
@@ -210,5 +187,4 @@ unsafe fn read_mat3(at: *const f64) -> crate::rotation::Mat3 {
 pub type StepFunction = unsafe extern "C" fn(*const c_void, *mut c_void);
 
 /// `mj_jacSite`.
-pub type JacSiteFunction =
-    unsafe extern "C" fn(*const c_void, *const c_void, *mut f64, *mut f64, i32);
+pub type JacSiteFunction = unsafe extern "C" fn(*const c_void, *const c_void, *mut f64, *mut f64, i32);
