@@ -1,1 +1,93 @@
-//! End-to-end tests that drive the real binaries live in `tests/tests/`.
+//! What the end-to-end tests share: where the programs and the shipped demonstrations are, how a program is run and how
+//! its refusal is checked. The tests themselves lie in `tests/tests/`; each drives the real binaries.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// The root of the checkout.
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the package lies in the checkout").to_owned()
+}
+
+/// The shipped demonstrations.
+pub fn lift() -> PathBuf {
+    root().join("data/lift.hdf5")
+}
+
+/// One of our programs, beside the running test in the target folder.
+///
+/// # Panics
+/// If it has not been built: `make test` builds every program before it tests.
+pub fn program(name: &str) -> Command {
+    let test = std::env::current_exe().expect("a test knows its own path");
+    let folder = test.parent().and_then(Path::parent).expect("tests lie in target/<profile>/deps");
+    let path = folder.join(name);
+    assert!(path.is_file(), "{} is not built: run `cargo build --release --workspace` first", path.display());
+    Command::new(path)
+}
+
+/// `actrm-data` with arguments.
+pub fn data<const N: usize>(arguments: [&str; N]) -> Command {
+    let mut command = program("actrm-data");
+    command.args(arguments);
+    command
+}
+
+/// `actrm-zoo` with arguments.
+pub fn zoo<const N: usize>(arguments: [&str; N]) -> Command {
+    let mut command = program("actrm-zoo");
+    command.args(arguments);
+    command
+}
+
+/// Run a command that must succeed; returns what it printed.
+///
+/// # Panics
+/// If it cannot be started or ends with another exit code than 0.
+pub fn succeeds(command: &mut Command) -> Output {
+    let output = command.output().expect("the program starts");
+    assert!(
+        output.status.success(),
+        "{command:?}: {}\n{}\n{}",
+        output.status,
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr)
+    );
+    output
+}
+
+/// Run a command that must be refused: an exit code (not a signal) other than 0, and one line on standard error that
+/// holds every one of `words`. Returns the line.
+///
+/// # Panics
+/// If it succeeds, dies of a signal, panics, prints several lines, or the line lacks a word.
+pub fn refused(command: &mut Command, words: &[&str]) -> String {
+    let output = command.env_remove("RUST_BACKTRACE").output().expect("the program starts");
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    let code = output.status.code();
+    assert!(matches!(code, Some(1 | 2)), "{command:?}: {:?}\n{text}", output.status);
+    let line = text.trim_end();
+    assert!(!line.contains("panicked"), "{command:?}: {line}");
+    assert!(code == Some(2) || line.lines().count() == 1, "{command:?}: more than one line:\n{line}");
+    for word in words {
+        assert!(line.contains(word), "{command:?}: no {word:?} in: {line}");
+    }
+    line.to_owned()
+}
+
+/// Names of what lies in a folder, sorted; nothing for a folder that is not there.
+pub fn listing(folder: &Path) -> Vec<String> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let mut names: Vec<String> =
+        entries.map(|entry| entry.expect("a readable folder").file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    names
+}
+
+/// A path as text, for argument lists.
+///
+/// # Panics
+/// If the path is not UTF-8.
+pub fn text(path: &Path) -> &str {
+    path.to_str().expect("test paths are UTF-8")
+}

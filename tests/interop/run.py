@@ -1,0 +1,217 @@
+"""What we write, opened by the others; what the others write, opened by us. Run by `make interop`.
+
+LeRobot and robomimic are the released packages from PyPI. Every check compares numbers with the source file, and any
+difference ends the run with exit code 1.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ["HF_HUB_OFFLINE"] = "1"
+
+import h5py
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parents[2]
+BIN = ROOT / "target" / "release"
+STATE_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos")
+ENV_KEYS = ("object",)
+
+
+def ours(program: str, *args: str | Path) -> str:
+    """Run one of our programs and return its standard output; its error ends the run."""
+    done = subprocess.run([BIN / program, *map(str, args)], text=True, capture_output=True, check=False)
+    if done.returncode != 0:
+        raise SystemExit(f"{program} {' '.join(map(str, args))}: exit code {done.returncode}\n{done.stderr}")
+    return done.stdout
+
+
+def demos(file: h5py.File) -> list[str]:
+    """Ids of the demos, in numeric order."""
+    return sorted(file["data"], key=lambda name: int(name.removeprefix("demo_")))
+
+
+def expected_columns(demo: h5py.Group) -> dict[str, np.ndarray]:
+    """The LeRobot columns that a demo must become, in float32 as LeRobot stores them."""
+    obs = demo["obs"]
+    return {
+        "observation.state": np.concatenate([obs[k][:] for k in STATE_KEYS], axis=1).astype(np.float32),
+        "observation.environment_state": np.concatenate([obs[k][:] for k in ENV_KEYS], axis=1).astype(np.float32),
+        "action": demo["actions"][:].astype(np.float32),
+        "next.reward": demo["rewards"][:].astype(np.float32),
+    }
+
+
+def open_lerobot(root: Path, **options: Any) -> Any:
+    """Open a data set offline with LeRobot."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset(f"actrm/{root.name}", root=root, **options)
+
+
+def compare_lerobot(source: Path, root: Path) -> str:
+    """Every frame, episode boundary, task and statistic of a converted directory, against the HDF5 file."""
+    data = open_lerobot(root)
+    with h5py.File(source) as file:
+        names = demos(file)
+        assert data.num_episodes == len(names), (data.num_episodes, len(names))
+        whole: dict[str, list[np.ndarray]] = {}
+        start = 0
+        for index, name in enumerate(names):
+            columns = expected_columns(file["data"][name])
+            length = len(columns["action"])
+            episode = data.meta.episodes[index]
+            bounds = (episode["dataset_from_index"], episode["dataset_to_index"])
+            assert bounds == (start, start + length), (name, bounds)
+            rows = data.hf_dataset[start : start + length]
+            assert [int(i) for i in rows["frame_index"]] == list(range(length)), name
+            assert {int(i) for i in rows["episode_index"]} == {index}, name
+            for key, values in columns.items():
+                got = torch.stack(list(rows[key])).numpy()
+                assert got.dtype == values.dtype and np.array_equal(got, values), (name, key)
+                whole.setdefault(key, []).append(values)
+            start += length
+        assert data.num_frames == start, (data.num_frames, start)
+    for key, parts in whole.items():
+        values = np.concatenate(parts).astype(np.float64).reshape(start, -1)
+        for statistic, want in {
+            "mean": values.mean(0),
+            "std": values.std(0),
+            "min": values.min(0),
+            "max": values.max(0),
+        }.items():
+            np.testing.assert_allclose(data.meta.stats[key][statistic], want, atol=1e-6, err_msg=f"{key} {statistic}")
+    item = data[data.num_frames - 1]
+    assert isinstance(item["task"], str) and item["task"], item["task"]
+    return f"{data.num_episodes} episodes, {data.num_frames} frames, task {item['task']!r}"
+
+
+def compare_windows(source: Path, root: Path) -> str:
+    """Action chunks and padding flags at the end of an episode, as LeRobot's delta_timestamps give them."""
+    horizon = 16
+    data = open_lerobot(root, delta_timestamps={"action": [k / 20 for k in range(horizon)]})
+    with h5py.File(source) as file:
+        actions = file["data"][demos(file)[0]]["actions"][:].astype(np.float32)
+    for start in (0, len(actions) - 3, len(actions) - 1):
+        item = data[start]
+        rows = np.minimum(np.arange(start, start + horizon), len(actions) - 1)
+        assert np.array_equal(item["action"].numpy(), actions[rows]), start
+        assert np.array_equal(item["action_is_pad"].numpy(), np.arange(start, start + horizon) >= len(actions)), start
+    return f"chunks of {horizon}, three places"
+
+
+def compare_robomimic(path: Path) -> str:
+    """robomimic's SequenceDataset opens the file and gives its numbers."""
+    from robomimic.utils.dataset import SequenceDataset
+
+    keys = (*STATE_KEYS, *ENV_KEYS)
+    data = SequenceDataset(
+        hdf5_path=str(path),
+        obs_keys=keys,
+        dataset_keys=("actions", "rewards", "dones"),
+        seq_length=10,
+        frame_stack=1,
+        pad_seq_length=True,
+        hdf5_cache_mode=None,
+        hdf5_use_swmr=False,
+        filter_by_attribute="train",
+        load_next_obs=True,
+    )
+    with h5py.File(path) as file:
+        train = [name.decode() for name in file["mask/train"][:]]
+        assert sum(len(file["data"][name]["actions"]) for name in train) == len(data), len(data)
+        name = data.demos[0]
+        first = data[0]
+        assert np.array_equal(first["actions"], file["data"][name]["actions"][:10]), name
+        for key in keys:
+            assert np.array_equal(first["obs"][key], file["data"][name]["obs"][key][:10]), (name, key)
+            assert np.array_equal(first["next_obs"][key], file["data"][name]["next_obs"][key][:10]), (name, key)
+    return f"{len(data)} sequences of 10 steps from {len(train)} demos"
+
+
+def compare_trees(one: Path, two: Path) -> str:
+    """Two HDF5 files: every group, data set, dtype, shape, attribute and value the same."""
+
+    def leaves(file: h5py.File) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+
+        def visit(name: str, node: Any) -> None:
+            shape = (node.dtype.str, node.shape, node[()].tobytes()) if isinstance(node, h5py.Dataset) else "group"
+            found[name] = (shape, {key: str(value) for key, value in node.attrs.items()})
+
+        visit("/", file)
+        file.visititems(visit)
+        return found
+
+    with h5py.File(one) as a, h5py.File(two) as b:
+        left, right = leaves(a), leaves(b)
+    assert left.keys() == right.keys(), left.keys() ^ right.keys()
+    for name, leaf in left.items():
+        assert leaf == right[name], name
+    return f"{len(left)} groups and data sets"
+
+
+def write_lerobot(root: Path) -> int:
+    """A small data set written by LeRobot itself; returns its number of frames."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (3,), "names": None},
+        "observation.environment_state": {"dtype": "float32", "shape": (2,), "names": None},
+        "action": {"dtype": "float32", "shape": (2,), "names": None},
+    }
+    data = LeRobotDataset.create("actrm/theirs", fps=20, features=features, root=root, use_videos=False)
+    rng = np.random.default_rng(0)
+    lengths = (7, 11, 5)
+    for length in lengths:
+        for _ in range(length):
+            frame = {key: rng.normal(size=f["shape"]).astype(np.float32) for key, f in features.items()}
+            data.add_frame({**frame, "task": "wander"})
+        data.save_episode()
+    data.finalize()
+    return sum(lengths)
+
+
+def open_theirs(folder: Path) -> str:
+    """A LeRobot-written data set opens in ours, with its frames, and is found whole."""
+    frames = write_lerobot(folder / "theirs")
+    report = json.loads(ours("actrm-data", "inspect", "--json", folder / "theirs"))
+    assert report["frames"] == frames, report
+    ours("actrm-data", "validate", folder / "theirs")
+    return f"{frames} frames"
+
+
+def main() -> None:
+    """Run every check; the first difference ends it."""
+    source = ROOT / "data" / "lift.hdf5"
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        root = folder / "lift"
+        ours("actrm-data", "convert", source, root)
+        exported = folder / "exported.hdf5"
+        ours("actrm-data", "export", root, exported)
+        checks: dict[str, Callable[[], str]] = {
+            "LeRobot opens the converted data set": lambda: compare_lerobot(source, root),
+            "LeRobot pads action chunks as we do": lambda: compare_windows(source, root),
+            "robomimic reads the collected file": lambda: compare_robomimic(source),
+            "export rebuilds the source": lambda: compare_trees(source, exported),
+            "robomimic reads the exported file": lambda: compare_robomimic(exported),
+            "a data set written by LeRobot opens in ours": lambda: open_theirs(folder),
+        }
+        for title, check in checks.items():
+            print(f"{title:<48} ", end="", flush=True)
+            print(f"ok   {check()}")
+    print(f"{len(checks)} passed, 0 failed")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

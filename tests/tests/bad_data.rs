@@ -1,0 +1,149 @@
+//! Bad demonstrations: each kind gives one clear line (what, where, expected, found), a non-zero exit code, and leaves
+//! nothing half-written.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use e2e::{data, lift, listing, refused, succeeds, text};
+use tempfile::TempDir;
+
+/// A folder with a damaged copy of the shipped demonstrations, `bad.hdf5`.
+fn damaged(damage: impl FnOnce(&Path)) -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let file = folder.path().join("bad.hdf5");
+    fs::copy(lift(), &file).expect("the shipped demonstrations are there");
+    damage(&file);
+    (folder, file)
+}
+
+/// As [`damaged`], with the copy opened as HDF5.
+fn edited(edit: impl FnOnce(&hdf5::Group)) -> (TempDir, PathBuf) {
+    damaged(|path| {
+        let file = hdf5::File::open_rw(path).expect("the copy opens");
+        edit(&file.group("data").expect("there is a data group"));
+        file.close().expect("the copy closes");
+    })
+}
+
+/// Replace a data set by other values.
+fn replace(group: &hdf5::Group, name: &str, values: &[f64], shape: [usize; 2]) {
+    group.unlink(name).expect("the old one goes");
+    let data = group.new_dataset::<f64>().shape(shape).create(name).expect("the new one comes");
+    data.write_raw(values).expect("it takes its values");
+}
+
+/// Converting the file is refused with `words`, and nothing is left beside it.
+fn convert_refused((folder, file): (TempDir, PathBuf), words: &[&str]) {
+    let before = fs::read(&file).ok();
+    let out = folder.path().join("out");
+    let line = refused(&mut data(["convert", text(&file), text(&out)]), words);
+    assert!(line.contains("bad.hdf5"), "the file is not named: {line}");
+    assert_eq!(listing(folder.path()), if before.is_some() { vec!["bad.hdf5"] } else { vec![] });
+    assert_eq!(fs::read(&file).ok(), before, "the source is untouched");
+}
+
+#[test]
+fn a_path_that_is_not_there() {
+    convert_refused(damaged(|path| fs::remove_file(path).expect("it was there")), &["no such file"]);
+}
+
+#[test]
+fn not_hdf5() {
+    convert_refused(damaged(|path| fs::write(path, "time,action\n0,1\n").expect("writable")), &["not an HDF5 file"]);
+}
+
+#[test]
+fn an_empty_file() {
+    convert_refused(damaged(|path| fs::write(path, "").expect("writable")), &["HDF5"]);
+}
+
+#[test]
+fn truncated() {
+    convert_refused(
+        damaged(|path| {
+            let bytes = fs::read(path).expect("readable");
+            fs::write(path, &bytes[..bytes.len() * 2 / 3]).expect("writable");
+        }),
+        &["truncated"],
+    );
+}
+
+#[test]
+fn no_data_group() {
+    convert_refused(
+        damaged(|path| {
+            fs::remove_file(path).expect("it was there");
+            let file = hdf5::File::create(path).expect("creatable");
+            file.create_group("demonstrations").expect("a group");
+        }),
+        &["data", "demonstrations"],
+    );
+}
+
+#[test]
+fn a_demo_with_a_missing_key() {
+    convert_refused(
+        edited(|demos| demos.group("demo_3").expect("there").unlink("obs/robot0_eef_pos").expect("there")),
+        &["demo_3", "robot0_eef_pos"],
+    );
+}
+
+#[test]
+fn a_demo_without_actions() {
+    convert_refused(
+        edited(|demos| demos.group("demo_3").expect("there").unlink("actions").expect("there")),
+        &["demo_3", "actions"],
+    );
+}
+
+#[test]
+fn a_wrong_length() {
+    convert_refused(
+        edited(|demos| replace(&demos.group("demo_7").expect("there"), "actions", &[0.0; 7 * 5], [5, 7])),
+        &["demo_7", "actions", "5"],
+    );
+}
+
+#[test]
+fn nan_in_actions() {
+    convert_refused(
+        edited(|demos| {
+            let demo = demos.group("demo_11").expect("there");
+            let mut values = demo.dataset("actions").expect("there").read_raw::<f64>().expect("readable");
+            let length = values.len() / 7;
+            values[7 * 4 + 2] = f64::NAN;
+            replace(&demo, "actions", &values, [length, 7]);
+        }),
+        &["demo_11", "actions", "NaN"],
+    );
+}
+
+#[test]
+fn an_output_folder_that_exists() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let out = folder.path().join("out");
+    fs::create_dir(&out).expect("creatable");
+    fs::write(out.join("precious.txt"), "mine").expect("writable");
+    refused(&mut data(["convert", text(&lift()), text(&out)]), &["out", "exists"]);
+    assert_eq!(listing(&out), ["precious.txt"]);
+    assert_eq!(listing(folder.path()), ["out"]);
+}
+
+#[test]
+fn an_unknown_task() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let out = folder.path().join("x.hdf5");
+    refused(&mut data(["collect", "--task", "Lfit", "--episodes", "1", "--seed", "1", "--out", text(&out)]), &["Lfit", "Lift"]);
+    assert!(listing(folder.path()).is_empty());
+}
+
+#[test]
+fn a_converted_data_set_is_valid_and_exports_its_source() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (set, again) = (folder.path().join("lift"), folder.path().join("again.hdf5"));
+    succeeds(&mut data(["convert", text(&lift()), text(&set)]));
+    succeeds(&mut data(["validate", text(&set)]));
+    succeeds(&mut data(["export", text(&set), text(&again)]));
+    succeeds(&mut data(["validate", text(&again)]));
+    assert_eq!(listing(folder.path()), ["again.hdf5", "lift"]);
+}

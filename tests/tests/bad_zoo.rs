@@ -1,0 +1,135 @@
+//! Bad experiments, entries and interpreters: each gives one clear line, a non-zero exit code, and leaves nothing behind.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use e2e::{data, lift, listing, refused, succeeds, text, zoo};
+use tempfile::TempDir;
+
+/// A zoo with one entry, trained for a few steps; made once for all tests of this file.
+fn trained() -> &'static Path {
+    static TRAINED: OnceLock<TempDir> = OnceLock::new();
+    TRAINED
+        .get_or_init(|| {
+            let folder = tempfile::tempdir().expect("a temporary folder");
+            let at = |name: &str| folder.path().join(name);
+            succeeds(&mut data(["convert", text(&lift()), text(&at("lift"))]));
+            succeeds(&mut zoo([
+                "train",
+                "act_lift",
+                "--data",
+                text(&at("lift")),
+                "--zoo",
+                text(&at("zoo")),
+                "--runs",
+                text(&at("runs")),
+                "train.steps=2",
+            ]));
+            folder
+        })
+        .path()
+}
+
+/// A copy of the trained zoo that a test may damage.
+fn copied() -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let to = folder.path().join("zoo");
+    copy(&trained().join("zoo"), &to);
+    (folder, to)
+}
+
+/// Copy a folder with everything in it.
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir(to).expect("creatable");
+    for entry in fs::read_dir(from).expect("readable") {
+        let entry = entry.expect("readable");
+        let target = to.join(entry.file_name());
+        if entry.file_type().expect("known").is_dir() {
+            copy(&entry.path(), &target);
+        } else {
+            fs::copy(entry.path(), target).expect("copied");
+        }
+    }
+}
+
+/// Train in a fresh folder with these arguments: refused, and neither a run nor an entry comes of it.
+fn train_refused(arguments: &[&str], words: &[&str]) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (runs, entries) = (folder.path().join("runs"), folder.path().join("zoo"));
+    let mut command = zoo(["train"]);
+    command.args(arguments).args(["--zoo", text(&entries), "--runs", text(&runs)]);
+    refused(&mut command, words);
+    assert!(listing(&entries).is_empty(), "{:?}", listing(&entries));
+}
+
+#[test]
+fn an_unknown_experiment() {
+    train_refused(&["act_lfit", "--data", text(&trained().join("lift"))], &["act_lfit", "act_lift"]);
+}
+
+#[test]
+fn an_unknown_key() {
+    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "train.stepz=5"], &["train.stepz", "train.steps"]);
+    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "polcy.dim_model=5"], &["polcy", "policy"]);
+}
+
+#[test]
+fn an_impossible_value() {
+    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "train.steps=many"], &["train.steps"]);
+    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "policy.n_heads=7"], &["n_heads", "7"]);
+}
+
+#[test]
+fn a_data_set_that_is_not_there() {
+    train_refused(&["act_lift", "--data", "/nowhere/at/all"], &["/nowhere/at/all"]);
+}
+
+#[test]
+fn an_unknown_entry() {
+    let (_folder, entries) = copied();
+    refused(&mut zoo(["eval", "lift-atc@1", "--episodes", "1", "--zoo", text(&entries)]), &["lift-atc", "lift-act"]);
+    refused(&mut zoo(["eval", "lift-act@7", "--episodes", "1", "--zoo", text(&entries)]), &["lift-act", "7"]);
+}
+
+#[test]
+fn an_empty_zoo() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    refused(&mut zoo(["eval", "--all", "--zoo", text(folder.path())]), &["no entr"]);
+    assert!(listing(folder.path()).is_empty());
+}
+
+#[test]
+fn a_python_without_robosuite() {
+    let (folder, entries) = copied();
+    let bare = folder.path().join("bare");
+    let made = std::process::Command::new(e2e::root().join(".venv/bin/python"))
+        .args(["-m", "venv", "--without-pip"])
+        .arg(&bare)
+        .output()
+        .expect("`make test` has made .venv");
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let python = bare.join("bin/python");
+    let mut command = zoo(["eval", "lift-act@1", "--episodes", "1", "--zoo", text(&entries), "--python", text(&python)]);
+    refused(&mut command, &[text(&python), "robosuite"]);
+}
+
+#[test]
+fn a_python_that_is_not_there() {
+    let (_folder, entries) = copied();
+    let mut command = zoo(["eval", "lift-act@1", "--episodes", "1", "--zoo", text(&entries), "--python", "/no/python"]);
+    refused(&mut command, &["/no/python"]);
+}
+
+#[test]
+fn an_entry_with_one_flipped_byte() {
+    for name in ["model.safetensors", "normaliser.safetensors", "config.toml", "entry.json"] {
+        let (_folder, entries) = copied();
+        let file = entries.join("lift-act/1").join(name);
+        let mut bytes = fs::read(&file).expect("an entry has this file");
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        fs::write(&file, &bytes).expect("writable");
+        refused(&mut zoo(["eval", "lift-act@1", "--episodes", "1", "--zoo", text(&entries)]), &[name]);
+    }
+}
