@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::error::InputError;
 use crate::tree::Dtype;
 
 /// Whose layout a file follows.
@@ -69,7 +70,7 @@ pub struct Plan {
     pub texts: BTreeMap<String, String>,
     /// Facts worth knowing that are no fault: camera orientation, a dropped tail.
     pub notes: Vec<String>,
-    /// Everything that is wrong. A demo with a problem is refused by `read_demo`.
+    /// Everything that is wrong. What is fatal is refused by `read_demo`.
     pub problems: Vec<Problem>,
 }
 
@@ -148,8 +149,12 @@ pub struct Place {
 pub struct Problem {
     /// The demo it concerns, if one.
     pub demo: Option<String>,
-    /// Whether reading the demo (or the source, if no demo is named) is refused because of it.
+    /// The dataset of the demo it concerns, if one.
+    pub key: Option<String>,
+    /// Whether reading the demo is refused because of it (where a dataset is named: reading that dataset).
     pub fatal: bool,
     /// What, where, expected, found.
     pub message: String,
+    /// The same, for programs: what reading would answer.
+    pub error: InputError,
 }

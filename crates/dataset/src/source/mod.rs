@@ -1,45 +1,86 @@
 //! Reading files of demonstrations and writing robomimic ones.
 
+mod codec;
+mod dialect;
+mod hash;
+pub mod isolation;
+mod local;
+mod value;
+mod walk;
+mod writer;
+
+use std::fs::File;
+use std::os::unix::fs::FileExt;
 use std::path::Path;
 
-use crate::error::Result;
-use crate::plan::Plan;
-use crate::tree::{Array, Demo};
+use crate::error::{InputError, Result};
+use crate::plan::{DemoPlan, KeyPlan, Plan};
+use crate::tree::{Array, Demo, Dtype};
+use local::{Backend, Local};
+
+pub use hash::{ArrayHasher, ContentHasher, DemoHasher};
+pub use writer::{RobomimicWriter, WriteOptions};
+
+/// The most that [`Source::read_demo`] reads at once.
+const MAX_DEMO: u64 = 512 << 20;
+/// How much is asked of the HDF5 library in one go.
+const WINDOW: u64 = 16 << 20;
 
 /// An opened file or folder of demonstrations. Shared freely between threads: what lies in the file as it is in
-/// memory is read in parallel, the rest one request at a time.
-pub struct Source {}
+/// memory is read in parallel and without libhdf5, the rest one request at a time.
+pub struct Source {
+    plan: Plan,
+    files: Vec<File>,
+    backend: Box<dyn Backend>,
+}
+
+impl std::fmt::Debug for Source {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Source").field("path", &self.plan.path).finish_non_exhaustive()
+    }
+}
 
 impl Source {
     /// Opens in this process: for files that are trusted.
-    pub fn open(_path: &Path) -> Result<Self> {
-        unimplemented!()
+    pub fn open(path: &Path) -> Result<Self> {
+        exists(path)?;
+        let (local, plan) = Local::open(path, &mut || {})?;
+        Self::with(plan, Box::new(local))
     }
 
     /// Opens with all parsing done in a child process with memory and time limits. The program has to have called
     /// [`isolation::serve_if_child`] first.
-    pub fn open_isolated(_path: &Path) -> Result<Self> {
-        unimplemented!()
+    pub fn open_isolated(path: &Path) -> Result<Self> {
+        exists(path)?;
+        let (remote, plan) = isolation::Remote::open(path)?;
+        Self::with(plan, Box::new(remote))
     }
 
     /// [`Self::open_isolated`] where the program has armed it, [`Self::open`] otherwise (tests, other programs).
     pub fn open_guarded(path: &Path) -> Result<Self> {
-        if isolation::armed() {
-            Self::open_isolated(path)
-        } else {
-            Self::open(path)
+        if isolation::armed() { Self::open_isolated(path) } else { Self::open(path) }
+    }
+
+    fn with(plan: Plan, backend: Box<dyn Backend>) -> Result<Self> {
+        let mut files = Vec::new();
+        // a folder of thousands of episodes would use up the file descriptors: those are opened as they are read
+        if plan.files.len() <= 64 {
+            for (path, _) in &plan.files {
+                files.push(open_file(path)?);
+            }
         }
+        Ok(Self { plan, files, backend })
     }
 
     /// What there is.
     pub fn plan(&self) -> &Plan {
-        unimplemented!()
+        &self.plan
     }
 
     /// Everything in the file that belongs to no demo: attributes, masks, extra datasets and groups, by path
     /// (`mask/train`; the attributes of `data` are `inner_attrs["data"]`).
     pub fn root(&self) -> Result<Demo> {
-        unimplemented!()
+        Ok(self.backend.root()?)
     }
 
     /// Reads and checks a demo. Refuses one beyond 512 MB: read that with [`Self::read_demo_where`] and
@@ -49,74 +90,218 @@ impl Source {
     }
 
     /// As [`Self::read_demo`], with only the datasets that are wanted; attributes and groups are always there.
-    pub fn read_demo_where(&self, _index: usize, _wanted: &dyn Fn(&str) -> bool) -> Result<Demo> {
-        unimplemented!()
+    /// What is wrong with datasets that are not wanted is no fault.
+    pub fn read_demo_where(&self, index: usize, wanted: &dyn Fn(&str) -> bool) -> Result<Demo> {
+        let plan = self.check(index, wanted)?;
+        let chosen: Vec<(&String, &KeyPlan)> =
+            plan.keys.iter().filter(|(key, _)| wanted(key)).collect();
+        let bytes = chosen
+            .iter()
+            .fold(0_u64, |sum, (_, k)| sum.saturating_add(k.bytes().unwrap_or(u64::from(u8::MAX))));
+        if bytes > MAX_DEMO {
+            return Err(InputError::TooLarge {
+                path: self.plan.path.clone(),
+                object: plan.id.clone(),
+                bytes,
+                limit: MAX_DEMO,
+            }
+            .into());
+        }
+        let (direct, rest): (Vec<_>, Vec<_>) =
+            chosen.into_iter().partition(|(_, k)| k.place.offset.is_some());
+        let small = |k: &KeyPlan| k.bytes().is_none_or(|b| b <= WINDOW / 16);
+        let (small, large): (Vec<_>, Vec<_>) = rest.into_iter().partition(|(_, k)| small(k));
+        let mut demo: Option<Demo> = None;
+        let mut batch: Vec<String> = Vec::new();
+        let mut batch_bytes = 0;
+        let mut ask = |batch: &mut Vec<String>, last: bool| -> Result<()> {
+            if batch.is_empty() && (demo.is_some() || !last) {
+                return Ok(());
+            }
+            let part = self.backend.demo(index, batch)?;
+            batch.clear();
+            match &mut demo {
+                Some(demo) => demo.datasets.extend(part.datasets),
+                None => demo = Some(part),
+            }
+            Ok(())
+        };
+        for (key, k) in small {
+            batch.push(key.clone());
+            batch_bytes += k.bytes().unwrap_or(1 << 16);
+            if batch_bytes > WINDOW {
+                ask(&mut batch, false)?;
+                batch_bytes = 0;
+            }
+        }
+        ask(&mut batch, true)?;
+        let mut demo = demo.unwrap_or_default();
+        for (key, k) in direct {
+            let rows = k.shape.first().copied();
+            let array = self.read_direct(k, 0, rows)?;
+            demo.datasets.insert(key.clone(), array);
+        }
+        for (key, k) in large {
+            let rows = k.shape.first().copied().unwrap_or(0);
+            let array = self.read_rows(index, key, 0, rows)?;
+            demo.datasets.insert(key.clone(), array);
+        }
+        for (key, array) in &demo.datasets {
+            self.check_values(&plan.id, key, array)?;
+        }
+        Ok(demo)
     }
 
     /// Rows `first .. first + count` of one dataset of a demo.
-    pub fn read_rows(
-        &self,
-        _index: usize,
-        _key: &str,
-        _first: usize,
-        _count: usize,
-    ) -> Result<Array> {
-        unimplemented!()
+    pub fn read_rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array> {
+        let plan = self.check(index, &|k| k == key)?;
+        let none = |wanted: String, found: String| InputError::NoSuch {
+            path: self.plan.path.clone(),
+            wanted,
+            found,
+        };
+        let Some(k) = plan.keys.get(key) else {
+            let found = dialect::list(plan.keys.keys().map(String::as_str));
+            return Err(none(format!("{key} in {}", plan.id), found).into());
+        };
+        let rows = k.shape.first().copied();
+        if rows.is_none_or(|rows| first.checked_add(count).is_none_or(|end| end > rows)) {
+            let wanted = format!("rows {first} and the {count} after of {key} in {}", plan.id);
+            return Err(none(wanted, format!("shape {:?}", k.shape)).into());
+        }
+        if k.place.offset.is_some() {
+            return self.read_direct(k, first, Some(count));
+        }
+        // in windows of whole stored blocks, so that nothing is unpacked twice and no answer is long
+        let row = k.bytes().unwrap_or(WINDOW) / (rows.unwrap_or(1).max(1) as u64);
+        let blocks = (WINDOW / row.max(1)) as usize / k.block_rows;
+        let window = blocks.max(1) * k.block_rows;
+        let mut shape = k.shape.clone();
+        shape[0] = count;
+        let mut bytes = Vec::with_capacity(row as usize * count);
+        let mut at = first;
+        while at < first + count {
+            let end = ((at / window + 1) * window).min(first + count);
+            let part = self.backend.rows(index, key, at, end - at)?;
+            bytes.extend_from_slice(&part.bytes);
+            at = end;
+        }
+        Ok(Array { dtype: k.dtype.clone(), shape, bytes })
+    }
+
+    /// The hash of everything in the source, independent of how it is laid out in the file.
+    pub fn content_hash(&self, progress: &mut dyn FnMut(u64, u64)) -> Result<String> {
+        let mut hasher = ContentHasher::new();
+        hasher.root(&self.root()?);
+        let total = self.plan.demos.len() as u64;
+        for (index, plan) in self.plan.demos.iter().enumerate() {
+            let small = |k: &KeyPlan| k.bytes().is_none_or(|b| b <= WINDOW);
+            let demo = self.read_demo_where(index, &|key| plan.keys.get(key).is_none_or(small))?;
+            let mut one = DemoHasher::new(&demo);
+            for (key, k) in plan.keys.iter().filter(|(_, k)| !small(k)) {
+                let rows = k.shape.first().copied().unwrap_or(0);
+                let row = k.bytes().unwrap_or(0) / rows.max(1) as u64;
+                let window = ((WINDOW / row.max(1)) as usize / k.block_rows).max(1) * k.block_rows;
+                let mut array = ArrayHasher::new(&k.dtype, &k.shape);
+                for first in (0..rows).step_by(window) {
+                    array.update(&self.read_rows(index, key, first, window.min(rows - first))?.bytes);
+                }
+                one.dataset(key, array.finish());
+            }
+            hasher.demo(&plan.id, one.finish());
+            progress(index as u64 + 1, total);
+        }
+        Ok(hasher.finish())
+    }
+
+    /// The demo's plan, if nothing fatal is known about what is wanted of it.
+    fn check(&self, index: usize, wanted: &dyn Fn(&str) -> bool) -> Result<&DemoPlan, InputError> {
+        let plan = self.plan.demos.get(index).ok_or_else(|| InputError::NoSuch {
+            path: self.plan.path.clone(),
+            wanted: format!("demo at position {index}"),
+            found: format!("{} demos", self.plan.demos.len()),
+        })?;
+        let fatal = self.plan.problems.iter().find(|p| {
+            p.fatal
+                && p.demo.as_ref().is_none_or(|id| *id == plan.id)
+                && p.key.as_ref().is_none_or(|key| wanted(key))
+        });
+        match fatal {
+            Some(problem) => Err(problem.error.clone()),
+            None => Ok(plan),
+        }
+    }
+
+    /// Elements that lie in the file as they are in memory: straight from there.
+    fn read_direct(&self, k: &KeyPlan, first: usize, count: Option<usize>) -> Result<Array> {
+        let mut shape = k.shape.clone();
+        if let (Some(extent), Some(count)) = (shape.first_mut(), count) {
+            *extent = count;
+        }
+        let size = k.dtype.size().expect("elements of a known place have a known size");
+        let row = k.shape.iter().skip(1).product::<usize>() * size;
+        let offset = k.place.offset.expect("the place is known") + (first * row) as u64;
+        let mut bytes = vec![0; shape.iter().product::<usize>() * size];
+        let (path, stated) = &self.plan.files[k.place.file];
+        let read = match self.files.get(k.place.file) {
+            Some(file) => file.read_exact_at(&mut bytes, offset),
+            None => open_file(path)?.read_exact_at(&mut bytes, offset),
+        };
+        read.map_err(|e| match e.kind() {
+            std::io::ErrorKind::UnexpectedEof => InputError::Truncated {
+                path: path.clone(),
+                expected: *stated,
+                found: std::fs::metadata(path).map_or(0, |m| m.len()),
+            },
+            _ => InputError::Unreadable { path: path.clone(), reason: e.to_string() },
+        })?;
+        Ok(Array { dtype: k.dtype.clone(), shape, bytes })
+    }
+
+    /// Actions have to be finite.
+    fn check_values(&self, demo: &str, key: &str, array: &Array) -> Result<(), InputError> {
+        if !matches!(key, "actions" | "actions_abs") {
+            return Ok(());
+        }
+        let bad = match array.dtype {
+            Dtype::F64 => {
+                let (values, _) = array.bytes.as_chunks();
+                values.iter().map(|b| f64::from_le_bytes(*b)).position(|v| !v.is_finite())
+            }
+            Dtype::F32 => {
+                let (values, _) = array.bytes.as_chunks();
+                values.iter().map(|b| f32::from_le_bytes(*b)).position(|v| !v.is_finite())
+            }
+            _ => None,
+        };
+        let Some(at) = bad else { return Ok(()) };
+        let width = array.shape.iter().skip(1).product::<usize>().max(1);
+        let value = array.to_f64().and_then(|v| v.get(at).copied()).unwrap_or(f64::NAN);
+        Err(InputError::NotFinite {
+            path: self.plan.path.clone(),
+            demo: demo.to_owned(),
+            key: key.to_owned(),
+            step: at / width,
+            dimension: at % width,
+            found: value.to_string(),
+        })
     }
 }
 
-/// Keeping hostile files away from the program.
-pub mod isolation {
-    /// First statement of `main`: in a reading process this serves its parent and never returns; in any other it
-    /// arms [`super::Source::open_isolated`] and returns at once.
-    pub fn serve_if_child() {
-        unimplemented!()
-    }
-
-    /// Whether [`serve_if_child`] has been called.
-    pub fn armed() -> bool {
-        false
+fn exists(path: &Path) -> Result<(), InputError> {
+    match std::fs::metadata(path) {
+        Ok(_) => Ok(()),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+            Err(InputError::NotFound { path: path.to_owned() })
+        }
+        Err(e) => Err(InputError::Unreadable { path: path.to_owned(), reason: e.to_string() }),
     }
 }
 
-/// How to store.
-#[derive(Debug, Clone, Default)]
-pub struct WriteOptions {
-    /// Compress datasets with shuffle and gzip of this level (1-9).
-    pub gzip: Option<u8>,
+fn open_file(path: &Path) -> Result<File, InputError> {
+    File::open(path)
+        .map_err(|e| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() })
 }
 
-/// Writes a robomimic file: under a temporary name, renamed by [`Self::finish`]; the same calls give the same bytes.
-pub struct RobomimicWriter {}
-
-impl RobomimicWriter {
-    /// Starts a file; refuses a path that exists.
-    pub fn create(_path: &Path, _options: &WriteOptions) -> Result<Self> {
-        unimplemented!()
-    }
-
-    /// Sets an attribute of the group `data` (`env_args`, `total`).
-    pub fn set_data_attr(&mut self, _name: &str, _value: &Array) -> Result<()> {
-        unimplemented!()
-    }
-
-    /// Writes what [`Source::root`] returned: attributes, masks and extras outside the demos.
-    pub fn set_root(&mut self, _root: &Demo) -> Result<()> {
-        unimplemented!()
-    }
-
-    /// Writes a demo under its id.
-    pub fn add_demo(&mut self, _demo: &Demo) -> Result<()> {
-        unimplemented!()
-    }
-
-    /// Writes a filter key.
-    pub fn set_mask(&mut self, _name: &str, _demos: &[String]) -> Result<()> {
-        unimplemented!()
-    }
-
-    /// Flushes, syncs and gives the file its name.
-    pub fn finish(self) -> Result<()> {
-        unimplemented!()
-    }
-}
+#[cfg(test)]
+mod tests;

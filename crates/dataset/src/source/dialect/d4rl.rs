@@ -1,0 +1,131 @@
+//! D4RL: no `/data`; one run of steps in root arrays, cut into episodes after terminals and timeouts. Steps
+//! after the last cut are an unfinished episode and left out, as robomimic's converter does.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::{DemoDraft, Draft, Layout, Survey, key_plan};
+use crate::error::InputError;
+use crate::plan::{DemoPlan, Dialect, KeyPlan, Problem};
+use crate::source::walk::Walked;
+use crate::tree::Dtype;
+
+pub(super) struct D4rl;
+
+impl Layout for D4rl {
+    fn expected(&self) -> &'static str {
+        "root arrays observations, actions, rewards, terminals (D4RL)"
+    }
+
+    fn recognises(&self, survey: &Survey) -> bool {
+        survey.single().is_some_and(|file| {
+            ["observations", "actions", "rewards", "terminals"]
+                .iter()
+                .all(|key| file.datasets.contains_key(*key))
+        })
+    }
+
+    fn draft(&self, survey: &Survey) -> Result<Draft, InputError> {
+        let file = survey.single().expect("recognised as one file");
+        let steps = file.datasets["actions"].shape.first().copied().unwrap_or(0);
+        let mut ends = flags(file, "terminals", steps)?;
+        if file.datasets.contains_key("timeouts") {
+            let timeouts = flags(file, "timeouts", steps)?;
+            ends.iter_mut().zip(timeouts).for_each(|(end, timeout)| *end |= timeout);
+        }
+        let mut demos = Vec::new();
+        let mut first = 0;
+        for (step, _) in ends.iter().enumerate().filter(|(_, end)| **end) {
+            demos.push(demo(file, demos.len(), first, step + 1 - first, steps));
+            first = step + 1;
+        }
+        let mut notes = Vec::new();
+        if first < steps {
+            notes.push(format!(
+                "the last {} steps belong to an episode that does not end and are left out",
+                steps - first
+            ));
+        }
+        let attrs = file.attrs("")?;
+        let texts = attrs.iter().filter_map(|(k, v)| Some((k.clone(), v.to_text()?))).collect();
+        let mut problems = Vec::new();
+        for (path, node) in &file.datasets {
+            if let Some(error) = node.fault.clone() {
+                problems.push(Problem {
+                    demo: None,
+                    key: Some(path.clone()),
+                    fatal: true,
+                    message: error.to_string(),
+                    error,
+                });
+            }
+        }
+        if demos.is_empty() {
+            return Err(InputError::NoDemos {
+                path: file.path.clone(),
+                found: format!("{steps} steps and neither terminal nor timeout"),
+            });
+        }
+        Ok(Draft {
+            dialect: Dialect::D4rl,
+            demos,
+            env_args: None,
+            env_name: None,
+            env_version: None,
+            masks: BTreeMap::new(),
+            texts,
+            notes,
+            problems,
+        })
+    }
+}
+
+/// Which steps are marked, of a dataset of one truth value or number per step.
+fn flags(file: &Walked, key: &str, steps: usize) -> Result<Vec<bool>, InputError> {
+    let array = file.read(key, None)?;
+    match array.to_f64().filter(|v| v.len() == steps) {
+        Some(values) => Ok(values.iter().map(|&v| v != 0.0).collect()),
+        None => Err(InputError::WrongLength {
+            path: file.path.clone(),
+            demo: "the run".to_owned(),
+            key: key.to_owned(),
+            expected: format!("{steps} (the actions)"),
+            found: format!("{} of shape {:?}", array.dtype, array.shape),
+        }),
+    }
+}
+
+/// robomimic's names for D4RL's arrays.
+fn name_of(path: &str) -> String {
+    match path {
+        "observations" => "obs/flat".to_owned(),
+        "next_observations" => "next_obs/flat".to_owned(),
+        "terminals" => "dones".to_owned(),
+        other => other.to_owned(),
+    }
+}
+
+fn demo(file: &Walked, number: usize, first: usize, length: usize, steps: usize) -> DemoDraft {
+    let mut keys: BTreeMap<String, KeyPlan> = BTreeMap::new();
+    for (path, node) in &file.datasets {
+        // arrays of another length (policy weights in metadata/) belong to no episode
+        if node.shape.first() != Some(&steps) || node.dtype == Dtype::VarStr {
+            continue;
+        }
+        if let Some(mut plan) = key_plan(0, file, path) {
+            let row = plan.dtype.size().unwrap_or(0) * plan.shape[1..].iter().product::<usize>();
+            plan.shape[0] = length;
+            plan.place.first_row = first;
+            plan.place.offset = plan.place.offset.map(|at| at + (first * row) as u64);
+            keys.insert(name_of(path), plan);
+        }
+    }
+    let plan = DemoPlan {
+        id: format!("demo_{number}"),
+        number: number as u64,
+        length,
+        keys,
+        attr_names: Vec::new(),
+        task: None,
+    };
+    DemoDraft { plan, home: None, groups: BTreeSet::new(), inner: Vec::new() }
+}

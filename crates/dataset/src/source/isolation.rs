@@ -1,0 +1,374 @@
+//! Parsing in a process of its own. libhdf5 is C and crashes on hostile files; here it can crash, hang or eat
+//! memory alone. The program starts itself again, the child opens the file and answers requests over its standard
+//! streams, under limits that it sets on itself first.
+
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec};
+use rustix::process::{Resource, Rlimit};
+use serde::{Deserialize, Serialize};
+
+use super::codec::{Taker, put_array, put_demo};
+use super::local::{Backend, Local};
+use crate::error::InputError;
+use crate::plan::Plan;
+use crate::tree::{Array, Demo};
+
+/// Set in the reading process: the file that it is to open.
+const PATH_VARIABLE: &str = "ACTRM_HDF5_READER";
+/// Address space of the reading process, program text included.
+const MEMORY: u64 = 900 << 20;
+/// How long the reading process may be silent.
+const SILENCE: Duration = Duration::from_secs(8);
+/// Processor time of the reading process: this, and a second for each so many bytes of the file.
+const CPU_SECONDS: u64 = 6;
+const BYTES_PER_CPU_SECOND: u64 = 2 << 20;
+/// The longest answer.
+const MAX_ANSWER: u64 = 384 << 20;
+
+const PLAN: u8 = b'P';
+const DEMO: u8 = b'D';
+const ARRAY: u8 = b'A';
+const ERROR: u8 = b'E';
+const BEAT: u8 = b'.';
+
+static ARMED: AtomicBool = AtomicBool::new(false);
+
+/// First statement of `main`: in a reading process this serves its parent and never returns; in any other it
+/// arms [`super::Source::open_isolated`] and returns at once.
+pub fn serve_if_child() {
+    match std::env::var_os(PATH_VARIABLE) {
+        Some(path) => {
+            let code = if serve(&PathBuf::from(path)).is_ok() { 0 } else { 1 };
+            std::process::exit(code);
+        }
+        None => ARMED.store(true, Ordering::Relaxed),
+    }
+}
+
+/// Whether [`serve_if_child`] has been called.
+pub fn armed() -> bool {
+    ARMED.load(Ordering::Relaxed)
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+enum Request {
+    Root,
+    Demo { index: usize, keys: Vec<String> },
+    Rows { index: usize, key: String, first: usize, count: usize },
+}
+
+impl Request {
+    /// What it asks for, for messages.
+    fn words(&self) -> String {
+        match self {
+            Self::Root => "read what belongs to no demo".to_owned(),
+            Self::Demo { index, keys } => match keys.as_slice() {
+                [] => format!("read the attributes of demo {index}"),
+                [one] => format!("read {one} of demo {index}"),
+                [first, .., last] => format!("read {first} to {last} of demo {index}"),
+            },
+            Self::Rows { index, key, .. } => format!("read {key} of demo {index}"),
+        }
+    }
+}
+
+// ---- the reading process ----
+
+fn limit_self(bytes: u64) -> std::io::Result<()> {
+    let set = |resource, value| {
+        rustix::process::setrlimit(resource, Rlimit { current: Some(value), maximum: Some(value) })
+    };
+    set(Resource::Core, 0)?;
+    set(Resource::As, MEMORY)?;
+    set(Resource::Cpu, CPU_SECONDS + bytes / BYTES_PER_CPU_SECOND)?;
+    Ok(())
+}
+
+fn source_bytes(path: &Path) -> u64 {
+    let size = |p: &Path| std::fs::metadata(p).map_or(0, |m| m.len());
+    match std::fs::read_dir(path) {
+        Ok(entries) => entries.flatten().map(|e| size(&e.path())).sum(),
+        Err(_) => size(path),
+    }
+}
+
+fn serve(path: &Path) -> std::io::Result<()> {
+    limit_self(source_bytes(path))?;
+    let mut out = std::io::stdout().lock();
+    let _ = rustix::pipe::fcntl_setpipe_size(&out, 1 << 20);
+    let mut beat_out = std::io::stdout();
+    let opened = {
+        drop(out);
+        let mut beat = || {
+            // a parent that has gone is noticed when the plan is sent
+            let _ = send(&mut beat_out, BEAT, &[]);
+        };
+        Local::open(path, &mut beat)
+    };
+    out = std::io::stdout().lock();
+    let local = match opened {
+        Ok((local, plan)) => {
+            send(&mut out, PLAN, &serde_json::to_vec(&plan)?)?;
+            local
+        }
+        Err(error) => return send(&mut out, ERROR, &serde_json::to_vec(&error)?),
+    };
+    let mut requests = std::io::stdin().lock();
+    let mut body = Vec::new();
+    loop {
+        let mut length = [0; 8];
+        if requests.read_exact(&mut length).is_err() {
+            return Ok(()); // the parent is done
+        }
+        let mut text = vec![0; usize::try_from(u64::from_le_bytes(length)).unwrap_or(0)];
+        requests.read_exact(&mut text)?;
+        body.clear();
+        let (kind, failed) = match serde_json::from_slice(&text)? {
+            Request::Root => (DEMO, local.root().map(|root| put_demo(&mut body, &root)).err()),
+            Request::Demo { index, keys } => {
+                (DEMO, local.demo(index, &keys).map(|demo| put_demo(&mut body, &demo)).err())
+            }
+            Request::Rows { index, key, first, count } => {
+                let rows = local.rows(index, &key, first, count);
+                (ARRAY, rows.map(|array| put_array(&mut body, &array)).err())
+            }
+        };
+        let failed = failed.or_else(|| {
+            (body.len() as u64 > MAX_ANSWER).then(|| InputError::TooLarge {
+                path: path.to_owned(),
+                object: "one answer".to_owned(),
+                bytes: body.len() as u64,
+                limit: MAX_ANSWER,
+            })
+        });
+        match failed {
+            None => send(&mut out, kind, &body)?,
+            Some(error) => send(&mut out, ERROR, &serde_json::to_vec(&error)?)?,
+        }
+    }
+}
+
+fn send(out: &mut impl Write, kind: u8, body: &[u8]) -> std::io::Result<()> {
+    let mut head = [kind; 9];
+    head[1..].copy_from_slice(&(body.len() as u64).to_le_bytes());
+    out.write_all(&head)?;
+    out.write_all(body)?;
+    out.flush()
+}
+
+// ---- its parent ----
+
+/// The reading process as its parent sees it.
+pub(super) struct Remote {
+    path: PathBuf,
+    state: Mutex<State>,
+}
+
+enum State {
+    Alive { child: Child, requests: ChildStdin, answers: ChildStdout },
+    /// How it ended; every later request gets the same answer.
+    Ended(InputError),
+}
+
+enum Failure {
+    /// The answer was an error, the process lives on.
+    Answered(InputError),
+    /// No answer in time.
+    Silent,
+    /// The stream ended or held nonsense.
+    Broken,
+}
+
+impl Remote {
+    /// Starts a reading process on a file or folder and takes its plan.
+    pub fn open(path: &Path) -> Result<(Self, Plan), InputError> {
+        let cannot = |reason: String| InputError::ReaderStart { path: path.to_owned(), reason };
+        if !armed() {
+            return Err(cannot("the program has not called isolation::serve_if_child".to_owned()));
+        }
+        // the link in /proc outlives a program that is replaced on disk while it runs
+        let mut child = Command::new("/proc/self/exe")
+            .env(PATH_VARIABLE, path)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .map_err(|e| cannot(e.to_string()))?;
+        let requests = child.stdin.take().expect("stdin is a pipe");
+        let answers = child.stdout.take().expect("stdout is a pipe");
+        let remote = Self {
+            path: path.to_owned(),
+            state: Mutex::new(State::Alive { child, requests, answers }),
+        };
+        let (kind, body) = remote.exchange(None)?;
+        match serde_json::from_slice::<Plan>(&body) {
+            Ok(plan) if kind == PLAN => Ok((remote, plan)),
+            _ => Err(cannot("its first answer is no plan".to_owned())),
+        }
+    }
+
+    /// Sends a request and takes the answer; `None` takes the answer that comes unasked.
+    fn exchange(&self, request: Option<&Request>) -> Result<(u8, Vec<u8>), InputError> {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let failure = match &mut *state {
+            State::Ended(error) => return Err(error.clone()),
+            State::Alive { requests, answers, .. } => {
+                let sent = request.is_none_or(|request| {
+                    let text = serde_json::to_vec(request).expect("requests are plain data");
+                    requests.write_all(&(text.len() as u64).to_le_bytes()).is_ok()
+                        && requests.write_all(&text).is_ok()
+                });
+                match if sent { receive(answers) } else { Err(Failure::Broken) } {
+                    Ok(answer) => return Ok(answer),
+                    Err(failure) => failure,
+                }
+            }
+        };
+        let during = request.map_or_else(|| "open the file".to_owned(), Request::words);
+        let path = self.path.clone();
+        if let Failure::Answered(error) = failure {
+            return Err(error);
+        }
+        let State::Alive { mut child, .. } =
+            std::mem::replace(&mut *state, State::Ended(InputError::NotFound { path: path.clone() }))
+        else {
+            unreachable!("only a living process fails");
+        };
+        let error = if let Failure::Silent = failure {
+            let _ = child.kill();
+            let _ = child.wait();
+            InputError::ReaderSilent { path, during, seconds: SILENCE.as_secs() }
+        } else {
+            let how = match wait_briefly(&mut child) {
+                Some(status) => ending(status),
+                None => "gave an answer that makes no sense".to_owned(),
+            };
+            InputError::ReaderDied { path, during, how }
+        };
+        *state = State::Ended(error.clone());
+        Err(error)
+    }
+}
+
+/// Waits for a process whose stream has ended; kills it if it lives on.
+fn wait_briefly(child: &mut Child) -> Option<std::process::ExitStatus> {
+    for _ in 0..100 {
+        if let Ok(Some(status)) = child.try_wait() {
+            return Some(status);
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let _ = child.kill();
+    let _ = child.wait();
+    None
+}
+
+fn ending(status: std::process::ExitStatus) -> String {
+    use std::os::unix::process::ExitStatusExt;
+    match status.signal() {
+        Some(24 | 9) => "ran out of processor time".to_owned(),
+        Some(6) => "ran out of memory or gave up (SIGABRT)".to_owned(),
+        Some(11) => "crashed (SIGSEGV)".to_owned(),
+        Some(n) => format!("crashed (signal {n})"),
+        None => format!("ended with {}", status.code().unwrap_or(-1)),
+    }
+}
+
+/// Waits for bytes, then reads; silence is an error.
+struct Timed<'a>(&'a mut ChildStdout);
+
+impl Read for Timed<'_> {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let limit = Timespec { tv_sec: SILENCE.as_secs() as i64, tv_nsec: 0 };
+        loop {
+            let mut fds = [PollFd::new(&*self.0, PollFlags::IN)];
+            match rustix::event::poll(&mut fds, Some(&limit)) {
+                Ok(0) => return Err(std::io::ErrorKind::TimedOut.into()),
+                Ok(_) => return self.0.read(buffer),
+                Err(rustix::io::Errno::INTR) => {}
+                Err(e) => return Err(e.into()),
+            }
+        }
+    }
+}
+
+fn receive(answers: &mut ChildStdout) -> Result<(u8, Vec<u8>), Failure> {
+    let failed = |e: std::io::Error| match e.kind() {
+        std::io::ErrorKind::TimedOut => Failure::Silent,
+        _ => Failure::Broken,
+    };
+    let mut answers = Timed(answers);
+    loop {
+        let mut head = [0; 9];
+        answers.read_exact(&mut head).map_err(failed)?;
+        let (kind, length) = (head[0], u64::from_le_bytes([
+            head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8],
+        ]));
+        if length > MAX_ANSWER {
+            return Err(Failure::Broken);
+        }
+        let mut body = Vec::with_capacity(length.min(1 << 20) as usize);
+        answers.by_ref().take(length).read_to_end(&mut body).map_err(failed)?;
+        if body.len() as u64 != length {
+            return Err(Failure::Broken);
+        }
+        match kind {
+            BEAT => {}
+            ERROR => {
+                return Err(match serde_json::from_slice(&body) {
+                    Ok(error) => Failure::Answered(error),
+                    Err(_) => Failure::Broken,
+                });
+            }
+            _ => return Ok((kind, body)),
+        }
+    }
+}
+
+impl Drop for Remote {
+    fn drop(&mut self) {
+        let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
+        if let State::Alive { child, .. } = state {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+impl Remote {
+    fn ask<T>(
+        &self,
+        request: &Request,
+        expected: u8,
+        take: impl FnOnce(&mut Taker<'_>) -> Option<T>,
+    ) -> Result<T, InputError> {
+        let (kind, body) = self.exchange(Some(request))?;
+        let taken = if kind == expected { take(&mut Taker(&body)) } else { None };
+        taken.ok_or_else(|| InputError::ReaderDied {
+            path: self.path.clone(),
+            during: request.words(),
+            how: "gave an answer that makes no sense".to_owned(),
+        })
+    }
+}
+
+impl Backend for Remote {
+    fn root(&self) -> Result<Demo, InputError> {
+        self.ask(&Request::Root, DEMO, Taker::demo)
+    }
+
+    fn demo(&self, index: usize, keys: &[String]) -> Result<Demo, InputError> {
+        self.ask(&Request::Demo { index, keys: keys.to_vec() }, DEMO, Taker::demo)
+    }
+
+    fn rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array, InputError> {
+        let request = Request::Rows { index, key: key.to_owned(), first, count };
+        self.ask(&request, ARRAY, Taker::array)
+    }
+}

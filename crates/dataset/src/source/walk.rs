@@ -1,0 +1,485 @@
+//! Walking a file: every group and dataset with type, shape and place, nothing read.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use hdf5::dataset::Layout;
+use hdf5::{Dataset, Datatype, Group, IndexType, IterationOrder, LinkType, LocationType};
+
+use super::value::{self, Part, dtype_of, reason};
+use crate::error::InputError;
+use crate::tree::{Array, Attrs, Dtype};
+
+/// A group as found.
+#[derive(Debug, Clone, Default)]
+pub(super) struct GroupNode {
+    /// How many attributes it has.
+    pub attrs: usize,
+    /// Whether it has any member.
+    pub empty: bool,
+}
+
+/// A dataset as found.
+#[derive(Debug, Clone)]
+pub(super) struct DatasetNode {
+    pub dtype: Dtype,
+    pub shape: Vec<usize>,
+    /// No dataspace (h5py's `Empty`).
+    pub null: bool,
+    /// Where the elements lie in the file just as in memory.
+    pub offset: Option<u64>,
+    /// Rows of a stored block; 1 unless chunked.
+    pub block_rows: usize,
+    pub attrs: usize,
+    /// Why it cannot be read, if it cannot.
+    pub fault: Option<InputError>,
+}
+
+/// An opened file with everything that it holds, by absolute path without the leading slash; the file's own
+/// group has the empty path.
+pub(super) struct Walked {
+    pub path: PathBuf,
+    pub bytes: u64,
+    /// Kept open; a folder of many files opens each when it is read.
+    file: Option<hdf5::File>,
+    pub groups: BTreeMap<String, GroupNode>,
+    pub datasets: BTreeMap<String, DatasetNode>,
+    /// Links that lead nowhere or out of the file.
+    pub faults: Vec<InputError>,
+}
+
+const SIGNATURE: [u8; 8] = [0x89, b'H', b'D', b'F', b'\r', b'\n', 0x1a, b'\n'];
+/// Nesting beyond this is a loop or an attack; real files have at most about six levels.
+const MAX_DEPTH: usize = 32;
+/// No filter packs better than deflate's 1032:1.
+const MAX_RATIO: u64 = 1_100;
+/// What a dataset without stored elements (all fill value) may claim.
+const MAX_UNSTORED: u64 = 16 << 20;
+
+/// Checks that there is a file with an HDF5 signature; gives its size.
+pub(super) fn check_signature(path: &Path) -> Result<u64, InputError> {
+    let unreadable =
+        |e: std::io::Error| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() };
+    let mut file = match File::open(path) {
+        Ok(file) => file,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+            return Err(InputError::NotFound { path: path.to_owned() });
+        }
+        Err(e) => return Err(unreadable(e)),
+    };
+    let meta = file.metadata().map_err(unreadable)?;
+    if !meta.is_file() {
+        let reason = "not a regular file".to_owned();
+        return Err(InputError::Unreadable { path: path.to_owned(), reason });
+    }
+    let bytes = meta.len();
+    // the superblock may follow a user block of 512, 1024, 2048, ... bytes
+    let mut at = 0;
+    while at + 8 <= bytes {
+        let mut found = [0; 8];
+        file.seek(SeekFrom::Start(at)).map_err(unreadable)?;
+        file.read_exact(&mut found).map_err(unreadable)?;
+        if found == SIGNATURE {
+            return Ok(bytes);
+        }
+        at = if at == 0 { 512 } else { at * 2 };
+    }
+    let mut first = Vec::new();
+    file.seek(SeekFrom::Start(0)).map_err(unreadable)?;
+    file.take(8).read_to_end(&mut first).map_err(unreadable)?;
+    let found = if first.is_empty() {
+        "an empty file".to_owned()
+    } else {
+        format!("the bytes {}", first.iter().map(|b| format!("{b:02x}")).collect::<Vec<_>>().join(" "))
+    };
+    Err(InputError::NotHdf5 { path: path.to_owned(), found })
+}
+
+/// The two sizes in libhdf5's words about a truncated file.
+fn truncated(text: &str) -> Option<(u64, u64)> {
+    let number = |key: &str| -> Option<u64> {
+        let tail = text.split_once(key)?.1.trim_start_matches([' ', '=']);
+        tail.split(|c: char| !c.is_ascii_digit()).next()?.parse().ok()
+    };
+    text.contains("truncated").then_some(())?;
+    Some((number("stored_eof")?, number("eof")?))
+}
+
+fn open_file(path: &Path) -> Result<hdf5::File, InputError> {
+    hdf5::File::with_options().with_fapl(|p| p.file_locking(false)).open(path).map_err(|e| {
+        let text = reason(&e);
+        match truncated(&text) {
+            Some((expected, found)) => {
+                InputError::Truncated { path: path.to_owned(), expected, found }
+            }
+            None => damaged(path, "the file", "open", text),
+        }
+    })
+}
+
+impl Walked {
+    /// Opens a file and walks it; `keep` holds it open for reading, `beat` is called as the walk goes on.
+    pub fn open(path: &Path, keep: bool, beat: &mut dyn FnMut()) -> Result<Self, InputError> {
+        let bytes = check_signature(path)?;
+        let file = open_file(path)?;
+        let mut walked = Self {
+            path: path.to_owned(),
+            bytes,
+            groups: BTreeMap::new(),
+            datasets: BTreeMap::new(),
+            faults: Vec::new(),
+            file: None,
+        };
+        let types = NativeTypes::new().map_err(|e| damaged(path, "the library", "set up", reason(&e)))?;
+        let root: Group = (*file).clone();
+        let attrs = root
+            .loc_info()
+            .map_err(|e| damaged(path, "/", "look at", reason(&e)))?
+            .num_attrs;
+        let mut above = Vec::new();
+        walked.group(&root, "", attrs, &types, &mut above, beat)?;
+        if keep {
+            walked.file = Some(file);
+        }
+        Ok(walked)
+    }
+
+    fn file(&self) -> Result<hdf5::File, InputError> {
+        match &self.file {
+            Some(file) => Ok(file.clone()),
+            None => open_file(&self.path),
+        }
+    }
+
+    fn group(
+        &mut self,
+        group: &Group,
+        path: &str,
+        attrs: usize,
+        types: &NativeTypes,
+        above: &mut Vec<hdf5::LocationToken>,
+        beat: &mut dyn FnMut(),
+    ) -> Result<(), InputError> {
+        let links = group
+            .links(IndexType::Name, IterationOrder::Increasing)
+            .map_err(|e| damaged(&self.path, path, "list", reason(&e)))?;
+        self.groups.insert(path.to_owned(), GroupNode { attrs, empty: links.is_empty() });
+        for (name, link) in links {
+            let full = if path.is_empty() { name.clone() } else { format!("{path}/{name}") };
+            if link.link_type == LinkType::External {
+                let what = "a link to another file".to_owned();
+                let path = self.path.clone();
+                self.faults.push(InputError::Unsupported { path, object: full, what });
+                continue;
+            }
+            let info = match group.loc_info_by_name(&name) {
+                Ok(info) => info,
+                Err(e) => return Err(damaged(&self.path, &full, "follow the link", reason(&e))),
+            };
+            // each object takes some 100 bytes; more of them than fit are the same ones again and again
+            let found = (self.groups.len() + self.datasets.len()) as u64;
+            if found % 256 == 0 {
+                beat();
+            }
+            let limit = 1_000 + self.bytes / 32;
+            if found > limit {
+                return Err(InputError::TooLarge {
+                    path: self.path.clone(),
+                    object: format!("{full} (objects, not bytes)"),
+                    bytes: found,
+                    limit,
+                });
+            }
+            match info.loc_type {
+                LocationType::Group => {
+                    if above.contains(&info.token) || above.len() >= MAX_DEPTH {
+                        let reason = "a group that contains itself, or nested too deep".to_owned();
+                        return Err(damaged(&self.path, &full, "walk", reason));
+                    }
+                    let inner = group
+                        .group(&name)
+                        .map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
+                    above.push(info.token);
+                    self.group(&inner, &full, info.num_attrs, types, above, beat)?;
+                    above.pop();
+                }
+                LocationType::Dataset => {
+                    let dataset = group
+                        .dataset(&name)
+                        .map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
+                    let node = self.dataset(&dataset, &full, info.num_attrs, types)?;
+                    self.datasets.insert(full, node);
+                }
+                _ => {
+                    let what = "a named type".to_owned();
+                    let path = self.path.clone();
+                    self.faults.push(InputError::Unsupported { path, object: full, what });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn dataset(
+        &self,
+        dataset: &Dataset,
+        full: &str,
+        attrs: usize,
+        types: &NativeTypes,
+    ) -> Result<DatasetNode, InputError> {
+        let bad = |operation: &str, e: hdf5::Error| damaged(&self.path, full, operation, reason(&e));
+        let unsupported = |what: String| InputError::Unsupported {
+            path: self.path.clone(),
+            object: full.to_owned(),
+            what,
+        };
+        let space = dataset.space().map_err(|e| bad("read the shape of", e))?;
+        let null = space.is_null();
+        let shape = if null { Vec::new() } else { space.shape() };
+        let file_type = dataset.dtype().map_err(|e| bad("read the type of", e))?;
+        let (dtype, native) = types.of(&file_type);
+        let mut node =
+            DatasetNode { dtype, shape, null, offset: None, block_rows: 1, attrs, fault: None };
+        if let Dtype::Other(text) = &node.dtype {
+            node.fault = Some(unsupported(format!("the type {text}")));
+            return Ok(node);
+        }
+        let bytes = node
+            .shape
+            .iter()
+            .try_fold(node.dtype.size().unwrap_or(16) as u64, |n, &e| n.checked_mul(e as u64))
+            .unwrap_or(u64::MAX);
+        let too_large = |limit| InputError::TooLarge {
+            path: self.path.clone(),
+            object: full.to_owned(),
+            bytes,
+            limit,
+        };
+        if let Some(offset) = dataset.offset() {
+            if offset.checked_add(bytes).is_none_or(|end| end > self.bytes) {
+                node.fault = Some(too_large(self.bytes.saturating_sub(offset)));
+            } else if native {
+                node.offset = Some(offset);
+            }
+            return Ok(node);
+        }
+        let plist = dataset.dcpl().map_err(|e| bad("read the layout of", e))?;
+        match plist.layout() {
+            Layout::Virtual => node.fault = Some(unsupported("a view of other files".to_owned())),
+            _ if !plist.external().is_empty() => {
+                node.fault = Some(unsupported("storage in another file".to_owned()));
+            }
+            layout => {
+                if let (Layout::Chunked, Some(chunk)) = (layout, plist.chunk()) {
+                    node.block_rows = chunk.first().copied().unwrap_or(1).max(1);
+                    let block = chunk
+                        .iter()
+                        .try_fold(node.dtype.size().unwrap_or(16) as u64, |n, &e| {
+                            n.checked_mul(e as u64)
+                        })
+                        .unwrap_or(u64::MAX);
+                    if block > 256 << 20 {
+                        node.fault = Some(InputError::TooLarge {
+                            path: self.path.clone(),
+                            object: format!("{full}: one stored block"),
+                            bytes: block,
+                            limit: 256 << 20,
+                        });
+                    }
+                }
+                if !plist.all_filters_avail() {
+                    let names: Vec<_> =
+                        plist.filters().iter().map(|f| format!("{f:?}")).collect();
+                    node.fault = Some(unsupported(format!("the compression {}", names.join(", "))));
+                }
+                let limit = MAX_UNSTORED.max(dataset.storage_size().saturating_mul(MAX_RATIO));
+                if bytes > limit {
+                    node.fault = Some(too_large(limit));
+                }
+            }
+        }
+        Ok(node)
+    }
+
+    /// All attributes of a group or dataset.
+    pub fn attrs(&self, path: &str) -> Result<Attrs, InputError> {
+        let object = if path.is_empty() { "/" } else { path };
+        let bad = |e: hdf5::Error| damaged(&self.path, object, "read the attributes of", reason(&e));
+        let file = self.file()?;
+        if self.datasets.contains_key(path) {
+            let dataset = file.dataset(path).map_err(bad)?;
+            self.attrs_of(&dataset, object)
+        } else {
+            let group = if path.is_empty() {
+                (*file).clone()
+            } else {
+                file.group(path).map_err(bad)?
+            };
+            self.attrs_of(&group, object)
+        }
+    }
+
+    /// Names of the attributes of a group, and the values of those among them that are wanted.
+    pub fn some_attrs(
+        &self,
+        path: &str,
+        wanted: &[&str],
+    ) -> Result<(Vec<String>, Attrs), InputError> {
+        let group = self
+            .file()?
+            .group(path)
+            .map_err(|e| damaged(&self.path, path, "open", reason(&e)))?;
+        let names = group
+            .attr_names()
+            .map_err(|e| damaged(&self.path, path, "list the attributes of", reason(&e)))?;
+        let mut values = Attrs::new();
+        for name in names.iter().filter(|n| wanted.contains(&n.as_str())) {
+            values.insert(name.clone(), self.one_attr(&group, path, name)?);
+        }
+        Ok((names, values))
+    }
+
+    fn attrs_of(&self, location: &hdf5::Location, object: &str) -> Result<Attrs, InputError> {
+        let names = location
+            .attr_names()
+            .map_err(|e| damaged(&self.path, object, "list the attributes of", reason(&e)))?;
+        names
+            .into_iter()
+            .map(|name| Ok((name.clone(), self.one_attr(location, object, &name)?)))
+            .collect()
+    }
+
+    fn one_attr(
+        &self,
+        location: &hdf5::Location,
+        object: &str,
+        name: &str,
+    ) -> Result<Array, InputError> {
+        let full = || format!("attribute {name} of {object}");
+        let bad = |e: hdf5::Error| damaged(&self.path, &full(), "read", reason(&e));
+        let attr = location.attr(name).map_err(bad)?;
+        let space = attr.space().map_err(bad)?;
+        let descriptor = attr.dtype().and_then(|t| t.to_descriptor()).map_err(bad)?;
+        let dtype = dtype_of(&descriptor);
+        if let Dtype::Other(text) = &dtype {
+            return Err(InputError::Unsupported {
+                path: self.path.clone(),
+                object: full(),
+                what: format!("the type {text}"),
+            });
+        }
+        if space.is_null() {
+            return Ok(Array { dtype, shape: Vec::new(), bytes: Vec::new() });
+        }
+        let shape = space.shape();
+        let bytes = shape
+            .iter()
+            .try_fold(dtype.size().unwrap_or(16) as u64, |n, &e| n.checked_mul(e as u64))
+            .unwrap_or(u64::MAX);
+        if bytes > self.bytes {
+            return Err(InputError::TooLarge {
+                path: self.path.clone(),
+                object: full(),
+                bytes,
+                limit: self.bytes,
+            });
+        }
+        let bytes = value::read(&attr, &dtype, Part::All)
+            .map_err(|text| damaged(&self.path, &full(), "read", text))?;
+        Ok(Array { dtype, shape, bytes })
+    }
+
+    /// Reads rows of a dataset, or all of it.
+    pub fn read(&self, path: &str, rows: Option<(usize, usize)>) -> Result<Array, InputError> {
+        let Some(node) = self.datasets.get(path) else {
+            return Err(InputError::NoSuch {
+                path: self.path.clone(),
+                wanted: format!("dataset {path}"),
+                found: format!("{} other datasets", self.datasets.len()),
+            });
+        };
+        if let Some(fault) = &node.fault {
+            return Err(fault.clone());
+        }
+        let mut shape = node.shape.clone();
+        if node.null {
+            return Ok(Array { dtype: node.dtype.clone(), shape, bytes: Vec::new() });
+        }
+        let dataset = self
+            .file()?
+            .dataset(path)
+            .map_err(|e| damaged(&self.path, path, "open", reason(&e)))?;
+        let part = match rows {
+            Some((first, count)) if Some(&count) != shape.first() => {
+                let end = first.checked_add(count);
+                if end.is_none_or(|end| shape.first().is_none_or(|&rows| end > rows)) {
+                    return Err(InputError::NoSuch {
+                        path: self.path.clone(),
+                        wanted: format!("rows {first} and the {count} after of {path}"),
+                        found: format!("shape {shape:?}"),
+                    });
+                }
+                Part::Rows { first, count, shape: &node.shape }
+            }
+            _ => Part::All,
+        };
+        let bytes = value::read(&dataset, &node.dtype, part)
+            .map_err(|text| damaged(&self.path, path, "read", text))?;
+        if let Part::Rows { count, .. } = part {
+            shape[0] = count;
+        }
+        Ok(Array { dtype: node.dtype.clone(), shape, bytes })
+    }
+}
+
+/// The types whose elements lie in a file as they do in memory.
+struct NativeTypes(Vec<(Datatype, Dtype)>);
+
+impl NativeTypes {
+    fn new() -> hdf5::Result<Self> {
+        let all = [
+            Dtype::F64,
+            Dtype::F32,
+            Dtype::U8,
+            Dtype::I64,
+            Dtype::I32,
+            Dtype::U32,
+            Dtype::U64,
+            Dtype::I8,
+            Dtype::I16,
+            Dtype::U16,
+        ];
+        let mut types = Vec::new();
+        for dtype in all {
+            if let Ok(descriptor) = value::descriptor_of(&dtype) {
+                types.push((Datatype::from_descriptor(&descriptor)?, dtype));
+            }
+        }
+        Ok(Self(types))
+    }
+
+    /// The type that carries `file_type`, and whether its elements can be taken from the file as they are.
+    fn of(&self, file_type: &Datatype) -> (Dtype, bool) {
+        if cfg!(target_endian = "little")
+            && let Some((_, dtype)) = self.0.iter().find(|(native, _)| native == file_type)
+        {
+            return (dtype.clone(), true);
+        }
+        match file_type.to_descriptor() {
+            Ok(descriptor) => (dtype_of(&descriptor), false),
+            Err(e) => (Dtype::Other(reason(&e)), false),
+        }
+    }
+}
+
+fn damaged(path: &Path, object: &str, operation: &str, reason: String) -> InputError {
+    let object = if object.is_empty() { "/" } else { object };
+    InputError::Damaged {
+        path: path.to_owned(),
+        object: object.to_owned(),
+        operation: operation.to_owned(),
+        reason,
+    }
+}
