@@ -7,7 +7,5 @@ mod tree;
 
 pub use error::{DatasetError, InputError, Result};
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
-pub use source::{
-    ArrayHasher, ContentHasher, DemoHasher, RobomimicWriter, Source, WriteOptions, isolation,
-};
+pub use source::{ArrayHasher, ContentHasher, DemoHasher, RobomimicWriter, Source, WriteOptions, isolation};
 pub use tree::{Array, Attrs, Demo, Dtype};

@@ -120,9 +120,7 @@ impl KeyPlan {
     /// Bytes once read; `None` where the size is not known beforehand.
     pub fn bytes(&self) -> Option<u64> {
         let size = self.dtype.size()? as u64;
-        self.shape
-            .iter()
-            .try_fold(size, |n, &extent| n.checked_mul(extent as u64))
+        self.shape.iter().try_fold(size, |n, &extent| n.checked_mul(extent as u64))
     }
 
     /// Whether each step is an image: 8-bit, height x width x channels.

@@ -57,10 +57,7 @@ impl Dtype {
 
     /// Whether elements are numbers or truth values.
     pub fn is_numeric(&self) -> bool {
-        !matches!(
-            self,
-            Self::FixedStr(_) | Self::FixedUtf8(_) | Self::VarStr | Self::VarAscii | Self::Other(_)
-        )
+        !matches!(self, Self::FixedStr(_) | Self::FixedUtf8(_) | Self::VarStr | Self::VarAscii | Self::Other(_))
     }
 }
 
@@ -131,49 +128,28 @@ impl Array {
 
     /// Strings of any length; `shape` has to hold as many elements as `values`.
     pub fn from_strings<S: AsRef<str>>(shape: Vec<usize>, values: &[S]) -> Self {
-        assert_eq!(
-            shape.iter().product::<usize>(),
-            values.len(),
-            "shape and values agree"
-        );
+        assert_eq!(shape.iter().product::<usize>(), values.len(), "shape and values agree");
         let mut bytes = Vec::new();
         for value in values {
             push_str(&mut bytes, value.as_ref().as_bytes());
         }
-        Self {
-            dtype: Dtype::VarStr,
-            shape,
-            bytes,
-        }
+        Self { dtype: Dtype::VarStr, shape, bytes }
     }
 
     /// A 1-D array of byte strings as numpy's `S` type makes it: as wide as the longest, at least 1.
     pub fn from_fixed_strings<S: AsRef<str>>(values: &[S]) -> Self {
-        let width = values
-            .iter()
-            .map(|v| v.as_ref().len())
-            .max()
-            .unwrap_or(0)
-            .max(1);
+        let width = values.iter().map(|v| v.as_ref().len()).max().unwrap_or(0).max(1);
         let mut bytes = Vec::with_capacity(width * values.len());
         for value in values {
             bytes.extend_from_slice(value.as_ref().as_bytes());
             bytes.resize(bytes.len() + width - value.as_ref().len(), 0);
         }
-        Self {
-            dtype: Dtype::FixedStr(width),
-            shape: vec![values.len()],
-            bytes,
-        }
+        Self { dtype: Dtype::FixedStr(width), shape: vec![values.len()], bytes }
     }
 
     /// Number of elements.
     pub fn len(&self) -> usize {
-        if self.is_null() {
-            0
-        } else {
-            self.shape.iter().product()
-        }
+        if self.is_null() { 0 } else { self.shape.iter().product() }
     }
 
     /// Whether there is no element.
@@ -197,23 +173,13 @@ impl Array {
         Some(match self.dtype {
             Dtype::U8 | Dtype::Bool => b.iter().map(|&v| f64::from(v)).collect(),
             Dtype::I8 => b.iter().map(|&v| f64::from(v as i8)).collect(),
-            Dtype::U16 => chunks(b)
-                .map(|v| f64::from(u16::from_le_bytes(v)))
-                .collect(),
-            Dtype::I16 => chunks(b)
-                .map(|v| f64::from(i16::from_le_bytes(v)))
-                .collect(),
-            Dtype::U32 => chunks(b)
-                .map(|v| f64::from(u32::from_le_bytes(v)))
-                .collect(),
-            Dtype::I32 => chunks(b)
-                .map(|v| f64::from(i32::from_le_bytes(v)))
-                .collect(),
+            Dtype::U16 => chunks(b).map(|v| f64::from(u16::from_le_bytes(v))).collect(),
+            Dtype::I16 => chunks(b).map(|v| f64::from(i16::from_le_bytes(v))).collect(),
+            Dtype::U32 => chunks(b).map(|v| f64::from(u32::from_le_bytes(v))).collect(),
+            Dtype::I32 => chunks(b).map(|v| f64::from(i32::from_le_bytes(v))).collect(),
             Dtype::U64 => chunks(b).map(|v| u64::from_le_bytes(v) as f64).collect(),
             Dtype::I64 => chunks(b).map(|v| i64::from_le_bytes(v) as f64).collect(),
-            Dtype::F32 => chunks(b)
-                .map(|v| f64::from(f32::from_le_bytes(v)))
-                .collect(),
+            Dtype::F32 => chunks(b).map(|v| f64::from(f32::from_le_bytes(v))).collect(),
             Dtype::F64 => chunks(b).map(f64::from_le_bytes).collect(),
             _ => return None,
         })

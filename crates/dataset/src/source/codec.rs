@@ -100,8 +100,7 @@ impl Taker<'_> {
         let attrs = self.attrs()?;
         let datasets = self.attrs()?;
         let groups = (0..self.count()?).map(|_| self.text()).collect::<Option<_>>()?;
-        let inner_attrs =
-            (0..self.count()?).map(|_| Some((self.text()?, self.attrs()?))).collect::<Option<_>>()?;
+        let inner_attrs = (0..self.count()?).map(|_| Some((self.text()?, self.attrs()?))).collect::<Option<_>>()?;
         Some(Demo { id, attrs, datasets, groups, inner_attrs })
     }
 

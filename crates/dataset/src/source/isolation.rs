@@ -81,9 +81,8 @@ impl Request {
 // ---- the reading process ----
 
 fn limit_self(bytes: u64) -> std::io::Result<()> {
-    let set = |resource, value| {
-        rustix::process::setrlimit(resource, Rlimit { current: Some(value), maximum: Some(value) })
-    };
+    let set =
+        |resource, value| rustix::process::setrlimit(resource, Rlimit { current: Some(value), maximum: Some(value) });
     set(Resource::Core, 0)?;
     set(Resource::As, MEMORY)?;
     set(Resource::Cpu, CPU_SECONDS + bytes / BYTES_PER_CPU_SECOND)?;
@@ -171,7 +170,11 @@ pub(super) struct Remote {
 }
 
 enum State {
-    Alive { child: Child, requests: ChildStdin, answers: ChildStdout },
+    Alive {
+        child: Child,
+        requests: ChildStdin,
+        answers: ChildStdout,
+    },
     /// How it ended; every later request gets the same answer.
     Ended(InputError),
 }
@@ -202,10 +205,7 @@ impl Remote {
             .map_err(|e| cannot(e.to_string()))?;
         let requests = child.stdin.take().expect("stdin is a pipe");
         let answers = child.stdout.take().expect("stdout is a pipe");
-        let remote = Self {
-            path: path.to_owned(),
-            state: Mutex::new(State::Alive { child, requests, answers }),
-        };
+        let remote = Self { path: path.to_owned(), state: Mutex::new(State::Alive { child, requests, answers }) };
         let (kind, body) = remote.exchange(None)?;
         match serde_json::from_slice::<Plan>(&body) {
             Ok(plan) if kind == PLAN => Ok((remote, plan)),
@@ -221,8 +221,7 @@ impl Remote {
             State::Alive { requests, answers, .. } => {
                 let sent = request.is_none_or(|request| {
                     let text = serde_json::to_vec(request).expect("requests are plain data");
-                    requests.write_all(&(text.len() as u64).to_le_bytes()).is_ok()
-                        && requests.write_all(&text).is_ok()
+                    requests.write_all(&(text.len() as u64).to_le_bytes()).is_ok() && requests.write_all(&text).is_ok()
                 });
                 match if sent { receive(answers) } else { Err(Failure::Broken) } {
                     Ok(answer) => return Ok(answer),
@@ -307,9 +306,8 @@ fn receive(answers: &mut ChildStdout) -> Result<(u8, Vec<u8>), Failure> {
     loop {
         let mut head = [0; 9];
         answers.read_exact(&mut head).map_err(failed)?;
-        let (kind, length) = (head[0], u64::from_le_bytes([
-            head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8],
-        ]));
+        let (kind, length) =
+            (head[0], u64::from_le_bytes([head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8]]));
         if length > MAX_ANSWER {
             return Err(Failure::Broken);
         }
@@ -360,15 +358,15 @@ impl Remote {
 
 impl Backend for Remote {
     fn root(&self) -> Result<Demo, InputError> {
-        self.ask(&Request::Root, DEMO, Taker::demo)
+        self.ask(&Request::Root, DEMO, |t| t.demo())
     }
 
     fn demo(&self, index: usize, keys: &[String]) -> Result<Demo, InputError> {
-        self.ask(&Request::Demo { index, keys: keys.to_vec() }, DEMO, Taker::demo)
+        self.ask(&Request::Demo { index, keys: keys.to_vec() }, DEMO, |t| t.demo())
     }
 
     fn rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array, InputError> {
         let request = Request::Rows { index, key: key.to_owned(), first, count };
-        self.ask(&request, ARRAY, Taker::array)
+        self.ask(&request, ARRAY, |t| t.array())
     }
 }

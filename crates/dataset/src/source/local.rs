@@ -35,20 +35,10 @@ impl Local {
     pub fn open(path: &Path, beat: &mut dyn FnMut()) -> Result<(Self, Plan), InputError> {
         let paths = if path.is_dir() { files_of(path)? } else { vec![path.to_owned()] };
         let keep = paths.len() <= KEEP_OPEN;
-        let files = 
-            paths.iter().map(|p| Walked::open(p, keep, beat)).collect::<Result<Vec<_>, _>>()?;
+        let files = paths.iter().map(|p| Walked::open(p, keep, beat)).collect::<Result<Vec<_>, _>>()?;
         let survey = Survey { path: path.to_owned(), files };
-        let Draft {
-            dialect,
-            demos,
-            env_args,
-            env_name,
-            env_version,
-            masks,
-            texts,
-            notes,
-            problems,
-        } = dialect::draft(&survey)?;
+        let Draft { dialect, demos, env_args, env_name, env_version, masks, texts, notes, problems } =
+            dialect::draft(&survey)?;
         let mut drafts = demos;
         drafts.sort_by(|a, b| (a.plan.number, &a.plan.id).cmp(&(b.plan.number, &b.plan.id)));
         let plan = Plan {
@@ -79,8 +69,7 @@ impl Local {
 
 /// The HDF5 files of a folder, by the number in their names and then by name.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
-    let unreadable =
-        |e: std::io::Error| InputError::Unreadable { path: folder.to_owned(), reason: e.to_string() };
+    let unreadable = |e: std::io::Error| InputError::Unreadable { path: folder.to_owned(), reason: e.to_string() };
     let mut found = Vec::new();
     let mut others = BTreeSet::new();
     for entry in std::fs::read_dir(folder).map_err(unreadable)? {
@@ -116,23 +105,15 @@ impl Backend for Local {
             return Ok(root);
         }
         root.attrs = file.attrs("")?;
-        let homes: Vec<String> = self
-            .drafts
-            .iter()
-            .filter_map(|d| Some(format!("{}/", d.home.as_ref()?.1)))
-            .collect();
+        let homes: Vec<String> = self.drafts.iter().filter_map(|d| Some(format!("{}/", d.home.as_ref()?.1))).collect();
         let homes: BTreeSet<&str> = homes.iter().map(String::as_str).collect();
         // a home is `data/demo_3/`: two levels, so the first two levels of a path decide
         let in_demo = |path: &str| {
             let end = path.match_indices('/').nth(1).map_or(path.len(), |(at, _)| at);
             homes.contains(format!("{}/", &path[..end]).as_str())
         };
-        let used: BTreeSet<&str> = self
-            .plan
-            .demos
-            .iter()
-            .flat_map(|d| d.keys.values().map(|k| k.place.path.as_str()))
-            .collect();
+        let used: BTreeSet<&str> =
+            self.plan.demos.iter().flat_map(|d| d.keys.values().map(|k| k.place.path.as_str())).collect();
         for (path, node) in &file.groups {
             if path.is_empty() || in_demo(path) {
                 continue;

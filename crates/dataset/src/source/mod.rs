@@ -93,11 +93,9 @@ impl Source {
     /// What is wrong with datasets that are not wanted is no fault.
     pub fn read_demo_where(&self, index: usize, wanted: &dyn Fn(&str) -> bool) -> Result<Demo> {
         let plan = self.check(index, wanted)?;
-        let chosen: Vec<(&String, &KeyPlan)> =
-            plan.keys.iter().filter(|(key, _)| wanted(key)).collect();
-        let bytes = chosen
-            .iter()
-            .fold(0_u64, |sum, (_, k)| sum.saturating_add(k.bytes().unwrap_or(u64::from(u8::MAX))));
+        let chosen: Vec<(&String, &KeyPlan)> = plan.keys.iter().filter(|(key, _)| wanted(key)).collect();
+        let bytes =
+            chosen.iter().fold(0_u64, |sum, (_, k)| sum.saturating_add(k.bytes().unwrap_or(u64::from(u8::MAX))));
         if bytes > MAX_DEMO {
             return Err(InputError::TooLarge {
                 path: self.plan.path.clone(),
@@ -107,8 +105,7 @@ impl Source {
             }
             .into());
         }
-        let (direct, rest): (Vec<_>, Vec<_>) =
-            chosen.into_iter().partition(|(_, k)| k.place.offset.is_some());
+        let (direct, rest): (Vec<_>, Vec<_>) = chosen.into_iter().partition(|(_, k)| k.place.offset.is_some());
         let small = |k: &KeyPlan| k.bytes().is_none_or(|b| b <= WINDOW / 16);
         let (small, large): (Vec<_>, Vec<_>) = rest.into_iter().partition(|(_, k)| small(k));
         let mut demo: Option<Demo> = None;
@@ -155,11 +152,7 @@ impl Source {
     /// Rows `first .. first + count` of one dataset of a demo.
     pub fn read_rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array> {
         let plan = self.check(index, &|k| k == key)?;
-        let none = |wanted: String, found: String| InputError::NoSuch {
-            path: self.plan.path.clone(),
-            wanted,
-            found,
-        };
+        let none = |wanted: String, found: String| InputError::NoSuch { path: self.plan.path.clone(), wanted, found };
         let Some(k) = plan.keys.get(key) else {
             let found = dialect::list(plan.keys.keys().map(String::as_str));
             return Err(none(format!("{key} in {}", plan.id), found).into());
@@ -222,9 +215,7 @@ impl Source {
             found: format!("{} demos", self.plan.demos.len()),
         })?;
         let fatal = self.plan.problems.iter().find(|p| {
-            p.fatal
-                && p.demo.as_ref().is_none_or(|id| *id == plan.id)
-                && p.key.as_ref().is_none_or(|key| wanted(key))
+            p.fatal && p.demo.as_ref().is_none_or(|id| *id == plan.id) && p.key.as_ref().is_none_or(|key| wanted(key))
         });
         match fatal {
             Some(problem) => Err(problem.error.clone()),
@@ -291,16 +282,13 @@ impl Source {
 fn exists(path: &Path) -> Result<(), InputError> {
     match std::fs::metadata(path) {
         Ok(_) => Ok(()),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-            Err(InputError::NotFound { path: path.to_owned() })
-        }
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Err(InputError::NotFound { path: path.to_owned() }),
         Err(e) => Err(InputError::Unreadable { path: path.to_owned(), reason: e.to_string() }),
     }
 }
 
 fn open_file(path: &Path) -> Result<File, InputError> {
-    File::open(path)
-        .map_err(|e| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() })
+    File::open(path).map_err(|e| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() })
 }
 
 #[cfg(test)]

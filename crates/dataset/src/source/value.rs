@@ -1,9 +1,6 @@
 //! Elements between HDF5 and [`Array`]: which types are carried, and how they are read and written.
 
-use hdf5::types::{
-    FixedAscii, FixedUnicode, FloatSize, H5Type, IntSize, TypeDescriptor, VarLenAscii,
-    VarLenUnicode,
-};
+use hdf5::types::{FixedAscii, FixedUnicode, FloatSize, H5Type, IntSize, TypeDescriptor, VarLenAscii, VarLenUnicode};
 use hdf5::{Container, Hyperslab, Selection, SliceOrIndex};
 use ndarray::IxDyn;
 
@@ -73,7 +70,7 @@ macro_rules! for_width {
 }
 
 /// A type whose values are text of a width known at compile time.
-trait FixedText: H5Type {
+trait FixedText: H5Type + Sized {
     fn text(&self) -> &[u8];
     fn make(bytes: &[u8]) -> ValueResult<Self>;
 }
@@ -182,8 +179,7 @@ pub(super) fn read(from: &Container, dtype: &Dtype, part: Part<'_>) -> ValueResu
         Dtype::VarStr => {
             let mut bytes = Vec::new();
             for value in elements::<VarLenUnicode>(from, part)? {
-                std::str::from_utf8(value.as_bytes())
-                    .map_err(|e| format!("a string that is not UTF-8: {e}"))?;
+                std::str::from_utf8(value.as_bytes()).map_err(|e| format!("a string that is not UTF-8: {e}"))?;
                 push_str(&mut bytes, value.as_bytes());
             }
             bytes

@@ -60,8 +60,7 @@ const MAX_UNSTORED: u64 = 16 << 20;
 
 /// Checks that there is a file with an HDF5 signature; gives its size.
 pub(super) fn check_signature(path: &Path) -> Result<u64, InputError> {
-    let unreadable =
-        |e: std::io::Error| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() };
+    let unreadable = |e: std::io::Error| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() };
     let mut file = match File::open(path) {
         Ok(file) => file,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
@@ -111,9 +110,7 @@ fn open_file(path: &Path) -> Result<hdf5::File, InputError> {
     hdf5::File::with_options().with_fapl(|p| p.file_locking(false)).open(path).map_err(|e| {
         let text = reason(&e);
         match truncated(&text) {
-            Some((expected, found)) => {
-                InputError::Truncated { path: path.to_owned(), expected, found }
-            }
+            Some((expected, found)) => InputError::Truncated { path: path.to_owned(), expected, found },
             None => damaged(path, "the file", "open", text),
         }
     })
@@ -134,10 +131,7 @@ impl Walked {
         };
         let types = NativeTypes::new().map_err(|e| damaged(path, "the library", "set up", reason(&e)))?;
         let root: Group = (*file).clone();
-        let attrs = root
-            .loc_info()
-            .map_err(|e| damaged(path, "/", "look at", reason(&e)))?
-            .num_attrs;
+        let attrs = root.loc_info().map_err(|e| damaged(path, "/", "look at", reason(&e)))?.num_attrs;
         let mut above = Vec::new();
         walked.group(&root, "", attrs, &types, &mut above, beat)?;
         if keep {
@@ -198,17 +192,13 @@ impl Walked {
                         let reason = "a group that contains itself, or nested too deep".to_owned();
                         return Err(damaged(&self.path, &full, "walk", reason));
                     }
-                    let inner = group
-                        .group(&name)
-                        .map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
+                    let inner = group.group(&name).map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
                     above.push(info.token);
                     self.group(&inner, &full, info.num_attrs, types, above, beat)?;
                     above.pop();
                 }
                 LocationType::Dataset => {
-                    let dataset = group
-                        .dataset(&name)
-                        .map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
+                    let dataset = group.dataset(&name).map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
                     let node = self.dataset(&dataset, &full, info.num_attrs, types)?;
                     self.datasets.insert(full, node);
                 }
@@ -230,18 +220,14 @@ impl Walked {
         types: &NativeTypes,
     ) -> Result<DatasetNode, InputError> {
         let bad = |operation: &str, e: hdf5::Error| damaged(&self.path, full, operation, reason(&e));
-        let unsupported = |what: String| InputError::Unsupported {
-            path: self.path.clone(),
-            object: full.to_owned(),
-            what,
-        };
+        let unsupported =
+            |what: String| InputError::Unsupported { path: self.path.clone(), object: full.to_owned(), what };
         let space = dataset.space().map_err(|e| bad("read the shape of", e))?;
         let null = space.is_null();
         let shape = if null { Vec::new() } else { space.shape() };
         let file_type = dataset.dtype().map_err(|e| bad("read the type of", e))?;
         let (dtype, native) = types.of(&file_type);
-        let mut node =
-            DatasetNode { dtype, shape, null, offset: None, block_rows: 1, attrs, fault: None };
+        let mut node = DatasetNode { dtype, shape, null, offset: None, block_rows: 1, attrs, fault: None };
         if let Dtype::Other(text) = &node.dtype {
             node.fault = Some(unsupported(format!("the type {text}")));
             return Ok(node);
@@ -251,12 +237,7 @@ impl Walked {
             .iter()
             .try_fold(node.dtype.size().unwrap_or(16) as u64, |n, &e| n.checked_mul(e as u64))
             .unwrap_or(u64::MAX);
-        let too_large = |limit| InputError::TooLarge {
-            path: self.path.clone(),
-            object: full.to_owned(),
-            bytes,
-            limit,
-        };
+        let too_large = |limit| InputError::TooLarge { path: self.path.clone(), object: full.to_owned(), bytes, limit };
         if let Some(offset) = dataset.offset() {
             if offset.checked_add(bytes).is_none_or(|end| end > self.bytes) {
                 node.fault = Some(too_large(self.bytes.saturating_sub(offset)));
@@ -276,9 +257,7 @@ impl Walked {
                     node.block_rows = chunk.first().copied().unwrap_or(1).max(1);
                     let block = chunk
                         .iter()
-                        .try_fold(node.dtype.size().unwrap_or(16) as u64, |n, &e| {
-                            n.checked_mul(e as u64)
-                        })
+                        .try_fold(node.dtype.size().unwrap_or(16) as u64, |n, &e| n.checked_mul(e as u64))
                         .unwrap_or(u64::MAX);
                     if block > 256 << 20 {
                         node.fault = Some(InputError::TooLarge {
@@ -290,8 +269,7 @@ impl Walked {
                     }
                 }
                 if !plist.all_filters_avail() {
-                    let names: Vec<_> =
-                        plist.filters().iter().map(|f| format!("{f:?}")).collect();
+                    let names: Vec<_> = plist.filters().iter().map(|f| format!("{f:?}")).collect();
                     node.fault = Some(unsupported(format!("the compression {}", names.join(", "))));
                 }
                 let limit = MAX_UNSTORED.max(dataset.storage_size().saturating_mul(MAX_RATIO));
@@ -312,28 +290,15 @@ impl Walked {
             let dataset = file.dataset(path).map_err(bad)?;
             self.attrs_of(&dataset, object)
         } else {
-            let group = if path.is_empty() {
-                (*file).clone()
-            } else {
-                file.group(path).map_err(bad)?
-            };
+            let group = if path.is_empty() { (*file).clone() } else { file.group(path).map_err(bad)? };
             self.attrs_of(&group, object)
         }
     }
 
     /// Names of the attributes of a group, and the values of those among them that are wanted.
-    pub fn some_attrs(
-        &self,
-        path: &str,
-        wanted: &[&str],
-    ) -> Result<(Vec<String>, Attrs), InputError> {
-        let group = self
-            .file()?
-            .group(path)
-            .map_err(|e| damaged(&self.path, path, "open", reason(&e)))?;
-        let names = group
-            .attr_names()
-            .map_err(|e| damaged(&self.path, path, "list the attributes of", reason(&e)))?;
+    pub fn some_attrs(&self, path: &str, wanted: &[&str]) -> Result<(Vec<String>, Attrs), InputError> {
+        let group = self.file()?.group(path).map_err(|e| damaged(&self.path, path, "open", reason(&e)))?;
+        let names = group.attr_names().map_err(|e| damaged(&self.path, path, "list the attributes of", reason(&e)))?;
         let mut values = Attrs::new();
         for name in names.iter().filter(|n| wanted.contains(&n.as_str())) {
             values.insert(name.clone(), self.one_attr(&group, path, name)?);
@@ -342,21 +307,12 @@ impl Walked {
     }
 
     fn attrs_of(&self, location: &hdf5::Location, object: &str) -> Result<Attrs, InputError> {
-        let names = location
-            .attr_names()
-            .map_err(|e| damaged(&self.path, object, "list the attributes of", reason(&e)))?;
-        names
-            .into_iter()
-            .map(|name| Ok((name.clone(), self.one_attr(location, object, &name)?)))
-            .collect()
+        let names =
+            location.attr_names().map_err(|e| damaged(&self.path, object, "list the attributes of", reason(&e)))?;
+        names.into_iter().map(|name| Ok((name.clone(), self.one_attr(location, object, &name)?))).collect()
     }
 
-    fn one_attr(
-        &self,
-        location: &hdf5::Location,
-        object: &str,
-        name: &str,
-    ) -> Result<Array, InputError> {
+    fn one_attr(&self, location: &hdf5::Location, object: &str, name: &str) -> Result<Array, InputError> {
         let full = || format!("attribute {name} of {object}");
         let bad = |e: hdf5::Error| damaged(&self.path, &full(), "read", reason(&e));
         let attr = location.attr(name).map_err(bad)?;
@@ -379,15 +335,9 @@ impl Walked {
             .try_fold(dtype.size().unwrap_or(16) as u64, |n, &e| n.checked_mul(e as u64))
             .unwrap_or(u64::MAX);
         if bytes > self.bytes {
-            return Err(InputError::TooLarge {
-                path: self.path.clone(),
-                object: full(),
-                bytes,
-                limit: self.bytes,
-            });
+            return Err(InputError::TooLarge { path: self.path.clone(), object: full(), bytes, limit: self.bytes });
         }
-        let bytes = value::read(&attr, &dtype, Part::All)
-            .map_err(|text| damaged(&self.path, &full(), "read", text))?;
+        let bytes = value::read(&attr, &dtype, Part::All).map_err(|text| damaged(&self.path, &full(), "read", text))?;
         Ok(Array { dtype, shape, bytes })
     }
 
@@ -407,10 +357,7 @@ impl Walked {
         if node.null {
             return Ok(Array { dtype: node.dtype.clone(), shape, bytes: Vec::new() });
         }
-        let dataset = self
-            .file()?
-            .dataset(path)
-            .map_err(|e| damaged(&self.path, path, "open", reason(&e)))?;
+        let dataset = self.file()?.dataset(path).map_err(|e| damaged(&self.path, path, "open", reason(&e)))?;
         let part = match rows {
             Some((first, count)) if Some(&count) != shape.first() => {
                 let end = first.checked_add(count);
@@ -425,8 +372,7 @@ impl Walked {
             }
             _ => Part::All,
         };
-        let bytes = value::read(&dataset, &node.dtype, part)
-            .map_err(|text| damaged(&self.path, path, "read", text))?;
+        let bytes = value::read(&dataset, &node.dtype, part).map_err(|text| damaged(&self.path, path, "read", text))?;
         if let Part::Rows { count, .. } = part {
             shape[0] = count;
         }
@@ -476,10 +422,5 @@ impl NativeTypes {
 
 fn damaged(path: &Path, object: &str, operation: &str, reason: String) -> InputError {
     let object = if object.is_empty() { "/" } else { object };
-    InputError::Damaged {
-        path: path.to_owned(),
-        object: object.to_owned(),
-        operation: operation.to_owned(),
-        reason,
-    }
+    InputError::Damaged { path: path.to_owned(), object: object.to_owned(), operation: operation.to_owned(), reason }
 }

@@ -101,11 +101,7 @@ impl RobomimicWriter {
             return Err(self.bad(path, "a name that HDF5 cannot hold"));
         }
         let above = self.group(above)?;
-        let group = above
-            .create_group_builder()
-            .obj_track_times(false)
-            .create(name)
-            .map_err(self.hdf5(path))?;
+        let group = above.create_group_builder().obj_track_times(false).create(name).map_err(self.hdf5(path))?;
         self.groups.insert(path.to_owned(), group.clone());
         Ok(group)
     }
@@ -114,14 +110,9 @@ impl RobomimicWriter {
         let full = format!("attribute {name} of {object}");
         let check = |r: value::ValueResult<()>| r.map_err(|reason| self.bad(&full, reason));
         check(value::check(value))?;
-        let descriptor =
-            value::descriptor_of(&value.dtype).map_err(|reason| self.bad(&full, reason))?;
-        let attr = to
-            .new_attr_builder()
-            .empty_as(&descriptor)
-            .shape(extents(value))
-            .create(name)
-            .map_err(self.hdf5(&full))?;
+        let descriptor = value::descriptor_of(&value.dtype).map_err(|reason| self.bad(&full, reason))?;
+        let attr =
+            to.new_attr_builder().empty_as(&descriptor).shape(extents(value)).create(name).map_err(self.hdf5(&full))?;
         check(value::write(&attr, value))
     }
 
@@ -132,8 +123,7 @@ impl RobomimicWriter {
     fn dataset(&mut self, path: &str, value: &Array) -> Result<()> {
         let check = |r: value::ValueResult<()>| r.map_err(|reason| self.bad(path, reason));
         check(value::check(value))?;
-        let descriptor =
-            value::descriptor_of(&value.dtype).map_err(|reason| self.bad(path, reason))?;
+        let descriptor = value::descriptor_of(&value.dtype).map_err(|reason| self.bad(path, reason))?;
         let (above, name) = path.rsplit_once('/').unwrap_or(("", path));
         if name.is_empty() {
             return Err(self.bad(path, "a name that HDF5 cannot hold"));
@@ -146,11 +136,7 @@ impl RobomimicWriter {
             block[0] = (BLOCK / row.max(1)).clamp(1, value.shape[0]);
             builder = builder.chunk(block).shuffle().deflate(level);
         }
-        let dataset = builder
-            .empty_as(&descriptor)
-            .shape(extents(value))
-            .create(name)
-            .map_err(self.hdf5(path))?;
+        let dataset = builder.empty_as(&descriptor).shape(extents(value)).create(name).map_err(self.hdf5(path))?;
         value::write(&dataset, value).map_err(|reason| self.bad(path, reason))?;
         self.datasets.insert(path.to_owned());
         Ok(())
@@ -158,8 +144,7 @@ impl RobomimicWriter {
 
     /// Writes a tree below a path.
     fn tree(&mut self, base: &str, tree: &Demo) -> Result<()> {
-        let full =
-            |below: &str| if base.is_empty() { below.to_owned() } else { format!("{base}/{below}") };
+        let full = |below: &str| if base.is_empty() { below.to_owned() } else { format!("{base}/{below}") };
         let home = self.group(base)?;
         self.attributes(&home, if base.is_empty() { "/" } else { base }, &tree.attrs)?;
         for group in &tree.groups {
@@ -213,11 +198,7 @@ impl RobomimicWriter {
     pub fn finish(self) -> Result<()> {
         let Self { path, temporary, file, groups, .. } = self;
         drop(groups);
-        let hdf5 = |source| DatasetError::Hdf5Write {
-            path: path.clone(),
-            object: "the file".to_owned(),
-            source,
-        };
+        let hdf5 = |source| DatasetError::Hdf5Write { path: path.clone(), object: "the file".to_owned(), source };
         file.flush().map_err(hdf5)?;
         file.close().map_err(hdf5)?;
         let io = |operation| {

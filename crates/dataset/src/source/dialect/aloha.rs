@@ -46,9 +46,7 @@ impl Layout for Aloha {
             episode(index, file, &mut out)?;
         }
         if survey.files.iter().any(|f| f.datasets.contains_key("compress_len")) {
-            out.notes.push(
-                "images are JPEG streams; they are kept as stored bytes, not as images".to_owned(),
-            );
+            out.notes.push("images are JPEG streams; they are kept as stored bytes, not as images".to_owned());
         }
         Ok(out)
     }

@@ -93,13 +93,7 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect) -> Result<Draft, InputErr
 }
 
 fn problem(demo: Option<&str>, key: Option<&str>, fatal: bool, error: InputError) -> Problem {
-    Problem {
-        demo: demo.map(str::to_owned),
-        key: key.map(str::to_owned),
-        fatal,
-        message: error.to_string(),
-        error,
-    }
+    Problem { demo: demo.map(str::to_owned), key: key.map(str::to_owned), fatal, message: error.to_string(), error }
 }
 
 fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
@@ -139,21 +133,13 @@ fn file_language(out: &Draft) -> Option<String> {
         .filter(|t| !t.is_empty())
 }
 
-fn demo(
-    file: &Walked,
-    number: u64,
-    id: &str,
-    language: Option<&str>,
-    out: &mut Draft,
-) -> Result<(), InputError> {
+fn demo(file: &Walked, number: u64, id: &str, language: Option<&str>, out: &mut Draft) -> Result<(), InputError> {
     let home = format!("data/{id}");
     let prefix = format!("{home}/");
     let (attr_names, attrs) = file.some_attrs(&home, &["num_samples", "ep_meta"])?;
     let mut keys = BTreeMap::new();
     let mut inner = Vec::new();
-    for (path, node) in
-        file.datasets.range(prefix.clone()..).take_while(|(p, _)| p.starts_with(&prefix))
-    {
+    for (path, node) in file.datasets.range(prefix.clone()..).take_while(|(p, _)| p.starts_with(&prefix)) {
         let key = path[prefix.len()..].to_owned();
         if node.attrs > 0 {
             inner.push((key.clone(), 0, path.clone()));
@@ -166,9 +152,7 @@ fn demo(
         }
     }
     let mut groups = BTreeSet::new();
-    for (path, node) in
-        file.groups.range(prefix.clone()..).take_while(|(p, _)| p.starts_with(&prefix))
-    {
+    for (path, node) in file.groups.range(prefix.clone()..).take_while(|(p, _)| p.starts_with(&prefix)) {
         let below = path[prefix.len()..].to_owned();
         if node.attrs > 0 {
             inner.push((below.clone(), 0, path.clone()));
@@ -192,13 +176,7 @@ fn demo(
 }
 
 /// Steps of a demo: `num_samples` where it is there, else the length of its actions.
-fn length(
-    file: &Walked,
-    id: &str,
-    attrs: &Attrs,
-    keys: &BTreeMap<String, KeyPlan>,
-    out: &mut Draft,
-) -> usize {
+fn length(file: &Walked, id: &str, attrs: &Attrs, keys: &BTreeMap<String, KeyPlan>, out: &mut Draft) -> usize {
     let rows = keys.get("actions").and_then(|k| k.shape.first().copied()).unwrap_or(0);
     let stated = attrs.get("num_samples");
     match stated.and_then(Array::to_i64).and_then(|n| usize::try_from(n).ok()) {
@@ -232,12 +210,8 @@ fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
     let id = plan.id.as_str();
     let path = || file.path.clone();
     let found = || list(plan.keys.keys().map(String::as_str));
-    let missing = |key: &str| InputError::MissingKey {
-        path: path(),
-        demo: id.to_owned(),
-        key: key.to_owned(),
-        found: found(),
-    };
+    let missing =
+        |key: &str| InputError::MissingKey { path: path(), demo: id.to_owned(), key: key.to_owned(), found: found() };
     let mut add = |key: &str, fatal: bool, error: InputError| {
         out.problems.push(problem(Some(id), Some(key), fatal, error));
     };
@@ -329,11 +303,7 @@ fn masks(file: &Walked, out: &mut Draft) -> Result<(), InputError> {
             continue;
         };
         for id in ids.iter().filter(|id| !known.contains(*id)) {
-            let error = InputError::UnknownMaskDemo {
-                path: file.path.clone(),
-                mask: name.clone(),
-                demo: id.clone(),
-            };
+            let error = InputError::UnknownMaskDemo { path: file.path.clone(), mask: name.clone(), demo: id.clone() };
             out.problems.push(problem(None, None, false, error));
         }
         out.masks.insert(name, ids);

@@ -26,9 +26,7 @@ impl Layout for RobosuiteRaw {
         let text = |key: &str| draft.texts.get(key).cloned();
         draft.env_name = draft.env_name.or_else(|| text("data/env"));
         draft.env_version = draft.env_version.or_else(|| text("data/repository_version"));
-        draft.notes.push(
-            "no observations: `actrm-data extract` replays the states and writes them".to_owned(),
-        );
+        draft.notes.push("no observations: `actrm-data extract` replays the states and writes them".to_owned());
         Ok(draft)
     }
 }
