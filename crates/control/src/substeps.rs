@@ -188,3 +188,300 @@ pub type StepFunction = unsafe extern "C" fn(*const c_void, *mut c_void);
 
 /// `mj_jacSite`.
 pub type JacSiteFunction = unsafe extern "C" fn(*const c_void, *const c_void, *mut f64, *mut f64, i32);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::abi::{Gripper, control_close, control_open, control_run};
+    use crate::osc::{Arm, Gains, Pose};
+
+    const NV: usize = 9;
+    const IDENTITY: crate::rotation::Mat3 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+
+    /// A simulation that counts its calls: a chain of nine joints, of which the arm has seven.
+    struct Fake {
+        log: Vec<u8>,
+        ctrl: [f64; NV],
+        qpos: [f64; NV],
+        qvel: [f64; NV],
+        qm: Vec<f64>,
+        bias: [f64; NV],
+        site_xpos: [f64; 6],
+        site_xmat: [f64; 18],
+        range: [f64; 2 * NV],
+        madr: [i32; NV],
+        parent: [i32; NV],
+        dense: [[f64; NV]; NV],
+    }
+
+    unsafe extern "C" fn step1(_: *const c_void, data: *mut c_void) {
+        // SAFETY: the tests bind a Fake as data
+        let fake = unsafe { &mut *data.cast::<Fake>() };
+        fake.log.push(1);
+        // what a real step1 does as well: positions become poses
+        fake.site_xpos[3] = fake.qpos[0];
+    }
+
+    unsafe extern "C" fn step2(_: *const c_void, data: *mut c_void) {
+        // SAFETY: as in step1
+        let fake = unsafe { &mut *data.cast::<Fake>() };
+        fake.log.push(2);
+        fake.qpos[0] += 0.001;
+    }
+
+    unsafe extern "C" fn jac_site(_: *const c_void, data: *const c_void, p: *mut f64, r: *mut f64, site: i32) {
+        // SAFETY: as in step1; the loop gives room for three rows of NV
+        unsafe {
+            (*data.cast_mut().cast::<Fake>()).log.push(10 + site as u8);
+            for i in 0..3 * NV {
+                *p.add(i) = ((i * 7 + 3) % 11) as f64 / 10.0;
+                *r.add(i) = ((i * 5 + 1) % 13) as f64 / 12.0;
+            }
+        }
+    }
+
+    impl Fake {
+        fn new() -> Box<Self> {
+            let mut dense = [[0.0; NV]; NV];
+            for i in 0..NV {
+                for j in 0..NV {
+                    dense[i][j] = 1.0 / (1.0 + i.abs_diff(j) as f64) + if i == j { 1.0 } else { 0.0 };
+                }
+            }
+            // MuJoCo's order: the diagonal, then the ancestors upwards
+            let (mut qm, mut madr) = (Vec::new(), [0; NV]);
+            for i in 0..NV {
+                madr[i] = qm.len() as i32;
+                (0..=i).rev().for_each(|j| qm.push(dense[i][j]));
+            }
+            let mut site_xmat = [0.0; 18];
+            IDENTITY
+                .as_flattened()
+                .iter()
+                .chain(IDENTITY.as_flattened())
+                .zip(&mut site_xmat)
+                .for_each(|(a, b)| *b = *a);
+            Box::new(Self {
+                log: Vec::new(),
+                ctrl: [0.0; NV],
+                qpos: std::array::from_fn(|i| 0.1 * i as f64),
+                qvel: std::array::from_fn(|i| 0.01 * i as f64),
+                qm,
+                bias: std::array::from_fn(|i| i as f64),
+                site_xpos: [0.0, 0.0, 0.9, 0.4, 0.0, 1.0],
+                site_xmat,
+                range: std::array::from_fn(|i| if i % 2 == 0 { -80.0 } else { 80.0 }),
+                madr,
+                parent: std::array::from_fn(|i| i as i32 - 1),
+                dense,
+            })
+        }
+
+        fn bind(&mut self) -> Binding {
+            let data: *mut Self = self;
+            Binding {
+                step1: Some(step1),
+                step2: Some(step2),
+                jac_site: Some(jac_site),
+                model: data.cast_const().cast(),
+                data: data.cast(),
+                ctrl: self.ctrl.as_mut_ptr(),
+                qpos: self.qpos.as_ptr(),
+                qvel: self.qvel.as_ptr(),
+                qm: self.qm.as_ptr(),
+                qfrc_bias: self.bias.as_ptr(),
+                site_xpos: self.site_xpos.as_ptr(),
+                site_xmat: self.site_xmat.as_ptr(),
+                ctrlrange: self.range.as_ptr(),
+                dof_madr: self.madr.as_ptr(),
+                dof_parent: self.parent.as_ptr(),
+                nq: NV as i32,
+                nv: NV as i32,
+                nu: NV as i32,
+                nm: self.qm.len() as i32,
+                nsite: 2,
+                grip_site: 1,
+                origin_site: 0,
+                arm_qpos: [0, 1, 2, 3, 4, 5, 6],
+                arm_dof: [0, 1, 2, 3, 4, 5, 6],
+                arm_actuator: [0, 1, 2, 3, 4, 5, 6],
+                gripper_actuator: [7, 8],
+                gains: Gains {
+                    kp: [150.0; 6],
+                    kd: [2.0 * 150.0_f64.sqrt(); 6],
+                    input_min: [-1.0; 6],
+                    input_max: [1.0; 6],
+                    input_offset: [0.0; 6],
+                    scale: [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],
+                    output_offset: [0.0; 6],
+                    initial_joint: [0.0; DOF],
+                },
+                gripper: Gripper {
+                    speed: 0.2,
+                    direction: [-1.0, 1.0],
+                    input_min: [-1.0; 2],
+                    input_max: [1.0; 2],
+                    input_offset: [0.0; 2],
+                    scale: [1.0; 2],
+                    output_offset: [0.0; 2],
+                    bias: [0.02, -0.02],
+                    weight: [0.02, 0.02],
+                },
+            }
+        }
+    }
+
+    fn state(new_update: u64) -> State {
+        let arm = Arm {
+            ref_pos: [0.3, 0.0, 1.1],
+            ref_ori: IDENTITY,
+            ref_pos_vel: [0.0; 3],
+            ref_ori_vel: [0.0; 3],
+            joint_pos: [0.5; DOF],
+            joint_vel: [0.0; DOF],
+            mass: std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j)))),
+            jacobian: std::array::from_fn(|i| std::array::from_fn(|j| ((i * 3 + j * 5) % 7) as f64 / 7.0)),
+        };
+        let pose = Pose { pos: [0.0; 3], ori: IDENTITY };
+        let policy_arm =
+            PolicyArm { ref_pos: [0.0; 3], ref_ori: IDENTITY, ref_pos_vel: [0.0; 3], ref_ori_vel: [0.0; 3] };
+        State {
+            arm,
+            origin: pose,
+            goal: pose,
+            torques: [0.0; DOF],
+            gripper_action: [0.0; 2],
+            gripper_goal: [0.0; 2],
+            policy_arm,
+            new_update,
+        }
+    }
+
+    const ACTION: [f64; 7] = [0.4, 0.0, -0.2, 0.0, 0.1, 0.0, 1.0];
+
+    #[test]
+    fn substeps_alternate_and_the_arm_is_read_between_them() {
+        let mut fake = Fake::new();
+        let mut made = Loop::new(fake.bind()).expect("sound");
+        let mut state = state(1);
+        // SAFETY: the fake outlives the loop
+        let status = unsafe { made.run(&mut state, &ACTION, 3, true) };
+        assert_eq!(status, Status::Done);
+        assert_eq!(fake.log, [1, 11, 2, 1, 11, 2, 1, 11, 2]);
+        assert_eq!(state.arm.ref_pos, [fake.qpos[0] - 0.001, 0.0, 1.0]);
+        for i in 0..DOF {
+            assert_eq!(state.arm.mass[i], fake.dense[i][..DOF]);
+        }
+        assert_eq!(state.policy_arm.ref_pos, [0.0, 0.0, 1.0]);
+        assert_eq!(state.origin.pos, [0.0, 0.0, 0.9]);
+        assert_eq!(state.new_update, 1);
+    }
+
+    #[test]
+    fn the_first_substep_after_a_reset_uses_the_old_snapshot_and_the_live_bias() {
+        let mut fake = Fake::new();
+        let binding = fake.bind();
+        let mut made = Loop::new(binding).expect("sound");
+        let mut state = state(0);
+        let snapshot = state.arm;
+        // SAFETY: the fake outlives the loop
+        unsafe { made.run(&mut state, &ACTION, 1, true) };
+        assert_eq!(fake.log, [1, 2], "the Jacobian is not asked for");
+        let origin = Pose { pos: [0.0, 0.0, 0.9], ori: IDENTITY };
+        let arm_action = [0.4, 0.0, -0.2, 0.0, 0.1, 0.0];
+        let goal = osc::goal(&binding.gains, &arm_action, &snapshot, &origin);
+        let bias = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+        let expected = osc::torques(&binding.gains, &snapshot, &origin, &goal, &bias).expect("regular");
+        assert_eq!(state.torques, expected);
+        // SAFETY: as above
+        unsafe { made.run(&mut state, &ACTION, 1, false) };
+        assert_ne!(state.arm.ref_pos, snapshot.ref_pos);
+    }
+
+    #[test]
+    fn the_gripper_moves_once_a_control_step_and_stops_at_its_limits() {
+        let mut fake = Fake::new();
+        let mut made = Loop::new(fake.bind()).expect("sound");
+        let mut state = state(1);
+        // commands after each control step: 0.2 a step, whatever the size of the action
+        for (action, expected) in [(1.0, 0.2), (0.01, 0.4), (0.0, 0.4), (-0.5, 0.2)] {
+            let full = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, action];
+            // SAFETY: the fake outlives the loop
+            unsafe { made.run(&mut state, &full, 25, true) };
+            assert!((state.gripper_action[1] - expected).abs() < 1e-15, "{:?}", state.gripper_action);
+            assert_eq!(state.gripper_action[0], -state.gripper_action[1]);
+            assert_eq!(fake.ctrl[7], 0.02 + 0.02 * state.gripper_action[0]);
+            assert_eq!(fake.ctrl[8], -0.02 + 0.02 * state.gripper_action[1]);
+        }
+        for _ in 0..20 {
+            // SAFETY: as above
+            unsafe { made.run(&mut state, &ACTION, 1, true) };
+        }
+        assert_eq!(state.gripper_action, [-1.0, 1.0]);
+        assert_eq!(fake.ctrl[7..], [0.0, 0.0]);
+    }
+
+    #[test]
+    fn controls_stay_within_the_actuators_ranges() {
+        let mut fake = Fake::new();
+        fake.bias[2] = 1e4;
+        fake.bias[3] = -1e4;
+        let mut made = Loop::new(fake.bind()).expect("sound");
+        let mut state = state(1);
+        // SAFETY: the fake outlives the loop
+        unsafe { made.run(&mut state, &ACTION, 1, true) };
+        assert_eq!((fake.ctrl[2], fake.ctrl[3]), (80.0, -80.0));
+        assert!(state.torques[2] > 80.0);
+    }
+
+    #[test]
+    fn a_diverged_simulation_is_reported() {
+        let mut fake = Fake::new();
+        fake.qm[0] = f64::NAN;
+        let mut made = Loop::new(fake.bind()).expect("sound");
+        // SAFETY: the fake outlives the loop
+        assert_eq!(unsafe { made.run(&mut state(1), &ACTION, 5, true) }, Status::Diverged);
+        assert_eq!(fake.log, [1, 11], "nothing runs on");
+    }
+
+    #[test]
+    fn unsound_bindings_are_refused() {
+        let mut fake = Fake::new();
+        let sound = fake.bind();
+        assert!(Loop::new(sound).is_ok());
+        let spoil: [fn(&mut Binding); 6] = [
+            |b| b.step2 = None,
+            |b| b.qm = std::ptr::null(),
+            |b| b.arm_dof[3] = NV as i32,
+            |b| b.arm_qpos[0] = -1,
+            |b| b.gripper_actuator[1] = 9,
+            |b| b.grip_site = 2,
+        ];
+        for (index, spoil) in spoil.iter().enumerate() {
+            let mut binding = sound;
+            spoil(&mut binding);
+            assert_eq!(Loop::new(binding).err(), Some(Status::BadArgument), "{index}");
+        }
+    }
+
+    #[test]
+    fn the_c_interface_runs_and_refuses() {
+        let mut fake = Fake::new();
+        let mut binding = fake.bind();
+        let mut state = state(1);
+        // SAFETY: every pointer is valid or null, and the fake outlives the handle
+        unsafe {
+            let handle = control_open(&binding);
+            assert!(!handle.is_null());
+            assert_eq!(control_run(handle, &mut state, &ACTION, 2, 1), 0);
+            assert_eq!(control_run(handle, &mut state, std::ptr::null(), 2, 1), Status::BadArgument as i32);
+            assert_eq!(control_run(std::ptr::null_mut(), &mut state, &ACTION, 2, 1), Status::BadArgument as i32);
+            control_close(handle);
+            control_close(std::ptr::null_mut());
+            binding.nsite = 0;
+            assert!(control_open(&binding).is_null());
+            assert!(control_open(std::ptr::null()).is_null());
+        }
+        assert_eq!(fake.log.len(), 6);
+    }
+}
