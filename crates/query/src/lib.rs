@@ -1,0 +1,1 @@
+//! SQL over the frames and episodes of a data set.
