@@ -19,10 +19,8 @@
 
 mod carry;
 mod official;
-mod train;
 
-pub use carry::{Carry, Example};
-pub use train::{StepReport, TrainConfig, Trainer};
+pub use carry::{Carry, Example, Release};
 
 use crate::error::{ModelError, Result, some_names};
 use crate::params::{Init, Params};

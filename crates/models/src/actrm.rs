@@ -1,0 +1,726 @@
+//! ACTRM: an action-chunking policy that thinks, with two designs behind one configuration.
+//!
+//! Origins: ACT (arXiv 2304.13705) for observations, latent and loss; the Tiny Recursive Model
+//! (Jolicoeur-Martineau, 2025) for the recursion; the original ACTRM (jshyunbin/R3PL) for putting
+//! the two together.
+//!
+//! **`reasoning.over = "actions"`** (default, our own): `y`, one token per action of the chunk,
+//! is the answer; `z`, a few latent tokens, is the reasoning. The memory (latent, robot state,
+//! environment state) is encoded once per observation. One small block, shared by everything,
+//! updates `z` (`l_cycles` times) and then `y`, each by attending to `[z, y, memory]`. A
+//! supervision step is `h_cycles` such rounds; after it `y` is decoded into a chunk by one dense
+//! layer, so every depth has an answer and the policy can stop at any of them.
+//!
+//! **`reasoning.over = "memory"`**, the original's: the observation encoder is replaced by a
+//! recursion of encoder layers over the observation tokens, with states `z_h` and `z_l` from
+//! fixed values, `h_cycles x l_cycles` per supervision step; ACT's decoder reads `z_h`. The carry
+//! goes on detached, and the number of supervision steps is drawn per batch.
+//!
+//! In both only the last round of a supervision step keeps a graph, the recursion has no dropout,
+//! and the latent is drawn once per batch (the original draws it anew for every step).
+//! Validation and inference run at latent zero, as ACT's do (the original validates with the
+//! posterior of the true actions, which flatters it).
+//!
+//! Halting: a head reads the reasoning after each step and is trained on whether one more step
+//! would still lower this sample's chunk error. For the last step's target one more step runs
+//! without gradient.
+
+mod reasoning;
+
+pub use reasoning::{Budget, Reasoning, ReasoningPolicy, ReasoningStep};
+
+use crate::act::{self, DecoderLayer, Encoder, LayerInit, Vae, absolute};
+use crate::batch::{Batch, Dims};
+use crate::classification::binary_cross_entropy;
+use crate::error::{ModelError, Result};
+use crate::layers::{Activation, Embedding, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention, sinusoid_table};
+use crate::model::{LossParts, PolicyModel};
+use crate::params::{Init, Params};
+use crate::rng::Rng;
+use candle_core::{DType, Device, Tensor};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// What the recursion refines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Over {
+    /// The action chunk.
+    #[default]
+    Actions,
+    /// The encoded observation.
+    Memory,
+}
+
+/// Starting the answer from the previous tick's.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WarmStart {
+    /// Actions executed between two queries: the old answer is moved on by as many.
+    pub shift: usize,
+    /// In training half of each batch starts from the answer to the same observation with this
+    /// much normal noise on it (network units).
+    #[serde(default = "default_noise")]
+    pub noise: f64,
+}
+
+fn default_noise() -> f64 {
+    0.1
+}
+
+/// Options of the recursion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ReasoningConfig {
+    /// what is refined
+    pub over: Over,
+    /// latent reasoning tokens (`over = "actions"`)
+    pub tokens: usize,
+    /// layers of the shared block
+    pub n_layers: usize,
+    /// hidden width of the shared block's dense part; half of `dim_feedforward` when absent
+    pub dim_feedforward: Option<usize>,
+    /// rounds per supervision step; the last one has gradients
+    pub h_cycles: usize,
+    /// updates of the reasoning per round
+    pub l_cycles: usize,
+    /// supervision steps in training (`over = "memory"`: the most that are drawn)
+    pub supervision_steps: usize,
+    /// most steps at inference; as many as in training when absent
+    pub max_steps: Option<usize>,
+    /// stop once the halting head's probability exceeds this; 1 never stops
+    pub halt_threshold: f64,
+    /// stop once the chunk's mean absolute change falls below this (network units); 0 never stops
+    pub change_threshold: f64,
+    /// stop once this much time has passed; the caller brings the clock
+    pub budget_ms: Option<f64>,
+    /// weight of the halting head's loss
+    pub halt_weight: f64,
+    /// an error that one more step lowers by less than this share counts as not lowered
+    pub halt_margin: f64,
+    /// start from the previous tick's answer (`over = "actions"`)
+    pub warm_start: Option<WarmStart>,
+}
+
+impl Default for ReasoningConfig {
+    fn default() -> Self {
+        Self {
+            over: Over::Actions,
+            tokens: 4,
+            n_layers: 1,
+            dim_feedforward: None,
+            h_cycles: 1,
+            l_cycles: 1,
+            supervision_steps: 3,
+            max_steps: None,
+            halt_threshold: 0.9,
+            change_threshold: 0.005,
+            budget_ms: None,
+            halt_weight: 0.1,
+            halt_margin: 0.02,
+            warm_start: None,
+        }
+    }
+}
+
+impl ReasoningConfig {
+    /// The original's recursion over the memory: 3 x 6 cycles of 4 layers, 16 supervision steps.
+    pub fn original() -> Self {
+        Self {
+            over: Over::Memory,
+            n_layers: 4,
+            h_cycles: 3,
+            l_cycles: 6,
+            supervision_steps: 16,
+            halt_threshold: 1.0,
+            change_threshold: 0.0,
+            ..Self::default()
+        }
+    }
+
+    /// Most steps at inference.
+    pub fn max_steps(&self) -> usize {
+        self.max_steps.unwrap_or(self.supervision_steps)
+    }
+}
+
+/// Options of ACTRM; names shared with ACT mean the same.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// actions predicted at once
+    pub action_horizon: usize,
+    /// width
+    pub dim_model: usize,
+    /// attention heads
+    pub n_heads: usize,
+    /// hidden width of the feed-forward layers outside the shared block
+    pub dim_feedforward: usize,
+    /// activation of the feed-forward layers
+    pub feedforward_activation: Activation,
+    /// layers that encode the memory before the recursion (`over = "actions"`)
+    pub n_memory_layers: usize,
+    /// layers of the decoder (`over = "memory"`)
+    pub n_decoder_layers: usize,
+    /// train with a latent
+    pub use_vae: bool,
+    /// width of the latent
+    pub latent_dim: usize,
+    /// layers of the VAE encoder
+    pub n_vae_encoder_layers: usize,
+    /// dropout probability outside the recursion
+    pub dropout: f64,
+    /// weight of the KL term
+    pub kl_weight: f64,
+    /// the recursion
+    pub reasoning: ReasoningConfig,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        let act = act::Config::default();
+        Self {
+            action_horizon: act.action_horizon,
+            dim_model: act.dim_model,
+            n_heads: act.n_heads,
+            dim_feedforward: act.dim_feedforward,
+            feedforward_activation: act.feedforward_activation,
+            n_memory_layers: 1,
+            n_decoder_layers: 1,
+            use_vae: act.use_vae,
+            latent_dim: act.latent_dim,
+            n_vae_encoder_layers: 1,
+            dropout: act.dropout,
+            kl_weight: act.kl_weight,
+            reasoning: ReasoningConfig::default(),
+        }
+    }
+}
+
+impl Config {
+    /// The layers outside the shared block, as ACT's.
+    fn layers(&self) -> act::Config {
+        act::Config {
+            action_horizon: self.action_horizon,
+            pre_norm: false,
+            dim_model: self.dim_model,
+            n_heads: self.n_heads,
+            dim_feedforward: self.dim_feedforward,
+            feedforward_activation: self.feedforward_activation,
+            n_encoder_layers: self.n_memory_layers.max(1),
+            n_decoder_layers: self.n_decoder_layers.max(1),
+            use_vae: self.use_vae,
+            latent_dim: self.latent_dim,
+            n_vae_encoder_layers: self.n_vae_encoder_layers,
+            dropout: self.dropout,
+            kl_weight: self.kl_weight,
+        }
+    }
+
+    /// Hidden width of the shared block's dense part.
+    pub fn block_feedforward(&self) -> usize {
+        self.reasoning.dim_feedforward.unwrap_or(self.dim_feedforward.div_ceil(2))
+    }
+
+    /// Checks that a model with this configuration can exist.
+    ///
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub fn validate(&self) -> Result<()> {
+        self.layers().validate()?;
+        let refuse = |field: &'static str, found: String, expected: &str| {
+            let expected = expected.to_string();
+            Err(ModelError::Config { model: "actrm", field, found, expected })
+        };
+        let r = &self.reasoning;
+        let decoder = if r.over == Over::Memory { self.n_decoder_layers } else { 1 };
+        for (field, value) in [
+            ("n_decoder_layers", decoder),
+            ("reasoning.tokens", r.tokens),
+            ("reasoning.n_layers", r.n_layers),
+            ("reasoning.dim_feedforward", self.block_feedforward()),
+            ("reasoning.h_cycles", r.h_cycles),
+            ("reasoning.l_cycles", r.l_cycles),
+            ("reasoning.supervision_steps", r.supervision_steps),
+            ("reasoning.max_steps", r.max_steps()),
+        ] {
+            if value == 0 {
+                return refuse(field, value.to_string(), "at least 1");
+            }
+        }
+        if !(0.0..=1.0).contains(&r.halt_threshold) {
+            return refuse("reasoning.halt_threshold", r.halt_threshold.to_string(), "0 to 1");
+        }
+        for (field, value) in [
+            ("reasoning.change_threshold", r.change_threshold),
+            ("reasoning.halt_weight", r.halt_weight),
+            ("reasoning.halt_margin", r.halt_margin),
+            ("reasoning.budget_ms", r.budget_ms.unwrap_or(0.0)),
+            ("reasoning.warm_start.noise", r.warm_start.map_or(0.0, |w| w.noise)),
+        ] {
+            if !(value.is_finite() && value >= 0.0) {
+                return refuse(field, value.to_string(), "a finite number, at least 0");
+            }
+        }
+        if let Some(warm) = r.warm_start {
+            if r.over == Over::Memory {
+                return refuse("reasoning.warm_start", "present".into(), "absent with over = \"memory\"");
+            }
+            if warm.shift > self.action_horizon {
+                let most = format!("at most action_horizon, {}", self.action_horizon);
+                return refuse("reasoning.warm_start.shift", warm.shift.to_string(), &most);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The shared layer of `over = "actions"`: attention to a context, then a dense part.
+#[derive(Debug)]
+struct BlockLayer {
+    attn: MultiHeadAttention,
+    ff: FeedForward,
+    norm1: LayerNorm,
+    norm2: LayerNorm,
+}
+
+impl BlockLayer {
+    fn new(params: &mut Params, prefix: &str, config: &Config, rng: &mut Rng) -> Result<Self> {
+        let dim = config.dim_model;
+        let init = LayerInit::Xavier.weight();
+        let hidden = (dim, config.block_feedforward());
+        let act = config.feedforward_activation;
+        Ok(Self {
+            attn: MultiHeadAttention::new(params, &format!("{prefix}.attn"), dim, config.n_heads, 0.0, init, rng)?,
+            ff: FeedForward::new(params, &format!("{prefix}."), hidden, act, 0.0, init, rng)?,
+            norm1: LayerNorm::new(params, &format!("{prefix}.norm1"), dim, rng)?,
+            norm2: LayerNorm::new(params, &format!("{prefix}.norm2"), dim, rng)?,
+        })
+    }
+
+    /// x: (b, t, D), context: (b, s, D) -> (b, t, D)
+    fn forward(&self, x: &Tensor, context: &Tensor) -> Result<Tensor> {
+        let mode = &mut Mode::Eval;
+        let seen = self.attn.forward(x, context, context, None, mode)?;
+        let x = self.norm1.forward(&(x + seen)?)?;
+        self.norm2.forward(&(&x + self.ff.forward(&x, mode)?)?)
+    }
+}
+
+/// The recursion over actions.
+#[derive(Debug)]
+struct OverActions {
+    memory_encoder: Option<Encoder>,
+    /// (R, D), added to z before every update
+    latent_pos: Embedding,
+    /// (H, D), added to y before every update
+    action_pos: Embedding,
+    layers: Vec<BlockLayer>,
+}
+
+/// The recursion over the memory, and ACT's decoder.
+#[derive(Debug)]
+struct OverMemory {
+    block: Encoder,
+    z_init: [Tensor; 2],
+    decoder: Vec<DecoderLayer>,
+    decoder_norm: LayerNorm,
+    decoder_pos: Embedding,
+}
+
+#[derive(Debug)]
+enum Design {
+    Actions(OverActions),
+    Memory(OverMemory),
+}
+
+/// The recursion's states: `(y, z)` over actions, `(z_h, z_l)` over the memory.
+#[derive(Debug, Clone)]
+struct Carry {
+    answer: Tensor,
+    reasoning: Tensor,
+}
+
+impl Carry {
+    fn detach(&self) -> Self {
+        Self { answer: self.answer.detach(), reasoning: self.reasoning.detach() }
+    }
+}
+
+/// What a supervision step gives.
+struct Step {
+    carry: Carry,
+    /// (b, H, A)
+    chunk: Tensor,
+    /// (b,)
+    halt_logit: Tensor,
+}
+
+/// The model.
+#[derive(Debug)]
+pub struct Actrm {
+    config: Config,
+    dims: Dims,
+    params: Params,
+    vae: Option<Vae>,
+    /// (1, H + 2, D), fixed
+    vae_pos_enc: Tensor,
+    latent_input_proj: Linear,
+    robot_state_input_proj: Linear,
+    env_state_input_proj: Option<Linear>,
+    feature_pos_embed: Embedding,
+    design: Design,
+    action_head: Linear,
+    halt_head: Linear,
+}
+
+impl Actrm {
+    /// Initial weights as ACT's: xavier-uniform matrices in the layers, torch's defaults elsewhere.
+    ///
+    /// # Errors
+    /// A configuration or dimensions that describe no possible model.
+    pub fn new(config: &Config, dims: &Dims, seed: u64) -> Result<Self> {
+        config.validate()?;
+        for (field, size) in [("dims.state", dims.state), ("dims.action", dims.action)] {
+            if size == 0 {
+                let expected = "at least 1".to_string();
+                return Err(ModelError::Config { model: "actrm", field, found: "0".into(), expected });
+            }
+        }
+        let rng = &mut Rng::new(seed, "init");
+        let mut p = Params::new();
+        let (dim, layers, r) = (config.dim_model, config.layers(), &config.reasoning);
+        let vae = match config.use_vae {
+            true => Some(Vae::new(&mut p, &layers, dims, rng)?),
+            false => None,
+        };
+        let env = match dims.environment_state {
+            0 => None,
+            e => Some(Linear::new(&mut p, "encoder_env_state_input_proj", e, dim, rng)?),
+        };
+        let tokens = 2 + usize::from(env.is_some());
+        let design = match r.over {
+            Over::Actions => Design::Actions(OverActions {
+                memory_encoder: match config.n_memory_layers {
+                    0 => None,
+                    n => Some(Encoder::new(&mut p, "encoder", n, &layers, LayerInit::Xavier, rng)?),
+                },
+                latent_pos: Embedding::new(&mut p, "reasoning.latent_pos_embed", r.tokens, dim, rng)?,
+                action_pos: Embedding::new(&mut p, "reasoning.action_pos_embed", config.action_horizon, dim, rng)?,
+                layers: (0..r.n_layers)
+                    .map(|i| BlockLayer::new(&mut p, &format!("reasoning.layers.{i}"), config, rng))
+                    .collect::<Result<_>>()?,
+            }),
+            Over::Memory => {
+                // no dropout inside the recursion
+                let quiet = act::Config { dropout: 0.0, ..layers.clone() };
+                Design::Memory(OverMemory {
+                    block: Encoder::new(&mut p, "reasoning", r.n_layers, &quiet, LayerInit::Xavier, rng)?,
+                    z_init: fixed_states(dim)?,
+                    decoder: (0..config.n_decoder_layers)
+                        .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), &layers, rng))
+                        .collect::<Result<_>>()?,
+                    decoder_norm: LayerNorm::new(&mut p, "decoder.norm", dim, rng)?,
+                    decoder_pos: Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?,
+                })
+            }
+        };
+        Ok(Self {
+            vae,
+            vae_pos_enc: sinusoid_table(config.action_horizon + 2, dim)?,
+            latent_input_proj: Linear::new(&mut p, "encoder_latent_input_proj", config.latent_dim, dim, rng)?,
+            robot_state_input_proj: Linear::new(&mut p, "encoder_robot_state_input_proj", dims.state, dim, rng)?,
+            env_state_input_proj: env,
+            feature_pos_embed: Embedding::new(&mut p, "encoder_1d_feature_pos_embed", tokens, dim, rng)?,
+            design,
+            action_head: Linear::new(&mut p, "action_head", dim, dims.action, rng)?,
+            halt_head: Linear::new(&mut p, "halt_head", dim, 1, rng)?,
+            params: p,
+            config: config.clone(),
+            dims: *dims,
+        })
+    }
+
+    /// Its configuration.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// Sizes of its inputs and outputs.
+    pub fn dims(&self) -> &Dims {
+        &self.dims
+    }
+
+    /// latent: (b, L), state: (b, S), environment_state: (b, E) -> (b, M, D)
+    fn tokens(&self, latent: &Tensor, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {
+        let mut tokens = vec![
+            self.latent_input_proj.forward(latent)?.unsqueeze(1)?,
+            self.robot_state_input_proj.forward(state)?.unsqueeze(1)?,
+        ];
+        if let (Some(proj), Some(env)) = (&self.env_state_input_proj, environment_state) {
+            tokens.push(proj.forward(env)?.unsqueeze(1)?);
+        }
+        Ok(Tensor::cat(&tokens, 1)?)
+    }
+
+    /// What the recursion reads, made once per observation: (b, M, D).
+    fn memory(
+        &self,
+        latent: &Tensor,
+        state: &Tensor,
+        environment_state: Option<&Tensor>,
+        mode: &mut Mode<'_>,
+    ) -> Result<Tensor> {
+        let tokens = self.tokens(latent, state, environment_state)?;
+        let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
+        match &self.design {
+            Design::Actions(OverActions { memory_encoder: Some(encoder), .. }) => {
+                let memory = encoder.forward(&tokens, &pos, None, mode)?;
+                Ok(memory.broadcast_add(&pos)?)
+            }
+            Design::Actions(_) => Ok(tokens.broadcast_add(&pos)?),
+            Design::Memory(_) => Ok(tokens),
+        }
+    }
+
+    /// The states before the first step.
+    fn start(&self, batch: usize, memory: &Tensor) -> Result<Carry> {
+        let dim = self.config.dim_model;
+        let zeros = |n: usize| Tensor::zeros((batch, n, dim), DType::F32, &Device::Cpu);
+        Ok(match &self.design {
+            Design::Actions(_) => Carry {
+                answer: zeros(self.config.action_horizon)?,
+                reasoning: zeros(self.config.reasoning.tokens)?,
+            },
+            Design::Memory(design) => {
+                let [h, l] = &design.z_init;
+                Carry {
+                    answer: h.broadcast_as(memory.shape())?.contiguous()?,
+                    reasoning: l.broadcast_as(memory.shape())?.contiguous()?,
+                }
+            }
+        })
+    }
+
+    /// One supervision step. Earlier rounds than the last are detached call by call, so that their
+    /// graphs are freed as they go.
+    fn step(&self, memory: &Tensor, carry: &Carry, mode: &mut Mode<'_>) -> Result<Step> {
+        let mut carry = carry.clone();
+        for round in 1..=self.config.reasoning.h_cycles {
+            carry = match round == self.config.reasoning.h_cycles {
+                true => self.round(memory, &carry, false)?,
+                false => self.round(&memory.detach(), &carry.detach(), true)?,
+            };
+        }
+        let chunk = self.action_head.forward(&match &self.design {
+            Design::Actions(_) => carry.answer.clone(),
+            Design::Memory(design) => self.decode(design, &carry.answer, mode)?,
+        })?;
+        let read = match &self.design {
+            Design::Actions(_) => &carry.reasoning,
+            Design::Memory(_) => &carry.answer,
+        };
+        // the head judges the reasoning and must not bend it
+        let halt_logit = self.halt_head.forward(&read.detach().mean(1)?)?.squeeze(1)?;
+        Ok(Step { carry, chunk, halt_logit })
+    }
+
+    /// `l_cycles` updates of the reasoning, one of the answer.
+    fn round(&self, memory: &Tensor, carry: &Carry, quiet: bool) -> Result<Carry> {
+        let Carry { mut answer, mut reasoning } = carry.clone();
+        let settle = |x: Tensor| if quiet { x.detach() } else { x };
+        match &self.design {
+            Design::Actions(design) => {
+                let action_pos = design.action_pos.weight.unsqueeze(0)?;
+                let latent_pos = design.latent_pos.weight.unsqueeze(0)?;
+                let y = answer.broadcast_add(&action_pos)?;
+                for _ in 0..self.config.reasoning.l_cycles {
+                    let z = reasoning.broadcast_add(&latent_pos)?;
+                    reasoning = settle(design.update(&z, &[&z, &y, memory])?);
+                }
+                let z = reasoning.broadcast_add(&latent_pos)?;
+                answer = settle(design.update(&y, &[&z, &y, memory])?);
+            }
+            Design::Memory(design) => {
+                let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
+                let update = |x: &Tensor| design.block.forward(x, &pos, None, &mut Mode::Eval);
+                let injected = (&answer + memory)?;
+                for _ in 0..self.config.reasoning.l_cycles {
+                    reasoning = settle(update(&(&reasoning + &injected)?)?);
+                }
+                answer = settle(update(&(&answer + &reasoning)?)?);
+            }
+        }
+        Ok(Carry { answer, reasoning })
+    }
+
+    /// ACT's decoder over `z_h`: (b, M, D) -> (b, H, D)
+    fn decode(&self, design: &OverMemory, memory: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
+        let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
+        let query_pos = design.decoder_pos.weight.unsqueeze(0)?;
+        let shape = (memory.dim(0)?, self.config.action_horizon, self.config.dim_model);
+        let mut x = Tensor::zeros(shape, DType::F32, &Device::Cpu)?;
+        for layer in &design.decoder {
+            x = layer.forward(&x, &query_pos, memory, &pos, mode)?;
+        }
+        design.decoder_norm.forward(&x)
+    }
+
+    /// Weights of the supervision steps, which sum to 1: growing with depth over actions (late
+    /// steps are what is executed), equal over the memory (the original's).
+    fn step_weights(&self, steps: usize) -> Vec<f64> {
+        let weight = |i: usize| match self.config.reasoning.over {
+            Over::Actions => (i + 1) as f64,
+            Over::Memory => 1.0,
+        };
+        let total: f64 = (0..steps).map(weight).sum();
+        (0..steps).map(|i| weight(i) / total).collect()
+    }
+
+    fn check_inputs(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<()> {
+        act::check_observation("actrm", &self.dims, state, environment_state)
+    }
+
+    fn check_batch(&self, batch: &Batch) -> Result<()> {
+        self.check_inputs(&batch.state, batch.environment_state.as_ref())?;
+        let expected = [batch.rows(), self.config.action_horizon, self.dims.action];
+        act::check_shape("actrm", "actions", &batch.actions, &expected)?;
+        act::check_shape("actrm", "is_pad", &batch.is_pad, &expected[..2])
+    }
+
+    /// With warm starts in use, the answer that half of the rows begin with: the model's own, to
+    /// the same observation under noise.
+    fn warm_answers(&self, batch: &Batch, warm: WarmStart, carry: &Carry, rng: &mut Rng) -> Result<Tensor> {
+        let mut noisy = |x: &Tensor| -> Result<Tensor> {
+            let noise = Tensor::from_vec(rng.normals(x.elem_count()), x.shape(), x.device())?;
+            Ok((x + (noise * warm.noise)?)?)
+        };
+        let state = noisy(&batch.state)?;
+        let environment_state = batch.environment_state.as_ref().map(&mut noisy).transpose()?;
+        let latent = Tensor::zeros((batch.rows(), self.config.latent_dim), DType::F32, &Device::Cpu)?;
+        let memory = self.memory(&latent, &state, environment_state.as_ref(), &mut Mode::Eval)?.detach();
+        let mut thought = carry.clone();
+        for _ in 0..self.config.reasoning.supervision_steps {
+            thought = self.step(&memory, &thought, &mut Mode::Eval)?.carry.detach();
+        }
+        let warm: Vec<f32> = (0..batch.rows()).map(|_| if rng.uniform() < 0.5 { 1.0 } else { 0.0 }).collect();
+        let warm = Tensor::from_vec(warm, (batch.rows(), 1, 1), &Device::Cpu)?;
+        Ok(thought.answer.broadcast_mul(&warm)?)
+    }
+}
+
+impl OverActions {
+    /// x: (b, t, D), context: tokens to attend to -> (b, t, D)
+    fn update(&self, x: &Tensor, context: &[&Tensor]) -> Result<Tensor> {
+        let context = Tensor::cat(context, 1)?;
+        let mut x = x.clone();
+        for layer in &self.layers {
+            x = layer.forward(&x, &context)?;
+        }
+        Ok(x)
+    }
+}
+
+/// The fixed values that `z_h` and `z_l` begin with: a pure function of the width, so that nothing
+/// untrained needs storing.
+fn fixed_states(dim: usize) -> Result<[Tensor; 2]> {
+    let state = |name: &str| -> Result<Tensor> {
+        let mut rng = Rng::new(0, name);
+        let mut scratch = Params::new();
+        let init = Init::TruncatedNormal { std: 1.0 };
+        Ok(scratch.create("state", &[dim], init, &mut rng)?.detach())
+    };
+    Ok([state("actrm z_h")?, state("actrm z_l")?])
+}
+
+impl PolicyModel for Actrm {
+    fn params(&self) -> &Params {
+        &self.params
+    }
+
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
+        self.check_batch(batch)?;
+        let rows = batch.rows();
+        let shape = (rows, self.config.latent_dim);
+        let latent = match &self.vae {
+            Some(vae) => Some(vae.encode(batch, &self.vae_pos_enc, &mut Mode::Train(rng))?),
+            None => None,
+        };
+        let sample = match &latent {
+            Some((mu, log_variance)) => {
+                let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, &Device::Cpu)?;
+                (mu + (log_variance / 2.0)?.exp()?.mul(&eps)?)?
+            }
+            None => Tensor::zeros(shape, DType::F32, &Device::Cpu)?,
+        };
+        let environment_state = batch.environment_state.as_ref();
+        let memory = self.memory(&sample, &batch.state, environment_state, &mut Mode::Train(rng))?;
+        let mut carry = self.start(rows, &memory)?;
+        if let Some(warm) = self.config.reasoning.warm_start {
+            carry.answer = self.warm_answers(batch, warm, &carry, rng)?;
+        }
+
+        let most = self.config.reasoning.supervision_steps;
+        let steps = match self.config.reasoning.over {
+            Over::Actions => most,
+            // the same for all shards of a batch
+            Over::Memory => 1 + Rng::new(batch.seed, "supervision steps").below(most as u64) as usize,
+        };
+        let (mut chunks, mut halts) = (Vec::new(), Vec::new());
+        for _ in 0..steps {
+            let step = self.step(&memory, &carry, &mut Mode::Train(rng))?;
+            carry = match self.config.reasoning.over {
+                Over::Actions => step.carry,
+                Over::Memory => step.carry.detach(),
+            };
+            chunks.push(step.chunk);
+            halts.push(step.halt_logit);
+        }
+        // one step more, so that the last depth has a halting target as well
+        let beyond = self.step(&memory.detach(), &carry.detach(), &mut Mode::Eval)?.chunk.detach();
+
+        let (b, c, a) = batch.actions.dims3()?;
+        let valid = (1.0 - batch.is_pad.reshape((b, c, 1))?)?;
+        let errors = |chunk: &Tensor| -> Result<Tensor> {
+            Ok(absolute(&(chunk - &batch.actions)?)?.broadcast_mul(&valid)?)
+        };
+        let entries = (batch.total_valid_steps * a).max(1) as f64;
+        let mut parts = BTreeMap::new();
+        let mut total = Tensor::zeros((), DType::F32, &Device::Cpu)?;
+        let mut row_errors = Vec::with_capacity(steps + 1);
+        for (chunk, weight) in chunks.iter().zip(self.step_weights(steps)) {
+            let error = errors(chunk)?;
+            let l1 = (error.sum_all()? / entries)?;
+            // the last step's is the one comparable with ACT's
+            parts.insert("l1_loss".to_string(), l1.detach());
+            parts.entry("l1_loss_first".to_string()).or_insert_with(|| l1.detach());
+            row_errors.push(error.detach().sum((1, 2))?);
+            total = (total + (l1 * weight)?)?;
+        }
+        row_errors.push(errors(&beyond)?.sum((1, 2))?);
+
+        let mut halt = Tensor::zeros((), DType::F32, &Device::Cpu)?;
+        let still = 1.0 - self.config.reasoning.halt_margin;
+        for (i, logit) in halts.iter().enumerate() {
+            let target = row_errors[i + 1].ge(&(&row_errors[i] * still)?)?.to_dtype(DType::F32)?;
+            halt = (halt + binary_cross_entropy(logit, &target)?.sum_all()?)?;
+        }
+        let halt = (halt / (batch.total_rows.max(1) * steps) as f64)?;
+        parts.insert("halt_loss".to_string(), halt.detach());
+        total = (total + (halt * self.config.reasoning.halt_weight)?)?;
+        if let Some((mu, log_variance)) = &latent {
+            let kld = act::kl_divergence(mu, log_variance, batch.total_rows)?;
+            parts.insert("kld_loss".to_string(), kld.detach());
+            total = (total + (kld * self.config.kl_weight)?)?;
+        }
+        Ok(LossParts { total, parts })
+    }
+
+    fn predict(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {
+        Ok(self.reason(state, environment_state, None, &mut |_| false)?.chunk)
+    }
+
+    fn action_horizon(&self) -> usize {
+        self.config.action_horizon
+    }
+}
