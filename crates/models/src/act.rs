@@ -135,7 +135,7 @@ pub(crate) struct EncoderLayer {
 }
 
 impl EncoderLayer {
-    fn new(params: &mut Params, prefix: &str, config: &Config, init: LayerInit, rng: &mut Rng) -> Result<Self> {
+    pub(crate) fn new(params: &mut Params, prefix: &str, config: &Config, init: LayerInit, rng: &mut Rng) -> Result<Self> {
         let (dim, p) = (config.dim_model, config.dropout);
         let attn = format!("{prefix}.self_attn");
         let hidden = (dim, config.dim_feedforward);
@@ -151,7 +151,7 @@ impl EncoderLayer {
     }
 
     /// x: (b, t, D), pos: (1, t, D) -> (b, t, D)
-    fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
+    pub(crate) fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
         let y = if self.pre_norm { self.norm1.forward(x)? } else { x.clone() };
         let qk = y.broadcast_add(pos)?;
         let branch = self.self_attn.forward(&qk, &qk, &y, key_pad, mode)?;
@@ -177,7 +177,7 @@ pub(crate) struct Encoder {
 }
 
 impl Encoder {
-    fn new(
+    pub(crate) fn new(
         params: &mut Params,
         prefix: &str,
         n_layers: usize,
@@ -196,7 +196,7 @@ impl Encoder {
     }
 
     /// x: (b, t, D), pos: (1, t, D) -> (b, t, D)
-    fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
+    pub(crate) fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
         let mut x = x.clone();
         for layer in &self.layers {
             x = layer.forward(&x, pos, key_pad, mode)?;
@@ -222,7 +222,7 @@ pub(crate) struct DecoderLayer {
 }
 
 impl DecoderLayer {
-    fn new(params: &mut Params, prefix: &str, config: &Config, rng: &mut Rng) -> Result<Self> {
+    pub(crate) fn new(params: &mut Params, prefix: &str, config: &Config, rng: &mut Rng) -> Result<Self> {
         let (dim, p, init) = (config.dim_model, config.dropout, LayerInit::Xavier.weight());
         let hidden = (dim, config.dim_feedforward);
         let act = config.feedforward_activation;
@@ -238,7 +238,7 @@ impl DecoderLayer {
     }
 
     /// x: (b, c, D), query_pos: (1, c, D), memory: (b, m, D), memory_pos: (1, m, D) -> (b, c, D)
-    fn forward(
+    pub(crate) fn forward(
         &self,
         x: &Tensor,
         query_pos: &Tensor,
@@ -267,7 +267,7 @@ impl DecoderLayer {
 
 /// How the matrices of a transformer layer start.
 #[derive(Debug, Clone, Copy)]
-enum LayerInit {
+pub(crate) enum LayerInit {
     /// encoder and decoder
     Xavier,
     /// VAE encoder
@@ -275,7 +275,7 @@ enum LayerInit {
 }
 
 impl LayerInit {
-    fn weight(self) -> Init {
+    pub(crate) fn weight(self) -> Init {
         match self {
             Self::Xavier => Init::XavierUniform,
             Self::TorchDefault => Init::KaimingUniform,
@@ -291,6 +291,34 @@ pub(crate) struct Vae {
     pub(crate) robot_state_input_proj: Linear,
     pub(crate) action_input_proj: Linear,
     pub(crate) latent_output_proj: Linear,
+}
+
+impl Vae {
+    pub(crate) fn new(p: &mut Params, config: &Config, dims: &Dims, rng: &mut Rng) -> Result<Self> {
+        let (dim, layers) = (config.dim_model, config.n_vae_encoder_layers);
+        Ok(Self {
+            encoder: Encoder::new(p, "vae_encoder", layers, config, LayerInit::TorchDefault, rng)?,
+            cls_embed: Embedding::new(p, "vae_encoder_cls_embed", 1, dim, rng)?,
+            robot_state_input_proj: Linear::new(p, "vae_encoder_robot_state_input_proj", dims.state, dim, rng)?,
+            action_input_proj: Linear::new(p, "vae_encoder_action_input_proj", dims.action, dim, rng)?,
+            latent_output_proj: Linear::new(p, "vae_encoder_latent_output_proj", dim, 2 * config.latent_dim, rng)?,
+        })
+    }
+
+    /// actions: (b, C, A), is_pad: (b, C), pos: (1, C + 2, D) -> mean and log-variance of the latent, (b, L) each
+    pub(crate) fn encode(&self, batch: &Batch, pos: &Tensor, mode: &mut Mode<'_>) -> Result<(Tensor, Tensor)> {
+        let (b, dim) = (batch.rows(), self.cls_embed.weight.dim(1)?);
+        let latent = self.latent_output_proj.weight.dim(0)? / 2;
+        let cls = self.cls_embed.weight.reshape((1, 1, dim))?.broadcast_as((b, 1, dim))?;
+        let state = self.robot_state_input_proj.forward(&batch.state)?.unsqueeze(1)?;
+        let actions = self.action_input_proj.forward(&batch.actions)?;
+        let tokens = Tensor::cat(&[&cls.contiguous()?, &state, &actions], 1)?;
+        let always = Tensor::zeros((b, 2), DType::F32, tokens.device())?;
+        let key_pad = Tensor::cat(&[&always, &batch.is_pad], 1)?;
+        let x = self.encoder.forward(&tokens, pos, Some(&key_pad), mode)?;
+        let out = self.latent_output_proj.forward(&x.narrow(1, 0, 1)?.squeeze(1)?)?;
+        Ok((out.narrow(1, 0, latent)?, out.narrow(1, latent, latent)?))
+    }
 }
 
 /// What the training forward pass gives.
@@ -345,32 +373,7 @@ impl Act {
         let mut p = Params::new();
         let dim = config.dim_model;
         let vae = match config.use_vae {
-            true => Some(Vae {
-                encoder: Encoder::new(
-                    &mut p,
-                    "vae_encoder",
-                    config.n_vae_encoder_layers,
-                    config,
-                    LayerInit::TorchDefault,
-                    rng,
-                )?,
-                cls_embed: Embedding::new(&mut p, "vae_encoder_cls_embed", 1, dim, rng)?,
-                robot_state_input_proj: Linear::new(
-                    &mut p,
-                    "vae_encoder_robot_state_input_proj",
-                    dims.state,
-                    dim,
-                    rng,
-                )?,
-                action_input_proj: Linear::new(&mut p, "vae_encoder_action_input_proj", dims.action, dim, rng)?,
-                latent_output_proj: Linear::new(
-                    &mut p,
-                    "vae_encoder_latent_output_proj",
-                    dim,
-                    2 * config.latent_dim,
-                    rng,
-                )?,
-            }),
+            true => Some(Vae::new(&mut p, config, dims, rng)?),
             false => None,
         };
         let encoder = Encoder::new(&mut p, "encoder", config.n_encoder_layers, config, LayerInit::Xavier, rng)?;
@@ -416,20 +419,6 @@ impl Act {
         &self.dims
     }
 
-    /// actions: (b, C, A), is_pad: (b, C) -> mean and log-variance of the latent, (b, L) each
-    fn encode_latent(&self, vae: &Vae, batch: &Batch, mode: &mut Mode<'_>) -> Result<(Tensor, Tensor)> {
-        let (b, dim, latent) = (batch.rows(), self.config.dim_model, self.config.latent_dim);
-        let cls = vae.cls_embed.weight.reshape((1, 1, dim))?.broadcast_as((b, 1, dim))?;
-        let state = vae.robot_state_input_proj.forward(&batch.state)?.unsqueeze(1)?;
-        let actions = vae.action_input_proj.forward(&batch.actions)?;
-        let tokens = Tensor::cat(&[&cls.contiguous()?, &state, &actions], 1)?;
-        let always = Tensor::zeros((b, 2), DType::F32, tokens.device())?;
-        let key_pad = Tensor::cat(&[&always, &batch.is_pad], 1)?;
-        let x = vae.encoder.forward(&tokens, &self.vae_encoder_pos_enc, Some(&key_pad), mode)?;
-        let out = vae.latent_output_proj.forward(&x.narrow(1, 0, 1)?.squeeze(1)?)?;
-        Ok((out.narrow(1, 0, latent)?, out.narrow(1, latent, latent)?))
-    }
-
     /// latent: (b, L), state: (b, S), environment_state: (b, E) -> (b, C, A)
     fn decode(
         &self,
@@ -464,7 +453,7 @@ impl Act {
     pub fn train_forward(&self, batch: &Batch, eps: &Tensor, mode: &mut Mode<'_>) -> Result<TrainOutput> {
         self.check_batch(batch)?;
         let latent = match &self.vae {
-            Some(vae) => Some(self.encode_latent(vae, batch, mode)?),
+            Some(vae) => Some(vae.encode(batch, &self.vae_encoder_pos_enc, mode)?),
             None => None,
         };
         let sample = match &latent {
@@ -485,8 +474,7 @@ impl Act {
         let mut parts = BTreeMap::from([("l1_loss".to_string(), l1.detach())]);
         let mut total = l1;
         if let Some((mu, log_variance)) = &output.latent {
-            let terms = ((log_variance + 1.0)? - mu.sqr()? - log_variance.exp()?)?;
-            let kld = (terms.sum_all()? * (-0.5 / batch.total_rows.max(1) as f64))?;
+            let kld = kl_divergence(mu, log_variance, batch.total_rows)?;
             parts.insert("kld_loss".to_string(), kld.detach());
             total = (total + (kld * self.config.kl_weight)?)?;
         }
@@ -497,23 +485,12 @@ impl Act {
         self.check_inputs(&batch.state, batch.environment_state.as_ref())?;
         let b = batch.rows();
         let expected = [b, self.config.action_horizon, self.dims.action];
-        check_shape("actions", &batch.actions, &expected)?;
-        check_shape("is_pad", &batch.is_pad, &expected[..2])
+        check_shape("act", "actions", &batch.actions, &expected)?;
+        check_shape("act", "is_pad", &batch.is_pad, &expected[..2])
     }
 
     pub(crate) fn check_inputs(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<()> {
-        let b = state.dims().first().copied().unwrap_or(0).max(1);
-        check_shape("state", state, &[b, self.dims.state])?;
-        match (environment_state, self.dims.environment_state) {
-            (None, 0) => Ok(()),
-            (Some(env), e) if e > 0 => check_shape("environment_state", env, &[b, e]),
-            (given, e) => Err(ModelError::Input {
-                operation: "act",
-                object: "environment_state",
-                found: given.map_or("absent".to_string(), |t| format!("{:?}", t.dims())),
-                expected: if e == 0 { "absent".to_string() } else { format!("[{b}, {e}]") },
-            }),
-        }
+        check_observation("act", &self.dims, state, environment_state)
     }
 
     /// The prediction on candle's autograd; `predict` runs the same maths faster.
@@ -525,17 +502,49 @@ impl Act {
 }
 
 /// |x| whose gradient at 0 is 0, as torch's; candle's own is 1 there.
-fn absolute(x: &Tensor) -> Result<Tensor> {
+pub(crate) fn absolute(x: &Tensor) -> Result<Tensor> {
     let sign = (x.gt(0.0)?.to_dtype(DType::F32)? - x.lt(0.0)?.to_dtype(DType::F32)?)?;
     Ok(x.mul(&sign.detach())?)
 }
 
-fn check_shape(object: &'static str, tensor: &Tensor, expected: &[usize]) -> Result<()> {
+pub(crate) fn check_shape(
+    operation: &'static str,
+    object: &'static str,
+    tensor: &Tensor,
+    expected: &[usize],
+) -> Result<()> {
     if tensor.dims() == expected {
         return Ok(());
     }
     let (expected, found) = (expected.to_vec(), tensor.dims().to_vec());
-    Err(ModelError::Shape { operation: "act", object, expected, found })
+    Err(ModelError::Shape { operation, object, expected, found })
+}
+
+/// Checks `state: (b, S)` and `environment_state: (b, E)` against the model's sizes.
+pub(crate) fn check_observation(
+    operation: &'static str,
+    dims: &Dims,
+    state: &Tensor,
+    environment_state: Option<&Tensor>,
+) -> Result<()> {
+    let b = state.dims().first().copied().unwrap_or(0).max(1);
+    check_shape(operation, "state", state, &[b, dims.state])?;
+    match (environment_state, dims.environment_state) {
+        (None, 0) => Ok(()),
+        (Some(env), e) if e > 0 => check_shape(operation, "environment_state", env, &[b, e]),
+        (given, e) => Err(ModelError::Input {
+            operation,
+            object: "environment_state",
+            found: given.map_or("absent".to_string(), |t| format!("{:?}", t.dims())),
+            expected: if e == 0 { "absent".to_string() } else { format!("[{b}, {e}]") },
+        }),
+    }
+}
+
+/// KL(latent ‖ N(0, 1)), summed over the latent and averaged over `total_rows`.
+pub(crate) fn kl_divergence(mu: &Tensor, log_variance: &Tensor, total_rows: usize) -> Result<Tensor> {
+    let terms = ((log_variance + 1.0)? - mu.sqr()? - log_variance.exp()?)?;
+    Ok((terms.sum_all()? * (-0.5 / total_rows.max(1) as f64))?)
 }
 
 impl PolicyModel for Act {

@@ -6,7 +6,10 @@
 //! randomness is drawn from `Rng`.
 
 pub mod act;
+pub mod actrm;
+pub mod baselines;
 mod batch;
+pub mod classification;
 mod error;
 mod gradients;
 pub mod layers;
@@ -15,6 +18,7 @@ mod normaliser;
 mod params;
 mod policy;
 mod rng;
+pub mod trm;
 
 pub use batch::{Batch, Dims};
 pub use error::{ModelError, Result};

@@ -1,6 +1,7 @@
 //! What the trainer, the zoo and the policies need of a model.
 
 use crate::act::{self, Act};
+use crate::actrm::{self, Actrm};
 use crate::batch::{Batch, Dims};
 use crate::error::{ModelError, Result};
 use crate::gradients::Gradients;
@@ -89,6 +90,8 @@ pub trait PolicyModel: Send + Sync {
 pub enum PolicyConfig {
     /// Action Chunking with Transformers
     Act(act::Config),
+    /// ACT that reasons recursively
+    Actrm(actrm::Config),
 }
 
 impl PolicyConfig {
@@ -99,6 +102,7 @@ impl PolicyConfig {
     pub fn build(&self, dims: &Dims, seed: u64) -> Result<Box<dyn PolicyModel>> {
         match self {
             Self::Act(config) => Ok(Box::new(Act::new(config, dims, seed)?)),
+            Self::Actrm(config) => Ok(Box::new(Actrm::new(config, dims, seed)?)),
         }
     }
 
@@ -106,6 +110,7 @@ impl PolicyConfig {
     pub fn action_horizon(&self) -> usize {
         match self {
             Self::Act(config) => config.action_horizon,
+            Self::Actrm(config) => config.action_horizon,
         }
     }
 }

@@ -1,0 +1,95 @@
+//! The TRM against the official implementation's numbers: every folder with `config.json`, `model.safetensors` and
+//! `io.safetensors` (inputs and the outputs of successive supervision steps) below `tests/fixtures/trm_official` and
+//! below the directory that `ACTRM_PARITY_DIR` names.
+#![allow(clippy::unwrap_used)]
+
+use candle_core::{DType, Device, Tensor};
+use models::trm::{Config, Gradient, Trm};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Largest absolute difference allowed between any two numbers.
+const TOLERANCE: f64 = 1e-5;
+
+fn fixtures(below: &Path, found: &mut Vec<PathBuf>) {
+    let mut entries: Vec<PathBuf> = std::fs::read_dir(below).unwrap().map(|entry| entry.unwrap().path()).collect();
+    entries.sort();
+    let has = |name: &str| below.join(name).is_file();
+    if has("config.json") && has("model.safetensors") && has("io.safetensors") {
+        found.push(below.to_path_buf());
+    }
+    for path in entries.into_iter().filter(|path| path.is_dir()) {
+        fixtures(&path, found);
+    }
+}
+
+fn load(path: PathBuf) -> BTreeMap<String, Tensor> {
+    candle_core::safetensors::load(path, &Device::Cpu).unwrap().into_iter().collect()
+}
+
+fn difference(got: &Tensor, expected: &Tensor) -> f64 {
+    let expected = expected.to_dtype(DType::F64).unwrap();
+    let difference = (got.to_dtype(DType::F64).unwrap() - expected).unwrap().abs().unwrap();
+    difference.max_all().unwrap().to_scalar().unwrap()
+}
+
+fn check(folder: &Path) {
+    let config = std::fs::read_to_string(folder.join("config.json")).unwrap();
+    let config = Config::from_official(&serde_json::from_str(&config).unwrap()).unwrap();
+    let mut model = Trm::new(config, 0).unwrap();
+    model.load(&load(folder.join("model.safetensors"))).unwrap();
+    let io = load(folder.join("io.safetensors"));
+    let inputs = io["inputs"].to_dtype(DType::U32).unwrap();
+    let identifiers = io.get("puzzle_identifiers").map(|t| t.to_dtype(DType::U32).unwrap());
+    for gradient in [Gradient::On, Gradient::Off] {
+        let mut states = model.initial_states(inputs.dim(0).unwrap()).unwrap();
+        let mut steps = 0;
+        while let Some(logits) = io.get(&format!("step{steps}.logits")) {
+            let out = model.supervision_step(&states, &inputs, identifiers.as_ref(), gradient).unwrap();
+            let expected = |name: &str| &io[&format!("step{steps}.{name}")];
+            for (name, got, expected) in [
+                ("logits", &out.logits, logits),
+                ("q_halt_logits", &out.q_halt, expected("q_halt_logits")),
+                ("z_h", &out.states.z_h, expected("z_h")),
+                ("z_l", &out.states.z_l, expected("z_l")),
+            ] {
+                let difference = difference(got, expected);
+                assert!(difference <= TOLERANCE, "{}: step {steps}: {name} is off by {difference:e}", folder.display());
+            }
+            states = out.states;
+            steps += 1;
+        }
+        assert!(steps > 0, "{}: no step to compare", folder.display());
+    }
+}
+
+#[test]
+fn the_official_outputs_are_reproduced() {
+    let mut found = Vec::new();
+    fixtures(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/trm_official"), &mut found);
+    assert_eq!(found.len(), 2, "the repository ships two fixtures: {found:?}");
+    if let Some(more) = std::env::var_os("ACTRM_PARITY_DIR") {
+        fixtures(Path::new(&more), &mut found);
+    }
+    for folder in found {
+        check(&folder);
+    }
+}
+
+#[test]
+fn tensors_of_another_model_are_named() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/trm_official");
+    let config = std::fs::read_to_string(folder.join("attention/config.json")).unwrap();
+    let config = Config::from_official(&serde_json::from_str(&config).unwrap()).unwrap();
+    let mut model = Trm::new(config, 0).unwrap();
+    let mut tensors = load(folder.join("mlp_t/model.safetensors"));
+    let error = model.load(&tensors).unwrap_err().to_string();
+    assert!(error.contains("L_level.layers.0.self_attn.o_proj.weight is missing"), "{error}");
+    tensors = load(folder.join("attention/model.safetensors"));
+    let state = tensors.remove("inner.H_init").unwrap();
+    let error = model.load(&tensors).unwrap_err().to_string();
+    assert!(error.contains("inner.H_init is missing"), "{error}");
+    tensors.insert("inner.H_init".into(), state.narrow(0, 0, 8).unwrap());
+    let error = model.load(&tensors).unwrap_err().to_string();
+    assert!(error.contains("inner.H_init has shape [8]"), "{error}");
+}
