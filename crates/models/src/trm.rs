@@ -9,6 +9,9 @@
 //! the last round keeps a graph, so memory does not grow with the number of rounds. The states
 //! then go, detached, to the next supervision step: see [`Carry`].
 //!
+//! This file is the model as one reads it, on candle's autograd. Supervision steps run the same
+//! maths in `trm/kernel.rs`, forward and backward by hand; tests hold the two together.
+//!
 //! Deviations from the reference:
 //! - everything is f32 (the reference trains in bf16 with f32 master weights);
 //! - [`Mixing::Conv`], a 3x3 convolution over a grid in place of attention, is ours;
@@ -18,6 +21,10 @@
 //!   reference's numbers.
 
 mod carry;
+mod elementwise;
+mod fused;
+mod gemm;
+mod kernel;
 mod official;
 
 pub use carry::{Carry, Example, Release};
@@ -366,6 +373,7 @@ pub struct Trm {
     h_init: Tensor,
     l_init: Tensor,
     rope: Option<(Tensor, Tensor)>,
+    fused: fused::Fused,
 }
 
 const H_INIT: &str = "inner.H_init";
@@ -459,6 +467,28 @@ impl Weights {
             q_weight: self.q_weight.detach(),
             q_bias: self.q_bias.detach(),
         }
+    }
+}
+
+impl Layer {
+    /// In the order in which the kernel expects them.
+    fn tensors(&self) -> Vec<&Tensor> {
+        let mut tensors = match &self.mix {
+            Mix::Attention { qkv, out } => vec![qkv, out],
+            Mix::MlpT { gate_up, down } => vec![gate_up, down],
+            Mix::Conv { kernel } => vec![kernel],
+        };
+        tensors.extend([&self.gate_up, &self.down]);
+        tensors
+    }
+}
+
+impl Weights {
+    /// The network's weights one after the other, as the kernel reads them.
+    fn flat(&self) -> Result<Tensor> {
+        let parts = self.layers.iter().flat_map(Layer::tensors).map(Tensor::flatten_all);
+        let parts: Vec<Tensor> = parts.collect::<candle_core::Result<_>>()?;
+        Ok(Tensor::cat(&parts, 0)?)
     }
 }
 
@@ -565,6 +595,7 @@ impl Trm {
             _ => None,
         };
         Ok(Self {
+            fused: fused::Fused::new(&config, rope.as_ref())?,
             frozen: tracked.detach(),
             h_init,
             l_init,
@@ -651,6 +682,45 @@ impl Trm {
         identifiers: Option<&Tensor>,
         gradient: Gradient,
     ) -> Result<StepOutput> {
+        self.check_step(states, inputs)?;
+        let weights = self.weights(gradient);
+        let embedded = self.embed(weights, inputs, identifiers)?;
+        let cycles = (self.config.h_cycles, self.config.l_cycles);
+        let now = self.fused.step(&weights.flat()?, states, &embedded, cycles, gradient)?;
+        self.read_out(weights, now)
+    }
+
+    /// [`Self::supervision_step`] on candle's autograd: slower, and what it is checked against.
+    ///
+    /// # Errors
+    /// The same.
+    pub fn supervision_step_composed(
+        &self,
+        states: &States,
+        inputs: &Tensor,
+        identifiers: Option<&Tensor>,
+        gradient: Gradient,
+    ) -> Result<StepOutput> {
+        self.check_step(states, inputs)?;
+        let weights = self.weights(gradient);
+        let embedded = self.embed(weights, inputs, identifiers)?;
+        let mut now = states.detach();
+        let quiet = embedded.detach();
+        for _ in 1..self.config.h_cycles {
+            now = self.round(&self.frozen, &now, &quiet)?;
+        }
+        let now = self.round(weights, &now, &embedded)?;
+        self.read_out(weights, now)
+    }
+
+    fn weights(&self, gradient: Gradient) -> &Weights {
+        match gradient {
+            Gradient::On => &self.tracked,
+            Gradient::Off => &self.frozen,
+        }
+    }
+
+    fn check_step(&self, states: &States, inputs: &Tensor) -> Result<()> {
         let (batch, len) = inputs.dims2()?;
         if len != self.config.seq_len {
             return Err(misfit("inputs", &[batch, self.config.seq_len], inputs.dims()));
@@ -661,18 +731,12 @@ impl Trm {
                 return Err(misfit(name, &expected, state.dims()));
             }
         }
-        let weights = match gradient {
-            Gradient::On => &self.tracked,
-            Gradient::Off => &self.frozen,
-        };
-        let embedded = self.embed(weights, inputs, identifiers)?;
-        let mut now = states.detach();
-        let quiet = embedded.detach();
-        for _ in 1..self.config.h_cycles {
-            now = self.round(&self.frozen, &now, &quiet)?;
-        }
-        let now = self.round(weights, &now, &embedded)?;
-        let answer = now.z_h.narrow(1, self.config.prefix_len(), len)?;
+        Ok(())
+    }
+
+    /// Answers and halting logits of the states after the last round.
+    fn read_out(&self, weights: &Weights, now: States) -> Result<StepOutput> {
+        let answer = now.z_h.narrow(1, self.config.prefix_len(), self.config.seq_len)?;
         let pooled = match self.config.pooling {
             Pooling::First => now.z_h.i((.., 0, ..))?.contiguous()?,
             Pooling::Mean => now.z_h.mean(1)?,
