@@ -13,7 +13,7 @@ pub use small_trm::{SmallTrm, SmallTrmConfig, Stem};
 
 use crate::error::{ModelError, Result};
 use crate::layers::{
-    Activation, Dropout, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention,
+    Activation, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention,
 };
 use crate::params::{Init, Params};
 use crate::rng::Rng;

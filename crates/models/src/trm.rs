@@ -26,6 +26,8 @@ mod fused;
 mod gemm;
 mod kernel;
 mod official;
+#[cfg(test)]
+mod tests;
 
 pub use carry::{Carry, Example, Release};
 
@@ -430,8 +432,9 @@ fn rotary_table(positions: usize, size: usize, theta: f64) -> Result<(Tensor, Te
     let mut angles = Vec::with_capacity(positions * size);
     for position in 0..positions {
         for i in 0..size {
-            let frequency = theta.powf(-(2.0 * (i % (size / 2)) as f64) / size as f64);
-            angles.push((position as f32) * frequency as f32);
+            // in f32 from the start, as the reference does: its numbers are what checkpoints know
+            let exponent = (2 * (i % (size / 2))) as f32 / size as f32;
+            angles.push(position as f32 * (1.0 / (theta as f32).powf(exponent)));
         }
     }
     let angles = Tensor::from_vec(angles, (positions, size), &Device::Cpu)?;
@@ -439,34 +442,26 @@ fn rotary_table(positions: usize, size: usize, theta: f64) -> Result<(Tensor, Te
 }
 
 impl Weights {
-    fn detach(&self) -> Self {
-        let detach = |t: &Option<Tensor>| t.as_ref().map(Tensor::detach);
-        let layer = |layer: &Layer| Layer {
-            mix: match &layer.mix {
-                Mix::Attention { qkv, out } => Mix::Attention {
-                    qkv: qkv.detach(),
-                    out: out.detach(),
-                },
-                Mix::MlpT { gate_up, down } => Mix::MlpT {
-                    gate_up: gate_up.detach(),
-                    down: down.detach(),
-                },
-                Mix::Conv { kernel } => Mix::Conv {
-                    kernel: kernel.detach(),
-                },
-            },
-            gate_up: layer.gate_up.detach(),
-            down: layer.down.detach(),
+    /// The same weights, each through `f`.
+    fn map(&self, f: &dyn Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
+        let optional = |t: &Option<Tensor>| t.as_ref().map(f).transpose();
+        let layer = |layer: &Layer| {
+            let mix = match &layer.mix {
+                Mix::Attention { qkv, out } => Mix::Attention { qkv: f(qkv)?, out: f(out)? },
+                Mix::MlpT { gate_up, down } => Mix::MlpT { gate_up: f(gate_up)?, down: f(down)? },
+                Mix::Conv { kernel } => Mix::Conv { kernel: f(kernel)? },
+            };
+            Ok(Layer { mix, gate_up: f(&layer.gate_up)?, down: f(&layer.down)? })
         };
-        Self {
-            embed: self.embed.detach(),
-            positions: detach(&self.positions),
-            puzzles: detach(&self.puzzles),
-            layers: self.layers.iter().map(layer).collect(),
-            lm_head: self.lm_head.detach(),
-            q_weight: self.q_weight.detach(),
-            q_bias: self.q_bias.detach(),
-        }
+        Ok(Self {
+            embed: f(&self.embed)?,
+            positions: optional(&self.positions)?,
+            puzzles: optional(&self.puzzles)?,
+            layers: self.layers.iter().map(layer).collect::<Result<_>>()?,
+            lm_head: f(&self.lm_head)?,
+            q_weight: f(&self.q_weight)?,
+            q_bias: f(&self.q_bias)?,
+        })
     }
 }
 
@@ -596,7 +591,7 @@ impl Trm {
         };
         Ok(Self {
             fused: fused::Fused::new(&config, rope.as_ref())?,
-            frozen: tracked.detach(),
+            frozen: tracked.map(&|t| Ok(t.detach()))?,
             h_init,
             l_init,
             config,
@@ -701,13 +696,42 @@ impl Trm {
         identifiers: Option<&Tensor>,
         gradient: Gradient,
     ) -> Result<StepOutput> {
+        self.composed((self.weights(gradient), &self.frozen), states, inputs, identifiers)
+    }
+
+    /// A supervision step without gradient in f64. The recursion amplifies rounding, so two
+    /// implementations in f32 drift apart; this one says how far the drift is rounding alone.
+    ///
+    /// # Errors
+    /// The same.
+    pub fn supervision_step_exact(
+        &self,
+        states: &States,
+        inputs: &Tensor,
+        identifiers: Option<&Tensor>,
+    ) -> Result<StepOutput> {
+        let weights = self.frozen.map(&|t| Ok(t.to_dtype(DType::F64)?))?;
+        let states = States {
+            z_h: states.z_h.to_dtype(DType::F64)?,
+            z_l: states.z_l.to_dtype(DType::F64)?,
+        };
+        self.composed((&weights, &weights), &states, inputs, identifiers)
+    }
+
+    /// One supervision step, its last round with the first weights, earlier ones with the second.
+    fn composed(
+        &self,
+        (weights, quiet_weights): (&Weights, &Weights),
+        states: &States,
+        inputs: &Tensor,
+        identifiers: Option<&Tensor>,
+    ) -> Result<StepOutput> {
         self.check_step(states, inputs)?;
-        let weights = self.weights(gradient);
         let embedded = self.embed(weights, inputs, identifiers)?;
         let mut now = states.detach();
         let quiet = embedded.detach();
         for _ in 1..self.config.h_cycles {
-            now = self.round(&self.frozen, &now, &quiet)?;
+            now = self.round(quiet_weights, &now, &quiet)?;
         }
         let now = self.round(weights, &now, &embedded)?;
         self.read_out(weights, now)
@@ -825,8 +849,9 @@ impl Trm {
         };
         let (mut q, mut k, v) = (part(0)?, part(1)?, part(2)?);
         if let Some((cos, sin)) = &self.rope {
-            q = rotate(&q, cos, sin)?;
-            k = rotate(&k, cos, sin)?;
+            let (cos, sin) = (cos.to_dtype(x.dtype())?, sin.to_dtype(x.dtype())?);
+            q = rotate(&q, &cos, &sin)?;
+            k = rotate(&k, &cos, &sin)?;
         }
         let scores = (q.matmul(&k.t()?)? * (1.0 / (size as f64).sqrt()))?;
         // candle's softmax_last_dim has no backward; this one is composed

@@ -1,0 +1,126 @@
+#![allow(clippy::unwrap_used)]
+use super::*;
+
+fn configs() -> Vec<Config> {
+    let base = Config { num_heads: 2, layers: 2, h_cycles: 2, l_cycles: 3, inner_size: Some(10), ..Config::new(5, 6, 8) };
+    let puzzles = Config { puzzle_emb_ndim: 12, num_puzzle_identifiers: 3, ..base.clone() };
+    vec![
+        base.clone(),
+        Config { positions: Positions::Learned, num_heads: 4, pooling: Pooling::Mean, ..base.clone() },
+        Config { mixing: Mixing::MlpT, positions: Positions::None, ..base.clone() },
+        Config {
+            mixing: Mixing::Conv,
+            positions: Positions::None,
+            grid: Some([2, 3]),
+            layers: 1,
+            classes: Some(3),
+            ..base.clone()
+        },
+        Config { mixing: Mixing::MlpT, positions: Positions::None, ..puzzles.clone() },
+        puzzles,
+    ]
+}
+
+/// Inputs and identifiers of `batch` puzzles.
+fn puzzles(config: &Config, batch: usize) -> (Tensor, Tensor) {
+    let mut rng = Rng::new(9, "puzzles");
+    let tokens: Vec<u32> = (0..batch * config.seq_len).map(|_| rng.below(config.vocab_size as u64) as u32).collect();
+    let inputs = Tensor::from_vec(tokens, (batch, config.seq_len), &Device::Cpu).unwrap();
+    let identifiers: Vec<u32> = (0..batch as u32).map(|i| i % 3).collect();
+    (inputs, Tensor::from_vec(identifiers, batch, &Device::Cpu).unwrap())
+}
+
+/// A loss that reads everything a step gives, in no symmetric way.
+fn loss(out: &StepOutput) -> Tensor {
+    let logits = out.logits.sin().unwrap().sqr().unwrap().sum_all().unwrap();
+    (logits + out.q_halt.cos().unwrap().sum_all().unwrap()).unwrap()
+}
+
+fn distance(a: &Tensor, b: &Tensor) -> f32 {
+    (a - b).unwrap().abs().unwrap().max_all().unwrap().to_scalar().unwrap()
+}
+
+#[test]
+fn the_kernel_is_the_composed_model_forward_and_backward() {
+    for config in configs() {
+        let model = Trm::new(config.clone(), 3).unwrap();
+        // the halting head starts at zero, which would hide its input's gradient
+        let mut rng = Rng::new(1, "head");
+        let head = model.params.get("inner.q_head.weight").unwrap();
+        let values = Tensor::from_vec(rng.normals(head.elem_count()), head.shape(), &Device::Cpu).unwrap();
+        head.set(&values).unwrap();
+        let (inputs, identifiers) = puzzles(&config, 5);
+        let states = model.initial_states(5).unwrap();
+        let fused = model.supervision_step(&states, &inputs, Some(&identifiers), Gradient::On).unwrap();
+        let composed = model.supervision_step_composed(&states, &inputs, Some(&identifiers), Gradient::On).unwrap();
+        for (name, a, b) in [
+            ("logits", &fused.logits, &composed.logits),
+            ("q", &fused.q_halt, &composed.q_halt),
+            ("z_h", &fused.states.z_h, &composed.states.z_h),
+            ("z_l", &fused.states.z_l, &composed.states.z_l),
+        ] {
+            // rounding grows over the eight calls of the network
+            let off = distance(a, b);
+            assert!(off < 5e-5, "{config:?}: {name} is off by {off:e}");
+        }
+        let (a, b) = (loss(&fused).backward().unwrap(), loss(&composed).backward().unwrap());
+        for (name, var) in model.params.iter() {
+            let (a, b) = (a.get(var.as_tensor()).unwrap(), b.get(var.as_tensor()).unwrap());
+            let size = b.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+            assert!(size > 0.0, "{config:?}: {name} has a zero gradient");
+            let off = distance(a, b) / size.max(1.0);
+            assert!(off < 1e-4, "{config:?}: gradient of {name} is off by {off:e} of {size}");
+        }
+    }
+}
+
+#[test]
+fn the_number_of_threads_does_not_change_the_forward_pass() {
+    for config in configs() {
+        let model = Trm::new(config.clone(), 3).unwrap();
+        let (inputs, identifiers) = puzzles(&config, 7);
+        let states = model.initial_states(7).unwrap();
+        let all = model.supervision_step(&states, &inputs, Some(&identifiers), Gradient::Off).unwrap();
+        // a puzzle by itself: another group, another thread
+        let one = States { z_h: states.z_h.narrow(0, 6, 1).unwrap(), z_l: states.z_l.narrow(0, 6, 1).unwrap() };
+        let (x, id) = (inputs.narrow(0, 6, 1).unwrap(), identifiers.narrow(0, 6, 1).unwrap());
+        let one = model.supervision_step(&one, &x, Some(&id), Gradient::Off).unwrap();
+        assert!(distance(&all.logits.narrow(0, 6, 1).unwrap(), &one.logits) < 5e-5);
+    }
+}
+
+#[test]
+fn impossible_configurations_name_the_field() {
+    let base = || Config { num_heads: 2, ..Config::new(5, 6, 8) };
+    for (config, field) in [
+        (Config { num_heads: 3, ..base() }, "num_heads"),
+        (Config { num_heads: 8, ..base() }, "num_heads"),
+        (Config { mixing: Mixing::Conv, ..base() }, "grid"),
+        (Config { mixing: Mixing::Conv, grid: Some([2, 2]), ..base() }, "grid"),
+        (Config { puzzle_emb_ndim: 8, ..base() }, "num_puzzle_identifiers"),
+        (Config { halt_max_steps: 0, ..base() }, "halt_max_steps"),
+    ] {
+        let error = Trm::new(config, 0).unwrap_err().to_string();
+        assert!(error.contains(field), "{error}");
+    }
+}
+
+#[test]
+fn official_sizes_have_the_papers_parameter_counts() {
+    let attention = Config { num_heads: 8, ..Config::new(11, 81, 512) };
+    let mlp = Config { mixing: Mixing::MlpT, positions: Positions::None, ..Config::new(11, 81, 64) };
+    let small = Config { num_heads: 8, ..Config::new(11, 81, 64) };
+    let dfs10 = Config {
+        mixing: Mixing::Conv,
+        positions: Positions::None,
+        grid: Some([10, 10]),
+        layers: 1,
+        classes: Some(2),
+        inner_size: Some(64),
+        q_outputs: 1,
+        ..Config::new(4, 100, 32)
+    };
+    for (config, count) in [(attention, 6_828_034), (small, 132_610), (mlp, 224_258), (dfs10, 15_585)] {
+        assert_eq!(Trm::new(config, 0).unwrap().params().count(), count);
+    }
+}
