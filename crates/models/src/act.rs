@@ -135,7 +135,13 @@ pub(crate) struct EncoderLayer {
 }
 
 impl EncoderLayer {
-    pub(crate) fn new(params: &mut Params, prefix: &str, config: &Config, init: LayerInit, rng: &mut Rng) -> Result<Self> {
+    pub(crate) fn new(
+        params: &mut Params,
+        prefix: &str,
+        config: &Config,
+        init: LayerInit,
+        rng: &mut Rng,
+    ) -> Result<Self> {
         let (dim, p) = (config.dim_model, config.dropout);
         let attn = format!("{prefix}.self_attn");
         let hidden = (dim, config.dim_feedforward);
@@ -151,7 +157,13 @@ impl EncoderLayer {
     }
 
     /// x: (b, t, D), pos: (1, t, D) -> (b, t, D)
-    pub(crate) fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
+    pub(crate) fn forward(
+        &self,
+        x: &Tensor,
+        pos: &Tensor,
+        key_pad: Option<&Tensor>,
+        mode: &mut Mode<'_>,
+    ) -> Result<Tensor> {
         let y = if self.pre_norm { self.norm1.forward(x)? } else { x.clone() };
         let qk = y.broadcast_add(pos)?;
         let branch = self.self_attn.forward(&qk, &qk, &y, key_pad, mode)?;
@@ -196,7 +208,13 @@ impl Encoder {
     }
 
     /// x: (b, t, D), pos: (1, t, D) -> (b, t, D)
-    pub(crate) fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
+    pub(crate) fn forward(
+        &self,
+        x: &Tensor,
+        pos: &Tensor,
+        key_pad: Option<&Tensor>,
+        mode: &mut Mode<'_>,
+    ) -> Result<Tensor> {
         let mut x = x.clone();
         for layer in &self.layers {
             x = layer.forward(&x, pos, key_pad, mode)?;

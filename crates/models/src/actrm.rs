@@ -26,6 +26,8 @@
 //! without gradient.
 
 mod reasoning;
+#[cfg(test)]
+mod tests;
 
 pub use reasoning::{Budget, Reasoning, ReasoningPolicy, ReasoningStep};
 
@@ -488,10 +490,9 @@ impl Actrm {
         let dim = self.config.dim_model;
         let zeros = |n: usize| Tensor::zeros((batch, n, dim), DType::F32, &Device::Cpu);
         Ok(match &self.design {
-            Design::Actions(_) => Carry {
-                answer: zeros(self.config.action_horizon)?,
-                reasoning: zeros(self.config.reasoning.tokens)?,
-            },
+            Design::Actions(_) => {
+                Carry { answer: zeros(self.config.action_horizon)?, reasoning: zeros(self.config.reasoning.tokens)? }
+            }
             Design::Memory(design) => {
                 let [h, l] = &design.z_init;
                 Carry {
@@ -681,9 +682,8 @@ impl PolicyModel for Actrm {
 
         let (b, c, a) = batch.actions.dims3()?;
         let valid = (1.0 - batch.is_pad.reshape((b, c, 1))?)?;
-        let errors = |chunk: &Tensor| -> Result<Tensor> {
-            Ok(absolute(&(chunk - &batch.actions)?)?.broadcast_mul(&valid)?)
-        };
+        let errors =
+            |chunk: &Tensor| -> Result<Tensor> { Ok(absolute(&(chunk - &batch.actions)?)?.broadcast_mul(&valid)?) };
         let entries = (batch.total_valid_steps * a).max(1) as f64;
         let mut parts = BTreeMap::new();
         let mut total = Tensor::zeros((), DType::F32, &Device::Cpu)?;

@@ -12,9 +12,7 @@ pub use policies::{ConvPolicy, MlpPolicy, PolicyNet, PolicyNetConfig, PolicyOutp
 pub use small_trm::{SmallTrm, SmallTrmConfig, Stem};
 
 use crate::error::{ModelError, Result};
-use crate::layers::{
-    Activation, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention,
-};
+use crate::layers::{Activation, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
 use candle_core::Tensor;
@@ -106,16 +104,9 @@ impl GridConfig {
         let mut rng = Rng::new(seed, "baseline");
         Ok(match self {
             Self::Cnn { channels } => Box::new(Cnn::new(dims, channels, &mut rng)?),
-            &Self::Transformer {
-                dim,
-                heads,
-                layers,
-                feedforward,
-            } => Box::new(Transformer::new(
-                dims,
-                (dim, heads, layers, feedforward),
-                &mut rng,
-            )?),
+            &Self::Transformer { dim, heads, layers, feedforward } => {
+                Box::new(Transformer::new(dims, (dim, heads, layers, feedforward), &mut rng)?)
+            }
             Self::Mlp { hidden } => Box::new(Mlp::new(dims, hidden, &mut rng)?),
             Self::SmallTrm(config) => Box::new(SmallTrm::new(dims, config.clone(), &mut rng)?),
         })
@@ -187,12 +178,7 @@ impl Cnn {
             width = next;
         }
         let head = Linear::new(&mut params, "head", width, dims.classes, rng)?;
-        Ok(Self {
-            params,
-            dims,
-            convolutions,
-            head,
-        })
+        Ok(Self { params, dims, convolutions, head })
     }
 }
 
@@ -271,15 +257,7 @@ impl Transformer {
             .collect::<Result<_>>()?;
         let hidden = Linear::new(&mut params, "hidden", dim, dim / 2, rng)?;
         let head = Linear::new(&mut params, "head", dim / 2, dims.classes, rng)?;
-        Ok(Self {
-            params,
-            dims,
-            input,
-            positions,
-            layers,
-            hidden,
-            head,
-        })
+        Ok(Self { params, dims, input, positions, layers, hidden, head })
     }
 }
 
@@ -319,11 +297,7 @@ impl Mlp {
             layers.push(Linear::new(&mut params, &format!("layers.{i}"), width, next, rng)?);
             width = next;
         }
-        Ok(Self {
-            params,
-            dims,
-            layers,
-        })
+        Ok(Self { params, dims, layers })
     }
 }
 
@@ -358,28 +332,12 @@ mod tests {
     use super::*;
     use candle_core::Device;
 
-    const MAZE8: GridDims = GridDims {
-        channels: 3,
-        height: 8,
-        width: 8,
-        classes: 2,
-    };
-    const MAZE10: GridDims = GridDims {
-        height: 10,
-        width: 10,
-        ..MAZE8
-    };
+    const MAZE8: GridDims = GridDims { channels: 3, height: 8, width: 8, classes: 2 };
+    const MAZE10: GridDims = GridDims { height: 10, width: 10, ..MAZE8 };
 
     fn all() -> Vec<(GridConfig, GridDims, usize)> {
-        let cnn = GridConfig::Cnn {
-            channels: vec![32, 64, 64, 32],
-        };
-        let transformer = GridConfig::Transformer {
-            dim: 128,
-            heads: 4,
-            layers: 3,
-            feedforward: 512,
-        };
+        let cnn = GridConfig::Cnn { channels: vec![32, 64, 64, 32] };
+        let transformer = GridConfig::Transformer { dim: 128, heads: 4, layers: 3, feedforward: 512 };
         let mlp = GridConfig::Mlp { hidden: vec![16] };
         let (simple, complex) = (SmallTrmConfig::simple(), SmallTrmConfig::complex());
         vec![

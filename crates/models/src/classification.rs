@@ -26,11 +26,7 @@ fn stable(x: f64) -> f64 {
 }
 
 fn stable_slope(x: f64) -> f64 {
-    if x >= 0.0 {
-        1.0
-    } else {
-        (1.0 - x).powi(-2)
-    }
+    if x >= 0.0 { 1.0 } else { (1.0 - x).powi(-2) }
 }
 
 impl ClassProbability {
@@ -78,9 +74,7 @@ impl ClassProbability {
 
 /// `(max, sum exp(x - max))`.
 fn log_sum_exp(scores: &[f32]) -> (f64, f64) {
-    let max = scores
-        .iter()
-        .fold(f64::NEG_INFINITY, |m, &x| m.max(f64::from(x)));
+    let max = scores.iter().fold(f64::NEG_INFINITY, |m, &x| m.max(f64::from(x)));
     let sum = scores.iter().map(|&x| (f64::from(x) - max).exp()).sum();
     (max, sum)
 }
@@ -122,11 +116,8 @@ impl CustomOp1 for CrossEntropy {
         let logits = arg.flatten_all()?.to_vec1::<f32>()?;
         let grad = grad.to_vec1::<f64>()?;
         let mut out = vec![0f32; logits.len()];
-        for (((row, out), &label), &weight) in logits
-            .chunks_exact(classes)
-            .zip(out.chunks_exact_mut(classes))
-            .zip(&self.labels)
-            .zip(&grad)
+        for (((row, out), &label), &weight) in
+            logits.chunks_exact(classes).zip(out.chunks_exact_mut(classes)).zip(&self.labels).zip(&grad)
         {
             if let Ok(label) = usize::try_from(label) {
                 self.probability.gradient(row, label, weight, out);
@@ -141,11 +132,7 @@ impl CustomOp1 for CrossEntropy {
 ///
 /// # Errors
 /// When the shapes do not fit or a label is neither a class nor [`IGNORE_LABEL`].
-pub fn cross_entropy(
-    logits: &Tensor,
-    labels: &[i64],
-    probability: ClassProbability,
-) -> CandleResult<Tensor> {
+pub fn cross_entropy(logits: &Tensor, labels: &[i64], probability: ClassProbability) -> CandleResult<Tensor> {
     let (n, classes) = logits.dims2()?;
     if labels.len() != n {
         candle_core::bail!("cross-entropy: {n} rows of logits and {} labels", labels.len());
@@ -155,10 +142,7 @@ pub fn cross_entropy(
             candle_core::bail!("cross-entropy: label {label} among {classes} classes");
         }
     }
-    let op = CrossEntropy {
-        labels: labels.to_vec(),
-        probability,
-    };
+    let op = CrossEntropy { labels: labels.to_vec(), probability };
     logits.to_dtype(DType::F32)?.contiguous()?.apply_op1(op)
 }
 
@@ -185,10 +169,8 @@ mod tests {
     #[test]
     fn stablemax_matches_its_definition() {
         let x = Tensor::from_vec(logits(), (3, 4), &Device::Cpu).unwrap();
-        let got = cross_entropy(&x, &[2, IGNORE_LABEL, 3], ClassProbability::Stablemax)
-            .unwrap()
-            .to_vec1::<f64>()
-            .unwrap();
+        let got =
+            cross_entropy(&x, &[2, IGNORE_LABEL, 3], ClassProbability::Stablemax).unwrap().to_vec1::<f64>().unwrap();
         let s = |x: f32| {
             let x = f64::from(x);
             if x < 0.0 { 1.0 / (1.0 - x) } else { x + 1.0 }
@@ -206,12 +188,8 @@ mod tests {
         for probability in [ClassProbability::Stablemax, ClassProbability::Softmax] {
             let labels = [2, IGNORE_LABEL, 0];
             let weights = Tensor::new(&[0.5f64, 2.0, 1.5], &Device::Cpu).unwrap();
-            let value = |x: &Tensor| {
-                (cross_entropy(x, &labels, probability).unwrap() * &weights)
-                    .unwrap()
-                    .sum_all()
-                    .unwrap()
-            };
+            let value =
+                |x: &Tensor| (cross_entropy(x, &labels, probability).unwrap() * &weights).unwrap().sum_all().unwrap();
             let var = Var::from_vec(logits(), (3, 4), &Device::Cpu).unwrap();
             let grads = value(var.as_tensor()).backward().unwrap();
             let grad = grads.get(&var).unwrap().flatten_all().unwrap();

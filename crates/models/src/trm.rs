@@ -34,9 +34,9 @@ pub use carry::{Carry, Example, Release};
 use crate::error::{ModelError, Result, some_names};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use std::collections::BTreeMap;
 use candle_core::{D, DType, Device, IndexOp, Tensor};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// How a layer lets positions see each other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -237,12 +237,7 @@ impl Config {
     /// [`ModelError::Config`] with the field, what it is and what it should be.
     pub fn check(&self) -> Result<()> {
         fn refuse(field: &'static str, found: impl ToString, expected: impl Into<String>) -> Result<()> {
-            Err(ModelError::Config {
-                model: "trm",
-                field,
-                found: found.to_string(),
-                expected: expected.into(),
-            })
+            Err(ModelError::Config { model: "trm", field, found: found.to_string(), expected: expected.into() })
         }
         for (field, value) in [
             ("vocab_size", self.vocab_size),
@@ -266,9 +261,7 @@ impl Config {
             Mixing::Attention if !d.is_multiple_of(heads) => {
                 return refuse("num_heads", heads, format!("a divisor of hidden_size {d}"));
             }
-            Mixing::Attention
-                if self.positions == Positions::Rope && !(d / heads).is_multiple_of(2) =>
-            {
+            Mixing::Attention if self.positions == Positions::Rope && !(d / heads).is_multiple_of(2) => {
                 return refuse("num_heads", heads, "an even size per head for rotary positions");
             }
             Mixing::Conv if self.prefix_len() > 0 => {
@@ -310,10 +303,7 @@ pub struct States {
 
 impl States {
     fn detach(&self) -> Self {
-        Self {
-            z_h: self.z_h.detach(),
-            z_l: self.z_l.detach(),
-        }
+        Self { z_h: self.z_h.detach(), z_l: self.z_l.detach() }
     }
 }
 
@@ -386,12 +376,7 @@ const PUZZLES: &str = "inner.puzzle_emb.weights";
 const TRUNCATED_DEVIATION: f64 = 0.879_625_661_034_239_8;
 
 fn misfit(object: &'static str, expected: &[usize], found: &[usize]) -> ModelError {
-    ModelError::Shape {
-        operation: "trm step",
-        object,
-        expected: expected.to_vec(),
-        found: found.to_vec(),
-    }
+    ModelError::Shape { operation: "trm step", object, expected: expected.to_vec(), found: found.to_vec() }
 }
 
 /// `x (.., n) -> (.., m)` with `weight (m, n)`.
@@ -554,21 +539,13 @@ impl Trm {
             .map(|i| {
                 let at = |name: &str| get(&format!("inner.L_level.layers.{i}.{name}.weight"));
                 let mix = match config.mixing {
-                    Mixing::Attention => Mix::Attention {
-                        qkv: at("self_attn.qkv_proj")?,
-                        out: at("self_attn.o_proj")?,
-                    },
-                    Mixing::MlpT => Mix::MlpT {
-                        gate_up: at("mlp_t.gate_up_proj")?,
-                        down: at("mlp_t.down_proj")?,
-                    },
+                    Mixing::Attention => {
+                        Mix::Attention { qkv: at("self_attn.qkv_proj")?, out: at("self_attn.o_proj")? }
+                    }
+                    Mixing::MlpT => Mix::MlpT { gate_up: at("mlp_t.gate_up_proj")?, down: at("mlp_t.down_proj")? },
                     Mixing::Conv => Mix::Conv { kernel: at("conv")? },
                 };
-                Ok(Layer {
-                    mix,
-                    gate_up: at("mlp.gate_up_proj")?,
-                    down: at("mlp.down_proj")?,
-                })
+                Ok(Layer { mix, gate_up: at("mlp.gate_up_proj")?, down: at("mlp.down_proj")? })
             })
             .collect::<Result<_>>()?;
         let optional = |wanted: bool, name: &str| wanted.then(|| get(name)).transpose();
@@ -582,11 +559,9 @@ impl Trm {
             q_bias: get("inner.q_head.bias")?,
         };
         let rope = match (config.mixing, config.positions) {
-            (Mixing::Attention, Positions::Rope) => Some(rotary_table(
-                config.positions_len(),
-                config.hidden_size / config.num_heads,
-                config.rope_theta,
-            )?),
+            (Mixing::Attention, Positions::Rope) => {
+                Some(rotary_table(config.positions_len(), config.hidden_size / config.num_heads, config.rope_theta)?)
+            }
             _ => None,
         };
         Ok(Self {
@@ -634,10 +609,7 @@ impl Trm {
             .collect();
         let mut initial = |name: &str| -> Result<Tensor> {
             let Some(tensor) = own.remove(name) else {
-                return Err(ModelError::MissingTensor {
-                    name: name.into(),
-                    given: some_names(tensors.keys()),
-                });
+                return Err(ModelError::MissingTensor { name: name.into(), given: some_names(tensors.keys()) });
             };
             let expected = vec![self.config.hidden_size];
             if tensor.dims() != expected {
@@ -711,10 +683,7 @@ impl Trm {
         identifiers: Option<&Tensor>,
     ) -> Result<StepOutput> {
         let weights = self.frozen.map(&|t| Ok(t.to_dtype(DType::F64)?))?;
-        let states = States {
-            z_h: states.z_h.to_dtype(DType::F64)?,
-            z_l: states.z_l.to_dtype(DType::F64)?,
-        };
+        let states = States { z_h: states.z_h.to_dtype(DType::F64)?, z_l: states.z_l.to_dtype(DType::F64)? };
         self.composed((&weights, &weights), &states, inputs, identifiers)
     }
 
@@ -827,9 +796,7 @@ impl Trm {
     fn mix(&self, mix: &Mix, x: &Tensor) -> Result<Tensor> {
         let eps = self.config.rms_norm_eps;
         match mix {
-            Mix::Attention { qkv, out } => {
-                rms_norm(&(x + self.attention(x, qkv, out)?)?, eps)
-            }
+            Mix::Attention { qkv, out } => rms_norm(&(x + self.attention(x, qkv, out)?)?, eps),
             Mix::MlpT { gate_up, down } => {
                 let across = x.transpose(1, 2)?.contiguous()?;
                 let mixed = (&across + swiglu(&across, gate_up, down)?)?;
@@ -844,9 +811,7 @@ impl Trm {
         let heads = self.config.num_heads;
         let size = d / heads;
         let qkv = linear(x, qkv)?.reshape((batch, len, 3, heads, size))?;
-        let part = |i: usize| -> Result<Tensor> {
-            Ok(qkv.i((.., .., i))?.transpose(1, 2)?.contiguous()?)
-        };
+        let part = |i: usize| -> Result<Tensor> { Ok(qkv.i((.., .., i))?.transpose(1, 2)?.contiguous()?) };
         let (mut q, mut k, v) = (part(0)?, part(1)?, part(2)?);
         if let Some((cos, sin)) = &self.rope {
             let (cos, sin) = (cos.to_dtype(x.dtype())?, sin.to_dtype(x.dtype())?);
@@ -864,10 +829,7 @@ impl Trm {
     fn convolution(&self, x: &Tensor, kernel: &Tensor) -> Result<Tensor> {
         let (batch, len, d) = x.dims3()?;
         let [h, w] = self.config.grid.expect("checked: convolution has a grid");
-        let padded = x
-            .reshape((batch, h, w, d))?
-            .pad_with_zeros(1, 1, 1)?
-            .pad_with_zeros(2, 1, 1)?;
+        let padded = x.reshape((batch, h, w, d))?.pad_with_zeros(1, 1, 1)?.pad_with_zeros(2, 1, 1)?;
         let mut neighbours = Vec::with_capacity(9);
         for row in 0..3 {
             for column in 0..3 {

@@ -56,13 +56,14 @@ fn check(folder: &Path) {
         let ids = identifiers.as_ref();
         let expected = |name: &str| &io[&format!("step{steps}.{name}")];
         let compare = |what: &str, out: &StepOutput, exact: &StepOutput| {
-            for (name, got, exact) in [
-                ("logits", &out.logits, &exact.logits),
-                ("q_halt_logits", &out.q_halt, &exact.q_halt),
-                ("z_h", &out.states.z_h, &exact.states.z_h),
-                ("z_l", &out.states.z_l, &exact.states.z_l),
-            ] {
-                let allowed = TOLERANCE.max(ROUNDING * difference(exact, expected(name)));
+            let parts = |out: &StepOutput| {
+                let StepOutput { logits, q_halt, states } = out.clone();
+                [("logits", logits), ("q_halt_logits", q_halt), ("z_h", states.z_h), ("z_l", states.z_l)]
+            };
+            // one distance for the whole step: a single number may be off by nothing by luck
+            let rounding = parts(exact).iter().map(|(name, t)| difference(t, expected(name))).fold(0.0, f64::max);
+            for (name, got) in &parts(out) {
+                let allowed = TOLERANCE.max(ROUNDING * rounding);
                 let off = difference(got, expected(name));
                 assert!(
                     off <= allowed,

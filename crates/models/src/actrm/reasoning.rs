@@ -79,8 +79,8 @@ impl Actrm {
             };
             let last = done == rules.max_steps() || should_stop(done);
             for row in 0..rows {
-                let settled = f64::from(change[row]) < rules.change_threshold
-                    || f64::from(halt[row]) > rules.halt_threshold;
+                let settled =
+                    f64::from(change[row]) < rules.change_threshold || f64::from(halt[row]) > rules.halt_threshold;
                 if depth[row] == 0 && (last || settled) {
                     depth[row] = done;
                 }

@@ -92,9 +92,7 @@ impl PolicyNetConfig {
         let mut rng = Rng::new(seed, "policy net");
         let rng = &mut rng;
         Ok(match *self {
-            Self::Mlp { ref hidden, value } => {
-                Box::new(MlpPolicy::new(observation, actions, hidden, value, rng)?)
-            }
+            Self::Mlp { ref hidden, value } => Box::new(MlpPolicy::new(observation, actions, hidden, value, rng)?),
             Self::Trm { high, low, cycles, previous_action, value } => {
                 let sizes = TrmPolicySizes { observation, actions, high, low, cycles };
                 Box::new(TrmPolicy::new(sizes, previous_action, value, rng)?)
@@ -133,13 +131,7 @@ pub struct MlpPolicy {
 }
 
 impl MlpPolicy {
-    fn new(
-        observation: usize,
-        actions: usize,
-        hidden: &[usize],
-        with_value: bool,
-        rng: &mut Rng,
-    ) -> Result<Self> {
+    fn new(observation: usize, actions: usize, hidden: &[usize], with_value: bool, rng: &mut Rng) -> Result<Self> {
         let mut params = Params::new();
         let mut width = observation;
         let mut layers = Vec::new();
@@ -163,10 +155,7 @@ impl PolicyNet for MlpPolicy {
         for layer in &self.layers {
             x = layer.forward(&x)?.relu()?;
         }
-        Ok(PolicyOutput {
-            logits: self.head.forward(&x)?,
-            value: value(self.value.as_ref(), &x)?,
-        })
+        Ok(PolicyOutput { logits: self.head.forward(&x)?, value: value(self.value.as_ref(), &x)? })
     }
 }
 
@@ -246,21 +235,13 @@ impl TrmPolicy {
         };
         let input = Linear::new(p, "input", observation, high, rng)?;
         let carry = Linear::new(p, "carry", high, high, rng)?;
-        let blocks = [
-            SwigluBlock::new(p, "high.0", high, 2 * high, rng)?,
-            SwigluBlock::new(p, "high.1", high, 2 * high, rng)?,
-        ];
+        let blocks =
+            [SwigluBlock::new(p, "high.0", high, 2 * high, rng)?, SwigluBlock::new(p, "high.1", high, 2 * high, rng)?];
         let down = Linear::new(p, "down", high, low, rng)?;
         let low_norm = LayerNorm::new(p, "low.norm", low, rng)?;
-        let low_layers = [
-            Linear::new(p, "low.0", low, 2 * low, rng)?,
-            Linear::new(p, "low.1", 2 * low, low, rng)?,
-        ];
+        let low_layers = [Linear::new(p, "low.0", low, 2 * low, rng)?, Linear::new(p, "low.1", 2 * low, low, rng)?];
         let up = Linear::new(p, "up", low, high, rng)?;
-        let head = [
-            Linear::new(p, "head.0", high, high / 2, rng)?,
-            Linear::new(p, "head.1", high / 2, actions, rng)?,
-        ];
+        let head = [Linear::new(p, "head.0", high, high / 2, rng)?, Linear::new(p, "head.1", high / 2, actions, rng)?];
         let value = value_head(p, with_value, high, rng)?;
         Ok(Self {
             params,
@@ -312,10 +293,7 @@ impl PolicyNet for TrmPolicy {
             let fed = dense(&self.low, &self.low_norm.forward(&low)?)?;
             h = (h + self.up.forward(&(low + fed)?)?)?;
         }
-        Ok(PolicyOutput {
-            logits: dense(&self.head, &h)?,
-            value: value(self.value.as_ref(), &h)?,
-        })
+        Ok(PolicyOutput { logits: dense(&self.head, &h)?, value: value(self.value.as_ref(), &h)? })
     }
 }
 
@@ -395,10 +373,7 @@ impl PolicyNet for ConvPolicy {
         }
         let here = h.broadcast_mul(&agent)?.sum(1)?;
         let seen = Tensor::cat(&[&here, &h.mean(1)?], D::Minus1)?;
-        Ok(PolicyOutput {
-            logits: self.head.forward(&here)?,
-            value: value(self.value.as_ref(), &seen)?,
-        })
+        Ok(PolicyOutput { logits: self.head.forward(&here)?, value: value(self.value.as_ref(), &seen)? })
     }
 }
 
@@ -413,15 +388,7 @@ mod tests {
     }
 
     fn small_conv() -> PolicyNetConfig {
-        PolicyNetConfig::Conv {
-            channels: 3,
-            height: 5,
-            width: 5,
-            hidden: 20,
-            inner: 32,
-            cycles: 6,
-            value: true,
-        }
+        PolicyNetConfig::Conv { channels: 3, height: 5, width: 5, hidden: 20, inner: 32, cycles: 6, value: true }
     }
 
     #[test]

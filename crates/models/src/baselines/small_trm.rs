@@ -103,14 +103,7 @@ impl SmallTrm {
     pub fn new(dims: GridDims, config: SmallTrmConfig, rng: &mut Rng) -> Result<Self> {
         let mut params = Params::new();
         let p = &mut params;
-        let SmallTrmConfig {
-            features,
-            latent,
-            answer,
-            hidden,
-            head,
-            ..
-        } = config;
+        let SmallTrmConfig { features, latent, answer, hidden, head, .. } = config;
         let stem = match config.stem {
             Stem::Convolutions => StemLayers::Convolutions([
                 Conv3x3::new(p, "stem.0", (dims.channels, features), rng)?,
@@ -125,28 +118,15 @@ impl SmallTrm {
             Linear::new(p, "update.0", features + answer + latent, hidden, rng)?,
             Linear::new(p, "update.1", hidden, latent, rng)?,
         ];
-        let head = [
-            Linear::new(p, "head.0", answer + latent, head, rng)?,
-            Linear::new(p, "head.1", head, dims.classes, rng)?,
-        ];
-        Ok(Self {
-            params,
-            dims,
-            config,
-            stem,
-            z_init,
-            answer_embed,
-            update,
-            head,
-        })
+        let head =
+            [Linear::new(p, "head.0", answer + latent, head, rng)?, Linear::new(p, "head.1", head, dims.classes, rng)?];
+        Ok(Self { params, dims, config, stem, z_init, answer_embed, update, head })
     }
 
     fn features(&self, grid: &Tensor) -> Result<Tensor> {
         let x = channels_last(grid)?;
         match &self.stem {
-            StemLayers::Convolutions([a, b]) => {
-                Ok(b.forward(&a.forward(&x)?.relu()?)?.relu()?)
-            }
+            StemLayers::Convolutions([a, b]) => Ok(b.forward(&a.forward(&x)?.relu()?)?.relu()?),
             StemLayers::Dense(layer) => layer.forward(&x),
         }
     }

@@ -13,9 +13,17 @@ use std::ops::Range;
 #[derive(Debug, Clone)]
 pub(super) enum PlanMix {
     /// `angles`: cosines and sines, `(positions, size / 2)` each.
-    Attention { heads: usize, angles: Option<(Vec<f32>, Vec<f32>)> },
-    MlpT { inner: usize },
-    Conv { height: usize, width: usize },
+    Attention {
+        heads: usize,
+        angles: Option<(Vec<f32>, Vec<f32>)>,
+    },
+    MlpT {
+        inner: usize,
+    },
+    Conv {
+        height: usize,
+        width: usize,
+    },
 }
 
 /// Sizes of the network, and where each weight lies in the flat vector.
@@ -93,11 +101,7 @@ impl Plan {
             at += n;
             at - n..at
         };
-        Spans {
-            mix: [take(first), take(second)],
-            gate_up: take(2 * self.inner * d),
-            down: take(self.inner * d),
-        }
+        Spans { mix: [take(first), take(second)], gate_up: take(2 * self.inner * d), down: take(self.inner * d) }
     }
 
     /// Numbers in the flat vector of weights.
@@ -580,12 +584,7 @@ impl Plan {
         total
     }
 
-    fn jobs<'a>(
-        &self,
-        z_h: &'a mut [f32],
-        z_l: &'a mut [f32],
-        embedded: &'a [f32],
-    ) -> Vec<(Range<usize>, Round<'a>)> {
+    fn jobs<'a>(&self, z_h: &'a mut [f32], z_l: &'a mut [f32], embedded: &'a [f32]) -> Vec<(Range<usize>, Round<'a>)> {
         let per = self.len * self.dim;
         let batch = z_h.len() / per;
         let (mut z_h, mut z_l) = (z_h, z_l);

@@ -2,7 +2,8 @@
 use super::*;
 
 fn configs() -> Vec<Config> {
-    let base = Config { num_heads: 2, layers: 2, h_cycles: 2, l_cycles: 3, inner_size: Some(10), ..Config::new(5, 6, 8) };
+    let base =
+        Config { num_heads: 2, layers: 2, h_cycles: 2, l_cycles: 3, inner_size: Some(10), ..Config::new(5, 6, 8) };
     let puzzles = Config { puzzle_emb_ndim: 12, num_puzzle_identifiers: 3, ..base.clone() };
     vec![
         base.clone(),

@@ -1,0 +1,247 @@
+#![allow(clippy::unwrap_used)]
+use super::*;
+use crate::act::Act;
+use crate::model::PolicyConfig;
+use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
+use crate::policy::{Observation, Policy};
+use std::sync::Arc;
+
+const DIMS: Dims = Dims { state: 9, environment_state: 10, action: 7 };
+
+fn small(reasoning: ReasoningConfig) -> Config {
+    Config {
+        action_horizon: 5,
+        dim_model: 16,
+        n_heads: 4,
+        dim_feedforward: 24,
+        latent_dim: 3,
+        dropout: 0.0,
+        reasoning,
+        ..Config::default()
+    }
+}
+
+fn designs() -> [Config; 3] {
+    let deep = ReasoningConfig { h_cycles: 2, l_cycles: 2, ..ReasoningConfig::default() };
+    let memory = ReasoningConfig { n_layers: 2, supervision_steps: 4, l_cycles: 2, ..ReasoningConfig::original() };
+    [small(ReasoningConfig::default()), small(deep), small(memory)]
+}
+
+fn batch(config: &Config, rows: usize, seed: u64) -> Batch {
+    let mut rng = Rng::new(seed, "batch");
+    let h = config.action_horizon;
+    let (state, env) = (rng.normals(rows * 9), rng.normals(rows * 10));
+    // a chunk that depends on the observation: something to learn
+    let actions: Vec<f32> = (0..rows * h * 7)
+        .map(|i| {
+            let (row, step, dim) = (i / (h * 7), i / 7 % h, i % 7);
+            (state[row * 9 + dim] + env[row * 10 + step % 10]) * 0.5
+        })
+        .collect();
+    let is_pad: Vec<bool> = (0..rows * h).map(|i| i % h == h - 1 && i / h % 3 == 0).collect();
+    Batch::from_slices(&DIMS, h, &state, &env, &actions, &is_pad).unwrap()
+}
+
+fn value(t: &Tensor) -> f32 {
+    t.to_scalar().unwrap()
+}
+
+#[test]
+fn it_has_at_most_half_of_acts_parameters() {
+    let sizes = [(512, 3200, 100), (256, 1024, 32), (128, 512, 16)];
+    for (dim_model, dim_feedforward, action_horizon) in sizes {
+        let act = act::Config { dim_model, dim_feedforward, action_horizon, ..act::Config::default() };
+        let ours = Config { dim_model, dim_feedforward, action_horizon, ..Config::default() };
+        let act = Act::new(&act, &DIMS, 0).unwrap().params().count();
+        let ours = Actrm::new(&ours, &DIMS, 0).unwrap().params().count();
+        assert!(2 * ours <= act, "{ours} against {act} at width {dim_model}");
+    }
+}
+
+#[test]
+fn every_parameter_gets_a_gradient() {
+    for config in designs() {
+        let model = Actrm::new(&config, &DIMS, 1).unwrap();
+        // off the zeros that biases start from, which hide gradients behind them
+        let mut rng = Rng::new(7, "noise");
+        for (_, var) in model.params().iter() {
+            let noise = Tensor::from_vec(rng.normals(var.elem_count()), var.shape(), &Device::Cpu).unwrap();
+            var.set(&(var.as_tensor().detach() + (noise * 0.1).unwrap()).unwrap()).unwrap();
+        }
+        for seed in 0..2 {
+            let mut batch = batch(&config, 6, seed);
+            batch.seed = seed;
+            let loss = model.loss(&batch, &mut Rng::new(seed, "loss")).unwrap();
+            let grads = loss.total.backward().unwrap();
+            for (name, var) in model.params().iter() {
+                let grad = grads.get(var.as_tensor()).unwrap_or_else(|| panic!("{name} has no gradient"));
+                let size = value(&grad.abs().unwrap().sum_all().unwrap());
+                assert!(size.is_finite(), "{name}: {size}");
+                assert!(size > 0.0, "{name} has a zero gradient");
+            }
+        }
+    }
+}
+
+#[test]
+fn shards_add_up_to_the_batch() {
+    for config in designs() {
+        let config = Config { use_vae: false, ..config };
+        let model = Actrm::new(&config, &DIMS, 1).unwrap();
+        let batch = batch(&config, 7, 3);
+        let whole = value(&model.loss(&batch, &mut Rng::new(0, "loss")).unwrap().total);
+        let shards = batch.shards(3).unwrap();
+        let sum: f32 = shards.iter().map(|s| value(&model.loss(s, &mut Rng::new(0, "loss")).unwrap().total)).sum();
+        assert!((whole - sum).abs() < 1e-5, "{whole} {sum}");
+    }
+}
+
+#[test]
+fn training_lowers_the_error_and_depth_helps() {
+    for config in [&designs()[0], &designs()[2]] {
+        let model = Actrm::new(config, &DIMS, 1).unwrap();
+        let mut rng = Rng::new(0, "train");
+        let error = |model: &Actrm| {
+            let batch = batch(config, 32, 99);
+            let chunk = model.predict(&batch.state, batch.environment_state.as_ref()).unwrap();
+            value(&(chunk - &batch.actions).unwrap().abs().unwrap().mean_all().unwrap())
+        };
+        let before = error(&model);
+        for step in 0..40 {
+            let mut batch = batch(config, 8, step);
+            batch.seed = step;
+            let grads = model.loss(&batch, &mut rng).unwrap().total.backward().unwrap();
+            for (_, var) in model.params().iter() {
+                let grad = grads.get(var.as_tensor()).unwrap();
+                let size = grad.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
+                let rate = 0.03 / f64::from(size.max(0.05));
+                var.set(&(var.as_tensor().detach() - (grad * rate).unwrap()).unwrap()).unwrap();
+            }
+        }
+        let after = error(&model);
+        assert!(after < 0.9 * before, "{:?}: {before} -> {after}", config.reasoning.over);
+    }
+}
+
+#[test]
+fn a_rows_thought_does_not_depend_on_its_neighbours() {
+    for mut config in designs() {
+        config.reasoning.max_steps = Some(6);
+        config.reasoning.change_threshold = 0.05;
+        config.reasoning.halt_threshold = 0.7;
+        let model = Actrm::new(&config, &DIMS, 5).unwrap();
+        let batch = batch(&config, 5, 1);
+        let env = batch.environment_state.clone().unwrap();
+        let all = model.reason(&batch.state, Some(&env), None, &mut |_| false).unwrap();
+        for row in 0..5 {
+            let one = (batch.state.narrow(0, row, 1).unwrap(), env.narrow(0, row, 1).unwrap());
+            let one = model.reason(&one.0, Some(&one.1), None, &mut |_| false).unwrap();
+            assert_eq!(one.depth[0], all.depth[row]);
+            let other = all.chunk.narrow(0, row, 1).unwrap();
+            let off = value(&(&one.chunk - other).unwrap().abs().unwrap().max_all().unwrap());
+            assert!(off < 1e-5, "{off:e}");
+        }
+    }
+}
+
+#[test]
+fn every_rule_stops_the_thought() {
+    for base in designs() {
+        let think = |change: f64, halt: f64, max: usize, stop_at: usize| {
+            let mut config = base.clone();
+            config.reasoning.change_threshold = change;
+            config.reasoning.halt_threshold = halt;
+            config.reasoning.max_steps = Some(max);
+            let model = Actrm::new(&config, &DIMS, 5).unwrap();
+            let batch = batch(&config, 2, 1);
+            let env = batch.environment_state.as_ref();
+            model.reason(&batch.state, env, None, &mut |done| done >= stop_at).unwrap()
+        };
+        assert_eq!(think(0.0, 1.0, 5, 99).depth, [5, 5]);
+        assert_eq!(think(0.0, 1.0, 5, 2).depth, [2, 2]);
+        assert_eq!(think(1e9, 1.0, 5, 99).depth, [2, 2]); // the first step has no change yet
+        assert_eq!(think(0.0, 0.0, 5, 99).depth, [1, 1]);
+        let thought = think(0.0, 1.0, 3, 99);
+        assert_eq!(thought.steps.len(), 3);
+        for (step, before) in thought.steps[1..].iter().zip(&thought.steps) {
+            let change = (&step.chunk - &before.chunk).unwrap().abs().unwrap().mean((1, 2)).unwrap();
+            assert_eq!(change.to_vec1::<f32>().unwrap(), step.change);
+            assert!(step.halt.iter().all(|h| (0.0..=1.0).contains(h)));
+        }
+    }
+}
+
+fn identity() -> Arc<Normaliser> {
+    let modes = [STATE, ENVIRONMENT_STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
+    Arc::new(Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap())
+}
+
+fn observation(seed: u64) -> Observation {
+    let mut rng = Rng::new(seed, "observation");
+    Observation { state: rng.normals(9), environment_state: rng.normals(10) }
+}
+
+struct Fake(f64);
+
+impl Budget for Fake {
+    fn begin(&mut self) {
+        self.0 = 0.0;
+    }
+    fn is_spent(&mut self, budget_ms: f64) -> bool {
+        self.0 += 1.0;
+        self.0 >= budget_ms
+    }
+}
+
+#[test]
+fn the_policy_keeps_to_its_budget_and_starts_warm() {
+    let mut config = small(ReasoningConfig::default());
+    config.reasoning.max_steps = Some(8);
+    config.reasoning.halt_threshold = 1.0;
+    config.reasoning.change_threshold = 0.0;
+    config.reasoning.budget_ms = Some(3.0);
+    config.reasoning.warm_start = Some(WarmStart { shift: 2, noise: 0.1 });
+    let model = Arc::new(Actrm::new(&config, &DIMS, 5).unwrap());
+    assert!(ReasoningPolicy::new(Arc::clone(&model), identity(), None).is_err());
+    let mut policy = ReasoningPolicy::new(Arc::clone(&model), identity(), Some(Box::new(Fake(0.0)))).unwrap();
+    let first = policy.predict(&observation(1)).unwrap();
+    assert_eq!((first.action_horizon, first.action_dim), (5, 7));
+    assert_eq!(policy.last_reasoning().unwrap().depth, [3]);
+    let warm = policy.predict(&observation(1)).unwrap();
+    assert_ne!(warm, first, "the second thought starts from the first");
+    policy.reset();
+    assert_eq!(policy.predict(&observation(1)).unwrap(), first);
+    // and the model trains with warm starts
+    let mut batch = batch(&config, 4, 0);
+    batch.seed = 1;
+    let loss = model.loss(&batch, &mut Rng::new(0, "loss")).unwrap();
+    assert!(value(&loss.total).is_finite());
+}
+
+#[test]
+fn impossible_configurations_name_the_field() {
+    let with = |change: &dyn Fn(&mut Config)| {
+        let mut config = small(ReasoningConfig::default());
+        change(&mut config);
+        Actrm::new(&config, &DIMS, 0).unwrap_err().to_string()
+    };
+    for (error, field) in [
+        (with(&|c| c.n_heads = 3), "n_heads"),
+        (with(&|c| c.reasoning.tokens = 0), "reasoning.tokens"),
+        (with(&|c| c.reasoning.max_steps = Some(0)), "reasoning.max_steps"),
+        (with(&|c| c.reasoning.halt_threshold = 1.5), "reasoning.halt_threshold"),
+        (with(&|c| c.reasoning.warm_start = Some(WarmStart { shift: 9, noise: 0.0 })), "warm_start.shift"),
+    ] {
+        assert!(error.contains(field), "{error}");
+    }
+}
+
+#[test]
+fn it_is_configured_beside_act() {
+    let json = serde_json::json!({"type": "actrm", "dim_model": 16, "n_heads": 2, "reasoning": {"over": "memory"}});
+    let config: PolicyConfig = serde_json::from_value(json).unwrap();
+    let PolicyConfig::Actrm(config) = &config else { panic!("{config:?}") };
+    assert_eq!((config.dim_model, config.reasoning.over), (16, Over::Memory));
+    let wrong = serde_json::json!({"type": "actrm", "reasoning": {"cycles": 3}});
+    assert!(serde_json::from_value::<PolicyConfig>(wrong).is_err());
+}
