@@ -103,11 +103,16 @@ def _typed(function: Any, result: Any, *arguments: Any) -> Any:
 
 
 def mujoco_functions() -> dict[str, int]:
-    """Addresses of the MuJoCo functions that the loop calls, in the library that Python already uses."""
+    """Addresses of the MuJoCo functions that the loop calls."""
+    lib = mujoco_library()
+    return {ours: ctypes.cast(getattr(lib, theirs), ctypes.c_void_p).value or 0 for ours, theirs in _FUNCTIONS.items()}
+
+
+def mujoco_library() -> ctypes.CDLL:
+    """MuJoCo's library, the one that Python's mujoco has loaded."""
     folder = Path(cast(str, importlib.import_module("mujoco").__file__)).parent
     names = (f"libmujoco.so.{MUJOCO}", f"libmujoco.{MUJOCO}.dylib")
     found = [folder / name for name in names if (folder / name).is_file()]
     if not found:
         raise ControlError(f"{folder} has no libmujoco {MUJOCO}")
-    lib = ctypes.CDLL(str(found[0]))
-    return {ours: ctypes.cast(getattr(lib, theirs), ctypes.c_void_p).value or 0 for ours, theirs in _FUNCTIONS.items()}
+    return ctypes.CDLL(str(found[0]))

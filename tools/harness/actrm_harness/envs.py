@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
-from actrm_harness import suite
+from actrm_harness import lean, suite
 from actrm_harness.protocol import RequestError
 from actrm_harness.suite import Env
 from actrm_harness.wire import Array, Tensors
@@ -63,6 +63,7 @@ class Session:
     control: Control | None = None
     renderer: "Renderer | None" = None
     foreign_model: bool = False
+    xml_forgotten: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +100,7 @@ def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Sessi
         "type": 1,
         "env_kwargs": json.loads(json.dumps(kwargs)),
     }
+    lean.prepare()
     # Images are drawn by `render`, so that an episode is the same with cameras and without.
     kwargs |= {"has_offscreen_renderer": False, "use_camera_obs": False}
     env = cast(
@@ -118,9 +120,19 @@ def reset(session: Session, seed: int) -> Tensors:
     env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
     if session.control is not None:
         session.control.release()
+    if env.hard_reset:
+        lean.forget_xml(give_back=False)
+        session.xml_forgotten = False
     raw = env.reset()
     env.hard_reset = not session.task.soft_reset
     return {**observation(raw), **images(session)}
+
+
+def slim(session: Session) -> None:
+    """Give back what only writing the model as MJCF needs, where the model is kept; loading it again restores it."""
+    if session.task.soft_reset and not session.xml_forgotten:
+        lean.forget_xml(give_back=True)
+        session.xml_forgotten = True
 
 
 def step_session(session: Session, action: Array) -> StepResult:

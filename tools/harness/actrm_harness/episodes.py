@@ -71,6 +71,7 @@ def _kept(observation: Tensors) -> Tensors:
 def expert_episode(session: Session, seed: int) -> Episode:
     """One episode of the task's expert; its noise has a generator of its own, drawn from the same seed."""
     env = session.env
+    session.foreign_model |= session.xml_forgotten
     recorder = _Recorder(envs.reset(session, seed))
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
     try:
@@ -102,6 +103,7 @@ def extract(session: Session, states: Array, actions: Array, model_file: str) ->
         raise RequestError("bad_request", f"extract: {steps} states and {action_steps} actions")
     for row in actions:
         envs.check_action(env, row)
+    env.hard_reset |= session.xml_forgotten
     session.foreign_model = True
     if model_file:
         env.reset()

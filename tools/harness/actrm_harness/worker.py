@@ -158,6 +158,7 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
         return reply, {f"obs/{name}": value for name, value in first.items()}
     if isinstance(request, protocol.Step):
         action = envs.check_action(session.env, tensor(tensors, "action"))
+        envs.slim(session)
         result = envs.step_session(session, action)
         reply = {"type": "step", "id": request.id, "reward": result.reward, "success": result.success}
         return reply, {f"obs/{name}": value for name, value in result.observation.items()}
