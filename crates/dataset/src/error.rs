@@ -40,6 +40,57 @@ pub enum DatasetError {
         source: ::hdf5::Error,
     },
 
+    /// A Parquet file could not be written or read.
+    #[error("{path}: cannot {operation}", path = path.display())]
+    Parquet {
+        /// The file.
+        path: PathBuf,
+        /// What was attempted, as a verb phrase.
+        operation: &'static str,
+        /// The Parquet library's answer.
+        source: parquet::errors::ParquetError,
+    },
+
+    /// A JSON file could not be written or read.
+    #[error("{path}: not the JSON that belongs there", path = path.display())]
+    Json {
+        /// The file.
+        path: PathBuf,
+        /// The parser's answer, with line and column.
+        source: serde_json::Error,
+    },
+
+    /// Something in a data set is not as it must be.
+    #[error("{path}: {object}: expected {expected}, found {found}", path = path.display())]
+    BadDataset {
+        /// The data set, or a file of it.
+        path: PathBuf,
+        /// The column, episode or entry.
+        object: String,
+        /// What belongs there.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+
+    /// An argument asks for something that a data set does not have.
+    #[error("{path}: no {wanted}; there is {found}", path = path.display())]
+    NotInDataset {
+        /// The data set.
+        path: PathBuf,
+        /// What was asked for.
+        wanted: String,
+        /// What there is.
+        found: String,
+    },
+
+    /// A query could not be answered.
+    #[error("cannot answer it")]
+    Query {
+        /// The SQL engine's answer.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+
     /// A tree that was handed over for writing contradicts itself.
     #[error("{path}: {object} cannot be written: {reason}", path = path.display())]
     BadTree {

@@ -1,11 +1,33 @@
 //! Demonstrations: robomimic-family HDF5 in, LeRobot-ready Parquet out, windows for training.
+//!
+//! [`Source`] reads a file or folder of demonstrations of any known layout, [`convert`] makes a LeRobotDataset v3.0
+//! directory of it, [`export`] rebuilds the file from that, [`Dataset`] opens a directory (ours or LeRobot's) with its
+//! numeric columns in memory, and [`Windows`] cuts training samples out of them. [`RobomimicWriter`] writes
+//! demonstrations that were just collected.
+//!
+//! It is the only crate that knows HDF5. It knows nothing of models, tensors or simulators, starts no process but its
+//! own isolated reader, and prints nothing.
 
 mod error;
+mod lerobot;
 mod plan;
+mod query;
+pub mod rotation;
+pub mod shuffle;
 mod source;
+mod stats;
 mod tree;
+mod windows;
 
 pub use error::{DatasetError, InputError, Result};
+pub use lerobot::{
+    ACTION, ActionKind, ActionProvenance, Check, Column, ConvertOptions, ConvertReport, Dataset, ENVIRONMENT_STATE,
+    EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info, Provenance, RotationForm, STATE, convert,
+    export, verify,
+};
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
+pub use query::{QueryResult, query, query_tables};
 pub use source::{ArrayHasher, ContentHasher, DemoHasher, RobomimicWriter, Source, WriteOptions, isolation};
+pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};
+pub use windows::{WindowBatch, WindowSpec, Windows};

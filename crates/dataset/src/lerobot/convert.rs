@@ -1,0 +1,383 @@
+//! From a file of demonstrations to a LeRobotDataset v3.0 directory.
+//!
+//! Threads read and encode row groups; this thread splices them into files in order and collects what the
+//! episodes say about themselves. The bytes written do not depend on the number of threads.
+
+use super::encode::{ColumnSummary, GroupOutput, Job, PartSummary, PictureSummary};
+use super::features::{ConvertOptions, Mapping};
+use super::fingerprint::Fingerprint;
+use super::info::{self, Info, Provenance};
+use super::meta::{self, EpisodeRow};
+use super::schema::{self, CREATED_BY};
+use super::shards::{GroupEncoder, Place, ShardWriter, WrittenFile};
+use super::side::{self, SideEncoder, SideOutput, SideWriter};
+use super::staging::Staging;
+use super::values::{Values, stats_of};
+use super::verify::hash_file;
+use super::work::{self, Part};
+use crate::error::{DatasetError, InputError, Result};
+use crate::plan::Plan;
+use crate::source::Source;
+use crate::stats::FeatureStats;
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// What a conversion did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ConvertReport {
+    /// Layout of the source.
+    pub dialect: &'static str,
+    /// Episodes written.
+    pub episodes: usize,
+    /// Frames written.
+    pub frames: usize,
+    /// Task texts.
+    pub tasks: Vec<String>,
+    /// Columns with their type and shape.
+    pub features: Vec<(String, String, Vec<usize>)>,
+    /// Files written.
+    pub files: usize,
+    /// Bytes written.
+    pub bytes: u64,
+    /// sha256 of the content.
+    pub fingerprint: String,
+    /// Facts and faults of the source that did not prevent the conversion.
+    pub notes: Vec<String>,
+}
+
+/// Converts the demonstrations at `source` into the directory `out`, which must not exist.
+///
+/// `progress` is told frames done and frames in all. Nothing appears at `out` unless everything went well.
+pub fn convert(
+    source: &Path,
+    out: &Path,
+    options: &ConvertOptions,
+    progress: &mut dyn FnMut(u64, u64),
+) -> Result<ConvertReport> {
+    let input = Source::open_guarded(source)?;
+    let plan = input.plan();
+    if plan.dialect.needs_extraction() {
+        return Err(InputError::NeedsExtraction { path: source.to_path_buf() }.into());
+    }
+    let mapping = Mapping::resolve(plan, options)?;
+    let staging = Staging::create(out)?;
+    let conversion = Conversion { source, plan, mapping: &mapping, options, root: staging.path() };
+    let report = std::thread::scope(|scope| {
+        // the file's hash needs nothing of what the conversion does
+        let hash = scope.spawn(|| hash_source(plan));
+        let frames = conversion.write_frames(&input, progress)?;
+        let hash = hash.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+        conversion.write_meta(frames, hash)
+    })?;
+    staging.publish()?;
+    Ok(report)
+}
+
+struct Conversion<'a> {
+    source: &'a Path,
+    plan: &'a Plan,
+    mapping: &'a Mapping,
+    options: &'a ConvertOptions,
+    root: &'a Path,
+}
+
+/// What is known once all frames are written.
+struct Frames {
+    tasks: Vec<String>,
+    rows: Vec<EpisodeRow>,
+    stats: BTreeMap<String, FeatureStats>,
+    fingerprint: String,
+    files: Vec<WrittenFile>,
+}
+
+impl Conversion<'_> {
+    fn write_frames(&self, input: &Source, progress: &mut dyn FnMut(u64, u64)) -> Result<Frames> {
+        let (tasks, task_of) = self.tasks();
+        let features = self.mapping.features();
+        let arrow_schema = schema::data_schema(&features);
+        let metadata = vec![schema::huggingface_metadata(&features)];
+        let encoder = schema::writer_properties(&arrow_schema, metadata)
+            .and_then(|properties| GroupEncoder::new(arrow_schema, properties))
+            .map_err(|source| DatasetError::Parquet {
+                path: self.root.join("data"),
+                operation: "prepare writing it",
+                source,
+            })?;
+        let job = Job {
+            path: self.source,
+            source: input,
+            mapping: self.mapping,
+            images: self.options.images,
+            encoder: &encoder,
+            task_of: &task_of,
+        };
+        let groups = work::cut(&self.plan.demos, self.mapping, self.options.lossless);
+        let limit = (self.options.data_file_mb * f64::from(1 << 20)) as u64;
+        let mut shards = ShardWriter::new(self.root, "data", &encoder, limit, info::FILES_PER_FOLDER);
+        let side = match self.options.lossless {
+            true => {
+                let side = SideEncoder::new(self.root, self.plan, &self.mapping.columns)?;
+                Some((side, side::object_encoder(self.root)?, input.root()?))
+            }
+            false => None,
+        };
+        let mut side_writer = match &side {
+            Some((side, objects, rest)) => {
+                Some(SideWriter::new(self.root, side, objects, limit, info::FILES_PER_FOLDER, rest)?)
+            }
+            None => None,
+        };
+        let mut collected = Collected::new(self.mapping, &tasks);
+        let total = self.plan.frames() as u64;
+        let mut done = 0;
+        progress(0, total);
+        work::in_order(
+            groups.len(),
+            self.jobs(),
+            |index| {
+                let mut loaded = job.load(&groups[index])?;
+                let beside = side.as_ref().map(|(side, _, _)| side.encode(&job, &loaded)).transpose()?;
+                Ok((job.encode(&mut loaded)?, beside))
+            },
+            |(output, beside): (GroupOutput, Option<SideOutput>)| {
+                let begins = output.parts.first().is_some_and(|p| p.part.begins());
+                done += output.group.rows as u64;
+                let place = shards.append(output.group, begins)?;
+                for part in output.parts {
+                    collected.add(part, place, &task_of);
+                }
+                if let (Some(writer), Some(beside)) = (&mut side_writer, beside) {
+                    writer.append(beside)?;
+                }
+                progress(done, total);
+                Ok::<(), DatasetError>(())
+            },
+        )?;
+        let mut files = shards.finish()?;
+        if let Some(writer) = side_writer {
+            files.extend(writer.finish()?);
+        }
+        let (rows, stats, fingerprint) = collected.finish();
+        Ok(Frames { tasks, rows, stats, fingerprint, files })
+    }
+
+    /// Task texts in order of first use, and each episode's.
+    fn tasks(&self) -> (Vec<String>, Vec<usize>) {
+        let mut tasks: Vec<String> = Vec::new();
+        let mut task_of = Vec::with_capacity(self.plan.demos.len());
+        let stem = self.source.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+        for demo in &self.plan.demos {
+            // no instruction: the environment names the task; a file that names none is known by its own name
+            let text = demo.task.as_ref().or(self.plan.env_name.as_ref()).unwrap_or(&stem);
+            let index = tasks.iter().position(|t| t == text).unwrap_or_else(|| {
+                tasks.push(text.clone());
+                tasks.len() - 1
+            });
+            task_of.push(index);
+        }
+        (tasks, task_of)
+    }
+
+    fn jobs(&self) -> usize {
+        match self.options.jobs {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            n => n,
+        }
+    }
+
+    fn write_meta(&self, frames: Frames, source_sha256: String) -> Result<ConvertReport> {
+        let statistical: Vec<(String, bool)> =
+            self.mapping.columns.iter().map(|c| (c.name.clone(), c.feature.is_visual())).collect();
+        let mut files = frames.files;
+        files.push(meta::write_tasks(self.root, &frames.tasks)?);
+        files.push(meta::write_episodes(self.root, &frames.tasks, &statistical, &frames.rows)?);
+        files.push(meta::write_stats(self.root, &statistical, &frames.stats)?);
+        let info = self.info(&frames.tasks, &frames.fingerprint, source_sha256)?;
+        files.push(meta::write_json(self.root, "meta/info.json", &info)?);
+        if self.options.lossless {
+            files.push(side::write_manifest(self.root, &files)?);
+        }
+        Ok(ConvertReport {
+            dialect: self.plan.dialect.name(),
+            episodes: info.total_episodes,
+            frames: info.total_frames,
+            features: info
+                .features
+                .0
+                .iter()
+                .map(|(name, f)| (name.clone(), f.dtype.clone(), f.shape.clone()))
+                .collect(),
+            files: files.len(),
+            bytes: files.iter().map(|f| f.bytes).sum(),
+            fingerprint: frames.fingerprint,
+            tasks: frames.tasks,
+            notes: self
+                .plan
+                .notes
+                .iter()
+                .chain(&self.mapping.notes)
+                .cloned()
+                .chain(self.plan.problems.iter().map(|p| p.message.clone()))
+                .collect(),
+        })
+    }
+
+    fn info(&self, tasks: &[String], fingerprint: &str, source_sha256: String) -> Result<Info> {
+        let plan = self.plan;
+        let mut masks = BTreeMap::new();
+        for (name, demos) in &plan.masks {
+            let mut episodes = Vec::with_capacity(demos.len());
+            for demo in demos {
+                let unknown = || InputError::UnknownMaskDemo {
+                    path: self.source.to_path_buf(),
+                    mask: name.clone(),
+                    demo: demo.clone(),
+                };
+                episodes.push(plan.position(demo).ok_or_else(unknown)?);
+            }
+            episodes.sort_unstable();
+            masks.insert(name.clone(), episodes);
+        }
+        let robots = plan.env_args.as_ref().and_then(|args| args.get("env_kwargs")?.get("robots").cloned());
+        let robot_type = match robots {
+            Some(serde_json::Value::String(name)) => Some(name),
+            Some(serde_json::Value::Array(names)) => {
+                let names: Vec<&str> = names.iter().filter_map(|n| n.as_str()).collect();
+                (!names.is_empty()).then(|| names.join("+"))
+            }
+            _ => None,
+        };
+        Ok(Info {
+            codebase_version: info::CODEBASE_VERSION.to_owned(),
+            robot_type,
+            total_episodes: plan.demos.len(),
+            total_frames: plan.frames(),
+            total_tasks: tasks.len(),
+            chunks_size: info::FILES_PER_FOLDER,
+            data_files_size_in_mb: self.options.data_file_mb,
+            video_files_size_in_mb: 200.0,
+            fps: self.mapping.fps,
+            splits: BTreeMap::from([("train".to_owned(), format!("0:{}", plan.demos.len()))]),
+            data_path: info::DATA_PATH.to_owned(),
+            video_path: None,
+            features: self.mapping.features(),
+            actrm: Some(Provenance {
+                format: 1,
+                writer: CREATED_BY.to_owned(),
+                source: self.source.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
+                source_sha256,
+                dialect: plan.dialect.name().to_owned(),
+                fingerprint: fingerprint.to_owned(),
+                env_name: plan.env_name.clone(),
+                env_version: plan.env_version.clone(),
+                env_args: plan.env_args.clone(),
+                state_keys: self.mapping.state_keys.clone(),
+                env_keys: self.mapping.env_keys.clone(),
+                action: self.mapping.action.clone(),
+                demos: plan.demos.iter().map(|d| d.id.clone()).collect(),
+                masks,
+                lossless: self.options.lossless,
+            }),
+        })
+    }
+}
+
+/// What the episodes said, as it comes in.
+struct Collected<'a> {
+    mapping: &'a Mapping,
+    rows: Vec<EpisodeRow>,
+    /// Values of each column, an entry an episode.
+    values: Vec<Vec<Values>>,
+    /// Pictures of each image column over all episodes (histograms only).
+    totals: BTreeMap<usize, PictureSummary>,
+    /// The episode that is being put together.
+    open: Option<(Vec<ColumnSummary>, BTreeMap<usize, PictureSummary>)>,
+    fingerprint: Fingerprint,
+    tasks: &'a [String],
+}
+
+impl<'a> Collected<'a> {
+    fn new(mapping: &'a Mapping, tasks: &'a [String]) -> Self {
+        Self {
+            mapping,
+            rows: Vec::new(),
+            values: mapping.columns.iter().map(|_| Vec::new()).collect(),
+            totals: BTreeMap::new(),
+            open: None,
+            fingerprint: Fingerprint::new(&mapping.features(), mapping.fps),
+            tasks,
+        }
+    }
+
+    fn add(&mut self, summary: PartSummary, place: Place, task_of: &[usize]) {
+        let part = summary.part;
+        if part.begins() {
+            self.rows.push(EpisodeRow {
+                length: part.length,
+                from: part.first_frame,
+                task_index: task_of[part.episode],
+                place,
+                stats: BTreeMap::new(),
+            });
+            self.open = Some((summary.values, summary.pictures));
+        } else if let Some((_, pictures)) = &mut self.open {
+            for (column, next) in summary.pictures {
+                pictures.entry(column).or_default().extend(next);
+            }
+        }
+        if part.ends() {
+            self.close(&part);
+        }
+    }
+
+    fn close(&mut self, part: &Part) {
+        let Some((columns, mut pictures)) = self.open.take() else { return };
+        let row = self.rows.last_mut().expect("an open episode has its row");
+        self.fingerprint.episode(part.length, &self.tasks[row.task_index]);
+        for (index, (column, summary)) in self.mapping.columns.iter().zip(columns).enumerate() {
+            let (stats, digest) = match pictures.remove(&index) {
+                Some(found) => {
+                    let digest = found.digest();
+                    let total = self.totals.entry(index).or_default();
+                    total.add_counts(&found.histograms, found.sampled);
+                    (FeatureStats::of_histograms(&found.histograms, found.sampled), digest)
+                }
+                None => (summary.stats, summary.digest),
+            };
+            if let Some(stats) = stats {
+                row.stats.insert(column.name.clone(), stats);
+            }
+            if column.has_content() {
+                self.fingerprint.column(&column.name, digest);
+            }
+            self.values[index].push(summary.values);
+        }
+    }
+
+    fn finish(self) -> (Vec<EpisodeRow>, BTreeMap<String, FeatureStats>, String) {
+        let mut stats = BTreeMap::new();
+        for (index, column) in self.mapping.columns.iter().enumerate() {
+            let of_column = match self.totals.get(&index) {
+                Some(total) => FeatureStats::of_histograms(&total.histograms, total.sampled),
+                None => stats_of(&self.values[index].iter().collect::<Vec<_>>(), column.dim()),
+            };
+            if let Some(of_column) = of_column {
+                stats.insert(column.name.clone(), of_column);
+            }
+        }
+        (self.rows, stats, self.fingerprint.finish())
+    }
+}
+
+/// sha256 of the source file; of a folder, of the lines `<sha256>  <name>`.
+fn hash_source(plan: &Plan) -> Result<String> {
+    let mut lines = String::new();
+    let mut single = String::new();
+    for (path, _) in &plan.files {
+        single = hash_file(path)?;
+        let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
+        lines.push_str(&format!("{single}  {name}\n"));
+    }
+    Ok(if plan.files.len() == 1 { single } else { schema::hex(&Sha256::digest(lines)) })
+}

@@ -1,0 +1,305 @@
+//! One row group of the data files: read from the source, turned into Arrow arrays, compressed.
+
+use super::features::{Column, ImageForm, Mapping, Origin};
+use super::images;
+use super::schema::{element, image_fields};
+use super::shards::{EncodedGroup, GroupEncoder};
+use super::values::{Position, Values, episode_values};
+use super::work::{Part, is_bulk};
+use crate::error::{DatasetError, InputError, Result};
+use crate::source::Source;
+use crate::stats::FeatureStats;
+use crate::tree::Demo;
+use arrow::array::{
+    ArrayRef, BinaryArray, BooleanArray, FixedSizeListArray, Float32Array, Int64Array, StringArray, StructArray,
+};
+use arrow::buffer::{OffsetBuffer, ScalarBuffer};
+use arrow::datatypes::DataType;
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+/// What every thread needs to know.
+pub(crate) struct Job<'a> {
+    pub path: &'a Path,
+    pub source: &'a Source,
+    pub mapping: &'a Mapping,
+    pub images: ImageForm,
+    pub encoder: &'a GroupEncoder,
+    /// Task of each episode.
+    pub task_of: &'a [usize],
+}
+
+/// Pictures of one column over the rows of a part.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct PictureSummary {
+    /// sha256 of each picture's pixels.
+    pub digests: Vec<[u8; 32]>,
+    /// Histogram of each channel over the sampled pixels of the sampled pictures.
+    pub histograms: Vec<[u64; 256]>,
+    /// Pictures sampled.
+    pub sampled: u64,
+}
+
+/// What an episode says about itself, once (with its first part) or in pieces (pictures).
+pub(crate) struct PartSummary {
+    pub part: Part,
+    /// Values, statistics and digest of every column without pictures, for the whole episode; with its first
+    /// part only.
+    pub values: Vec<ColumnSummary>,
+    /// Pictures of this part by column index.
+    pub pictures: BTreeMap<usize, PictureSummary>,
+}
+
+/// Values of a column over an episode and what follows from them.
+pub(crate) struct ColumnSummary {
+    pub values: Values,
+    pub stats: Option<FeatureStats>,
+    pub digest: [u8; 32],
+}
+
+/// A row group with what its episodes say.
+pub(crate) struct GroupOutput {
+    pub group: EncodedGroup,
+    pub parts: Vec<PartSummary>,
+}
+
+/// A part with what was read for it.
+pub(crate) struct Loaded {
+    pub part: Part,
+    /// Everything that is not bulk, whole.
+    pub demo: Demo,
+    pub values: Vec<Values>,
+}
+
+impl Job<'_> {
+    /// Reads what is small of the demos of a row group.
+    pub(crate) fn load(&self, parts: &[Part]) -> Result<Vec<Loaded>> {
+        let mut loaded = Vec::with_capacity(parts.len());
+        for part in parts {
+            let plan = &self.source.plan().demos[part.episode];
+            let small = |key: &str| plan.keys.get(key).is_none_or(|k| !is_bulk(k, plan.length));
+            let small = |key: &str| small(key) && !self.is_picture(key);
+            let demo = self.source.read_demo_where(part.episode, &small)?;
+            let position = Position {
+                episode: part.episode,
+                first_frame: part.first_frame,
+                task_index: self.task_of[part.episode],
+                length: part.length,
+            };
+            let values = episode_values(self.path, self.mapping, &demo, position)?;
+            loaded.push(Loaded { part: part.clone(), demo, values });
+        }
+        Ok(loaded)
+    }
+
+    fn is_picture(&self, key: &str) -> bool {
+        self.mapping.columns.iter().any(|c| matches!(&c.origin, Origin::Image { key: k, .. } if k == key))
+    }
+
+    /// Encodes the data columns of a row group.
+    pub(crate) fn encode(&self, loaded: &mut [Loaded]) -> Result<GroupOutput> {
+        let mut summaries: Vec<PartSummary> = loaded
+            .iter()
+            .map(|l| PartSummary { part: l.part.clone(), values: Vec::new(), pictures: BTreeMap::new() })
+            .collect();
+        let mut arrays: Vec<ArrayRef> = Vec::with_capacity(self.mapping.columns.len());
+        for (index, column) in self.mapping.columns.iter().enumerate() {
+            arrays.push(match &column.origin {
+                Origin::Image { key, height, width } => {
+                    self.pictures(index, key, *height, *width, loaded, &mut summaries)?
+                }
+                _ => number_array(column, index, loaded),
+            });
+        }
+        let failed = |source| DatasetError::Parquet {
+            path: self.path.to_path_buf(),
+            operation: "encode a row group of it",
+            source,
+        };
+        let group = self.encoder.encode(&arrays).map_err(failed)?;
+        for (summary, l) in summaries.iter_mut().zip(loaded) {
+            if l.part.begins() {
+                let columns = std::mem::take(&mut l.values).into_iter().zip(&self.mapping.columns);
+                summary.values = columns
+                    .map(|(values, column)| ColumnSummary {
+                        stats: values.stats(column.dim()),
+                        digest: values.digest(),
+                        values,
+                    })
+                    .collect();
+            }
+        }
+        Ok(GroupOutput { group, parts: summaries })
+    }
+
+    fn pictures(
+        &self,
+        index: usize,
+        key: &str,
+        height: usize,
+        width: usize,
+        loaded: &[Loaded],
+        summaries: &mut [PartSummary],
+    ) -> Result<ArrayRef> {
+        let mut files = Vec::new();
+        let mut offsets = vec![0_i32];
+        let mut names = Vec::new();
+        for (l, summary) in loaded.iter().zip(summaries) {
+            let rows = l.part.rows.clone();
+            let array = self.source.read_rows(l.part.episode, key, rows.start, rows.len())?;
+            let size = height * width * 3;
+            if array.bytes.len() != size * rows.len() {
+                return Err(InputError::WrongShape {
+                    path: self.path.to_path_buf(),
+                    demo: l.demo.id.clone(),
+                    key: key.to_owned(),
+                    expected: format!("{} images of {height} x {width} x 3", rows.len()),
+                    found: format!("{} {:?}", array.dtype, array.shape),
+                }
+                .into());
+            }
+            let sampled = sample(l.part.length);
+            let mut pictures = PictureSummary { histograms: vec![[0; 256]; 3], ..PictureSummary::default() };
+            for (frame, pixels) in rows.zip(array.bytes.chunks_exact(size)) {
+                images::encode(self.images, height, width, pixels, &mut files).map_err(|e| {
+                    DatasetError::BadDataset {
+                        path: self.path.to_path_buf(),
+                        object: format!("{} {key} frame {frame}", l.demo.id),
+                        expected: "a picture that can be encoded".to_owned(),
+                        found: e.to_string(),
+                    }
+                })?;
+                offsets.push(i32::try_from(files.len()).map_err(|_| too_large(self.path, key))?);
+                names.push(format!("frame-{frame:06}.{}", images::extension(self.images)));
+                pictures.digests.push(Sha256::digest(pixels).into());
+                if sampled.binary_search(&frame).is_ok() {
+                    add_to_histograms(&mut pictures, height, width, pixels);
+                }
+            }
+            summary.pictures.insert(index, pictures);
+        }
+        let offsets = OffsetBuffer::new(ScalarBuffer::from(offsets));
+        let bytes = BinaryArray::new(offsets, files.into(), None);
+        let columns: Vec<ArrayRef> = vec![Arc::new(bytes), Arc::new(StringArray::from_iter_values(names))];
+        Ok(Arc::new(StructArray::new(image_fields(), columns, None)))
+    }
+}
+
+fn too_large(path: &Path, key: &str) -> DatasetError {
+    InputError::TooLarge {
+        path: path.to_path_buf(),
+        object: format!("{key} in one row group"),
+        bytes: u64::MAX >> 32,
+        limit: i32::MAX as u64,
+    }
+    .into()
+}
+
+/// Concatenates the rows of one column over the parts of a row group.
+fn number_array(column: &Column, index: usize, loaded: &[Loaded]) -> ArrayRef {
+    let dim = column.dim();
+    let rows: usize = loaded.iter().map(|l| l.part.rows.len()).sum();
+    let slices = loaded.iter().map(|l| (&l.values[index], l.part.rows.start * dim..l.part.rows.end * dim));
+    match loaded.first().map(|l| &l.values[index]) {
+        Some(Values::I64(_)) => {
+            let mut all = Vec::with_capacity(rows * dim);
+            for (values, range) in slices {
+                if let Values::I64(v) = values {
+                    all.extend_from_slice(&v[range]);
+                }
+            }
+            Arc::new(Int64Array::from(all))
+        }
+        Some(Values::Bool(_)) => {
+            let mut all = Vec::with_capacity(rows * dim);
+            for (values, range) in slices {
+                if let Values::Bool(v) = values {
+                    all.extend_from_slice(&v[range]);
+                }
+            }
+            Arc::new(BooleanArray::from(all))
+        }
+        _ => {
+            let mut all = Vec::with_capacity(rows * dim);
+            for (values, range) in slices {
+                if let Values::F32(v) = values {
+                    all.extend_from_slice(&v[range]);
+                }
+            }
+            let flat = Float32Array::from(all);
+            debug_assert_eq!(flat.len(), rows * dim);
+            match dim {
+                1 => Arc::new(flat),
+                n => Arc::new(FixedSizeListArray::new(element(DataType::Float32), n as i32, Arc::new(flat), None)),
+            }
+        }
+    }
+}
+
+/// Frames of an episode whose pictures enter the statistics: LeRobot's choice, `round(linspace(0, n - 1, k))`
+/// with `k = min(max(n^0.75, 100), 10000, n)`.
+fn sample(length: usize) -> Vec<usize> {
+    let wanted = (length as f64).powf(0.75) as usize;
+    let count = wanted.clamp(100, 10_000).min(length);
+    if count < 2 {
+        return (0..count).collect();
+    }
+    let step = (length - 1) as f64 / (count - 1) as f64;
+    (0..count).map(|i| (i as f64 * step).round_ties_even() as usize).collect()
+}
+
+/// LeRobot looks at every `k`-th pixel of pictures of 300 or more on a side, so that 150 are left.
+fn add_to_histograms(summary: &mut PictureSummary, height: usize, width: usize, pixels: &[u8]) {
+    const LARGE: usize = 300;
+    const TARGET: usize = 150;
+    let stride = if height.max(width) < LARGE { 1 } else { (height.max(width) / TARGET).max(1) };
+    summary.sampled += 1;
+    for row in pixels.chunks_exact(width * 3).step_by(stride) {
+        for pixel in row.chunks_exact(3).step_by(stride) {
+            for (histogram, &level) in summary.histograms.iter_mut().zip(pixel) {
+                histogram[usize::from(level)] += 1;
+            }
+        }
+    }
+}
+
+impl PictureSummary {
+    /// Joins the next part of the same episode.
+    pub(crate) fn extend(&mut self, next: Self) {
+        self.digests.extend(next.digests);
+        self.add_counts(&next.histograms, next.sampled);
+    }
+
+    /// Adds pixels counted elsewhere.
+    pub(crate) fn add_counts(&mut self, histograms: &[[u64; 256]], sampled: u64) {
+        self.histograms.resize(histograms.len(), [0; 256]);
+        for (mine, theirs) in self.histograms.iter_mut().zip(histograms) {
+            for (a, b) in mine.iter_mut().zip(theirs) {
+                *a += b;
+            }
+        }
+        self.sampled += sampled;
+    }
+
+    /// sha256 over the pictures' digests.
+    pub(crate) fn digest(&self) -> [u8; 32] {
+        Sha256::digest(self.digests.concat()).into()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn short_episodes_are_sampled_whole_and_long_ones_evenly() {
+        assert_eq!(sample(1), [0]);
+        assert_eq!(sample(57), (0..57).collect::<Vec<_>>());
+        let long = sample(5000);
+        assert_eq!(long.len(), 594);
+        assert_eq!((long[0], long[593]), (0, 4999));
+        assert!(long.is_sorted());
+    }
+}

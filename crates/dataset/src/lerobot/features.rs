@@ -1,0 +1,430 @@
+//! Which dataset of a demo becomes which column: resolved once from the plan, before anything is read.
+
+use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm};
+use crate::error::{DatasetError, InputError, Result};
+use crate::plan::{DemoPlan, KeyPlan, Plan};
+use serde_json::{Value, json};
+use std::collections::BTreeSet;
+
+/// Default keys of `observation.state`: the first set that is there whole wins. Robots after the first
+/// (`robot1_...`) are added to robomimic's.
+const STATE_DEFAULTS: [&[&str]; 4] = [
+    &["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"],
+    &["ee_pos", "ee_ori", "gripper_states"],
+    &["qpos"],
+    &["flat"],
+];
+
+/// Default key of `observation.environment_state`.
+const ENV_DEFAULT: &str = "object";
+
+/// Control frequency of robosuite environments whose arguments state none, in Hz.
+const ROBOSUITE_CONTROL_FREQ: f64 = 20.0;
+
+/// How images are stored in the data files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ImageForm {
+    /// PNG: small, slower to write and read.
+    #[default]
+    Png,
+    /// PPM, uncompressed: fast, larger.
+    Ppm,
+}
+
+/// What a conversion may be told; the defaults are robomimic's.
+#[derive(Debug, Clone)]
+pub struct ConvertOptions {
+    /// Observation keys of `observation.state`; `None` takes the defaults of the layout.
+    pub state_keys: Option<Vec<String>>,
+    /// Observation keys of `observation.environment_state`; `None` takes `object` where it is there.
+    pub env_keys: Option<Vec<String>>,
+    /// Frames a second; `None` takes the control frequency that the source states.
+    pub fps: Option<f64>,
+    /// How images are stored.
+    pub images: ImageForm,
+    /// Which actions to take.
+    pub actions: ActionKind,
+    /// How to write the rotation part of actions.
+    pub rotation: RotationForm,
+    /// Keep everything that the format has no place for in the side folder.
+    pub lossless: bool,
+    /// Threads that encode, besides the one that reads; 0 takes the number of cores.
+    pub jobs: usize,
+    /// Size at which a data file is closed, in MiB.
+    pub data_file_mb: f64,
+}
+
+impl Default for ConvertOptions {
+    fn default() -> Self {
+        Self {
+            state_keys: None,
+            env_keys: None,
+            fps: None,
+            images: ImageForm::default(),
+            actions: ActionKind::default(),
+            rotation: RotationForm::default(),
+            lossless: true,
+            jobs: 0,
+            data_file_mb: 100.0,
+        }
+    }
+}
+
+/// Where the values of a column come from.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Origin {
+    /// Datasets side by side, each with its width.
+    Concat(Vec<(String, usize)>),
+    /// The action dataset.
+    Action { key: String, width: usize, rotation: RotationForm },
+    /// `rewards` as float.
+    Reward,
+    /// `dones` as truth value.
+    Done,
+    /// `rewards` at its maximum of 1: the task is solved at this step.
+    Success,
+    /// A dataset of 8-bit images.
+    Image { key: String, height: usize, width: usize },
+    /// One of the five columns that every data set has.
+    Index(IndexColumn),
+}
+
+/// The columns that follow from an episode's number and length.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum IndexColumn {
+    Timestamp,
+    FrameIndex,
+    EpisodeIndex,
+    Index,
+    TaskIndex,
+}
+
+/// One column of the output.
+#[derive(Debug, Clone)]
+pub(crate) struct Column {
+    pub name: String,
+    pub feature: Feature,
+    pub origin: Origin,
+}
+
+impl Column {
+    /// Number of values a frame.
+    pub(crate) fn dim(&self) -> usize {
+        self.feature.dim()
+    }
+
+    /// Whether the values say something that the episode's number and length do not.
+    pub(crate) fn has_content(&self) -> bool {
+        !matches!(self.origin, Origin::Index(_))
+    }
+}
+
+/// The columns, and what was chosen on the way.
+#[derive(Debug, Clone)]
+pub(crate) struct Mapping {
+    pub columns: Vec<Column>,
+    pub fps: f64,
+    pub state_keys: Vec<String>,
+    pub env_keys: Vec<String>,
+    pub action: ActionProvenance,
+    /// What was taken for granted.
+    pub notes: Vec<String>,
+}
+
+impl Mapping {
+    /// Chooses columns for `plan`. Every demo must have every chosen dataset in the same shape.
+    pub(crate) fn resolve(plan: &Plan, options: &ConvertOptions) -> Result<Self> {
+        let first = plan
+            .demos
+            .first()
+            .ok_or_else(|| InputError::NoDemos { path: plan.path.clone(), found: "none".to_owned() })?;
+        let chooser = Chooser { plan, first };
+        let state_keys = chooser.state_keys(options)?;
+        let env_keys = chooser.env_keys(options)?;
+        let mut columns = vec![chooser.concat("observation.state", &state_keys)?];
+        if !env_keys.is_empty() {
+            columns.push(chooser.concat("observation.environment_state", &env_keys)?);
+        }
+        columns.extend(chooser.images()?);
+        let (action, provenance) = chooser.action(options)?;
+        columns.push(action);
+        columns.extend(chooser.outcomes()?);
+        columns.extend(index_columns());
+        let mut notes = Vec::new();
+        let fps = chooser.fps(options, &mut notes)?;
+        Ok(Self { columns, fps, state_keys, env_keys, action: provenance, notes })
+    }
+
+    /// The columns as `info.json` lists them.
+    pub(crate) fn features(&self) -> Features {
+        Features(self.columns.iter().map(|c| (c.name.clone(), c.feature.clone())).collect())
+    }
+
+    /// Bytes of image data in a frame.
+    pub(crate) fn image_bytes_per_frame(&self) -> usize {
+        self.columns.iter().filter(|c| c.feature.is_visual()).map(Column::dim).sum()
+    }
+}
+
+struct Chooser<'a> {
+    plan: &'a Plan,
+    first: &'a DemoPlan,
+}
+
+impl Chooser<'_> {
+    fn state_keys(&self, options: &ConvertOptions) -> Result<Vec<String>> {
+        if let Some(keys) = &options.state_keys {
+            return Ok(keys.clone());
+        }
+        let has = |key: &str| self.first.keys.contains_key(&format!("obs/{key}"));
+        let chosen = STATE_DEFAULTS.iter().find(|set| set.iter().all(|key| has(key)));
+        let Some(set) = chosen else {
+            // name what robomimic's set lacks, and what there is to choose from
+            let lacking = STATE_DEFAULTS[0].iter().find(|key| !has(key)).expect("one is lacking");
+            return Err(self.missing(self.first, &format!("obs/{lacking}")).into());
+        };
+        let mut keys: Vec<String> = set.iter().map(|&k| k.to_owned()).collect();
+        for robot in 1.. {
+            let more: Vec<String> = set.iter().map(|k| k.replace("robot0", &format!("robot{robot}"))).collect();
+            if !set[0].starts_with("robot0") || !more.iter().all(|key| has(key)) {
+                break;
+            }
+            keys.extend(more);
+        }
+        Ok(keys)
+    }
+
+    fn env_keys(&self, options: &ConvertOptions) -> Result<Vec<String>> {
+        Ok(match &options.env_keys {
+            Some(keys) => keys.clone(),
+            None if self.first.keys.contains_key(&format!("obs/{ENV_DEFAULT}")) => {
+                vec![ENV_DEFAULT.to_owned()]
+            }
+            None => Vec::new(),
+        })
+    }
+
+    fn concat(&self, name: &str, keys: &[String]) -> Result<Column> {
+        let mut parts = Vec::with_capacity(keys.len());
+        let mut names = Vec::new();
+        for key in keys {
+            let path = format!("obs/{key}");
+            let width = self.width_everywhere(&path)?;
+            names.extend((0..width).map(|i| match width {
+                1 => key.clone(),
+                _ => format!("{key}_{i}"),
+            }));
+            parts.push((path, width));
+        }
+        Ok(Column {
+            name: name.to_owned(),
+            feature: Feature { dtype: "float32".to_owned(), shape: vec![names.len()], names: json!(names) },
+            origin: Origin::Concat(parts),
+        })
+    }
+
+    fn action(&self, options: &ConvertOptions) -> Result<(Column, ActionProvenance)> {
+        let key = match options.actions {
+            ActionKind::Delta => "actions",
+            ActionKind::Absolute => "actions_abs",
+        };
+        let stored = self.width_everywhere(key)?;
+        let width = match options.rotation {
+            RotationForm::AxisAngle => stored,
+            RotationForm::SixD if stored % 7 == 0 => stored / 7 * 10,
+            RotationForm::SixD => {
+                return Err(self
+                    .wrong_shape(self.first, key, "7 numbers an arm (position, axis-angle, gripper) for 6D rotations")
+                    .into());
+            }
+        };
+        let names: Vec<String> = (0..width).map(|i| format!("action_{i}")).collect();
+        let column = Column {
+            name: "action".to_owned(),
+            feature: Feature { dtype: "float32".to_owned(), shape: vec![width], names: json!(names) },
+            origin: Origin::Action { key: key.to_owned(), width: stored, rotation: options.rotation },
+        };
+        let provenance = ActionProvenance { key: key.to_owned(), kind: options.actions, rotation: options.rotation };
+        Ok((column, provenance))
+    }
+
+    /// Every dataset of colour images becomes `observation.images.<camera>`.
+    fn images(&self) -> Result<Vec<Column>> {
+        let mut columns = Vec::new();
+        let mut taken = BTreeSet::new();
+        for (path, key) in &self.first.keys {
+            let Some(name) = path.strip_prefix("obs/") else { continue };
+            if !key.is_image() || key.shape[3] != 3 {
+                continue;
+            }
+            let camera = name
+                .strip_suffix("_image")
+                .or_else(|| name.strip_suffix("_rgb"))
+                .unwrap_or(name)
+                .trim_start_matches("images/")
+                .replace('/', ".");
+            // two datasets of one camera name keep their full names apart
+            let camera = if taken.insert(camera.clone()) { camera } else { name.replace('/', ".") };
+            let (height, width) = (key.shape[1], key.shape[2]);
+            for demo in &self.plan.demos {
+                let other = self.key(demo, path)?;
+                if !other.is_image() || other.shape[1..] != key.shape[1..] {
+                    let expected = format!("uint8 images {height} x {width} x 3");
+                    return Err(self.wrong_shape(demo, path, &expected).into());
+                }
+            }
+            columns.push(Column {
+                name: format!("observation.images.{camera}"),
+                feature: Feature {
+                    dtype: "image".to_owned(),
+                    shape: vec![height, width, 3],
+                    names: json!(["height", "width", "channels"]),
+                },
+                origin: Origin::Image { key: path.clone(), height, width },
+            });
+        }
+        Ok(columns)
+    }
+
+    /// Rewards, dones and success, where the demos have them. A file that has none gets no such columns.
+    fn outcomes(&self) -> Result<Vec<Column>> {
+        let scalar = |name: &str, dtype: &str, origin| Column {
+            name: name.to_owned(),
+            feature: Feature { dtype: dtype.to_owned(), shape: vec![1], names: Value::Null },
+            origin,
+        };
+        let mut columns = Vec::new();
+        if self.first.keys.contains_key("rewards") {
+            self.one_a_step("rewards")?;
+            columns.push(scalar("next.reward", "float32", Origin::Reward));
+        }
+        if self.first.keys.contains_key("dones") {
+            self.one_a_step("dones")?;
+            columns.push(scalar("next.done", "bool", Origin::Done));
+        }
+        if self.first.keys.contains_key("rewards") && self.rewards_tell_success() {
+            columns.push(scalar("next.success", "bool", Origin::Success));
+        }
+        Ok(columns)
+    }
+
+    /// robosuite's sparse reward, and that of everything built on it, is 1 exactly when the task is solved.
+    fn rewards_tell_success(&self) -> bool {
+        self.is_robosuite()
+    }
+
+    /// Whether `env_args` says so: robomimic numbers the kinds of environments.
+    fn is_robosuite(&self) -> bool {
+        const ROBOSUITE: i64 = 1;
+        let kind = self.plan.env_args.as_ref().and_then(|args| args.get("type")?.as_i64());
+        kind == Some(ROBOSUITE)
+    }
+
+    fn one_a_step(&self, path: &str) -> Result<()> {
+        match self.width_everywhere(path)? {
+            1 => Ok(()),
+            _ => Err(self.wrong_shape(self.first, path, "one number a step").into()),
+        }
+    }
+
+    fn fps(&self, options: &ConvertOptions, notes: &mut Vec<String>) -> Result<f64> {
+        let kwargs = self.plan.env_args.as_ref().and_then(|args| args.get("env_kwargs"));
+        let stated = kwargs.and_then(|kwargs| kwargs.get("control_freq")?.as_f64());
+        let mut default = || {
+            self.is_robosuite().then(|| {
+                notes.push(format!(
+                    "env_args state no control_freq; {ROBOSUITE_CONTROL_FREQ} Hz is taken, robosuite's default (--fps decides)"
+                ));
+                ROBOSUITE_CONTROL_FREQ
+            })
+        };
+        let fps = options.fps.or(stated).or_else(&mut default).ok_or_else(|| InputError::BadAttribute {
+            path: self.plan.path.clone(),
+            object: "data".to_owned(),
+            attribute: "env_args".to_owned(),
+            expected: "env_kwargs.control_freq, or a rate given by hand (--fps)".to_owned(),
+            found: "neither".to_owned(),
+        })?;
+        if fps.is_finite() && fps > 0.0 {
+            return Ok(fps);
+        }
+        Err(InputError::BadAttribute {
+            path: self.plan.path.clone(),
+            object: "data".to_owned(),
+            attribute: "frames a second".to_owned(),
+            expected: "a number above 0".to_owned(),
+            found: fps.to_string(),
+        }
+        .into())
+    }
+
+    /// Values a step of dataset `path`, the same in every demo.
+    fn width_everywhere(&self, path: &str) -> Result<usize> {
+        let shape_of = |demo| -> Result<usize> {
+            let key = self.key(demo, path)?;
+            if !key.dtype.is_numeric() || key.shape.is_empty() {
+                return Err(self.wrong_shape(demo, path, "one or more numbers a step").into());
+            }
+            Ok(key.shape[1..].iter().product())
+        };
+        let width = shape_of(self.first)?;
+        if width == 0 {
+            return Err(self.wrong_shape(self.first, path, "one or more numbers a step").into());
+        }
+        for demo in &self.plan.demos {
+            if shape_of(demo)? != width {
+                let expected = format!("{width} numbers a step, as in {}", self.first.id);
+                return Err(self.wrong_shape(demo, path, &expected).into());
+            }
+        }
+        Ok(width)
+    }
+
+    fn key<'d>(&self, demo: &'d DemoPlan, path: &str) -> Result<&'d KeyPlan> {
+        demo.keys.get(path).ok_or_else(|| DatasetError::from(self.missing(demo, path)))
+    }
+
+    fn missing(&self, demo: &DemoPlan, path: &str) -> InputError {
+        let folder = path.rsplit_once('/').map_or("", |(folder, _)| folder);
+        let near: Vec<&str> = demo
+            .keys
+            .keys()
+            .filter(|k| k.rsplit_once('/').map_or("", |(f, _)| f) == folder)
+            .map(String::as_str)
+            .collect();
+        let found = if near.is_empty() { demo.keys.keys().map(String::as_str).collect::<Vec<_>>() } else { near };
+        InputError::MissingKey {
+            path: self.plan.path.clone(),
+            demo: demo.id.clone(),
+            key: path.to_owned(),
+            found: found.join(", "),
+        }
+    }
+
+    fn wrong_shape(&self, demo: &DemoPlan, path: &str, expected: &str) -> InputError {
+        InputError::WrongShape {
+            path: self.plan.path.clone(),
+            demo: demo.id.clone(),
+            key: path.to_owned(),
+            expected: expected.to_owned(),
+            found: demo.keys.get(path).map_or_else(|| "nothing".to_owned(), |k| format!("{} {:?}", k.dtype, k.shape)),
+        }
+    }
+}
+
+fn index_columns() -> Vec<Column> {
+    [
+        ("timestamp", "float32", IndexColumn::Timestamp),
+        ("frame_index", "int64", IndexColumn::FrameIndex),
+        ("episode_index", "int64", IndexColumn::EpisodeIndex),
+        ("index", "int64", IndexColumn::Index),
+        ("task_index", "int64", IndexColumn::TaskIndex),
+    ]
+    .into_iter()
+    .map(|(name, dtype, index)| Column {
+        name: name.to_owned(),
+        feature: Feature { dtype: dtype.to_owned(), shape: vec![1], names: Value::Null },
+        origin: Origin::Index(index),
+    })
+    .collect()
+}

@@ -1,0 +1,122 @@
+//! Images as files inside a column: PNG or uncompressed PPM, and back to pixels.
+
+use super::features::ImageForm;
+use std::io::Cursor;
+
+/// What a picture's file name ends in.
+pub(crate) fn extension(form: ImageForm) -> &'static str {
+    match form {
+        ImageForm::Png => "png",
+        ImageForm::Ppm => "ppm",
+    }
+}
+
+/// Appends one RGB picture as a file. `pixels` is `height * width * 3` bytes.
+pub(crate) fn encode(
+    form: ImageForm,
+    height: usize,
+    width: usize,
+    pixels: &[u8],
+    out: &mut Vec<u8>,
+) -> Result<(), png::EncodingError> {
+    match form {
+        ImageForm::Ppm => {
+            out.extend_from_slice(format!("P6\n{width} {height}\n255\n").as_bytes());
+            out.extend_from_slice(pixels);
+            Ok(())
+        }
+        ImageForm::Png => {
+            let mut encoder = png::Encoder::new(out, width as u32, height as u32);
+            encoder.set_color(png::ColorType::Rgb);
+            encoder.set_depth(png::BitDepth::Eight);
+            encoder.set_compression(png::Compression::Fast);
+            let mut writer = encoder.write_header()?;
+            writer.write_image_data(pixels)?;
+            writer.finish()
+        }
+    }
+}
+
+/// Pixels of an encoded picture that must be `height` x `width` RGB; in words what is wrong otherwise.
+pub(crate) fn decode(file: &[u8], height: usize, width: usize, out: &mut Vec<u8>) -> Result<(), String> {
+    let found = match file {
+        [b'P', b'6', ..] => decode_ppm(file, height, width, out)?,
+        [0x89, b'P', b'N', b'G', ..] => decode_png(file, height * width * 3, out)?,
+        _ => return Err("neither a PNG nor a PPM file".to_owned()),
+    };
+    if found != (height, width) {
+        return Err(format!("a picture of {} x {} instead of {height} x {width}", found.0, found.1));
+    }
+    Ok(())
+}
+
+fn decode_ppm(file: &[u8], height: usize, width: usize, out: &mut Vec<u8>) -> Result<(usize, usize), String> {
+    // magic, width, height and depth, separated by white space; one byte of white space before the pixels
+    let mut fields = [0_usize; 3];
+    let mut at = 2;
+    for field in &mut fields {
+        while file.get(at).is_some_and(u8::is_ascii_whitespace) {
+            at += 1;
+        }
+        let start = at;
+        while file.get(at).is_some_and(u8::is_ascii_digit) {
+            at += 1;
+        }
+        let text = std::str::from_utf8(&file[start..at]).unwrap_or_default();
+        *field = text.parse().map_err(|e| format!("a PPM header with a bad number: {e}"))?;
+    }
+    if fields[2] != 255 {
+        return Err(format!("a PPM file of depth {} instead of 255", fields[2]));
+    }
+    let pixels = file.get(at + 1..).unwrap_or_default();
+    if (fields[1], fields[0]) == (height, width) && pixels.len() != height * width * 3 {
+        return Err(format!("a PPM file with {} bytes of pixels instead of {}", pixels.len(), height * width * 3));
+    }
+    out.extend_from_slice(pixels);
+    Ok((fields[1], fields[0]))
+}
+
+fn decode_png(file: &[u8], expected: usize, out: &mut Vec<u8>) -> Result<(usize, usize), String> {
+    let limits = png::Limits { bytes: 64 << 20 };
+    let decoder = png::Decoder::new_with_limits(Cursor::new(file), limits);
+    let mut reader = decoder.read_info().map_err(|e| format!("a broken PNG file: {e}"))?;
+    let info = reader.info();
+    let size = (info.height as usize, info.width as usize);
+    if info.color_type != png::ColorType::Rgb || info.bit_depth != png::BitDepth::Eight {
+        return Err(format!("a PNG file of {:?} with {:?} bits instead of 8-bit RGB", info.color_type, info.bit_depth));
+    }
+    if size.0.checked_mul(size.1).and_then(|n| n.checked_mul(3)) != Some(expected) {
+        return Ok(size);
+    }
+    let start = out.len();
+    out.resize(start + expected, 0);
+    reader.next_frame(&mut out[start..]).map_err(|e| format!("a broken PNG file: {e}"))?;
+    Ok(size)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn pictures_come_back_pixel_by_pixel(height in 1_usize..9, width in 1_usize..9, seed in any::<u64>(), ppm in any::<bool>()) {
+            let mut rng = crate::shuffle::SplitMix64::new(seed, 0);
+            let pixels: Vec<u8> = (0..height * width * 3).map(|_| rng.below(256) as u8).collect();
+            let form = if ppm { ImageForm::Ppm } else { ImageForm::Png };
+            let mut file = Vec::new();
+            encode(form, height, width, &pixels, &mut file).unwrap();
+            let mut back = vec![1, 2, 3];
+            decode(&file, height, width, &mut back).unwrap();
+            prop_assert_eq!(&back[3..], &pixels[..]);
+            prop_assert!(decode(&file, height + 1, width, &mut Vec::new()).is_err());
+            // a damaged file may decode to other pixels or be refused, it never panics
+            let at = rng.below(file.len() as u64) as usize;
+            file[at] ^= 1 << rng.below(8);
+            let _ = decode(&file, height, width, &mut Vec::new());
+            let _ = decode(&file[..at], height, width, &mut Vec::new());
+        }
+    }
+}

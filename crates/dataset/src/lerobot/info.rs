@@ -1,0 +1,242 @@
+//! `meta/info.json`: what a LeRobotDataset v3.0 says about itself, and the provenance that we add to it.
+
+use serde::de::{MapAccess, Visitor};
+use serde::ser::SerializeMap;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::fmt;
+
+/// The version of the format that is written.
+pub const CODEBASE_VERSION: &str = "v3.0";
+/// Where frames lie, in Python's format language, as the format wants it.
+pub const DATA_PATH: &str = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet";
+/// Files in one folder before the next begins.
+pub const FILES_PER_FOLDER: usize = 1000;
+
+/// The whole of `meta/info.json`. Keys that LeRobot may add later are ignored.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Info {
+    /// `v3.0`; another major version is refused.
+    pub codebase_version: String,
+    /// The robot, where it is known.
+    #[serde(default)]
+    pub robot_type: Option<String>,
+    /// Number of episodes.
+    pub total_episodes: usize,
+    /// Number of frames over all episodes.
+    pub total_frames: usize,
+    /// Number of task texts.
+    pub total_tasks: usize,
+    /// Files in one folder before the next begins.
+    #[serde(default = "files_per_folder")]
+    pub chunks_size: usize,
+    /// Size at which a data file is closed, in MiB.
+    #[serde(default = "data_files_size")]
+    pub data_files_size_in_mb: f64,
+    /// Size at which a video file is closed, in MiB.
+    #[serde(default = "video_files_size")]
+    pub video_files_size_in_mb: f64,
+    /// Frames a second.
+    #[serde(serialize_with = "integral_if_possible")]
+    pub fps: f64,
+    /// Named ranges of episodes, `"0:50"`.
+    #[serde(default)]
+    pub splits: BTreeMap<String, String>,
+    /// Where frames lie.
+    #[serde(default = "data_path")]
+    pub data_path: String,
+    /// Where videos lie; none are written.
+    #[serde(default)]
+    pub video_path: Option<String>,
+    /// The columns, in their order in the data files.
+    pub features: Features,
+    /// What we add: where the data came from. Absent in data sets that LeRobot wrote.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub actrm: Option<Provenance>,
+}
+
+fn files_per_folder() -> usize {
+    FILES_PER_FOLDER
+}
+
+fn data_files_size() -> f64 {
+    100.0
+}
+
+fn video_files_size() -> f64 {
+    200.0
+}
+
+fn data_path() -> String {
+    DATA_PATH.to_owned()
+}
+
+fn integral_if_possible<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+    if value.fract() == 0.0 && value.abs() < 1e15 {
+        serializer.serialize_i64(*value as i64)
+    } else {
+        serializer.serialize_f64(*value)
+    }
+}
+
+/// One column.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Feature {
+    /// `float32`, `int64`, `bool`, `string`, `image`, `video` or another numpy name.
+    pub dtype: String,
+    /// Extent of one frame's value; `[1]` is stored as a scalar.
+    pub shape: Vec<usize>,
+    /// Names of the entries: a list, a dictionary or null.
+    #[serde(default)]
+    pub names: Value,
+}
+
+impl Feature {
+    /// Number of values in one frame.
+    pub fn dim(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether the column holds pictures.
+    pub fn is_visual(&self) -> bool {
+        self.dtype == "image" || self.dtype == "video"
+    }
+}
+
+/// Columns in order. JSON objects keep the order in which they were written, maps of `serde_json` do not.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Features(pub Vec<(String, Feature)>);
+
+impl Features {
+    /// The column of this name.
+    pub fn get(&self, name: &str) -> Option<&Feature> {
+        self.0.iter().find(|(n, _)| n == name).map(|(_, f)| f)
+    }
+
+    /// Names in order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.0.iter().map(|(n, _)| n.as_str())
+    }
+}
+
+impl Serialize for Features {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(Some(self.0.len()))?;
+        for (name, feature) in &self.0 {
+            map.serialize_entry(name, feature)?;
+        }
+        map.end()
+    }
+}
+
+impl<'de> Deserialize<'de> for Features {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct InOrder;
+        impl<'de> Visitor<'de> for InOrder {
+            type Value = Features;
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("an object of features")
+            }
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Features, A::Error> {
+                let mut features = Vec::new();
+                while let Some(entry) = map.next_entry()? {
+                    features.push(entry);
+                }
+                Ok(Features(features))
+            }
+        }
+        deserializer.deserialize_map(InOrder)
+    }
+}
+
+/// Where a converted data set came from and what it holds, in `info.json` under `actrm`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// Version of this object.
+    pub format: u32,
+    /// Program and version that wrote it.
+    pub writer: String,
+    /// Name of the source file or folder, without its path.
+    pub source: String,
+    /// sha256 of the source file; for a folder, of its files' hashes in order of name.
+    pub source_sha256: String,
+    /// Layout of the source.
+    pub dialect: String,
+    /// sha256 of the frames' content: names, shapes and values of every feature, episode lengths, tasks.
+    pub fingerprint: String,
+    /// Environment name, where the source states it.
+    pub env_name: Option<String>,
+    /// Simulator generation, where the source states it.
+    pub env_version: Option<String>,
+    /// The environment's arguments as the source has them.
+    pub env_args: Option<Value>,
+    /// Observation keys that make up `observation.state`, in order.
+    pub state_keys: Vec<String>,
+    /// Observation keys that make up `observation.environment_state`, in order.
+    pub env_keys: Vec<String>,
+    /// Where `action` came from: `actions`, `actions_abs`, and its rotation representation.
+    pub action: ActionProvenance,
+    /// Demo id of each episode.
+    pub demos: Vec<String>,
+    /// Masks of the source as episode indices.
+    pub masks: BTreeMap<String, Vec<usize>>,
+    /// Whether the side folder is there.
+    pub lossless: bool,
+}
+
+/// Which action a data set holds.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ActionProvenance {
+    /// Dataset of the source.
+    pub key: String,
+    /// `delta` or `absolute`.
+    pub kind: ActionKind,
+    /// How the rotation part is written.
+    pub rotation: RotationForm,
+}
+
+/// Whether actions are relative to the present pose or poses themselves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ActionKind {
+    /// As robosuite's controllers take them by default: changes, scaled to -1..1.
+    #[default]
+    Delta,
+    /// Absolute end-effector poses (`actions_abs`).
+    Absolute,
+}
+
+/// How the rotation part of an action is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RotationForm {
+    /// As stored: three numbers, axis times angle.
+    #[default]
+    AxisAngle,
+    /// Six numbers: the first two rows of the rotation matrix (Zhou et al. 2019, as pytorch3d writes them).
+    #[serde(rename = "6d")]
+    SixD,
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn features_keep_their_order_and_whole_rates_are_integers() {
+        let text = r#"{"codebase_version":"v3.0","robot_type":null,"total_episodes":1,"total_frames":2,"total_tasks":1,
+            "fps":20,"splits":{"train":"0:1"},"features":{"z":{"dtype":"float32","shape":[3],"names":["a","b","c"]},
+            "a":{"dtype":"bool","shape":[1],"names":null}},"some_new_key":5}"#;
+        let info: Info = serde_json::from_str(text).unwrap();
+        assert_eq!(info.features.names().collect::<Vec<_>>(), ["z", "a"]);
+        assert_eq!(info.features.get("z").unwrap().dim(), 3);
+        assert_eq!((info.chunks_size, info.data_files_size_in_mb), (1000, 100.0));
+        let again = serde_json::to_string(&info).unwrap();
+        assert!(again.contains("\"fps\":20,"), "{again}");
+        assert!(again.find("\"z\"").unwrap() < again.find("\"a\":").unwrap());
+        assert_eq!(serde_json::from_str::<Info>(&again).unwrap(), info);
+    }
+}

@@ -1,0 +1,251 @@
+//! `meta/`: tasks, episodes and statistics.
+
+use super::schema::{element, writer_properties};
+use super::shards::{GroupEncoder, HashingFile, Place, WrittenFile, write_parquet};
+use crate::error::{DatasetError, Result};
+use crate::stats::FeatureStats;
+use arrow::array::{
+    ArrayRef, Float64Array, Float64Builder, Int64Array, Int64Builder, ListArray, ListBuilder, StringArray,
+    StringBuilder,
+};
+use arrow::buffer::OffsetBuffer;
+use arrow::datatypes::{DataType, Field, Schema};
+use parquet::errors::ParquetError;
+use parquet::file::metadata::KeyValue;
+use serde_json::{Map, Value, json};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Where the episodes lie; one file holds them all.
+pub(crate) const EPISODES_FILE: &str = "meta/episodes/chunk-000/file-000.parquet";
+/// Episodes in a row group of the episodes file.
+const EPISODES_PER_GROUP: usize = 1000;
+
+/// One row of the episodes file.
+#[derive(Debug, Clone)]
+pub(crate) struct EpisodeRow {
+    pub length: usize,
+    pub from: usize,
+    pub task_index: usize,
+    pub place: Place,
+    /// Statistics of each feature that has them, by name.
+    pub stats: BTreeMap<String, FeatureStats>,
+}
+
+fn write(
+    root: &Path,
+    relative: &str,
+    schema: Schema,
+    metadata: Vec<KeyValue>,
+    groups: &[Vec<ArrayRef>],
+) -> Result<WrittenFile> {
+    let failed =
+        |source: ParquetError| DatasetError::Parquet { path: root.join(relative), operation: "write it", source };
+    let properties = writer_properties(&schema, metadata).map_err(failed)?;
+    let encoder = GroupEncoder::new(Arc::new(schema), properties).map_err(failed)?;
+    write_parquet(root, relative, &encoder, groups)
+}
+
+/// `meta/tasks.parquet`: a pandas frame whose index is the task's text; row `i` has `task_index` `i`.
+pub(crate) fn write_tasks(root: &Path, tasks: &[String]) -> Result<WrittenFile> {
+    let pandas = json!({
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": null},
+            {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": null},
+        ],
+        "pandas_version": "2.3.3",
+    });
+    let schema =
+        Schema::new(vec![Field::new("task_index", DataType::Int64, false), Field::new("task", DataType::Utf8, false)]);
+    let arrays: Vec<ArrayRef> = vec![
+        Arc::new(Int64Array::from_iter_values(0..tasks.len() as i64)),
+        Arc::new(StringArray::from_iter_values(tasks)),
+    ];
+    let metadata = vec![KeyValue::new("pandas".to_owned(), pandas.to_string())];
+    write(root, "meta/tasks.parquet", schema, metadata, &[arrays])
+}
+
+/// The file of episodes: one row each, with its statistics in flat columns named `stats/<feature>/<statistic>`.
+///
+/// `features` are the names that have statistics, with the length of their vectors and whether they are images.
+pub(crate) fn write_episodes(
+    root: &Path,
+    tasks: &[String],
+    features: &[(String, bool)],
+    rows: &[EpisodeRow],
+) -> Result<WrittenFile> {
+    let mut groups = Vec::new();
+    let mut schema = None;
+    let mut start = 0;
+    for part in rows.chunks(EPISODES_PER_GROUP) {
+        let columns = episode_columns(start, tasks, features, part);
+        start += part.len();
+        if schema.is_none() {
+            let fields: Vec<Field> =
+                columns.iter().map(|(name, array)| Field::new(name, array.data_type().clone(), false)).collect();
+            schema = Some(Schema::new(fields));
+        }
+        groups.push(columns.into_iter().map(|(_, array)| array).collect());
+    }
+    let schema = schema.expect("a data set has an episode");
+    write(root, EPISODES_FILE, schema, Vec::new(), &groups)
+}
+
+fn episode_columns(
+    start: usize,
+    tasks: &[String],
+    features: &[(String, bool)],
+    rows: &[EpisodeRow],
+) -> Vec<(String, ArrayRef)> {
+    let ints = |f: &dyn Fn(usize, &EpisodeRow) -> usize| -> ArrayRef {
+        let values = rows.iter().enumerate().map(|(i, row)| f(start + i, row) as i64);
+        Arc::new(Int64Array::from_iter_values(values))
+    };
+    let mut texts = ListBuilder::new(StringBuilder::new()).with_field(element(DataType::Utf8));
+    for row in rows {
+        texts.values().append_value(&tasks[row.task_index]);
+        texts.append(true);
+    }
+    let mut columns: Vec<(String, ArrayRef)> = vec![
+        ("episode_index".to_owned(), ints(&|i, _| i)),
+        ("tasks".to_owned(), Arc::new(texts.finish())),
+        ("length".to_owned(), ints(&|_, row| row.length)),
+        ("data/chunk_index".to_owned(), ints(&|_, row| row.place.folder)),
+        ("data/file_index".to_owned(), ints(&|_, row| row.place.file)),
+        ("dataset_from_index".to_owned(), ints(&|_, row| row.from)),
+        ("dataset_to_index".to_owned(), ints(&|_, row| row.from + row.length)),
+    ];
+    for (feature, is_image) in features {
+        for (name, get) in STATISTICS {
+            let mut values = Float64Builder::new();
+            let mut lengths = Vec::with_capacity(rows.len());
+            for row in rows {
+                let of_row = get(&row.stats[feature]);
+                values.append_slice(of_row);
+                lengths.push(of_row.len());
+            }
+            let list = nested(Arc::new(values.finish()), lengths, *is_image);
+            columns.push((format!("stats/{feature}/{name}"), list));
+        }
+        let mut counts = ListBuilder::new(Int64Builder::new()).with_field(element(DataType::Int64));
+        for row in rows {
+            counts.values().append_value(row.stats[feature].count as i64);
+            counts.append(true);
+        }
+        columns.push((format!("stats/{feature}/count"), Arc::new(counts.finish())));
+    }
+    columns.push(("meta/episodes/chunk_index".to_owned(), ints(&|_, _| 0)));
+    columns.push(("meta/episodes/file_index".to_owned(), ints(&|_, _| 0)));
+    columns
+}
+
+/// A statistic's name and where it is.
+type Getter = (&'static str, fn(&FeatureStats) -> &Vec<f64>);
+
+/// The statistics that are vectors.
+const STATISTICS: [Getter; 9] = [
+    ("min", |s| &s.min),
+    ("max", |s| &s.max),
+    ("mean", |s| &s.mean),
+    ("std", |s| &s.std),
+    ("q01", |s| &s.q01),
+    ("q10", |s| &s.q10),
+    ("q50", |s| &s.q50),
+    ("q90", |s| &s.q90),
+    ("q99", |s| &s.q99),
+];
+
+/// `list<double>` of the given lengths, or `list<list<list<double>>>` of shape (length, 1, 1) for images.
+fn nested(values: Arc<Float64Array>, lengths: Vec<usize>, is_image: bool) -> ArrayRef {
+    let mut inner: ArrayRef = values;
+    if is_image {
+        for _ in 0..2 {
+            let ones = OffsetBuffer::from_lengths(vec![1; inner.len()]);
+            inner = Arc::new(ListArray::new(element(inner.data_type().clone()), ones, inner, None));
+        }
+    }
+    let offsets = OffsetBuffer::from_lengths(lengths);
+    Arc::new(ListArray::new(element(inner.data_type().clone()), offsets, inner, None))
+}
+
+/// `meta/stats.json`.
+pub(crate) fn write_stats(
+    root: &Path,
+    features: &[(String, bool)],
+    stats: &BTreeMap<String, FeatureStats>,
+) -> Result<WrittenFile> {
+    let mut all = Map::new();
+    for (name, is_image) in features {
+        let mut one = Map::new();
+        for (statistic, get) in STATISTICS {
+            let values = get(&stats[name]);
+            let value = match is_image {
+                true => Value::from(values.iter().map(|v| json!([[v]])).collect::<Vec<_>>()),
+                false => json!(values),
+            };
+            one.insert(statistic.to_owned(), value);
+        }
+        one.insert("count".to_owned(), json!([stats[name].count]));
+        all.insert(name.clone(), Value::Object(one));
+    }
+    write_json(root, "meta/stats.json", &Value::Object(all))
+}
+
+/// Indented JSON with a final newline.
+pub(crate) fn write_json<T: serde::Serialize>(root: &Path, relative: &str, value: &T) -> Result<WrittenFile> {
+    let mut text = serde_json::to_string_pretty(value)
+        .map_err(|source| DatasetError::Json { path: root.join(relative), source })?;
+    text.push('\n');
+    HashingFile::write_whole(root, relative, text.as_bytes())
+}
+
+/// Reads statistics as LeRobot or we write them: vectors, or 3 x 1 x 1 for images.
+pub(crate) fn parse_stats(value: &Value) -> Result<BTreeMap<String, FeatureStats>, String> {
+    let object = value.as_object().ok_or("expected an object of features")?;
+    let mut all = BTreeMap::new();
+    for (name, entry) in object {
+        let vector = |statistic: &str| -> Result<Vec<f64>, String> {
+            let found = entry.get(statistic).ok_or_else(|| format!("{name}: no {statistic}"))?;
+            let mut out = Vec::new();
+            flatten(found, &mut out).map_err(|what| format!("{name}: {statistic}: {what}"))?;
+            Ok(out)
+        };
+        // sets written before quantiles were stored have the first five only
+        let quantile = |statistic: &str| match entry.get(statistic) {
+            None => Ok(Vec::new()),
+            Some(_) => vector(statistic),
+        };
+        let count = vector("count")?;
+        let stats = FeatureStats {
+            min: vector("min")?,
+            max: vector("max")?,
+            mean: vector("mean")?,
+            std: vector("std")?,
+            count: count.first().copied().unwrap_or(0.0) as u64,
+            q01: quantile("q01")?,
+            q10: quantile("q10")?,
+            q50: quantile("q50")?,
+            q90: quantile("q90")?,
+            q99: quantile("q99")?,
+        };
+        all.insert(name.clone(), stats);
+    }
+    Ok(all)
+}
+
+fn flatten(value: &Value, out: &mut Vec<f64>) -> Result<(), String> {
+    match value {
+        Value::Array(items) => items.iter().try_for_each(|item| flatten(item, out)),
+        Value::Bool(b) => {
+            out.push(f64::from(u8::from(*b)));
+            Ok(())
+        }
+        other => {
+            out.push(other.as_f64().ok_or_else(|| format!("expected a number, found {other}"))?);
+            Ok(())
+        }
+    }
+}

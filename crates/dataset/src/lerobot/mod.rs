@@ -1,0 +1,26 @@
+//! LeRobotDataset v3.0 directories: written from demonstrations, opened for training.
+
+mod convert;
+mod encode;
+mod export;
+mod features;
+mod fingerprint;
+mod images;
+mod info;
+mod meta;
+mod open;
+mod read;
+mod schema;
+mod shards;
+mod side;
+mod staging;
+mod values;
+mod verify;
+mod work;
+
+pub use convert::{ConvertReport, convert};
+pub use export::{ExportReport, export};
+pub use features::{ConvertOptions, ImageForm};
+pub use info::{ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm};
+pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};
+pub use verify::{Check, verify};

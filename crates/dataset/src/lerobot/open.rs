@@ -1,0 +1,464 @@
+//! An opened data set: everything but pictures in memory, ready for training.
+
+use super::fingerprint::{Fingerprint, INDEX_COLUMNS};
+use super::info::{Info, Provenance};
+use super::meta::parse_stats;
+use super::read;
+use super::values::Values;
+use crate::error::{DatasetError, Result};
+use crate::shuffle::SplitMix64;
+use crate::stats::FeatureStats;
+use crate::windows::{Resident, WindowSpec, Windows};
+use arrow::buffer::ScalarBuffer;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Column of a policy's proprioceptive input.
+pub const STATE: &str = "observation.state";
+/// Column of a policy's input about the environment.
+pub const ENVIRONMENT_STATE: &str = "observation.environment_state";
+/// Column of actions.
+pub const ACTION: &str = "action";
+
+/// A LeRobotDataset v3.0 directory, written by us or by LeRobot, with its numeric columns in memory.
+#[derive(Debug)]
+pub struct Dataset {
+    root: PathBuf,
+    info: Info,
+    episodes: Vec<EpisodeMeta>,
+    tasks: Vec<String>,
+    columns: BTreeMap<String, Resident>,
+    stats: BTreeMap<String, FeatureStats>,
+    fingerprint: String,
+    env: Option<EnvMeta>,
+}
+
+/// One episode of a data set.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EpisodeMeta {
+    /// Its number, from 0.
+    pub index: usize,
+    /// Frames.
+    pub length: usize,
+    /// Its first frame in the columns.
+    pub from: usize,
+    /// The frame after its last.
+    pub to: usize,
+    /// Instructions in words.
+    pub tasks: Vec<String>,
+    /// Id of the demo that it was converted from.
+    pub demo: Option<String>,
+}
+
+/// The environment that the demonstrations come from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EnvMeta {
+    /// Its name.
+    pub env_name: String,
+    /// Simulator generation, where it is known.
+    pub env_version: Option<String>,
+    /// Its arguments; null where the source has none.
+    pub env_args: serde_json::Value,
+}
+
+/// A numeric column in memory.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Column<'a> {
+    /// Row-major values.
+    pub data: &'a [f32],
+    /// Values a frame.
+    pub dim: usize,
+}
+
+impl Dataset {
+    /// Opens the directory `root` and reads its numeric columns. A data set of ours without pictures is checked
+    /// against the fingerprint that was recorded when it was made.
+    pub fn open(root: &Path) -> Result<Self> {
+        let info = read_info(root)?;
+        let tasks = read_tasks(root, &info)?;
+        let episodes = read_episodes(root, &info)?;
+        let columns = read_columns(root, &info, &episodes)?;
+        let stats = read_stats(root)?;
+        let provenance = info.actrm.as_ref();
+        let env = provenance.and_then(|p| {
+            p.env_name.clone().map(|env_name| EnvMeta {
+                env_name,
+                env_version: p.env_version.clone(),
+                env_args: p.env_args.clone().unwrap_or(serde_json::Value::Null),
+            })
+        });
+        let mut dataset =
+            Self { root: root.to_path_buf(), info, episodes, tasks, columns, stats, fingerprint: String::new(), env };
+        dataset.fingerprint = dataset.checked_fingerprint()?;
+        Ok(dataset)
+    }
+
+    /// The fingerprint recorded, after comparing it with the content where the content is in memory.
+    fn checked_fingerprint(&self) -> Result<String> {
+        let recorded = self.info.actrm.as_ref().map(|p| &p.fingerprint);
+        let pictures = self.info.features.0.iter().any(|(_, f)| f.is_visual());
+        if let (Some(recorded), true) = (recorded, pictures) {
+            return Ok(recorded.clone());
+        }
+        let computed = self.numeric_fingerprint();
+        match recorded {
+            Some(recorded) if *recorded != computed => Err(DatasetError::BadDataset {
+                path: self.root.clone(),
+                object: "content".to_owned(),
+                expected: format!("fingerprint {recorded}, recorded when it was made"),
+                found: format!("{computed}: the data were changed or damaged"),
+            }),
+            _ => Ok(computed),
+        }
+    }
+
+    /// The fingerprint of the columns in memory.
+    fn numeric_fingerprint(&self) -> String {
+        let mut fingerprint = Fingerprint::new(&self.info.features, self.info.fps);
+        for episode in &self.episodes {
+            fingerprint.episode(episode.length, episode.tasks.first().map_or("", String::as_str));
+            for (name, digest) in self.episode_digests(episode) {
+                fingerprint.column(&name, digest);
+            }
+        }
+        fingerprint.finish()
+    }
+
+    /// Digests of an episode's numeric columns, as the fingerprint wants them.
+    pub(crate) fn episode_digests(&self, episode: &EpisodeMeta) -> Vec<(String, [u8; 32])> {
+        let mut digests = Vec::new();
+        for (name, column) in &self.columns {
+            if INDEX_COLUMNS.contains(&name.as_str()) {
+                continue;
+            }
+            let rows = column.data[episode.from * column.dim..episode.to * column.dim].to_vec();
+            let boolean = self.info.features.get(name).is_some_and(|f| f.dtype == "bool");
+            let values = match boolean {
+                true => Values::Bool(rows.iter().map(|&v| v != 0.0).collect()),
+                false => Values::F32(rows),
+            };
+            digests.push((name.clone(), values.digest()));
+        }
+        digests
+    }
+
+    /// Where it lies.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// What it says about itself.
+    pub fn info(&self) -> &Info {
+        &self.info
+    }
+
+    /// Where it came from, if we converted it.
+    pub fn provenance(&self) -> Option<&Provenance> {
+        self.info.actrm.as_ref()
+    }
+
+    /// Its episodes in order.
+    pub fn episodes(&self) -> &[EpisodeMeta] {
+        &self.episodes
+    }
+
+    /// Frames over all episodes.
+    pub fn frames(&self) -> usize {
+        self.episodes.last().map_or(0, |e| e.to)
+    }
+
+    /// Task texts; a frame's `task_index` counts them.
+    pub fn tasks(&self) -> &[String] {
+        &self.tasks
+    }
+
+    /// A numeric column, if there is one of this name.
+    pub fn column(&self, name: &str) -> Option<Column<'_>> {
+        self.columns.get(name).map(|c| Column { data: &c.data, dim: c.dim })
+    }
+
+    /// Names of the numeric columns, sorted.
+    pub fn column_names(&self) -> impl Iterator<Item = &str> {
+        self.columns.keys().map(String::as_str)
+    }
+
+    /// Statistics over all episodes as they are stored; empty where the directory has none.
+    pub fn stats(&self) -> &BTreeMap<String, FeatureStats> {
+        &self.stats
+    }
+
+    /// Statistics of the numeric columns over some episodes, computed now.
+    pub fn statistics_of(&self, episodes: &[usize]) -> Result<BTreeMap<String, FeatureStats>> {
+        let ranges = self.ranges(episodes)?;
+        let mut all = BTreeMap::new();
+        for (name, column) in &self.columns {
+            let pieces: Vec<&[f32]> =
+                ranges.iter().map(|&(from, to)| &column.data[from * column.dim..to * column.dim]).collect();
+            if let Some(stats) = FeatureStats::of_rows(&pieces, column.dim) {
+                all.insert(name.clone(), stats);
+            }
+        }
+        Ok(all)
+    }
+
+    /// sha256 of the content in hexadecimal: the same for the same demonstrations and choice of columns, however
+    /// they are stored. For sets that LeRobot wrote it covers the numeric columns.
+    pub fn fingerprint(&self) -> &str {
+        &self.fingerprint
+    }
+
+    /// The environment that the demonstrations come from, where that is known.
+    pub fn env(&self) -> Option<&EnvMeta> {
+        self.env.as_ref()
+    }
+
+    /// Episodes of a mask (`train`, `valid`, ...), ascending; of a named range for sets that LeRobot wrote.
+    pub fn split(&self, name: &str) -> Option<Vec<usize>> {
+        if let Some(provenance) = &self.info.actrm {
+            return provenance.masks.get(name).cloned();
+        }
+        let (from, to) = self.info.splits.get(name)?.split_once(':')?;
+        let (from, to) = (from.trim().parse::<usize>().ok()?, to.trim().parse::<usize>().ok()?);
+        (from <= to && to <= self.episodes.len()).then(|| (from..to).collect())
+    }
+
+    /// Names that [`Dataset::split`] knows.
+    pub fn split_names(&self) -> Vec<&str> {
+        match &self.info.actrm {
+            Some(provenance) => provenance.masks.keys().map(String::as_str).collect(),
+            None => self.info.splits.keys().map(String::as_str).collect(),
+        }
+    }
+
+    /// `count` of `episodes`, chosen by `seed`, ascending. With one seed a smaller choice lies in every larger.
+    pub fn subset(&self, episodes: &[usize], count: usize, seed: u64) -> Result<Vec<usize>> {
+        if count == 0 || count > episodes.len() {
+            return Err(DatasetError::NotInDataset {
+                path: self.root.clone(),
+                wanted: format!("{count} demos"),
+                found: format!("{} to choose from", episodes.len()),
+            });
+        }
+        self.ranges(episodes)?;
+        let mut chosen = episodes.to_vec();
+        SplitMix64::new(seed, 0).shuffle(&mut chosen);
+        chosen.truncate(count);
+        chosen.sort_unstable();
+        Ok(chosen)
+    }
+
+    /// Windows over some episodes.
+    pub fn windows(&self, spec: &WindowSpec) -> Result<Windows> {
+        if spec.action_horizon == 0 {
+            return Err(DatasetError::NotInDataset {
+                path: self.root.clone(),
+                wanted: "window of 0 actions".to_owned(),
+                found: "1 or more to ask for".to_owned(),
+            });
+        }
+        let ranges = self.ranges(&spec.episodes)?;
+        let environment_state = self.columns.get(ENVIRONMENT_STATE).cloned().unwrap_or_else(Resident::empty);
+        Ok(Windows::new(self.required(STATE)?, environment_state, self.required(ACTION)?, spec.action_horizon, &ranges))
+    }
+
+    fn required(&self, name: &str) -> Result<Resident> {
+        self.columns.get(name).cloned().ok_or_else(|| DatasetError::NotInDataset {
+            path: self.root.clone(),
+            wanted: format!("column {name}"),
+            found: self.column_names().collect::<Vec<_>>().join(", "),
+        })
+    }
+
+    fn ranges(&self, episodes: &[usize]) -> Result<Vec<(usize, usize)>> {
+        let range = |&index: &usize| {
+            let episode = self.episodes.get(index).ok_or_else(|| DatasetError::NotInDataset {
+                path: self.root.clone(),
+                wanted: format!("episode {index}"),
+                found: format!("0 to {}", self.episodes.len().saturating_sub(1)),
+            })?;
+            Ok((episode.from, episode.to))
+        };
+        episodes.iter().map(range).collect()
+    }
+}
+
+/// A JSON file.
+pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
+    let text = std::fs::read(path).map_err(|source| DatasetError::Io {
+        path: path.to_path_buf(),
+        operation: "read it",
+        source,
+    })?;
+    serde_json::from_slice(&text).map_err(|source| DatasetError::Json { path: path.to_path_buf(), source })
+}
+
+/// `meta/info.json`, checked for a version that is understood.
+pub(crate) fn read_info(root: &Path) -> Result<Info> {
+    let path = root.join("meta/info.json");
+    if !path.exists() {
+        let found = if root.is_dir() {
+            "a folder without it"
+        } else if root.exists() {
+            "a file"
+        } else {
+            "nothing at that path"
+        };
+        return Err(DatasetError::BadDataset {
+            path: root.to_path_buf(),
+            object: "data set".to_owned(),
+            expected: "a LeRobotDataset v3.0 directory with meta/info.json".to_owned(),
+            found: found.to_owned(),
+        });
+    }
+    let info: Info = read_json(&path)?;
+    if !info.codebase_version.starts_with("v3.") {
+        return Err(DatasetError::BadDataset {
+            path,
+            object: "codebase_version".to_owned(),
+            expected: "v3.0".to_owned(),
+            found: info.codebase_version,
+        });
+    }
+    Ok(info)
+}
+
+fn read_stats(root: &Path) -> Result<BTreeMap<String, FeatureStats>> {
+    let path = root.join("meta/stats.json");
+    if !path.exists() {
+        return Ok(BTreeMap::new());
+    }
+    let value = read_json(&path)?;
+    parse_stats(&value).map_err(|found| DatasetError::BadDataset {
+        path,
+        object: "statistics".to_owned(),
+        expected: "min, max, mean, std and count of every feature".to_owned(),
+        found,
+    })
+}
+
+fn read_tasks(root: &Path, info: &Info) -> Result<Vec<String>> {
+    if info.total_tasks == 0 {
+        return Ok(Vec::new());
+    }
+    let path = root.join("meta/tasks.parquet");
+    // pandas calls an index without a name `__index_level_0__`
+    let (rows, arrays) = match read::columns(&path, &["task_index", "task"]) {
+        Err(DatasetError::NotInDataset { .. }) => read::columns(&path, &["task_index", "__index_level_0__"])?,
+        other => other?,
+    };
+    let indices = read::integers(&path, "task_index", &arrays[0])?;
+    let texts = read::texts(&path, "task", &arrays[1])?;
+    if rows != info.total_tasks || indices.iter().enumerate().any(|(i, &index)| index != i as i64) {
+        return Err(DatasetError::BadDataset {
+            path,
+            object: "column task_index".to_owned(),
+            expected: format!("0 to {}, in order", info.total_tasks.saturating_sub(1)),
+            found: format!("{:?}", &indices[..indices.len().min(10)]),
+        });
+    }
+    Ok(texts)
+}
+
+/// The episodes, checked to follow each other.
+pub(crate) fn read_episodes(root: &Path, info: &Info) -> Result<Vec<EpisodeMeta>> {
+    let mut episodes: Vec<EpisodeMeta> = Vec::new();
+    let demos = info.actrm.as_ref().map_or(&[][..], |p| &p.demos);
+    for path in read::files(root, "meta/episodes")? {
+        let names = ["episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"];
+        let (rows, arrays) = read::columns(&path, &names)?;
+        let tasks = read::text_lists(&path, names[1], &arrays[1])?;
+        let index = read::integers(&path, names[0], &arrays[0])?;
+        let length = read::integers(&path, names[2], &arrays[2])?;
+        let from = read::integers(&path, names[3], &arrays[3])?;
+        let to = read::integers(&path, names[4], &arrays[4])?;
+        for (row, tasks) in (0..rows).zip(tasks) {
+            let number = episodes.len();
+            let start = episodes.last().map_or(0, |e| e.to);
+            let good = index[row] == number as i64
+                && from[row] == start as i64
+                && length[row] >= 0
+                && to[row].checked_sub(from[row]) == Some(length[row]);
+            if !good {
+                return Err(DatasetError::BadDataset {
+                    path,
+                    object: format!("row {number}"),
+                    expected: format!("episode {number} from frame {start}, as long as it says"),
+                    found: format!("episode {} from {} to {}, length {}", index[row], from[row], to[row], length[row]),
+                });
+            }
+            episodes.push(EpisodeMeta {
+                index: number,
+                length: length[row] as usize,
+                from: start,
+                to: to[row] as usize,
+                tasks,
+                demo: demos.get(number).cloned(),
+            });
+        }
+    }
+    let frames = episodes.last().map_or(0, |e| e.to);
+    if (episodes.len(), frames) != (info.total_episodes, info.total_frames) {
+        return Err(DatasetError::BadDataset {
+            path: root.to_path_buf(),
+            object: "meta/episodes".to_owned(),
+            expected: format!("{} episodes with {} frames, as info.json says", info.total_episodes, info.total_frames),
+            found: format!("{} with {frames}", episodes.len()),
+        });
+    }
+    Ok(episodes)
+}
+
+fn read_columns(root: &Path, info: &Info, episodes: &[EpisodeMeta]) -> Result<BTreeMap<String, Resident>> {
+    // whole numbers do not fit f32; the index columns follow from the episodes
+    let wanted: Vec<(&str, usize)> = info
+        .features
+        .0
+        .iter()
+        .filter(|(name, f)| !INDEX_COLUMNS.contains(&name.as_str()) && !f.is_visual() && f.dtype != "string")
+        .map(|(name, f)| (name.as_str(), f.dim()))
+        .collect();
+    let mut names: Vec<&str> = wanted.iter().map(|(name, _)| *name).collect();
+    names.push("episode_index");
+    let mut pieces: Vec<Vec<Resident>> = wanted.iter().map(|_| Vec::new()).collect();
+    let mut row = 0;
+    let mut episode = 0;
+    for path in read::files(root, "data")? {
+        let (rows, arrays) = read::columns(&path, &names)?;
+        for ((name, dim), (array, out)) in wanted.iter().zip(arrays.iter().zip(&mut pieces)) {
+            out.push(read::numbers(&path, name, array, *dim)?);
+        }
+        let owners = read::integers(&path, "episode_index", &arrays[wanted.len()])?;
+        for &owner in owners.iter() {
+            while episodes.get(episode).is_some_and(|e| row >= e.to) {
+                episode += 1;
+            }
+            if episodes.get(episode).is_none() || owner != episode as i64 {
+                return Err(DatasetError::BadDataset {
+                    path,
+                    object: format!("frame {row}"),
+                    expected: format!("episode {episode} of {}", episodes.len()),
+                    found: format!("episode_index {owner}"),
+                });
+            }
+            row += 1;
+        }
+        debug_assert!(rows == owners.len());
+    }
+    if row != info.total_frames {
+        return Err(DatasetError::BadDataset {
+            path: root.to_path_buf(),
+            object: "data".to_owned(),
+            expected: format!("{} frames", info.total_frames),
+            found: row.to_string(),
+        });
+    }
+    let mut columns = BTreeMap::new();
+    for ((name, dim), mut files) in wanted.into_iter().zip(pieces) {
+        let data = match files.len() {
+            1 => files.swap_remove(0).data,
+            _ => ScalarBuffer::from(files.iter().flat_map(|f| f.data.iter().copied()).collect::<Vec<f32>>()),
+        };
+        columns.insert(name.to_owned(), Resident { data, dim });
+    }
+    Ok(columns)
+}

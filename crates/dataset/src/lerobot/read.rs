@@ -1,0 +1,218 @@
+//! Parquet files as plain vectors: columns of numbers of any width, lists of any kind.
+
+use crate::error::{DatasetError, Result};
+use crate::windows::Resident;
+use arrow::array::{
+    Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, LargeListArray, ListArray, RecordBatch,
+};
+use arrow::buffer::ScalarBuffer;
+use arrow::compute::{cast, concat};
+use arrow::datatypes::DataType;
+use parquet::arrow::ProjectionMask;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+/// The files `<root>/<prefix>/*/*.parquet` in order of their paths, as LeRobot lists them.
+pub(crate) fn files(root: &Path, prefix: &str) -> Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    let top = root.join(prefix);
+    for folder in list(&top)? {
+        if folder.is_dir() {
+            found.extend(list(&folder)?.into_iter().filter(|f| f.extension().is_some_and(|e| e == "parquet")));
+        }
+    }
+    found.sort();
+    if found.is_empty() {
+        return Err(DatasetError::BadDataset {
+            path: root.to_path_buf(),
+            object: prefix.to_owned(),
+            expected: format!("{prefix}/chunk-000/file-000.parquet"),
+            found: "no Parquet file".to_owned(),
+        });
+    }
+    Ok(found)
+}
+
+fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+    let failed = |source| DatasetError::Io { path: folder.to_path_buf(), operation: "list it", source };
+    let entries = std::fs::read_dir(folder).map_err(failed)?;
+    entries.map(|entry| entry.map(|e| e.path()).map_err(failed)).collect()
+}
+
+/// Reads columns of one file whole, each as one array, in the order of `columns`; a missing one is an error.
+pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<ArrayRef>)> {
+    let failed = |source| DatasetError::Parquet { path: path.to_path_buf(), operation: "read it", source };
+    let file = File::open(path).map_err(|source| DatasetError::Io {
+        path: path.to_path_buf(),
+        operation: "open it",
+        source,
+    })?;
+    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(failed)?;
+    let rows = builder.metadata().file_metadata().num_rows();
+    let rows = usize::try_from(rows).map_err(|_| bad_count(path, rows))?;
+    let mut indices = Vec::with_capacity(columns.len());
+    for name in columns {
+        indices.push(builder.schema().index_of(name).map_err(|_| missing_column(path, name, &builder))?);
+    }
+    let mask = ProjectionMask::roots(builder.parquet_schema(), indices);
+    // one batch for the whole file: its buffers become the resident columns without another copy
+    let reader = builder.with_projection(mask).with_batch_size(rows.max(1)).build().map_err(failed)?;
+    let mut batches: Vec<RecordBatch> = Vec::new();
+    for batch in reader {
+        batches.push(batch.map_err(|e| failed(e.into()))?);
+    }
+    let mut arrays = Vec::with_capacity(columns.len());
+    for name in columns {
+        let pieces: Vec<&ArrayRef> = batches.iter().filter_map(|b| b.column_by_name(name)).collect();
+        arrays.push(match pieces.as_slice() {
+            [] => return Err(BadColumn { path, name }.because("rows", "none")),
+            [one] => ArrayRef::clone(one),
+            many => {
+                let many: Vec<&dyn Array> = many.iter().map(|a| a.as_ref()).collect();
+                concat(&many).map_err(|e| failed(e.into()))?
+            }
+        });
+    }
+    Ok((rows, arrays))
+}
+
+fn bad_count(path: &Path, rows: i64) -> DatasetError {
+    DatasetError::BadDataset {
+        path: path.to_path_buf(),
+        object: "number of rows".to_owned(),
+        expected: "0 or more".to_owned(),
+        found: rows.to_string(),
+    }
+}
+
+fn missing_column(path: &Path, name: &str, builder: &ParquetRecordBatchReaderBuilder<File>) -> DatasetError {
+    let names: Vec<&str> = builder.schema().fields().iter().map(|f| f.name().as_str()).collect();
+    DatasetError::NotInDataset { path: path.to_path_buf(), wanted: format!("column {name}"), found: names.join(", ") }
+}
+
+/// A column of a file, for error messages.
+pub(crate) struct BadColumn<'a> {
+    pub path: &'a Path,
+    pub name: &'a str,
+}
+
+impl BadColumn<'_> {
+    pub(crate) fn because(&self, expected: impl Into<String>, found: impl Into<String>) -> DatasetError {
+        DatasetError::BadDataset {
+            path: self.path.to_path_buf(),
+            object: format!("column {}", self.name),
+            expected: expected.into(),
+            found: found.into(),
+        }
+    }
+}
+
+/// Numbers of a column as `dim` f32 a row, whatever the stored type and kind of list.
+pub(crate) fn numbers(path: &Path, name: &str, array: &ArrayRef, dim: usize) -> Result<Resident> {
+    let column = BadColumn { path, name };
+    let leaf = leaf(&column, array, array.len(), dim)?;
+    let floats = match leaf.data_type() {
+        DataType::Float32 => leaf,
+        DataType::Boolean => {
+            let flags = leaf.as_any().downcast_ref::<BooleanArray>().expect("a boolean column");
+            let values: Vec<f32> = flags.values().iter().map(|b| f32::from(u8::from(b))).collect();
+            return Ok(Resident { data: values.into(), dim });
+        }
+        t if t.is_numeric() => cast(&leaf, &DataType::Float32).map_err(|e| column.because("numbers", e.to_string()))?,
+        t => return Err(column.because("numbers", t.to_string())),
+    };
+    let floats = floats.as_any().downcast_ref::<Float32Array>().expect("a float column");
+    Ok(Resident { data: floats.values().clone(), dim })
+}
+
+/// Unwraps lists down to values: every row must hold exactly `dim` of them, none may be null.
+fn leaf(column: &BadColumn<'_>, array: &ArrayRef, rows: usize, dim: usize) -> Result<ArrayRef> {
+    if array.null_count() > 0 {
+        return Err(column.because("a value in every row", format!("{} nulls", array.null_count())));
+    }
+    let any = array.as_any();
+    let inner = match array.data_type() {
+        DataType::FixedSizeList(_, _) => any.downcast_ref::<FixedSizeListArray>().map(|a| ArrayRef::clone(a.values())),
+        DataType::List(_) => any
+            .downcast_ref::<ListArray>()
+            .map(|a| {
+                let offsets = a.value_offsets();
+                even(offsets.iter().map(|&o| o as usize))
+                    .then(|| a.values().slice(offsets[0] as usize, (offsets[offsets.len() - 1] - offsets[0]) as usize))
+            })
+            .flatten(),
+        DataType::LargeList(_) => any
+            .downcast_ref::<LargeListArray>()
+            .map(|a| {
+                let offsets = a.value_offsets();
+                even(offsets.iter().map(|&o| o as usize))
+                    .then(|| a.values().slice(offsets[0] as usize, (offsets[offsets.len() - 1] - offsets[0]) as usize))
+            })
+            .flatten(),
+        _ => {
+            if array.len() != rows * dim {
+                return Err(
+                    column.because(format!("{dim} values a row"), format!("{} values in {rows} rows", array.len()))
+                );
+            }
+            return Ok(ArrayRef::clone(array));
+        }
+    };
+    let inner = inner.ok_or_else(|| column.because(format!("{dim} values a row"), "rows of different lengths"))?;
+    leaf(column, &inner, rows, dim)
+}
+
+/// Whether all differences are the same.
+fn even(mut offsets: impl Iterator<Item = usize>) -> bool {
+    let (Some(first), Some(second)) = (offsets.next(), offsets.next()) else { return true };
+    let step = second - first;
+    let mut last = second;
+    offsets.all(|o| {
+        let same = o - last == step;
+        last = o;
+        same
+    })
+}
+
+/// A column of whole numbers.
+pub(crate) fn integers(path: &Path, name: &str, array: &ArrayRef) -> Result<ScalarBuffer<i64>> {
+    let column = BadColumn { path, name };
+    if array.null_count() > 0 || !array.data_type().is_integer() {
+        return Err(column.because("whole numbers", format!("{} with {} nulls", array.data_type(), array.null_count())));
+    }
+    let cast = cast(array, &DataType::Int64).map_err(|e| column.because("64-bit numbers", e.to_string()))?;
+    let longs = cast.as_any().downcast_ref::<arrow::array::Int64Array>().expect("an int64 column");
+    Ok(longs.values().clone())
+}
+
+/// A column of texts.
+pub(crate) fn texts(path: &Path, name: &str, array: &ArrayRef) -> Result<Vec<String>> {
+    let column = BadColumn { path, name };
+    let plain = cast(array, &DataType::Utf8).map_err(|e| column.because("texts", e.to_string()))?;
+    let plain = plain.as_any().downcast_ref::<arrow::array::StringArray>().expect("a text column");
+    if plain.null_count() > 0 {
+        return Err(column.because("a text in every row", format!("{} nulls", plain.null_count())));
+    }
+    Ok(plain.iter().flatten().map(str::to_owned).collect())
+}
+
+/// A column of lists of texts.
+pub(crate) fn text_lists(path: &Path, name: &str, array: &ArrayRef) -> Result<Vec<Vec<String>>> {
+    let column = BadColumn { path, name };
+    let lists: Vec<ArrayRef> = match array.data_type() {
+        DataType::List(_) => {
+            let list = array.as_any().downcast_ref::<ListArray>().expect("a list column");
+            list.iter().flatten().collect()
+        }
+        DataType::LargeList(_) => {
+            let list = array.as_any().downcast_ref::<LargeListArray>().expect("a list column");
+            list.iter().flatten().collect()
+        }
+        t => return Err(column.because("lists of texts", t.to_string())),
+    };
+    if lists.len() != array.len() {
+        return Err(column.because("a list in every row", "nulls"));
+    }
+    lists.iter().map(|list| texts(path, name, list)).collect()
+}

@@ -1,0 +1,278 @@
+//! Parquet files that roll over by size, and row groups that are encoded apart from them.
+//!
+//! [`GroupEncoder`] turns arrays into compressed pages on any thread; [`ShardWriter`] splices the pages into
+//! files in order, on one thread. The order of the calls alone decides the bytes.
+
+use super::schema::hex;
+use crate::error::{DatasetError, Result};
+use arrow::array::ArrayRef;
+use arrow::datatypes::SchemaRef;
+use parquet::arrow::ArrowSchemaConverter;
+use parquet::arrow::arrow_writer::{ArrowColumnChunk, ArrowRowGroupWriterFactory, compute_leaves};
+use parquet::errors::{ParquetError, Result as ParquetResult};
+use parquet::file::properties::WriterProperties;
+use parquet::file::writer::SerializedFileWriter;
+use sha2::{Digest, Sha256};
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// A file that is hashed while it is written.
+pub(crate) struct HashingFile {
+    file: File,
+    hash: Sha256,
+    bytes: u64,
+    /// Parquet's writer turns I/O errors into text; the original waits here.
+    failure: Option<io::Error>,
+}
+
+impl HashingFile {
+    pub(crate) fn create(path: &Path) -> Result<Self> {
+        let file = File::create_new(path).map_err(|source| DatasetError::Io {
+            path: path.to_path_buf(),
+            operation: "create it",
+            source,
+        })?;
+        Ok(Self { file, hash: Sha256::new(), bytes: 0, failure: None })
+    }
+
+    /// Writes everything at once and returns what was written.
+    pub(crate) fn write_whole(root: &Path, relative: &str, content: &[u8]) -> Result<WrittenFile> {
+        let path = root.join(relative);
+        create_parent(&path)?;
+        let mut file = Self::create(&path)?;
+        file.write_all(content).map_err(|source| DatasetError::Io { path, operation: "write it", source })?;
+        Ok(file.written(relative))
+    }
+
+    /// What has been written so far, under the path that it has in the data set.
+    pub(crate) fn written(&self, relative: &str) -> WrittenFile {
+        let sha256 = hex(self.hash.clone().finalize().as_slice());
+        WrittenFile { path: relative.to_owned(), bytes: self.bytes, sha256 }
+    }
+}
+
+impl Write for HashingFile {
+    fn write(&mut self, buffer: &[u8]) -> io::Result<usize> {
+        match self.file.write(buffer) {
+            Ok(n) => {
+                self.hash.update(&buffer[..n]);
+                self.bytes += n as u64;
+                Ok(n)
+            }
+            Err(e) => {
+                if e.kind() != io::ErrorKind::Interrupted {
+                    self.failure = Some(io::Error::new(e.kind(), e.to_string()));
+                }
+                Err(e)
+            }
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// A file of the data set, by its path in it.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct WrittenFile {
+    pub path: String,
+    pub bytes: u64,
+    pub sha256: String,
+}
+
+/// Creates the folder that `path` lies in.
+pub(crate) fn create_parent(path: &Path) -> Result<()> {
+    let parent = path.parent().expect("a file of a data set lies in a folder");
+    std::fs::create_dir_all(parent).map_err(|source| DatasetError::Io {
+        path: parent.to_path_buf(),
+        operation: "create the folder",
+        source,
+    })
+}
+
+/// Encodes row groups of one schema. Shared between threads.
+pub(crate) struct GroupEncoder {
+    schema: SchemaRef,
+    properties: Arc<WriterProperties>,
+    factory: ArrowRowGroupWriterFactory,
+}
+
+/// A row group, compressed, not yet in a file.
+pub(crate) struct EncodedGroup {
+    chunks: Vec<ArrowColumnChunk>,
+    pub rows: usize,
+    pub bytes: u64,
+}
+
+impl GroupEncoder {
+    pub(crate) fn new(schema: SchemaRef, properties: WriterProperties) -> ParquetResult<Self> {
+        let properties = Arc::new(properties);
+        let nowhere = file_writer(io::sink(), &schema, &properties)?;
+        let factory = ArrowRowGroupWriterFactory::new(&nowhere, Arc::clone(&schema));
+        Ok(Self { schema, properties, factory })
+    }
+
+    pub(crate) fn schema(&self) -> &SchemaRef {
+        &self.schema
+    }
+
+    /// Encodes one row group; `arrays` follow the schema's fields.
+    pub(crate) fn encode(&self, arrays: &[ArrayRef]) -> ParquetResult<EncodedGroup> {
+        let mut writers = self.factory.create_column_writers(0)?.into_iter();
+        let mut chunks = Vec::new();
+        let mut bytes = 0;
+        for (field, array) in self.schema.fields().iter().zip(arrays) {
+            for leaf in compute_leaves(field, array)? {
+                let missing = || ParquetError::General(format!("no writer for {}", field.name()));
+                let mut writer = writers.next().ok_or_else(missing)?;
+                writer.write(&leaf)?;
+                let chunk = writer.close()?;
+                bytes += chunk.close().bytes_written;
+                chunks.push(chunk);
+            }
+        }
+        Ok(EncodedGroup { chunks, rows: arrays.first().map_or(0, |a| a.len()), bytes })
+    }
+}
+
+fn file_writer<W: Write + Send>(
+    to: W,
+    schema: &SchemaRef,
+    properties: &Arc<WriterProperties>,
+) -> ParquetResult<SerializedFileWriter<W>> {
+    let descriptor = ArrowSchemaConverter::new().convert(schema)?;
+    SerializedFileWriter::new(to, descriptor.root_schema_ptr(), Arc::clone(properties))
+}
+
+/// Where a row group went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Place {
+    pub folder: usize,
+    pub file: usize,
+}
+
+/// Appends encoded row groups to `<root>/<prefix>/chunk-NNN/file-NNN.parquet`.
+pub(crate) struct ShardWriter<'a> {
+    root: &'a Path,
+    prefix: &'static str,
+    encoder: &'a GroupEncoder,
+    limit: u64,
+    files_per_folder: usize,
+    number: usize,
+    current: Option<(SerializedFileWriter<HashingFile>, u64)>,
+    finished: Vec<WrittenFile>,
+}
+
+impl<'a> ShardWriter<'a> {
+    pub(crate) fn new(
+        root: &'a Path,
+        prefix: &'static str,
+        encoder: &'a GroupEncoder,
+        limit: u64,
+        files_per_folder: usize,
+    ) -> Self {
+        Self { root, prefix, encoder, limit, files_per_folder, number: 0, current: None, finished: Vec::new() }
+    }
+
+    fn relative(&self) -> String {
+        let (folder, file) = (self.number / self.files_per_folder, self.number % self.files_per_folder);
+        format!("{}/chunk-{folder:03}/file-{file:03}.parquet", self.prefix)
+    }
+
+    fn error(&self, failure: Option<io::Error>, source: ParquetError) -> DatasetError {
+        let path = self.root.join(self.relative());
+        match failure {
+            Some(source) => DatasetError::Io { path, operation: "write it", source },
+            None => DatasetError::Parquet { path, operation: "write it", source },
+        }
+    }
+
+    /// Appends a row group, beginning a new file when the present one would grow beyond the limit and the group
+    /// begins an episode: an episode never spans two files.
+    pub(crate) fn append(&mut self, group: EncodedGroup, begins_episode: bool) -> Result<Place> {
+        if let Some((_, written)) = &self.current
+            && begins_episode
+            && *written > 0
+            && written + group.bytes > self.limit
+        {
+            self.close_file()?;
+            self.number += 1;
+        }
+        let (mut writer, written) = match self.current.take() {
+            Some(current) => current,
+            None => {
+                let path = self.root.join(self.relative());
+                create_parent(&path)?;
+                let file = HashingFile::create(&path)?;
+                let opened = file_writer(file, self.encoder.schema(), &self.encoder.properties);
+                (opened.map_err(|e| self.error(None, e))?, 0)
+            }
+        };
+        let bytes = group.bytes;
+        if let Err(e) = splice(&mut writer, group) {
+            let failure = writer.inner_mut().failure.take();
+            return Err(self.error(failure, e));
+        }
+        self.current = Some((writer, written + bytes));
+        Ok(Place { folder: self.number / self.files_per_folder, file: self.number % self.files_per_folder })
+    }
+
+    fn close_file(&mut self) -> Result<()> {
+        let Some((mut writer, _)) = self.current.take() else { return Ok(()) };
+        let closed = writer.finish();
+        if let Err(e) = closed {
+            let failure = writer.inner_mut().failure.take();
+            return Err(self.error(failure, e));
+        }
+        self.finished.push(writer.inner().written(&self.relative()));
+        Ok(())
+    }
+
+    /// Closes the last file; returns all of them in order.
+    pub(crate) fn finish(mut self) -> Result<Vec<WrittenFile>> {
+        self.close_file()?;
+        Ok(self.finished)
+    }
+}
+
+fn splice(writer: &mut SerializedFileWriter<HashingFile>, group: EncodedGroup) -> ParquetResult<()> {
+    let mut row_group = writer.next_row_group()?;
+    for chunk in group.chunks {
+        chunk.append_to_row_group(&mut row_group)?;
+    }
+    row_group.close()?;
+    writer.flush().map_err(ParquetError::from)
+}
+
+/// Writes a small Parquet file of one row group.
+pub(crate) fn write_parquet(
+    root: &Path,
+    relative: &str,
+    encoder: &GroupEncoder,
+    groups: &[Vec<ArrayRef>],
+) -> Result<WrittenFile> {
+    let path: PathBuf = root.join(relative);
+    create_parent(&path)?;
+    let failed = |source| DatasetError::Parquet { path: path.clone(), operation: "write it", source };
+    let file = HashingFile::create(&path)?;
+    let mut writer = file_writer(file, encoder.schema(), &encoder.properties).map_err(failed)?;
+    for arrays in groups {
+        let written = encoder.encode(arrays).and_then(|group| splice(&mut writer, group));
+        if let Err(e) = written {
+            return Err(match writer.inner_mut().failure.take() {
+                Some(source) => DatasetError::Io { path, operation: "write it", source },
+                None => failed(e),
+            });
+        }
+    }
+    if let Err(e) = writer.finish() {
+        return Err(match writer.inner_mut().failure.take() {
+            Some(source) => DatasetError::Io { path, operation: "write it", source },
+            None => failed(e),
+        });
+    }
+    Ok(writer.inner().written(relative))
+}

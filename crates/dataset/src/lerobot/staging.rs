@@ -1,0 +1,206 @@
+//! A folder that appears whole or not at all.
+//!
+//! Everything is written into a hidden folder beside the target; [`Staging::publish`] flushes it to disk and
+//! renames it. A writer that is killed leaves the hidden folder, locked by nobody, and the next writer of the
+//! same target removes it.
+
+use crate::error::{DatasetError, Result};
+use rustix::fs::{CWD, RenameFlags, renameat_with};
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// A folder under construction. Dropped before it is published, it removes itself.
+#[derive(Debug)]
+pub(crate) struct Staging {
+    path: PathBuf,
+    target: PathBuf,
+    /// Held open and locked: a folder that somebody is still writing is not removed by others.
+    _lock: File,
+    published: bool,
+}
+
+fn io_error(path: &Path, operation: &'static str) -> impl FnOnce(io::Error) -> DatasetError {
+    let path = path.to_path_buf();
+    move |source| DatasetError::Io { path, operation, source }
+}
+
+impl Staging {
+    /// Starts a folder that is to appear as `target`, which must not exist; its parent must.
+    pub(crate) fn create(target: &Path) -> Result<Self> {
+        refuse_existing(target)?;
+        let parent = parent_of(target);
+        let name = target.file_name().ok_or_else(|| DatasetError::Io {
+            path: target.to_path_buf(),
+            operation: "create a folder of this name",
+            source: io::Error::from(io::ErrorKind::InvalidInput),
+        })?;
+        let prefix = format!(".{}.partial-", name.to_string_lossy());
+        sweep(parent, &prefix);
+        loop {
+            let folder = tempfile::Builder::new()
+                .prefix(&prefix)
+                .tempdir_in(parent)
+                .map_err(io_error(parent, "create a folder in it"))?;
+            let lock = File::open(folder.path()).map_err(io_error(folder.path(), "open it"))?;
+            lock.lock().map_err(io_error(folder.path(), "lock it"))?;
+            // somebody who swept between creation and lock has removed it: take another
+            if folder.path().exists() {
+                widen_permissions(folder.path())?;
+                let path = folder.keep();
+                return Ok(Self { path, target: target.to_path_buf(), _lock: lock, published: false });
+            }
+        }
+    }
+
+    /// Where to write.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Flushes everything to disk and gives the folder its name.
+    pub(crate) fn publish(mut self) -> Result<()> {
+        sync_tree(&self.path)?;
+        match renameat_with(CWD, &self.path, CWD, &self.target, RenameFlags::NOREPLACE) {
+            Ok(()) => {}
+            Err(rustix::io::Errno::EXIST) => {
+                return Err(DatasetError::OutputExists { path: self.target.clone() });
+            }
+            // file systems without RENAME_NOREPLACE: a plain rename never replaces a folder that has content
+            Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) => {
+                refuse_existing(&self.target)?;
+                std::fs::rename(&self.path, &self.target)
+                    .map_err(io_error(&self.target, "move the finished folder there"))?;
+            }
+            Err(errno) => {
+                return Err(io_error(&self.target, "move the finished folder there")(errno.into()));
+            }
+        }
+        self.published = true;
+        let parent = parent_of(&self.target);
+        let folder = File::open(parent).map_err(io_error(parent, "open it"))?;
+        folder.sync_all().map_err(io_error(parent, "flush it to disk"))
+    }
+}
+
+impl Drop for Staging {
+    fn drop(&mut self) {
+        if !self.published {
+            // nothing more can be done about a failure here; the next writer sweeps
+            let _ = std::fs::remove_dir_all(&self.path);
+        }
+    }
+}
+
+fn parent_of(target: &Path) -> &Path {
+    match target.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    }
+}
+
+fn refuse_existing(target: &Path) -> Result<()> {
+    match std::fs::symlink_metadata(target) {
+        Ok(_) => Err(DatasetError::OutputExists { path: target.to_path_buf() }),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(e) => Err(io_error(target, "look at it")(e)),
+    }
+}
+
+/// Removes what killed writers of the same target left. Best effort: what is locked is in use.
+fn sweep(parent: &Path, prefix: &str) {
+    let Ok(entries) = std::fs::read_dir(parent) else { return };
+    for entry in entries.flatten() {
+        if !entry.file_name().to_string_lossy().starts_with(prefix) {
+            continue;
+        }
+        if let Ok(folder) = File::open(entry.path())
+            && folder.try_lock().is_ok()
+        {
+            let _ = std::fs::remove_dir_all(entry.path());
+        }
+    }
+}
+
+/// `tempfile` makes folders that only the owner may enter; a data set is for whoever the umask lets in.
+fn widen_permissions(path: &Path) -> Result<()> {
+    use std::os::unix::fs::PermissionsExt;
+    let probe = path.join("probe");
+    std::fs::create_dir(&probe).map_err(io_error(path, "create a folder in it"))?;
+    let mode = std::fs::metadata(&probe).map_err(io_error(&probe, "look at it"))?.permissions().mode();
+    std::fs::remove_dir(&probe).map_err(io_error(&probe, "remove it"))?;
+    std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).map_err(io_error(path, "set its permissions"))
+}
+
+fn sync_tree(path: &Path) -> Result<()> {
+    for entry in std::fs::read_dir(path).map_err(io_error(path, "list it"))? {
+        let entry = entry.map_err(io_error(path, "list it"))?.path();
+        if entry.is_dir() {
+            sync_tree(&entry)?;
+        } else {
+            let file = File::open(&entry).map_err(io_error(&entry, "open it"))?;
+            file.sync_all().map_err(io_error(&entry, "flush it to disk"))?;
+        }
+    }
+    let folder = File::open(path).map_err(io_error(path, "open it"))?;
+    folder.sync_all().map_err(io_error(path, "flush it to disk"))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let mut names: Vec<String> =
+            std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_published_folder_appears_with_its_content_and_nothing_else_stays() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("set");
+        let staging = Staging::create(&target).unwrap();
+        std::fs::create_dir(staging.path().join("meta")).unwrap();
+        std::fs::write(staging.path().join("meta/x"), "1").unwrap();
+        assert!(!target.exists());
+        staging.publish().unwrap();
+        assert_eq!(names(dir.path()), ["set"]);
+        assert_eq!(std::fs::read_to_string(target.join("meta/x")).unwrap(), "1");
+    }
+
+    #[test]
+    fn an_unfinished_folder_disappears_and_an_existing_target_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("set");
+        drop(Staging::create(&target).unwrap());
+        assert!(names(dir.path()).is_empty());
+        std::fs::write(&target, "precious").unwrap();
+        assert!(matches!(Staging::create(&target), Err(DatasetError::OutputExists { .. })));
+        assert_eq!(std::fs::read_to_string(&target).unwrap(), "precious");
+    }
+
+    #[test]
+    fn a_target_that_appears_meanwhile_is_not_replaced() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("set");
+        let staging = Staging::create(&target).unwrap();
+        std::fs::create_dir(&target).unwrap();
+        assert!(matches!(staging.publish(), Err(DatasetError::OutputExists { .. })));
+        assert_eq!(names(dir.path()), ["set"]);
+    }
+
+    #[test]
+    fn leftovers_are_swept_but_not_those_in_use() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("set");
+        std::fs::create_dir(dir.path().join(".set.partial-dead")).unwrap();
+        std::fs::write(dir.path().join(".set.partial-dead/half"), "x").unwrap();
+        let alive = Staging::create(&target).unwrap();
+        let second = Staging::create(&target).unwrap();
+        assert!(alive.path().exists() && second.path().exists());
+        assert!(!dir.path().join(".set.partial-dead").exists());
+    }
+}

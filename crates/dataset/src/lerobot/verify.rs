@@ -1,0 +1,182 @@
+//! Every check that a data set can be given.
+
+use super::encode::PictureSummary;
+use super::export::{Rows, picture_pixels};
+use super::fingerprint::Fingerprint;
+use super::info::Info;
+use super::open::{Dataset, read_json};
+use super::schema;
+use super::side::{MANIFEST_FILE, Manifest};
+use crate::error::{DatasetError, Result};
+use crate::stats::FeatureStats;
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// Relative difference up to which a stored statistic counts as right: LeRobot computes some in f32.
+const STATISTICS_TOLERANCE: f64 = 1e-5;
+
+/// sha256 of a file in hexadecimal.
+pub(crate) fn hash_file(path: &Path) -> Result<String> {
+    let failed = |source| DatasetError::Io { path: path.to_path_buf(), operation: "read it", source };
+    let mut file = File::open(path).map_err(failed)?;
+    let mut hash = Sha256::new();
+    let mut buffer = vec![0; 1 << 18];
+    loop {
+        match file.read(&mut buffer).map_err(failed)? {
+            0 => return Ok(schema::hex(&hash.finalize())),
+            n => hash.update(&buffer[..n]),
+        }
+    }
+}
+
+/// What a check found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Check {
+    /// What was checked.
+    pub name: &'static str,
+    /// `None` when all is well, what is wrong otherwise.
+    pub problem: Option<String>,
+}
+
+/// Runs every check on the data set at `root`: that it opens, that its columns are finite, that its statistics
+/// follow from its frames, that its content has the recorded fingerprint and its files the recorded hashes.
+/// An error means that a check could not be made.
+pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Check>> {
+    let mut checks = Vec::new();
+    let mut note = |name, problem| checks.push(Check { name, problem });
+    note("files have the hashes recorded", manifest_problem(root)?);
+    let dataset = match Dataset::open(root) {
+        Ok(dataset) => {
+            note("it opens: columns, episodes and tasks agree", None);
+            dataset
+        }
+        Err(e) => {
+            note("it opens: columns, episodes and tasks agree", Some(e.to_string()));
+            return Ok(checks);
+        }
+    };
+    note("every number is finite", not_finite(&dataset));
+    note("statistics follow from the frames", statistics_problem(&dataset)?);
+    note("splits name episodes", split_problem(&dataset));
+    let pictures = dataset.info().features.0.iter().any(|(_, f)| f.dtype == "image");
+    if pictures {
+        note("pictures decode and have the content recorded", picture_problem(&dataset, progress)?);
+    } else if dataset.provenance().is_some() {
+        // opening compared it
+        note("content has the fingerprint recorded", None);
+    }
+    Ok(checks)
+}
+
+fn manifest_problem(root: &Path) -> Result<Option<String>> {
+    let path = root.join(MANIFEST_FILE);
+    if !path.exists() {
+        return Ok(None);
+    }
+    let manifest: Manifest = match read_json(&path) {
+        Ok(manifest) => manifest,
+        Err(e) => return Ok(Some(e.to_string())),
+    };
+    for (name, expected) in &manifest.files {
+        match hash_file(&root.join(name)) {
+            Ok(found) if found == *expected => {}
+            Ok(found) => return Ok(Some(format!("{name}: expected sha256 {expected}, found {found}"))),
+            Err(e) => return Ok(Some(e.to_string())),
+        }
+    }
+    Ok(None)
+}
+
+fn not_finite(dataset: &Dataset) -> Option<String> {
+    for name in dataset.column_names() {
+        let column = dataset.column(name)?;
+        if let Some(at) = column.data.iter().position(|v| !v.is_finite()) {
+            let (frame, dimension) = (at / column.dim, at % column.dim);
+            return Some(format!("{name}: frame {frame}, dimension {dimension}: {}", column.data[at]));
+        }
+    }
+    None
+}
+
+fn statistics_problem(dataset: &Dataset) -> Result<Option<String>> {
+    let episodes: Vec<usize> = (0..dataset.episodes().len()).collect();
+    if dataset.stats().is_empty() {
+        return Ok(Some("there are none (meta/stats.json)".to_owned()));
+    }
+    for (name, computed) in dataset.statistics_of(&episodes)? {
+        let Some(stored) = dataset.stats().get(&name) else {
+            return Ok(Some(format!("{name}: none stored")));
+        };
+        if stored.count != computed.count {
+            return Ok(Some(format!("{name}: count: expected {}, found {}", computed.count, stored.count)));
+        }
+        type Get = fn(&FeatureStats) -> &Vec<f64>;
+        let vectors: [(&str, Get); 4] =
+            [("min", |s| &s.min), ("max", |s| &s.max), ("mean", |s| &s.mean), ("std", |s| &s.std)];
+        for (statistic, get) in vectors {
+            let (a, b) = (get(&computed), get(stored));
+            let close = |x: f64, y: f64| (x - y).abs() <= STATISTICS_TOLERANCE * x.abs().max(1.0);
+            if a.len() != b.len() || !a.iter().zip(b).all(|(&x, &y)| close(x, y)) {
+                return Ok(Some(format!("{name}: {statistic}: expected {a:?}, found {b:?}")));
+            }
+        }
+    }
+    Ok(None)
+}
+
+fn split_problem(dataset: &Dataset) -> Option<String> {
+    let count = dataset.episodes().len();
+    for name in dataset.split_names() {
+        let Some(episodes) = dataset.split(name) else {
+            return Some(format!("{name}: not a range of episodes"));
+        };
+        if let Some(bad) = episodes.iter().find(|&&e| e >= count) {
+            return Some(format!("{name}: names episode {bad} of {count}"));
+        }
+    }
+    None
+}
+
+/// Decodes every picture and compares the whole content with the fingerprint.
+fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u64)) -> Result<Option<String>> {
+    let info: &Info = dataset.info();
+    let root = dataset.root();
+    let mut cursors = BTreeMap::new();
+    for (name, feature) in info.features.0.iter().filter(|(_, f)| f.dtype == "image") {
+        let &[height, width, 3] = feature.shape.as_slice() else {
+            return Ok(Some(format!("{name}: pictures of shape {:?} are not read", feature.shape)));
+        };
+        cursors.insert(name.as_str(), (Rows::open(root, "data", Some(name), 32)?, height, width));
+    }
+    let mut fingerprint = Fingerprint::new(&info.features, info.fps);
+    let mut pixels = Vec::new();
+    for episode in dataset.episodes() {
+        fingerprint.episode(episode.length, episode.tasks.first().map_or("", String::as_str));
+        for (name, digest) in dataset.episode_digests(episode) {
+            fingerprint.column(&name, digest);
+        }
+        for (name, (rows, height, width)) in &mut cursors {
+            let mut summary = PictureSummary::default();
+            for batch in rows.take(episode.length)? {
+                pixels.clear();
+                if let Err(e) = picture_pixels(root, name, batch.column(0), *height, *width, &mut pixels) {
+                    return Ok(Some(format!("episode {}: {e}", episode.index)));
+                }
+                let frames = pixels.chunks_exact(*height * *width * 3);
+                summary.digests.extend(frames.map(|p| <[u8; 32]>::from(Sha256::digest(p))));
+            }
+            fingerprint.column(name, summary.digest());
+        }
+        progress(episode.to as u64, dataset.frames() as u64);
+    }
+    let computed = fingerprint.finish();
+    Ok(match dataset.provenance() {
+        Some(p) if p.fingerprint != computed => {
+            Some(format!("expected fingerprint {}, found {computed}", p.fingerprint))
+        }
+        _ => None,
+    })
+}

@@ -1,0 +1,157 @@
+//! SQL over a data set's frames and episodes.
+
+use crate::error::{DatasetError, Result};
+use crate::lerobot::Dataset;
+use polars::prelude::{
+    AnyValue, Column as Series, DataFrame, IntoColumn, IntoLazy, NamedFrom, PolarsError, Series as Values,
+};
+use polars::sql::SQLContext;
+use serde_json::Value;
+use std::collections::BTreeSet;
+
+/// The answer to a query.
+#[derive(Debug, Clone, PartialEq)]
+pub struct QueryResult {
+    /// Names of the columns.
+    pub columns: Vec<String>,
+    /// Rows, each with a value a column.
+    pub rows: Vec<Vec<Value>>,
+}
+
+/// Answers `sql` over the tables `frames` and `episodes`.
+pub fn query(dataset: &Dataset, sql: &str) -> Result<QueryResult> {
+    let failed = |source: PolarsError| DatasetError::Query { source: Box::new(source) };
+    let mut context = SQLContext::new();
+    context.register("frames", frames(dataset).map_err(failed)?.lazy());
+    context.register("episodes", episodes(dataset).map_err(failed)?.lazy());
+    let answer = context.execute(sql).and_then(|plan| plan.collect()).map_err(failed)?;
+    let columns: Vec<String> = answer.get_column_names().iter().map(|n| n.to_string()).collect();
+    let mut rows = vec![Vec::with_capacity(columns.len()); answer.height()];
+    for column in answer.columns() {
+        for (index, row) in rows.iter_mut().enumerate() {
+            row.push(json(column.get(index).map_err(failed)?));
+        }
+    }
+    Ok(QueryResult { columns, rows })
+}
+
+/// Table, column and type of everything that can be asked for.
+pub fn query_tables(dataset: &Dataset) -> Result<Vec<(String, String, String)>> {
+    let failed = |source: PolarsError| DatasetError::Query { source: Box::new(source) };
+    let mut all = Vec::new();
+    for (name, table) in [("frames", frames(dataset)), ("episodes", episodes(dataset))] {
+        for column in table.map_err(failed)?.columns() {
+            all.push((name.to_owned(), column.name().to_string(), column.dtype().to_string()));
+        }
+    }
+    Ok(all)
+}
+
+fn json(value: AnyValue<'_>) -> Value {
+    match value {
+        AnyValue::Null => Value::Null,
+        AnyValue::Boolean(b) => b.into(),
+        AnyValue::Float32(v) => shortest(v),
+        AnyValue::Float64(v) => v.into(),
+        AnyValue::String(s) => s.into(),
+        AnyValue::StringOwned(s) => s.to_string().into(),
+        other => match other.extract::<i64>() {
+            Some(v) => v.into(),
+            None => other.to_string().into(),
+        },
+    }
+}
+
+/// An f32 as the shortest decimal that reads back as itself, not as its f64 neighbour's digits.
+fn shortest(value: f32) -> Value {
+    value.to_string().parse::<f64>().map_or(Value::Null, Value::from)
+}
+
+fn column<T>(name: &str, values: T) -> Series
+where
+    Values: NamedFrom<T, [<T as Elements>::Item]>,
+    T: Elements,
+{
+    Values::new(name.into(), values).into_column()
+}
+
+/// Names the element type of a vector, for [`column`].
+trait Elements {
+    type Item;
+}
+
+impl<T> Elements for Vec<T> {
+    type Item = T;
+}
+
+/// A name that SQL takes without quotes.
+fn plain(name: &str) -> String {
+    name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect()
+}
+
+fn frames(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
+    let episodes = dataset.episodes();
+    let total = dataset.frames();
+    let mut episode_index = Vec::with_capacity(total);
+    let mut frame_index = Vec::with_capacity(total);
+    let mut timestamp = Vec::with_capacity(total);
+    let mut task = Vec::with_capacity(total);
+    for episode in episodes {
+        for i in 0..episode.length {
+            episode_index.push(episode.index as i64);
+            frame_index.push(i as i64);
+            timestamp.push(i as f64 / dataset.info().fps);
+            task.push(episode.tasks.first().cloned().unwrap_or_default());
+        }
+    }
+    let mut columns = vec![
+        column("episode_index", episode_index),
+        column("frame_index", frame_index),
+        column("index", (0..total as i64).collect::<Vec<i64>>()),
+        column("timestamp", timestamp),
+        column("task", task),
+    ];
+    let mut taken: BTreeSet<String> = columns.iter().map(|c| c.name().to_string()).collect();
+    for (name, feature) in &dataset.info().features.0 {
+        let Some(values) = dataset.column(name).filter(|_| !taken.contains(name)) else { continue };
+        for d in 0..values.dim {
+            let given = feature.names.get(d).and_then(Value::as_str).map(plain);
+            let own = match values.dim {
+                1 => plain(name),
+                _ => format!("{}_{d}", plain(name)),
+            };
+            let unique = given.filter(|n| values.dim > 1 && !taken.contains(n)).unwrap_or(own);
+            let data: Vec<f32> = values.data.iter().skip(d).step_by(values.dim).copied().collect();
+            columns.push(match feature.dtype.as_str() {
+                "bool" => column(&unique, data.iter().map(|&v| v != 0.0).collect::<Vec<bool>>()),
+                _ => column(&unique, data),
+            });
+            taken.insert(unique);
+        }
+    }
+    DataFrame::new(total, columns)
+}
+
+fn episodes(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
+    let episodes = dataset.episodes();
+    let mut columns = vec![
+        column("episode_index", episodes.iter().map(|e| e.index as i64).collect::<Vec<_>>()),
+        column("demo", episodes.iter().map(|e| e.demo.clone().unwrap_or_default()).collect::<Vec<_>>()),
+        column("length", episodes.iter().map(|e| e.length as i64).collect::<Vec<_>>()),
+        column("task", episodes.iter().map(|e| e.tasks.first().cloned().unwrap_or_default()).collect::<Vec<_>>()),
+    ];
+    if let Some(reward) = dataset.column("next.reward") {
+        let returns = episodes.iter().map(|e| reward.data[e.from..e.to].iter().map(|&v| f64::from(v)).sum());
+        columns.push(column("return", returns.collect::<Vec<f64>>()));
+    }
+    if let Some(success) = dataset.column("next.success") {
+        let any = episodes.iter().map(|e| success.data[e.from..e.to].iter().any(|&v| v != 0.0));
+        columns.push(column("success", any.collect::<Vec<bool>>()));
+    }
+    for name in dataset.split_names() {
+        let members: BTreeSet<usize> = dataset.split(name).unwrap_or_default().into_iter().collect();
+        let inside = episodes.iter().map(|e| members.contains(&e.index)).collect::<Vec<bool>>();
+        columns.push(column(&format!("in_{}", plain(name)), inside));
+    }
+    DataFrame::new(episodes.len(), columns)
+}

@@ -1,0 +1,265 @@
+//! Statistics of a feature: what a normaliser needs and what a LeRobotDataset stores.
+//!
+//! Mean and standard deviation (population, ddof 0) are computed in f64 in two passes; quantiles are
+//! exact, with linear interpolation between order statistics as numpy's default does it.
+
+use serde::{Deserialize, Serialize};
+use std::cmp::Ordering;
+
+/// The quantiles that LeRobot stores, with their names.
+pub const QUANTILES: [(&str, f64); 5] = [("q01", 0.01), ("q10", 0.10), ("q50", 0.50), ("q90", 0.90), ("q99", 0.99)];
+
+/// Per-dimension statistics of one feature over a number of frames.
+///
+/// Every vector has the feature's length; image features have one value a channel, in `[0, 1]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FeatureStats {
+    /// Smallest value.
+    pub min: Vec<f64>,
+    /// Largest value.
+    pub max: Vec<f64>,
+    /// Arithmetic mean.
+    pub mean: Vec<f64>,
+    /// Population standard deviation.
+    pub std: Vec<f64>,
+    /// Number of frames.
+    pub count: u64,
+    /// 1% quantile.
+    pub q01: Vec<f64>,
+    /// 10% quantile.
+    pub q10: Vec<f64>,
+    /// Median.
+    pub q50: Vec<f64>,
+    /// 90% quantile.
+    pub q90: Vec<f64>,
+    /// 99% quantile.
+    pub q99: Vec<f64>,
+}
+
+/// A number that statistics can be taken of.
+pub trait Sample: Copy {
+    /// The value in f64.
+    fn to_f64(self) -> f64;
+    /// Total order; NaN sorts last.
+    fn order(&self, other: &Self) -> Ordering;
+}
+
+impl Sample for f32 {
+    fn to_f64(self) -> f64 {
+        f64::from(self)
+    }
+    fn order(&self, other: &Self) -> Ordering {
+        self.total_cmp(other)
+    }
+}
+
+impl Sample for f64 {
+    fn to_f64(self) -> f64 {
+        self
+    }
+    fn order(&self, other: &Self) -> Ordering {
+        self.total_cmp(other)
+    }
+}
+
+impl Sample for i64 {
+    fn to_f64(self) -> f64 {
+        self as f64
+    }
+    fn order(&self, other: &Self) -> Ordering {
+        self.cmp(other)
+    }
+}
+
+impl FeatureStats {
+    fn with_capacity(dim: usize, count: u64) -> Self {
+        let v = || Vec::with_capacity(dim);
+        Self { min: v(), max: v(), mean: v(), std: v(), count, q01: v(), q10: v(), q50: v(), q90: v(), q99: v() }
+    }
+
+    /// Statistics of row-major values, `dim` to a row. `None` when there are no rows.
+    pub fn of<T: Sample>(values: &[T], dim: usize) -> Option<Self> {
+        Self::of_rows(&[values], dim)
+    }
+
+    /// Like [`FeatureStats::of`] over several pieces, one after the other.
+    pub fn of_rows<T: Sample>(pieces: &[&[T]], dim: usize) -> Option<Self> {
+        let rows = pieces.iter().map(|p| p.len()).sum::<usize>().checked_div(dim)?;
+        if rows == 0 {
+            return None;
+        }
+        let mut stats = Self::with_capacity(dim, rows as u64);
+        let mut scratch: Vec<T> = Vec::with_capacity(rows);
+        for d in 0..dim {
+            scratch.clear();
+            for piece in pieces {
+                scratch.extend(piece.iter().skip(d).step_by(dim));
+            }
+            stats.push_dimension(&mut scratch);
+        }
+        Some(stats)
+    }
+
+    /// Statistics of an image channel from its histogram over `0..=255`, scaled to `[0, 1]`.
+    ///
+    /// `counts` holds one histogram a channel; `frames` is the number of images sampled.
+    pub fn of_histograms(counts: &[[u64; 256]], frames: u64) -> Option<Self> {
+        let mut stats = Self::with_capacity(counts.len(), frames);
+        for histogram in counts {
+            let n: u64 = histogram.iter().sum();
+            if n == 0 {
+                return None;
+            }
+            let value_at = |rank: u64| {
+                let mut seen = 0;
+                let level = histogram.iter().position(|&c| {
+                    seen += c;
+                    seen > rank
+                });
+                level.expect("a rank below the number of pixels is inside the histogram") as f64
+            };
+            let moment = |f: &dyn Fn(f64) -> f64| {
+                let total: f64 = histogram.iter().enumerate().map(|(v, &c)| f(v as f64) * c as f64).sum();
+                total / n as f64
+            };
+            let mean = moment(&|v| v);
+            let variance = moment(&|v| (v - mean) * (v - mean));
+            stats.min.push(value_at(0) / 255.0);
+            stats.max.push(value_at(n - 1) / 255.0);
+            stats.mean.push(mean / 255.0);
+            stats.std.push(variance.sqrt() / 255.0);
+            let quantiles = stats.quantiles_mut();
+            for (out, (_, q)) in quantiles.into_iter().zip(QUANTILES) {
+                let (low, high, t) = ranks(n as usize, q);
+                out.push(lerp(value_at(low as u64), value_at(high as u64), t) / 255.0);
+            }
+        }
+        Some(stats)
+    }
+
+    /// The quantile vectors in the order of [`QUANTILES`].
+    pub fn quantiles(&self) -> [&[f64]; 5] {
+        [&self.q01, &self.q10, &self.q50, &self.q90, &self.q99]
+    }
+
+    fn quantiles_mut(&mut self) -> [&mut Vec<f64>; 5] {
+        [&mut self.q01, &mut self.q10, &mut self.q50, &mut self.q90, &mut self.q99]
+    }
+
+    fn push_dimension<T: Sample>(&mut self, values: &mut [T]) {
+        let n = values.len() as f64;
+        let low = values.iter().fold(f64::INFINITY, |m, v| m.min(v.to_f64()));
+        let high = values.iter().fold(f64::NEG_INFINITY, |m, v| m.max(v.to_f64()));
+        // rounding must not push the mean of a constant column beside its only value
+        let mean = (values.iter().map(|v| v.to_f64()).sum::<f64>() / n).max(low).min(high);
+        let variance = values.iter().map(|v| (v.to_f64() - mean).powi(2)).sum::<f64>() / n;
+        let mut wanted = Vec::with_capacity(2 * QUANTILES.len());
+        for (_, q) in QUANTILES {
+            let (low, high, _) = ranks(values.len(), q);
+            wanted.extend([low, high]);
+        }
+        wanted.sort_unstable();
+        wanted.dedup();
+        select_ranks(values, 0, &wanted);
+        let at = |rank: usize| values[rank].to_f64();
+        self.min.push(low);
+        self.max.push(high);
+        self.mean.push(mean);
+        self.std.push(variance.sqrt());
+        for (out, (_, q)) in self.quantiles_mut().into_iter().zip(QUANTILES) {
+            let (low, high, t) = ranks(values.len(), q);
+            out.push(lerp(at(low), at(high), t));
+        }
+    }
+}
+
+/// The two order statistics around quantile `q` of `n` values, and the weight of the second.
+fn ranks(n: usize, q: f64) -> (usize, usize, f64) {
+    let position = q * (n - 1) as f64;
+    let low = position.floor() as usize;
+    (low, (low + 1).min(n - 1), position - low as f64)
+}
+
+/// numpy's interpolation: symmetric in its ends, so that equal ends give themselves.
+fn lerp(a: f64, b: f64, t: f64) -> f64 {
+    if t >= 0.5 { b - (b - a) * (1.0 - t) } else { a + (b - a) * t }
+}
+
+/// Partially sorts `values` so that every index in `ranks` (sorted; offset by `base`) holds its order statistic.
+fn select_ranks<T: Sample>(values: &mut [T], base: usize, ranks: &[usize]) {
+    let Some(&middle) = ranks.get(ranks.len() / 2) else { return };
+    let (left, _, right) = values.select_nth_unstable_by(middle - base, T::order);
+    let half = ranks.len() / 2;
+    select_ranks(left, base, &ranks[..half]);
+    select_ranks(right, middle + 1, &ranks[half + 1..]);
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use proptest::prelude::*;
+
+    /// The definition, by sorting.
+    fn naive(values: &[f64], q: f64) -> f64 {
+        let mut v = values.to_vec();
+        v.sort_by(f64::total_cmp);
+        let position = q * (v.len() - 1) as f64;
+        let low = position.floor() as usize;
+        let high = position.ceil() as usize;
+        v[low] + (v[high] - v[low]) * (position - low as f64)
+    }
+
+    proptest! {
+        #[test]
+        fn statistics_agree_with_their_definitions(rows in prop::collection::vec((-1e3_f32..1e3, -1.0_f32..1.0), 1..200)) {
+            let flat: Vec<f32> = rows.iter().flat_map(|&(a, b)| [a, b]).collect();
+            let stats = FeatureStats::of(&flat, 2).unwrap();
+            for d in 0..2 {
+                let column: Vec<f64> = flat.iter().skip(d).step_by(2).map(|&v| f64::from(v)).collect();
+                let n = column.len() as f64;
+                let mean = column.iter().sum::<f64>() / n;
+                let var = column.iter().map(|v| v * v).sum::<f64>() / n - mean * mean;
+                prop_assert!((stats.mean[d] - mean).abs() < 1e-9);
+                prop_assert!((stats.std[d].powi(2) - var).abs() < 1e-6);
+                prop_assert_eq!(stats.min[d], column.iter().copied().fold(f64::INFINITY, f64::min));
+                prop_assert_eq!(stats.max[d], column.iter().copied().fold(f64::NEG_INFINITY, f64::max));
+                for (got, (_, q)) in stats.quantiles().iter().zip(QUANTILES) {
+                    prop_assert!((got[d] - naive(&column, q)).abs() < 1e-9);
+                }
+            }
+            prop_assert_eq!(stats.count, rows.len() as u64);
+        }
+
+        #[test]
+        fn a_histogram_gives_the_statistics_of_its_pixels(pixels in prop::collection::vec(any::<u8>(), 1..300)) {
+            let mut histogram = [0_u64; 256];
+            for &p in &pixels {
+                histogram[usize::from(p)] += 1;
+            }
+            let values: Vec<f64> = pixels.iter().map(|&p| f64::from(p)).collect();
+            let expected = FeatureStats::of(&values, 1).unwrap();
+            let got = FeatureStats::of_histograms(&[histogram], 1).unwrap();
+            for (a, b) in [(&got.min, &expected.min), (&got.max, &expected.max), (&got.mean, &expected.mean), (&got.std, &expected.std), (&got.q01, &expected.q01), (&got.q50, &expected.q50), (&got.q99, &expected.q99)] {
+                prop_assert!((a[0] - b[0] / 255.0).abs() < 1e-9, "{a:?} {b:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn no_rows_have_no_statistics() {
+        assert_eq!(FeatureStats::of::<f32>(&[], 3), None);
+        assert_eq!(FeatureStats::of::<f32>(&[], 0), None);
+    }
+
+    #[test]
+    fn numpy_agrees_on_a_known_vector() {
+        // numpy.quantile([3, 1, 4, 1, 5, 9, 2, 6], [.01, .1, .5, .9, .99]), std ddof 0
+        let stats = FeatureStats::of(&[3.0_f64, 1.0, 4.0, 1.0, 5.0, 9.0, 2.0, 6.0], 1).unwrap();
+        let got: Vec<f64> = stats.quantiles().iter().map(|q| q[0]).collect();
+        for (g, e) in got.iter().zip([1.0, 1.0, 3.5, 6.9, 8.79]) {
+            assert!((g - e).abs() < 1e-12, "{got:?}");
+        }
+        assert!((stats.std[0] - 2.570_870_475_150_391_7).abs() < 1e-12);
+    }
+}
