@@ -84,13 +84,6 @@ pub enum DatasetError {
         found: String,
     },
 
-    /// A query could not be answered.
-    #[error("cannot answer it")]
-    Query {
-        /// The SQL engine's answer.
-        source: Box<dyn std::error::Error + Send + Sync>,
-    },
-
     /// A tree that was handed over for writing contradicts itself.
     #[error("{path}: {object} cannot be written: {reason}", path = path.display())]
     BadTree {

@@ -11,7 +11,6 @@
 mod error;
 mod lerobot;
 mod plan;
-mod query;
 pub mod rotation;
 pub mod shuffle;
 mod source;
@@ -26,7 +25,6 @@ pub use lerobot::{
     export, verify,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
-pub use query::{QueryResult, query, query_tables};
 pub use source::{ArrayHasher, ContentHasher, DemoHasher, RobomimicWriter, Source, WriteOptions, isolation};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};

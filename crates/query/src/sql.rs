@@ -1,13 +1,33 @@
-//! SQL over a data set's frames and episodes.
+//! The two tables and the answers.
 
-use crate::error::{DatasetError, Result};
-use crate::lerobot::Dataset;
+use dataset::Dataset;
 use polars::prelude::{
     AnyValue, Column as Series, DataFrame, IntoColumn, IntoLazy, NamedFrom, PolarsError, Series as Values,
 };
 use polars::sql::SQLContext;
 use serde_json::Value;
 use std::collections::BTreeSet;
+
+/// Why a query has no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum QueryError {
+    /// The engine refused the statement, or failed on it.
+    #[error("cannot answer {sql:?}")]
+    Refused {
+        /// The statement.
+        sql: String,
+        /// The engine's words.
+        source: PolarsError,
+    },
+    /// A table could not be made of the data set.
+    #[error("cannot make the table {table}")]
+    Table {
+        /// Its name.
+        table: &'static str,
+        /// The engine's words.
+        source: PolarsError,
+    },
+}
 
 /// The answer to a query.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,30 +38,45 @@ pub struct QueryResult {
     pub rows: Vec<Vec<Value>>,
 }
 
+/// Both tables by name.
+fn both(dataset: &Dataset) -> Result<[(&'static str, DataFrame); 2], QueryError> {
+    let failed = |table| move |source| QueryError::Table { table, source };
+    Ok([
+        ("frames", frames(dataset).map_err(failed("frames"))?),
+        ("episodes", episodes(dataset).map_err(failed("episodes"))?),
+    ])
+}
+
 /// Answers `sql` over the tables `frames` and `episodes`.
-pub fn query(dataset: &Dataset, sql: &str) -> Result<QueryResult> {
-    let failed = |source: PolarsError| DatasetError::Query { source: Box::new(source) };
+///
+/// # Errors
+/// When the engine refuses the statement.
+pub fn query(dataset: &Dataset, sql: &str) -> Result<QueryResult, QueryError> {
+    let refused = |source: PolarsError| QueryError::Refused { sql: sql.to_owned(), source };
     let mut context = SQLContext::new();
-    context.register("frames", frames(dataset).map_err(failed)?.lazy());
-    context.register("episodes", episodes(dataset).map_err(failed)?.lazy());
-    let answer = context.execute(sql).and_then(|plan| plan.collect()).map_err(failed)?;
+    for (name, table) in both(dataset)? {
+        context.register(name, table.lazy());
+    }
+    let answer = context.execute(sql).and_then(|plan| plan.collect()).map_err(refused)?;
     let columns: Vec<String> = answer.get_column_names().iter().map(|n| n.to_string()).collect();
     let mut rows = vec![Vec::with_capacity(columns.len()); answer.height()];
     for column in answer.columns() {
         for (index, row) in rows.iter_mut().enumerate() {
-            row.push(json(column.get(index).map_err(failed)?));
+            row.push(json(column.get(index).map_err(refused)?));
         }
     }
     Ok(QueryResult { columns, rows })
 }
 
 /// Table, column and type of everything that can be asked for.
-pub fn query_tables(dataset: &Dataset) -> Result<Vec<(String, String, String)>> {
-    let failed = |source: PolarsError| DatasetError::Query { source: Box::new(source) };
+///
+/// # Errors
+/// When a table cannot be made of the data set.
+pub fn tables(dataset: &Dataset) -> Result<Vec<(&'static str, String, String)>, QueryError> {
     let mut all = Vec::new();
-    for (name, table) in [("frames", frames(dataset)), ("episodes", episodes(dataset))] {
-        for column in table.map_err(failed)?.columns() {
-            all.push((name.to_owned(), column.name().to_string(), column.dtype().to_string()));
+    for (name, table) in both(dataset)? {
+        for column in table.columns() {
+            all.push((name, column.name().to_string(), column.dtype().to_string()));
         }
     }
     Ok(all)
