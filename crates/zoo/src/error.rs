@@ -191,6 +191,77 @@ pub enum ZooError {
         /// The hash of what is there, or `no such file`.
         found: String,
     },
+
+    // ---- rollouts and results ----------------------------------------------------------------
+    /// A rollout in a worker process.
+    #[error(transparent)]
+    Rollout(#[from] crate::rollout::RolloutError),
+    /// A table of results cannot be read or written.
+    #[error("cannot {operation} {}", path.display())]
+    Table {
+        /// What was tried.
+        operation: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// What the Parquet library said.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// Another process evaluates the same thing into the same folder.
+    #[error("results folder {} is in use by another evaluation", folder.display())]
+    ResultsBusy {
+        /// The evaluation's folder.
+        folder: PathBuf,
+    },
+    /// What is stored and what was found now are not the same.
+    #[error("results in {}: {what} differs: stored {expected}, now {found}", folder.display())]
+    ResultsDiffer {
+        /// The evaluation's folder.
+        folder: PathBuf,
+        /// What differs.
+        what: String,
+        /// What is stored.
+        expected: String,
+        /// What was found.
+        found: String,
+    },
+    /// Shards that are not parts of one evaluation.
+    #[error("cannot merge {}: {what}: expected {expected}, found {found}", folder.display())]
+    Merge {
+        /// The shard.
+        folder: PathBuf,
+        /// What does not fit.
+        what: String,
+        /// What the others have.
+        expected: String,
+        /// What this one has.
+        found: String,
+    },
+    /// The entry was trained on demonstrations of another simulator generation.
+    #[error(
+        "entry {entry} was trained on data of robosuite {recorded}, this is robosuite {running}: another generation, in which policies fail in silence; --force evaluates all the same"
+    )]
+    SimulatorGeneration {
+        /// The entry.
+        entry: String,
+        /// The version recorded with the data set, or `unknown`.
+        recorded: String,
+        /// The version that the worker runs.
+        running: String,
+    },
+    /// The entry and the environment do not fit each other.
+    #[error("entry {entry} in task {task}: {what}: expected {expected}, found {found}")]
+    UnfitEntry {
+        /// The entry.
+        entry: String,
+        /// The task.
+        task: String,
+        /// What does not fit.
+        what: String,
+        /// What the entry was made for.
+        expected: String,
+        /// What the environment has.
+        found: String,
+    },
 }
 
 impl ZooError {

@@ -16,6 +16,11 @@ pub mod run;
 mod tensors;
 
 // rollouts, evaluations, leaderboard
+pub mod evaluation;
+pub mod leaderboard;
+pub mod report;
+pub mod results;
+pub mod rollout;
 
 pub use error::ZooError;
 pub use files::{sha256_file, sha256_hex, write_atomic};

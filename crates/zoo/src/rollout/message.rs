@@ -1,0 +1,216 @@
+//! The messages of worker protocol version 1, as the harness speaks it.
+//!
+//! A worker greets with [`Ready`] (or an error) unasked; every request after that carries an `id`
+//! that its reply repeats.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+/// The protocol version that this program speaks.
+pub const PROTOCOL: u32 = 1;
+
+/// Which loop runs a control step inside the simulator.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Control {
+    /// robosuite's own Python loop.
+    Robosuite,
+    /// The compiled loop of `crates/control`.
+    Compiled,
+}
+
+impl Control {
+    /// The word that names it on command lines and in results.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Control::Robosuite => "robosuite",
+            Control::Compiled => "compiled",
+        }
+    }
+}
+
+impl std::fmt::Display for Control {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+impl std::str::FromStr for Control {
+    type Err = String;
+    fn from_str(word: &str) -> Result<Self, String> {
+        match word {
+            "robosuite" => Ok(Control::Robosuite),
+            "compiled" => Ok(Control::Compiled),
+            other => Err(format!("control {other:?}: expected \"robosuite\" or \"compiled\"")),
+        }
+    }
+}
+
+/// The greeting of a worker: what it runs and what its environment looks like.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Ready {
+    /// Protocol version; must be [`PROTOCOL`].
+    pub protocol: u32,
+    /// robosuite's version.
+    pub robosuite: String,
+    /// MuJoCo's version.
+    pub mujoco: String,
+    /// The interpreter's version.
+    pub python: String,
+    /// numpy's version.
+    #[serde(default)]
+    pub numpy: String,
+    /// The task, as asked for.
+    pub task: String,
+    /// The environment's class name.
+    pub env_name: String,
+    /// The loop really used, which may differ from the one asked for.
+    pub control: Control,
+    /// Control steps per simulated second.
+    pub control_freq: f64,
+    /// The task's usual cap on an episode, in control steps.
+    pub max_steps: usize,
+    /// Number of action values.
+    pub action_dim: usize,
+    /// Smallest action, per value.
+    pub action_low: Vec<f64>,
+    /// Largest action, per value.
+    pub action_high: Vec<f64>,
+    /// Observation keys with their shapes.
+    pub observations: BTreeMap<String, Vec<usize>>,
+    /// robomimic's `env_args` of this environment.
+    #[serde(default)]
+    pub env_args: serde_json::Value,
+}
+
+impl Ready {
+    /// The versions that a result depends on, sorted by name.
+    pub fn versions(&self) -> BTreeMap<String, String> {
+        [("mujoco", &self.mujoco), ("numpy", &self.numpy), ("python", &self.python), ("robosuite", &self.robosuite)]
+            .into_iter()
+            .map(|(name, version)| (name.to_owned(), version.clone()))
+            .collect()
+    }
+}
+
+/// What we ask of a worker.
+#[derive(Debug, Clone, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(crate) enum Request<'a> {
+    Reset { id: u64, seed: u64 },
+    Step { id: u64 },
+    Expert { id: u64, seed: u64 },
+    Extract { id: u64, model_file: &'a str },
+    Render { id: u64, camera: &'a str, size: [usize; 2] },
+    Close { id: u64 },
+}
+
+impl Request<'_> {
+    /// The request's name, for messages about it.
+    pub(crate) fn name(&self) -> &'static str {
+        match self {
+            Request::Reset { .. } => "reset",
+            Request::Step { .. } => "step",
+            Request::Expert { .. } => "expert",
+            Request::Extract { .. } => "extract",
+            Request::Render { .. } => "render",
+            Request::Close { .. } => "close",
+        }
+    }
+}
+
+/// What a worker answers.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(crate) enum Reply {
+    Ready(Box<Ready>),
+    Reset {
+        id: u64,
+        fingerprint: String,
+    },
+    Step {
+        id: u64,
+        reward: f64,
+        success: bool,
+    },
+    Expert(EpisodeReply),
+    Extract(EpisodeReply),
+    Render {
+        id: u64,
+    },
+    Closed {
+        #[serde(default)]
+        id: Option<u64>,
+    },
+    Error {
+        #[serde(default)]
+        id: Option<u64>,
+        kind: String,
+        message: String,
+    },
+}
+
+/// The message part of a whole recorded episode.
+#[derive(Debug, Clone, Deserialize)]
+pub(crate) struct EpisodeReply {
+    pub id: u64,
+    #[serde(default)]
+    pub success: bool,
+    #[serde(default)]
+    pub steps: Option<usize>,
+    #[serde(default)]
+    pub attrs: BTreeMap<String, serde_json::Value>,
+}
+
+impl Reply {
+    /// The reply's name and the request that it answers.
+    pub(crate) fn answers(&self) -> (&'static str, Option<u64>) {
+        match self {
+            Reply::Ready(_) => ("ready", None),
+            Reply::Reset { id, .. } => ("reset", Some(*id)),
+            Reply::Step { id, .. } => ("step", Some(*id)),
+            Reply::Expert(EpisodeReply { id, .. }) => ("expert", Some(*id)),
+            Reply::Extract(EpisodeReply { id, .. }) => ("extract", Some(*id)),
+            Reply::Render { id } => ("render", Some(*id)),
+            Reply::Closed { id } => ("closed", *id),
+            Reply::Error { id, .. } => ("error", *id),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn requests_are_written_as_the_protocol_says() {
+        let text = |request: &Request<'_>| serde_json::to_string(request).unwrap();
+        assert_eq!(text(&Request::Reset { id: 1, seed: 10000 }), r#"{"type":"reset","id":1,"seed":10000}"#);
+        assert_eq!(text(&Request::Step { id: 2 }), r#"{"type":"step","id":2}"#);
+        assert_eq!(
+            text(&Request::Render { id: 3, camera: "agentview", size: [84, 96] }),
+            r#"{"type":"render","id":3,"camera":"agentview","size":[84,96]}"#
+        );
+        assert_eq!(text(&Request::Close { id: 4 }), r#"{"type":"close","id":4}"#);
+    }
+
+    #[test]
+    fn replies_are_read_as_the_protocol_says() {
+        let reply: Reply = serde_json::from_str(r#"{"type":"step","id":7,"reward":0.25,"success":false}"#).unwrap();
+        assert_eq!(reply.answers(), ("step", Some(7)));
+        let reply: Reply = serde_json::from_str(r#"{"type":"error","kind":"unknown_task","message":"no"}"#).unwrap();
+        assert_eq!(reply.answers(), ("error", None));
+        assert!(serde_json::from_str::<Reply>(r#"{"type":"stepp","id":7}"#).is_err());
+        assert!(serde_json::from_str::<Reply>(r#"{"type":"step","id":7}"#).is_err());
+    }
+
+    #[test]
+    fn control_words_round_trip() {
+        for control in [Control::Robosuite, Control::Compiled] {
+            assert_eq!(control.as_str().parse::<Control>().unwrap(), control);
+        }
+        assert!("fast".parse::<Control>().unwrap_err().contains("expected"));
+    }
+}
