@@ -1,0 +1,224 @@
+//! Evaluating an entry: its policy in a task's environment, once per seed, results to disk as they come.
+//!
+//! An episode's outcome depends on task, seed, entry and protocol. It does not depend on the worker, the
+//! number of workers, the order, what ran before, or what had to be run again.
+
+mod subject;
+
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use models::Actor;
+
+pub use self::subject::Subject;
+use crate::ZooError;
+use crate::results::{EpisodeRecord, EpisodeTiming, ResultsFolder, Seeds, Shard, StoredEvaluation};
+use crate::rollout::{EpisodePlan, Image, JobError, Pool, QueryTimes, RolloutError, Worker};
+
+/// The first seed of an evaluation unless another is asked for: demonstrations never use these.
+pub const FIRST_SEED: u64 = 10_000;
+
+/// What to evaluate and where to put it.
+#[derive(Debug, Clone)]
+pub struct EvaluationOptions {
+    /// The episodes' seeds.
+    pub seeds: Seeds,
+    /// The part of them to run here.
+    pub shard: Option<Shard>,
+    /// The module of the user's that registers the environment.
+    pub env_module: Option<String>,
+    /// Evaluate although the demonstrations are of another simulator generation.
+    pub force: bool,
+}
+
+/// How an evaluation ended.
+#[derive(Debug)]
+pub enum EvaluationEnd {
+    /// Every episode has an outcome.
+    Complete(Box<StoredEvaluation>),
+    /// It was stopped; what is done is on disk.
+    Stopped {
+        /// Episodes on disk.
+        done: u64,
+        /// Episodes asked for.
+        total: u64,
+    },
+    /// Some episodes have no outcome because no worker could run them.
+    Failed {
+        /// Episodes on disk.
+        done: u64,
+        /// What went wrong, by seed.
+        errors: Vec<RolloutError>,
+    },
+}
+
+/// News from an evaluation under way.
+#[derive(Debug)]
+pub enum Progress<'a> {
+    /// It begins, or goes on.
+    Begin {
+        /// Episodes that were on disk already.
+        done: u64,
+        /// Episodes asked for.
+        total: u64,
+        /// The results' folder.
+        folder: &'a Path,
+    },
+    /// An episode has its outcome.
+    Episode(&'a EpisodeRecord),
+}
+
+/// Runs the episodes that have no outcome yet on `pool` and puts each on disk when it is done.
+///
+/// # Errors
+/// An entry that does not fit, files that cannot be written, a policy that fails. A worker's failure is
+/// made good on a fresh worker; where that fails too, the end is [`EvaluationEnd::Failed`].
+pub fn evaluate(
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+    results: &Path,
+    options: &EvaluationOptions,
+    progress: &mut dyn FnMut(Progress<'_>),
+) -> Result<EvaluationEnd, ZooError> {
+    let record = subject.record(pool.ready(), options)?;
+    let folder = ResultsFolder::open(results, &record)?;
+    let missing = folder.missing();
+    let total = record.own_seeds().len() as u64;
+    progress(Progress::Begin { done: total - missing.len() as u64, total, folder: folder.path() });
+    if folder.is_finished() {
+        return Ok(EvaluationEnd::Complete(Box::new(folder.finish()?)));
+    }
+    // written by the workers' threads, so that an episode is on disk even while an earlier one runs on
+    let folder = Mutex::new(folder);
+    let failure = Mutex::new(None);
+    let mut errors = Vec::new();
+    run_episodes(
+        subject,
+        pool,
+        record.protocol.max_steps,
+        &missing,
+        &|episode, timing| {
+            let mut folder = folder.lock().unwrap_or_else(PoisonError::into_inner);
+            folder.add(episode, timing).map_err(|error| {
+                failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+            })
+        },
+        &mut |result| match result {
+            Ok(episode) => progress(Progress::Episode(&episode)),
+            Err(error) => errors.push(error),
+        },
+    )
+    .map_err(|error| match failure.lock().unwrap_or_else(PoisonError::into_inner).take() {
+        Some(cause) => cause,
+        None => error.into(),
+    })?;
+    let folder = folder.into_inner().unwrap_or_else(PoisonError::into_inner);
+    let done = folder.done().len() as u64;
+    if !errors.is_empty() {
+        return Ok(EvaluationEnd::Failed { done, errors });
+    }
+    if done < total {
+        return Ok(EvaluationEnd::Stopped { done, total });
+    }
+    Ok(EvaluationEnd::Complete(Box::new(folder.finish()?)))
+}
+
+/// Runs the episodes of `seeds` without touching any file; the outcomes come in the order of `seeds`.
+///
+/// # Errors
+/// A failure on our side; a worker's failure that could not be made good is handed to `deliver`.
+pub fn run_episodes(
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+    max_steps: usize,
+    seeds: &[u64],
+    store: &(dyn Fn(EpisodeRecord, EpisodeTiming) -> Result<(), ()> + Sync),
+    deliver: &mut dyn FnMut(Result<EpisodeRecord, RolloutError>),
+) -> Result<(), RolloutError> {
+    let plan = EpisodePlan::new(pool.ready(), &subject.state_keys, &subject.env_keys, max_steps)?;
+    let seed_of = |job: u64| seeds[usize::try_from(job).expect("a job is an index of seeds")];
+    let failed = |seed, operation, source| RolloutError::Policy { seed, step: 0, operation, source };
+    let state = || {
+        let made = subject.actor();
+        made.map_err(|source| failed(seeds[0], "building the policy", Box::new(source)))
+    };
+    let work = |(actor, times): &mut (Box<dyn Actor>, QueryTimes), worker: &mut Worker, job| {
+        let seed = seed_of(job);
+        times.take();
+        let outcome = plan.run(worker, actor.as_mut(), seed, &mut |_| Ok(()))?;
+        let episode = EpisodeRecord {
+            seed,
+            success: outcome.success,
+            steps: u32::try_from(outcome.steps).unwrap_or(u32::MAX),
+            total_reward: outcome.total_reward,
+            fingerprint: outcome.fingerprint,
+        };
+        let milliseconds = |duration: Duration| (duration.as_secs_f64() * 1e6).round() / 1e3;
+        let timing = EpisodeTiming {
+            seed,
+            wall_ms: milliseconds(outcome.wall),
+            simulator_ms: milliseconds(outcome.simulator),
+            inference_ms: times.take().into_iter().map(milliseconds).collect(),
+        };
+        store(episode.clone(), timing)
+            .map_err(|()| JobError::Final(failed(seed, "storing the outcome", "see the file error".into())))?;
+        Ok(episode)
+    };
+    pool.run(0..seeds.len() as u64, &seed_of, &state, &work, &mut |_, result| {
+        deliver(result);
+        ControlFlow::Continue(())
+    })?;
+    Ok(())
+}
+
+/// One episode with an image of the start and of every step.
+///
+/// # Errors
+/// As for an evaluation; a machine that cannot render.
+pub fn film(
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+    seeds: &[u64],
+    view: &View,
+    deliver: &mut dyn FnMut(u64, Vec<Image>, bool) -> ControlFlow<()>,
+) -> Result<(), RolloutError> {
+    let max_steps = subject.max_steps.unwrap_or(pool.ready().max_steps);
+    let plan = EpisodePlan::new(pool.ready(), &subject.state_keys, &subject.env_keys, max_steps)?;
+    let seed_of = |job: u64| seeds[usize::try_from(job).expect("a job is an index of seeds")];
+    let state = || {
+        subject.actor().map_err(|source| {
+            let operation = "building the policy";
+            RolloutError::Policy { seed: seeds[0], step: 0, operation, source: Box::new(source) }
+        })
+    };
+    let work = |(actor, _): &mut (Box<dyn Actor>, QueryTimes), worker: &mut Worker, job| {
+        let mut images = Vec::new();
+        let outcome = plan.run(worker, actor.as_mut(), seed_of(job), &mut |worker| {
+            images.push(worker.render(&view.camera, view.height, view.width)?);
+            Ok(())
+        })?;
+        Ok((images, outcome.success))
+    };
+    let mut failure = None;
+    pool.run(0..seeds.len() as u64, &seed_of, &state, &work, &mut |job, result| match result {
+        Ok((images, success)) => deliver(seed_of(job), images, success),
+        Err(error) => {
+            failure = Some(error);
+            ControlFlow::Break(())
+        }
+    })?;
+    failure.map_or(Ok(()), Err)
+}
+
+/// A camera and the size of its images.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct View {
+    /// robosuite's name of the camera.
+    pub camera: String,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+}

@@ -1,0 +1,173 @@
+//! What is evaluated: an entry's policy with all that an evaluation has to know of it.
+
+use models::{Actor, ModelError, Policy, RecedingHorizon, TemporalEnsemble};
+
+use super::EvaluationOptions;
+use crate::ZooError;
+//ZOO use crate::entry::LoadedEntry;
+use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, TrainingFacts};
+use crate::rollout::{EpisodePlan, QueryTimes, Ready, Timed};
+
+/// The entry under evaluation, as far as an evaluation needs to know it.
+pub struct Subject<'a> {
+    /// Which entry.
+    pub entry: EntryIdentity,
+    /// Where it comes from.
+    pub training: TrainingFacts,
+    /// The task it was trained for.
+    pub task: String,
+    /// The simulator's version that its data set records.
+    pub env_version: Option<String>,
+    /// Keys of the state, in order.
+    pub state_keys: Vec<String>,
+    /// Keys of the environment's state, in order.
+    pub env_keys: Vec<String>,
+    /// How predictions become actions.
+    pub execution: Execution,
+    /// The cap on an episode, if the entry sets one; the task's own otherwise.
+    pub max_steps: Option<usize>,
+    /// Expected lengths of state, environment state and action.
+    pub dims: models::Dims,
+    /// Makes a policy of its own for one environment.
+    pub policy: Box<dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a>,
+}
+
+//ZOO impl<'a> Subject<'a> {
+//ZOO     /// The subject that a loaded entry is.
+//ZOO     pub fn new(loaded: &'a LoadedEntry) -> Self {
+//ZOO         let meta = loaded.entry().meta();
+//ZOO         let rollout = &loaded.experiment().rollout;
+//ZOO         let training = meta.training.as_ref();
+//ZOO         let data = meta.data.as_ref();
+//ZOO         Self {
+//ZOO             entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
+//ZOO             training: TrainingFacts {
+//ZOO                 policy: meta.policy.clone(),
+//ZOO                 parameters: meta.parameters,
+//ZOO                 steps: training.map_or(0, |t| t.steps),
+//ZOO                 minutes: training.map_or(0.0, |t| t.minutes),
+//ZOO                 seed: training.map_or(0, |t| t.seed),
+//ZOO                 data_set: data.map_or_else(String::new, |d| d.name.clone()),
+//ZOO                 data_fingerprint: data.map_or_else(String::new, |d| d.fingerprint.clone()),
+//ZOO                 data_simulator: meta.env_version.clone(),
+//ZOO                 demos: data.map_or(0, |d| d.train_episodes),
+//ZOO             },
+//ZOO             task: meta.task.clone(),
+//ZOO             env_version: meta.env_version.clone(),
+//ZOO             state_keys: meta.state_keys.clone(),
+//ZOO             env_keys: meta.env_keys.clone(),
+//ZOO             execution: match rollout.temporal_ensemble {
+//ZOO                 Some(coefficient) => Execution::TemporalEnsemble { coefficient },
+//ZOO                 None => Execution::RecedingHorizon { n_action_steps: rollout.n_action_steps },
+//ZOO             },
+//ZOO             max_steps: rollout.max_steps.map(|steps| usize::try_from(steps).unwrap_or(usize::MAX)),
+//ZOO             dims: meta.dims,
+//ZOO             policy: Box::new(|| Ok(Box::new(loaded.policy()))),
+//ZOO         }
+//ZOO     }
+//ZOO
+//ZOO }
+
+impl Subject<'_> {
+    /// Everything that the outcome will depend on.
+    ///
+    /// # Errors
+    /// [`ZooError::SimulatorGeneration`] and [`ZooError::UnfitEntry`].
+    pub fn record(&self, ready: &Ready, options: &EvaluationOptions) -> Result<EvaluationRecord, ZooError> {
+        if !options.force {
+            check_generation(&self.entry, self.env_version.as_deref(), &ready.robosuite)?;
+        }
+        self.check_dims(ready)?;
+        Ok(EvaluationRecord {
+            format: EvaluationRecord::FORMAT,
+            entry: self.entry.clone(),
+            training: self.training.clone(),
+            protocol: Protocol {
+                rules: Protocol::RULES,
+                task: ready.task.clone(),
+                env_name: ready.env_name.clone(),
+                env_module: options.env_module.clone(),
+                control: ready.control,
+                max_steps: self.max_steps.unwrap_or(ready.max_steps),
+            },
+            execution: self.execution,
+            seeds: options.seeds,
+            shard: options.shard,
+            versions: ready.versions(),
+        })
+    }
+
+    fn check_dims(&self, ready: &Ready) -> Result<(), ZooError> {
+        let size = |keys: &[String]| -> usize {
+            let shapes = keys.iter().filter_map(|key| ready.observations.get(key));
+            shapes.map(|shape| shape.iter().product::<usize>()).sum()
+        };
+        EpisodePlan::new(ready, &self.state_keys, &self.env_keys, 1)?;
+        for (what, expected, found) in [
+            ("length of the state", self.dims.state, size(&self.state_keys)),
+            ("length of the environment's state", self.dims.environment_state, size(&self.env_keys)),
+            ("length of an action", self.dims.action, ready.action_dim),
+        ] {
+            if expected != found {
+                return Err(ZooError::UnfitEntry {
+                    entry: self.entry.to_string(),
+                    task: ready.task.clone(),
+                    what: what.to_owned(),
+                    expected: expected.to_string(),
+                    found: found.to_string(),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// An actor of its own for one environment, and where its queries' durations go.
+    ///
+    /// # Errors
+    /// The policy cannot be built.
+    pub fn actor(&self) -> Result<(Box<dyn Actor>, QueryTimes), ModelError> {
+        let times = QueryTimes::default();
+        let policy = Timed::new((self.policy)()?, times.clone());
+        let actor: Box<dyn Actor> = match self.execution {
+            Execution::RecedingHorizon { n_action_steps } => Box::new(RecedingHorizon::new(policy, n_action_steps)?),
+            Execution::TemporalEnsemble { coefficient } => Box::new(TemporalEnsemble::new(policy, coefficient)?),
+        };
+        Ok((actor, times))
+    }
+}
+
+/// robosuite's generation: major and minor version.
+fn generation(version: &str) -> Option<(u32, u32)> {
+    let mut parts = version.split('.');
+    Some((parts.next()?.trim().parse().ok()?, parts.next()?.trim().parse().ok()?))
+}
+
+fn check_generation(entry: &EntryIdentity, recorded: Option<&str>, running: &str) -> Result<(), ZooError> {
+    if recorded.is_some_and(|r| generation(r).is_some() && generation(r) == generation(running)) {
+        return Ok(());
+    }
+    Err(ZooError::SimulatorGeneration {
+        entry: entry.to_string(),
+        recorded: recorded.unwrap_or("unknown (none is recorded)").to_owned(),
+        running: running.to_owned(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn generations_are_major_and_minor() {
+        let entry = EntryIdentity { name: "a".into(), version: 1, hash: String::new() };
+        let check = |recorded| check_generation(&entry, recorded, "1.5.2");
+        check(Some("1.5.2")).unwrap();
+        check(Some("1.5.0")).unwrap();
+        for other in [Some("1.4.1"), Some("2.5.2"), Some(""), None] {
+            let error = check(other).unwrap_err().to_string();
+            assert!(error.contains("a@1") && error.contains("--force"), "{error}");
+        }
+        assert!(check(Some("1.4.1")).unwrap_err().to_string().contains("robosuite 1.4.1"));
+    }
+}

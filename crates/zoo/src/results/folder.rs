@@ -1,0 +1,397 @@
+//! One evaluation's folder: its life from the first episode to the last.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::{ErrorKind, Write};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::record::{EpisodeRecord, EpisodeTiming, EvaluationRecord};
+use super::tables;
+use crate::ZooError;
+use crate::files::{sync_folder, write_atomic};
+
+const RECORD: &str = "evaluation.json";
+const OUTCOMES: &str = "outcomes.parquet";
+const TIMINGS: &str = "timings.parquet";
+const JOURNAL: &str = "journal.jsonl";
+const LOCK: &str = "lock";
+
+/// A finished evaluation, read back.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StoredEvaluation {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// What it depends on.
+    pub record: EvaluationRecord,
+    /// Outcomes, by seed.
+    pub episodes: Vec<EpisodeRecord>,
+    /// Timings, by seed.
+    pub timings: Vec<EpisodeTiming>,
+}
+
+impl StoredEvaluation {
+    /// Reads a finished evaluation; `None` if it is still under way.
+    ///
+    /// # Errors
+    /// Files that are missing, damaged or do not belong together.
+    pub fn read(folder: &Path) -> Result<Option<Self>, ZooError> {
+        let record = read_record(folder)?;
+        let outcomes = folder.join(OUTCOMES);
+        if !outcomes.exists() {
+            return Ok(None);
+        }
+        let episodes = tables::read_episodes(&outcomes)?;
+        let timings = tables::read_timings(&folder.join(TIMINGS))?;
+        let expected = record.own_seeds();
+        for (path, found) in [
+            (outcomes, episodes.iter().map(|e| e.seed).collect::<Vec<_>>()),
+            (folder.join(TIMINGS), timings.iter().map(|t| t.seed).collect()),
+        ] {
+            if found != expected {
+                let (n, seeds, rows) = (expected.len(), record.seeds, found.len());
+                let reason =
+                    format!("expected {n} rows for the seeds of {seeds} in order, found {rows} rows or other seeds");
+                return Err(ZooError::Malformed { path, reason });
+            }
+        }
+        Ok(Some(Self { folder: folder.to_owned(), record, episodes, timings }))
+    }
+
+    /// How many episodes succeeded.
+    pub fn successes(&self) -> u64 {
+        self.episodes.iter().filter(|episode| episode.success).count() as u64
+    }
+}
+
+/// Every finished evaluation under `results`, by folder name. A folder that does not exist holds none.
+///
+/// # Errors
+/// The first evaluation that cannot be read.
+pub fn list_evaluations(results: &Path) -> Result<Vec<StoredEvaluation>, ZooError> {
+    let entries = match fs::read_dir(results) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) => return Err(ZooError::io("read folder", results)(error)),
+    };
+    let mut folders = Vec::new();
+    for entry in entries {
+        let path = entry.map_err(ZooError::io("read folder", results))?.path();
+        if path.join(RECORD).is_file() {
+            folders.push(path);
+        }
+    }
+    folders.sort();
+    let mut all = Vec::new();
+    for folder in folders {
+        all.extend(StoredEvaluation::read(&folder)?);
+    }
+    Ok(all)
+}
+
+fn read_record(folder: &Path) -> Result<EvaluationRecord, ZooError> {
+    let path = folder.join(RECORD);
+    let text = fs::read(&path).map_err(ZooError::io("read", &path))?;
+    let malformed = |reason: String| ZooError::Malformed { path: path.clone(), reason };
+    let record: EvaluationRecord =
+        serde_json::from_slice(&text).map_err(|e| malformed(format!("not an evaluation: {e}")))?;
+    if record.format != EvaluationRecord::FORMAT {
+        let (expected, found) = (EvaluationRecord::FORMAT, record.format);
+        return Err(malformed(format!("format: expected {expected}, found {found}")));
+    }
+    Ok(record)
+}
+
+#[derive(Serialize, Deserialize)]
+struct JournalLine {
+    episode: EpisodeRecord,
+    timing: EpisodeTiming,
+}
+
+/// An evaluation under way. Holds the folder's lock.
+pub struct ResultsFolder {
+    folder: PathBuf,
+    record: EvaluationRecord,
+    journal: Option<File>,
+    done: BTreeMap<u64, (EpisodeRecord, EpisodeTiming)>,
+    _lock: File,
+}
+
+impl ResultsFolder {
+    /// Opens the folder of `record` under `results`, new or with the episodes that are done.
+    ///
+    /// # Errors
+    /// [`ZooError::ResultsBusy`] while another process works there; damaged files.
+    pub fn open(results: &Path, record: &EvaluationRecord) -> Result<Self, ZooError> {
+        let folder = results.join(record.folder_name());
+        fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
+        let path = folder.join(LOCK);
+        let lock = File::create(&path).map_err(ZooError::io("create", &path))?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Err(ZooError::ResultsBusy { folder }),
+            Err(TryLockError::Error(error)) => return Err(ZooError::io("lock", &path)(error)),
+        }
+        if folder.join(RECORD).exists() {
+            let found = read_record(&folder)?;
+            // the folder's name pins what decides outcomes; the rest is the entry's story, which may
+            // not change for one entry hash either
+            if found != *record {
+                return Err(ZooError::ResultsDiffer {
+                    folder,
+                    what: RECORD.to_owned(),
+                    expected: json(&found),
+                    found: json(record),
+                });
+            }
+        } else {
+            let mut text = serde_json::to_vec_pretty(record).expect("plain fields are always JSON");
+            text.push(b'\n');
+            write_atomic(&folder.join(RECORD), &text)?;
+        }
+        let path = folder.join(JOURNAL);
+        let (done, journal) = match StoredEvaluation::read(&folder)? {
+            Some(stored) => {
+                if path.exists() {
+                    // a writer that was killed between its last two steps leaves it behind
+                    fs::remove_file(&path).map_err(ZooError::io("remove", &path))?;
+                }
+                let rows = stored.episodes.into_iter().zip(stored.timings);
+                (rows.map(|(e, t)| (e.seed, (e, t))).collect(), None)
+            }
+            None => {
+                let done = read_journal(&path, record)?;
+                let journal = OpenOptions::new().create(true).append(true).open(&path);
+                (done, Some(journal.map_err(ZooError::io("open", &path))?))
+            }
+        };
+        Ok(Self { folder, record: record.clone(), journal, done, _lock: lock })
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Whether every episode is done and the tables are written.
+    pub fn is_finished(&self) -> bool {
+        self.journal.is_none()
+    }
+
+    /// Outcome and timing of the episodes that are done, by seed.
+    pub fn done(&self) -> &BTreeMap<u64, (EpisodeRecord, EpisodeTiming)> {
+        &self.done
+    }
+
+    /// The seeds that have no outcome yet, ascending.
+    pub fn missing(&self) -> Vec<u64> {
+        self.record.own_seeds().into_iter().filter(|seed| !self.done.contains_key(seed)).collect()
+    }
+
+    /// Puts a finished episode on disk.
+    ///
+    /// # Errors
+    /// [`ZooError::ResultsDiffer`] if the seed has another outcome already; a journal that cannot be
+    /// written.
+    pub fn add(&mut self, episode: EpisodeRecord, timing: EpisodeTiming) -> Result<(), ZooError> {
+        let seed = episode.seed;
+        if let Some((stored, _)) = self.done.get(&seed) {
+            if *stored == episode {
+                return Ok(());
+            }
+            return Err(ZooError::ResultsDiffer {
+                folder: self.folder.clone(),
+                what: format!("outcome of seed {seed}"),
+                expected: json(stored),
+                found: json(&episode),
+            });
+        }
+        let line = JournalLine { episode, timing };
+        let mut text = serde_json::to_vec(&line).expect("plain fields are always JSON");
+        text.push(b'\n');
+        let journal = self.journal.as_mut().expect("a finished evaluation holds every seed");
+        journal
+            .write_all(&text)
+            .and_then(|()| journal.sync_data())
+            .map_err(ZooError::io("write", self.folder.join(JOURNAL)))?;
+        self.done.insert(seed, (line.episode, line.timing));
+        Ok(())
+    }
+
+    /// Writes the tables, if every episode is done, and reads them back.
+    ///
+    /// # Errors
+    /// [`ZooError::Malformed`] if episodes are missing; files that cannot be written.
+    pub fn finish(self) -> Result<StoredEvaluation, ZooError> {
+        if !self.is_finished() {
+            let missing = self.missing();
+            if let Some(first) = missing.first() {
+                let reason = format!("{} episodes have no outcome, the first is {first}", missing.len());
+                return Err(ZooError::Malformed { path: self.folder, reason });
+            }
+            let (episodes, timings): (Vec<_>, Vec<_>) = self.done.values().cloned().unzip();
+            tables::write_timings(&self.folder.join(TIMINGS), &timings)?;
+            // the last one: its presence says that the evaluation is whole
+            tables::write_episodes(&self.folder.join(OUTCOMES), &episodes)?;
+            let journal = self.folder.join(JOURNAL);
+            fs::remove_file(&journal).map_err(ZooError::io("remove", &journal))?;
+            sync_folder(&self.folder)?;
+        }
+        let stored = StoredEvaluation::read(&self.folder)?;
+        Ok(stored.expect("its tables were just written"))
+    }
+}
+
+fn json<T: Serialize>(value: &T) -> String {
+    serde_json::to_string(value).unwrap_or_default()
+}
+
+/// The episodes in a journal. A last line that was cut off is no episode; it is cut away.
+fn read_journal(
+    path: &Path,
+    record: &EvaluationRecord,
+) -> Result<BTreeMap<u64, (EpisodeRecord, EpisodeTiming)>, ZooError> {
+    let text = match fs::read(path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(BTreeMap::new()),
+        Err(error) => return Err(ZooError::io("read", path)(error)),
+    };
+    let whole = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
+    if whole < text.len() {
+        let cut = OpenOptions::new().write(true).open(path).and_then(|f| f.set_len(whole as u64));
+        cut.map_err(ZooError::io("cut the unfinished last line of", path))?;
+    }
+    let own = record.own_seeds();
+    let mut done = BTreeMap::new();
+    for (index, line) in text[..whole].split_inclusive(|&byte| byte == b'\n').enumerate() {
+        let malformed = |reason: String| ZooError::Malformed {
+            path: path.to_owned(),
+            reason: format!("line {}: {reason}", index + 1),
+        };
+        let JournalLine { episode, timing } =
+            serde_json::from_slice(line).map_err(|e| malformed(format!("not an episode: {e}")))?;
+        let seed = episode.seed;
+        if own.binary_search(&seed).is_err() {
+            return Err(malformed(format!("seed {seed} is none of {}", record.seeds)));
+        }
+        if done.insert(seed, (episode, timing)).is_some() {
+            return Err(malformed(format!("seed {seed} is there twice")));
+        }
+    }
+    Ok(done)
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::super::record::tests::sample;
+    use super::*;
+
+    pub(crate) fn episode(seed: u64) -> (EpisodeRecord, EpisodeTiming) {
+        let success = seed % 5 != 0;
+        let episode = EpisodeRecord {
+            seed,
+            success,
+            steps: if success { 40 + (seed % 7) as u32 } else { 400 },
+            total_reward: if success { 1.0 } else { 0.0 },
+            fingerprint: format!("{seed:064x}"),
+        };
+        let timing = EpisodeTiming {
+            seed,
+            wall_ms: 900.0,
+            simulator_ms: 700.0,
+            inference_ms: (0..6).map(|i| 2.0 + (seed % 3) as f64 / 8.0 + f64::from(i)).collect(),
+        };
+        (episode, timing)
+    }
+
+    /// A finished evaluation on disk.
+    pub(crate) fn finished(results: &Path, record: &EvaluationRecord) -> StoredEvaluation {
+        let mut folder = ResultsFolder::open(results, record).unwrap();
+        for seed in folder.missing() {
+            let (episode, timing) = episode(seed);
+            folder.add(episode, timing).unwrap();
+        }
+        folder.finish().unwrap()
+    }
+
+    #[test]
+    fn an_interrupted_evaluation_goes_on_and_ends_in_the_same_bytes() {
+        let dir = tempfile::tempdir().unwrap();
+        let record = sample("a", 1, 6);
+        let straight = finished(&dir.path().join("straight"), &record);
+        let results = dir.path().join("interrupted");
+        for seed in [10_003, 10_001] {
+            let mut folder = ResultsFolder::open(&results, &record).unwrap();
+            assert!(folder.missing().contains(&seed));
+            let (e, t) = episode(seed);
+            folder.add(e, t).unwrap();
+            // killed in the middle of the next line
+            let journal = folder.path().join(JOURNAL);
+            let mut file = OpenOptions::new().append(true).open(journal).unwrap();
+            file.write_all(b"{\"episode\":{\"seed\":10002,").unwrap();
+        }
+        let folder = ResultsFolder::open(&results, &record).unwrap();
+        assert_eq!(folder.missing(), [10_000, 10_002, 10_004, 10_005]);
+        drop(folder);
+        assert!(list_evaluations(&results).unwrap().is_empty(), "half an evaluation is none");
+        let resumed = finished(&results, &record);
+        for name in [RECORD, OUTCOMES] {
+            let read = |folder: &Path| fs::read(folder.join(name)).unwrap();
+            assert_eq!(read(&straight.folder), read(&resumed.folder), "{name}");
+        }
+        assert_eq!(list_evaluations(&results).unwrap(), [resumed.clone()]);
+        let mut again = ResultsFolder::open(&results, &record).unwrap();
+        assert!(again.is_finished() && again.missing().is_empty());
+        let (mut other, timing) = episode(10_001);
+        again.add(other.clone(), timing.clone()).unwrap();
+        other.steps += 1;
+        let error = again.add(other, timing).unwrap_err().to_string();
+        assert!(error.contains("outcome of seed 10001 differs"), "{error}");
+    }
+
+    #[test]
+    fn two_processes_cannot_work_in_one_folder() {
+        let dir = tempfile::tempdir().unwrap();
+        let record = sample("a", 1, 2);
+        let first = ResultsFolder::open(dir.path(), &record).unwrap();
+        let error = ResultsFolder::open(dir.path(), &record).err().unwrap().to_string();
+        assert!(error.contains("another evaluation"), "{error}");
+        drop(first);
+        ResultsFolder::open(dir.path(), &record).unwrap();
+    }
+
+    #[test]
+    fn damage_inside_the_journal_is_an_error_and_not_a_shorter_journal() {
+        let dir = tempfile::tempdir().unwrap();
+        let record = sample("a", 1, 3);
+        let mut folder = ResultsFolder::open(dir.path(), &record).unwrap();
+        for seed in [10_000, 10_001] {
+            let (e, t) = episode(seed);
+            folder.add(e, t).unwrap();
+        }
+        let journal = folder.path().join(JOURNAL);
+        drop(folder);
+        let text = fs::read_to_string(&journal).unwrap();
+        for (damaged, word) in [
+            (text.replacen("10000", "1x000", 1), "line 1"),
+            (text.replacen("10000", "99999", 1), "99999"),
+            (text.replacen("10001", "10000", 1), "there twice"),
+        ] {
+            fs::write(&journal, damaged).unwrap();
+            let error = ResultsFolder::open(dir.path(), &record).err().unwrap().to_string();
+            assert!(error.contains(word), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_changed_story_for_the_same_entry_hash_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut record = sample("a", 1, 2);
+        drop(ResultsFolder::open(dir.path(), &record).unwrap());
+        record.training.demos = 51;
+        let error = ResultsFolder::open(dir.path(), &record).err().unwrap().to_string();
+        assert!(error.contains("evaluation.json differs"), "{error}");
+    }
+}

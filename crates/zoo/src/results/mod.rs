@@ -1,0 +1,26 @@
+//! What evaluations leave on disk: one folder each, under the zoo's `results/`.
+//!
+//! - `evaluation.json`: the entry, the task, the protocol, the seeds and the simulator's versions.
+//! - `outcomes.parquet`: the outcome of every episode, sorted by seed. Depends on nothing but what
+//!   `evaluation.json` says: two evaluations of the same entry give the same bytes.
+//! - `timings.parquet`: how long things took. Never the same twice.
+//! - `journal.jsonl`: episodes as they finish, while an evaluation is under way; an interrupted one goes
+//!   on from it.
+
+mod folder;
+mod merge;
+mod record;
+mod tables;
+mod wilson;
+
+pub use folder::{ResultsFolder, StoredEvaluation, list_evaluations};
+pub use merge::merge_shards;
+pub use record::{
+    EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Execution, Protocol, Seeds, Shard, TrainingFacts,
+};
+pub use wilson::wilson_interval;
+
+#[cfg(test)]
+pub(crate) use folder::tests::finished;
+#[cfg(test)]
+pub(crate) use record::tests::sample;

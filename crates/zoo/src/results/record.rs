@@ -1,0 +1,346 @@
+//! The records of an evaluation.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::files::sha256_hex;
+use crate::rollout::Control;
+
+/// The rules of an evaluation that entries must share to be compared.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Protocol {
+    /// Version of these rules: how an episode's seed sets its initial state, when it ends.
+    pub rules: u32,
+    /// The task.
+    pub task: String,
+    /// The environment's class.
+    pub env_name: String,
+    /// The module of the user's that registers the environment, if any.
+    pub env_module: Option<String>,
+    /// The control loop that was really used.
+    pub control: Control,
+    /// Control steps after which an episode counts as failed.
+    pub max_steps: usize,
+}
+
+impl Protocol {
+    /// The version of the rules that this program plays by: the generator's state is set from the seed
+    /// before the reset, success ends an episode.
+    pub const RULES: u32 = 1;
+
+    /// A short name, the same for the same rules: `Lift-400-robosuite-v1-1a2b3c`.
+    pub fn id(&self) -> String {
+        let Self { rules, task, max_steps, control, .. } = self;
+        format!("{task}-{max_steps}-{control}-v{rules}-{}", &self.hash()[..6])
+    }
+
+    /// sha256 of the rules as JSON.
+    pub fn hash(&self) -> String {
+        sha256_hex(&serde_json::to_vec(self).expect("plain fields are always JSON"))
+    }
+}
+
+/// How a policy's predictions become actions.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Execution {
+    /// The first `n_action_steps` of a prediction are executed before the next query.
+    RecedingHorizon {
+        /// How many actions.
+        n_action_steps: usize,
+    },
+    /// A query every step; overlapping predictions are averaged with weights `exp(-coefficient * age)`.
+    TemporalEnsemble {
+        /// Decay of the weights, oldest prediction first.
+        coefficient: f64,
+    },
+}
+
+/// Which entry was evaluated.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EntryIdentity {
+    /// Its name.
+    pub name: String,
+    /// Its version.
+    pub version: u32,
+    /// sha256 over its content.
+    pub hash: String,
+}
+
+impl std::fmt::Display for EntryIdentity {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}@{}", self.name, self.version)
+    }
+}
+
+/// Where an entry comes from, as the leaderboard shows it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingFacts {
+    /// The kind of policy, such as `act`.
+    pub policy: String,
+    /// Number of trained values.
+    pub parameters: u64,
+    /// Optimiser steps.
+    pub steps: u64,
+    /// Wall time of the training in minutes.
+    pub minutes: f64,
+    /// The seed of the training.
+    pub seed: u64,
+    /// Name of the data set.
+    pub data_set: String,
+    /// Hash of the data set's content.
+    pub data_fingerprint: String,
+    /// Version of the simulator that recorded the demonstrations, if it is known.
+    pub data_simulator: Option<String>,
+    /// Number of demonstrations trained on.
+    pub demos: u64,
+}
+
+/// A row of seeds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Seeds {
+    /// The first.
+    pub start: u64,
+    /// How many.
+    pub count: u64,
+}
+
+impl Seeds {
+    /// Every seed, ascending.
+    pub fn iter(&self) -> std::ops::Range<u64> {
+        self.start..self.start.saturating_add(self.count)
+    }
+}
+
+impl std::fmt::Display for Seeds {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.count {
+            0 => f.write_str("none"),
+            1 => write!(f, "{}", self.start),
+            _ => write!(f, "{}-{}", self.start, self.iter().end - 1),
+        }
+    }
+}
+
+/// One of several parts of an evaluation: every `count`-th seed, from the `index`-th.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Shard {
+    /// Which part, from 1.
+    pub index: u64,
+    /// Of how many.
+    pub count: u64,
+}
+
+impl std::str::FromStr for Shard {
+    type Err = String;
+    /// Reads `2/8`.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parsed = text.split_once('/').and_then(|(index, count)| {
+            Some(Self { index: index.trim().parse().ok()?, count: count.trim().parse().ok()? })
+        });
+        match parsed {
+            Some(shard) if 1 <= shard.index && shard.index <= shard.count => Ok(shard),
+            _ => Err(format!("shard {text:?}: expected I/N with 1 <= I <= N, such as 2/8")),
+        }
+    }
+}
+
+impl std::fmt::Display for Shard {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}/{}", self.index, self.count)
+    }
+}
+
+/// All that an evaluation's outcome depends on, and where the entry comes from: `evaluation.json`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluationRecord {
+    /// Version of this file's layout.
+    pub format: u32,
+    /// The entry.
+    pub entry: EntryIdentity,
+    /// Its origin.
+    pub training: TrainingFacts,
+    /// The rules.
+    pub protocol: Protocol,
+    /// How predictions become actions.
+    pub execution: Execution,
+    /// The episodes' seeds.
+    pub seeds: Seeds,
+    /// The part of them that is here, if not all.
+    pub shard: Option<Shard>,
+    /// Versions of the simulator and what it stands on.
+    pub versions: BTreeMap<String, String>,
+}
+
+impl EvaluationRecord {
+    /// The layout that this program writes.
+    pub const FORMAT: u32 = 1;
+
+    /// The seeds that belong here.
+    pub fn own_seeds(&self) -> Vec<u64> {
+        let mine = |k: u64| self.shard.is_none_or(|shard| k % shard.count == shard.index - 1);
+        self.seeds.iter().filter(|seed| mine(seed - self.seeds.start)).collect()
+    }
+
+    /// The name of its folder: readable, and different for anything that could change an outcome.
+    pub fn folder_name(&self) -> String {
+        let Self { entry, protocol, execution, seeds, versions, .. } = self;
+        let whole = serde_json::to_vec(&(entry, protocol, execution, seeds, versions));
+        let hash = sha256_hex(&whole.expect("plain fields are always JSON"));
+        let shard = self.shard.map(|s| format!("_shard-{}-of-{}", s.index, s.count));
+        let (task, shard) = (&protocol.task, shard.unwrap_or_default());
+        format!("{entry}_{task}_{seeds}_{}{shard}", &hash[..8])
+    }
+}
+
+/// The outcome of one episode: depends on task, seed, entry and protocol alone.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpisodeRecord {
+    /// Its seed.
+    pub seed: u64,
+    /// Whether the task was done.
+    pub success: bool,
+    /// Control steps until then, or until the cap.
+    pub steps: u32,
+    /// Sum of the rewards.
+    #[serde(with = "exact")]
+    pub total_reward: f64,
+    /// sha256 of the simulator's initial state.
+    pub fingerprint: String,
+}
+
+/// How one episode went on the clock, to the microsecond.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpisodeTiming {
+    /// Its seed.
+    pub seed: u64,
+    /// Wall time of the attempt that counted, in milliseconds.
+    pub wall_ms: f64,
+    /// Time spent waiting for the simulator, in milliseconds.
+    pub simulator_ms: f64,
+    /// Duration of each query of the policy, in milliseconds.
+    pub inference_ms: Vec<f64>,
+}
+
+/// `f64` as text: JSON numbers are not read back to the last bit.
+mod exact {
+    use serde::{Deserialize, Deserializer, Serializer, de::Error};
+
+    pub(super) fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&format!("{value:?}"))
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        text.parse().map_err(|e| D::Error::custom(format!("number {text:?}: {e}")))
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    #![allow(clippy::unwrap_used)]
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A record to build tests on.
+    pub(crate) fn sample(name: &str, version: u32, count: u64) -> EvaluationRecord {
+        let versions = [("mujoco", "3.3.7"), ("robosuite", "1.5.2")];
+        EvaluationRecord {
+            format: EvaluationRecord::FORMAT,
+            entry: EntryIdentity { name: name.into(), version, hash: sha256_hex(name.as_bytes()) },
+            training: TrainingFacts {
+                policy: "act".into(),
+                parameters: 1_500_000,
+                steps: 500,
+                minutes: 0.95,
+                seed: 1,
+                data_set: "lift".into(),
+                data_fingerprint: sha256_hex(b"data"),
+                data_simulator: Some("1.5.2".into()),
+                demos: 50,
+            },
+            protocol: Protocol {
+                rules: 1,
+                task: "Lift".into(),
+                env_name: "Lift".into(),
+                env_module: None,
+                control: Control::Robosuite,
+                max_steps: 400,
+            },
+            execution: Execution::RecedingHorizon { n_action_steps: 8 },
+            seeds: Seeds { start: 10_000, count },
+            shard: None,
+            versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),
+        }
+    }
+
+    #[test]
+    fn shards_cover_every_seed_once() {
+        for count in 1..6 {
+            let mut record = sample("a", 1, 17);
+            let mut all = Vec::new();
+            for index in 1..=count {
+                record.shard = Some(Shard { index, count });
+                all.extend(record.own_seeds());
+            }
+            all.sort_unstable();
+            assert_eq!(all, (10_000..10_017).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn shards_are_read_from_text() {
+        assert_eq!("2/8".parse(), Ok(Shard { index: 2, count: 8 }));
+        for wrong in ["0/8", "9/8", "2", "a/b", "", "2/8/1", "-1/2"] {
+            assert!(wrong.parse::<Shard>().is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn whatever_can_change_an_outcome_changes_the_folder() {
+        let first = sample("a", 1, 20);
+        let changes: [fn(&mut EvaluationRecord); 8] = [
+            |r| r.entry.hash = "0".repeat(64),
+            |r| r.entry.version = 2,
+            |r| r.protocol.max_steps = 401,
+            |r| r.protocol.control = Control::Compiled,
+            |r| r.execution = Execution::RecedingHorizon { n_action_steps: 4 },
+            |r| r.seeds.count = 21,
+            |r| drop(r.versions.insert("mujoco".into(), "3.3.8".into())),
+            |r| r.shard = Some(Shard { index: 1, count: 2 }),
+        ];
+        let mut names = vec![first.folder_name()];
+        for change in changes {
+            let mut record = first.clone();
+            change(&mut record);
+            names.push(record.folder_name());
+        }
+        names.sort();
+        names.dedup();
+        assert_eq!(names.len(), changes.len() + 1, "{names:?}");
+        assert!(first.folder_name().starts_with("a@1_Lift_10000-10019_"));
+    }
+
+    proptest! {
+        #[test]
+        fn an_episode_survives_the_journal_to_the_last_bit(seed: u64, bits: u64, steps: u32) {
+            let total_reward = f64::from_bits(bits);
+            prop_assume!(total_reward.is_finite());
+            let record = EpisodeRecord { seed, success: true, steps, total_reward, fingerprint: "ab".into() };
+            let text = serde_json::to_string(&record).unwrap();
+            let back: EpisodeRecord = serde_json::from_str(&text).unwrap();
+            prop_assert_eq!(back.total_reward.to_bits(), bits);
+            prop_assert_eq!(back.seed, seed);
+        }
+    }
+}

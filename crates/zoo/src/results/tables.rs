@@ -1,0 +1,228 @@
+//! Episodes and timings as Parquet.
+
+use std::fs::File;
+use std::path::Path;
+use std::sync::Arc;
+
+use arrow::array::{
+    Array, ArrayRef, AsArray, BooleanArray, Float64Array, Float64Builder, ListBuilder, RecordBatch, StringArray,
+    UInt32Array, UInt64Array,
+};
+use arrow::datatypes::{DataType, Field, Float64Type, UInt32Type, UInt64Type};
+use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use parquet::basic::{Compression, ZstdLevel};
+use parquet::file::properties::WriterProperties;
+
+use super::record::{EpisodeRecord, EpisodeTiming};
+use crate::ZooError;
+use crate::files::write_atomic;
+
+fn table_error<E: std::error::Error + Send + Sync + 'static>(
+    operation: &'static str,
+    path: &Path,
+) -> impl FnOnce(E) -> ZooError {
+    let path = path.to_owned();
+    move |source| ZooError::Table { operation, path, source: Box::new(source) }
+}
+
+fn write(path: &Path, columns: Vec<(&str, ArrayRef)>) -> Result<(), ZooError> {
+    let columns = columns.into_iter().map(|(name, array)| (name, array, false));
+    let batch = RecordBatch::try_from_iter_with_nullable(columns).map_err(table_error("build table", path))?;
+    let level = ZstdLevel::try_new(3).map_err(table_error("set up compression of", path))?;
+    let properties = WriterProperties::builder().set_compression(Compression::ZSTD(level)).build();
+    let mut bytes = Vec::new();
+    let mut writer =
+        ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties)).map_err(table_error("write table", path))?;
+    writer.write(&batch).map_err(table_error("write table", path))?;
+    writer.close().map_err(table_error("write table", path))?;
+    write_atomic(path, &bytes)
+}
+
+/// The columns of a table, each whole, checked for name and type.
+struct Columns<'a> {
+    path: &'a Path,
+    batches: Vec<RecordBatch>,
+}
+
+impl<'a> Columns<'a> {
+    fn read(path: &'a Path) -> Result<Self, ZooError> {
+        let file = File::open(path).map_err(ZooError::io("read", path))?;
+        let reader = ParquetRecordBatchReaderBuilder::try_new(file)
+            .and_then(ParquetRecordBatchReaderBuilder::build)
+            .map_err(table_error("read table", path))?;
+        let batches: Vec<RecordBatch> = reader.collect::<Result<_, _>>().map_err(table_error("read table", path))?;
+        Ok(Self { path, batches })
+    }
+
+    fn get<T>(
+        &self,
+        name: &str,
+        kind: &DataType,
+        values: impl Fn(&dyn Array, &mut Vec<T>),
+    ) -> Result<Vec<T>, ZooError> {
+        let malformed = |reason| ZooError::Malformed { path: self.path.to_owned(), reason };
+        let mut all = Vec::new();
+        for batch in &self.batches {
+            let column = batch.column_by_name(name).ok_or_else(|| malformed(format!("column `{name}` is missing")))?;
+            let (found, nulls) = (column.data_type(), column.null_count());
+            if found != kind || nulls > 0 {
+                return Err(malformed(format!(
+                    "column `{name}`: expected {kind} without nulls, found {found}, {nulls} nulls"
+                )));
+            }
+            values(column, &mut all);
+        }
+        Ok(all)
+    }
+
+    fn u64(&self, name: &str) -> Result<Vec<u64>, ZooError> {
+        self.get(name, &DataType::UInt64, |a, out| {
+            out.extend_from_slice(a.as_primitive::<UInt64Type>().values());
+        })
+    }
+
+    fn u32(&self, name: &str) -> Result<Vec<u32>, ZooError> {
+        self.get(name, &DataType::UInt32, |a, out| {
+            out.extend_from_slice(a.as_primitive::<UInt32Type>().values());
+        })
+    }
+
+    fn f64(&self, name: &str) -> Result<Vec<f64>, ZooError> {
+        self.get(name, &DataType::Float64, |a, out| {
+            out.extend_from_slice(a.as_primitive::<Float64Type>().values());
+        })
+    }
+}
+
+/// Writes the outcomes.
+pub(super) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), ZooError> {
+    let fingerprints = all.iter().map(|e| &e.fingerprint);
+    write(
+        path,
+        vec![
+            ("seed", Arc::new(UInt64Array::from_iter_values(all.iter().map(|e| e.seed)))),
+            ("success", Arc::new(all.iter().map(|e| Some(e.success)).collect::<BooleanArray>())),
+            ("steps", Arc::new(UInt32Array::from_iter_values(all.iter().map(|e| e.steps)))),
+            ("return", Arc::new(Float64Array::from_iter_values(all.iter().map(|e| e.total_reward)))),
+            ("fingerprint", Arc::new(StringArray::from_iter_values(fingerprints))),
+        ],
+    )
+}
+
+/// Reads the outcomes.
+pub(super) fn read_episodes(path: &Path) -> Result<Vec<EpisodeRecord>, ZooError> {
+    let columns = Columns::read(path)?;
+    let success = columns.get("success", &DataType::Boolean, |a, out| {
+        out.extend(a.as_boolean().iter().map(|v| v == Some(true)));
+    })?;
+    let fingerprint = columns.get("fingerprint", &DataType::Utf8, |a, out| {
+        out.extend(a.as_string::<i32>().iter().map(|v| v.unwrap_or_default().to_owned()));
+    })?;
+    let (steps, returns) = (columns.u32("steps")?, columns.f64("return")?);
+    let seeds = columns.u64("seed")?;
+    let rows = seeds.into_iter().zip(success).zip(steps).zip(returns).zip(fingerprint);
+    Ok(rows
+        .map(|((((seed, success), steps), total_reward), fingerprint)| EpisodeRecord {
+            seed,
+            success,
+            steps,
+            total_reward,
+            fingerprint,
+        })
+        .collect())
+}
+
+/// Writes the timings.
+pub(super) fn write_timings(path: &Path, timings: &[EpisodeTiming]) -> Result<(), ZooError> {
+    let floats =
+        |f: fn(&EpisodeTiming) -> f64| -> ArrayRef { Arc::new(Float64Array::from_iter_values(timings.iter().map(f))) };
+    let item = Arc::new(Field::new("item", DataType::Float64, false));
+    let mut queries = ListBuilder::new(Float64Builder::new()).with_field(item);
+    for timing in timings {
+        queries.values().append_slice(&timing.inference_ms);
+        queries.append(true);
+    }
+    write(
+        path,
+        vec![
+            ("seed", Arc::new(UInt64Array::from_iter_values(timings.iter().map(|t| t.seed)))),
+            ("wall_ms", floats(|t| t.wall_ms)),
+            ("simulator_ms", floats(|t| t.simulator_ms)),
+            ("inference_ms", Arc::new(queries.finish())),
+        ],
+    )
+}
+
+/// Reads the timings.
+pub(super) fn read_timings(path: &Path) -> Result<Vec<EpisodeTiming>, ZooError> {
+    let columns = Columns::read(path)?;
+    let (seeds, wall) = (columns.u64("seed")?, columns.f64("wall_ms")?);
+    let simulator = columns.f64("simulator_ms")?;
+    let list = DataType::List(Arc::new(Field::new("item", DataType::Float64, false)));
+    let queries = columns.get("inference_ms", &list, |a, out| {
+        let rows = a.as_list::<i32>().iter().flatten();
+        out.extend(rows.map(|row| row.as_primitive::<Float64Type>().values().to_vec()));
+    })?;
+    let rows = seeds.into_iter().zip(wall).zip(simulator).zip(queries);
+    Ok(rows
+        .map(|(((seed, wall_ms), simulator_ms), inference_ms)| EpisodeTiming {
+            seed,
+            wall_ms,
+            simulator_ms,
+            inference_ms,
+        })
+        .collect())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn episodes(count: u64) -> Vec<EpisodeRecord> {
+        (0..count)
+            .map(|k| EpisodeRecord {
+                seed: 10_000 + k,
+                success: k % 3 != 0,
+                steps: 40 + k as u32,
+                total_reward: 0.1 * k as f64,
+                fingerprint: format!("{k:064x}"),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn tables_come_back_as_written_and_bytes_are_the_same_twice() {
+        let dir = tempfile::tempdir().unwrap();
+        let (a, b, t) = (dir.path().join("a"), dir.path().join("b"), dir.path().join("t"));
+        for count in [0, 1, 3000] {
+            let all = episodes(count);
+            write_episodes(&a, &all).unwrap();
+            write_episodes(&b, &all).unwrap();
+            assert_eq!(read_episodes(&a).unwrap(), all);
+            assert_eq!(std::fs::read(&a).unwrap(), std::fs::read(&b).unwrap());
+        }
+        let timings = [Vec::new(), vec![0.5, 0.75]].map(|inference_ms| EpisodeTiming {
+            seed: 3,
+            wall_ms: 1.5,
+            simulator_ms: 1.0,
+            inference_ms,
+        });
+        write_timings(&t, &timings).unwrap();
+        assert_eq!(read_timings(&t).unwrap(), timings);
+        let error = read_episodes(&t).unwrap_err().to_string();
+        assert!(error.contains("column `success` is missing"), "{error}");
+    }
+
+    #[test]
+    fn a_damaged_table_is_an_error_that_names_the_file() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("outcomes.parquet");
+        write_episodes(&path, &episodes(5)).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+        let error = read_episodes(&path).unwrap_err().to_string();
+        assert!(error.contains("outcomes.parquet"), "{error}");
+    }
+}
