@@ -45,7 +45,7 @@ venv: .venv/.complete ## Python with robosuite, in .venv
 
 .PHONY: build
 build: .venv/.complete ## the programs, in target/release
-	@$(CARGO) build $(CARGO_FLAGS) --workspace
+	@$(CARGO) build $(CARGO_FLAGS) --workspace --all-targets
 
 # ---- the main job ---------------------------------------------------------------------------------------------
 

@@ -1,0 +1,20 @@
+#!/usr/bin/env bash
+# Every benchmark, each beside its peers in one run: a table (work, ours, peer, ratio, bar) on the terminal and
+# target/bench/<name>.json. Called by `make bench`, which has built the programs and the peers' .venv-peers.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+export ACTRM_PEER_PYTHON="$PWD/.venv-peers/bin/python"
+examples=target/release/examples
+
+for name in ${*:-puzzles data act control}; do
+    printf '\n== %s\n' "$name"
+    case $name in
+    puzzles | data) "$examples/bench_$name" ;;
+    act) "$examples/bench_act" --peer "$ACTRM_PEER_PYTHON" ;;
+    control) .venv/bin/python benches/control.py ;;
+    *)
+        echo "error: no benchmark $name; there are: puzzles data act control" >&2
+        exit 2
+        ;;
+    esac
+done
