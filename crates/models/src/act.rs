@@ -14,12 +14,14 @@
 //! This file is the model as one reads it, on candle's autograd. Training steps and predictions run the same maths with
 //! hand-written backward passes (`act_fused.rs`); tests hold the two together.
 
+use crate::act_fused::Workspaces;
 use crate::batch::{Batch, Dims};
 use crate::error::{ModelError, Result};
+use crate::gradients::Gradients;
 use crate::layers::{
     Activation, Dropout, Embedding, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention, sinusoid_table,
 };
-use crate::model::{LossParts, PolicyModel};
+use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
 use candle_core::{DType, Tensor};
@@ -364,6 +366,9 @@ pub struct Act {
     pub(crate) encoder_1d_feature_pos_embed: Embedding,
     pub(crate) decoder_pos_embed: Embedding,
     pub(crate) action_head: Linear,
+    pub(crate) workspaces: Workspaces,
+    /// the same as a slice
+    position_table: Vec<f32>,
     /// (1, action_horizon + 2, D), fixed
     pub(crate) vae_encoder_pos_enc: Tensor,
 }
@@ -403,6 +408,7 @@ impl Act {
             e => Some(Linear::new(&mut p, "encoder_env_state_input_proj", e, dim, rng)?),
         };
         let tokens = 2 + usize::from(env.is_some());
+        let table = sinusoid_table(config.action_horizon + 2, dim)?;
         Ok(Self {
             vae,
             encoder,
@@ -420,7 +426,9 @@ impl Act {
             encoder_1d_feature_pos_embed: Embedding::new(&mut p, "encoder_1d_feature_pos_embed", tokens, dim, rng)?,
             decoder_pos_embed: Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?,
             action_head: Linear::new(&mut p, "action_head", dim, dims.action, rng)?,
-            vae_encoder_pos_enc: sinusoid_table(config.action_horizon + 2, dim)?,
+            workspaces: Workspaces::default(),
+            position_table: table.flatten_all()?.to_vec1()?,
+            vae_encoder_pos_enc: table,
             params: p,
             config: config.clone(),
             dims: *dims,
@@ -430,6 +438,11 @@ impl Act {
     /// Its configuration.
     pub fn config(&self) -> &Config {
         &self.config
+    }
+
+    /// (action_horizon + 2, D)
+    pub(crate) fn position_table(&self) -> &[f32] {
+        &self.position_table
     }
 
     /// Sizes of its inputs and outputs.
@@ -577,8 +590,14 @@ impl PolicyModel for Act {
         self.loss_of(&output, batch)
     }
 
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        let shape = (batch.rows(), self.config.latent_dim);
+        let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.state.device())?;
+        self.fused_gradients(batch, &eps, Some(rng), into)
+    }
+
     fn predict(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {
-        self.predict_composed(state, environment_state)
+        self.fused_predict(state, environment_state)
     }
 
     fn action_horizon(&self) -> usize {

@@ -6,18 +6,25 @@
 //! randomness is drawn from `Rng`.
 
 pub mod act;
+mod act_fused;
 pub mod actrm;
 pub mod baselines;
 mod batch;
 pub mod classification;
 mod error;
+mod fused;
 mod gradients;
+mod kernels;
 pub mod layers;
+pub mod lerobot;
 mod model;
 mod normaliser;
+mod optim;
 mod params;
 mod policy;
 mod rng;
+mod simd;
+mod train;
 pub mod trm;
 
 pub use batch::{Batch, Dims};
@@ -25,6 +32,8 @@ pub use error::{ModelError, Result};
 pub use gradients::{Gradients, ParamLayout};
 pub use model::{LossParts, LossValues, PolicyConfig, PolicyModel};
 pub use normaliser::{ACTION, ENVIRONMENT_STATE, Guarded, NormMode, Normaliser, STATE};
+pub use optim::{Optimiser, OptimiserConfig};
 pub use params::{Init, Params};
 pub use policy::{ActionChunk, Actor, Observation, Policy, RecedingHorizon, TemporalEnsemble};
 pub use rng::Rng;
+pub use train::{Schedule, StepMetrics, TrainConfig, Trainer, TrainerState};

@@ -1,0 +1,16 @@
+//! Arithmetic on plain slices, single-threaded: matrix products, layer norm, attention, activations.
+//!
+//! What candle's autograd would do in several passes with a new tensor each is done here in one, into buffers that are
+//! reused. Every function with a backward pass is held against candle's composed operations by the tests of `fused`.
+
+mod attention;
+mod elementwise;
+mod gemm;
+mod norm;
+mod pool;
+
+pub(crate) use attention::{Heads, attend, attend_backward};
+pub(crate) use elementwise::{activate, activate_backward, add, column_sums, drop_scale};
+pub(crate) use gemm::{Mat, Pack, Start, gemm, gemm_with, product};
+pub(crate) use norm::{layer_norm, layer_norm_backward};
+pub(crate) use pool::Pool;

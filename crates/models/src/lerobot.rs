@@ -1,0 +1,343 @@
+//! LeRobot's ACT files as values: its `config.json` and its tensor names. Reading and writing files is not done here.
+
+use crate::act::{Act, Config, LEROBOT_PREFIX, POSITION_BUFFER};
+use crate::batch::Dims;
+use crate::error::{ModelError, Result, some_names};
+use crate::layers::{Activation, sinusoid_table};
+use crate::model::PolicyModel;
+use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
+use crate::params::Params;
+use candle_core::Tensor;
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+use std::collections::BTreeMap;
+
+/// What a LeRobot `config.json` of type `act` says.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LerobotAct {
+    /// the model
+    pub config: Config,
+    /// its inputs and outputs
+    pub dims: Dims,
+    /// actions executed before the next prediction
+    pub n_action_steps: usize,
+    /// temporal ensembling instead
+    pub temporal_ensemble_coeff: Option<f64>,
+    /// normalisation of state, environment state and action; LeRobot leaves the environment state raw by default
+    pub modes: BTreeMap<String, NormMode>,
+}
+
+/// The keys of `config.json` that matter here, under LeRobot's names and with its defaults.
+#[derive(Debug, Deserialize)]
+#[serde(default)]
+struct Keys {
+    chunk_size: usize,
+    n_action_steps: usize,
+    n_obs_steps: usize,
+    pre_norm: bool,
+    dim_model: usize,
+    n_heads: usize,
+    dim_feedforward: usize,
+    feedforward_activation: Activation,
+    n_encoder_layers: usize,
+    n_decoder_layers: usize,
+    use_vae: bool,
+    latent_dim: usize,
+    n_vae_encoder_layers: usize,
+    temporal_ensemble_coeff: Option<f64>,
+    dropout: f64,
+    kl_weight: f64,
+    normalization_mapping: BTreeMap<String, String>,
+    input_features: BTreeMap<String, FeatureKeys>,
+    output_features: BTreeMap<String, FeatureKeys>,
+}
+
+#[derive(Debug, Deserialize)]
+struct FeatureKeys {
+    #[serde(rename = "type")]
+    kind: String,
+    shape: Vec<usize>,
+}
+
+impl Default for Keys {
+    fn default() -> Self {
+        let config = Config::default();
+        let mapping = ["VISUAL", "STATE", "ACTION"].map(|k| (k.to_string(), "MEAN_STD".to_string()));
+        Self {
+            chunk_size: config.action_horizon,
+            n_action_steps: 100,
+            n_obs_steps: 1,
+            pre_norm: config.pre_norm,
+            dim_model: config.dim_model,
+            n_heads: config.n_heads,
+            dim_feedforward: config.dim_feedforward,
+            feedforward_activation: config.feedforward_activation,
+            n_encoder_layers: config.n_encoder_layers,
+            n_decoder_layers: config.n_decoder_layers,
+            use_vae: config.use_vae,
+            latent_dim: config.latent_dim,
+            n_vae_encoder_layers: config.n_vae_encoder_layers,
+            temporal_ensemble_coeff: None,
+            dropout: config.dropout,
+            kl_weight: config.kl_weight,
+            normalization_mapping: BTreeMap::from(mapping),
+            input_features: BTreeMap::new(),
+            output_features: BTreeMap::new(),
+        }
+    }
+}
+
+fn refuse(field: &'static str, found: impl Into<String>, expected: &str) -> ModelError {
+    ModelError::Config { model: "LeRobot act", field, found: found.into(), expected: expected.to_string() }
+}
+
+/// Reads a `config.json`.
+///
+/// # Errors
+/// Another type of policy, images, several observation steps, a missing feature, or a configuration that is impossible.
+pub fn read_config(config: &Value) -> Result<LerobotAct> {
+    let kind = config.get("type").and_then(Value::as_str).unwrap_or("absent");
+    if kind != "act" {
+        return Err(refuse("type", kind, "act"));
+    }
+    // LeRobot writes `null` for absent options
+    let given: Map<String, Value> = match config {
+        Value::Object(map) => map.iter().filter(|(_, v)| !v.is_null()).map(|(k, v)| (k.clone(), v.clone())).collect(),
+        _ => Map::new(),
+    };
+    let keys: Keys = serde_json::from_value(Value::Object(given))
+        .map_err(|e| refuse("config.json", e.to_string(), "LeRobot's keys and types"))?;
+    if keys.n_obs_steps != 1 {
+        return Err(refuse("n_obs_steps", keys.n_obs_steps.to_string(), "1"));
+    }
+    let (mut state, mut env) = (0, 0);
+    for (name, feature) in &keys.input_features {
+        let size = match feature.shape[..] {
+            [n] => n,
+            _ => return Err(refuse("input_features", format!("{name} of shape {:?}", feature.shape), "one dimension")),
+        };
+        match (feature.kind.as_str(), name.as_str()) {
+            ("STATE", STATE) => state = size,
+            ("ENV", ENVIRONMENT_STATE) => env = size,
+            (kind, _) => {
+                let expected = "observation.state of type STATE and observation.environment_state of type ENV";
+                return Err(refuse("input_features", format!("{name} of type {kind}"), expected));
+            }
+        }
+    }
+    let action = match keys.output_features.get(ACTION).map(|f| &f.shape[..]) {
+        Some([n]) => *n,
+        other => return Err(refuse("output_features", format!("action of shape {other:?}"), "one dimension")),
+    };
+    if state == 0 {
+        return Err(refuse("input_features", "no observation.state", "observation.state"));
+    }
+    let mut modes = BTreeMap::new();
+    for (feature, kind, present) in
+        [(STATE, "STATE", true), (ENVIRONMENT_STATE, "ENV", env > 0), (ACTION, "ACTION", true)]
+    {
+        let mode = match keys.normalization_mapping.get(kind).map(String::as_str) {
+            Some("MEAN_STD") => NormMode::MeanStd,
+            Some("MIN_MAX") => NormMode::MinMax,
+            Some("IDENTITY") | None => NormMode::Identity,
+            Some(other) => return Err(refuse("normalization_mapping", other, "MEAN_STD, MIN_MAX or IDENTITY")),
+        };
+        if present {
+            modes.insert(feature.to_string(), mode);
+        }
+    }
+    if keys.n_action_steps == 0 || keys.n_action_steps > keys.chunk_size {
+        let expected = format!("1 to chunk_size, {}", keys.chunk_size);
+        return Err(refuse("n_action_steps", keys.n_action_steps.to_string(), &expected));
+    }
+    if keys.temporal_ensemble_coeff.is_some() && keys.n_action_steps != 1 {
+        return Err(refuse("n_action_steps", keys.n_action_steps.to_string(), "1 with temporal_ensemble_coeff"));
+    }
+    let config = Config {
+        action_horizon: keys.chunk_size,
+        pre_norm: keys.pre_norm,
+        dim_model: keys.dim_model,
+        n_heads: keys.n_heads,
+        dim_feedforward: keys.dim_feedforward,
+        feedforward_activation: keys.feedforward_activation,
+        n_encoder_layers: keys.n_encoder_layers,
+        n_decoder_layers: keys.n_decoder_layers,
+        use_vae: keys.use_vae,
+        latent_dim: keys.latent_dim,
+        n_vae_encoder_layers: keys.n_vae_encoder_layers,
+        dropout: keys.dropout,
+        kl_weight: keys.kl_weight,
+    };
+    config.validate()?;
+    Ok(LerobotAct {
+        config,
+        dims: Dims { state, environment_state: env, action },
+        n_action_steps: keys.n_action_steps,
+        temporal_ensemble_coeff: keys.temporal_ensemble_coeff,
+        modes,
+    })
+}
+
+/// Writes a `config.json` that LeRobot 0.6.1 loads.
+pub fn write_config(act: &LerobotAct) -> Value {
+    let (c, d) = (&act.config, &act.dims);
+    let mut inputs = json!({ STATE: { "type": "STATE", "shape": [d.state] } });
+    if d.environment_state > 0 {
+        inputs[ENVIRONMENT_STATE] = json!({ "type": "ENV", "shape": [d.environment_state] });
+    }
+    let mut mapping = Map::from_iter([("VISUAL".to_string(), json!("MEAN_STD"))]);
+    for (feature, kind) in [(STATE, "STATE"), (ENVIRONMENT_STATE, "ENV"), (ACTION, "ACTION")] {
+        let mode = match act.modes.get(feature) {
+            Some(NormMode::MeanStd) => "MEAN_STD",
+            Some(NormMode::MinMax) => "MIN_MAX",
+            Some(NormMode::Identity) => "IDENTITY",
+            None => continue,
+        };
+        mapping.insert(kind.to_string(), json!(mode));
+    }
+    json!({
+        "type": "act",
+        "n_obs_steps": 1,
+        "input_features": inputs,
+        "output_features": { ACTION: { "type": "ACTION", "shape": [d.action] } },
+        "device": "cpu",
+        "normalization_mapping": mapping,
+        "chunk_size": c.action_horizon,
+        "n_action_steps": act.n_action_steps,
+        "temporal_ensemble_coeff": act.temporal_ensemble_coeff,
+        "pre_norm": c.pre_norm,
+        "dim_model": c.dim_model,
+        "n_heads": c.n_heads,
+        "dim_feedforward": c.dim_feedforward,
+        "feedforward_activation": c.feedforward_activation,
+        "n_encoder_layers": c.n_encoder_layers,
+        "n_decoder_layers": c.n_decoder_layers,
+        "use_vae": c.use_vae,
+        "latent_dim": c.latent_dim,
+        "n_vae_encoder_layers": c.n_vae_encoder_layers,
+        "dropout": c.dropout,
+        "kl_weight": c.kl_weight,
+    })
+}
+
+/// Loads the tensors of a LeRobot `model.safetensors` into `act`: the name set must be exactly the model's, each with
+/// LeRobot's prefix, plus the fixed position table, which must hold LeRobot's values.
+///
+/// # Errors
+/// The first tensor that is missing, extra, misshapen or, for the table, different.
+pub fn load_tensors(act: &Act, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
+    load_into(act.params(), act.config(), tensors)
+}
+
+fn load_into(params: &Params, config: &Config, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
+    let mut own = BTreeMap::new();
+    for (name, tensor) in tensors {
+        let known = || params.names().map(|n| format!("{LEROBOT_PREFIX}{n}")).collect::<Vec<_>>();
+        let short = name
+            .strip_prefix(LEROBOT_PREFIX)
+            .ok_or_else(|| ModelError::ExtraTensor { name: name.clone(), known: some_names(&known()) })?;
+        own.insert(short.to_string(), tensor.clone());
+    }
+    if config.use_vae {
+        let name = format!("{LEROBOT_PREFIX}{POSITION_BUFFER}");
+        let table = own
+            .remove(POSITION_BUFFER)
+            .ok_or_else(|| ModelError::MissingTensor { name: name.clone(), given: some_names(tensors.keys()) })?;
+        let expected = sinusoid_table(config.action_horizon + 2, config.dim_model)?;
+        if table.dims() != expected.dims() {
+            let (expected, found) = (expected.dims().to_vec(), table.dims().to_vec());
+            return Err(ModelError::MisshapenTensor { name, expected, found });
+        }
+        let off = (table - expected)?.abs()?.flatten_all()?.max(0)?.to_scalar::<f32>()?;
+        if off > 1e-5 {
+            return Err(ModelError::Input {
+                operation: "load LeRobot act",
+                object: POSITION_BUFFER,
+                found: format!("{off} away from the sinusoid"),
+                expected: "LeRobot's sinusoid to 1e-5".to_string(),
+            });
+        }
+    }
+    params.load(&own)
+}
+
+/// The tensors of a LeRobot `model.safetensors`.
+pub fn tensors_out(act: &Act) -> Result<BTreeMap<String, Tensor>> {
+    let mut tensors: BTreeMap<String, Tensor> =
+        act.params().tensors().into_iter().map(|(name, t)| (format!("{LEROBOT_PREFIX}{name}"), t)).collect();
+    if act.config().use_vae {
+        let table = sinusoid_table(act.config().action_horizon + 2, act.config().dim_model)?;
+        tensors.insert(format!("{LEROBOT_PREFIX}{POSITION_BUFFER}"), table);
+    }
+    Ok(tensors)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn example() -> LerobotAct {
+        LerobotAct {
+            config: Config {
+                action_horizon: 4,
+                dim_model: 8,
+                n_heads: 2,
+                dim_feedforward: 12,
+                pre_norm: true,
+                ..Default::default()
+            },
+            dims: Dims { state: 3, environment_state: 2, action: 2 },
+            n_action_steps: 4,
+            temporal_ensemble_coeff: None,
+            modes: BTreeMap::from([
+                (STATE.to_string(), NormMode::MeanStd),
+                (ENVIRONMENT_STATE.to_string(), NormMode::MinMax),
+                (ACTION.to_string(), NormMode::MeanStd),
+            ]),
+        }
+    }
+
+    #[test]
+    fn config_and_tensors_come_back() {
+        let one = example();
+        assert_eq!(read_config(&write_config(&one)).unwrap(), one);
+        let (a, b) = (Act::new(&one.config, &one.dims, 1).unwrap(), Act::new(&one.config, &one.dims, 2).unwrap());
+        let tensors = tensors_out(&a).unwrap();
+        load_tensors(&b, &tensors).unwrap();
+        let weight = |act: &Act| act.params().get("action_head.weight").unwrap().to_vec2::<f32>().unwrap();
+        assert_eq!(weight(&a), weight(&b));
+
+        let mut bad = tensors.clone();
+        let moved = bad.remove("model.decoder.norm.weight").unwrap();
+        assert!(load_tensors(&b, &bad).unwrap_err().to_string().contains("decoder.norm.weight is missing"));
+        bad.insert("model.decoder.norm.wait".to_string(), moved.clone());
+        assert!(load_tensors(&b, &bad).is_err());
+        let mut bad = tensors.clone();
+        bad.insert("decoder.stray".to_string(), moved);
+        assert!(load_tensors(&b, &bad).unwrap_err().to_string().contains("decoder.stray"));
+        let mut bad = tensors;
+        let table = &bad["model.vae_encoder_pos_enc"];
+        bad.insert("model.vae_encoder_pos_enc".to_string(), (table * 1.1).unwrap());
+        assert!(load_tensors(&b, &bad).is_err());
+    }
+
+    #[test]
+    fn what_cannot_be_run_is_refused_by_name() {
+        let good = write_config(&example());
+        for (field, value, named) in [
+            ("type", json!("diffusion"), "diffusion"),
+            ("n_obs_steps", json!(2), "n_obs_steps"),
+            ("n_action_steps", json!(5), "n_action_steps"),
+            ("n_heads", json!(3), "n_heads"),
+            ("feedforward_activation", json!("glu"), "glu"),
+            ("chunk_size", json!("many"), "config.json"),
+            ("input_features", json!({}), "observation.state"),
+        ] {
+            let mut bad = good.clone();
+            bad[field] = value;
+            let error = read_config(&bad).unwrap_err().to_string();
+            assert!(error.contains(named), "{error}");
+        }
+    }
+}

@@ -1,0 +1,61 @@
+//! Plain loops compiled for the widest vectors of the machine that runs them.
+
+use pulp::{Scalar, Simd, WithSimd};
+
+struct Run<F>(F);
+
+impl<F: FnOnce() -> R, R> WithSimd for Run<F> {
+    type Output = R;
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> R {
+        (self.0)()
+    }
+}
+
+/// Runs `op` with the widest instruction set found at run time.
+#[inline]
+pub(crate) fn dispatch<Op: WithSimd>(op: Op) -> Op::Output {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use pulp::x86::{V3, V4};
+        use std::sync::OnceLock;
+        static WIDEST: OnceLock<(Option<V4>, Option<V3>)> = OnceLock::new();
+        match *WIDEST.get_or_init(|| (V4::try_new(), V3::try_new())) {
+            (Some(v4), _) => return Simd::vectorize(v4, op),
+            (None, Some(v3)) => return Simd::vectorize(v3, op),
+            (None, None) => {}
+        }
+    }
+    #[cfg(target_arch = "aarch64")]
+    return pulp::Arch::new().dispatch(op);
+    #[cfg(not(target_arch = "aarch64"))]
+    Simd::vectorize(Scalar, op)
+}
+
+/// Compiles the closure for the widest vectors; what it calls must be `#[inline(always)]`.
+#[inline]
+pub(crate) fn vectorised<R>(f: impl FnOnce() -> R) -> R {
+    dispatch(Run(f))
+}
+
+/// Sum of squares in a fixed order: sixteen running sums, joined every 4096 numbers in f64.
+pub(crate) fn sum_of_squares(values: &[f32]) -> f64 {
+    let mut total = 0.0f64;
+    vectorised(
+        #[inline(always)]
+        || {
+            for block in values.chunks(4096) {
+                let mut lanes = [0f32; 16];
+                let groups = block.chunks_exact(16);
+                let rest: f32 = groups.remainder().iter().map(|x| x * x).sum();
+                for group in groups {
+                    for (lane, x) in lanes.iter_mut().zip(group) {
+                        *lane += x * x;
+                    }
+                }
+                total += f64::from(lanes.iter().sum::<f32>() + rest);
+            }
+        },
+    );
+    total
+}

@@ -1,0 +1,168 @@
+//! ACT against outputs of LeRobot's `ACTPolicy` on PyTorch: the fixtures of this repository, and every folder of the
+//! same layout below `$ACTRM_PARITY_DIR`.
+#![allow(clippy::unwrap_used)]
+
+use candle_core::{DType, Device, Tensor};
+use models::act::Act;
+use models::layers::Mode;
+use models::{Batch, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Largest absolute difference that counts as equal.
+const TOLERANCE: f32 = 1e-5;
+
+struct Fixture {
+    name: String,
+    act: Act,
+    io: BTreeMap<String, Tensor>,
+    /// of LeRobot's loss, if the folder has them
+    gradients: Option<BTreeMap<String, Tensor>>,
+}
+
+fn read(folder: &Path) -> Option<Fixture> {
+    let config = std::fs::read_to_string(folder.join("config.json")).ok()?;
+    let config: serde_json::Value = serde_json::from_str(&config).unwrap();
+    if config.get("type").and_then(|t| t.as_str()) != Some("act") {
+        return None;
+    }
+    let lerobot = lerobot::read_config(&config).unwrap();
+    let act = Act::new(&lerobot.config, &lerobot.dims, 0).unwrap();
+    let load = |file: &str| candle_core::safetensors::load(folder.join(file), &Device::Cpu).unwrap();
+    let tensors: BTreeMap<_, _> = load("model.safetensors").into_iter().collect();
+    lerobot::load_tensors(&act, &tensors).unwrap();
+    let io = Tensor::read_npz(folder.join("io.npz")).unwrap().into_iter().collect();
+    let gradients =
+        folder.join("gradients.safetensors").exists().then(|| load("gradients.safetensors").into_iter().collect());
+    Some(Fixture { name: folder.display().to_string(), act, io, gradients })
+}
+
+fn fixtures() -> Vec<Fixture> {
+    let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
+    let mut roots = vec![own];
+    roots.extend(std::env::var_os("ACTRM_PARITY_DIR").map(PathBuf::from));
+    let mut folders = Vec::new();
+    for root in roots {
+        for entry in std::fs::read_dir(&root).unwrap_or_else(|e| panic!("{}: {e}", root.display())) {
+            folders.push(entry.unwrap().path());
+        }
+    }
+    folders.sort();
+    let found: Vec<_> = folders.iter().filter_map(|f| read(f)).collect();
+    assert!(!found.is_empty());
+    found
+}
+
+impl Fixture {
+    fn get(&self, name: &str) -> Tensor {
+        self.io[name].to_dtype(DType::F32).unwrap()
+    }
+
+    fn batch(&self) -> Batch {
+        let pad: Vec<f32> = self.get("pad").flatten_all().unwrap().to_vec1().unwrap();
+        Batch {
+            state: self.get("state"),
+            environment_state: self.io.contains_key("env").then(|| self.get("env")),
+            actions: self.get("action"),
+            is_pad: self.get("pad"),
+            total_rows: self.get("state").dim(0).unwrap(),
+            total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
+            seed: 0,
+        }
+    }
+
+    fn same(&self, what: &str, got: &Tensor, expected: &Tensor) {
+        assert_eq!(got.dims(), expected.dims(), "{}: {what}", self.name);
+        let off = (got - expected).unwrap().abs().unwrap().flatten_all().unwrap().max(0).unwrap();
+        let off: f32 = off.to_scalar().unwrap();
+        println!("{}: {what} differs by {off:.1e}", self.name);
+        assert!(off <= TOLERANCE, "{}: {what} is {off} away", self.name);
+    }
+}
+
+#[test]
+fn inference_is_lerobots() {
+    for f in fixtures() {
+        let batch = f.batch();
+        let env = batch.environment_state.as_ref();
+        f.same("inference", &f.act.predict(&batch.state, env).unwrap(), &f.get("out_infer"));
+        f.same("composed inference", &f.act.predict_composed(&batch.state, env).unwrap(), &f.get("out_infer"));
+    }
+}
+
+#[test]
+fn the_training_forward_pass_and_the_loss_are_lerobots() {
+    for f in fixtures() {
+        let batch = f.batch();
+        let shape = (batch.rows(), f.act.config().latent_dim);
+        let eps = match f.io.contains_key("eps") {
+            true => f.get("eps"),
+            false => Tensor::zeros(shape, DType::F32, &Device::Cpu).unwrap(),
+        };
+        let output = f.act.train_forward(&batch, &eps, &mut Mode::Eval).unwrap();
+        f.same("training output", &output.actions, &f.get("out_train"));
+        if let Some((mu, log_variance)) = &output.latent {
+            f.same("mu", mu, &f.get("mu"));
+            f.same("logvar", log_variance, &f.get("logvar"));
+        }
+        let loss = f.act.loss_of(&output, &batch).unwrap();
+        // a loss of some tens has fewer digits behind the point
+        let expected = f.get("loss").to_scalar::<f32>().unwrap();
+        let got = loss.total.to_scalar::<f32>().unwrap();
+        assert!((got - expected).abs() <= TOLERANCE * expected.abs().max(1.0), "{}: loss {got} {expected}", f.name);
+        for (ours, theirs) in [("l1_loss", "l1_loss"), ("kld_loss", "kld_loss")] {
+            if f.io.contains_key(theirs) && loss.parts.contains_key(ours) {
+                let (got, expected) =
+                    (loss.parts[ours].to_scalar::<f32>().unwrap(), f.get(theirs).to_scalar::<f32>().unwrap());
+                assert!(
+                    (got - expected).abs() <= TOLERANCE * expected.abs().max(1.0),
+                    "{}: {ours} {got} {expected}",
+                    f.name
+                );
+            }
+        }
+        if let Some(expected) = &f.gradients {
+            let grads = loss.total.backward().unwrap();
+            for (name, var) in f.act.params().iter() {
+                let got = grads.get(var).unwrap_or_else(|| panic!("{}: no gradient for {name}", f.name));
+                close(&f.name, name, got, &expected[&format!("model.{name}")]);
+            }
+            // shards add up to the whole, and the fused path has the same gradients
+            let mut sum = Gradients::zeros(Arc::new(ParamLayout::new(f.act.params())));
+            let mut values = LossValues::default();
+            let at = batch.rows() / 2;
+            for (from, shard) in [0, at].into_iter().zip(batch.shards(2).unwrap()) {
+                let eps = eps.narrow(0, from, shard.rows()).unwrap().contiguous().unwrap();
+                values.add(&f.act.fused_gradients(&shard, &eps, None, &mut sum).unwrap());
+            }
+            assert!((values.total - got).abs() <= TOLERANCE * got.abs().max(1.0), "{}: {values:?} {got}", f.name);
+            for (name, _) in f.act.params().iter() {
+                let expected = &expected[&format!("model.{name}")];
+                let got = Tensor::from_slice(sum.get(name).unwrap(), expected.dims(), &Device::Cpu).unwrap();
+                close(&f.name, name, &got, expected);
+            }
+        }
+    }
+}
+
+fn close(folder: &str, name: &str, got: &Tensor, expected: &Tensor) {
+    let largest = |t: &Tensor| t.abs().unwrap().flatten_all().unwrap().max(0).unwrap().to_scalar::<f32>().unwrap();
+    let off = largest(&(got - expected).unwrap());
+    // relative to the largest entry: sums over hundreds of rows
+    let scale = largest(expected).max(1e-2);
+    assert!(off <= 2e-4 * scale, "{folder}: gradient of {name} is {off} away, largest {scale}");
+}
+
+#[test]
+fn every_parameter_gets_a_gradient() {
+    for f in fixtures() {
+        let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(f.act.params())));
+        f.act.accumulate_gradients(&f.batch(), &mut Rng::new(1, "test"), &mut grads).unwrap();
+        for (name, span) in grads.layout().clone().iter() {
+            // a query's bias shifts all scores of a row alike where keys are equal; only a whole tensor of zeros is wrong
+            let largest = grads.values()[span].iter().fold(0f32, |m, x| m.max(x.abs()));
+            assert!(largest > 0.0, "{}: {name}", f.name);
+        }
+    }
+}
