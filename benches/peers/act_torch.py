@@ -1,0 +1,88 @@
+"""LeRobot's ACT on PyTorch, driven step by step: one line of JSON in, one out.
+
+Lines: {"work": "train" | "predict", "size": "d256" | "d512", "threads": 1, "times": 3}
+Answers: {"wall": seconds, "cpu": seconds} for one of the `times` repetitions (their mean), and {"rss": bytes} for "memory".
+"""
+
+import json
+import resource
+import sys
+import time
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+
+SIZES = {
+    "d128": {"dim_model": 128, "dim_feedforward": 512, "chunk_size": 16},
+    "d256": {"dim_model": 256, "dim_feedforward": 1024, "chunk_size": 32},
+    "d512": {"dim_model": 512, "dim_feedforward": 3200, "chunk_size": 100},
+}
+BATCH = 64
+
+
+def policy(size: str) -> ACTPolicy:
+    settings = SIZES[size]
+    config = ACTConfig(
+        input_features={
+            "observation.state": PolicyFeature(FeatureType.STATE, (9,)),
+            "observation.environment_state": PolicyFeature(FeatureType.ENV, (10,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        n_action_steps=settings["chunk_size"],
+        device="cpu",
+        **settings,
+    )
+    return ACTPolicy(config)
+
+
+class Peer:
+    def __init__(self, size: str) -> None:
+        torch.manual_seed(0)
+        self.policy = policy(size)
+        self.optimiser = torch.optim.AdamW(self.policy.parameters(), lr=1e-4, weight_decay=1e-4)
+        chunk = SIZES[size]["chunk_size"]
+        self.batch = {
+            "observation.state": torch.randn(BATCH, 9),
+            "observation.environment_state": torch.randn(BATCH, 10),
+            "action": torch.randn(BATCH, chunk, 7),
+            "action_is_pad": torch.zeros(BATCH, chunk, dtype=torch.bool),
+        }
+        self.one = {name: value[:1] for name, value in self.batch.items() if "observation" in name}
+
+    def train(self) -> None:
+        self.policy.train()
+        loss, _ = self.policy(self.batch)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
+        self.optimiser.step()
+        self.optimiser.zero_grad()
+
+    def predict(self) -> None:
+        self.policy.eval()
+        with torch.inference_mode():
+            self.policy.model(self.one)
+
+
+def main() -> None:
+    peers: dict[str, Peer] = {}
+    print(json.dumps({"torch": torch.__version__}), flush=True)
+    for line in sys.stdin:
+        order = json.loads(line)
+        if order["work"] == "memory":
+            print(json.dumps({"rss": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}), flush=True)
+            continue
+        torch.set_num_threads(order["threads"])
+        peer = peers.setdefault(order["size"], Peer(order["size"]))
+        run = peer.train if order["work"] == "train" else peer.predict
+        wall, cpu = time.perf_counter(), time.process_time()
+        for _ in range(order["times"]):
+            run()
+        times = order["times"]
+        answer = {"wall": (time.perf_counter() - wall) / times, "cpu": (time.process_time() - cpu) / times}
+        print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    main()
