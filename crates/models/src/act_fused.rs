@@ -413,3 +413,7 @@ fn final_norm(pass: &mut Pass<'_>, prefix: &str, x: Vec<f32>) -> (Vec<f32>, Opti
     pass.give(x);
     (out, Some(norm))
 }
+
+#[cfg(test)]
+#[path = "act_fused_tests.rs"]
+mod tests;

@@ -108,7 +108,7 @@ fn training_lowers_the_loss() {
     for _ in 0..59 {
         last = trainer.step(&batch).unwrap().parts["l1_loss"];
     }
-    assert!(last < 0.7 * first, "{first} {last}");
+    assert!(last < 0.9 * first, "{first} {last}");
 }
 
 #[test]

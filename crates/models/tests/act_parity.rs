@@ -160,7 +160,10 @@ fn every_parameter_gets_a_gradient() {
         let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(f.act.params())));
         f.act.accumulate_gradients(&f.batch(), &mut Rng::new(1, "test"), &mut grads).unwrap();
         for (name, span) in grads.layout().clone().iter() {
-            // a query's bias shifts all scores of a row alike where keys are equal; only a whole tensor of zeros is wrong
+            // without a VAE the latent is 0, and so is the gradient of its weights, in LeRobot too
+            if !f.act.config().use_vae && name == "encoder_latent_input_proj.weight" {
+                continue;
+            }
             let largest = grads.values()[span].iter().fold(0f32, |m, x| m.max(x.abs()));
             assert!(largest > 0.0, "{}: {name}", f.name);
         }

@@ -93,10 +93,9 @@ pub(crate) fn gemm_with<E: Fn(usize, usize, &mut [f32])>(
         return;
     }
     assert!(ldc >= n && c.len() >= (m - 1) * ldc + n, "the output holds m rows of n");
-    if k > 0 {
-        assert!(a.data.len() > (m - 1) * a.row + (k - 1) * a.col, "A holds (m, k)");
-        assert!(b.data.len() > (k - 1) * b.row + (n - 1) * b.col, "B holds (k, n)");
-    }
+    assert!(k > 0, "a product over nothing");
+    assert!(a.data.len() > (m - 1) * a.row + (k - 1) * a.col, "A holds (m, k)");
+    assert!(b.data.len() > (k - 1) * b.row + (n - 1) * b.col, "B holds (k, n)");
     dispatch(Gemm { m, n, k, a, b, start, c, ldc, pack, epilogue });
 }
 
@@ -118,8 +117,66 @@ impl<E: Fn(usize, usize, &mut [f32])> WithSimd for Gemm<'_, E> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
+        // a few rows against rows of weights: reading the weights once is all there is to do, packing would double it
+        if self.a.col == 1 && self.b.row == 1 {
+            match self.m {
+                1 => return few_rows::<S, 1, E>(simd, self),
+                2 => return few_rows::<S, 2, E>(simd, self),
+                3 => return few_rows::<S, 3, E>(simd, self),
+                4 => return few_rows::<S, 4, E>(simd, self),
+                _ => {}
+            }
+        }
         // the tile fills the registers: 12 x 2 of 32, 6 x 2 of 16
         if S::F32_LANES >= 16 { blocks::<S, 12, E>(simd, self) } else { blocks::<S, 6, E>(simd, self) }
+    }
+}
+
+/// Scalar products of M rows of A with four columns of B at a time, both contiguous.
+#[inline(always)]
+fn few_rows<S: Simd, const M: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g: Gemm<'_, E>) {
+    const COLUMNS: usize = 4;
+    let Gemm { n, k, a, b, start, c, ldc, epilogue, .. } = g;
+    let whole = k / S::F32_LANES;
+    let split = |data: &'_ [f32], from: usize| -> (usize, usize) {
+        debug_assert!(from + k <= data.len());
+        (from, from + whole * S::F32_LANES)
+    };
+    let rows: [(&[S::f32s], &[f32]); M] = std::array::from_fn(|i| {
+        let (from, tail) = split(a.data, i * a.row);
+        (S::as_simd_f32s(&a.data[from..tail]).0, &a.data[tail..from + k])
+    });
+    for j0 in (0..n).step_by(COLUMNS) {
+        let count = COLUMNS.min(n - j0);
+        // beyond the last column the last one is computed again
+        let columns: [(&[S::f32s], &[f32]); COLUMNS] = std::array::from_fn(|j| {
+            let (from, tail) = split(b.data, (j0 + j.min(count - 1)) * b.col);
+            (S::as_simd_f32s(&b.data[from..tail]).0, &b.data[tail..from + k])
+        });
+        let mut acc = [[simd.splat_f32s(0.0); COLUMNS]; M];
+        for p in 0..whole {
+            for j in 0..COLUMNS {
+                let w = columns[j].0[p];
+                for i in 0..M {
+                    acc[i][j] = simd.mul_add_e_f32s(rows[i].0[p], w, acc[i][j]);
+                }
+            }
+        }
+        for i in 0..M {
+            for j in 0..count {
+                let tail: f32 = rows[i].1.iter().zip(columns[j].1).map(|(x, y)| x * y).sum();
+                let to = &mut c[i * ldc + j0 + j];
+                let before = match start {
+                    Start::Zero => 0.0,
+                    Start::Add => *to,
+                    Start::Bias(bias) => bias[j0 + j],
+                };
+                *to = simd.reduce_sum_f32s(acc[i][j]) + tail + before;
+            }
+        }
+    }
+    for i in 0..M {
+        epilogue(i, 0, &mut c[i * ldc..i * ldc + n]);
     }
 }
 
@@ -145,10 +202,10 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
             for ic in (0..m).step_by(MC) {
                 let mc = MC.min(m - ic);
                 pack_a::<MR>(&mut pack.a, a, (ic, mc), (pc, kc));
-                for (jp, panel_b) in pack.b.chunks_exact(nr * kc.max(1)).take(nc.div_ceil(nr)).enumerate() {
+                for (jp, panel_b) in pack.b.chunks_exact(nr * kc).take(nc.div_ceil(nr)).enumerate() {
                     let j = jc + jp * nr;
                     let cols = nr.min(n - j);
-                    for (ip, panel_a) in pack.a.chunks_exact(MR * kc.max(1)).take(mc.div_ceil(MR)).enumerate() {
+                    for (ip, panel_a) in pack.a.chunks_exact(MR * kc).take(mc.div_ceil(MR)).enumerate() {
                         let i = ic + ip * MR;
                         let rows = MR.min(m - i);
                         let start = if pc > 0 { Start::Add } else { start };
@@ -157,7 +214,6 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
                             Start::Bias(bias) => Start::Bias(&bias[j..j + cols]),
                             other => other,
                         };
-                        let (panel_a, panel_b) = if kc == 0 { (&[][..], &[][..]) } else { (panel_a, panel_b) };
                         tile::<S, MR>(simd, panel_a, panel_b, bias, at, ldc, (rows, cols));
                     }
                 }
@@ -178,7 +234,7 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
 /// Panels of `nr` columns, depth first; missing columns are zero.
 #[inline(always)]
 fn pack_b(out: &mut [f32], b: Mat<'_>, (pc, kc): (usize, usize), (jc, nc): (usize, usize), nr: usize) {
-    for (jp, panel) in out.chunks_exact_mut(nr * kc.max(1)).take(nc.div_ceil(nr)).enumerate() {
+    for (jp, panel) in out.chunks_exact_mut(nr * kc).take(nc.div_ceil(nr)).enumerate() {
         let j0 = jc + jp * nr;
         let cols = nr.min(jc + nc - j0);
         if cols < nr {
@@ -198,7 +254,7 @@ fn pack_b(out: &mut [f32], b: Mat<'_>, (pc, kc): (usize, usize), (jc, nc): (usiz
 /// Panels of `MR` rows, depth first; missing rows are zero.
 #[inline(always)]
 fn pack_a<const MR: usize>(out: &mut [f32], a: Mat<'_>, (ic, mc): (usize, usize), (pc, kc): (usize, usize)) {
-    for (ip, panel) in out.chunks_exact_mut(MR * kc.max(1)).take(mc.div_ceil(MR)).enumerate() {
+    for (ip, panel) in out.chunks_exact_mut(MR * kc).take(mc.div_ceil(MR)).enumerate() {
         let i0 = ic + ip * MR;
         let rows = MR.min(ic + mc - i0);
         if rows < MR {
@@ -302,7 +358,7 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(60))]
         #[test]
         fn it_is_the_naive_product(
-            m in 1usize..70, n in 1usize..70, k in 0usize..40, deep: bool, wide: bool,
+            m in 1usize..70, n in 1usize..70, k in 1usize..40, deep: bool, wide: bool,
             ta: bool, tb: bool, start in 0u8..3, extra in 0usize..3,
         ) {
             // beyond one block in depth and in width
