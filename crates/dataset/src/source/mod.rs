@@ -292,4 +292,8 @@ fn open_file(path: &Path) -> Result<File, InputError> {
 }
 
 #[cfg(test)]
+mod dialect_tests;
+#[cfg(test)]
+mod roundtrip_tests;
+#[cfg(test)]
 mod tests;

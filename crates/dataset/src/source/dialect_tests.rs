@@ -1,0 +1,252 @@
+#![allow(clippy::unwrap_used)]
+//! Every dialect from a small file of its kind, made with libhdf5 as its own tools make them.
+
+use std::path::Path;
+
+use hdf5::types::VarLenUnicode;
+use hdf5::{File, Group};
+
+use super::*;
+use crate::plan::Dialect;
+
+fn text(group: &Group, name: &str, value: &str) {
+    let value: VarLenUnicode = value.parse().unwrap();
+    group.new_attr::<VarLenUnicode>().create(name).unwrap().write_scalar(&value).unwrap();
+}
+
+fn floats(group: &Group, name: &str, shape: &[usize]) {
+    let values: Vec<f32> = (0..shape.iter().product()).map(|i| i as f32 * 0.5).collect();
+    let dataset = group.new_dataset::<f32>().shape(shape.to_vec()).create(name).unwrap();
+    dataset.write_raw(&values).unwrap();
+}
+
+fn bytes(group: &Group, name: &str, shape: &[usize], value: impl Fn(usize) -> u8) {
+    let values: Vec<u8> = (0..shape.iter().product()).map(value).collect();
+    group.new_dataset::<u8>().shape(shape.to_vec()).create(name).unwrap().write_raw(&values).unwrap();
+}
+
+/// `data/demo_<k>` with what every robomimic-like file has.
+fn demo(file: &File, number: usize, steps: usize) -> Group {
+    let data = file.group("data").or_else(|_| file.create_group("data")).unwrap();
+    let demo = data.create_group(&format!("demo_{number}")).unwrap();
+    demo.new_attr::<i64>().create("num_samples").unwrap().write_scalar(&(steps as i64)).unwrap();
+    floats(&demo, "actions", &[steps, 7]);
+    floats(&demo, "rewards", &[steps]);
+    bytes(&demo, "dones", &[steps], |i| u8::from(i + 1 == steps));
+    let obs = demo.create_group("obs").unwrap();
+    floats(&obs, "ee_pos", &[steps, 3]);
+    demo
+}
+
+fn made(make: impl FnOnce(&File)) -> (tempfile::TempDir, Source) {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("some.hdf5");
+    let file = File::create(&path).unwrap();
+    make(&file);
+    file.close().unwrap();
+    let source = Source::open(&path).unwrap();
+    (dir, source)
+}
+
+#[test]
+fn libero_has_its_instruction_and_orientation() {
+    let (_dir, source) = made(|file| {
+        let one = demo(file, 0, 4);
+        bytes(&one.group("obs").unwrap(), "agentview_rgb", &[4, 8, 8, 3], |i| i as u8);
+        let data = file.group("data").unwrap();
+        text(&data, "problem_info", r#"{"language_instruction": "\"open the drawer\"", "problem_name": "x"}"#);
+        text(&data, "bddl_file_name", "a.bddl");
+        text(&data, "env_name", "Libero_Tabletop");
+    });
+    let plan = source.plan();
+    assert_eq!(plan.dialect, Dialect::Libero);
+    assert_eq!(plan.demos[0].task.as_deref(), Some("open the drawer"));
+    assert_eq!(plan.env_name.as_deref(), Some("Libero_Tabletop"));
+    assert!(plan.notes[0].contains("OpenGL"));
+    assert!(plan.problems.is_empty(), "{:?}", plan.problems);
+    assert_eq!(source.read_demo(0).unwrap().datasets["obs/agentview_rgb"].bytes[5], 5);
+}
+
+#[test]
+fn robocasa_has_a_task_for_each_demo() {
+    let (_dir, source) = made(|file| {
+        for (number, lang) in [(0, "pick the apple"), (1, "open the door")] {
+            let one = demo(file, number, 3);
+            text(&one, "ep_meta", &format!(r#"{{"lang": "{lang}", "layout_id": 2, "style_id": 5}}"#));
+        }
+    });
+    assert_eq!(source.plan().dialect, Dialect::Robocasa);
+    let tasks: Vec<_> = source.plan().demos.iter().map(|d| d.task.as_deref().unwrap()).collect();
+    assert_eq!(tasks, ["pick the apple", "open the door"]);
+}
+
+#[test]
+fn mimicgen_keeps_its_nested_groups() {
+    let (_dir, source) = made(|file| {
+        let one = demo(file, 0, 3);
+        let info = one.create_group("datagen_info").unwrap();
+        floats(&info, "eef_pose", &[3, 4, 4]);
+        floats(&info.create_group("object_poses").unwrap(), "cube", &[3, 4, 4]);
+        one.new_dataset::<i64>().shape([2]).create("src_demo_inds").unwrap().write_raw(&[4, 5]).unwrap();
+    });
+    assert_eq!(source.plan().dialect, Dialect::Mimicgen);
+    let one = source.read_demo(0).unwrap();
+    assert_eq!(one.datasets["datagen_info/object_poses/cube"].shape, [3, 4, 4]);
+    assert_eq!(one.datasets["src_demo_inds"].to_f64().unwrap(), [4.0, 5.0]);
+}
+
+#[test]
+fn isaac_lab_nests_observations_and_states() {
+    let (_dir, source) = made(|file| {
+        let one = demo(file, 0, 3);
+        let obs = one.group("obs").unwrap();
+        floats(&obs.create_group("datagen_info").unwrap(), "object_pose", &[3, 4, 4]);
+        let initial = one.create_group("initial_state").unwrap();
+        floats(&initial.create_group("articulation").unwrap(), "joint_position", &[1, 9]);
+        floats(&one.create_group("states").unwrap(), "joint_position", &[3, 9]);
+    });
+    assert_eq!(source.plan().dialect, Dialect::Mimicgen);
+    let one = source.read_demo(0).unwrap();
+    assert_eq!(one.datasets["obs/datagen_info/object_pose"].shape, [3, 4, 4]);
+    assert_eq!(one.datasets["initial_state/articulation/joint_position"].shape, [1, 9]);
+}
+
+#[test]
+fn d4rl_is_cut_at_terminals_and_timeouts() {
+    let (_dir, source) = made(|file| {
+        floats(file, "observations", &[10, 4]);
+        floats(file, "actions", &[10, 2]);
+        floats(file, "rewards", &[10]);
+        bytes(file, "terminals", &[10], |i| u8::from(i == 2));
+        bytes(file, "timeouts", &[10], |i| u8::from(i == 6));
+        floats(&file.create_group("infos").unwrap(), "qpos", &[10, 3]);
+        floats(&file.create_group("metadata").unwrap(), "weights", &[5, 5]);
+    });
+    let plan = source.plan();
+    assert_eq!(plan.dialect, Dialect::D4rl);
+    let lengths: Vec<_> = plan.demos.iter().map(|d| d.length).collect();
+    assert_eq!(lengths, [3, 4]);
+    assert!(plan.notes[0].contains("last 3 steps"), "{:?}", plan.notes);
+    let second = source.read_demo(1).unwrap();
+    let expected: Vec<f64> = (3 * 4..7 * 4).map(|i| f64::from(i) * 0.5).collect();
+    assert_eq!(second.datasets["obs/flat"].to_f64().unwrap(), expected);
+    assert_eq!(second.datasets["infos/qpos"].shape, [4, 3]);
+    assert_eq!(second.datasets["dones"].bytes, [0, 0, 0, 0]);
+    assert_eq!(source.read_rows(1, "actions", 1, 2).unwrap().to_f64().unwrap(), [4.0, 4.5, 5.0, 5.5]);
+    let root = source.root().unwrap();
+    assert_eq!(root.datasets.keys().collect::<Vec<_>>(), ["metadata/weights"]);
+}
+
+fn episode(path: &Path, steps: usize) {
+    let file = File::create(path).unwrap();
+    file.new_attr::<bool>().create("sim").unwrap().write_scalar(&true).unwrap();
+    floats(&file, "action", &[steps, 14]);
+    let observations = file.create_group("observations").unwrap();
+    floats(&observations, "qpos", &[steps, 14]);
+    floats(&observations, "qvel", &[steps, 14]);
+    bytes(&observations.create_group("images").unwrap(), "top", &[steps, 6, 8, 3], |i| i as u8);
+    file.close().unwrap();
+}
+
+#[test]
+fn a_folder_of_aloha_episodes_is_one_data_set() {
+    let dir = tempfile::tempdir().unwrap();
+    for (number, steps) in [(0, 3), (2, 5), (10, 4)] {
+        episode(&dir.path().join(format!("episode_{number}.hdf5")), steps);
+    }
+    std::fs::write(dir.path().join("README.txt"), "not an episode").unwrap();
+    let source = Source::open(dir.path()).unwrap();
+    assert_eq!(source.plan().dialect, Dialect::Aloha);
+    let demos: Vec<_> = source.plan().demos.iter().map(|d| (d.id.as_str(), d.length)).collect();
+    assert_eq!(demos, [("demo_0", 3), ("demo_2", 5), ("demo_10", 4)]);
+    assert!(source.plan().demos[0].keys["obs/images/top"].is_image());
+    let last = source.read_demo(2).unwrap();
+    assert_eq!(last.datasets["actions"].shape, [4, 14]);
+    assert_eq!(last.attrs["sim"].bytes, [1]);
+    // one file of them is a data set of one demo
+    let one = Source::open(&dir.path().join("episode_2.hdf5")).unwrap();
+    assert_eq!(one.plan().demos.len(), 1);
+    assert_eq!(one.read_demo(0).unwrap().datasets["obs/qpos"].shape, [5, 14]);
+}
+
+#[test]
+fn a_folder_without_episodes_says_what_is_there() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("notes.txt"), "x").unwrap();
+    let error = Source::open(dir.path()).unwrap_err().to_string();
+    assert!(error.ends_with("found notes.txt"), "{error}");
+}
+
+#[test]
+fn an_unknown_file_is_told_what_was_expected_and_found() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("weather.h5");
+    let file = File::create(&path).unwrap();
+    floats(&file, "temperature", &[4]);
+    file.create_group("stations").unwrap();
+    file.close().unwrap();
+    let error = Source::open(&path).unwrap_err().to_string();
+    assert!(error.contains("(robomimic)") && error.contains("(ALOHA, ACT)"), "{error}");
+    assert!(error.ends_with("found stations/, temperature"), "{error}");
+}
+
+#[test]
+fn links_out_of_the_file_are_not_followed() {
+    let (_dir, source) = made(|file| {
+        let one = demo(file, 0, 3);
+        one.link_external("/etc/passwd", "/", "secret").unwrap();
+    });
+    let problem = &source.plan().problems[0];
+    assert!(problem.message.ends_with("data/demo_0/secret: a link to another file is not supported"), "{problem:?}");
+    assert!(source.read_demo(0).is_ok());
+}
+
+#[test]
+fn a_group_that_contains_itself_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("loop.hdf5");
+    let file = File::create(&path).unwrap();
+    let one = demo(&file, 0, 3);
+    one.link_hard("/data", "again").unwrap();
+    drop(one);
+    file.close().unwrap();
+    let error = Source::open(&path).unwrap_err().to_string();
+    assert!(error.contains("contains itself"), "{error}");
+}
+
+#[test]
+fn lzf_and_odd_blocks_are_read() {
+    let values: Vec<f64> = (0..50 * 7).map(f64::from).collect();
+    let (_dir, source) = made(|file| {
+        let one = demo(file, 0, 50);
+        let packed = one.group("obs").unwrap().new_dataset_builder().chunk((7, 3)).shuffle().lzf();
+        packed.empty::<f64>().shape((50, 7)).create("packed").unwrap().write_raw(&values).unwrap();
+    });
+    assert_eq!(source.plan().demos[0].keys["obs/packed"].block_rows, 7);
+    assert_eq!(source.read_demo(0).unwrap().datasets["obs/packed"].to_f64().unwrap(), values);
+    let rows = source.read_rows(0, "obs/packed", 5, 40).unwrap().to_f64().unwrap();
+    assert_eq!(rows, values[5 * 7..45 * 7]);
+}
+
+#[test]
+fn a_type_that_cannot_be_carried_is_a_fault_of_its_dataset_only() {
+    let (_dir, source) = made(|file| {
+        let one = demo(file, 0, 3);
+        let list = one.new_dataset::<hdf5::types::VarLenArray<f32>>().shape([3]).create("ragged").unwrap();
+        drop(list);
+    });
+    let error = source.read_demo(0).unwrap_err().to_string();
+    assert!(error.ends_with("data/demo_0/ragged: the type [float32] (var len) is not supported"), "{error}");
+    assert!(source.read_demo_where(0, &|key| key != "ragged").is_ok());
+}
+
+#[test]
+fn a_shape_without_elements_behind_it_is_refused() {
+    let (_dir, source) = made(|file| {
+        let one = demo(file, 0, 3);
+        let huge = one.new_dataset_builder().chunk((1, 1024)).empty::<f64>().shape((1 << 40, 1024));
+        huge.create("huge").unwrap();
+    });
+    let error = source.read_demo(0).unwrap_err().to_string();
+    assert!(error.contains("data/demo_0/huge") && error.contains("bytes stated"), "{error}");
+}
