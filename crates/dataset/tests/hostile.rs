@@ -20,6 +20,7 @@ fn main() {
     isolation::serve_if_child();
     isolated_reading_equals_reading_in_process();
     an_unarmed_path_reports_like_an_armed_one();
+    a_reading_process_that_dies_is_an_error();
     mutations();
 }
 
@@ -62,6 +63,30 @@ fn an_unarmed_path_reports_like_an_armed_one() {
     let texts = [Source::open(&text), Source::open_isolated(&text)].map(|r| r.unwrap_err().to_string());
     assert_eq!(texts[0], texts[1]);
     println!("errors cross from the reading process unchanged: ok");
+}
+
+fn a_reading_process_that_dies_is_an_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let copy = dir.path().join("packed.hdf5");
+    packed(&fixture("lift_low_dim_3_demos.hdf5"), &copy);
+    let source = Source::open_isolated(&copy).unwrap();
+    let child = children()[0];
+    rustix::process::kill_process(rustix::process::Pid::from_raw(child).unwrap(), rustix::process::Signal::ABORT)
+        .unwrap();
+    for _ in 0..2 {
+        let text = source.read_demo(0).map(|demo| demo.id).unwrap_err().to_string();
+        assert!(text.contains("gave up (SIGABRT) while it was to read actions"), "{text}");
+    }
+    drop(source);
+    assert!(children().is_empty(), "nothing is left running");
+    println!("a reading process that dies is an error: ok");
+}
+
+/// The processes that this one has started and that live.
+fn children() -> Vec<i32> {
+    let me = std::process::id();
+    let list = std::fs::read_to_string(format!("/proc/{me}/task/{me}/children")).unwrap_or_default();
+    list.split_whitespace().filter_map(|pid| pid.parse().ok()).collect()
 }
 
 fn number(name: &str, otherwise: u64) -> u64 {
@@ -185,7 +210,5 @@ fn children_peak() -> u64 {
         let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:")).unwrap_or("0 kB").trim();
         line.split(' ').next().and_then(|n| n.parse::<u64>().ok()).unwrap_or(0) << 10
     };
-    let me = std::process::id().to_string();
-    let children = std::fs::read_to_string(format!("/proc/{me}/task/{me}/children")).unwrap_or_default();
-    peak(&me) + children.split_whitespace().map(peak).sum::<u64>()
+    peak(&std::process::id().to_string()) + children().iter().map(|pid| peak(&pid.to_string())).sum::<u64>()
 }

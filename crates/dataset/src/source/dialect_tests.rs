@@ -250,3 +250,32 @@ fn a_shape_without_elements_behind_it_is_refused() {
     let error = source.read_demo(0).unwrap_err().to_string();
     assert!(error.contains("data/demo_0/huge") && error.contains("bytes stated"), "{error}");
 }
+
+#[test]
+fn numbers_of_another_byte_order_are_read_and_noted() {
+    // robomimic's file with the type of one dataset turned to big-endian, as another machine writes it
+    let (_dir, source) = made(|file| {
+        demo(file, 0, 3);
+    });
+    let path = source.plan().path.clone();
+    let key = source.plan().demos[0].keys["obs/ee_pos"].clone();
+    let mut bytes = std::fs::read(&path).unwrap();
+    // IEEE little-endian float32 in a datatype message: class 1 version 1, bit fields 20 1f 00, size 4
+    let little = [0x11, 0x20, 0x1f, 0x00, 4, 0, 0, 0, 0, 0, 32, 0, 23, 8, 0, 23, 127, 0, 0, 0];
+    let at: Vec<usize> = (0..bytes.len() - 20).filter(|&i| bytes[i..i + 20] == little).collect();
+    assert_eq!(at.len(), 3, "actions, rewards, ee_pos");
+    for at in at {
+        bytes[at + 1] |= 1;
+    }
+    for (name, count) in [("actions", 21), ("rewards", 3), ("obs/ee_pos", 9)] {
+        let offset = source.plan().demos[0].keys[name].place.offset.unwrap() as usize;
+        bytes[offset..offset + count * 4].chunks_exact_mut(4).for_each(<[u8]>::reverse);
+    }
+    let before = source.read_demo(0).unwrap();
+    drop(source); // libhdf5 keeps what it knows of a file that is open
+    std::fs::write(&path, bytes).unwrap();
+    let source = Source::open(&path).unwrap();
+    assert_eq!(source.read_demo(0).unwrap(), before);
+    assert_eq!(source.plan().demos[0].keys["obs/ee_pos"].shape, key.shape);
+    assert!(source.plan().notes[0].ends_with("data/demo_0/actions, data/demo_0/obs/ee_pos, data/demo_0/rewards"));
+}

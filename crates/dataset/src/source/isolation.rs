@@ -27,7 +27,7 @@ const MEMORY: u64 = 900 << 20;
 const SILENCE: Duration = Duration::from_secs(8);
 /// Processor time of the reading process: this, and a second for each so many bytes of the file.
 const CPU_SECONDS: u64 = 6;
-const BYTES_PER_CPU_SECOND: u64 = 2 << 20;
+const BYTES_PER_CPU_SECOND: u64 = 256 << 10;
 /// The longest answer.
 const MAX_ANSWER: u64 = 384 << 20;
 
@@ -271,7 +271,7 @@ fn wait_briefly(child: &mut Child) -> Option<std::process::ExitStatus> {
 fn ending(status: std::process::ExitStatus) -> String {
     use std::os::unix::process::ExitStatusExt;
     match status.signal() {
-        Some(24 | 9) => "ran out of processor time".to_owned(),
+        Some(9 | 24) => "ran out of processor time, or was killed".to_owned(),
         Some(6) => "ran out of memory or gave up (SIGABRT)".to_owned(),
         Some(11) => "crashed (SIGSEGV)".to_owned(),
         Some(n) => format!("crashed (signal {n})"),

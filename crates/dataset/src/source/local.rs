@@ -38,7 +38,7 @@ impl Local {
         let files = paths.iter().map(|p| Walked::open(p, keep, beat)).collect::<Result<Vec<_>, _>>()?;
         let survey = Survey { path: path.to_owned(), files };
         let Draft { dialect, demos, env_args, env_name, env_version, masks, texts, notes, problems } =
-            dialect::draft(&survey)?;
+            dialect::draft(&survey, beat)?;
         let mut drafts = demos;
         drafts.sort_by(|a, b| (a.plan.number, &a.plan.id).cmp(&(b.plan.number, &b.plan.id)));
         let plan = Plan {

@@ -144,7 +144,7 @@ impl Source {
             demo.datasets.insert(key.clone(), array);
         }
         for (key, array) in &demo.datasets {
-            self.check_values(&plan.id, key, array)?;
+            self.check_values(&plan.id, key, array, 0)?;
         }
         Ok(demo)
     }
@@ -163,7 +163,9 @@ impl Source {
             return Err(none(wanted, format!("shape {:?}", k.shape)).into());
         }
         if k.place.offset.is_some() {
-            return self.read_direct(k, first, Some(count));
+            let array = self.read_direct(k, first, Some(count))?;
+            self.check_values(&plan.id, key, &array, first)?;
+            return Ok(array);
         }
         // in windows of whole stored blocks, so that nothing is unpacked twice and no answer is long
         let row = k.bytes().unwrap_or(WINDOW) / (rows.unwrap_or(1).max(1) as u64);
@@ -179,7 +181,9 @@ impl Source {
             bytes.extend_from_slice(&part.bytes);
             at = end;
         }
-        Ok(Array { dtype: k.dtype.clone(), shape, bytes })
+        let array = Array { dtype: k.dtype.clone(), shape, bytes };
+        self.check_values(&plan.id, key, &array, first)?;
+        Ok(array)
     }
 
     /// The hash of everything in the source, independent of how it is laid out in the file.
@@ -249,8 +253,8 @@ impl Source {
         Ok(Array { dtype: k.dtype.clone(), shape, bytes })
     }
 
-    /// Actions have to be finite.
-    fn check_values(&self, demo: &str, key: &str, array: &Array) -> Result<(), InputError> {
+    /// Actions have to be finite; `first` is the step of the array's first row.
+    fn check_values(&self, demo: &str, key: &str, array: &Array, first: usize) -> Result<(), InputError> {
         if !matches!(key, "actions" | "actions_abs") {
             return Ok(());
         }
@@ -272,7 +276,7 @@ impl Source {
             path: self.plan.path.clone(),
             demo: demo.to_owned(),
             key: key.to_owned(),
-            step: at / width,
+            step: first + at / width,
             dimension: at % width,
             found: value.to_string(),
         })

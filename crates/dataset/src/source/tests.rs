@@ -89,6 +89,19 @@ fn fixture_is_planned_in_full() {
     assert!(demo.attrs["model_file"].to_text().unwrap().starts_with("<mujoco model=\"base\">"));
 }
 
+/// `tests/fixtures/content_hash.py` reads the same files with h5py and comes to these hashes: every group,
+/// dataset, type, shape, attribute and value is read as h5py reads it.
+#[test]
+fn fixture_hashes_equal_h5py() {
+    for (name, expected) in [
+        ("lift_low_dim_3_demos.hdf5", "f32adc64bcc5c60f1863febd3b2d25ea0e388dae9781aa749b7bd66a6d10b939"),
+        ("lift_raw_3_demos.hdf5", "405ea8898dc0a1c6de80779bdaf72cf70f11b7ef191f983f29a9acfdf5cf2fca"),
+    ] {
+        let source = Source::open(&fixture(name)).unwrap();
+        assert_eq!(source.content_hash(&mut |_, _| {}).unwrap(), expected, "{name}");
+    }
+}
+
 #[test]
 fn raw_recordings_are_recognised() {
     let source = Source::open(&fixture("lift_raw_3_demos.hdf5")).unwrap();
@@ -246,6 +259,12 @@ fn not_there_not_hdf5_empty_truncated() {
     std::fs::write(&path, &whole[..200_000]).unwrap();
     let (expected, found) = (whole.len() as u64, 200_000);
     assert_eq!(input_error(Source::open(&path)), InputError::Truncated { path, expected, found });
+}
+
+#[test]
+fn what_is_no_regular_file_is_refused_at_once() {
+    let error = input_error(Source::open(Path::new("/dev/null")));
+    assert!(matches!(&error, InputError::Unreadable { reason, .. } if reason == "not a regular file"), "{error}");
 }
 
 #[test]

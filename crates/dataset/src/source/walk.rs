@@ -46,6 +46,8 @@ pub(super) struct Walked {
     file: Option<hdf5::File>,
     pub groups: BTreeMap<String, GroupNode>,
     pub datasets: BTreeMap<String, DatasetNode>,
+    /// Numbers that are converted when read: another byte order, another precision.
+    pub foreign: Vec<String>,
     /// Links that lead nowhere or out of the file.
     pub faults: Vec<InputError>,
 }
@@ -61,19 +63,20 @@ const MAX_UNSTORED: u64 = 16 << 20;
 /// Checks that there is a file with an HDF5 signature; gives its size.
 pub(super) fn check_signature(path: &Path) -> Result<u64, InputError> {
     let unreadable = |e: std::io::Error| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() };
-    let mut file = match File::open(path) {
-        Ok(file) => file,
+    // looked at before it is opened: opening a pipe would wait for its writer
+    let meta = match std::fs::metadata(path) {
+        Ok(meta) => meta,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
             return Err(InputError::NotFound { path: path.to_owned() });
         }
         Err(e) => return Err(unreadable(e)),
     };
-    let meta = file.metadata().map_err(unreadable)?;
     if !meta.is_file() {
         let reason = "not a regular file".to_owned();
         return Err(InputError::Unreadable { path: path.to_owned(), reason });
     }
     let bytes = meta.len();
+    let mut file = File::open(path).map_err(unreadable)?;
     // the superblock may follow a user block of 512, 1024, 2048, ... bytes
     let mut at = 0;
     while at + 8 <= bytes {
@@ -126,6 +129,7 @@ impl Walked {
             bytes,
             groups: BTreeMap::new(),
             datasets: BTreeMap::new(),
+            foreign: Vec::new(),
             faults: Vec::new(),
             file: None,
         };
@@ -199,7 +203,10 @@ impl Walked {
                 }
                 LocationType::Dataset => {
                     let dataset = group.dataset(&name).map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
-                    let node = self.dataset(&dataset, &full, info.num_attrs, types)?;
+                    let (node, native) = self.dataset(&dataset, &full, info.num_attrs, types)?;
+                    if node.dtype.is_numeric() && node.dtype != Dtype::Bool && !native {
+                        self.foreign.push(full.clone());
+                    }
                     self.datasets.insert(full, node);
                 }
                 _ => {
@@ -218,7 +225,7 @@ impl Walked {
         full: &str,
         attrs: usize,
         types: &NativeTypes,
-    ) -> Result<DatasetNode, InputError> {
+    ) -> Result<(DatasetNode, bool), InputError> {
         let bad = |operation: &str, e: hdf5::Error| damaged(&self.path, full, operation, reason(&e));
         let unsupported =
             |what: String| InputError::Unsupported { path: self.path.clone(), object: full.to_owned(), what };
@@ -230,7 +237,7 @@ impl Walked {
         let mut node = DatasetNode { dtype, shape, null, offset: None, block_rows: 1, attrs, fault: None };
         if let Dtype::Other(text) = &node.dtype {
             node.fault = Some(unsupported(format!("the type {text}")));
-            return Ok(node);
+            return Ok((node, native));
         }
         let bytes = node
             .shape
@@ -244,7 +251,7 @@ impl Walked {
             } else if native {
                 node.offset = Some(offset);
             }
-            return Ok(node);
+            return Ok((node, native));
         }
         let plist = dataset.dcpl().map_err(|e| bad("read the layout of", e))?;
         match plist.layout() {
@@ -278,7 +285,7 @@ impl Walked {
                 }
             }
         }
-        Ok(node)
+        Ok((node, native))
     }
 
     /// All attributes of a group or dataset.

@@ -20,6 +20,8 @@ pub struct WriteOptions {
 
 /// Rows are packed together up to about this many bytes.
 const BLOCK: usize = 256 << 10;
+/// What an object may take beyond its elements.
+const OVERHEAD: u64 = 256 << 10;
 /// Smaller datasets are not worth packing.
 const WORTH_PACKING: usize = 1 << 10;
 
@@ -32,6 +34,8 @@ pub struct RobomimicWriter {
     options: WriteOptions,
     groups: BTreeMap<String, Group>,
     datasets: BTreeSet<String>,
+    /// Bytes of the disk that are ours already.
+    reserved: u64,
 }
 
 impl std::fmt::Debug for RobomimicWriter {
@@ -75,6 +79,7 @@ impl RobomimicWriter {
             options: options.clone(),
             groups: BTreeMap::new(),
             datasets: BTreeSet::new(),
+            reserved: 0,
         };
         writer.groups.insert(String::new(), (*writer.file).clone());
         writer.group("data")?;
@@ -89,6 +94,27 @@ impl RobomimicWriter {
     fn bad(&self, object: &str, reason: impl Into<String>) -> DatasetError {
         let (path, object, reason) = (self.path.clone(), object.to_owned(), reason.into());
         DatasetError::BadTree { path, object, reason }
+    }
+
+    /// Makes sure that the disk has room for an object of this many bytes. libhdf5 crashes when a file is closed
+    /// after a write has failed, so it must never see a full disk.
+    fn reserve(&mut self, bytes: usize) -> Result<()> {
+        let end = self.file.size() + bytes as u64 + OVERHEAD;
+        if end <= self.reserved {
+            return Ok(());
+        }
+        let step = (end - self.reserved).max(1 << 20);
+        let flags = rustix::fs::FallocateFlags::KEEP_SIZE;
+        match rustix::fs::fallocate(self.temporary.as_file(), flags, self.reserved, step) {
+            Ok(()) => self.reserved += step,
+            // a file system that cannot reserve
+            Err(rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::NOSYS) => self.reserved = u64::MAX,
+            Err(e) => {
+                let operation = "reserve disk space for the file beside it";
+                return Err(DatasetError::Io { path: self.path.clone(), operation, source: e.into() });
+            }
+        }
+        Ok(())
     }
 
     /// The group at a path; it and those above it are made if they are not there.
@@ -106,8 +132,9 @@ impl RobomimicWriter {
         Ok(group)
     }
 
-    fn attribute(&self, to: &Location, object: &str, name: &str, value: &Array) -> Result<()> {
+    fn attribute(&mut self, to: &Location, object: &str, name: &str, value: &Array) -> Result<()> {
         let full = format!("attribute {name} of {object}");
+        self.reserve(value.bytes.len())?;
         let check = |r: value::ValueResult<()>| r.map_err(|reason| self.bad(&full, reason));
         check(value::check(value))?;
         let descriptor = value::descriptor_of(&value.dtype).map_err(|reason| self.bad(&full, reason))?;
@@ -116,11 +143,12 @@ impl RobomimicWriter {
         check(value::write(&attr, value))
     }
 
-    fn attributes(&self, to: &Location, object: &str, attrs: &Attrs) -> Result<()> {
+    fn attributes(&mut self, to: &Location, object: &str, attrs: &Attrs) -> Result<()> {
         attrs.iter().try_for_each(|(name, value)| self.attribute(to, object, name, value))
     }
 
     fn dataset(&mut self, path: &str, value: &Array) -> Result<()> {
+        self.reserve(value.bytes.len())?;
         let check = |r: value::ValueResult<()>| r.map_err(|reason| self.bad(path, reason));
         check(value::check(value))?;
         let descriptor = value::descriptor_of(&value.dtype).map_err(|reason| self.bad(path, reason))?;
@@ -199,12 +227,15 @@ impl RobomimicWriter {
         let Self { path, temporary, file, groups, .. } = self;
         drop(groups);
         let hdf5 = |source| DatasetError::Hdf5Write { path: path.clone(), object: "the file".to_owned(), source };
-        file.flush().map_err(hdf5)?;
-        file.close().map_err(hdf5)?;
         let io = |operation| {
             let path = path.clone();
             move |source| DatasetError::Io { path, operation, source }
         };
+        file.flush().map_err(hdf5)?;
+        file.close().map_err(hdf5)?;
+        // gives back what was reserved beyond the end
+        let length = temporary.as_file().metadata().map_err(io("look at the file beside"))?.len();
+        temporary.as_file().set_len(length).map_err(io("set the length of the file beside"))?;
         temporary.as_file().sync_all().map_err(io("sync"))?;
         temporary.persist_noclobber(&path).map_err(|e| match e.error.kind() {
             std::io::ErrorKind::AlreadyExists => DatasetError::OutputExists { path: path.clone() },

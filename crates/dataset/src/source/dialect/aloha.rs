@@ -23,7 +23,7 @@ impl Layout for Aloha {
         survey.files.first().is_some_and(is_episode)
     }
 
-    fn draft(&self, survey: &Survey) -> Result<Draft, InputError> {
+    fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
         let mut out = Draft {
             dialect: Dialect::Aloha,
             demos: Vec::new(),
@@ -44,6 +44,7 @@ impl Layout for Aloha {
                 });
             }
             episode(index, file, &mut out)?;
+            beat();
         }
         if survey.files.iter().any(|f| f.datasets.contains_key("compress_len")) {
             out.notes.push("images are JPEG streams; they are kept as stored bytes, not as images".to_owned());

@@ -22,7 +22,7 @@ impl Layout for D4rl {
         })
     }
 
-    fn draft(&self, survey: &Survey) -> Result<Draft, InputError> {
+    fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
         let file = survey.single().expect("recognised as one file");
         let steps = file.datasets["actions"].shape.first().copied().unwrap_or(0);
         let mut ends = flags(file, "terminals", steps)?;
@@ -35,6 +35,7 @@ impl Layout for D4rl {
         for (step, _) in ends.iter().enumerate().filter(|(_, end)| **end) {
             demos.push(demo(file, demos.len(), first, step + 1 - first, steps));
             first = step + 1;
+            beat();
         }
         let mut notes = Vec::new();
         if first < steps {

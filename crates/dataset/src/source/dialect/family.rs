@@ -44,7 +44,7 @@ pub(super) fn first_ep_meta(file: &Walked) -> Option<serde_json::Value> {
 }
 
 /// Finds demos, masks and the environment of a file in robomimic's layout.
-pub(super) fn draft(survey: &Survey, dialect: Dialect) -> Result<Draft, InputError> {
+pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
     let Some(file) = survey.single() else {
         return Err(InputError::UnknownLayout {
             path: survey.path.clone(),
@@ -85,6 +85,13 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect) -> Result<Draft, InputErr
     let language = file_language(&out);
     for (number, id) in ids {
         demo(file, number, &id, language.as_deref(), &mut out)?;
+        beat();
+    }
+    if !file.foreign.is_empty() {
+        out.notes.push(format!(
+            "numbers in another byte order or precision: the values are kept, their type becomes the machine's: {}",
+            list(file.foreign.iter().map(String::as_str))
+        ));
     }
     total(file, &data_attrs, &mut out);
     masks(file, &mut out)?;

@@ -20,8 +20,8 @@ impl Layout for Libero {
         })
     }
 
-    fn draft(&self, survey: &Survey) -> Result<Draft, InputError> {
-        let mut draft = family::draft(survey, Dialect::Libero)?;
+    fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
+        let mut draft = family::draft(survey, Dialect::Libero, beat)?;
         let instruction = draft
             .texts
             .get("data/problem_info")

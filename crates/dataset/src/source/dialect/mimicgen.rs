@@ -17,7 +17,7 @@ impl Layout for Mimicgen {
         })
     }
 
-    fn draft(&self, survey: &Survey) -> Result<Draft, InputError> {
-        family::draft(survey, Dialect::Mimicgen)
+    fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
+        family::draft(survey, Dialect::Mimicgen, beat)
     }
 }

@@ -81,8 +81,8 @@ trait Layout {
     fn expected(&self) -> &'static str;
     /// Whether the source is laid out this way.
     fn recognises(&self, survey: &Survey) -> bool;
-    /// Finds the demos.
-    fn draft(&self, survey: &Survey) -> Result<Draft, InputError>;
+    /// Finds the demos; `beat` is called as the work goes on.
+    fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError>;
 }
 
 /// The special ones first: most are robomimic's layout with something more.
@@ -97,9 +97,9 @@ const LAYOUTS: [&dyn Layout; 7] = [
 ];
 
 /// Recognises the layout and finds the demos.
-pub(super) fn draft(survey: &Survey) -> Result<Draft, InputError> {
+pub(super) fn draft(survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
     match LAYOUTS.iter().find(|layout| layout.recognises(survey)) {
-        Some(layout) => layout.draft(survey),
+        Some(layout) => layout.draft(survey, beat),
         None => {
             let expected: Vec<_> = LAYOUTS.iter().map(|layout| layout.expected()).collect();
             Err(InputError::UnknownLayout {

@@ -19,7 +19,7 @@ impl Layout for Robocasa {
         })
     }
 
-    fn draft(&self, survey: &Survey) -> Result<Draft, InputError> {
-        family::draft(survey, Dialect::Robocasa)
+    fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
+        family::draft(survey, Dialect::Robocasa, beat)
     }
 }

@@ -15,7 +15,7 @@ impl Layout for Robomimic {
         survey.single().is_some_and(|file| file.groups.contains_key("data"))
     }
 
-    fn draft(&self, survey: &Survey) -> Result<Draft, InputError> {
-        family::draft(survey, Dialect::Robomimic)
+    fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
+        family::draft(survey, Dialect::Robomimic, beat)
     }
 }

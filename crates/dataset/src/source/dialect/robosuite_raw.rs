@@ -20,8 +20,8 @@ impl Layout for RobosuiteRaw {
         })
     }
 
-    fn draft(&self, survey: &Survey) -> Result<Draft, InputError> {
-        let mut draft = family::draft(survey, Dialect::RobosuiteRaw)?;
+    fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
+        let mut draft = family::draft(survey, Dialect::RobosuiteRaw, beat)?;
         // robosuite itself states name and version beside env_info; robomimic's converter adds env_args
         let text = |key: &str| draft.texts.get(key).cloned();
         draft.env_name = draft.env_name.or_else(|| text("data/env"));
