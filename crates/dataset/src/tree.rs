@@ -122,6 +122,7 @@ impl Array {
     }
 
     /// A scalar string, as h5py stores Python's `str`.
+    #[allow(clippy::should_implement_trait)] // nothing is parsed, nothing can fail
     pub fn from_str(text: &str) -> Self {
         Self::from_strings(Vec::new(), &[text])
     }

@@ -55,7 +55,7 @@ pub(super) fn descriptor_of(dtype: &Dtype) -> ValueResult<TypeDescriptor> {
 
 /// Widest fixed-length string that is carried, in bytes. Memory types have their width at compile time, so a
 /// string travels in the next wider of a few widths.
-const MAX_FIXED: usize = 131_072;
+const MAX_FIXED: usize = 65_536;
 
 macro_rules! for_width {
     ($n:expr, $kind:ident, $call:ident ( $($arg:expr),* )) => {

@@ -178,7 +178,7 @@ impl Walked {
             };
             // each object takes some 100 bytes; more of them than fit are the same ones again and again
             let found = (self.groups.len() + self.datasets.len()) as u64;
-            if found % 256 == 0 {
+            if found.is_multiple_of(256) {
                 beat();
             }
             let limit = 1_000 + self.bytes / 32;
