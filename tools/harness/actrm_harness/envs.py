@@ -11,6 +11,7 @@ import json
 import os
 import re
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
@@ -138,6 +139,8 @@ def slim(session: Session) -> None:
 def step_session(session: Session, action: Array) -> StepResult:
     """One control step with the session's control loop, images included."""
     result = step(session.env, action, session.control)
+    if not session.cameras:
+        return result
     return replace(result, observation={**result.observation, **images(session)})
 
 
@@ -169,10 +172,10 @@ def success(env: Env) -> bool:
 
 def check_action(env: Env, action: Array) -> Array:
     """The action as float64; RequestError where its shape, type or values are not an action."""
-    low, _ = env.action_spec
-    if action.dtype != np.float64 or action.shape != low.shape:
-        raise RequestError("bad_action", f"action must be F64 of shape {low.shape}, got {action.dtype} {action.shape}")
-    if not np.all(np.isfinite(action)):
+    shape = (env.action_dim,)
+    if action.dtype != np.float64 or action.shape != shape:
+        raise RequestError("bad_action", f"action must be F64 of shape {shape}, got {action.dtype} {action.shape}")
+    if not np.isfinite(action).all():
         raise RequestError("bad_action", f"action has values that are not finite: {action.tolist()}")
     return np.array(action)
 
@@ -187,9 +190,14 @@ def observation(raw: dict[str, Array]) -> Tensors:
     for name, value in raw.items():
         if name == "object-state":
             kept["object"] = np.asarray(value, dtype=np.float64)
-        elif re.match(r"robot\d+_", name) and not name.endswith("-state"):
+        elif _of_robot(name):
             kept[name] = np.asarray(value, dtype=np.float64)
     return kept
+
+
+@cache
+def _of_robot(name: str) -> bool:
+    return re.match(r"robot\d+_", name) is not None and not name.endswith("-state")
 
 
 def state(env: Env) -> Array:

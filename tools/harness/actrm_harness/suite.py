@@ -45,6 +45,7 @@ class Env(Protocol):
     hard_reset: bool
     control_freq: float
     action_spec: tuple[Array, Array]
+    action_dim: int
     timestep: int
     done: bool
     cur_time: float

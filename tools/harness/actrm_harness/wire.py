@@ -5,7 +5,10 @@ header is parsed here because the safetensors package does not give metadata bac
 """
 
 import json
+import math
 import struct
+import sys
+from functools import lru_cache
 from typing import Any, BinaryIO, cast
 
 import numpy as np
@@ -19,7 +22,8 @@ METADATA_KEY = "actrm"
 MAX_FRAME_BYTES = 256 * 1024 * 1024
 
 _DTYPES = {"F64": "<f8", "F32": "<f4", "I64": "<i8", "U8": "|u1"}
-_NAMES = {np.dtype(layout): name for name, layout in _DTYPES.items()}
+_LAYOUTS = {name: np.dtype(layout) for name, layout in _DTYPES.items()}
+_NAMES = {layout: name for name, layout in _LAYOUTS.items()}
 
 
 class WireError(Exception):
@@ -28,22 +32,34 @@ class WireError(Exception):
 
 def encode(message: Message, tensors: Tensors | None = None) -> bytes:
     """One frame's payload: the message and its tensors in safetensors layout."""
-    header: dict[str, Any] = {"__metadata__": {METADATA_KEY: json.dumps(message, allow_nan=False)}}
-    bodies: list[bytes] = []
-    end = 0
-    for name in sorted(tensors or {}):
-        array = np.asarray((tensors or {})[name])
-        kind = _NAMES.get(array.dtype.newbyteorder("<"))
-        if kind is None:
-            known = ", ".join(_DTYPES)
-            raise WireError(f"tensor {name!r} has dtype {array.dtype}; a frame carries {known}")
-        body = array.astype(_DTYPES[kind], copy=False).tobytes()
-        header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [end, end + len(body)]}
-        bodies.append(body)
-        end += len(body)
-    text = json.dumps(header, separators=(",", ":")).encode()
+    arrays = [(name, np.asarray(array)) for name, array in sorted((tensors or {}).items())]
+    entries = _entries(tuple((name, array.dtype, array.shape) for name, array in arrays))
+    metadata = json.dumps(json.dumps(message, allow_nan=False))
+    text = f'{{"__metadata__":{{"{METADATA_KEY}":{metadata}}}{entries}}}'.encode()
     text += b" " * (-len(text) % 8)
+    bodies = [_little(array).tobytes() for _, array in arrays]
     return b"".join([struct.pack("<Q", len(text)), text, *bodies])
+
+
+def _little(array: Array) -> Array:
+    if sys.byteorder == "little" and array.dtype.isnative:
+        return array
+    return array.astype(array.dtype.newbyteorder("<"))
+
+
+@lru_cache(maxsize=64)
+def _entries(arrays: tuple[tuple[str, "np.dtype[Any]", tuple[int, ...]], ...]) -> str:
+    """The header's text for these tensors, the same for every step of an episode."""
+    entries = ""
+    end = 0
+    for name, dtype, shape in arrays:
+        kind = _NAMES.get(dtype.newbyteorder("<"))
+        if kind is None:
+            raise WireError(f"tensor {name!r} has dtype {dtype}; a frame carries {', '.join(_DTYPES)}")
+        begin, end = end, end + math.prod(shape) * dtype.itemsize
+        entry = {"dtype": kind, "shape": list(shape), "data_offsets": [begin, end]}
+        entries += f",{json.dumps(name)}:{json.dumps(entry, separators=(',', ':'))}"
+    return entries
 
 
 def decode(payload: bytes) -> tuple[Message, Tensors]:
@@ -75,12 +91,12 @@ def _json_object(text: bytes, what: str) -> Message:
 def _tensor(name: str, entry: object, body: memoryview) -> Array:
     try:
         fields = cast(Message, entry)
-        dtype = np.dtype(_DTYPES[fields["dtype"]])
+        dtype = _LAYOUTS[fields["dtype"]]
         shape = tuple(int(size) for size in fields["shape"])
         begin, end = (int(offset) for offset in fields["data_offsets"])
     except (KeyError, TypeError, ValueError) as error:
         raise WireError(f"tensor {name!r} has a bad header entry: {entry!r}") from error
-    count = int(np.prod(shape, dtype=np.int64)) if all(size >= 0 for size in shape) else -1
+    count = math.prod(shape) if all(size >= 0 for size in shape) else -1
     if count < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * dtype.itemsize:
         raise WireError(f"tensor {name!r}: shape {shape} of {dtype} does not fit bytes {begin}..{end} of {len(body)}")
     return np.frombuffer(body, dtype=dtype, count=count, offset=begin).reshape(shape)
