@@ -1,0 +1,142 @@
+use crate::output;
+use anyhow::Result;
+use dataset::{ActionKind, ConvertOptions, ImageForm, RotationForm};
+use serde_json::json;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Instant;
+
+/// Convert demonstrations into a LeRobotDataset v3.0 directory.
+///
+/// Columns: observation.state, observation.environment_state, observation.images.<camera>, action, next.reward,
+/// next.done, next.success, and the five index columns. What the format has no place for is kept in the side folder
+/// `actrm/`, from which `actrm-data export` rebuilds the source. OUT appears whole or not at all.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-data convert data/lift.hdf5 lift
+  actrm-data convert image.hdf5 set --images ppm --jobs 2
+  actrm-data convert can.hdf5 can --state-keys robot0_eef_pos,robot0_gripper_qpos --env-keys object
+  actrm-data convert square.hdf5 square --actions absolute --rotation 6d")]
+pub struct Args {
+    /// HDF5 file, or a folder with one file an episode
+    source: PathBuf,
+    /// Directory to create
+    out: PathBuf,
+    /// Observation keys of observation.state, in order [default: those of the file's layout]
+    #[arg(long, value_delimiter = ',', value_name = "KEYS")]
+    state_keys: Option<Vec<String>>,
+    /// Observation keys of observation.environment_state, in order [default: object, where there is one]
+    #[arg(long, value_delimiter = ',', value_name = "KEYS")]
+    env_keys: Option<Vec<String>>,
+    /// Frames a second [default: the control frequency that the file states]
+    #[arg(long)]
+    fps: Option<f64>,
+    /// How to store images
+    #[arg(long, value_enum, default_value_t = Images::Png)]
+    images: Images,
+    /// Which actions to take: as the controller got them, or absolute poses (actions_abs)
+    #[arg(long, value_enum, default_value_t = Actions::Delta)]
+    actions: Actions,
+    /// How to write rotations in actions
+    #[arg(long, value_enum, default_value_t = Rotation::AxisAngle)]
+    rotation: Rotation,
+    /// Leave the side folder out: smaller, but the source cannot be rebuilt
+    #[arg(long)]
+    no_lossless: bool,
+    /// Size at which a data file is closed, in MiB
+    #[arg(long, value_name = "MIB", default_value_t = 100.0, value_parser = positive)]
+    file_size: f64,
+    /// Threads [default: one a core]
+    #[arg(long, default_value_t = 0, hide_default_value = true)]
+    jobs: usize,
+    /// Report as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Images {
+    Png,
+    Ppm,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Actions {
+    Delta,
+    Absolute,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Rotation {
+    AxisAngle,
+    #[value(name = "6d")]
+    SixD,
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(v) if v.is_finite() && v > 0.0 => Ok(v),
+        _ => Err("expected a number above 0".to_owned()),
+    }
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let options = ConvertOptions {
+        state_keys: args.state_keys.clone(),
+        env_keys: args.env_keys.clone(),
+        fps: args.fps,
+        images: match args.images {
+            Images::Png => ImageForm::Png,
+            Images::Ppm => ImageForm::Ppm,
+        },
+        actions: match args.actions {
+            Actions::Delta => ActionKind::Delta,
+            Actions::Absolute => ActionKind::Absolute,
+        },
+        rotation: match args.rotation {
+            Rotation::AxisAngle => RotationForm::AxisAngle,
+            Rotation::SixD => RotationForm::SixD,
+        },
+        lossless: !args.no_lossless,
+        jobs: args.jobs,
+        data_file_mb: args.file_size,
+    };
+    let start = Instant::now();
+    let bar = output::bar("frames").with_message("converting");
+    let report = dataset::convert(&args.source, &args.out, &options, &mut output::advance(&bar));
+    bar.finish_and_clear();
+    let report = report?;
+    let seconds = start.elapsed().as_secs_f64();
+    for note in &report.notes {
+        eprintln!("note: {note}");
+    }
+    if args.json {
+        let features: serde_json::Map<_, _> = report
+            .features
+            .iter()
+            .map(|(name, dtype, shape)| (name.clone(), json!({"dtype": dtype, "shape": shape})))
+            .collect();
+        output::print_json(&json!({
+            "source": args.source, "out": args.out, "layout": report.dialect, "episodes": report.episodes,
+            "frames": report.frames, "tasks": report.tasks, "features": features, "files": report.files,
+            "bytes": report.bytes, "fingerprint": report.fingerprint, "seconds": seconds, "notes": report.notes,
+        }))?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let rows: Vec<Vec<String>> = report
+        .features
+        .iter()
+        .map(|(name, dtype, shape)| vec![name.clone(), dtype.clone(), output::shape(shape)])
+        .collect();
+    let mut text = output::table(&["column", "type", "shape"], &rows, &[]);
+    text.push_str(&format!(
+        "{}: {} episodes, {} frames, {} files, {} in {seconds:.2} s\n",
+        args.out.display(),
+        output::count(report.episodes),
+        output::count(report.frames),
+        report.files,
+        output::bytes(report.bytes),
+    ));
+    output::print(&text)?;
+    Ok(ExitCode::SUCCESS)
+}

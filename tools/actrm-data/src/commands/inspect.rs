@@ -1,0 +1,275 @@
+use crate::output;
+use anyhow::Result;
+use dataset::{Dataset, Dtype, Source};
+use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+/// Show what is in a file of demonstrations or in a data set.
+///
+/// For HDF5: layout, environment and version, demos and their lengths, every dataset with type, shape and range,
+/// masks, and everything that is wrong. For a data set directory: the same from its columns.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-data inspect data/lift.hdf5
+  actrm-data inspect lift --json
+  actrm-data inspect image.hdf5 --quick --demos")]
+pub struct Args {
+    /// HDF5 file, folder with one file an episode, or data set directory
+    path: PathBuf,
+    /// Do not read the data: no ranges
+    #[arg(long)]
+    quick: bool,
+    /// List every demo
+    #[arg(long)]
+    demos: bool,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What is shown, whatever it was read from.
+#[derive(Serialize)]
+struct Summary {
+    path: PathBuf,
+    layout: String,
+    bytes: u64,
+    env_name: Option<String>,
+    env_version: Option<String>,
+    demos: usize,
+    frames: usize,
+    length_min: usize,
+    length_mean: f64,
+    length_max: usize,
+    keys: Vec<KeyRow>,
+    masks: BTreeMap<String, usize>,
+    tasks: Vec<String>,
+    notes: Vec<String>,
+    problems: Vec<String>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    each: Vec<DemoRow>,
+}
+
+#[derive(Serialize)]
+struct KeyRow {
+    key: String,
+    dtype: String,
+    shapes: Vec<Vec<usize>>,
+    demos: usize,
+    min: Option<f64>,
+    max: Option<f64>,
+}
+
+#[derive(Serialize)]
+struct DemoRow {
+    id: String,
+    length: usize,
+    task: Option<String>,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let summary = match args.path.join("meta/info.json").exists() {
+        true => of_dataset(args)?,
+        false => of_source(args)?,
+    };
+    if args.json {
+        output::print_json(&summary)?;
+    } else {
+        output::print(&show(&summary))?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn of_source(args: &Args) -> Result<Summary> {
+    let source = Source::open_guarded(&args.path)?;
+    let plan = source.plan();
+    let mut problems: Vec<String> = plan.problems.iter().map(|p| p.message.clone()).collect();
+    let mut ranges: BTreeMap<String, (f64, f64)> = BTreeMap::new();
+    if !args.quick {
+        let bar = output::bar("demos").with_message("reading");
+        let mut advance = output::advance(&bar);
+        let known: BTreeSet<&str> =
+            plan.problems.iter().filter(|p| p.fatal).filter_map(|p| p.demo.as_deref()).collect();
+        for (index, demo) in plan.demos.iter().enumerate() {
+            let small = |key: &str| demo.keys.get(key).is_some_and(|k| !k.is_image() && k.dtype.is_numeric());
+            match source.read_demo_where(index, &small) {
+                Ok(read) => {
+                    for (key, array) in &read.datasets {
+                        for value in array.to_f64().unwrap_or_default() {
+                            let range = ranges.entry(key.clone()).or_insert((f64::INFINITY, f64::NEG_INFINITY));
+                            *range = (range.0.min(value), range.1.max(value));
+                        }
+                    }
+                }
+                Err(_) if known.contains(demo.id.as_str()) => {}
+                Err(e) => problems.push(e.to_string()),
+            }
+            advance(index as u64 + 1, plan.demos.len() as u64);
+        }
+        bar.finish_and_clear();
+    }
+    let mut keys: BTreeMap<&str, KeyRow> = BTreeMap::new();
+    for demo in &plan.demos {
+        for (path, key) in &demo.keys {
+            let row = keys.entry(path).or_insert_with(|| KeyRow {
+                key: path.clone(),
+                dtype: dtype_name(&key.dtype),
+                shapes: Vec::new(),
+                demos: 0,
+                min: ranges.get(path).map(|r| r.0),
+                max: ranges.get(path).map(|r| r.1),
+            });
+            row.demos += 1;
+            // a step's shape where there is one row a step, the whole shape otherwise
+            let shape = match key.shape.split_first() {
+                Some((&rows, rest)) if rows == demo.length => rest.to_vec(),
+                _ => key.shape.clone(),
+            };
+            if !row.shapes.contains(&shape) {
+                row.shapes.push(shape);
+            }
+        }
+    }
+    let lengths: Vec<usize> = plan.demos.iter().map(|d| d.length).collect();
+    let mut tasks: Vec<String> = plan.demos.iter().filter_map(|d| d.task.clone()).collect();
+    tasks.sort();
+    tasks.dedup();
+    let each = plan.demos.iter().map(|d| DemoRow { id: d.id.clone(), length: d.length, task: d.task.clone() });
+    Ok(Summary {
+        path: args.path.clone(),
+        layout: format!("{} HDF5", plan.dialect.name()),
+        bytes: plan.files.iter().map(|(_, size)| size).sum(),
+        env_name: plan.env_name.clone(),
+        env_version: plan.env_version.clone(),
+        demos: lengths.len(),
+        frames: plan.frames(),
+        length_min: lengths.iter().copied().min().unwrap_or(0),
+        length_mean: plan.frames() as f64 / lengths.len().max(1) as f64,
+        length_max: lengths.iter().copied().max().unwrap_or(0),
+        keys: keys.into_values().collect(),
+        masks: plan.masks.iter().map(|(name, demos)| (name.clone(), demos.len())).collect(),
+        tasks,
+        notes: plan.notes.clone(),
+        problems,
+        each: if args.demos { each.collect() } else { Vec::new() },
+    })
+}
+
+fn dtype_name(dtype: &Dtype) -> String {
+    dtype.to_string()
+}
+
+fn of_dataset(args: &Args) -> Result<Summary> {
+    let set = Dataset::open(&args.path)?;
+    let lengths: Vec<usize> = set.episodes().iter().map(|e| e.length).collect();
+    let ranges = |name: &str| {
+        let stats = set.stats().get(name)?;
+        let least = stats.min.iter().copied().fold(f64::INFINITY, f64::min);
+        Some((least, stats.max.iter().copied().fold(f64::NEG_INFINITY, f64::max)))
+    };
+    let keys = set.info().features.0.iter().map(|(name, feature)| KeyRow {
+        key: name.clone(),
+        dtype: feature.dtype.clone(),
+        shapes: vec![feature.shape.clone()],
+        demos: lengths.len(),
+        min: ranges(name).map(|r| r.0),
+        max: ranges(name).map(|r| r.1),
+    });
+    let each = set.episodes().iter().map(|e| DemoRow {
+        id: e.demo.clone().unwrap_or_else(|| format!("episode {}", e.index)),
+        length: e.length,
+        task: e.tasks.first().cloned(),
+    });
+    let lossless = set.provenance().map(|p| match p.lossless {
+        true => format!("converted from {} ({}); the side folder keeps the rest of it", p.source, p.dialect),
+        false => format!("converted from {} ({}) without the side folder", p.source, p.dialect),
+    });
+    Ok(Summary {
+        path: args.path.clone(),
+        layout: format!("LeRobotDataset {}", set.info().codebase_version),
+        bytes: folder_bytes(&args.path),
+        env_name: set.env().map(|e| e.env_name.clone()),
+        env_version: set.env().and_then(|e| e.env_version.clone()),
+        demos: lengths.len(),
+        frames: set.frames(),
+        length_min: lengths.iter().copied().min().unwrap_or(0),
+        length_mean: set.frames() as f64 / lengths.len().max(1) as f64,
+        length_max: lengths.iter().copied().max().unwrap_or(0),
+        keys: keys.collect(),
+        masks: set
+            .split_names()
+            .into_iter()
+            .filter_map(|name| Some((name.to_owned(), set.split(name)?.len())))
+            .collect(),
+        tasks: set.tasks().to_vec(),
+        notes: lossless.into_iter().chain([format!("fingerprint {}", set.fingerprint())]).collect(),
+        problems: Vec::new(),
+        each: if args.demos { each.collect() } else { Vec::new() },
+    })
+}
+
+fn folder_bytes(path: &Path) -> u64 {
+    let Ok(entries) = std::fs::read_dir(path) else { return 0 };
+    entries
+        .flatten()
+        .map(|e| match e.metadata() {
+            Ok(m) if m.is_dir() => folder_bytes(&e.path()),
+            Ok(m) => m.len(),
+            Err(_) => 0,
+        })
+        .sum()
+}
+
+fn show(s: &Summary) -> String {
+    let mut text = format!("{}: {}, {}\n", s.path.display(), s.layout, output::bytes(s.bytes));
+    let env = s.env_name.as_deref().unwrap_or("not stated");
+    let version = s.env_version.as_ref().map_or_else(|| "version not stated".to_owned(), |v| format!("version {v}"));
+    text.push_str(&format!("environment: {env}, {version}\n"));
+    text.push_str(&format!(
+        "demos: {} with {} steps (shortest {}, mean {:.1}, longest {})\n",
+        output::count(s.demos),
+        output::count(s.frames),
+        s.length_min,
+        s.length_mean,
+        s.length_max
+    ));
+    if !s.masks.is_empty() {
+        let masks: Vec<String> = s.masks.iter().map(|(name, n)| format!("{name} {n}")).collect();
+        text.push_str(&format!("masks: {}\n", masks.join(", ")));
+    }
+    if !s.tasks.is_empty() {
+        text.push_str(&format!("tasks: {}\n", s.tasks.join("; ")));
+    }
+    let range = |v: Option<f64>| v.map_or_else(String::new, output::number);
+    let rows: Vec<Vec<String>> = s
+        .keys
+        .iter()
+        .map(|k| {
+            let shapes: Vec<String> = k.shapes.iter().map(|shape| output::shape(shape)).collect();
+            let demos = if k.demos == s.demos { "all".to_owned() } else { format!("{} of {}", k.demos, s.demos) };
+            vec![k.key.clone(), k.dtype.clone(), shapes.join(" or "), demos, range(k.min), range(k.max)]
+        })
+        .collect();
+    text.push_str(&output::table(&["key", "type", "shape of a step", "demos", "min", "max"], &rows, &[4, 5]));
+    if !s.each.is_empty() {
+        let rows: Vec<Vec<String>> = s
+            .each
+            .iter()
+            .map(|d| vec![d.id.clone(), d.length.to_string(), d.task.clone().unwrap_or_default()])
+            .collect();
+        text.push_str(&output::table(&["demo", "steps", "task"], &rows, &[1]));
+    }
+    for note in &s.notes {
+        text.push_str(&format!("note: {note}\n"));
+    }
+    match s.problems.as_slice() {
+        [] => text.push_str("no problems found\n"),
+        problems => {
+            for problem in problems {
+                text.push_str(&format!("problem: {problem}\n"));
+            }
+        }
+    }
+    text
+}

@@ -1,0 +1,10 @@
+//! One file a command: its arguments, whose doc comment is its help, and what it does.
+
+pub mod completions;
+pub mod convert;
+pub mod export;
+pub mod inspect;
+pub mod plot;
+pub mod query;
+pub mod stats;
+pub mod validate;

@@ -1,0 +1,74 @@
+use crate::output;
+use anyhow::{Result, bail};
+use dataset::{Dataset, FeatureStats};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Show a data set's statistics, dimension by dimension.
+///
+/// Those of the whole set are the stored ones; those of a split or of single episodes are computed.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-data stats lift
+  actrm-data stats lift --split train --feature action
+  actrm-data stats lift --episodes 0,1,2 --json")]
+pub struct Args {
+    /// Data set directory
+    dir: PathBuf,
+    /// Only the episodes of this mask
+    #[arg(long, conflicts_with = "episodes")]
+    split: Option<String>,
+    /// Only these episodes
+    #[arg(long, value_delimiter = ',', value_name = "NUMBERS")]
+    episodes: Option<Vec<usize>>,
+    /// Only features whose name contains this
+    #[arg(long, value_name = "TEXT")]
+    feature: Option<String>,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let set = Dataset::open(&args.dir)?;
+    let mut stats = match (&args.split, &args.episodes) {
+        (Some(split), _) => match set.split(split) {
+            Some(episodes) => set.statistics_of(&episodes)?,
+            None => bail!("{}: no split {split}; there is {}", args.dir.display(), set.split_names().join(", ")),
+        },
+        (None, Some(episodes)) => set.statistics_of(episodes)?,
+        (None, None) => set.stats().clone(),
+    };
+    if let Some(text) = &args.feature {
+        stats.retain(|name, _| name.contains(text.as_str()));
+        if stats.is_empty() {
+            bail!("{}: no feature with {text:?} in its name", args.dir.display());
+        }
+    }
+    if args.json {
+        output::print_json(&stats)?;
+    } else {
+        output::print(&show(&set, &stats))?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn show(set: &Dataset, stats: &BTreeMap<String, FeatureStats>) -> String {
+    let mut rows = Vec::new();
+    for (name, s) in stats {
+        let names = set.info().features.get(name).map(|f| f.names.clone()).unwrap_or_default();
+        for d in 0..s.mean.len() {
+            let dimension = match names.get(d).and_then(|n| n.as_str()) {
+                Some(text) if s.mean.len() > 1 => text.to_owned(),
+                _ => d.to_string(),
+            };
+            let mut row = vec![if d == 0 { name.clone() } else { String::new() }, dimension];
+            let values = [&s.mean, &s.std, &s.min, &s.q01, &s.q50, &s.q99, &s.max];
+            row.extend(values.map(|v| v.get(d).map_or_else(|| "-".to_owned(), |&v| output::number(v))));
+            rows.push(row);
+        }
+    }
+    let header = ["feature", "dimension", "mean", "std", "min", "1%", "50%", "99%", "max"];
+    output::table(&header, &rows, &[2, 3, 4, 5, 6, 7, 8])
+}

@@ -1,0 +1,88 @@
+use crate::output;
+use anyhow::Result;
+use dataset::{Check, Source};
+use serde_json::json;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Make every check of a data set or of a file of demonstrations.
+///
+/// A data set: hashes of its files, agreement of columns, episodes and tasks, finite numbers, statistics, splits,
+/// pictures, and the fingerprint of its content. A file: its structure, and every value of every demo. The exit code
+/// is 1 when anything is wrong.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-data validate lift
+  actrm-data validate data/lift.hdf5
+  actrm-data validate lift --json")]
+pub struct Args {
+    /// Data set directory, HDF5 file, or folder with one file an episode
+    path: PathBuf,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let checks = if args.path.join("meta/info.json").exists() {
+        let bar = output::bar("frames").with_message("checking");
+        let checks = dataset::verify(&args.path, &mut output::advance(&bar));
+        bar.finish_and_clear();
+        checks?
+    } else {
+        check_source(args)?
+    };
+    let problems = checks.iter().filter(|c| c.problem.is_some()).count();
+    if args.json {
+        let list: Vec<_> =
+            checks.iter().map(|c| json!({"check": c.name, "ok": c.problem.is_none(), "problem": c.problem})).collect();
+        output::print_json(&json!({"path": args.path, "ok": problems == 0, "checks": list}))?;
+    } else {
+        let mut text = String::new();
+        for check in &checks {
+            match &check.problem {
+                None => text.push_str(&format!("ok      {}\n", check.name)),
+                Some(problem) => text.push_str(&format!("WRONG   {}: {problem}\n", check.name)),
+            }
+        }
+        output::print(&text)?;
+    }
+    Ok(if problems == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Bytes of a large dataset that are read at once.
+const BLOCK_BYTES: u64 = 8 << 20;
+
+fn check_source(args: &Args) -> Result<Vec<Check>> {
+    let source = Source::open_guarded(&args.path)?;
+    let plan = source.plan();
+    let mut checks = Vec::new();
+    let mut note = |name, problem| checks.push(Check { name, problem });
+    note("it opens: a known layout with demos", None);
+    let structure: Vec<&str> = plan.problems.iter().map(|p| p.message.as_str()).collect();
+    note("demos have what they must have", (!structure.is_empty()).then(|| structure.join("; ")));
+    let bar = output::bar("demos").with_message("reading");
+    let mut advance = output::advance(&bar);
+    let mut failed = Vec::new();
+    for (index, demo) in plan.demos.iter().enumerate() {
+        // large datasets by rows, the rest whole
+        let large = |key: &str| demo.keys.get(key).and_then(|k| k.bytes()).is_some_and(|b| b > BLOCK_BYTES);
+        let mut outcome = source.read_demo_where(index, &|key| !large(key)).map(drop);
+        for (path, key) in demo.keys.iter().filter(|(path, _)| large(path)) {
+            let rows = key.shape.first().copied().unwrap_or(0);
+            let step = (BLOCK_BYTES as usize * rows / key.bytes().unwrap_or(1).max(1) as usize).max(1);
+            for first in (0..rows).step_by(step) {
+                if outcome.is_ok() {
+                    outcome = source.read_rows(index, path, first, step.min(rows - first)).map(drop);
+                }
+            }
+        }
+        if let Err(e) = outcome {
+            failed.push(e.to_string());
+        }
+        advance(index as u64 + 1, plan.demos.len() as u64);
+    }
+    bar.finish_and_clear();
+    note("every demo can be read and holds finite actions", (!failed.is_empty()).then(|| failed.join("; ")));
+    Ok(checks)
+}
