@@ -4,7 +4,6 @@ use models::{Actor, ModelError, Policy, RecedingHorizon, TemporalEnsemble};
 
 use super::EvaluationOptions;
 use crate::ZooError;
-//ZOO use crate::entry::LoadedEntry;
 use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, TrainingFacts};
 use crate::rollout::{EpisodePlan, QueryTimes, Ready, Timed};
 
@@ -32,41 +31,6 @@ pub struct Subject<'a> {
     pub policy: Box<dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a>,
 }
 
-//ZOO impl<'a> Subject<'a> {
-//ZOO     /// The subject that a loaded entry is.
-//ZOO     pub fn new(loaded: &'a LoadedEntry) -> Self {
-//ZOO         let meta = loaded.entry().meta();
-//ZOO         let rollout = &loaded.experiment().rollout;
-//ZOO         let training = meta.training.as_ref();
-//ZOO         let data = meta.data.as_ref();
-//ZOO         Self {
-//ZOO             entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
-//ZOO             training: TrainingFacts {
-//ZOO                 policy: meta.policy.clone(),
-//ZOO                 parameters: meta.parameters,
-//ZOO                 steps: training.map_or(0, |t| t.steps),
-//ZOO                 minutes: training.map_or(0.0, |t| t.minutes),
-//ZOO                 seed: training.map_or(0, |t| t.seed),
-//ZOO                 data_set: data.map_or_else(String::new, |d| d.name.clone()),
-//ZOO                 data_fingerprint: data.map_or_else(String::new, |d| d.fingerprint.clone()),
-//ZOO                 data_simulator: meta.env_version.clone(),
-//ZOO                 demos: data.map_or(0, |d| d.train_episodes),
-//ZOO             },
-//ZOO             task: meta.task.clone(),
-//ZOO             env_version: meta.env_version.clone(),
-//ZOO             state_keys: meta.state_keys.clone(),
-//ZOO             env_keys: meta.env_keys.clone(),
-//ZOO             execution: match rollout.temporal_ensemble {
-//ZOO                 Some(coefficient) => Execution::TemporalEnsemble { coefficient },
-//ZOO                 None => Execution::RecedingHorizon { n_action_steps: rollout.n_action_steps },
-//ZOO             },
-//ZOO             max_steps: rollout.max_steps.map(|steps| usize::try_from(steps).unwrap_or(usize::MAX)),
-//ZOO             dims: meta.dims,
-//ZOO             policy: Box::new(|| Ok(Box::new(loaded.policy()))),
-//ZOO         }
-//ZOO     }
-//ZOO
-//ZOO }
 
 impl Subject<'_> {
     /// Everything that the outcome will depend on.
