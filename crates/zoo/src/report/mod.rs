@@ -36,8 +36,8 @@ pub fn to_html(evaluations: &[StoredEvaluation], curves: &[Curve]) -> String {
     let _ = writeln!(
         html,
         "<p class=\"lead\">{} evaluations, {} episodes. Entries are ranked by success rate inside a task and \
-         protocol; bars are 95% Wilson intervals. Entries whose intervals overlap cannot be told apart by these \
-         episodes.</p>",
+         protocol; bars are 95% Wilson intervals. Where intervals overlap widely, these \
+         episodes do not decide between the entries.</p>",
         rows.len(),
         episodes
     );
