@@ -333,6 +333,7 @@ impl Act {
         latent_grad
     }
 
+    #[allow(clippy::needless_range_loop)] // mean and log-variance lie side by side in one row
     /// One shard, forwards and backwards. `totals`: rows and valid steps of the whole batch.
     fn step(&self, pass: &mut Pass<'_>, data: &Data<'_>, totals: (usize, usize), grads: &mut Grads<'_>) -> LossValues {
         let width = self.config().latent_dim;

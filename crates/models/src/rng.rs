@@ -93,9 +93,9 @@ impl Rng {
             return Err(wrong());
         }
         let part = |range: std::ops::Range<usize>| state.get(range).ok_or_else(wrong);
-        let seed: [u8; 32] = part(0..32)?.try_into().map_err(|_| wrong())?;
-        let stream: [u8; 8] = part(32..40)?.try_into().map_err(|_| wrong())?;
-        let position: [u8; 16] = part(40..56)?.try_into().map_err(|_| wrong())?;
+        let seed: [u8; 32] = part(0..32)?.try_into().ok().ok_or_else(wrong)?;
+        let stream: [u8; 8] = part(32..40)?.try_into().ok().ok_or_else(wrong)?;
+        let position: [u8; 16] = part(40..56)?.try_into().ok().ok_or_else(wrong)?;
         let mut inner = ChaCha8Rng::from_seed(seed);
         inner.set_stream(u64::from_le_bytes(stream));
         inner.set_word_pos(u128::from_le_bytes(position));

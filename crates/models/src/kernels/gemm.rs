@@ -133,6 +133,7 @@ impl<E: Fn(usize, usize, &mut [f32])> WithSimd for Gemm<'_, E> {
 }
 
 /// Scalar products of M rows of A with four columns of B at a time, both contiguous.
+#[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
 #[inline(always)]
 fn few_rows<S: Simd, const M: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g: Gemm<'_, E>) {
     const COLUMNS: usize = 4;
@@ -294,6 +295,7 @@ fn transpose(out: &mut [f32], width: usize, data: &[f32], (kc, lanes): (usize, u
 }
 
 /// One register tile: MR rows of two vectors.
+#[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
 #[inline(always)]
 fn tile<S: Simd, const MR: usize>(
     simd: S,

@@ -1,0 +1,153 @@
+//! The encoder layer.
+
+use super::attention::{Attention, Side};
+use super::feed_forward::FeedForward;
+use super::{Entry, Grads, Pass, Residual, Rows, Shape, enter, enter_backward};
+use crate::kernels::{Heads, Start, add};
+
+/// What an encoder layer's backward pass needs.
+#[derive(Debug)]
+pub(crate) struct EncoderLayer {
+    prefix: String,
+    /// input of the attention
+    y1: Vec<f32>,
+    /// its first tokens, if only those are computed
+    y1_first: Option<Vec<f32>>,
+    attention: Attention,
+    residual1: Residual,
+    y2: Vec<f32>,
+    ff: FeedForward,
+    residual2: Residual,
+}
+
+/// The first of every `tokens` rows.
+fn first_rows(pass: &mut Pass<'_>, x: &[f32], tokens: usize) -> Vec<f32> {
+    let dim = pass.shape.dim;
+    let mut out = pass.take(x.len() / tokens);
+    for (to, from) in out.chunks_exact_mut(dim).zip(x.chunks_exact(tokens * dim)) {
+        to.copy_from_slice(&from[..dim]);
+    }
+    out
+}
+
+impl EncoderLayer {
+    /// x: (b, t, D), pos: (t, D), key_pad: (b, t) -> (b, t, D), or (b, 1, D) with `only_first`: then only the first
+    /// token's output is computed, for a last layer of which nothing else is used.
+    pub(crate) fn forward(
+        pass: &mut Pass<'_>,
+        prefix: String,
+        x: Vec<f32>,
+        pos: &[f32],
+        key_pad: Option<&[f32]>,
+        only_first: bool,
+    ) -> (Vec<f32>, Self) {
+        let Shape { dim, heads, .. } = pass.shape;
+        let tokens = pos.len() / dim;
+        let only_first = only_first && tokens > 1;
+        let queries = if only_first { 1 } else { tokens };
+        let rows = Rows { computed: queries, all: tokens };
+        let batch = x.len() / (tokens * dim);
+        let heads = Heads { batch, heads, queries, all_queries: tokens, keys: tokens, dim, shared: false };
+
+        let Entry { y: y1, x, norm } = enter(pass, &format!("{prefix}.norm1"), x);
+        let y1_first = only_first.then(|| first_rows(pass, &y1, tokens));
+        let query = Side { x: y1_first.as_ref().unwrap_or(&y1), pos: &pos[..queries * dim] };
+        let (branch, attention) =
+            Attention::forward(pass, &format!("{prefix}.self_attn"), heads, query, Side { x: &y1, pos }, key_pad);
+        let x_first = x.as_ref().filter(|_| only_first).map(|x| first_rows(pass, x, tokens));
+        // the residual's x: its own buffer if pre-norm, else what the branch read
+        let sum = x_first.as_ref().or(x.as_ref()).unwrap_or(y1_first.as_ref().unwrap_or(&y1));
+        let (x1, residual1) = Residual::leave(pass, &format!("{prefix}.norm1"), norm, sum, branch, rows);
+        for buffer in [x, x_first].into_iter().flatten() {
+            pass.give(buffer);
+        }
+
+        let Entry { y: y2, x, norm } = enter(pass, &format!("{prefix}.norm2"), x1);
+        let (branch, ff) = FeedForward::forward(pass, &prefix, &y2, rows);
+        let sum = x.as_ref().unwrap_or(&y2);
+        let (out, residual2) = Residual::leave(pass, &format!("{prefix}.norm2"), norm, sum, branch, rows);
+        if let Some(x) = x {
+            pass.give(x);
+        }
+        (out, Self { prefix, y1, y1_first, attention, residual1, y2, ff, residual2 })
+    }
+
+    /// grad: that of the output -> that of x; adds to `pos_grad`.
+    pub(crate) fn backward(
+        self,
+        pass: &mut Pass<'_>,
+        mut grad: Vec<f32>,
+        pos: &[f32],
+        pos_grad: Option<&mut [f32]>,
+        grads: &mut Grads<'_>,
+    ) -> Vec<f32> {
+        let Self { prefix, y1, y1_first, attention, residual1, y2, ff, residual2 } = self;
+        let dim = pass.shape.dim;
+        let (norm1, norm2, attn) =
+            (format!("{prefix}.norm1"), format!("{prefix}.norm2"), format!("{prefix}.self_attn"));
+
+        let (branch, norm) = residual2.leave_backward(pass, &norm2, &mut grad, grads);
+        let mut y_grad = ff.backward(pass, &prefix, &branch, &y2, grads);
+        enter_backward(pass, &norm2, norm, &mut y_grad, grads);
+        add(&mut grad, &y_grad);
+        for buffer in [branch, y_grad, y2] {
+            pass.give(buffer);
+        }
+
+        let (branch, norm) = residual1.leave_backward(pass, &norm1, &mut grad, grads);
+        let heads = attention.heads;
+        let query = Side { x: y1_first.as_ref().unwrap_or(&y1), pos: &pos[..heads.queries * dim] };
+        // both sides' positions are the same rows
+        let mut both =
+            pos_grad.is_some().then(|| (pass.space.pool.zeros(heads.queries * dim), pass.space.pool.zeros(pos.len())));
+        let (for_query, for_key) = both.as_mut().map_or((None, None), |(q, k)| (Some(&mut q[..]), Some(&mut k[..])));
+        let (dq, dkv) =
+            attention.backward(pass, &attn, &branch, query, Side { x: &y1, pos }, for_query, for_key, grads);
+        if let (Some(into), Some((q, k))) = (pos_grad, both) {
+            add(&mut into[..q.len()], &q);
+            add(into, &k);
+            pass.give(q);
+            pass.give(k);
+        }
+        pass.give(branch);
+        let mut y_grad = pass.take(y1.len());
+        Attention::key_input(pass, &attn, &dkv, Start::Zero, &mut y_grad);
+        let out = if heads.queries == heads.keys {
+            Attention::query_input(pass, &attn, &dq, Start::Add, &mut y_grad);
+            enter_backward(pass, &norm1, norm, &mut y_grad, grads);
+            add(&mut y_grad, &grad);
+            pass.give(grad);
+            y_grad
+        } else {
+            let mut first = pass.take(dq.len());
+            Attention::query_input(pass, &attn, &dq, Start::Zero, &mut first);
+            add_to_first_rows(&mut y_grad, &first, dim, heads.keys);
+            pass.give(first);
+            enter_backward(pass, &norm1, norm, &mut y_grad, grads);
+            add_to_first_rows(&mut y_grad, &grad, dim, heads.keys);
+            pass.give(grad);
+            y_grad
+        };
+        for buffer in [dq, dkv, y1].into_iter().chain(y1_first) {
+            pass.give(buffer);
+        }
+        out
+    }
+
+    /// Gives the buffers back without a backward pass.
+    pub(crate) fn free(self, pass: &mut Pass<'_>) {
+        self.attention.free(pass);
+        self.ff.free(pass);
+        self.residual1.norm.free(pass);
+        self.residual2.norm.free(pass);
+        for buffer in [self.y1, self.y2].into_iter().chain(self.y1_first) {
+            pass.give(buffer);
+        }
+    }
+}
+
+fn add_to_first_rows(x: &mut [f32], first: &[f32], dim: usize, tokens: usize) {
+    for (to, from) in x.chunks_exact_mut(tokens * dim).zip(first.chunks_exact(dim)) {
+        to[..dim].iter_mut().zip(from).for_each(|(a, b)| *a += b);
+    }
+}
