@@ -7,6 +7,7 @@ it again for every task but Lift (its cube's size is drawn when the model is loa
 """
 
 import hashlib
+import importlib
 import json
 import os
 import re
@@ -37,7 +38,18 @@ class Task:
     max_steps: int = DEFAULT_MAX_STEPS
 
 
-TASKS = {task.name: task for task in (Task("Lift"),)}
+TASKS = {
+    task.name: task
+    for task in (
+        Task("Lift"),
+        Task("Stack", soft_reset=True),
+        Task("PickPlaceCan", soft_reset=True),
+        Task("NutAssemblySquare", soft_reset=True),
+        Task("Door", soft_reset=True),
+        Task("StackThreeCubes", soft_reset=True, max_steps=600),
+        Task("StackColor", soft_reset=True, max_steps=600),
+    )
+}
 
 
 class Control(Protocol):
@@ -78,6 +90,7 @@ class StepResult:
 
 def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Session:
     """Make the environment of a task; RequestError("unknown_task") where there is none of that name."""
+    importlib.import_module("actrm_harness.tasks")
     known = suite.known_environments()
     if task_name not in known:
         raise RequestError("unknown_task", f"unknown task {task_name!r}; known: {', '.join(known)}")
@@ -113,9 +126,13 @@ def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Sessi
     return Session(env=env, task=task, env_args=env_args, cameras=cameras, image_size=size)
 
 
-def reset(session: Session, seed: int) -> Tensors:
-    """Begin the episode of `seed` and give its first observation."""
+def reset(session: Session, seed: int, demonstration: bool = False) -> Tensors:
+    """Begin the episode of `seed` and give its first observation.
+
+    `demonstration` tells an environment that splits its episodes (StackColor) that this one is to be learned from.
+    """
     env = session.env
+    env.demonstration = demonstration
     env.hard_reset = not session.task.soft_reset or session.foreign_model
     session.foreign_model = False
     env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state

@@ -72,7 +72,7 @@ def expert_episode(session: Session, seed: int) -> Episode:
     """One episode of the task's expert; its noise has a generator of its own, drawn from the same seed."""
     env = session.env
     session.foreign_model |= session.xml_forgotten
-    recorder = _Recorder(envs.reset(session, seed))
+    recorder = _Recorder(envs.reset(session, seed, demonstration=True))
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
     try:
         expert = make_expert(session.task.name, Scene(env), np.random.default_rng([seed, 1]))

@@ -21,6 +21,9 @@ RADIANS_PER_UNIT = 0.5
 
 OPEN, CLOSE = -1.0, 1.0
 
+# The hand pointing straight down, its fingers opening along the world's y axis.
+DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
 
 class Expert(Protocol):
     """A scripted controller for one episode."""
@@ -66,6 +69,11 @@ class Scene:
         self._finger_speeds: list[int] = list(self._robot._ref_gripper_joint_vel_indexes["right"])
 
     @property
+    def task(self) -> Any:
+        """The environment, for what only an environment of our own can say."""
+        return self.env
+
+    @property
     def hand(self) -> Array:
         """Position of the grip site."""
         return np.array(self.env.sim.data.site_xpos[self._site])
@@ -99,9 +107,10 @@ class Scene:
 class Servo:
     """Turns a target pose of the hand into an action, with this episode's style, noise and pushes."""
 
-    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+    def __init__(self, scene: Scene, rng: np.random.Generator, pace: float = 1.0) -> None:
         self.scene = scene
         self.style = Style.draw(rng)
+        self.pace = pace
         self.upright = scene.hand_rotation
         self._rng = rng
         self._noise = np.zeros(6)
@@ -110,10 +119,10 @@ class Servo:
         self._push = rng.normal(size=3)
         self._push *= rng.uniform(0.2, 0.6) / np.linalg.norm(self._push)
 
-    def move(self, target: Array, grip: float, rotation: Array | None = None, gentle: float = 1.0) -> Array:
-        """A step towards `target` (and `rotation`, else as the hand was at the start), at `gentle` times the speed."""
+    def move(self, target: Array, grip: float, rotation: Array | None = None) -> Array:
+        """A step towards `target` (and `rotation`, else as the hand was at the start)."""
         style = self.style
-        wanted = limit((target - self.scene.hand) / METRES_PER_UNIT * style.gain, style.speed * gentle)
+        wanted = limit((target - self.scene.hand) / METRES_PER_UNIT * style.gain, style.speed * self.pace)
         goal = self.upright if rotation is None else rotation
         turn = limit(rotation_vector(goal @ self.scene.hand_rotation.T) / RADIANS_PER_UNIT, 0.5)
         self._noise = 0.7 * self._noise + self._rng.normal(size=6) * style.noise * np.repeat([1.0, 0.3], 3)
@@ -145,6 +154,21 @@ def about_z(angle: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def yaw(rotation: Array) -> float:
+    """Angle about the vertical of a body that lies flat."""
+    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+def hand_yaw(rotation: Array) -> float:
+    """Angle about the vertical of a hand that points down; 0 for `DOWN`."""
+    return yaw(rotation @ DOWN.T)
+
+
+def nearest(angle: float, period: float, reference: float) -> float:
+    """The angle equal to `angle` up to a multiple of `period` that is nearest to `reference`."""
+    return angle + period * round((reference - angle) / period)
+
+
 def funnel(distance: float, near: float, far: float) -> float:
     """0 within `near`, 1 beyond `far`, straight in between."""
     return float(np.clip((distance - near) / (far - near), 0.0, 1.0))
@@ -164,8 +188,11 @@ class Grasp:
         self.closing = False
         self.held = False
 
-    def reach(self, point: Array) -> tuple[Array, float]:
-        """Where the hand should go now to have `point` between its fingers, and what the fingers do."""
+    def reach(self, point: Array, askew: float = 0.0) -> tuple[Array, float]:
+        """Where the hand should go now to have `point` between its fingers, and what the fingers do.
+
+        `askew` is the angle by which the hand still has to turn; it stays above until that is small.
+        """
         hand = self.scene.hand
         offset = point - hand
         flat, height = float(np.linalg.norm(offset[:2])), abs(float(offset[2]))
@@ -178,10 +205,45 @@ class Grasp:
             self.held = True
         target = np.array(point)
         if not self.closing:
-            lift = funnel(flat, 0.012, 0.05)
+            lift = max(funnel(flat, 0.008, 0.03), funnel(abs(askew), 0.15, 0.4))
             target[2] += self.style.hover * lift
             target[:2] += self.style.side * lift
         return target, CLOSE if self.closing else OPEN
+
+
+class Carry:
+    """Bringing a held thing to a place, over what stands in between, and letting go of it there."""
+
+    def __init__(self, scene: Scene, grasp: Grasp, clear: float) -> None:
+        self.scene = scene
+        self.grasp = grasp
+        self.clear = clear
+        self.released = False
+
+    def bring(self, thing: Array, goal: Array, near: float = 0.012, far: float = 0.06) -> Array:
+        """Where the hand should go to take `thing` to `goal`: up, across, and down once it is within `near` of it."""
+        away = goal - thing
+        high = funnel(float(np.linalg.norm(away[:2])), near, far)
+        height = float(goal[2]) + max(self.clear - float(goal[2]), 0.0) * high
+        across = 1.0 - funnel(height - float(thing[2]), 0.01, 0.05) * high
+        wanted = np.array([*(thing[:2] + away[:2] * across), height])
+        return wanted + self.scene.hand - thing
+
+    def let_go(self) -> tuple[Array, float]:
+        """Open, and leave upwards once the fingers are off."""
+        up = 0.12 * funnel(self.scene.gap, 0.05, 0.07)
+        return self.scene.hand + np.array([0.0, 0.0, up]), OPEN
+
+    def update(self, thing: Array, goal: Array, flat: float, height: float, lost: float = 0.04) -> bool:
+        """Whether the thing has been let go at the goal: from when it is close until it is away again."""
+        away = thing - goal
+        distance = float(np.linalg.norm(away[:2]))
+        if self.grasp.held and distance < flat and abs(float(away[2])) < height:
+            self.released = True
+            self.grasp.closing = self.grasp.held = False
+        elif self.released and (distance > lost or abs(float(away[2])) > lost):
+            self.released = False
+        return self.released
 
 
 def make_expert(task: str, scene: Scene, rng: np.random.Generator) -> Expert:
@@ -197,4 +259,12 @@ def _from(module: str, name: str) -> ExpertFactory:
     return build
 
 
-EXPERTS: dict[str, ExpertFactory] = {"Lift": _from("experts_cubes", "LiftExpert")}
+EXPERTS: dict[str, ExpertFactory] = {
+    "Lift": _from("experts_cubes", "LiftExpert"),
+    "Stack": _from("experts_cubes", "StackExpert"),
+    "StackThreeCubes": _from("experts_cubes", "TowerExpert"),
+    "StackColor": _from("experts_cubes", "TowerExpert"),
+    "PickPlaceCan": _from("experts_objects", "CanExpert"),
+    "NutAssemblySquare": _from("experts_objects", "SquareExpert"),
+    "Door": _from("experts_objects", "DoorExpert"),
+}

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from actrm_harness.experts import Grasp, Scene, Servo
+from actrm_harness.experts import DOWN, Carry, Grasp, Scene, Servo, about_z, hand_yaw, nearest, yaw
 from actrm_harness.wire import Array
 
 TABLE = 0.8
@@ -24,3 +24,91 @@ class LiftExpert:
         if self.grasp.held:
             target = np.array([*self.scene.hand[:2], self.top])
         return self.servo.move(target, grip)
+
+
+class StackExpert:
+    """Take the small cube and put it on the large one."""
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.scene = scene
+        self.servo = Servo(scene, rng, pace=1.3)
+        self.grasp = Grasp(scene, self.servo.style)
+        self.carry = Carry(scene, self.grasp, clear=TABLE + rng.uniform(0.12, 0.14))
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        cube = self.scene.body("cubeA_main")
+        hand = hand_yaw(self.scene.hand_rotation)
+        turn = nearest(yaw(self.scene.body_rotation("cubeA_main")), np.pi / 2, hand)
+        goal = self.scene.body("cubeB_main") + np.array([0.0, 0.0, 0.046])
+        if self.carry.update(cube, goal, flat=0.012, height=0.006):
+            target, grip = self.carry.let_go()
+            turn = hand
+        else:
+            target, grip = self.grasp.reach(cube, turn - hand)
+            if self.grasp.held:
+                target = self.carry.bring(cube, goal)
+                turn = hand
+        return self.servo.move(target, grip, about_z(turn) @ DOWN)
+
+
+class TowerExpert:
+    """Build a tower of three cubes in the order that the environment asks for."""
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.scene = scene
+        self.servo = Servo(scene, rng, pace=1.4)
+        self.grasp = Grasp(scene, self.servo.style)
+        order: tuple[str, ...] = scene.task.order
+        self.order = tuple(f"{name}_main" for name in order)
+        rise = rng.uniform(0.12, 0.14)
+        self.carries = [Carry(scene, self.grasp, clear=TABLE + rise + 0.04 * level) for level in range(2)]
+        self.level = 0
+        self.above = TABLE + rise + 0.12
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        scene = self.scene
+        bottom, middle, top = self.order
+        # The hand leaves a cube before it is off to the next.
+        if not self.grasp.held and self._left(middle if self.level == 0 else top):
+            self.level = int(self._stands(middle, bottom))
+        level = self.level
+        cube, below = (top, middle) if level else (middle, bottom)
+        carry = self.carries[level]
+        thing, goal = scene.body(cube), scene.body(below) + np.array([0.0, 0.0, 0.041])
+        hand = hand_yaw(scene.hand_rotation)
+        turn = hand
+        if carry.update(thing, goal, flat=0.01, height=0.006):
+            target, grip = carry.let_go()
+        else:
+            turn = self._grip_yaw(cube)
+            target, grip = self.grasp.reach(thing, turn - hand)
+            if level and not self.grasp.closing and np.linalg.norm((thing - scene.hand)[:2]) > 0.05:
+                target[2] = self.above
+            if self.grasp.held:
+                target = carry.bring(thing, goal, near=0.008, far=0.04)
+                turn = hand
+        return self.servo.move(target, grip, about_z(turn) @ DOWN)
+
+    def _stands(self, upper: str, lower: str) -> bool:
+        away = self.scene.body(upper) - self.scene.body(lower)
+        return bool(np.linalg.norm(away[:2]) < 0.03 and abs(float(away[2]) - 0.04) < 0.008)
+
+    def _left(self, cube: str) -> bool:
+        return float(np.linalg.norm(self.scene.hand - self.scene.body(cube))) > 0.06
+
+    def _grip_yaw(self, cube: str) -> float:
+        """The hand's angle that fits the cube, its fingers clear of the other cubes."""
+        here = self.scene.body(cube)
+        first = nearest(yaw(self.scene.body_rotation(cube)), np.pi / 2, 0.0)
+        second = first - np.copysign(np.pi / 2, first)
+        others = [self.scene.body(name) for name in self.order if name != cube]
+        others = [other for other in others if float(other[2]) > float(here[2]) - 0.03]
+
+        def room(angle: float) -> float:
+            fingers = [here + about_z(angle) @ np.array([0.0, side, 0.0]) for side in (-0.055, 0.055)]
+            gaps = [float(np.linalg.norm((finger - other)[:2])) for finger in fingers for other in others]
+            return min(gaps, default=1.0)
+
+        return first if room(first) > 0.055 or room(first) >= room(second) else second

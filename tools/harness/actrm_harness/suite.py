@@ -49,6 +49,7 @@ class Env(Protocol):
     timestep: int
     done: bool
     cur_time: float
+    demonstration: bool
 
     def reset(self) -> dict[str, Array]: ...
     def step(self, action: Array) -> tuple[dict[str, Array], float, bool, dict[str, Any]]: ...

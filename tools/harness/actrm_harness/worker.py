@@ -21,8 +21,21 @@ if TYPE_CHECKING:
     from actrm_harness.episodes import Episode
 
 
+# What has to be set before the interpreter starts. Sets of names must not be ordered by chance (robosuite draws from
+# one), and one thread a library keeps their buffers small: a worker computes on one core.
+SETTINGS = {
+    "PYTHONHASHSEED": "0",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "2",
+}
+
+
 def main() -> NoReturn:
     """Take the pipes, start the environment, answer requests."""
+    if any(os.environ.get(name) != value for name, value in SETTINGS.items()):
+        os.environ.update(SETTINGS)
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     requests = os.fdopen(os.dup(0), "rb")
     replies = os.fdopen(os.dup(1), "wb")
     with open(os.devnull, "rb") as nothing:
@@ -154,7 +167,12 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
 
     if isinstance(request, protocol.Reset):
         first = envs.reset(session, request.seed)
-        reply = {"type": "reset", "id": request.id, "fingerprint": envs.fingerprint(session.env)}
+        reply = {
+            "type": "reset",
+            "id": request.id,
+            "fingerprint": envs.fingerprint(session.env),
+            "ep_meta": session.env.get_ep_meta(),
+        }
         return reply, {f"obs/{name}": value for name, value in first.items()}
     if isinstance(request, protocol.Step):
         action = envs.check_action(session.env, tensor(tensors, "action"))

@@ -1,0 +1,118 @@
+"""Every task: episodes that depend on their seed alone, experts that solve it, and environments of our own."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Client, WorkerError, walk
+
+from actrm_harness import envs, episodes, suite
+
+suite.prepare()
+
+HERE = Path(__file__).resolve().parent
+
+
+def trace(session: envs.Session, seed: int, steps: int = 12) -> list[object]:
+    """Everything that an episode shows."""
+    first = envs.reset(session, seed)
+    seen: list[object] = [envs.fingerprint(session.env), *(first[name].tobytes() for name in sorted(first))]
+    for action in walk(seed, steps):
+        result = envs.step_session(session, action)
+        seen += [envs.state(session.env).tobytes(), result.reward, result.success]
+        seen += [result.observation[name].tobytes() for name in sorted(result.observation)]
+    return seen
+
+
+@pytest.mark.parametrize("task", [name for name, task in envs.TASKS.items() if task.soft_reset])
+def test_a_soft_reset_is_a_hard_reset_bit_for_bit(task: str) -> None:
+    """Kept models show the same episodes as models loaded again, after other episodes and after an expert's."""
+    soft, hard = envs.make(task), envs.make(task)
+    hard.task = dataclasses.replace(hard.task, soft_reset=False)
+    trace(soft, 5, 3)
+    short = dataclasses.replace(soft.task, max_steps=5)
+    kept, soft.task = soft.task, short
+    episodes.expert_episode(soft, 1)
+    soft.task = kept
+    for seed in (10_000, 3):
+        assert trace(soft, seed) == trace(hard, seed)
+    soft.env.close()
+    hard.env.close()
+
+
+@pytest.mark.parametrize("task", ["Stack", "PickPlaceCan", "NutAssemblySquare"])
+def test_the_expert_solves_the_task(task: str) -> None:
+    session = envs.make(task)
+    solved = [episodes.expert_episode(session, 1_000_000 + seed).success for seed in range(2)]
+    session.env.close()
+    assert all(solved)
+
+
+def test_extract_works_where_the_reward_wants_an_action() -> None:
+    """Robosuite's Stack.reward() cannot be called without one; robomimic 0.5 fails there."""
+    session = envs.make("Stack")
+    short = dataclasses.replace(session.task, max_steps=4)
+    session.task = short
+    demo = episodes.expert_episode(session, 1_000_000)
+    again = episodes.extract(session, demo.tensors["states"], demo.tensors["actions"], demo.attrs["model_file"])
+    assert np.array_equal(again.tensors["rewards"], demo.tensors["rewards"])
+    assert np.array_equal(again.tensors["obs/robot0_joint_pos"], demo.tensors["obs/robot0_joint_pos"])
+    session.env.close()
+
+
+def test_cubes_are_apart_and_success_is_as_specified() -> None:
+    session = envs.make("StackThreeCubes")
+    env = session.env
+    for seed in range(20):
+        envs.reset(session, seed)
+        red, green, blue = (np.array(env.sim.data.get_body_xpos(f"{name}_main")) for name in ("red", "green", "blue"))
+        assert min(np.linalg.norm((a - b)[:2]) for a, b in ((red, green), (red, blue), (green, blue))) >= 0.06
+
+    def put(name: str, place: tuple[float, float, float]) -> tuple[float, bool]:
+        env.sim.data.set_joint_qpos(f"{name}_joint0", np.array([*place, 1.0, 0.0, 0.0, 0.0]))
+        env.sim.forward()
+        return env.reward(np.zeros(7)), envs.success(env)
+
+    put("blue", (0.2, 0.2, 0.82))
+    assert put("red", (0.0, 0.0, 0.82)) == (0.0, False)
+    assert put("green", (0.049, 0.0, 0.86)) == (0.5, False)
+    assert put("green", (0.051, 0.0, 0.86)) == (0.0, False)
+    assert put("green", (0.0, 0.0, 0.8745)) == (0.5, False)
+    assert put("green", (0.0, 0.0, 0.8755)) == (0.0, False)
+    put("green", (0.0, 0.0, 0.86))
+    assert put("blue", (0.0, 0.0, 0.90)) == (1.0, True)
+    env.close()
+
+
+def test_stack_color_has_to_be_read() -> None:
+    """Slots and goals vary; demonstrations keep to four orders and exact colours, evaluation does not."""
+    session = envs.make("StackColor")
+    seen: dict[bool, set[tuple[str, ...]]] = {True: set(), False: set()}
+    firsts: set[bytes] = set()
+    for demonstration in (True, False):
+        for seed in range(60):
+            value = envs.reset(session, seed, demonstration=demonstration)["object"]
+            meta = session.env.get_ep_meta()
+            seen[demonstration].add(tuple(meta["order"]))
+            colors = np.array([value[10 * slot + 7 : 10 * slot + 10] for slot in range(3)])
+            firsts.add(colors[0].round().tobytes())
+            exact = bool(np.all((colors == 0) | (colors == 1)))
+            assert exact == demonstration
+            assert value.shape == (48,)
+            if demonstration:
+                assert meta["split"] == "seen"
+    assert len(seen[True]) == 4 and len(seen[False]) == 6 and seen[True] < seen[False]
+    assert len(firsts) == 3
+    session.env.close()
+
+
+def test_an_environment_of_ones_own_is_registered_by_its_module() -> None:
+    paths = {"PYTHONPATH": f"{HERE}:{HERE.parent}"}
+    client = Client("--task", "LiftHigh", "--env-module", "example_env", env=paths)
+    assert client.ready["env_name"] == "LiftHigh"
+    assert client.ask("reset", seed=0)[0]["type"] == "reset"
+    assert client.step(np.zeros(7))[0]["success"] is False
+    with pytest.raises(WorkerError, match="no scripted expert"):
+        client.ask("expert", seed=0)
+    client.close()
