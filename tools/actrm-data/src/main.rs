@@ -22,6 +22,8 @@ struct Cli {
 enum Command {
     Inspect(commands::inspect::Args),
     Convert(commands::convert::Args),
+    Collect(commands::collect::Args),
+    Extract(commands::extract::Args),
     Export(commands::export::Args),
     Validate(commands::validate::Args),
     Stats(commands::stats::Args),
@@ -36,6 +38,8 @@ fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Inspect(args) => commands::inspect::run(&args),
         Command::Convert(args) => commands::convert::run(&args),
+        Command::Collect(args) => commands::collect::run(&args),
+        Command::Extract(args) => commands::extract::run(&args),
         Command::Export(args) => commands::export::run(&args),
         Command::Validate(args) => commands::validate::run(&args),
         Command::Stats(args) => commands::stats::run(&args),

@@ -1,8 +1,10 @@
 //! One file a command: its arguments, whose doc comment is its help, and what it does.
 
+pub mod collect;
 pub mod completions;
 pub mod convert;
 pub mod export;
+pub mod extract;
 pub mod inspect;
 pub mod plot;
 pub mod query;
