@@ -114,6 +114,27 @@ pub enum ZooError {
         reason: String,
     },
 
+    /// The data set refused.
+    #[error("data {}", path.display())]
+    Dataset {
+        /// File or folder.
+        path: PathBuf,
+        /// What it refused.
+        #[source]
+        source: Box<dataset::DatasetError>,
+    },
+    /// The model refused.
+    #[error("cannot {operation} `{name}`")]
+    Model {
+        /// What was tried: `build the policy of`, `load the weights of`, …
+        operation: &'static str,
+        /// Entry or experiment.
+        name: String,
+        /// What it refused.
+        #[source]
+        source: models::ModelError,
+    },
+
     // ---- training runs -----------------------------------------------------------------------
     /// Another process trains in this folder.
     #[error("run folder {} is in use by another training (lock file {})", folder.display(), folder.join("lock").display())]

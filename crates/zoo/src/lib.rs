@@ -10,6 +10,7 @@
 pub mod config;
 pub mod entry;
 mod error;
+pub mod experiment;
 mod files;
 pub mod registry;
 pub mod run;
@@ -24,3 +25,21 @@ pub mod rollout;
 
 pub use error::ZooError;
 pub use files::{sha256_file, sha256_hex, write_atomic};
+
+/// Versions of the software that makes entries and results, by name.
+pub fn versions() -> std::collections::BTreeMap<String, String> {
+    let versions = [("actrm", env!("CARGO_PKG_VERSION")), ("candle", CANDLE)];
+    versions.into_iter().map(|(name, version)| (name.to_owned(), version.to_owned())).collect()
+}
+
+/// The pinned version of candle; a test compares it with the workspace's manifest.
+const CANDLE: &str = "0.11.1";
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn the_version_of_candle_is_the_pinned_one() {
+        let manifest = include_str!("../../../Cargo.toml");
+        assert!(manifest.contains(&format!("candle-core = {{ version = \"={}\"", super::CANDLE)));
+    }
+}

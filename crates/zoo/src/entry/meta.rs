@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use models::Dims;
 use serde::{Deserialize, Serialize};
 
 use crate::sha256_hex;
@@ -38,8 +39,8 @@ pub struct EntryMeta {
     pub state_keys: Vec<String>,
     /// Observation keys that make `observation.environment_state`, in order.
     pub env_keys: Vec<String>,
-    /// Lengths: `state`, `environment_state`, `action`.
-    pub dims: BTreeMap<String, usize>,
+    /// Lengths of the features.
+    pub dims: Dims,
     /// The demonstrations.
     pub data: DataMeta,
     /// How it was trained; `None` for an imported entry.

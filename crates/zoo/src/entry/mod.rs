@@ -8,11 +8,14 @@ mod card;
 mod id;
 mod meta;
 mod open;
+mod policy;
 mod seal;
 
+pub(crate) use id::check_name;
 pub use id::{EntryId, EntryRequest};
 pub use meta::{CurvePoint, DataMeta, EntryMeta, FileMeta, TrainingMeta};
 pub use open::Entry;
+pub use policy::{EntryPolicy, LoadedEntry};
 pub use seal::EntryDraft;
 #[cfg(test)]
 pub(crate) use seal::tests::draft as test_draft;

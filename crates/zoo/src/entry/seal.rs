@@ -123,7 +123,7 @@ pub(crate) mod tests {
                 parameters: 12,
                 state_keys: vec!["robot0_eef_pos".to_owned()],
                 env_keys: vec!["object".to_owned()],
-                dims: BTreeMap::from([("state".to_owned(), 9)]),
+                dims: models::Dims { state: 9, environment_state: 10, action: 7 },
                 data: DataMeta {
                     name: "lift.hdf5".to_owned(),
                     fingerprint: "f".repeat(64),

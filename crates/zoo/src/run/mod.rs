@@ -1,11 +1,19 @@
 //! Training runs: a folder, checkpoints, metrics, and the loop that makes an entry.
 
 mod checkpoint;
+mod data;
 mod folder;
 mod metrics;
+mod sampler;
+mod section;
 mod tensorboard;
+mod training;
+mod validation;
 
 pub use checkpoint::Checkpoint;
+pub use data::locate;
 pub use folder::RunFolder;
 pub use metrics::{Metrics, MetricsRow};
+pub use section::{Schedule, TrainSection};
 pub use tensorboard::EventWriter;
+pub use training::{TrainEvent, TrainOutcome, TrainRequest, train};

@@ -1,0 +1,308 @@
+//! An experiment: what is trained, on which demonstrations, how, and how the result acts.
+
+use std::collections::BTreeMap;
+
+use models::{ACTION, ENVIRONMENT_STATE, ModelError, NormMode, PolicyConfig, STATE};
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+use crate::ZooError;
+use crate::config::{Library, apply_overrides, from_value};
+use crate::run::TrainSection;
+
+/// A resolved experiment, as `config.toml` of runs and entries holds it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Experiment {
+    /// Name of the entry that it makes.
+    pub entry: String,
+    /// One sentence for the model card.
+    pub description: String,
+    /// The task.
+    pub task: TaskSection,
+    /// The demonstrations.
+    pub data: DataSection,
+    /// How features are normalised.
+    pub normalisation: NormalisationSection,
+    /// The model.
+    pub policy: PolicyConfig,
+    /// The training.
+    pub train: TrainSection,
+    /// How predictions become actions.
+    pub rollout: RolloutSection,
+}
+
+/// The same with the policy still a table: its type decides which keys it may have.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Sections {
+    entry: String,
+    #[serde(default)]
+    description: String,
+    task: TaskSection,
+    #[serde(default)]
+    data: DataSection,
+    #[serde(default)]
+    normalisation: NormalisationSection,
+    policy: Table,
+    train: TrainSection,
+    rollout: RolloutSection,
+}
+
+/// `[task]`
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TaskSection {
+    /// The task's name, as the worker knows it.
+    pub name: String,
+}
+
+/// `[data]`
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DataSection {
+    /// Demonstrations: an HDF5 file or a LeRobotDataset folder, from the current folder or as shipped.
+    pub path: String,
+    /// Observation keys that make `observation.state`, in order.
+    pub state_keys: Vec<String>,
+    /// Observation keys that make `observation.environment_state`, in order; may be empty.
+    pub env_keys: Vec<String>,
+    /// Mask of the episodes to train on; a data set without masks is trained on whole.
+    pub train_mask: String,
+    /// Mask of the episodes to validate on.
+    pub valid_mask: String,
+}
+
+impl Default for DataSection {
+    fn default() -> Self {
+        let owned = |keys: &[&str]| keys.iter().map(|k| (*k).to_owned()).collect();
+        Self {
+            path: String::new(),
+            state_keys: owned(&["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]),
+            env_keys: owned(&["object"]),
+            train_mask: "train".to_owned(),
+            valid_mask: "valid".to_owned(),
+        }
+    }
+}
+
+/// `[normalisation]`: mean and standard deviation everywhere unless said otherwise.
+///
+/// LeRobot's ACT leaves the environment state raw; `environment_state = "identity"` does the same.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NormalisationSection {
+    /// Of `observation.state`.
+    pub state: NormMode,
+    /// Of `observation.environment_state`.
+    pub environment_state: NormMode,
+    /// Of `action`.
+    pub action: NormMode,
+}
+
+impl NormalisationSection {
+    /// The modes by feature name; without an environment state there is none for it.
+    pub fn modes(&self, has_environment_state: bool) -> BTreeMap<String, NormMode> {
+        let mut modes = BTreeMap::from([(STATE.to_owned(), self.state), (ACTION.to_owned(), self.action)]);
+        if has_environment_state {
+            modes.insert(ENVIRONMENT_STATE.to_owned(), self.environment_state);
+        }
+        modes
+    }
+}
+
+/// `[rollout]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RolloutSection {
+    /// Actions of a chunk that are executed before the policy is asked again.
+    pub n_action_steps: usize,
+    /// Ask at every step and average all predictions, with this coefficient (ACT uses 0.01).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub temporal_ensemble: Option<f64>,
+    /// Steps after which an episode has failed; the task's own cap unless given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_steps: Option<u64>,
+}
+
+impl Experiment {
+    /// Resolves experiment `name` of `library` with dotted `overrides` laid over it.
+    ///
+    /// # Errors
+    /// Unknown experiments, keys and values; combinations that cannot work.
+    pub fn load(library: &Library, name: &str, overrides: &[String]) -> Result<Self, ZooError> {
+        let mut table = library.resolve(name)?;
+        apply_overrides(&mut table, overrides)?;
+        Self::from_table(table)
+    }
+
+    /// Reads the text of a saved `config.toml`.
+    ///
+    /// # Errors
+    /// As [`Experiment::load`].
+    pub fn from_toml(name: &str, text: &str) -> Result<Self, ZooError> {
+        let table = toml::from_str(text)
+            .map_err(|source| ZooError::ExperimentSyntax { experiment: name.to_owned(), source: Box::new(source) })?;
+        Self::from_table(table)
+    }
+
+    fn from_table(table: Table) -> Result<Self, ZooError> {
+        let sections: Sections = from_value(&Value::Table(table), &[])?;
+        let experiment = Self {
+            entry: sections.entry,
+            description: sections.description,
+            task: sections.task,
+            data: sections.data,
+            normalisation: sections.normalisation,
+            policy: policy(sections.policy)?,
+            train: sections.train,
+            rollout: sections.rollout,
+        };
+        experiment.check()?;
+        Ok(experiment)
+    }
+
+    /// What serde cannot see: values that do not go together.
+    fn check(&self) -> Result<(), ZooError> {
+        let invalid = |key: &str, expected: String, found: String| {
+            Err(ZooError::InvalidValue { key: key.to_owned(), expected, found })
+        };
+        crate::entry::check_name(&self.entry)?;
+        let steps = self.rollout.n_action_steps;
+        let action_horizon = self.policy.action_horizon();
+        if steps == 0 || steps > action_horizon {
+            let expected = format!("1 to policy.action_horizon, {action_horizon}");
+            return invalid("rollout.n_action_steps", expected, steps.to_string());
+        }
+        if self.rollout.temporal_ensemble.is_some() && steps != 1 {
+            let expected = "1, because rollout.temporal_ensemble asks at every step".to_owned();
+            return invalid("rollout.n_action_steps", expected, steps.to_string());
+        }
+        if self.data.state_keys.is_empty() {
+            return invalid("data.state_keys", "at least one key".to_owned(), "none".to_owned());
+        }
+        self.train.check()
+    }
+
+    /// Kind of policy, as the config names it.
+    pub fn policy_type(&self) -> String {
+        let value = Value::try_from(&self.policy).ok();
+        let kind = value.as_ref().and_then(|v| v.get("type")).and_then(Value::as_str);
+        kind.expect("a policy serialises with its type").to_owned()
+    }
+
+    /// The resolved experiment as TOML: the same text for the same experiment.
+    pub fn to_toml(&self) -> String {
+        // through a table: its keys are sorted, and values come before sections
+        let table = Table::try_from(self).expect("an experiment read from TOML can be written as TOML");
+        toml::to_string_pretty(&table).expect("a table is TOML")
+    }
+
+    /// Dotted keys and values, for comparing two experiments.
+    pub fn flat(&self) -> BTreeMap<String, String> {
+        let mut flat = BTreeMap::new();
+        let table = Table::try_from(self).expect("an experiment read from TOML can be written as TOML");
+        flatten("", &table, &mut flat);
+        flat
+    }
+
+    /// Wraps an error of the model's configuration with where it comes from.
+    pub(crate) fn model_error(&self, operation: &'static str) -> impl FnOnce(ModelError) -> ZooError + use<> {
+        let name = self.entry.clone();
+        move |source| ZooError::Model { operation, name, source }
+    }
+}
+
+/// Reads `[policy]` as the config of the model that its `type` names.
+fn policy(mut table: Table) -> Result<PolicyConfig, ZooError> {
+    const TYPES: [&str; 1] = ["act"];
+    let kind = match table.remove("type") {
+        Some(kind) => kind,
+        None => return Err(ZooError::MissingKey { key: "policy.type".to_owned() }),
+    };
+    let rest = Value::Table(table);
+    match kind.as_str() {
+        Some("act") => Ok(PolicyConfig::Act(from_value(&rest, &["policy"])?)),
+        _ => Err(ZooError::InvalidValue {
+            key: "policy.type".to_owned(),
+            expected: format!("one of {}", TYPES.join(", ")),
+            found: kind.to_string(),
+        }),
+    }
+}
+
+fn flatten(prefix: &str, table: &Table, flat: &mut BTreeMap<String, String>) {
+    for (key, value) in table {
+        let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+        match value {
+            Value::Table(inner) => flatten(&path, inner, flat),
+            other => {
+                flat.insert(path, other.to_string());
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn load(overrides: &[&str]) -> Result<Experiment, String> {
+        let overrides: Vec<String> = overrides.iter().map(|o| (*o).to_owned()).collect();
+        Experiment::load(&Library::built_in(), "act_lift", &overrides).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn every_experiment_built_in_is_sound() {
+        let library = Library::built_in();
+        for name in library.names().unwrap() {
+            let experiment = Experiment::load(&library, &name, &[]).unwrap();
+            assert!(!experiment.description.is_empty(), "{name}");
+        }
+    }
+
+    #[test]
+    fn saved_experiments_read_back() {
+        let experiment = load(&["rollout.max_steps=300", "data.env_keys=[]"]).unwrap();
+        let text = experiment.to_toml();
+        let back = Experiment::from_toml("x", &text).unwrap();
+        assert_eq!(back, experiment);
+        assert_eq!(back.to_toml(), text);
+    }
+
+    #[test]
+    fn overrides_reach_every_section() {
+        let experiment = load(&["train.steps=7", "policy.dim_model=64", "task.name=Stack"]).unwrap();
+        assert_eq!(experiment.train.steps, 7);
+        assert_eq!(experiment.task.name, "Stack");
+        assert_eq!(experiment.flat()["policy.dim_model"], "64");
+    }
+
+    #[test]
+    fn typos_name_the_key_and_its_alternatives() {
+        let error = |o: &str| load(&[o]).unwrap_err();
+        let message = error("train.stesp=5");
+        assert!(message.starts_with("unknown key `train.stesp` (did you mean `steps`?); keys here: "), "{message}");
+        let message = error("policy.dim_modle=5");
+        assert!(message.starts_with("unknown key `policy.dim_modle` (did you mean `dim_model`?)"), "{message}");
+        let message = error("trian.steps=5");
+        assert!(message.starts_with("unknown key `trian` (did you mean `train`?)"), "{message}");
+        assert_eq!(error("policy.dim_model=wide"), "key `policy.dim_model`: expected usize, found string \"wide\"");
+        assert!(error("policy.type=atc").starts_with("key `policy.type`: expected one of act"));
+        assert!(error("normalisation.state=none").starts_with("key `normalisation.state`: expected one of identity, "));
+    }
+
+    #[test]
+    fn combinations_that_cannot_work_are_refused() {
+        let error = |o: &[&str]| load(o).unwrap_err();
+        assert_eq!(
+            error(&["rollout.n_action_steps=17"]),
+            "key `rollout.n_action_steps`: expected 1 to policy.action_horizon, 16, found 17"
+        );
+        assert!(error(&["rollout.temporal_ensemble=0.01"]).starts_with("key `rollout.n_action_steps`: expected 1, "));
+        assert!(load(&["rollout.temporal_ensemble=0.01", "rollout.n_action_steps=1"]).is_ok());
+        assert!(error(&["train.batch_size=0"]).starts_with("key `train.batch_size`: expected at least 1"));
+        assert!(error(&["entry=Lift"]).starts_with("entry name `Lift`"));
+        assert!(error(&["data.state_keys=[]"]).starts_with("key `data.state_keys`"));
+    }
+}

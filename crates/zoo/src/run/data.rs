@@ -1,0 +1,183 @@
+//! The demonstrations of a run: found, converted if need be, split and normalised.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use candle_core::{Device, Tensor};
+use dataset::{ConvertOptions, Dataset, FeatureStats, WindowSpec, Windows};
+use models::{Dims, Normaliser};
+
+use crate::ZooError;
+use crate::entry::DataMeta;
+use crate::experiment::Experiment;
+
+/// Folder of the run that a converted HDF5 file goes to.
+const CONVERTED: &str = "data";
+
+/// Finds `path`: as given, or, when relative, above the current folder or the program.
+///
+/// # Errors
+/// [`ZooError::DataNotFound`] with every place looked at.
+pub fn locate(path: &Path) -> Result<PathBuf, ZooError> {
+    let mut roots: Vec<PathBuf> = Vec::new();
+    if let Ok(here) = std::env::current_dir() {
+        roots.extend(here.ancestors().map(Path::to_owned));
+    }
+    if let Ok(program) = std::env::current_exe() {
+        roots.extend(program.ancestors().skip(1).map(Path::to_owned));
+    }
+    locate_from(path, &roots)
+}
+
+fn locate_from(path: &Path, roots: &[PathBuf]) -> Result<PathBuf, ZooError> {
+    let mut tried: Vec<String> = Vec::new();
+    let candidates = match path.is_absolute() {
+        true => vec![path.to_owned()],
+        false => roots.iter().map(|root| root.join(path)).collect(),
+    };
+    for candidate in candidates {
+        if candidate.exists() {
+            return Ok(candidate);
+        }
+        let text = candidate.display().to_string();
+        if !tried.contains(&text) {
+            tried.push(text);
+        }
+    }
+    Err(ZooError::DataNotFound { path: path.to_owned(), tried })
+}
+
+/// Opens a LeRobotDataset folder, or converts an HDF5 file into the run's folder and opens that.
+///
+/// # Errors
+/// What `dataset` refuses.
+pub(super) fn open(
+    path: &Path,
+    run: &Path,
+    experiment: &Experiment,
+    progress: &mut dyn FnMut(u64, u64),
+) -> Result<Dataset, ZooError> {
+    let folder = match path.is_dir() {
+        true => path.to_owned(),
+        false => {
+            let folder = run.join(CONVERTED);
+            if !folder.exists() {
+                let options = ConvertOptions {
+                    state_keys: experiment.data.state_keys.clone(),
+                    env_keys: experiment.data.env_keys.clone(),
+                    ..ConvertOptions::default()
+                };
+                dataset::convert(path, &folder, &options, progress)
+                    .map_err(|source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) })?;
+            }
+            folder
+        }
+    };
+    Dataset::open(&folder).map_err(|source| ZooError::Dataset { path: folder, source: Box::new(source) })
+}
+
+/// Windows to train and to validate on, with the statistics of the episodes trained on.
+pub(super) struct Demonstrations {
+    pub train: Windows,
+    pub valid: Option<Windows>,
+    pub normaliser: Normaliser,
+    pub dims: Dims,
+    pub meta: DataMeta,
+    /// What a user should know: a missing mask, constant dimensions.
+    pub notes: Vec<String>,
+}
+
+/// Splits `dataset` by the experiment's masks and takes the statistics of the training episodes.
+pub(super) fn prepare(
+    dataset: &Dataset,
+    path: &Path,
+    name: &str,
+    experiment: &Experiment,
+) -> Result<Demonstrations, ZooError> {
+    let unfit = |reason: String| ZooError::UnfitData { path: path.to_owned(), reason };
+    let failed = |source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) };
+    let mut notes = Vec::new();
+    let all: Vec<usize> = (0..dataset.episodes().len()).collect();
+    let mask = &experiment.data.train_mask;
+    let train = dataset.split(mask).unwrap_or_else(|| {
+        notes.push(format!("no mask `{mask}`: training on all {} episodes", all.len()));
+        all
+    });
+    if train.is_empty() {
+        return Err(unfit(format!("mask `{mask}`: expected at least one episode, found none")));
+    }
+    let valid: Vec<usize> = dataset.split(&experiment.data.valid_mask).unwrap_or_default();
+    if let Some(both) = valid.iter().find(|episode| train.contains(episode)) {
+        return Err(unfit(format!(
+            "masks `{mask}` and `{}` share episode {both}: a validation on training data says nothing",
+            experiment.data.valid_mask
+        )));
+    }
+
+    let statistics = tensors(&dataset.statistics_of(&train).map_err(failed)?).map_err(|e| unfit(e.to_string()))?;
+    let action_horizon = experiment.policy.action_horizon();
+    let windows = |episodes: Vec<usize>| dataset.windows(&WindowSpec { action_horizon, episodes }).map_err(failed);
+    let meta = DataMeta {
+        name: name.to_owned(),
+        fingerprint: dataset.fingerprint().to_owned(),
+        train_episodes: train.len() as u64,
+        train_frames: train.iter().map(|e| dataset.episodes()[*e].length as u64).sum(),
+        valid_episodes: valid.len() as u64,
+    };
+    let train = windows(train)?;
+    let valid = match valid.is_empty() {
+        true => None,
+        false => Some(windows(valid)?),
+    };
+    let dims = Dims {
+        state: train.state_dim(),
+        environment_state: train.environment_state_dim(),
+        action: train.action_dim(),
+    };
+    let modes = experiment.normalisation.modes(dims.environment_state > 0);
+    let mut normaliser =
+        Normaliser::new(&modes, &statistics).map_err(experiment.model_error("take the statistics for"))?;
+    for guarded in normaliser.guard_constant() {
+        notes.push(format!(
+            "{}[{}] is constant (spread {:e}): normalised to 0",
+            guarded.feature, guarded.dim, guarded.spread
+        ));
+    }
+    Ok(Demonstrations { train, valid, normaliser, dims, meta, notes })
+}
+
+fn tensors(statistics: &BTreeMap<String, FeatureStats>) -> candle_core::Result<BTreeMap<String, Tensor>> {
+    let mut tensors = BTreeMap::new();
+    for (feature, stats) in statistics {
+        for (name, values) in [("mean", &stats.mean), ("std", &stats.std), ("min", &stats.min), ("max", &stats.max)] {
+            let values: Vec<f32> = values.iter().map(|v| *v as f32).collect();
+            let tensor = Tensor::from_slice(&values, values.len(), &Device::Cpu)?;
+            tensors.insert(format!("{feature}.{name}"), tensor);
+        }
+    }
+    Ok(tensors)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn data_is_found_above_and_every_place_is_named() {
+        let root = tempfile::tempdir().unwrap();
+        let deep = root.path().join("a/b");
+        std::fs::create_dir_all(&deep).unwrap();
+        std::fs::create_dir_all(root.path().join("data")).unwrap();
+        std::fs::write(root.path().join("data/x.hdf5"), "").unwrap();
+        let roots: Vec<PathBuf> = deep.ancestors().take(3).map(Path::to_owned).collect();
+        let found = locate_from(Path::new("data/x.hdf5"), &roots).unwrap();
+        assert_eq!(found, root.path().join("data/x.hdf5"));
+        let error = locate_from(Path::new("data/y.hdf5"), &roots).unwrap_err().to_string();
+        for place in &roots {
+            assert!(error.contains(&place.join("data/y.hdf5").display().to_string()), "{error}");
+        }
+        let error = locate_from(Path::new("/nonexistent/y.hdf5"), &roots).unwrap_err().to_string();
+        assert_eq!(error, "data `/nonexistent/y.hdf5` not found; looked at /nonexistent/y.hdf5");
+    }
+}

@@ -1,0 +1,48 @@
+//! The validation loss: how far predictions at latent zero are from the demonstrations held out.
+
+use candle_core::Tensor;
+use dataset::{WindowBatch, Windows};
+use models::{Batch, ModelError, PolicyModel};
+
+use crate::ZooError;
+use crate::experiment::Experiment;
+
+use super::data::Demonstrations;
+use super::training::normalised;
+
+/// Windows used, evenly spread; more would cost time and tell the same.
+const MOST_WINDOWS: usize = 512;
+/// Windows at once.
+const BATCH: usize = 128;
+
+/// Mean absolute error in network units over all steps that are not padding.
+pub(super) fn validation_loss(
+    model: &dyn PolicyModel,
+    windows: &Windows,
+    demonstrations: &Demonstrations,
+    experiment: &Experiment,
+) -> Result<f64, ZooError> {
+    let stride = windows.len().div_ceil(MOST_WINDOWS).max(1);
+    let indices: Vec<u32> = (0..windows.len()).step_by(stride).map(|i| i as u32).collect();
+    let (mut sum, mut count) = (0.0, 0.0);
+    let mut gathered = WindowBatch::default();
+    for chunk in indices.chunks(BATCH) {
+        windows.gather(chunk, &mut gathered);
+        let batch = normalised(&mut gathered, &demonstrations.normaliser, &demonstrations.dims, experiment)?;
+        let (error, entries) = absolute_error(model, &batch).map_err(experiment.model_error("validate"))?;
+        sum += error;
+        count += entries;
+    }
+    Ok(sum / count)
+}
+
+/// Sum of absolute errors and the number of entries it is over.
+fn absolute_error(model: &dyn PolicyModel, batch: &Batch) -> Result<(f64, f64), ModelError> {
+    let predicted = model.predict(&batch.state, batch.environment_state.as_ref())?;
+    let valid: Tensor = (1.0 - &batch.is_pad)?.unsqueeze(2)?;
+    let error = (predicted - &batch.actions)?.abs()?.broadcast_mul(&valid)?;
+    let action_dim = batch.actions.dim(2)? as f64;
+    let sum = f64::from(error.sum_all()?.to_scalar::<f32>()?);
+    let steps = f64::from(valid.sum_all()?.to_scalar::<f32>()?);
+    Ok((sum, steps * action_dim))
+}
