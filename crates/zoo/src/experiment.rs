@@ -162,7 +162,7 @@ impl Experiment {
     }
 
     /// What serde cannot see: values that do not go together.
-    fn check(&self) -> Result<(), ZooError> {
+    pub(crate) fn check(&self) -> Result<(), ZooError> {
         let invalid = |key: &str, expected: String, found: String| {
             Err(ZooError::InvalidValue { key: key.to_owned(), expected, found })
         };

@@ -12,6 +12,7 @@ pub mod entry;
 mod error;
 pub mod experiment;
 mod files;
+pub mod lerobot;
 pub mod registry;
 pub mod run;
 mod tensors;

@@ -24,18 +24,19 @@ fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
     row("parameters", grouped(meta.parameters))?;
     row("observation.state", keys(&meta.state_keys))?;
     row("observation.environment_state", keys(&meta.env_keys))?;
-    let data = &meta.data;
-    row(
-        "demonstrations",
-        format!(
-            "{}: {} episodes, {} frames trained on, {} episodes held out",
-            data.name,
-            data.train_episodes,
-            grouped(data.train_frames),
-            data.valid_episodes
-        ),
-    )?;
-    row("data set", format!("`{}`", data.fingerprint))?;
+    if let Some(data) = &meta.data {
+        row(
+            "demonstrations",
+            format!(
+                "{}: {} episodes, {} frames trained on, {} episodes held out",
+                data.name,
+                data.train_episodes,
+                grouped(data.train_frames),
+                data.valid_episodes
+            ),
+        )?;
+        row("data set", format!("`{}`", data.fingerprint))?;
+    }
     if let Some(env) = &meta.env_name {
         let version = meta.env_version.as_deref().unwrap_or("unknown version");
         row("recorded in", format!("{env}, {version}"))?;

@@ -41,8 +41,8 @@ pub struct EntryMeta {
     pub env_keys: Vec<String>,
     /// Lengths of the features.
     pub dims: Dims,
-    /// The demonstrations.
-    pub data: DataMeta,
+    /// The demonstrations; `None` for an imported entry.
+    pub data: Option<DataMeta>,
     /// How it was trained; `None` for an imported entry.
     pub training: Option<TrainingMeta>,
     /// Versions of the software that made it.

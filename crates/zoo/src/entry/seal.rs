@@ -124,13 +124,13 @@ pub(crate) mod tests {
                 state_keys: vec!["robot0_eef_pos".to_owned()],
                 env_keys: vec!["object".to_owned()],
                 dims: models::Dims { state: 9, environment_state: 10, action: 7 },
-                data: DataMeta {
+                data: Some(DataMeta {
                     name: "lift.hdf5".to_owned(),
                     fingerprint: "f".repeat(64),
                     train_episodes: 45,
                     train_frames: 2000,
                     valid_episodes: 5,
-                },
+                }),
                 training: Some(TrainingMeta {
                     steps: 3,
                     batch_size: 64,

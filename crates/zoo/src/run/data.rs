@@ -63,8 +63,8 @@ pub(super) fn open(
             let folder = run.join(CONVERTED);
             if !folder.exists() {
                 let options = ConvertOptions {
-                    state_keys: experiment.data.state_keys.clone(),
-                    env_keys: experiment.data.env_keys.clone(),
+                    state_keys: Some(experiment.data.state_keys.clone()),
+                    env_keys: Some(experiment.data.env_keys.clone()),
                     ..ConvertOptions::default()
                 };
                 dataset::convert(path, &folder, &options, progress)

@@ -381,7 +381,7 @@ impl<'a> Run<'a> {
             state_keys: experiment.data.state_keys.clone(),
             env_keys: experiment.data.env_keys.clone(),
             dims,
-            data: demonstrations.meta.clone(),
+            data: Some(demonstrations.meta.clone()),
             training: Some(TrainingMeta {
                 steps: self.step,
                 batch_size: section.batch_size as u64,

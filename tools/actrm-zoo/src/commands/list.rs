@@ -61,7 +61,7 @@ pub fn cmd_list(args: &ListArgs) -> anyhow::Result<ExitCode> {
             meta.parameters.to_string(),
             number(training.map(|t| t.steps.to_string())),
             number(training.map(|t| format!("{:.1}", t.minutes))),
-            format!("{} ({} demos)", meta.data.name, meta.data.train_episodes),
+            number(meta.data.as_ref().map(|d| format!("{} ({} demos)", d.name, d.train_episodes))),
         ]);
     }
     println!("{}", table.trim_fmt());

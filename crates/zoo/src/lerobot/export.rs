@@ -1,0 +1,131 @@
+//! An ACT entry becomes a folder that LeRobot loads.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use models::act::POSITION_BUFFER;
+use models::layers::sinusoid_table;
+use models::{ACTION, ENVIRONMENT_STATE, PolicyConfig, STATE};
+use serde_json::{Value, json};
+
+use crate::entry::Entry;
+use crate::files::sync_folder;
+use crate::{ZooError, tensors, write_atomic};
+
+use super::config::{ActConfig, Feature, Features, NormaliserStep, Pipeline, Step, mode_name};
+use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREFIX, PREPROCESSOR};
+
+/// Writes `entry` into the new folder `out`.
+///
+/// # Errors
+/// When `out` exists, the entry is not ACT, or a file cannot be written.
+pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
+    let loaded = entry.load()?;
+    let experiment = loaded.experiment();
+    let PolicyConfig::Act(act) = &experiment.policy else {
+        return Err(ZooError::InvalidValue {
+            key: format!("policy.type of {}", entry.id()),
+            expected: "act: LeRobot has no other policy of ours".to_owned(),
+            found: experiment.policy_type(),
+        });
+    };
+    let (meta, normalisation) = (entry.meta(), &experiment.normalisation);
+    let feature = |kind: &str, n: usize| Feature { kind: kind.to_owned(), shape: vec![n] };
+    let mut inputs = Features::from([(STATE.to_owned(), feature("STATE", meta.dims.state))]);
+    let mut modes = BTreeMap::from([
+        ("STATE".to_owned(), mode_name(normalisation.state).to_owned()),
+        ("ACTION".to_owned(), mode_name(normalisation.action).to_owned()),
+    ]);
+    if meta.dims.environment_state > 0 {
+        inputs.insert(ENVIRONMENT_STATE.to_owned(), feature("ENV", meta.dims.environment_state));
+        modes.insert("ENV".to_owned(), mode_name(normalisation.environment_state).to_owned());
+    }
+    let outputs = Features::from([(ACTION.to_owned(), feature("ACTION", meta.dims.action))]);
+    let rollout = &experiment.rollout;
+    let mut config = ActConfig::new(act, rollout.n_action_steps, rollout.temporal_ensemble);
+    config.input_features = inputs.clone();
+    config.output_features = outputs.clone();
+    config.normalization_mapping = modes.clone();
+
+    let model_error = || experiment.model_error("export");
+    let mut weights: BTreeMap<_, _> = loaded
+        .model()
+        .params()
+        .tensors()
+        .into_iter()
+        .map(|(name, tensor)| (format!("{PREFIX}{name}"), tensor))
+        .collect();
+    if act.use_vae {
+        // LeRobot keeps the table as a buffer of shape (1, action_horizon + 2, dim_model)
+        let table = sinusoid_table(act.action_horizon + 2, act.dim_model)
+            .and_then(|table| Ok(table.reshape((1, act.action_horizon + 2, act.dim_model))?))
+            .map_err(model_error())?;
+        weights.insert(format!("{PREFIX}{POSITION_BUFFER}"), table);
+    }
+    let statistics = loaded.normaliser().tensors().map_err(model_error())?;
+
+    let mut features = inputs;
+    features.extend(outputs.clone());
+    let device = || step("device_processor", json!({"device": "cpu", "float_dtype": null}));
+    let normalise = |name: &str, features: Features, pipeline: &str, index: usize| Step {
+        state_file: Some(format!("{pipeline}_step_{index}_{name}.safetensors")),
+        ..step(name, to_json(&NormaliserStep { eps: 1e-8, features, norm_map: modes.clone() }))
+    };
+    let before = Pipeline {
+        name: PREPROCESSOR.to_owned(),
+        steps: vec![
+            step("rename_observations_processor", json!({"rename_map": {}})),
+            step("to_batch_processor", json!({})),
+            device(),
+            normalise("normalizer_processor", features, PREPROCESSOR, 3),
+        ],
+    };
+    let after = Pipeline {
+        name: POSTPROCESSOR.to_owned(),
+        steps: vec![normalise("unnormalizer_processor", outputs, POSTPROCESSOR, 0), device()],
+    };
+
+    let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    if out.exists() {
+        let exists = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
+        return Err(ZooError::io("create folder", out)(exists));
+    }
+    let staging = tempfile::Builder::new()
+        .prefix(".tmp-")
+        .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o755))
+        .tempdir_in(parent)
+        .map_err(ZooError::io("create a temporary folder in", parent))?;
+    let about = json!({"entry": entry.id().to_string(), "sha256": meta.content_sha256()});
+    let put = |name: &str, bytes: &[u8]| write_atomic(&staging.path().join(name), bytes);
+    put(MODEL_FILE, &tensors::to_bytes(out, &weights, &about)?)?;
+    put(CONFIG_FILE, pretty(&to_json(&config)).as_bytes())?;
+    for pipeline in [&before, &after] {
+        put(&format!("{}.json", pipeline.name), pretty(&to_json(pipeline)).as_bytes())?;
+        for file in pipeline.steps.iter().filter_map(|s| s.state_file.as_ref()) {
+            put(file, &tensors::to_bytes(out, &statistics, &about)?)?;
+        }
+    }
+    rustix::fs::renameat_with(
+        rustix::fs::CWD,
+        staging.path(),
+        rustix::fs::CWD,
+        out,
+        rustix::fs::RenameFlags::NOREPLACE,
+    )
+    .map_err(|e| ZooError::io("create folder", out)(e.into()))?;
+    // renamed away: nothing is left to remove
+    let _gone = staging.keep();
+    sync_folder(parent)
+}
+
+fn step(registry_name: &str, config: Value) -> Step {
+    Step { registry_name: registry_name.to_owned(), config, state_file: None }
+}
+
+fn to_json<T: serde::Serialize>(value: &T) -> Value {
+    serde_json::to_value(value).expect("names and numbers become JSON")
+}
+
+fn pretty(value: &Value) -> String {
+    format!("{value:#}\n")
+}

@@ -1,0 +1,18 @@
+//! LeRobot's ACT checkpoints in and out: `config.json`, `model.safetensors` and the two processors.
+//!
+//! LeRobot loads weights by name without complaint about missing or extra ones, and passes features through
+//! whose statistics are missing. Here both are errors that name what is wrong.
+
+mod config;
+mod export;
+mod import;
+
+pub use export::export;
+pub use import::{ImportOptions, import};
+
+/// Before every tensor's name in LeRobot's files.
+const PREFIX: &str = "model.";
+const MODEL_FILE: &str = "model.safetensors";
+const CONFIG_FILE: &str = "config.json";
+const PREPROCESSOR: &str = "policy_preprocessor";
+const POSTPROCESSOR: &str = "policy_postprocessor";

@@ -1,0 +1,148 @@
+//! LeRobot 0.6.1's own checkpoints, its own answers, and the way back. `fixtures/lerobot/make.py` made them.
+
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use models::{Observation, Policy};
+use safetensors::SafeTensors;
+use zoo::entry::Entry;
+use zoo::lerobot::{ImportOptions, export, import};
+
+fn fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/lerobot").join(name)
+}
+
+fn options() -> ImportOptions {
+    ImportOptions {
+        name: "imported".to_owned(),
+        task: "Lift".to_owned(),
+        state_keys: ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"].map(str::to_owned).to_vec(),
+        env_keys: vec!["object".to_owned()],
+    }
+}
+
+fn floats(file: &[u8], name: &str) -> Vec<f32> {
+    let parsed = SafeTensors::deserialize(file).unwrap();
+    let view = parsed.tensor(name).unwrap();
+    view.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
+}
+
+/// The largest difference from LeRobot's actions, raw observation to raw action.
+fn difference(entry: &Entry, folder: &Path) -> f32 {
+    let io = fs::read(folder.join("io.safetensors")).unwrap();
+    let (state, env, actions) = (floats(&io, "state"), floats(&io, "environment_state"), floats(&io, "actions"));
+    let mut policy = entry.load().unwrap().policy();
+    let rows = state.chunks(9).zip(env.chunks(10)).zip(actions.chunks(8 * 7));
+    assert_eq!(rows.len(), 5);
+    let mut largest = 0.0_f32;
+    for ((state, env), expected) in rows {
+        let observation = Observation { state: state.to_vec(), environment_state: env.to_vec() };
+        let chunk = policy.predict(&observation).unwrap();
+        assert_eq!((chunk.action_horizon, chunk.action_dim), (8, 7));
+        for (got, expected) in chunk.actions.iter().zip(expected) {
+            largest = largest.max((got - expected).abs());
+        }
+    }
+    largest
+}
+
+#[test]
+fn imported_checkpoints_answer_as_lerobot_does() {
+    for name in ["environment_raw", "environment_normalised"] {
+        let zoo = tempfile::tempdir().unwrap();
+        let id = import(&fixture(name), &options(), zoo.path()).unwrap();
+        let entry = Entry::open(zoo.path(), &id).unwrap();
+        assert_eq!(entry.meta().policy, "act");
+        assert_eq!(entry.load().unwrap().experiment().rollout.n_action_steps, 4);
+        let largest = difference(&entry, &fixture(name));
+        assert!(largest <= 1e-5, "{name}: {largest:e}");
+    }
+}
+
+#[test]
+fn what_is_exported_comes_back_the_same() {
+    for name in ["environment_raw", "environment_normalised"] {
+        let root = tempfile::tempdir().unwrap();
+        let zoo = root.path().join("zoo");
+        let first = Entry::open(&zoo, &import(&fixture(name), &options(), &zoo).unwrap()).unwrap();
+        let out = root.path().join("exported");
+        export(&first, &out).unwrap();
+        let theirs = fs::read(fixture(name).join("model.safetensors")).unwrap();
+        let ours = fs::read(out.join("model.safetensors")).unwrap();
+        let names = |file: &[u8]| {
+            let parsed = SafeTensors::deserialize(file).unwrap();
+            let mut all: Vec<_> = parsed.iter().map(|(n, v)| (n.to_owned(), v.shape().to_vec())).collect();
+            all.sort();
+            all
+        };
+        assert_eq!(names(&ours), names(&theirs));
+        let second = Entry::open(&zoo, &import(&out, &options(), &zoo).unwrap()).unwrap();
+        assert_eq!(second.meta().files["model.safetensors"], first.meta().files["model.safetensors"]);
+        assert_eq!(second.meta().content_sha256(), first.meta().content_sha256());
+        let error = export(&first, &out).unwrap_err().to_string();
+        assert!(error.contains("exported"), "{error}");
+    }
+}
+
+/// A copy of a fixture in which one file was changed, and the error that importing it gives.
+fn refusal(change: impl Fn(&Path)) -> String {
+    let root = tempfile::tempdir().unwrap();
+    let copy = root.path().join("checkpoint");
+    fs::create_dir(&copy).unwrap();
+    for item in fs::read_dir(fixture("environment_raw")).unwrap() {
+        let item = item.unwrap();
+        fs::copy(item.path(), copy.join(item.file_name())).unwrap();
+    }
+    change(&copy);
+    let zoo = root.path().join("zoo");
+    let error = import(&copy, &options(), &zoo).unwrap_err();
+    assert!(!zoo.exists(), "nothing may be left of a refused import");
+    let mut text = error.to_string();
+    let mut source = std::error::Error::source(&error);
+    while let Some(cause) = source {
+        text.push_str(&format!(": {cause}"));
+        source = cause.source();
+    }
+    text
+}
+
+fn edit(path: &Path, from: &str, to: &str) {
+    let text = fs::read_to_string(path).unwrap();
+    assert!(text.contains(from));
+    fs::write(path, text.replace(from, to)).unwrap();
+}
+
+/// Replaces text in the header of a safetensors file by text of the same length.
+fn rename(path: &Path, from: &str, to: &str) {
+    let mut bytes = fs::read(path).unwrap();
+    let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+    bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
+    fs::write(path, bytes).unwrap();
+}
+
+#[test]
+fn a_renamed_tensor_is_an_error_that_names_it() {
+    let text = refusal(|f| rename(&f.join("model.safetensors"), "model.action_head.bias", "model.action_haed.bias"));
+    assert!(text.contains("action_head.bias") || text.contains("action_haed.bias"), "{text}");
+}
+
+#[test]
+fn a_missing_statistic_is_an_error_that_names_it() {
+    let file = "policy_postprocessor_step_0_unnormalizer_processor.safetensors";
+    let text = refusal(|f| rename(&f.join(file), "action.std", "action.stx"));
+    assert!(text.contains("action.std"), "{text}");
+}
+
+#[test]
+fn what_we_cannot_run_is_refused() {
+    let text = refusal(|f| edit(&f.join("config.json"), "\"type\": \"act\"", "\"type\": \"diffusion\""));
+    assert!(text.contains("type: expected act, found diffusion"), "{text}");
+    let text = refusal(|f| edit(&f.join("config.json"), "\"n_heads\"", "\"n_haeds\""));
+    assert!(text.contains("n_haeds"), "{text}");
+    let text = refusal(|f| edit(&f.join("policy_preprocessor.json"), "\"STATE\": \"MEAN_STD\"", "\"STATE\": \"QUANTILES\""));
+    assert!(text.contains("QUANTILES"), "{text}");
+    let text = refusal(|f| fs::remove_file(f.join("policy_preprocessor.json")).unwrap());
+    assert!(text.contains("policy_preprocessor.json"), "{text}");
+}
