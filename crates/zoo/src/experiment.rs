@@ -121,7 +121,7 @@ pub struct RolloutSection {
     pub temporal_ensemble: Option<f64>,
     /// Steps after which an episode has failed; the task's own cap unless given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub max_steps: Option<u64>,
+    pub max_steps: Option<usize>,
 }
 
 impl Experiment {
@@ -209,6 +209,12 @@ impl Experiment {
     pub(crate) fn model_error(&self, operation: &'static str) -> impl FnOnce(ModelError) -> ZooError + use<> {
         let name = self.entry.clone();
         move |source| ZooError::Model { operation, name, source }
+    }
+
+    /// The same for what the tensor library refuses.
+    pub(crate) fn tensor_error(&self, operation: &'static str) -> impl FnOnce(candle_core::Error) -> ZooError + use<> {
+        let wrap = self.model_error(operation);
+        move |source| wrap(ModelError::Tensor(source))
     }
 }
 

@@ -141,7 +141,8 @@ fn what_we_cannot_run_is_refused() {
     assert!(text.contains("type: expected act, found diffusion"), "{text}");
     let text = refusal(|f| edit(&f.join("config.json"), "\"n_heads\"", "\"n_haeds\""));
     assert!(text.contains("n_haeds"), "{text}");
-    let text = refusal(|f| edit(&f.join("policy_preprocessor.json"), "\"STATE\": \"MEAN_STD\"", "\"STATE\": \"QUANTILES\""));
+    let text =
+        refusal(|f| edit(&f.join("policy_preprocessor.json"), "\"STATE\": \"MEAN_STD\"", "\"STATE\": \"QUANTILES\""));
     assert!(text.contains("QUANTILES"), "{text}");
     let text = refusal(|f| fs::remove_file(f.join("policy_preprocessor.json")).unwrap());
     assert!(text.contains("policy_preprocessor.json"), "{text}");

@@ -20,6 +20,8 @@ struct Cli {
 }
 
 fn main() -> ExitCode {
+    // converting an HDF5 file reads it in a process of its own, which is this program again
+    dataset::isolation::serve_if_child();
     match Cli::parse().command.run() {
         Ok(code) => code,
         Err(error) => {

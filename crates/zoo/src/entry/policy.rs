@@ -40,12 +40,7 @@ impl Entry {
         let (statistics, _) = tensors::read(&self.folder().join(NORMALISER_FILE))?;
         let modes = experiment.normalisation.modes(dims.environment_state > 0);
         let normaliser = Normaliser::new(&modes, &statistics).map_err(failed("load the normaliser of"))?;
-        Ok(LoadedEntry {
-            entry: self.clone(),
-            experiment,
-            model: model.into(),
-            normaliser: Arc::new(normaliser),
-        })
+        Ok(LoadedEntry { entry: self.clone(), experiment, model: model.into(), normaliser: Arc::new(normaliser) })
     }
 }
 
@@ -85,11 +80,7 @@ impl LoadedEntry {
     /// When `[rollout]` does not go with the policy.
     pub fn actor(&self) -> Result<Box<dyn Actor>, ZooError> {
         let rollout = &self.experiment.rollout;
-        let failed = |source| ZooError::Model {
-            operation: "act with",
-            name: self.entry.id().to_string(),
-            source,
-        };
+        let failed = |source| ZooError::Model { operation: "act with", name: self.entry.id().to_string(), source };
         Ok(match rollout.temporal_ensemble {
             Some(coefficient) => Box::new(TemporalEnsemble::new(self.policy(), coefficient).map_err(failed)?),
             None => Box::new(RecedingHorizon::new(self.policy(), rollout.n_action_steps).map_err(failed)?),

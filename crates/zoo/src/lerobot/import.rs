@@ -127,9 +127,11 @@ fn dims(path: &Path, act: &ActConfig) -> Result<Dims, ZooError> {
         action: length(&act.output_features, ACTION)?,
     };
     if dims.state == 0 || dims.action == 0 {
-        return Err(malformed(format!("expected features {STATE} and {ACTION}, found {act_in:?} and {act_out:?}",
+        return Err(malformed(format!(
+            "expected features {STATE} and {ACTION}, found {act_in:?} and {act_out:?}",
             act_in = act.input_features.keys().collect::<Vec<_>>(),
-            act_out = act.output_features.keys().collect::<Vec<_>>())));
+            act_out = act.output_features.keys().collect::<Vec<_>>()
+        )));
     }
     Ok(dims)
 }
@@ -188,7 +190,9 @@ fn weights(path: &Path, action_horizon: usize) -> Result<BTreeMap<String, Tensor
         let largest = difference().map_err(|e| malformed(format!("tensor `{name}`: {e}")))?;
         // the table is sines and cosines in f32
         if largest.is_nan() || largest > 1e-5 {
-            return Err(malformed(format!("tensor `{name}`: expected the sinusoid table, found {largest:e} away from it")));
+            return Err(malformed(format!(
+                "tensor `{name}`: expected the sinusoid table, found {largest:e} away from it"
+            )));
         }
     }
     Ok(weights)

@@ -46,14 +46,19 @@ struct Latest {
 }
 
 impl Checkpoint {
+    /// Where the checkpoint of a step is.
+    pub fn path(folder: &Path, step: u64) -> PathBuf {
+        folder.join(file_name(step))
+    }
+
     /// Writes the checkpoint into `folder` and forgets older ones.
     ///
     /// # Errors
     /// When a file cannot be written.
     pub fn save(&self, folder: &Path) -> Result<PathBuf, ZooError> {
         fs::create_dir_all(folder).map_err(ZooError::io("create folder", folder))?;
-        let file = format!("{:08}.safetensors", self.step);
-        let path = folder.join(&file);
+        let path = Self::path(folder, self.step);
+        let file = file_name(self.step);
         let latest_path = folder.join("latest.json");
         let meta = Meta { step: self.step, seconds: self.seconds, trainer: self.trainer.clone() };
         let meta = serde_json::to_value(meta).expect("numbers and JSON become JSON");
@@ -91,6 +96,10 @@ impl Checkpoint {
             .map_err(|e| ZooError::Malformed { path: path.clone(), reason: format!("not a checkpoint: {e}") })?;
         Ok(Some(Self { step: meta.step, seconds: meta.seconds, tensors, trainer: meta.trainer }))
     }
+}
+
+fn file_name(step: u64) -> String {
+    format!("{step:08}.safetensors")
 }
 
 fn prune(folder: &Path) -> Result<(), ZooError> {

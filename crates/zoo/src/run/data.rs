@@ -57,23 +57,32 @@ pub(super) fn open(
     experiment: &Experiment,
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Dataset, ZooError> {
-    let folder = match path.is_dir() {
-        true => path.to_owned(),
-        false => {
-            let folder = run.join(CONVERTED);
-            if !folder.exists() {
-                let options = ConvertOptions {
-                    state_keys: Some(experiment.data.state_keys.clone()),
-                    env_keys: Some(experiment.data.env_keys.clone()),
-                    ..ConvertOptions::default()
-                };
-                dataset::convert(path, &folder, &options, progress)
-                    .map_err(|source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) })?;
-            }
-            folder
-        }
+    let opened = |folder: PathBuf| {
+        Dataset::open(&folder).map_err(|source| ZooError::Dataset { path: folder, source: Box::new(source) })
     };
-    Dataset::open(&folder).map_err(|source| ZooError::Dataset { path: folder, source: Box::new(source) })
+    if path.is_dir() {
+        return opened(path.to_owned());
+    }
+    let folder = run.join(CONVERTED);
+    if folder.exists() {
+        // an earlier session's conversion, of this file or of another
+        let dataset = opened(folder)?;
+        let expected = dataset.provenance().map_or_else(String::new, |p| p.source_sha256.clone());
+        let found = crate::sha256_file(path)?;
+        if expected != found {
+            let (folder, what) = (run.to_owned(), "data set".to_owned());
+            return Err(ZooError::ResumeMismatch { folder, what, expected, found });
+        }
+        return Ok(dataset);
+    }
+    let options = ConvertOptions {
+        state_keys: Some(experiment.data.state_keys.clone()),
+        env_keys: Some(experiment.data.env_keys.clone()),
+        ..ConvertOptions::default()
+    };
+    dataset::convert(path, &folder, &options, progress)
+        .map_err(|source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) })?;
+    opened(folder)
 }
 
 /// Windows to train and to validate on, with the statistics of the episodes trained on.
@@ -97,6 +106,17 @@ pub(super) fn prepare(
     let unfit = |reason: String| ZooError::UnfitData { path: path.to_owned(), reason };
     let failed = |source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) };
     let mut notes = Vec::new();
+    if let Some(provenance) = dataset.provenance() {
+        let keys = [
+            ("state_keys", &experiment.data.state_keys, &provenance.state_keys),
+            ("env_keys", &experiment.data.env_keys, &provenance.env_keys),
+        ];
+        for (key, expected, found) in keys {
+            if expected != found {
+                return Err(unfit(format!("data.{key}: expected {}, found {}", expected.join(", "), found.join(", "))));
+            }
+        }
+    }
     let all: Vec<usize> = (0..dataset.episodes().len()).collect();
     let mask = &experiment.data.train_mask;
     let train = dataset.split(mask).unwrap_or_else(|| {
@@ -129,11 +149,8 @@ pub(super) fn prepare(
         true => None,
         false => Some(windows(valid)?),
     };
-    let dims = Dims {
-        state: train.state_dim(),
-        environment_state: train.environment_state_dim(),
-        action: train.action_dim(),
-    };
+    let dims =
+        Dims { state: train.state_dim(), environment_state: train.environment_state_dim(), action: train.action_dim() };
     let modes = experiment.normalisation.modes(dims.environment_state > 0);
     let mut normaliser =
         Normaliser::new(&modes, &statistics).map_err(experiment.model_error("take the statistics for"))?;

@@ -14,6 +14,6 @@ pub use checkpoint::Checkpoint;
 pub use data::locate;
 pub use folder::RunFolder;
 pub use metrics::{Metrics, MetricsRow};
-pub use section::{Schedule, TrainSection};
+pub use section::{OptimiserKind, TrainSection};
 pub use tensorboard::EventWriter;
 pub use training::{TrainEvent, TrainOutcome, TrainRequest, train};

@@ -20,9 +20,7 @@ impl<'a> Sampler<'a> {
     /// The windows of step `step`, counted from 0.
     pub fn batch(&mut self, step: u64) -> Vec<u32> {
         let size = self.windows.len() as u64;
-        positions(step, self.batch_size, size)
-            .map(|(epoch, position)| self.order(epoch)[position])
-            .collect()
+        positions(step, self.batch_size, size).map(|(epoch, position)| self.order(epoch)[position]).collect()
     }
 
     fn order(&mut self, epoch: u64) -> &[u32] {

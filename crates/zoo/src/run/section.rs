@@ -1,17 +1,18 @@
 //! `[train]`: the numbers of a training.
 
+use models::{OptimiserConfig, Schedule, TrainConfig};
 use serde::{Deserialize, Serialize};
 
 use crate::ZooError;
 
-/// How the learning rate goes after the warm-up.
+/// Which optimiser.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Schedule {
-    /// It stays.
-    Constant,
-    /// Half a cosine down to zero at the last step.
-    Cosine,
+pub enum OptimiserKind {
+    /// AdamW with PyTorch's eps of 1e-8.
+    Adamw,
+    /// Adam with `atan2` in place of the quotient, as the official TRM.
+    AdamAtan2,
 }
 
 /// `[train]`
@@ -30,10 +31,18 @@ pub struct TrainSection {
     pub warmup_steps: u64,
     /// What it does after that.
     pub schedule: Schedule,
-    /// AdamW's decoupled weight decay.
+    /// End of the cosine as a share of `lr`.
+    pub min_lr_ratio: f64,
+    /// The optimiser.
+    pub optimiser: OptimiserKind,
+    /// Decays of its first and second moment.
+    pub betas: [f64; 2],
+    /// Its decoupled weight decay.
     pub weight_decay: f64,
-    /// Largest norm of the gradient; larger ones are scaled down.
+    /// Largest norm of the gradient, larger ones are scaled down; 0 for none.
     pub grad_clip_norm: f64,
+    /// Parts that a batch is cut into, one after the other, to save memory.
+    pub accumulation: usize,
     /// Decay of the moving average of the weights; absent: no average.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ema_decay: Option<f64>,
@@ -54,8 +63,12 @@ impl Default for TrainSection {
             lr: 1e-3,
             warmup_steps: 50,
             schedule: Schedule::Cosine,
+            min_lr_ratio: 0.0,
+            optimiser: OptimiserKind::Adamw,
+            betas: [0.9, 0.999],
             weight_decay: 1e-4,
             grad_clip_norm: 10.0,
+            accumulation: 1,
             ema_decay: None,
             log_every: 10,
             validate_every: 100,
@@ -73,6 +86,7 @@ impl TrainSection {
         for (key, value) in [
             ("steps", self.steps),
             ("batch_size", self.batch_size as u64),
+            ("accumulation", self.accumulation as u64),
             ("log_every", self.log_every),
             ("validate_every", self.validate_every),
             ("checkpoint_every", self.checkpoint_every),
@@ -84,13 +98,19 @@ impl TrainSection {
         if i64::try_from(self.seed).is_err() {
             return invalid("seed", "at most 9223372036854775807, the largest integer of TOML", self.seed.to_string());
         }
-        for (key, value) in [("lr", self.lr), ("grad_clip_norm", self.grad_clip_norm)] {
-            if !value.is_finite() || value <= 0.0 {
-                return invalid(key, "a positive number", value.to_string());
+        if !self.lr.is_finite() || self.lr <= 0.0 {
+            return invalid("lr", "a positive number", self.lr.to_string());
+        }
+        for (key, value) in [("grad_clip_norm", self.grad_clip_norm), ("weight_decay", self.weight_decay)] {
+            if !value.is_finite() || value < 0.0 {
+                return invalid(key, "a number from 0", value.to_string());
             }
         }
-        if !self.weight_decay.is_finite() || self.weight_decay < 0.0 {
-            return invalid("weight_decay", "a number from 0", self.weight_decay.to_string());
+        if !(0.0..=1.0).contains(&self.min_lr_ratio) {
+            return invalid("min_lr_ratio", "0 to 1", self.min_lr_ratio.to_string());
+        }
+        if let Some(beta) = self.betas.into_iter().find(|beta| !(0.0..1.0).contains(beta)) {
+            return invalid("betas", "numbers at least 0 and below 1", beta.to_string());
         }
         if let Some(decay) = self.ema_decay
             && !(0.0..1.0).contains(&decay)
@@ -98,5 +118,24 @@ impl TrainSection {
             return invalid("ema_decay", "at least 0 and below 1", decay.to_string());
         }
         Ok(())
+    }
+
+    /// The part of it that the trainer wants.
+    pub(super) fn trainer_config(&self) -> TrainConfig {
+        let ([beta1, beta2], weight_decay) = (self.betas, self.weight_decay);
+        TrainConfig {
+            steps: self.steps,
+            lr: self.lr,
+            warmup_steps: self.warmup_steps,
+            schedule: self.schedule,
+            min_lr_ratio: self.min_lr_ratio,
+            optimiser: match self.optimiser {
+                OptimiserKind::Adamw => OptimiserConfig::AdamW { beta1, beta2, eps: 1e-8, weight_decay },
+                OptimiserKind::AdamAtan2 => OptimiserConfig::AdamAtan2 { beta1, beta2, weight_decay },
+            },
+            clip_norm: self.grad_clip_norm,
+            ema_decay: self.ema_decay,
+            accumulation: self.accumulation,
+        }
     }
 }

@@ -4,8 +4,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Instant, SystemTime};
 
+use candle_core::Tensor;
 use dataset::WindowBatch;
-use models::{ACTION, Batch, Dims, ENVIRONMENT_STATE, ModelError, Normaliser, PolicyModel, STATE, Trainer, TrainerState};
+use models::{
+    ACTION, Batch, Dims, ENVIRONMENT_STATE, ModelError, Normaliser, PolicyModel, STATE, Trainer, TrainerState,
+};
 use serde::{Deserialize, Serialize};
 
 use crate::entry::{CurvePoint, EntryDraft, EntryId, EntryMeta, TrainingMeta};
@@ -123,7 +126,10 @@ pub fn train(
     let dataset = data::open(&path, folder.path(), experiment, &mut |done, total| {
         on_event(TrainEvent::Converting(done, total));
     })?;
-    let name = path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
+    let name = match dataset.provenance() {
+        Some(provenance) => provenance.source.clone(),
+        None => path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
+    };
     let demonstrations = data::prepare(&dataset, &path, &name, experiment)?;
     for note in &demonstrations.notes {
         on_event(TrainEvent::Note(note));
@@ -194,10 +200,8 @@ fn begun(folder: &RunFolder, note_path: &Path, request: &TrainRequest) -> Result
         }
     }
     let text = std::fs::read_to_string(note_path).map_err(ZooError::io("read", note_path))?;
-    let note: RunNote = serde_json::from_str(&text).map_err(|e| ZooError::Malformed {
-        path: note_path.to_owned(),
-        reason: format!("not a run's note: {e}"),
-    })?;
+    let note: RunNote = serde_json::from_str(&text)
+        .map_err(|e| ZooError::Malformed { path: note_path.to_owned(), reason: format!("not a run's note: {e}") })?;
     if note.experiment != request.name {
         return Err(ZooError::ResumeMismatch {
             folder: folder.path().to_owned(),
@@ -240,11 +244,12 @@ impl<'a> Run<'a> {
         };
         let mut trainer = Trainer::new(build()?, section.trainer_config(), section.seed)
             .map_err(experiment.model_error("set up the training of"))?;
-        let (mut step, mut before) = (0, 0.0);
+        let (mut step, mut before, mut last_checkpoint) = (0, 0.0, None);
         if let Some(checkpoint) = Checkpoint::latest(&folder.checkpoints())? {
             (step, before) = (checkpoint.step, checkpoint.seconds);
+            last_checkpoint = Some(Checkpoint::path(&folder.checkpoints(), step));
             let state = TrainerState { tensors: checkpoint.tensors, meta: checkpoint.trainer };
-            trainer.restore(state).map_err(experiment.model_error("restore the checkpoint of"))?;
+            trainer.restore(&state).map_err(experiment.model_error("restore the checkpoint of"))?;
         }
         let metrics = Metrics::open(folder.path().join("metrics.csv"), step)?;
         let events_path = folder.path().join("events.out.tfevents.0.actrm");
@@ -267,7 +272,7 @@ impl<'a> Run<'a> {
             step,
             before,
             started: Instant::now(),
-            last_checkpoint: None,
+            last_checkpoint,
         })
     }
 
@@ -276,11 +281,7 @@ impl<'a> Run<'a> {
     }
 
     /// Steps until all are done (true) or `stop` says so (false). Either way a checkpoint is written.
-    fn go(
-        &mut self,
-        stop: &dyn Fn() -> bool,
-        on_event: &mut dyn FnMut(TrainEvent<'_>),
-    ) -> Result<bool, ZooError> {
+    fn go(&mut self, stop: &dyn Fn() -> bool, on_event: &mut dyn FnMut(TrainEvent<'_>)) -> Result<bool, ZooError> {
         let section = &self.experiment.train;
         let mut sampler = Sampler::new(&self.demonstrations.train, section.seed, section.batch_size);
         let mut windows = WindowBatch::default();
@@ -292,7 +293,8 @@ impl<'a> Run<'a> {
             }
             let indices = sampler.batch(self.step);
             self.demonstrations.train.gather(&indices, &mut windows);
-            let batch = normalised(&mut windows, &self.demonstrations.normaliser, &self.demonstrations.dims, self.experiment)?;
+            let batch =
+                normalised(&mut windows, &self.demonstrations.normaliser, &self.demonstrations.dims, self.experiment)?;
             let done = self.trainer.step(&batch).map_err(|source| self.step_error(source))?;
             self.step += 1;
             samples += indices.len() as u64;
@@ -300,7 +302,7 @@ impl<'a> Run<'a> {
             let last = self.step == section.steps;
             let mut values = BTreeMap::from([
                 ("loss".to_owned(), f64::from(done.loss)),
-                ("grad_norm".to_owned(), f64::from(done.grad_norm)),
+                ("grad_norm".to_owned(), done.grad_norm),
                 ("lr".to_owned(), done.lr),
                 ("samples_per_s".to_owned(), samples as f64 / since.elapsed().as_secs_f64()),
             ]);
@@ -326,31 +328,28 @@ impl<'a> Run<'a> {
     }
 
     fn take_evaluated(&mut self) -> Result<(), ZooError> {
-        let weights = self.trainer.eval_params();
-        self.evaluated.params().load(&weights).map_err(self.experiment.model_error("take the weights of"))
+        let taken = self.trainer.eval_params().and_then(|weights| self.evaluated.params().load(&weights));
+        taken.map_err(self.experiment.model_error("take the weights of"))
     }
 
     /// A number that is not finite stops the run; the checkpoint before it stays.
     fn step_error(&self, source: ModelError) -> ZooError {
         match source {
-            ModelError::NotFinite { step, tensor, value } => ZooError::NotFinite {
-                step,
-                tensor,
-                value: f64::from(value),
-                checkpoint: self.last_checkpoint.clone(),
-            },
+            ModelError::NotFinite { step, tensor, value } => {
+                ZooError::NotFinite { step, tensor, value: f64::from(value), checkpoint: self.last_checkpoint.clone() }
+            }
             other => self.experiment.model_error("train")(other),
         }
     }
 
     fn save(&mut self, on_event: &mut dyn FnMut(TrainEvent<'_>)) -> Result<(), ZooError> {
         let state = self.trainer.state().map_err(self.experiment.model_error("save the training of"))?;
-        let checkpoint = Checkpoint {
-            step: self.step,
-            seconds: self.seconds(),
-            tensors: state.tensors,
-            trainer: state.meta,
-        };
+        if let Some((tensor, value)) = not_finite(&state.tensors).map_err(self.experiment.tensor_error("save"))? {
+            let checkpoint = self.last_checkpoint.clone();
+            return Err(ZooError::NotFinite { step: self.step, tensor, value, checkpoint });
+        }
+        let checkpoint =
+            Checkpoint { step: self.step, seconds: self.seconds(), tensors: state.tensors, trainer: state.meta };
         let path = checkpoint.save(&self.folder.checkpoints())?;
         self.metrics.write_parquet(&self.folder.path().join("metrics.parquet"))?;
         on_event(TrainEvent::Saved(&path));
@@ -364,7 +363,7 @@ impl<'a> Run<'a> {
         self.take_evaluated()?;
         let section = &experiment.train;
         let (env_name, env_version) = env.map_or((None, None), |(name, version)| (Some(name), version));
-        let weights = self.trainer.eval_params();
+        let weights = self.evaluated.params().tensors();
         let dims = demonstrations.dims;
         let policy = experiment.policy_type();
         let meta = EntryMeta {
@@ -393,7 +392,8 @@ impl<'a> Run<'a> {
             versions: crate::versions(),
             files: BTreeMap::new(),
         };
-        let statistics = demonstrations.normaliser.tensors().map_err(experiment.model_error("store the normaliser of"))?;
+        let statistics =
+            demonstrations.normaliser.tensors().map_err(experiment.model_error("store the normaliser of"))?;
         let about = serde_json::json!({"format": 1, "policy": policy});
         Ok(EntryDraft {
             meta,
@@ -435,6 +435,17 @@ pub(super) fn normalised(
         .map_err(experiment.model_error("make a batch for"))
 }
 
+/// The first tensor with a value that no training recovers from.
+fn not_finite(tensors: &BTreeMap<String, Tensor>) -> candle_core::Result<Option<(String, f64)>> {
+    for (name, tensor) in tensors {
+        let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+        if let Some(value) = values.into_iter().find(|x| !x.is_finite()) {
+            return Ok(Some((name.clone(), f64::from(value))));
+        }
+    }
+    Ok(None)
+}
+
 /// At most [`CURVE_POINTS`] rows, evenly thinned; the last always stays.
 fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
     let stride = rows.len().div_ceil(CURVE_POINTS).max(1);
@@ -455,9 +466,8 @@ mod tests {
 
     #[test]
     fn curves_are_thinned_to_their_end() {
-        let rows: Vec<MetricsRow> = (1..=1003)
-            .map(|step| MetricsRow { step, values: [("loss".to_owned(), step as f64)].into() })
-            .collect();
+        let rows: Vec<MetricsRow> =
+            (1..=1003).map(|step| MetricsRow { step, values: [("loss".to_owned(), step as f64)].into() }).collect();
         let points = curve(&rows);
         assert!(points.len() <= CURVE_POINTS && points.len() > CURVE_POINTS / 2);
         assert_eq!(points.last().map(|p| p.step), Some(1003));

@@ -1,6 +1,8 @@
 //! The commands and the arguments that several of them share.
 
 mod completions;
+mod export;
+mod import;
 mod list;
 mod show;
 mod train;
@@ -16,6 +18,8 @@ pub enum Command {
     Train(train::TrainArgs),
     List(list::ListArgs),
     Show(show::ShowArgs),
+    Import(import::ImportArgs),
+    Export(export::ExportArgs),
     Completions(completions::CompletionsArgs),
 }
 
@@ -26,6 +30,8 @@ impl Command {
             Self::Train(args) => train::cmd_train(&args),
             Self::List(args) => list::cmd_list(&args),
             Self::Show(args) => show::cmd_show(&args),
+            Self::Import(args) => import::cmd_import(args),
+            Self::Export(args) => export::cmd_export(&args),
             Self::Completions(args) => completions::cmd_completions(&args),
         }
     }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::atomic::Ordering;
 
 use anyhow::Context;
 use clap::Args;
@@ -57,7 +58,7 @@ pub fn cmd_train(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         print!("{}", experiment.to_toml());
         return Ok(ExitCode::SUCCESS);
     }
-    stop::install()?;
+    let asked = stop::install()?;
     let request = TrainRequest {
         name: args.experiment.clone(),
         experiment,
@@ -68,15 +69,23 @@ pub fn cmd_train(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         zoo: args.zoo.zoo.clone(),
     };
     let mut bar = ProgressBar::hidden();
-    let outcome = train(&request, &stop::asked, &mut |event| on_event(&event, &mut bar));
+    let outcome = train(&request, &|| asked.load(Ordering::SeqCst), &mut |event| on_event(&event, &mut bar));
     bar.finish_and_clear();
     match outcome? {
         TrainOutcome::Finished { entry, run, minutes } => {
-            println!("{entry} is in {} after {minutes:.1} minutes of training (run {})", shown(&args.zoo.zoo), shown(&run));
+            println!(
+                "{entry} is in {} after {minutes:.1} minutes of training (run {})",
+                shown(&args.zoo.zoo),
+                shown(&run)
+            );
             Ok(ExitCode::SUCCESS)
         }
         TrainOutcome::Stopped { step, run } => {
-            eprintln!("stopped after step {step}; go on with: actrm-zoo train {} --resume --run {}", args.experiment, shown(&run));
+            eprintln!(
+                "stopped after step {step}; go on with: actrm-zoo train {} --resume --run {}",
+                args.experiment,
+                shown(&run)
+            );
             Ok(ExitCode::from(stop::INTERRUPTED))
         }
     }

@@ -1,0 +1,225 @@
+//! Whole trainings on a small real file: the same bytes again, through stops, and nothing lost to a NaN.
+
+#![allow(clippy::unwrap_used)]
+
+use std::cell::Cell;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use dataset::{RobomimicWriter, Source, WriteOptions};
+use models::{Observation, Policy};
+use zoo::ZooError;
+use zoo::config::Library;
+use zoo::entry::Entry;
+use zoo::experiment::Experiment;
+use zoo::registry::Registry;
+use zoo::run::{Checkpoint, TrainEvent, TrainOutcome, TrainRequest, train};
+
+fn fixture() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../dataset/tests/fixtures/lift_low_dim_3_demos.hdf5")
+}
+
+/// The fixture with its first two demos for training and the third for validation.
+fn demonstrations(folder: &Path) -> PathBuf {
+    let out = folder.join("demos.hdf5");
+    let source = Source::open(&fixture()).unwrap();
+    let ids: Vec<String> = source.plan().demos.iter().map(|d| d.id.clone()).collect();
+    let mut writer = RobomimicWriter::create(&out, &WriteOptions::default()).unwrap();
+    let mut root = source.root().unwrap();
+    root.datasets.retain(|name, _| !name.starts_with("mask"));
+    writer.set_root(&root).unwrap();
+    for index in 0..ids.len() {
+        writer.add_demo(&source.read_demo(index).unwrap()).unwrap();
+    }
+    writer.set_mask("train", &ids[..2]).unwrap();
+    writer.set_mask("valid", &ids[2..]).unwrap();
+    writer.finish().unwrap();
+    out
+}
+
+const SMALL: [&str; 13] = [
+    "policy.dim_model=16",
+    "policy.n_heads=2",
+    "policy.dim_feedforward=32",
+    "policy.n_encoder_layers=1",
+    "policy.n_vae_encoder_layers=1",
+    "policy.latent_dim=4",
+    "train.steps=12",
+    "train.batch_size=8",
+    "train.warmup_steps=2",
+    "train.log_every=2",
+    "train.validate_every=4",
+    "train.checkpoint_every=3",
+    "train.ema_decay=0.9",
+];
+
+fn request(root: &Path, data: &Path, extra: &[&str]) -> TrainRequest {
+    let overrides: Vec<String> = SMALL.iter().chain(extra).map(|o| (*o).to_owned()).collect();
+    TrainRequest {
+        name: "act_lift".to_owned(),
+        experiment: Experiment::load(&Library::built_in(), "act_lift", &overrides).unwrap(),
+        data: Some(data.to_owned()),
+        runs: root.join("runs"),
+        run: None,
+        resume: false,
+        zoo: root.join("zoo"),
+    }
+}
+
+fn finish(request: &TrainRequest) -> Entry {
+    match train(request, &|| false, &mut |_| {}).unwrap() {
+        TrainOutcome::Finished { entry, .. } => Entry::open(&request.zoo, &entry).unwrap(),
+        TrainOutcome::Stopped { step, .. } => panic!("stopped after step {step}"),
+    }
+}
+
+fn model(entry: &Entry) -> Vec<u8> {
+    fs::read(entry.folder().join("model.safetensors")).unwrap()
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let (one, two) = (finish(&request(root.path(), &data, &[])), finish(&request(root.path(), &data, &[])));
+    assert_eq!((one.id().version, two.id().version), (1, 2));
+    assert!(model(&one) == model(&two), "two trainings with the same seed differ");
+    assert_eq!(one.meta().content_sha256(), two.meta().content_sha256());
+    let other = finish(&request(root.path(), &data, &["train.seed=2"]));
+    assert!(model(&one) != model(&other));
+
+    let meta = one.meta();
+    assert_eq!(meta.task, "Lift");
+    assert_eq!(meta.env_version.as_deref(), Some("1.5.2"));
+    let data = meta.data.as_ref().unwrap();
+    assert_eq!((data.name.as_str(), data.train_episodes, data.valid_episodes), ("demos.hdf5", 2, 1));
+    assert_eq!(data.train_frames, 112);
+    let curve = &meta.training.as_ref().unwrap().curve;
+    assert_eq!(curve.last().unwrap().step, 12);
+    assert!(curve.last().unwrap().valid_loss.unwrap().is_finite());
+
+    // a policy of it answers in the units of the environment
+    let mut policy = one.load().unwrap().policy();
+    let observation = Observation { state: vec![0.1; 9], environment_state: vec![0.1; 10] };
+    let chunk = policy.predict(&observation).unwrap();
+    assert_eq!((chunk.action_horizon, chunk.action_dim), (16, 7));
+    assert!(chunk.actions.iter().all(|a| a.is_finite()));
+    assert!(policy.predict(&Observation { state: vec![0.1; 8], ..observation }).is_err());
+}
+
+#[test]
+fn a_run_stopped_anywhere_goes_on_to_the_same_bytes() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let whole = finish(&request(root.path(), &data, &[]));
+    let mut request = request(root.path(), &data, &[]);
+    request.runs = root.path().join("interrupted");
+    // stopped before the first step, then after every second one
+    let mut outcome = None;
+    for round in 0..8 {
+        let polls = Cell::new(0);
+        let patience = if round == 0 { 0 } else { 2 };
+        let stop = || {
+            polls.set(polls.get() + 1);
+            polls.get() > patience
+        };
+        outcome = Some(train(&request, &stop, &mut |_| {}).unwrap());
+        request.resume = true;
+        if matches!(outcome, Some(TrainOutcome::Finished { .. })) {
+            break;
+        }
+    }
+    let Some(TrainOutcome::Finished { entry, run, .. }) = outcome else { panic!("{outcome:?}") };
+    let pieced = Entry::open(&request.zoo, &entry).unwrap();
+    assert!(model(&whole) == model(&pieced), "a resumed run differs from one that ran through");
+    // the metrics are those of one run, step by step
+    let csv = fs::read_to_string(run.join("metrics.csv")).unwrap();
+    let steps: Vec<&str> = csv.lines().skip(1).map(|line| line.split(',').next().unwrap()).collect();
+    assert_eq!(steps, ["2", "4", "6", "8", "10", "12"]);
+    assert!(run.join("metrics.parquet").is_file());
+    // and it is finished
+    let error = train(&request, &|| false, &mut |_| {}).unwrap_err().to_string();
+    assert!(error.ends_with("the run is finished"), "{error}");
+}
+
+#[test]
+fn a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_checkpoint() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let extra = [
+        "train.lr=1e37",
+        "train.warmup_steps=1000000",
+        "train.steps=1000",
+        "train.checkpoint_every=1",
+        "train.grad_clip_norm=0",
+    ];
+    let request = request(root.path(), &data, &extra);
+    let mut saved = Vec::new();
+    let error = train(&request, &|| false, &mut |event| {
+        if let TrainEvent::Saved(path) = event {
+            saved.push(path.to_owned());
+        }
+    })
+    .unwrap_err();
+    let ZooError::NotFinite { step, tensor, checkpoint, .. } = &error else { panic!("{error}") };
+    assert!(!tensor.is_empty() && error.to_string().starts_with(&format!("step {step}: ")));
+    assert_eq!(checkpoint.as_ref(), saved.last());
+    if let Some(path) = checkpoint {
+        let kept = Checkpoint::latest(path.parent().unwrap()).unwrap().unwrap();
+        for (name, tensor) in &kept.tensors {
+            let values = tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            assert!(values.iter().all(|x| x.is_finite()), "{name}");
+        }
+    }
+    assert!(Registry::open(&request.zoo).ids().unwrap().is_empty(), "no entry may come of it");
+}
+
+#[test]
+fn a_run_goes_on_only_with_what_it_began_with() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let mut first = request(root.path(), &data, &[]);
+    first.run = Some(root.path().join("run"));
+    let polls = Cell::new(0);
+    let stop = || {
+        polls.set(polls.get() + 1);
+        polls.get() > 2
+    };
+    assert!(matches!(train(&first, &stop, &mut |_| {}).unwrap(), TrainOutcome::Stopped { step: 2, .. }));
+
+    let again = train(&first, &|| false, &mut |_| {}).unwrap_err().to_string();
+    assert!(again.contains("already holds a run"), "{again}");
+    let mut other = request(root.path(), &data, &["train.lr=0.5"]);
+    (other.run, other.resume) = (first.run.clone(), true);
+    let error = train(&other, &|| false, &mut |_| {}).unwrap_err().to_string();
+    assert!(error.ends_with("train.lr differs: the run has 0.001, asked for 0.5"), "{error}");
+
+    // the same demonstrations, split otherwise, are the same data; one demo less is not
+    let less = root.path().join("less.hdf5");
+    let source = Source::open(&data).unwrap();
+    let mut writer = RobomimicWriter::create(&less, &WriteOptions::default()).unwrap();
+    let mut root_group = source.root().unwrap();
+    root_group.datasets.retain(|name, _| !name.starts_with("mask"));
+    writer.set_root(&root_group).unwrap();
+    writer.add_demo(&source.read_demo(0).unwrap()).unwrap();
+    writer.finish().unwrap();
+    let mut other = first.clone();
+    (other.data, other.resume) = (Some(less), true);
+    let error = train(&other, &|| false, &mut |_| {}).unwrap_err().to_string();
+    assert!(error.contains("data set differs"), "{error}");
+}
+
+#[test]
+fn data_that_does_not_serve_is_refused_before_anything_is_trained() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let refuse = |request: &TrainRequest| {
+        let error = train(request, &|| false, &mut |_| {}).unwrap_err();
+        assert!(!request.zoo.exists());
+        error.to_string()
+    };
+    let shared = refuse(&request(root.path(), &data, &["data.valid_mask=train"]));
+    assert!(shared.contains("share episode 0"), "{shared}");
+    let absent = refuse(&request(root.path(), Path::new("nowhere/x.hdf5"), &[]));
+    assert!(absent.starts_with("data `nowhere/x.hdf5` not found; looked at "), "{absent}");
+}

@@ -1,0 +1,58 @@
+//! `actrm-zoo import`
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Subcommand};
+use zoo::lerobot::{ImportOptions, import};
+
+use super::{ZooArgs, shown};
+
+/// Make an entry of a policy that was trained elsewhere
+#[derive(Args)]
+#[command(after_help = "Examples:
+  actrm-zoo import lerobot outputs/train/checkpoints/last/pretrained_model --name lift-theirs --task Lift")]
+pub struct ImportArgs {
+    #[command(subcommand)]
+    from: From,
+}
+
+#[derive(Subcommand)]
+enum From {
+    Lerobot(LerobotArgs),
+}
+
+/// A checkpoint folder of LeRobot's ACT
+#[derive(Args)]
+struct LerobotArgs {
+    /// Folder with config.json, model.safetensors and the two processors
+    folder: PathBuf,
+    /// Name of the entry
+    #[arg(long)]
+    name: String,
+    /// Task that the policy was trained for
+    #[arg(long)]
+    task: String,
+    /// Observation keys that make its state, in order
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "KEYS",
+        default_value = "robot0_eef_pos,robot0_eef_quat,robot0_gripper_qpos"
+    )]
+    state_keys: Vec<String>,
+    /// Observation keys that make its environment state, in order
+    #[arg(long, value_delimiter = ',', value_name = "KEYS", default_value = "object")]
+    env_keys: Vec<String>,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+pub fn cmd_import(args: ImportArgs) -> anyhow::Result<ExitCode> {
+    let From::Lerobot(args) = args.from;
+    let options =
+        ImportOptions { name: args.name, task: args.task, state_keys: args.state_keys, env_keys: args.env_keys };
+    let id = import(&args.folder, &options, &args.zoo.zoo)?;
+    println!("{id} is in {}", shown(&args.zoo.zoo));
+    Ok(ExitCode::SUCCESS)
+}
