@@ -220,13 +220,14 @@ impl Experiment {
 
 /// Reads `[policy]` as the config of the model that its `type` names.
 fn policy(mut table: Table) -> Result<PolicyConfig, ZooError> {
-    const TYPES: [&str; 1] = ["act"];
+    const TYPES: [&str; 2] = ["act", "actrm"];
     let kind = match table.remove("type") {
         Some(kind) => kind,
         None => return Err(ZooError::MissingKey { key: "policy.type".to_owned() }),
     };
     let rest = Value::Table(table);
     match kind.as_str() {
+        Some("actrm") => Ok(PolicyConfig::Actrm(from_value(&rest, &["policy"])?)),
         Some("act") => Ok(PolicyConfig::Act(from_value(&rest, &["policy"])?)),
         _ => Err(ZooError::InvalidValue {
             key: "policy.type".to_owned(),

@@ -10,6 +10,7 @@ mod meta;
 mod open;
 mod policy;
 mod seal;
+mod subject;
 
 pub(crate) use id::check_name;
 pub use id::{EntryId, EntryRequest};
@@ -17,6 +18,7 @@ pub use meta::{CurvePoint, DataMeta, EntryMeta, FileMeta, TrainingMeta};
 pub use open::Entry;
 pub use policy::{EntryPolicy, LoadedEntry};
 pub use seal::EntryDraft;
+pub use subject::MakePolicy;
 #[cfg(test)]
 pub(crate) use seal::tests::draft as test_draft;
 

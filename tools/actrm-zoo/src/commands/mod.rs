@@ -1,9 +1,12 @@
 //! The commands and the arguments that several of them share.
 
 mod completions;
+mod eval;
 mod export;
 mod import;
+mod leaderboard;
 mod list;
+mod merge;
 mod show;
 mod train;
 
@@ -16,6 +19,9 @@ use zoo::config::Library;
 #[derive(Subcommand)]
 pub enum Command {
     Train(train::TrainArgs),
+    Eval(eval::EvalArgs),
+    Merge(merge::MergeArgs),
+    Leaderboard(leaderboard::LeaderboardArgs),
     List(list::ListArgs),
     Show(show::ShowArgs),
     Import(import::ImportArgs),
@@ -28,6 +34,9 @@ impl Command {
     pub fn run(self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Train(args) => train::cmd_train(&args),
+            Self::Eval(args) => eval::cmd_eval(&args),
+            Self::Merge(args) => merge::cmd_merge(&args),
+            Self::Leaderboard(args) => leaderboard::cmd_leaderboard(&args),
             Self::List(args) => list::cmd_list(&args),
             Self::Show(args) => show::cmd_show(&args),
             Self::Import(args) => import::cmd_import(args),
@@ -41,7 +50,7 @@ impl Command {
 #[derive(Args)]
 pub struct ZooArgs {
     /// Folder of the zoo
-    #[arg(long, value_name = "DIR", default_value = "zoo", env = "ACTRM_ZOO")]
+    #[arg(long, value_name = "DIR", default_value = "zoo", env = "ACTRM_ZOO_DIR")]
     pub zoo: PathBuf,
 }
 

@@ -1,0 +1,43 @@
+//! An entry as the subject of an evaluation.
+
+use models::{ModelError, Policy};
+
+use crate::evaluation::Subject;
+use crate::results::{EntryIdentity, Execution, TrainingFacts};
+
+use super::LoadedEntry;
+
+/// Makes a policy of its own for one environment.
+pub type MakePolicy<'a> = &'a (dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync);
+
+impl LoadedEntry {
+    /// What an evaluation needs to know; `policy` gives this entry's [`LoadedEntry::policy`].
+    pub fn subject<'a>(&self, policy: MakePolicy<'a>) -> Subject<'a> {
+        let (meta, rollout) = (self.entry().meta(), &self.experiment().rollout);
+        let (training, data) = (meta.training.as_ref(), meta.data.as_ref());
+        Subject {
+            entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
+            training: TrainingFacts {
+                policy: meta.policy.clone(),
+                parameters: meta.parameters,
+                steps: training.map_or(0, |t| t.steps),
+                minutes: training.map_or(0.0, |t| t.minutes),
+                seed: training.map_or(0, |t| t.seed),
+                data_set: data.map_or_else(|| "not recorded".to_owned(), |d| d.name.clone()),
+                data_fingerprint: data.map_or_else(String::new, |d| d.fingerprint.clone()),
+                demos: data.map_or(0, |d| d.train_episodes),
+            },
+            task: meta.task.clone(),
+            env_version: meta.env_version.clone(),
+            state_keys: meta.state_keys.clone(),
+            env_keys: meta.env_keys.clone(),
+            execution: match rollout.temporal_ensemble {
+                Some(coefficient) => Execution::TemporalEnsemble { coefficient },
+                None => Execution::RecedingHorizon { n_action_steps: rollout.n_action_steps },
+            },
+            max_steps: rollout.max_steps,
+            dims: meta.dims,
+            policy,
+        }
+    }
+}

@@ -1,0 +1,67 @@
+//! `actrm-zoo leaderboard`
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::Args;
+use comfy_table::{Table, presets};
+use zoo::leaderboard::{TABLE_COLUMNS, rank, to_csv, to_table};
+use zoo::registry::Registry;
+use zoo::report::{Curve, to_html};
+use zoo::results::list_evaluations;
+use zoo::write_atomic;
+
+use super::{ZooArgs, shown};
+
+/// Rank all evaluations: a table here, leaderboard.csv and report.html in the zoo
+#[derive(Args)]
+#[command(after_help = "Examples:
+  actrm-zoo leaderboard
+  actrm-zoo leaderboard --zoo my-zoo --out public")]
+pub struct LeaderboardArgs {
+    /// Folder of results (`results` in the zoo)
+    #[arg(long, value_name = "DIR")]
+    results: Option<PathBuf>,
+    /// Folder for leaderboard.csv and report.html (the zoo)
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+pub fn cmd_leaderboard(args: &LeaderboardArgs) -> anyhow::Result<ExitCode> {
+    let results = args.results.clone().unwrap_or_else(|| args.zoo.zoo.join("results"));
+    let evaluations = list_evaluations(&results)?;
+    if evaluations.is_empty() {
+        eprintln!("no evaluations in {}; make one with: actrm-zoo eval --all", shown(&results));
+        return Ok(ExitCode::SUCCESS);
+    }
+    let rows = rank(&evaluations);
+    let mut table = Table::new();
+    table.load_preset(presets::UTF8_HORIZONTAL_ONLY).set_header(TABLE_COLUMNS);
+    for row in to_table(&rows) {
+        table.add_row(row);
+    }
+    println!("{}", table.trim_fmt());
+
+    let out = args.out.as_ref().unwrap_or(&args.zoo.zoo);
+    let (csv, html) = (out.join("leaderboard.csv"), out.join("report.html"));
+    write_atomic(&csv, to_csv(&rows).as_bytes())?;
+    write_atomic(&html, to_html(&evaluations, &curves(args)?).as_bytes())?;
+    println!("{}\n{}", shown(&csv), shown(&html));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Training curves of the entries that are in this zoo.
+fn curves(args: &LeaderboardArgs) -> anyhow::Result<Vec<Curve>> {
+    let registry = Registry::open(&args.zoo.zoo);
+    let mut curves = Vec::new();
+    for id in registry.ids()? {
+        let entry = registry.entry(&id.to_string())?;
+        if let Some(training) = &entry.meta().training {
+            let points = training.curve.iter().map(|p| (p.step, p.loss)).collect();
+            curves.push(Curve { entry: id.to_string(), points });
+        }
+    }
+    Ok(curves)
+}

@@ -1,0 +1,75 @@
+//! `actrm-zoo merge`
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, bail};
+use clap::Args;
+use zoo::results::merge_shards;
+
+use super::{ZooArgs, shown};
+
+/// Between an evaluation's name and the number of its shard.
+const MARK: &str = "_shard-";
+
+/// Join the shards of an evaluation that several machines ran
+///
+/// Shards that differ in entry, protocol, seeds or versions are refused.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  actrm-zoo eval lift-act --episodes 200 --shard 1/2
+  actrm-zoo eval lift-act --episodes 200 --shard 2/2
+  actrm-zoo merge
+  actrm-zoo merge zoo/results/*_shard-*")]
+pub struct MergeArgs {
+    /// Result folders of all shards of one evaluation (every evaluation's in the folder of results)
+    #[arg(value_name = "FOLDER")]
+    shards: Vec<PathBuf>,
+    /// Folder of results to put the whole into (`results` in the zoo)
+    #[arg(long, value_name = "DIR")]
+    results: Option<PathBuf>,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+pub fn cmd_merge(args: &MergeArgs) -> anyhow::Result<ExitCode> {
+    let results = args.results.clone().unwrap_or_else(|| args.zoo.zoo.join("results"));
+    let mut groups: BTreeMap<String, Vec<PathBuf>> = BTreeMap::new();
+    match args.shards.is_empty() {
+        true => {
+            for folder in shard_folders(&results)? {
+                groups.entry(group(&folder)).or_default().push(folder);
+            }
+        }
+        false => {
+            groups.insert(String::new(), args.shards.clone());
+        }
+    }
+    if groups.is_empty() {
+        bail!("no shards in {}", shown(&results));
+    }
+    for shards in groups.values() {
+        let whole = merge_shards(shards, &results)?;
+        println!("{} of {} episodes succeeded ({})", whole.successes(), whole.episodes.len(), shown(&whole.folder));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn shard_folders(results: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let mut folders = Vec::new();
+    for item in results.read_dir().with_context(|| format!("cannot read folder {}", shown(results)))? {
+        let path = item?.path();
+        if path.is_dir() && path.to_string_lossy().contains(MARK) {
+            folders.push(path);
+        }
+    }
+    folders.sort();
+    Ok(folders)
+}
+
+/// What the folders of one evaluation's shards have in common.
+fn group(folder: &Path) -> String {
+    let name = folder.file_name().unwrap_or_default().to_string_lossy();
+    name.split(MARK).next().unwrap_or_default().to_owned()
+}
