@@ -18,7 +18,6 @@ pub use meta::{CurvePoint, DataMeta, EntryMeta, FileMeta, TrainingMeta};
 pub use open::Entry;
 pub use policy::{EntryPolicy, LoadedEntry};
 pub use seal::EntryDraft;
-pub use subject::MakePolicy;
 #[cfg(test)]
 pub(crate) use seal::tests::draft as test_draft;
 

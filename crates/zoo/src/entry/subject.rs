@@ -1,18 +1,14 @@
 //! An entry as the subject of an evaluation.
 
-use models::{ModelError, Policy};
-
 use crate::evaluation::Subject;
 use crate::results::{EntryIdentity, Execution, TrainingFacts};
 
 use super::LoadedEntry;
 
-/// Makes a policy of its own for one environment.
-pub type MakePolicy<'a> = &'a (dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync);
-
 impl LoadedEntry {
-    /// What an evaluation needs to know; `policy` gives this entry's [`LoadedEntry::policy`].
-    pub fn subject<'a>(&self, policy: MakePolicy<'a>) -> Subject<'a> {
+    /// What an evaluation needs to know.
+    pub fn subject(&self) -> Subject<'static> {
+        let policy = self.policy();
         let (meta, rollout) = (self.entry().meta(), &self.experiment().rollout);
         let (training, data) = (meta.training.as_ref(), meta.data.as_ref());
         Subject {
@@ -25,6 +21,7 @@ impl LoadedEntry {
                 seed: training.map_or(0, |t| t.seed),
                 data_set: data.map_or_else(|| "not recorded".to_owned(), |d| d.name.clone()),
                 data_fingerprint: data.map_or_else(String::new, |d| d.fingerprint.clone()),
+                data_simulator: meta.env_version.clone(),
                 demos: data.map_or(0, |d| d.train_episodes),
             },
             task: meta.task.clone(),
@@ -37,7 +34,7 @@ impl LoadedEntry {
             },
             max_steps: rollout.max_steps,
             dims: meta.dims,
-            policy,
+            policy: Box::new(move || Ok(Box::new(policy.clone()))),
         }
     }
 }

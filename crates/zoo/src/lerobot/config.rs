@@ -23,6 +23,7 @@ pub(super) type Features = BTreeMap<String, Feature>;
 /// The keys of LeRobot 0.6.1's `ACTConfig`; another key is an error, as it is there.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[expect(dead_code, reason = "keys that LeRobot knows and whose values do not matter here are accepted by name")]
 pub(super) struct ActConfig {
     #[serde(rename = "type")]
     pub kind: String,

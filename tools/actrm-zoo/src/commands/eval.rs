@@ -9,7 +9,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::ProgressBar;
-use models::Policy;
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, FIRST_SEED, Progress, evaluate};
 use zoo::leaderboard::LeaderboardRow;
@@ -118,7 +117,8 @@ fn start(args: &EvalArgs, task: &str, asked: &Arc<AtomicBool>) -> anyhow::Result
     spec.env_module.clone_from(&args.env_module);
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let mut options = PoolOptions::new(spec, args.workers.unwrap_or(cores));
-    options.stop = Arc::clone(asked);
+    let asked = Arc::clone(asked);
+    options.stop = Arc::new(move || asked.load(Ordering::SeqCst));
     let bar = ProgressBar::new_spinner().with_message(format!("starting simulators for {task}"));
     bar.enable_steady_tick(std::time::Duration::from_millis(200));
     let pool = Pool::start(options);
@@ -129,8 +129,7 @@ fn start(args: &EvalArgs, task: &str, asked: &Arc<AtomicBool>) -> anyhow::Result
 /// Whether it was stopped before its end.
 fn evaluate_entry(args: &EvalArgs, loaded: &LoadedEntry, pool: &mut Pool) -> anyhow::Result<bool> {
     let id = loaded.entry().id();
-    let policy = || Ok(Box::new(loaded.policy()) as Box<dyn Policy>);
-    let subject = loaded.subject(&policy);
+    let subject = loaded.subject();
     let options = EvaluationOptions {
         seeds: Seeds { start: args.seed, count: args.episodes },
         shard: args.shard,

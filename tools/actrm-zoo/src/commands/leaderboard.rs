@@ -38,7 +38,7 @@ pub fn cmd_leaderboard(args: &LeaderboardArgs) -> anyhow::Result<ExitCode> {
     }
     let rows = rank(&evaluations);
     let mut table = Table::new();
-    table.load_preset(presets::UTF8_HORIZONTAL_ONLY).set_header(TABLE_COLUMNS);
+    table.load_style(presets::UTF8_HORIZONTAL_ONLY).set_header(TABLE_COLUMNS);
     for row in to_table(&rows) {
         table.add_row(row);
     }

@@ -39,7 +39,7 @@ pub fn cmd_list(args: &ListArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let mut table = Table::new();
-    table.load_preset(presets::NOTHING);
+    table.load_style(presets::NOTHING);
     table.set_header(["entry", "policy", "task", "parameters", "steps", "minutes", "data"]);
     let mut failures = Vec::new();
     for id in ids {
