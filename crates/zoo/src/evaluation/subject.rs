@@ -31,7 +31,6 @@ pub struct Subject<'a> {
     pub policy: Box<dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a>,
 }
 
-
 impl Subject<'_> {
     /// Everything that the outcome will depend on.
     ///
