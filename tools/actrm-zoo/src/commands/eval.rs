@@ -36,11 +36,14 @@ pub struct EvalArgs {
     #[arg(long, conflicts_with = "entries")]
     all: bool,
     /// Episodes an entry
-    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..))]
     episodes: u64,
     /// Seed of the first episode; the others count up from it
-    #[arg(long, default_value_t = FIRST_SEED)]
+    #[arg(long = "seed-start", alias = "seed", value_name = "SEED", default_value_t = FIRST_SEED)]
     seed: u64,
+    /// Control steps after which an episode has failed (the entry's or the task's own cap)
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    max_steps: Option<u64>,
     /// Simulators at once (as many as cores)
     #[arg(long, value_name = "N")]
     workers: Option<usize>,
@@ -129,7 +132,10 @@ fn start(args: &EvalArgs, task: &str, asked: &Arc<AtomicBool>) -> anyhow::Result
 /// Whether it was stopped before its end.
 fn evaluate_entry(args: &EvalArgs, loaded: &LoadedEntry, pool: &mut Pool) -> anyhow::Result<bool> {
     let id = loaded.entry().id();
-    let subject = loaded.subject();
+    let mut subject = loaded.subject();
+    if let Some(max_steps) = args.max_steps {
+        subject.max_steps = Some(usize::try_from(max_steps)?);
+    }
     let options = EvaluationOptions {
         seeds: Seeds { start: args.seed, count: args.episodes },
         shard: args.shard,
