@@ -113,6 +113,12 @@ impl Params {
         self.vars.get(name)
     }
 
+    /// The same parameters but some; storage is shared.
+    pub fn without(&self, names: &[&str]) -> Self {
+        let kept = self.vars.iter().filter(|(name, _)| !names.contains(&name.as_str()));
+        Self { vars: kept.map(|(name, var)| (name.clone(), var.clone())).collect() }
+    }
+
     /// Number of scalar parameters.
     pub fn count(&self) -> usize {
         self.vars.values().map(|v| v.elem_count()).sum()

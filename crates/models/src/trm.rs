@@ -28,8 +28,10 @@ mod kernel;
 mod official;
 #[cfg(test)]
 mod tests;
+mod train;
 
 pub use carry::{Carry, Example, Release};
+pub use train::{PuzzleConfig, StepReport, Trainer};
 
 use crate::error::{ModelError, Result, some_names};
 use crate::params::{Init, Params};

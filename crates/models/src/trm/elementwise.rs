@@ -1,8 +1,8 @@
-//! The element-wise halves of the fused network, written for the vectoriser: `pulp` compiles each
+//! The element-wise halves of the fused network, written for the vectoriser: `vectorised` compiles each
 //! body for the machine's best instructions and picks one at run time. Sums run over lanes in a
 //! fixed order, so that results do not depend on which was picked more than rounding does.
 
-use pulp::Arch;
+use crate::simd::vectorised;
 
 /// Lanes that sums are kept in: one AVX-512 register, two AVX2 ones.
 const LANES: usize = 16;
@@ -78,7 +78,7 @@ fn sigmoid(x: f32) -> f32 {
 
 /// `y += x`
 pub(super) fn add(y: &mut [f32], x: &[f32]) {
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         for (y, x) in y.iter_mut().zip(x) {
             *y += x;
         }
@@ -94,7 +94,7 @@ pub(super) fn add_short(y: &mut [f32], x: &[f32]) {
 
 /// `out = a + b`
 pub(super) fn sum_into(out: &mut [f32], a: &[f32], b: &[f32]) {
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
             *o = a + b;
         }
@@ -103,7 +103,7 @@ pub(super) fn sum_into(out: &mut [f32], a: &[f32], b: &[f32]) {
 
 /// Rows of `2 * inner` (gate, up) -> rows of `inner`: `silu(gate) * up`.
 pub(super) fn swiglu(both: &[f32], inner: usize, out: &mut [f32]) {
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         for (both, out) in both.chunks_exact(2 * inner).zip(out.chunks_exact_mut(inner)) {
             let (gate, up) = both.split_at(inner);
             for ((o, &g), &u) in out.iter_mut().zip(gate).zip(up) {
@@ -115,7 +115,7 @@ pub(super) fn swiglu(both: &[f32], inner: usize, out: &mut [f32]) {
 
 /// The backward of [`swiglu`]: `grad` of its output -> gradient of `both`, and its output again.
 pub(super) fn swiglu_backward(both: &[f32], inner: usize, grad: &[f32], into: &mut [f32], again: &mut [f32]) {
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         let rows = both.chunks_exact(2 * inner).zip(grad.chunks_exact(inner));
         let outs = into.chunks_exact_mut(2 * inner).zip(again.chunks_exact_mut(inner));
         for ((both, grad), (into, again)) in rows.zip(outs) {
@@ -136,7 +136,7 @@ pub(super) fn swiglu_backward(both: &[f32], inner: usize, grad: &[f32], into: &m
 /// `x (rows, n)` += `branch`, then each row divided by its root mean square; `inverse` keeps one
 /// over it per row.
 pub(super) fn add_and_norm(x: &[f32], branch: &[f32], n: usize, eps: f32, out: &mut [f32], inverse: &mut [f32]) {
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         let rows = x.chunks_exact(n).zip(branch.chunks_exact(n));
         for ((x, b), (o, inv)) in rows.zip(out.chunks_exact_mut(n).zip(inverse)) {
             for i in 0..n {
@@ -153,7 +153,7 @@ pub(super) fn add_and_norm(x: &[f32], branch: &[f32], n: usize, eps: f32, out: &
 /// The backward of the norm in [`add_and_norm`], in place: gradient of `out` -> gradient of the
 /// sum before it.
 pub(super) fn norm_backward(out: &[f32], inverse: &[f32], n: usize, grad: &mut [f32]) {
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         let rows = out.chunks_exact(n).zip(inverse);
         for ((o, &inv), g) in rows.zip(grad.chunks_exact_mut(n)) {
             let along = dot(g, o) / n as f32;
@@ -166,7 +166,7 @@ pub(super) fn norm_backward(out: &[f32], inverse: &[f32], n: usize, grad: &mut [
 
 /// Each row of `x (rows, n)` -> `softmax(scale * row)`.
 pub(super) fn softmax(x: &mut [f32], n: usize, scale: f32) {
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         for row in x.chunks_exact_mut(n) {
             let most = max(row);
             for x in row.iter_mut() {
@@ -182,7 +182,7 @@ pub(super) fn softmax(x: &mut [f32], n: usize, scale: f32) {
 
 /// The backward of [`softmax`] in place: gradient of the weights -> gradient of the scores.
 pub(super) fn softmax_backward(weights: &[f32], n: usize, scale: f32, grad: &mut [f32]) {
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         for (w, g) in weights.chunks_exact(n).zip(grad.chunks_exact_mut(n)) {
             let along = dot(w, g);
             for i in 0..n {
@@ -197,7 +197,7 @@ pub(super) fn softmax_backward(weights: &[f32], n: usize, scale: f32, grad: &mut
 pub(super) fn rotate(qkv: &mut [f32], heads: usize, size: usize, table: (&[f32], &[f32]), direction: f32) {
     let (half, width) = (size / 2, heads * size);
     let positions = table.0.len() / half;
-    Arch::new().dispatch(|| {
+    vectorised(#[inline(always)] || {
         for (row, qkv) in qkv.chunks_exact_mut(3 * width).enumerate() {
             let at = (row % positions) * half;
             let (cos, sin) = (&table.0[at..at + half], &table.1[at..at + half]);
