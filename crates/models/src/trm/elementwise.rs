@@ -56,8 +56,10 @@ fn max(a: &[f32]) -> f32 {
 fn exp(x: f32) -> f32 {
     let x = if x > -87.0 { x } else { -87.0 };
     let x = if x < 88.0 { x } else { 88.0 };
-    // adding and subtracting 1.5 * 2^23 rounds to the nearest integer
-    let n = (x * std::f32::consts::LOG2_E + 12_582_912.0) - 12_582_912.0;
+    // adding 1.5 * 2^23 rounds to the nearest integer and leaves it in the low bits; a conversion
+    // to an integer would saturate lane by lane
+    let shifted = x * std::f32::consts::LOG2_E + 12_582_912.0;
+    let n = shifted - 12_582_912.0;
     let r = x - n * 0.693_359_375;
     let r = r - n * -2.121_944_4e-4;
     let p = 1.987_569_1e-4;
@@ -67,7 +69,7 @@ fn exp(x: f32) -> f32 {
     let p = p * r + 1.666_666_5e-1;
     let p = p * r + 5.000_000_1e-1;
     let p = p * r * r + r + 1.0;
-    let scale = f32::from_bits((((n as i32) + 127) << 23) as u32);
+    let scale = f32::from_bits(shifted.to_bits().wrapping_sub(0x4b40_0000 - 127) << 23);
     p * scale
 }
 
@@ -78,11 +80,14 @@ fn sigmoid(x: f32) -> f32 {
 
 /// `y += x`
 pub(super) fn add(y: &mut [f32], x: &[f32]) {
-    vectorised(#[inline(always)] || {
-        for (y, x) in y.iter_mut().zip(x) {
-            *y += x;
-        }
-    });
+    vectorised(
+        #[inline(always)]
+        || {
+            for (y, x) in y.iter_mut().zip(x) {
+                *y += x;
+            }
+        },
+    );
 }
 
 /// `y += x` for a few numbers, without the dispatch.
@@ -94,102 +99,123 @@ pub(super) fn add_short(y: &mut [f32], x: &[f32]) {
 
 /// `out = a + b`
 pub(super) fn sum_into(out: &mut [f32], a: &[f32], b: &[f32]) {
-    vectorised(#[inline(always)] || {
-        for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
-            *o = a + b;
-        }
-    });
+    vectorised(
+        #[inline(always)]
+        || {
+            for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
+                *o = a + b;
+            }
+        },
+    );
 }
 
 /// Rows of `2 * inner` (gate, up) -> rows of `inner`: `silu(gate) * up`.
 pub(super) fn swiglu(both: &[f32], inner: usize, out: &mut [f32]) {
-    vectorised(#[inline(always)] || {
-        for (both, out) in both.chunks_exact(2 * inner).zip(out.chunks_exact_mut(inner)) {
-            let (gate, up) = both.split_at(inner);
-            for ((o, &g), &u) in out.iter_mut().zip(gate).zip(up) {
-                *o = g * sigmoid(g) * u;
+    vectorised(
+        #[inline(always)]
+        || {
+            for (both, out) in both.chunks_exact(2 * inner).zip(out.chunks_exact_mut(inner)) {
+                let (gate, up) = both.split_at(inner);
+                for ((o, &g), &u) in out.iter_mut().zip(gate).zip(up) {
+                    *o = g * sigmoid(g) * u;
+                }
             }
-        }
-    });
+        },
+    );
 }
 
 /// The backward of [`swiglu`]: `grad` of its output -> gradient of `both`, and its output again.
 pub(super) fn swiglu_backward(both: &[f32], inner: usize, grad: &[f32], into: &mut [f32], again: &mut [f32]) {
-    vectorised(#[inline(always)] || {
-        let rows = both.chunks_exact(2 * inner).zip(grad.chunks_exact(inner));
-        let outs = into.chunks_exact_mut(2 * inner).zip(again.chunks_exact_mut(inner));
-        for ((both, grad), (into, again)) in rows.zip(outs) {
-            let (gate, up) = both.split_at(inner);
-            let (d_gate, d_up) = into.split_at_mut(inner);
-            for i in 0..inner {
-                let (g, u, d) = (gate[i], up[i], grad[i]);
-                let s = sigmoid(g);
-                let silu = g * s;
-                again[i] = silu * u;
-                d_up[i] = d * silu;
-                d_gate[i] = d * u * (s + silu * (1.0 - s));
+    vectorised(
+        #[inline(always)]
+        || {
+            let rows = both.chunks_exact(2 * inner).zip(grad.chunks_exact(inner));
+            let outs = into.chunks_exact_mut(2 * inner).zip(again.chunks_exact_mut(inner));
+            for ((both, grad), (into, again)) in rows.zip(outs) {
+                let (gate, up) = both.split_at(inner);
+                let (d_gate, d_up) = into.split_at_mut(inner);
+                for i in 0..inner {
+                    let (g, u, d) = (gate[i], up[i], grad[i]);
+                    let s = sigmoid(g);
+                    let silu = g * s;
+                    again[i] = silu * u;
+                    d_up[i] = d * silu;
+                    d_gate[i] = d * u * (s + silu * (1.0 - s));
+                }
             }
-        }
-    });
+        },
+    );
 }
 
 /// `x (rows, n)` += `branch`, then each row divided by its root mean square; `inverse` keeps one
 /// over it per row.
 pub(super) fn add_and_norm(x: &[f32], branch: &[f32], n: usize, eps: f32, out: &mut [f32], inverse: &mut [f32]) {
-    vectorised(#[inline(always)] || {
-        let rows = x.chunks_exact(n).zip(branch.chunks_exact(n));
-        for ((x, b), (o, inv)) in rows.zip(out.chunks_exact_mut(n).zip(inverse)) {
-            for i in 0..n {
-                o[i] = x[i] + b[i];
+    vectorised(
+        #[inline(always)]
+        || {
+            let rows = x.chunks_exact(n).zip(branch.chunks_exact(n));
+            for ((x, b), (o, inv)) in rows.zip(out.chunks_exact_mut(n).zip(inverse)) {
+                for i in 0..n {
+                    o[i] = x[i] + b[i];
+                }
+                *inv = 1.0 / (dot(o, o) / n as f32 + eps).sqrt();
+                for o in o.iter_mut() {
+                    *o *= *inv;
+                }
             }
-            *inv = 1.0 / (dot(o, o) / n as f32 + eps).sqrt();
-            for o in o.iter_mut() {
-                *o *= *inv;
-            }
-        }
-    });
+        },
+    );
 }
 
 /// The backward of the norm in [`add_and_norm`], in place: gradient of `out` -> gradient of the
 /// sum before it.
 pub(super) fn norm_backward(out: &[f32], inverse: &[f32], n: usize, grad: &mut [f32]) {
-    vectorised(#[inline(always)] || {
-        let rows = out.chunks_exact(n).zip(inverse);
-        for ((o, &inv), g) in rows.zip(grad.chunks_exact_mut(n)) {
-            let along = dot(g, o) / n as f32;
-            for i in 0..n {
-                g[i] = inv * (g[i] - o[i] * along);
+    vectorised(
+        #[inline(always)]
+        || {
+            let rows = out.chunks_exact(n).zip(inverse);
+            for ((o, &inv), g) in rows.zip(grad.chunks_exact_mut(n)) {
+                let along = dot(g, o) / n as f32;
+                for i in 0..n {
+                    g[i] = inv * (g[i] - o[i] * along);
+                }
             }
-        }
-    });
+        },
+    );
 }
 
 /// Each row of `x (rows, n)` -> `softmax(scale * row)`.
 pub(super) fn softmax(x: &mut [f32], n: usize, scale: f32) {
-    vectorised(#[inline(always)] || {
-        for row in x.chunks_exact_mut(n) {
-            let most = max(row);
-            for x in row.iter_mut() {
-                *x = exp((*x - most) * scale);
+    vectorised(
+        #[inline(always)]
+        || {
+            for row in x.chunks_exact_mut(n) {
+                let most = max(row);
+                for x in row.iter_mut() {
+                    *x = exp((*x - most) * scale);
+                }
+                let inverse = 1.0 / sum(row);
+                for x in row.iter_mut() {
+                    *x *= inverse;
+                }
             }
-            let inverse = 1.0 / sum(row);
-            for x in row.iter_mut() {
-                *x *= inverse;
-            }
-        }
-    });
+        },
+    );
 }
 
 /// The backward of [`softmax`] in place: gradient of the weights -> gradient of the scores.
 pub(super) fn softmax_backward(weights: &[f32], n: usize, scale: f32, grad: &mut [f32]) {
-    vectorised(#[inline(always)] || {
-        for (w, g) in weights.chunks_exact(n).zip(grad.chunks_exact_mut(n)) {
-            let along = dot(w, g);
-            for i in 0..n {
-                g[i] = w[i] * (g[i] - along) * scale;
+    vectorised(
+        #[inline(always)]
+        || {
+            for (w, g) in weights.chunks_exact(n).zip(grad.chunks_exact_mut(n)) {
+                let along = dot(w, g);
+                for i in 0..n {
+                    g[i] = w[i] * (g[i] - along) * scale;
+                }
             }
-        }
-    });
+        },
+    );
 }
 
 /// Rotates the first two of three parts (queries, keys, values) of every row by its position's
@@ -197,20 +223,23 @@ pub(super) fn softmax_backward(weights: &[f32], n: usize, scale: f32, grad: &mut
 pub(super) fn rotate(qkv: &mut [f32], heads: usize, size: usize, table: (&[f32], &[f32]), direction: f32) {
     let (half, width) = (size / 2, heads * size);
     let positions = table.0.len() / half;
-    vectorised(#[inline(always)] || {
-        for (row, qkv) in qkv.chunks_exact_mut(3 * width).enumerate() {
-            let at = (row % positions) * half;
-            let (cos, sin) = (&table.0[at..at + half], &table.1[at..at + half]);
-            for head in qkv[..2 * width].chunks_exact_mut(size) {
-                let (a, b) = head.split_at_mut(half);
-                for i in 0..half {
-                    let (x, y, s) = (a[i], b[i], direction * sin[i]);
-                    a[i] = x * cos[i] - y * s;
-                    b[i] = y * cos[i] + x * s;
+    vectorised(
+        #[inline(always)]
+        || {
+            for (row, qkv) in qkv.chunks_exact_mut(3 * width).enumerate() {
+                let at = (row % positions) * half;
+                let (cos, sin) = (&table.0[at..at + half], &table.1[at..at + half]);
+                for head in qkv[..2 * width].chunks_exact_mut(size) {
+                    let (a, b) = head.split_at_mut(half);
+                    for i in 0..half {
+                        let (x, y, s) = (a[i], b[i], direction * sin[i]);
+                        a[i] = x * cos[i] - y * s;
+                        b[i] = y * cos[i] + x * s;
+                    }
                 }
             }
-        }
-    });
+        },
+    );
 }
 
 /// `(rows, columns) -> (columns, rows)`

@@ -159,7 +159,8 @@ fn training_carries_puzzles_and_lowers_the_loss() {
     for config in [&configs()[0], &configs()[3], &configs()[5]] {
         let config = Config { halt_max_steps: 5, ..config.clone() };
         let mut trainer = trainer(&config, Release::Head);
-        let table = |trainer: &Trainer| trainer.model().params().get(PUZZLES).map(|v| v.as_detached_tensor().copy().unwrap());
+        let table =
+            |trainer: &Trainer| trainer.model().params().get(PUZZLES).map(|v| v.as_detached_tensor().copy().unwrap());
         let before = table(&trainer);
         let (mut first, mut last) = (0.0, 0.0);
         for step in 0..80 {

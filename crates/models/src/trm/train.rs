@@ -83,9 +83,8 @@ fn grade(logits: &Tensor, labels: &[i64]) -> Result<Vec<(usize, usize)>> {
     let grades = (0..batch).map(|puzzle| {
         let at = puzzle * len..(puzzle + 1) * len;
         let labelled = labels[at.clone()].iter().zip(&predicted[at]).filter(|(label, _)| **label != IGNORE_LABEL);
-        labelled.fold((0, 0), |(right, all), (&label, &class)| {
-            (right + usize::from(label == i64::from(class)), all + 1)
-        })
+        labelled
+            .fold((0, 0), |(right, all), (&label, &class)| (right + usize::from(label == i64::from(class)), all + 1))
     });
     Ok(grades.collect())
 }
