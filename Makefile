@@ -64,7 +64,7 @@ lint: .venv/.complete ## formatting and lints, Rust and Python
 	@$(CARGO) clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings
 	@.venv/bin/python -m ruff check tools benches
 	@.venv/bin/python -m ruff format --check tools benches
-	@.venv/bin/python -m pyright --project tools/harness
+	@.venv/bin/python -m basedpyright --project tools/harness
 
 # ---- beside the others ----------------------------------------------------------------------------------------
 
