@@ -60,7 +60,7 @@ fn train_refused(arguments: &[&str], words: &[&str]) {
     let mut command = zoo(["train"]);
     command.args(arguments).args(["--zoo", text(&entries), "--runs", text(&runs)]);
     refused(&mut command, words);
-    assert!(listing(&entries).is_empty(), "{:?}", listing(&entries));
+    assert!(listing(folder.path()).is_empty(), "{:?}", listing(folder.path()));
 }
 
 #[test]
@@ -70,8 +70,8 @@ fn an_unknown_experiment() {
 
 #[test]
 fn an_unknown_key() {
-    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "train.stepz=5"], &["train.stepz", "train.steps"]);
-    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "polcy.dim_model=5"], &["polcy", "policy"]);
+    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "train.stepz=5"], &["train.stepz", "did you mean `steps`"]);
+    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "polcy.dim_model=5"], &["polcy", "did you mean `policy`"]);
 }
 
 #[test]

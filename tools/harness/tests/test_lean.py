@@ -14,8 +14,8 @@ from actrm_harness import envs, episodes  # noqa: E402
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> envs.Session:
     """A session that keeps its model between episodes."""
-    monkeypatch.setitem(envs.TASKS, "Lift", envs.Task("Lift", soft_reset=True))
-    return envs.make("Lift")
+    monkeypatch.setitem(envs.TASKS, "Stack", envs.Task("Stack", soft_reset=True))
+    return envs.make("Stack")
 
 
 def test_the_robots_own_model_is_compiled_when_somebody_looks_at_it(kept: envs.Session) -> None:

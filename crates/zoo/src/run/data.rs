@@ -12,7 +12,7 @@ use crate::entry::DataMeta;
 use crate::experiment::Experiment;
 
 /// Folder of the run that a converted HDF5 file goes to.
-const CONVERTED: &str = "data";
+pub(super) const CONVERTED: &str = "data";
 
 /// Finds `path`: as given, or, when relative, above the current folder or the program.
 ///

@@ -111,11 +111,24 @@ pub fn train(
     stop: &dyn Fn() -> bool,
     on_event: &mut dyn FnMut(TrainEvent<'_>),
 ) -> Result<TrainOutcome, ZooError> {
-    let experiment = &request.experiment;
     let folder = open_folder(request)?;
-    on_event(TrainEvent::Folder(folder.path()));
+    let outcome = train_in(&folder, request, stop, on_event);
+    if outcome.is_err() && !folder.config_path().exists() {
+        // refused before it began: as if it had never been asked for
+        folder.discard();
+    }
+    outcome
+}
+
+fn train_in(
+    folder: &RunFolder,
+    request: &TrainRequest,
+    stop: &dyn Fn() -> bool,
+    on_event: &mut dyn FnMut(TrainEvent<'_>),
+) -> Result<TrainOutcome, ZooError> {
+    let experiment = &request.experiment;
     let note_path = folder.path().join("run.json");
-    let earlier = begun(&folder, &note_path, request)?;
+    let earlier = begun(folder, &note_path, request)?;
 
     let wanted = match (&request.data, &earlier) {
         (Some(path), _) => path.clone(),
@@ -145,6 +158,9 @@ pub fn train(
         }
         Some(_) => {}
         None => {
+            // an impossible policy is refused before anything is kept
+            let built = experiment.policy.build(&demonstrations.dims, experiment.train.seed);
+            built.map_err(experiment.model_error("build the policy of"))?;
             let note = RunNote {
                 experiment: request.name.clone(),
                 data: path.clone(),
@@ -157,7 +173,8 @@ pub fn train(
         }
     }
 
-    let mut run = Run::start(experiment, &folder, &demonstrations, on_event)?;
+    on_event(TrainEvent::Folder(folder.path()));
+    let mut run = Run::start(experiment, folder, &demonstrations, on_event)?;
     if !run.go(stop, on_event)? {
         return Ok(TrainOutcome::Stopped { step: run.step, run: folder.path().to_owned() });
     }
