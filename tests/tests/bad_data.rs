@@ -133,7 +133,10 @@ fn an_output_folder_that_exists() {
 fn an_unknown_task() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let out = folder.path().join("x.hdf5");
-    refused(&mut data(["collect", "--task", "Lfit", "--episodes", "1", "--seed", "1", "--out", text(&out)]), &["Lfit", "Lift"]);
+    refused(
+        &mut data(["collect", "--task", "Lfit", "--episodes", "1", "--seed", "1", "--out", text(&out)]),
+        &["Lfit", "Lift"],
+    );
     assert!(listing(folder.path()).is_empty());
 }
 

@@ -70,8 +70,14 @@ fn an_unknown_experiment() {
 
 #[test]
 fn an_unknown_key() {
-    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "train.stepz=5"], &["train.stepz", "did you mean `steps`"]);
-    train_refused(&["act_lift", "--data", text(&trained().join("lift")), "polcy.dim_model=5"], &["polcy", "did you mean `policy`"]);
+    train_refused(
+        &["act_lift", "--data", text(&trained().join("lift")), "train.stepz=5"],
+        &["train.stepz", "did you mean `steps`"],
+    );
+    train_refused(
+        &["act_lift", "--data", text(&trained().join("lift")), "polcy.dim_model=5"],
+        &["polcy", "did you mean `policy`"],
+    );
 }
 
 #[test]
@@ -110,7 +116,8 @@ fn a_python_without_robosuite() {
         .expect("`make test` has made .venv");
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let python = bare.join("bin/python");
-    let mut command = zoo(["eval", "lift-act@1", "--episodes", "1", "--zoo", text(&entries), "--python", text(&python)]);
+    let mut command =
+        zoo(["eval", "lift-act@1", "--episodes", "1", "--zoo", text(&entries), "--python", text(&python)]);
     refused(&mut command, &[text(&python), "robosuite"]);
 }
 

@@ -100,7 +100,7 @@ fn main() {
         let (state, env) =
             (batch.state.narrow(0, 0, 1).unwrap(), batch.environment_state.as_ref().unwrap().narrow(0, 0, 1).unwrap());
         for (work, bar, times) in [("train", if size == "d512" { 1.1 } else { 1.0 }, 1), ("predict", 0.6, 30)] {
-            let mut ours = |trainer: &mut Trainer| match work {
+            let ours = |trainer: &mut Trainer| match work {
                 "train" => timed(times, || drop(trainer.step(&batch).unwrap())),
                 _ => timed(times, || drop(trainer.model().predict(&state, Some(&env)).unwrap())),
             };

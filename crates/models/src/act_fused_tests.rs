@@ -47,7 +47,7 @@ fn batch(config: &Config, dims: &Dims, rows: usize) -> Batch {
     let h = config.action_horizon;
     let (s, e) = (rng.normals(rows * dims.state), rng.normals(rows * dims.environment_state));
     let a = rng.normals(rows * h * dims.action);
-    let pad: Vec<bool> = (0..rows * h).map(|i| i / h % 2 == 1 && i % h >= 1 + h / 2).collect();
+    let pad: Vec<bool> = (0..rows * h).map(|i| i / h % 2 == 1 && i % h > h / 2).collect();
     Batch::from_slices(dims, h, &s, &e, &a, &pad).unwrap()
 }
 

@@ -247,7 +247,7 @@ fn what_does_not_fit_is_refused_before_anything_is_written() {
             struct Broken;
             impl Policy for Broken {
                 fn predict(&mut self, _: &Observation) -> Result<ActionChunk, ModelError> {
-                    ActionChunk::new(vec![0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0, 0.0].repeat(2), 2, 7)
+                    ActionChunk::new([0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0, 0.0].repeat(2), 2, 7)
                 }
                 fn reset(&mut self) {}
             }

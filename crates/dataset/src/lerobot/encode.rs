@@ -171,7 +171,7 @@ impl Job<'_> {
                         found: e.to_string(),
                     }
                 })?;
-                offsets.push(i32::try_from(files.len()).map_err(|_| too_large(self.path, key))?);
+                offsets.push(i32::try_from(files.len()).ok().ok_or_else(|| too_large(self.path, key))?);
                 names.push(format!("frame-{frame:06}.{}", images::extension(self.images)));
                 pictures.digests.push(Sha256::digest(pixels).into());
                 if sampled.binary_search(&frame).is_ok() {

@@ -352,7 +352,7 @@ fn parse_objects(root: &Path, batch: &RecordBatch) -> Result<Vec<(i64, Object)>>
     let sizes = |list: &ListArray, row: usize| -> Result<Vec<usize>> {
         let values = list.value(row);
         let values = values.as_any().downcast_ref::<Int64Array>().ok_or_else(|| bad("a list of no numbers"))?;
-        values.values().iter().map(|&v| usize::try_from(v).map_err(|_| bad("a negative number"))).collect()
+        values.values().iter().map(|&v| usize::try_from(v).ok().ok_or_else(|| bad("a negative number"))).collect()
     };
     let mut objects = Vec::with_capacity(batch.num_rows());
     for row in 0..batch.num_rows() {
@@ -361,7 +361,7 @@ fn parse_objects(root: &Path, batch: &RecordBatch) -> Result<Vec<(i64, Object)>>
         let array = match dtype.is_null(row) {
             true => None,
             false => Some(Array {
-                dtype: serde_json::from_str(dtype.value(row)).map_err(|_| bad(dtype.value(row)))?,
+                dtype: serde_json::from_str(dtype.value(row)).ok().ok_or_else(|| bad(dtype.value(row)))?,
                 shape: sizes(shape, row)?,
                 bytes: bytes.value(row).to_vec(),
             }),

@@ -50,10 +50,10 @@ pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<Array
     })?;
     let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(failed)?;
     let rows = builder.metadata().file_metadata().num_rows();
-    let rows = usize::try_from(rows).map_err(|_| bad_count(path, rows))?;
+    let rows = usize::try_from(rows).ok().ok_or_else(|| bad_count(path, rows))?;
     let mut indices = Vec::with_capacity(columns.len());
     for name in columns {
-        indices.push(builder.schema().index_of(name).map_err(|_| missing_column(path, name, &builder))?);
+        indices.push(builder.schema().index_of(name).ok().ok_or_else(|| missing_column(path, name, &builder))?);
     }
     let mask = ProjectionMask::roots(builder.parquet_schema(), indices);
     // one batch for the whole file: its buffers become the resident columns without another copy
@@ -134,22 +134,16 @@ fn leaf(column: &BadColumn<'_>, array: &ArrayRef, rows: usize, dim: usize) -> Re
     let any = array.as_any();
     let inner = match array.data_type() {
         DataType::FixedSizeList(_, _) => any.downcast_ref::<FixedSizeListArray>().map(|a| ArrayRef::clone(a.values())),
-        DataType::List(_) => any
-            .downcast_ref::<ListArray>()
-            .map(|a| {
-                let offsets = a.value_offsets();
-                even(offsets.iter().map(|&o| o as usize))
-                    .then(|| a.values().slice(offsets[0] as usize, (offsets[offsets.len() - 1] - offsets[0]) as usize))
-            })
-            .flatten(),
-        DataType::LargeList(_) => any
-            .downcast_ref::<LargeListArray>()
-            .map(|a| {
-                let offsets = a.value_offsets();
-                even(offsets.iter().map(|&o| o as usize))
-                    .then(|| a.values().slice(offsets[0] as usize, (offsets[offsets.len() - 1] - offsets[0]) as usize))
-            })
-            .flatten(),
+        DataType::List(_) => any.downcast_ref::<ListArray>().and_then(|a| {
+            let offsets = a.value_offsets();
+            even(offsets.iter().map(|&o| o as usize))
+                .then(|| a.values().slice(offsets[0] as usize, (offsets[offsets.len() - 1] - offsets[0]) as usize))
+        }),
+        DataType::LargeList(_) => any.downcast_ref::<LargeListArray>().and_then(|a| {
+            let offsets = a.value_offsets();
+            even(offsets.iter().map(|&o| o as usize))
+                .then(|| a.values().slice(offsets[0] as usize, (offsets[offsets.len() - 1] - offsets[0]) as usize))
+        }),
         _ => {
             if array.len() != rows * dim {
                 return Err(

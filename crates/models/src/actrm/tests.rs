@@ -38,7 +38,7 @@ fn batch(config: &Config, rows: usize, seed: u64) -> Batch {
             (state[row * 9 + dim] + env[row * 10 + step % 10]) * 0.5
         })
         .collect();
-    let is_pad: Vec<bool> = (0..rows * h).map(|i| i % h == h - 1 && i / h % 3 == 0).collect();
+    let is_pad: Vec<bool> = (0..rows * h).map(|i| i % h == h - 1 && (i / h).is_multiple_of(3)).collect();
     Batch::from_slices(&DIMS, h, &state, &env, &actions, &is_pad).unwrap()
 }
 

@@ -10,7 +10,7 @@ const EPS: f32 = 1e-5;
 /// For each row `z = x + mask * branch` (without `branch`: `z = x`): `normed = (z - mean) / std`,
 /// `out = normed * weight + bias`. `branch` becomes `normed`; `inverse` takes 1/std of each row.
 /// `full_row(r)` is the number of row `r` in the tensor that the mask was drawn for.
-#[allow(clippy::too_many_arguments)] // inputs, parameters, outputs
+#[allow(clippy::too_many_arguments, clippy::type_complexity)] // inputs, parameters, outputs
 pub(crate) fn layer_norm(
     x: &[f32],
     branch: &mut [f32],

@@ -153,7 +153,7 @@ impl Plan {
         let marks = self.marks(puzzles);
         let (d, len, rows) = (self.dim, self.len, puzzles * self.len);
         let [first, second] = spans.mix.map(|span| &weights[span]);
-        let mut parts = Parts::cut(tape, &marks);
+        let parts = Parts::cut(tape, &marks);
         match &self.mix {
             PlanMix::Attention { heads, angles } => {
                 let size = d / heads;
@@ -201,7 +201,7 @@ impl Plan {
         let dense = (&weights[spans.gate_up], &weights[spans.down]);
         swiglu_forward(parts.middle, (d, self.inner), dense, parts.both, scratch);
         let branch = &scratch.row[..rows * d];
-        ew::add_and_norm(parts.middle, branch, d, self.eps, &mut parts.out, parts.inverse2);
+        ew::add_and_norm(parts.middle, branch, d, self.eps, parts.out, parts.inverse2);
     }
 
     /// The backward of [`Self::layer_forward`]: `grad` of the output becomes that of the input,
@@ -221,7 +221,7 @@ impl Plan {
         let [first, second] = spans.mix.clone().map(|span| &weights[span]);
         let parts = Parts::cut(tape, &marks);
 
-        ew::norm_backward(&parts.out, parts.inverse2, d, grad);
+        ew::norm_backward(parts.out, parts.inverse2, d, grad);
         let dense = (&weights[spans.gate_up.clone()], &weights[spans.down.clone()]);
         let (head, tail) = into.split_at_mut(spans.down.start);
         let dense_into = (&mut head[spans.gate_up.clone()], &mut tail[..spans.down.len()]);

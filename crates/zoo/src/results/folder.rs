@@ -289,7 +289,7 @@ pub(crate) mod tests {
     use super::*;
 
     pub(crate) fn episode(seed: u64) -> (EpisodeRecord, EpisodeTiming) {
-        let success = seed % 5 != 0;
+        let success = !seed.is_multiple_of(5);
         let episode = EpisodeRecord {
             seed,
             success,
@@ -341,7 +341,7 @@ pub(crate) mod tests {
             let read = |folder: &Path| fs::read(folder.join(name)).unwrap();
             assert_eq!(read(&straight.folder), read(&resumed.folder), "{name}");
         }
-        assert_eq!(list_evaluations(&results).unwrap(), [resumed.clone()]);
+        assert_eq!(list_evaluations(&results).unwrap(), std::slice::from_ref(&resumed));
         let mut again = ResultsFolder::open(&results, &record).unwrap();
         assert!(again.is_finished() && again.missing().is_empty());
         let (mut other, timing) = episode(10_001);

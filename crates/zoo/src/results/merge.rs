@@ -116,6 +116,7 @@ mod tests {
         assert!(merge(&[]).contains("at least one"));
         let mut other = sample("a", 1, 11);
         other.shard = Some(Shard { index: 2, count: 2 });
+        #[allow(clippy::type_complexity)]
         let changes: [(&str, fn(&mut EvaluationRecord)); 3] = [
             ("entry", |r| r.entry.hash = "f".repeat(64)),
             ("protocol", |r| r.protocol.max_steps = 1),

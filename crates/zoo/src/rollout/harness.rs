@@ -85,10 +85,10 @@ fn unpack(cache: &Path, files: &[(&str, &[u8])]) -> Result<PathBuf, RolloutError
                 .map_err(error("writing harness file", &path))?;
         }
         // another process may have been first: its copy is as good as ours
-        if let Err(source) = fs::rename(temporary.path(), &target) {
-            if !target.is_dir() {
-                return Err(error("moving the harness to", &target)(source));
-            }
+        if let Err(source) = fs::rename(temporary.path(), &target)
+            && !target.is_dir()
+        {
+            return Err(error("moving the harness to", &target)(source));
         }
     }
     for (name, content) in files {

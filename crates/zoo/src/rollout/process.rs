@@ -259,9 +259,7 @@ mod tests {
         bytes.extend(&body);
         // more than a pipe holds: both directions must move at once, so another thread echoes
         std::thread::scope(|scope| {
-            let mut stdout = std::process::ChildStdout::from(std::os::fd::OwnedFd::from(
-                process.stdout.as_fd().try_clone_to_owned().unwrap(),
-            ));
+            let mut stdout = std::process::ChildStdout::from(process.stdout.as_fd().try_clone_to_owned().unwrap());
             let reader = scope.spawn(move || {
                 let mut got: Vec<u8> = Vec::new();
                 let mut buffer = vec![0; 65536];
