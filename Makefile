@@ -62,9 +62,9 @@ test: build ## every test: Rust, Python and end to end
 lint: .venv/.complete ## formatting and lints, Rust and Python
 	@$(CARGO) fmt --all --check
 	@$(CARGO) clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings
-	@.venv/bin/python -m ruff check tools benches
-	@.venv/bin/python -m ruff format --check tools benches
-	@.venv/bin/python -m basedpyright --project tools/harness
+	@.venv/bin/python -m ruff check tools benches tests
+	@.venv/bin/python -m ruff format --check tools benches tests
+	@.venv/bin/python -m basedpyright --project tools/harness --pythonpath .venv/bin/python
 
 # ---- beside the others ----------------------------------------------------------------------------------------
 

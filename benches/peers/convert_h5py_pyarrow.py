@@ -56,7 +56,11 @@ def main() -> None:
         for episode, name in enumerate(demos):
             demo = file["data"][name]
             found: dict[str, np.ndarray] = {}
-            demo.visititems(lambda path, item, found=found: found.update({path: item[:]}) if isinstance(item, h5py.Dataset) else None)
+            demo.visititems(
+                lambda path, item, found=found: (
+                    found.update({path: item[:]}) if isinstance(item, h5py.Dataset) else None
+                )
+            )
             length = len(found["actions"])
             images = {k: v for k, v in found.items() if v.dtype == np.uint8 and v.ndim == 4}
             low = {k: v for k, v in found.items() if k not in images}
