@@ -1,7 +1,8 @@
 """LeRobot's ACT on PyTorch, driven step by step: one line of JSON in, one out.
 
 Lines: {"work": "train" | "predict", "size": "d256" | "d512", "threads": 1, "times": 3}
-Answers: {"wall": seconds, "cpu": seconds} for one of the `times` repetitions (their mean), and {"rss": bytes} for "memory".
+Answers: {"wall": seconds, "cpu": seconds} for one of the `times` repetitions (their mean),
+and {"rss": bytes} for "memory".
 """
 
 import json

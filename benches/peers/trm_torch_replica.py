@@ -1,6 +1,7 @@
 """Times one TRM supervision step (forward, loss, backward) in PyTorch.
 
-A replica of the official model's maths (SamsungSAILMontreal/TinyRecursiveModels, models/recursive_reasoning/trm.py), not
+A replica of the official model's maths
+(SamsungSAILMontreal/TinyRecursiveModels, models/recursive_reasoning/trm.py), not
 the official code: given the official weights it returns the official outputs to the bit on the machine that made the
 fixtures, and it makes the same tensor operations, so it stands in for the official code where that cannot be installed.
 
