@@ -77,6 +77,9 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 /// compresses them best and fastest; integers as differences; row-group statistics for scalar columns only.
 pub(crate) fn writer_properties(schema: &Schema, metadata: Vec<KeyValue>) -> ParquetResult<WriterProperties> {
     let descriptor = ArrowSchemaConverter::new().convert(schema)?;
+    // pyarrow reads a file's metadata from the Arrow schema where there is one, and looks nowhere else
+    let pairs = metadata.iter().filter_map(|pair| Some((pair.key.clone(), pair.value.clone()?)));
+    let described = schema.clone().with_metadata(pairs.collect::<std::collections::HashMap<_, _>>());
     let mut builder = WriterProperties::builder()
         .set_created_by(CREATED_BY.to_owned())
         .set_compression(Compression::ZSTD(ZstdLevel::try_new(1)?))
@@ -96,6 +99,6 @@ pub(crate) fn writer_properties(schema: &Schema, metadata: Vec<KeyValue>) -> Par
         builder = builder.set_column_encoding(path, encoding);
     }
     let mut properties = builder.build();
-    add_encoded_arrow_schema_to_metadata(schema, &mut properties);
+    add_encoded_arrow_schema_to_metadata(&described, &mut properties);
     Ok(properties)
 }
