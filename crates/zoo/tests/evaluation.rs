@@ -135,7 +135,8 @@ fn one_and_two_workers_shards_and_resuming_give_the_same_bytes() {
         }
     });
     let EvaluationEnd::Stopped { done, total: 6 } = end.unwrap() else { panic!("expected a stop") };
-    assert!((1..=3).contains(&done), "{done}");
+    // results come in order: the other worker may have run ahead of a slow first episode
+    assert!((1..6).contains(&done), "{done}");
     stop.store(false, Ordering::Relaxed);
     let mut begun = 0;
     let resumed = evaluate(&subject(), &mut two, &at("stopped"), &wanted(6), &mut |news| {
@@ -175,15 +176,17 @@ fn chaos_among_the_workers_does_not_change_a_byte() {
                 state ^= state << 17;
                 state % below
             };
+            // the first blow comes early and kills: a fast machine is done in seconds
+            let mut first = true;
             while !over.load(Ordering::Relaxed) {
-                std::thread::sleep(Duration::from_millis(1500 + draw(2500)));
+                std::thread::sleep(Duration::from_millis(if first { 200 } else { 700 + draw(2000) }));
                 let workers = worker_processes();
                 if workers.is_empty() {
                     continue;
                 }
                 let victim = workers[draw(workers.len() as u64) as usize];
                 let send = |signal| Pid::from_raw(victim).map(|pid| kill_process(pid, signal));
-                match draw(4) {
+                match if std::mem::take(&mut first) { 0 } else { draw(4) } {
                     0 => drop(send(Signal::KILL)),
                     1 => drop(send(Signal::STOP)),
                     _ => {
