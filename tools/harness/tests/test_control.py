@@ -325,7 +325,7 @@ def test_a_missing_or_foreign_library_is_one_line(
 def test_the_worker_says_which_loop_it_runs_and_both_tell_the_same_episode() -> None:
     found: dict[str, Any] = {}
     for loop in ("compiled", "robosuite"):
-        client = Client("--task", "Lift", "--control", loop)
+        client = Client("--task", "Lift", "--control", loop, env={control.LIBRARY: str(LIBRARY)})
         assert client.ready["control"] == loop
         message, data = client.ask("expert", seed=1_000_000)
         found[loop] = (message["success"], message["steps"], data["states"])
