@@ -335,7 +335,11 @@ fn print_table(rows: &[Value]) {
             r["peer"].as_str().unwrap_or("-"),
             number("theirs"),
             number("ratio"),
-            if r["met"] == json!(true) { "met" } else { "MISSED" },
+            match (r["ratio_bar"].is_null(), r["ratio"].is_null(), r["met"] == json!(true)) {
+                (false, true, _) => "not measured: no peer",
+                (_, _, true) => "met",
+                (_, _, false) => "MISSED",
+            },
         );
     }
 }
