@@ -23,6 +23,7 @@ mod normaliser;
 mod optim;
 mod params;
 mod policy;
+pub mod rl;
 mod rng;
 mod simd;
 mod train;

@@ -27,6 +27,9 @@ pub trait PolicyNet: Send + Sync {
     /// Its parameters.
     fn params(&self) -> &Params;
 
+    /// Numbers in an observation, number of actions, and whether there is a value head.
+    fn sizes(&self) -> (usize, usize, bool);
+
     /// `observation: (batch, observation_dim)`, `previous_action: (batch,)` of u32, used by
     /// networks that look at it.
     ///
@@ -113,6 +116,11 @@ impl PolicyNetConfig {
     }
 }
 
+/// Rows of a dense layer's weight.
+fn out_size(layer: &Linear) -> usize {
+    layer.weight.dims()[0]
+}
+
 fn value_head(params: &mut Params, wanted: bool, input: usize, rng: &mut Rng) -> Result<Option<Linear>> {
     wanted.then(|| Linear::new(params, "value", input, 1, rng)).transpose()
 }
@@ -125,6 +133,7 @@ fn value(head: Option<&Linear>, x: &Tensor) -> Result<Option<Tensor>> {
 #[derive(Debug)]
 pub struct MlpPolicy {
     params: Params,
+    observation: usize,
     layers: Vec<Linear>,
     head: Linear,
     value: Option<Linear>,
@@ -141,13 +150,17 @@ impl MlpPolicy {
         }
         let head = Linear::new(&mut params, "head", width, actions, rng)?;
         let value = value_head(&mut params, with_value, width, rng)?;
-        Ok(Self { params, layers, head, value })
+        Ok(Self { params, observation, layers, head, value })
     }
 }
 
 impl PolicyNet for MlpPolicy {
     fn params(&self) -> &Params {
         &self.params
+    }
+
+    fn sizes(&self) -> (usize, usize, bool) {
+        (self.observation, out_size(&self.head), self.value.is_some())
     }
 
     fn forward(&self, observation: &Tensor, _: Option<&Tensor>) -> Result<PolicyOutput> {
@@ -200,6 +213,7 @@ struct TrmPolicySizes {
 #[derive(Debug)]
 pub struct TrmPolicy {
     params: Params,
+    observation: usize,
     cycles: usize,
     previous: Option<(Tensor, Linear)>,
     input: Linear,
@@ -245,6 +259,7 @@ impl TrmPolicy {
         let value = value_head(p, with_value, high, rng)?;
         Ok(Self {
             params,
+            observation,
             cycles,
             previous,
             input,
@@ -263,6 +278,10 @@ impl TrmPolicy {
 impl PolicyNet for TrmPolicy {
     fn params(&self) -> &Params {
         &self.params
+    }
+
+    fn sizes(&self) -> (usize, usize, bool) {
+        (self.observation, out_size(&self.head[1]), self.value.is_some())
     }
 
     fn forward(&self, observation: &Tensor, previous_action: Option<&Tensor>) -> Result<PolicyOutput> {
@@ -350,6 +369,11 @@ fn rms_norm(x: &Tensor) -> Result<Tensor> {
 impl PolicyNet for ConvPolicy {
     fn params(&self) -> &Params {
         &self.params
+    }
+
+    fn sizes(&self) -> (usize, usize, bool) {
+        let (channels, height, width) = self.grid;
+        (channels * height * width, out_size(&self.head), self.value.is_some())
     }
 
     fn forward(&self, observation: &Tensor, _: Option<&Tensor>) -> Result<PolicyOutput> {
