@@ -133,6 +133,7 @@ def reset(session: Session, seed: int, demonstration: bool = False) -> Tensors:
     """
     env = session.env
     env.demonstration = demonstration
+    env.unset_ep_meta()
     env.hard_reset = not session.task.soft_reset or session.foreign_model
     session.foreign_model = False
     env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state

@@ -7,6 +7,7 @@ is solved, and in the last step.
 
 import json
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -68,11 +69,14 @@ def _kept(observation: Tensors) -> Tensors:
     return {name: value for name, value in observation.items() if not name.endswith(LEFT_OUT)}
 
 
-def expert_episode(session: Session, seed: int) -> Episode:
-    """One episode of the task's expert; its noise has a generator of its own, drawn from the same seed."""
+def expert_episode(session: Session, seed: int, demonstration: bool = True) -> Episode:
+    """One episode of the task's expert; its noise has a generator of its own, drawn from the same seed.
+
+    `demonstration` False asks for the episode that an evaluation of this seed begins with.
+    """
     env = session.env
     session.foreign_model |= session.xml_forgotten
-    recorder = _Recorder(envs.reset(session, seed, demonstration=True))
+    recorder = _Recorder(envs.reset(session, seed, demonstration))
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
     try:
         expert = make_expert(session.task.name, Scene(env), np.random.default_rng([seed, 1]))
@@ -90,11 +94,14 @@ def expert_episode(session: Session, seed: int) -> Episode:
     return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors())
 
 
-def extract(session: Session, states: Array, actions: Array, model_file: str) -> Episode:
+def extract(
+    session: Session, states: Array, actions: Array, model_file: str, ep_meta: dict[str, Any] | None = None
+) -> Episode:
     """Observations, rewards and dones of stored states, in the way of robomimic's dataset_states_to_obs.
 
     Every state is put into the simulator and looked at; only what follows the last action is simulated. The model is
-    the demonstration's own, so the next reset loads the task's again.
+    the demonstration's own, so the next reset loads the task's again. `ep_meta` is what the demonstration's attribute
+    of that name holds: a task that draws more than places (StackColor's goal) reads it back from there.
     """
     env = session.env
     steps, width = _matrix("states", states)
@@ -105,6 +112,7 @@ def extract(session: Session, states: Array, actions: Array, model_file: str) ->
         envs.check_action(env, row)
     env.hard_reset |= session.xml_forgotten
     session.foreign_model = True
+    env.set_ep_meta(dict(ep_meta or {}))
     if model_file:
         env.reset()
         env.reset_from_xml_string(env.edit_model_xml(model_file))

@@ -107,10 +107,11 @@ class Scene:
 class Servo:
     """Turns a target pose of the hand into an action, with this episode's style, noise and pushes."""
 
-    def __init__(self, scene: Scene, rng: np.random.Generator, pace: float = 1.0) -> None:
+    def __init__(self, scene: Scene, rng: np.random.Generator, pace: float = 1.0, turn: float = 0.5) -> None:
         self.scene = scene
         self.style = Style.draw(rng)
         self.pace = pace
+        self.turn = turn
         self.upright = scene.hand_rotation
         self._rng = rng
         self._noise = np.zeros(6)
@@ -124,7 +125,7 @@ class Servo:
         style = self.style
         wanted = limit((target - self.scene.hand) / METRES_PER_UNIT * style.gain, style.speed * self.pace)
         goal = self.upright if rotation is None else rotation
-        turn = limit(rotation_vector(goal @ self.scene.hand_rotation.T) / RADIANS_PER_UNIT, 0.5)
+        turn = limit(rotation_vector(goal @ self.scene.hand_rotation.T) / RADIANS_PER_UNIT, self.turn)
         self._noise = 0.7 * self._noise + self._rng.normal(size=6) * style.noise * np.repeat([1.0, 0.3], 3)
         if self._push_at <= self._time < self._push_at + 3:
             wanted = wanted + self._push

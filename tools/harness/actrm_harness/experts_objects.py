@@ -2,7 +2,21 @@
 
 import numpy as np
 
-from actrm_harness.experts import CLOSE, DOWN, Carry, Grasp, Scene, Servo, about_z, funnel, hand_yaw, nearest, yaw
+from actrm_harness.experts import (
+    CLOSE,
+    DOWN,
+    OPEN,
+    Carry,
+    Grasp,
+    Scene,
+    Servo,
+    about_z,
+    funnel,
+    hand_yaw,
+    nearest,
+    rotation_vector,
+    yaw,
+)
 from actrm_harness.wire import Array
 
 
@@ -36,84 +50,120 @@ class CanExpert:
 class SquareExpert:
     """Take the square nut by its handle, turn it to the peg and lower it around it.
 
-    The peg is at the end of the arm's reach, so the handle has to point at the robot in the end, and the hand is then
-    as it was at the start. Joint 7 lets the hand turn from about -120 to 210 degrees about the vertical; a handle just
-    outside of that is taken a little askew and straightens as the fingers close.
+    The peg is at the end of the arm's reach, so the handle has to point at the robot in the end, and the hand never
+    reaches further out than it is then: a stretched elbow does not come back. The hand holds the handle either way
+    round, as it was at the start or turned by half a circle in the end, whichever is the shorter way for joint 7.
     """
 
-    LOWEST, HIGHEST = np.radians(-110), np.radians(205)
+    # What joint 7 lets the hand turn about the vertical.
+    LOWEST, HIGHEST = np.radians(-95), np.radians(200)
+    FINAL = (0.0, np.pi)
+    REACH = 0.185
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4)
+        self.servo = Servo(scene, rng, pace=1.4, turn=0.8)
         self.grasp = Grasp(scene, self.servo.style)
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
+        self.final = min(self.FINAL, key=self._way)
 
     def act(self) -> Array:
         """The action for the current state."""
         scene = self.scene
         nut, rotation = scene.body("SquareNut_main"), scene.body_rotation("SquareNut_main")
-        hand = self._unwrapped(hand_yaw(scene.hand_rotation))
+        hand = self._hand()
         goal = np.array([*scene.body("peg1")[:2], 0.86])
         if self.carry.update(nut, goal, flat=0.01, height=0.01):
             target, grip = self.carry.let_go()
             wanted = hand
         else:
-            wanted = min(self._unwrapped(yaw(rotation) - np.pi), self.HIGHEST)
+            if not self.grasp.closing:
+                best = min(self.FINAL, key=self._way)
+                self.final = best if self._way(best) < self._way(self.final) - 0.5 else self.final
+            wanted = self._at_handle(self.final)
             target, grip = self.grasp.reach(nut + rotation @ np.array([0.054, 0.0, 0.0]), wanted - hand)
             if self.grasp.held:
                 target = self.carry.bring(nut, goal, near=0.005, far=0.012)
-                wanted = hand + nearest(np.pi - yaw(rotation), 2 * np.pi, -hand)
+                target[0] = min(float(target[0]), self.REACH)
+                wanted = self.final + hand - nearest(self._at_handle(self.final), 2 * np.pi, hand)
         return self.servo.move(target, grip, about_z(hand + float(np.clip(wanted - hand, -1.0, 1.0))) @ DOWN)
+
+    def _hand(self) -> float:
+        return self._unwrapped(hand_yaw(self.scene.hand_rotation))
+
+    def _at_handle(self, final: float) -> float:
+        """The hand's angle on the handle that is `final` once the handle points at the robot."""
+        return self._unwrapped(yaw(self.scene.body_rotation("SquareNut_main")) - np.pi + final)
+
+    def _way(self, final: float) -> float:
+        """How far the hand has to turn, to the handle and with it."""
+        there = self._at_handle(final)
+        far = 100.0 if there > self.HIGHEST else 0.0
+        return abs(there - self._hand()) + abs(final - there) + far
 
     def _unwrapped(self, angle: float) -> float:
         return self.LOWEST + float((angle - self.LOWEST) % (2 * np.pi))
 
 
 class DoorExpert:
-    """Press the lever down from above with closed fingers, and draw the door open by what they press on.
+    """Take the lever, turn it down with the hand, and draw the door open by it.
 
-    There is no room for the hand's width between the door's panel and the lever's far side, so the hand is turned
-    along the door, and friction does the pulling: the lever's spring wants some 10 N, the door 3 N. Lever and door turn
-    about axes that can be seen; the hand is led along the arc that the touched
-    point would follow, a little ahead of it.
+    The hand comes from above and in front, leaning so far that it does not touch the panel: one finger goes behind the
+    lever and pulls. From then on the hand moves as if fixed to the lever. Lever and door turn about axes that can be
+    seen, so the hand's pose for any two angles is known; it is led a little ahead of where they are.
     """
 
-    TOP = 0.02
-    SIDE = -0.088
+    LEAN = 1.15
+    FREE = 1.25
+    AHEAD = 0.4
+    PULL = 0.2
+    HINGE = np.array([0.255, 0.0, 0.0])
+    CENTRE = -0.1
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=2.0)
-        self.along = rng.uniform(0.12, 0.135)
+        self.servo = Servo(scene, rng, pace=2.0, turn=1.0)
+        self.along = rng.uniform(0.115, 0.13)
+        self.closing = self.held = False
 
     def act(self) -> Array:
         """The action for the current state."""
-        scene, style = self.scene, self.servo.style
+        scene = self.scene
         data = scene.env.sim.data
-        axis, door = scene.body("Door_latch"), scene.body_rotation("Door_door")
         pressed = float(data.get_joint_qpos("Door_latch_joint"))
         opened = float(data.get_joint_qpos("Door_hinge"))
-        touched = axis + door @ self._on_lever(pressed)
-        away = touched - scene.hand
-        flat = float(np.linalg.norm(away[:2]))
-        off = funnel(flat, 0.02, 0.05)
-        target = touched + np.array([0.0, 0.0, style.hover * off])
-        if pressed > 0.08 or (off == 0.0 and abs(float(away[2])) < 0.03):
-            # Along the arc, a little towards the middle of the lever, and back with the door once the bolt is out.
-            c, s = np.cos(pressed), np.sin(pressed)
-            reached = float((door.T @ (scene.hand - axis)) @ np.array([c, 0.0, -s]))
-            out = float(np.clip(self.along - reached, -0.02, 0.02))
-            free = funnel(pressed, 1.0, 1.25) if opened < 0.02 else 1.0
-            push = 0.08 - 0.02 * free
-            side = (self.SIDE - float((door.T @ (scene.hand - axis))[1])) * (1.0 - free)
-            target = scene.hand + door @ np.array([out * c - push * s, side, -out * s - push * c])
-            hinge = scene.body("Door_door") + door @ np.array([0.255, 0.0, 0.0])
-            lead = 0.06 + 0.12 * funnel(opened, 0.02, 0.06)
-            target = target + free * (about_z(lead) @ (scene.hand - hinge) - (scene.hand - hinge))
-        return self.servo.move(target, CLOSE, about_z(nearest(yaw(door), np.pi, 0.0) + np.pi / 2) @ DOWN)
+        place, rotation = self._pose(pressed, 0.0)
+        away = place - scene.hand
+        distance = float(np.linalg.norm(away))
+        askew = float(np.linalg.norm(rotation_vector(rotation @ scene.hand_rotation.T)))
+        if not self.closing and distance < 0.012 and askew < 0.2:
+            self.closing = True
+        elif self.closing and (distance > 0.06 or scene.gap < 0.03):
+            self.closing = self.held = False
+        if not self.closing:
+            pointing = rotation[:, 2]
+            aside = float(np.linalg.norm(away - pointing * (away @ pointing)))
+            back = max(funnel(aside, 0.01, 0.04), funnel(askew, 0.15, 0.4))
+            return self.servo.move(place - pointing * self.servo.style.hover * back, OPEN, rotation)
+        self.held |= scene.gap < 0.062 and abs(scene.gap_speed) < 0.02
+        if not self.held:
+            return self.servo.move(place, CLOSE, rotation)
+        free = funnel(pressed, self.FREE - 0.15, self.FREE) if opened < 0.03 else 1.0
+        ahead = self.AHEAD if opened < 0.2 else 0.0
+        place, rotation = self._pose(min(pressed + ahead, 1.5), self.PULL * free)
+        return self.servo.move(place, CLOSE, rotation)
 
-    def _on_lever(self, angle: float) -> Array:
-        """The touched point of the lever in the door's frame, when the lever is pressed by `angle`."""
-        c, s = np.cos(angle), np.sin(angle)
-        return np.array([self.along * c + self.TOP * s, self.SIDE, self.TOP * c - self.along * s])
+    def _pose(self, pressed: float, further: float) -> tuple[Array, Array]:
+        """Position and rotation of a hand that holds the lever turned by `pressed`, the door `further` open."""
+        scene = self.scene
+        swing = about_z(further)
+        frame, door = scene.body_rotation("Door_door"), scene.body("Door_door")
+        hinge = door + frame @ self.HINGE
+        axis = hinge + swing @ (scene.body("Door_latch") - hinge)
+        frame = swing @ frame
+        c, s = np.cos(pressed), np.sin(pressed)
+        lever, top, inward = np.array([c, 0.0, -s]), np.array([s, 0.0, c]), np.array([0.0, 1.0, 0.0])
+        pointing = np.sin(self.LEAN) * inward - np.cos(self.LEAN) * top
+        opening = -np.cos(self.LEAN) * inward - np.sin(self.LEAN) * top
+        rotation = np.stack([opening, np.cross(pointing, opening), pointing], axis=1)
+        return axis + frame @ (self.along * lever + self.CENTRE * inward), frame @ rotation

@@ -1,6 +1,9 @@
-"""The messages of worker protocol 1, as dataclasses. They travel as JSON beside the tensors of a frame (`wire`)."""
+"""The messages of worker protocol 1, as dataclasses. They travel as JSON beside the tensors of a frame (`wire`).
 
-from dataclasses import asdict, dataclass
+docs/worker_protocol.md describes them with their replies. A field with a default may be left out.
+"""
+
+from dataclasses import MISSING, asdict, dataclass, field
 from typing import Any, cast
 
 from actrm_harness.wire import Message
@@ -29,10 +32,11 @@ class Ready:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """Begin the episode of `seed`."""
+    """Begin the episode of `seed`, as an evaluation sees it or, with `split`, as a demonstration does."""
 
     id: int
     seed: int
+    split: str = "evaluation"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +52,19 @@ class Expert:
 
     id: int
     seed: int
+    split: str = "demonstration"
 
 
 @dataclass(frozen=True, slots=True)
 class Extract:
-    """Observations, rewards and dones of stored states; tensors "states" and "actions"."""
+    """Observations, rewards and dones of stored states; tensors "states" and "actions".
+
+    `ep_meta` is the demonstration's own: what an environment has to know of the episode beyond its states.
+    """
 
     id: int
     model_file: str
+    ep_meta: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +84,8 @@ class Close:
 
 
 Request = Reset | Step | Expert | Extract | Render | Close
+
+SPLITS = ("demonstration", "evaluation")
 
 _REQUESTS: dict[str, type[Request]] = {
     "reset": Reset,
@@ -101,8 +112,10 @@ def parse_request(message: Message) -> Request:
         raise RequestError("unknown_request", f"unknown request {kind!r}; known: {', '.join(_REQUESTS)}")
     fields = {name: value for name, value in message.items() if name != "type"}
     cls = _REQUESTS[kind]
-    expected = set(cls.__dataclass_fields__)
-    if set(fields) != expected:
+    known = cls.__dataclass_fields__.values()
+    expected = {entry.name for entry in known}
+    required = {entry.name for entry in known if entry.default is MISSING and entry.default_factory is MISSING}
+    if not required <= set(fields) <= expected:
         raise RequestError("bad_request", f"{kind} takes {sorted(expected)}, got {sorted(fields)}")
     for name in ("id", "seed"):
         if name in fields and not _is_count(fields[name]):
@@ -110,6 +123,10 @@ def parse_request(message: Message) -> Request:
     for name in ("camera", "model_file"):
         if name in fields and not isinstance(fields[name], str):
             raise RequestError("bad_request", f"{kind}: {name} must be text, got {fields[name]!r}")
+    if fields.get("split", SPLITS[0]) not in SPLITS:
+        raise RequestError("bad_request", f"{kind}: split must be one of {list(SPLITS)}, got {fields['split']!r}")
+    if not isinstance(fields.get("ep_meta", {}), dict):
+        raise RequestError("bad_request", f"{kind}: ep_meta must be an object, got {fields['ep_meta']!r}")
     if "size" in fields:
         fields["size"] = _image_size(fields["size"])
     return cls(**fields)

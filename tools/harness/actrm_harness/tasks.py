@@ -5,7 +5,8 @@
 `StackColor`: the same cubes, but the observation lists them in a random order of slots with their colours, and which
 has to stand on which is the episode's goal, given as an observation: three colours from bottom to top. Demonstrations
 show four of the six orders in exact colours; evaluation asks for all six, with hues slightly shifted. An episode's
-`ep_meta` says its order, and whether demonstrations show it ("seen" or "unseen").
+`ep_meta` says its order, its slots, and whether demonstrations show the order (its group: "seen" or "unseen"); set
+before a reset, it decides them.
 """
 
 import colorsys
@@ -146,13 +147,17 @@ class StackColor(StackThreeCubes):
         orders = SEEN if self.demonstration else ORDERS
         self.order = orders[int(self.rng.integers(len(orders)))]
         self.slots = tuple(self.rng.permutation(list(COLORS)).tolist())
+        given = self._ep_meta
+        if given:
+            self.order, self.slots = tuple(given["order"]), tuple(given["slots"])
         shifts = self.rng.uniform(-HUE_SHIFT, HUE_SHIFT, size=len(COLORS)) * (not self.demonstration)
         for name, shift in zip(COLORS, shifts, strict=True):
             hue, saturation, value = colorsys.rgb_to_hsv(*COLORS[name])
             color = colorsys.hsv_to_rgb((hue + shift) % 1.0, saturation, value)
             for geom in self.cubes[name].visual_geoms:
                 self.sim.model.geom_rgba[self.sim.model.geom_name2id(geom)][:3] = color
-        self._ep_meta = {"order": list(self.order), "split": "unseen" if self.order in UNSEEN else "seen"}
+        group = "unseen" if self.order in UNSEEN else "seen"
+        self._ep_meta = {"order": list(self.order), "slots": list(self.slots), "group": group}
 
     def color(self, name: str) -> Array:
         """The colour that a cube shows."""

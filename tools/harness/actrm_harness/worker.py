@@ -33,9 +33,7 @@ SETTINGS = {
 
 def main() -> NoReturn:
     """Take the pipes, start the environment, answer requests."""
-    if any(os.environ.get(name) != value for name, value in SETTINGS.items()):
-        os.environ.update(SETTINGS)
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    settle()
     requests = os.fdopen(os.dup(0), "rb")
     replies = os.fdopen(os.dup(1), "wb")
     with open(os.devnull, "rb") as nothing:
@@ -45,6 +43,13 @@ def main() -> NoReturn:
     code = run(requests, replies)
     sys.stderr.flush()
     os._exit(code)
+
+
+def settle() -> None:
+    """Start the interpreter again where `SETTINGS` were not there when it started."""
+    if any(os.environ.get(name) != value for name, value in SETTINGS.items()):
+        os.environ.update(SETTINGS)
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def run(requests: BinaryIO, replies: BinaryIO) -> int:
@@ -166,12 +171,15 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
     from actrm_harness import envs, episodes
 
     if isinstance(request, protocol.Reset):
-        first = envs.reset(session, request.seed)
+        first = envs.reset(session, request.seed, request.split == "demonstration")
+        ep_meta = session.env.get_ep_meta()
         reply = {
             "type": "reset",
             "id": request.id,
             "fingerprint": envs.fingerprint(session.env),
-            "ep_meta": session.env.get_ep_meta(),
+            "split": request.split,
+            "group": ep_meta.get("group"),
+            "ep_meta": ep_meta,
         }
         return reply, {f"obs/{name}": value for name, value in first.items()}
     if isinstance(request, protocol.Step):
@@ -181,11 +189,11 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
         reply = {"type": "step", "id": request.id, "reward": result.reward, "success": result.success}
         return reply, {f"obs/{name}": value for name, value in result.observation.items()}
     if isinstance(request, protocol.Expert):
-        episode = episodes.expert_episode(session, request.seed)
+        episode = episodes.expert_episode(session, request.seed, request.split == "demonstration")
         return episode_reply("expert", request.id, episode), episode.tensors
     if isinstance(request, protocol.Extract):
         states, actions = tensor(tensors, "states"), tensor(tensors, "actions")
-        episode = episodes.extract(session, states, actions, request.model_file)
+        episode = episodes.extract(session, states, actions, request.model_file, request.ep_meta)
         return episode_reply("extract", request.id, episode), episode.tensors
     if isinstance(request, protocol.Render):
         image = envs.image(session, request.camera, *request.size)

@@ -16,6 +16,9 @@ sys.path.insert(0, str(HARNESS))
 from actrm_harness import wire  # noqa: E402
 from actrm_harness.wire import Array, Message, Tensors  # noqa: E402
 
+TARGET = Path(os.environ.get("CARGO_TARGET_DIR", HARNESS.parents[1] / "target"))
+LIBRARY = Path(os.environ.get("ACTRM_CONTROL_LIB") or TARGET / "release" / "libcontrol.so")
+
 
 class WorkerError(Exception):
     """An error reply."""
@@ -84,3 +87,11 @@ def lift() -> Iterator[Client]:
 def walk(seed: int, steps: int, dim: int = 7) -> Array:
     """A deterministic sequence of actions."""
     return np.random.default_rng(seed).uniform(-1, 1, size=(steps, dim))
+
+
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The compiled control loop, where the worker looks for it."""
+    assert LIBRARY.is_file(), f"{LIBRARY} is missing: cargo build --release -p control"
+    monkeypatch.setenv("ACTRM_CONTROL_LIB", str(LIBRARY))
+    return LIBRARY

@@ -1,7 +1,6 @@
 """The compiled control loop beside robosuite's own, on the same seeds and actions."""
 
 import importlib
-import os
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Client
+from conftest import LIBRARY, Client
 
 from actrm_harness import suite
 
@@ -20,19 +19,10 @@ from actrm_harness.control import CompiledControl  # noqa: E402
 from actrm_harness.control_abi import Library  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[3]
-TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
-LIBRARY = Path(os.environ.get(control.LIBRARY) or TARGET / "release" / "libcontrol.so")
-
 TASKS = ["Lift", "Stack", "PickPlaceCan", "NutAssemblySquare", "Door"]
 
 
-@pytest.fixture(autouse=True)
-def library(monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The library, where the worker looks for it."""
-    assert LIBRARY.is_file(), f"{LIBRARY} is missing: cargo build --release -p control"
-    monkeypatch.setenv(control.LIBRARY, str(LIBRARY))
-    return LIBRARY
+pytestmark = pytest.mark.usefixtures("library")
 
 
 @pytest.fixture(scope="module", params=TASKS)

@@ -1,0 +1,144 @@
+"""Count how often the scripted experts succeed.
+
+    PYTHONPATH=tools/harness .venv/bin/python -m actrm_harness.check_experts --task Door --seeds 200 --workers 2
+    PYTHONPATH=tools/harness .venv/bin/python -m actrm_harness.check_experts --task all
+
+Every seed is the demonstration that `actrm-data collect` would record for it. With --out, a line of JSON is written for
+each seed, and a second run goes on where the first was interrupted. The exit code is 1 where a bar is missed. Set
+ACTRM_CONTROL_LIB to the compiled control loop (target/release/libcontrol.so), or it takes five times as long.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from actrm_harness.worker import settle
+
+if TYPE_CHECKING:
+    from actrm_harness.envs import Session
+
+BARS = {
+    "Lift": 0.95,
+    "Stack": 0.95,
+    "PickPlaceCan": 0.95,
+    "NutAssemblySquare": 0.85,
+    "Door": 0.85,
+    "StackThreeCubes": 0.95,
+    "StackColor": 0.95,
+}
+
+# A step in which no action of the arm is larger than this is a pause.
+STILL = 0.08
+
+FIRST_SEED = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of one seed."""
+
+    task: str
+    seed: int
+    success: bool
+    steps: int
+    pause: int
+    """The longest run of steps in which the arm was hardly told to move."""
+
+
+_session: "Session | None" = None
+
+
+def main() -> int:
+    """Run the seeds that are missing, count, compare."""
+    settle()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="all", help="a task, several with commas, or all (default)")
+    parser.add_argument("--seeds", type=int, default=200, help="episodes a task (default: %(default)s)")
+    parser.add_argument("--first", type=int, default=FIRST_SEED, help="the first seed (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=1, help="processes (default: %(default)s)")
+    parser.add_argument("--out", type=Path, help="a file of one line of JSON a seed; what it holds is not run again")
+    args = parser.parse_args()
+    tasks = list(BARS) if args.task == "all" else args.task.split(",")
+    unknown = sorted(set(tasks) - set(BARS))
+    if unknown:
+        parser.error(f"no expert for {', '.join(unknown)}; known: {', '.join(BARS)}")
+    met = True
+    for task in tasks:
+        known = {outcome.seed: outcome for outcome in read(args.out) if outcome.task == task}
+        wanted = range(args.first, args.first + args.seeds)
+        for outcome in play(task, [seed for seed in wanted if seed not in known], args.workers):
+            known[outcome.seed] = outcome
+            if args.out:
+                with args.out.open("a") as file:
+                    file.write(json.dumps(asdict(outcome)) + "\n")
+        met &= report(task, [known[seed] for seed in wanted])
+    return 0 if met else 1
+
+
+def read(path: Path | None) -> list[Outcome]:
+    """The outcomes of an earlier run; a last line that was cut off is not one."""
+    if path is None or not path.exists():
+        return []
+    lines = path.read_text().split("\n")[:-1]
+    return [Outcome(**json.loads(line)) for line in lines]
+
+
+def play(task: str, seeds: list[int], workers: int) -> Iterator[Outcome]:
+    """The outcomes of these seeds, in any order."""
+    if not seeds:
+        return
+    processes = multiprocessing.get_context("spawn").Pool(min(workers, len(seeds)), _start, (task,))
+    with processes as pool:
+        yield from pool.imap_unordered(_play, seeds)
+
+
+def _start(task: str) -> None:
+    global _session  # noqa: PLW0603
+    from actrm_harness import suite
+
+    suite.prepare()
+    from actrm_harness import control, envs
+
+    _session = envs.make(task)
+    if os.environ.get(control.LIBRARY):
+        _session.control = control.attach(_session.env)
+
+
+def _play(seed: int) -> Outcome:
+    import numpy as np
+
+    from actrm_harness import episodes
+
+    assert _session is not None, "the pool's initializer made it"
+    episode = episodes.expert_episode(_session, seed)
+    moving = np.abs(episode.tensors["actions"][:, :6]).max(axis=1) > STILL
+    longest = current = 0
+    for moves in moving.tolist():
+        current = 0 if moves else current + 1
+        longest = max(longest, current)
+    return Outcome(_session.task.name, seed, episode.success, episode.steps, longest)
+
+
+def report(task: str, outcomes: list[Outcome]) -> bool:
+    """Print a task's line; whether its bar is met."""
+    solved = sorted(outcome.steps for outcome in outcomes if outcome.success)
+    failed = [outcome.seed for outcome in outcomes if not outcome.success]
+    met = len(solved) >= BARS[task] * len(outcomes)
+    middle, last = (solved[len(solved) // 2], solved[-1]) if solved else (0, 0)
+    pause = max((outcome.pause for outcome in outcomes if outcome.success), default=0)
+    print(
+        f"{task}: {len(solved)} of {len(outcomes)} (bar {BARS[task]:.0%}, {'met' if met else 'MISSED'}), "
+        f"steps median {middle}, most {last}, longest pause {pause}; failed seeds: {failed or 'none'}",
+        flush=True,
+    )
+    return met
+
+
+if __name__ == "__main__":
+    sys.exit(main())
