@@ -3,21 +3,23 @@
 An episode depends on (task, seed, actions) only, whatever ran before in the process: `reset` writes the seed's bit
 generator state into the environment's own generator (a new generator would not reach robosuite's placement samplers)
 and then resets. Where `Task.soft_reset` is set, the model is kept between episodes, which is bit-identical to loading
-it again for every task but Lift (its cube's size is drawn when the model is loaded).
+it again; for Lift, whose cube robosuite draws when it loads the model, because `Task.redraw` draws it (`lift_cube`).
 """
 
 import hashlib
 import importlib
 import json
+import math
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
-from actrm_harness import lean, suite
+from actrm_harness import lean, lift_cube, suite
 from actrm_harness.protocol import RequestError
 from actrm_harness.suite import Env
 from actrm_harness.wire import Array, Tensors
@@ -36,12 +38,14 @@ class Task:
     name: str
     soft_reset: bool = False
     max_steps: int = DEFAULT_MAX_STEPS
+    redraw: Callable[[Env], None] | None = None
+    """What loading the model would draw, drawn into a kept model."""
 
 
 TASKS = {
     task.name: task
     for task in (
-        Task("Lift"),
+        Task("Lift", soft_reset=True, redraw=lift_cube.redraw),
         Task("Stack", soft_reset=True),
         Task("PickPlaceCan", soft_reset=True),
         Task("NutAssemblySquare", soft_reset=True),
@@ -142,6 +146,8 @@ def reset(session: Session, seed: int, demonstration: bool = False) -> Tensors:
     if env.hard_reset:
         lean.forget_xml(give_back=False)
         session.xml_forgotten = False
+    elif session.task.redraw is not None:
+        session.task.redraw(env)
     raw = env.reset()
     env.hard_reset = not session.task.soft_reset
     return {**observation(raw), **images(session)}
@@ -193,8 +199,9 @@ def check_action(env: Env, action: Array) -> Array:
     shape = (env.action_dim,)
     if action.dtype != np.float64 or action.shape != shape:
         raise RequestError("bad_action", f"action must be F64 of shape {shape}, got {action.dtype} {action.shape}")
-    if not np.isfinite(action).all():
-        raise RequestError("bad_action", f"action has values that are not finite: {action.tolist()}")
+    values: list[float] = action.tolist()
+    if not all(map(math.isfinite, values)):
+        raise RequestError("bad_action", f"action has values that are not finite: {values}")
     return np.array(action)
 
 

@@ -97,6 +97,16 @@ _REQUESTS: dict[str, type[Request]] = {
 }
 
 
+def _fields_of(cls: type[Request]) -> tuple[frozenset[str], frozenset[str]]:
+    """The names of the fields that a request must have, and of those it may have."""
+    known = cls.__dataclass_fields__.values()
+    required = [entry.name for entry in known if entry.default is MISSING and entry.default_factory is MISSING]
+    return frozenset(required), frozenset(entry.name for entry in known)
+
+
+_FIELDS = {kind: _fields_of(cls) for kind, cls in _REQUESTS.items()}
+
+
 class RequestError(Exception):
     """A request that cannot be answered; `kind` is a stable word, the text says what was wrong."""
 
@@ -112,10 +122,8 @@ def parse_request(message: Message) -> Request:
         raise RequestError("unknown_request", f"unknown request {kind!r}; known: {', '.join(_REQUESTS)}")
     fields = {name: value for name, value in message.items() if name != "type"}
     cls = _REQUESTS[kind]
-    known = cls.__dataclass_fields__.values()
-    expected = {entry.name for entry in known}
-    required = {entry.name for entry in known if entry.default is MISSING and entry.default_factory is MISSING}
-    if not required <= set(fields) <= expected:
+    required, expected = _FIELDS[kind]
+    if not required <= fields.keys() <= expected:
         raise RequestError("bad_request", f"{kind} takes {sorted(expected)}, got {sorted(fields)}")
     for name in ("id", "seed"):
         if name in fields and not _is_count(fields[name]):

@@ -30,58 +30,75 @@ class WireError(Exception):
     """A frame that is not what the protocol says; the text says where and how."""
 
 
+# A worker encodes and decodes between two steps of physics, with cold caches: what counts is how much code runs.
+_ENCODER = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
+_decode = json.JSONDecoder().raw_decode
+_LITTLE = sys.byteorder == "little"
+_LENGTH = struct.Struct("<Q")
+
+
 def encode(message: Message, tensors: Tensors | None = None) -> bytes:
     """One frame's payload: the message and its tensors in safetensors layout."""
-    arrays = [(name, np.asarray(array)) for name, array in sorted((tensors or {}).items())]
-    entries = _entries(tuple((name, array.dtype, array.shape) for name, array in arrays))
-    metadata = json.dumps(json.dumps(message, allow_nan=False))
+    arrays = tensors or {}
+    names = _order(tuple(arrays))
+    sorted_arrays = [np.asarray(arrays[name]) for name in names]
+    entries, native = _entries(names, tuple([(array.dtype, array.shape) for array in sorted_arrays]))
+    metadata = json.encoder.encode_basestring_ascii(_ENCODER.encode(message))
     text = f'{{"__metadata__":{{"{METADATA_KEY}":{metadata}}}{entries}}}'.encode()
     text += b" " * (-len(text) % 8)
-    bodies = [_little(array).tobytes() for _, array in arrays]
-    return b"".join([struct.pack("<Q", len(text)), text, *bodies])
-
-
-def _little(array: Array) -> Array:
-    if sys.byteorder == "little" and array.dtype.isnative:
-        return array
-    return array.astype(array.dtype.newbyteorder("<"))
+    if not native:
+        sorted_arrays = [array.astype(array.dtype.newbyteorder("<")) for array in sorted_arrays]
+    return b"".join([_LENGTH.pack(len(text)), text, *[array.tobytes() for array in sorted_arrays]])
 
 
 @lru_cache(maxsize=64)
-def _entries(arrays: tuple[tuple[str, "np.dtype[Any]", tuple[int, ...]], ...]) -> str:
-    """The header's text for these tensors, the same for every step of an episode."""
+def _order(names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(sorted(names))
+
+
+@lru_cache(maxsize=64)
+def _entries(names: tuple[str, ...], arrays: tuple[tuple["np.dtype[Any]", tuple[int, ...]], ...]) -> tuple[str, bool]:
+    """The header's text for these tensors, the same for every step of an episode, and whether they lie as they go."""
     entries = ""
     end = 0
-    for name, dtype, shape in arrays:
+    for name, (dtype, shape) in zip(names, arrays, strict=True):
         kind = _NAMES.get(dtype.newbyteorder("<"))
         if kind is None:
             raise WireError(f"tensor {name!r} has dtype {dtype}; a frame carries {', '.join(_DTYPES)}")
         begin, end = end, end + math.prod(shape) * dtype.itemsize
         entry = {"dtype": kind, "shape": list(shape), "data_offsets": [begin, end]}
         entries += f",{json.dumps(name)}:{json.dumps(entry, separators=(',', ':'))}"
-    return entries
+    return entries, _LITTLE and all(dtype.isnative for dtype, _ in arrays)
 
 
 def decode(payload: bytes) -> tuple[Message, Tensors]:
     """The message and the tensors of one frame's payload."""
     if len(payload) < 8:
         raise WireError(f"a payload of {len(payload)} bytes has no safetensors header")
-    (size,) = struct.unpack_from("<Q", payload)
+    (size,) = _LENGTH.unpack_from(payload)
     if size > len(payload) - 8:
         raise WireError(f"safetensors header of {size} bytes in a payload of {len(payload)} bytes")
-    header = _json_object(payload[8 : 8 + size], "safetensors header")
+    try:
+        text = payload[8 : 8 + size].decode()
+    except UnicodeDecodeError as error:
+        raise WireError(f"safetensors header is not JSON: {error}") from error
+    header = _json_object(text, "safetensors header")
     metadata = header.pop("__metadata__", None)
     if not isinstance(metadata, dict) or not isinstance(cast(Message, metadata).get(METADATA_KEY), str):
         raise WireError(f"safetensors metadata has no text under {METADATA_KEY!r}")
-    message = _json_object(cast(Message, metadata)[METADATA_KEY].encode(), "message")
+    message = _json_object(cast(Message, metadata)[METADATA_KEY], "message")
     body = memoryview(payload)[8 + size :]
     return message, {name: _tensor(name, entry, body) for name, entry in header.items()}
 
 
-def _json_object(text: bytes, what: str) -> Message:
+def _json_object(text: str, what: str) -> Message:
+    value: object = None
     try:
-        value: object = json.loads(text)
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        if text.startswith("{"):
+            value, end = _decode(text)
+            if end < len(text) and text[end:].strip():
+                raise WireError(f"{what} is followed by {text[end:].strip()[:20]!r}")
+    except json.JSONDecodeError as error:
         raise WireError(f"{what} is not JSON: {error}") from error
     if not isinstance(value, dict):
         raise WireError(f"{what} is not a JSON object")
@@ -107,7 +124,7 @@ def write_frame(stream: BinaryIO, message: Message, tensors: Tensors | None = No
     payload = encode(message, tensors)
     if len(payload) > MAX_FRAME_BYTES:
         raise WireError(f"a frame of {len(payload)} bytes; at most {MAX_FRAME_BYTES} are allowed")
-    stream.write(struct.pack("<Q", len(payload)) + payload)
+    stream.write(_LENGTH.pack(len(payload)) + payload)
     stream.flush()
 
 
@@ -118,7 +135,7 @@ def read_frame(stream: BinaryIO) -> tuple[Message, Tensors] | None:
         return None
     if len(head) < 8:
         raise WireError(f"the stream ended {len(head)} bytes into a frame length")
-    (size,) = struct.unpack("<Q", head)
+    (size,) = _LENGTH.unpack(head)
     if size > MAX_FRAME_BYTES:
         raise WireError(f"a frame of {size} bytes is announced; at most {MAX_FRAME_BYTES} are allowed")
     payload = _read_exactly(stream, size)
@@ -128,9 +145,12 @@ def read_frame(stream: BinaryIO) -> tuple[Message, Tensors] | None:
 
 
 def _read_exactly(stream: BinaryIO, size: int) -> bytes:
-    parts: list[bytes] = []
-    left = size
-    while left > 0:
+    first = stream.read(size)
+    if len(first) == size:
+        return first
+    parts = [first]
+    left = size - len(first)
+    while first and left > 0:
         part = stream.read(left)
         if not part:
             break
