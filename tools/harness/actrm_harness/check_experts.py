@@ -1,17 +1,17 @@
-"""Count how often the scripted experts succeed.
+"""Count how often the scripted experts succeed, and whether they do so with either control loop.
 
     PYTHONPATH=tools/harness .venv/bin/python -m actrm_harness.check_experts --task Door --seeds 200 --workers 2
-    PYTHONPATH=tools/harness .venv/bin/python -m actrm_harness.check_experts --task all
+    PYTHONPATH=tools/harness .venv/bin/python -m actrm_harness.check_experts --task Lift,Stack --control both
 
 Every seed is the demonstration that `actrm-data collect` would record for it. With --out, a line of JSON is written for
-each seed, and a second run goes on where the first was interrupted. The exit code is 1 where a bar is missed. Set
-ACTRM_CONTROL_LIB to the compiled control loop (target/release/libcontrol.so), or it takes five times as long.
+each seed, and a second run goes on where the first was interrupted. The exit code is 1 where a bar is missed. The
+compiled loop is the library that ACTRM_CONTROL_LIB names (target/release/libcontrol.so); `--control both` runs each
+seed with robosuite's own loop too, which takes five times as long, and compares what came of it.
 """
 
 import argparse
 import json
 import multiprocessing
-import os
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -44,12 +44,16 @@ class Outcome:
     """What came of one seed."""
 
     task: str
+    control: str
     seed: int
     success: bool
     steps: int
     pause: int
     """The longest run of steps in which the arm was hardly told to move."""
 
+
+# Of seeds, share that must end alike with both loops.
+SAME = 0.99
 
 _session: "Session | None" = None
 
@@ -62,22 +66,31 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=200, help="episodes a task (default: %(default)s)")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="the first seed (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=1, help="processes (default: %(default)s)")
+    parser.add_argument(
+        "--control", default="compiled", choices=["compiled", "robosuite", "both"], help="loop (default: %(default)s)"
+    )
     parser.add_argument("--out", type=Path, help="a file of one line of JSON a seed; what it holds is not run again")
     args = parser.parse_args()
     tasks = list(BARS) if args.task == "all" else args.task.split(",")
     unknown = sorted(set(tasks) - set(BARS))
     if unknown:
         parser.error(f"no expert for {', '.join(unknown)}; known: {', '.join(BARS)}")
+    loops = ["compiled", "robosuite"] if args.control == "both" else [args.control]
+    wanted = range(args.first, args.first + args.seeds)
     met = True
     for task in tasks:
-        known = {outcome.seed: outcome for outcome in read(args.out) if outcome.task == task}
-        wanted = range(args.first, args.first + args.seeds)
-        for outcome in play(task, [seed for seed in wanted if seed not in known], args.workers):
-            known[outcome.seed] = outcome
-            if args.out:
-                with args.out.open("a") as file:
-                    file.write(json.dumps(asdict(outcome)) + "\n")
-        met &= report(task, [known[seed] for seed in wanted])
+        found: list[list[Outcome]] = []
+        for loop in loops:
+            known = {each.seed: each for each in read(args.out) if (each.task, each.control) == (task, loop)}
+            for outcome in play(task, loop, [seed for seed in wanted if seed not in known], args.workers):
+                known[outcome.seed] = outcome
+                if args.out:
+                    with args.out.open("a") as file:
+                        file.write(json.dumps(asdict(outcome)) + "\n")
+            found.append([known[seed] for seed in wanted])
+            met &= report(task, loop, found[-1])
+        if args.control == "both":
+            met &= compare(task, *found)
     return 0 if met else 1
 
 
@@ -89,16 +102,16 @@ def read(path: Path | None) -> list[Outcome]:
     return [Outcome(**json.loads(line)) for line in lines]
 
 
-def play(task: str, seeds: list[int], workers: int) -> Iterator[Outcome]:
+def play(task: str, loop: str, seeds: list[int], workers: int) -> Iterator[Outcome]:
     """The outcomes of these seeds, in any order."""
     if not seeds:
         return
-    processes = multiprocessing.get_context("spawn").Pool(min(workers, len(seeds)), _start, (task,))
+    processes = multiprocessing.get_context("spawn").Pool(min(workers, len(seeds)), _start, (task, loop))
     with processes as pool:
         yield from pool.imap_unordered(_play, seeds)
 
 
-def _start(task: str) -> None:
+def _start(task: str, loop: str) -> None:
     global _session  # noqa: PLW0603
     from actrm_harness import suite
 
@@ -106,7 +119,7 @@ def _start(task: str) -> None:
     from actrm_harness import control, envs
 
     _session = envs.make(task)
-    if os.environ.get(control.LIBRARY):
+    if loop == "compiled":
         _session.control = control.attach(_session.env)
 
 
@@ -122,10 +135,11 @@ def _play(seed: int) -> Outcome:
     for moves in moving.tolist():
         current = 0 if moves else current + 1
         longest = max(longest, current)
-    return Outcome(_session.task.name, seed, episode.success, episode.steps, longest)
+    loop = "robosuite" if _session.control is None else "compiled"
+    return Outcome(_session.task.name, loop, seed, episode.success, episode.steps, longest)
 
 
-def report(task: str, outcomes: list[Outcome]) -> bool:
+def report(task: str, loop: str, outcomes: list[Outcome]) -> bool:
     """Print a task's line; whether its bar is met."""
     solved = sorted(outcome.steps for outcome in outcomes if outcome.success)
     failed = [outcome.seed for outcome in outcomes if not outcome.success]
@@ -133,8 +147,21 @@ def report(task: str, outcomes: list[Outcome]) -> bool:
     middle, last = (solved[len(solved) // 2], solved[-1]) if solved else (0, 0)
     pause = max((outcome.pause for outcome in outcomes if outcome.success), default=0)
     print(
-        f"{task}: {len(solved)} of {len(outcomes)} (bar {BARS[task]:.0%}, {'met' if met else 'MISSED'}), "
+        f"{task}, {loop} loop: {len(solved)} of {len(outcomes)} (bar {BARS[task]:.0%}, {'met' if met else 'MISSED'}), "
         f"steps median {middle}, most {last}, longest pause {pause}; failed seeds: {failed or 'none'}",
+        flush=True,
+    )
+    return met
+
+
+def compare(task: str, ours: list[Outcome], plain: list[Outcome]) -> bool:
+    """Print in how many seeds both loops came to the same end; whether they are enough."""
+    other = [mine.seed for mine, theirs in zip(ours, plain, strict=True) if mine.success != theirs.success]
+    met = len(other) <= (1.0 - SAME) * len(ours)
+    alike = sum(mine.steps == theirs.steps for mine, theirs in zip(ours, plain, strict=True))
+    print(
+        f"{task}, both loops: same outcome in {len(ours) - len(other)} of {len(ours)} (bar {SAME:.0%}, "
+        f"{'met' if met else 'MISSED'}), same number of steps in {alike}; other seeds: {other or 'none'}",
         flush=True,
     )
     return met

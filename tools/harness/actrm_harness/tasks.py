@@ -120,14 +120,17 @@ class StackThreeCubes(_Base):
     def reward(self, action: Array | None = None) -> float:
         """Half for the middle cube on the lowest, one for all three."""
         del action
+        first, both = self.staged_rewards()
+        return max(first, both) * (1.0 if self.reward_scale is None else self.reward_scale)
+
+    def staged_rewards(self) -> tuple[float, float]:
+        """Half where the middle cube stands on the lowest, one where all three stand."""
         bottom, middle, top = (self.position(name) for name in self.order)
         first = stands_on(middle, bottom)
-        reward = 1.0 if first and stands_on(top, middle) else 0.5 * first
-        return reward * (1.0 if self.reward_scale is None else self.reward_scale)
+        return 0.5 * first, 1.0 * (first and stands_on(top, middle))
 
     def _check_success(self) -> bool:
-        bottom, middle, top = (self.position(name) for name in self.order)
-        return stands_on(middle, bottom) and stands_on(top, middle)
+        return self.staged_rewards()[1] > 0.0
 
     def visualize(self, vis_settings: dict[str, bool]) -> None:
         """Nothing of the task is drawn into the scene."""

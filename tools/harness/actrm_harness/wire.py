@@ -109,11 +109,11 @@ def _tensor(name: str, entry: object, body: memoryview) -> Array:
     try:
         fields = cast(Message, entry)
         dtype = _LAYOUTS[fields["dtype"]]
-        shape = tuple(int(size) for size in fields["shape"])
-        begin, end = (int(offset) for offset in fields["data_offsets"])
+        shape = tuple([int(size) for size in fields["shape"]])
+        begin, end = [int(offset) for offset in fields["data_offsets"]]
     except (KeyError, TypeError, ValueError) as error:
         raise WireError(f"tensor {name!r} has a bad header entry: {entry!r}") from error
-    count = math.prod(shape) if all(size >= 0 for size in shape) else -1
+    count = math.prod(shape) if min(shape, default=0) >= 0 else -1
     if count < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * dtype.itemsize:
         raise WireError(f"tensor {name!r}: shape {shape} of {dtype} does not fit bytes {begin}..{end} of {len(body)}")
     return np.frombuffer(body, dtype=dtype, count=count, offset=begin).reshape(shape)

@@ -11,7 +11,8 @@ import os
 import platform
 import sys
 import traceback
-from typing import TYPE_CHECKING, BinaryIO, NoReturn
+from functools import cache
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from actrm_harness import PROTOCOL, protocol, wire
 from actrm_harness.protocol import RequestError, error_message
@@ -166,8 +167,24 @@ def serve(session: "Session", requests: BinaryIO, replies: BinaryIO) -> int:
         wire.write_frame(replies, reply, data)
 
 
-def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors) -> tuple[wire.Message, wire.Tensors]:
+Answer = tuple[wire.Message, wire.Tensors]
+
+
+def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors) -> Answer:
     """The reply to one request."""
+    # first what is asked most, between two steps of physics
+    if isinstance(request, protocol.Step):
+        envs = environments()
+        action = envs.check_action(session.env, tensor(tensors, "action"))
+        envs.slim(session)
+        result = envs.step_session(session, action)
+        reply = {"type": "step", "id": request.id, "reward": result.reward, "success": result.success}
+        return reply, {f"obs/{name}": value for name, value in result.observation.items()}
+    return answer_seldom(session, request, tensors)
+
+
+def answer_seldom(session: "Session", request: protocol.Request, tensors: wire.Tensors) -> Answer:
+    """The reply to a request that is not a step."""
     from actrm_harness import envs, episodes
 
     if isinstance(request, protocol.Reset):
@@ -182,12 +199,6 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
             "ep_meta": ep_meta,
         }
         return reply, {f"obs/{name}": value for name, value in first.items()}
-    if isinstance(request, protocol.Step):
-        action = envs.check_action(session.env, tensor(tensors, "action"))
-        envs.slim(session)
-        result = envs.step_session(session, action)
-        reply = {"type": "step", "id": request.id, "reward": result.reward, "success": result.success}
-        return reply, {f"obs/{name}": value for name, value in result.observation.items()}
     if isinstance(request, protocol.Expert):
         episode = episodes.expert_episode(session, request.seed, request.split == "demonstration")
         return episode_reply("expert", request.id, episode), episode.tensors
@@ -199,6 +210,12 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
         image = envs.image(session, request.camera, *request.size)
         return {"type": "render", "id": request.id}, {"image": image}
     raise RequestError("unknown_request", f"request {request!r} cannot be answered")
+
+
+@cache
+def environments() -> Any:
+    """The module `envs`, which is imported late, as it brings the simulator."""
+    return importlib.import_module("actrm_harness.envs")
 
 
 def episode_reply(kind: str, number: int, episode: "Episode") -> wire.Message:
