@@ -1,5 +1,6 @@
 """Images: as robosuite draws them, whatever other contexts do, and without a trace in the episode."""
 
+import dataclasses
 import gc
 import importlib
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import Client, WorkerError, walk
 
-from actrm_harness import envs, render, suite
+from actrm_harness import envs, episodes, render, suite, wire
 
 suite.prepare()
 
@@ -64,6 +65,28 @@ def test_a_collected_context_does_not_corrupt_a_live_one(
     assert not np.array_equal(corrupted, before)
     disturb()
     assert np.array_equal(envs.image(session, "agentview", 84, 84), before)
+
+
+def test_a_recorded_episode_is_not_corrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What goes into a data set, while contexts come and go around it."""
+    session = envs.make("Lift", ("agentview",), 48)
+    session.task = dataclasses.replace(session.task, max_steps=3)
+    expected = episodes.expert_episode(session, 4).tensors["obs/agentview_image"]
+    look = envs.image
+
+    def disturbed(*arguments: Any) -> wire.Array:
+        other = render.Renderer()
+        other.image(session.env.sim, "frontview", 48, 48)
+        del other
+        gc.collect()
+        return look(*arguments)
+
+    monkeypatch.setattr(envs, "image", disturbed)
+    assert np.array_equal(episodes.expert_episode(session, 4).tensors["obs/agentview_image"], expected)
+    # without the cure it would be
+    monkeypatch.setattr(session.renderer, "make_current", do_nothing)
+    assert not np.array_equal(episodes.expert_episode(session, 4).tensors["obs/agentview_image"], expected)
+    session.env.close()
 
 
 def test_images_follow_the_model_after_a_hard_reset(session: envs.Session) -> None:

@@ -180,8 +180,21 @@ def test_an_environment_of_ones_own_is_registered_by_its_module() -> None:
     paths = {"PYTHONPATH": f"{HERE}:{HERE.parent}"}
     client = Client("--task", "LiftHigh", "--env-module", "example_env", env=paths)
     assert client.ready["env_name"] == "LiftHigh"
-    assert client.ask("reset", seed=0)[0]["type"] == "reset"
+    groups = {client.ask("reset", seed=seed)[0]["group"] for seed in range(4)}
+    assert groups == {"left", "right"}
     assert client.step(np.zeros(7))[0]["success"] is False
+    message, data = client.ask("expert", seed=0)
+    assert message["success"] and data["obs/object"][-1][2] > 1.0
+    client.close()
+
+
+def test_the_documentation_shows_that_module() -> None:
+    page = (HERE.parents[2] / "docs" / "environments.md").read_text()
+    assert f"```python\n{(HERE / 'example_env.py').read_text()}```" in page
+
+
+def test_a_task_without_an_expert_says_so() -> None:
+    client = Client("--task", "PickPlaceMilk")
     with pytest.raises(WorkerError, match="no scripted expert"):
         client.ask("expert", seed=0)
     client.close()
