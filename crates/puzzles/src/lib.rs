@@ -12,6 +12,7 @@ mod maze;
 mod rng;
 mod split;
 mod sudoku;
+mod task;
 mod walker;
 
 pub use grid::{Grid, RIGHT_DOWN_LEFT_UP};
@@ -19,4 +20,5 @@ pub use maze::{Maze, MazeTask};
 pub use rng::Rng;
 pub use split::{Split, fingerprint};
 pub use sudoku::{Sudoku, SudokuTask};
+pub use task::{Grade, Puzzle, Task};
 pub use walker::{MAX_MOVES, MOVES, Moved, Walker};

@@ -52,19 +52,22 @@ pub enum MazeTask {
     Dfs16,
     /// As `Dfs10`, 20×20 (9×9 rooms).
     Dfs20,
+    /// 5×5 without walls, from (0,0) to (4,4): the study's maze for reinforcement learning.
+    Empty5,
     /// 5×5, 4 to 9 wall draws, random start and goal, solvable.
     Walls5,
 }
 
 impl MazeTask {
     /// Every family, with the name it has in commands and files.
-    pub const ALL: [(&'static str, Self); 7] = [
+    pub const ALL: [(&'static str, Self); 8] = [
         ("maze8-original", Self::Original8),
         ("maze10-original", Self::Original10),
         ("open8", Self::Open8),
         ("dfs10", Self::Dfs10),
         ("dfs16", Self::Dfs16),
         ("dfs20", Self::Dfs20),
+        ("maze5-rl", Self::Empty5),
         ("maze5-walls", Self::Walls5),
     ];
 
@@ -75,7 +78,7 @@ impl MazeTask {
             Self::Original10 | Self::Dfs10 => 10,
             Self::Dfs16 => 16,
             Self::Dfs20 => 20,
-            Self::Walls5 => 5,
+            Self::Empty5 | Self::Walls5 => 5,
         }
     }
 
@@ -84,6 +87,7 @@ impl MazeTask {
         match self {
             Self::Original8 => original8(rng),
             Self::Original10 => original10(rng),
+            Self::Empty5 => empty5(),
             Self::Open8 => scattered(8, 10, 24, rng),
             Self::Walls5 => scattered(5, 4, 9, rng),
             Self::Dfs10 | Self::Dfs16 | Self::Dfs20 => perfect(self.side(), rng),
@@ -95,7 +99,7 @@ impl MazeTask {
     pub fn draw_from(self, split: Split, rng: &mut Rng) -> Maze {
         loop {
             let maze = self.draw(rng);
-            let original = matches!(self, Self::Original8 | Self::Original10);
+            let original = matches!(self, Self::Original8 | Self::Original10 | Self::Empty5);
             if original || Split::of(fingerprint(maze.grid.walls().iter().map(|&wall| u64::from(wall)))) == split {
                 return maze;
             }
@@ -152,6 +156,12 @@ fn carve(side: usize, rng: &mut Rng) -> Grid {
         stack.push(grid.step(cell, (down, right)).expect("the room that was found closed"));
     }
     grid
+}
+
+fn empty5() -> Maze {
+    let grid = Grid::filled(5, 5, false);
+    let (start, goal) = (grid.cell(0, 0), grid.cell(4, 4));
+    solved(grid, start, goal)
 }
 
 fn original10(rng: &mut Rng) -> Maze {

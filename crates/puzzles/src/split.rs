@@ -16,6 +16,20 @@ impl Split {
     /// All three.
     pub const ALL: [Self; 3] = [Self::Train, Self::Valid, Self::Test];
 
+    /// `train`, `valid` or `test`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Valid => "valid",
+            Self::Test => "test",
+        }
+    }
+
+    /// The split of that name.
+    pub fn by_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|split| split.name() == name)
+    }
+
     /// The split of a puzzle by the [`fingerprint`] of what must not be shared.
     pub fn of(fingerprint: u64) -> Self {
         match fingerprint % 10 {

@@ -3,7 +3,6 @@
 //! Rewards are the published study's: a move inside the grid costs 0.01 and earns 0.2 for every step nearer (in Manhattan
 //! distance), reaching the goal earns 10 more, a move that cannot be made costs 0.5 and changes nothing.
 
-use crate::grid::Grid;
 use crate::maze::{Maze, MazeTask};
 use crate::rng::Rng;
 use crate::split::Split;
@@ -36,10 +35,7 @@ pub struct Walker {
 impl Walker {
     /// The study's `maze5-rl`: an empty 5×5 grid, from (0,0) to (4,4).
     pub fn empty5() -> Self {
-        let grid = Grid::filled(5, 5, false);
-        let (start, goal) = (grid.cell(0, 0), grid.cell(4, 4));
-        let path = grid.first_shortest_path(start, goal).expect("an empty grid has a way");
-        Self::new(Maze { grid, start, goal, path })
+        Self::new(MazeTask::Empty5.draw(&mut Rng::new(0, 0)))
     }
 
     /// `maze5-walls`: random walls, start and goal, from one of the splits.
@@ -100,14 +96,14 @@ impl Walker {
         observation
     }
 
-    /// Three planes of one number a cell: walls, walker, goal.
+    /// Three planes of one number a cell: walker, walls, goal.
     pub fn observe_planes(&self) -> Vec<f32> {
         let cells = self.maze.grid.len();
         let mut observation = vec![0.0; 3 * cells];
         for (cell, &wall) in self.maze.grid.walls().iter().enumerate() {
-            observation[cell] = f32::from(u8::from(wall));
+            observation[cells + cell] = f32::from(u8::from(wall));
         }
-        observation[cells + self.at] = 1.0;
+        observation[self.at] = 1.0;
         observation[2 * cells + self.maze.goal] = 1.0;
         observation
     }
@@ -163,14 +159,14 @@ mod tests {
     }
 
     #[test]
-    fn planes_show_walls_walker_and_goal() {
+    fn planes_show_walker_walls_and_goal() {
         let walker = Walker::walls5(Split::Train, &mut Rng::new(2, 0));
         let planes = walker.observe_planes();
         assert_eq!(
             planes.iter().filter(|&&x| x == 1.0).count(),
             2 + walker.maze().grid.walls().iter().filter(|&&w| w).count()
         );
-        assert_eq!(planes[25 + walker.maze().start], 1.0);
+        assert_eq!(planes[walker.maze().start], 1.0);
         assert_eq!(planes[50 + walker.maze().goal], 1.0);
     }
 }

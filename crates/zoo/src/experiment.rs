@@ -145,7 +145,7 @@ impl Experiment {
         Self::from_table(table)
     }
 
-    fn from_table(table: Table) -> Result<Self, ZooError> {
+    pub(crate) fn from_table(table: Table) -> Result<Self, ZooError> {
         let sections: Sections = from_value(&Value::Table(table), &[])?;
         let experiment = Self {
             entry: sections.entry,
@@ -237,7 +237,8 @@ fn policy(mut table: Table) -> Result<PolicyConfig, ZooError> {
     }
 }
 
-fn flatten(prefix: &str, table: &Table, flat: &mut BTreeMap<String, String>) {
+/// Puts the dotted keys and values of `table` into `flat`.
+pub(crate) fn flatten(prefix: &str, table: &Table, flat: &mut BTreeMap<String, String>) {
     for (key, value) in table {
         let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
         match value {
@@ -253,6 +254,7 @@ fn flatten(prefix: &str, table: &Table, flat: &mut BTreeMap<String, String>) {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::puzzle::AnyExperiment;
 
     fn load(overrides: &[&str]) -> Result<Experiment, String> {
         let overrides: Vec<String> = overrides.iter().map(|o| (*o).to_owned()).collect();
@@ -263,8 +265,8 @@ mod tests {
     fn every_experiment_built_in_is_sound() {
         let library = Library::built_in();
         for name in library.names().unwrap() {
-            let experiment = Experiment::load(&library, &name, &[]).unwrap();
-            assert!(!experiment.description.is_empty(), "{name}");
+            let experiment = AnyExperiment::load(&library, &name, &[]).unwrap();
+            assert!(!experiment.description().is_empty(), "{name}");
         }
     }
 

@@ -13,6 +13,7 @@ mod error;
 pub mod experiment;
 mod files;
 pub mod lerobot;
+pub mod puzzle;
 pub mod registry;
 pub mod run;
 mod tensors;

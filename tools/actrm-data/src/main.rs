@@ -29,6 +29,7 @@ enum Command {
     Stats(commands::stats::Args),
     Query(commands::query::Args),
     Plot(commands::plot::Args),
+    Puzzle(commands::puzzle::Args),
     Completions(commands::completions::Args),
 }
 
@@ -45,6 +46,7 @@ fn main() -> ExitCode {
         Command::Stats(args) => commands::stats::run(&args),
         Command::Query(args) => commands::query::run(&args),
         Command::Plot(args) => commands::plot::run(&args),
+        Command::Puzzle(args) => commands::puzzle::run(&args),
         Command::Completions(args) => {
             use clap::CommandFactory;
             commands::completions::run(&args, &mut Cli::command())

@@ -22,8 +22,19 @@ fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
     row("task", meta.task.clone())?;
     row("experiment", meta.experiment.clone())?;
     row("parameters", grouped(meta.parameters))?;
-    row("observation.state", keys(&meta.state_keys))?;
-    row("observation.environment_state", keys(&meta.env_keys))?;
+    match &meta.puzzle {
+        None => {
+            row("observation.state", keys(&meta.state_keys))?;
+            row("observation.environment_state", keys(&meta.env_keys))?;
+        }
+        Some(puzzle) => {
+            row("puzzles trained on", grouped(puzzle.train_puzzles))?;
+            if puzzle.givens[1] > 0 {
+                row("givens", format!("{} to {}", puzzle.givens[0], puzzle.givens[1]))?;
+            }
+            row("processor time", format!("{:.0} s, validation left out", puzzle.cpu_seconds))?;
+        }
+    }
     if let Some(data) = &meta.data {
         row(
             "demonstrations",
@@ -45,9 +56,10 @@ fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
         row(
             "training",
             format!(
-                "{} steps of {} windows, seed {}, {:.1} minutes on {} threads",
+                "{} steps of {} {}, seed {}, {:.1} minutes on {} threads",
                 grouped(training.steps),
                 training.batch_size,
+                if meta.puzzle.is_some() { "puzzles" } else { "windows" },
                 training.seed,
                 training.minutes,
                 training.threads
@@ -63,6 +75,14 @@ fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
     }
     let versions: Vec<String> = meta.versions.iter().map(|(n, v)| format!("{n} {v}")).collect();
     row("made with", versions.join(", "))?;
+    if meta.puzzle.is_some() {
+        return writeln!(
+            card,
+            "\nUse: `actrm-zoo eval {id}`, `actrm-zoo trace {id}`. Provenance and the hash of every file: \
+             `entry.json`; the whole experiment: `config.toml`.",
+            id = meta.id()
+        );
+    }
     writeln!(
         card,
         "\nUse: `actrm-zoo eval {id} --episodes 50`. Provenance and the hash of every file: `entry.json`; \

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use models::Dims;
 use serde::{Deserialize, Serialize};
 
+use crate::puzzle::PuzzleMeta;
 use crate::sha256_hex;
 
 use super::EntryId;
@@ -43,6 +44,9 @@ pub struct EntryMeta {
     pub dims: Dims,
     /// The demonstrations; `None` for an imported entry.
     pub data: Option<DataMeta>,
+    /// What it was trained on, if it solves puzzles.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub puzzle: Option<PuzzleMeta>,
     /// How it was trained; `None` for an imported entry.
     pub training: Option<TrainingMeta>,
     /// Versions of the software that made it.

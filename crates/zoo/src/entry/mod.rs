@@ -20,6 +20,7 @@ pub use policy::{EntryPolicy, LoadedEntry};
 pub use seal::EntryDraft;
 #[cfg(test)]
 pub(crate) use seal::tests::draft as test_draft;
+pub(crate) use subject::training_facts;
 
 /// The weights.
 pub const MODEL_FILE: &str = "model.safetensors";

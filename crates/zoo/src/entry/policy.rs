@@ -28,6 +28,15 @@ impl Entry {
     /// # Errors
     /// What does not fit, by name.
     pub fn load(&self) -> Result<LoadedEntry, ZooError> {
+        if self.meta().puzzle.is_some() {
+            return Err(ZooError::UnfitEntry {
+                entry: self.id().to_string(),
+                task: self.meta().task.clone(),
+                what: "kind of entry".to_owned(),
+                expected: "a robot policy".to_owned(),
+                found: "a puzzle solver".to_owned(),
+            });
+        }
         let experiment = Experiment::from_toml(&self.id().to_string(), &self.config_text()?)?;
         let failed = |operation| {
             let name = self.id().to_string();

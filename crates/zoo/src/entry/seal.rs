@@ -131,6 +131,7 @@ pub(crate) mod tests {
                     train_frames: 2000,
                     valid_episodes: 5,
                 }),
+                puzzle: None,
                 training: Some(TrainingMeta {
                     steps: 3,
                     batch_size: 64,

@@ -3,27 +3,33 @@
 use crate::evaluation::Subject;
 use crate::results::{EntryIdentity, Execution, TrainingFacts};
 
-use super::LoadedEntry;
+use super::{EntryMeta, LoadedEntry};
+
+/// Where an entry comes from, as results record it.
+pub(crate) fn training_facts(meta: &EntryMeta) -> TrainingFacts {
+    let (training, data) = (meta.training.as_ref(), meta.data.as_ref());
+    let drawn = meta.puzzle.as_ref().map(|_| format!("puzzles of {}", meta.task));
+    TrainingFacts {
+        policy: meta.policy.clone(),
+        parameters: meta.parameters,
+        steps: training.map_or(0, |t| t.steps),
+        minutes: training.map_or(0.0, |t| t.minutes),
+        seed: training.map_or(0, |t| t.seed),
+        data_set: data.map(|d| d.name.clone()).or(drawn).unwrap_or_else(|| "not recorded".to_owned()),
+        data_fingerprint: data.map_or_else(String::new, |d| d.fingerprint.clone()),
+        data_simulator: meta.env_version.clone(),
+        demos: data.map_or(0, |d| d.train_episodes),
+    }
+}
 
 impl LoadedEntry {
     /// What an evaluation needs to know.
     pub fn subject(&self) -> Subject<'static> {
         let policy = self.policy();
         let (meta, rollout) = (self.entry().meta(), &self.experiment().rollout);
-        let (training, data) = (meta.training.as_ref(), meta.data.as_ref());
         Subject {
             entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
-            training: TrainingFacts {
-                policy: meta.policy.clone(),
-                parameters: meta.parameters,
-                steps: training.map_or(0, |t| t.steps),
-                minutes: training.map_or(0.0, |t| t.minutes),
-                seed: training.map_or(0, |t| t.seed),
-                data_set: data.map_or_else(|| "not recorded".to_owned(), |d| d.name.clone()),
-                data_fingerprint: data.map_or_else(String::new, |d| d.fingerprint.clone()),
-                data_simulator: meta.env_version.clone(),
-                demos: data.map_or(0, |d| d.train_episodes),
-            },
+            training: training_facts(meta),
             task: meta.task.clone(),
             env_version: meta.env_version.clone(),
             state_keys: meta.state_keys.clone(),

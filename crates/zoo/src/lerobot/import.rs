@@ -103,6 +103,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             env_keys: experiment.data.env_keys.clone(),
             dims,
             data: None,
+            puzzle: None,
             training: None,
             versions: crate::versions(),
             files: BTreeMap::new(),

@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use crate::leaderboard::{LeaderboardRow, count_text, rank};
+use crate::puzzle::{PuzzleEvaluation, puzzle_section};
 use crate::results::StoredEvaluation;
 
 /// An entry's training loss over optimiser steps.
@@ -20,8 +21,8 @@ pub struct Curve {
     pub points: Vec<(u64, f64)>,
 }
 
-/// The report over all whole evaluations, as HTML.
-pub fn to_html(evaluations: &[StoredEvaluation], curves: &[Curve]) -> String {
+/// The report over all whole evaluations, of robot policies and of puzzle solvers, as HTML.
+pub fn to_html(evaluations: &[StoredEvaluation], puzzles: &[PuzzleEvaluation], curves: &[Curve]) -> String {
     let rows = rank(evaluations);
     let mut groups: BTreeMap<(&str, &str), Vec<&LeaderboardRow>> = BTreeMap::new();
     for row in &rows {
@@ -41,7 +42,7 @@ pub fn to_html(evaluations: &[StoredEvaluation], curves: &[Curve]) -> String {
         rows.len(),
         episodes
     );
-    if rows.is_empty() {
+    if rows.is_empty() && puzzles.is_empty() {
         html.push_str("<p>No finished evaluation yet.</p>\n");
     }
     for ((task, protocol), rows) in &groups {
@@ -84,6 +85,7 @@ pub fn to_html(evaluations: &[StoredEvaluation], curves: &[Curve]) -> String {
         }
         html.push_str("</div>\n");
     }
+    html.push_str(&puzzle_section(puzzles));
     let _ = writeln!(
         html,
         "<footer>Made by <code>actrm-zoo leaderboard</code> {} from the results in the zoo; nothing here is loaded \
@@ -176,7 +178,7 @@ fn provenance(row: &LeaderboardRow) -> String {
 }
 
 /// Text as HTML.
-fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for character in text.chars() {
         match character {
@@ -206,7 +208,7 @@ mod tests {
         finished(dir.path(), &stack);
         let points = (0..=500).step_by(10).map(|step| (step, 2.0 * (-(step as f64) / 120.0).exp() + 0.03)).collect();
         let curves = [Curve { entry: "lift-act@1".into(), points }];
-        to_html(&list_evaluations(dir.path()).unwrap(), &curves)
+        to_html(&list_evaluations(dir.path()).unwrap(), &[], &curves)
     }
 
     #[test]
@@ -227,6 +229,6 @@ mod tests {
 
     #[test]
     fn no_result_is_a_page_that_says_so() {
-        assert!(to_html(&[], &[]).contains("No finished evaluation yet"));
+        assert!(to_html(&[], &[], &[]).contains("No finished evaluation yet"));
     }
 }

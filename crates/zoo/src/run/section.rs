@@ -121,7 +121,7 @@ impl TrainSection {
     }
 
     /// The part of it that the trainer wants.
-    pub(super) fn trainer_config(&self) -> TrainConfig {
+    pub(crate) fn trainer_config(&self) -> TrainConfig {
         let ([beta1, beta2], weight_decay) = (self.betas, self.weight_decay);
         TrainConfig {
             steps: self.steps,

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::{Instant, SystemTime};
+use std::time::Instant;
 
 use candle_core::Tensor;
 use dataset::WindowBatch;
@@ -11,20 +11,18 @@ use models::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::entry::{CurvePoint, EntryDraft, EntryId, EntryMeta, TrainingMeta};
+use crate::entry::{EntryDraft, EntryId, EntryMeta, TrainingMeta};
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors, write_atomic};
 
 use super::checkpoint::Checkpoint;
 use super::data::{self, Demonstrations};
 use super::folder::RunFolder;
+use super::loop_parts::{curve, open_folder, same_settings, wall_time};
 use super::metrics::{Metrics, MetricsRow};
 use super::sampler::Sampler;
 use super::tensorboard::EventWriter;
 use super::validation::validation_loss;
-
-/// Points kept of a training curve.
-const CURVE_POINTS: usize = 50;
 
 /// What to train and where to put it.
 #[derive(Debug, Clone)]
@@ -111,7 +109,7 @@ pub fn train(
     stop: &dyn Fn() -> bool,
     on_event: &mut dyn FnMut(TrainEvent<'_>),
 ) -> Result<TrainOutcome, ZooError> {
-    let folder = open_folder(request)?;
+    let folder = open_folder(&request.name, &request.runs, request.run.as_deref(), request.resume)?;
     let outcome = train_in(&folder, request, stop, on_event);
     if outcome.is_err() && !folder.config_path().exists() {
         // refused before it began: as if it had never been asked for
@@ -187,15 +185,6 @@ fn train_in(
     Ok(TrainOutcome::Finished { entry, run: folder.path().to_owned(), minutes })
 }
 
-fn open_folder(request: &TrainRequest) -> Result<RunFolder, ZooError> {
-    match (&request.run, request.resume) {
-        (Some(path), true) => RunFolder::resume(path),
-        (Some(path), false) => RunFolder::fresh(path),
-        (None, true) => RunFolder::resume_latest(&request.runs, &request.name),
-        (None, false) => RunFolder::next(&request.runs, &request.name),
-    }
-}
-
 /// The note of the session that began this run, once its config is known to be the one asked for.
 fn begun(folder: &RunFolder, note_path: &Path, request: &TrainRequest) -> Result<Option<RunNote>, ZooError> {
     if !request.resume {
@@ -204,18 +193,7 @@ fn begun(folder: &RunFolder, note_path: &Path, request: &TrainRequest) -> Result
     let config_path = folder.config_path();
     let text = std::fs::read_to_string(&config_path).map_err(ZooError::io("read", &config_path))?;
     let (saved, asked) = (Experiment::from_toml(&request.name, &text)?.flat(), request.experiment.flat());
-    let absent = || "nothing".to_owned();
-    for key in saved.keys().chain(asked.keys()) {
-        let (expected, found) = (saved.get(key), asked.get(key));
-        if expected != found {
-            return Err(ZooError::ResumeMismatch {
-                folder: folder.path().to_owned(),
-                what: key.clone(),
-                expected: expected.cloned().unwrap_or_else(absent),
-                found: found.cloned().unwrap_or_else(absent),
-            });
-        }
-    }
+    same_settings(folder.path(), &saved, &asked)?;
     let text = std::fs::read_to_string(note_path).map_err(ZooError::io("read", note_path))?;
     let note: RunNote = serde_json::from_str(&text)
         .map_err(|e| ZooError::Malformed { path: note_path.to_owned(), reason: format!("not a run's note: {e}") })?;
@@ -398,6 +376,7 @@ impl<'a> Run<'a> {
             env_keys: experiment.data.env_keys.clone(),
             dims,
             data: Some(demonstrations.meta.clone()),
+            puzzle: None,
             training: Some(TrainingMeta {
                 steps: self.step,
                 batch_size: section.batch_size as u64,
@@ -461,34 +440,4 @@ fn not_finite(tensors: &BTreeMap<String, Tensor>) -> candle_core::Result<Option<
         }
     }
     Ok(None)
-}
-
-/// At most [`CURVE_POINTS`] rows, evenly thinned; the last always stays.
-fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
-    let stride = rows.len().div_ceil(CURVE_POINTS).max(1);
-    let point = |row: &MetricsRow| {
-        let loss = *row.values.get("loss")?;
-        Some(CurvePoint { step: row.step, loss, valid_loss: row.values.get("valid_loss").copied() })
-    };
-    rows.iter().rev().step_by(stride).filter_map(point).collect::<Vec<_>>().into_iter().rev().collect()
-}
-
-fn wall_time() -> f64 {
-    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn curves_are_thinned_to_their_end() {
-        let rows: Vec<MetricsRow> =
-            (1..=1003).map(|step| MetricsRow { step, values: [("loss".to_owned(), step as f64)].into() }).collect();
-        let points = curve(&rows);
-        assert!(points.len() <= CURVE_POINTS && points.len() > CURVE_POINTS / 2);
-        assert_eq!(points.last().map(|p| p.step), Some(1003));
-        assert!(points.windows(2).all(|p| p[0].step < p[1].step));
-        assert_eq!(curve(&rows[..3]).len(), 3);
-    }
 }

@@ -7,6 +7,7 @@ pub mod export;
 pub mod extract;
 pub mod inspect;
 pub mod plot;
+pub mod puzzle;
 pub mod query;
 pub mod stats;
 pub mod validate;

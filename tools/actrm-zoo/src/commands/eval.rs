@@ -16,10 +16,11 @@ use zoo::registry::Registry;
 use zoo::results::{Seeds, Shard, StoredEvaluation};
 use zoo::rollout::{Control, Pool, PoolOptions, WorkerSpec, find_python, harness_folder};
 
+use super::puzzles::{PuzzleArgs, evaluate_solver};
 use super::{ZooArgs, shown};
 use crate::{stop, terminal};
 
-/// Evaluate entries in simulation, one episode a seed
+/// Evaluate entries: policies in simulation, one episode a seed; puzzle solvers here, on test puzzles
 ///
 /// Finished episodes are on disk: an interrupted evaluation goes on where it was, a finished one is shown again.
 #[derive(Args)]
@@ -27,6 +28,8 @@ use crate::{stop, terminal};
   actrm-zoo eval lift-act --episodes 50
   actrm-zoo eval lift-act@1 stack-act --episodes 100 --workers 2
   actrm-zoo eval --all --episodes 20
+  actrm-zoo eval trm-dfs10 --puzzles 600
+  actrm-zoo eval trm-dfs10 --task dfs16 --depth 32
   actrm-zoo eval lift-act --episodes 200 --shard 2/8")]
 pub struct EvalArgs {
     /// Entries: `name` (its newest version) or `name@version`
@@ -69,6 +72,8 @@ pub struct EvalArgs {
     #[arg(long, value_name = "DIR")]
     results: Option<PathBuf>,
     #[command(flatten)]
+    puzzles: PuzzleArgs,
+    #[command(flatten)]
     zoo: ZooArgs,
 }
 
@@ -91,7 +96,14 @@ pub fn cmd_eval(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     // one set of simulators serves all entries of a task
     let mut by_task: BTreeMap<String, Vec<LoadedEntry>> = BTreeMap::new();
     for id in ids {
-        let loaded = registry.entry(&id.to_string())?.load().with_context(|| format!("entry {id}"))?;
+        let entry = registry.entry(&id.to_string())?;
+        if entry.meta().puzzle.is_some() {
+            let results = args.results.clone().unwrap_or_else(|| args.zoo.zoo.join("results"));
+            let evaluated = evaluate_solver(&entry, args.task.as_deref(), &args.puzzles, &results);
+            println!("{}", evaluated.with_context(|| format!("entry {id}"))?);
+            continue;
+        }
+        let loaded = entry.load().with_context(|| format!("entry {id}"))?;
         let task = args.task.clone().unwrap_or_else(|| loaded.entry().meta().task.clone());
         by_task.entry(task).or_default().push(loaded);
     }

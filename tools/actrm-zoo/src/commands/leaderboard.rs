@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use clap::Args;
 use comfy_table::{Table, presets};
 use zoo::leaderboard::{TABLE_COLUMNS, rank, to_csv, to_table};
+use zoo::puzzle::{PUZZLE_COLUMNS, list_puzzle_evaluations, puzzle_csv, puzzle_table, rank_puzzles};
 use zoo::registry::Registry;
 use zoo::report::{Curve, to_html};
 use zoo::results::list_evaluations;
@@ -13,7 +14,7 @@ use zoo::write_atomic;
 
 use super::{ZooArgs, shown};
 
-/// Rank all evaluations: a table here, leaderboard.csv and report.html in the zoo
+/// Rank all evaluations: tables here, leaderboard.csv, leaderboard_puzzles.csv and report.html in the zoo
 #[derive(Args)]
 #[command(after_help = "Examples:
   actrm-zoo leaderboard
@@ -32,23 +33,39 @@ pub struct LeaderboardArgs {
 pub fn cmd_leaderboard(args: &LeaderboardArgs) -> anyhow::Result<ExitCode> {
     let results = args.results.clone().unwrap_or_else(|| args.zoo.zoo.join("results"));
     let evaluations = list_evaluations(&results)?;
-    if evaluations.is_empty() {
+    let puzzles = rank_puzzles(&list_puzzle_evaluations(&results)?);
+    if evaluations.is_empty() && puzzles.is_empty() {
         eprintln!("no evaluations in {}; make one with: actrm-zoo eval --all", shown(&results));
         return Ok(ExitCode::SUCCESS);
     }
     let rows = rank(&evaluations);
-    let mut table = Table::new();
-    table.load_style(presets::UTF8_HORIZONTAL_ONLY).set_header(TABLE_COLUMNS);
-    for row in to_table(&rows) {
-        table.add_row(row);
+    if !rows.is_empty() {
+        let mut table = Table::new();
+        table.load_style(presets::UTF8_HORIZONTAL_ONLY).set_header(TABLE_COLUMNS);
+        for row in to_table(&rows) {
+            table.add_row(row);
+        }
+        println!("{}", table.trim_fmt());
     }
-    println!("{}", table.trim_fmt());
+    if !puzzles.is_empty() {
+        let mut table = Table::new();
+        table.load_style(presets::UTF8_HORIZONTAL_ONLY).set_header(PUZZLE_COLUMNS);
+        for row in puzzle_table(&puzzles) {
+            table.add_row(row);
+        }
+        println!("{}", table.trim_fmt());
+    }
 
     let out = args.out.as_ref().unwrap_or(&args.zoo.zoo);
     let (csv, html) = (out.join("leaderboard.csv"), out.join("report.html"));
     write_atomic(&csv, to_csv(&rows).as_bytes())?;
-    write_atomic(&html, to_html(&evaluations, &curves(args)?).as_bytes())?;
+    write_atomic(&html, to_html(&evaluations, &puzzles, &curves(args)?).as_bytes())?;
     println!("{}\n{}", shown(&csv), shown(&html));
+    if !puzzles.is_empty() {
+        let csv = out.join("leaderboard_puzzles.csv");
+        write_atomic(&csv, puzzle_csv(&puzzles).as_bytes())?;
+        println!("{}", shown(&csv));
+    }
     Ok(ExitCode::SUCCESS)
 }
 

@@ -61,7 +61,11 @@ pub fn cmd_list(args: &ListArgs) -> anyhow::Result<ExitCode> {
             meta.parameters.to_string(),
             number(training.map(|t| t.steps.to_string())),
             number(training.map(|t| format!("{:.1}", t.minutes))),
-            number(meta.data.as_ref().map(|d| format!("{} ({} demos)", d.name, d.train_episodes))),
+            number(match (&meta.data, &meta.puzzle) {
+                (Some(data), _) => Some(format!("{} ({} demos)", data.name, data.train_episodes)),
+                (None, Some(puzzle)) => Some(format!("{} puzzles", puzzle.train_puzzles)),
+                (None, None) => None,
+            }),
         ]);
     }
     println!("{}", table.trim_fmt());

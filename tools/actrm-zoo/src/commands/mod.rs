@@ -7,7 +7,9 @@ mod import;
 mod leaderboard;
 mod list;
 mod merge;
+mod puzzles;
 mod show;
+mod trace;
 mod train;
 
 use std::path::{Path, PathBuf};
@@ -24,6 +26,7 @@ pub enum Command {
     Leaderboard(leaderboard::LeaderboardArgs),
     List(list::ListArgs),
     Show(show::ShowArgs),
+    Trace(trace::TraceArgs),
     Import(import::ImportArgs),
     Export(export::ExportArgs),
     Completions(completions::CompletionsArgs),
@@ -39,6 +42,7 @@ impl Command {
             Self::Leaderboard(args) => leaderboard::cmd_leaderboard(&args),
             Self::List(args) => list::cmd_list(&args),
             Self::Show(args) => show::cmd_show(&args),
+            Self::Trace(args) => trace::cmd_trace(&args),
             Self::Import(args) => import::cmd_import(args),
             Self::Export(args) => export::cmd_export(&args),
             Self::Completions(args) => completions::cmd_completions(&args),

@@ -4,10 +4,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::ProgressBar;
-use zoo::experiment::Experiment;
+use zoo::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
 use zoo::run::{MetricsRow, TrainEvent, TrainOutcome, TrainRequest, train};
 
 use super::{ConfigArgs, ZooArgs, shown};
@@ -22,6 +22,7 @@ use crate::{stop, terminal};
   actrm-zoo train act_lift train.steps=2000 policy.dim_model=256
   actrm-zoo train act_lift --data demos.hdf5 --zoo my-zoo
   actrm-zoo train act_lift --resume
+  actrm-zoo train trm_dfs10 train.seed=2
   actrm-zoo train act_lift --print-config")]
 pub struct TrainArgs {
     /// Experiment, by name (`actrm-zoo list --experiments`)
@@ -52,24 +53,31 @@ pub struct TrainArgs {
 
 pub fn cmd_train(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let library = args.configs.library()?;
-    let experiment = Experiment::load(&library, &args.experiment, &args.overrides)
+    let experiment = AnyExperiment::load(&library, &args.experiment, &args.overrides)
         .with_context(|| format!("experiment `{}`", args.experiment))?;
     if args.print_config {
         print!("{}", experiment.to_toml());
         return Ok(ExitCode::SUCCESS);
     }
     let asked = stop::install()?;
-    let request = TrainRequest {
-        name: args.experiment.clone(),
-        experiment,
-        data: args.data.clone(),
-        runs: args.runs.clone(),
-        run: args.run.clone(),
-        resume: args.resume,
-        zoo: args.zoo.zoo.clone(),
-    };
     let mut bar = ProgressBar::hidden();
-    let outcome = train(&request, &|| asked.load(Ordering::SeqCst), &mut |event| on_event(&event, &mut bar));
+    let stop = || asked.load(Ordering::SeqCst);
+    let (name, runs, run) = (args.experiment.clone(), args.runs.clone(), args.run.clone());
+    let (resume, zoo) = (args.resume, args.zoo.zoo.clone());
+    let outcome = match experiment {
+        AnyExperiment::Robot(experiment) => {
+            let data = args.data.clone();
+            let request = TrainRequest { name, experiment: *experiment, data, runs, run, resume, zoo };
+            train(&request, &stop, &mut |event| on_event(&event, &mut bar))
+        }
+        AnyExperiment::Puzzle(experiment) => {
+            if args.data.is_some() {
+                bail!("--data: experiment `{name}` draws its own puzzles");
+            }
+            let request = PuzzleTrainRequest { name, experiment: *experiment, runs, run, resume, zoo };
+            train_puzzles(&request, &stop, &mut |event| on_event(&event, &mut bar))
+        }
+    };
     bar.finish_and_clear();
     match outcome? {
         TrainOutcome::Finished { entry, run, minutes } => {
@@ -104,7 +112,11 @@ fn on_event(event: &TrainEvent<'_>, bar: &mut ProgressBar) {
         TrainEvent::Note(note) => bar.suspend(|| eprintln!("note: {note}")),
         TrainEvent::Begin { from, steps, parameters, windows } => {
             bar.finish_and_clear();
-            eprintln!("{parameters} parameters, {windows} windows, {steps} steps");
+            let examples = match windows {
+                0 => "puzzles drawn as they are needed".to_owned(),
+                n => format!("{n} examples"),
+            };
+            eprintln!("{parameters} parameters, {examples}, {steps} steps");
             if *from > 0 {
                 eprintln!("resumed after step {from}");
             }
@@ -131,13 +143,15 @@ fn summary(row: &MetricsRow) -> String {
         .map(|(name, x)| format!("{} {x:.4}", name.trim_end_matches("_loss")))
         .collect();
     let mut text = format!(
-        "loss {:.4} ({}) grad {:.2} lr {:.1e} {:.0}/s",
+        "loss {:.4} ({}) grad {:.2} lr {:.1e}",
         value("loss").unwrap_or(f64::NAN),
         parts.join(", "),
         value("grad_norm").unwrap_or(f64::NAN),
         value("lr").unwrap_or(f64::NAN),
-        value("samples_per_s").unwrap_or(f64::NAN),
     );
+    if let Some(rate) = value("samples_per_s") {
+        text.push_str(&format!(" {rate:.0}/s"));
+    }
     if let Some(valid) = value("valid_loss") {
         text.push_str(&format!(" valid {valid:.4}"));
     }

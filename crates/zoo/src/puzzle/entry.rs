@@ -1,0 +1,112 @@
+//! An entry that solves puzzles.
+
+use puzzles::Task;
+use serde::{Deserialize, Serialize};
+
+use crate::entry::{Entry, MODEL_FILE};
+use crate::{ZooError, tensors};
+
+use super::experiment::{PuzzleExperiment, SolverConfig};
+use super::solver::Solver;
+use models::trm::Mixing;
+
+/// What `entry.json` says of a solver's training beside what it says of every entry's.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PuzzleMeta {
+    /// Fewest and most givens that it was trained on.
+    pub givens: [usize; 2],
+    /// Different puzzles that it was trained on.
+    pub train_puzzles: u64,
+    /// Processor seconds of its training, all threads, validation left out.
+    pub cpu_seconds: f64,
+    /// How it did on the way.
+    #[serde(default)]
+    pub progress: Vec<ProgressPoint>,
+}
+
+/// One validation during a training.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ProgressPoint {
+    /// Optimiser steps, or updates of a walker.
+    pub step: u64,
+    /// Puzzles, or episodes, seen.
+    pub seen: u64,
+    /// Processor seconds so far.
+    pub cpu_seconds: f64,
+    /// Share of the validation puzzles that were answered right; for a walker by its most probable moves.
+    pub valid: f64,
+    /// A walker's successes in its last 50 training episodes, with the moves that it drew.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sampled: Option<f64>,
+}
+
+/// A solver's entry with its weights in memory.
+pub struct SolverEntry {
+    entry: Entry,
+    experiment: PuzzleExperiment,
+    solver: Solver,
+}
+
+impl Entry {
+    /// Reads the weights of a solver, built for `task` if it is given: a model whose weights are shared by all cells
+    /// works on grids of another size than it was trained on.
+    ///
+    /// # Errors
+    /// An entry that is no solver or does not fit `task`; what else does not fit, by name.
+    pub fn load_solver(&self, task: Option<Task>) -> Result<SolverEntry, ZooError> {
+        let unfit = |what: &str, expected: String, found: String| ZooError::UnfitEntry {
+            entry: self.id().to_string(),
+            task: task.map_or_else(|| self.meta().task.clone(), |task| task.name().to_owned()),
+            what: what.to_owned(),
+            expected,
+            found,
+        };
+        if self.meta().puzzle.is_none() {
+            return Err(unfit(
+                "kind of entry",
+                "a puzzle solver".to_owned(),
+                format!("a policy for {}", self.meta().task),
+            ));
+        }
+        let experiment = PuzzleExperiment::from_toml(&self.id().to_string(), &self.config_text()?)?;
+        let own = experiment.task.family()?;
+        let built_for = task.unwrap_or(own);
+        let any_size = matches!(&experiment.model, SolverConfig::Trm(section) if section.mixing == Mixing::Conv)
+            || matches!(&experiment.model, SolverConfig::Cnn(_) | SolverConfig::SmallTrm(_));
+        let any_size = any_size && experiment.rl.is_none();
+        if (own.vocabulary(), own.classes()) != (built_for.vocabulary(), built_for.classes()) {
+            let tokens = |task: Task| format!("{} tokens, {} answers", task.vocabulary(), task.classes());
+            return Err(unfit("cells", tokens(own), tokens(built_for)));
+        }
+        if own.side() != built_for.side() && !any_size {
+            let size = |task: Task| format!("{0}x{0}", task.side());
+            return Err(unfit("grid (its weights depend on the cell)", size(own), size(built_for)));
+        }
+        let failed = |operation| {
+            let name = self.id().to_string();
+            move |source| ZooError::Model { operation, name, source }
+        };
+        let built = experiment.build(built_for, 0);
+        let mut solver = built.map_err(failed("build the model of"))?;
+        let (weights, _) = tensors::read(&self.folder().join(MODEL_FILE))?;
+        solver.load(&weights).map_err(failed("load the weights of"))?;
+        Ok(SolverEntry { entry: self.clone(), experiment, solver })
+    }
+}
+
+impl SolverEntry {
+    /// The entry.
+    pub fn entry(&self) -> &Entry {
+        &self.entry
+    }
+
+    /// The experiment that it was made by.
+    pub fn experiment(&self) -> &PuzzleExperiment {
+        &self.experiment
+    }
+
+    /// The model with its weights.
+    pub fn solver(&self) -> &Solver {
+        &self.solver
+    }
+}

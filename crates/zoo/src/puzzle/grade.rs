@@ -1,0 +1,189 @@
+//! What answers are worth, in counts, and the answers of those who do not think.
+
+use std::collections::BTreeMap;
+
+use puzzles::{Puzzle, Split, Task};
+use serde::{Deserialize, Serialize};
+
+/// Graded answers in counts; rates are derived.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Counts {
+    /// Puzzles graded.
+    pub puzzles: u64,
+    /// Answered exactly as the first shortest path, or the solution, is.
+    pub exact: u64,
+    /// Answered right: a shortest path, whichever; the solution.
+    pub valid: u64,
+    /// Mazes in which a walk that follows the answer's scores takes a shortest way.
+    pub walk: u64,
+    /// Mazes whose way is longer than it would be without walls.
+    pub detours: u64,
+    /// Of these, answered right.
+    pub detours_valid: u64,
+    /// Cells.
+    pub cells: u64,
+    /// Cells answered as the solution has them.
+    pub cells_right: u64,
+}
+
+impl Counts {
+    /// Adds one answer; `scores` say where a walker goes in a maze.
+    pub fn add(&mut self, puzzle: &Puzzle, answer: &[u8], scores: &[f32]) {
+        let grade = puzzle.grade(answer);
+        self.puzzles += 1;
+        self.exact += u64::from(grade.exact);
+        self.valid += u64::from(grade.valid);
+        self.cells += answer.len() as u64;
+        self.cells_right += grade.cells_right as u64;
+        if let (Puzzle::Maze(maze), Some(distance)) = (puzzle, puzzle.distance()) {
+            self.walk += u64::from(maze.greedy_walk(scores) == Some(distance));
+            if maze.has_detour() {
+                self.detours += 1;
+                self.detours_valid += u64::from(grade.valid);
+            }
+        }
+    }
+
+    /// `part` of all puzzles.
+    pub fn share(&self, part: u64) -> f64 {
+        part as f64 / self.puzzles.max(1) as f64
+    }
+
+    /// Share of cells that are right.
+    pub fn cell_accuracy(&self) -> f64 {
+        self.cells_right as f64 / self.cells.max(1) as f64
+    }
+}
+
+/// An answer that needs no thought: what a number is worth is how far it is above these.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Baseline {
+    /// Nothing is on the path.
+    AllOff,
+    /// The same answer for every puzzle: each cell's most common one among training puzzles.
+    Constant,
+    /// The way without walls, along the row and then along the column.
+    Straight,
+    /// A walk of moves that are all as probable.
+    Random,
+    /// The givens, and each other cell's most common digit.
+    Givens,
+}
+
+/// Training puzzles that the constant answer is made of.
+const CONSTANT_FROM: u64 = 1000;
+
+impl Baseline {
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::AllOff => "all off",
+            Self::Constant => "constant",
+            Self::Straight => "straight",
+            Self::Givens => "givens",
+            Self::Random => "random",
+        }
+    }
+
+    /// The one that walkers are compared with.
+    pub(super) fn of_walkers(tests: &[Puzzle]) -> BTreeMap<Self, Counts> {
+        [(Self::Random, super::walk::random_walks(tests))].into()
+    }
+
+    /// Those that a family has, graded on `tests`.
+    pub fn grade_all(task: Task, givens: (usize, usize), tests: &[Puzzle]) -> BTreeMap<Self, Counts> {
+        let constant = constant(task, givens);
+        let which: &[Self] = match task {
+            Task::Maze(_) => &[Self::AllOff, Self::Constant, Self::Straight],
+            Task::Sudoku(_) => &[Self::Constant, Self::Givens],
+        };
+        which
+            .iter()
+            .map(|&baseline| {
+                let mut counts = Counts::default();
+                for puzzle in tests {
+                    let answer = baseline.answer(puzzle, &constant);
+                    let scores: Vec<f32> = answer.iter().map(|&x| f32::from(x)).collect();
+                    counts.add(puzzle, &answer, &scores);
+                }
+                (baseline, counts)
+            })
+            .collect()
+    }
+
+    fn answer(self, puzzle: &Puzzle, constant: &[u8]) -> Vec<u8> {
+        match (self, puzzle) {
+            (Self::AllOff, _) => vec![0; puzzle.cells()],
+            (Self::Straight, Puzzle::Maze(maze)) => maze.straight_path().into_iter().map(u8::from).collect(),
+            (Self::Givens, Puzzle::Sudoku(_, sudoku)) => sudoku
+                .puzzle
+                .iter()
+                .zip(constant)
+                .map(|(&given, &common)| if given > 0 { given } else { common })
+                .collect(),
+            _ => constant.to_vec(),
+        }
+    }
+}
+
+/// Each cell's most common answer; the smaller one where two are as common.
+fn constant(task: Task, givens: (usize, usize)) -> Vec<u8> {
+    let classes = usize::from(task.first_answer()) + task.classes();
+    let mut counts = vec![0_u32; task.cells() * classes];
+    for index in 0..CONSTANT_FROM {
+        let puzzle = task.numbered(Split::Train, givens, 0, index);
+        for (cell, answer) in puzzle.answer().into_iter().enumerate() {
+            counts[cell * classes + usize::from(answer)] += 1;
+        }
+    }
+    counts
+        .chunks(classes)
+        .map(|counts| {
+            let most = counts.iter().max().copied().unwrap_or(0);
+            counts.iter().position(|&n| n == most).unwrap_or(0) as u8
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn graded(name: &str, count: u64) -> BTreeMap<Baseline, Counts> {
+        let task = Task::by_name(name).unwrap();
+        let tests: Vec<Puzzle> = (0..count).map(|i| task.numbered(Split::Test, (0, 0), 99, i)).collect();
+        Baseline::grade_all(task, (0, 0), &tests)
+    }
+
+    #[test]
+    fn the_studys_mazes_are_answered_without_thought_and_the_repaired_ones_are_not() {
+        assert_eq!(graded("maze8-original", 200)[&Baseline::Constant].exact, 200);
+        assert_eq!(graded("maze10-original", 200)[&Baseline::AllOff].exact, 200);
+        let open = graded("open8", 2000);
+        assert_eq!(open[&Baseline::AllOff].exact, 0);
+        assert_eq!(open[&Baseline::Constant].valid, 0);
+        // measured elsewhere: exact 39.0%, valid 45.8%, all-off cells 89.5%; four standard errors of 2000
+        let straight = open[&Baseline::Straight];
+        assert!((straight.share(straight.exact) - 0.39).abs() < 0.05, "{straight:?}");
+        assert!((straight.share(straight.valid) - 0.458).abs() < 0.05, "{straight:?}");
+        assert!((open[&Baseline::AllOff].cell_accuracy() - 0.895).abs() < 0.01);
+        assert_eq!(graded("dfs10", 500)[&Baseline::Constant].exact, 0);
+    }
+
+    #[test]
+    fn a_right_answer_counts_everywhere() {
+        let task = Task::by_name("dfs10").unwrap();
+        let mut counts = Counts::default();
+        for index in 0..50 {
+            let puzzle = task.numbered(Split::Test, (0, 0), 1, index);
+            let answer = puzzle.answer();
+            counts.add(&puzzle, &answer, &answer.iter().map(|&x| f32::from(x)).collect::<Vec<_>>());
+        }
+        assert_eq!((counts.exact, counts.valid, counts.walk), (50, 50, 50));
+        assert!(counts.detours > 5 && counts.detours == counts.detours_valid);
+        assert_eq!(counts.cell_accuracy(), 1.0);
+    }
+}

@@ -1,0 +1,225 @@
+//! A model that answers puzzles, of whatever kind, and what it believes after each step of its recursion.
+
+use std::collections::BTreeMap;
+
+use candle_core::{Device, Tensor};
+use models::ModelError;
+use models::baselines::{GridDims, GridModel, PolicyNet};
+use models::classification::ClassProbability;
+use models::trm::{Gradient, Trm};
+use puzzles::{MazeTask, Puzzle, Task};
+
+/// A model for one family of puzzles.
+pub enum Solver {
+    /// Recursive: may take as many steps as it is given.
+    Trm {
+        /// The network.
+        model: Box<Trm>,
+        /// What it is built for.
+        task: Task,
+        /// What turns its scores into probabilities.
+        probability: ClassProbability,
+    },
+    /// From the grid to scores in a fixed number of steps.
+    Grid {
+        /// The network.
+        model: Box<dyn GridModel>,
+        /// Its grid.
+        dims: GridDims,
+        /// What it is built for.
+        task: Task,
+        /// What turns its scores into probabilities.
+        probability: ClassProbability,
+    },
+    /// A policy that walks through mazes instead of marking cells.
+    Walker {
+        /// The network.
+        net: Box<dyn PolicyNet>,
+        /// The mazes that it walks in.
+        task: MazeTask,
+    },
+}
+
+/// What a model believes of one puzzle after a supervision step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Thought {
+    /// Its answer, a number a cell as in [`Puzzle::answer`].
+    pub answer: Vec<u8>,
+    /// The probability that it gives each cell's answer.
+    pub confidence: Vec<f32>,
+    /// For mazes: the probability that each cell is on the path; empty for Sudoku.
+    pub on_path: Vec<f32>,
+    /// The probability that the answer is right as a whole, if the model has a halting head.
+    pub halt: Option<f32>,
+}
+
+impl Solver {
+    /// Number of weights.
+    pub fn parameters(&self) -> u64 {
+        match self {
+            Self::Trm { model, .. } => model.params().count() as u64,
+            Self::Grid { model, .. } => model.params().count() as u64,
+            Self::Walker { net, .. } => net.params().count() as u64,
+        }
+    }
+
+    /// Everything that has to be stored.
+    pub fn tensors(&self) -> BTreeMap<String, Tensor> {
+        match self {
+            Self::Trm { model, .. } => model.tensors(),
+            Self::Grid { model, .. } => model.params().tensors(),
+            Self::Walker { net, .. } => net.params().tensors(),
+        }
+    }
+
+    /// Takes what [`Solver::tensors`] gave.
+    ///
+    /// # Errors
+    /// The first tensor that is missing, extra or misshapen.
+    pub fn load(&mut self, tensors: &BTreeMap<String, Tensor>) -> Result<(), ModelError> {
+        match self {
+            Self::Trm { model, .. } => model.load(tensors),
+            Self::Grid { model, .. } => model.params().load(tensors),
+            Self::Walker { net, .. } => net.params().load(tensors),
+        }
+    }
+
+    /// Whether more steps are possible than it was trained with.
+    pub fn is_recursive(&self) -> bool {
+        matches!(self, Self::Trm { .. })
+    }
+
+    /// What it believes of each puzzle after each of up to `steps` supervision steps: `[step][puzzle]`. A model without a
+    /// free number of steps takes those that it has.
+    ///
+    /// # Errors
+    /// Puzzles of another size than the model's.
+    pub fn think(&self, puzzles: &[Puzzle], steps: usize) -> Result<Vec<Vec<Thought>>, ModelError> {
+        let mut thoughts = Vec::new();
+        match self {
+            Self::Trm { model, task, probability } => {
+                let inputs = tokens(puzzles)?;
+                let mut states = model.initial_states(puzzles.len())?;
+                for _ in 0..steps {
+                    let out = model.supervision_step(&states, &inputs, None, Gradient::Off)?;
+                    states = out.states;
+                    let halt = out.q_halt.to_vec1::<f32>()?.into_iter().map(|q| 1.0 / (1.0 + (-q).exp()));
+                    thoughts.push(read(*task, *probability, &out.logits, halt.map(Some).collect())?);
+                }
+            }
+            Self::Grid { model, dims, task, probability } => {
+                for (_, scores) in model.forward(&planes(puzzles, *dims)?)?.into_iter().take(steps.max(1)) {
+                    thoughts.push(read(*task, *probability, &scores, vec![None; puzzles.len()])?);
+                }
+            }
+            Self::Walker { .. } => {
+                return Err(ModelError::Input {
+                    operation: "think",
+                    object: "model",
+                    found: "a walker, which marks no cells".to_owned(),
+                    expected: "a model that answers cell by cell".to_owned(),
+                });
+            }
+        }
+        Ok(thoughts)
+    }
+}
+
+/// `(batch, cells)` of token numbers.
+fn tokens(puzzles: &[Puzzle]) -> Result<Tensor, ModelError> {
+    let all: Vec<u32> = puzzles.iter().flat_map(|puzzle| puzzle.tokens().into_iter().map(u32::from)).collect();
+    let cells = puzzles.first().map_or(0, Puzzle::cells);
+    Ok(Tensor::from_vec(all, (puzzles.len(), cells), &Device::Cpu)?)
+}
+
+/// `(batch, channels, height, width)`: 1 where a cell holds token `channel + 1`, so walls, start and goal for a maze.
+pub(super) fn planes(puzzles: &[Puzzle], dims: GridDims) -> Result<Tensor, ModelError> {
+    let (channels, cells) = (dims.channels, dims.cells());
+    let mut all = vec![0.0_f32; puzzles.len() * channels * cells];
+    for (puzzle, planes) in puzzles.iter().zip(all.chunks_mut(channels * cells)) {
+        for (cell, token) in puzzle.tokens().into_iter().enumerate().filter(|(_, token)| *token > 0) {
+            planes[(usize::from(token) - 1) * cells + cell] = 1.0;
+        }
+    }
+    Ok(Tensor::from_vec(all, (puzzles.len(), channels, dims.height, dims.width), &Device::Cpu)?)
+}
+
+/// Class numbers of the answers, one puzzle after the other.
+pub(super) fn labels(task: Task, puzzle: &Puzzle) -> Vec<i64> {
+    puzzle.answer().into_iter().map(|answer| i64::from(answer - task.first_answer())).collect()
+}
+
+/// `logits (batch, cells, classes)` as answers and probabilities.
+fn read(
+    task: Task,
+    probability: ClassProbability,
+    logits: &Tensor,
+    halt: Vec<Option<f32>>,
+) -> Result<Vec<Thought>, ModelError> {
+    let (_, cells, classes) = logits.dims3()?;
+    let scores = logits.flatten_all()?.to_vec1::<f32>()?;
+    let each = scores.chunks(cells * classes).zip(halt).map(|(scores, halt)| {
+        let mut thought = Thought { answer: Vec::new(), confidence: Vec::new(), on_path: Vec::new(), halt };
+        for scores in scores.chunks(classes) {
+            let shares = shares(probability, scores);
+            let mut best = 0;
+            for class in 1..classes {
+                if scores[class] > scores[best] {
+                    best = class;
+                }
+            }
+            thought.answer.push(best as u8 + task.first_answer());
+            thought.confidence.push(shares[best]);
+            if matches!(task, Task::Maze(_)) {
+                thought.on_path.push(shares[1]);
+            }
+        }
+        thought
+    });
+    Ok(each.collect())
+}
+
+fn shares(probability: ClassProbability, scores: &[f32]) -> Vec<f32> {
+    let most = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let weight = |x: f32| match probability {
+        ClassProbability::Softmax => (x - most).exp(),
+        ClassProbability::Stablemax if x >= 0.0 => x + 1.0,
+        ClassProbability::Stablemax => 1.0 / (1.0 - x),
+    };
+    let weights: Vec<f32> = scores.iter().map(|&x| weight(x)).collect();
+    let sum: f32 = weights.iter().sum();
+    weights.into_iter().map(|w| w / sum).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn probabilities_add_up_and_follow_the_scores() {
+        for probability in [ClassProbability::Softmax, ClassProbability::Stablemax] {
+            let shares = shares(probability, &[0.5, -2.0, 3.0]);
+            assert!((shares.iter().sum::<f32>() - 1.0).abs() < 1e-6);
+            assert!(shares[2] > shares[0] && shares[0] > shares[1]);
+        }
+        let even = shares(ClassProbability::Softmax, &[800.0, 800.0]);
+        assert_eq!(even, [0.5, 0.5]);
+    }
+
+    #[test]
+    fn planes_mark_each_token_once() {
+        let task = Task::by_name("open8").unwrap();
+        let puzzle = task.numbered(puzzles::Split::Train, (0, 0), 1, 0);
+        let dims = GridDims { channels: 3, height: 8, width: 8, classes: 2 };
+        let planes =
+            planes(std::slice::from_ref(&puzzle), dims).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let tokens = puzzle.tokens();
+        for (i, &x) in planes.iter().enumerate() {
+            assert_eq!(x == 1.0, usize::from(tokens[i % 64]) == i / 64 + 1);
+        }
+        let sudoku = Task::by_name("sudoku4").unwrap();
+        let puzzle = sudoku.numbered(puzzles::Split::Train, (4, 8), 1, 0);
+        assert!(labels(sudoku, &puzzle).iter().all(|label| (0..4).contains(label)));
+    }
+}

@@ -1,0 +1,66 @@
+//! What `eval` does with an entry that solves puzzles.
+
+use std::path::Path;
+
+use anyhow::bail;
+use clap::Args;
+use puzzles::Task;
+use zoo::entry::Entry;
+use zoo::puzzle::{PuzzleEvaluationOptions, evaluate_puzzles};
+use zoo::results::wilson_interval;
+
+/// How solvers are evaluated.
+#[derive(Args)]
+pub struct PuzzleArgs {
+    /// Test puzzles a solver
+    #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u64).range(1..))]
+    puzzles: u64,
+    /// Most supervision steps of a solver
+    #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    depth: u64,
+    /// Givens of a Sudoku (the fewest that the solver was trained on)
+    #[arg(long, value_name = "N")]
+    givens: Option<usize>,
+}
+
+/// The family of that name, or an error that lists them.
+pub fn family(name: &str) -> anyhow::Result<Task> {
+    match Task::by_name(name) {
+        Some(task) => Ok(task),
+        None => {
+            let names: Vec<&str> = Task::all().into_iter().map(|(name, _)| name).collect();
+            bail!("unknown puzzle task `{name}`; tasks: {}", names.join(", "))
+        }
+    }
+}
+
+/// Evaluates a solver; the line to show.
+pub fn evaluate_solver(entry: &Entry, task: Option<&str>, args: &PuzzleArgs, results: &Path) -> anyhow::Result<String> {
+    let task = task.map(family).transpose()?;
+    let solver = entry.load_solver(task)?;
+    let options = PuzzleEvaluationOptions {
+        task,
+        givens: args.givens,
+        puzzles: args.puzzles,
+        depth: usize::try_from(args.depth)?,
+    };
+    let (_, record) = evaluate_puzzles(&solver, results, &options)?;
+    let counts = &record.answers;
+    let (low, high) = wilson_interval(counts.valid, counts.puzzles);
+    let mut text = format!(
+        "{} on {}: {} of {} right ({:.1}%, 95% interval {:.1}-{:.1}), {} exact",
+        record.entry,
+        record.task,
+        counts.valid,
+        counts.puzzles,
+        100.0 * counts.share(counts.valid),
+        100.0 * low,
+        100.0 * high,
+        counts.exact
+    );
+    if let Some((baseline, best)) = record.baselines.iter().max_by_key(|(_, counts)| counts.valid) {
+        text.push_str(&format!(", without thought {} ({})", best.valid, baseline.name()));
+    }
+    text.push_str(&format!(", mean {:.1} steps", record.mean_steps()));
+    Ok(text)
+}
