@@ -72,6 +72,10 @@ lint: .venv/.complete ## formatting and lints, Rust and Python
 bench: build .venv-peers/.complete ## our speed beside the peers', measured in one run (table, target/bench/*.json)
 	@tools/bench.sh
 
+.PHONY: study-puzzles
+study-puzzles: build ## the puzzle study, as far as it has not been run (hours), and its page, docs/puzzles.md
+	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study --page docs/puzzles.md
+
 .PHONY: interop
 interop: build .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round
 	@.venv-peers/bin/python tests/interop/run.py

@@ -258,6 +258,7 @@ mod tests {
             training: record.training,
             cpu_seconds: 61.3,
             experiment: "trm_open8".into(),
+            config_sha256: String::new(),
             task: task.into(),
             givens: 0,
             seed: 20_000,

@@ -16,7 +16,7 @@ use crate::{ZooError, sha256_hex, write_atomic};
 
 use super::entry::{ProgressPoint, SolverEntry};
 use super::grade::{Baseline, Counts};
-use super::solver::{Solver, Thought};
+use super::solver::{Solver, Thought, settled};
 use super::walk;
 
 /// Seed of the test puzzles: every solver answers the same ones.
@@ -62,6 +62,8 @@ pub struct PuzzleEvaluation {
     pub cpu_seconds: f64,
     /// The experiment that made it.
     pub experiment: String,
+    /// SHA-256 of its resolved text.
+    pub config_sha256: String,
     /// The family of puzzles.
     pub task: String,
     /// Givens of a Sudoku at least; 0 for mazes.
@@ -70,7 +72,7 @@ pub struct PuzzleEvaluation {
     pub seed: u64,
     /// Most supervision steps that it was given.
     pub depth: usize,
-    /// Its answers: when its halting head says so, or after the last step.
+    /// Its answers: once its halting head is sure of one that stays the same, or after the last step.
     pub answers: Counts,
     /// Supervision steps that these took, or moves of a walker, together.
     pub steps: u64,
@@ -182,8 +184,12 @@ pub(super) fn graded(solver: &Solver, puzzles: &[Puzzle], depths: &[usize], most
             }
         }
         for (place, puzzle) in batch.iter().enumerate() {
-            let wants = |thoughts: &Vec<Thought>| thoughts[place].halt.is_some_and(|halt| halt > 0.5);
-            let at = thoughts.iter().position(wants).unwrap_or(thoughts.len() - 1);
+            let answer = |at: usize| thoughts[at][place].answer.as_slice();
+            let stops = |at: &usize| {
+                let before = at.checked_sub(1).map(answer);
+                settled(thoughts[*at][place].halt, answer(*at), before)
+            };
+            let at = (0..thoughts.len()).find(stops).unwrap_or(thoughts.len() - 1);
             let thought = &thoughts[at][place];
             add(&mut graded.halting, puzzle, thought);
             graded.steps += at as u64 + 1;
@@ -222,6 +228,7 @@ pub fn evaluate_puzzles(
         training: crate::entry::training_facts(meta),
         cpu_seconds: meta.puzzle.as_ref().map_or(0.0, |puzzle| puzzle.cpu_seconds),
         experiment: meta.experiment.clone(),
+        config_sha256: meta.files.get(crate::entry::CONFIG_FILE).map_or_else(String::new, |file| file.sha256.clone()),
         task: task.name().to_owned(),
         givens,
         seed: TEST_SEED,

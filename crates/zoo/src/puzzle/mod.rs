@@ -11,8 +11,10 @@ mod entry;
 mod evaluation;
 mod experiment;
 mod grade;
+mod page;
 mod solver;
 mod stream;
+mod study;
 mod table;
 mod trace;
 mod training;
@@ -27,7 +29,11 @@ pub use evaluation::{
 };
 pub use experiment::{AnyExperiment, Learning, PuzzleExperiment, PuzzleTask, SolverConfig, TrmSection};
 pub use grade::{Baseline, Counts};
+pub use page::study_page;
 pub use solver::{Solver, Thought};
+pub use study::{
+    Bar, STUDY, STUDY_PUZZLES, StudyEvent, StudyRequest, StudyRow, StudyTest, TestedRow, run_study, study_results,
+};
 pub use table::{PuzzleSet, write_puzzles};
 pub use trace::{Trace, TraceStep, trace};
 pub use training::{PuzzleTrainRequest, train_puzzles};

@@ -125,6 +125,12 @@ impl Solver {
     }
 }
 
+/// Whether a solver stops after a step: its halting head says that the answer is right, and the answer is the one that it
+/// had before. The head alone stops too early: it was trained on answers that are still changing.
+pub(super) fn settled(halt: Option<f32>, answer: &[u8], before: Option<&[u8]>) -> bool {
+    halt.is_some_and(|halt| halt > 0.5) && before == Some(answer)
+}
+
 /// `(batch, cells)` of token numbers.
 fn tokens(puzzles: &[Puzzle]) -> Result<Tensor, ModelError> {
     let all: Vec<u32> = puzzles.iter().flat_map(|puzzle| puzzle.tokens().into_iter().map(u32::from)).collect();
@@ -205,6 +211,13 @@ mod tests {
         }
         let even = shares(ClassProbability::Softmax, &[800.0, 800.0]);
         assert_eq!(even, [0.5, 0.5]);
+    }
+
+    #[test]
+    fn a_solver_stops_once_it_is_sure_of_an_answer_that_stays() {
+        assert!(settled(Some(0.9), &[1, 2], Some(&[1, 2])));
+        assert!(!settled(Some(0.9), &[1, 2], Some(&[1, 1])) && !settled(Some(0.9), &[1, 2], None));
+        assert!(!settled(Some(0.5), &[1, 2], Some(&[1, 2])) && !settled(None, &[1, 2], Some(&[1, 2])));
     }
 
     #[test]

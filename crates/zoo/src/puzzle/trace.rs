@@ -8,6 +8,7 @@ use serde::Serialize;
 
 use super::entry::SolverEntry;
 use super::evaluation::TEST_SEED;
+use super::solver::settled;
 use crate::ZooError;
 
 /// The course of one answer.
@@ -76,7 +77,11 @@ pub fn trace(entry: &SolverEntry, task: Task, givens: usize, index: u64, depth: 
             }
         })
         .collect();
-    let stopped = steps.iter().find(|step| step.halt.is_some_and(|halt| halt > 0.5)).map_or(steps.len(), |s| s.step);
+    let stops = |at: &usize| {
+        let before = at.checked_sub(1).map(|before| steps[before].answer.as_slice());
+        settled(steps[*at].halt, &steps[*at].answer, before)
+    };
+    let stopped = (0..steps.len()).find(stops).map_or(steps.len(), |at| at + 1);
     Ok(Trace {
         entry: id,
         task: task.name().to_owned(),
@@ -155,7 +160,8 @@ impl Trace {
 
     /// As a strip of pictures, one a step, and the right answer last: SVG that needs nothing else.
     pub fn to_svg(&self) -> String {
-        let size = if self.side > 12 { 11 } else { 20 };
+        // small grids in large cells: a caption has to fit under each
+        let size = (176 / self.side).clamp(11, 44);
         let (picture, count) = (self.side * size, self.steps.len() + 1);
         let columns = count.min(ROW);
         let (wide, high) = (picture + GAP, picture + GAP + CAPTION);

@@ -9,6 +9,7 @@ mod list;
 mod merge;
 mod puzzles;
 mod show;
+mod study;
 mod trace;
 mod train;
 
@@ -27,6 +28,7 @@ pub enum Command {
     List(list::ListArgs),
     Show(show::ShowArgs),
     Trace(trace::TraceArgs),
+    Study(study::StudyArgs),
     Import(import::ImportArgs),
     Export(export::ExportArgs),
     Completions(completions::CompletionsArgs),
@@ -43,6 +45,7 @@ impl Command {
             Self::List(args) => list::cmd_list(&args),
             Self::Show(args) => show::cmd_show(&args),
             Self::Trace(args) => trace::cmd_trace(&args),
+            Self::Study(args) => study::cmd_study(&args),
             Self::Import(args) => import::cmd_import(args),
             Self::Export(args) => export::cmd_export(&args),
             Self::Completions(args) => completions::cmd_completions(&args),
