@@ -53,6 +53,10 @@ build: .venv/.complete ## the programs, in target/release
 demo: build ## the whole line: demonstrations, data set, training, evaluation, leaderboard (in out/demo)
 	@tools/demo.sh
 
+.PHONY: study-robots
+study-robots: build ## ACT on every robot task: 200 demonstrations, training, 100 unseen seeds (hours; goes on where it was)
+	@tools/study_robots.sh
+
 .PHONY: test
 test: build ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace

@@ -3,6 +3,9 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+use tempfile::TempDir;
 
 /// The root of the checkout.
 pub fn root() -> PathBuf {
@@ -90,4 +93,66 @@ pub fn listing(folder: &Path) -> Vec<String> {
 /// If the path is not UTF-8.
 pub fn text(path: &Path) -> &str {
     path.to_str().expect("test paths are UTF-8")
+}
+
+/// A zoo with one entry, `lift-act@1`, trained on the shipped demonstrations for a few steps: `zoo` in this folder,
+/// beside the data set `lift`. Made once in a test program.
+///
+/// # Panics
+/// If it cannot be made.
+pub fn trained() -> &'static Path {
+    static TRAINED: OnceLock<TempDir> = OnceLock::new();
+    TRAINED
+        .get_or_init(|| {
+            let folder = tempfile::tempdir().expect("a temporary folder");
+            let at = |name: &str| folder.path().join(name);
+            succeeds(&mut data(["convert", text(&lift()), text(&at("lift"))]));
+            train_lift(&at("lift"), &at("zoo"), &at("runs"));
+            folder
+        })
+        .path()
+}
+
+/// Train `lift-act` for two steps.
+///
+/// # Panics
+/// If that fails.
+pub fn train_lift(demonstrations: &Path, entries: &Path, runs: &Path) {
+    let (demonstrations, entries, runs) = (text(demonstrations), text(entries), text(runs));
+    succeeds(&mut zoo([
+        "train",
+        "act_lift",
+        "--data",
+        demonstrations,
+        "--zoo",
+        entries,
+        "--runs",
+        runs,
+        "train.steps=2",
+    ]));
+}
+
+/// A copy of the trained zoo that a test may change, and the temporary folder that it lies in.
+///
+/// # Panics
+/// If it cannot be made.
+pub fn copied_zoo() -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let to = folder.path().join("zoo");
+    copy(&trained().join("zoo"), &to);
+    (folder, to)
+}
+
+/// Copy a folder with everything in it.
+fn copy(from: &Path, to: &Path) {
+    std::fs::create_dir(to).expect("creatable");
+    for entry in std::fs::read_dir(from).expect("readable") {
+        let entry = entry.expect("readable");
+        let target = to.join(entry.file_name());
+        if entry.file_type().expect("known").is_dir() {
+            copy(&entry.path(), &target);
+        } else {
+            std::fs::copy(entry.path(), target).expect("copied");
+        }
+    }
 }

@@ -1,57 +1,8 @@
 //! Bad experiments, entries and interpreters: each gives one clear line, a non-zero exit code, and leaves nothing behind.
 
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
 
-use e2e::{data, lift, listing, refused, succeeds, text, zoo};
-use tempfile::TempDir;
-
-/// A zoo with one entry, trained for a few steps; made once for all tests of this file.
-fn trained() -> &'static Path {
-    static TRAINED: OnceLock<TempDir> = OnceLock::new();
-    TRAINED
-        .get_or_init(|| {
-            let folder = tempfile::tempdir().expect("a temporary folder");
-            let at = |name: &str| folder.path().join(name);
-            succeeds(&mut data(["convert", text(&lift()), text(&at("lift"))]));
-            succeeds(&mut zoo([
-                "train",
-                "act_lift",
-                "--data",
-                text(&at("lift")),
-                "--zoo",
-                text(&at("zoo")),
-                "--runs",
-                text(&at("runs")),
-                "train.steps=2",
-            ]));
-            folder
-        })
-        .path()
-}
-
-/// A copy of the trained zoo that a test may damage.
-fn copied() -> (TempDir, PathBuf) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let to = folder.path().join("zoo");
-    copy(&trained().join("zoo"), &to);
-    (folder, to)
-}
-
-/// Copy a folder with everything in it.
-fn copy(from: &Path, to: &Path) {
-    fs::create_dir(to).expect("creatable");
-    for entry in fs::read_dir(from).expect("readable") {
-        let entry = entry.expect("readable");
-        let target = to.join(entry.file_name());
-        if entry.file_type().expect("known").is_dir() {
-            copy(&entry.path(), &target);
-        } else {
-            fs::copy(entry.path(), target).expect("copied");
-        }
-    }
-}
+use e2e::{copied_zoo, listing, refused, text, trained, zoo};
 
 /// Train in a fresh folder with these arguments: refused, and neither a run nor an entry comes of it.
 fn train_refused(arguments: &[&str], words: &[&str]) {
@@ -93,7 +44,7 @@ fn a_data_set_that_is_not_there() {
 
 #[test]
 fn an_unknown_entry() {
-    let (_folder, entries) = copied();
+    let (_folder, entries) = copied_zoo();
     refused(&mut zoo(["eval", "lift-atc@1", "--episodes", "1", "--zoo", text(&entries)]), &["lift-atc", "lift-act"]);
     refused(&mut zoo(["eval", "lift-act@7", "--episodes", "1", "--zoo", text(&entries)]), &["lift-act", "7"]);
 }
@@ -107,7 +58,7 @@ fn an_empty_zoo() {
 
 #[test]
 fn a_python_without_robosuite() {
-    let (folder, entries) = copied();
+    let (folder, entries) = copied_zoo();
     let bare = folder.path().join("bare");
     let made = std::process::Command::new(e2e::root().join(".venv/bin/python"))
         .args(["-m", "venv", "--without-pip"])
@@ -123,7 +74,7 @@ fn a_python_without_robosuite() {
 
 #[test]
 fn a_python_that_is_not_there() {
-    let (_folder, entries) = copied();
+    let (_folder, entries) = copied_zoo();
     let mut command = zoo(["eval", "lift-act@1", "--episodes", "1", "--zoo", text(&entries), "--python", "/no/python"]);
     refused(&mut command, &["/no/python"]);
 }
@@ -131,7 +82,7 @@ fn a_python_that_is_not_there() {
 #[test]
 fn an_entry_with_one_flipped_byte() {
     for name in ["model.safetensors", "normaliser.safetensors", "config.toml", "entry.json"] {
-        let (_folder, entries) = copied();
+        let (_folder, entries) = copied_zoo();
         let file = entries.join("lift-act/1").join(name);
         let mut bytes = fs::read(&file).expect("an entry has this file");
         let middle = bytes.len() / 2;

@@ -3,7 +3,9 @@
     python tools/cluster/ray_eval.py --shards 8 -- lift-act@1 --episodes 400 --zoo /shared/zoo
 
 What follows `--` are arguments of `actrm-zoo eval`. The zoo must lie on a file system that all nodes see. A shard whose
-node dies is run again by Ray and goes on where it was. Needs the package `ray`, on this machine and the nodes.
+node dies is run again by Ray and goes on where it was. Needs the package `ray`, on this machine and the nodes (tried
+with 2.51.1). Ray runs its workers at a lower priority than everything else on a node (nice 15); where other programs
+share it, RAY_worker_niceness=0 in the environment of `ray start` changes that.
 """
 
 import argparse

@@ -69,6 +69,11 @@ impl<P: Policy + ?Sized> Policy for Box<P> {
 pub trait Actor: Send {
     /// The action to execute now, raw units.
     fn act(&mut self, observation: &Observation) -> Result<Vec<f32>>;
+    /// The actions up to the next observation that matters, at least one: what as many calls of [`Actor::act`] would
+    /// give, whatever they were shown after the first.
+    fn act_ahead(&mut self, observation: &Observation) -> Result<Vec<Vec<f32>>> {
+        Ok(vec![self.act(observation)?])
+    }
     /// Forgets the episode.
     fn reset(&mut self);
 }
@@ -117,6 +122,11 @@ impl<P: Policy> Actor for RecedingHorizon<P> {
             self.queue.extend(chunk.rows().take(self.n_action_steps).map(<[f32]>::to_vec));
         }
         Ok(self.queue.pop_front().expect("a chunk has at least one row, and it was just refilled"))
+    }
+
+    fn act_ahead(&mut self, observation: &Observation) -> Result<Vec<Vec<f32>>> {
+        let first = self.act(observation)?;
+        Ok(std::iter::once(first).chain(self.queue.drain(..)).collect())
     }
 
     fn reset(&mut self) {

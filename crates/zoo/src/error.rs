@@ -233,6 +233,28 @@ pub enum ZooError {
         /// The evaluation's folder.
         folder: PathBuf,
     },
+    /// Another process collects demonstrations into the same folder.
+    #[error("folder {} is in use by another collection", folder.display())]
+    CollectionBusy {
+        /// The collection's folder.
+        folder: PathBuf,
+    },
+    /// A folder holds attempts of another collection.
+    #[error(
+        "{} holds attempts of another collection: {what}: expected {expected}, found {found}; \
+         remove it, or collect into another file",
+        folder.display()
+    )]
+    CollectionDiffers {
+        /// The collection's folder.
+        folder: PathBuf,
+        /// The field that differs.
+        what: String,
+        /// As it is now.
+        expected: String,
+        /// As it is in the folder.
+        found: String,
+    },
     /// What is stored and what was found now are not the same.
     #[error("results in {}: {what} differs: stored {expected}, now {found}", folder.display())]
     ResultsDiffer {

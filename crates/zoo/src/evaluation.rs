@@ -15,7 +15,7 @@ use models::Actor;
 pub use self::subject::Subject;
 use crate::ZooError;
 use crate::results::{EpisodeRecord, EpisodeTiming, ResultsFolder, Seeds, Shard, StoredEvaluation};
-use crate::rollout::{EpisodePlan, Image, JobError, Pool, QueryTimes, RolloutError, Worker};
+use crate::rollout::{EpisodePlan, FaultKind, Image, JobError, Pool, QueryTimes, RolloutError, Worker, WorkerFault};
 
 /// The first seed of an evaluation unless another is asked for: demonstrations never use these.
 pub const FIRST_SEED: u64 = 10_000;
@@ -147,13 +147,14 @@ pub fn run_episodes(
     let work = |(actor, times): &mut (Box<dyn Actor>, QueryTimes), worker: &mut Worker, job| {
         let seed = seed_of(job);
         times.take();
-        let outcome = plan.run(worker, actor.as_mut(), seed, &mut |_| Ok(()))?;
+        let outcome = plan.run(worker, actor.as_mut(), seed, None)?;
         let episode = EpisodeRecord {
             seed,
             success: outcome.success,
             steps: u32::try_from(outcome.steps).unwrap_or(u32::MAX),
             total_reward: outcome.total_reward,
             fingerprint: outcome.fingerprint,
+            group: outcome.group,
         };
         let milliseconds = |duration: Duration| (duration.as_secs_f64() * 1e6).round() / 1e3;
         let timing = EpisodeTiming {
@@ -173,7 +174,8 @@ pub fn run_episodes(
     Ok(())
 }
 
-/// One episode with an image of the start and of every step.
+/// Episodes with an image of the start and of every step each; the images of one episode are kept at a time by each
+/// worker, and handed to `deliver` with the episode's seed and success.
 ///
 /// # Errors
 /// As for an evaluation; a machine that cannot render.
@@ -185,6 +187,7 @@ pub fn film(
     deliver: &mut dyn FnMut(u64, Vec<Image>, bool) -> ControlFlow<()>,
 ) -> Result<(), RolloutError> {
     let max_steps = subject.max_steps.unwrap_or(pool.ready().max_steps);
+    let task = &pool.ready().task.clone();
     let plan = EpisodePlan::new(pool.ready(), &subject.state_keys, &subject.env_keys, max_steps)?;
     let seed_of = |job: u64| seeds[usize::try_from(job).expect("a job is an index of seeds")];
     let state = || {
@@ -195,10 +198,11 @@ pub fn film(
     };
     let work = |(actor, _): &mut (Box<dyn Actor>, QueryTimes), worker: &mut Worker, job| {
         let mut images = Vec::new();
-        let outcome = plan.run(worker, actor.as_mut(), seed_of(job), &mut |worker| {
-            images.push(worker.render(&view.camera, view.height, view.width)?);
+        let mut shoot = |worker: &mut Worker| -> Result<(), JobError> {
+            images.push(worker.render(&view.camera, view.height, view.width).map_err(|fault| unhelpable(task, fault))?);
             Ok(())
-        })?;
+        };
+        let outcome = plan.run(worker, actor.as_mut(), seed_of(job), Some(&mut shoot))?;
         Ok((images, outcome.success))
     };
     let mut failure = None;
@@ -210,6 +214,16 @@ pub fn film(
         }
     })?;
     failure.map_or(Ok(()), Err)
+}
+
+/// A machine that cannot draw, and a camera that is not there, are the same for a fresh worker.
+fn unhelpable(task: &str, fault: WorkerFault) -> JobError {
+    match fault.kind {
+        FaultKind::Reported { kind, message } if kind == "no_renderer" || kind == "unknown_camera" => {
+            RolloutError::Refused { task: task.to_owned(), kind, message }.into()
+        }
+        _ => fault.into(),
+    }
 }
 
 /// A camera and the size of its images.

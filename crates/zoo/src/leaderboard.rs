@@ -25,6 +25,8 @@ pub struct LeaderboardRow {
     pub successes: u64,
     /// Episodes run.
     pub episodes: u64,
+    /// Both for each group of episodes, where the task has groups.
+    pub groups: BTreeMap<String, Counts>,
     /// Sum of all episodes' returns.
     pub return_sum: f64,
     /// Sum of the steps of the successful episodes.
@@ -37,13 +39,31 @@ pub struct LeaderboardRow {
     pub versions: BTreeMap<String, String>,
 }
 
+/// Episodes in which the task was done, of those that were run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    /// Episodes in which the task was done.
+    pub successes: u64,
+    /// Episodes run.
+    pub episodes: u64,
+}
+
 impl LeaderboardRow {
     /// The row of a finished evaluation.
     pub fn new(evaluation: &StoredEvaluation) -> Self {
         let StoredEvaluation { record, episodes, timings, .. } = evaluation;
         let queries: Vec<f64> = timings.iter().flat_map(|t| t.inference_ms.iter().copied()).collect();
         let won = || episodes.iter().filter(|episode| episode.success);
+        let mut groups: BTreeMap<String, Counts> = BTreeMap::new();
+        for episode in episodes {
+            if let Some(group) = &episode.group {
+                let counts = groups.entry(group.clone()).or_default();
+                counts.episodes += 1;
+                counts.successes += u64::from(episode.success);
+            }
+        }
         Self {
+            groups,
             entry: record.entry.clone(),
             training: record.training.clone(),
             task: record.protocol.task.clone(),
@@ -93,6 +113,13 @@ impl LeaderboardRow {
         }
     }
 
+    /// `seen 52/66, unseen 20/34`; nothing where the task has no groups.
+    pub fn groups_text(&self) -> String {
+        let each: Vec<String> =
+            self.groups.iter().map(|(name, c)| format!("{name} {}/{}", c.successes, c.episodes)).collect();
+        each.join(", ")
+    }
+
     /// Best first; ties by what does not change.
     fn order(&self, other: &Self) -> Ordering {
         let group = |row: &Self| (row.task.clone(), row.protocol.clone());
@@ -122,7 +149,7 @@ pub fn rank(evaluations: &[StoredEvaluation]) -> Vec<LeaderboardRow> {
 }
 
 /// The columns of [`to_csv`].
-pub const CSV_COLUMNS: [&str; 25] = [
+pub const CSV_COLUMNS: [&str; 26] = [
     "entry",
     "version",
     "policy",
@@ -148,6 +175,7 @@ pub const CSV_COLUMNS: [&str; 25] = [
     "training_seed",
     "entry_hash",
     "data_fingerprint",
+    "groups",
 ];
 
 /// The leaderboard as CSV (RFC 4180, `\n` line ends): one row an evaluation, every column of the record.
@@ -184,6 +212,7 @@ pub fn to_csv(rows: &[LeaderboardRow]) -> String {
             t.seed.to_string(),
             row.entry.hash.clone(),
             t.data_fingerprint.clone(),
+            row.groups_text(),
         ];
         let quoted: Vec<String> = cells.iter().map(|cell| quote(cell)).collect();
         text.push_str(&quoted.join(","));
@@ -209,7 +238,7 @@ pub fn to_table(rows: &[LeaderboardRow]) -> Vec<[String; TABLE_COLUMNS.len()]> {
             [
                 row.entry.to_string(),
                 row.task.clone(),
-                format!("{}/{}", row.successes, row.episodes),
+                success_text(row),
                 format!("{:.0}% [{:.0}-{:.0}]", row.success_rate() * 1e2, low * 1e2, high * 1e2),
                 optional(row.mean_return(), 2),
                 optional(row.mean_steps_to_success(), 1),
@@ -221,6 +250,25 @@ pub fn to_table(rows: &[LeaderboardRow]) -> Vec<[String; TABLE_COLUMNS.len()]> {
             ]
         })
         .collect()
+}
+
+/// The leaderboard as a Markdown table, with the columns of [`TABLE_COLUMNS`].
+pub fn to_markdown(rows: &[LeaderboardRow]) -> String {
+    let line = |cells: &[String]| {
+        let escaped: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|").replace('\n', "<br>")).collect();
+        format!("| {} |\n", escaped.join(" | "))
+    };
+    let mut text = line(&TABLE_COLUMNS.map(str::to_owned));
+    text.push_str(&line(&TABLE_COLUMNS.map(|_| "---".to_owned())));
+    to_table(rows).iter().for_each(|cells| text.push_str(&line(cells)));
+    text
+}
+
+/// `72/100`, and below it each group's.
+fn success_text(row: &LeaderboardRow) -> String {
+    let groups = row.groups_text().replace(", ", "\n");
+    let total = format!("{}/{}", row.successes, row.episodes);
+    if groups.is_empty() { total } else { format!("{total}\n{groups}") }
 }
 
 /// `9,922` stays as it is, `1500000` becomes `1.50M`.
@@ -293,6 +341,21 @@ mod tests {
             all.rotate_left(1);
             assert_eq!(to_csv(&rank(&all)), expected);
         }
+    }
+
+    #[test]
+    fn groups_are_counted_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut evaluation = finished(dir.path(), &sample("color", 1, 20));
+        for (k, episode) in evaluation.episodes.iter_mut().enumerate() {
+            episode.group = Some(if k < 15 { "seen" } else { "unseen" }.to_owned());
+        }
+        let row = LeaderboardRow::new(&evaluation);
+        // the sample fails for every fifth seed
+        assert_eq!(row.groups_text(), "seen 12/15, unseen 4/5");
+        assert_eq!(to_table(std::slice::from_ref(&row))[0][2], "16/20\nseen 12/15\nunseen 4/5");
+        assert!(to_markdown(std::slice::from_ref(&row)).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
+        assert!(to_csv(&[row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\""));
     }
 
     #[test]

@@ -19,6 +19,7 @@ pub mod run;
 mod tensors;
 
 // rollouts, evaluations, leaderboard
+pub mod collection;
 pub mod evaluation;
 pub mod leaderboard;
 pub mod report;

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use common::{alive, impatient, options, spec, wait_until, wrapped};
 use rustix::process::{Pid, Signal, kill_process};
-use zoo::rollout::{JobError, Pool, PoolOptions, RolloutError, RunEnd, TimeLimits, Worker, video};
+use zoo::rollout::{JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, TimeLimits, Worker, video};
 
 /// Everything that an episode shows, to the last bit: fingerprint, observations, rewards.
 fn trace(worker: &mut Worker, seed: u64, steps: u32) -> Result<Vec<String>, JobError> {
@@ -24,8 +24,8 @@ fn trace(worker: &mut Worker, seed: u64, steps: u32) -> Result<Vec<String>, JobE
     for step in 0..steps {
         let wave = |k: u64| ((seed * 31 + u64::from(step) * 7 + k * 13) % 201) as f64 / 100.0 - 1.0;
         let action: Vec<f64> = (0..7).map(wave).collect();
-        let stepped = worker.step(&action)?;
-        lines.push(format!("{:x} {:x}", stepped.reward.to_bits(), bits(&stepped.observations)));
+        let stepped = worker.step(&[action])?;
+        lines.push(format!("{:x} {:x}", stepped.rewards[0].to_bits(), bits(&stepped.observations)));
     }
     Ok(lines)
 }
@@ -66,22 +66,23 @@ fn an_episode_is_the_same_on_any_worker_in_any_order_after_anything() {
     again.sort_by_key(|(seed, _)| *seed);
     assert_eq!(again, expected);
     // expert episodes too, and they do not disturb the others
-    let mut experts = Vec::new();
-    two.expert_episodes(0..3, &|k| 1_000_000 + k, &mut |_, episode| {
-        experts.push(episode.unwrap());
+    let experts = shown(&mut two, 0..3);
+    assert_eq!(traces(&mut two, &seeds, 12), expected);
+    assert!(experts.iter().any(|episode| episode.success));
+    assert_eq!(shown(&mut two, 2..3)[0], experts[2], "an expert's episode depends on its seed alone");
+    assert!(two.incidents().is_empty(), "{:?}", two.incidents());
+}
+
+/// Episodes of the expert.
+fn shown(pool: &mut Pool, attempts: std::ops::Range<u64>) -> Vec<RecordedEpisode> {
+    let work = |(): &mut (), worker: &mut Worker, attempt| Ok(worker.expert(1_000_000 + attempt)?);
+    let mut all = Vec::new();
+    pool.run(attempts, &|attempt| attempt, &|| Ok(()), &work, &mut |_, episode| {
+        all.push(episode.unwrap());
         ControlFlow::Continue(())
     })
     .unwrap();
-    assert_eq!(traces(&mut two, &seeds, 12), expected);
-    assert!(experts.iter().any(|episode| episode.success));
-    let mut third = two;
-    third
-        .expert_episodes(2..3, &|k| 1_000_000 + k, &mut |_, episode| {
-            assert_eq!(episode.unwrap(), experts[2], "an expert's episode depends on its seed alone");
-            ControlFlow::Break(())
-        })
-        .unwrap();
-    assert!(third.incidents().is_empty(), "{:?}", third.incidents());
+    all
 }
 
 #[test]
@@ -239,6 +240,41 @@ fn a_request_to_stop_ends_a_run_after_the_episodes_under_way() {
     assert!((1..=2).contains(&delivered), "{delivered}");
 }
 
+/// Steps that go to the worker together are the steps that it does one after the other.
+#[test]
+fn many_actions_in_one_request_are_as_many_requests() {
+    let mut pool = Pool::start(options("Lift", 1)).unwrap();
+    let wave = |k: u64| (0..7).map(|j| ((k * 17 + j * 29) % 101) as f64 / 50.0 - 1.0).collect::<Vec<f64>>();
+    let actions: Vec<Vec<f64>> = (0..9).map(wave).collect();
+    let parts = |sizes: &'static [usize]| {
+        let actions = actions.clone();
+        move |(): &mut (), worker: &mut Worker, _: u64| {
+            worker.reset(10_000)?;
+            let (mut rewards, mut at, mut seen) = (Vec::new(), 0, None);
+            for size in sizes {
+                let stepped = worker.step(&actions[at..at + size])?;
+                rewards.extend(stepped.rewards);
+                seen = Some((stepped.success, stepped.observations));
+                at += size;
+            }
+            Ok((rewards, seen))
+        }
+    };
+    let mut run = |sizes: &'static [usize]| {
+        let mut all = Vec::new();
+        pool.run(0..1, &|job| job, &|| Ok(()), &parts(sizes), &mut |_, result| {
+            all.push(result.unwrap());
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+        all.remove(0)
+    };
+    let single = run(&[1; 9]);
+    assert_eq!(single.0.len(), 9);
+    assert_eq!(run(&[9]), single);
+    assert_eq!(run(&[4, 1, 4]), single);
+}
+
 #[test]
 fn images_become_a_video_file() {
     let dir = tempfile::tempdir().unwrap();
@@ -247,7 +283,7 @@ fn images_become_a_video_file() {
         worker.reset(10_000)?;
         let mut images = vec![worker.render("agentview", 96, 128)?];
         for _ in 0..5 {
-            worker.step(&[0.5, 0.0, -0.5, 0.0, 0.0, 0.0, 1.0])?;
+            worker.step(&[vec![0.5, 0.0, -0.5, 0.0, 0.0, 0.0, 1.0]])?;
             images.push(worker.render("agentview", 96, 128)?);
         }
         Ok(images)

@@ -2,6 +2,7 @@
 
 mod commands;
 mod output;
+mod simulator;
 mod svg;
 
 use clap::{Parser, Subcommand};
@@ -24,6 +25,7 @@ enum Command {
     Convert(commands::convert::Args),
     Collect(commands::collect::Args),
     Extract(commands::extract::Args),
+    Replay(commands::replay::Args),
     Export(commands::export::Args),
     Validate(commands::validate::Args),
     Stats(commands::stats::Args),
@@ -41,6 +43,7 @@ fn main() -> ExitCode {
         Command::Convert(args) => commands::convert::run(&args),
         Command::Collect(args) => commands::collect::run(&args),
         Command::Extract(args) => commands::extract::run(&args),
+        Command::Replay(args) => commands::replay::run(&args),
         Command::Export(args) => commands::export::run(&args),
         Command::Validate(args) => commands::validate::run(&args),
         Command::Stats(args) => commands::stats::run(&args),

@@ -41,7 +41,7 @@ class Reset:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One control step; the action is the tensor "action"."""
+    """Control steps; the tensor "action" is one action, or one a row, done in order until the task is solved."""
 
     id: int
 

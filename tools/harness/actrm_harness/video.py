@@ -12,12 +12,19 @@ import numpy as np
 def main() -> int:
     """Encode what standard input holds; the exit code."""
     path, width, height, rate = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
-    import cv2
+    try:
+        import cv2
+    except ImportError as error:
+        print(f"no encoder: {error}; pip install opencv-python-headless brings one", file=sys.stderr)
+        return 1
 
     code = cv2.VideoWriter.fourcc(*"mp4v")
     writer = cv2.VideoWriter(path, code, rate, (width, height))
     if not writer.isOpened():
-        print(f"OpenCV {cv2.__version__} cannot write MPEG-4 video to {path}", file=sys.stderr)
+        print(
+            f"OpenCV {cv2.__version__} cannot write MPEG-4 video to {path}; the wheel opencv-python-headless can",
+            file=sys.stderr,
+        )
         return 1
     size = width * height * 3
     while frame := sys.stdin.buffer.read(size):

@@ -174,13 +174,21 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
     """The reply to one request."""
     # first what is asked most, between two steps of physics
     if isinstance(request, protocol.Step):
-        envs = environments()
-        action = envs.check_action(session.env, tensor(tensors, "action"))
-        envs.slim(session)
-        result = envs.step_session(session, action)
-        reply = {"type": "step", "id": request.id, "reward": result.reward, "success": result.success}
-        return reply, {f"obs/{name}": value for name, value in result.observation.items()}
+        return step_reply(session, request.id, tensor(tensors, "action"))
     return answer_seldom(session, request, tensors)
+
+
+def step_reply(session: "Session", number: int, actions: wire.Array) -> Answer:
+    """Do one action, or one after the other until the task is solved; what the last one led to, and all rewards."""
+    envs = environments()
+    rows = actions[None] if actions.ndim == 1 else actions
+    checked = [envs.check_action(session.env, row) for row in rows]
+    if not checked:
+        raise RequestError("bad_action", f"step: no action in a tensor of shape {actions.shape}")
+    envs.slim(session)
+    result, rewards = envs.steps_session(session, checked)
+    reply = {"type": "step", "id": number, "reward": result.reward, "success": result.success}
+    return reply, {"rewards": rewards, **{f"obs/{name}": value for name, value in result.observation.items()}}
 
 
 def answer_seldom(session: "Session", request: protocol.Request, tensors: wire.Tensors) -> Answer:

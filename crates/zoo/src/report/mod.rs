@@ -8,9 +8,9 @@ mod charts;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use crate::leaderboard::{LeaderboardRow, count_text, rank};
+use crate::leaderboard::{Counts, LeaderboardRow, count_text, rank};
 use crate::puzzle::{PuzzleEvaluation, puzzle_section};
-use crate::results::StoredEvaluation;
+use crate::results::{StoredEvaluation, wilson_interval};
 
 /// An entry's training loss over optimiser steps.
 #[derive(Debug, Clone, PartialEq)]
@@ -122,13 +122,14 @@ fn table(rows: &[&LeaderboardRow]) -> String {
         let t = &row.training;
         let _ = writeln!(
             html,
-            "<tr><td class=\"name\">{}</td><td>{}</td><td>{}/{}</td><td>{:.1}%</td><td>{:.1}–{:.1}%</td><td>{}</td>\
+            "<tr><td class=\"name\">{}</td><td>{}</td><td>{}/{}{}</td><td>{:.1}%</td><td>{:.1}–{:.1}%</td><td>{}</td>\
              <td>{}</td><td>{}</td><td>{:.2} / {:.2}</td><td>{} steps<br><small>{:.1} min</small></td>\
              <td>{}<br><small>{} demos</small></td></tr>",
             escape(&row.entry.to_string()),
             escape(&t.policy),
             row.successes,
             row.episodes,
+            groups(row),
             row.success_rate() * 1e2,
             low * 1e2,
             high * 1e2,
@@ -145,6 +146,16 @@ fn table(rows: &[&LeaderboardRow]) -> String {
     }
     html.push_str("</tbody></table>");
     html
+}
+
+/// A line for each group of episodes, with its interval.
+fn groups(row: &LeaderboardRow) -> String {
+    let line = |(name, counts): (&String, &Counts)| {
+        let (low, high) = wilson_interval(counts.successes, counts.episodes);
+        let (name, Counts { successes, episodes }) = (escape(name), counts);
+        format!("<br><small>{name} {successes}/{episodes} ({:.0}–{:.0}%)</small>", low * 1e2, high * 1e2)
+    };
+    row.groups.iter().map(line).collect()
 }
 
 fn provenance(row: &LeaderboardRow) -> String {
@@ -225,6 +236,17 @@ mod tests {
         assert!(!html.contains("<b>&\""));
         assert!(html.contains("&lt;b&gt;&amp;&quot;@2"));
         assert_eq!(html, page());
+    }
+
+    #[test]
+    fn groups_of_episodes_are_shown_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut evaluation = finished(dir.path(), &sample("color", 1, 20));
+        for (k, episode) in evaluation.episodes.iter_mut().enumerate() {
+            episode.group = Some(if k < 15 { "seen" } else { "unseen" }.to_owned());
+        }
+        let html = to_html(&[evaluation], &[], &[]);
+        assert!(html.contains("16/20<br><small>seen 12/15 (55–93%)</small><br><small>unseen 4/5 (38–96%)</small>"));
     }
 
     #[test]

@@ -296,6 +296,7 @@ pub(crate) mod tests {
             steps: if success { 40 + (seed % 7) as u32 } else { 400 },
             total_reward: if success { 1.0 } else { 0.0 },
             fingerprint: format!("{seed:064x}"),
+            group: None,
         };
         let timing = EpisodeTiming {
             seed,

@@ -215,6 +215,9 @@ pub struct EpisodeRecord {
     pub total_reward: f64,
     /// sha256 of the simulator's initial state.
     pub fingerprint: String,
+    /// The group of episodes that this one belongs to, where the task has groups, such as `seen` and `unseen`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub group: Option<String>,
 }
 
 /// How one episode went on the clock, to the microsecond.
@@ -336,7 +339,7 @@ pub(crate) mod tests {
         fn an_episode_survives_the_journal_to_the_last_bit(seed: u64, bits: u64, steps: u32) {
             let total_reward = f64::from_bits(bits);
             prop_assume!(total_reward.is_finite());
-            let record = EpisodeRecord { seed, success: true, steps, total_reward, fingerprint: "ab".into() };
+            let record = EpisodeRecord { seed, success: true, steps, total_reward, fingerprint: "ab".into(), group: None };
             let text = serde_json::to_string(&record).unwrap();
             let back: EpisodeRecord = serde_json::from_str(&text).unwrap();
             prop_assert_eq!(back.total_reward.to_bits(), bits);

@@ -76,6 +76,16 @@ impl<'a> Columns<'a> {
         Ok(all)
     }
 
+    fn has(&self, name: &str) -> bool {
+        self.batches.iter().any(|batch| batch.column_by_name(name).is_some())
+    }
+
+    fn text(&self, name: &str) -> Result<Vec<String>, ZooError> {
+        self.get(name, &DataType::Utf8, |a, out| {
+            out.extend(a.as_string::<i32>().iter().map(|v| v.unwrap_or_default().to_owned()));
+        })
+    }
+
     fn u64(&self, name: &str) -> Result<Vec<u64>, ZooError> {
         self.get(name, &DataType::UInt64, |a, out| {
             out.extend_from_slice(a.as_primitive::<UInt64Type>().values());
@@ -95,19 +105,21 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// Writes the outcomes.
+/// Writes the outcomes. The column `group` is there only where a task has groups; empty text is none.
 pub(super) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), ZooError> {
     let fingerprints = all.iter().map(|e| &e.fingerprint);
-    write(
-        path,
-        vec![
-            ("seed", Arc::new(UInt64Array::from_iter_values(all.iter().map(|e| e.seed)))),
-            ("success", Arc::new(all.iter().map(|e| Some(e.success)).collect::<BooleanArray>())),
-            ("steps", Arc::new(UInt32Array::from_iter_values(all.iter().map(|e| e.steps)))),
-            ("return", Arc::new(Float64Array::from_iter_values(all.iter().map(|e| e.total_reward)))),
-            ("fingerprint", Arc::new(StringArray::from_iter_values(fingerprints))),
-        ],
-    )
+    let mut columns: Vec<(&str, ArrayRef)> = vec![
+        ("seed", Arc::new(UInt64Array::from_iter_values(all.iter().map(|e| e.seed)))),
+        ("success", Arc::new(all.iter().map(|e| Some(e.success)).collect::<BooleanArray>())),
+        ("steps", Arc::new(UInt32Array::from_iter_values(all.iter().map(|e| e.steps)))),
+        ("return", Arc::new(Float64Array::from_iter_values(all.iter().map(|e| e.total_reward)))),
+        ("fingerprint", Arc::new(StringArray::from_iter_values(fingerprints))),
+    ];
+    if all.iter().any(|e| e.group.is_some()) {
+        let groups = all.iter().map(|e| e.group.as_deref().unwrap_or_default());
+        columns.push(("group", Arc::new(StringArray::from_iter_values(groups))));
+    }
+    write(path, columns)
 }
 
 /// Reads the outcomes.
@@ -116,19 +128,22 @@ pub(super) fn read_episodes(path: &Path) -> Result<Vec<EpisodeRecord>, ZooError>
     let success = columns.get("success", &DataType::Boolean, |a, out| {
         out.extend(a.as_boolean().iter().map(|v| v == Some(true)));
     })?;
-    let fingerprint = columns.get("fingerprint", &DataType::Utf8, |a, out| {
-        out.extend(a.as_string::<i32>().iter().map(|v| v.unwrap_or_default().to_owned()));
-    })?;
+    let fingerprint = columns.text("fingerprint")?;
     let (steps, returns) = (columns.u32("steps")?, columns.f64("return")?);
     let seeds = columns.u64("seed")?;
-    let rows = seeds.into_iter().zip(success).zip(steps).zip(returns).zip(fingerprint);
+    let groups = match columns.has("group") {
+        true => columns.text("group")?,
+        false => vec![String::new(); seeds.len()],
+    };
+    let rows = seeds.into_iter().zip(success).zip(steps).zip(returns).zip(fingerprint).zip(groups);
     Ok(rows
-        .map(|((((seed, success), steps), total_reward), fingerprint)| EpisodeRecord {
+        .map(|(((((seed, success), steps), total_reward), fingerprint), group)| EpisodeRecord {
             seed,
             success,
             steps,
             total_reward,
             fingerprint,
+            group: Some(group).filter(|group| !group.is_empty()),
         })
         .collect())
 }
@@ -188,6 +203,7 @@ mod tests {
                 steps: 40 + k as u32,
                 total_reward: 0.1 * k as f64,
                 fingerprint: format!("{k:064x}"),
+                group: None,
             })
             .collect()
     }
@@ -197,7 +213,12 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (a, b, t) = (dir.path().join("a"), dir.path().join("b"), dir.path().join("t"));
         for count in [0, 1, 3000] {
-            let all = episodes(count);
+            let mut all = episodes(count);
+            if count == 3000 {
+                for (k, episode) in all.iter_mut().enumerate() {
+                    episode.group = [None, Some("seen".to_owned()), Some("unseen".to_owned())][k % 3].clone();
+                }
+            }
             write_episodes(&a, &all).unwrap();
             write_episodes(&b, &all).unwrap();
             assert_eq!(read_episodes(&a).unwrap(), all);

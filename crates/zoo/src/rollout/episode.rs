@@ -8,7 +8,7 @@ use models::{ActionChunk, Actor, ModelError, Observation, Policy};
 use super::error::RolloutError;
 use super::message::Ready;
 use super::pool::JobError;
-use super::worker::{Observations, Worker};
+use super::worker::{Initial, Observations, Worker};
 
 /// What an episode shows its policy and when it ends.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,6 +36,8 @@ pub struct Outcome {
     pub total_reward: f64,
     /// Hash of the initial state.
     pub fingerprint: String,
+    /// The group of episodes that this one belongs to, where the task has groups.
+    pub group: Option<String>,
     /// Time spent waiting for the simulator.
     pub simulator: Duration,
     /// Time of the whole episode.
@@ -95,8 +97,20 @@ impl EpisodePlan {
         Ok(action.iter().zip(limits).map(clip).collect())
     }
 
-    /// Runs the episode of `seed`; `watch` is called with the worker after the reset and after every
-    /// step.
+    /// The actions that can be executed, and why the one after them cannot, if so.
+    fn executable(&self, planned: &[Vec<f32>]) -> (Vec<Vec<f64>>, Option<String>) {
+        let mut good = Vec::with_capacity(planned.len());
+        for action in planned {
+            match self.clipped(action) {
+                Ok(action) => good.push(action),
+                Err(found) => return (good, Some(found)),
+            }
+        }
+        (good, None)
+    }
+
+    /// Runs the episode of `seed`. Actions that the policy plans ahead go to the worker together, unless `watch` wants
+    /// to be called with the worker after the reset and after every step.
     ///
     /// # Errors
     /// A failure of the worker, or one of the policy.
@@ -105,40 +119,49 @@ impl EpisodePlan {
         worker: &mut Worker,
         actor: &mut dyn Actor,
         seed: u64,
-        watch: &mut dyn FnMut(&mut Worker) -> Result<(), JobError>,
+        mut watch: Option<Watch<'_>>,
     ) -> Result<Outcome, JobError> {
         let begun = Instant::now();
         actor.reset();
-        let mut initial = worker.reset(seed)?;
+        let Initial { fingerprint, group, mut observations } = worker.reset(seed)?;
         let mut simulator = begun.elapsed();
-        watch(worker)?;
-        let mut observations = std::mem::take(&mut initial.observations);
+        if let Some(watch) = &mut watch {
+            watch(worker)?;
+        }
         let (mut success, mut steps, mut total_reward) = (false, 0, 0.0);
         while !success && steps < self.max_steps {
-            let action = actor.act(&self.observation(&observations)).map_err(|source| {
+            let seen = self.observation(&observations);
+            let planned = if watch.is_some() { actor.act(&seen).map(|one| vec![one]) } else { actor.act_ahead(&seen) };
+            let mut planned = planned.map_err(|source| {
                 let operation = "querying the policy";
                 RolloutError::Policy { seed, step: steps, operation, source: Box::new(source) }
             })?;
-            let action = self.clipped(&action).map_err(|found| RolloutError::Action {
-                seed,
-                step: steps,
-                expected: format!("{} finite values", self.action_low.len()),
-                found,
-            })?;
-            let asked = Instant::now();
-            let stepped = worker.step(&action)?;
-            simulator += asked.elapsed();
-            steps += 1;
-            total_reward += stepped.reward;
-            success = stepped.success;
-            observations = stepped.observations;
-            watch(worker)?;
+            planned.truncate(self.max_steps - steps);
+            let (actions, unusable) = self.executable(&planned);
+            if !actions.is_empty() {
+                let asked = Instant::now();
+                let stepped = worker.step(&actions)?;
+                simulator += asked.elapsed();
+                steps += stepped.rewards.len();
+                total_reward = stepped.rewards.iter().fold(total_reward, |sum, reward| sum + reward);
+                success = stepped.success;
+                observations = stepped.observations;
+            }
+            if let Some(found) = unusable.filter(|_| !success) {
+                let expected = format!("{} finite values", self.action_low.len());
+                return Err(RolloutError::Action { seed, step: steps, expected, found }.into());
+            }
+            if let Some(watch) = &mut watch {
+                watch(worker)?;
+            }
         }
         worker.check_quiet()?;
-        let fingerprint = initial.fingerprint;
-        Ok(Outcome { success, steps, total_reward, fingerprint, simulator, wall: begun.elapsed() })
+        Ok(Outcome { success, steps, total_reward, fingerprint, group, simulator, wall: begun.elapsed() })
     }
 }
+
+/// Called with the worker after an episode's reset and after every step of it.
+pub type Watch<'a> = &'a mut dyn FnMut(&mut Worker) -> Result<(), JobError>;
 
 /// A policy whose queries are timed.
 pub struct Timed {
@@ -208,5 +231,7 @@ mod tests {
         assert_eq!(plan().clipped(&[0.0, f32::NAN]).unwrap_err(), "NaN at index 1");
         assert_eq!(plan().clipped(&[f32::INFINITY, 0.0]).unwrap_err(), "inf at index 0");
         assert_eq!(plan().clipped(&[0.0]).unwrap_err(), "1 values");
+        let (good, unusable) = plan().executable(&[vec![0.0, 2.0], vec![f32::NAN, 0.0], vec![0.0, 0.0]]);
+        assert_eq!((good, unusable), (vec![vec![0.0, 0.5]], Some("NaN at index 0".to_owned())));
     }
 }

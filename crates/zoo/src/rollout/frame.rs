@@ -137,6 +137,9 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// Bytes of the length before the body.
+    pub const PREFIX: usize = 8;
+
     /// A frame of a message without tensors.
     ///
     /// # Errors
@@ -170,20 +173,22 @@ impl Frame {
     /// [`FrameError::Body`] or [`FrameError::Metadata`].
     pub fn decode(body: &[u8]) -> Result<Self, FrameError> {
         let broken = |source| FrameError::Body { bytes: body.len(), source };
-        let (_, header) = SafeTensors::read_metadata(body).map_err(broken)?;
-        let parsed = SafeTensors::deserialize(body).map_err(broken)?;
+        let (length, header) = SafeTensors::read_metadata(body).map_err(broken)?;
         let mut keys: Vec<String> = header.metadata().iter().flat_map(|map| map.keys().cloned()).collect();
         keys.sort();
         let message = match header.metadata().as_ref().and_then(|map| map.get(MESSAGE_KEY)) {
             Some(message) if keys.len() == 1 => message.clone(),
             _ => return Err(FrameError::Metadata { found: keys }),
         };
-        let tensors = parsed
-            .iter()
-            .map(|(name, view)| {
-                let tensor =
-                    FrameTensor { dtype: view.dtype(), shape: view.shape().to_vec(), bytes: view.data().to_vec() };
-                (name.to_owned(), tensor)
+        // the header was checked against the body's length: its offsets lie inside
+        let data = &body[8 + length..];
+        let tensors = header
+            .tensors()
+            .into_iter()
+            .map(|(name, info)| {
+                let (begin, end) = info.data_offsets;
+                let bytes = data[begin..end].to_vec();
+                (name, FrameTensor { dtype: info.dtype, shape: info.shape.clone(), bytes })
             })
             .collect();
         Ok(Self { message, tensors })

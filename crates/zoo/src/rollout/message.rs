@@ -98,12 +98,31 @@ impl Ready {
 #[derive(Debug, Clone, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(crate) enum Request<'a> {
-    Reset { id: u64, seed: u64 },
-    Step { id: u64 },
-    Expert { id: u64, seed: u64 },
-    Extract { id: u64, model_file: &'a str },
-    Render { id: u64, camera: &'a str, size: [usize; 2] },
-    Close { id: u64 },
+    Reset {
+        id: u64,
+        seed: u64,
+    },
+    Step {
+        id: u64,
+    },
+    Expert {
+        id: u64,
+        seed: u64,
+    },
+    Extract {
+        id: u64,
+        model_file: &'a str,
+        #[serde(skip_serializing_if = "is_empty")]
+        ep_meta: &'a serde_json::Value,
+    },
+    Render {
+        id: u64,
+        camera: &'a str,
+        size: [usize; 2],
+    },
+    Close {
+        id: u64,
+    },
 }
 
 impl Request<'_> {
@@ -120,6 +139,11 @@ impl Request<'_> {
     }
 }
 
+/// Whether an environment has nothing to read from it.
+fn is_empty(ep_meta: &serde_json::Value) -> bool {
+    ep_meta.as_object().is_none_or(serde_json::Map::is_empty)
+}
+
 /// What a worker answers.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
@@ -128,10 +152,12 @@ pub(crate) enum Reply {
     Reset {
         id: u64,
         fingerprint: String,
+        /// The group of episodes that this one belongs to, where the task has groups.
+        #[serde(default)]
+        group: Option<String>,
     },
     Step {
         id: u64,
-        reward: f64,
         success: bool,
     },
     Expert(EpisodeReply),
@@ -193,12 +219,21 @@ mod tests {
             text(&Request::Render { id: 3, camera: "agentview", size: [84, 96] }),
             r#"{"type":"render","id":3,"camera":"agentview","size":[84,96]}"#
         );
+        let (none, some) = (serde_json::Value::Null, serde_json::json!({"order": ["red"]}));
+        assert_eq!(
+            text(&Request::Extract { id: 5, model_file: "m", ep_meta: &none }),
+            r#"{"type":"extract","id":5,"model_file":"m"}"#
+        );
+        assert_eq!(
+            text(&Request::Extract { id: 6, model_file: "m", ep_meta: &some }),
+            r#"{"type":"extract","id":6,"model_file":"m","ep_meta":{"order":["red"]}}"#
+        );
         assert_eq!(text(&Request::Close { id: 4 }), r#"{"type":"close","id":4}"#);
     }
 
     #[test]
     fn replies_are_read_as_the_protocol_says() {
-        let reply: Reply = serde_json::from_str(r#"{"type":"step","id":7,"reward":0.25,"success":false}"#).unwrap();
+        let reply: Reply = serde_json::from_str(r#"{"type":"step","id":7,"success":false}"#).unwrap();
         assert_eq!(reply.answers(), ("step", Some(7)));
         let reply: Reply = serde_json::from_str(r#"{"type":"error","kind":"unknown_task","message":"no"}"#).unwrap();
         assert_eq!(reply.answers(), ("error", None));

@@ -10,7 +10,7 @@ use std::time::Duration;
 use super::error::{RolloutError, WorkerFault};
 use super::message::Ready;
 use super::spec::WorkerSpec;
-use super::worker::{RecordedEpisode, StartFailure, Worker};
+use super::worker::{StartFailure, Worker};
 
 /// How far workers may run ahead of the next result to deliver, in jobs.
 const LOOK_AHEAD: u64 = 64;
@@ -252,21 +252,6 @@ impl Pool {
         let progress = progress.into_inner().unwrap_or_else(PoisonError::into_inner);
         let complete = progress.halted || progress.delivered >= jobs.end;
         Ok(if complete { RunEnd::Complete } else { RunEnd::Stopped })
-    }
-
-    /// Runs scripted episodes for attempts `attempts`, whose seeds `seed_of` gives, and delivers them in
-    /// order until `deliver` breaks.
-    ///
-    /// # Errors
-    /// As for [`Pool::run`].
-    pub fn expert_episodes(
-        &mut self,
-        attempts: Range<u64>,
-        seed_of: &(dyn Fn(u64) -> u64 + Sync),
-        deliver: &mut dyn FnMut(u64, Result<RecordedEpisode, RolloutError>) -> ControlFlow<()>,
-    ) -> Result<RunEnd, RolloutError> {
-        let work = |(): &mut (), worker: &mut Worker, job| Ok(worker.expert(seed_of(job))?);
-        self.run(attempts, seed_of, &|| Ok(()), &work, deliver)
     }
 
     /// Asks every worker to end.

@@ -13,6 +13,7 @@ use super::error::{FaultKind, RolloutError, WorkerFault};
 use super::frame::{Frame, FrameTensor};
 use super::message::{Control, EpisodeReply, PROTOCOL, Ready, Reply, Request};
 use super::process::{Limit, Process};
+use super::recorded::RecordedEpisode;
 use super::spec::{TimeLimits, WorkerSpec};
 
 /// Observation values by key, flattened row-major.
@@ -23,32 +24,21 @@ pub type Observations = BTreeMap<String, Vec<f64>>;
 pub struct Initial {
     /// sha256 of the simulator's initial state, in hexadecimal.
     pub fingerprint: String,
+    /// The group of episodes that this one belongs to, where the task has groups.
+    pub group: Option<String>,
     /// What the environment shows.
     pub observations: Observations,
 }
 
-/// What one control step did.
+/// What control steps did.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stepped {
-    /// The step's reward.
-    pub reward: f64,
+    /// The reward of each step that was done; the task done ends them early.
+    pub rewards: Vec<f64>,
     /// Whether the task is done.
     pub success: bool,
-    /// What the environment shows after the step.
+    /// What the environment shows after the last of them.
     pub observations: Observations,
-}
-
-/// A whole episode as the harness recorded or replayed it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RecordedEpisode {
-    /// Whether the task was done in it.
-    pub success: bool,
-    /// Its length in control steps.
-    pub steps: usize,
-    /// The demo's attributes, such as `model_file`.
-    pub attrs: BTreeMap<String, serde_json::Value>,
-    /// Arrays by their name in a robomimic demo, such as `actions` or `obs/object`.
-    pub tensors: BTreeMap<String, FrameTensor>,
 }
 
 /// An RGB image, row-major from the top.
@@ -149,33 +139,46 @@ impl Worker {
         let request = Request::Reset { id: self.next_id, seed };
         let (reply, frame) = self.ask(&request, Vec::new(), self.limits.reset, 1)?;
         match reply {
-            Reply::Reset { fingerprint, .. } => {
+            Reply::Reset { fingerprint, group, .. } => {
                 let observations = self.observations("reset", &frame)?;
-                Ok(Initial { fingerprint, observations })
+                Ok(Initial { fingerprint, group, observations })
             }
             other => Err(self.fault("reset", unexpected("reset", &other))),
         }
     }
 
-    /// Runs one control step.
+    /// Runs control steps, one an action, until the task is done: one exchange for all that a policy planned.
     ///
     /// # Errors
     /// Any failure of the worker.
-    pub fn step(&mut self, action: &[f64]) -> Result<Stepped, WorkerFault> {
+    pub fn step(&mut self, actions: &[Vec<f64>]) -> Result<Stepped, WorkerFault> {
         self.next_id += 1;
         let request = Request::Step { id: self.next_id };
-        let tensors = vec![("action", FrameTensor::from_f64(&[action.len()], action))];
+        let shape = [actions.len(), actions.first().map_or(0, Vec::len)];
+        let tensors = vec![("action", FrameTensor::from_f64(&shape, &actions.concat()))];
         let (reply, frame) = self.ask(&request, tensors, self.limits.step, 2)?;
         match reply {
-            Reply::Step { reward, success, .. } => {
-                if !reward.is_finite() {
-                    return Err(self.fault("step", FaultKind::Values(format!("reward {reward}"))));
-                }
+            Reply::Step { success, .. } => {
+                let rewards = self.rewards(&frame, actions.len(), success).map_err(|kind| self.fault("step", kind))?;
                 let observations = self.observations("step", &frame)?;
-                Ok(Stepped { reward, success, observations })
+                Ok(Stepped { rewards, success, observations })
             }
             other => Err(self.fault("step", unexpected("step", &other))),
         }
+    }
+
+    /// The rewards of a step's answer: one for each action, fewer only where the task was done before the last.
+    fn rewards(&self, frame: &Frame, actions: usize, success: bool) -> Result<Vec<f64>, FaultKind> {
+        let rewards =
+            frame.tensor("rewards").and_then(|tensor| tensor.to_f64("rewards")).map_err(FaultKind::Nonsense)?;
+        let done = rewards.len();
+        if done == 0 || done > actions || (done < actions && !success) {
+            return Err(FaultKind::Values(format!("rewards: expected {actions} values, found {done}")));
+        }
+        if let Some(reward) = rewards.iter().find(|reward| !reward.is_finite()) {
+            return Err(FaultKind::Values(format!("reward {reward}")));
+        }
+        Ok(rewards)
     }
 
     /// Runs a whole scripted episode.
@@ -192,18 +195,20 @@ impl Worker {
         }
     }
 
-    /// Replays stored states and returns what the environment shows along them.
+    /// Replays stored states and returns what the environment shows along them. `ep_meta` is the demonstration's
+    /// attribute of that name, an object: what an environment has to know of an episode beyond its states.
     ///
     /// # Errors
     /// Any failure of the worker.
     pub fn extract(
         &mut self,
         model_file: &str,
+        ep_meta: &serde_json::Value,
         states: FrameTensor,
         actions: FrameTensor,
     ) -> Result<RecordedEpisode, WorkerFault> {
         self.next_id += 1;
-        let request = Request::Extract { id: self.next_id, model_file };
+        let request = Request::Extract { id: self.next_id, model_file, ep_meta };
         let tensors = vec![("states", states), ("actions", actions)];
         let (reply, frame) = self.ask(&request, tensors, self.limits.episode, 8)?;
         match reply {

@@ -1,15 +1,17 @@
 use crate::output;
+use crate::simulator::{self, CameraArgs, INTERRUPTED, SimulatorArgs};
 use anyhow::{Context, Result, bail};
 use dataset::shuffle::SplitMix64;
-use dataset::{Array, Demo, Dtype, RobomimicWriter, WriteOptions};
+use dataset::{Array, RobomimicWriter, WriteOptions};
 use serde_json::json;
 use std::ops::ControlFlow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
-use zoo::rollout::{self, FrameTensor, Pool, PoolOptions, RecordedEpisode, WorkerSpec};
+use zoo::collection::{Attempt, Collection, CollectionRecord};
+use zoo::rollout::RunEnd;
 
 /// Share of the demonstrations in the mask `valid`.
 const VALID_SHARE: f64 = 0.1;
@@ -23,10 +25,14 @@ const ATTEMPTS_PER_EPISODE: u64 = 20;
 /// Attempt k runs in an environment seeded with 1000000 * SEED + k, and attempts are taken in this order until
 /// enough have succeeded, so that the same command writes the same bytes with any number of workers. Failures are
 /// counted and not stored. The file is in robomimic's layout, with masks `train` (90%) and `valid` (10%).
+///
+/// Attempts are kept in a hidden folder beside the file until it is written: stopped or killed, the same command goes on
+/// where it was, and ends in the same bytes.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data collect --task Lift --episodes 50 --seed 1 --out lift.hdf5
-  actrm-data collect --task Stack --episodes 200 --seed 7 --workers 4 --out stack.hdf5")]
+  actrm-data collect --task Stack --episodes 200 --seed 7 --workers 4 --out stack.hdf5
+  actrm-data collect --task Lift --episodes 20 --cameras agentview,robot0_eye_in_hand --out lift_image.hdf5")]
 pub struct Args {
     /// Task, as robosuite or the environment module names it
     #[arg(long)]
@@ -40,18 +46,16 @@ pub struct Args {
     /// File to create
     #[arg(long)]
     out: PathBuf,
-    /// Simulators at once [default: one a core]
-    #[arg(long)]
-    workers: Option<usize>,
+    #[command(flatten)]
+    cameras: CameraArgs,
+    #[command(flatten)]
+    simulator: SimulatorArgs,
     /// Leave next_obs out
     #[arg(long)]
     no_next_obs: bool,
     /// Compress datasets with gzip of this level; 0 stores them as they are, which is smaller for short demos
     #[arg(long, value_parser = clap::value_parser!(u8).range(0..=9), default_value_t = 0)]
     gzip: u8,
-    /// Python with robosuite [default: $ACTRM_PYTHON, else .venv/bin/python here or above, else python3]
-    #[arg(long)]
-    python: Option<PathBuf>,
     /// Report as JSON
     #[arg(long)]
     json: bool,
@@ -59,135 +63,112 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<ExitCode> {
     let start = Instant::now();
-    let mut writer = RobomimicWriter::create(&args.out, &WriteOptions { gzip: (args.gzip > 0).then_some(args.gzip) })?;
+    simulator::refuse_existing(&args.out)?;
     let stop = Arc::new(AtomicBool::new(false));
-    let raise = Arc::clone(&stop);
-    ctrlc::set_handler(move || raise.store(true, Ordering::Relaxed)).context("cannot catch ctrl-C")?;
-    let workers = args.workers.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-    let python = rollout::find_python(args.python.as_deref())?;
-    let spec = WorkerSpec::new(python, rollout::harness_folder()?, &args.task);
-    let mut pool = Pool::start(PoolOptions { stop: stopped(stop), ..PoolOptions::new(spec, workers) })?;
-    let env_args = serde_json::to_string_pretty(&pool.ready().env_args).context("environment arguments")?;
+    let mut pool = args.simulator.start(&args.task, &args.cameras.cameras, args.cameras.size, &stop)?;
+    let first = args.seed * SEED_STRIDE;
+    let record = CollectionRecord::new(pool.ready(), first, args.simulator.env_module.clone());
+    let collection = Collection::open(&attempts_folder(&args.out), &record)?;
+    let earlier = collection.count()?;
+    if earlier > 0 {
+        eprintln!("note: going on after {earlier} attempts");
+    }
 
     let bar = output::bar("demos").with_message(format!("collecting {}", args.task));
     bar.set_length(args.episodes);
-    let mut stored: Vec<String> = Vec::new();
-    let mut total_steps = 0_u64;
+    let mut good: Vec<Attempt> = Vec::new();
     let mut attempts = 0_u64;
-    let mut failure: Option<anyhow::Error> = None;
-    let first = args.seed * SEED_STRIDE;
+    let mut failure = None;
     let most = (args.episodes * ATTEMPTS_PER_EPISODE).min(SEED_STRIDE);
-    let end = pool.expert_episodes(0..most, &|attempt| first + attempt, &mut |_, result| {
+    let end = collection.run(&mut pool, 0..most, &mut |result| {
         attempts += 1;
-        let outcome = result.map_err(anyhow::Error::from).and_then(|episode| {
-            if !episode.success {
-                return Ok(());
-            }
-            let id = format!("demo_{}", stored.len());
-            total_steps += episode.steps as u64;
-            writer.add_demo(&demo(&id, episode, !args.no_next_obs)?)?;
-            stored.push(id);
-            Ok(())
-        });
-        bar.set_position(stored.len() as u64);
-        match outcome {
+        match result {
+            Ok(attempt) => good.extend(Some(attempt).filter(|attempt| attempt.success)),
             Err(error) => {
                 failure = Some(error);
-                ControlFlow::Break(())
+                return ControlFlow::Break(());
             }
-            Ok(()) if stored.len() as u64 == args.episodes => ControlFlow::Break(()),
-            Ok(()) => ControlFlow::Continue(()),
         }
+        bar.set_position(good.len() as u64);
+        if good.len() as u64 == args.episodes { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
     bar.finish_and_clear();
+    simulator::close(pool);
     let end = end?;
-    let incidents = pool.incidents().to_vec();
-    pool.close();
-    for incident in &incidents {
-        eprintln!("note: {}", incident.text);
-    }
     if let Some(error) = failure {
-        return Err(error);
+        return Err(error.into());
     }
-    if stored.len() as u64 != args.episodes {
+    if good.len() as u64 != args.episodes {
         match end {
-            rollout::RunEnd::Stopped => {
-                bail!("stopped after {} of {} demos; nothing was written", stored.len(), args.episodes)
+            RunEnd::Stopped => {
+                let (done, wanted) = (good.len(), args.episodes);
+                eprintln!("stopped after {done} of {wanted} demos; the same command goes on where it was");
+                return Ok(ExitCode::from(INTERRUPTED));
             }
-            rollout::RunEnd::Complete => bail!(
-                "the expert succeeded in {} of {attempts} attempts at {}: too few for {} demos; nothing was written",
-                stored.len(),
-                args.task,
-                args.episodes
-            ),
+            RunEnd::Complete => {
+                collection.discard()?;
+                bail!(
+                    "the expert succeeded in {} of {attempts} attempts at {}: too few for {} demos; nothing was written",
+                    good.len(),
+                    args.task,
+                    args.episodes
+                )
+            }
         }
     }
-    writer.set_data_attr("total", &Array::from_i64(Vec::new(), &[total_steps as i64]))?;
-    writer.set_data_attr("env_args", &Array::from_str(&env_args))?;
-    let (train, valid) = masks(&stored, args.seed);
-    writer.set_mask("train", &train)?;
-    writer.set_mask("valid", &valid)?;
-    writer.finish()?;
+    write(args, &collection, &good, &record.env_args)?;
+    collection.discard()?;
 
-    let rate = stored.len() as f64 / attempts as f64;
+    let total_steps: usize = good.iter().map(|attempt| attempt.steps).sum();
+    let rate = good.len() as f64 / attempts as f64;
     let size = std::fs::metadata(&args.out).map_or(0, |m| m.len());
     let seconds = start.elapsed().as_secs_f64();
     if args.json {
         output::print_json(&json!({
-            "out": args.out, "task": args.task, "demos": stored.len(), "steps": total_steps, "attempts": attempts,
+            "out": args.out, "task": args.task, "demos": good.len(), "steps": total_steps, "attempts": attempts,
             "expert_success_rate": rate, "first_seed": first, "bytes": size, "seconds": seconds,
         }))?;
     } else {
         output::print(&format!(
             "{}: {} demos, {} steps, {} in {seconds:.1} s\nexpert: {} of {attempts} attempts succeeded ({:.1}%)\n",
             args.out.display(),
-            stored.len(),
-            output::count(total_steps as usize),
+            good.len(),
+            output::count(total_steps),
             output::bytes(size),
-            stored.len(),
+            good.len(),
             100.0 * rate,
         ))?;
     }
     Ok(ExitCode::SUCCESS)
 }
 
-/// What the pool asks between jobs.
-pub fn stopped(flag: Arc<AtomicBool>) -> Arc<dyn Fn() -> bool + Send + Sync> {
-    Arc::new(move || flag.load(Ordering::Relaxed))
+/// Where attempts are kept until the file is written.
+fn attempts_folder(out: &Path) -> PathBuf {
+    let name = out.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    out.with_file_name(format!(".{name}.attempts"))
 }
 
-/// A demo in robomimic's layout from what a worker recorded.
-pub fn demo(id: &str, episode: RecordedEpisode, next_obs: bool) -> Result<Demo> {
-    let mut demo = Demo { id: id.to_owned(), ..Demo::default() };
-    for (name, value) in &episode.attrs {
-        let text = match value {
-            serde_json::Value::String(text) => text.clone(),
-            other => other.to_string(),
-        };
-        demo.attrs.insert(name.clone(), Array::from_str(&text));
+/// Writes the file from the attempts that succeeded.
+fn write(args: &Args, collection: &Collection, good: &[Attempt], env_args: &serde_json::Value) -> Result<()> {
+    let options = WriteOptions { gzip: (args.gzip > 0).then_some(args.gzip) };
+    let mut writer = RobomimicWriter::create(&args.out, &options)?;
+    let mut ids = Vec::new();
+    for (index, attempt) in good.iter().enumerate() {
+        let id = format!("demo_{index}");
+        let episode = collection.get(attempt.index)?;
+        let episode = episode.with_context(|| format!("attempt {} is not on disk any more", attempt.index))?;
+        writer.add_demo(&simulator::demo(&id, episode, !args.no_next_obs)?)?;
+        ids.push(id);
     }
-    let steps = i64::try_from(episode.steps).context("number of steps")?;
-    demo.attrs.insert("num_samples".to_owned(), Array::from_i64(Vec::new(), &[steps]));
-    for (name, tensor) in episode.tensors {
-        if next_obs || !name.starts_with("next_obs/") {
-            let array = array(&name, tensor)?;
-            demo.datasets.insert(name, array);
-        }
-    }
-    Ok(demo)
-}
-
-fn array(name: &str, tensor: FrameTensor) -> Result<Array> {
-    use safetensors::Dtype as Wire;
-    let dtype = match tensor.dtype {
-        Wire::F64 => Dtype::F64,
-        Wire::F32 => Dtype::F32,
-        Wire::I64 => Dtype::I64,
-        Wire::U8 => Dtype::U8,
-        Wire::BOOL => Dtype::Bool,
-        other => bail!("{name}: a worker sent {other:?}, expected numbers that HDF5 files of demonstrations hold"),
-    };
-    Ok(Array { dtype, shape: tensor.shape, bytes: tensor.bytes })
+    let total = i64::try_from(good.iter().map(|attempt| attempt.steps).sum::<usize>()).context("number of steps")?;
+    let env_args = serde_json::to_string_pretty(env_args).context("environment arguments")?;
+    writer.set_data_attr("total", &Array::from_i64(Vec::new(), &[total]))?;
+    writer.set_data_attr("env_args", &Array::from_str(&env_args))?;
+    let (train, valid) = masks(&ids, args.seed);
+    writer.set_mask("train", &train)?;
+    writer.set_mask("valid", &valid)?;
+    writer.finish()?;
+    Ok(())
 }
 
 /// Ids of the masks `train` and `valid`: a shuffle by the collection's seed decides.
@@ -219,5 +200,11 @@ mod tests {
         assert_eq!(masks(&ids, 1), masks(&ids, 1));
         assert_ne!(masks(&ids, 1), masks(&ids, 2));
         assert_eq!(masks(&ids[..1], 1).1.len(), 0);
+    }
+
+    #[test]
+    fn attempts_lie_beside_the_file() {
+        assert_eq!(attempts_folder(Path::new("a/lift.hdf5")), Path::new("a/.lift.hdf5.attempts"));
+        assert_eq!(attempts_folder(Path::new("lift.hdf5")), Path::new(".lift.hdf5.attempts"));
     }
 }

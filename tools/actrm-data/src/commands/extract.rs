@@ -1,5 +1,5 @@
-use crate::commands::collect::{demo, stopped};
 use crate::output;
+use crate::simulator::{self, CameraArgs, Recording, SimulatorArgs};
 use anyhow::{Context, Result, bail};
 use dataset::{Array, RobomimicWriter, Source, WriteOptions};
 use serde_json::{Value, json};
@@ -8,8 +8,8 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use zoo::rollout::{self, FrameTensor, Pool, PoolOptions, RolloutError, WorkerSpec};
+use std::sync::atomic::AtomicBool;
+use zoo::rollout::{self, RolloutError};
 
 /// Add observations, rewards and dones to a raw robosuite recording by replaying its states.
 ///
@@ -25,24 +25,16 @@ pub struct Args {
     raw: PathBuf,
     /// File to create
     out: PathBuf,
-    /// Cameras to render
-    #[arg(long, value_delimiter = ',', value_name = "NAMES")]
-    cameras: Vec<String>,
-    /// Side of the images, in pixels
-    #[arg(long, default_value_t = 84, value_parser = clap::value_parser!(u16).range(1..=4096))]
-    size: u16,
-    /// Simulators at once [default: one a core]
-    #[arg(long)]
-    workers: Option<usize>,
+    #[command(flatten)]
+    cameras: CameraArgs,
+    #[command(flatten)]
+    simulator: SimulatorArgs,
     /// Leave next_obs out
     #[arg(long)]
     no_next_obs: bool,
     /// Compress datasets with gzip of this level; 0 stores them as they are
     #[arg(long, value_parser = clap::value_parser!(u8).range(0..=9), default_value_t = 0)]
     gzip: u8,
-    /// Python with robosuite [default: $ACTRM_PYTHON, else .venv/bin/python here or above, else python3]
-    #[arg(long)]
-    python: Option<PathBuf>,
     /// Report as JSON
     #[arg(long)]
     json: bool,
@@ -63,13 +55,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     let mut writer = RobomimicWriter::create(&args.out, &WriteOptions { gzip: (args.gzip > 0).then_some(args.gzip) })?;
     let stop = Arc::new(AtomicBool::new(false));
-    let raise = Arc::clone(&stop);
-    ctrlc::set_handler(move || raise.store(true, Ordering::Relaxed)).context("cannot catch ctrl-C")?;
-    let workers = args.workers.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-    let mut spec = WorkerSpec::new(rollout::find_python(args.python.as_deref())?, rollout::harness_folder()?, &task);
-    spec.cameras = args.cameras.clone();
-    spec.image_size = usize::from(args.size);
-    let mut pool = Pool::start(PoolOptions { stop: stopped(stop), ..PoolOptions::new(spec, workers) })?;
+    let mut pool = args.simulator.start(&task, &args.cameras.cameras, args.cameras.size, &stop)?;
     let env_args = env_args(plan.env_args.as_ref(), &pool.ready().env_args);
 
     let bar = output::bar("demos").with_message(format!("replaying {task}"));
@@ -78,20 +64,15 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut done = 0_usize;
     let mut failure: Option<anyhow::Error> = None;
     let work = |(): &mut (), worker: &mut rollout::Worker, job: u64| {
-        let index = job as usize;
-        let failed = |error: dataset::DatasetError| RolloutError::Policy {
-            seed: job,
-            step: 0,
-            operation: "reading the recording",
-            source: Box::new(error),
+        let failed = |source: Box<dyn std::error::Error + Send + Sync>| {
+            let operation = "reading the recording";
+            RolloutError::Policy { seed: job, step: 0, operation, source }
         };
-        let recorded = source.read_demo_where(index, &|key| key == "states" || key == "actions").map_err(failed)?;
-        let tensor = |key: &str| -> FrameTensor {
-            let array = &recorded.datasets[key];
-            FrameTensor::from_f64(&array.shape, &array.to_f64().unwrap_or_default())
-        };
-        let model = recorded.attrs.get("model_file").and_then(Array::to_text).unwrap_or_default();
-        let episode = worker.extract(&model, tensor("states"), tensor("actions"))?;
+        let wanted = |key: &str| key == "states" || key == "actions";
+        let recorded = source.read_demo_where(job as usize, &wanted).map_err(|error| failed(error.into()))?;
+        let Recording { model, ep_meta, states, actions } =
+            Recording::of(&recorded).map_err(|error| failed(error.into()))?;
+        let episode = worker.extract(&model, &ep_meta, states, actions)?;
         Ok((recorded, episode))
     };
     let jobs = plan.demos.len() as u64;
@@ -99,7 +80,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let id = &plan.demos[job as usize].id;
         let outcome = result.map_err(anyhow::Error::from).and_then(|(recorded, episode)| {
             steps += episode.steps as u64;
-            let mut made = demo(id, episode, !args.no_next_obs)?;
+            let mut made = simulator::demo(id, episode, !args.no_next_obs)?;
             // what was recorded stays as it was recorded
             for (name, value) in recorded.attrs {
                 made.attrs.entry(name).or_insert(value);
@@ -119,11 +100,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
     });
     bar.finish_and_clear();
+    simulator::close(pool);
     end?;
-    for incident in pool.incidents() {
-        eprintln!("note: {}", incident.text);
-    }
-    pool.close();
     if let Some(error) = failure {
         return Err(error);
     }

@@ -9,5 +9,6 @@ pub mod inspect;
 pub mod plot;
 pub mod puzzle;
 pub mod query;
+pub mod replay;
 pub mod stats;
 pub mod validate;

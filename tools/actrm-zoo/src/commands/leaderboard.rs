@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 use comfy_table::{Table, presets};
-use zoo::leaderboard::{TABLE_COLUMNS, rank, to_csv, to_table};
+use zoo::leaderboard::{TABLE_COLUMNS, rank, to_csv, to_markdown, to_table};
 use zoo::puzzle::{PUZZLE_COLUMNS, list_puzzle_evaluations, puzzle_csv, puzzle_table, rank_puzzles};
 use zoo::registry::Registry;
 use zoo::report::{Curve, to_html};
@@ -18,7 +18,8 @@ use super::{ZooArgs, shown};
 #[derive(Args)]
 #[command(after_help = "Examples:
   actrm-zoo leaderboard
-  actrm-zoo leaderboard --zoo my-zoo --out public")]
+  actrm-zoo leaderboard --zoo my-zoo --out public
+  actrm-zoo leaderboard --markdown RESULTS.md")]
 pub struct LeaderboardArgs {
     /// Folder of results (`results` in the zoo)
     #[arg(long, value_name = "DIR")]
@@ -26,6 +27,9 @@ pub struct LeaderboardArgs {
     /// Folder for leaderboard.csv and report.html (the zoo)
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// Also write the table as Markdown
+    #[arg(long, value_name = "FILE")]
+    markdown: Option<PathBuf>,
     #[command(flatten)]
     zoo: ZooArgs,
 }
@@ -65,6 +69,10 @@ pub fn cmd_leaderboard(args: &LeaderboardArgs) -> anyhow::Result<ExitCode> {
         let csv = out.join("leaderboard_puzzles.csv");
         write_atomic(&csv, puzzle_csv(&puzzles).as_bytes())?;
         println!("{}", shown(&csv));
+    }
+    if let Some(file) = &args.markdown {
+        write_atomic(file, to_markdown(&rows).as_bytes())?;
+        println!("{}", shown(file));
     }
     Ok(ExitCode::SUCCESS)
 }

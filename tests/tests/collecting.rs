@@ -1,0 +1,69 @@
+//! `actrm-data collect` as users run it: killed and run again, with cameras, refused.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use e2e::{data, listing, refused, succeeds, text};
+
+fn collect(out: &Path, more: &[&str]) -> Command {
+    let mut command = data(["collect", "--task", "Lift", "--episodes", "3", "--out", text(out)]);
+    command.args(more);
+    command
+}
+
+/// Runs it until its first attempt is on disk and kills it there.
+fn killed(out: &Path) {
+    let mut child = collect(out, &["--workers", "1"]).stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("it starts");
+    let attempts = out.with_file_name(format!(".{}.attempts", out.file_name().expect("a file").to_string_lossy()));
+    let until = Instant::now() + Duration::from_secs(120);
+    while !listing(&attempts).iter().any(|name| name.starts_with("attempt-")) {
+        assert!(Instant::now() < until, "no attempt within two minutes");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    child.kill().expect("it can be killed");
+    child.wait().expect("it ends");
+    assert!(!out.exists());
+}
+
+#[test]
+fn killed_and_run_again_it_writes_the_same_bytes_and_leaves_nothing_else() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (straight, again) = (folder.path().join("straight.hdf5"), folder.path().join("again.hdf5"));
+    succeeds(&mut collect(&straight, &["--workers", "2"]));
+    killed(&again);
+    // what lies there belongs to seed 1
+    refused(&mut collect(&again, &["--seed", "2"]), &[".again.hdf5.attempts", "first_seed", "2000000", "1000000"]);
+    let output = succeeds(&mut collect(&again, &["--workers", "1"]));
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(error.contains("going on after"), "{error}");
+    assert!(fs::read(&straight).expect("a file") == fs::read(&again).expect("a file"), "the files differ");
+    assert_eq!(listing(folder.path()), ["again.hdf5", "straight.hdf5"]);
+    refused(&mut collect(&again, &[]), &["again.hdf5", "exists"]);
+}
+
+#[test]
+fn cameras_add_images_and_change_nothing_else() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (plain, seen) = (folder.path().join("plain.hdf5"), folder.path().join("seen.hdf5"));
+    let one = |out: &Path, more: &[&str]| {
+        let mut command = data(["collect", "--task", "Lift", "--episodes", "1", "--workers", "1", "--out", text(out)]);
+        command.args(more);
+        command
+    };
+    succeeds(&mut one(&plain, &[]));
+    succeeds(&mut one(&seen, &["--cameras", "agentview", "--size", "16"]));
+    let open = |path: &Path| hdf5::File::open(path).expect("an HDF5 file").group("data/demo_0").expect("demo_0");
+    let (plain, seen) = (open(&plain), open(&seen));
+    let values = |group: &hdf5::Group, name: &str| group.dataset(name).expect(name).read_raw::<f64>().expect("numbers");
+    for name in ["actions", "states", "obs/object", "next_obs/robot0_eef_pos"] {
+        assert!(values(&plain, name) == values(&seen, name), "{name} differs");
+    }
+    let images = seen.dataset("obs/agentview_image").expect("images");
+    let steps = plain.dataset("actions").expect("actions").shape()[0];
+    assert_eq!(images.shape(), [steps, 16, 16, 3]);
+    let pixels = images.read_raw::<u8>().expect("bytes");
+    assert!(pixels.iter().any(|&value| value != pixels[0]), "something is to be seen");
+    refused(&mut one(&folder.path().join("x.hdf5"), &["--cameras", "nowhere"]), &["nowhere", "agentview"]);
+}

@@ -1,0 +1,186 @@
+//! `actrm-zoo eval` and `merge` as users run them: stopped and gone on with, in parts, again, filmed, refused.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use e2e::{copied_zoo, data, lift, listing, refused, succeeds, text, train_lift, trained, zoo};
+
+/// An evaluation of the trained entry: short episodes, whose number does not matter to what is tested.
+fn eval(entries: &Path, episodes: &str, more: &[&str]) -> Command {
+    let mut command =
+        zoo(["eval", "lift-act@1", "--max-steps", "6", "--episodes", episodes, "--zoo", text(entries)]);
+    command.args(more);
+    command
+}
+
+/// The only result folder whose name holds a text.
+fn result(results: &Path, holding: &str) -> PathBuf {
+    let names: Vec<String> = listing(results).into_iter().filter(|name| name.contains(holding)).collect();
+    assert_eq!(names.len(), 1, "{holding}: {names:?} of {:?}", listing(results));
+    results.join(&names[0])
+}
+
+fn outcomes(folder: &Path) -> Vec<u8> {
+    fs::read(folder.join("outcomes.parquet")).expect("a finished evaluation")
+}
+
+/// What it printed.
+fn said(command: &mut Command) -> String {
+    String::from_utf8(succeeds(command).stdout).expect("text")
+}
+
+#[test]
+fn ctrl_c_once_finishes_the_episode_and_saves_and_the_same_command_goes_on() {
+    let (_folder, entries) = copied_zoo();
+    let stopped = entries.join("stopped");
+    let mut command = eval(&entries, "24", &["--workers", "2", "--results", text(&stopped)]);
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it starts");
+    // as soon as the first episode is on disk
+    let until = Instant::now() + Duration::from_secs(120);
+    let journal = loop {
+        let name = listing(&stopped).pop();
+        let path = name.map(|name| stopped.join(name).join("journal.jsonl"));
+        if let Some(path) = path.filter(|path| fs::metadata(path).is_ok_and(|m| m.len() > 0)) {
+            break path;
+        }
+        assert!(Instant::now() < until, "no episode within two minutes");
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+    assert!(killed.success());
+    let output = child.wait_with_output().expect("it ends");
+    let error = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(130), "{error}");
+    assert!(error.contains("of 24 episodes done") && error.contains("the same command goes on"), "{error}");
+    let done = fs::read_to_string(&journal).expect("a journal").lines().count();
+    assert!((1..24).contains(&done), "{done} episodes on disk");
+
+    let resumed = said(&mut eval(&entries, "24", &["--workers", "1", "--results", text(&stopped)]));
+    let straight = entries.join("straight");
+    assert_eq!(said(&mut eval(&entries, "24", &["--workers", "2", "--results", text(&straight)])), resumed);
+    assert_eq!(outcomes(&result(&stopped, "lift-act")), outcomes(&result(&straight, "lift-act")));
+}
+
+#[test]
+fn parts_are_joined_to_the_whole_and_others_are_refused() {
+    let (_folder, entries) = copied_zoo();
+    let results = entries.join("results");
+    succeeds(&mut eval(&entries, "4", &["--shard", "2/2"]));
+    refused(&mut zoo(["merge", "--zoo", text(&entries)]), &["shards 1/2 to 2/2", "no 1/2"]);
+    succeeds(&mut eval(&entries, "4", &["--shard", "1/2"]));
+    let parts = ["_shard-1-of-2", "_shard-2-of-2"].map(|mark| result(&results, mark));
+
+    // the same seeds under other rules, and of another number of parts, do not belong to them
+    let other = entries.join("other");
+    succeeds(&mut eval(&entries, "4", &["--shard", "2/2", "--results", text(&other), "--n-action-steps", "4"]));
+    let foreign = result(&other, "_shard-2-of-2");
+    refused(&mut zoo(["merge", text(&parts[0]), text(&foreign), "--zoo", text(&entries)]), &["execution: expected"]);
+    refused(&mut zoo(["merge", text(&parts[0]), text(&parts[0]), "--zoo", text(&entries)]), &["once"]);
+
+    assert!(said(&mut zoo(["merge", "--zoo", text(&entries)])).contains("of 4 episodes succeeded"));
+    let whole = entries.join("whole");
+    succeeds(&mut eval(&entries, "4", &["--results", text(&whole)]));
+    let joined: Vec<String> = listing(&results).into_iter().filter(|name| !name.contains("_shard-")).collect();
+    assert_eq!(joined.len(), 1, "{joined:?}");
+    assert_eq!(outcomes(&results.join(&joined[0])), outcomes(&result(&whole, "lift-act")));
+}
+
+#[test]
+fn a_finished_evaluation_runs_again_to_the_same_outcomes() {
+    let (_folder, entries) = copied_zoo();
+    refused(&mut eval(&entries, "2", &["--again"]), &["nothing to run again"]);
+    succeeds(&mut eval(&entries, "2", &[]));
+    assert!(said(&mut eval(&entries, "2", &["--again"])).contains("2 episodes run again, every outcome the same"));
+    let results = entries.join("results");
+    assert_eq!(listing(&results).len(), 1, "{:?}", listing(&results));
+    // results of another entry of that name
+    let record = result(&results, "lift-act").join("evaluation.json");
+    let changed = fs::read_to_string(&record).expect("a record").replace("\"demos\": 45", "\"demos\": 44");
+    fs::write(&record, changed).expect("writable");
+    refused(&mut eval(&entries, "2", &["--again"]), &["evaluation.json differs", "44", "45"]);
+}
+
+#[test]
+fn another_way_to_act_is_another_evaluation() {
+    let (_folder, entries) = copied_zoo();
+    succeeds(&mut eval(&entries, "1", &[]));
+    succeeds(&mut eval(&entries, "1", &["--n-action-steps", "2"]));
+    succeeds(&mut eval(&entries, "1", &["--temporal-ensemble", "0.01"]));
+    assert_eq!(listing(&entries.join("results")).len(), 3);
+    refused(&mut eval(&entries, "1", &["--n-action-steps", "17"]), &["--n-action-steps", "at most", "16", "17"]);
+    refused(&mut eval(&entries, "1", &["--temporal-ensemble", "nan"]), &["coefficient", "finite"]);
+}
+
+#[test]
+fn all_means_the_newest_versions() {
+    let (folder, entries) = copied_zoo();
+    train_lift(&trained().join("lift"), &entries, &folder.path().join("runs"));
+    let all = |flag: &str| {
+        let arguments = ["eval", flag, "--episodes", "1", "--max-steps", "2", "--zoo", text(&entries)];
+        said(&mut zoo(arguments))
+    };
+    let newest = all("--all");
+    assert!(newest.contains("lift-act@2 ") && !newest.contains("lift-act@1 "), "{newest}");
+    let every = all("--all-versions");
+    assert!(every.contains("lift-act@2 ") && every.contains("lift-act@1 "), "{every}");
+}
+
+#[test]
+fn demonstrations_of_another_simulator_generation_are_refused_unless_forced() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (file, entries) = (folder.path().join("old.hdf5"), folder.path().join("zoo"));
+    fs::copy(lift(), &file).expect("the shipped demonstrations");
+    let old = hdf5::File::open_rw(&file).expect("the copy opens");
+    let group = old.group("data").expect("a data group");
+    let attribute = group.attr("env_args").expect("env_args");
+    let stored: hdf5::types::VarLenUnicode = attribute.read_scalar().expect("text");
+    let changed = stored.as_str().replace("\"1.5.2\"", "\"1.4.1\"");
+    assert_ne!(changed, stored.as_str());
+    let changed: hdf5::types::VarLenUnicode = changed.parse().expect("text");
+    attribute.write_scalar(&changed).expect("writable");
+    old.close().expect("the copy closes");
+    train_lift(&file, &entries, &folder.path().join("runs"));
+    refused(&mut eval(&entries, "1", &[]), &["lift-act@1", "1.4.1", "1.5.2", "--force"]);
+    assert!(!entries.join("results").exists());
+    succeeds(&mut eval(&entries, "1", &["--force"]));
+}
+
+#[test]
+fn episodes_and_demonstrations_become_videos() {
+    let (folder, entries) = copied_zoo();
+    let is_video = |path: &Path| {
+        let bytes = fs::read(path).expect("a video");
+        bytes.len() > 1000 && &bytes[4..8] == b"ftyp"
+    };
+    let printed = said(&mut eval(&entries, "2", &["--video", "1", "--video-size", "64"]));
+    let videos = entries.join("videos/lift-act@1");
+    assert_eq!(listing(&videos), ["Lift-10000-failure.mp4"], "{printed}");
+    assert!(is_video(&videos.join("Lift-10000-failure.mp4")));
+
+    // of a robomimic file, and of the data set that was converted from it: the same images
+    let set = trained().join("lift");
+    let mut made = Vec::new();
+    for (name, input, demo) in [("file.mp4", &lift(), "3"), ("set.mp4", &set, "demo_3")] {
+        let path = folder.path().join(name);
+        let arguments =
+            ["replay", text(input), "--demo", demo, "--video", text(&path), "--size", "64", "--workers", "1"];
+        let printed = said(&mut data(arguments));
+        assert!(printed.contains("Lift demo_3") && printed.contains("images at 20 Hz, success"), "{printed}");
+        assert!(is_video(&path));
+        made.push(fs::read(path).expect("a video"));
+    }
+    assert!(made[0] == made[1], "the videos differ");
+
+    let at = |name: &str| folder.path().join(name);
+    let replay = |demo: &str, name: &str| {
+        data(["replay", text(&lift()), "--demo", demo, "--video", text(&at(name)), "--size", "64"])
+    };
+    refused(&mut replay("50", "none.mp4"), &["no demo \"50\"", "demo_0"]);
+    refused(&mut replay("3", "file.mp4"), &["file.mp4", "exists"]);
+    // a machine that can draw but is told not to
+    refused(replay("3", "none.mp4").env("MUJOCO_GL", "glx"), &["egl or osmesa"]);
+    refused(eval(&entries, "1", &["--video", "1"]).env("MUJOCO_GL", "glx"), &["egl or osmesa"]);
+    assert!(!at("none.mp4").exists());
+}

@@ -1,0 +1,198 @@
+use crate::output;
+use crate::simulator::{self, Recording, SimulatorArgs};
+use anyhow::{Context, Result, bail};
+use dataset::{Demo, Source, WriteOptions};
+use safetensors::Dtype;
+use serde_json::json;
+use std::ops::{ControlFlow, Range};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use zoo::rollout::video::Encoder;
+use zoo::rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
+
+/// Steps that a worker is asked to draw at a time.
+const PART: usize = 32;
+
+/// Show a demonstration: its recorded states, put into the simulator one after the other, as a video.
+///
+/// Works for robomimic files and raw robosuite recordings, which hold the states, and for converted data sets with
+/// their side folder `actrm/`, from which the states are taken back. Nothing is simulated but what follows the last
+/// action. Drawing needs EGL or OSMesa; the encoder comes with Python's opencv-python-headless.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-data replay lift.hdf5 --demo 3 --video lift_3.mp4
+  actrm-data replay lift --demo demo_3 --video lift_3.mp4 --camera frontview --size 512")]
+pub struct Args {
+    /// File or data set directory
+    input: PathBuf,
+    /// Demonstration: its number or its name
+    #[arg(long, value_name = "DEMO")]
+    demo: String,
+    /// Video to create (MPEG-4)
+    #[arg(long, value_name = "OUT")]
+    video: PathBuf,
+    /// Camera
+    #[arg(long, value_name = "NAME", default_value = "agentview")]
+    camera: String,
+    /// Side of the images, in pixels
+    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=1024))]
+    size: u16,
+    #[command(flatten)]
+    simulator: SimulatorArgs,
+    /// Report as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    simulator::refuse_existing(&args.video)?;
+    // a data set is taken back to the file that it was made of
+    let rebuilt = tempfile::tempdir().context("a folder for the rebuilt file")?;
+    let file = match args.input.is_dir() {
+        true => rebuild(&args.input, rebuilt.path())?,
+        false => args.input.clone(),
+    };
+    let (task, recorded) = read(args, &file)?;
+    let id = recorded.id.clone();
+    let recording = Recording::of(&recorded).with_context(|| args.input.display().to_string())?;
+    let steps = rows(&recording.actions);
+    if steps == 0 || rows(&recording.states) != steps {
+        let found = rows(&recording.states);
+        bail!("{}: {id}: states: expected {steps} rows, one an action and at least one, found {found}", file.display());
+    }
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let mut pool = args.simulator.start(&task, std::slice::from_ref(&args.camera), args.size, &stop)?;
+    let size = (usize::from(args.size), usize::from(args.size));
+    let rate = pool.ready().control_freq;
+    let mut encoder = Encoder::start(&args.simulator.python()?, &args.video, size, rate)?;
+    let bar = output::bar("steps").with_message(format!("drawing {id}"));
+    bar.set_length(steps as u64);
+    let parts = steps.div_ceil(PART);
+    let part = |job: u64| job as usize * PART..steps.min((job as usize + 1) * PART);
+    let work = |(): &mut (), worker: &mut Worker, job: u64| {
+        let Recording { model, ep_meta, states, actions } = &recording;
+        let cut = |tensor: &FrameTensor| slice(tensor, part(job));
+        Ok(worker.extract(model, ep_meta, cut(states), cut(actions))?)
+    };
+    let (mut success, mut images) = (false, 0);
+    let mut failure: Option<anyhow::Error> = None;
+    let end = pool.run(0..parts as u64, &|job| job, &|| Ok(()), &work, &mut |job, result| {
+        let last = job + 1 == parts as u64;
+        let drawn = result.map_err(anyhow::Error::from).and_then(|episode| {
+            success |= episode.success;
+            let drawn = pictures(&args.camera, size, &episode, last)?;
+            drawn.iter().try_for_each(|image| encoder.push(image))?;
+            images += drawn.len();
+            Ok(())
+        });
+        bar.set_position(part(job).end as u64);
+        match drawn {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(error) => {
+                failure = Some(error);
+                ControlFlow::Break(())
+            }
+        }
+    });
+    bar.finish_and_clear();
+    simulator::close(pool);
+    let end = end?;
+    if let Some(error) = failure {
+        return Err(error.context(format!("{}: {id}", args.input.display())));
+    }
+    if end == RunEnd::Stopped {
+        bail!("stopped after {images} of {} images; nothing was written", steps + 1);
+    }
+    encoder.finish()?;
+    if args.json {
+        output::print_json(&json!({
+            "video": args.video, "task": task, "demo": id, "images": images, "rate": rate, "success": success,
+        }))?;
+    } else {
+        let word = if success { "success" } else { "no success" };
+        output::print(&format!("{}: {task} {id}, {images} images at {rate} Hz, {word}\n", args.video.display()))?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn rebuild(set: &Path, folder: &Path) -> Result<PathBuf> {
+    let file = folder.join("source.hdf5");
+    let bar = output::bar("frames").with_message("rebuilding the recording");
+    let report = dataset::export(set, &file, &WriteOptions::default(), &mut output::advance(&bar));
+    bar.finish_and_clear();
+    report?;
+    Ok(file)
+}
+
+/// The task and the demo that was asked for, with what replaying needs.
+fn read(args: &Args, file: &Path) -> Result<(String, Demo)> {
+    let shown = args.input.display();
+    let source = Source::open_guarded(file)?;
+    let plan = source.plan();
+    let Some(task) = plan.env_name.clone() else {
+        bail!("{shown}: names no environment: expected env_args, env_info or env");
+    };
+    let names = [args.demo.clone(), format!("demo_{}", args.demo)];
+    let Some(index) = plan.demos.iter().position(|demo| names.contains(&demo.id)) else {
+        let (first, last) = (plan.demos.first(), plan.demos.last());
+        let range = first.zip(last).map_or("none".to_owned(), |(first, last)| format!("{} to {}", first.id, last.id));
+        bail!("{shown}: no demo {:?}; there are {}: {range}", args.demo, plan.demos.len());
+    };
+    for key in ["states", "actions"] {
+        if !plan.demos[index].keys.contains_key(key) {
+            bail!("{shown}: {}: no {key}; replaying needs states and actions", plan.demos[index].id);
+        }
+    }
+    let demo = source.read_demo_where(index, &|key| key == "states" || key == "actions")?;
+    Ok((task, demo))
+}
+
+fn rows(tensor: &FrameTensor) -> usize {
+    tensor.shape.first().copied().unwrap_or(0)
+}
+
+/// Some rows of a matrix.
+fn slice(tensor: &FrameTensor, rows: Range<usize>) -> FrameTensor {
+    let width = tensor.bytes.len() / tensor.shape[0].max(1);
+    let mut shape = tensor.shape.clone();
+    shape[0] = rows.len();
+    FrameTensor { dtype: tensor.dtype, shape, bytes: tensor.bytes[rows.start * width..rows.end * width].to_vec() }
+}
+
+/// The images of a part; of the last one also what the last action led to.
+fn pictures(camera: &str, size: (usize, usize), episode: &RecordedEpisode, last: bool) -> Result<Vec<Image>> {
+    let (height, width) = size;
+    let take = |group: &str| {
+        let name = format!("{group}/{camera}_image");
+        match episode.tensors.get(&name) {
+            Some(tensor) if tensor.dtype == Dtype::U8 && tensor.shape == [episode.steps, height, width, 3] => {
+                Ok(tensor.bytes.chunks_exact(height * width * 3))
+            }
+            Some(tensor) => {
+                bail!("{name}: expected U8[{}, {height}, {width}, 3], found {:?}", episode.steps, tensor.shape)
+            }
+            None => bail!("{name}: the worker drew nothing"),
+        }
+    };
+    let image = |rgb: &[u8]| Image { height, width, rgb: rgb.to_vec() };
+    let mut images: Vec<Image> = take("obs")?.map(image).collect();
+    if last {
+        images.extend(take("next_obs")?.next_back().map(image));
+    }
+    Ok(images)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_rows() {
+        let whole = FrameTensor::from_f64(&[3, 2], &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
+        assert_eq!(slice(&whole, 1..3), FrameTensor::from_f64(&[2, 2], &[2.0, 3.0, 4.0, 5.0]));
+        assert_eq!(slice(&whole, 0..0).shape, [0, 2]);
+    }
+}
