@@ -15,7 +15,8 @@ fn collect(out: &Path, more: &[&str]) -> Command {
 
 /// Runs it until its first attempt is on disk and kills it there.
 fn killed(out: &Path) {
-    let mut child = collect(out, &["--workers", "1"]).stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("it starts");
+    let mut child =
+        collect(out, &["--workers", "1"]).stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("it starts");
     let attempts = out.with_file_name(format!(".{}.attempts", out.file_name().expect("a file").to_string_lossy()));
     let until = Instant::now() + Duration::from_secs(120);
     while !listing(&attempts).iter().any(|name| name.starts_with("attempt-")) {

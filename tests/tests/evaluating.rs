@@ -9,8 +9,7 @@ use e2e::{copied_zoo, data, lift, listing, refused, succeeds, text, train_lift, 
 
 /// An evaluation of the trained entry: short episodes, whose number does not matter to what is tested.
 fn eval(entries: &Path, episodes: &str, more: &[&str]) -> Command {
-    let mut command =
-        zoo(["eval", "lift-act@1", "--max-steps", "6", "--episodes", episodes, "--zoo", text(entries)]);
+    let mut command = zoo(["eval", "lift-act@1", "--max-steps", "6", "--episodes", episodes, "--zoo", text(entries)]);
     command.args(more);
     command
 }

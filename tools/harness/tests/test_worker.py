@@ -103,6 +103,17 @@ def test_replaying_a_demos_actions_gives_its_states(lift: Client) -> None:
         assert message["reward"] == data["rewards"][index]
 
 
+def test_actions_in_one_request_end_where_the_task_is_solved(lift: Client) -> None:
+    _, data = lift.ask("expert", seed=1_000_001)
+    lift.ask("reset", seed=1_000_001)
+    message, seen = lift.ask("step", {"action": data["actions"]})
+    solved = int(np.argmax(data["rewards"] > 0))
+    assert solved + 1 < len(data["actions"]), "the expert stays a while"
+    assert message["success"] and message["reward"] == 1.0
+    assert np.array_equal(seen["rewards"], data["rewards"][: solved + 1])
+    assert seen["obs/object"].tobytes() == data["next_obs/object"][solved].tobytes()
+
+
 def test_extract_gives_the_observations_of_stored_states(lift: Client) -> None:
     message, data = lift.ask("expert", seed=1_000_002)
     stored = {"states": data["states"], "actions": data["actions"]}
@@ -126,6 +137,7 @@ def test_extract_gives_the_observations_of_stored_states(lift: Client) -> None:
         ("step", {}, {"action": np.zeros(6)}, "bad_action", r"\(7,\)"),
         ("step", {}, {"action": np.full(7, np.nan)}, "bad_action", "not finite"),
         ("step", {}, {"action": np.zeros(7, dtype=np.float32)}, "bad_action", "F64"),
+        ("step", {}, {"action": np.zeros((0, 7))}, "bad_action", "no action"),
         ("step", {}, {}, "bad_request", "'action' is missing"),
         ("reset", {}, {}, "bad_request", "seed"),
         ("reset", {"seed": -1}, {}, "bad_request", "seed"),
