@@ -169,6 +169,24 @@ def step_session(session: Session, action: Array) -> StepResult:
     return replace(result, observation={**result.observation, **images(session)})
 
 
+def steps_session(session: Session, actions: list[Array]) -> tuple[StepResult, Array]:
+    """Control steps, one after the other until the task is solved: what the last one led to, and all rewards.
+
+    What is seen between them is not looked at.
+    """
+    env, control = session.env, session.control
+    raw: dict[str, Array] = {}
+    rewards: list[float] = []
+    solved = False
+    for action in actions:
+        raw, reward, _, _ = env.step(action) if control is None else control.step(action)
+        rewards.append(float(reward))
+        solved = success(env)
+        if solved:
+            break
+    return StepResult({**observation(raw), **images(session)}, rewards[-1], solved), np.array(rewards)
+
+
 def image(session: Session, camera: str, height: int, width: int) -> Array:
     """What a camera sees now; the OpenGL context is made when the first image is asked for."""
     if session.renderer is None:
