@@ -179,9 +179,10 @@ def steps_session(session: Session, actions: list[Array]) -> tuple[StepResult, A
     rewards: list[float] = []
     solved = False
     for action in actions:
-        raw, reward, _, _ = env.step(action) if control is None else control.step(action)
+        with judged_once(env):
+            raw, reward, _, _ = env.step(action) if control is None else control.step(action)
+            solved = success(env)
         rewards.append(float(reward))
-        solved = success(env)
         if solved:
             break
     return StepResult({**observation(raw), **images(session)}, rewards[-1], solved), np.array(rewards)
