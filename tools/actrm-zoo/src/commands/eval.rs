@@ -188,6 +188,9 @@ fn subject(args: &EvalArgs, loaded: &LoadedEntry) -> anyhow::Result<Subject<'sta
         subject.execution = Execution::RecedingHorizon { n_action_steps };
     }
     if let Some(coefficient) = args.temporal_ensemble {
+        if !coefficient.is_finite() {
+            bail!("--temporal-ensemble: expected a finite number, found {coefficient}");
+        }
         subject.execution = Execution::TemporalEnsemble { coefficient };
     }
     Ok(subject)
