@@ -82,6 +82,25 @@ def test_the_expert_solves_the_task(task: str) -> None:
     assert all(solved)
 
 
+@pytest.mark.usefixtures("library")
+@pytest.mark.parametrize("task", ["Stack", "StackThreeCubes"])
+def test_reward_and_success_are_what_the_state_says(task: str) -> None:
+    """A step judges the state once; judged anew, it says the same at every step of a solved episode."""
+    session = envs.make(task)
+    session.control = control.attach(session.env)
+    demo = episodes.expert_episode(session, 1_000_000)
+    envs.reset(session, 1_000_000)
+    verdicts: set[tuple[float, bool]] = set()
+    for action in demo.tensors["actions"]:
+        result = envs.step_session(session, action)
+        assert result.success == envs.success(session.env)
+        assert result.reward == session.env.reward(action)
+        verdicts.add((result.reward, result.success))
+    assert len(verdicts) >= 2
+    assert "staged_rewards" not in vars(session.env)
+    session.env.close()
+
+
 def test_extract_works_where_the_reward_wants_an_action() -> None:
     """Robosuite's Stack.reward() cannot be called without one; robomimic 0.5 fails there."""
     session = envs.make("Stack")
