@@ -25,10 +25,10 @@ pub use error::{DatasetError, InputError, Result};
 pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, Check, Column, ConvertOptions, ConvertReport, Dataset, ENVIRONMENT_STATE,
     EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info, Provenance, RotationForm, STATE, convert,
-    export, verify,
+    export, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
-pub use source::{ArrayHasher, ContentHasher, DemoHasher, RobomimicWriter, Source, WriteOptions, isolation};
+pub use source::{RobomimicWriter, Source, WriteOptions, isolation};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};
 pub use windows::{WindowBatch, WindowSpec, Windows};

@@ -160,7 +160,10 @@ impl FeatureStats {
         }
         wanted.sort_unstable();
         wanted.dedup();
-        select_ranks(values, 0, &wanted);
+        // index columns, rewards and dones mostly are in order already
+        if !values.is_sorted_by(|a, b| a.order(b).is_le()) {
+            select_ranks(values, 0, &wanted);
+        }
         let at = |rank: usize| values[rank].to_f64();
         self.min.push(low);
         self.max.push(high);

@@ -4,7 +4,7 @@
 
 use dataset::{
     Array, ConvertOptions, Dataset, DatasetError, Demo, ImageForm, RobomimicWriter, RotationForm, Source, WindowBatch,
-    WindowSpec, WriteOptions, convert, export, verify,
+    WindowSpec, WriteOptions, convert, export, verify, verify_source,
 };
 use proptest::prelude::*;
 use std::collections::BTreeMap;
@@ -127,9 +127,9 @@ fn the_same_bytes_whatever_the_number_of_threads() {
 fn small_files_change_the_shards_and_nothing_else() {
     let dir = tempfile::tempdir().unwrap();
     let (small, whole, bare) = (dir.path().join("small"), dir.path().join("whole"), dir.path().join("bare"));
-    // every row group begins a file; the demos are too short for several row groups, so take a longer set
+    // every row group begins a file; the fixture's demos are too short for several row groups
     let long = dir.path().join("long.hdf5");
-    write_demos(&long, &(0..30).map(|i| synthetic(i, 100, false)).collect::<Vec<_>>());
+    write_demos(&long, &(0..30).map(|i| synthetic(i, 400, false)).collect::<Vec<_>>());
     convert(&long, &small, &ConvertOptions { data_file_mb: 0.001, ..options() }, &mut quiet).unwrap();
     convert(&long, &whole, &options(), &mut quiet).unwrap();
     convert(&long, &bare, &ConvertOptions { lossless: false, ..options() }, &mut quiet).unwrap();
@@ -275,6 +275,55 @@ fn pictures_are_the_same_in_both_forms_and_on_the_way_back() {
         assert!(content(&back) == content(&file), "{name}");
     }
     assert_eq!(fingerprints[0], fingerprints[1]);
+}
+
+#[test]
+fn a_source_that_changed_is_told_from_the_one_that_was_converted() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("lift.hdf5"), dir.path().join("set"));
+    std::fs::copy(fixture(), &source).unwrap();
+    convert(&source, &out, &ConvertOptions::default(), &mut quiet).unwrap();
+    assert_eq!(verify_source(&out, &source).unwrap().problem, None);
+    let mut bytes = std::fs::read(&source).unwrap();
+    // the first number of the first demo's `obs/object`: every reader takes it
+    bytes[27080 + 3] ^= 1;
+    std::fs::write(&source, bytes).unwrap();
+    assert!(content(&source) != content(&fixture()));
+    let problem = verify_source(&out, &source).unwrap().problem.unwrap();
+    assert!(problem.contains("lift.hdf5: expected sha256 ") && problem.contains(", found "), "{problem}");
+    std::fs::remove_file(out.join("actrm/manifest.json")).unwrap();
+    let checks = verify(&out, &mut quiet).unwrap();
+    assert!(checks.iter().any(|c| c.problem.as_deref() == Some("actrm/manifest.json is missing")), "{checks:?}");
+}
+
+#[test]
+fn pictures_that_are_not_colour_stay_beside_and_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let (file, out, back) = (dir.path().join("a.hdf5"), dir.path().join("set"), dir.path().join("b.hdf5"));
+    let mut demo = synthetic(0, 6, true);
+    demo.datasets.insert("obs/depth".to_owned(), Array::from_f32(vec![6, 4, 4, 1], &[0.5; 96]));
+    demo.datasets.insert("obs/grey".to_owned(), Array::from_u8(vec![6, 4, 4, 1], &[7; 96]));
+    demo.datasets.insert("obs/rgba".to_owned(), Array::from_u8(vec![6, 4, 4, 4], &[9; 384]));
+    demo.datasets.insert("obs/images/cam_high".to_owned(), Array::from_u8(vec![6, 5], &[0xff; 30]));
+    write_demos(&file, &[demo]);
+    let report = convert(&file, &out, &options(), &mut quiet).unwrap();
+    let visual: Vec<&str> = report.features.iter().filter(|(_, t, _)| t == "image").map(|(n, ..)| n.as_str()).collect();
+    assert_eq!(visual, ["observation.images.agentview"]);
+    for (name, what) in [
+        ("obs/depth", "float32 [4, 4, 1]"),
+        ("obs/grey", "uint8 [4, 4, 1]"),
+        ("obs/rgba", "uint8 [4, 4, 4]"),
+        ("obs/images/cam_high", "encoded images, uint8 [5]"),
+    ] {
+        let note = report.notes.iter().find(|n| n.starts_with(name)).unwrap();
+        assert!(note.contains(what) && note.contains("side folder"), "{note}");
+    }
+    export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
+    assert!(content(&back) == content(&file));
+    let bare = ConvertOptions { lossless: false, state_keys: Some(vec![]), ..options() };
+    let report = convert(&file, &dir.path().join("bare"), &bare, &mut quiet).unwrap();
+    assert!(report.notes.iter().any(|n| n.starts_with("obs/depth") && n.contains("left out")), "{:?}", report.notes);
+    assert!(report.features.iter().all(|(name, ..)| name != "observation.state"));
 }
 
 /// Options for files without an environment.

@@ -19,6 +19,16 @@ pub enum QueryError {
         /// The engine's words.
         source: PolarsError,
     },
+    /// A statement that changes something, or is none.
+    #[error(
+        "cannot answer {sql:?}: expected a statement that begins with SELECT, WITH, SHOW or EXPLAIN, found {found:?}"
+    )]
+    NoQuestion {
+        /// The statement.
+        sql: String,
+        /// Its first word.
+        found: String,
+    },
     /// A table could not be made of the data set.
     #[error("cannot make the table {table}")]
     Table {
@@ -52,6 +62,11 @@ fn both(dataset: &Dataset) -> Result<[(&'static str, DataFrame); 2], QueryError>
 /// # Errors
 /// When the engine refuses the statement.
 pub fn query(dataset: &Dataset, sql: &str) -> Result<QueryResult, QueryError> {
+    let first = sql.trim_start_matches(|c: char| c.is_whitespace() || c == '(');
+    let first = first.split(|c: char| !c.is_alphanumeric()).next().unwrap_or_default();
+    if !["SELECT", "WITH", "SHOW", "EXPLAIN"].iter().any(|word| first.eq_ignore_ascii_case(word)) {
+        return Err(QueryError::NoQuestion { sql: sql.to_owned(), found: first.to_owned() });
+    }
     let refused = |source: PolarsError| QueryError::Refused { sql: sql.to_owned(), source };
     let mut context = SQLContext::new();
     for (name, table) in both(dataset)? {

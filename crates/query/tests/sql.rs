@@ -41,12 +41,15 @@ fn sums_counts_and_joins_agree_with_the_columns() {
 fn a_wrong_query_names_what_is_wrong() {
     let dir = tempfile::tempdir().unwrap();
     let set = set(dir.path());
-    for (sql, word) in [("SELECT nothing FROM frames", "nothing"), ("SELECT * FROM steps", "steps"), ("hello", "hello")]
-    {
+    for (sql, word) in [("SELECT nothing FROM frames", "nothing"), ("SELECT * FROM steps", "steps")] {
         let error = query::query(&set, sql).unwrap_err();
         let source = std::error::Error::source(&error).unwrap().to_string();
         assert!(error.to_string().contains(sql), "{error}");
         assert!(source.contains(word), "{source}");
+    }
+    for (sql, found) in [("hello", "\"hello\""), ("DROP TABLE frames", "\"DROP\""), ("", "\"\"")] {
+        let error = query::query(&set, sql).unwrap_err().to_string();
+        assert!(error.contains("SELECT") && error.contains(found), "{error}");
     }
     assert!(query::tables(&set).unwrap().iter().any(|(t, c, _)| *t == "frames" && c == "object_3"));
 }

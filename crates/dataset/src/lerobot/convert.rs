@@ -13,13 +13,12 @@ use super::shards::{GroupEncoder, Place, ShardWriter, WrittenFile};
 use super::side::{self, SideEncoder, SideOutput, SideWriter};
 use super::staging::Staging;
 use super::values::{Values, stats_of};
-use super::verify::hash_file;
+use super::verify::hash_source;
 use super::work::{self, Part};
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::Plan;
 use crate::source::Source;
 use crate::stats::FeatureStats;
-use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -65,7 +64,7 @@ pub fn convert(
     let conversion = Conversion { source, plan, mapping: &mapping, options, root: staging.path() };
     let report = std::thread::scope(|scope| {
         // the file's hash needs nothing of what the conversion does
-        let hash = scope.spawn(|| hash_source(plan));
+        let hash = scope.spawn(|| hash_source(source));
         let frames = conversion.write_frames(&input, progress)?;
         let hash = hash.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         conversion.write_meta(frames, hash)
@@ -368,16 +367,4 @@ impl<'a> Collected<'a> {
         }
         (self.rows, stats, self.fingerprint.finish())
     }
-}
-
-/// sha256 of the source file; of a folder, of the lines `<sha256>  <name>`.
-fn hash_source(plan: &Plan) -> Result<String> {
-    let mut lines = String::new();
-    let mut single = String::new();
-    for (path, _) in &plan.files {
-        single = hash_file(path)?;
-        let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
-        lines.push_str(&format!("{single}  {name}\n"));
-    }
-    Ok(if plan.files.len() == 1 { single } else { schema::hex(&Sha256::digest(lines)) })
 }

@@ -101,8 +101,8 @@ fn side_folder(root: &Path, info: &Info) -> Result<Layout> {
     let manifest_path = root.join(MANIFEST_FILE);
     if !manifest_path.exists() {
         let found = match info.actrm {
-            Some(_) => "it was converted without (--no-lossless)",
-            None => "it was not converted from demonstrations",
+            Some(_) => "a data set that was converted without one (--no-lossless)",
+            None => "a data set that was not converted from demonstrations",
         };
         return Err(DatasetError::NotInDataset {
             path: root.to_path_buf(),

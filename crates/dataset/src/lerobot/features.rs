@@ -4,7 +4,7 @@ use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm}
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::{DemoPlan, KeyPlan, Plan};
 use serde_json::{Value, json};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Default keys of `observation.state`: the first set that is there whole wins. Robots after the first
 /// (`robot1_...`) are added to robomimic's.
@@ -34,9 +34,11 @@ pub enum ImageForm {
 /// What a conversion may be told; the defaults are robomimic's.
 #[derive(Debug, Clone)]
 pub struct ConvertOptions {
-    /// Observation keys of `observation.state`; `None` takes the defaults of the layout.
+    /// Observation keys of `observation.state`; `None` takes the defaults of the layout, an empty list makes no such
+    /// column.
     pub state_keys: Option<Vec<String>>,
-    /// Observation keys of `observation.environment_state`; `None` takes `object` where it is there.
+    /// Observation keys of `observation.environment_state`; `None` takes `object` where it is there, an empty list makes
+    /// no such column.
     pub env_keys: Option<Vec<String>>,
     /// Frames a second; `None` takes the control frequency that the source states.
     pub fps: Option<f64>,
@@ -141,16 +143,18 @@ impl Mapping {
         let chooser = Chooser { plan, first };
         let state_keys = chooser.state_keys(options)?;
         let env_keys = chooser.env_keys(options)?;
-        let mut columns = vec![chooser.concat("observation.state", &state_keys)?];
-        if !env_keys.is_empty() {
-            columns.push(chooser.concat("observation.environment_state", &env_keys)?);
+        let mut columns = Vec::new();
+        for (name, keys) in [("observation.state", &state_keys), ("observation.environment_state", &env_keys)] {
+            if !keys.is_empty() {
+                columns.push(chooser.concat(name, keys)?);
+            }
         }
         columns.extend(chooser.images()?);
         let (action, provenance) = chooser.action(options)?;
         columns.push(action);
         columns.extend(chooser.outcomes()?);
         columns.extend(index_columns());
-        let mut notes = Vec::new();
+        let mut notes = chooser.pictures_left_out(options.lossless);
         let fps = chooser.fps(options, &mut notes)?;
         Ok(Self { columns, fps, state_keys, env_keys, action: provenance, notes })
     }
@@ -284,6 +288,28 @@ impl Chooser<'_> {
             });
         }
         Ok(columns)
+    }
+
+    /// What looks like pictures and becomes no column: LeRobot's policies take 8-bit colour images of three channels,
+    /// and a made-up channel would not be the recording's.
+    fn pictures_left_out(&self, lossless: bool) -> Vec<String> {
+        let mut found: BTreeMap<&str, String> = BTreeMap::new();
+        for (path, key) in self.plan.demos.iter().flat_map(|d| &d.keys) {
+            let shape = key.shape.get(1..).unwrap_or_default();
+            let what = match shape {
+                _ if !path.starts_with("obs/") => continue,
+                [_, _, 3] if key.is_image() => continue,
+                [_, _, 1 | 3 | 4] => format!("{} {shape:?}", key.dtype),
+                // a row of bytes a step under the name of a camera: JPEG files, as newer ALOHA recordings have them
+                [_] | [] if path.starts_with("obs/images/") => format!("encoded images, {} {shape:?}", key.dtype),
+                _ => continue,
+            };
+            found.entry(path).or_insert(what);
+        }
+        let fate = if lossless { "the side folder keeps it as stored" } else { "it is left out (--no-lossless)" };
+        let note =
+            |(path, what)| format!("{path} ({what}) becomes no column, only uint8 [height, width, 3] does; {fate}");
+        found.into_iter().map(note).collect()
     }
 
     /// Rewards, dones and success, where the demos have them. A file that has none gets no such columns.

@@ -23,4 +23,4 @@ pub use export::{ExportReport, export};
 pub use features::{ConvertOptions, ImageForm};
 pub use info::{ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm};
 pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};
-pub use verify::{Check, verify};
+pub use verify::{Check, verify, verify_source};

@@ -8,6 +8,7 @@ use super::open::{Dataset, read_json};
 use super::schema;
 use super::side::{MANIFEST_FILE, Manifest};
 use crate::error::{DatasetError, Result};
+use crate::source;
 use crate::stats::FeatureStats;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -32,6 +33,20 @@ pub(crate) fn hash_file(path: &Path) -> Result<String> {
     }
 }
 
+/// sha256 of a source file; of a folder, of the lines `<sha256>  <name>` of its files.
+pub(crate) fn hash_source(path: &Path) -> Result<String> {
+    let files = source::files(path)?;
+    if let [single] = files.as_slice() {
+        return hash_file(single);
+    }
+    let mut lines = String::new();
+    for file in &files {
+        let name = file.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
+        lines.push_str(&format!("{}  {name}\n", hash_file(file)?));
+    }
+    Ok(schema::hex(&Sha256::digest(lines)))
+}
+
 /// What a check found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Check {
@@ -41,13 +56,37 @@ pub struct Check {
     pub problem: Option<String>,
 }
 
+const FILES_CHECK: &str = "files have the hashes recorded";
+
+/// Compares a file or folder of demonstrations with the hash that was recorded when the data set at `root` was made
+/// of it: a change that every reader accepts in silence shows here.
+pub fn verify_source(root: &Path, source: &Path) -> Result<Check> {
+    let info: Info = read_json(&root.join("meta/info.json"))?;
+    let Some(provenance) = info.actrm else {
+        return Err(DatasetError::NotInDataset {
+            path: root.to_path_buf(),
+            wanted: "hash of a source".to_owned(),
+            found: "a data set that was not converted from demonstrations".to_owned(),
+        });
+    };
+    let found = hash_source(source)?;
+    let problem = (found != provenance.source_sha256).then(|| {
+        let name = source.display();
+        format!("{name}: expected sha256 {} as at the conversion, found {found}", provenance.source_sha256)
+    });
+    Ok(Check { name: "the source is what was converted", problem })
+}
+
 /// Runs every check on the data set at `root`: that it opens, that its columns are finite, that its statistics
 /// follow from its frames, that its content has the recorded fingerprint and its files the recorded hashes.
 /// An error means that a check could not be made.
 pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Check>> {
     let mut checks = Vec::new();
     let mut note = |name, problem| checks.push(Check { name, problem });
-    note("files have the hashes recorded", manifest_problem(root)?);
+    let manifest = root.join(MANIFEST_FILE).exists();
+    if manifest {
+        note(FILES_CHECK, manifest_problem(root)?);
+    }
     let dataset = match Dataset::open(root) {
         Ok(dataset) => {
             note("it opens: columns, episodes and tasks agree", None);
@@ -58,6 +97,9 @@ pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Che
             return Ok(checks);
         }
     };
+    if !manifest && dataset.provenance().is_some_and(|p| p.lossless) {
+        note(FILES_CHECK, Some(format!("{MANIFEST_FILE} is missing")));
+    }
     note("every number is finite", not_finite(&dataset));
     note("statistics follow from the frames", statistics_problem(&dataset)?);
     note("splits name episodes", split_problem(&dataset));
@@ -72,11 +114,7 @@ pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Che
 }
 
 fn manifest_problem(root: &Path) -> Result<Option<String>> {
-    let path = root.join(MANIFEST_FILE);
-    if !path.exists() {
-        return Ok(None);
-    }
-    let manifest: Manifest = match read_json(&path) {
+    let manifest: Manifest = match read_json(&root.join(MANIFEST_FILE)) {
         Ok(manifest) => manifest,
         Err(e) => return Ok(Some(e.to_string())),
     };

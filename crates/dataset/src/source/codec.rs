@@ -1,4 +1,4 @@
-//! Trees as bytes: how they cross from the reading process, and what is hashed.
+//! Trees as bytes: how they cross from the reading process.
 
 use crate::tree::{Array, Attrs, Demo, Dtype};
 
@@ -48,7 +48,7 @@ fn put_text(out: &mut Vec<u8>, text: &str) {
     out.extend_from_slice(text.as_bytes());
 }
 
-/// A number for each type, and the width of fixed-length strings. Part of the content hash: never renumbered.
+/// A number for each type, and the width of fixed-length strings.
 pub(super) fn code_of(dtype: &Dtype) -> (u8, usize) {
     match dtype {
         Dtype::U8 => (0, 0),

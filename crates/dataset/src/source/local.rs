@@ -33,7 +33,7 @@ const KEEP_OPEN: usize = 64;
 impl Local {
     /// Opens a file, or a folder of files, and plans it; `beat` is called as the work goes on.
     pub fn open(path: &Path, beat: &mut dyn FnMut()) -> Result<(Self, Plan), InputError> {
-        let paths = if path.is_dir() { files_of(path)? } else { vec![path.to_owned()] };
+        let paths = files(path)?;
         let keep = paths.len() <= KEEP_OPEN;
         let files = paths.iter().map(|p| Walked::open(p, keep, beat)).collect::<Result<Vec<_>, _>>()?;
         let survey = Survey { path: path.to_owned(), files };
@@ -67,14 +67,21 @@ impl Local {
     }
 }
 
-/// The HDF5 files of a folder, by the number in their names and then by name.
+/// The files of a source: itself, or those of a folder.
+pub(crate) fn files(path: &Path) -> Result<Vec<PathBuf>, InputError> {
+    if path.is_dir() { files_of(path) } else { Ok(vec![path.to_owned()]) }
+}
+
+/// The HDF5 files of a folder, by the number in their names and then by name. Hidden ones are somebody's work in
+/// progress.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
     let unreadable = |e: std::io::Error| InputError::Unreadable { path: folder.to_owned(), reason: e.to_string() };
     let mut found = Vec::new();
     let mut others = BTreeSet::new();
     for entry in std::fs::read_dir(folder).map_err(unreadable)? {
         let path = entry.map_err(unreadable)?.path();
-        if path.is_file() && check_signature(&path).is_ok() {
+        let hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
+        if !hidden && path.is_file() && check_signature(&path).is_ok() {
             found.push(path);
         } else if let Some(name) = path.file_name() {
             others.insert(name.to_string_lossy().into_owned());

@@ -2,7 +2,6 @@
 
 mod codec;
 mod dialect;
-mod hash;
 pub mod isolation;
 mod local;
 mod value;
@@ -10,15 +9,16 @@ mod walk;
 mod writer;
 
 use std::fs::File;
-use std::os::unix::fs::FileExt;
 use std::path::Path;
+
+use rustix::buffer::spare_capacity;
 
 use crate::error::{InputError, Result};
 use crate::plan::{DemoPlan, KeyPlan, Plan};
 use crate::tree::{Array, Demo, Dtype};
 use local::{Backend, Local};
 
-pub use hash::{ArrayHasher, ContentHasher, DemoHasher};
+pub(crate) use local::files;
 pub use writer::{RobomimicWriter, WriteOptions};
 
 /// The most that [`Source::read_demo`] reads at once.
@@ -186,31 +186,6 @@ impl Source {
         Ok(array)
     }
 
-    /// The hash of everything in the source, independent of how it is laid out in the file.
-    pub fn content_hash(&self, progress: &mut dyn FnMut(u64, u64)) -> Result<String> {
-        let mut hasher = ContentHasher::new();
-        hasher.root(&self.root()?);
-        let total = self.plan.demos.len() as u64;
-        for (index, plan) in self.plan.demos.iter().enumerate() {
-            let small = |k: &KeyPlan| k.bytes().is_none_or(|b| b <= WINDOW);
-            let demo = self.read_demo_where(index, &|key| plan.keys.get(key).is_none_or(small))?;
-            let mut one = DemoHasher::new(&demo);
-            for (key, k) in plan.keys.iter().filter(|(_, k)| !small(k)) {
-                let rows = k.shape.first().copied().unwrap_or(0);
-                let row = k.bytes().unwrap_or(0) / rows.max(1) as u64;
-                let window = ((WINDOW / row.max(1)) as usize / k.block_rows).max(1) * k.block_rows;
-                let mut array = ArrayHasher::new(&k.dtype, &k.shape);
-                for first in (0..rows).step_by(window) {
-                    array.update(&self.read_rows(index, key, first, window.min(rows - first))?.bytes);
-                }
-                one.dataset(key, array.finish());
-            }
-            hasher.demo(&plan.id, one.finish());
-            progress(index as u64 + 1, total);
-        }
-        Ok(hasher.finish())
-    }
-
     /// The demo's plan, if nothing fatal is known about what is wanted of it.
     fn check(&self, index: usize, wanted: &dyn Fn(&str) -> bool) -> Result<&DemoPlan, InputError> {
         let plan = self.plan.demos.get(index).ok_or_else(|| InputError::NoSuch {
@@ -236,13 +211,13 @@ impl Source {
         let size = k.dtype.size().expect("elements of a known place have a known size");
         let row = k.shape.iter().skip(1).product::<usize>() * size;
         let offset = k.place.offset.expect("the place is known") + (first * row) as u64;
-        let mut bytes = vec![0; shape.iter().product::<usize>() * size];
+        let wanted = shape.iter().product::<usize>() * size;
         let (path, stated) = &self.plan.files[k.place.file];
         let read = match self.files.get(k.place.file) {
-            Some(file) => file.read_exact_at(&mut bytes, offset),
-            None => open_file(path)?.read_exact_at(&mut bytes, offset),
+            Some(file) => read_at(file, offset, wanted),
+            None => read_at(&open_file(path)?, offset, wanted),
         };
-        read.map_err(|e| match e.kind() {
+        let bytes = read.map_err(|e| match e.kind() {
             std::io::ErrorKind::UnexpectedEof => InputError::Truncated {
                 path: path.clone(),
                 expected: *stated,
@@ -291,10 +266,28 @@ fn exists(path: &Path) -> Result<(), InputError> {
     }
 }
 
+/// Reads so many bytes from there, into memory that is not cleared first.
+fn read_at(file: &File, offset: u64, wanted: usize) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(wanted);
+    while bytes.len() < wanted {
+        let at = offset + bytes.len() as u64;
+        match rustix::io::pread(file, spare_capacity(&mut bytes), at) {
+            Ok(0) => return Err(std::io::ErrorKind::UnexpectedEof.into()),
+            Ok(_) | Err(rustix::io::Errno::INTR) => {}
+            Err(e) => return Err(e.into()),
+        }
+    }
+    // a vector may have room for more than was asked for
+    bytes.truncate(wanted);
+    Ok(bytes)
+}
+
 fn open_file(path: &Path) -> Result<File, InputError> {
     File::open(path).map_err(|e| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() })
 }
 
+#[cfg(test)]
+mod content_hash;
 #[cfg(test)]
 mod dialect_tests;
 #[cfg(test)]

@@ -10,7 +10,8 @@ use std::time::Instant;
 ///
 /// Columns: observation.state, observation.environment_state, observation.images.<camera>, action, next.reward,
 /// next.done, next.success, and the five index columns. What the format has no place for is kept in the side folder
-/// `actrm/`, from which `actrm-data export` rebuilds the source. OUT appears whole or not at all.
+/// `actrm/`, from which `actrm-data export` rebuilds the source; so are pictures that are not 8-bit colour (depth, grey,
+/// RGBA, encoded JPEG), and a note says so. OUT appears whole or not at all.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data convert data/lift.hdf5 lift
@@ -25,11 +26,12 @@ pub struct Args {
     /// Observation keys of observation.state, in order [default: those of the file's layout]
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     state_keys: Option<Vec<String>>,
-    /// Observation keys of observation.environment_state, in order [default: object, where there is one]
+    /// Observation keys of observation.environment_state, in order; "" makes no such column [default: object, where
+    /// there is one]
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     env_keys: Option<Vec<String>>,
     /// Frames a second [default: the control frequency that the file states]
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     fps: Option<f64>,
     /// How to store images
     #[arg(long, value_enum, default_value_t = Images::Png)]
@@ -73,6 +75,11 @@ enum Rotation {
     SixD,
 }
 
+/// `--env-keys ""` gives no keys, which makes no column.
+fn keys(given: &[String]) -> Vec<String> {
+    given.iter().filter(|key| !key.is_empty()).cloned().collect()
+}
+
 fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(v) if v.is_finite() && v > 0.0 => Ok(v),
@@ -82,8 +89,8 @@ fn positive(text: &str) -> Result<f64, String> {
 
 pub fn run(args: &Args) -> Result<ExitCode> {
     let options = ConvertOptions {
-        state_keys: args.state_keys.clone(),
-        env_keys: args.env_keys.clone(),
+        state_keys: args.state_keys.as_deref().map(keys),
+        env_keys: args.env_keys.as_deref().map(keys),
         fps: args.fps,
         images: match args.images {
             Images::Png => ImageForm::Png,

@@ -1,5 +1,5 @@
 use crate::output;
-use anyhow::Result;
+use anyhow::{Result, bail};
 use dataset::{Check, Source};
 use serde_json::json;
 use std::path::PathBuf;
@@ -8,16 +8,21 @@ use std::process::ExitCode;
 /// Make every check of a data set or of a file of demonstrations.
 ///
 /// A data set: hashes of its files, agreement of columns, episodes and tasks, finite numbers, statistics, splits,
-/// pictures, and the fingerprint of its content. A file: its structure, and every value of every demo. The exit code
-/// is 1 when anything is wrong.
+/// pictures, and the fingerprint of its content; with --source also whether the file that it was converted from is still
+/// the same, down to the last bit. A file: its structure, and every value of every demo. The exit code is 1 when
+/// anything is wrong.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data validate lift
+  actrm-data validate lift --source data/lift.hdf5
   actrm-data validate data/lift.hdf5
   actrm-data validate lift --json")]
 pub struct Args {
     /// Data set directory, HDF5 file, or folder with one file an episode
     path: PathBuf,
+    /// File or folder that the data set was converted from: compare it with the hash recorded then
+    #[arg(long, value_name = "FILE")]
+    source: Option<PathBuf>,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -28,7 +33,13 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let bar = output::bar("frames").with_message("checking");
         let checks = dataset::verify(&args.path, &mut output::advance(&bar));
         bar.finish_and_clear();
-        checks?
+        let mut checks = checks?;
+        if let Some(source) = &args.source {
+            checks.push(dataset::verify_source(&args.path, source)?);
+        }
+        checks
+    } else if args.source.is_some() {
+        bail!("{}: --source belongs to a data set directory, expected meta/info.json in it", args.path.display());
     } else {
         check_source(args)?
     };
