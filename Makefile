@@ -80,6 +80,17 @@ bench: build .venv-peers/.complete ## our speed beside the peers', measured in o
 study-puzzles: build ## the puzzle study, as far as it has not been run (hours), and its page, docs/puzzles.md
 	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study --page docs/puzzles.md
 
+# other files, and more of them: make fuzz MUTATIONS=20000 SEED=7
+MUTATIONS ?= 2000
+SEED ?= 1
+.PHONY: fuzz
+fuzz: .venv/.complete ## damaged HDF5 files through the reader: data or an error, in time (MUTATIONS=2000 SEED=1)
+	@ACTRM_MUTATIONS=$(MUTATIONS) ACTRM_MUTATION_SEED=$(SEED) $(CARGO) test $(CARGO_FLAGS) -p dataset --test hostile
+
+.PHONY: bench-memory
+bench-memory: build ## memory that converting a 3 GB image file takes (needs 6 GB of disk; target/bench/memory.json)
+	@target/release/examples/bench_memory
+
 .PHONY: interop
 interop: build .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round
 	@.venv-peers/bin/python tests/interop/run.py

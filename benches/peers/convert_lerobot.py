@@ -1,6 +1,8 @@
 """Convert the first demos of a robomimic HDF5 file with LeRobot's own API: `add_frame` and `save_episode`.
 
-    convert_lerobot.py FILE OUT [--demos 4]
+The same frame columns as `actrm-data convert` writes; there is no side folder, which this API has no place for.
+
+    convert_lerobot.py FILE OUT [--demos 6]
 
 Prints one line of JSON: frames, CPU seconds, wall seconds. The API is slow; its rate does not depend on how many
 episodes it is given.
@@ -28,18 +30,21 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("file", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--demos", type=int, default=4)
+    parser.add_argument("--demos", type=int, default=6)
     args = parser.parse_args()
     wall, cpu = time.perf_counter(), time.process_time()
     with h5py.File(args.file) as file:
         demos = sorted(file["data"], key=lambda name: int(name.removeprefix("demo_")))[: args.demos]
         obs = file["data"][demos[0]]["obs"]
         vector = lambda n: {"dtype": "float32", "shape": (n,), "names": [f"x{i}" for i in range(n)]}  # noqa: E731
+        scalar = lambda dtype: {"dtype": dtype, "shape": (1,), "names": None}  # noqa: E731
         features = {
             "observation.state": vector(sum(obs[k].shape[1] for k in STATE)),
             "observation.environment_state": vector(obs["object"].shape[1]),
             "action": vector(file["data"][demos[0]]["actions"].shape[1]),
-            "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+            "next.reward": scalar("float32"),
+            "next.done": scalar("bool"),
+            "next.success": scalar("bool"),
         }
         data = LeRobotDataset.create("actrm/bench", fps=20, root=args.out, features=features, use_videos=False)
         frames = 0
@@ -49,12 +54,15 @@ def main() -> None:
             env = demo["obs/object"][:].astype(np.float32)
             actions = demo["actions"][:].astype(np.float32)
             rewards = demo["rewards"][:].astype(np.float32)
+            dones = demo["dones"][:] != 0
             for i in range(len(actions)):
                 frame = {
                     "observation.state": state[i],
                     "observation.environment_state": env[i],
                     "action": actions[i],
                     "next.reward": rewards[i : i + 1],
+                    "next.done": dones[i : i + 1],
+                    "next.success": rewards[i : i + 1] >= 1.0,
                     "task": "Lift",
                 }
                 data.add_frame(frame)

@@ -58,21 +58,71 @@ fn killed_at_fifty_moments_it_leaves_all_or_nothing() {
     assert_eq!(names(dir.path()), ["in.hdf5", "set"]);
 }
 
-#[test]
-fn without_room_it_says_so_and_leaves_nothing() {
-    let dir = tempfile::tempdir().unwrap();
-    let out = dir.path().join("set");
-    // files may not grow beyond 20 blocks of 512 or 1024 bytes; writing more fails as on a full disk
-    let output = Command::new("sh")
-        .args(["-c", "trap '' XFSZ; ulimit -f 20; exec \"$0\" convert \"$1\" \"$2\""])
-        .arg(env!("CARGO_BIN_EXE_actrm-data"))
-        .arg(fixture())
-        .arg(&out)
-        .output()
-        .unwrap();
+/// Runs one of our commands that has no room for its output: it says so in one line, and `before` is all that is left.
+fn refused_without_room(dir: &Path, command: &mut Command, before: &[&str]) -> String {
+    let output = command.output().unwrap();
     let message = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1), "{message}");
     assert_eq!(message.lines().filter(|l| l.starts_with("error: ")).count(), 1, "{message}");
+    assert_eq!(names(dir), before, "{message}");
+    message
+}
+
+/// Files may not grow beyond so many blocks of 512 bytes; writing more fails as on a full disk.
+fn limited(blocks: u32, command: &str, from: &Path, to: &Path) -> Command {
+    let mut limited = Command::new("bash");
+    limited.arg("-c").arg(format!("trap '' XFSZ; ulimit -S -f {}; exec \"$0\" {command} \"$1\" \"$2\"", blocks / 2));
+    limited.arg(env!("CARGO_BIN_EXE_actrm-data")).arg(from).arg(to);
+    limited
+}
+
+#[test]
+fn without_room_it_says_so_and_leaves_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, set, back) = (dir.path().join("in.hdf5"), dir.path().join("set"), dir.path().join("back.hdf5"));
+    std::fs::copy(fixture(), &source).unwrap();
+    let before = std::fs::read(&source).unwrap();
+    let message = refused_without_room(dir.path(), &mut limited(40, "convert", &source, &set), &["in.hdf5"]);
     assert!(message.contains(".parquet") && message.contains("cannot write"), "{message}");
-    assert!(names(dir.path()).is_empty(), "{:?}", names(dir.path()));
+    assert!(convert(&source, &set).status().unwrap().success());
+    let message = refused_without_room(dir.path(), &mut limited(40, "export", &set, &back), &["in.hdf5", "set"]);
+    assert!(message.contains("back.hdf5") && message.contains("reserve disk space"), "{message}");
+    assert_eq!(std::fs::read(&source).unwrap(), before);
+    // with room, both do what they could not
+    assert!(limited(40_000, "export", &set, &back).status().unwrap().success());
+}
+
+#[test]
+fn a_full_disk_is_told_and_left_as_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let mount = dir.path().join("small");
+    std::fs::create_dir(&mount).unwrap();
+    let (source, set) = (dir.path().join("in.hdf5"), dir.path().join("set"));
+    std::fs::copy(fixture(), &source).unwrap();
+    assert!(convert(&source, &set).status().unwrap().success());
+    // a disk of 150 kB that only this command sees, in name spaces of its own
+    let on_small_disk = |command: &str, from: &Path, to: &str| {
+        let script = format!(
+            "mount -t tmpfs -o size=150k none \"$2\" || exit 77; \"$0\" {command} \"$1\" \"$2/{to}\"; code=$?; \
+             [ -z \"$(ls -A \"$2\")\" ] || echo left: $(ls -A \"$2\") >&2; exit $code"
+        );
+        let mut command = Command::new("unshare");
+        command.args(["--user", "--map-root-user", "--mount", "sh", "-c"]).arg(script);
+        command.arg(env!("CARGO_BIN_EXE_actrm-data")).arg(from).arg(&mount);
+        command.output()
+    };
+    for (command, from, to) in [("convert", &source, "set"), ("export", &set, "back.hdf5")] {
+        let output = match on_small_disk(command, from, to) {
+            Ok(output) if output.status.code() != Some(77) && !output.stderr.starts_with(b"unshare:") => output,
+            other => {
+                eprintln!("SKIPPED: this system lets nobody mount a small disk: {other:?}");
+                return;
+            }
+        };
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{command}: {message}");
+        assert!(message.contains("No space left on device") && message.contains(to), "{command}: {message}");
+        assert!(!message.contains("left:"), "{command}: {message}");
+    }
+    assert_eq!(std::fs::read(&source).unwrap(), std::fs::read(fixture()).unwrap());
 }

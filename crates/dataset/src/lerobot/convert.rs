@@ -111,8 +111,8 @@ impl Conversion<'_> {
             encoder: &encoder,
             task_of: &task_of,
         };
-        let groups = work::cut(&self.plan.demos, self.mapping, self.options.lossless);
         let limit = (self.options.data_file_mb * f64::from(1 << 20)) as u64;
+        let groups = work::cut(&self.plan.demos, self.mapping, self.options.lossless, limit);
         let mut shards = ShardWriter::new(self.root, "data", &encoder, limit, info::FILES_PER_FOLDER);
         let side = match self.options.lossless {
             true => {

@@ -50,8 +50,10 @@ fn row_bytes(key: &KeyPlan) -> u64 {
     key.bytes().unwrap_or(0) / rows
 }
 
-/// Cuts the demos into row groups: small episodes together, a large one into even pieces.
-pub(crate) fn cut(demos: &[DemoPlan], mapping: &Mapping, lossless: bool) -> Vec<Vec<Part>> {
+/// Cuts the demos into row groups: small episodes together, as long as they fit a file of `file_bytes`, a large one into
+/// even pieces.
+pub(crate) fn cut(demos: &[DemoPlan], mapping: &Mapping, lossless: bool, file_bytes: u64) -> Vec<Vec<Part>> {
+    let full = GROUP_BYTES.min(file_bytes);
     let mut groups: Vec<Vec<Part>> = Vec::new();
     let mut open: Vec<Part> = Vec::new();
     let (mut frames, mut bytes) = (0, 0_u64);
@@ -78,7 +80,7 @@ pub(crate) fn cut(demos: &[DemoPlan], mapping: &Mapping, lossless: bool) -> Vec<
             let starts = (0..demo.length).step_by(step);
             groups.extend(starts.map(|from| vec![part(from..(from + step).min(demo.length))]));
         } else {
-            if !open.is_empty() && (frames + demo.length > GROUP_FRAMES || bytes + total > GROUP_BYTES) {
+            if !open.is_empty() && (frames + demo.length > GROUP_FRAMES || bytes + total > full) {
                 groups.push(std::mem::take(&mut open));
                 (frames, bytes) = (0, 0);
             }

@@ -104,16 +104,10 @@ impl RobomimicWriter {
             return Ok(());
         }
         let step = (end - self.reserved).max(1 << 20);
-        let flags = rustix::fs::FallocateFlags::KEEP_SIZE;
-        match rustix::fs::fallocate(self.temporary.as_file(), flags, self.reserved, step) {
-            Ok(()) => self.reserved += step,
-            // a file system that cannot reserve
-            Err(rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::NOSYS) => self.reserved = u64::MAX,
-            Err(e) => {
-                let operation = "reserve disk space for the file beside it";
-                return Err(DatasetError::Io { path: self.path.clone(), operation, source: e.into() });
-            }
-        }
+        let reserved = take_room(self.temporary.as_file(), self.reserved, step, end);
+        let operation = "reserve disk space for the file beside it";
+        reserved.map_err(|e| DatasetError::Io { path: self.path.clone(), operation, source: e.into() })?;
+        self.reserved += step;
         Ok(())
     }
 
@@ -243,6 +237,23 @@ impl RobomimicWriter {
         })?;
         File::open(folder_of(&path)).and_then(|f| f.sync_all()).map_err(io("sync the folder of"))?;
         Ok(())
+    }
+}
+
+/// Takes `step` bytes of the disk for a file of which `from` bytes are taken and which is about to grow to `end`.
+fn take_room(file: &File, from: u64, step: u64, end: u64) -> rustix::io::Result<()> {
+    use rustix::io::Errno;
+    // what is reserved without growing the file is not held against the limit on the size of files
+    if rustix::process::getrlimit(rustix::process::Resource::Fsize).current.is_some_and(|most| end > most) {
+        return Err(Errno::FBIG);
+    }
+    match rustix::fs::fallocate(file, rustix::fs::FallocateFlags::KEEP_SIZE, from, step) {
+        // a file system that cannot reserve can still be asked
+        Err(Errno::OPNOTSUPP | Errno::NOSYS) => {
+            let disk = rustix::fs::fstatvfs(file)?;
+            if disk.f_bavail.saturating_mul(disk.f_frsize) < step { Err(Errno::NOSPC) } else { Ok(()) }
+        }
+        other => other,
     }
 }
 
