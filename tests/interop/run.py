@@ -7,6 +7,7 @@ difference ends the run with exit code 1.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -22,17 +23,22 @@ import numpy as np
 import torch
 
 ROOT = Path(__file__).resolve().parents[2]
-BIN = ROOT / "target" / "release"
+BIN = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "release"
 STATE_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos")
 ENV_KEYS = ("object",)
 
 
-def ours(program: str, *args: str | Path) -> str:
-    """Run one of our programs and return its standard output; its error ends the run."""
-    done = subprocess.run([BIN / program, *map(str, args)], text=True, capture_output=True, check=False)
+def run(command: list[str | Path], given: str = "") -> str:
+    """Run a program and return its standard output; its error ends the run."""
+    done = subprocess.run([*map(str, command)], input=given, text=True, capture_output=True, check=False)
     if done.returncode != 0:
-        raise SystemExit(f"{program} {' '.join(map(str, args))}: exit code {done.returncode}\n{done.stderr}")
+        raise SystemExit(f"{' '.join(map(str, command))}: exit code {done.returncode}\n{done.stderr[-4000:]}")
     return done.stdout
+
+
+def ours(program: str, *args: str | Path) -> str:
+    """Run one of our programs."""
+    return run([BIN / program, *args])
 
 
 def demos(file: h5py.File) -> list[str]:
@@ -107,6 +113,138 @@ def compare_windows(source: Path, root: Path) -> str:
         assert np.array_equal(item["action"].numpy(), actions[rows]), start
         assert np.array_equal(item["action_is_pad"].numpy(), np.arange(start, start + horizon) >= len(actions)), start
     return f"chunks of {horizon}, three places"
+
+
+def compare_shards(source: Path, root: Path) -> str:
+    """A set of several data files opens like one of a single file."""
+    ours("actrm-data", "convert", source, root, "--file-size", "0.05")
+    files = len(list((root / "data").glob("*/*.parquet")))
+    assert files >= 3, f"{files} data files"
+    return f"{files} files: {compare_lerobot(source, root)}"
+
+
+def write_images(source: Path, path: Path) -> None:
+    """Two demos of the source with two cameras, pixel values drawn at random."""
+    rng = np.random.default_rng(1)
+    with h5py.File(source) as file, h5py.File(path, "w") as out:
+        for key, value in file["data"].attrs.items():
+            out.require_group("data").attrs[key] = value
+        total = 0
+        for name in demos(file)[:2]:
+            file.copy(file["data"][name], out["data"], name=name)
+            length = len(file["data"][name]["actions"])
+            total += length
+            for key, side in (("agentview_image", 84), ("robot0_eye_in_hand_image", 60)):
+                pixels = rng.integers(0, 256, (length, side, side, 3), dtype=np.uint8)
+                out["data"][name]["obs"][key] = pixels
+                out["data"][name]["next_obs"][key] = np.concatenate([pixels[1:], pixels[:1]])
+        out["data"].attrs["total"] = total
+
+
+def compare_images(source: Path, root: Path, form: str) -> str:
+    """Every picture that LeRobot shows has the pixels of the file; its statistics are those of its pixels."""
+    ours("actrm-data", "convert", source, root, "--images", form)
+    data = open_lerobot(root)
+    pictures = 0
+    with h5py.File(source) as file:
+        start = 0
+        for name in demos(file):
+            demo = file["data"][name]
+            for key in ("agentview_image", "robot0_eye_in_hand_image"):
+                column = f"observation.images.{key.removesuffix('_image')}"
+                for index, pixels in enumerate(demo["obs"][key][:]):
+                    shown = data[start + index][column]
+                    assert shown.dtype == torch.float32 and shown.shape[0] == 3, (shown.dtype, shown.shape)
+                    levels = np.rint(shown.numpy() * 255).astype(np.uint8).transpose(1, 2, 0)
+                    assert np.array_equal(levels, pixels), (name, key, index)
+                    pictures += 1
+                assert np.shape(data.meta.stats[column]["mean"]) == (3, 1, 1), column
+            start += len(demo["actions"])
+        first = data.meta.stats["observation.images.agentview"]
+        pixels = np.concatenate([file["data"][n]["obs/agentview_image"][:] for n in demos(file)]) / 255.0
+        np.testing.assert_allclose(np.ravel(first["mean"]), pixels.mean((0, 1, 2)), atol=1e-6)
+        np.testing.assert_allclose(np.ravel(first["std"]), pixels.std((0, 1, 2)), atol=1e-6)
+    back = root.with_suffix(".hdf5")
+    ours("actrm-data", "export", root, back)
+    compare_trees(source, back)
+    return f"{pictures} pictures, pixel by pixel, and back"
+
+
+def train_lerobot(root: Path, out: Path) -> str:
+    """LeRobot trains its ACT on one of our sets for two steps, as its own example does, and stores what it has."""
+    from lerobot.configs.types import FeatureType
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    torch.manual_seed(0)
+    meta = open_lerobot(root).meta
+    features = dataset_to_policy_features(meta.features)
+    config = ACTConfig(
+        input_features={k: f for k, f in features.items() if f.type in (FeatureType.STATE, FeatureType.ENV)},
+        output_features={k: f for k, f in features.items() if f.type is FeatureType.ACTION},
+        chunk_size=8,
+        n_action_steps=8,
+        dim_model=64,
+        n_heads=4,
+        dim_feedforward=128,
+        device="cpu",
+    )
+    policy = ACTPolicy(config).train()
+    before, after = make_pre_post_processors(config, dataset_stats=meta.stats)
+    data = open_lerobot(root, delta_timestamps={"action": [k / meta.fps for k in config.action_delta_indices]})
+    batches = iter(torch.utils.data.DataLoader(data, batch_size=16, shuffle=True))
+    optimiser = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3)
+    losses: list[float] = []
+    for _ in range(2):
+        loss, _ = policy.forward(before(next(batches)))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert np.isfinite(losses).all(), losses
+    for part in (policy, before, after):
+        part.save_pretrained(out)
+    return f"2 steps, loss {losses[0]:.1f} then {losses[1]:.1f}"
+
+
+def compare_actions(root: Path, zoo: Path, entry: str, checkpoint: Path) -> str:
+    """An entry and a checkpoint of LeRobot give the same action chunks to 1e-5, raw observation to raw action."""
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
+    data = open_lerobot(root)
+    rows = [data[i] for i in (0, 17, 400, data.num_frames - 1)]
+    keys = ("observation.state", "observation.environment_state")
+    asked = [{key.removeprefix("observation."): row[key].tolist() for key in keys} for row in rows]
+    answers = np.array(json.loads(run([BIN / "examples" / "predict", zoo, entry], json.dumps(asked))))
+    policy = ACTPolicy.from_pretrained(checkpoint).eval()
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
+    largest = 0.0
+    for row, answer in zip(rows, answers, strict=True):
+        with torch.no_grad():
+            chunk = policy.predict_action_chunk(before({key: row[key] for key in keys}))
+        theirs = torch.stack([after(chunk[:, i]) for i in range(chunk.shape[1])], 1)[0].numpy()
+        assert theirs.shape == answer.shape, (theirs.shape, answer.shape)
+        largest = max(largest, float(np.abs(theirs - answer).max()))
+    assert largest <= 1e-5, f"{entry}: actions differ by {largest:g}"
+    return f"{len(rows)} chunks of {answers.shape[1]} x {answers.shape[2]}, largest difference {largest:.1e}"
+
+
+def export_entry(root: Path, folder: Path) -> str:
+    """An entry that we trained answers the same in LeRobot."""
+    zoo = folder / "zoo"
+    ours("actrm-zoo", "train", "act_lift", "--data", root, "--zoo", zoo, "--runs", folder / "runs", "train.steps=5")
+    ours("actrm-zoo", "export", "lerobot", "lift-act@1", folder / "lift-act", "--zoo", zoo)
+    return compare_actions(root, zoo, "lift-act@1", folder / "lift-act")
+
+
+def import_entry(root: Path, folder: Path) -> str:
+    """What LeRobot trained answers the same as an entry of ours."""
+    zoo, checkpoint = folder / "zoo", folder / "trained"
+    ours("actrm-zoo", "import", "lerobot", checkpoint, "--name", "theirs", "--task", "Lift", "--zoo", zoo)
+    return compare_actions(root, zoo, "theirs@1", checkpoint)
 
 
 def compare_robomimic(path: Path) -> str:
@@ -192,16 +330,28 @@ def open_theirs(folder: Path) -> str:
 
 def main() -> None:
     """Run every check; the first difference ends it."""
+    # LeRobot warns of video decoders that are not needed here, and of our entry in info.json
+    logging.disable(logging.WARNING)
     source = ROOT / "data" / "lift.hdf5"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        # read when LeRobot is imported: its copies of our data sets go when we go
+        os.environ["HF_HOME"] = str(folder / "hf")
         root = folder / "lift"
         ours("actrm-data", "convert", source, root)
         exported = folder / "exported.hdf5"
         ours("actrm-data", "export", root, exported)
+        images = folder / "images.hdf5"
+        write_images(source, images)
         checks: dict[str, Callable[[], str]] = {
             "LeRobot opens the converted data set": lambda: compare_lerobot(source, root),
             "LeRobot pads action chunks as we do": lambda: compare_windows(source, root),
+            "LeRobot opens a set of several files": lambda: compare_shards(source, folder / "shards"),
+            "LeRobot shows PNG pictures pixel by pixel": lambda: compare_images(images, folder / "png", "png"),
+            "LeRobot shows PPM pictures pixel by pixel": lambda: compare_images(images, folder / "ppm", "ppm"),
+            "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
+            "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
+            "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),
             "robomimic reads the collected file": lambda: compare_robomimic(source),
             "export rebuilds the source": lambda: compare_trees(source, exported),
             "robomimic reads the exported file": lambda: compare_robomimic(exported),

@@ -27,7 +27,7 @@ pub(super) fn dtype_of(descriptor: &TypeDescriptor) -> Dtype {
         TypeDescriptor::FixedUnicode(n) if *n <= MAX_FIXED => Dtype::FixedUtf8(*n),
         TypeDescriptor::VarLenAscii => Dtype::VarAscii,
         TypeDescriptor::VarLenUnicode => Dtype::VarStr,
-        other => Dtype::Other(other.to_string()),
+        other => Dtype::Other(one_line(&other.to_string())),
     }
 }
 
@@ -273,5 +273,14 @@ pub(super) fn write(to: &Container, array: &Array) -> ValueResult<()> {
 /// An HDF5 error in a line: the deepest message says what happened, the rest is the way up.
 pub(super) fn reason(error: &hdf5::Error) -> String {
     let text = error.to_string();
-    text.lines().map(str::trim).filter(|l| !l.is_empty()).collect::<Vec<_>>().join("; ")
+    one_line(&text.lines().map(str::trim).filter(|l| !l.is_empty()).collect::<Vec<_>>().join("; "))
+}
+
+/// Text of a file, fit for a message: what would end the line or command the terminal is written out.
+pub(super) fn one_line(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        if c.is_control() { out.extend(c.escape_default()) } else { out.push(c) }
+    }
+    out
 }

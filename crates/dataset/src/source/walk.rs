@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use hdf5::dataset::Layout;
 use hdf5::{Dataset, Datatype, Group, IndexType, IterationOrder, LinkType, LocationType};
 
-use super::value::{self, Part, dtype_of, reason};
+use super::value::{self, Part, dtype_of, one_line, reason};
 use crate::error::InputError;
 use crate::tree::{Array, Attrs, Dtype};
 
@@ -166,6 +166,7 @@ impl Walked {
         self.groups.insert(path.to_owned(), GroupNode { attrs, empty: links.is_empty() });
         for (name, link) in links {
             let full = if path.is_empty() { name.clone() } else { format!("{path}/{name}") };
+            self.check_name(&name, &full)?;
             if link.link_type == LinkType::External {
                 let what = "a link to another file".to_owned();
                 let path = self.path.clone();
@@ -217,6 +218,15 @@ impl Walked {
             }
         }
         Ok(())
+    }
+
+    /// Refuses names that no program writes and that would command the terminal they are shown on.
+    fn check_name(&self, name: &str, full: &str) -> Result<(), InputError> {
+        if !name.contains(char::is_control) {
+            return Ok(());
+        }
+        let what = "a name with control characters".to_owned();
+        Err(InputError::Unsupported { path: self.path.clone(), object: one_line(full), what })
     }
 
     fn dataset(
@@ -306,6 +316,7 @@ impl Walked {
     pub fn some_attrs(&self, path: &str, wanted: &[&str]) -> Result<(Vec<String>, Attrs), InputError> {
         let group = self.file()?.group(path).map_err(|e| damaged(&self.path, path, "open", reason(&e)))?;
         let names = group.attr_names().map_err(|e| damaged(&self.path, path, "list the attributes of", reason(&e)))?;
+        names.iter().try_for_each(|name| self.check_name(name, &format!("attribute {name} of {path}")))?;
         let mut values = Attrs::new();
         for name in names.iter().filter(|n| wanted.contains(&n.as_str())) {
             values.insert(name.clone(), self.one_attr(&group, path, name)?);
@@ -316,6 +327,7 @@ impl Walked {
     fn attrs_of(&self, location: &hdf5::Location, object: &str) -> Result<Attrs, InputError> {
         let names =
             location.attr_names().map_err(|e| damaged(&self.path, object, "list the attributes of", reason(&e)))?;
+        names.iter().try_for_each(|name| self.check_name(name, &format!("attribute {name} of {object}")))?;
         names.into_iter().map(|name| Ok((name.clone(), self.one_attr(location, object, &name)?))).collect()
     }
 

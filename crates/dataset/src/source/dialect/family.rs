@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{DemoDraft, Draft, Survey, key_plan, list, number_after};
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Problem};
+use crate::source::value::one_line;
 use crate::source::walk::Walked;
 use crate::tree::{Array, Attrs, Dtype};
 
@@ -310,7 +311,8 @@ fn masks(file: &Walked, out: &mut Draft) -> Result<(), InputError> {
             continue;
         };
         for id in ids.iter().filter(|id| !known.contains(*id)) {
-            let error = InputError::UnknownMaskDemo { path: file.path.clone(), mask: name.clone(), demo: id.clone() };
+            let demo = one_line(id);
+            let error = InputError::UnknownMaskDemo { path: file.path.clone(), mask: name.clone(), demo };
             out.problems.push(problem(None, None, false, error));
         }
         out.masks.insert(name, ids);
