@@ -68,6 +68,17 @@ impl Peers {
     }
 }
 
+/// The best rate of several runs of a peer, `count` a second of `seconds`.
+fn best_rate(count: &str, seconds: &str, mut run: impl FnMut() -> Result<Value, AnyError>) -> Result<f64, AnyError> {
+    let mut best = 0.0_f64;
+    for _ in 0..REPEATS {
+        let report = run()?;
+        let number = |key: &str| report[key].as_f64().unwrap_or(f64::NAN);
+        best = best.max(number(count) / number(seconds));
+    }
+    Ok(best)
+}
+
 /// CPU and wall seconds.
 #[derive(Clone, Copy)]
 struct Cost {
@@ -134,22 +145,16 @@ impl Bench {
         match &self.peers {
             None => rows.push(row(work, "frames/s", ours, None, None, None)),
             Some(peers) => {
-                let rate = |v: &Value, what: &str| -> f64 {
-                    v[what].as_f64().unwrap_or(f64::NAN) / v["cpu_seconds"].as_f64().unwrap_or(f64::NAN)
+                let script = |name: &str| {
+                    best_rate("frames", "cpu_seconds", || {
+                        let peer_out = self.fresh("peer")?;
+                        peers.run(name, &[file_text, text(&peer_out)?])
+                    })
                 };
-                let peer_out = self.fresh("peer")?;
-                let script = peers.run("convert_h5py_pyarrow.py", &[file_text, text(&peer_out)?])?;
-                rows.push(row(
-                    work,
-                    "frames/s",
-                    ours,
-                    Some(("h5py + pyarrow", rate(&script, "frames"))),
-                    Some(3.0),
-                    None,
-                ));
-                let peer_out = self.fresh("peer")?;
-                let api = peers.run("convert_lerobot.py", &[file_text, text(&peer_out)?])?;
-                rows.push(row(work, "frames/s", ours, Some(("LeRobot", rate(&api, "frames"))), Some(100.0), None));
+                let theirs = script("convert_h5py_pyarrow.py")?;
+                rows.push(row(work, "frames/s", ours, Some(("h5py + pyarrow", theirs)), Some(3.0), None));
+                let theirs = script("convert_lerobot.py")?;
+                rows.push(row(work, "frames/s", ours, Some(("LeRobot", theirs)), Some(100.0), None));
             }
         }
         let open = measure(|| Dataset::open(&out).map(drop))?;
@@ -159,11 +164,10 @@ impl Bench {
         let work = "windows of 32 actions, batch 64, CPU";
         rows.push(row(work, "samples/s", ours, None, None, Some(WINDOWS_BAR)));
         if let Some(peers) = &self.peers {
-            let rate =
-                |v: Value| v["samples"].as_f64().unwrap_or(f64::NAN) / v["cpu_seconds"].as_f64().unwrap_or(f64::NAN);
-            let robomimic = rate(peers.run("windows_robomimic.py", &[file_text])?);
+            let rate = |name, path| best_rate("samples", "cpu_seconds", || peers.run(name, &[path]));
+            let robomimic = rate("windows_robomimic.py", file_text)?;
             rows.push(row(work, "samples/s", ours, Some(("robomimic, cache all", robomimic)), Some(25.0), None));
-            let lerobot = rate(peers.run("windows_lerobot.py", &[out_text])?);
+            let lerobot = rate("windows_lerobot.py", out_text)?;
             rows.push(row(work, "samples/s", ours, Some(("LeRobot", lerobot)), Some(3000.0), None));
         }
         Ok(())
@@ -179,19 +183,16 @@ impl Bench {
             remove(&out);
             convert(&file, &out, &options(ImageForm::Ppm), &mut |_, _| {}).map(drop)
         })?;
+        let file_text = text(&file)?;
         let work = "image convert (2 x 84 x 84, PPM), wall";
         let ours = 5_400.0 / cost.wall;
         let peer = match &self.peers {
             None => None,
             Some(peers) => {
-                let mut best = 0.0_f64;
-                for _ in 0..REPEATS {
+                let best = best_rate("frames", "wall_seconds", || {
                     let peer_out = self.fresh("peer")?;
-                    let args = [text(&file)?, text(&peer_out)?, "--level", "1"];
-                    let v = peers.run("convert_h5py_pyarrow.py", &args)?;
-                    let wall = v["wall_seconds"].as_f64().unwrap_or(f64::NAN);
-                    best = best.max(v["frames"].as_f64().unwrap_or(f64::NAN) / wall);
-                }
+                    peers.run("convert_h5py_pyarrow.py", &[file_text, text(&peer_out)?, "--level", "1"])
+                })?;
                 Some(("h5py + pyarrow", best))
             }
         };

@@ -8,11 +8,21 @@ use std::io::{ErrorKind, IsTerminal, Write};
 
 /// Writes text to stdout. A reader that has gone (`| head`) ends the output, it is no error.
 pub fn print(text: &str) -> Result<()> {
+    let text = plain(text);
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(()),
         other => other.context("cannot write to stdout"),
     }
+}
+
+/// Lines without what would command the terminal: names and task texts come from files of anywhere.
+fn plain(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        if c.is_control() && c != '\n' { out.extend(c.escape_default()) } else { out.push(c) }
+    }
+    out
 }
 
 /// Writes a value as indented JSON.
@@ -128,6 +138,11 @@ pub fn shape(extents: &[usize]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_text_from_a_file_does_not_command_the_terminal() {
+        assert_eq!(plain("lift\tthe \u{1b}[31mred\ncube ß"), "lift\\tthe \\u{1b}[31mred\ncube ß");
+    }
 
     #[test]
     fn numbers_are_short_and_right() {

@@ -93,7 +93,7 @@ pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Che
             dataset
         }
         Err(e) => {
-            note("it opens: columns, episodes and tasks agree", Some(e.to_string()));
+            note("it opens: columns, episodes and tasks agree", Some(in_full(&e)));
             return Ok(checks);
         }
     };
@@ -116,16 +116,22 @@ pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Che
 fn manifest_problem(root: &Path) -> Result<Option<String>> {
     let manifest: Manifest = match read_json(&root.join(MANIFEST_FILE)) {
         Ok(manifest) => manifest,
-        Err(e) => return Ok(Some(e.to_string())),
+        Err(e) => return Ok(Some(in_full(&e))),
     };
     for (name, expected) in &manifest.files {
         match hash_file(&root.join(name)) {
             Ok(found) if found == *expected => {}
             Ok(found) => return Ok(Some(format!("{name}: expected sha256 {expected}, found {found}"))),
-            Err(e) => return Ok(Some(e.to_string())),
+            Err(e) => return Ok(Some(in_full(&e))),
         }
     }
     Ok(None)
+}
+
+/// An error with what caused it, in a line.
+fn in_full(error: &dyn std::error::Error) -> String {
+    let causes = std::iter::successors(error.source(), |e| e.source());
+    causes.fold(error.to_string(), |text, cause| format!("{text}: {cause}"))
 }
 
 fn not_finite(dataset: &Dataset) -> Option<String> {

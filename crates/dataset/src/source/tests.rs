@@ -104,13 +104,10 @@ fn fixture_hashes_equal_h5py() {
 
 #[test]
 fn names_that_command_a_terminal_are_refused_in_one_plain_line() {
-    let dir = tempfile::tempdir().unwrap();
-    let path = dir.path().join("names.hdf5");
-    for (group, attribute) in [("demo_1\u{1b}[31m\n", "num_samples"), ("demo_1", "a\u{7}b")] {
-        let file = hdf5::File::create(&path).unwrap();
-        let made = file.create_group("data").unwrap().create_group(group).unwrap();
-        made.new_attr::<i64>().create(attribute).unwrap().write_scalar(&1).unwrap();
-        file.close().unwrap();
+    for (id, attribute) in [("demo_1\u{1b}[31m\n", "note"), ("demo_1", "a\u{7}b")] {
+        let mut demo = small_demo(id, 3);
+        demo.attrs.insert(attribute.to_owned(), Array::from_str("x"));
+        let (_dir, path) = saved(&[demo], |_| {});
         let text = Source::open(&path).unwrap_err().to_string();
         assert!(text.contains("control characters") && !text.contains(char::is_control), "{text:?}");
     }
