@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 use crate::entry::{Entry, MODEL_FILE};
 use crate::{ZooError, tensors};
 
-use super::experiment::{PuzzleExperiment, SolverConfig};
+use super::experiment::PuzzleExperiment;
+use super::model::SolverConfig;
 use super::solver::Solver;
 use models::trm::Mixing;
 

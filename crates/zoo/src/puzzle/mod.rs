@@ -11,6 +11,7 @@ mod entry;
 mod evaluation;
 mod experiment;
 mod grade;
+mod model;
 mod page;
 mod solver;
 mod stream;
@@ -27,8 +28,11 @@ pub use evaluation::{
     DEPTHS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, TEST_SEED, evaluate_puzzles,
     list_puzzle_evaluations,
 };
-pub use experiment::{AnyExperiment, Learning, PuzzleExperiment, PuzzleTask, SolverConfig, TrmSection};
+pub use experiment::{AnyExperiment, Learning, PuzzleExperiment, PuzzleTask};
 pub use grade::{Baseline, Counts};
+pub use model::{
+    CnnSection, ConvSection, HierarchicalSection, MlpSection, SolverConfig, TransformerSection, TrmSection,
+};
 pub use page::study_page;
 pub use solver::{Solver, Thought};
 pub use study::{

@@ -7,6 +7,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use crate::ZooError;
+use crate::config::Library;
 use crate::results::wilson_interval;
 
 use super::evaluation::{DEPTHS, PuzzleEvaluation};
@@ -46,9 +47,9 @@ As coded, none of these tasks can tell models apart:
 /// The page for the results stored in `results`.
 ///
 /// # Errors
-/// A result that cannot be read.
-pub fn study_page(results: &Path) -> Result<String, ZooError> {
-    let rows = study_results(results)?;
+/// A result that cannot be read, an experiment that `library` lacks.
+pub fn study_page(library: &Library, results: &Path) -> Result<String, ZooError> {
+    let rows = study_results(library, results)?;
     let of = |names: &[&str]| -> Vec<&Row> {
         rows.iter().filter(|(row, ..)| names.iter().any(|name| row.experiment.ends_with(name))).collect()
     };
@@ -381,7 +382,7 @@ mod tests {
     #[test]
     fn without_results_everything_is_not_run() {
         let folder = tempfile::tempdir().unwrap();
-        let page = study_page(folder.path()).unwrap();
+        let page = study_page(&Library::built_in(), folder.path()).unwrap();
         assert!(page.contains("0 of ") && page.contains("| dfs10 | trm | not run |"), "{page}");
         assert!(page.contains("| dfs16 | trm | right 90.0% | | not run |"));
         assert!(page.contains("`ppo_trm_maze5-walls` is not run."));

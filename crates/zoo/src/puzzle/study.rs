@@ -278,20 +278,21 @@ fn finished(run: &Path, zoo: &Path) -> Result<Option<Entry>, ZooError> {
 /// A test of a row with the results that there are of it, by seed.
 pub type TestedRow = (&'static StudyRow, &'static StudyTest, Vec<PuzzleEvaluation>);
 
-/// Every result of the study that is stored in `results`, in the study's order, by row and test.
+/// Every result of the study that is stored in `results`, in the study's order, by row and test. Results of an experiment
+/// that is another one by now are left out.
 ///
 /// # Errors
-/// A file that cannot be read.
-pub fn study_results(results: &Path) -> Result<Vec<TestedRow>, ZooError> {
+/// A file that cannot be read, an experiment that `library` lacks.
+pub fn study_results(library: &Library, results: &Path) -> Result<Vec<TestedRow>, ZooError> {
     let mut all = Vec::new();
     for row in STUDY {
+        let configs: Vec<(u64, String)> = (1..=row.seeds)
+            .map(|seed| Ok((seed, sha256_hex(experiment(library, row.experiment, seed)?.to_toml().as_bytes()))))
+            .collect::<Result<_, ZooError>>()?;
         for test in row.tests {
             let mut found = Vec::new();
-            for seed in 1..=row.seeds {
-                let path = results.join(test.file_name(row.experiment, seed));
-                if path.is_file() {
-                    found.push(PuzzleEvaluation::read(&path)?);
-                }
+            for (seed, config) in &configs {
+                found.extend(stored(results, row, test, *seed, config)?);
             }
             all.push((row, test, found));
         }

@@ -76,7 +76,7 @@ pub fn cmd_study(args: &StudyArgs) -> anyhow::Result<ExitCode> {
         whole = done?;
     }
     if let Some(path) = &args.page {
-        write_atomic(path, study_page(&args.results)?.as_bytes())?;
+        write_atomic(path, study_page(&args.configs.library()?, &args.results)?.as_bytes())?;
         println!("{}", shown(path));
     }
     if !whole {
