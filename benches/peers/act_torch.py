@@ -2,13 +2,13 @@
 
 Lines: {"work": "train" | "predict", "size": "d256" | "d512", "threads": 1, "times": 3}
 Answers: {"wall": seconds, "cpu": seconds} for one of the `times` repetitions (their mean),
-and {"rss": bytes} for "memory".
+and {"peak": bytes} for "memory": the most that this process has had in memory so far.
 """
 
 import json
-import resource
 import sys
 import time
+from pathlib import Path
 
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -66,16 +66,24 @@ class Peer:
             self.policy.model(self.one)
 
 
+def peak_memory() -> int:
+    """In bytes, of this process alone (`ru_maxrss` would begin with the parent's)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+
+
 def main() -> None:
     peers: dict[str, Peer] = {}
     print(json.dumps({"torch": torch.__version__}), flush=True)
     for line in sys.stdin:
         order = json.loads(line)
         if order["work"] == "memory":
-            print(json.dumps({"rss": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}), flush=True)
+            print(json.dumps({"peak": peak_memory()}), flush=True)
             continue
         torch.set_num_threads(order["threads"])
-        peer = peers.setdefault(order["size"], Peer(order["size"]))
+        if order["size"] not in peers:
+            peers[order["size"]] = Peer(order["size"])
+        peer = peers[order["size"]]
         run = peer.train if order["work"] == "train" else peer.predict
         wall, cpu = time.perf_counter(), time.process_time()
         for _ in range(order["times"]):

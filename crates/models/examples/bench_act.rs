@@ -1,40 +1,90 @@
-//! ACT's training step and batch-1 prediction beside LeRobot's on PyTorch, in turns, in one run.
+//! ACT's and ACTRM's training steps, predictions and memory, beside LeRobot's ACT on PyTorch, in turns, in one run.
 //!
-//!     cargo run --release -p models --example bench_act -- [--peer PYTHON] [--rounds N] [--sizes d256,d512]
+//!     cargo run --release -p models --example bench_act -- [--peer PYTHON] [--rounds N] [--only WORD]
 //!
-//! prints a table and writes `target/bench/act.json`. Two ratios each: wall time with two threads on both sides, and
-//! process CPU time with PyTorch on one thread (which a busy machine disturbs less). Without `--peer` only ours is timed.
+//! prints a table and writes `target/bench/act.json`. Work on one thread is compared by CPU time (the least of all
+//! rounds; a busy machine only ever adds to it), on two threads by wall time (the median). Without `--peer` only ours is
+//! timed. `--only` takes a part of a row's name. ACTRM's rows have peers of our own: our ACT, the original's plan, and
+//! the same model on candle's autograd.
 #![allow(clippy::unwrap_used)]
 
-use models::{Batch, Dims, PolicyConfig, Rng, TrainConfig, Trainer, act};
+use models::actrm::{Actrm, Over, ReasoningConfig};
+use models::{Batch, Dims, LossParts, PolicyConfig, PolicyModel, Rng, TrainConfig, Trainer, act, actrm};
+use serde_json::json;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Instant;
 
 const DIMS: Dims = Dims { state: 9, environment_state: 10, action: 7 };
 const BATCH: usize = 64;
+/// Predictions of one measurement.
+const PREDICTIONS: usize = 30;
+/// Calls of the encoder in one prediction of the original ACTRM: 16 supervision steps of 3 rounds of 6 + 1.
+const ORIGINAL_CALLS: usize = 336;
 
-fn config(size: &str) -> act::Config {
-    let (dim_model, dim_feedforward, action_horizon) = match size {
+/// Width, hidden width, actions.
+fn sizes(size: &str) -> (usize, usize, usize) {
+    match size {
         "d128" => (128, 512, 16),
         "d256" => (256, 1024, 32),
         "d512" => (512, 3200, 100),
         other => panic!("unknown size {other}: d128, d256 or d512"),
-    };
-    act::Config { dim_model, dim_feedforward, action_horizon, ..Default::default() }
+    }
 }
 
-/// Seconds of CPU that this process has used, all threads.
-fn cpu_seconds() -> f64 {
-    let stat = std::fs::read_to_string("/proc/self/stat").unwrap();
-    let fields: Vec<&str> = stat.rsplit_once(')').unwrap().1.split_whitespace().collect();
-    (fields[11].parse::<f64>().unwrap() + fields[12].parse::<f64>().unwrap()) / 100.0
+fn act_config(size: &str) -> PolicyConfig {
+    let (dim_model, dim_feedforward, action_horizon) = sizes(size);
+    PolicyConfig::Act(act::Config { dim_model, dim_feedforward, action_horizon, ..Default::default() })
 }
 
-fn timed(times: usize, mut f: impl FnMut()) -> (f64, f64) {
-    let (wall, cpu) = (Instant::now(), cpu_seconds());
-    (0..times).for_each(|_| f());
-    (wall.elapsed().as_secs_f64() / times as f64, (cpu_seconds() - cpu) / times as f64)
+fn actrm_config(size: &str, reasoning: ReasoningConfig) -> actrm::Config {
+    let (dim_model, dim_feedforward, action_horizon) = sizes(size);
+    actrm::Config { dim_model, dim_feedforward, action_horizon, reasoning, ..Default::default() }
+}
+
+/// The default, made to think to its full depth.
+fn full_depth() -> ReasoningConfig {
+    ReasoningConfig { halt_threshold: 1.0, change_threshold: 0.0, ..ReasoningConfig::default() }
+}
+
+/// What the original does to predict: 48 rounds of 6 + 1 calls of a four-layer encoder, one decoding at the end.
+fn original_plan() -> ReasoningConfig {
+    let (h_cycles, l_cycles) = (48, 6);
+    assert_eq!(h_cycles * (l_cycles + 1), ORIGINAL_CALLS);
+    ReasoningConfig { over: Over::Memory, h_cycles, l_cycles, supervision_steps: 1, ..ReasoningConfig::original() }
+}
+
+fn batch(size: &str) -> Batch {
+    let mut rng = Rng::new(1, "bench");
+    let h = sizes(size).2;
+    let (s, e, a) = (rng.normals(BATCH * 9), rng.normals(BATCH * 10), rng.normals(BATCH * h * 7));
+    Batch::from_slices(&DIMS, h, &s, &e, &a, &vec![false; BATCH * h]).unwrap()
+}
+
+fn trainer(config: &PolicyConfig, threads: usize) -> Trainer {
+    let mut trainer = Trainer::new(config.build(&DIMS, 1).unwrap(), TrainConfig::default(), 1).unwrap();
+    trainer.set_threads(threads);
+    trainer
+}
+
+/// Seconds.
+#[derive(Clone, Copy)]
+struct Cost {
+    wall: f64,
+    cpu: f64,
+}
+
+/// CPU time of this thread, which has only been counted in steps of the scheduler: to a few microseconds.
+fn thread_cpu() -> f64 {
+    let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap();
+    text.split_whitespace().next().unwrap().parse::<f64>().unwrap() / 1e9
+}
+
+/// One measurement of work that runs on this thread (its CPU time would lack other threads').
+fn timed(times: usize, work: &mut dyn FnMut()) -> Cost {
+    let (wall, cpu) = (Instant::now(), thread_cpu());
+    (0..times).for_each(|_| work());
+    Cost { wall: wall.elapsed().as_secs_f64() / times as f64, cpu: (thread_cpu() - cpu) / times as f64 }
 }
 
 struct Peer {
@@ -46,12 +96,8 @@ struct Peer {
 impl Peer {
     fn start(python: &str) -> Self {
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../../benches/peers/act_torch.py");
-        let mut child = Command::new(python)
-            .arg(script)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("the peer's Python starts");
+        let mut command = Command::new(python);
+        let mut child = command.arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         let (orders, answers) = (child.stdin.take().unwrap(), BufReader::new(child.stdout.take().unwrap()));
         let mut peer = Self { child, orders, answers };
         peer.read();
@@ -64,78 +110,203 @@ impl Peer {
         serde_json::from_str(&line).expect("the peer answers in JSON")
     }
 
-    fn ask(&mut self, work: &str, size: &str, threads: usize, times: usize) -> (f64, f64) {
-        let order = serde_json::json!({ "work": work, "size": size, "threads": threads, "times": times });
+    fn ask(&mut self, work: &str, size: &str, threads: usize, times: usize) -> serde_json::Value {
+        let order = json!({ "work": work, "size": size, "threads": threads, "times": times });
         writeln!(self.orders, "{order}").unwrap();
-        let answer = self.read();
-        (answer["wall"].as_f64().unwrap(), answer["cpu"].as_f64().unwrap())
+        self.read()
+    }
+
+    fn timed(&mut self, work: &str, size: &str, threads: usize, times: usize) -> Cost {
+        let answer = self.ask(work, size, threads, times);
+        Cost { wall: answer["wall"].as_f64().unwrap(), cpu: answer["cpu"].as_f64().unwrap() }
+    }
+
+    fn end(self) {
+        let Self { mut child, orders, .. } = self;
+        drop(orders);
+        child.wait().unwrap();
     }
 }
 
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
+struct Bench {
+    python: Option<String>,
+    rounds: usize,
+    only: String,
+    rows: Vec<serde_json::Value>,
 }
 
-fn least(values: &[f64]) -> f64 {
-    values.iter().copied().fold(f64::INFINITY, f64::min)
+impl Bench {
+    fn wants(&self, name: &str) -> bool {
+        name.contains(&self.only)
+    }
+
+    /// Both sides in turns, after one run of each to warm up.
+    fn in_turns(
+        &mut self,
+        name: &str,
+        bar: Option<f64>,
+        by_wall: bool,
+        mut ours: impl FnMut() -> Cost,
+        mut theirs: Option<impl FnMut() -> Cost>,
+    ) {
+        let mut costs = [Vec::new(), Vec::new()];
+        for round in 0..=self.rounds {
+            let pair = [Some(ours()), theirs.as_mut().map(|theirs| theirs())];
+            for (all, cost) in costs.iter_mut().zip(pair).filter(|_| round > 0) {
+                all.extend(cost);
+            }
+        }
+        let pick = |costs: &[Cost]| {
+            let mut values: Vec<f64> = costs.iter().map(|c| if by_wall { c.wall } else { c.cpu }).collect();
+            values.sort_by(f64::total_cmp);
+            values.get(if by_wall { values.len() / 2 } else { 0 }).map(|s| s * 1e3)
+        };
+        let name = format!("{name}, {}", if by_wall { "wall" } else { "CPU" });
+        self.row(&name, "ms", pick(&costs[0]).unwrap(), pick(&costs[1]), bar);
+    }
+
+    fn row(&mut self, work: &str, unit: &str, ours: f64, peer: Option<f64>, bar: Option<f64>) {
+        let ratio = peer.map(|peer| ours / peer);
+        let met = ratio.zip(bar).map(|(ratio, bar)| ratio <= bar);
+        let verdict = match met {
+            Some(true) => "met",
+            Some(false) => "MISSED",
+            None => "",
+        };
+        let show = |value: Option<f64>, digits: usize| value.map_or("-".to_string(), |v| format!("{v:.digits$}"));
+        println!(
+            "{work:<50} {:>10} {:>10} {unit:<4} {:>7} {:>5} {verdict}",
+            show(Some(ours), 2),
+            show(peer, 2),
+            show(ratio, 4),
+            show(bar, 2)
+        );
+        self.rows.push(json!({
+            "work": work, "unit": unit, "ours": ours, "peer": peer, "ratio": ratio, "bar": bar, "met": met,
+        }));
+    }
+
+    /// ACT beside LeRobot's.
+    fn act(&mut self, size: &str, train_bar: f64) {
+        for threads in [1, 2] {
+            let name = format!("ACT train {size}, {threads} threads");
+            if !self.wants(&name) {
+                continue;
+            }
+            let (batch, mut trainer) = (batch(size), trainer(&act_config(size), threads));
+            let mut peer = self.python.as_deref().map(Peer::start);
+            let theirs = peer.as_mut().map(|peer| || peer.timed("train", size, threads, 1));
+            let ours = || timed(1, &mut || drop(trainer.step(&batch).unwrap()));
+            self.in_turns(&name, Some(train_bar), threads > 1, ours, theirs);
+            peer.into_iter().for_each(Peer::end);
+        }
+        let name = format!("ACT predict {size}, batch 1");
+        if self.wants(&name) {
+            let model = act_config(size).build(&DIMS, 1).unwrap();
+            let mut peer = self.python.as_deref().map(Peer::start);
+            let theirs = peer.as_mut().map(|peer| || peer.timed("predict", size, 1, PREDICTIONS));
+            self.in_turns(&name, Some(0.6), false, || predictions(model.as_ref(), size, PREDICTIONS), theirs);
+            peer.into_iter().for_each(Peer::end);
+        }
+    }
+
+    /// ACTRM beside ACT, the original's plan and autograd.
+    fn actrm(&mut self, size: &str) {
+        let name = format!("ACTRM predict {size} (peer: our ACT)");
+        let ours = PolicyConfig::Actrm(actrm_config(size, full_depth())).build(&DIMS, 1).unwrap();
+        if self.wants(&name) {
+            let act = act_config(size).build(&DIMS, 1).unwrap();
+            let theirs = Some(|| predictions(act.as_ref(), size, PREDICTIONS));
+            self.in_turns(&name, Some(2.0), false, || predictions(ours.as_ref(), size, PREDICTIONS), theirs);
+        }
+        let name = format!("ACTRM predict {size} (peer: {ORIGINAL_CALLS} encoder calls)");
+        if self.wants(&name) {
+            let plan = PolicyConfig::Actrm(actrm_config(size, original_plan())).build(&DIMS, 1).unwrap();
+            let theirs = Some(|| predictions(plan.as_ref(), size, 1));
+            self.in_turns(&name, Some(0.01), false, || predictions(ours.as_ref(), size, PREDICTIONS), theirs);
+        }
+    }
+
+    fn actrm_training(&mut self, size: &str, reasoning: ReasoningConfig, peer: bool) {
+        let over = format!("{:?}", reasoning.over).to_lowercase();
+        let name = format!("ACTRM train {size} over {over}, 1 threads (peer: autograd)");
+        if !self.wants(&name) {
+            return;
+        }
+        let config = actrm_config(size, reasoning);
+        let composed = Actrm::new(&config, &DIMS, 1).unwrap();
+        let (batch, mut trainer) = (batch(size), trainer(&PolicyConfig::Actrm(config), 1));
+        let ours = || timed(1, &mut || drop(trainer.step(&batch).unwrap()));
+        // the composed model's gradients only: what the optimiser costs is in ours
+        let step = || {
+            let LossParts { total, .. } = composed.loss(&batch, &mut Rng::new(1, "bench")).unwrap();
+            drop(total.backward().unwrap());
+        };
+        let theirs = peer.then_some(|| timed(1, &mut { step }));
+        self.in_turns(&name, None, false, ours, theirs);
+    }
+
+    /// Peak memory of two training steps, each side in a process of its own.
+    fn memory(&mut self, size: &str) {
+        let name = format!("ACT train {size}, peak memory");
+        if !self.wants(&name) {
+            return;
+        }
+        let me = std::env::current_exe().unwrap();
+        let output = Command::new(me).args(["--memory-of", size]).output().unwrap();
+        let ours: f64 = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
+        let theirs = self.python.as_deref().map(|python| {
+            let mut peer = Peer::start(python);
+            peer.ask("train", size, 2, 2);
+            let peak = peer.ask("memory", size, 2, 1)["peak"].as_f64().unwrap();
+            peer.end();
+            peak
+        });
+        self.row(&name, "MB", ours / 1e6, theirs.map(|peak| peak / 1e6), Some(1.0));
+    }
+}
+
+fn predictions(model: &dyn PolicyModel, size: &str, times: usize) -> Cost {
+    let batch = batch(size);
+    let one = |t: &candle_core::Tensor| t.narrow(0, 0, 1).unwrap().contiguous().unwrap();
+    let (state, env) = (one(&batch.state), batch.environment_state.as_ref().map(one));
+    timed(times, &mut || drop(model.predict(&state, env.as_ref()).unwrap()))
+}
+
+/// Bytes that this process had in memory at its fullest.
+fn peak_memory() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap() * 1024.0
 }
 
 fn main() {
     let args: Vec<String> = std::env::args().collect();
     let option = |name: &str| args.iter().position(|a| a == name).and_then(|i| args.get(i + 1).cloned());
-    let rounds: usize = option("--rounds").map_or(5, |n| n.parse().expect("--rounds takes a number"));
-    let sizes = option("--sizes").unwrap_or("d256,d512".to_string());
-    let mut peer = option("--peer").map(|python| Peer::start(&python));
-    let mut rows = Vec::new();
-    println!("{:<28} {:>12} {:>12} {:>7} {:>6}", "work", "ours", "peer", "ratio", "bar");
-    for size in sizes.split(',') {
-        let config = config(size);
-        let policy = PolicyConfig::Act(config.clone());
-        let mut trainer = Trainer::new(policy.build(&DIMS, 1).unwrap(), TrainConfig::default(), 1).unwrap();
-        let mut rng = Rng::new(1, "bench");
-        let h = config.action_horizon;
-        let (s, e, a) = (rng.normals(BATCH * 9), rng.normals(BATCH * 10), rng.normals(BATCH * h * 7));
-        let batch = Batch::from_slices(&DIMS, h, &s, &e, &a, &vec![false; BATCH * h]).unwrap();
-        let (state, env) =
-            (batch.state.narrow(0, 0, 1).unwrap(), batch.environment_state.as_ref().unwrap().narrow(0, 0, 1).unwrap());
-        for (work, bar, times) in [("train", if size == "d512" { 1.1 } else { 1.0 }, 1), ("predict", 0.6, 30)] {
-            let ours = |trainer: &mut Trainer| match work {
-                "train" => timed(times, || drop(trainer.step(&batch).unwrap())),
-                _ => timed(times, || drop(trainer.model().predict(&state, Some(&env)).unwrap())),
-            };
-            ours(&mut trainer);
-            if let Some(peer) = &mut peer {
-                peer.ask(work, size, 2, times);
-            }
-            let [mut wall, mut cpu, mut peer_wall, mut peer_cpu] = [const { Vec::new() }; 4];
-            for _ in 0..rounds {
-                let (w, c) = ours(&mut trainer);
-                wall.push(w);
-                cpu.push(c);
-                if let Some(peer) = &mut peer {
-                    // a prediction runs on one thread
-                    peer_wall.push(peer.ask(work, size, if work == "train" { 2 } else { 1 }, times).0);
-                    peer_cpu.push(peer.ask(work, size, 1, times).1);
-                }
-            }
-            for (kind, mine, theirs) in [("wall", &mut wall, &mut peer_wall), ("cpu", &mut cpu, &mut peer_cpu)] {
-                // CPU time is only ever disturbed upwards
-                let pick = |v: &mut Vec<f64>| if kind == "cpu" { least(v) } else { median(v) };
-                let (mine, theirs) = (pick(mine), if theirs.is_empty() { f64::NAN } else { pick(theirs) });
-                let (name, ratio) = (format!("ACT {work} {size} ({kind})"), mine / theirs);
-                println!("{name:<28} {:>9.2} ms {:>9.2} ms {ratio:>7.2} {bar:>6.2}", mine * 1e3, theirs * 1e3);
-                rows.push(
-                    serde_json::json!({ "work": name, "ours_s": mine, "peer_s": theirs, "ratio": ratio, "bar": bar }),
-                );
-            }
-        }
+    if let Some(size) = option("--memory-of") {
+        let (batch, mut trainer) = (batch(&size), trainer(&act_config(&size), 2));
+        (0..2).for_each(|_| drop(trainer.step(&batch).unwrap()));
+        println!("{}", peak_memory());
+        return;
     }
-    if let Some(mut peer) = peer {
-        drop(peer.orders);
-        peer.child.wait().unwrap();
+    let rounds = option("--rounds").map_or(5, |n| n.parse().expect("--rounds takes a number"));
+    let only = option("--only").unwrap_or_default();
+    let mut bench = Bench { python: option("--peer"), rounds, only, rows: Vec::new() };
+    println!("{:<50} {:>10} {:>10} {:<4} {:>7} {:>5}", "work", "ours", "peer", "", "ratio", "bar");
+    bench.act("d256", 1.0);
+    for size in ["d128", "d256", "d512"] {
+        bench.actrm(size);
     }
+    bench.actrm_training("d128", ReasoningConfig::default(), true);
+    bench.actrm_training("d256", ReasoningConfig::default(), true);
+    let memory = ReasoningConfig { h_cycles: 2, l_cycles: 2, n_layers: 2, supervision_steps: 2, ..original_plan() };
+    bench.actrm_training("d128", memory, true);
+    bench.memory("d256");
+    // slow: fewer rounds keep the whole within minutes
+    bench.rounds = rounds.min(3);
+    bench.act("d512", 1.1);
+    bench.memory("d512");
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../target/bench");
     std::fs::create_dir_all(folder).unwrap();
-    std::fs::write(format!("{folder}/act.json"), serde_json::to_string_pretty(&rows).unwrap()).unwrap();
+    std::fs::write(format!("{folder}/act.json"), serde_json::to_string_pretty(&bench.rows).unwrap()).unwrap();
 }

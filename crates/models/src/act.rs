@@ -14,9 +14,9 @@
 //! This file is the model as one reads it, on candle's autograd. Training steps and predictions run the same maths with
 //! hand-written backward passes (`act_fused.rs`); tests hold the two together.
 
-use crate::act_fused::Workspaces;
 use crate::batch::{Batch, Dims};
 use crate::error::{ModelError, Result};
+use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
     Activation, Dropout, Embedding, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention, sinusoid_table,

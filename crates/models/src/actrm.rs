@@ -24,7 +24,11 @@
 //! Halting: a head reads the reasoning after each step and is trained on whether one more step
 //! would still lower this sample's chunk error. For the last step's target one more step runs
 //! without gradient.
+//!
+//! This file is the model as one reads it, on candle's autograd. Training steps and thoughts run the same maths with
+//! hand-written backward passes (`actrm/fused.rs`); tests hold the two together.
 
+mod fused;
 mod reasoning;
 #[cfg(test)]
 mod tests;
@@ -35,8 +39,10 @@ use crate::act::{self, DecoderLayer, Encoder, LayerInit, Vae, absolute};
 use crate::batch::{Batch, Dims};
 use crate::classification::binary_cross_entropy;
 use crate::error::{ModelError, Result};
+use crate::fused::Workspaces;
+use crate::gradients::Gradients;
 use crate::layers::{Activation, Embedding, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention, sinusoid_table};
-use crate::model::{LossParts, PolicyModel};
+use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
 use candle_core::{DType, Device, Tensor};
@@ -324,7 +330,7 @@ struct OverActions {
 #[derive(Debug)]
 struct OverMemory {
     block: Encoder,
-    z_init: [Tensor; 2],
+    z_init: [Vec<f32>; 2],
     decoder: Vec<DecoderLayer>,
     decoder_norm: LayerNorm,
     decoder_pos: Embedding,
@@ -367,6 +373,8 @@ pub struct Actrm {
     vae: Option<Vae>,
     /// (1, H + 2, D), fixed
     vae_pos_enc: Tensor,
+    /// the same as a slice
+    vae_positions: Vec<f32>,
     latent_input_proj: Linear,
     robot_state_input_proj: Linear,
     env_state_input_proj: Option<Linear>,
@@ -374,6 +382,7 @@ pub struct Actrm {
     design: Design,
     action_head: Linear,
     halt_head: Linear,
+    workspaces: Workspaces,
 }
 
 impl Actrm {
@@ -401,6 +410,7 @@ impl Actrm {
             e => Some(Linear::new(&mut p, "encoder_env_state_input_proj", e, dim, rng)?),
         };
         let tokens = 2 + usize::from(env.is_some());
+        let positions = sinusoid_table(config.action_horizon + 2, dim)?;
         let design = match r.over {
             Over::Actions => Design::Actions(OverActions {
                 memory_encoder: match config.n_memory_layers {
@@ -418,7 +428,7 @@ impl Actrm {
                 let quiet = act::Config { dropout: 0.0, ..layers.clone() };
                 Design::Memory(OverMemory {
                     block: Encoder::new(&mut p, "reasoning", r.n_layers, &quiet, LayerInit::Xavier, rng)?,
-                    z_init: fixed_states(dim)?,
+                    z_init: fixed_values(dim),
                     decoder: (0..config.n_decoder_layers)
                         .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), &layers, rng))
                         .collect::<Result<_>>()?,
@@ -429,7 +439,8 @@ impl Actrm {
         };
         Ok(Self {
             vae,
-            vae_pos_enc: sinusoid_table(config.action_horizon + 2, dim)?,
+            vae_positions: positions.flatten_all()?.to_vec1()?,
+            vae_pos_enc: positions,
             latent_input_proj: Linear::new(&mut p, "encoder_latent_input_proj", config.latent_dim, dim, rng)?,
             robot_state_input_proj: Linear::new(&mut p, "encoder_robot_state_input_proj", dims.state, dim, rng)?,
             env_state_input_proj: env,
@@ -437,6 +448,7 @@ impl Actrm {
             design,
             action_head: Linear::new(&mut p, "action_head", dim, dims.action, rng)?,
             halt_head: Linear::new(&mut p, "halt_head", dim, 1, rng)?,
+            workspaces: Workspaces::default(),
             params: p,
             config: config.clone(),
             dims: *dims,
@@ -495,10 +507,8 @@ impl Actrm {
             }
             Design::Memory(design) => {
                 let [h, l] = &design.z_init;
-                Carry {
-                    answer: h.broadcast_as(memory.shape())?.contiguous()?,
-                    reasoning: l.broadcast_as(memory.shape())?.contiguous()?,
-                }
+                let all = |z: &[f32]| Tensor::from_slice(z, z.len(), &Device::Cpu)?.broadcast_as(memory.shape());
+                Carry { answer: all(h)?.contiguous()?, reasoning: all(l)?.contiguous()? }
             }
         })
     }
@@ -567,6 +577,16 @@ impl Actrm {
         design.decoder_norm.forward(&x)
     }
 
+    /// Supervision steps for this batch.
+    fn steps_of(&self, batch: &Batch) -> usize {
+        let most = self.config.reasoning.supervision_steps;
+        match self.config.reasoning.over {
+            Over::Actions => most,
+            // the same for all shards of a batch
+            Over::Memory => 1 + Rng::new(batch.seed, "supervision steps").below(most as u64) as usize,
+        }
+    }
+
     /// Weights of the supervision steps, which sum to 1: growing with depth over actions (late
     /// steps are what is executed), equal over the memory (the original's).
     fn step_weights(&self, steps: usize) -> Vec<f64> {
@@ -622,16 +642,11 @@ impl OverActions {
     }
 }
 
-/// The fixed values that `z_h` and `z_l` begin with: a pure function of the width, so that nothing
-/// untrained needs storing.
-fn fixed_states(dim: usize) -> Result<[Tensor; 2]> {
-    let state = |name: &str| -> Result<Tensor> {
-        let mut rng = Rng::new(0, name);
-        let mut scratch = Params::new();
-        let init = Init::TruncatedNormal { std: 1.0 };
-        Ok(scratch.create("state", &[dim], init, &mut rng)?.detach())
-    };
-    Ok([state("actrm z_h")?, state("actrm z_l")?])
+/// The fixed values that `z_h` and `z_l` begin with, (D) each: a pure function of the width, so that nothing untrained
+/// needs storing.
+fn fixed_values(dim: usize) -> [Vec<f32>; 2] {
+    let init = Init::TruncatedNormal { std: 1.0 };
+    ["actrm z_h", "actrm z_l"].map(|name| init.values(&[dim], &mut Rng::new(0, name)))
 }
 
 impl PolicyModel for Actrm {
@@ -661,12 +676,7 @@ impl PolicyModel for Actrm {
             carry.answer = self.warm_answers(batch, warm, &carry, rng)?;
         }
 
-        let most = self.config.reasoning.supervision_steps;
-        let steps = match self.config.reasoning.over {
-            Over::Actions => most,
-            // the same for all shards of a batch
-            Over::Memory => 1 + Rng::new(batch.seed, "supervision steps").below(most as u64) as usize,
-        };
+        let steps = self.steps_of(batch);
         let (mut chunks, mut halts) = (Vec::new(), Vec::new());
         for _ in 0..steps {
             let step = self.step(&memory, &carry, &mut Mode::Train(rng))?;
@@ -714,6 +724,10 @@ impl PolicyModel for Actrm {
             total = (total + (kld * self.config.kl_weight)?)?;
         }
         Ok(LossParts { total, parts })
+    }
+
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        self.fused_gradients(batch, rng, into)
     }
 
     fn predict(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {

@@ -6,18 +6,33 @@
 //! are computed once for the batch: `(x + pos) Wᵀ = x Wᵀ + pos Wᵀ`.
 
 mod attention;
+mod block;
 mod decoder;
 mod encoder;
 mod feed_forward;
+mod loss;
+mod observation;
+#[cfg(test)]
+pub(crate) mod testing;
+mod vae;
 
-pub(crate) use decoder::{DecoderGrads, DecoderLayer, Memory};
-pub(crate) use encoder::EncoderLayer;
+pub(crate) use block::{BlockLayer, Part, gather, keys_and_values, keys_and_values_backward, scatter};
+pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
+pub(crate) use encoder::Encoder;
+pub(crate) use loss::AbsoluteError;
+pub(crate) use observation::{Data, Tokens};
+pub(crate) use vae::Vae;
+
+use crate::error::{ModelError, Result};
 
 use crate::kernels::{Mat, Pack, Pool, Start, add, column_sums, drop_scale, layer_norm, layer_norm_backward, product};
 use crate::layers::{Activation, DropoutMask};
+use crate::params::Params;
 use crate::rng::Rng;
 use crate::simd::vectorised;
+use candle_core::Storage;
 use std::collections::BTreeMap;
+use std::sync::{Mutex, PoisonError};
 
 /// Parameters by name.
 pub(crate) type Weights<'a> = BTreeMap<&'a str, &'a [f32]>;
@@ -29,6 +44,36 @@ pub(crate) type Grads<'a> = BTreeMap<&'a str, &'a mut [f32]>;
 pub(crate) struct Workspace {
     pub(crate) pool: Pool,
     pub(crate) pack: Pack,
+}
+
+/// Workspaces of shards that ran before.
+#[derive(Debug, Default)]
+pub(crate) struct Workspaces(Mutex<Vec<Workspace>>);
+
+impl Workspaces {
+    /// Calls `f` with a workspace that no other thread has.
+    pub(crate) fn with<R>(&self, f: impl FnOnce(&mut Workspace) -> R) -> R {
+        let taken = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut space = taken.unwrap_or_default();
+        let result = f(&mut space);
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(space);
+        result
+    }
+}
+
+/// Calls `f` with all parameters as slices.
+pub(crate) fn with_weights<R>(params: &Params, f: impl FnOnce(&Weights<'_>) -> R) -> Result<R> {
+    let guards: Vec<_> = params.iter().map(|(name, var)| (name, var.as_tensor().storage_and_layout())).collect();
+    let mut weights = BTreeMap::new();
+    for (name, (storage, layout)) in &guards {
+        let Storage::Cpu(storage) = &**storage else {
+            let (found, expected) = ("on another device".to_string(), "on the CPU".to_string());
+            return Err(ModelError::Input { operation: "read", object: "parameter", found, expected });
+        };
+        let from = layout.start_offset();
+        weights.insert(*name, &storage.as_slice::<f32>()?[from..from + layout.shape().elem_count()]);
+    }
+    Ok(f(&weights))
 }
 
 /// What all layers of a model share.

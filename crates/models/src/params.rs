@@ -33,6 +33,43 @@ pub enum Init {
     KaimingUniform,
 }
 
+impl Init {
+    /// Values of a parameter of this shape.
+    pub fn values(self, shape: &[usize], rng: &mut Rng) -> Vec<f32> {
+        let n: usize = shape.iter().product();
+        let (fan_out, fan_in) = match *shape {
+            [out, input] => (out as f64, input as f64),
+            [len] => (len as f64, len as f64),
+            _ => {
+                let per = shape.iter().skip(2).product::<usize>();
+                let at = |i: usize| shape.get(i).copied().unwrap_or(1) * per;
+                (at(0) as f64, at(1) as f64)
+            }
+        };
+        let mut uniform = |bound: f64| -> Vec<f32> {
+            (0..n).map(|_| ((2.0 * f64::from(rng.uniform()) - 1.0) * bound) as f32).collect()
+        };
+        match self {
+            Self::Zeros => vec![0.0; n],
+            Self::Ones => vec![1.0; n],
+            Self::Uniform { bound } => uniform(bound),
+            Self::XavierUniform => uniform((6.0 / (fan_in + fan_out)).sqrt()),
+            Self::KaimingUniform => uniform(1.0 / fan_in.sqrt()),
+            Self::Normal { std } => (0..n).map(|_| rng.normal_f32() * std as f32).collect(),
+            Self::TruncatedNormal { std } => (0..n)
+                .map(|_| {
+                    loop {
+                        let x = rng.normal_f32();
+                        if x.abs() <= 2.0 {
+                            break x * std as f32;
+                        }
+                    }
+                })
+                .collect(),
+        }
+    }
+}
+
 /// A model's parameters by name. Cloning shares the storage.
 #[derive(Debug, Clone, Default)]
 pub struct Params {
@@ -50,38 +87,7 @@ impl Params {
     /// # Errors
     /// If the name is taken, or the tensor library fails.
     pub fn create(&mut self, name: &str, shape: &[usize], init: Init, rng: &mut Rng) -> Result<Tensor> {
-        let n: usize = shape.iter().product();
-        let (fan_out, fan_in) = match *shape {
-            [out, input] => (out as f64, input as f64),
-            [len] => (len as f64, len as f64),
-            _ => {
-                let per = shape.iter().skip(2).product::<usize>();
-                let at = |i: usize| shape.get(i).copied().unwrap_or(1) * per;
-                (at(0) as f64, at(1) as f64)
-            }
-        };
-        let mut uniform = |bound: f64| -> Vec<f32> {
-            (0..n).map(|_| ((2.0 * f64::from(rng.uniform()) - 1.0) * bound) as f32).collect()
-        };
-        let values: Vec<f32> = match init {
-            Init::Zeros => vec![0.0; n],
-            Init::Ones => vec![1.0; n],
-            Init::Uniform { bound } => uniform(bound),
-            Init::XavierUniform => uniform((6.0 / (fan_in + fan_out)).sqrt()),
-            Init::KaimingUniform => uniform(1.0 / fan_in.sqrt()),
-            Init::Normal { std } => (0..n).map(|_| rng.normal_f32() * std as f32).collect(),
-            Init::TruncatedNormal { std } => (0..n)
-                .map(|_| {
-                    loop {
-                        let x = rng.normal_f32();
-                        if x.abs() <= 2.0 {
-                            break x * std as f32;
-                        }
-                    }
-                })
-                .collect(),
-        };
-        self.insert(name, Tensor::from_vec(values, shape, &Device::Cpu)?)
+        self.insert(name, Tensor::from_vec(init.values(shape, rng), shape, &Device::Cpu)?)
     }
 
     /// Adds `name` with the given values.

@@ -20,7 +20,10 @@ pub(crate) fn dispatch<Op: WithSimd>(op: Op) -> Op::Output {
         use pulp::x86::{V3, V4};
         use std::sync::OnceLock;
         static WIDEST: OnceLock<(Option<V4>, Option<V3>)> = OnceLock::new();
-        match *WIDEST.get_or_init(|| (V4::try_new(), V3::try_new())) {
+        let (v4, v3) = *WIDEST.get_or_init(|| (V4::try_new(), V3::try_new()));
+        #[cfg(test)]
+        let (v4, v3) = limit::limited(v4, v3);
+        match (v4, v3) {
             (Some(v4), _) => return Simd::vectorize(v4, op),
             (None, Some(v3)) => return Simd::vectorize(v3, op),
             (None, None) => {}
@@ -58,4 +61,39 @@ pub(crate) fn sum_of_squares(values: &[f32]) -> f64 {
         },
     );
     total
+}
+
+/// For tests: code for machines with less than this one has.
+#[cfg(test)]
+pub(crate) use limit::{Level, at_most};
+
+#[cfg(test)]
+mod limit {
+    use std::cell::Cell;
+
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+    pub(crate) enum Level {
+        Scalar,
+        Avx2,
+        Avx512,
+    }
+
+    impl Level {
+        pub(crate) const ALL: [Self; 3] = [Self::Avx512, Self::Avx2, Self::Scalar];
+    }
+
+    thread_local!(static MOST: Cell<Level> = const { Cell::new(Level::Avx512) });
+
+    /// Runs `f` as on a machine whose widest vectors are those of `level`; on this thread only.
+    pub(crate) fn at_most<R>(level: Level, f: impl FnOnce() -> R) -> R {
+        let before = MOST.replace(level);
+        let result = f();
+        MOST.set(before);
+        result
+    }
+
+    pub(super) fn limited<A, B>(v4: Option<A>, v3: Option<B>) -> (Option<A>, Option<B>) {
+        let most = MOST.get();
+        (v4.filter(|_| most >= Level::Avx512), v3.filter(|_| most >= Level::Avx2))
+    }
 }

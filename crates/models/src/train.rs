@@ -154,6 +154,7 @@ pub struct Trainer {
     gradients: Vec<Gradients>,
     ema: Option<Vec<f32>>,
     rng: Rng,
+    threads: usize,
 }
 
 impl std::fmt::Debug for Trainer {
@@ -177,7 +178,12 @@ impl Trainer {
             None => None,
         };
         let optimiser = Optimiser::new(config.optimiser, layout);
-        Ok(Self { model, config, optimiser, gradients, ema, rng: Rng::new(seed, "train") })
+        Ok(Self { model, config, optimiser, gradients, ema, rng: Rng::new(seed, "train"), threads: SHARDS })
+    }
+
+    /// Runs on at most `threads` threads (2 unless set). The weights do not depend on it.
+    pub fn set_threads(&mut self, threads: usize) {
+        self.threads = threads.max(1);
     }
 
     /// The model as it is now.
@@ -245,13 +251,14 @@ impl Trainer {
                 .zip(&mut self.gradients)
                 .map(|(shard, into)| (shard, Rng::new(self.rng.next_u64(), "shard"), into))
                 .collect();
-            let mine = work.remove(0);
+            let alone = if self.threads == 1 { work.len() } else { 1 };
+            let mine: Vec<_> = work.drain(..alone).collect();
             let run = |(shard, mut rng, into): (&Batch, Rng, &mut Gradients)| {
                 model.accumulate_gradients(shard, &mut rng, into)
             };
             let values = std::thread::scope(|scope| {
                 let others: Vec<_> = work.into_iter().map(|w| scope.spawn(move || run(w))).collect();
-                let mut values = vec![run(mine)];
+                let mut values: Vec<_> = mine.into_iter().map(run).collect();
                 for other in others {
                     values.push(other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
                 }

@@ -1,6 +1,7 @@
 //! Thinking at inference: step by step, until a rule says stop, with everything on record.
 
-use super::{Actrm, Carry};
+use super::{Actrm, Carry, Over, ReasoningConfig};
+use crate::act;
 use crate::error::{ModelError, Result};
 use crate::layers::Mode;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, Normaliser, STATE};
@@ -49,47 +50,91 @@ impl Actrm {
         start: Option<&Tensor>,
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
-        self.check_inputs(state, environment_state)?;
+        self.check_thought(state, environment_state, start)?;
+        let mut thought = Thought::new(&self.config.reasoning, state.dim(0)?, should_stop);
+        let answer = self.think(state, environment_state, start, &mut |chunk, logits| thought.step(chunk, &logits))?;
+        thought.end(answer)
+    }
+
+    /// The thought on candle's autograd; `reason` runs the same maths faster.
+    ///
+    /// # Errors
+    /// Inputs of the wrong shape.
+    pub fn reason_composed(
+        &self,
+        state: &Tensor,
+        environment_state: Option<&Tensor>,
+        start: Option<&Tensor>,
+        should_stop: &mut dyn FnMut(usize) -> bool,
+    ) -> Result<Reasoning> {
+        self.check_thought(state, environment_state, start)?;
         let rows = state.dim(0)?;
-        let rules = &self.config.reasoning;
         let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, &Device::Cpu)?;
         let memory = self.memory(&latent, state, environment_state, &mut Mode::Eval)?.detach();
         let mut carry = self.start(rows, &memory)?;
         if let Some(start) = start {
-            if start.dims() != carry.answer.dims() {
-                return Err(ModelError::Shape {
-                    operation: "actrm",
-                    object: "warm start",
-                    expected: carry.answer.dims().to_vec(),
-                    found: start.dims().to_vec(),
-                });
-            }
             carry.answer = start.clone();
         }
-        let mut steps: Vec<ReasoningStep> = Vec::new();
-        let mut depth = vec![0usize; rows];
-        for done in 1..=rules.max_steps() {
+        let mut thought = Thought::new(&self.config.reasoning, rows, should_stop);
+        loop {
             let step = self.step(&memory, &carry, &mut Mode::Eval)?;
             carry = Carry::detach(&step.carry);
-            let chunk = step.chunk.detach();
-            let halt = candle_nn::ops::sigmoid(&step.halt_logit)?.to_vec1::<f32>()?;
-            let change = match steps.last() {
-                Some(before) => (&chunk - &before.chunk)?.abs()?.mean((1, 2))?.to_vec1::<f32>()?,
-                None => vec![f32::INFINITY; rows],
-            };
-            let last = done == rules.max_steps() || should_stop(done);
-            for row in 0..rows {
-                let settled =
-                    f64::from(change[row]) < rules.change_threshold || f64::from(halt[row]) > rules.halt_threshold;
-                if depth[row] == 0 && (last || settled) {
-                    depth[row] = done;
-                }
-            }
-            steps.push(ReasoningStep { chunk, halt, change });
-            if depth.iter().all(|&d| d > 0) {
-                break;
+            if thought.step(step.chunk.detach(), &step.halt_logit.to_vec1()?)? {
+                return thought.end(carry.answer);
             }
         }
+    }
+
+    fn check_thought(&self, state: &Tensor, environment_state: Option<&Tensor>, start: Option<&Tensor>) -> Result<()> {
+        self.check_inputs(state, environment_state)?;
+        let tokens = match self.config.reasoning.over {
+            Over::Actions => self.config.action_horizon,
+            Over::Memory => self.feature_pos_embed.weight.dim(0)?,
+        };
+        match start {
+            Some(start) => {
+                act::check_shape("actrm", "warm start", start, &[state.dim(0)?, tokens, self.config.dim_model])
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// A thought in progress: the rules that end it, and its record.
+struct Thought<'a> {
+    rules: &'a ReasoningConfig,
+    should_stop: &'a mut dyn FnMut(usize) -> bool,
+    steps: Vec<ReasoningStep>,
+    depth: Vec<usize>,
+}
+
+impl<'a> Thought<'a> {
+    fn new(rules: &'a ReasoningConfig, rows: usize, should_stop: &'a mut dyn FnMut(usize) -> bool) -> Self {
+        Self { rules, should_stop, steps: Vec::new(), depth: vec![0; rows] }
+    }
+
+    /// Records a step's chunk, (b, H, A), and halting logits, (b); whether every row has halted.
+    fn step(&mut self, chunk: Tensor, halt_logits: &[f32]) -> Result<bool> {
+        let done = self.steps.len() + 1;
+        let halt: Vec<f32> = halt_logits.iter().map(|x| 1.0 / (1.0 + (-x).exp())).collect();
+        let change = match self.steps.last() {
+            Some(before) => (&chunk - &before.chunk)?.abs()?.mean((1, 2))?.to_vec1::<f32>()?,
+            None => vec![f32::INFINITY; halt.len()],
+        };
+        let last = done == self.rules.max_steps() || (self.should_stop)(done);
+        for ((depth, change), halt) in self.depth.iter_mut().zip(&change).zip(&halt) {
+            let settled =
+                f64::from(*change) < self.rules.change_threshold || f64::from(*halt) > self.rules.halt_threshold;
+            if *depth == 0 && (last || settled) {
+                *depth = done;
+            }
+        }
+        self.steps.push(ReasoningStep { chunk, halt, change });
+        Ok(self.depth.iter().all(|&d| d > 0))
+    }
+
+    fn end(self, answer: Tensor) -> Result<Reasoning> {
+        let Self { steps, depth, .. } = self;
         let chunk = match depth.iter().all(|&d| d == steps.len()) {
             true => steps[steps.len() - 1].chunk.clone(),
             false => {
@@ -99,7 +144,7 @@ impl Actrm {
                 Tensor::cat(&rows, 0)?
             }
         };
-        Ok(Reasoning { steps, chunk, depth, answer: carry.answer })
+        Ok(Reasoning { steps, chunk, depth, answer })
     }
 }
 

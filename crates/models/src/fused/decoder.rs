@@ -1,13 +1,13 @@
-//! The decoder layer.
+//! The decoder: its layer, and the stack with its final norm.
 
 use super::attention::{Attention, Side};
 use super::feed_forward::FeedForward;
-use super::{Entry, Grads, Pass, Residual, Rows, Shape, enter, enter_backward, sum_over_sequences};
+use super::{Entry, Grads, Norm, Pass, Residual, Rows, Shape, enter, enter_backward, sum_over_sequences};
 use crate::kernels::{Heads, Start, add};
 
 /// What a decoder layer's backward pass needs.
 #[derive(Debug)]
-pub(crate) struct DecoderLayer {
+struct DecoderLayer {
     prefix: String,
     y1: Vec<f32>,
     self_attn: Attention,
@@ -38,7 +38,7 @@ pub(crate) struct DecoderGrads<'a> {
 impl DecoderLayer {
     /// x: (b, c, D), or (c, D) if it is the same for the whole batch, as for the first layer, whose input is zero;
     /// query_pos: (c, D) -> (b, c, D)
-    pub(crate) fn forward(
+    fn forward(
         pass: &mut Pass<'_>,
         prefix: String,
         x: Vec<f32>,
@@ -49,7 +49,16 @@ impl DecoderLayer {
         let (batch, queries) = (memory.batch, query_pos.len() / dim);
         let shared = x.len() == query_pos.len();
         let rows = Rows { computed: queries, all: queries };
-        let heads = Heads { batch, heads, queries, all_queries: queries, keys: queries, dim, shared };
+        let heads = Heads {
+            batch,
+            heads,
+            queries,
+            all_queries: queries,
+            keys: queries,
+            dim,
+            shared_queries: shared,
+            shared_keys: shared,
+        };
         let name = |part: &str| format!("{prefix}.{part}");
 
         let Entry { y: y1, x, norm } = enter(pass, &name("norm1"), x);
@@ -62,7 +71,7 @@ impl DecoderLayer {
 
         let Entry { y: y2, x, norm } = enter(pass, &name("norm2"), x1);
         let key = Side { x: memory.x, pos: memory.pos };
-        let heads = Heads { keys: memory.pos.len() / dim, shared: false, ..heads };
+        let heads = Heads { keys: memory.pos.len() / dim, shared_queries: false, shared_keys: false, ..heads };
         let query = Side { x: &y2, pos: query_pos };
         let (branch, cross) = Attention::forward(pass, &name("multihead_attn"), heads, query, key, None);
         let (x2, residual2) = Residual::leave(pass, &name("norm2"), norm, x.as_ref().unwrap_or(&y2), branch, rows);
@@ -80,7 +89,7 @@ impl DecoderLayer {
     }
 
     /// grad: that of the output -> that of x, of x's own number of rows
-    pub(crate) fn backward(
+    fn backward(
         self,
         pass: &mut Pass<'_>,
         mut grad: Vec<f32>,
@@ -142,7 +151,7 @@ impl DecoderLayer {
     }
 
     /// Gives the buffers back without a backward pass.
-    pub(crate) fn free(self, pass: &mut Pass<'_>) {
+    fn free(self, pass: &mut Pass<'_>) {
         self.self_attn.free(pass);
         self.cross.free(pass);
         self.ff.free(pass);
@@ -152,5 +161,52 @@ impl DecoderLayer {
         for buffer in [self.y1, self.y2, self.y3] {
             pass.give(buffer);
         }
+    }
+}
+
+/// What the backward pass of a decoder over the memory needs.
+#[derive(Debug)]
+pub(crate) struct Decoder {
+    layers: Vec<DecoderLayer>,
+    norm: Norm,
+}
+
+impl Decoder {
+    /// Layers `decoder.layers.0..n` over an input of zeros, and `decoder.norm`; query_pos: (c, D) -> (b, c, D)
+    pub(crate) fn forward(pass: &mut Pass<'_>, n: usize, query_pos: &[f32], memory: Memory<'_>) -> (Vec<f32>, Self) {
+        // zero for every sample: one sequence stands for all of them
+        let mut x = pass.space.pool.zeros(query_pos.len());
+        let mut layers = Vec::with_capacity(n);
+        for i in 0..n {
+            let (out, layer) = DecoderLayer::forward(pass, format!("decoder.layers.{i}"), x, query_pos, memory);
+            x = out;
+            layers.push(layer);
+        }
+        let (out, norm) = Norm::forward(pass, "decoder.norm", &x);
+        pass.give(x);
+        (out, Self { layers, norm })
+    }
+
+    /// grad: that of the output, (b, c, D)
+    pub(crate) fn backward(
+        self,
+        pass: &mut Pass<'_>,
+        mut grad: Vec<f32>,
+        query_pos: &[f32],
+        memory: Memory<'_>,
+        into: &mut DecoderGrads<'_>,
+        grads: &mut Grads<'_>,
+    ) {
+        self.norm.backward(pass, "decoder.norm", &mut grad, grads);
+        for layer in self.layers.into_iter().rev() {
+            grad = layer.backward(pass, grad, query_pos, memory, into, grads);
+        }
+        pass.give(grad);
+    }
+
+    /// Gives the buffers back without a backward pass.
+    pub(crate) fn free(self, pass: &mut Pass<'_>) {
+        self.norm.free(pass);
+        self.layers.into_iter().for_each(|layer| layer.free(pass));
     }
 }

@@ -1,13 +1,13 @@
-//! The encoder layer.
+//! The encoder: its layer, and the stack with its final norm.
 
 use super::attention::{Attention, Side};
 use super::feed_forward::FeedForward;
-use super::{Entry, Grads, Pass, Residual, Rows, Shape, enter, enter_backward};
+use super::{Entry, Grads, Norm, Pass, Residual, Rows, Shape, enter, enter_backward};
 use crate::kernels::{Heads, Start, add};
 
 /// What an encoder layer's backward pass needs.
 #[derive(Debug)]
-pub(crate) struct EncoderLayer {
+struct EncoderLayer {
     prefix: String,
     /// input of the attention
     y1: Vec<f32>,
@@ -33,7 +33,7 @@ fn first_rows(pass: &mut Pass<'_>, x: &[f32], tokens: usize) -> Vec<f32> {
 impl EncoderLayer {
     /// x: (b, t, D), pos: (t, D), key_pad: (b, t) -> (b, t, D), or (b, 1, D) with `only_first`: then only the first
     /// token's output is computed, for a last layer of which nothing else is used.
-    pub(crate) fn forward(
+    fn forward(
         pass: &mut Pass<'_>,
         prefix: String,
         x: Vec<f32>,
@@ -47,7 +47,16 @@ impl EncoderLayer {
         let queries = if only_first { 1 } else { tokens };
         let rows = Rows { computed: queries, all: tokens };
         let batch = x.len() / (tokens * dim);
-        let heads = Heads { batch, heads, queries, all_queries: tokens, keys: tokens, dim, shared: false };
+        let heads = Heads {
+            batch,
+            heads,
+            queries,
+            all_queries: tokens,
+            keys: tokens,
+            dim,
+            shared_queries: false,
+            shared_keys: false,
+        };
 
         let Entry { y: y1, x, norm } = enter(pass, &format!("{prefix}.norm1"), x);
         let y1_first = only_first.then(|| first_rows(pass, &y1, tokens));
@@ -73,7 +82,7 @@ impl EncoderLayer {
     }
 
     /// grad: that of the output -> that of x; adds to `pos_grad`.
-    pub(crate) fn backward(
+    fn backward(
         self,
         pass: &mut Pass<'_>,
         mut grad: Vec<f32>,
@@ -135,7 +144,7 @@ impl EncoderLayer {
     }
 
     /// Gives the buffers back without a backward pass.
-    pub(crate) fn free(self, pass: &mut Pass<'_>) {
+    fn free(self, pass: &mut Pass<'_>) {
         self.attention.free(pass);
         self.ff.free(pass);
         self.residual1.norm.free(pass);
@@ -149,5 +158,68 @@ impl EncoderLayer {
 fn add_to_first_rows(x: &mut [f32], first: &[f32], dim: usize, tokens: usize) {
     for (to, from) in x.chunks_exact_mut(tokens * dim).zip(first.chunks_exact(dim)) {
         to[..dim].iter_mut().zip(from).for_each(|(a, b)| *a += b);
+    }
+}
+
+/// What an encoder's backward pass needs.
+#[derive(Debug)]
+pub(crate) struct Encoder {
+    layers: Vec<EncoderLayer>,
+    /// after the last layer and under this prefix, if layers norm before their branches
+    norm: Option<(String, Norm)>,
+}
+
+impl Encoder {
+    /// Layers `{prefix}.layers.0..n` and, if they are pre-norm, `{prefix}.norm`. x: (b, t, D), pos: (t, D),
+    /// key_pad: (b, t) -> (b, t, D), or (b, 1, D) with `only_first`.
+    pub(crate) fn forward(
+        pass: &mut Pass<'_>,
+        prefix: &str,
+        n: usize,
+        mut x: Vec<f32>,
+        pos: &[f32],
+        key_pad: Option<&[f32]>,
+        only_first: bool,
+    ) -> (Vec<f32>, Self) {
+        let mut layers = Vec::with_capacity(n);
+        for i in 0..n {
+            let only_first = only_first && i + 1 == n;
+            let (out, layer) = EncoderLayer::forward(pass, format!("{prefix}.layers.{i}"), x, pos, key_pad, only_first);
+            x = out;
+            layers.push(layer);
+        }
+        if !pass.shape.pre_norm {
+            return (x, Self { layers, norm: None });
+        }
+        let name = format!("{prefix}.norm");
+        let (out, norm) = Norm::forward(pass, &name, &x);
+        pass.give(x);
+        (out, Self { layers, norm: Some((name, norm)) })
+    }
+
+    /// grad: that of the output -> that of x; adds to `pos_grad`.
+    pub(crate) fn backward(
+        self,
+        pass: &mut Pass<'_>,
+        mut grad: Vec<f32>,
+        pos: &[f32],
+        mut pos_grad: Option<&mut [f32]>,
+        grads: &mut Grads<'_>,
+    ) -> Vec<f32> {
+        if let Some((name, norm)) = self.norm {
+            norm.backward(pass, &name, &mut grad, grads);
+        }
+        for layer in self.layers.into_iter().rev() {
+            grad = layer.backward(pass, grad, pos, pos_grad.as_deref_mut(), grads);
+        }
+        grad
+    }
+
+    /// Gives the buffers back without a backward pass.
+    pub(crate) fn free(self, pass: &mut Pass<'_>) {
+        self.layers.into_iter().for_each(|layer| layer.free(pass));
+        if let Some((_, norm)) = self.norm {
+            norm.free(pass);
+        }
     }
 }

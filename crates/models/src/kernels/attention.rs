@@ -18,8 +18,10 @@ pub(crate) struct Heads {
     pub(crate) keys: usize,
     /// width of all heads together
     pub(crate) dim: usize,
-    /// queries, keys and values are those of one sequence, the same for the whole batch
-    pub(crate) shared: bool,
+    /// queries are those of one sequence, the same for the whole batch
+    pub(crate) shared_queries: bool,
+    /// so are keys and values
+    pub(crate) shared_keys: bool,
 }
 
 impl Heads {
@@ -32,9 +34,10 @@ impl Heads {
         self.batch * self.heads * self.queries * self.keys
     }
 
-    /// Offset of sequence `b` in rows of `len` tokens.
-    fn sequence(&self, b: usize, len: usize) -> usize {
-        if self.shared { 0 } else { b * len }
+    /// First row of the queries of sequence `b`, and of its keys.
+    fn sequence(&self, b: usize) -> (usize, usize) {
+        let start = |shared: bool, len: usize| if shared { 0 } else { b * len };
+        (start(self.shared_queries, self.queries), start(self.shared_keys, self.keys))
     }
 
     /// Where row `t` of head `h` of sequence `b` starts in the mask.
@@ -63,9 +66,10 @@ pub(crate) fn attend(
     let mut dropped = pool.take(t * s);
     for b in 0..batch {
         let pad = key_pad.map(|p| &p[b * s..(b + 1) * s]);
+        let (q_row, kv_row) = heads.sequence(b);
         for h in 0..heads.heads {
-            let q = Mat::rows(&q[heads.sequence(b, t) * dim + h * head..], dim);
-            let kv = &kv[heads.sequence(b, s) * 2 * dim + h * head..];
+            let q = Mat::rows(&q[q_row * dim + h * head..], dim);
+            let kv = &kv[kv_row * 2 * dim + h * head..];
             let at = (b * heads.heads + h) * t * s;
             let p = &mut weights[at..at + t * s];
             gemm((t, s, head), q, Mat::rows(kv, 2 * dim).t(), Start::Zero, p, s, pack);
@@ -115,8 +119,9 @@ pub(crate) fn attend_backward(
     let scale = 1.0 / (head as f32).sqrt();
     let (mut dropped, mut grad) = (pool.take(t * s), pool.take(t * s));
     for b in 0..batch {
+        let (q_row, kv_row) = heads.sequence(b);
         for h in 0..heads.heads {
-            let (q_at, kv_at) = (heads.sequence(b, t) * dim + h * head, heads.sequence(b, s) * 2 * dim + h * head);
+            let (q_at, kv_at) = (q_row * dim + h * head, kv_row * 2 * dim + h * head);
             let at = (b * heads.heads + h) * t * s;
             let p = &weights[at..at + t * s];
             let out_grad = Mat::rows(&out_grad[b * t * dim + h * head..], dim);

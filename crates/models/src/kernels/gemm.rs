@@ -354,14 +354,15 @@ fn tile<S: Simd, const MR: usize>(
 mod tests {
     use super::*;
     use crate::rng::Rng;
+    use crate::simd::{Level, at_most};
     use proptest::prelude::*;
 
     proptest! {
-        #![proptest_config(ProptestConfig::with_cases(60))]
+        #![proptest_config(ProptestConfig::with_cases(90))]
         #[test]
         fn it_is_the_naive_product(
             m in 1usize..70, n in 1usize..70, k in 1usize..40, deep: bool, wide: bool,
-            ta: bool, tb: bool, start in 0u8..3, extra in 0usize..3,
+            ta: bool, tb: bool, start in 0u8..3, extra in 0usize..3, level in 0usize..3,
         ) {
             // beyond one block in depth and in width
             let k = if deep { k + 250 } else { k };
@@ -374,10 +375,12 @@ mod tests {
             let (am, bm) = (mat(&a[..], ta, m, k), mat(&b[..], tb, k, n));
             let mut c = before.clone();
             let kind = match start { 0 => Start::Zero, 1 => Start::Add, _ => Start::Bias(&bias) };
-            gemm_with((m, n, k), am, bm, kind, &mut c, n + extra, &mut Pack::default(), |i, j0, row| {
-                for (j, x) in row.iter_mut().enumerate() {
-                    *x += (i * 2 + (j0 + j)) as f32;
-                }
+            at_most(Level::ALL[level], || {
+                gemm_with((m, n, k), am, bm, kind, &mut c, n + extra, &mut Pack::default(), |i, j0, row| {
+                    for (j, x) in row.iter_mut().enumerate() {
+                        *x += (i * 2 + (j0 + j)) as f32;
+                    }
+                });
             });
             for i in 0..m {
                 for j in 0..n {

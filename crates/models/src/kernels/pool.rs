@@ -32,4 +32,10 @@ impl Pool {
     pub(crate) fn give(&mut self, buffer: Vec<f32>) {
         self.free.entry(buffer.len()).or_default().push(buffer);
     }
+
+    /// Numbers in all free buffers.
+    #[cfg(test)]
+    pub(crate) fn numbers(&self) -> usize {
+        self.free.iter().map(|(len, buffers)| len * buffers.len()).sum()
+    }
 }

@@ -1,0 +1,333 @@
+//! ACTRM's training step and thought on `fused` layers: the maths of `actrm.rs`, written out forwards and backwards.
+//!
+//! Random numbers are drawn in the order in which the composed model draws them, so both see the same noise.
+
+mod over_actions;
+mod over_memory;
+#[cfg(test)]
+mod tests;
+
+use super::{Actrm, Config, Over, WarmStart};
+use crate::batch::Batch;
+use crate::error::Result;
+use crate::fused::{AbsoluteError, Data, Grads, Pass, Shape, Tokens, Vae, with_weights};
+use crate::gradients::Gradients;
+use crate::model::{LossValues, PolicyModel};
+use crate::rng::Rng;
+use crate::train::with_values;
+use candle_core::{Device, Tensor};
+use over_actions::OverActions;
+use over_memory::OverMemory;
+
+/// The recursion's states, or their gradients; `None` is the state that a thought begins with, the same in every row.
+#[derive(Debug, Default)]
+struct Carry {
+    answer: Option<Vec<f32>>,
+    reasoning: Option<Vec<f32>>,
+}
+
+impl Carry {
+    fn free(self, pass: &mut Pass<'_>) {
+        self.answer.into_iter().chain(self.reasoning).for_each(|buffer| pass.give(buffer));
+    }
+}
+
+/// What a supervision step gives.
+struct Step<T> {
+    carry: Carry,
+    /// (b, H, A)
+    chunk: Vec<f32>,
+    /// what the halting head reads, (b, D)
+    read: Vec<f32>,
+    /// what its backward pass needs
+    trace: T,
+}
+
+impl<T> Step<T> {
+    /// (b,)
+    fn halt_logits(&self, pass: &mut Pass<'_>) -> Vec<f32> {
+        let dim = pass.shape.dim;
+        pass.linear("halt_head", &self.read, dim)
+    }
+}
+
+/// One of the two designs, about one shard of observations.
+trait Recursion<'m>: Sized {
+    type Trace;
+
+    /// Reads the observations.
+    fn observe(model: &'m Actrm, pass: &mut Pass<'_>, tokens: &Tokens<'_>, rows: usize) -> Self;
+
+    /// One supervision step.
+    fn step(&self, pass: &mut Pass<'_>, carry: &Carry) -> Step<Self::Trace>;
+
+    /// Takes the gradient of the step's chunk, (b, H, A), and of the carry that it left, if that flows; returns that of
+    /// the carry it began with, if it does.
+    fn backward(
+        &mut self,
+        pass: &mut Pass<'_>,
+        step: Step<Self::Trace>,
+        chunk_grad: &[f32],
+        carry_grad: Carry,
+        grads: &mut Grads<'_>,
+    ) -> Carry;
+
+    /// Gives the buffers of a step back without a backward pass; the carry stays.
+    fn forget(pass: &mut Pass<'_>, step: Step<Self::Trace>) -> Carry;
+
+    /// After all steps' backward passes: the gradient of the latent, (b, L).
+    fn finish(self, pass: &mut Pass<'_>, tokens: &Tokens<'_>, grads: &mut Grads<'_>) -> Vec<f32>;
+
+    /// Gives the buffers back without a backward pass.
+    fn free(self, pass: &mut Pass<'_>);
+}
+
+/// Calls `f` with dropout off.
+fn quietly<R>(pass: &mut Pass<'_>, f: impl FnOnce(&mut Pass<'_>) -> R) -> R {
+    let rng = pass.rng.take();
+    let result = f(pass);
+    pass.rng = rng;
+    result
+}
+
+/// Calls `f` with the layers' shape changed.
+fn shaped<R>(pass: &mut Pass<'_>, shape: Shape, f: impl FnOnce(&mut Pass<'_>) -> R) -> R {
+    let outer = std::mem::replace(&mut pass.shape, shape);
+    let result = f(pass);
+    pass.shape = outer;
+    result
+}
+
+/// x: (b, t, D) -> the mean over t, (b, D)
+fn mean_over_tokens(pass: &mut Pass<'_>, x: &[f32], rows: usize) -> Vec<f32> {
+    let dim = pass.shape.dim;
+    let tokens = x.len() / (rows * dim);
+    let mut mean = pass.space.pool.zeros(rows * dim);
+    for (mean, x) in mean.chunks_exact_mut(dim).zip(x.chunks_exact(tokens * dim)) {
+        for token in x.chunks_exact(dim) {
+            mean.iter_mut().zip(token).for_each(|(m, x)| *m += x);
+        }
+        mean.iter_mut().for_each(|m| *m /= tokens as f32);
+    }
+    mean
+}
+
+impl Config {
+    /// Of the layers outside the recursion.
+    fn shape(&self) -> Shape {
+        Shape {
+            dim: self.dim_model,
+            heads: self.n_heads,
+            hidden: self.dim_feedforward,
+            activation: self.feedforward_activation,
+            dropout: self.dropout,
+            pre_norm: false,
+        }
+    }
+}
+
+impl Actrm {
+    /// Loss of a training forward pass, and its gradients added to `into`.
+    pub(super) fn fused_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        self.check_batch(batch)?;
+        let data = Data::of(batch)?;
+        let steps = self.steps_of(batch);
+        self.workspaces.with(|space| {
+            with_weights(self.params(), |weights| {
+                let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: Some(rng) };
+                let grads = &mut into.views();
+                match self.config.reasoning.over {
+                    Over::Actions => self.supervise::<OverActions<'_>>(pass, &data, steps, grads),
+                    Over::Memory => self.supervise::<OverMemory<'_>>(pass, &data, steps, grads),
+                }
+            })
+        })
+    }
+
+    /// One shard, forwards and backwards.
+    fn supervise<'m, R: Recursion<'m>>(
+        &'m self,
+        pass: &mut Pass<'_>,
+        data: &Data,
+        steps: usize,
+        grads: &mut Grads<'_>,
+    ) -> LossValues {
+        let (config, rows) = (&self.config, data.rows);
+        let vae = Vae {
+            n_layers: config.n_vae_encoder_layers,
+            latent_dim: config.latent_dim,
+            dims: &self.dims,
+            positions: &self.vae_positions,
+        };
+        let (latent, encoded) = match config.use_vae {
+            true => {
+                let draw = |pass: &mut Pass<'_>| {
+                    let rng = pass.rng.as_mut().expect("a training step has a generator");
+                    rng.normals(rows * config.latent_dim)
+                };
+                let (latent, encoded) = vae.forward(pass, data, draw);
+                (latent, Some(encoded))
+            }
+            false => (pass.space.pool.zeros(rows * config.latent_dim), None),
+        };
+        let tokens = Tokens::new(&self.dims, (&latent, config.latent_dim), &data.state, &data.environment_state);
+        let mut recursion = R::observe(self, pass, &tokens, rows);
+        let answer = config.reasoning.warm_start.map(|warm| self.warm_answers_fused::<R>(pass, data, warm));
+        let start = Carry { answer, reasoning: None };
+        let mut done: Vec<Step<R::Trace>> = Vec::with_capacity(steps);
+        for _ in 0..steps {
+            let carry = done.last().map_or(&start, |step| &step.carry);
+            done.push(recursion.step(pass, carry));
+        }
+        // one step more, so that the last depth has a halting target as well
+        let carry = done.last().map_or(&start, |step| &step.carry);
+        let beyond = quietly(pass, |pass| recursion.step(pass, carry));
+
+        let entries = data.total_entries as f64;
+        let mut loss = LossValues::default();
+        let (mut errors, mut chunk_grads) = (Vec::with_capacity(steps + 1), Vec::with_capacity(steps));
+        for (step, weight) in done.iter().zip(self.step_weights(steps)) {
+            let mut grad = pass.take(step.chunk.len());
+            let into = Some((&mut grad[..], (weight / entries) as f32));
+            let error = AbsoluteError::of(&step.chunk, &data.actions, &data.is_pad, rows, into);
+            let l1 = (error.total() / entries) as f32;
+            loss.total += l1 * weight as f32;
+            // the last step's is the one comparable with ACT's
+            loss.parts.insert("l1_loss".to_string(), l1);
+            loss.parts.entry("l1_loss_first".to_string()).or_insert(l1);
+            errors.push(error);
+            chunk_grads.push(grad);
+        }
+        errors.push(AbsoluteError::of(&beyond.chunk, &data.actions, &data.is_pad, rows, None));
+        R::forget(pass, beyond).free(pass);
+
+        let (mut halt, still) = (0.0f64, 1.0 - config.reasoning.halt_margin);
+        let share = 1.0 / (data.total_rows * steps) as f64;
+        for (i, step) in done.iter().enumerate() {
+            let mut logits = step.halt_logits(pass);
+            for (row, logit) in logits.iter_mut().enumerate() {
+                let halted = errors[i + 1].rows[row] >= errors[i].rows[row] * still;
+                let (x, target) = (f64::from(*logit), if halted { 1.0 } else { 0.0 });
+                halt += (x.max(0.0) - x * target + (-x.abs()).exp().ln_1p()) * share;
+                *logit = ((1.0 / (1.0 + (-x).exp()) - target) * share * config.reasoning.halt_weight) as f32;
+            }
+            let dim = pass.shape.dim;
+            pass.linear_backward("halt_head", &step.read, &logits, dim, grads);
+            pass.give(logits);
+        }
+        loss.parts.insert("halt_loss".to_string(), halt as f32);
+        loss.total += (halt * config.reasoning.halt_weight) as f32;
+
+        let mut carry_grad = Carry::default();
+        for (step, grad) in done.into_iter().zip(chunk_grads).rev() {
+            carry_grad = recursion.backward(pass, step, &grad, carry_grad, grads);
+            pass.give(grad);
+        }
+        carry_grad.free(pass);
+        start.free(pass);
+        let latent_grad = recursion.finish(pass, &tokens, grads);
+        if let Some(encoded) = encoded {
+            let kld = vae.backward(pass, data, encoded, &latent_grad, config.kl_weight, grads);
+            loss.parts.insert("kld_loss".to_string(), kld);
+            loss.total += config.kl_weight as f32 * kld;
+        }
+        pass.give(latent);
+        pass.give(latent_grad);
+        loss
+    }
+
+    /// `warm_answers` of the composed model.
+    fn warm_answers_fused<'m, R: Recursion<'m>>(
+        &'m self,
+        pass: &mut Pass<'_>,
+        data: &Data,
+        warm: WarmStart,
+    ) -> Vec<f32> {
+        let mut noisy = |x: &[f32]| -> Vec<f32> {
+            let rng = pass.rng.as_mut().expect("a training step has a generator");
+            x.iter().zip(rng.normals(x.len())).map(|(x, noise)| x + noise * warm.noise as f32).collect()
+        };
+        let state = noisy(&data.state);
+        let environment_state =
+            if self.dims.environment_state > 0 { noisy(&data.environment_state) } else { Vec::new() };
+        let latent = vec![0.0; data.rows * self.config.latent_dim];
+        let tokens = Tokens::new(&self.dims, (&latent, self.config.latent_dim), &state, &environment_state);
+        let mut answer = quietly(pass, |pass| {
+            let recursion = R::observe(self, pass, &tokens, data.rows);
+            let mut carry = Carry::default();
+            for _ in 0..self.config.reasoning.supervision_steps {
+                let step = recursion.step(pass, &carry);
+                let next = R::forget(pass, step);
+                std::mem::replace(&mut carry, next).free(pass);
+            }
+            recursion.free(pass);
+            carry.reasoning.into_iter().for_each(|buffer| pass.give(buffer));
+            carry.answer.expect("a step leaves an answer")
+        });
+        let rng = pass.rng.as_mut().expect("a training step has a generator");
+        let per_row = answer.len() / data.rows;
+        for row in answer.chunks_exact_mut(per_row) {
+            if rng.uniform() >= 0.5 {
+                row.fill(0.0);
+            }
+        }
+        answer
+    }
+
+    /// Thinks about observations from the answer state `start`, (b, t, D), until `on_step`, which gets each step's
+    /// chunk, (b, H, A), and halting logits, returns true; returns the last answer state.
+    pub(super) fn think(
+        &self,
+        state: &Tensor,
+        environment_state: Option<&Tensor>,
+        start: Option<&Tensor>,
+        on_step: &mut dyn FnMut(Tensor, Vec<f32>) -> Result<bool>,
+    ) -> Result<Tensor> {
+        let values = |t: Option<&Tensor>| t.map(|t| with_values(t, <[f32]>::to_vec)).transpose();
+        let (state, env) = (values(Some(state))?.unwrap_or_default(), values(environment_state)?.unwrap_or_default());
+        let start = values(start)?;
+        self.workspaces.with(|space| {
+            with_weights(self.params(), |weights| {
+                let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: None };
+                match self.config.reasoning.over {
+                    Over::Actions => self.think_with::<OverActions<'_>>(pass, (&state, &env), start, on_step),
+                    Over::Memory => self.think_with::<OverMemory<'_>>(pass, (&state, &env), start, on_step),
+                }
+            })
+        })?
+    }
+
+    fn think_with<'m, R: Recursion<'m>>(
+        &'m self,
+        pass: &mut Pass<'_>,
+        (state, env): (&[f32], &[f32]),
+        start: Option<Vec<f32>>,
+        on_step: &mut dyn FnMut(Tensor, Vec<f32>) -> Result<bool>,
+    ) -> Result<Tensor> {
+        let rows = state.len() / self.dims.state;
+        let latent = pass.space.pool.zeros(rows * self.config.latent_dim);
+        let tokens = Tokens::new(&self.dims, (&latent, self.config.latent_dim), state, env);
+        let recursion = R::observe(self, pass, &tokens, rows);
+        let mut carry = Carry { answer: start, reasoning: None };
+        let shape = (rows, self.config.action_horizon, self.dims.action);
+        loop {
+            let step = recursion.step(pass, &carry);
+            let logits = step.halt_logits(pass);
+            let chunk = Tensor::from_slice(&step.chunk, shape, &Device::Cpu)?;
+            let halted = on_step(chunk, logits.clone())?;
+            pass.give(logits);
+            let next = R::forget(pass, step);
+            std::mem::replace(&mut carry, next).free(pass);
+            if halted {
+                break;
+            }
+        }
+        recursion.free(pass);
+        pass.give(latent);
+        let answer = carry.answer.as_ref().expect("a step leaves an answer");
+        let tokens = answer.len() / (rows * self.config.dim_model);
+        let answer = Tensor::from_slice(answer, (rows, tokens, self.config.dim_model), &Device::Cpu)?;
+        carry.free(pass);
+        Ok(answer)
+    }
+}
