@@ -341,6 +341,58 @@ impl Vae {
     }
 }
 
+/// A sample of the latent with noise `eps`: (b, L)
+pub(crate) fn sample((mu, log_variance): &(Tensor, Tensor), eps: &Tensor) -> Result<Tensor> {
+    Ok((mu + (log_variance / 2.0)?.exp()?.mul(eps)?)?)
+}
+
+/// Observations as tokens, a dense layer each.
+#[derive(Debug)]
+pub(crate) struct InputTokens {
+    pub(crate) latent: Linear,
+    pub(crate) robot_state: Linear,
+    pub(crate) env_state: Option<Linear>,
+}
+
+impl InputTokens {
+    /// latent: (b, L), state: (b, S), environment_state: (b, E) -> (b, M, D)
+    pub(crate) fn forward(
+        &self,
+        latent: &Tensor,
+        state: &Tensor,
+        environment_state: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        let mut tokens =
+            vec![self.latent.forward(latent)?.unsqueeze(1)?, self.robot_state.forward(state)?.unsqueeze(1)?];
+        if let (Some(layer), Some(env)) = (&self.env_state, environment_state) {
+            tokens.push(layer.forward(env)?.unsqueeze(1)?);
+        }
+        Ok(Tensor::cat(&tokens, 1)?)
+    }
+}
+
+/// Decoder layers over learned queries, and their final norm.
+#[derive(Debug)]
+pub(crate) struct Decoder {
+    pub(crate) layers: Vec<DecoderLayer>,
+    pub(crate) norm: LayerNorm,
+    /// (C, D)
+    pub(crate) pos_embed: Embedding,
+}
+
+impl Decoder {
+    /// memory: (b, M, D), pos: (1, M, D) -> (b, C, D)
+    pub(crate) fn forward(&self, memory: &Tensor, pos: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
+        let query_pos = self.pos_embed.weight.unsqueeze(0)?;
+        let (c, dim) = self.pos_embed.weight.dims2()?;
+        let mut x = Tensor::zeros((memory.dim(0)?, c, dim), DType::F32, memory.device())?;
+        for layer in &self.layers {
+            x = layer.forward(&x, &query_pos, memory, pos, mode)?;
+        }
+        self.norm.forward(&x)
+    }
+}
+
 /// What the training forward pass gives.
 #[derive(Debug)]
 pub struct TrainOutput {
@@ -358,25 +410,16 @@ pub struct Act {
     params: Params,
     pub(crate) vae: Option<Vae>,
     pub(crate) encoder: Encoder,
-    pub(crate) decoder: Vec<DecoderLayer>,
-    pub(crate) decoder_norm: LayerNorm,
-    pub(crate) encoder_latent_input_proj: Linear,
-    pub(crate) encoder_robot_state_input_proj: Linear,
-    pub(crate) encoder_env_state_input_proj: Option<Linear>,
+    pub(crate) decoder: Decoder,
+    pub(crate) tokens: InputTokens,
     pub(crate) encoder_1d_feature_pos_embed: Embedding,
-    pub(crate) decoder_pos_embed: Embedding,
     pub(crate) action_head: Linear,
     pub(crate) workspaces: Workspaces,
-    /// the same as a slice
-    position_table: Vec<f32>,
     /// (1, action_horizon + 2, D), fixed
     pub(crate) vae_encoder_pos_enc: Tensor,
+    /// the same as a slice
+    position_table: Vec<f32>,
 }
-
-/// The prefix of every tensor in LeRobot's files.
-pub const LEROBOT_PREFIX: &str = "model.";
-/// LeRobot saves this fixed table with the weights.
-pub const POSITION_BUFFER: &str = "vae_encoder_pos_enc";
 
 impl Act {
     /// Initial weights are LeRobot's distributions: xavier-uniform matrices in encoder and decoder, torch's defaults
@@ -386,12 +429,7 @@ impl Act {
     /// A configuration or dimensions that describe no possible model.
     pub fn new(config: &Config, dims: &Dims, seed: u64) -> Result<Self> {
         config.validate()?;
-        for (field, size) in [("dims.state", dims.state), ("dims.action", dims.action)] {
-            if size == 0 {
-                let expected = "at least 1".to_string();
-                return Err(ModelError::Config { model: "act", field, found: "0".to_string(), expected });
-            }
-        }
+        check_dims("act", dims)?;
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
         let dim = config.dim_model;
@@ -400,31 +438,27 @@ impl Act {
             false => None,
         };
         let encoder = Encoder::new(&mut p, "encoder", config.n_encoder_layers, config, LayerInit::Xavier, rng)?;
-        let decoder = (0..config.n_decoder_layers)
+        // in the order in which initial weights are drawn
+        let layers = (0..config.n_decoder_layers)
             .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), config, rng))
             .collect::<Result<_>>()?;
-        let env = match dims.environment_state {
+        let env_state = match dims.environment_state {
             0 => None,
             e => Some(Linear::new(&mut p, "encoder_env_state_input_proj", e, dim, rng)?),
         };
-        let tokens = 2 + usize::from(env.is_some());
+        let n_tokens = 2 + usize::from(env_state.is_some());
+        let norm = LayerNorm::new(&mut p, "decoder.norm", dim, rng)?;
+        let latent = Linear::new(&mut p, "encoder_latent_input_proj", config.latent_dim, dim, rng)?;
+        let robot_state = Linear::new(&mut p, "encoder_robot_state_input_proj", dims.state, dim, rng)?;
+        let feature_pos = Embedding::new(&mut p, "encoder_1d_feature_pos_embed", n_tokens, dim, rng)?;
+        let pos_embed = Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?;
         let table = sinusoid_table(config.action_horizon + 2, dim)?;
         Ok(Self {
             vae,
             encoder,
-            decoder,
-            decoder_norm: LayerNorm::new(&mut p, "decoder.norm", dim, rng)?,
-            encoder_latent_input_proj: Linear::new(&mut p, "encoder_latent_input_proj", config.latent_dim, dim, rng)?,
-            encoder_robot_state_input_proj: Linear::new(
-                &mut p,
-                "encoder_robot_state_input_proj",
-                dims.state,
-                dim,
-                rng,
-            )?,
-            encoder_env_state_input_proj: env,
-            encoder_1d_feature_pos_embed: Embedding::new(&mut p, "encoder_1d_feature_pos_embed", tokens, dim, rng)?,
-            decoder_pos_embed: Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?,
+            decoder: Decoder { layers, norm, pos_embed },
+            tokens: InputTokens { latent, robot_state, env_state },
+            encoder_1d_feature_pos_embed: feature_pos,
             action_head: Linear::new(&mut p, "action_head", dim, dims.action, rng)?,
             workspaces: Workspaces::default(),
             position_table: table.flatten_all()?.to_vec1()?,
@@ -458,23 +492,10 @@ impl Act {
         environment_state: Option<&Tensor>,
         mode: &mut Mode<'_>,
     ) -> Result<Tensor> {
-        let (b, dim) = (state.dim(0)?, self.config.dim_model);
-        let mut tokens = vec![
-            self.encoder_latent_input_proj.forward(latent)?.unsqueeze(1)?,
-            self.encoder_robot_state_input_proj.forward(state)?.unsqueeze(1)?,
-        ];
-        if let (Some(proj), Some(env)) = (&self.encoder_env_state_input_proj, environment_state) {
-            tokens.push(proj.forward(env)?.unsqueeze(1)?);
-        }
+        let tokens = self.tokens.forward(latent, state, environment_state)?;
         let pos = self.encoder_1d_feature_pos_embed.weight.unsqueeze(0)?;
-        let memory = self.encoder.forward(&Tensor::cat(&tokens, 1)?, &pos, None, mode)?;
-
-        let query_pos = self.decoder_pos_embed.weight.unsqueeze(0)?;
-        let mut x = Tensor::zeros((b, self.config.action_horizon, dim), DType::F32, state.device())?;
-        for layer in &self.decoder {
-            x = layer.forward(&x, &query_pos, &memory, &pos, mode)?;
-        }
-        self.action_head.forward(&self.decoder_norm.forward(&x)?)
+        let memory = self.encoder.forward(&tokens, &pos, None, mode)?;
+        self.action_head.forward(&self.decoder.forward(&memory, &pos, mode)?)
     }
 
     /// The training forward pass with dropout from `mode` and the latent's noise `eps`: (b, L).
@@ -488,7 +509,7 @@ impl Act {
             None => None,
         };
         let sample = match &latent {
-            Some((mu, log_variance)) => (mu + (log_variance / 2.0)?.exp()?.mul(eps)?)?,
+            Some(latent) => sample(latent, eps)?,
             None => eps.zeros_like()?,
         };
         let actions = self.decode(&sample, &batch.state, batch.environment_state.as_ref(), mode)?;
@@ -513,11 +534,7 @@ impl Act {
     }
 
     pub(crate) fn check_batch(&self, batch: &Batch) -> Result<()> {
-        self.check_inputs(&batch.state, batch.environment_state.as_ref())?;
-        let b = batch.rows();
-        let expected = [b, self.config.action_horizon, self.dims.action];
-        check_shape("act", "actions", &batch.actions, &expected)?;
-        check_shape("act", "is_pad", &batch.is_pad, &expected[..2])
+        check_batch("act", &self.dims, self.config.action_horizon, batch)
     }
 
     pub(crate) fn check_inputs(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<()> {
@@ -549,6 +566,25 @@ pub(crate) fn check_shape(
     }
     let (expected, found) = (expected.to_vec(), tensor.dims().to_vec());
     Err(ModelError::Shape { operation, object, expected, found })
+}
+
+/// Checks that there is something to see and something to do.
+pub(crate) fn check_dims(model: &'static str, dims: &Dims) -> Result<()> {
+    for (field, size) in [("dims.state", dims.state), ("dims.action", dims.action)] {
+        if size == 0 {
+            let expected = "at least 1".to_string();
+            return Err(ModelError::Config { model, field, found: "0".to_string(), expected });
+        }
+    }
+    Ok(())
+}
+
+/// Checks a batch of windows against the model's sizes.
+pub(crate) fn check_batch(operation: &'static str, dims: &Dims, action_horizon: usize, batch: &Batch) -> Result<()> {
+    check_observation(operation, dims, &batch.state, batch.environment_state.as_ref())?;
+    let expected = [batch.rows(), action_horizon, dims.action];
+    check_shape(operation, "actions", &batch.actions, &expected)?;
+    check_shape(operation, "is_pad", &batch.is_pad, &expected[..2])
 }
 
 /// Checks `state: (b, S)` and `environment_state: (b, E)` against the model's sizes.

@@ -59,7 +59,7 @@ impl Act {
         let eps = with_values(eps, <[f32]>::to_vec)?;
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.shape(), space, rng };
+                let pass = &mut Pass { weights, shape: self.shape(), space, rng, packed: None };
                 self.step(pass, &data, eps, &mut into.views())
             })
         })
@@ -75,9 +75,10 @@ impl Act {
             None => Vec::new(),
         };
         let state = values(state)?;
+        let packed = self.workspaces.packed(self.params());
         let actions = self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.shape(), space, rng: None };
+                let pass = &mut Pass { weights, shape: self.shape(), space, rng: None, packed: Some(&packed) };
                 let latent = pass.space.pool.zeros(rows * self.config().latent_dim);
                 let tokens = Tokens::new(self.dims(), (&latent, self.config().latent_dim), &state, &env);
                 let Decoded { encoder, memory, decoder, x, actions } = self.decode_fused(pass, rows, &tokens);
@@ -94,14 +95,13 @@ impl Act {
     }
 
     fn decode_fused(&self, pass: &mut Pass<'_>, rows: usize, tokens: &Tokens<'_>) -> Decoded {
-        let dim = pass.shape.dim;
         let x = tokens.forward(pass);
         let pos = pass.weight("encoder_1d_feature_pos_embed", ".weight");
         let (memory, encoder) = Encoder::forward(pass, "encoder", self.config().n_encoder_layers, x, pos, None, false);
         let query_pos = pass.weight("decoder_pos_embed", ".weight");
         let from = Memory { x: &memory, pos, batch: rows };
         let (x, decoder) = Decoder::forward(pass, self.config().n_decoder_layers, query_pos, from);
-        let actions = pass.linear("action_head", &x, dim);
+        let actions = pass.linear("action_head", &x);
         Decoded { encoder, memory, decoder, x, actions }
     }
 

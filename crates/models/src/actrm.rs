@@ -35,7 +35,7 @@ mod tests;
 
 pub use reasoning::{Budget, Reasoning, ReasoningPolicy, ReasoningStep};
 
-use crate::act::{self, DecoderLayer, Encoder, LayerInit, Vae, absolute};
+use crate::act::{self, Decoder, DecoderLayer, Encoder, InputTokens, LayerInit, Vae, absolute};
 use crate::batch::{Batch, Dims};
 use crate::classification::binary_cross_entropy;
 use crate::error::{ModelError, Result};
@@ -331,9 +331,7 @@ struct OverActions {
 struct OverMemory {
     block: Encoder,
     z_init: [Vec<f32>; 2],
-    decoder: Vec<DecoderLayer>,
-    decoder_norm: LayerNorm,
-    decoder_pos: Embedding,
+    decoder: Decoder,
 }
 
 #[derive(Debug)]
@@ -375,9 +373,7 @@ pub struct Actrm {
     vae_pos_enc: Tensor,
     /// the same as a slice
     vae_positions: Vec<f32>,
-    latent_input_proj: Linear,
-    robot_state_input_proj: Linear,
-    env_state_input_proj: Option<Linear>,
+    tokens: InputTokens,
     feature_pos_embed: Embedding,
     design: Design,
     action_head: Linear,
@@ -392,12 +388,7 @@ impl Actrm {
     /// A configuration or dimensions that describe no possible model.
     pub fn new(config: &Config, dims: &Dims, seed: u64) -> Result<Self> {
         config.validate()?;
-        for (field, size) in [("dims.state", dims.state), ("dims.action", dims.action)] {
-            if size == 0 {
-                let expected = "at least 1".to_string();
-                return Err(ModelError::Config { model: "actrm", field, found: "0".into(), expected });
-            }
-        }
+        act::check_dims("actrm", dims)?;
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
         let (dim, layers, r) = (config.dim_model, config.layers(), &config.reasoning);
@@ -405,11 +396,11 @@ impl Actrm {
             true => Some(Vae::new(&mut p, &layers, dims, rng)?),
             false => None,
         };
-        let env = match dims.environment_state {
+        let env_state = match dims.environment_state {
             0 => None,
             e => Some(Linear::new(&mut p, "encoder_env_state_input_proj", e, dim, rng)?),
         };
-        let tokens = 2 + usize::from(env.is_some());
+        let tokens = 2 + usize::from(env_state.is_some());
         let positions = sinusoid_table(config.action_horizon + 2, dim)?;
         let design = match r.over {
             Over::Actions => Design::Actions(OverActions {
@@ -429,11 +420,13 @@ impl Actrm {
                 Design::Memory(OverMemory {
                     block: Encoder::new(&mut p, "reasoning", r.n_layers, &quiet, LayerInit::Xavier, rng)?,
                     z_init: fixed_values(dim),
-                    decoder: (0..config.n_decoder_layers)
-                        .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), &layers, rng))
-                        .collect::<Result<_>>()?,
-                    decoder_norm: LayerNorm::new(&mut p, "decoder.norm", dim, rng)?,
-                    decoder_pos: Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?,
+                    decoder: Decoder {
+                        layers: (0..config.n_decoder_layers)
+                            .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), &layers, rng))
+                            .collect::<Result<_>>()?,
+                        norm: LayerNorm::new(&mut p, "decoder.norm", dim, rng)?,
+                        pos_embed: Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?,
+                    },
                 })
             }
         };
@@ -441,9 +434,11 @@ impl Actrm {
             vae,
             vae_positions: positions.flatten_all()?.to_vec1()?,
             vae_pos_enc: positions,
-            latent_input_proj: Linear::new(&mut p, "encoder_latent_input_proj", config.latent_dim, dim, rng)?,
-            robot_state_input_proj: Linear::new(&mut p, "encoder_robot_state_input_proj", dims.state, dim, rng)?,
-            env_state_input_proj: env,
+            tokens: InputTokens {
+                latent: Linear::new(&mut p, "encoder_latent_input_proj", config.latent_dim, dim, rng)?,
+                robot_state: Linear::new(&mut p, "encoder_robot_state_input_proj", dims.state, dim, rng)?,
+                env_state,
+            },
             feature_pos_embed: Embedding::new(&mut p, "encoder_1d_feature_pos_embed", tokens, dim, rng)?,
             design,
             action_head: Linear::new(&mut p, "action_head", dim, dims.action, rng)?,
@@ -465,18 +460,6 @@ impl Actrm {
         &self.dims
     }
 
-    /// latent: (b, L), state: (b, S), environment_state: (b, E) -> (b, M, D)
-    fn tokens(&self, latent: &Tensor, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {
-        let mut tokens = vec![
-            self.latent_input_proj.forward(latent)?.unsqueeze(1)?,
-            self.robot_state_input_proj.forward(state)?.unsqueeze(1)?,
-        ];
-        if let (Some(proj), Some(env)) = (&self.env_state_input_proj, environment_state) {
-            tokens.push(proj.forward(env)?.unsqueeze(1)?);
-        }
-        Ok(Tensor::cat(&tokens, 1)?)
-    }
-
     /// What the recursion reads, made once per observation: (b, M, D).
     fn memory(
         &self,
@@ -485,7 +468,7 @@ impl Actrm {
         environment_state: Option<&Tensor>,
         mode: &mut Mode<'_>,
     ) -> Result<Tensor> {
-        let tokens = self.tokens(latent, state, environment_state)?;
+        let tokens = self.tokens.forward(latent, state, environment_state)?;
         let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
         match &self.design {
             Design::Actions(OverActions { memory_encoder: Some(encoder), .. }) => {
@@ -525,7 +508,10 @@ impl Actrm {
         }
         let chunk = self.action_head.forward(&match &self.design {
             Design::Actions(_) => carry.answer.clone(),
-            Design::Memory(design) => self.decode(design, &carry.answer, mode)?,
+            Design::Memory(design) => {
+                let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
+                design.decoder.forward(&carry.answer, &pos, mode)?
+            }
         })?;
         let read = match &self.design {
             Design::Actions(_) => &carry.reasoning,
@@ -565,18 +551,6 @@ impl Actrm {
         Ok(Carry { answer, reasoning })
     }
 
-    /// ACT's decoder over `z_h`: (b, M, D) -> (b, H, D)
-    fn decode(&self, design: &OverMemory, memory: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
-        let query_pos = design.decoder_pos.weight.unsqueeze(0)?;
-        let shape = (memory.dim(0)?, self.config.action_horizon, self.config.dim_model);
-        let mut x = Tensor::zeros(shape, DType::F32, &Device::Cpu)?;
-        for layer in &design.decoder {
-            x = layer.forward(&x, &query_pos, memory, &pos, mode)?;
-        }
-        design.decoder_norm.forward(&x)
-    }
-
     /// Supervision steps for this batch.
     fn steps_of(&self, batch: &Batch) -> usize {
         let most = self.config.reasoning.supervision_steps;
@@ -603,10 +577,7 @@ impl Actrm {
     }
 
     fn check_batch(&self, batch: &Batch) -> Result<()> {
-        self.check_inputs(&batch.state, batch.environment_state.as_ref())?;
-        let expected = [batch.rows(), self.config.action_horizon, self.dims.action];
-        act::check_shape("actrm", "actions", &batch.actions, &expected)?;
-        act::check_shape("actrm", "is_pad", &batch.is_pad, &expected[..2])
+        act::check_batch("actrm", &self.dims, self.config.action_horizon, batch)
     }
 
     /// With warm starts in use, the answer that half of the rows begin with: the model's own, to
@@ -663,9 +634,9 @@ impl PolicyModel for Actrm {
             None => None,
         };
         let sample = match &latent {
-            Some((mu, log_variance)) => {
+            Some(latent) => {
                 let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, &Device::Cpu)?;
-                (mu + (log_variance / 2.0)?.exp()?.mul(&eps)?)?
+                act::sample(latent, &eps)?
             }
             None => Tensor::zeros(shape, DType::F32, &Device::Cpu)?,
         };

@@ -25,14 +25,16 @@ pub(crate) use vae::Vae;
 
 use crate::error::{ModelError, Result};
 
-use crate::kernels::{Mat, Pack, Pool, Start, add, column_sums, drop_scale, layer_norm, layer_norm_backward, product};
+use crate::kernels::{
+    Mat, Pack, Packed, Pool, Start, add, column_sums, drop_scale, gemm_with, layer_norm, layer_norm_backward, product,
+};
 use crate::layers::{Activation, DropoutMask};
 use crate::params::Params;
 use crate::rng::Rng;
 use crate::simd::vectorised;
 use candle_core::Storage;
 use std::collections::BTreeMap;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Parameters by name.
 pub(crate) type Weights<'a> = BTreeMap<&'a str, &'a [f32]>;
@@ -46,20 +48,53 @@ pub(crate) struct Workspace {
     pub(crate) pack: Pack,
 }
 
-/// Workspaces of shards that ran before.
+/// Workspaces of shards that ran before, and packed weights.
 #[derive(Debug, Default)]
-pub(crate) struct Workspaces(Mutex<Vec<Workspace>>);
+pub(crate) struct Workspaces {
+    free: Mutex<Vec<Workspace>>,
+    packed: Mutex<Arc<PackedWeights>>,
+}
 
 impl Workspaces {
     /// Calls `f` with a workspace that no other thread has.
     pub(crate) fn with<R>(&self, f: impl FnOnce(&mut Workspace) -> R) -> R {
-        let taken = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let taken = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
         let mut space = taken.unwrap_or_default();
         let result = f(&mut space);
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(space);
+        self.free.lock().unwrap_or_else(PoisonError::into_inner).push(space);
         result
     }
+
+    /// Packed weights of `params` as they are now.
+    pub(crate) fn packed(&self, params: &Params) -> Arc<PackedWeights> {
+        let mut packed = self.packed.lock().unwrap_or_else(PoisonError::into_inner);
+        if packed.version != params.version() {
+            *packed = Arc::new(PackedWeights { version: params.version(), panels: Mutex::default() });
+        }
+        packed.clone()
+    }
 }
+
+/// Weights in the panels that products read, each made when it is first used: for predictions, which use the same
+/// weights again and again.
+#[derive(Debug, Default)]
+pub(crate) struct PackedWeights {
+    version: u64,
+    /// by the place in memory, which a parameter keeps, and the number of rows
+    panels: Mutex<BTreeMap<(usize, usize), Arc<Packed>>>,
+}
+
+impl PackedWeights {
+    /// w: (out, in), whole rows of a parameter; its transpose in panels
+    fn get(&self, w: &[f32], (out, input): (usize, usize)) -> Arc<Packed> {
+        let mut panels = self.panels.lock().unwrap_or_else(PoisonError::into_inner);
+        let make = || Arc::new(Packed::new(Mat::rows(w, input).t(), (out, input)));
+        panels.entry((w.as_ptr().addr(), out)).or_insert_with(make).clone()
+    }
+}
+
+/// Rows up to which a product reads the weights as they are.
+const UNPACKED_ROWS: usize = 4;
 
 /// Calls `f` with all parameters as slices.
 pub(crate) fn with_weights<R>(params: &Params, f: impl FnOnce(&Weights<'_>) -> R) -> Result<R> {
@@ -94,6 +129,8 @@ pub(crate) struct Pass<'a> {
     pub(crate) space: &'a mut Workspace,
     /// draws dropout masks, in the order in which the composed layers draw them; `None` for no dropout
     pub(crate) rng: Option<&'a mut Rng>,
+    /// for predictions
+    pub(crate) packed: Option<&'a PackedWeights>,
 }
 
 /// Row `r` of a computed tensor is row `r / computed * all + r % computed` of the whole one.
@@ -132,12 +169,29 @@ impl<'a> Pass<'a> {
     }
 
     /// x: (rows, in) -> (rows, out), `y = x Wᵀ + b`
-    pub(crate) fn linear(&mut self, prefix: &str, x: &[f32], input: usize) -> Vec<f32> {
+    pub(crate) fn linear(&mut self, prefix: &str, x: &[f32]) -> Vec<f32> {
         let (w, b) = (self.weight(prefix, ".weight"), self.weight(prefix, ".bias"));
-        let (rows, output) = (x.len() / input, b.len());
-        let mut y = self.take(rows * output);
-        let (x, w) = (Mat::rows(x, input), Mat::rows(w, input).t());
-        product((rows, output, input), x, w, Start::Bias(b), &mut y, &mut self.space.pack);
+        self.times(x, w, Start::Bias(b), |_, _, _| ())
+    }
+
+    /// x: (rows, in), w: (out, in), whole rows of a parameter -> `start + x wᵀ`, (rows, out), then `epilogue` as in
+    /// `gemm_with`
+    fn times(
+        &mut self,
+        x: &[f32],
+        w: &[f32],
+        start: Start<'_>,
+        epilogue: impl Fn(usize, usize, &mut [f32]),
+    ) -> Vec<f32> {
+        let input = match start {
+            Start::Bias(bias) => w.len() / bias.len(),
+            Start::Zero | Start::Add => self.shape.dim,
+        };
+        let (rows, out) = (x.len() / input, w.len() / input);
+        let mut y = self.take(rows * out);
+        let packed = self.packed.filter(|_| rows > UNPACKED_ROWS).map(|packed| packed.get(w, (out, input)));
+        let b = (Mat::rows(w, input).t(), packed.as_deref());
+        gemm_with((rows, out, input), Mat::rows(x, input), b, start, &mut y, out, &mut self.space.pack, epilogue);
         y
     }
 

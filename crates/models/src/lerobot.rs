@@ -1,16 +1,42 @@
-//! LeRobot's ACT files as values: its `config.json` and its tensor names. Reading and writing files is not done here.
+//! LeRobot's ACT files as values: its `config.json`, its tensor names, its names of normalisation modes. This is the one
+//! place that knows them; files are read and written in `zoo`.
 
-use crate::act::{Act, Config, LEROBOT_PREFIX, POSITION_BUFFER};
+use crate::act::Config;
 use crate::batch::Dims;
 use crate::error::{ModelError, Result, some_names};
 use crate::layers::{Activation, sinusoid_table};
-use crate::model::PolicyModel;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
 use crate::params::Params;
 use candle_core::Tensor;
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
+
+/// The prefix of every tensor in LeRobot's files.
+const PREFIX: &str = "model.";
+/// LeRobot saves this fixed table with the weights.
+const POSITION_BUFFER: &str = "vae_encoder_pos_enc";
+
+/// Keys that LeRobot knows and that do not matter to a low-dimensional policy at rest.
+const OF_NO_MATTER: [&str; 17] = [
+    "type",
+    "device",
+    "use_amp",
+    "use_peft",
+    "push_to_hub",
+    "repo_id",
+    "private",
+    "tags",
+    "license",
+    "pretrained_path",
+    "pretrained_revision",
+    "vision_backbone",
+    "pretrained_backbone_weights",
+    "replace_final_stride_with_dilation",
+    "optimizer_lr",
+    "optimizer_weight_decay",
+    "optimizer_lr_backbone",
+];
 
 /// What a LeRobot `config.json` of type `act` says.
 #[derive(Debug, Clone, PartialEq)]
@@ -27,9 +53,9 @@ pub struct LerobotAct {
     pub modes: BTreeMap<String, NormMode>,
 }
 
-/// The keys of `config.json` that matter here, under LeRobot's names and with its defaults.
+/// The keys of `config.json` under LeRobot's names and with its defaults; another key is an error, as it is there.
 #[derive(Debug, Deserialize)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 struct Keys {
     chunk_size: usize,
     n_action_steps: usize,
@@ -87,6 +113,28 @@ impl Default for Keys {
     }
 }
 
+/// LeRobot's name of a mode.
+pub fn mode_name(mode: NormMode) -> &'static str {
+    match mode {
+        NormMode::MeanStd => "MEAN_STD",
+        NormMode::MinMax => "MIN_MAX",
+        NormMode::Identity => "IDENTITY",
+    }
+}
+
+/// The mode of a kind of feature (`STATE`, `ENV`, `ACTION`) in a mapping of LeRobot's; what it leaves out passes as it is.
+///
+/// # Errors
+/// A mode that we do not have.
+pub fn mode_of(mapping: &BTreeMap<String, String>, kind: &str) -> Result<NormMode> {
+    match mapping.get(kind).map(String::as_str) {
+        None | Some("IDENTITY") => Ok(NormMode::Identity),
+        Some("MEAN_STD") => Ok(NormMode::MeanStd),
+        Some("MIN_MAX") => Ok(NormMode::MinMax),
+        Some(other) => Err(refuse("normalization mapping", other, "MEAN_STD, MIN_MAX or IDENTITY")),
+    }
+}
+
 fn refuse(field: &'static str, found: impl Into<String>, expected: &str) -> ModelError {
     ModelError::Config { model: "LeRobot act", field, found: found.into(), expected: expected.to_string() }
 }
@@ -100,11 +148,9 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
     if kind != "act" {
         return Err(refuse("type", kind, "act"));
     }
+    let mut given: Map<String, Value> = config.as_object().cloned().unwrap_or_default();
     // LeRobot writes `null` for absent options
-    let given: Map<String, Value> = match config {
-        Value::Object(map) => map.iter().filter(|(_, v)| !v.is_null()).map(|(k, v)| (k.clone(), v.clone())).collect(),
-        _ => Map::new(),
-    };
+    given.retain(|key, value| !value.is_null() && !OF_NO_MATTER.contains(&key.as_str()));
     let keys: Keys = serde_json::from_value(Value::Object(given))
         .map_err(|e| refuse("config.json", e.to_string(), "LeRobot's keys and types"))?;
     if keys.n_obs_steps != 1 {
@@ -136,12 +182,7 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
     for (feature, kind, present) in
         [(STATE, "STATE", true), (ENVIRONMENT_STATE, "ENV", env > 0), (ACTION, "ACTION", true)]
     {
-        let mode = match keys.normalization_mapping.get(kind).map(String::as_str) {
-            Some("MEAN_STD") => NormMode::MeanStd,
-            Some("MIN_MAX") => NormMode::MinMax,
-            Some("IDENTITY") | None => NormMode::Identity,
-            Some(other) => return Err(refuse("normalization_mapping", other, "MEAN_STD, MIN_MAX or IDENTITY")),
-        };
+        let mode = mode_of(&keys.normalization_mapping, kind)?;
         if present {
             modes.insert(feature.to_string(), mode);
         }
@@ -187,13 +228,9 @@ pub fn write_config(act: &LerobotAct) -> Value {
     }
     let mut mapping = Map::from_iter([("VISUAL".to_string(), json!("MEAN_STD"))]);
     for (feature, kind) in [(STATE, "STATE"), (ENVIRONMENT_STATE, "ENV"), (ACTION, "ACTION")] {
-        let mode = match act.modes.get(feature) {
-            Some(NormMode::MeanStd) => "MEAN_STD",
-            Some(NormMode::MinMax) => "MIN_MAX",
-            Some(NormMode::Identity) => "IDENTITY",
-            None => continue,
-        };
-        mapping.insert(kind.to_string(), json!(mode));
+        if let Some(mode) = act.modes.get(feature) {
+            mapping.insert(kind.to_string(), json!(mode_name(*mode)));
+        }
     }
     json!({
         "type": "act",
@@ -220,26 +257,22 @@ pub fn write_config(act: &LerobotAct) -> Value {
     })
 }
 
-/// Loads the tensors of a LeRobot `model.safetensors` into `act`: the name set must be exactly the model's, each with
-/// LeRobot's prefix, plus the fixed position table, which must hold LeRobot's values.
+/// Loads the tensors of a LeRobot `model.safetensors` into the parameters of an ACT: the name set must be exactly the
+/// model's, each with LeRobot's prefix, plus the fixed position table, which must hold LeRobot's values.
 ///
 /// # Errors
 /// The first tensor that is missing, extra, misshapen or, for the table, different.
-pub fn load_tensors(act: &Act, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
-    load_into(act.params(), act.config(), tensors)
-}
-
-fn load_into(params: &Params, config: &Config, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
+pub fn load_tensors(params: &Params, config: &Config, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
     let mut own = BTreeMap::new();
     for (name, tensor) in tensors {
-        let known = || params.names().map(|n| format!("{LEROBOT_PREFIX}{n}")).collect::<Vec<_>>();
+        let known = || params.names().map(|n| format!("{PREFIX}{n}")).collect::<Vec<_>>();
         let short = name
-            .strip_prefix(LEROBOT_PREFIX)
+            .strip_prefix(PREFIX)
             .ok_or_else(|| ModelError::ExtraTensor { name: name.clone(), known: some_names(&known()) })?;
         own.insert(short.to_string(), tensor.clone());
     }
     if config.use_vae {
-        let name = format!("{LEROBOT_PREFIX}{POSITION_BUFFER}");
+        let name = format!("{PREFIX}{POSITION_BUFFER}");
         let table = own
             .remove(POSITION_BUFFER)
             .ok_or_else(|| ModelError::MissingTensor { name: name.clone(), given: some_names(tensors.keys()) })?;
@@ -249,7 +282,8 @@ fn load_into(params: &Params, config: &Config, tensors: &BTreeMap<String, Tensor
             return Err(ModelError::MisshapenTensor { name, expected, found });
         }
         let off = (table - expected)?.abs()?.flatten_all()?.max(0)?.to_scalar::<f32>()?;
-        if off > 1e-5 {
+        // the table is sines and cosines in f32
+        if off.is_nan() || off > 1e-5 {
             return Err(ModelError::Input {
                 operation: "load LeRobot act",
                 object: POSITION_BUFFER,
@@ -261,13 +295,16 @@ fn load_into(params: &Params, config: &Config, tensors: &BTreeMap<String, Tensor
     params.load(&own)
 }
 
-/// The tensors of a LeRobot `model.safetensors`.
-pub fn tensors_out(act: &Act) -> Result<BTreeMap<String, Tensor>> {
-    let mut tensors: BTreeMap<String, Tensor> =
-        act.params().tensors().into_iter().map(|(name, t)| (format!("{LEROBOT_PREFIX}{name}"), t)).collect();
-    if act.config().use_vae {
-        let table = sinusoid_table(act.config().action_horizon + 2, act.config().dim_model)?;
-        tensors.insert(format!("{LEROBOT_PREFIX}{POSITION_BUFFER}"), table);
+/// The tensors of a LeRobot `model.safetensors` for the parameters of an ACT.
+///
+/// # Errors
+/// If the tensor library fails.
+pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, Tensor>> {
+    let named = params.tensors().into_iter().map(|(name, t)| (format!("{PREFIX}{name}"), t));
+    let mut tensors: BTreeMap<String, Tensor> = named.collect();
+    if config.use_vae {
+        let table = sinusoid_table(config.action_horizon + 2, config.dim_model)?;
+        tensors.insert(format!("{PREFIX}{POSITION_BUFFER}"), table);
     }
     Ok(tensors)
 }
@@ -276,6 +313,8 @@ pub fn tensors_out(act: &Act) -> Result<BTreeMap<String, Tensor>> {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::act::Act;
+    use crate::model::PolicyModel;
 
     fn example() -> LerobotAct {
         LerobotAct {
@@ -303,23 +342,24 @@ mod tests {
         let one = example();
         assert_eq!(read_config(&write_config(&one)).unwrap(), one);
         let (a, b) = (Act::new(&one.config, &one.dims, 1).unwrap(), Act::new(&one.config, &one.dims, 2).unwrap());
-        let tensors = tensors_out(&a).unwrap();
-        load_tensors(&b, &tensors).unwrap();
+        let tensors = tensors_out(a.params(), &one.config).unwrap();
+        let load_into_b = |tensors: &BTreeMap<String, Tensor>| load_tensors(b.params(), &one.config, tensors);
+        load_into_b(&tensors).unwrap();
         let weight = |act: &Act| act.params().get("action_head.weight").unwrap().to_vec2::<f32>().unwrap();
         assert_eq!(weight(&a), weight(&b));
 
         let mut bad = tensors.clone();
         let moved = bad.remove("model.decoder.norm.weight").unwrap();
-        assert!(load_tensors(&b, &bad).unwrap_err().to_string().contains("decoder.norm.weight is missing"));
+        assert!(load_into_b(&bad).unwrap_err().to_string().contains("decoder.norm.weight is missing"));
         bad.insert("model.decoder.norm.wait".to_string(), moved.clone());
-        assert!(load_tensors(&b, &bad).is_err());
+        assert!(load_into_b(&bad).is_err());
         let mut bad = tensors.clone();
         bad.insert("decoder.stray".to_string(), moved);
-        assert!(load_tensors(&b, &bad).unwrap_err().to_string().contains("decoder.stray"));
+        assert!(load_into_b(&bad).unwrap_err().to_string().contains("decoder.stray"));
         let mut bad = tensors;
         let table = &bad["model.vae_encoder_pos_enc"];
         bad.insert("model.vae_encoder_pos_enc".to_string(), (table * 1.1).unwrap());
-        assert!(load_tensors(&b, &bad).is_err());
+        assert!(load_into_b(&bad).is_err());
     }
 
     #[test]
@@ -332,6 +372,8 @@ mod tests {
             ("n_heads", json!(3), "n_heads"),
             ("feedforward_activation", json!("glu"), "glu"),
             ("chunk_size", json!("many"), "config.json"),
+            ("n_haeds", json!(2), "n_haeds"),
+            ("normalization_mapping", json!({"STATE": "QUANTILES"}), "QUANTILES"),
             ("input_features", json!({}), "observation.state"),
         ] {
             let mut bad = good.clone();

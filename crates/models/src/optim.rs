@@ -50,6 +50,7 @@ pub struct Optimiser {
     first: Vec<f32>,
     second: Vec<f32>,
     step: u64,
+    threads: usize,
 }
 
 /// One step's constants.
@@ -134,7 +135,7 @@ impl Optimiser {
     pub fn new(config: OptimiserConfig, layout: Arc<ParamLayout>) -> Self {
         let zeros = || vec![0.0; layout.len()];
         let (first, second) = (zeros(), zeros());
-        Self { config, layout, first, second, step: 0 }
+        Self { config, layout, first, second, step: 0, threads: 2 }
     }
 
     /// Steps taken.
@@ -142,7 +143,12 @@ impl Optimiser {
         self.step
     }
 
-    /// One update of `params` with `grads * grad_scale`, on two threads; parameters are updated in place.
+    /// Runs on at most `threads` threads (2 unless set). The result does not depend on it.
+    pub fn set_threads(&mut self, threads: usize) {
+        self.threads = threads.max(1);
+    }
+
+    /// One update of `params` with `grads * grad_scale`; parameters are updated in place.
     ///
     /// # Errors
     /// If `params` are not those of the layout.
@@ -179,12 +185,16 @@ impl Optimiser {
         let cut = cut.count();
         let (left, right) = work.split_at(cut);
         let run = |part: &[(&Var, InPlace<'_>)]| part.iter().try_for_each(|(var, op)| var.inplace_op1(op));
-        std::thread::scope(|scope| {
-            let other = scope.spawn(|| run(right));
-            let mine = run(left);
-            mine.and(other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
-        })?;
-        Ok(())
+        let done = match self.threads {
+            1 => run(left).and_then(|()| run(right)),
+            _ => std::thread::scope(|scope| {
+                let other = scope.spawn(|| run(right));
+                let mine = run(left);
+                mine.and(other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            }),
+        };
+        params.changed();
+        Ok(done?)
     }
 
     /// Both moments as tensors named `moment1.<name>` and `moment2.<name>`.

@@ -4,6 +4,8 @@ use crate::error::{ModelError, Result, some_names};
 use crate::rng::Rng;
 use candle_core::{DType, Device, Tensor, Var};
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// How a new parameter is filled. Fans are those of a `(out, in)` matrix.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -74,6 +76,7 @@ impl Init {
 #[derive(Debug, Clone, Default)]
 pub struct Params {
     vars: BTreeMap<String, Var>,
+    version: Arc<AtomicU64>,
 }
 
 impl Params {
@@ -109,20 +112,31 @@ impl Params {
         self.vars.keys().map(String::as_str)
     }
 
-    /// Names and variables in order.
+    /// Names and variables in order. After setting a value say so with [`Self::changed`].
     pub fn iter(&self) -> impl Iterator<Item = (&str, &Var)> {
         self.vars.iter().map(|(k, v)| (k.as_str(), v))
     }
 
-    /// One variable.
+    /// One variable. After setting its value say so with [`Self::changed`].
     pub fn get(&self, name: &str) -> Option<&Var> {
         self.vars.get(name)
+    }
+
+    /// How often values were changed: what is derived from them is stale once it is another number.
+    pub fn version(&self) -> u64 {
+        self.version.load(Ordering::Acquire)
+    }
+
+    /// Says that values were changed. `load` and the optimisers do so themselves.
+    pub fn changed(&self) {
+        self.version.fetch_add(1, Ordering::AcqRel);
     }
 
     /// The same parameters but some; storage is shared.
     pub fn without(&self, names: &[&str]) -> Self {
         let kept = self.vars.iter().filter(|(name, _)| !names.contains(&name.as_str()));
-        Self { vars: kept.map(|(name, var)| (name.clone(), var.clone())).collect() }
+        let vars = kept.map(|(name, var)| (name.clone(), var.clone())).collect();
+        Self { vars, version: self.version.clone() }
     }
 
     /// Number of scalar parameters.
@@ -159,6 +173,7 @@ impl Params {
         for (name, var) in &self.vars {
             var.set(&tensors[name].to_dtype(DType::F32)?.contiguous()?)?;
         }
+        self.changed();
         Ok(())
     }
 }

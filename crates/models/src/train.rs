@@ -184,6 +184,7 @@ impl Trainer {
     /// Runs on at most `threads` threads (2 unless set). The weights do not depend on it.
     pub fn set_threads(&mut self, threads: usize) {
         self.threads = threads.max(1);
+        self.optimiser.set_threads(threads);
     }
 
     /// The model as it is now.

@@ -48,6 +48,47 @@ fn the_same_seed_gives_the_same_bits() {
 }
 
 #[test]
+fn one_thread_gives_the_same_bits() {
+    let run = |threads: usize| {
+        let mut trainer = Trainer::new(model(1), TrainConfig { accumulation: 2, ..config() }, 5).unwrap();
+        trainer.set_threads(threads);
+        for k in 0..3 {
+            trainer.step(&batch(k, 7)).unwrap();
+        }
+        bits(&trainer.state().unwrap().tensors)
+    };
+    assert_eq!(run(1), run(2));
+}
+
+#[test]
+fn predictions_use_the_weights_as_they_are_now() {
+    for kind in ["act", "actrm"] {
+        let config = serde_json::json!({
+            "type": kind, "action_horizon": HORIZON, "dim_model": 16, "n_heads": 2, "dim_feedforward": 24,
+        });
+        let config: PolicyConfig = serde_json::from_value(config).unwrap();
+        let mut trainer = Trainer::new(config.build(&DIMS, 1).unwrap(), self::config(), 5).unwrap();
+        let batch = batch(0, 5);
+        let predict = |model: &dyn PolicyModel| {
+            let chunk = model.predict(&batch.state, batch.environment_state.as_ref()).unwrap();
+            chunk.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        };
+        let before = predict(trainer.model());
+        let weights = trainer.state().unwrap();
+        trainer.step(&batch).unwrap();
+        let after = predict(trainer.model());
+        assert_ne!(before, after, "{kind}");
+        // a model that never predicted before knows no other weights
+        let fresh = config.build(&DIMS, 2).unwrap();
+        let now: BTreeMap<_, _> = trainer.model().params().tensors();
+        fresh.params().load(&now).unwrap();
+        assert_eq!(predict(fresh.as_ref()), after, "{kind}");
+        trainer.restore(&weights).unwrap();
+        assert_eq!(predict(trainer.model()), before, "{kind}");
+    }
+}
+
+#[test]
 fn a_resumed_training_gives_the_same_bits() {
     let mut whole = Trainer::new(model(1), config(), 5).unwrap();
     let mut saved = None;

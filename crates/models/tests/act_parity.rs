@@ -1,13 +1,15 @@
 //! ACT against outputs of LeRobot's `ACTPolicy` on PyTorch: the fixtures of this repository, and every folder of the
-//! same layout below `$ACTRM_PARITY_DIR`.
+//! same layout below `$ACTRM_PARITY_DIR` (`benches/peers/make_act_fixture.py --random N` makes fresh ones).
 #![allow(clippy::unwrap_used)]
+
+mod common;
 
 use candle_core::{DType, Device, Tensor};
 use models::act::Act;
 use models::layers::Mode;
 use models::{Batch, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 /// Largest absolute difference that counts as equal.
@@ -21,37 +23,21 @@ struct Fixture {
     gradients: Option<BTreeMap<String, Tensor>>,
 }
 
-fn read(folder: &Path) -> Option<Fixture> {
-    let config = std::fs::read_to_string(folder.join("config.json")).ok()?;
-    let config: serde_json::Value = serde_json::from_str(&config).unwrap();
-    if config.get("type").and_then(|t| t.as_str()) != Some("act") {
-        return None;
-    }
-    let lerobot = lerobot::read_config(&config).unwrap();
+fn read(folder: &Path) -> Fixture {
+    let config = std::fs::read_to_string(folder.join("config.json")).unwrap();
+    let lerobot = lerobot::read_config(&serde_json::from_str(&config).unwrap()).unwrap();
     let act = Act::new(&lerobot.config, &lerobot.dims, 0).unwrap();
     let load = |file: &str| candle_core::safetensors::load(folder.join(file), &Device::Cpu).unwrap();
     let tensors: BTreeMap<_, _> = load("model.safetensors").into_iter().collect();
-    lerobot::load_tensors(&act, &tensors).unwrap();
+    lerobot::load_tensors(act.params(), &lerobot.config, &tensors).unwrap();
     let io = Tensor::read_npz(folder.join("io.npz")).unwrap().into_iter().collect();
     let gradients =
         folder.join("gradients.safetensors").exists().then(|| load("gradients.safetensors").into_iter().collect());
-    Some(Fixture { name: folder.display().to_string(), act, io, gradients })
+    Fixture { name: folder.display().to_string(), act, io, gradients }
 }
 
 fn fixtures() -> Vec<Fixture> {
-    let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
-    let mut roots = vec![own];
-    roots.extend(std::env::var_os("ACTRM_PARITY_DIR").map(PathBuf::from));
-    let mut folders = Vec::new();
-    for root in roots {
-        for entry in std::fs::read_dir(&root).unwrap_or_else(|e| panic!("{}: {e}", root.display())) {
-            folders.push(entry.unwrap().path());
-        }
-    }
-    folders.sort();
-    let found: Vec<_> = folders.iter().filter_map(|f| read(f)).collect();
-    assert!(!found.is_empty());
-    found
+    common::fixtures(&common::ACT, 7).iter().map(|folder| read(folder)).collect()
 }
 
 impl Fixture {

@@ -9,6 +9,8 @@
 //! previous states, and on from the reference's.
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use candle_core::{DType, Device, Tensor};
 use models::trm::{Config, Gradient, States, StepOutput, Trm};
 use std::collections::BTreeMap;
@@ -18,18 +20,6 @@ use std::path::{Path, PathBuf};
 const TOLERANCE: f64 = 1e-5;
 /// Where it is: multiple of the distance between the reference and the same maths in f64.
 const ROUNDING: f64 = 4.0;
-
-fn fixtures(below: &Path, found: &mut Vec<PathBuf>) {
-    let mut entries: Vec<PathBuf> = std::fs::read_dir(below).unwrap().map(|entry| entry.unwrap().path()).collect();
-    entries.sort();
-    let has = |name: &str| below.join(name).is_file();
-    if has("config.json") && has("model.safetensors") && has("io.safetensors") {
-        found.push(below.to_path_buf());
-    }
-    for path in entries.into_iter().filter(|path| path.is_dir()) {
-        fixtures(&path, found);
-    }
-}
 
 fn load(path: PathBuf) -> BTreeMap<String, Tensor> {
     candle_core::safetensors::load(path, &Device::Cpu).unwrap().into_iter().collect()
@@ -95,12 +85,7 @@ fn check(folder: &Path) {
 
 #[test]
 fn the_official_outputs_are_reproduced() {
-    let mut found = Vec::new();
-    fixtures(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/trm_official"), &mut found);
-    assert_eq!(found.len(), 2, "the repository ships two fixtures: {found:?}");
-    if let Some(more) = std::env::var_os("ACTRM_PARITY_DIR") {
-        fixtures(Path::new(&more), &mut found);
-    }
+    let found = common::fixtures(&common::TRM, 2);
     for folder in found {
         check(&folder);
     }

@@ -46,8 +46,7 @@ struct Step<T> {
 impl<T> Step<T> {
     /// (b,)
     fn halt_logits(&self, pass: &mut Pass<'_>) -> Vec<f32> {
-        let dim = pass.shape.dim;
-        pass.linear("halt_head", &self.read, dim)
+        pass.linear("halt_head", &self.read)
     }
 }
 
@@ -134,7 +133,7 @@ impl Actrm {
         let steps = self.steps_of(batch);
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: Some(rng) };
+                let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: Some(rng), packed: None };
                 let grads = &mut into.views();
                 match self.config.reasoning.over {
                     Over::Actions => self.supervise::<OverActions<'_>>(pass, &data, steps, grads),
@@ -286,9 +285,10 @@ impl Actrm {
         let values = |t: Option<&Tensor>| t.map(|t| with_values(t, <[f32]>::to_vec)).transpose();
         let (state, env) = (values(Some(state))?.unwrap_or_default(), values(environment_state)?.unwrap_or_default());
         let start = values(start)?;
+        let packed = self.workspaces.packed(self.params());
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: None };
+                let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: None, packed: Some(&packed) };
                 match self.config.reasoning.over {
                     Over::Actions => self.think_with::<OverActions<'_>>(pass, (&state, &env), start, on_step),
                     Over::Memory => self.think_with::<OverMemory<'_>>(pass, (&state, &env), start, on_step),

@@ -1,7 +1,7 @@
 //! The attention branch: projections, positions, attention, output projection.
 
 use super::{Grads, Pass, Workspace, slot, sum_over_sequences, weight_gradient};
-use crate::kernels::{Heads, Mat, Start, attend, attend_backward, column_sums, gemm_with, product};
+use crate::kernels::{Heads, Mat, Start, attend, attend_backward, column_sums, product};
 use crate::layers::DropoutMask;
 
 /// What attention's backward pass needs.
@@ -35,29 +35,16 @@ impl Attention {
         let dim = heads.dim;
         let (w, bias) = (pass.weight(prefix, ".in_proj_weight"), pass.weight(prefix, ".in_proj_bias"));
         let mut project = |side: Side<'_>, w: &[f32], bias: &[f32]| {
-            let (rows, out) = (side.x.len() / dim, bias.len());
             let steps = side.pos.len() / dim;
-            let mut pos = pass.take(steps * dim);
-            let mut y = pass.take(rows * out);
-            let weight = Mat::rows(w, dim).t();
-            product((steps, dim, dim), Mat::rows(side.pos, dim), weight, Start::Zero, &mut pos, &mut pass.space.pack);
-            let epilogue = |i: usize, from: usize, row: &mut [f32]| {
+            // of keys with values only the keys have positions
+            let pos = pass.times(side.pos, &w[..dim * dim], Start::Zero, |_, _, _| ());
+            let y = pass.times(side.x, w, Start::Bias(bias), |i, from, row| {
                 let to = dim.min(from + row.len());
                 if from < to {
                     let pos = &pos[i % steps * dim..][from..to];
                     row.iter_mut().zip(pos).for_each(|(y, p)| *y += p);
                 }
-            };
-            gemm_with(
-                (rows, out, dim),
-                Mat::rows(side.x, dim),
-                weight,
-                Start::Bias(bias),
-                &mut y,
-                out,
-                &mut pass.space.pack,
-                epilogue,
-            );
+            });
             pass.give(pos);
             y
         };
@@ -68,7 +55,7 @@ impl Attention {
         let (mut weights, mut mixed) = (pass.take(heads.weights()), pass.take(heads.batch * heads.queries * dim));
         let Workspace { pool, pack } = &mut *pass.space;
         attend(heads, &q, &kv, key_pad, mask, &mut weights, &mut mixed, pool, pack);
-        let branch = pass.linear(&format!("{prefix}.out_proj"), &mixed, dim);
+        let branch = pass.linear(&format!("{prefix}.out_proj"), &mixed);
         (branch, Self { heads, mask, q, kv, weights, mixed })
     }
 

@@ -63,7 +63,7 @@ pub(crate) fn scatter(x: &[f32], width: usize, parts: &mut [(&mut [f32], usize)]
 pub(crate) fn keys_and_values(pass: &mut Pass<'_>, prefix: &str, x: &[f32]) -> Vec<f32> {
     let dim = pass.shape.dim;
     let (w, bias) = (pass.weight(prefix, ".in_proj_weight"), pass.weight(prefix, ".in_proj_bias"));
-    project(pass, x, &w[dim * dim..], &bias[dim..])
+    pass.times(x, &w[dim * dim..], Start::Bias(&bias[dim..]), |_, _, _| ())
 }
 
 /// Adds the parameters' gradients, given that of keys and values, and adds that of x to `into`.
@@ -79,16 +79,6 @@ pub(crate) fn keys_and_values_backward(
     let w = &pass.weight(prefix, ".in_proj_weight")[dim * dim..];
     project_backward(pass, (x, grad), w, Some(into), &mut slot(grads, prefix, ".in_proj_weight")[dim * dim..]);
     column_sums(&mut slot(grads, prefix, ".in_proj_bias")[dim..], grad);
-}
-
-/// x: (rows, D), w: (out, D) -> (rows, out)
-fn project(pass: &mut Pass<'_>, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
-    let dim = pass.shape.dim;
-    let (rows, out) = (x.len() / dim, bias.len());
-    let mut y = pass.take(rows * out);
-    let (x, w) = (Mat::rows(x, dim), Mat::rows(w, dim).t());
-    product((rows, out, dim), x, w, Start::Bias(bias), &mut y, &mut pass.space.pack);
-    y
 }
 
 /// Adds the gradients of w and x, given that of `x wᵀ`.
@@ -125,11 +115,11 @@ impl BlockLayer {
         let rows = Rows { computed: queries, all: queries };
         let attn = format!("{prefix}.attn");
         let (w, bias) = (pass.weight(&attn, ".in_proj_weight"), pass.weight(&attn, ".in_proj_bias"));
-        let q = project(pass, x, &w[..dim * dim], &bias[..dim]);
+        let q = pass.times(x, &w[..dim * dim], Start::Bias(&bias[..dim]), |_, _, _| ());
         let (mut weights, mut mixed) = (pass.take(heads.weights()), pass.take(batch * queries * dim));
         let Workspace { pool, pack } = &mut *pass.space;
         attend(heads, &q, &kv, None, None, &mut weights, &mut mixed, pool, pack);
-        let branch = pass.linear(&format!("{attn}.out_proj"), &mixed, dim);
+        let branch = pass.linear(&format!("{attn}.out_proj"), &mixed);
         let (y, residual1) = Residual::leave(pass, &format!("{prefix}.norm1"), None, x, branch, rows);
         let (branch, ff) = FeedForward::forward(pass, &prefix, &y, rows);
         let (out, residual2) = Residual::leave(pass, &format!("{prefix}.norm2"), None, &y, branch, rows);

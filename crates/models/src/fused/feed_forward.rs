@@ -1,7 +1,7 @@
 //! The feed-forward branch.
 
 use super::{Grads, Pass, Rows, Shape};
-use crate::kernels::{Mat, Start, activate, activate_backward, gemm_with, product};
+use crate::kernels::{Mat, Start, activate, activate_backward, gemm_with};
 use crate::layers::{Activation, DropoutMask};
 
 /// What the feed-forward branch's backward pass needs.
@@ -17,28 +17,24 @@ pub(super) struct FeedForward {
 impl FeedForward {
     /// x: (rows, D) -> (rows, D)
     pub(super) fn forward(pass: &mut Pass<'_>, prefix: &str, x: &[f32], rows: Rows) -> (Vec<f32>, Self) {
-        let Shape { dim, hidden: width, activation, .. } = pass.shape;
+        let Shape { hidden: width, activation, .. } = pass.shape;
         let mask = pass.mask();
         let (w, bias) = (pass.weight(prefix, ".linear1.weight"), pass.weight(prefix, ".linear1.bias"));
-        let n = x.len() / dim;
-        let mut hidden = pass.take(n * width);
-        let (x, w) = (Mat::rows(x, dim), Mat::rows(w, dim).t());
-        let shape = (n, width, dim);
         let mut before = None;
-        if activation == Activation::Relu {
+        let hidden = if activation == Activation::Relu {
             let epilogue =
                 |i: usize, j: usize, row: &mut [f32]| activate(row, activation, mask, rows.full(i) * width + j);
-            gemm_with(shape, x, w, Start::Bias(bias), &mut hidden, width, &mut pass.space.pack, epilogue);
+            pass.times(x, w, Start::Bias(bias), epilogue)
         } else {
-            let mut linear = pass.take(n * width);
-            product(shape, x, w, Start::Bias(bias), &mut linear, &mut pass.space.pack);
-            for (i, (row, from)) in hidden.chunks_exact_mut(width).zip(linear.chunks_exact(width)).enumerate() {
-                row.copy_from_slice(from);
+            let linear = pass.times(x, w, Start::Bias(bias), |_, _, _| ());
+            let mut hidden = pass.space.pool.copy(&linear);
+            for (i, row) in hidden.chunks_exact_mut(width).enumerate() {
                 activate(row, activation, mask, rows.full(i) * width);
             }
             before = Some(linear);
-        }
-        let branch = pass.linear(&format!("{prefix}.linear2"), &hidden, width);
+            hidden
+        };
+        let branch = pass.linear(&format!("{prefix}.linear2"), &hidden);
         (branch, Self { mask, rows, before, hidden })
     }
 
@@ -62,7 +58,7 @@ impl FeedForward {
             let before = &before[i * width + j..][..row.len()];
             activate_backward(row, before, activation, self.mask, self.rows.full(i) * width + j);
         };
-        gemm_with((n, width, dim), g, w, Start::Zero, &mut grad, width, &mut pass.space.pack, epilogue);
+        gemm_with((n, width, dim), g, (w, None), Start::Zero, &mut grad, width, &mut pass.space.pack, epilogue);
         pass.linear_backward(&first, x, &grad, dim, grads);
         let x_grad = pass.linear_input(&first, &grad, dim);
         pass.give(grad);

@@ -39,8 +39,8 @@ impl Vae<'_> {
         let tokens = self.positions.len() / dim;
         let horizon = tokens - 2;
         let cls = pass.weight("vae_encoder_cls_embed", ".weight");
-        let state = pass.linear("vae_encoder_robot_state_input_proj", &data.state, self.dims.state);
-        let actions = pass.linear("vae_encoder_action_input_proj", &data.actions, self.dims.action);
+        let state = pass.linear("vae_encoder_robot_state_input_proj", &data.state);
+        let actions = pass.linear("vae_encoder_action_input_proj", &data.actions);
         let mut x = pass.take(b * tokens * dim);
         let mut key_pad = pass.space.pool.zeros(b * tokens);
         for i in 0..b {
@@ -55,7 +55,7 @@ impl Vae<'_> {
         let (cls, encoder) =
             Encoder::forward(pass, "vae_encoder", self.n_layers, x, self.positions, Some(&key_pad), true);
         pass.give(key_pad);
-        let latent = pass.linear("vae_encoder_latent_output_proj", &cls, dim);
+        let latent = pass.linear("vae_encoder_latent_output_proj", &cls);
         let eps = eps(pass);
         let width = self.latent_dim;
         let mut sample = pass.take(b * width);

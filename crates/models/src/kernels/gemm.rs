@@ -4,7 +4,7 @@
 //! register tile, B's panel stays in the first-level cache, A's block in the second. Plain safe Rust; `pulp` picks
 //! AVX-512, AVX2 or scalar code at run time. The order of additions depends on the shape alone.
 
-use crate::simd::dispatch;
+use crate::simd::{dispatch, vectorised};
 use pulp::{Simd, WithSimd};
 
 /// A view: element (i, j) is `data[i * row + j * col]`.
@@ -52,6 +52,50 @@ pub(crate) struct Pack {
     b: Vec<f32>,
 }
 
+/// A matrix (k, n) in panels, for many products with it on the right.
+#[derive(Debug)]
+pub(crate) struct Packed {
+    panels: Vec<f32>,
+    /// width of a panel: that of the machine's vectors
+    nr: usize,
+}
+
+struct PanelWidth;
+
+impl WithSimd for PanelWidth {
+    type Output = usize;
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> usize {
+        2 * S::F32_LANES
+    }
+}
+
+impl Packed {
+    pub(crate) fn new(b: Mat<'_>, (n, k): (usize, usize)) -> Self {
+        let nr = dispatch(PanelWidth);
+        let mut panels = vec![0.0; k * n.next_multiple_of(nr)];
+        vectorised(
+            #[inline(always)]
+            || {
+                for jc in (0..n).step_by(NC) {
+                    let nc = NC.min(n - jc);
+                    for pc in (0..k).step_by(KC) {
+                        let kc = KC.min(k - pc);
+                        pack_b(&mut panels[Self::at((jc, nc), pc, k, nr)..], b, (pc, kc), (jc, nc), nr);
+                    }
+                }
+            },
+        );
+        Self { panels, nr }
+    }
+
+    /// Where the block of `nc` columns from `jc` and of rows from `pc` begins; only the last columns are padded.
+    #[inline(always)]
+    fn at((jc, nc): (usize, usize), pc: usize, k: usize, nr: usize) -> usize {
+        jc * k + pc * nc.next_multiple_of(nr)
+    }
+}
+
 /// `c = start + a b` for a: (m, k), b: (k, n), c: (m, n) with rows `ldc` apart.
 pub(crate) fn gemm(
     (m, n, k): (usize, usize, usize),
@@ -62,7 +106,7 @@ pub(crate) fn gemm(
     ldc: usize,
     pack: &mut Pack,
 ) {
-    gemm_with((m, n, k), a, b, start, c, ldc, pack, |_, _, _| ());
+    gemm_with((m, n, k), a, (b, None), start, c, ldc, pack, |_, _, _| ());
 }
 
 /// `gemm` into a compact output.
@@ -78,11 +122,12 @@ pub(crate) fn product(
 }
 
 /// `gemm`, then `epilogue(row, first column, values)` on every stretch of a finished row while it is in the cache.
+/// With `b` may come its panels.
 #[allow(clippy::too_many_arguments)] // the signature of a BLAS
 pub(crate) fn gemm_with<E: Fn(usize, usize, &mut [f32])>(
     (m, n, k): (usize, usize, usize),
     a: Mat<'_>,
-    b: Mat<'_>,
+    (b, packed): (Mat<'_>, Option<&Packed>),
     start: Start<'_>,
     c: &mut [f32],
     ldc: usize,
@@ -96,7 +141,7 @@ pub(crate) fn gemm_with<E: Fn(usize, usize, &mut [f32])>(
     assert!(k > 0, "a product over nothing");
     assert!(a.data.len() > (m - 1) * a.row + (k - 1) * a.col, "A holds (m, k)");
     assert!(b.data.len() > (k - 1) * b.row + (n - 1) * b.col, "B holds (k, n)");
-    dispatch(Gemm { m, n, k, a, b, start, c, ldc, pack, epilogue });
+    dispatch(Gemm { m, n, k, a, b, packed, start, c, ldc, pack, epilogue });
 }
 
 struct Gemm<'a, E> {
@@ -105,6 +150,7 @@ struct Gemm<'a, E> {
     k: usize,
     a: Mat<'a>,
     b: Mat<'a>,
+    packed: Option<&'a Packed>,
     start: Start<'a>,
     c: &'a mut [f32],
     ldc: usize,
@@ -183,11 +229,12 @@ fn few_rows<S: Simd, const M: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g
 
 #[inline(always)]
 fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g: Gemm<'_, E>) {
-    let Gemm { m, n, k, a, b, start, c, ldc, pack, epilogue } = g;
+    let Gemm { m, n, k, a, b, packed, start, c, ldc, pack, epilogue } = g;
     let nr = 2 * S::F32_LANES;
     let (depth, wide) = (k.min(KC), n.min(NC).next_multiple_of(nr));
     let tall = m.min(MC).next_multiple_of(MR);
-    if pack.b.len() < depth * wide {
+    let packed = packed.filter(|packed| packed.nr == nr);
+    if packed.is_none() && pack.b.len() < depth * wide {
         pack.b.resize(depth * wide, 0.0);
     }
     if pack.a.len() < depth * tall {
@@ -199,11 +246,17 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
         loop {
             let kc = KC.min(k - pc);
             let last = pc + kc == k;
-            pack_b(&mut pack.b, b, (pc, kc), (jc, nc), nr);
+            let panels = match packed {
+                Some(packed) => &packed.panels[Packed::at((jc, nc), pc, k, nr)..],
+                None => {
+                    pack_b(&mut pack.b, b, (pc, kc), (jc, nc), nr);
+                    &pack.b
+                }
+            };
             for ic in (0..m).step_by(MC) {
                 let mc = MC.min(m - ic);
                 pack_a::<MR>(&mut pack.a, a, (ic, mc), (pc, kc));
-                for (jp, panel_b) in pack.b.chunks_exact(nr * kc).take(nc.div_ceil(nr)).enumerate() {
+                for (jp, panel_b) in panels.chunks_exact(nr * kc).take(nc.div_ceil(nr)).enumerate() {
                     let j = jc + jp * nr;
                     let cols = nr.min(n - j);
                     for (ip, panel_a) in pack.a.chunks_exact(MR * kc).take(mc.div_ceil(MR)).enumerate() {
@@ -362,7 +415,7 @@ mod tests {
         #[test]
         fn it_is_the_naive_product(
             m in 1usize..70, n in 1usize..70, k in 1usize..40, deep: bool, wide: bool,
-            ta: bool, tb: bool, start in 0u8..3, extra in 0usize..3, level in 0usize..3,
+            ta: bool, tb: bool, start in 0u8..3, extra in 0usize..3, level in 0usize..3, packed: bool,
         ) {
             // beyond one block in depth and in width
             let k = if deep { k + 250 } else { k };
@@ -376,7 +429,8 @@ mod tests {
             let mut c = before.clone();
             let kind = match start { 0 => Start::Zero, 1 => Start::Add, _ => Start::Bias(&bias) };
             at_most(Level::ALL[level], || {
-                gemm_with((m, n, k), am, bm, kind, &mut c, n + extra, &mut Pack::default(), |i, j0, row| {
+                let panels = packed.then(|| Packed::new(bm, (n, k)));
+                gemm_with((m, n, k), am, (bm, panels.as_ref()), kind, &mut c, n + extra, &mut Pack::default(), |i, j0, row| {
                     for (j, x) in row.iter_mut().enumerate() {
                         *x += (i * 2 + (j0 + j)) as f32;
                     }

@@ -11,6 +11,6 @@ mod pool;
 
 pub(crate) use attention::{Heads, attend, attend_backward};
 pub(crate) use elementwise::{activate, activate_backward, add, column_sums, drop_scale};
-pub(crate) use gemm::{Mat, Pack, Start, gemm, gemm_with, product};
+pub(crate) use gemm::{Mat, Pack, Packed, Start, gemm, gemm_with, product};
 pub(crate) use norm::{layer_norm, layer_norm_backward};
 pub(crate) use pool::Pool;

@@ -3,17 +3,16 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use models::act::POSITION_BUFFER;
-use models::layers::sinusoid_table;
-use models::{ACTION, ENVIRONMENT_STATE, PolicyConfig, STATE};
+use models::PolicyConfig;
+use models::lerobot::{self, LerobotAct};
 use serde_json::{Value, json};
 
 use crate::entry::Entry;
 use crate::files::sync_folder;
 use crate::{ZooError, tensors, write_atomic};
 
-use super::config::{ActConfig, Feature, Features, NormaliserStep, Pipeline, Step, mode_name};
-use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREFIX, PREPROCESSOR};
+use super::config::{NormaliserStep, Pipeline, Step};
+use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR};
 
 /// Writes `entry` into the new folder `out`.
 ///
@@ -29,47 +28,29 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
             found: experiment.policy_type(),
         });
     };
-    let (meta, normalisation) = (entry.meta(), &experiment.normalisation);
-    let feature = |kind: &str, n: usize| Feature { kind: kind.to_owned(), shape: vec![n] };
-    let mut inputs = Features::from([(STATE.to_owned(), feature("STATE", meta.dims.state))]);
-    let mut modes = BTreeMap::from([
-        ("STATE".to_owned(), mode_name(normalisation.state).to_owned()),
-        ("ACTION".to_owned(), mode_name(normalisation.action).to_owned()),
-    ]);
-    if meta.dims.environment_state > 0 {
-        inputs.insert(ENVIRONMENT_STATE.to_owned(), feature("ENV", meta.dims.environment_state));
-        modes.insert("ENV".to_owned(), mode_name(normalisation.environment_state).to_owned());
-    }
-    let outputs = Features::from([(ACTION.to_owned(), feature("ACTION", meta.dims.action))]);
-    let rollout = &experiment.rollout;
-    let mut config = ActConfig::new(act, rollout.n_action_steps, rollout.temporal_ensemble);
-    config.input_features = inputs.clone();
-    config.output_features = outputs.clone();
-    config.normalization_mapping = modes.clone();
-
+    let (meta, rollout) = (entry.meta(), &experiment.rollout);
+    let config = lerobot::write_config(&LerobotAct {
+        config: act.clone(),
+        dims: meta.dims,
+        n_action_steps: rollout.n_action_steps,
+        temporal_ensemble_coeff: rollout.temporal_ensemble,
+        modes: experiment.normalisation.modes(meta.dims.environment_state > 0),
+    });
     let model_error = || experiment.model_error("export");
-    let mut weights: BTreeMap<_, _> = loaded
-        .model()
-        .params()
-        .tensors()
-        .into_iter()
-        .map(|(name, tensor)| (format!("{PREFIX}{name}"), tensor))
-        .collect();
-    if act.use_vae {
-        // LeRobot keeps the table as a buffer of shape (1, action_horizon + 2, dim_model)
-        let table = sinusoid_table(act.action_horizon + 2, act.dim_model)
-            .and_then(|table| Ok(table.reshape((1, act.action_horizon + 2, act.dim_model))?))
-            .map_err(model_error())?;
-        weights.insert(format!("{PREFIX}{POSITION_BUFFER}"), table);
-    }
+    let weights = lerobot::tensors_out(loaded.model().params(), act).map_err(model_error())?;
     let statistics = loaded.normaliser().tensors().map_err(model_error())?;
 
-    let mut features = inputs;
-    features.extend(outputs.clone());
+    let (inputs, outputs) = (&config["input_features"], &config["output_features"]);
+    let norm_map: BTreeMap<String, String> =
+        serde_json::from_value(config["normalization_mapping"].clone()).expect("names of modes");
+    let mut features = inputs.clone();
+    for (name, feature) in outputs.as_object().expect("features by name") {
+        features[name] = feature.clone();
+    }
     let device = || step("device_processor", json!({"device": "cpu", "float_dtype": null}));
-    let normalise = |name: &str, features: Features, pipeline: &str, index: usize| Step {
+    let normalise = |name: &str, features: Value, pipeline: &str, index: usize| Step {
         state_file: Some(format!("{pipeline}_step_{index}_{name}.safetensors")),
-        ..step(name, to_json(&NormaliserStep { eps: 1e-8, features, norm_map: modes.clone() }))
+        ..step(name, to_json(&NormaliserStep { eps: 1e-8, features, norm_map: norm_map.clone() }))
     };
     let before = Pipeline {
         name: PREPROCESSOR.to_owned(),
@@ -82,7 +63,7 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
     };
     let after = Pipeline {
         name: POSTPROCESSOR.to_owned(),
-        steps: vec![normalise("unnormalizer_processor", outputs, POSTPROCESSOR, 0), device()],
+        steps: vec![normalise("unnormalizer_processor", outputs.clone(), POSTPROCESSOR, 0), device()],
     };
 
     let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
@@ -98,7 +79,7 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
     let about = json!({"entry": entry.id().to_string(), "sha256": meta.content_sha256()});
     let put = |name: &str, bytes: &[u8]| write_atomic(&staging.path().join(name), bytes);
     put(MODEL_FILE, &tensors::to_bytes(out, &weights, &about)?)?;
-    put(CONFIG_FILE, pretty(&to_json(&config)).as_bytes())?;
+    put(CONFIG_FILE, pretty(&config).as_bytes())?;
     for pipeline in [&before, &after] {
         put(&format!("{}.json", pipeline.name), pretty(&to_json(pipeline)).as_bytes())?;
         for file in pipeline.steps.iter().filter_map(|s| s.state_file.as_ref()) {

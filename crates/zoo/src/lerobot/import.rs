@@ -4,17 +4,16 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use candle_core::Tensor;
-use models::act::POSITION_BUFFER;
-use models::layers::sinusoid_table;
-use models::{ACTION, Dims, ENVIRONMENT_STATE, Normaliser, PolicyConfig, STATE};
+use models::lerobot::{self, LerobotAct};
+use models::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, PolicyConfig, STATE};
 
 use crate::entry::{EntryDraft, EntryId, EntryMeta};
 use crate::experiment::{DataSection, Experiment, NormalisationSection, RolloutSection, TaskSection};
 use crate::run::TrainSection;
 use crate::{ZooError, tensors};
 
-use super::config::{self, ActConfig, Features, NormaliserStep, Pipeline};
-use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREFIX, PREPROCESSOR};
+use super::config::{self, NormaliserStep, Pipeline};
+use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR};
 
 /// What the checkpoint does not say about itself.
 #[derive(Debug, Clone)]
@@ -35,16 +34,15 @@ pub struct ImportOptions {
 /// Files, keys, tensors or statistics that are missing, extra or misshapen, each by name.
 pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<EntryId, ZooError> {
     let config_path = folder.join(CONFIG_FILE);
-    let act: ActConfig = config::read(&config_path)?;
-    let policy = PolicyConfig::Act(act.model(&config_path)?);
-    let dims = dims(&config_path, &act)?;
+    let LerobotAct { config: act, dims, n_action_steps, temporal_ensemble_coeff, .. } =
+        lerobot::read_config(&config::read(&config_path)?).map_err(config::misfit(&config_path))?;
 
     let before = step(folder, PREPROCESSOR, "normalizer_processor")?;
     let after = step(folder, POSTPROCESSOR, "unnormalizer_processor")?;
     let normalisation = NormalisationSection {
-        state: config::mode(&before.path, &before.config.norm_map, "STATE")?,
-        environment_state: config::mode(&before.path, &before.config.norm_map, "ENV")?,
-        action: config::mode(&after.path, &after.config.norm_map, "ACTION")?,
+        state: before.mode("STATE")?,
+        environment_state: before.mode("ENV")?,
+        action: after.mode("ACTION")?,
     };
     // observations as they go in, actions as they come out
     let mut statistics = before.statistics;
@@ -64,20 +62,16 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             ..DataSection::default()
         },
         normalisation,
-        policy,
+        policy: PolicyConfig::Act(act.clone()),
         train: TrainSection::default(),
-        rollout: RolloutSection {
-            n_action_steps: act.n_action_steps,
-            temporal_ensemble: act.temporal_ensemble_coeff,
-            max_steps: None,
-        },
+        rollout: RolloutSection { n_action_steps, temporal_ensemble: temporal_ensemble_coeff, max_steps: None },
     };
     experiment.check()?;
 
     let model = experiment.policy.build(&dims, 0).map_err(experiment.model_error("build the policy of"))?;
     let model_path = folder.join(MODEL_FILE);
-    let weights = weights(&model_path, act.chunk_size)?;
-    model.params().load(&weights).map_err(experiment.model_error("load the weights of"))?;
+    let (weights, _) = tensors::read(&model_path)?;
+    lerobot::load_tensors(model.params(), &act, &weights).map_err(config::misfit(&model_path))?;
     let modes = experiment.normalisation.modes(dims.environment_state > 0);
     let normaliser = Normaliser::new(&modes, &statistics).map_err(experiment.model_error("take the statistics of"))?;
     let lengths = [(STATE, dims.state), (ENVIRONMENT_STATE, dims.environment_state), (ACTION, dims.action)];
@@ -115,33 +109,17 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     draft.seal(zoo)
 }
 
-fn dims(path: &Path, act: &ActConfig) -> Result<Dims, ZooError> {
-    let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
-    let length = |features: &Features, name: &str| match features.get(name).map(|f| f.shape.as_slice()) {
-        None => Ok(0),
-        Some([n]) => Ok(*n),
-        Some(shape) => Err(malformed(format!("{name}: expected a vector, found shape {shape:?}"))),
-    };
-    let dims = Dims {
-        state: length(&act.input_features, STATE)?,
-        environment_state: length(&act.input_features, ENVIRONMENT_STATE)?,
-        action: length(&act.output_features, ACTION)?,
-    };
-    if dims.state == 0 || dims.action == 0 {
-        return Err(malformed(format!(
-            "expected features {STATE} and {ACTION}, found {act_in:?} and {act_out:?}",
-            act_in = act.input_features.keys().collect::<Vec<_>>(),
-            act_out = act.output_features.keys().collect::<Vec<_>>()
-        )));
-    }
-    Ok(dims)
-}
-
 /// The normalising step of a processor.
 struct Normalising {
     path: std::path::PathBuf,
     config: NormaliserStep,
     statistics: BTreeMap<String, Tensor>,
+}
+
+impl Normalising {
+    fn mode(&self, kind: &str) -> Result<NormMode, ZooError> {
+        lerobot::mode_of(&self.config.norm_map, kind).map_err(config::misfit(&self.path))
+    }
 }
 
 fn step(folder: &Path, name: &str, registry_name: &str) -> Result<Normalising, ZooError> {
@@ -168,33 +146,4 @@ fn step(folder: &Path, name: &str, registry_name: &str) -> Result<Normalising, Z
     }
     let (statistics, _) = tensors::read(&folder.join(file))?;
     Ok(Normalising { path, config, statistics })
-}
-
-/// LeRobot's weights under our names; the stored position table must be the computed one.
-fn weights(path: &Path, action_horizon: usize) -> Result<BTreeMap<String, Tensor>, ZooError> {
-    let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
-    let (stored, _) = tensors::read(path)?;
-    let mut weights = BTreeMap::new();
-    for (name, tensor) in stored {
-        let Some(ours) = name.strip_prefix(PREFIX) else {
-            return Err(malformed(format!("tensor `{name}`: expected a name that begins with `{PREFIX}`")));
-        };
-        if ours != POSITION_BUFFER {
-            weights.insert(ours.to_owned(), tensor);
-            continue;
-        }
-        let difference = || {
-            let dim = tensor.dims().last().copied().unwrap_or(0);
-            let table = sinusoid_table(action_horizon + 2, dim).map_err(candle_core::Error::wrap)?;
-            (tensor.flatten_all()? - table.flatten_all()?)?.abs()?.max_all()?.to_scalar::<f32>()
-        };
-        let largest = difference().map_err(|e| malformed(format!("tensor `{name}`: {e}")))?;
-        // the table is sines and cosines in f32
-        if largest.is_nan() || largest > 1e-5 {
-            return Err(malformed(format!(
-                "tensor `{name}`: expected the sinusoid table, found {largest:e} away from it"
-            )));
-        }
-    }
-    Ok(weights)
 }

@@ -1,4 +1,5 @@
-//! LeRobot's ACT checkpoints in and out: `config.json`, `model.safetensors` and the two processors.
+//! LeRobot's ACT checkpoints in and out: `config.json`, `model.safetensors` and the two processors. What stands in the
+//! first two is `models::lerobot`'s business; here are the files.
 //!
 //! LeRobot loads weights by name without complaint about missing or extra ones, and passes features through
 //! whose statistics are missing. Here both are errors that name what is wrong.
@@ -10,8 +11,6 @@ mod import;
 pub use export::export;
 pub use import::{ImportOptions, import};
 
-/// Before every tensor's name in LeRobot's files.
-const PREFIX: &str = "model.";
 const MODEL_FILE: &str = "model.safetensors";
 const CONFIG_FILE: &str = "config.json";
 const PREPROCESSOR: &str = "policy_preprocessor";

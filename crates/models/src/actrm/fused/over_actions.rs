@@ -218,8 +218,7 @@ impl<'m> Recursion<'m> for OverActions<'m> {
                 before.free(pass);
             }
             let (answer, reasoning) = (after.answer.as_ref(), after.reasoning.as_ref());
-            let dim = pass.shape.dim;
-            let chunk = pass.linear("action_head", answer.expect("a round leaves an answer"), dim);
+            let chunk = pass.linear("action_head", answer.expect("a round leaves an answer"));
             let read = mean_over_tokens(pass, reasoning.expect("a round leaves a reasoning"), self.rows);
             Step { carry: after, chunk, read, trace: round }
         })

@@ -98,8 +98,7 @@ impl<'m> Recursion<'m> for OverMemory<'m> {
             (pass.weight("encoder_1d_feature_pos_embed", ".weight"), pass.weight("decoder_pos_embed", ".weight"));
         let memory = Memory { x: answer, pos, batch: self.rows };
         let (decoded, decoder) = Decoder::forward(pass, self.config.n_decoder_layers, query_pos, memory);
-        let dim = pass.shape.dim;
-        let chunk = pass.linear("action_head", &decoded, dim);
+        let chunk = pass.linear("action_head", &decoded);
         let read = mean_over_tokens(pass, answer, self.rows);
         Step { carry: after, chunk, read, trace: Trace { updates, decoder, decoded } }
     }
