@@ -210,7 +210,7 @@ impl Bench {
         }
     }
 
-    /// ACTRM beside ACT, the original's plan and autograd.
+    /// ACTRM's predictions beside ACT's and the original's plan.
     fn actrm(&mut self, size: &str) {
         let name = format!("ACTRM predict {size} (peer: our ACT)");
         let ours = PolicyConfig::Actrm(actrm_config(size, full_depth())).build(&DIMS, 1).unwrap();
@@ -227,7 +227,21 @@ impl Bench {
         }
     }
 
-    fn actrm_training(&mut self, size: &str, reasoning: ReasoningConfig, peer: bool) {
+    /// The default's training step beside ACT's.
+    fn actrm_beside_act(&mut self, size: &str) {
+        let name = format!("ACTRM train {size}, 1 threads (peer: our ACT)");
+        if !self.wants(&name) {
+            return;
+        }
+        let batch = batch(size);
+        let config = PolicyConfig::Actrm(actrm_config(size, ReasoningConfig::default()));
+        let (mut ours, mut theirs) = (trainer(&config, 1), trainer(&act_config(size), 1));
+        let step = |trainer: &mut Trainer| timed(1, &mut || drop(trainer.step(&batch).unwrap()));
+        self.in_turns(&name, None, false, || step(&mut ours), Some(|| step(&mut theirs)));
+    }
+
+    /// Beside the same model on candle's autograd.
+    fn actrm_training(&mut self, size: &str, reasoning: ReasoningConfig) {
         let over = format!("{:?}", reasoning.over).to_lowercase();
         let name = format!("ACTRM train {size} over {over}, 1 threads (peer: autograd)");
         if !self.wants(&name) {
@@ -242,8 +256,7 @@ impl Bench {
             let LossParts { total, .. } = composed.loss(&batch, &mut Rng::new(1, "bench")).unwrap();
             drop(total.backward().unwrap());
         };
-        let theirs = peer.then_some(|| timed(1, &mut { step }));
-        self.in_turns(&name, None, false, ours, theirs);
+        self.in_turns(&name, None, false, ours, Some(|| timed(1, &mut { step })));
     }
 
     /// Peak memory of two training steps, each side in a process of its own.
@@ -297,10 +310,11 @@ fn main() {
     for size in ["d128", "d256", "d512"] {
         bench.actrm(size);
     }
-    bench.actrm_training("d128", ReasoningConfig::default(), true);
-    bench.actrm_training("d256", ReasoningConfig::default(), true);
+    bench.actrm_beside_act("d256");
+    bench.actrm_training("d128", ReasoningConfig::default());
+    bench.actrm_training("d256", ReasoningConfig::default());
     let memory = ReasoningConfig { h_cycles: 2, l_cycles: 2, n_layers: 2, supervision_steps: 2, ..original_plan() };
-    bench.actrm_training("d128", memory, true);
+    bench.actrm_training("d128", memory);
     bench.memory("d256");
     // slow: fewer rounds keep the whole within minutes
     bench.rounds = rounds.min(3);

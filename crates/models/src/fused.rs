@@ -34,7 +34,7 @@ use crate::rng::Rng;
 use crate::simd::vectorised;
 use candle_core::Storage;
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Parameters by name.
 pub(crate) type Weights<'a> = BTreeMap<&'a str, &'a [f32]>;
@@ -69,19 +69,20 @@ impl Workspaces {
     pub(crate) fn packed(&self, params: &Params) -> Arc<PackedWeights> {
         let mut packed = self.packed.lock().unwrap_or_else(PoisonError::into_inner);
         if packed.version != params.version() {
-            *packed = Arc::new(PackedWeights { version: params.version(), panels: Mutex::default() });
+            *packed = Arc::new(PackedWeights { version: params.version(), ..PackedWeights::default() });
         }
         packed.clone()
     }
 }
 
-/// Weights in the panels that products read, each made when it is first used: for predictions, which use the same
-/// weights again and again.
+/// Weights in the panels that products read, each made when it is first used, and what else depends on the weights
+/// alone: for predictions, which use the same weights again and again.
 #[derive(Debug, Default)]
 pub(crate) struct PackedWeights {
     version: u64,
     /// by the place in memory, which a parameter keeps, and the number of rows
     panels: Mutex<BTreeMap<(usize, usize), Arc<Packed>>>,
+    begun: OnceLock<decoder::Begun>,
 }
 
 impl PackedWeights {
@@ -90,6 +91,11 @@ impl PackedWeights {
         let mut panels = self.panels.lock().unwrap_or_else(PoisonError::into_inner);
         let make = || Arc::new(Packed::new(Mat::rows(w, input).t(), (out, input)));
         panels.entry((w.as_ptr().addr(), out)).or_insert_with(make).clone()
+    }
+
+    /// The decoder's first layer before the memory, made once.
+    fn begun(&self, make: impl FnOnce() -> decoder::Begun) -> &decoder::Begun {
+        self.begun.get_or_init(make)
     }
 }
 

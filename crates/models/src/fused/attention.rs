@@ -22,7 +22,30 @@ pub(super) struct Side<'a> {
     pub(super) pos: &'a [f32],
 }
 
+/// `x w + bias`, and `pos` through the first D columns of w, which are queries or keys: values have no positions.
+fn project(pass: &mut Pass<'_>, side: Side<'_>, w: &[f32], bias: &[f32]) -> Vec<f32> {
+    let dim = pass.shape.dim;
+    let steps = side.pos.len() / dim;
+    let pos = pass.times(side.pos, &w[..dim * dim], Start::Zero, |_, _, _| ());
+    let y = pass.times(side.x, w, Start::Bias(bias), |i, from, row| {
+        let to = dim.min(from + row.len());
+        if from < to {
+            let pos = &pos[i % steps * dim..][from..to];
+            row.iter_mut().zip(pos).for_each(|(y, p)| *y += p);
+        }
+    });
+    pass.give(pos);
+    y
+}
+
 impl Attention {
+    /// The queries, (rows, D)
+    pub(super) fn queries(pass: &mut Pass<'_>, prefix: &str, query: Side<'_>) -> Vec<f32> {
+        let dim = pass.shape.dim;
+        let (w, bias) = (pass.weight(prefix, ".in_proj_weight"), pass.weight(prefix, ".in_proj_bias"));
+        project(pass, query, &w[..dim * dim], &bias[..dim])
+    }
+
     /// -> (b * queries, D)
     pub(super) fn forward(
         pass: &mut Pass<'_>,
@@ -32,25 +55,22 @@ impl Attention {
         key: Side<'_>,
         key_pad: Option<&[f32]>,
     ) -> (Vec<f32>, Self) {
+        let q = Self::queries(pass, prefix, query);
+        Self::of_queries(pass, prefix, heads, q, key, key_pad)
+    }
+
+    /// `forward` with the queries at hand.
+    pub(super) fn of_queries(
+        pass: &mut Pass<'_>,
+        prefix: &str,
+        heads: Heads,
+        q: Vec<f32>,
+        key: Side<'_>,
+        key_pad: Option<&[f32]>,
+    ) -> (Vec<f32>, Self) {
         let dim = heads.dim;
         let (w, bias) = (pass.weight(prefix, ".in_proj_weight"), pass.weight(prefix, ".in_proj_bias"));
-        let mut project = |side: Side<'_>, w: &[f32], bias: &[f32]| {
-            let steps = side.pos.len() / dim;
-            // of keys with values only the keys have positions
-            let pos = pass.times(side.pos, &w[..dim * dim], Start::Zero, |_, _, _| ());
-            let y = pass.times(side.x, w, Start::Bias(bias), |i, from, row| {
-                let to = dim.min(from + row.len());
-                if from < to {
-                    let pos = &pos[i % steps * dim..][from..to];
-                    row.iter_mut().zip(pos).for_each(|(y, p)| *y += p);
-                }
-            });
-            pass.give(pos);
-            y
-        };
-        let (wq, wkv) = w.split_at(dim * dim);
-        let (bq, bkv) = bias.split_at(dim);
-        let (q, kv) = (project(query, wq, bq), project(key, wkv, bkv));
+        let kv = project(pass, key, &w[dim * dim..], &bias[dim..]);
         let mask = pass.mask();
         let (mut weights, mut mixed) = (pass.take(heads.weights()), pass.take(heads.batch * heads.queries * dim));
         let Workspace { pool, pack } = &mut *pass.space;
