@@ -6,6 +6,21 @@ use crate::simd::vectorised;
 
 /// Lanes that sums are kept in: one AVX-512 register, two AVX2 ones.
 const LANES: usize = 16;
+/// Rows that a norm takes at a time.
+const ROWS: usize = 16;
+
+/// The sum of the lanes, in pairs: short chains instead of one long one.
+#[inline(always)]
+fn fold(mut lanes: [f32; LANES]) -> f32 {
+    let mut half = LANES / 2;
+    while half > 0 {
+        for i in 0..half {
+            lanes[i] += lanes[i + half];
+        }
+        half /= 2;
+    }
+    lanes[0]
+}
 
 #[inline(always)]
 fn dot(a: &[f32], b: &[f32]) -> f32 {
@@ -17,7 +32,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
             lanes[i] += x[i] * y[i];
         }
     }
-    lanes.iter().sum::<f32>() + tail
+    fold(lanes) + tail
 }
 
 #[inline(always)]
@@ -30,7 +45,7 @@ fn sum(a: &[f32]) -> f32 {
             lanes[i] += x[i];
         }
     }
-    lanes.iter().sum::<f32>() + tail
+    fold(lanes) + tail
 }
 
 #[inline(always)]
@@ -90,13 +105,6 @@ pub(super) fn add(y: &mut [f32], x: &[f32]) {
     );
 }
 
-/// `y += x` for a few numbers, without the dispatch.
-pub(super) fn add_short(y: &mut [f32], x: &[f32]) {
-    for (y, x) in y.iter_mut().zip(x) {
-        *y += x;
-    }
-}
-
 /// `out = a + b`
 pub(super) fn sum_into(out: &mut [f32], a: &[f32], b: &[f32]) {
     vectorised(
@@ -153,14 +161,23 @@ pub(super) fn add_and_norm(x: &[f32], branch: &[f32], n: usize, eps: f32, out: &
     vectorised(
         #[inline(always)]
         || {
-            let rows = x.chunks_exact(n).zip(branch.chunks_exact(n));
-            for ((x, b), (o, inv)) in rows.zip(out.chunks_exact_mut(n).zip(inverse)) {
-                for i in 0..n {
-                    o[i] = x[i] + b[i];
+            // some rows at a time, so that their roots and quotients are taken together
+            let blocks = x.chunks(ROWS * n).zip(branch.chunks(ROWS * n));
+            let outs = out.chunks_mut(ROWS * n).zip(inverse.chunks_mut(ROWS));
+            for ((x, b), (out, inverse)) in blocks.zip(outs) {
+                for ((o, x), b) in out.iter_mut().zip(x).zip(b) {
+                    *o = x + b;
                 }
-                *inv = 1.0 / (dot(o, o) / n as f32 + eps).sqrt();
-                for o in o.iter_mut() {
-                    *o *= *inv;
+                for (o, inv) in out.chunks_exact(n).zip(inverse.iter_mut()) {
+                    *inv = dot(o, o);
+                }
+                for inv in inverse.iter_mut() {
+                    *inv = 1.0 / (*inv / n as f32 + eps).sqrt();
+                }
+                for (o, &inv) in out.chunks_exact_mut(n).zip(inverse.iter()) {
+                    for o in o {
+                        *o *= inv;
+                    }
                 }
             }
         },

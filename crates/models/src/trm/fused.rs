@@ -1,6 +1,7 @@
 //! The kernel as an operation of candle's graph: embedded input and flat weights in, `z_h` out.
 
 use super::kernel::{Plan, PlanMix};
+use super::layer::Direction;
 use super::{Config, Gradient, Mixing, States};
 use crate::error::Result;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result as CandleResult, Shape, Storage, Tensor};
@@ -11,13 +12,13 @@ type Pool = Arc<Mutex<Vec<Vec<f32>>>>;
 
 /// The kernel, ready for a configuration.
 #[derive(Debug)]
-pub(super) struct Fused {
+pub(crate) struct Fused {
     plan: Arc<Plan>,
     pool: Pool,
 }
 
 impl Fused {
-    pub(super) fn new(config: &Config, rope: Option<&(Tensor, Tensor)>) -> Result<Self> {
+    pub(crate) fn new(config: &Config, rope: Option<&(Tensor, Tensor)>) -> Result<Self> {
         let mix = match config.mixing {
             Mixing::Attention => {
                 let angles = match rope {
@@ -49,7 +50,7 @@ impl Fused {
     }
 
     /// All rounds of a supervision step; the last with a graph if `gradient` is on.
-    pub(super) fn step(
+    pub(crate) fn step(
         &self,
         flat: &Tensor,
         states: &States,
@@ -67,13 +68,14 @@ impl Fused {
             Gradient::Off => h_cycles,
         };
         let tape = with_slices(flat, &embedded, |weights, embedded| {
-            self.plan.run(weights, (&mut z_h, &mut z_l, embedded), (quiet, l_cycles), threads);
+            let packs = self.plan.pack(weights, Direction::Forward);
+            self.plan.run(&packs, (&mut z_h, &mut z_l, embedded), (quiet, l_cycles), threads);
             if gradient == Gradient::Off {
                 return Vec::new();
             }
             let mut tape = self.pool.lock().map(|mut pool| pool.pop()).ok().flatten().unwrap_or_default();
             tape.resize(self.plan.tape_len(shape.dims()[0], l_cycles), 0.0);
-            self.plan.record(weights, (&mut z_h, &mut z_l, embedded), l_cycles, &mut tape, threads);
+            self.plan.record(&packs, (&mut z_h, &mut z_l, embedded), l_cycles, &mut tape, threads);
             tape
         })?;
         let z_l = Tensor::from_vec(z_l, shape.clone(), embedded.device())?;
@@ -163,8 +165,9 @@ impl CustomOp2 for Recorded {
         let mut grad = grad.flatten_all()?.to_vec1::<f32>()?;
         let mut d_embedded = vec![0f32; grad.len()];
         let d_flat = with_slices(flat, embedded, |weights, _| {
+            let packs = self.plan.pack(weights, Direction::Backward);
             let grads = (grad.as_mut_slice(), d_embedded.as_mut_slice());
-            self.plan.backward(weights, self.l_cycles, &mut tape, grads, self.threads)
+            self.plan.backward(&packs, self.l_cycles, &mut tape, grads, self.threads)
         })?;
         if let Ok(mut pool) = self.pool.lock() {
             pool.push(tape);

@@ -1,6 +1,7 @@
 //! Training on puzzles: one optimiser step per supervision step, with the carry between them.
 
-use super::{Carry, Example, Gradient, PUZZLES, Release, States, StepOutput, Trm};
+use super::weights::PUZZLES;
+use super::{Carry, Example, Gradient, Release, States, StepOutput, Trm};
 use crate::classification::{ClassProbability, IGNORE_LABEL, binary_cross_entropy, cross_entropy};
 use crate::error::{ModelError, Result};
 use crate::learner::Learner;
