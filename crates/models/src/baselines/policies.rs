@@ -3,13 +3,14 @@
 //!
 //! Sizes of [`MlpPolicy`] (20,356 on the 5x5 maze) and [`TrmPolicy`] (69,038 for any number of
 //! cycles) are those of acharyaanusha/Tiny-Recursive-Model, `trm_core/trm_rl.py`; the value head
-//! is ours and optional. [`ConvPolicy`] is ours: a weight-shared 3x3 recursion over the maze.
+//! is ours and optional. [`ConvPolicy`] is ours: a small TRM with 3x3 convolutions over the maze.
 
-use super::{dense, neighbours};
+use super::dense;
 use crate::error::{ModelError, Result};
 use crate::layers::{LayerNorm, Linear};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
+use crate::trm::{self, Fused};
 use candle_core::{D, Tensor};
 use serde::{Deserialize, Serialize};
 
@@ -65,8 +66,7 @@ pub enum PolicyNetConfig {
         #[serde(default)]
         value: bool,
     },
-    /// A recursion of one 3x3 convolution block over `channels` planes of `height x width`,
-    /// the first of which marks the agent.
+    /// A TRM with 3x3 convolutions over `channels` planes of `height x width`, the first of which marks the agent.
     Conv {
         /// Planes of the observation.
         channels: usize,
@@ -78,7 +78,7 @@ pub enum PolicyNetConfig {
         hidden: usize,
         /// Hidden width of the block's dense part.
         inner: usize,
-        /// Applications of the block.
+        /// Applications of the block, at least 2.
         cycles: usize,
         /// Whether there is a value head.
         #[serde(default)]
@@ -107,6 +107,14 @@ impl PolicyNetConfig {
                         field: "channels x height x width",
                         found: (channels * height * width).to_string(),
                         expected: format!("the observation's length, {observation}"),
+                    });
+                }
+                if cycles < 2 {
+                    return Err(ModelError::Config {
+                        model: "conv policy",
+                        field: "cycles",
+                        found: cycles.to_string(),
+                        expected: "at least 2".into(),
                     });
                 }
                 let grid = (channels, height, width);
@@ -316,17 +324,18 @@ impl PolicyNet for TrmPolicy {
     }
 }
 
-/// A weight-shared recursion over the cells: `h = rms(h + conv(h + x))`, `h = rms(h + swiglu(h))`.
-/// Scores are read where the agent stands, the value from the mean as well.
+/// A TRM with one round, from states of zero: `z = net(z + x)` for all cycles but the last, then `h = net(z)`, where
+/// `net` is `h = rms(h + conv(h))`, `h = rms(h + swiglu(h))`. Scores are read where the agent stands, the value from the
+/// mean as well.
 #[derive(Debug)]
 pub struct ConvPolicy {
     params: Params,
     grid: (usize, usize, usize),
     cycles: usize,
+    fused: Fused,
     input: Linear,
-    mix: Linear,
-    gate_up: Linear,
-    down: Linear,
+    /// The network's weights in the kernel's order.
+    block: [Tensor; 3],
     head: Linear,
     value: Option<Linear>,
 }
@@ -339,31 +348,38 @@ impl ConvPolicy {
         with_value: bool,
         rng: &mut Rng,
     ) -> Result<Self> {
+        let (channels, height, width) = grid;
+        let config = trm::Config {
+            mixing: trm::Mixing::Conv,
+            positions: trm::Positions::None,
+            grid: Some([height, width]),
+            layers: 1,
+            inner_size: Some(inner),
+            ..trm::Config::new(1, height * width, hidden)
+        };
+        config.check()?;
         let mut params = Params::new();
         let p = &mut params;
         let weight = |params: &mut Params, name: &str, input: usize, output: usize, rng: &mut Rng| {
             let init = Init::TruncatedNormal { std: 1.0 / (input as f64).sqrt() };
-            Linear::with_init(params, name, (input, output), init, None, rng)
+            Ok::<_, ModelError>(Linear::with_init(params, name, (input, output), init, None, rng)?.weight)
         };
         Ok(Self {
-            input: Linear::new(p, "input", grid.0, hidden, rng)?,
-            mix: weight(p, "mix", 9 * hidden, hidden, rng)?,
-            gate_up: weight(p, "gate_up", hidden, 2 * inner, rng)?,
-            down: weight(p, "down", inner, hidden, rng)?,
+            input: Linear::new(p, "input", channels, hidden, rng)?,
+            block: [
+                weight(p, "mix", 9 * hidden, hidden, rng)?,
+                weight(p, "gate_up", hidden, 2 * inner, rng)?,
+                weight(p, "down", inner, hidden, rng)?,
+            ],
             // a flat policy at first: exploration must not start with an opinion
             head: Linear::with_init(p, "head", (hidden, actions), Init::Zeros, Some(Init::Zeros), rng)?,
             value: value_head(p, with_value, 2 * hidden, rng)?,
+            fused: Fused::new(&config, None)?,
             params,
             grid,
             cycles,
         })
     }
-}
-
-/// Root-mean-square norm over the last axis.
-fn rms_norm(x: &Tensor) -> Result<Tensor> {
-    let mean_square = x.sqr()?.mean_keepdim(D::Minus1)?;
-    Ok(x.broadcast_div(&(mean_square + 1e-5)?.sqrt()?)?)
 }
 
 impl PolicyNet for ConvPolicy {
@@ -382,19 +398,13 @@ impl PolicyNet for ConvPolicy {
         let planes = observation.reshape((batch, channels, height * width))?;
         let agent = planes.narrow(1, 0, 1)?.reshape((batch, height * width, 1))?;
         let x = self.input.forward(&planes.transpose(1, 2)?.contiguous()?)?;
-        let hidden = x.dim(D::Minus1)?;
-        let inner = self.down.weight.dim(1)?;
-        let mut h = x.zeros_like()?;
-        for _ in 0..self.cycles {
-            let seen = (&h + &x)?;
-            let around = neighbours(&seen.reshape((batch, height, width, hidden))?)?;
-            let mixed = self.mix.forward(&around.reshape((batch, height * width, 9 * hidden))?)?;
-            h = rms_norm(&(&seen + mixed)?)?;
-            let both = self.gate_up.forward(&h)?;
-            let gate = both.narrow(D::Minus1, 0, inner)?.contiguous()?.silu()?;
-            let up = both.narrow(D::Minus1, inner, inner)?.contiguous()?;
-            h = rms_norm(&(&h + self.down.forward(&(gate * up)?)?)?)?;
-        }
+        let zeros = x.zeros_like()?.detach();
+        let states = trm::States { z_h: zeros.clone(), z_l: zeros };
+        let flat = Tensor::cat(
+            &self.block.each_ref().map(Tensor::flatten_all).into_iter().collect::<candle_core::Result<Vec<_>>>()?,
+            0,
+        )?;
+        let h = self.fused.step(&flat, &states, &x, (1, self.cycles - 1), trm::Gradient::On)?.z_h;
         let here = h.broadcast_mul(&agent)?.sum(1)?;
         let seen = Tensor::cat(&[&here, &h.mean(1)?], D::Minus1)?;
         Ok(PolicyOutput { logits: self.head.forward(&here)?, value: value(self.value.as_ref(), &seen)? })
