@@ -6,14 +6,14 @@ cd "$(dirname "$0")/.."
 export ACTRM_PEER_PYTHON="$PWD/.venv-peers/bin/python"
 examples=target/release/examples
 
-for name in ${*:-puzzles data act control evaluation}; do
+for name in ${*:-puzzles data act trm control evaluation}; do
     printf '\n== %s\n' "$name"
     case $name in
     puzzles | data) "$examples/bench_$name" ;;
-    act) "$examples/bench_act" --peer "$ACTRM_PEER_PYTHON" ;;
+    act | trm) "$examples/bench_$name" --peer "$ACTRM_PEER_PYTHON" ;;
     control | evaluation) .venv/bin/python "benches/$name.py" ;;
     *)
-        echo "error: no benchmark $name; there are: puzzles data act control evaluation" >&2
+        echo "error: no benchmark $name; there are: puzzles data act trm control evaluation" >&2
         exit 2
         ;;
     esac

@@ -161,6 +161,7 @@ fn grade(model: &Trm, tests: &[Puzzle], depth: usize) -> Value {
         let inputs = Tensor::from_vec(inputs, (group.len(), len), &Device::Cpu).unwrap();
         let mut states = model.initial_states(group.len()).unwrap();
         let mut halted = vec![false; group.len()];
+        let mut before: Vec<Vec<u32>> = vec![Vec::new(); group.len()];
         for step in 0..depth {
             let out = model.supervision_step(&states, &inputs, None, Gradient::Off).unwrap();
             states = out.states;
@@ -175,7 +176,9 @@ fn grade(model: &Trm, tests: &[Puzzle], depth: usize) -> Value {
                 };
                 exact[step] += usize::from(same);
                 valid[step] += usize::from(good);
-                if !halted[i] && (q[i] > 0.0 || step + 1 == depth) {
+                // the head says so and the answer has come to rest
+                let rests = q[i] > 0.0 && classes[i] == before[i];
+                if !halted[i] && (rests || step + 1 == depth) {
                     halted[i] = true;
                     steps += step + 1;
                     exact[depth] += usize::from(same);
@@ -186,6 +189,7 @@ fn grade(model: &Trm, tests: &[Puzzle], depth: usize) -> Value {
                     }
                 }
             }
+            before = classes;
         }
     }
     let share = |n: usize| (n as f64 / tests.len() as f64 * 1e4).round() / 1e4;
