@@ -70,7 +70,7 @@ fn recipe(name: &str) -> Option<(Task, Value)> {
             MazeTask::Dfs10,
             json!({ "hidden_size": 32, "inner_size": 64, "halt_max_steps": 8 }),
             json!({}),
-            json!({ "steps": 3000 }),
+            json!({ "steps": 4000 }),
         ),
         "open8" => maze(
             MazeTask::Open8,
@@ -95,7 +95,7 @@ fn recipe(name: &str) -> Option<(Task, Value)> {
             (4, 10),
             json!({ "hidden_size": 32, "inner_size": 64, "halt_max_steps": 6 }),
             json!({}),
-            json!({ "steps": 1500 }),
+            json!({ "steps": 2000 }),
         ),
         "sudoku6" => sudoku(
             SudokuTask::SIX,

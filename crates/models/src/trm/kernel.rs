@@ -153,9 +153,9 @@ impl Plan {
         let size = self.layer_tape(puzzles);
         let marks = self.marks(puzzles);
         ew::sum_into(&mut tape[..state.len()], state, injected);
-        for layer in 0..self.layers {
+        for (layer, packs) in packs.iter().enumerate() {
             let at = if keep { layer * size } else { 0 };
-            self.layer_forward(&packs[layer], puzzles, &mut tape[at..at + size], scratch);
+            self.layer_forward(packs, puzzles, &mut tape[at..at + size], scratch);
             let last = layer + 1 == self.layers;
             if last {
                 state.copy_from_slice(&tape[at..at + size][marks.out.clone()]);

@@ -248,36 +248,21 @@ fn tile<S: Simd, F: Fn(usize) -> usize + Copy, const MR: usize, const NV: usize>
             }
         }
     }
-    store(simd, out, row_stride, &acc, cols, add);
+    for (r, sums) in acc.into_iter().enumerate() {
+        store::<S, NV>(simd, &mut out[r * row_stride..][..cols], sums, add);
+    }
 }
 
-/// Writes or adds a tile to lines of `cols` numbers, the last of which may end within a vector.
-#[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
+/// Writes or adds vectors to a line that ends within the last of them.
 #[inline(always)]
-fn store<S: Simd, const MR: usize, const NV: usize>(
-    simd: S,
-    out: &mut [f32],
-    row_stride: usize,
-    acc: &[[S::f32s; NV]; MR],
-    cols: usize,
-    add: bool,
-) {
-    let lanes = S::F32_LANES;
-    if cols == NV * lanes {
-        for r in 0..MR {
-            let (line, _) = S::as_mut_simd_f32s(&mut out[r * row_stride..][..NV * lanes]);
-            for v in 0..NV {
-                line[v] = if add { simd.add_f32s(line[v], acc[r][v]) } else { acc[r][v] };
-            }
-        }
-        return;
-    }
-    for r in 0..MR {
-        let line = &mut out[r * row_stride..][..cols];
-        for v in 0..NV {
-            let part = &mut line[(v * lanes).min(cols)..((v + 1) * lanes).min(cols)];
+fn store<S: Simd, const NV: usize>(simd: S, line: &mut [f32], sums: [S::f32s; NV], add: bool) {
+    for (sum, part) in sums.into_iter().zip(line.chunks_mut(S::F32_LANES)) {
+        if part.len() == S::F32_LANES {
+            let (to, _) = S::as_mut_simd_f32s(part);
+            to[0] = if add { simd.add_f32s(to[0], sum) } else { sum };
+        } else {
             let before = if add { simd.partial_load_f32s(part) } else { simd.splat_f32s(0.0) };
-            simd.partial_store_f32s(part, simd.add_f32s(before, acc[r][v]));
+            simd.partial_store_f32s(part, simd.add_f32s(before, sum));
         }
     }
 }
@@ -376,7 +361,9 @@ fn outer_tile<S: Simd, F: Fn(usize) -> usize + Copy, const MR: usize, const NV: 
             }
         }
     }
-    store(simd, out, row_stride, &acc, cols, true);
+    for (r, sums) in acc.into_iter().enumerate() {
+        store::<S, NV>(simd, &mut out[r * row_stride..][..cols], sums, true);
+    }
 }
 
 #[cfg(test)]
