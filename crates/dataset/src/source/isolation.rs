@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec};
 use rustix::process::{Resource, Rlimit};
@@ -23,8 +23,13 @@ use crate::tree::{Array, Demo};
 const PATH_VARIABLE: &str = "ACTRM_HDF5_READER";
 /// Address space of the reading process, program text included.
 const MEMORY: u64 = 900 << 20;
-/// How long the reading process may be silent.
+/// How long the reading process may compute, or sleep, without a word. Waiting for its turn on a busy machine, or for
+/// a disk, does not count: a sound file may take long.
 const SILENCE: Duration = Duration::from_secs(8);
+/// How long it may be silent whatever it does.
+const STALL: Duration = Duration::from_secs(120);
+/// How often it is looked at.
+const LOOK: Timespec = Timespec { tv_sec: 0, tv_nsec: 500_000_000 };
 /// Processor time of the reading process: this, and a second for each so many bytes of the file.
 const CPU_SECONDS: u64 = 6;
 const BYTES_PER_CPU_SECOND: u64 = 256 << 10;
@@ -218,12 +223,12 @@ impl Remote {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let failure = match &mut *state {
             State::Ended(error) => return Err(error.clone()),
-            State::Alive { requests, answers, .. } => {
+            State::Alive { child, requests, answers } => {
                 let sent = request.is_none_or(|request| {
                     let text = serde_json::to_vec(request).expect("requests are plain data");
                     requests.write_all(&(text.len() as u64).to_le_bytes()).is_ok() && requests.write_all(&text).is_ok()
                 });
-                match if sent { receive(answers) } else { Err(Failure::Broken) } {
+                match if sent { receive(child.id(), answers) } else { Err(Failure::Broken) } {
                     Ok(answer) => return Ok(answer),
                     Err(failure) => failure,
                 }
@@ -280,16 +285,32 @@ fn ending(status: std::process::ExitStatus) -> String {
 }
 
 /// Waits for bytes, then reads; silence is an error.
-struct Timed<'a>(&'a mut ChildStdout);
+struct Timed<'a> {
+    process: u32,
+    answers: &'a mut ChildStdout,
+}
 
 impl Read for Timed<'_> {
     fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        let limit = Timespec { tv_sec: SILENCE.as_secs() as i64, tv_nsec: 0 };
+        let since = Instant::now();
+        let mut last = Look::at(self.process);
+        let before = last.spent;
+        let mut awake = since;
         loop {
-            let mut fds = [PollFd::new(&*self.0, PollFlags::IN)];
-            match rustix::event::poll(&mut fds, Some(&limit)) {
-                Ok(0) => return Err(std::io::ErrorKind::TimedOut.into()),
-                Ok(_) => return self.0.read(buffer),
+            let mut fds = [PollFd::new(&*self.answers, PollFlags::IN)];
+            match rustix::event::poll(&mut fds, Some(&LOOK)) {
+                Ok(0) => {
+                    let now = Look::at(self.process);
+                    if !now.asleep || now.spent != last.spent {
+                        awake = Instant::now();
+                    }
+                    let computed = now.spent.saturating_sub(before);
+                    if computed.max(awake.elapsed()) >= SILENCE || since.elapsed() >= STALL {
+                        return Err(std::io::ErrorKind::TimedOut.into());
+                    }
+                    last = now;
+                }
+                Ok(_) => return self.answers.read(buffer),
                 Err(rustix::io::Errno::INTR) => {}
                 Err(e) => return Err(e.into()),
             }
@@ -297,12 +318,38 @@ impl Read for Timed<'_> {
     }
 }
 
-fn receive(answers: &mut ChildStdout) -> Result<(u8, Vec<u8>), Failure> {
+/// What a process was doing when it was looked at.
+struct Look {
+    /// Processor time so far.
+    spent: Duration,
+    /// It waits, and not for a disk.
+    asleep: bool,
+}
+
+impl Look {
+    /// Of a process that cannot be looked at: asleep, so that the clock decides.
+    fn at(process: u32) -> Self {
+        // behind the name, which stands in brackets and may hold anything: the state, and as the 11th and 12th field
+        // after it user and system time, in hundredths of a second on every Linux
+        std::fs::read_to_string(format!("/proc/{process}/stat"))
+            .ok()
+            .and_then(|text| {
+                let mut fields = text.rsplit_once(')')?.1.split_ascii_whitespace();
+                let asleep = fields.next()? == "S";
+                let mut times = fields.skip(10).map(str::parse::<u64>);
+                let (user, system) = (times.next()?.ok()?, times.next()?.ok()?);
+                Some(Self { spent: Duration::from_millis(10 * (user + system)), asleep })
+            })
+            .unwrap_or(Self { spent: Duration::ZERO, asleep: true })
+    }
+}
+
+fn receive(process: u32, answers: &mut ChildStdout) -> Result<(u8, Vec<u8>), Failure> {
     let failed = |e: std::io::Error| match e.kind() {
         std::io::ErrorKind::TimedOut => Failure::Silent,
         _ => Failure::Broken,
     };
-    let mut answers = Timed(answers);
+    let mut answers = Timed { process, answers };
     loop {
         let mut head = [0; 9];
         answers.read_exact(&mut head).map_err(failed)?;
@@ -368,5 +415,57 @@ impl Backend for Remote {
     fn rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array, InputError> {
         let request = Request::Rows { index, key: key.to_owned(), first, count };
         self.ask(&request, ARRAY, |t| t.array())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn silent_for(program: &str, arguments: &[&str]) -> (std::io::Result<usize>, Duration) {
+        let mut child = Command::new(program)
+            .args(arguments)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("the program starts");
+        let mut answers = child.stdout.take().expect("a pipe");
+        let started = Instant::now();
+        let read = Timed { process: child.id(), answers: &mut answers }.read(&mut [0; 16]);
+        let waited = started.elapsed();
+        let _ = child.kill();
+        let _ = child.wait();
+        (read, waited)
+    }
+
+    #[test]
+    fn neither_sleep_nor_computing_goes_on_for_ever() {
+        let sleeping = std::thread::spawn(|| silent_for("sh", &["-c", "read nothing"]));
+        let (read, waited) = silent_for("sh", &["-c", "while :; do :; done"]);
+        assert!(waited >= SILENCE, "{waited:?}");
+        assert_eq!(read.expect_err("silence").kind(), std::io::ErrorKind::TimedOut);
+        let (read, waited) = sleeping.join().expect("no panic");
+        assert!(waited >= SILENCE, "{waited:?}");
+        assert_eq!(read.expect_err("silence").kind(), std::io::ErrorKind::TimedOut);
+    }
+
+    #[test]
+    fn a_process_that_waits_for_its_turn_is_waited_for() {
+        // stopped is not asleep: it has something to do and nobody lets it
+        let (read, waited) = silent_for("sh", &["-c", "(sleep 10; kill -CONT $$; echo yes) & kill -STOP $$; wait"]);
+        assert!(waited >= SILENCE, "{waited:?}");
+        assert!(read.expect("its word") > 0);
+    }
+
+    #[test]
+    fn a_look_at_this_process_sees_its_time() {
+        let before = Look::at(std::process::id()).spent;
+        let started = Instant::now();
+        while started.elapsed() < Duration::from_millis(300) {
+            std::hint::black_box(0);
+        }
+        assert!(Look::at(std::process::id()).spent >= before);
+        assert!(Look::at(std::process::id()).spent > Duration::ZERO);
+        assert!(Look::at(u32::MAX).asleep);
     }
 }
