@@ -12,7 +12,8 @@ use zoo::puzzle::{PuzzleSet, write_puzzles};
 /// path. Sudoku: the digit, 0 where none is given. Puzzles of different splits never share a maze or a solution.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Tasks: maze8-original, maze10-original, open8, dfs10, dfs16, dfs20, maze5-walls, sudoku4, sudoku6, sudoku9
+    after_help = "Tasks: maze8-original, maze10-original, maze5-rl, open8, dfs10, dfs16, dfs20, maze5-walls, sudoku4, sudoku6,
+sudoku9
 
 Examples:
   actrm-data puzzle open8 --count 10000 --seed 1 open8.parquet
