@@ -420,11 +420,15 @@ impl Backend for Remote {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::process::CommandExt;
+
     use super::*;
 
     fn silent_for(program: &str, arguments: &[&str]) -> (std::io::Result<usize>, Duration) {
+        // in a group of its own: one that is stopped must not take others of the test's group along
         let mut child = Command::new(program)
             .args(arguments)
+            .process_group(0)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
