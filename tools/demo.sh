@@ -21,7 +21,7 @@ begin=$SECONDS
 step "1/6 What is in the demonstrations" "$bin/actrm-data" inspect "$data"
 step "2/6 HDF5 to a LeRobot data set" "$bin/actrm-data" convert "$data" "$out/lift"
 step "3/6 Train ACT" "$bin/actrm-zoo" train act_lift --data "$out/lift" --zoo "$out/zoo" --runs "$out/runs"
-step "4/6 Train ACTRM, which reasons first" "$bin/actrm-zoo" train actrm_lift --data "$out/lift" --zoo "$out/zoo" --runs "$out/runs" train.steps=200
+step "4/6 Train ACTRM, which reasons first" "$bin/actrm-zoo" train actrm_lift --data "$out/lift" --zoo "$out/zoo" --runs "$out/runs"
 step "5/6 Evaluate every entry in robosuite" "$bin/actrm-zoo" eval --all --episodes 20 --zoo "$out/zoo"
 step "6/6 Leaderboard" "$bin/actrm-zoo" leaderboard --zoo "$out/zoo"
 printf '\nThe whole line took %d s. Open %s/zoo/report.html in a browser.\n' $((SECONDS - begin)) "$out"
