@@ -1,6 +1,7 @@
 """LeRobot's ACT on PyTorch, driven step by step: one line of JSON in, one out.
 
-Lines: {"work": "train" | "predict", "size": "d256" | "d512", "threads": 1, "times": 3}
+Lines: {"work": "train" | "predict" | "plan", "size": "d256" | "d512", "threads": 1, "times": 3}
+"plan" predicts as the original ACTRM does: the encoder is a recursion of 336 calls, the rest is ACT's.
 Answers: {"wall": seconds, "cpu": seconds} for one of the `times` repetitions (their mean),
 and {"peak": bytes} for "memory": the most that this process has had in memory so far.
 """
@@ -21,6 +22,8 @@ SIZES = {
     "d512": {"dim_model": 512, "dim_feedforward": 3200, "chunk_size": 100},
 }
 BATCH = 64
+# 16 supervision steps of 3 rounds of 6 + 1
+PLAN_CALLS = 336
 
 
 def policy(size: str) -> ACTPolicy:
@@ -36,6 +39,20 @@ def policy(size: str) -> ACTPolicy:
         **settings,
     )
     return ACTPolicy(config)
+
+
+class Recursion(torch.nn.Module):
+    """ACT's encoder, called again and again on its own output and the observation."""
+
+    def __init__(self, encoder: torch.nn.Module) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, tokens: torch.Tensor, pos_embed: torch.Tensor) -> torch.Tensor:
+        state = torch.zeros_like(tokens)
+        for _ in range(PLAN_CALLS):
+            state = self.encoder(state + tokens, pos_embed=pos_embed)
+        return state
 
 
 class Peer:
@@ -65,6 +82,15 @@ class Peer:
         with torch.inference_mode():
             self.policy.model(self.one)
 
+    def plan(self) -> None:
+        model = self.policy.model
+        encoder = model.encoder
+        model.encoder = Recursion(encoder)
+        try:
+            self.predict()
+        finally:
+            model.encoder = encoder
+
 
 def peak_memory() -> int:
     """In bytes, of this process alone (`ru_maxrss` would begin with the parent's)."""
@@ -84,7 +110,7 @@ def main() -> None:
         if order["size"] not in peers:
             peers[order["size"]] = Peer(order["size"])
         peer = peers[order["size"]]
-        run = peer.train if order["work"] == "train" else peer.predict
+        run = {"train": peer.train, "predict": peer.predict, "plan": peer.plan}[order["work"]]
         wall, cpu = time.perf_counter(), time.process_time()
         for _ in range(order["times"]):
             run()

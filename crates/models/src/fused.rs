@@ -16,7 +16,7 @@ mod observation;
 pub(crate) mod testing;
 mod vae;
 
-pub(crate) use block::{BlockLayer, Part, gather, keys_and_values, keys_and_values_backward, scatter};
+pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_and_values_backward, scatter};
 pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::Encoder;
 pub(crate) use loss::AbsoluteError;
@@ -83,6 +83,8 @@ pub(crate) struct PackedWeights {
     /// by the place in memory, which a parameter keeps, and the number of rows
     panels: Mutex<BTreeMap<(usize, usize), Arc<Packed>>>,
     begun: OnceLock<decoder::Begun>,
+    /// what layers make of inputs that are parameters themselves
+    fixed: Mutex<BTreeMap<String, Arc<Vec<f32>>>>,
 }
 
 impl PackedWeights {
@@ -91,6 +93,17 @@ impl PackedWeights {
         let mut panels = self.panels.lock().unwrap_or_else(PoisonError::into_inner);
         let make = || Arc::new(Packed::new(Mat::rows(w, input).t(), (out, input)));
         panels.entry((w.as_ptr().addr(), out)).or_insert_with(make).clone()
+    }
+
+    /// What was kept under this name.
+    fn kept(&self, name: &str) -> Option<Arc<Vec<f32>>> {
+        self.fixed.lock().unwrap_or_else(PoisonError::into_inner).get(name).cloned()
+    }
+
+    fn keep(&self, name: String, values: &[f32]) {
+        // a copy: the workspace keeps its buffers
+        let values = Arc::new(values.to_vec());
+        self.fixed.lock().unwrap_or_else(PoisonError::into_inner).insert(name, values);
     }
 
     /// The decoder's first layer before the memory, made once.
@@ -172,6 +185,18 @@ impl<'a> Pass<'a> {
 
     pub(crate) fn give(&mut self, buffer: Vec<f32>) {
         self.space.pool.give(buffer);
+    }
+
+    /// What `make` computes from the weights alone; predictions compute it once.
+    pub(crate) fn fixed(&mut self, name: impl Fn() -> String, make: impl FnOnce(&mut Self) -> Vec<f32>) -> Vec<f32> {
+        let Some(packed) = self.packed else { return make(self) };
+        let name = name();
+        if let Some(kept) = packed.kept(&name) {
+            return self.space.pool.copy(&kept);
+        }
+        let values = make(self);
+        packed.keep(name, &values);
+        values
     }
 
     /// x: (rows, in) -> (rows, out), `y = x Wᵀ + b`

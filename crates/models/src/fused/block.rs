@@ -4,6 +4,7 @@
 use super::feed_forward::FeedForward;
 use super::{Grads, Pass, Residual, Rows, Workspace, slot, sum_over_sequences, weight_gradient};
 use crate::kernels::{Heads, Mat, Start, add, attend, attend_backward, column_sums, product};
+use std::ops::Range;
 
 /// What a layer's backward pass needs.
 #[derive(Debug)]
@@ -59,11 +60,30 @@ pub(crate) fn scatter(x: &[f32], width: usize, parts: &mut [(&mut [f32], usize)]
     }
 }
 
+/// A layer's input.
+#[derive(Clone, Copy)]
+pub(crate) struct Input<'a> {
+    pub(crate) x: &'a [f32],
+    /// the name of an x that is a parameter, so that predictions project it once
+    pub(crate) parameter: Option<&'static str>,
+}
+
 /// x: (rows, D) -> keys and values (rows, 2D) of the attention below `prefix`
-pub(crate) fn keys_and_values(pass: &mut Pass<'_>, prefix: &str, x: &[f32]) -> Vec<f32> {
+pub(crate) fn keys_and_values(pass: &mut Pass<'_>, prefix: &str, input: Input<'_>) -> Vec<f32> {
+    let dim = pass.shape.dim;
+    project(pass, prefix, input, "keys and values", dim..3 * dim)
+}
+
+/// x: (rows, D) -> (rows, n) by these n rows of the attention's projections
+fn project(pass: &mut Pass<'_>, prefix: &str, input: Input<'_>, what: &str, rows: Range<usize>) -> Vec<f32> {
     let dim = pass.shape.dim;
     let (w, bias) = (pass.weight(prefix, ".in_proj_weight"), pass.weight(prefix, ".in_proj_bias"));
-    pass.times(x, &w[dim * dim..], Start::Bias(&bias[dim..]), |_, _, _| ())
+    let (w, bias) = (&w[rows.start * dim..rows.end * dim], &bias[rows]);
+    let make = |pass: &mut Pass<'_>| pass.times(input.x, w, Start::Bias(bias), |_, _, _| ());
+    match input.parameter {
+        Some(parameter) => pass.fixed(|| format!("{prefix}: {what} of {parameter}"), make),
+        None => make(pass),
+    }
 }
 
 /// Adds the parameters' gradients, given that of keys and values, and adds that of x to `into`.
@@ -104,9 +124,10 @@ impl BlockLayer {
         pass: &mut Pass<'_>,
         prefix: String,
         (batch, queries): (usize, usize),
-        x: &[f32],
+        input: Input<'_>,
         kv: Vec<f32>,
     ) -> (Vec<f32>, Self) {
+        let x = input.x;
         let (dim, heads) = (pass.shape.dim, pass.shape.heads);
         let keys = kv.len() / (batch * 2 * dim);
         let shared_queries = x.len() == queries * dim;
@@ -114,8 +135,7 @@ impl BlockLayer {
             Heads { batch, heads, queries, all_queries: queries, keys, dim, shared_queries, shared_keys: false };
         let rows = Rows { computed: queries, all: queries };
         let attn = format!("{prefix}.attn");
-        let (w, bias) = (pass.weight(&attn, ".in_proj_weight"), pass.weight(&attn, ".in_proj_bias"));
-        let q = pass.times(x, &w[..dim * dim], Start::Bias(&bias[..dim]), |_, _, _| ());
+        let q = project(pass, &attn, input, "queries", 0..dim);
         let (mut weights, mut mixed) = (pass.take(heads.weights()), pass.take(batch * queries * dim));
         let Workspace { pool, pack } = &mut *pass.space;
         attend(heads, &q, &kv, None, None, &mut weights, &mut mixed, pool, pack);

@@ -165,11 +165,17 @@ impl<E: Fn(usize, usize, &mut [f32])> WithSimd for Gemm<'_, E> {
     fn with_simd<S: Simd>(self, simd: S) {
         // a few rows against rows of weights: reading the weights once is all there is to do, packing would double it
         if self.a.col == 1 && self.b.row == 1 {
-            match self.m {
-                1 => return few_rows::<S, 1, E>(simd, self),
-                2 => return few_rows::<S, 2, E>(simd, self),
-                3 => return few_rows::<S, 3, E>(simd, self),
-                4 => return few_rows::<S, 4, E>(simd, self),
+            // sums and one weight fill the registers: 24 of 32, 12 of 16
+            let wide = S::F32_LANES >= 16;
+            match (self.m, wide) {
+                (1, true) => return few_rows::<S, 1, 8, E>(simd, self),
+                (2, true) => return few_rows::<S, 2, 8, E>(simd, self),
+                (3, true) => return few_rows::<S, 3, 8, E>(simd, self),
+                (4, true) => return few_rows::<S, 4, 6, E>(simd, self),
+                (1, false) => return few_rows::<S, 1, 4, E>(simd, self),
+                (2, false) => return few_rows::<S, 2, 4, E>(simd, self),
+                (3, false) => return few_rows::<S, 3, 4, E>(simd, self),
+                (4, false) => return few_rows::<S, 4, 3, E>(simd, self),
                 _ => {}
             }
         }
@@ -178,11 +184,11 @@ impl<E: Fn(usize, usize, &mut [f32])> WithSimd for Gemm<'_, E> {
     }
 }
 
-/// Scalar products of M rows of A with four columns of B at a time, both contiguous.
+/// Scalar products of M rows of A with C columns of B at a time, all contiguous. The C columns are a C-th of the matrix
+/// apart: each runs on where its last one ended, so the machine sees C long streams and fetches all of them ahead.
 #[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
 #[inline(always)]
-fn few_rows<S: Simd, const M: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g: Gemm<'_, E>) {
-    const COLUMNS: usize = 4;
+fn few_rows<S: Simd, const M: usize, const C: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g: Gemm<'_, E>) {
     let Gemm { n, k, a, b, start, c, ldc, epilogue, .. } = g;
     let whole = k / S::F32_LANES;
     let split = |data: &'_ [f32], from: usize| -> (usize, usize) {
@@ -193,16 +199,16 @@ fn few_rows<S: Simd, const M: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g
         let (from, tail) = split(a.data, i * a.row);
         (S::as_simd_f32s(&a.data[from..tail]).0, &a.data[tail..from + k])
     });
-    for j0 in (0..n).step_by(COLUMNS) {
-        let count = COLUMNS.min(n - j0);
+    let apart = n.div_ceil(C);
+    for j0 in 0..apart {
         // beyond the last column the last one is computed again
-        let columns: [(&[S::f32s], &[f32]); COLUMNS] = std::array::from_fn(|j| {
-            let (from, tail) = split(b.data, (j0 + j.min(count - 1)) * b.col);
+        let columns: [(&[S::f32s], &[f32]); C] = std::array::from_fn(|j| {
+            let (from, tail) = split(b.data, (j0 + j * apart).min(n - 1) * b.col);
             (S::as_simd_f32s(&b.data[from..tail]).0, &b.data[tail..from + k])
         });
-        let mut acc = [[simd.splat_f32s(0.0); COLUMNS]; M];
+        let mut acc = [[simd.splat_f32s(0.0); C]; M];
         for p in 0..whole {
-            for j in 0..COLUMNS {
+            for j in 0..C {
                 let w = columns[j].0[p];
                 for i in 0..M {
                     acc[i][j] = simd.mul_add_e_f32s(rows[i].0[p], w, acc[i][j]);
@@ -210,13 +216,17 @@ fn few_rows<S: Simd, const M: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g
             }
         }
         for i in 0..M {
-            for j in 0..count {
+            for j in 0..C {
+                let column = j0 + j * apart;
+                if column >= n {
+                    break;
+                }
                 let tail: f32 = rows[i].1.iter().zip(columns[j].1).map(|(x, y)| x * y).sum();
-                let to = &mut c[i * ldc + j0 + j];
+                let to = &mut c[i * ldc + column];
                 let before = match start {
                     Start::Zero => 0.0,
                     Start::Add => *to,
-                    Start::Bias(bias) => bias[j0 + j],
+                    Start::Bias(bias) => bias[column],
                 };
                 *to = simd.reduce_sum_f32s(acc[i][j]) + tail + before;
             }
@@ -268,7 +278,13 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
                             Start::Bias(bias) => Start::Bias(&bias[j..j + cols]),
                             other => other,
                         };
-                        tile::<S, MR>(simd, panel_a, panel_b, bias, at, ldc, (rows, cols));
+                        let size = (rows, cols);
+                        // the last rows of a block may be few
+                        match rows {
+                            0..=4 => tile::<S, MR, 4>(simd, panel_a, panel_b, bias, at, ldc, size),
+                            5..=8 if MR > 8 => tile::<S, MR, 8>(simd, panel_a, panel_b, bias, at, ldc, size),
+                            _ => tile::<S, MR, MR>(simd, panel_a, panel_b, bias, at, ldc, size),
+                        }
                     }
                 }
                 if last {
@@ -347,10 +363,10 @@ fn transpose(out: &mut [f32], width: usize, data: &[f32], (kc, lanes): (usize, u
     }
 }
 
-/// One register tile: MR rows of two vectors.
+/// One register tile: the first R of a panel's MR rows, two vectors of columns.
 #[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
 #[inline(always)]
-fn tile<S: Simd, const MR: usize>(
+fn tile<S: Simd, const MR: usize, const R: usize>(
     simd: S,
     a: &[f32],
     b: &[f32],
@@ -362,10 +378,10 @@ fn tile<S: Simd, const MR: usize>(
     let lanes = S::F32_LANES;
     let nr = 2 * lanes;
     let zero = simd.splat_f32s(0.0);
-    let mut acc = [[zero; 2]; MR];
+    let mut acc = [[zero; 2]; R];
     let (b, _) = S::as_simd_f32s(b);
     for (a, b) in a.chunks_exact(MR).zip(b.chunks_exact(2)) {
-        for r in 0..MR {
+        for r in 0..R {
             let x = simd.splat_f32s(a[r]);
             acc[r][0] = simd.mul_add_e_f32s(x, b[0], acc[r][0]);
             acc[r][1] = simd.mul_add_e_f32s(x, b[1], acc[r][1]);

@@ -7,8 +7,8 @@
 use super::{Carry, Recursion, Step, mean_over_tokens, shaped};
 use crate::actrm::{Actrm, Config};
 use crate::fused::{
-    BlockLayer, Encoder, Grads, Part, Pass, Shape, Tokens, gather, keys_and_values, keys_and_values_backward, scatter,
-    slot,
+    BlockLayer, Encoder, Grads, Input, Part, Pass, Shape, Tokens, gather, keys_and_values, keys_and_values_backward,
+    scatter, slot,
 };
 use crate::kernels::add;
 
@@ -96,14 +96,19 @@ impl OverActions<'_> {
         let action_pos = pass.weight("reasoning.action_pos_embed", ".weight");
         let latent_pos = pass.weight("reasoning.latent_pos_embed", ".weight");
         let y = positioned(pass, carry.answer.as_deref(), action_pos);
-        let y_kv: Vec<_> = (0..self.n_layers()).map(|i| keys_and_values(pass, &attention_prefix(i), &y)).collect();
+        // a thought that begins at zero reads its positions alone
+        let y_parameter = carry.answer.is_none().then_some("the action positions");
+        let y_input = Input { x: &y, parameter: y_parameter };
+        let y_kv: Vec<_> = (0..self.n_layers()).map(|i| keys_and_values(pass, &attention_prefix(i), y_input)).collect();
         let mut z = vec![positioned(pass, carry.reasoning.as_deref(), latent_pos)];
         let mut updates = Vec::with_capacity(l_cycles + 1);
         let mut settled: Option<Vec<f32>> = None;
         loop {
             let of_answer = updates.len() == l_cycles;
             let seen = z.last().expect("it begins with one");
-            let (first, queries) = if of_answer { (&y, horizon) } else { (seen, tokens) };
+            let parameter = (settled.is_none() && carry.reasoning.is_none()).then_some("the latent positions");
+            let seen = Input { x: seen, parameter };
+            let (first, queries) = if of_answer { (y_input, horizon) } else { (seen, tokens) };
             let (mut inputs, mut layers) = (Vec::<Vec<f32>>::new(), Vec::with_capacity(self.n_layers()));
             for (i, y_kv) in y_kv.iter().enumerate() {
                 let z_kv = keys_and_values(pass, &attention_prefix(i), seen);
@@ -114,8 +119,8 @@ impl OverActions<'_> {
                 ];
                 let kv = gather(pass, self.rows, 2 * dim, &parts);
                 pass.give(z_kv);
-                let x = inputs.last().unwrap_or(first);
-                let (out, layer) = BlockLayer::forward(pass, layer_prefix(i), (self.rows, queries), x, kv);
+                let input = inputs.last().map_or(first, |x| Input { x, parameter: None });
+                let (out, layer) = BlockLayer::forward(pass, layer_prefix(i), (self.rows, queries), input, kv);
                 inputs.push(out);
                 layers.push(layer);
             }
@@ -203,7 +208,9 @@ impl<'m> Recursion<'m> for OverActions<'m> {
         }
         memory.chunks_exact_mut(pos.len()).for_each(|sequence| add(sequence, pos));
         let layers = 0..config.reasoning.n_layers;
-        let memory_kv = layers.map(|i| keys_and_values(pass, &attention_prefix(i), &memory)).collect();
+        let memory_kv = layers
+            .map(|i| keys_and_values(pass, &attention_prefix(i), Input { x: &memory, parameter: None }))
+            .collect();
         Self { config, rows, encoder, memory, memory_kv, memory_kv_grad: Vec::new() }
     }
 
