@@ -178,14 +178,20 @@ def funnel(distance: float, near: float, far: float) -> float:
 class Grasp:
     """Reaching for a thing and holding it: where to go, and what the fingers do.
 
-    `held` is read off the fingers: they were told to close, have stopped, and stopped before they met.
+    `held` is read off the fingers: they were told to close, have stopped, and stopped before they met. `tall` is how
+    far the thing stands up above the point that is gripped: the hand comes from that much higher, and goes down only
+    where it is beside the thing by less than `mouth` (down to the first, down not at all from the second on).
     """
 
-    def __init__(self, scene: Scene, style: Style, thinnest: float = 0.01, widest: float = 0.07) -> None:
+    THINNEST, WIDEST = 0.01, 0.07
+
+    def __init__(
+        self, scene: Scene, style: Style, tall: float = 0.0, mouth: tuple[float, float] = (0.008, 0.03)
+    ) -> None:
         self.scene = scene
         self.style = style
-        self.thinnest = thinnest
-        self.widest = widest
+        self.hover = style.hover + tall
+        self.mouth = mouth
         self.closing = False
         self.held = False
 
@@ -199,15 +205,15 @@ class Grasp:
         flat, height = float(np.linalg.norm(offset[:2])), abs(float(offset[2]))
         if not self.closing and flat < 0.01 and height < 0.012:
             self.closing = True
-        elif self.closing and (flat > 0.035 or height > 0.035 or self.scene.gap < self.thinnest):
+        elif self.closing and (flat > 0.035 or height > 0.035 or self.scene.gap < self.THINNEST):
             self.closing = self.held = False
         gap = self.scene.gap
-        if self.closing and self.thinnest < gap < self.widest and abs(self.scene.gap_speed) < 0.01:
+        if self.closing and self.THINNEST < gap < self.WIDEST and abs(self.scene.gap_speed) < 0.01:
             self.held = True
         target = np.array(point)
         if not self.closing:
-            lift = max(funnel(flat, 0.008, 0.03), funnel(abs(askew), 0.15, 0.4))
-            target[2] += self.style.hover * lift
+            lift = max(funnel(flat, *self.mouth), funnel(abs(askew), 0.15, 0.4))
+            target[2] += self.hover * lift
             target[:2] += self.style.side * lift
         return target, CLOSE if self.closing else OPEN
 
