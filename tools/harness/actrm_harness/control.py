@@ -19,7 +19,7 @@ import numpy as np
 
 from actrm_harness.control_abi import ACTION, DOF, MUJOCO, STATE, Binding, ControlError, Library, mujoco_functions
 from actrm_harness.control_recent import Recent
-from actrm_harness.control_sensors import ContactTest, Sensor, cheaper
+from actrm_harness.control_sensors import ContactTest, Sensor, WatchedCache, cheaper
 from actrm_harness.wire import Array
 
 LIBRARY = "ACTRM_CONTROL_LIB"
@@ -235,6 +235,8 @@ class CompiledControl:
         self._clocks: dict[tuple[float, bool, float, float], tuple[float, bool] | None] = {}
         self._sensors: dict[str, tuple[Any, Sensor | None]] = {}
         self._parts: tuple[Any, ...] = ()
+        self._unseen: tuple[float, bool] | None = None
+        self._late_reads: bool | None = None
         self._bind()
 
     def release(self) -> None:
@@ -244,6 +246,7 @@ class CompiledControl:
             self._handle = None
         self._sensors.clear()
         self._parts = ()
+        self._unseen = self._late_reads = None
         self._recent = None
         self.env.__dict__.pop("check_contact", None)
 
@@ -317,8 +320,8 @@ class CompiledControl:
 
     # ---- stepping --------------------------------------------------------------------------------------------------
 
-    def step(self, action: Any) -> tuple[Observations, float, bool, dict[str, Any]]:
-        """What `env.step(action)` does and returns."""
+    def step(self, action: Any, look: bool = True) -> tuple[Observations, float, bool, dict[str, Any]]:
+        """What `env.step(action)` does and returns; without `look`, no observations (`look` gives them later)."""
         env = self.env
         if env.done:
             raise ValueError("executing action in terminated episode")
@@ -326,6 +329,7 @@ class CompiledControl:
             raise ControlError(f"an action has {ACTION} numbers, got {len(action)}")
         if not self._bound():
             self._bind()
+        self._unseen = None
         recent = self._recent
         assert recent is not None
         before = recent.before()
@@ -338,11 +342,21 @@ class CompiledControl:
                 env._update_observables()
         else:
             self._run(self._substeps, True)
-            self._observe(*clock)
+            if look or self._has_past():
+                self._observe(*clock)
+            else:
+                self._tick(*clock)
         recent.note(before, self._action, self._policy_site)
         env.cur_time += env.control_timestep
         reward, done, info = env._post_action(action)
-        return self._observations(), reward, done, info
+        return self._observations() if look else {}, reward, done, info
+
+    def look(self) -> Observations:
+        """What a step without `look` led to, had it looked; nothing may have moved since."""
+        clock, self._unseen = self._unseen, None
+        if clock is not None:
+            self._observe(*clock)
+        return self._observations()
 
     def _run(self, substeps: int, policy_step: bool) -> None:
         status = self._library.run(self._handle, *self._addresses, substeps, policy_step)
@@ -375,6 +389,30 @@ class CompiledControl:
         if start not in self._clocks:
             self._clocks[start] = _advance(start, self.env.model_timestep, self._substeps)
         return self._clocks[start]
+
+    def _tick(self, time: float, sampled: bool) -> None:
+        """`_observe` for nobody: the observables' clocks alone."""
+        for observable in self.env._observables.values():
+            if observable._enabled:
+                observable._time_since_last_sample = time
+                observable._sampled = sampled
+        self._unseen = (time, sampled)
+
+    def _has_past(self) -> bool:
+        """Whether what is observed depends on what was observed at the step before, so that none may be left out.
+
+        Noise and filters may; and PickPlace's and NutAssembly's sensors of where a thing is from the hand run before
+        those of where it is, and take that from the step before.
+        """
+        enabled = {name: each for name, each in self.env._observables.items() if each._enabled}
+        if any((each._corrupter, each._filter) != self._untouched for each in enabled.values()):
+            return True
+        if self._late_reads is None:
+            cache = WatchedCache(self.env._obs_cache, set(enabled))
+            for name, observable in enabled.items():
+                cache[name] = observable._sensor(cache)
+            self._late_reads = cache.late_reads
+        return self._late_reads
 
     def _observe(self, time: float, sampled: bool) -> None:
         """`env._update_observables` in the substep in which all sample."""

@@ -113,6 +113,28 @@ _MAKERS: dict[str, Maker] = {
 }
 
 
+class WatchedCache(dict[str, Any]):
+    """The cache that an update of all sensors shares; notices when one reads what another has yet to write in it."""
+
+    def __init__(self, cache: dict[str, Any], awaited: set[str]) -> None:
+        super().__init__(cache)
+        self.late_reads = False
+        self._awaited = awaited
+
+    def __getitem__(self, name: str) -> Any:
+        self.late_reads |= name in self._awaited
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """As a dictionary's own, which would not come through here."""
+        self.late_reads |= name in self._awaited
+        return super().get(name, default)
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self._awaited.discard(name)
+        super().__setitem__(name, value)
+
+
 class ContactTest:
     """`env.check_contact` on the array of touching geoms instead of contact by contact."""
 

@@ -60,8 +60,12 @@ TASKS = {
 class Control(Protocol):
     """The inner loop of a control step, in place of robosuite's."""
 
-    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, dict[str, Any]]:
-        """Do and return what `Env.step` does and returns."""
+    def step(self, action: Array, look: bool = True) -> tuple[dict[str, Array], float, bool, dict[str, Any]]:
+        """Do and return what `Env.step` does and returns; without `look` nothing is observed."""
+        ...
+
+    def look(self) -> dict[str, Array]:
+        """The observations of a step that was done without looking."""
         ...
 
     def release(self) -> None:
@@ -172,18 +176,21 @@ def step_session(session: Session, action: Array) -> StepResult:
 def steps_session(session: Session, actions: list[Array]) -> tuple[StepResult, Array]:
     """Control steps, one after the other until the task is solved: what the last one led to, and all rewards.
 
-    What is seen between them is not looked at.
+    What is seen between them is not looked at, nor observed where that is known to change nothing.
     """
     env, control = session.env, session.control
     raw: dict[str, Array] = {}
     rewards: list[float] = []
     solved = False
-    for action in actions:
+    blind = len(actions) - 1 if _ours(env) else 0
+    for index, action in enumerate(actions):
+        look = index >= blind
         with judged_once(env):
-            raw, reward, _, _ = env.step(action) if control is None else control.step(action)
+            raw, reward, _, _ = env.step(action) if control is None else control.step(action, look)
             solved = success(env)
         rewards.append(float(reward))
         if solved:
+            raw = raw if look or control is None else control.look()
             break
     return StepResult({**observation(raw), **images(session)}, rewards[-1], solved), np.array(rewards)
 
@@ -211,7 +218,12 @@ def step(env: Env, action: Array, control: Control | None) -> StepResult:
 
 
 _JUDGES = ("_check_success", "staged_rewards")
-_JUDGED_ONCE = ("robosuite.environments.", "actrm_harness.")
+_OURS = ("robosuite.environments.", "actrm_harness.")
+
+
+def _ours(env: Env) -> bool:
+    """Whether reward and success are known to follow from the simulation's state alone."""
+    return type(env).__module__.startswith(_OURS)
 
 
 @contextmanager
@@ -221,7 +233,7 @@ def judged_once(env: Env) -> Generator[None]:
     In robosuite's tasks and ours both follow from the same state by the same functions, which take a third of the time
     around a step; an environment of somebody else's may count how often it is asked, and is left alone.
     """
-    if not type(env).__module__.startswith(_JUDGED_ONCE):
+    if not _ours(env):
         yield
         return
     names = [name for name in _JUDGES if hasattr(env, name)]

@@ -167,6 +167,47 @@ def test_observing_once_a_step_gives_the_bits_of_observing_at_every_substep(pair
                 )
 
 
+def test_steps_that_nobody_looks_at_change_nothing_of_what_is_seen_later(pair: tuple[Any, Any]) -> None:
+    """Some steps with and some without looking, beside looking at every one."""
+    looking, blind = pair
+    careful, compiled = attached(looking), attached(blind)
+    seeded(looking, 6)
+    seeded(blind, 6)
+    for index, action in enumerate(smooth(6, 20)):
+        expected = careful.step(action)
+        found = compiled.step(action, look=index % 4 == 3)
+        assert expected[1:] == found[1:]
+        if index % 4 == 1:
+            assert_same_bits(expected[0], compiled.look())
+        elif index % 4 == 3:
+            assert_same_bits(expected[0], found[0])
+            assert_same_bits(looking._obs_cache, blind._obs_cache)
+        else:
+            assert found[0] == {}
+
+
+def test_noise_on_an_observable_is_drawn_at_every_step(pair: tuple[Any, Any]) -> None:
+    """What has a past of its own is observed whether anybody looks or not."""
+    drawn: list[int] = []
+    for env, look in zip(pair, (True, False), strict=True):
+        draws: list[None] = []
+
+        def noisy(value: Any, draws: list[None] = draws) -> Any:
+            draws.append(None)
+            return value
+
+        compiled = attached(env)
+        seeded(env, 7)
+        observable = env._observables["robot0_eef_pos"]
+        untouched = observable._corrupter
+        observable._corrupter = noisy
+        for action in smooth(7, 5):
+            compiled.step(action, look)
+        observable._corrupter = untouched
+        drawn.append(len(draws))
+    assert drawn == [5, 5]
+
+
 @contextmanager
 def without_shortcuts(compiled: CompiledControl) -> Generator[None, None, None]:
     """Robosuite's own observing, and its own contact test, around the compiled physics."""
