@@ -14,7 +14,7 @@ from actrm_harness import suite
 
 suite.prepare()
 
-from actrm_harness import control, envs  # noqa: E402
+from actrm_harness import control, envs, episodes  # noqa: E402
 from actrm_harness.control import CompiledControl  # noqa: E402
 from actrm_harness.control_abi import Library  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
@@ -184,6 +184,21 @@ def test_steps_that_nobody_looks_at_change_nothing_of_what_is_seen_later(pair: t
             assert_same_bits(looking._obs_cache, blind._obs_cache)
         else:
             assert found[0] == {}
+
+
+def test_steps_together_end_where_the_task_is_solved() -> None:
+    """An expert's actions sent at once: the same rewards, and what is seen in the end although nobody looked before."""
+    session = envs.make("Lift")
+    session.control = attached(session.env)
+    demo = episodes.expert_episode(session, 1_000_001)
+    envs.reset(session, 1_000_001, demonstration=True)
+    result, rewards = envs.steps_session(session, list(demo.tensors["actions"]))
+    solved = int(np.argmax(demo.tensors["rewards"] > 0))
+    assert result.success and solved + 1 < demo.steps
+    assert rewards.tobytes() == demo.tensors["rewards"][: solved + 1].tobytes()
+    seen = {name: value for name, value in result.observation.items() if f"next_obs/{name}" in demo.tensors}
+    assert_same_bits(seen, {name: demo.tensors[f"next_obs/{name}"][solved] for name in seen})
+    assert "object" in seen
 
 
 def test_noise_on_an_observable_is_drawn_at_every_step(pair: tuple[Any, Any]) -> None:
