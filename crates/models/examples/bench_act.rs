@@ -17,8 +17,14 @@ use std::time::Instant;
 
 const DIMS: Dims = Dims { state: 9, environment_state: 10, action: 7 };
 const BATCH: usize = 64;
-/// Predictions of one measurement.
-const PREDICTIONS: usize = 30;
+/// Predictions of one measurement: a few tenths of a second, as the system counts CPU time in steps of milliseconds.
+fn repeats(size: &str) -> usize {
+    match size {
+        "d128" => 800,
+        "d256" => 200,
+        _ => 30,
+    }
+}
 /// Calls of the encoder in one prediction of the original ACTRM: 16 supervision steps of 3 rounds of 6 + 1.
 const ORIGINAL_CALLS: usize = 336;
 
@@ -74,7 +80,7 @@ struct Cost {
     cpu: f64,
 }
 
-/// CPU time of this thread, which has only been counted in steps of the scheduler: to a few microseconds.
+/// CPU time of this thread; counted in steps of the scheduler, some milliseconds.
 fn thread_cpu() -> f64 {
     let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap();
     text.split_whitespace().next().unwrap().parse::<f64>().unwrap() / 1e9
@@ -204,8 +210,8 @@ impl Bench {
         if self.wants(&name) {
             let model = act_config(size).build(&DIMS, 1).unwrap();
             let mut peer = self.python.as_deref().map(Peer::start);
-            let theirs = peer.as_mut().map(|peer| || peer.timed("predict", size, 1, PREDICTIONS));
-            self.in_turns(&name, Some(0.6), false, || predictions(model.as_ref(), size, PREDICTIONS), theirs);
+            let theirs = peer.as_mut().map(|peer| || peer.timed("predict", size, 1, repeats(size)));
+            self.in_turns(&name, Some(0.6), false, || predictions(model.as_ref(), size, repeats(size)), theirs);
             peer.into_iter().for_each(Peer::end);
         }
     }
@@ -216,14 +222,14 @@ impl Bench {
         let ours = PolicyConfig::Actrm(actrm_config(size, full_depth())).build(&DIMS, 1).unwrap();
         if self.wants(&name) {
             let act = act_config(size).build(&DIMS, 1).unwrap();
-            let theirs = Some(|| predictions(act.as_ref(), size, PREDICTIONS));
-            self.in_turns(&name, Some(2.0), false, || predictions(ours.as_ref(), size, PREDICTIONS), theirs);
+            let theirs = Some(|| predictions(act.as_ref(), size, repeats(size)));
+            self.in_turns(&name, Some(2.0), false, || predictions(ours.as_ref(), size, repeats(size)), theirs);
         }
         let name = format!("ACTRM predict {size} (peer: {ORIGINAL_CALLS} calls of LeRobot's encoder)");
         if self.wants(&name) {
             let mut peer = self.python.as_deref().map(Peer::start);
             let theirs = peer.as_mut().map(|peer| || peer.timed("plan", size, 1, 1));
-            self.in_turns(&name, Some(0.01), false, || predictions(ours.as_ref(), size, PREDICTIONS), theirs);
+            self.in_turns(&name, Some(0.01), false, || predictions(ours.as_ref(), size, repeats(size)), theirs);
             peer.into_iter().for_each(Peer::end);
         }
         // on our own layers the plan is as fast as it can be made: what remains is what the design saves
@@ -231,7 +237,7 @@ impl Bench {
         if self.wants(&name) {
             let plan = PolicyConfig::Actrm(actrm_config(size, original_plan())).build(&DIMS, 1).unwrap();
             let theirs = Some(|| predictions(plan.as_ref(), size, 1));
-            self.in_turns(&name, None, false, || predictions(ours.as_ref(), size, PREDICTIONS), theirs);
+            self.in_turns(&name, None, false, || predictions(ours.as_ref(), size, repeats(size)), theirs);
         }
     }
 

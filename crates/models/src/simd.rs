@@ -41,6 +41,21 @@ pub(crate) fn vectorised<R>(f: impl FnOnce() -> R) -> R {
     dispatch(Run(f))
 }
 
+/// Asks for the cache line of `data[at]`, which may lie beyond the end.
+#[inline(always)]
+pub(crate) fn prefetch(data: &[f32], at: usize) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use pulp::core_arch::x86::Sse;
+        // every x86-64 has it: this is decided when compiling
+        if let Some(sse) = Sse::try_new() {
+            sse._mm_prefetch::<{ std::arch::x86_64::_MM_HINT_T0 }>(data.as_ptr().wrapping_add(at).cast());
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (data, at);
+}
+
 /// Sum of squares in a fixed order: sixteen running sums, joined every 4096 numbers in f64.
 pub(crate) fn sum_of_squares(values: &[f32]) -> f64 {
     let mut total = 0.0f64;

@@ -442,6 +442,11 @@ mod tests {
         for (config, size) in [(mlp, 25), (study_trm(3), 25), (small_conv(), 75)] {
             let net = config.build(size, 4, 1).unwrap();
             let mut rng = Rng::new(1, "observation");
+            // off the zeros that heads and biases start from, which hide gradients behind them
+            for (_, var) in net.params().iter() {
+                let noise = Tensor::from_vec(rng.normals(var.elem_count()), var.shape(), &Device::Cpu).unwrap();
+                var.set(&(var.as_tensor().detach() + (noise * 0.1).unwrap()).unwrap()).unwrap();
+            }
             let x = Tensor::from_vec(rng.normals(3 * size), (3, size), &Device::Cpu).unwrap();
             let previous = Tensor::new(&[0u32, 3, 1], &Device::Cpu).unwrap();
             let out = net.forward(&x, Some(&previous)).unwrap();
@@ -452,8 +457,10 @@ mod tests {
             }
             let grads = loss.backward().unwrap();
             for (name, var) in net.params().iter() {
-                // with a zero head nothing below it moves before the first step: only existence
-                assert!(grads.get(var.as_tensor()).is_some(), "{config:?}: {name}");
+                let grad = grads.get(var.as_tensor());
+                let grad = grad.unwrap_or_else(|| panic!("{config:?}: {name} has no gradient"));
+                let size = grad.abs().unwrap().sum_all().unwrap();
+                assert!(size.to_scalar::<f32>().unwrap() > 0.0, "{config:?}: {name}");
             }
         }
     }

@@ -4,7 +4,7 @@
 //! register tile, B's panel stays in the first-level cache, A's block in the second. Plain safe Rust; `pulp` picks
 //! AVX-512, AVX2 or scalar code at run time. The order of additions depends on the shape alone.
 
-use crate::simd::{dispatch, vectorised};
+use crate::simd::{dispatch, prefetch, vectorised};
 use pulp::{Simd, WithSimd};
 
 /// A view: element (i, j) is `data[i * row + j * col]`.
@@ -44,6 +44,9 @@ const KC: usize = 256;
 const MC: usize = 240;
 /// Columns of a block of B.
 const NC: usize = 1024;
+
+/// Numbers by which a stream of weights is asked for ahead.
+const AHEAD: usize = 512;
 
 /// Panels, kept between calls.
 #[derive(Debug, Default)]
@@ -201,6 +204,7 @@ fn few_rows<S: Simd, const M: usize, const C: usize, E: Fn(usize, usize, &mut [f
     });
     let apart = n.div_ceil(C);
     for j0 in 0..apart {
+        let starts: [usize; C] = std::array::from_fn(|j| (j0 + j * apart).min(n - 1) * b.col + AHEAD);
         // beyond the last column the last one is computed again
         let columns: [(&[S::f32s], &[f32]); C] = std::array::from_fn(|j| {
             let (from, tail) = split(b.data, (j0 + j * apart).min(n - 1) * b.col);
@@ -209,6 +213,7 @@ fn few_rows<S: Simd, const M: usize, const C: usize, E: Fn(usize, usize, &mut [f
         let mut acc = [[simd.splat_f32s(0.0); C]; M];
         for p in 0..whole {
             for j in 0..C {
+                prefetch(b.data, starts[j] + p * S::F32_LANES);
                 let w = columns[j].0[p];
                 for i in 0..M {
                     acc[i][j] = simd.mul_add_e_f32s(rows[i].0[p], w, acc[i][j]);
@@ -269,7 +274,10 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
                 for (jp, panel_b) in panels.chunks_exact(nr * kc).take(nc.div_ceil(nr)).enumerate() {
                     let j = jc + jp * nr;
                     let cols = nr.min(n - j);
-                    for (ip, panel_a) in pack.a.chunks_exact(MR * kc).take(mc.div_ceil(MR)).enumerate() {
+                    // panels that wait in memory are fetched while the one before is used, a piece by each tile
+                    let next = packed.map_or(&[][..], |_| &panels[panels.len().min((jp + 1) * nr * kc)..]);
+                    let tiles = mc.div_ceil(MR);
+                    for (ip, panel_a) in pack.a.chunks_exact(MR * kc).take(tiles).enumerate() {
                         let i = ic + ip * MR;
                         let rows = MR.min(m - i);
                         let start = if pc > 0 { Start::Add } else { start };
@@ -278,12 +286,13 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
                             Start::Bias(bias) => Start::Bias(&bias[j..j + cols]),
                             other => other,
                         };
+                        let ahead = (&next[next.len().min(ip * kc * nr / tiles)..], nr.div_ceil(tiles));
                         let size = (rows, cols);
                         // the last rows of a block may be few
                         match rows {
-                            0..=4 => tile::<S, MR, 4>(simd, panel_a, panel_b, bias, at, ldc, size),
-                            5..=8 if MR > 8 => tile::<S, MR, 8>(simd, panel_a, panel_b, bias, at, ldc, size),
-                            _ => tile::<S, MR, MR>(simd, panel_a, panel_b, bias, at, ldc, size),
+                            0..=4 => tile::<S, MR, 4>(simd, panel_a, panel_b, bias, at, ldc, size, ahead),
+                            5..=8 if MR > 8 => tile::<S, MR, 8>(simd, panel_a, panel_b, bias, at, ldc, size, ahead),
+                            _ => tile::<S, MR, MR>(simd, panel_a, panel_b, bias, at, ldc, size, ahead),
                         }
                     }
                 }
@@ -363,7 +372,9 @@ fn transpose(out: &mut [f32], width: usize, data: &[f32], (kc, lanes): (usize, u
     }
 }
 
-/// One register tile: the first R of a panel's MR rows, two vectors of columns.
+/// One register tile: the first R of a panel's MR rows, two vectors of columns. Meanwhile `ahead` is fetched, at its pace
+/// in numbers a step.
+#[allow(clippy::too_many_arguments)] // two panels, the output, sizes
 #[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
 #[inline(always)]
 fn tile<S: Simd, const MR: usize, const R: usize>(
@@ -374,13 +385,17 @@ fn tile<S: Simd, const MR: usize, const R: usize>(
     c: &mut [f32],
     ldc: usize,
     (rows, cols): (usize, usize),
+    (ahead, pace): (&[f32], usize),
 ) {
     let lanes = S::F32_LANES;
     let nr = 2 * lanes;
     let zero = simd.splat_f32s(0.0);
     let mut acc = [[zero; 2]; R];
     let (b, _) = S::as_simd_f32s(b);
-    for (a, b) in a.chunks_exact(MR).zip(b.chunks_exact(2)) {
+    for (p, (a, b)) in a.chunks_exact(MR).zip(b.chunks_exact(2)).enumerate() {
+        if !ahead.is_empty() {
+            prefetch(ahead, p * pace);
+        }
         for r in 0..R {
             let x = simd.splat_f32s(a[r]);
             acc[r][0] = simd.mul_add_e_f32s(x, b[0], acc[r][0]);
