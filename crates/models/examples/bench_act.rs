@@ -1,11 +1,11 @@
 //! ACT's and ACTRM's training steps, predictions and memory, beside LeRobot's ACT on PyTorch, in turns, in one run.
 //!
-//!     cargo run --release -p models --example bench_act -- [--peer PYTHON] [--rounds N] [--only WORD]
+//!     target/release/examples/bench_act [--peer PYTHON] [--rounds N] [--only WORD]
 //!
 //! prints a table and writes `target/bench/act.json`. Work on one thread is compared by CPU time (the least of all
 //! rounds; a busy machine only ever adds to it), on two threads by wall time (the median). Without `--peer` only ours is
-//! timed. `--only` takes a part of a row's name. ACTRM's rows have peers of our own: our ACT, the original's plan, and
-//! the same model on candle's autograd.
+//! timed. `--only` takes a part of a row's name. ACTRM's rows stand beside our ACT, the original's plan (on LeRobot's encoder
+//! and on ours), and the same model on candle's autograd.
 #![allow(clippy::unwrap_used)]
 
 use models::actrm::{Actrm, Over, ReasoningConfig};

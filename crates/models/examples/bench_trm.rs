@@ -1,6 +1,6 @@
 //! One TRM supervision step (forward, loss, backward) beside PyTorch, in turns, in one run.
 //!
-//!     cargo run --release -p models --example bench_trm -- [--peer PYTHON] [--rounds N] [--mixings attention,mlp_t,conv]
+//!     target/release/examples/bench_trm [--peer PYTHON] [--rounds N] [--mixings attention,mlp_t,conv]
 //!
 //! prints a table and writes `target/bench/trm.json`. The shapes are hidden 64, 2 layers, 81 positions, batch 64, 3 rounds
 //! of 6 cycles, f32; both sides run as processes of their own. Two ratios each: process CPU time with one thread (which a

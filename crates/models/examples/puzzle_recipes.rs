@@ -1,7 +1,7 @@
 //! Trains a TRM on one puzzle task with this crate's recipe for it, and prints how it does on puzzles that it has not
 //! seen, with the CPU seconds that training took. Recipes are starting points: any value can be changed.
 //!
-//!     RAYON_NUM_THREADS=1 cargo run --release -p models --example puzzle_recipes -- dfs10 seed=1 train.lr=0.003
+//!     RAYON_NUM_THREADS=1 target/release/examples/puzzle_recipes dfs10 seed=1 train.lr=0.003
 //!
 //! Every line is a JSON object; the last one is measured on the test split, those before it on the validation split.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]

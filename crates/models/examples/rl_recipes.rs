@@ -1,8 +1,8 @@
 //! Trains a policy network on the 5x5 mazes with this crate's recipe for it: by reinforcement, or supervised by search.
 //!
-//!     RAYON_NUM_THREADS=1 cargo run --release -p models --example rl_recipes -- maze5-rl mlp seed=1
-//!     RAYON_NUM_THREADS=1 cargo run --release -p models --example rl_recipes -- maze5-walls conv episodes=5000
-//!     RAYON_NUM_THREADS=1 cargo run --release -p models --example rl_recipes -- maze5-walls conv search=2000
+//!     RAYON_NUM_THREADS=1 target/release/examples/rl_recipes maze5-rl mlp seed=1
+//!     RAYON_NUM_THREADS=1 target/release/examples/rl_recipes maze5-walls conv episodes=5000
+//!     RAYON_NUM_THREADS=1 target/release/examples/rl_recipes maze5-walls conv search=2000
 //!
 //! Networks: mlp, trm3, trm5 (the study's), conv (a TRM of at most 6,100 parameters). Every line is a JSON object: success
 //! is the share of held-out mazes that greedy moves solve on a shortest way.
