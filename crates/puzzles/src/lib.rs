@@ -12,6 +12,7 @@ mod maze;
 mod rng;
 mod split;
 mod sudoku;
+mod symmetry;
 mod task;
 mod walker;
 
@@ -20,5 +21,6 @@ pub use maze::{Maze, MazeTask};
 pub use rng::Rng;
 pub use split::{Split, fingerprint};
 pub use sudoku::{Sudoku, SudokuTask};
+pub use symmetry::Symmetry;
 pub use task::{Grade, Puzzle, Task};
 pub use walker::{MAX_MOVES, MOVES, Moved, Walker};

@@ -99,11 +99,16 @@ impl MazeTask {
     pub fn draw_from(self, split: Split, rng: &mut Rng) -> Maze {
         loop {
             let maze = self.draw(rng);
-            let original = matches!(self, Self::Original8 | Self::Original10 | Self::Empty5);
-            if original || Split::of(fingerprint(maze.grid.walls().iter().map(|&wall| u64::from(wall)))) == split {
+            if self.split_of(maze.grid.walls()).is_none_or(|its| its == split) {
                 return maze;
             }
         }
+    }
+
+    /// The split that mazes with these walls belong to, if this family has splits.
+    pub fn split_of(self, walls: &[bool]) -> Option<Split> {
+        let original = matches!(self, Self::Original8 | Self::Original10 | Self::Empty5);
+        (!original).then(|| Split::of(fingerprint(walls.iter().map(|&wall| u64::from(wall)))))
     }
 }
 

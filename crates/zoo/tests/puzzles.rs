@@ -78,6 +78,47 @@ fn walkers_learn_the_studys_maze_by_every_algorithm() {
     }
 }
 
+/// As `short`, with up to 16 supervision steps.
+fn learned(name: &str, overrides: &[&str]) -> PuzzleEvaluation {
+    let root = tempfile::tempdir().unwrap();
+    let mut all = vec!["train.validate_every=1000000"];
+    all.extend(overrides);
+    let entry = finish(&request(root.path(), name, &all));
+    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles: 200, depth: 16 };
+    evaluate_puzzles(&entry.load_solver(None).unwrap(), &root.path().join("zoo/results"), &options).unwrap().1
+}
+
+#[test]
+fn a_short_training_finds_ways_through_perfect_mazes_it_has_not_seen() {
+    let result = learned("trm_dfs10", &["train.steps=600"]);
+    // who does not look marks no way at all
+    assert!(result.baselines.values().all(|counts| counts.exact < 40), "{:?}", result.baselines);
+    assert!(result.answers.exact > 120, "{:?}", result.answers);
+}
+
+#[test]
+fn a_short_training_finds_shortest_ways_through_open_mazes_it_has_not_seen() {
+    let result = learned("trm_open8", &["train.steps=800"]);
+    // along the row and then along the column is a shortest way in 46% of them
+    assert!(result.baselines.values().all(|counts| counts.valid < 120), "{:?}", result.baselines);
+    assert!(result.answers.valid > 140, "{:?}", result.answers);
+}
+
+#[test]
+fn a_short_training_fills_sudoku_it_has_not_seen() {
+    let result = learned("trm_sudoku4", &["train.steps=700"]);
+    assert!(result.baselines.values().all(|counts| counts.exact == 0), "{:?}", result.baselines);
+    assert!(result.answers.exact > 120, "{:?}", result.answers);
+}
+
+#[test]
+fn a_walker_learns_mazes_with_walls_from_search_and_from_rewards() {
+    let searched = short("search_trm_maze5-walls", &["train.steps=200"]);
+    assert!(searched.answers.valid > 150, "{:?}", searched.answers);
+    let rewarded = short("ppo_trm_maze5-walls", &["train.steps=40"]);
+    assert!(rewarded.answers.valid > 100, "{:?}", rewarded.answers);
+}
+
 const TINY_TRM: [&str; 6] = [
     "model.hidden_size=8",
     "model.inner_size=8",

@@ -15,7 +15,7 @@ use crate::run::TrainSection;
 
 use super::model::SolverConfig;
 use super::solver::Solver;
-use super::walk::RlSection;
+use super::walk::{RlKind, RlSection};
 
 /// An experiment of any kind.
 #[derive(Debug, Clone, PartialEq)]
@@ -243,6 +243,13 @@ impl PuzzleExperiment {
         if let Some(rl) = &self.rl {
             if rl.episodes == 0 {
                 return invalid("rl.episodes", "at least 1".to_owned(), "0".to_owned());
+            }
+            if rl.mirrored && rl.algorithm != RlKind::Ppo {
+                return invalid(
+                    "rl.mirrored",
+                    "false: only PPO weighs what another policy did".to_owned(),
+                    "true".to_owned(),
+                );
             }
             if !matches!(task, Task::Maze(maze) if maze != MazeTask::Original10) {
                 return invalid("task.puzzle", "mazes that have a way, with [rl]".to_owned(), self.task.puzzle.clone());

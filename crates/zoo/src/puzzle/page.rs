@@ -341,7 +341,10 @@ fn thesis(rows: &[Row]) -> String {
     };
     let best =
         |results: &[PuzzleEvaluation]| results.iter().map(|r| r.answers.share(r.answers.valid)).fold(0.0, f64::max);
-    let mut text = String::new();
+    let mut text = String::from(
+        "A walking MLP shares nothing between cells, a walking TRM shares one 3x3 convolution; `trm2` is that TRM, weight for \
+         weight, applied twice instead of eight times: recursion is all that the two differ in.\n\n",
+    );
     let mut compare = |task: &str, what: &str, recursive: &str, other: &str| {
         let line = match (found(recursive), found(other)) {
             (Some(one), Some(two)) => {
@@ -368,7 +371,9 @@ fn thesis(rows: &[Row]) -> String {
     };
     compare("Empty 5x5 maze", "REINFORCE, greedy", "reinforce_trm5_maze5-rl", "reinforce_mlp_maze5-rl");
     compare("5x5 mazes with walls", "PPO, greedy", "ppo_trm_maze5-walls", "ppo_mlp_maze5-walls");
+    compare("5x5 mazes with walls", "PPO, greedy", "ppo_trm_maze5-walls", "ppo_trm2_maze5-walls");
     compare("5x5 mazes with walls", "labels from search, greedy", "search_trm_maze5-walls", "search_mlp_maze5-walls");
+    compare("5x5 mazes with walls", "labels from search, greedy", "search_trm_maze5-walls", "search_trm2_maze5-walls");
     compare("open8", "supervised, right", "trm_open8", "cnn_open8");
     compare("dfs10", "supervised, right", "trm_dfs10", "transformer_dfs10");
     text

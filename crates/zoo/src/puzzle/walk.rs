@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use models::baselines::PolicyNet;
 use models::rl::{Agent, Algorithm, Choice, Decision, Episode, RlConfig};
 use models::{ModelError, Rng, TrainConfig};
-use puzzles::{MOVES, Maze, MazeTask, Puzzle, Walker};
+use puzzles::{MOVES, Maze, MazeTask, Puzzle, Split, Symmetry, Walker};
 use serde::{Deserialize, Serialize};
 
 use super::grade::Counts;
@@ -51,6 +51,9 @@ pub struct RlSection {
     /// PPO: the passes end once the divergence exceeds this.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub target_kl: Option<f64>,
+    /// PPO: learn from each episode's mirror images too, as far as their mazes are training mazes.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub mirrored: bool,
 }
 
 fn default_gamma() -> f64 {
@@ -169,6 +172,25 @@ fn play(task: MazeTask, mazes: &[Maze], decide: &mut Decide<'_>) -> Result<(Vec<
     Ok((episodes, reached))
 }
 
+/// An episode and its mirror images: what a policy that is itself mirrored would have seen and done, which is why the
+/// probabilities at the time stay. Images whose walls belong to another split are left out.
+fn mirrored(task: MazeTask, maze: &Maze, episode: &Episode) -> Vec<Episode> {
+    let side = task.side();
+    let image = |symmetry: Symmetry| {
+        let walls = symmetry.plane(side, maze.grid.walls());
+        task.split_of(&walls).is_none_or(|split| split == Split::Train).then(|| Episode {
+            observations: episode
+                .observations
+                .chunks(side * side)
+                .flat_map(|plane| symmetry.plane(side, plane))
+                .collect(),
+            actions: episode.actions.iter().map(|&action| symmetry.action(action as usize) as u32).collect(),
+            ..episode.clone()
+        })
+    };
+    Symmetry::all().into_iter().filter_map(image).collect()
+}
+
 /// Shares of the moves that begin a shortest way from `at`.
 fn first_moves(maze: &Maze, at: usize) -> [f32; MOVES.len()] {
     let distances = maze.grid.distances(maze.goal);
@@ -228,7 +250,13 @@ impl Learning {
                         self.recent.pop_front();
                     }
                 }
-                let done = self.agent.update(&episodes)?;
+                let done = if self.section.mirrored {
+                    let seen = mazes.iter().zip(&episodes);
+                    let all: Vec<Episode> = seen.flat_map(|(maze, one)| mirrored(self.task, maze, one)).collect();
+                    self.agent.update(&all)?
+                } else {
+                    self.agent.update(&episodes)?
+                };
                 let rewards: f64 = episodes.iter().map(Episode::total_reward).sum();
                 let share = |of: usize, all: usize| of as f64 / all as f64;
                 vec![
@@ -370,6 +398,33 @@ mod tests {
             }
             assert_eq!((walker.at(), Some(walker.moves())), (maze.goal, puzzle.distance()));
         }
+    }
+
+    #[test]
+    fn mirror_images_of_a_walk_are_walks_in_other_training_mazes() {
+        let task = MazeTask::Walls5;
+        let mut images = 0;
+        for index in 0..40 {
+            let puzzle = Task::Maze(task).numbered(Split::Train, (0, 0), 1, index);
+            let maze = maze(&puzzle).unwrap();
+            let mut rng = puzzles::Rng::new(7, index);
+            let mut drawn = |seen: &[f32], _: &[u32]| {
+                let decision = |_| Decision { action: rng.below(4) as u32, log_prob: -1.4, value: 0.5 };
+                Ok((0..seen.len() / observation_len(task)).map(decision).collect())
+            };
+            let (episodes, _) = play(task, std::slice::from_ref(maze), &mut drawn).unwrap();
+            let all = mirrored(task, maze, &episodes[0]);
+            assert_eq!(all[0], episodes[0]);
+            for image in &all {
+                let cells = task.side() * task.side();
+                let walls: Vec<bool> = image.observations[cells..2 * cells].iter().map(|&x| x == 1.0).collect();
+                assert_eq!(task.split_of(&walls), Some(Split::Train));
+                assert_eq!((&image.rewards, image.last_value), (&episodes[0].rewards, episodes[0].last_value));
+            }
+            images += all.len();
+        }
+        // 1 + 7 * 0.7 of 8 are training mazes, fewer where two images are the same
+        assert!((40 * 5..40 * 7).contains(&images), "{images}");
     }
 
     #[test]
