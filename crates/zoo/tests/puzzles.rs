@@ -90,32 +90,27 @@ fn learned(name: &str, overrides: &[&str]) -> PuzzleEvaluation {
 
 #[test]
 fn a_short_training_finds_ways_through_perfect_mazes_it_has_not_seen() {
-    let result = learned("trm_dfs10", &["train.steps=600"]);
-    // who does not look marks no way at all
-    assert!(result.baselines.values().all(|counts| counts.exact < 40), "{:?}", result.baselines);
-    assert!(result.answers.exact > 120, "{:?}", result.answers);
-}
-
-#[test]
-fn a_short_training_finds_shortest_ways_through_open_mazes_it_has_not_seen() {
-    let result = learned("trm_open8", &["train.steps=800"]);
-    // along the row and then along the column is a shortest way in 46% of them
-    assert!(result.baselines.values().all(|counts| counts.valid < 120), "{:?}", result.baselines);
-    assert!(result.answers.valid > 140, "{:?}", result.answers);
+    let result = learned("trm_dfs10", &["train.steps=1700", "model.hidden_size=24", "model.inner_size=48"]);
+    // along the row and then along the column is the way in a quarter of them
+    assert!(result.baselines.values().all(|counts| counts.exact < 70), "{:?}", result.baselines);
+    assert!(result.answers.exact > 90, "{:?}", result.answers);
+    // none of them is a way that ignores the walls
+    assert!(result.answers.detours_valid > 25, "{:?}", result.answers);
 }
 
 #[test]
 fn a_short_training_fills_sudoku_it_has_not_seen() {
-    let result = learned("trm_sudoku4", &["train.steps=700"]);
+    let result = learned("trm_sudoku4", &["train.steps=600"]);
     assert!(result.baselines.values().all(|counts| counts.exact == 0), "{:?}", result.baselines);
     assert!(result.answers.exact > 120, "{:?}", result.answers);
 }
 
 #[test]
 fn a_walker_learns_mazes_with_walls_from_search_and_from_rewards() {
-    let searched = short("search_trm_maze5-walls", &["train.steps=200"]);
-    assert!(searched.answers.valid > 150, "{:?}", searched.answers);
-    let rewarded = short("ppo_trm_maze5-walls", &["train.steps=40"]);
+    let searched = short("search_trm_maze5-walls", &["train.steps=250"]);
+    // half of them are what random moves reach
+    assert!(searched.answers.valid > 140, "{:?}", searched.answers);
+    let rewarded = short("ppo_trm_maze5-walls", &["train.steps=25"]);
     assert!(rewarded.answers.valid > 100, "{:?}", rewarded.answers);
 }
 
@@ -213,6 +208,7 @@ fn experiments_that_cannot_work_are_refused_by_key() {
     assert!(error("trm_dfs10", "task.givens=[3, 5]").contains("mazes have no givens"));
     assert!(error("trm_sudoku4", "task.givens=[9, 5]").contains("key `task.givens`"));
     assert!(error("ppo_mlp_maze5-walls", "task.puzzle=sudoku4").contains("mazes that have a way"));
+    assert!(error("a2c_trm_maze5-walls", "rl.mirrored=true").contains("only PPO"));
     assert!(error("ppo_mlp_maze5-walls", "rl.algorithm=sarsa").contains("one of a2c, ppo, reinforce, search"));
     let root = tempfile::tempdir().unwrap();
     let request = request(root.path(), "trm_dfs10", &["model.mixing=attention", "model.num_heads=5"]);

@@ -77,7 +77,8 @@ pub fn study_page(library: &Library, results: &Path) -> Result<String, ZooError>
     page.push_str(&depths(&rows));
     page.push_str("\n### 5x5 mazes with walls, walked\n\nHeld-out mazes, 5,000 episodes (`search`: labels from search instead of rewards).\n\n");
     page.push_str(&walking(&of(&["maze5-walls"])));
-    page.push_str("\nGreedy success on validation mazes on the way, mean (worst) of the seeds:\n\n");
+    page.push_str("\nGreedy success on validation mazes on the way, mean (worst) of the seeds; *deepest fall*: the farthest that any seed \
+         ever was below its own best before, in validations 500 episodes apart:\n\n");
     page.push_str(&curves(&of(&["maze5-walls"])));
     page.push_str("\n## Bars\n\n");
     page.push_str(&bars(&rows));
@@ -258,12 +259,13 @@ fn depths(rows: &[Row]) -> String {
 const EPISODES: [u64; 5] = [500, 1000, 2000, 3500, 5000];
 
 fn curves(rows: &[&Row]) -> String {
-    let mut text =
-        String::from("| model | 500 | 1,000 | 2,000 | 3,500 | 5,000 episodes |\n|---|---|---|---|---|---|\n");
+    let mut text = String::from(
+        "| model | 500 | 1,000 | 2,000 | 3,500 | 5,000 episodes | deepest fall |\n|---|---|---|---|---|---|---|\n",
+    );
     for (row, _, results) in rows.iter().filter(|(row, ..)| !row.experiment.starts_with("search")) {
         let _ = write!(text, "| {} |", model(row));
         if results.is_empty() {
-            text.push_str(&not_run(EPISODES.len()));
+            text.push_str(&not_run(EPISODES.len() + 1));
         }
         for episodes in EPISODES.iter().filter(|_| !results.is_empty()) {
             let at: Vec<f64> = results
@@ -278,9 +280,23 @@ fn curves(rows: &[&Row]) -> String {
             };
             let _ = write!(text, " {cell} |");
         }
+        if !results.is_empty() {
+            let deepest = results.iter().map(fall).fold(0.0, f64::max);
+            let _ = write!(text, " {:.1} points |", 100.0 * deepest);
+        }
         text.push('\n');
     }
     text
+}
+
+/// How far the greedy success on validation mazes ever fell below the best before it: a collapse shows here.
+fn fall(result: &PuzzleEvaluation) -> f64 {
+    let mut best = 0.0_f64;
+    let falls = result.progress.iter().map(|point| {
+        best = best.max(point.valid);
+        best - point.valid
+    });
+    falls.fold(0.0, f64::max)
 }
 
 /// What was asked for beside what was reached.
