@@ -75,7 +75,7 @@ pub fn study_page(library: &Library, results: &Path) -> Result<String, ZooError>
     page.push_str(&marking(&of(&["open8", "dfs10", "sudoku4", "sudoku6", "sudoku9"])));
     page.push_str("\n### Right answers by supervision steps\n\nThe weights do not change, only how long they are applied. *Halting* stops once the model is sure of an answer that stays the same.\n\n");
     page.push_str(&depths(&rows));
-    page.push_str("\n### 5x5 mazes with walls, walked\n\nHeld-out mazes, 5,000 episodes (`search`: labels from search instead of rewards).\n\n");
+    page.push_str("\n### 5x5 mazes with walls, walked\n\nHeld-out mazes, 5,000 episodes, each in a new maze (`search`: labels from search instead of rewards). PPO also learns from the mirror images of its episodes, as far as their mazes are training mazes; the weights that walk are a moving average. `trm2` is `trm` with two applications of its network instead of eight.\n\n");
     page.push_str(&walking(&of(&["maze5-walls"])));
     page.push_str("\nGreedy success on validation mazes on the way, mean (worst) of the seeds; *deepest fall*: the farthest that any seed \
          ever was below its own best before, in validations 500 episodes apart:\n\n");
