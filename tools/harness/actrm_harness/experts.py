@@ -6,6 +6,7 @@ side of the approach), by correlated noise on the command, and by pushes of a fe
 """
 
 import importlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
@@ -105,9 +106,15 @@ class Scene:
 
 
 class Servo:
-    """Turns a target pose of the hand into an action, with this episode's style, noise and pushes."""
+    """Turns a target pose of the hand into an action, with this episode's style, noise and pushes.
 
-    def __init__(self, scene: Scene, rng: np.random.Generator, pace: float = 1.0, turn: float = 0.5) -> None:
+    There is one push, or with `pushed` one every so many steps on average: what the expert does to make up for them is
+    what a policy learns from to make up for errors of its own, where little is forgiven.
+    """
+
+    def __init__(
+        self, scene: Scene, rng: np.random.Generator, pace: float = 1.0, turn: float = 0.5, pushed: float = math.inf
+    ) -> None:
         self.scene = scene
         self.style = Style.draw(rng)
         self.pace = pace
@@ -116,9 +123,13 @@ class Servo:
         self._rng = rng
         self._noise = np.zeros(6)
         self._time = 0
-        self._push_at = 3 + int(37 * rng.random())
-        self._push = rng.normal(size=3)
-        self._push *= rng.uniform(0.2, 0.6) / np.linalg.norm(self._push)
+        self._pushed = pushed
+        self._push_at: int = 3 + int(37 * rng.random())
+        self._push = self._draw_push()
+
+    def _draw_push(self) -> Array:
+        push = self._rng.normal(size=3)
+        return push * (self._rng.uniform(0.2, 0.6) / np.linalg.norm(push))
 
     def move(self, target: Array, grip: float, rotation: Array | None = None) -> Array:
         """A step towards `target` (and `rotation`, else as the hand was at the start)."""
@@ -129,6 +140,9 @@ class Servo:
         self._noise = 0.7 * self._noise + self._rng.normal(size=6) * style.noise * np.repeat([1.0, 0.3], 3)
         if self._push_at <= self._time < self._push_at + 3:
             wanted = wanted + self._push
+        elif self._time == self._push_at + 3 and math.isfinite(self._pushed):
+            self._push_at += 4 + int(2 * (self._pushed - 4) * self._rng.random())
+            self._push = self._draw_push()
         self._time += 1
         return np.concatenate([np.concatenate([wanted, turn]) + self._noise, [grip]])
 
@@ -219,12 +233,16 @@ class Grasp:
 
 
 class Carry:
-    """Bringing a held thing to a place, over what stands in between, and letting go of it there."""
+    """Bringing a held thing to a place, over what stands in between, and letting go of it there.
 
-    def __init__(self, scene: Scene, grasp: Grasp, clear: float) -> None:
+    `off` is how far the fingers are open when they begin to be off it, and when they are.
+    """
+
+    def __init__(self, scene: Scene, grasp: Grasp, clear: float, off: tuple[float, float] = (0.05, 0.07)) -> None:
         self.scene = scene
         self.grasp = grasp
         self.clear = clear
+        self.off = off
         self.released = False
 
     def bring(self, thing: Array, goal: Array, near: float = 0.012, far: float = 0.06) -> Array:
@@ -238,7 +256,7 @@ class Carry:
 
     def let_go(self) -> tuple[Array, float]:
         """Open, and leave upwards once the fingers are off."""
-        up = 0.12 * funnel(self.scene.gap, 0.05, 0.07)
+        up = 0.12 * funnel(self.scene.gap, *self.off)
         return self.scene.hand + np.array([0.0, 0.0, up]), OPEN
 
     def update(self, thing: Array, goal: Array, flat: float, height: float, lost: float = 0.04) -> bool:

@@ -55,6 +55,10 @@ class StackExpert:
 class TowerExpert:
     """Build a tower of three cubes in the order that the environment asks for."""
 
+    # From a finger to the middle of another cube, and the turns of the hand that are tried, the least first.
+    CLEAR = 0.055
+    TURNS = tuple(np.radians(side * degrees) for degrees in range(0, 91, 6) for side in (1, -1))
+
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
         self.servo = Servo(scene, rng, pace=1.4)
@@ -62,7 +66,9 @@ class TowerExpert:
         order: tuple[str, ...] = scene.task.order
         self.order = tuple(f"{name}_main" for name in order)
         rise = rng.uniform(0.12, 0.14)
-        self.carries = [Carry(scene, self.grasp, clear=TABLE + rise + 0.04 * level) for level in range(2)]
+        # a cube that is held by two of its edges is 5.7 cm wide
+        off = (0.062, 0.076)
+        self.carries = [Carry(scene, self.grasp, TABLE + rise + 0.04 * level, off) for level in range(2)]
         self.level = 0
         self.above = TABLE + rise + 0.12
 
@@ -99,16 +105,18 @@ class TowerExpert:
         return float(np.linalg.norm(self.scene.hand - self.scene.body(cube))) > 0.06
 
     def _grip_yaw(self, cube: str) -> float:
-        """The hand's angle that fits the cube, its fingers clear of the other cubes."""
+        """The least turn of the hand that keeps its fingers clear of the other cubes, whichever way the cube lies.
+
+        Closing turns the cube between the fingers. What is asked of the hand follows from places alone, and is
+        nothing at all where there is room: that is far easier to learn than a quarter turn's symmetry.
+        """
         here = self.scene.body(cube)
-        first = nearest(yaw(self.scene.body_rotation(cube)), np.pi / 2, 0.0)
-        second = first - np.copysign(np.pi / 2, first)
         others = [self.scene.body(name) for name in self.order if name != cube]
         others = [other for other in others if float(other[2]) > float(here[2]) - 0.03]
 
-        def room(angle: float) -> float:
+        def wanting(angle: float) -> float:
             fingers = [here + about_z(angle) @ np.array([0.0, side, 0.0]) for side in (-0.055, 0.055)]
             gaps = [float(np.linalg.norm((finger - other)[:2])) for finger in fingers for other in others]
-            return min(gaps, default=1.0)
+            return max(self.CLEAR - min(gaps, default=1.0), 0.0)
 
-        return first if room(first) > 0.055 or room(first) >= room(second) else second
+        return min(self.TURNS, key=wanting)

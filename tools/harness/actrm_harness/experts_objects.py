@@ -32,7 +32,7 @@ class CanExpert:
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4)
+        self.servo = Servo(scene, rng, pace=1.4, pushed=15.0)
         self.grasp = Grasp(scene, self.servo.style, tall=0.04, mouth=(0.006, 0.018))
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
 
@@ -64,7 +64,7 @@ class SquareExpert:
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4, turn=0.8)
+        self.servo = Servo(scene, rng, pace=1.4, turn=0.8, pushed=15.0)
         self.grasp = Grasp(scene, self.servo.style)
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
         self.final = min(self.FINAL, key=self._way)
