@@ -194,16 +194,23 @@ class Grasp:
 
     `held` is read off the fingers: they were told to close, have stopped, and stopped before they met. `tall` is how
     far the thing stands up above the point that is gripped: the hand comes from that much higher, and goes down only
-    where it is beside the thing by less than `mouth` (down to the first, down not at all from the second on).
+    where it is beside the thing by less than `mouth` (down to the first, down not at all from the second on). Within
+    `close` of the point, sideways and in height, the fingers close.
     """
 
     THINNEST, WIDEST = 0.01, 0.07
 
     def __init__(
-        self, scene: Scene, style: Style, tall: float = 0.0, mouth: tuple[float, float] = (0.008, 0.03)
+        self,
+        scene: Scene,
+        style: Style,
+        tall: float = 0.0,
+        mouth: tuple[float, float] = (0.008, 0.03),
+        close: tuple[float, float] = (0.01, 0.012),
     ) -> None:
         self.scene = scene
         self.style = style
+        self.close = close
         self.hover = style.hover + tall
         self.mouth = mouth
         self.closing = False
@@ -217,7 +224,7 @@ class Grasp:
         hand = self.scene.hand
         offset = point - hand
         flat, height = float(np.linalg.norm(offset[:2])), abs(float(offset[2]))
-        if not self.closing and flat < 0.01 and height < 0.012:
+        if not self.closing and flat < self.close[0] and height < self.close[1]:
             self.closing = True
         elif self.closing and (flat > 0.035 or height > 0.035 or self.scene.gap < self.THINNEST):
             self.closing = self.held = False

@@ -65,7 +65,8 @@ class SquareExpert:
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
         self.servo = Servo(scene, rng, pace=1.4, turn=0.8, pushed=15.0)
-        self.grasp = Grasp(scene, self.servo.style)
+        # the handle is long and thin: who waits for its very middle may wait for ever
+        self.grasp = Grasp(scene, self.servo.style, tall=0.02, mouth=(0.012, 0.025), close=(0.018, 0.015))
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
         self.final = min(self.FINAL, key=self._way)
 
