@@ -5,8 +5,8 @@
 mod common;
 
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
 use std::time::Duration;
 
 use common::{impatient, options, spec, worker_processes, wrapped};
@@ -16,6 +16,14 @@ use zoo::ZooError;
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate};
 use zoo::results::{EntryIdentity, Execution, Seeds, Shard, StoredEvaluation, TrainingFacts, merge_shards};
 use zoo::rollout::{Pool, PoolOptions, RolloutError, TimeLimits};
+
+/// The test that strikes at workers finds them among this process' children: meanwhile no other test may have any.
+static WORKERS: RwLock<()> = RwLock::new(());
+
+/// Held by a test that leaves others' workers alone.
+fn beside_others() -> RwLockReadGuard<'static, ()> {
+    WORKERS.read().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// A small closed-loop controller for Lift with a state of its own: over the cube, down, close, up.
 #[derive(Default)]
@@ -99,6 +107,7 @@ fn assert_same(a: &StoredEvaluation, b: &StoredEvaluation) {
 
 #[test]
 fn one_and_two_workers_shards_and_resuming_give_the_same_bytes() {
+    let _workers = beside_others();
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let mut one = Pool::start(options("Lift", 1)).unwrap();
@@ -152,6 +161,7 @@ fn one_and_two_workers_shards_and_resuming_give_the_same_bytes() {
 /// Kills, stops and slows workers at random, and prints into their pipes, while 40 episodes run.
 #[test]
 fn chaos_among_the_workers_does_not_change_a_byte() {
+    let _workers = WORKERS.write().unwrap_or_else(PoisonError::into_inner);
     let dir = tempfile::tempdir().unwrap();
     let mut calm = Pool::start(options("Lift", 2)).unwrap();
     let expected = run(&mut calm, &dir.path().join("calm"), &wanted(40));
@@ -220,6 +230,7 @@ fn chaos_among_the_workers_does_not_change_a_byte() {
 
 #[test]
 fn what_does_not_fit_is_refused_before_anything_is_written() {
+    let _workers = beside_others();
     let dir = tempfile::tempdir().unwrap();
     let mut pool = Pool::start(options("Lift", 1)).unwrap();
     let results = dir.path().join("results");
