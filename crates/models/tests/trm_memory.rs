@@ -68,9 +68,9 @@ fn memory_is_flat_in_the_rounds_without_gradient() {
                 l_cycles,
                 ..Config::new(5, 36, 16)
             };
-            // what a process allocates once is no part of a step
-            peak(&config(2, 3), composed);
-            let (short, long) = (peak(&config(2, 3), composed), peak(&config(12, 3), composed));
+            // what a process or one of its threads allocates once, whenever that has its first turn, is no part of a step
+            let least = |config: Config| (0..4).map(|_| peak(&config, composed)).min().unwrap();
+            let (short, long) = (least(config(2, 3)), least(config(12, 3)));
             let what = format!("{mixing:?}, composed {composed}: {short} bytes with 2 rounds, {long} with 12");
             assert!(long as f64 <= 1.02 * short as f64, "{what}");
             // what this counts does grow where it must: with the cycles that keep a graph
