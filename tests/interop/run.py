@@ -232,10 +232,16 @@ def compare_actions(root: Path, zoo: Path, entry: str, checkpoint: Path) -> str:
     return f"{len(rows)} chunks of {answers.shape[1]} x {answers.shape[2]}, largest difference {largest:.1e}"
 
 
+def train_ours(root: Path, folder: Path, steps: int) -> Path:
+    """The zoo in which we put an ACT of a few steps, as lift-act@1."""
+    zoo, changes = folder / "zoo", f"train.steps={steps}"
+    ours("actrm-zoo", "train", "act_lift", "--data", root, "--zoo", zoo, "--runs", folder / "runs", changes)
+    return zoo
+
+
 def export_entry(root: Path, folder: Path) -> str:
     """An entry that we trained answers the same in LeRobot."""
-    zoo = folder / "zoo"
-    ours("actrm-zoo", "train", "act_lift", "--data", root, "--zoo", zoo, "--runs", folder / "runs", "train.steps=5")
+    zoo = train_ours(root, folder, 5)
     ours("actrm-zoo", "export", "lerobot", "lift-act@1", folder / "lift-act", "--zoo", zoo)
     return compare_actions(root, zoo, "lift-act@1", folder / "lift-act")
 
@@ -328,6 +334,27 @@ def open_theirs(folder: Path) -> str:
     return f"{frames} frames"
 
 
+def evaluate_on_ray(root: Path, folder: Path) -> str:
+    """The driver for Ray: shards on a cluster of two cores, merged, are the bytes of an evaluation in one piece."""
+    # enough steps for some of the episodes to succeed
+    zoo, whole = train_ours(root, folder, 60), folder / "whole"
+    asked = ["lift-act@1", "--episodes", "6", "--max-steps", "60", "--zoo", str(zoo)]
+    program = BIN / "actrm-zoo"
+    driver = [sys.executable, ROOT / "tools" / "cluster" / "ray_eval.py", "--shards", "2", "--program", program, "--"]
+    os.environ.setdefault("ACTRM_PYTHON", str(ROOT / ".venv" / "bin" / "python"))
+    shown = run([*driver, *asked])
+    assert "shard 1/2: ok" in shown and "shard 2/2: ok" in shown, shown
+    ours("actrm-zoo", "eval", *asked, "--results", whole)
+    (merged,) = (path for path in (zoo / "results").iterdir() if "_shard-" not in path.name)
+    expected = (whole / merged.name / "outcomes.parquet").read_bytes()
+    assert (merged / "outcomes.parquet").read_bytes() == expected, merged
+    # a shard that cannot run is told of, and nothing is merged
+    unknown = ["no-such-entry@1", *asked[1:]]
+    failed = subprocess.run([*map(str, driver), *unknown], text=True, capture_output=True, check=False)
+    assert failed.returncode == 1 and "2 of 2 shards failed" in failed.stderr, failed
+    return shown.splitlines()[-1].split(" (")[0]
+
+
 def main() -> None:
     """Run every check; the first difference ends it."""
     # LeRobot warns of video decoders that are not needed here, and of our entry in info.json
@@ -356,6 +383,7 @@ def main() -> None:
             "export rebuilds the source": lambda: compare_trees(source, exported),
             "robomimic reads the exported file": lambda: compare_robomimic(exported),
             "a data set written by LeRobot opens in ours": lambda: open_theirs(folder),
+            "shards on a Ray cluster make one evaluation": lambda: evaluate_on_ray(root, folder / "ray"),
         }
         for title, check in checks.items():
             print(f"{title:<48} ", end="", flush=True)

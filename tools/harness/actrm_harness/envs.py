@@ -9,7 +9,6 @@ it again; for Lift, whose cube robosuite draws when it loads the model, because 
 import hashlib
 import importlib
 import json
-import math
 import os
 import re
 from collections.abc import Callable, Generator
@@ -173,7 +172,7 @@ def step_session(session: Session, action: Array) -> StepResult:
     return replace(result, observation={**result.observation, **images(session)})
 
 
-def steps_session(session: Session, actions: list[Array]) -> tuple[StepResult, Array]:
+def steps_session(session: Session, actions: Array) -> tuple[StepResult, Array]:
     """Control steps, one after the other until the task is solved: what the last one led to, and all rewards.
 
     What is seen between them is not looked at, nor observed where that is known to change nothing.
@@ -183,15 +182,16 @@ def steps_session(session: Session, actions: list[Array]) -> tuple[StepResult, A
     rewards: list[float] = []
     solved = False
     blind = len(actions) - 1 if _ours(env) else 0
-    for index, action in enumerate(actions):
-        look = index >= blind
-        with judged_once(env):
+    with judged_once(env) as begin_step:
+        for index, action in enumerate(actions):
+            look = index >= blind
+            begin_step()
             raw, reward, _, _ = env.step(action) if control is None else control.step(action, look)
+            rewards.append(float(reward))
             solved = success(env)
-        rewards.append(float(reward))
-        if solved:
-            raw = raw if look or control is None else control.look()
-            break
+            if solved:
+                raw = raw if look or control is None else control.look()
+                break
     return StepResult({**observation(raw), **images(session)}, rewards[-1], solved), np.array(rewards)
 
 
@@ -227,32 +227,32 @@ def _ours(env: Env) -> bool:
 
 
 @contextmanager
-def judged_once(env: Env) -> Generator[None]:
+def judged_once(env: Env) -> Generator[Callable[[], None]]:
     """Within a control step, the reward and the question of success share one look at the state.
 
     In robosuite's tasks and ours both follow from the same state by the same functions, which take a third of the time
-    around a step; an environment of somebody else's may count how often it is asked, and is left alone.
+    around a step; an environment of somebody else's may count how often it is asked, and is left alone. What this gives
+    is to be called before every step but the first.
     """
     if not _ours(env):
-        yield
+        yield lambda: None
         return
+    verdicts: dict[str, Any] = {}
     names = [name for name in _JUDGES if hasattr(env, name)]
     for name in names:
-        setattr(env, name, _once(getattr(env, name)))
+        setattr(env, name, _once(getattr(env, name), name, verdicts))
     try:
-        yield
+        yield verdicts.clear
     finally:
         for name in names:
             delattr(env, name)
 
 
-def _once(judge: Callable[[], Any]) -> Callable[[], Any]:
-    verdict: list[Any] = []
-
+def _once(judge: Callable[[], Any], name: str, verdicts: dict[str, Any]) -> Callable[[], Any]:
     def remembered() -> Any:
-        if not verdict:
-            verdict.append(judge())
-        return verdict[0]
+        if name not in verdicts:
+            verdicts[name] = judge()
+        return verdicts[name]
 
     return remembered
 
@@ -262,15 +262,15 @@ def success(env: Env) -> bool:
     return bool(env._check_success())  # pyright: ignore[reportPrivateUsage]
 
 
-def check_action(env: Env, action: Array) -> Array:
-    """The action as float64; RequestError where its shape, type or values are not an action."""
-    shape = (env.action_dim,)
-    if action.dtype != np.float64 or action.shape != shape:
-        raise RequestError("bad_action", f"action must be F64 of shape {shape}, got {action.dtype} {action.shape}")
-    values: list[float] = action.tolist()
-    if not all(map(math.isfinite, values)):
-        raise RequestError("bad_action", f"action has values that are not finite: {values}")
-    return np.array(action)
+def check_actions(env: Env, actions: Array) -> Array:
+    """The actions, one or a row each, as rows of float64; RequestError where they are none."""
+    width = env.action_dim
+    rows = actions[None] if actions.ndim == 1 else actions
+    if rows.dtype != np.float64 or rows.ndim != 2 or rows.shape[1] != width:
+        raise RequestError("bad_action", f"action must be F64 of shape ({width},), got {actions.dtype} {actions.shape}")
+    if not np.isfinite(rows).all():
+        raise RequestError("bad_action", f"action has values that are not finite: {actions.tolist()}")
+    return rows.copy()
 
 
 def observation(raw: dict[str, Array]) -> Tensors:

@@ -108,8 +108,7 @@ def extract(
     action_steps, _ = _matrix("actions", actions)
     if steps == 0 or action_steps != steps:
         raise RequestError("bad_request", f"extract: {steps} states and {action_steps} actions")
-    for row in actions:
-        envs.check_action(env, row)
+    envs.check_actions(env, actions)
     env.hard_reset |= session.xml_forgotten
     session.foreign_model = True
     env.set_ep_meta(dict(ep_meta or {}))

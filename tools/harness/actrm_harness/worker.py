@@ -181,9 +181,8 @@ def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors)
 def step_reply(session: "Session", number: int, actions: wire.Array) -> Answer:
     """Do one action, or one after the other until the task is solved; what the last one led to, and all rewards."""
     envs = environments()
-    rows = actions[None] if actions.ndim == 1 else actions
-    checked = [envs.check_action(session.env, row) for row in rows]
-    if not checked:
+    checked = envs.check_actions(session.env, actions)
+    if not len(checked):
         raise RequestError("bad_action", f"step: no action in a tensor of shape {actions.shape}")
     envs.slim(session)
     result, rewards = envs.steps_session(session, checked)

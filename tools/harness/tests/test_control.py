@@ -192,7 +192,7 @@ def test_steps_together_end_where_the_task_is_solved() -> None:
     session.control = attached(session.env)
     demo = episodes.expert_episode(session, 1_000_001)
     envs.reset(session, 1_000_001, demonstration=True)
-    result, rewards = envs.steps_session(session, list(demo.tensors["actions"]))
+    result, rewards = envs.steps_session(session, demo.tensors["actions"])
     solved = int(np.argmax(demo.tensors["rewards"] > 0))
     assert result.success and solved + 1 < demo.steps
     assert rewards.tobytes() == demo.tensors["rewards"][: solved + 1].tobytes()
