@@ -105,15 +105,33 @@ class Scene:
         return np.array(self.env.sim.data.body_xmat[self.env.sim.model.body_name2id(name)]).reshape(3, 3)
 
 
-class Servo:
-    """Turns a target pose of the hand into an action, with this episode's style, noise and pushes.
+@dataclass(frozen=True, slots=True)
+class Mishaps:
+    """What befalls an expert, each every so many steps on average.
 
-    There is one push, or with `pushed` one every so many steps on average: what the expert does to make up for them is
-    what a policy learns from to make up for errors of its own, where little is forgiven.
+    A push moves the hand for three steps. A fumble makes the fingers do the opposite of what they should for 4 to 13:
+    a thing is lost, or they close on nothing. What the expert does to make up for them is what a policy learns from to
+    make up for errors of its own, where little is forgiven.
     """
 
+    pushed: float = math.inf
+    """Infinite: one push an episode."""
+    fumbled: float = math.inf
+
+
+ONE_PUSH = Mishaps()
+
+
+class Servo:
+    """Turns a target pose of the hand into an action, with this episode's style, noise and mishaps."""
+
     def __init__(
-        self, scene: Scene, rng: np.random.Generator, pace: float = 1.0, turn: float = 0.5, pushed: float = math.inf
+        self,
+        scene: Scene,
+        rng: np.random.Generator,
+        pace: float = 1.0,
+        turn: float = 0.5,
+        mishaps: Mishaps = ONE_PUSH,
     ) -> None:
         self.scene = scene
         self.style = Style.draw(rng)
@@ -123,9 +141,18 @@ class Servo:
         self._rng = rng
         self._noise = np.zeros(6)
         self._time = 0
-        self._pushed = pushed
+        self._pushed = mishaps.pushed
         self._push_at: int = 3 + int(37 * rng.random())
         self._push = self._draw_push()
+        self._fumbled = mishaps.fumbled
+        self._fumble: tuple[int, int] = self._draw_fumble()
+
+    def _draw_fumble(self) -> tuple[int, int]:
+        """The steps between which the fingers do the opposite next."""
+        if not math.isfinite(self._fumbled):
+            return (-1, -1)
+        begin = self._time + int(2 * self._fumbled * self._rng.random())
+        return begin, begin + 4 + int(10 * self._rng.random())
 
     def _draw_push(self) -> Array:
         push = self._rng.normal(size=3)
@@ -143,6 +170,10 @@ class Servo:
         elif self._time == self._push_at + 3 and math.isfinite(self._pushed):
             self._push_at += 4 + int(2 * (self._pushed - 4) * self._rng.random())
             self._push = self._draw_push()
+        if self._fumble[0] <= self._time < self._fumble[1]:
+            grip = -grip
+        elif self._time == self._fumble[1]:
+            self._fumble = self._draw_fumble()
         self._time += 1
         return np.concatenate([np.concatenate([wanted, turn]) + self._noise, [grip]])
 

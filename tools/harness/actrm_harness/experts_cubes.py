@@ -2,10 +2,29 @@
 
 import numpy as np
 
-from actrm_harness.experts import DOWN, Carry, Grasp, Scene, Servo, about_z, hand_yaw, nearest, yaw
+from actrm_harness.experts import DOWN, Carry, Grasp, Mishaps, Scene, Servo, about_z, hand_yaw
 from actrm_harness.wire import Array
 
 TABLE = 0.8
+
+# From a finger to the middle of another cube, and the turns of the hand that are tried, the least first.
+CLEAR = 0.055
+TURNS = tuple(np.radians(side * degrees) for degrees in range(0, 91, 6) for side in (1, -1))
+
+
+def clear_yaw(here: Array, others: list[Array]) -> float:
+    """The least turn of a hand at a cube that keeps its fingers clear of the other cubes, whichever way the cube lies.
+
+    Closing turns the cube between the fingers. What is asked of the hand follows from places alone, and is nothing at
+    all where there is room: that is far easier to learn than a quarter turn's symmetry.
+    """
+
+    def wanting(angle: float) -> float:
+        fingers = [here + about_z(angle) @ np.array([0.0, side, 0.0]) for side in (-0.055, 0.055)]
+        gaps = [float(np.linalg.norm((finger - other)[:2])) for finger in fingers for other in others]
+        return max(CLEAR - min(gaps, default=1.0), 0.0)
+
+    return min(TURNS, key=wanting)
 
 
 class LiftExpert:
@@ -31,20 +50,21 @@ class StackExpert:
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.3)
+        self.servo = Servo(scene, rng, pace=1.3, mishaps=Mishaps(pushed=15.0))
         self.grasp = Grasp(scene, self.servo.style)
-        self.carry = Carry(scene, self.grasp, clear=TABLE + rng.uniform(0.12, 0.14))
+        # a cube that is held by two of its edges is 5.7 cm wide
+        self.carry = Carry(scene, self.grasp, TABLE + rng.uniform(0.12, 0.14), off=(0.062, 0.076))
 
     def act(self) -> Array:
         """The action for the current state."""
-        cube = self.scene.body("cubeA_main")
+        cube, below = self.scene.body("cubeA_main"), self.scene.body("cubeB_main")
+        goal = below + np.array([0.0, 0.0, 0.046])
         hand = hand_yaw(self.scene.hand_rotation)
-        turn = nearest(yaw(self.scene.body_rotation("cubeA_main")), np.pi / 2, hand)
-        goal = self.scene.body("cubeB_main") + np.array([0.0, 0.0, 0.046])
+        turn = hand
         if self.carry.update(cube, goal, flat=0.012, height=0.006):
             target, grip = self.carry.let_go()
-            turn = hand
         else:
+            turn = clear_yaw(cube, [below])
             target, grip = self.grasp.reach(cube, turn - hand)
             if self.grasp.held:
                 target = self.carry.bring(cube, goal)
@@ -54,10 +74,6 @@ class StackExpert:
 
 class TowerExpert:
     """Build a tower of three cubes in the order that the environment asks for."""
-
-    # From a finger to the middle of another cube, and the turns of the hand that are tried, the least first.
-    CLEAR = 0.055
-    TURNS = tuple(np.radians(side * degrees) for degrees in range(0, 91, 6) for side in (1, -1))
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
@@ -105,18 +121,6 @@ class TowerExpert:
         return float(np.linalg.norm(self.scene.hand - self.scene.body(cube))) > 0.06
 
     def _grip_yaw(self, cube: str) -> float:
-        """The least turn of the hand that keeps its fingers clear of the other cubes, whichever way the cube lies.
-
-        Closing turns the cube between the fingers. What is asked of the hand follows from places alone, and is
-        nothing at all where there is room: that is far easier to learn than a quarter turn's symmetry.
-        """
         here = self.scene.body(cube)
         others = [self.scene.body(name) for name in self.order if name != cube]
-        others = [other for other in others if float(other[2]) > float(here[2]) - 0.03]
-
-        def wanting(angle: float) -> float:
-            fingers = [here + about_z(angle) @ np.array([0.0, side, 0.0]) for side in (-0.055, 0.055)]
-            gaps = [float(np.linalg.norm((finger - other)[:2])) for finger in fingers for other in others]
-            return max(self.CLEAR - min(gaps, default=1.0), 0.0)
-
-        return min(self.TURNS, key=wanting)
+        return clear_yaw(here, [other for other in others if float(other[2]) > float(here[2]) - 0.03])

@@ -8,6 +8,7 @@ from actrm_harness.experts import (
     OPEN,
     Carry,
     Grasp,
+    Mishaps,
     Scene,
     Servo,
     about_z,
@@ -32,7 +33,7 @@ class CanExpert:
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4, pushed=15.0)
+        self.servo = Servo(scene, rng, pace=1.4, mishaps=Mishaps(pushed=15.0))
         self.grasp = Grasp(scene, self.servo.style, tall=0.04, mouth=(0.006, 0.018))
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
 
@@ -64,7 +65,7 @@ class SquareExpert:
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4, turn=0.8, pushed=15.0)
+        self.servo = Servo(scene, rng, pace=1.4, turn=0.8, mishaps=Mishaps(pushed=15.0, fumbled=100.0))
         # the handle is long and thin: who waits for its very middle may wait for ever
         self.grasp = Grasp(scene, self.servo.style, tall=0.02, mouth=(0.012, 0.025), close=(0.018, 0.015))
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
