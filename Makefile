@@ -57,6 +57,10 @@ demo: build ## the whole line: demonstrations, data set, training, evaluation, l
 study-robots: build ## ACT on every robot task: 200 demonstrations, training, 100 unseen seeds (hours; goes on where it was)
 	@tools/study_robots.sh
 
+.PHONY: study-thinking
+study-thinking: build ## ACT beside ACTRM beside ACTRM that may not think, from 25 to 200 demonstrations (hours; goes on where it was)
+	@tools/study_thinking.sh
+
 .PHONY: test
 test: build ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace

@@ -187,6 +187,12 @@ impl Trainer {
         self.optimiser.set_threads(threads);
     }
 
+    /// Threads that a step is spread over, as far as the machine has them.
+    pub fn threads(&self) -> usize {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        self.threads.min(SHARDS).min(cores)
+    }
+
     /// The model as it is now.
     pub fn model(&self) -> &dyn PolicyModel {
         self.model.as_ref()

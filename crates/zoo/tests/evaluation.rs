@@ -106,7 +106,7 @@ fn assert_same(a: &StoredEvaluation, b: &StoredEvaluation) {
 }
 
 #[test]
-fn one_and_two_workers_shards_and_resuming_give_the_same_bytes() {
+fn one_two_and_four_workers_shards_and_resuming_give_the_same_bytes() {
     let _workers = beside_others();
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
@@ -121,6 +121,10 @@ fn one_and_two_workers_shards_and_resuming_give_the_same_bytes() {
     assert!(matches!(again.unwrap(), EvaluationEnd::Complete(_)));
     assert_eq!(episodes, 0);
     drop(one);
+
+    let mut four = Pool::start(options("Lift", 4)).unwrap();
+    assert_same(&run(&mut four, &at("four"), &wanted(6)), &straight);
+    drop(four);
 
     let stop = Arc::new(AtomicBool::new(false));
     let mut pool_options = options("Lift", 2);

@@ -396,7 +396,7 @@ impl<'a> Run<'a> {
                 batch_size: section.batch_size as u64,
                 seed: section.seed,
                 minutes: self.seconds() / 60.0,
-                threads: std::thread::available_parallelism().map_or(1, usize::from) as u64,
+                threads: candle_core::utils::get_num_threads() as u64,
                 curve: loop_parts::curve(self.metrics.rows()),
             }),
             versions: crate::versions(),

@@ -382,7 +382,7 @@ impl<'a> Run<'a> {
                 batch_size: section.batch_size as u64,
                 seed: section.seed,
                 minutes: self.seconds() / 60.0,
-                threads: std::thread::available_parallelism().map_or(1, usize::from) as u64,
+                threads: self.trainer.threads() as u64,
                 curve: curve(self.metrics.rows()),
             }),
             versions: crate::versions(),
