@@ -21,7 +21,10 @@ fn every_entry_opens_and_has_a_row_on_the_leaderboard() {
     for entry in &entries {
         // opening checks every file's hash, every tensor's name and shape
         succeeds(&mut zoo(["show", &format!("{entry}@1"), "--zoo", text(&shipped)]));
-        assert!(board.lines().any(|row| row.starts_with(&format!("{entry},1,"))), "{entry} is not on the board:\n{board}");
+        assert!(
+            board.lines().any(|row| row.starts_with(&format!("{entry},1,"))),
+            "{entry} is not on the board:\n{board}"
+        );
     }
 }
 

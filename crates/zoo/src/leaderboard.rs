@@ -84,6 +84,13 @@ impl LeaderboardRow {
         ratio(self.successes as f64, self.episodes).unwrap_or(0.0)
     }
 
+    /// The success rate in whole percents, in tenths where those would say that all or none succeeded.
+    pub fn percent(&self) -> String {
+        let rate = self.success_rate() * 1e2;
+        let misleading = 0 < self.successes && self.successes < self.episodes && (rate < 0.5 || rate >= 99.5);
+        if misleading { format!("{:.1}%", rate.clamp(0.1, 99.9)) } else { format!("{rate:.0}%") }
+    }
+
     /// The 95% Wilson interval of the success rate.
     pub fn interval(&self) -> (f64, f64) {
         wilson_interval(self.successes, self.episodes)
@@ -239,7 +246,7 @@ pub fn to_table(rows: &[LeaderboardRow]) -> Vec<[String; TABLE_COLUMNS.len()]> {
                 row.entry.to_string(),
                 row.task.clone(),
                 success_text(row),
-                format!("{:.0}% [{:.0}-{:.0}]", row.success_rate() * 1e2, low * 1e2, high * 1e2),
+                format!("{} [{:.0}-{:.0}]", row.percent(), low * 1e2, high * 1e2),
                 optional(row.mean_return(), 2),
                 optional(row.mean_steps_to_success(), 1),
                 count_text(row.training.parameters),
@@ -309,6 +316,23 @@ mod tests {
         assert_eq!(quantile(&[7.0], 0.95), 7.0);
         assert_eq!(quantile(&[], 0.5), 0.0);
     }
+
+    #[test]
+    fn a_rate_is_not_rounded_to_all_or_none() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut row = board(dir.path()).remove(0);
+        row.episodes = 200;
+        let texts = [(0, "0%"), (1, "0.5%"), (2, "1%"), (151, "76%"), (198, "99%"), (199, "99.5%"), (200, "100%")];
+        for (successes, text) in texts {
+            row.successes = successes;
+            assert_eq!(row.percent(), text);
+        }
+        (row.successes, row.episodes) = (99_999, 100_000);
+        assert_eq!(row.percent(), "99.9%");
+        (row.successes, row.episodes) = (1, 100_000);
+        assert_eq!(row.percent(), "0.1%");
+    }
+
     fn board(folder: &std::path::Path) -> Vec<LeaderboardRow> {
         for (name, version, count) in [("lift-act", 1, 20), ("lift-act", 2, 4), ("lift, \"b\"", 1, 20)] {
             finished(folder, &sample(name, version, count));

@@ -33,7 +33,7 @@ pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
         let name = escape(&row.entry.to_string());
         let _ = write!(
             svg,
-            r##"<g><title>{name}: {}/{}, 95% interval {:.1}% to {:.1}%</title><text class="label" x="0" y="{:.1}">{name}</text><line x1="{low_x:.1}" x2="{high_x:.1}" y1="{y:.1}" y2="{y:.1}" stroke="var(--good-soft)" stroke-width="12" stroke-linecap="round"/><circle cx="{rate_x:.1}" cy="{y:.1}" r="5.5" fill="var(--good)"/><text x="{:.1}" y="{:.1}" text-anchor="end">{}/{} · {:.0}%</text></g>"##,
+            r##"<g><title>{name}: {}/{}, 95% interval {:.1}% to {:.1}%</title><text class="label" x="0" y="{:.1}">{name}</text><line x1="{low_x:.1}" x2="{high_x:.1}" y1="{y:.1}" y2="{y:.1}" stroke="var(--good-soft)" stroke-width="12" stroke-linecap="round"/><circle cx="{rate_x:.1}" cy="{y:.1}" r="5.5" fill="var(--good)"/><text x="{:.1}" y="{:.1}" text-anchor="end">{}/{} · {}</text></g>"##,
             row.successes,
             row.episodes,
             low * 1e2,
@@ -43,7 +43,7 @@ pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
             y + 4.0,
             row.successes,
             row.episodes,
-            row.success_rate() * 1e2,
+            row.percent(),
         );
     }
     svg.push_str("</svg>");
