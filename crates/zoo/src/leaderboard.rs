@@ -87,8 +87,12 @@ impl LeaderboardRow {
     /// The success rate in whole percents, in tenths where those would say that all or none succeeded.
     pub fn percent(&self) -> String {
         let rate = self.success_rate() * 1e2;
-        let misleading = 0 < self.successes && self.successes < self.episodes && (rate < 0.5 || rate >= 99.5);
-        if misleading { format!("{:.1}%", rate.clamp(0.1, 99.9)) } else { format!("{rate:.0}%") }
+        let whole = format!("{rate:.0}");
+        let some = 0 < self.successes && self.successes < self.episodes;
+        if some && (whole == "0" || whole == "100") {
+            return format!("{:.1}%", rate.clamp(0.1, 99.9));
+        }
+        format!("{whole}%")
     }
 
     /// The 95% Wilson interval of the success rate.
