@@ -1,6 +1,6 @@
 """What we write, opened by the others; what the others write, opened by us; shards run by Ray. Run by `make interop`.
 
-LeRobot, robomimic and Ray are the released packages from PyPI. Every check compares numbers with the source file, and any
+LeRobot, robomimic and Ray are the released packages from PyPI. Every check compares numbers with their source, and any
 difference ends the run with exit code 1.
 """
 
