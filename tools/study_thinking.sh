@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Does thinking help, and from how few demonstrations? ACT, ACTRM, and ACTRM that may not think (one supervision step
 # instead of three: the same parameters), all trained and evaluated alike. Called by `make study-thinking`; TASKS, DEMOS,
-# POLICIES, EPISODES, SEED_START and STEPS change the sizes.
+# POLICIES, SEEDS (of the training), EPISODES, SEED_START and STEPS change the sizes.
 #
 # Everything lies in out/thinking. Killed at any moment, it goes on where it was; what is there is not made again. It
 # ends with a leaderboard, as Markdown in out/thinking/results.md.
@@ -27,14 +27,17 @@ for task in ${TASKS:-stack pickplacecan}; do
         fi
         for policy in ${POLICIES:-act unthinking actrm}; do
             read -ra changes <<<"${policies[$policy]:?no such policy; there are: ${!policies[*]}}"
-            entry=$task-$policy-$demos run=$out/runs/$task-$policy-$demos
-            printf '\n\033[1m%s\033[0m\n' "$entry"
-            if [[ ! -e $out/zoo/$entry/1 ]]; then
-                arguments=(train "${changes[0]}_$task" --data "$file" --zoo "$out/zoo" --run "$run" "entry=$entry")
-                if [[ -e $run/config.toml ]]; then arguments+=(--resume); fi
-                "$bin/actrm-zoo" "${arguments[@]}" "${common[@]}" "${changes[@]:1}"
-            fi
-            "$bin/actrm-zoo" eval "$entry" --episodes "${EPISODES:-100}" --seed-start "${SEED_START:-10000}" --zoo "$out/zoo"
+            for seed in ${SEEDS:-1 2 3}; do
+                entry=$task-$policy-$demos-seed$seed run=$out/runs/$task-$policy-$demos-seed$seed
+                printf '\n\033[1m%s\033[0m\n' "$entry"
+                if [[ ! -e $out/zoo/$entry/1 ]]; then
+                    arguments=(train "${changes[0]}_$task" --data "$file" --zoo "$out/zoo" --run "$run" "entry=$entry")
+                    if [[ -e $run/config.toml ]]; then arguments+=(--resume); fi
+                    "$bin/actrm-zoo" "${arguments[@]}" "train.seed=$seed" "${common[@]}" "${changes[@]:1}"
+                fi
+                "$bin/actrm-zoo" eval "$entry" --episodes "${EPISODES:-100}" --seed-start "${SEED_START:-10000}" \
+                    --zoo "$out/zoo"
+            done
         done
     done
 done
