@@ -14,8 +14,7 @@ demos=${DEMOS:-200}
 episodes=${EPISODES:-100}
 mkdir -p "$out"
 
-declare -A names=([lift]=Lift [stack]=Stack [pickplacecan]=PickPlaceCan [door]=Door [stackthreecubes]=StackThreeCubes
-    [nutassemblysquare]=NutAssemblySquare [stackcolor]=StackColor)
+source tools/robot_tasks.sh
 
 step() { # step TEXT COMMAND...: say what is done, show the command, do it
     printf '\n\033[1m%s\033[0m\n$ %s\n' "$1" "${*:2}"

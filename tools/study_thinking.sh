@@ -12,8 +12,7 @@ out=${OUT_DIR:-out/thinking}
 mkdir -p "$out"
 common=("train.steps=${STEPS:-4000}" train.batch_size=32 train.ema_decay=0.99 policy.use_vae=false)
 
-declare -A names=([lift]=Lift [stack]=Stack [pickplacecan]=PickPlaceCan [door]=Door [stackthreecubes]=StackThreeCubes
-    [nutassemblysquare]=NutAssemblySquare [stackcolor]=StackColor)
+source tools/robot_tasks.sh
 # experiment, then what is changed in it
 declare -A policies=([act]=act [actrm]=actrm [unthinking]="actrm policy.reasoning.supervision_steps=1")
 
