@@ -3,7 +3,7 @@
 //! [`Source`] reads a file or folder of demonstrations of any known layout, [`convert`] makes a LeRobotDataset v3.0
 //! directory of it, [`export`] rebuilds the file from that, [`Dataset`] opens a directory (ours or LeRobot's) with its
 //! numeric columns in memory, and [`Windows`] cuts training samples out of them. [`RobomimicWriter`] writes
-//! demonstrations that were just collected.
+//! demonstrations that were just collected, [`write_puzzles`] a table of puzzles.
 //!
 //! It is the only crate that knows HDF5. It knows nothing of models, tensors or simulators, starts no process but its
 //! own isolated reader, and prints nothing.
@@ -14,6 +14,7 @@
 mod error;
 mod lerobot;
 mod plan;
+mod puzzle_table;
 pub mod rotation;
 pub mod shuffle;
 mod source;
@@ -28,6 +29,7 @@ pub use lerobot::{
     export, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
+pub use puzzle_table::{PuzzleSet, write_puzzles};
 pub use source::{RobomimicWriter, Source, WriteOptions, isolation};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};

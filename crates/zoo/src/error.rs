@@ -216,7 +216,7 @@ pub enum ZooError {
     // ---- rollouts and results ----------------------------------------------------------------
     /// A rollout in a worker process.
     #[error(transparent)]
-    Rollout(#[from] crate::rollout::RolloutError),
+    Rollout(#[from] rollout::RolloutError),
     /// A table of results cannot be read or written.
     #[error("cannot {operation} {}", path.display())]
     Table {
@@ -232,28 +232,6 @@ pub enum ZooError {
     ResultsBusy {
         /// The evaluation's folder.
         folder: PathBuf,
-    },
-    /// Another process collects demonstrations into the same folder.
-    #[error("folder {} is in use by another collection", folder.display())]
-    CollectionBusy {
-        /// The collection's folder.
-        folder: PathBuf,
-    },
-    /// A folder holds attempts of another collection.
-    #[error(
-        "{} holds attempts of another collection: {what}: expected {expected}, found {found}; \
-         remove it, or collect into another file",
-        folder.display()
-    )]
-    CollectionDiffers {
-        /// The collection's folder.
-        folder: PathBuf,
-        /// The field that differs.
-        what: String,
-        /// As it is now.
-        expected: String,
-        /// As it is in the folder.
-        found: String,
     },
     /// What is stored and what was found now are not the same.
     #[error("results in {}: {what} differs: stored {expected}, now {found}", folder.display())]
@@ -309,7 +287,7 @@ pub enum ZooError {
 
 impl ZooError {
     /// Builds the closure that `map_err` wants around a file operation.
-    pub(crate) fn io(operation: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+    pub fn io(operation: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io { operation, path, source }
     }

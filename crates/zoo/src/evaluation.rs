@@ -3,6 +3,7 @@
 //! An episode's outcome depends on task, seed, entry and protocol. It does not depend on the worker, the
 //! number of workers, the order, what ran before, or what had to be run again.
 
+mod agent;
 mod subject;
 
 use std::ops::ControlFlow;
@@ -10,12 +11,12 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use models::Actor;
+use rollout::{EpisodePlan, FaultKind, Image, JobError, Pool, RolloutError, Worker, WorkerFault};
 
+pub use self::agent::{PolicyAgent, QueryTimes};
 pub use self::subject::Subject;
 use crate::ZooError;
 use crate::results::{EpisodeRecord, EpisodeTiming, ResultsFolder, Seeds, Shard, StoredEvaluation};
-use crate::rollout::{EpisodePlan, FaultKind, Image, JobError, Pool, QueryTimes, RolloutError, Worker, WorkerFault};
 
 /// The first seed of an evaluation unless another is asked for: demonstrations never use these.
 pub const FIRST_SEED: u64 = 10_000;
@@ -137,17 +138,17 @@ pub fn run_episodes(
     store: &(dyn Fn(EpisodeRecord, EpisodeTiming) -> Result<(), ()> + Sync),
     deliver: &mut dyn FnMut(Result<EpisodeRecord, RolloutError>),
 ) -> Result<(), RolloutError> {
-    let plan = EpisodePlan::new(pool.ready(), &subject.state_keys, &subject.env_keys, max_steps)?;
+    let plan = EpisodePlan::new(pool.ready(), subject.keys(), max_steps)?;
     let seed_of = |job: u64| seeds[usize::try_from(job).expect("a job is an index of seeds")];
     let failed = |seed, operation, source| RolloutError::Policy { seed, step: 0, operation, source };
     let state = || {
-        let made = subject.actor();
+        let made = subject.agent();
         made.map_err(|source| failed(seeds[0], "building the policy", Box::new(source)))
     };
-    let work = |(actor, times): &mut (Box<dyn Actor>, QueryTimes), worker: &mut Worker, job| {
+    let work = |(agent, times): &mut (PolicyAgent, QueryTimes), worker: &mut Worker, job| {
         let seed = seed_of(job);
         times.take();
-        let outcome = plan.run(worker, actor.as_mut(), seed, None)?;
+        let outcome = plan.run(worker, agent, seed, None)?;
         let episode = EpisodeRecord {
             seed,
             success: outcome.success,
@@ -188,21 +189,21 @@ pub fn film(
 ) -> Result<(), RolloutError> {
     let max_steps = subject.max_steps.unwrap_or(pool.ready().max_steps);
     let task = &pool.ready().task.clone();
-    let plan = EpisodePlan::new(pool.ready(), &subject.state_keys, &subject.env_keys, max_steps)?;
+    let plan = EpisodePlan::new(pool.ready(), subject.keys(), max_steps)?;
     let seed_of = |job: u64| seeds[usize::try_from(job).expect("a job is an index of seeds")];
     let state = || {
-        subject.actor().map_err(|source| {
+        subject.agent().map_err(|source| {
             let operation = "building the policy";
             RolloutError::Policy { seed: seeds[0], step: 0, operation, source: Box::new(source) }
         })
     };
-    let work = |(actor, _): &mut (Box<dyn Actor>, QueryTimes), worker: &mut Worker, job| {
+    let work = |(agent, _): &mut (PolicyAgent, QueryTimes), worker: &mut Worker, job| {
         let mut images = Vec::new();
         let mut shoot = |worker: &mut Worker| -> Result<(), JobError> {
             images.push(worker.render(&view.camera, view.height, view.width).map_err(|fault| unhelpable(task, fault))?);
             Ok(())
         };
-        let outcome = plan.run(worker, actor.as_mut(), seed_of(job), Some(&mut shoot))?;
+        let outcome = plan.run(worker, agent, seed_of(job), Some(&mut shoot))?;
         Ok((images, outcome.success))
     };
     let mut failure = None;

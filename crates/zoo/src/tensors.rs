@@ -13,10 +13,13 @@ use crate::ZooError;
 const METADATA_KEY: &str = "actrm";
 
 /// Tensors and the JSON stored beside them.
-pub(crate) type Contents = (BTreeMap<String, Tensor>, serde_json::Value);
+pub type Contents = (BTreeMap<String, Tensor>, serde_json::Value);
 
 /// Serialises `tensors` with `metadata` (whose keys `serde_json` keeps sorted).
-pub(crate) fn to_bytes(
+///
+/// # Errors
+/// A tensor of a type that such files do not hold; `path` is named.
+pub fn to_bytes(
     path: &Path,
     tensors: &BTreeMap<String, Tensor>,
     metadata: &serde_json::Value,
@@ -55,7 +58,10 @@ fn raw(tensor: &Tensor) -> candle_core::Result<(Dtype, Vec<u8>)> {
 }
 
 /// Parses the bytes of `path`; the metadata is `null` where there is none of ours.
-pub(crate) fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Contents, ZooError> {
+///
+/// # Errors
+/// Bytes that are something else.
+pub fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Contents, ZooError> {
     let failed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
     let not_ours = |e: safetensors::SafeTensorError| failed(format!("not a safetensors file: {e}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(not_ours)?;
@@ -92,7 +98,10 @@ fn tensor(view: &TensorView<'_>) -> candle_core::Result<Tensor> {
 }
 
 /// Reads a safetensors file.
-pub(crate) fn read(path: &Path) -> Result<Contents, ZooError> {
+///
+/// # Errors
+/// A file that cannot be read or is something else.
+pub fn read(path: &Path) -> Result<Contents, ZooError> {
     let bytes = std::fs::read(path).map_err(ZooError::io("read", path))?;
     from_bytes(path, &bytes)
 }

@@ -11,11 +11,11 @@ use std::time::Duration;
 
 use common::{impatient, options, spec, worker_processes, wrapped};
 use models::{ActionChunk, Dims, ModelError, Observation, Policy};
+use rollout::{Pool, PoolOptions, RolloutError, TimeLimits};
 use rustix::process::{Pid, Signal, kill_process};
 use zoo::ZooError;
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate};
 use zoo::results::{EntryIdentity, Execution, Seeds, Shard, StoredEvaluation, TrainingFacts, merge_shards};
-use zoo::rollout::{Pool, PoolOptions, RolloutError, TimeLimits};
 
 /// The test that strikes at workers finds them among this process' children: meanwhile no other test may have any.
 static WORKERS: RwLock<()> = RwLock::new(());

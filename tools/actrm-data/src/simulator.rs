@@ -3,10 +3,10 @@
 
 use anyhow::{Context, Result, bail};
 use dataset::{Array, Demo, Dtype};
+use rollout::{FrameTensor, Pool, PoolOptions, RecordedEpisode, WorkerSpec};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use zoo::rollout::{self, FrameTensor, Pool, PoolOptions, RecordedEpisode, WorkerSpec};
 
 /// Exit code of a program that an interrupt ended, as shells have it.
 pub const INTERRUPTED: u8 = 130;

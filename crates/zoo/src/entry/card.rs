@@ -4,14 +4,25 @@ use std::fmt::Write;
 
 use super::EntryMeta;
 
+/// What the card of another kind of entry says differently from a robot policy's.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct CardWords {
+    /// Rows in place of the observations that a policy reads.
+    pub rows: Vec<(String, String)>,
+    /// What a batch is made of; empty: windows.
+    pub examples: String,
+    /// What to do with it: the commands after "Use:", with `{id}` for the entry; empty: a robot policy's, and what it is intended for.
+    pub usage: String,
+}
+
 /// Renders the README.md of an entry.
-pub(super) fn render(meta: &EntryMeta) -> String {
+pub(super) fn render(meta: &EntryMeta, words: &CardWords) -> String {
     let mut card = String::new();
-    render_into(meta, &mut card).expect("writing into a String cannot fail");
+    render_into(meta, words, &mut card).expect("writing into a String cannot fail");
     card
 }
 
-fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
+fn render_into(meta: &EntryMeta, words: &CardWords, card: &mut String) -> std::fmt::Result {
     writeln!(card, "# {}\n", meta.id())?;
     if !meta.description.is_empty() {
         writeln!(card, "{}\n", meta.description)?;
@@ -22,18 +33,12 @@ fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
     row("task", meta.task.clone())?;
     row("experiment", meta.experiment.clone())?;
     row("parameters", grouped(meta.parameters))?;
-    match &meta.puzzle {
-        None => {
-            row("observation.state", keys(&meta.state_keys))?;
-            row("observation.environment_state", keys(&meta.env_keys))?;
-        }
-        Some(puzzle) => {
-            row("puzzles trained on", grouped(puzzle.train_puzzles))?;
-            if puzzle.givens[1] > 0 {
-                row("givens", format!("{} to {}", puzzle.givens[0], puzzle.givens[1]))?;
-            }
-            row("processor time", format!("{:.0} s, validation left out", puzzle.cpu_seconds))?;
-        }
+    if meta.is_robot_policy() {
+        row("observation.state", keys(&meta.state_keys))?;
+        row("observation.environment_state", keys(&meta.env_keys))?;
+    }
+    for (what, value) in &words.rows {
+        row(what, value.clone())?;
     }
     if let Some(data) = &meta.data {
         row(
@@ -59,7 +64,7 @@ fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
                 "{} steps of {} {}, seed {}, {:.1} minutes on {} threads",
                 grouped(training.steps),
                 training.batch_size,
-                if meta.puzzle.is_some() { "puzzles" } else { "windows" },
+                if words.examples.is_empty() { "windows" } else { &words.examples },
                 training.seed,
                 training.minutes,
                 training.threads
@@ -75,12 +80,11 @@ fn render_into(meta: &EntryMeta, card: &mut String) -> std::fmt::Result {
     }
     let versions: Vec<String> = meta.versions.iter().map(|(n, v)| format!("{n} {v}")).collect();
     row("made with", versions.join(", "))?;
-    if meta.puzzle.is_some() {
+    if !words.usage.is_empty() {
         return writeln!(
             card,
-            "\nUse: `actrm-zoo eval {id}`, `actrm-zoo trace {id}`. Provenance and the hash of every file: \
-             `entry.json`; the whole experiment: `config.toml`.",
-            id = meta.id()
+            "\nUse: {}. Provenance and the hash of every file: `entry.json`; the whole experiment: `config.toml`.",
+            words.usage.replace("{id}", &meta.id().to_string())
         );
     }
     writeln!(
@@ -101,7 +105,7 @@ fn keys(names: &[String]) -> String {
 }
 
 /// 1503751 as `1,503,751`.
-fn grouped(number: u64) -> String {
+pub fn grouped(number: u64) -> String {
     let digits = number.to_string();
     let mut text = String::new();
     for (i, digit) in digits.chars().enumerate() {
@@ -122,7 +126,7 @@ mod tests {
         let mut meta = super::super::test_draft("lift-act").meta;
         meta.version = 3;
         meta.parameters = 1_503_751;
-        let card = render(&meta);
+        let card = render(&meta, &CardWords::default());
         for expected in [
             "# lift-act@3",
             "| parameters | 1,503,751 |",

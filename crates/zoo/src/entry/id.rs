@@ -61,7 +61,7 @@ impl FromStr for EntryRequest {
 }
 
 /// Refuses names that cannot be a folder's, or that the zoo uses itself.
-pub(crate) fn check_name(name: &str) -> Result<(), ZooError> {
+pub fn check_name(name: &str) -> Result<(), ZooError> {
     let refuse = |reason| Err(ZooError::EntryName { name: name.to_owned(), reason });
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-_.".contains(c);
     if RESERVED.contains(&name) {

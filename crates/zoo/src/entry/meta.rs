@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use models::Dims;
 use serde::{Deserialize, Serialize};
 
-use crate::puzzle::PuzzleMeta;
 use crate::sha256_hex;
 
 use super::EntryId;
@@ -44,9 +43,12 @@ pub struct EntryMeta {
     pub dims: Dims,
     /// The demonstrations; `None` for an imported entry.
     pub data: Option<DataMeta>,
-    /// What it was trained on, if it solves puzzles.
+    /// What it is, if no robot policy.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub puzzle: Option<PuzzleMeta>,
+    pub kind: Option<String>,
+    /// What only entries of its kind record; whoever makes that kind reads it.
+    #[serde(default, alias = "puzzle", skip_serializing_if = "Option::is_none")]
+    pub section: Option<serde_json::Value>,
     /// How it was trained; `None` for an imported entry.
     pub training: Option<TrainingMeta>,
     /// Versions of the software that made it.
@@ -109,6 +111,11 @@ pub struct FileMeta {
 }
 
 impl EntryMeta {
+    /// Whether it is a policy for a robot's task.
+    pub fn is_robot_policy(&self) -> bool {
+        self.kind.is_none() && self.section.is_none()
+    }
+
     /// `name@version`.
     pub fn id(&self) -> EntryId {
         EntryId { name: self.name.clone(), version: self.version }

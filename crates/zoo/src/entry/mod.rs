@@ -12,15 +12,15 @@ mod policy;
 mod seal;
 mod subject;
 
-pub(crate) use id::check_name;
-pub use id::{EntryId, EntryRequest};
+pub use card::{CardWords, grouped};
+pub use id::{EntryId, EntryRequest, check_name};
 pub use meta::{CurvePoint, DataMeta, EntryMeta, FileMeta, TrainingMeta};
 pub use open::Entry;
 pub use policy::{EntryPolicy, LoadedEntry};
 pub use seal::EntryDraft;
 #[cfg(test)]
 pub(crate) use seal::tests::draft as test_draft;
-pub(crate) use subject::training_facts;
+pub use subject::training_facts;
 
 /// The weights.
 pub const MODEL_FILE: &str = "model.safetensors";

@@ -28,13 +28,13 @@ impl Entry {
     /// # Errors
     /// What does not fit, by name.
     pub fn load(&self) -> Result<LoadedEntry, ZooError> {
-        if self.meta().puzzle.is_some() {
+        if !self.meta().is_robot_policy() {
             return Err(ZooError::UnfitEntry {
                 entry: self.id().to_string(),
                 task: self.meta().task.clone(),
                 what: "kind of entry".to_owned(),
                 expected: "a robot policy".to_owned(),
-                found: "a puzzle solver".to_owned(),
+                found: self.meta().kind.clone().unwrap_or_else(|| "another kind".to_owned()),
             });
         }
         let experiment = Experiment::from_toml(&self.id().to_string(), &self.config_text()?)?;

@@ -10,7 +10,9 @@ use crate::files::sync_folder;
 use crate::{ZooError, sha256_hex};
 
 use super::meta::{FORMAT, seal_text};
-use super::{CARD_FILE, CONFIG_FILE, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE, NORMALISER_FILE, card, id};
+use super::{
+    CARD_FILE, CONFIG_FILE, CardWords, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE, NORMALISER_FILE, card, id,
+};
 
 /// An entry before it has a version.
 #[derive(Debug, Clone)]
@@ -23,6 +25,8 @@ pub struct EntryDraft {
     pub config: String,
     /// Content of `normaliser.safetensors`.
     pub normaliser: Vec<u8>,
+    /// What its model card says in other words than a robot policy's.
+    pub card: CardWords,
 }
 
 impl EntryDraft {
@@ -45,7 +49,7 @@ impl EntryDraft {
         self.meta.format = FORMAT;
         self.meta.version = newest + 1;
         self.meta.files = BTreeMap::new();
-        let card = card::render(&self.meta);
+        let card = card::render(&self.meta, &self.card);
         let contents: [(&str, &[u8]); 4] = [
             (MODEL_FILE, &self.model),
             (CONFIG_FILE, self.config.as_bytes()),
@@ -131,7 +135,8 @@ pub(crate) mod tests {
                     train_frames: 2000,
                     valid_episodes: 5,
                 }),
-                puzzle: None,
+                kind: None,
+                section: None,
                 training: Some(TrainingMeta {
                     steps: 3,
                     batch_size: 64,
@@ -146,6 +151,7 @@ pub(crate) mod tests {
             model: b"weights".to_vec(),
             config: "[task]\nname = \"Lift\"\n".to_owned(),
             normaliser: b"statistics".to_vec(),
+            card: CardWords::default(),
         }
     }
 

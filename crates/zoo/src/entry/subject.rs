@@ -6,16 +6,15 @@ use crate::results::{EntryIdentity, Execution, TrainingFacts};
 use super::{EntryMeta, LoadedEntry};
 
 /// Where an entry comes from, as results record it.
-pub(crate) fn training_facts(meta: &EntryMeta) -> TrainingFacts {
+pub fn training_facts(meta: &EntryMeta) -> TrainingFacts {
     let (training, data) = (meta.training.as_ref(), meta.data.as_ref());
-    let drawn = meta.puzzle.as_ref().map(|_| format!("puzzles of {}", meta.task));
     TrainingFacts {
         policy: meta.policy.clone(),
         parameters: meta.parameters,
         steps: training.map_or(0, |t| t.steps),
         minutes: training.map_or(0.0, |t| t.minutes),
         seed: training.map_or(0, |t| t.seed),
-        data_set: data.map(|d| d.name.clone()).or(drawn).unwrap_or_else(|| "not recorded".to_owned()),
+        data_set: data.map(|d| d.name.clone()).unwrap_or_else(|| "not recorded".to_owned()),
         data_fingerprint: data.map_or_else(String::new, |d| d.fingerprint.clone()),
         data_simulator: meta.env_version.clone(),
         demos: data.map_or(0, |d| d.train_episodes),

@@ -1,11 +1,12 @@
 //! What is evaluated: an entry's policy with all that an evaluation has to know of it.
 
 use models::{Actor, ModelError, Policy, RecedingHorizon, TemporalEnsemble};
+use rollout::{EpisodePlan, Ready};
 
 use super::EvaluationOptions;
+use super::agent::{PolicyAgent, QueryTimes, Timed};
 use crate::ZooError;
 use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, TrainingFacts};
-use crate::rollout::{EpisodePlan, QueryTimes, Ready, Timed};
 
 /// The entry under evaluation, as far as an evaluation needs to know it.
 pub struct Subject<'a> {
@@ -65,7 +66,7 @@ impl Subject<'_> {
             let shapes = keys.iter().filter_map(|key| ready.observations.get(key));
             shapes.map(|shape| shape.iter().product::<usize>()).sum()
         };
-        EpisodePlan::new(ready, &self.state_keys, &self.env_keys, 1)?;
+        EpisodePlan::new(ready, self.keys(), 1)?;
         for (what, expected, found) in [
             ("length of the state", self.dims.state, size(&self.state_keys)),
             ("length of the environment's state", self.dims.environment_state, size(&self.env_keys)),
@@ -84,18 +85,23 @@ impl Subject<'_> {
         Ok(())
     }
 
-    /// An actor of its own for one environment, and where its queries' durations go.
+    /// The observations that it reads.
+    pub fn keys(&self) -> impl Iterator<Item = &String> {
+        self.state_keys.iter().chain(&self.env_keys)
+    }
+
+    /// An agent of its own for one environment, and where its queries' durations go.
     ///
     /// # Errors
     /// The policy cannot be built.
-    pub fn actor(&self) -> Result<(Box<dyn Actor>, QueryTimes), ModelError> {
+    pub fn agent(&self) -> Result<(PolicyAgent, QueryTimes), ModelError> {
         let times = QueryTimes::default();
         let policy = Timed::new((self.policy)()?, times.clone());
         let actor: Box<dyn Actor> = match self.execution {
             Execution::RecedingHorizon { n_action_steps } => Box::new(RecedingHorizon::new(policy, n_action_steps)?),
             Execution::TemporalEnsemble { coefficient } => Box::new(TemporalEnsemble::new(policy, coefficient)?),
         };
-        Ok((actor, times))
+        Ok((PolicyAgent::new(actor, &self.state_keys, &self.env_keys), times))
     }
 }
 

@@ -7,7 +7,7 @@ use candle_core::Tensor;
 use models::lerobot::{self, LerobotAct};
 use models::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, PolicyConfig, STATE};
 
-use crate::entry::{EntryDraft, EntryId, EntryMeta};
+use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta};
 use crate::experiment::{DataSection, Experiment, NormalisationSection, RolloutSection, TaskSection};
 use crate::run::TrainSection;
 use crate::{ZooError, tensors};
@@ -82,6 +82,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     let statistics = normaliser.tensors().map_err(experiment.model_error("store the normaliser of"))?;
     let about = serde_json::json!({"format": 1, "policy": experiment.policy_type()});
     let draft = EntryDraft {
+        card: CardWords::default(),
         meta: EntryMeta {
             format: 0,
             name: options.name.clone(),
@@ -97,7 +98,8 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             env_keys: experiment.data.env_keys.clone(),
             dims,
             data: None,
-            puzzle: None,
+            kind: None,
+            section: None,
             training: None,
             versions: crate::versions(),
             files: BTreeMap::new(),

@@ -11,16 +11,9 @@ mod folder;
 mod merge;
 mod record;
 mod tables;
-mod wilson;
 
 pub use folder::{ResultsFolder, StoredEvaluation, list_evaluations};
 pub use merge::merge_shards;
 pub use record::{
     EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Execution, Protocol, Seeds, Shard, TrainingFacts,
 };
-pub use wilson::wilson_interval;
-
-#[cfg(test)]
-pub(crate) use folder::tests::finished;
-#[cfg(test)]
-pub(crate) use record::tests::sample;

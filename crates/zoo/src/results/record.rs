@@ -2,10 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use rollout::Control;
 use serde::{Deserialize, Serialize};
 
 use crate::files::sha256_hex;
-use crate::rollout::Control;
 
 /// The rules of an evaluation that entries must share to be compared.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

@@ -92,7 +92,7 @@ impl RunFolder {
 
     /// Removes what a run that never began has put here, and the folders that are empty without it. Files of others
     /// stay, and so does the folder then.
-    pub(crate) fn discard(&self) {
+    pub fn discard(&self) {
         // whatever cannot be removed is not worth hiding the error that led here
         let _ = fs::remove_file(self.path.join("lock"));
         let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));

@@ -14,7 +14,10 @@ use super::metrics::MetricsRow;
 const CURVE_POINTS: usize = 50;
 
 /// The folder of a training: `run` exactly, or the next or latest one of experiment `name` under `runs`.
-pub(crate) fn open_folder(name: &str, runs: &Path, run: Option<&Path>, resume: bool) -> Result<RunFolder, ZooError> {
+///
+/// # Errors
+/// As [`RunFolder`]'s functions.
+pub fn open_folder(name: &str, runs: &Path, run: Option<&Path>, resume: bool) -> Result<RunFolder, ZooError> {
     match (run, resume) {
         (Some(path), true) => RunFolder::resume(path),
         (Some(path), false) => RunFolder::fresh(path),
@@ -24,7 +27,10 @@ pub(crate) fn open_folder(name: &str, runs: &Path, run: Option<&Path>, resume: b
 }
 
 /// Refuses to go on with other settings than the run began with, naming the first that differs.
-pub(crate) fn same_settings(
+///
+/// # Errors
+/// [`ZooError::ResumeMismatch`].
+pub fn same_settings(
     folder: &Path,
     saved: &BTreeMap<String, String>,
     asked: &BTreeMap<String, String>,
@@ -44,8 +50,8 @@ pub(crate) fn same_settings(
     Ok(())
 }
 
-/// At most [`CURVE_POINTS`] rows, evenly thinned; the last always stays.
-pub(crate) fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
+/// At most 50 rows, evenly thinned; the last always stays.
+pub fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
     let stride = rows.len().div_ceil(CURVE_POINTS).max(1);
     let point = |row: &MetricsRow| {
         let loss = *row.values.get("loss")?;
@@ -55,7 +61,7 @@ pub(crate) fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
 }
 
 /// Seconds since 1970.
-pub(crate) fn wall_time() -> f64 {
+pub fn wall_time() -> f64 {
     SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
 }
 

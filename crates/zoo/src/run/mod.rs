@@ -3,7 +3,7 @@
 mod checkpoint;
 mod data;
 mod folder;
-pub(crate) mod loop_parts;
+pub mod loop_parts;
 mod metrics;
 mod sampler;
 mod section;

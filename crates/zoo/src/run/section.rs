@@ -79,7 +79,10 @@ impl Default for TrainSection {
 
 impl TrainSection {
     /// Refuses numbers that no training can have.
-    pub(crate) fn check(&self) -> Result<(), ZooError> {
+    ///
+    /// # Errors
+    /// [`ZooError::InvalidValue`] naming the key.
+    pub fn check(&self) -> Result<(), ZooError> {
         let invalid = |key: &str, expected: &str, found: String| {
             Err(ZooError::InvalidValue { key: format!("train.{key}"), expected: expected.to_owned(), found })
         };
@@ -121,7 +124,7 @@ impl TrainSection {
     }
 
     /// The part of it that the trainer wants.
-    pub(crate) fn trainer_config(&self) -> TrainConfig {
+    pub fn trainer_config(&self) -> TrainConfig {
         let ([beta1, beta2], weight_decay) = (self.betas, self.weight_decay);
         TrainConfig {
             steps: self.steps,

@@ -11,7 +11,7 @@ use models::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::entry::{EntryDraft, EntryId, EntryMeta, TrainingMeta};
+use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta, TrainingMeta};
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors, write_atomic};
 
@@ -376,7 +376,8 @@ impl<'a> Run<'a> {
             env_keys: experiment.data.env_keys.clone(),
             dims,
             data: Some(demonstrations.meta.clone()),
-            puzzle: None,
+            kind: None,
+            section: None,
             training: Some(TrainingMeta {
                 steps: self.step,
                 batch_size: section.batch_size as u64,
@@ -392,6 +393,7 @@ impl<'a> Run<'a> {
             demonstrations.normaliser.tensors().map_err(experiment.model_error("store the normaliser of"))?;
         let about = serde_json::json!({"format": 1, "policy": policy});
         Ok(EntryDraft {
+            card: CardWords::default(),
             meta,
             model: tensors::to_bytes(Path::new(crate::entry::MODEL_FILE), &weights, &about)?,
             config: experiment.to_toml(),

@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use zoo::rollout::{PoolOptions, Python, TimeLimits, WorkerSpec, find_python, harness_folder};
+use rollout::{PoolOptions, Python, TimeLimits, WorkerSpec, find_python, harness_folder};
 
 /// The Python of the repository's `.venv`, or the one that `ACTRM_PYTHON` names.
 pub fn python() -> Python {

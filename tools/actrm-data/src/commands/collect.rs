@@ -3,6 +3,8 @@ use crate::simulator::{self, CameraArgs, INTERRUPTED, SimulatorArgs};
 use anyhow::{Context, Result, bail};
 use dataset::shuffle::SplitMix64;
 use dataset::{Array, RobomimicWriter, WriteOptions};
+use rollout::RunEnd;
+use rollout::collection::{Attempt, Collection, CollectionRecord};
 use serde_json::json;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -10,8 +12,6 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
-use zoo::collection::{Attempt, Collection, CollectionRecord};
-use zoo::rollout::RunEnd;
 
 /// Share of the demonstrations in the mask `valid`.
 const VALID_SHARE: f64 = 0.1;

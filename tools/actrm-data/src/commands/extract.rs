@@ -2,6 +2,7 @@ use crate::output;
 use crate::simulator::{self, CameraArgs, Recording, SimulatorArgs};
 use anyhow::{Context, Result, bail};
 use dataset::{Array, RobomimicWriter, Source, WriteOptions};
+use rollout::RolloutError;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
@@ -9,7 +10,6 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use zoo::rollout::{self, RolloutError};
 
 /// Add observations, rewards and dones to a raw robosuite recording by replaying its states.
 ///

@@ -1,9 +1,9 @@
 use crate::output;
 use anyhow::{Result, bail};
+use dataset::{PuzzleSet, write_puzzles};
 use puzzles::{Split, Task};
 use std::path::PathBuf;
 use std::process::ExitCode;
-use zoo::puzzle::{PuzzleSet, write_puzzles};
 
 /// Draw puzzles and write them to a Parquet file, one row a puzzle.
 ///

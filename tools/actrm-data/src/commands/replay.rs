@@ -2,6 +2,8 @@ use crate::output;
 use crate::simulator::{self, Recording, SimulatorArgs};
 use anyhow::{Context, Result, bail};
 use dataset::{Demo, Source, WriteOptions};
+use rollout::video::Encoder;
+use rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
 use safetensors::Dtype;
 use serde_json::json;
 use std::ops::{ControlFlow, Range};
@@ -9,8 +11,6 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use zoo::rollout::video::Encoder;
-use zoo::rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
 
 /// Steps that a worker is asked to draw at a time.
 const PART: usize = 32;

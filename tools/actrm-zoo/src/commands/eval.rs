@@ -12,12 +12,12 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::ProgressBar;
+use report::{LeaderboardRow, wilson_interval};
+use rollout::{Control, Pool, PoolOptions, RolloutError, WorkerSpec, find_python, harness_folder, video};
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, FIRST_SEED, Progress, Subject, View, evaluate, film};
-use zoo::leaderboard::LeaderboardRow;
 use zoo::registry::Registry;
-use zoo::results::{Execution, ResultsFolder, Seeds, Shard, StoredEvaluation, wilson_interval};
-use zoo::rollout::{Control, Pool, PoolOptions, RolloutError, WorkerSpec, find_python, harness_folder, video};
+use zoo::results::{Execution, ResultsFolder, Seeds, Shard, StoredEvaluation};
 
 use super::puzzles::{PuzzleArgs, evaluate_solver};
 use super::{ZooArgs, shown};
@@ -124,7 +124,7 @@ pub fn cmd_eval(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let mut by_task: BTreeMap<String, Vec<LoadedEntry>> = BTreeMap::new();
     for id in ids {
         let entry = registry.entry(&id.to_string())?;
-        if entry.meta().puzzle.is_some() {
+        if !entry.meta().is_robot_policy() {
             let results = args.results.clone().unwrap_or_else(|| args.zoo.zoo.join("results"));
             let evaluated = evaluate_solver(&entry, args.task.as_deref(), &args.puzzles, &results);
             println!("{}", evaluated.with_context(|| format!("entry {id}"))?);

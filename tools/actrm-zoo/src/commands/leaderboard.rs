@@ -5,10 +5,9 @@ use std::process::ExitCode;
 
 use clap::Args;
 use comfy_table::{Table, presets};
-use zoo::leaderboard::{TABLE_COLUMNS, rank, to_csv, to_markdown, to_table};
-use zoo::puzzle::{PUZZLE_COLUMNS, list_puzzle_evaluations, puzzle_csv, puzzle_table, rank_puzzles};
+use report::{Curve, TABLE_COLUMNS, rank, to_csv, to_html, to_markdown, to_table};
+use study::puzzle::{PUZZLE_COLUMNS, list_puzzle_evaluations, puzzle_csv, puzzle_section, puzzle_table, rank_puzzles};
 use zoo::registry::Registry;
-use zoo::report::{Curve, to_html};
 use zoo::results::list_evaluations;
 use zoo::write_atomic;
 
@@ -63,7 +62,7 @@ pub fn cmd_leaderboard(args: &LeaderboardArgs) -> anyhow::Result<ExitCode> {
     let out = args.out.as_ref().unwrap_or(&args.zoo.zoo);
     let (csv, html) = (out.join("leaderboard.csv"), out.join("report.html"));
     write_atomic(&csv, to_csv(&rows).as_bytes())?;
-    write_atomic(&html, to_html(&evaluations, &puzzles, &curves(args)?).as_bytes())?;
+    write_atomic(&html, to_html(&evaluations, &curves(args)?, &puzzle_section(&puzzles)).as_bytes())?;
     println!("{}\n{}", shown(&csv), shown(&html));
     if !puzzles.is_empty() {
         let csv = out.join("leaderboard_puzzles.csv");

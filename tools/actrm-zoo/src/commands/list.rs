@@ -4,6 +4,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 use comfy_table::{Table, presets};
+use study::puzzle::PuzzleMeta;
 use zoo::entry::Entry;
 use zoo::registry::Registry;
 
@@ -61,7 +62,7 @@ pub fn cmd_list(args: &ListArgs) -> anyhow::Result<ExitCode> {
             meta.parameters.to_string(),
             number(training.map(|t| t.steps.to_string())),
             number(training.map(|t| format!("{:.1}", t.minutes))),
-            number(match (&meta.data, &meta.puzzle) {
+            number(match (&meta.data, PuzzleMeta::of(&entry)?) {
                 (Some(data), _) => Some(format!("{} ({} demos)", data.name, data.train_episodes)),
                 (None, Some(puzzle)) => Some(format!("{} puzzles", puzzle.train_puzzles)),
                 (None, None) => None,

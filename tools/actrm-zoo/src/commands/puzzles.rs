@@ -5,9 +5,9 @@ use std::path::Path;
 use anyhow::bail;
 use clap::Args;
 use puzzles::Task;
+use report::wilson_interval;
+use study::puzzle::{PuzzleEvaluationOptions, SolverEntry, evaluate_puzzles};
 use zoo::entry::Entry;
-use zoo::puzzle::{PuzzleEvaluationOptions, evaluate_puzzles};
-use zoo::results::wilson_interval;
 
 /// How solvers are evaluated.
 #[derive(Args)]
@@ -37,7 +37,7 @@ pub fn family(name: &str) -> anyhow::Result<Task> {
 /// Evaluates a solver; the line to show.
 pub fn evaluate_solver(entry: &Entry, task: Option<&str>, args: &PuzzleArgs, results: &Path) -> anyhow::Result<String> {
     let task = task.map(family).transpose()?;
-    let solver = entry.load_solver(task)?;
+    let solver = SolverEntry::load(entry, task)?;
     let options = PuzzleEvaluationOptions {
         task,
         givens: args.givens,

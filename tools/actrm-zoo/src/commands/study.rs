@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering;
 
 use clap::Args;
 use indicatif::ProgressBar;
-use zoo::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, run_study, study_page};
+use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, run_study, study_page};
 use zoo::run::TrainEvent;
 use zoo::write_atomic;
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
-use zoo::puzzle::trace;
+use study::puzzle::{SolverEntry, trace};
 use zoo::registry::Registry;
 use zoo::write_atomic;
 
@@ -46,7 +46,7 @@ pub struct TraceArgs {
 pub fn cmd_trace(args: &TraceArgs) -> anyhow::Result<ExitCode> {
     let entry = Registry::open(&args.zoo.zoo).entry(&args.entry)?;
     let other = args.task.as_deref().map(family).transpose()?;
-    let solver = entry.load_solver(other)?;
+    let solver = SolverEntry::load(&entry, other)?;
     let task = match other {
         Some(task) => task,
         None => solver.experiment().task.family()?,

@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::ProgressBar;
-use zoo::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
+use study::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
 use zoo::run::{MetricsRow, TrainEvent, TrainOutcome, TrainRequest, train};
 
 use super::{ConfigArgs, ZooArgs, shown};

@@ -1,0 +1,164 @@
+//! Puzzles as a Parquet file: one row a puzzle.
+
+use std::fs::File;
+use std::io::Write;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::Arc;
+
+use arrow::array::{
+    ArrayRef, BooleanArray, ListBuilder, RecordBatch, StringArray, UInt8Builder, UInt32Array, UInt64Array,
+};
+use parquet::arrow::ArrowWriter;
+use parquet::basic::Compression;
+use parquet::file::properties::WriterProperties;
+use puzzles::{Puzzle, Split, Task};
+
+use crate::error::{DatasetError, Result};
+
+/// Which puzzles to write.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PuzzleSet {
+    /// The family.
+    pub task: Task,
+    /// The split that all of them belong to.
+    pub split: Split,
+    /// Cells that a Sudoku keeps at least.
+    pub givens: usize,
+    /// Seed of the set.
+    pub seed: u64,
+    /// Number of puzzles.
+    pub count: u64,
+}
+
+/// Draws the puzzles of `set` and writes them to `path`: the same bytes for the same set.
+///
+/// Columns: `index`, `task`, `split`, `seed`, `height`, `width`, `input` and `target` (lists of u8, row by row), `start`
+/// and `goal` (cell numbers), `distance` (steps of the shortest way), `detour` (whether it is longer than without walls)
+/// for mazes, `givens` for Sudoku. `progress` is told how many are drawn.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write_puzzles(set: &PuzzleSet, path: &Path, progress: &mut dyn FnMut(u64)) -> Result<()> {
+    let mut puzzles = Vec::new();
+    for index in 0..set.count {
+        puzzles.push(set.task.numbered(set.split, (set.givens, set.givens), set.seed, index));
+        progress(index + 1);
+    }
+    let failed =
+        |source| DatasetError::Parquet { path: path.to_owned(), operation: "make a table of puzzles for", source };
+    let batch = batch(set, &puzzles).map_err(|e| failed(e.into()))?;
+    let properties = WriterProperties::builder().set_compression(Compression::SNAPPY).build();
+    let mut bytes = Vec::new();
+    let written = || -> std::result::Result<(), parquet::errors::ParquetError> {
+        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties))?;
+        writer.write(&batch)?;
+        writer.close()?;
+        Ok(())
+    }();
+    written.map_err(failed)?;
+    write(path, &bytes)
+}
+
+/// The whole file or none: a temporary name beside it, fsync, rename.
+fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    let failed = |operation| move |source| DatasetError::Io { path: path.to_owned(), operation, source };
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    let mut file = tempfile::Builder::new()
+        .prefix(".tmp-")
+        .permissions(std::fs::Permissions::from_mode(0o644))
+        .tempfile_in(folder)
+        .map_err(failed("create a temporary file beside it"))?;
+    file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(failed("write"))?;
+    file.persist(path).map_err(|e| failed("write")(e.error))?;
+    File::open(folder).and_then(|f| f.sync_all()).map_err(failed("sync its folder"))
+}
+
+fn batch(set: &PuzzleSet, puzzles: &[Puzzle]) -> std::result::Result<RecordBatch, arrow::error::ArrowError> {
+    let rows = puzzles.len();
+    let same = |value: &str| -> ArrayRef { Arc::new(StringArray::from(vec![value; rows])) };
+    let side = set.task.side() as u32;
+    let sides = || -> ArrayRef { Arc::new(UInt32Array::from(vec![side; rows])) };
+    let grids = |cells: fn(&Puzzle) -> Vec<u8>| -> ArrayRef {
+        let mut lists = ListBuilder::new(UInt8Builder::new());
+        for puzzle in puzzles {
+            lists.values().append_slice(&cells(puzzle));
+            lists.append(true);
+        }
+        Arc::new(lists.finish())
+    };
+    let number = |of: fn(&Puzzle) -> Option<usize>| -> ArrayRef {
+        Arc::new(puzzles.iter().map(|puzzle| of(puzzle).map(|n| n as u32)).collect::<UInt32Array>())
+    };
+    let detours: BooleanArray = puzzles
+        .iter()
+        .map(|puzzle| match puzzle {
+            Puzzle::Maze(maze) => Some(maze.has_detour()),
+            Puzzle::Sudoku(..) => None,
+        })
+        .collect();
+    fn start(puzzle: &Puzzle) -> Option<usize> {
+        matches!(puzzle, Puzzle::Maze(_)).then(|| position(puzzle, 2))?
+    }
+    fn goal(puzzle: &Puzzle) -> Option<usize> {
+        matches!(puzzle, Puzzle::Maze(_)).then(|| position(puzzle, 3))?
+    }
+    RecordBatch::try_from_iter_with_nullable([
+        ("index", Arc::new(UInt64Array::from_iter_values(0..rows as u64)) as ArrayRef, false),
+        ("task", same(set.task.name()), false),
+        ("split", same(set.split.name()), false),
+        ("seed", Arc::new(UInt64Array::from(vec![set.seed; rows])), false),
+        ("height", sides(), false),
+        ("width", sides(), false),
+        ("input", grids(Puzzle::tokens), false),
+        ("target", grids(Puzzle::answer), false),
+        ("start", number(start), true),
+        ("goal", number(goal), true),
+        ("distance", number(Puzzle::distance), true),
+        ("detour", Arc::new(detours), true),
+        ("givens", number(Puzzle::givens), true),
+    ])
+}
+
+fn position(puzzle: &Puzzle, token: u8) -> Option<usize> {
+    puzzle.tokens().iter().position(|&t| t == token)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use parquet::file::reader::{FileReader, SerializedFileReader};
+    use parquet::record::{ListAccessor, RowAccessor};
+
+    #[test]
+    fn what_is_written_reads_back_and_repeats() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["open8", "maze10-original", "sudoku6"] {
+            let task = Task::by_name(name).unwrap();
+            let set = PuzzleSet { task, split: Split::Valid, givens: 0, seed: 7, count: 12 };
+            let path = folder.path().join(name);
+            write_puzzles(&set, &path, &mut |_| {}).unwrap();
+            let bytes = std::fs::read(&path).unwrap();
+            write_puzzles(&set, &path, &mut |_| {}).unwrap();
+            assert_eq!(std::fs::read(&path).unwrap(), bytes);
+            let reader = SerializedFileReader::new(std::fs::File::open(&path).unwrap()).unwrap();
+            let rows: Vec<_> = reader.get_row_iter(None).unwrap().map(Result::unwrap).collect();
+            assert_eq!(rows.len(), 12);
+            for (index, row) in rows.iter().enumerate() {
+                let puzzle = task.numbered(Split::Valid, (0, 0), 7, index as u64);
+                let list = |column: usize| -> Vec<u8> {
+                    let list = row.get_list(column).unwrap();
+                    (0..list.len()).map(|i| list.get_ubyte(i).unwrap()).collect()
+                };
+                assert_eq!((list(6), list(7)), (puzzle.tokens(), puzzle.answer()));
+                assert_eq!(row.get_uint(10).ok(), puzzle.distance().map(|d| d as u32), "{name}");
+                assert_eq!(row.get_uint(12).ok(), puzzle.givens().map(|g| g as u32));
+                if let Puzzle::Maze(maze) = &puzzle {
+                    assert_eq!(row.get_uint(8).unwrap() as usize, maze.start);
+                    assert_eq!(row.get_bool(11).unwrap(), maze.has_detour());
+                }
+            }
+        }
+    }
+}

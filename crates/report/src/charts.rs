@@ -1,0 +1,207 @@
+//! The report's pictures, each a pure function from numbers to SVG.
+
+use std::fmt::Write as _;
+
+use zoo::results::StoredEvaluation;
+
+use crate::html::{Curve, escape};
+use crate::leaderboard::LeaderboardRow;
+
+/// Colours of the training curves, in order, readable on light and dark ground.
+const COLOURS: [&str; 8] = ["#2f62c8", "#d9772b", "#1f8f5f", "#a14fb8", "#c8452f", "#128c9c", "#8a7a1f", "#6b7480"];
+
+const WIDTH: f64 = 1040.0;
+
+/// Success rates with their 95% intervals, one line a row.
+pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
+    let (left, right, step) = (250.0, 130.0, 30.0);
+    let scale = |rate: f64| left + rate * (WIDTH - left - right);
+    let height = 16.0 + step * rows.len() as f64 + 26.0;
+    let bottom = height - 26.0;
+    let mut svg = open(height, "Success rate of each entry with its 95% Wilson interval");
+    for percent in (0..=100).step_by(20) {
+        let x = scale(f64::from(percent) / 100.0);
+        let _ = write!(
+            svg,
+            r#"<line class="grid" x1="{x:.1}" x2="{x:.1}" y1="8" y2="{bottom:.1}"/><text x="{x:.1}" y="{:.1}" text-anchor="middle">{percent}%</text>"#,
+            height - 8.0
+        );
+    }
+    for (index, row) in rows.iter().enumerate() {
+        let y = 16.0 + step * (index as f64 + 0.5);
+        let (low, high) = row.interval();
+        let (low_x, high_x, rate_x) = (scale(low), scale(high), scale(row.success_rate()));
+        let name = escape(&row.entry.to_string());
+        let _ = write!(
+            svg,
+            r##"<g><title>{name}: {}/{}, 95% interval {:.1}% to {:.1}%</title><text class="label" x="0" y="{:.1}">{name}</text><line x1="{low_x:.1}" x2="{high_x:.1}" y1="{y:.1}" y2="{y:.1}" stroke="var(--good-soft)" stroke-width="12" stroke-linecap="round"/><circle cx="{rate_x:.1}" cy="{y:.1}" r="5.5" fill="var(--good)"/><text x="{:.1}" y="{:.1}" text-anchor="end">{}/{} · {}</text></g>"##,
+            row.successes,
+            row.episodes,
+            low * 1e2,
+            high * 1e2,
+            y + 4.0,
+            WIDTH,
+            y + 4.0,
+            row.successes,
+            row.episodes,
+            row.percent(),
+        );
+    }
+    svg.push_str("</svg>");
+    svg
+}
+
+/// Every episode as a bar: as high as it took steps, failures at full height and hatched.
+pub(super) fn strip(evaluation: &StoredEvaluation) -> String {
+    let count = evaluation.episodes.len().max(1) as f64;
+    let cap = evaluation.record.protocol.max_steps.max(1) as f64;
+    let height = 56.0;
+    let (baseline, full) = (height - 14.0, height - 18.0);
+    let pitch = (WIDTH / count).min(18.0);
+    let bar = (pitch - 2.0).max(pitch * 0.6);
+    // the tallest success fills most of the strip, so that quick and slow ones can be told apart
+    let slowest = evaluation.episodes.iter().filter(|e| e.success).map(|e| e.steps).max();
+    let top = slowest.map_or(cap, |steps| f64::from(steps) * 1.25).min(cap).max(1.0);
+    let mut svg = open(height, "Episodes in the order of their seeds");
+    for (index, episode) in evaluation.episodes.iter().enumerate() {
+        let x = pitch * index as f64;
+        let share = if episode.success { (f64::from(episode.steps) / top).min(1.0) } else { 1.0 };
+        let tall = (full * share).max(2.0);
+        let (fill, word) = if episode.success { ("var(--good)", "success") } else { ("url(#failed)", "failure") };
+        let _ = write!(
+            svg,
+            r#"<rect x="{x:.1}" y="{:.1}" width="{bar:.1}" height="{tall:.1}" rx="1.5" fill="{fill}"><title>seed {}: {word} after {} steps, return {:.2}</title></rect>"#,
+            baseline - tall,
+            episode.seed,
+            episode.steps,
+            episode.total_reward
+        );
+    }
+    if let (Some(first), Some(last)) = (evaluation.episodes.first(), evaluation.episodes.last()) {
+        let end = pitch * (count - 1.0) + bar;
+        let _ = write!(svg, r#"<text x="0" y="{:.1}">{}</text>"#, height - 1.0, first.seed);
+        if end > 120.0 {
+            let y = height - 1.0;
+            let _ = write!(svg, r#"<text x="{end:.1}" y="{y:.1}" text-anchor="end">{}</text>"#, last.seed);
+        }
+    }
+    svg.push_str("</svg>");
+    svg
+}
+
+/// The pattern of failed episodes; once a page.
+pub(super) fn patterns() -> &'static str {
+    r##"<svg width="0" height="0" aria-hidden="true" style="position:absolute"><defs><pattern id="failed" width="5" height="5" patternUnits="userSpaceOnUse" patternTransform="rotate(45)"><rect width="5" height="5" fill="var(--bad)" fill-opacity=".25"/><rect width="2.5" height="5" fill="var(--bad)"/></pattern></defs></svg>"##
+}
+
+/// Training loss over optimiser steps, logarithmic.
+pub(super) fn curves(curves: &[&Curve]) -> String {
+    let points = || curves.iter().flat_map(|curve| &curve.points);
+    let drawable = || points().filter(|(_, loss)| loss.is_finite() && *loss > 0.0);
+    let last = drawable().map(|(step, _)| *step).max().unwrap_or(1).max(1) as f64;
+    let low = drawable().map(|(_, loss)| *loss).fold(f64::INFINITY, f64::min);
+    let high = drawable().map(|(_, loss)| *loss).fold(0.0, f64::max);
+    if !low.is_finite() {
+        return String::new();
+    }
+    // whole decades around the values, at least one
+    let (bottom, mut top) = (low.log10().floor(), high.log10().ceil());
+    if top <= bottom {
+        top = bottom + 1.0;
+    }
+    let (left, plot_height, legend) = (56.0, 230.0, 22.0 * curves.len() as f64);
+    let height = plot_height + 34.0 + legend;
+    let x_of = |step: u64| left + step as f64 / last * (WIDTH - left - 10.0);
+    let y_of = |loss: f64| 8.0 + (top - loss.log10()) / (top - bottom) * (plot_height - 8.0);
+    let mut svg = open(height, "Training loss");
+    for decade in bottom as i32..=top as i32 {
+        let value = 10f64.powi(decade);
+        let y = y_of(value);
+        let _ = write!(
+            svg,
+            r#"<line class="grid" x1="{left}" x2="{WIDTH}" y1="{y:.1}" y2="{y:.1}"/><text x="{:.1}" y="{:.1}" text-anchor="end">{value}</text>"#,
+            left - 8.0,
+            y + 4.0
+        );
+    }
+    for quarter in 0..=4u32 {
+        let step = (last * f64::from(quarter) / 4.0).round() as u64;
+        let anchor = if quarter == 4 { "end" } else { "middle" };
+        let _ = write!(
+            svg,
+            r#"<text x="{:.1}" y="{:.1}" text-anchor="{anchor}">{step}</text>"#,
+            x_of(step),
+            plot_height + 18.0
+        );
+    }
+    for (index, curve) in curves.iter().enumerate() {
+        let colour = COLOURS[index % COLOURS.len()];
+        let drawn: Vec<(f64, f64)> = curve
+            .points
+            .iter()
+            .filter(|(_, loss)| loss.is_finite() && *loss > 0.0)
+            .map(|&(step, loss)| (x_of(step), y_of(loss)))
+            .collect();
+        let path: Vec<String> = thin(&drawn).iter().map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
+        let y = plot_height + 34.0 + 22.0 * (index as f64 + 0.5);
+        let end = curve.points.last().map_or(String::new(), |(_, loss)| format!(" — {loss:.4} at the end"));
+        let _ = write!(
+            svg,
+            r#"<polyline points="{}" fill="none" stroke="{colour}" stroke-width="1.8" stroke-linejoin="round"/><rect x="{left}" y="{:.1}" width="18" height="3" fill="{colour}"/><text x="{:.1}" y="{:.1}">{}{end}</text>"#,
+            path.join(" "),
+            y - 4.0,
+            left + 26.0,
+            y,
+            escape(&curve.entry)
+        );
+    }
+    svg.push_str("</svg>");
+    svg
+}
+
+/// At most about 800 of a curve's points: the smallest and the largest of each stretch, so that a
+/// spike stays visible.
+fn thin(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let stretch = points.len().div_ceil(400).max(1);
+    if stretch == 1 {
+        return points.to_vec();
+    }
+    let mut kept = Vec::new();
+    for part in points.chunks(stretch) {
+        let by_loss = |a: &&(f64, f64), b: &&(f64, f64)| a.1.total_cmp(&b.1);
+        let ends = [part.iter().min_by(by_loss), part.iter().max_by(by_loss)];
+        let mut ends: Vec<(f64, f64)> = ends.into_iter().flatten().copied().collect();
+        ends.sort_by(|a, b| a.0.total_cmp(&b.0));
+        ends.dedup();
+        kept.extend(ends);
+    }
+    kept
+}
+
+fn open(height: f64, title: &str) -> String {
+    format!(
+        r#"<svg viewBox="0 0 {WIDTH} {height:.0}" width="{WIDTH}" height="{height:.0}" role="img" aria-label="{title}">"#
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn thinning_keeps_order_and_extremes() {
+        let points: Vec<(f64, f64)> =
+            (0..10_000).map(|i| (f64::from(i), if i == 6_789 { 99.0 } else { f64::from(i % 7) })).collect();
+        let kept = thin(&points);
+        assert!(kept.len() <= 800, "{}", kept.len());
+        assert!(kept.windows(2).all(|pair| pair[0].0 < pair[1].0));
+        assert!(kept.contains(&(6_789.0, 99.0)));
+        assert_eq!(thin(&points[..300]), &points[..300]);
+    }
+
+    #[test]
+    fn a_curve_without_a_drawable_point_is_no_picture() {
+        let curve = Curve { entry: "a@1".into(), points: vec![(1, f64::NAN), (2, 0.0)] };
+        assert_eq!(curves(&[&curve]), "");
+    }
+}

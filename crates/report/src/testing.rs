@@ -1,0 +1,68 @@
+//! Evaluations to build tests on.
+
+#![allow(clippy::unwrap_used)]
+
+use std::path::Path;
+
+use rollout::Control;
+use zoo::results::{
+    EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Execution, Protocol, ResultsFolder, Seeds,
+    StoredEvaluation, TrainingFacts,
+};
+use zoo::sha256_hex;
+
+/// The record of an evaluation of `name@version` over `count` seeds.
+pub(crate) fn sample(name: &str, version: u32, count: u64) -> EvaluationRecord {
+    let versions = [("mujoco", "3.3.7"), ("robosuite", "1.5.2")];
+    EvaluationRecord {
+        format: EvaluationRecord::FORMAT,
+        entry: EntryIdentity { name: name.into(), version, hash: sha256_hex(name.as_bytes()) },
+        training: TrainingFacts {
+            policy: "act".into(),
+            parameters: 1_500_000,
+            steps: 500,
+            minutes: 0.95,
+            seed: 1,
+            data_set: "lift".into(),
+            data_fingerprint: sha256_hex(b"data"),
+            data_simulator: Some("1.5.2".into()),
+            demos: 50,
+        },
+        protocol: Protocol {
+            rules: 1,
+            task: "Lift".into(),
+            env_name: "Lift".into(),
+            env_module: None,
+            control: Control::Robosuite,
+            max_steps: 400,
+        },
+        execution: Execution::RecedingHorizon { n_action_steps: 8 },
+        seeds: Seeds { start: 10_000, count },
+        shard: None,
+        versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),
+    }
+}
+
+/// A finished evaluation on disk: every fifth seed fails.
+pub(crate) fn finished(results: &Path, record: &EvaluationRecord) -> StoredEvaluation {
+    let mut folder = ResultsFolder::open(results, record).unwrap();
+    for seed in folder.missing() {
+        let success = !seed.is_multiple_of(5);
+        let episode = EpisodeRecord {
+            seed,
+            success,
+            steps: if success { 40 + (seed % 7) as u32 } else { 400 },
+            total_reward: if success { 1.0 } else { 0.0 },
+            fingerprint: format!("{seed:064x}"),
+            group: None,
+        };
+        let timing = EpisodeTiming {
+            seed,
+            wall_ms: 900.0,
+            simulator_ms: 700.0,
+            inference_ms: (0..6).map(|i| 2.0 + (seed % 3) as f64 / 8.0 + f64::from(i)).collect(),
+        };
+        folder.add(episode, timing).unwrap();
+    }
+    folder.finish().unwrap()
+}

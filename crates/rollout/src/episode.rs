@@ -1,0 +1,187 @@
+//! One rollout: reset, then observe, act and step until success or the cap.
+
+use std::time::{Duration, Instant};
+
+use crate::error::RolloutError;
+use crate::message::Ready;
+use crate::pool::JobError;
+use crate::worker::{Initial, Observations, Worker};
+
+/// What an agent's failure is to whoever runs it.
+pub type AgentError = Box<dyn std::error::Error + Send + Sync>;
+
+/// What acts in an episode: the observations of a step in, actions in the environment's units out.
+pub trait Agent: Send {
+    /// The action to execute now.
+    ///
+    /// # Errors
+    /// Whatever keeps it from acting; it ends the episode and everything that it is a part of.
+    fn act(&mut self, observations: &Observations) -> Result<Vec<f32>, AgentError>;
+
+    /// The actions up to the next observation that matters, at least one: what as many calls of [`Agent::act`] would
+    /// give, whatever they were shown after the first.
+    ///
+    /// # Errors
+    /// As [`Agent::act`].
+    fn act_ahead(&mut self, observations: &Observations) -> Result<Vec<Vec<f32>>, AgentError> {
+        Ok(vec![self.act(observations)?])
+    }
+
+    /// Forgets the episode.
+    fn reset(&mut self);
+}
+
+/// How an episode is run and when it ends.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EpisodePlan {
+    /// Control steps after which the episode has failed.
+    pub max_steps: usize,
+    /// The environment's smallest action.
+    pub action_low: Vec<f64>,
+    /// The environment's largest action.
+    pub action_high: Vec<f64>,
+}
+
+/// How an episode ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Outcome {
+    /// Whether the task was done.
+    pub success: bool,
+    /// Control steps done.
+    pub steps: usize,
+    /// Sum of the rewards.
+    pub total_reward: f64,
+    /// Hash of the initial state.
+    pub fingerprint: String,
+    /// The group of episodes that this one belongs to, where the task has groups.
+    pub group: Option<String>,
+    /// Time spent waiting for the simulator.
+    pub simulator: Duration,
+    /// Time of the whole episode.
+    pub wall: Duration,
+}
+
+impl EpisodePlan {
+    /// A plan for the environment that `ready` describes and an agent that reads `keys` of its observations.
+    ///
+    /// # Errors
+    /// [`RolloutError::ObservationKey`] for a key that the environment does not give.
+    pub fn new<'k>(
+        ready: &Ready,
+        keys: impl IntoIterator<Item = &'k String>,
+        max_steps: usize,
+    ) -> Result<Self, RolloutError> {
+        for key in keys {
+            if !ready.observations.contains_key(key) {
+                let available: Vec<&str> = ready.observations.keys().map(String::as_str).collect();
+                return Err(RolloutError::ObservationKey {
+                    key: key.clone(),
+                    task: ready.task.clone(),
+                    available: available.join(", "),
+                });
+            }
+        }
+        Ok(Self { max_steps, action_low: ready.action_low.clone(), action_high: ready.action_high.clone() })
+    }
+
+    /// The action that is executed: of the right length, finite, inside the environment's limits.
+    fn clipped(&self, action: &[f32]) -> Result<Vec<f64>, String> {
+        if action.len() != self.action_low.len() {
+            return Err(format!("{} values", action.len()));
+        }
+        if let Some(at) = action.iter().position(|value| !value.is_finite()) {
+            return Err(format!("{} at index {at}", action[at]));
+        }
+        let limits = self.action_low.iter().zip(&self.action_high);
+        let clip = |(&value, (&low, &high)): (&f32, (&f64, &f64))| f64::from(value).clamp(low, high);
+        Ok(action.iter().zip(limits).map(clip).collect())
+    }
+
+    /// The actions that can be executed, and why the one after them cannot, if so.
+    fn executable(&self, planned: &[Vec<f32>]) -> (Vec<Vec<f64>>, Option<String>) {
+        let mut good = Vec::with_capacity(planned.len());
+        for action in planned {
+            match self.clipped(action) {
+                Ok(action) => good.push(action),
+                Err(found) => return (good, Some(found)),
+            }
+        }
+        (good, None)
+    }
+
+    /// Runs the episode of `seed`. Actions that the policy plans ahead go to the worker together, unless `watch` wants
+    /// to be called with the worker after the reset and after every step.
+    ///
+    /// # Errors
+    /// A failure of the worker, or one of the policy.
+    pub fn run(
+        &self,
+        worker: &mut Worker,
+        agent: &mut dyn Agent,
+        seed: u64,
+        mut watch: Option<Watch<'_>>,
+    ) -> Result<Outcome, JobError> {
+        let begun = Instant::now();
+        agent.reset();
+        let Initial { fingerprint, group, mut observations } = worker.reset(seed)?;
+        let mut simulator = begun.elapsed();
+        if let Some(watch) = &mut watch {
+            watch(worker)?;
+        }
+        let (mut success, mut steps, mut total_reward) = (false, 0, 0.0);
+        while !success && steps < self.max_steps {
+            let planned = match watch.is_some() {
+                true => agent.act(&observations).map(|one| vec![one]),
+                false => agent.act_ahead(&observations),
+            };
+            let mut planned = planned.map_err(|source| {
+                let operation = "querying the policy";
+                RolloutError::Policy { seed, step: steps, operation, source }
+            })?;
+            planned.truncate(self.max_steps - steps);
+            let (actions, unusable) = self.executable(&planned);
+            if !actions.is_empty() {
+                let asked = Instant::now();
+                let stepped = worker.step(&actions)?;
+                simulator += asked.elapsed();
+                steps += stepped.rewards.len();
+                total_reward = stepped.rewards.iter().fold(total_reward, |sum, reward| sum + reward);
+                success = stepped.success;
+                observations = stepped.observations;
+            }
+            if let Some(found) = unusable.filter(|_| !success) {
+                let expected = format!("{} finite values", self.action_low.len());
+                return Err(RolloutError::Action { seed, step: steps, expected, found }.into());
+            }
+            if let Some(watch) = &mut watch {
+                watch(worker)?;
+            }
+        }
+        worker.check_quiet()?;
+        Ok(Outcome { success, steps, total_reward, fingerprint, group, simulator, wall: begun.elapsed() })
+    }
+}
+
+/// Called with the worker after an episode's reset and after every step of it.
+pub type Watch<'a> = &'a mut dyn FnMut(&mut Worker) -> Result<(), JobError>;
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn plan() -> EpisodePlan {
+        EpisodePlan { max_steps: 5, action_low: vec![-1.0, -0.5], action_high: vec![1.0, 0.5] }
+    }
+
+    #[test]
+    fn actions_are_clipped_and_must_be_finite_and_complete() {
+        assert_eq!(plan().clipped(&[2.0, -0.25]).unwrap(), [1.0, -0.25]);
+        assert_eq!(plan().clipped(&[-7.0, 0.75]).unwrap(), [-1.0, 0.5]);
+        assert_eq!(plan().clipped(&[0.0, f32::NAN]).unwrap_err(), "NaN at index 1");
+        assert_eq!(plan().clipped(&[f32::INFINITY, 0.0]).unwrap_err(), "inf at index 0");
+        assert_eq!(plan().clipped(&[0.0]).unwrap_err(), "1 values");
+        let (good, unusable) = plan().executable(&[vec![0.0, 2.0], vec![f32::NAN, 0.0], vec![0.0, 0.0]]);
+        assert_eq!((good, unusable), (vec![vec![0.0, 0.5]], Some("NaN at index 0".to_owned())));
+    }
+}

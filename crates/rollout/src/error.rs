@@ -1,0 +1,252 @@
+//! What can go wrong between us and a worker.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use crate::frame::FrameError;
+
+/// Why a rollout could not be run, or could not be run to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum RolloutError {
+    /// A file or folder of the harness, its cache or a worker's log.
+    #[error("{operation} {}", path.display())]
+    File {
+        /// What was being done.
+        operation: &'static str,
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// `ACTRM_HARNESS` does not hold the harness.
+    #[error("harness: no actrm_harness/worker.py under {} (from ACTRM_HARNESS)", path.display())]
+    NoHarness {
+        /// The folder that was named.
+        path: PathBuf,
+    },
+    /// No Python interpreter was found.
+    #[error("python: none found (looked at {searched}); name one with --python or ACTRM_PYTHON")]
+    NoPython {
+        /// The places, in order.
+        searched: String,
+    },
+    /// The interpreter that was named is not there.
+    #[error("python: {} (from {origin}) is not there", path.display())]
+    PythonMissing {
+        /// The file that was named.
+        path: PathBuf,
+        /// Which option named it.
+        origin: String,
+    },
+    /// The interpreter cannot run the harness.
+    #[error(
+        "python {} (from {origin}): {problem}; run `make venv` in the repository, or name a Python with robosuite 1.5.2 and mujoco 3.3.7 by --python or ACTRM_PYTHON",
+        path.display()
+    )]
+    PythonUnusable {
+        /// The interpreter.
+        path: PathBuf,
+        /// How it was found.
+        origin: String,
+        /// What it lacks.
+        problem: String,
+    },
+    /// A worker's process could not be started.
+    #[error("worker: starting {}", program.display())]
+    Spawn {
+        /// The program.
+        program: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A worker said at once that it cannot do what was asked.
+    #[error("worker for task {task:?}: {message} ({kind})")]
+    Refused {
+        /// The task.
+        task: String,
+        /// The worker's word for it.
+        kind: String,
+        /// The worker's explanation.
+        message: String,
+    },
+    /// A worker greets with something else than expected.
+    #[error("worker handshake: {what}: expected {expected}, found {found}")]
+    Handshake {
+        /// The item.
+        what: &'static str,
+        /// What we need.
+        expected: String,
+        /// What it said.
+        found: String,
+    },
+    /// No worker could be started, after several tries.
+    #[error("worker for task {task:?} did not start in {attempts} tries: {fault}")]
+    Start {
+        /// The task.
+        task: String,
+        /// How many tries.
+        attempts: u32,
+        /// The last failure.
+        fault: Box<WorkerFault>,
+    },
+    /// An episode failed on every worker that tried it; it has no result.
+    #[error("episode with seed {seed}: no result after {attempts} workers: {fault}")]
+    Episode {
+        /// The episode's seed.
+        seed: u64,
+        /// How many workers tried.
+        attempts: u32,
+        /// The last failure.
+        fault: Box<WorkerFault>,
+    },
+    /// The policy or another part on our side failed during an episode.
+    #[error("episode with seed {seed}, step {step}: {operation}")]
+    Policy {
+        /// The episode's seed.
+        seed: u64,
+        /// Control steps done so far.
+        step: usize,
+        /// What was being done.
+        operation: &'static str,
+        /// What it said.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// The policy's action is not a usable one.
+    #[error("episode with seed {seed}, step {step}: action: expected {expected}, found {found}")]
+    Action {
+        /// The episode's seed.
+        seed: u64,
+        /// Control steps done so far.
+        step: usize,
+        /// What the environment takes.
+        expected: String,
+        /// What the policy gave.
+        found: String,
+    },
+    /// The policy reads an observation that the environment does not give.
+    #[error("observation key {key:?}: the environment of task {task:?} has {available}")]
+    ObservationKey {
+        /// The missing key.
+        key: String,
+        /// The task.
+        task: String,
+        /// The keys that are there.
+        available: String,
+    },
+    /// The thread pool of one worker could not be made.
+    #[error("starting the inference thread of worker {slot}")]
+    Thread {
+        /// The worker's place in the pool.
+        slot: usize,
+        /// What the thread library said.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// A video could not be written.
+    #[error("video {}: {problem}", path.display())]
+    Video {
+        /// The file.
+        path: PathBuf,
+        /// What went wrong.
+        problem: String,
+    },
+    /// A stored attempt of a collection is not one that was written.
+    #[error("{}: not an attempt: {problem}", path.display())]
+    Attempt {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: FrameError,
+    },
+    /// Another process collects demonstrations into the same folder.
+    #[error("folder {} is in use by another collection", folder.display())]
+    CollectionBusy {
+        /// The collection's folder.
+        folder: PathBuf,
+    },
+    /// A folder holds attempts of another collection.
+    #[error(
+        "{} holds attempts of another collection: {what}: expected {expected}, found {found}; \
+         remove it, or collect into another file",
+        folder.display()
+    )]
+    CollectionDiffers {
+        /// The collection's folder.
+        folder: PathBuf,
+        /// The field that differs.
+        what: String,
+        /// As it is now.
+        expected: String,
+        /// As it is in the folder.
+        found: String,
+    },
+}
+
+impl RolloutError {
+    /// Builds the closure that `map_err` wants around a file operation.
+    pub(crate) fn file(operation: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::File { operation, path, source }
+    }
+}
+
+/// A worker's failure: never an outcome of an episode, always a reason to take a fresh worker.
+#[derive(Debug, thiserror::Error)]
+#[error("worker {worker} during {phase}: {kind}{}", tail(.stderr, .log))]
+pub struct WorkerFault {
+    /// Which worker, as `slot.generation`.
+    pub worker: String,
+    /// What it was doing.
+    pub phase: &'static str,
+    /// What happened.
+    pub kind: FaultKind,
+    /// The last lines of its stderr.
+    pub stderr: String,
+    /// The file with all of its stderr.
+    pub log: PathBuf,
+}
+
+fn tail(stderr: &str, log: &std::path::Path) -> String {
+    if stderr.is_empty() {
+        return String::new();
+    }
+    format!("; its stderr ({}) ends: {stderr}", log.display())
+}
+
+/// How a worker failed.
+#[derive(Debug, thiserror::Error)]
+pub enum FaultKind {
+    /// The process ended or closed its pipe.
+    #[error("it ended ({0})")]
+    Died(String),
+    /// It did not answer in time.
+    #[error("no answer within {:.1} s", .0.as_secs_f64())]
+    TimedOut(Duration),
+    /// It wrote bytes that are not a frame.
+    #[error("nonsense in the pipe: {0}")]
+    Nonsense(FrameError),
+    /// It wrote bytes that nobody asked for.
+    #[error("bytes in the pipe that nobody asked for")]
+    Unasked,
+    /// It answered another question.
+    #[error("answer: expected {expected}, found {found}")]
+    Unexpected {
+        /// The answer that the protocol wants.
+        expected: String,
+        /// The one that came.
+        found: String,
+    },
+    /// It answered with values that cannot be.
+    #[error("answer: {0}")]
+    Values(String),
+    /// It reported an error of its own.
+    #[error("it reports {kind}: {message}")]
+    Reported {
+        /// Its word for it.
+        kind: String,
+        /// Its explanation.
+        message: String,
+    },
+    /// The pipe itself failed.
+    #[error("pipe: {0}")]
+    Pipe(std::io::Error),
+}

@@ -1,0 +1,369 @@
+//! N workers, one list of jobs: results come back in the jobs' order, whatever the number of workers
+//! and whoever finished first. A worker that fails is replaced and its job run again from the start.
+
+use std::collections::BTreeMap;
+use std::ops::{ControlFlow, Range};
+use std::path::PathBuf;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, mpsc};
+use std::time::Duration;
+
+use crate::error::{RolloutError, WorkerFault};
+use crate::message::Ready;
+use crate::spec::WorkerSpec;
+use crate::worker::{StartFailure, Worker};
+
+/// How far workers may run ahead of the next result to deliver, in jobs.
+const LOOK_AHEAD: u64 = 64;
+
+/// What a pool is made of.
+#[derive(Clone)]
+pub struct PoolOptions {
+    /// What each worker runs.
+    pub spec: WorkerSpec,
+    /// How many workers.
+    pub workers: usize,
+    /// How many workers may try a job, and how often a worker's start is tried: 3 means "again, at most
+    /// twice".
+    pub attempts: u32,
+    /// Where workers' stderr goes; a temporary folder if none is named.
+    pub logs: Option<PathBuf>,
+    /// Says whether to stop after the jobs that are under way.
+    pub stop: Arc<dyn Fn() -> bool + Send + Sync>,
+}
+
+impl PoolOptions {
+    /// `workers` workers with the usual patience.
+    pub fn new(spec: WorkerSpec, workers: usize) -> Self {
+        Self { spec, workers: workers.max(1), attempts: 3, logs: None, stop: Arc::new(|| false) }
+    }
+}
+
+/// Why a job ended without a result.
+#[derive(Debug)]
+pub enum JobError {
+    /// The worker failed: the job is run again on a fresh one.
+    Worker(WorkerFault),
+    /// Our side failed: no worker can help, the run ends.
+    Final(RolloutError),
+}
+
+impl From<WorkerFault> for JobError {
+    fn from(fault: WorkerFault) -> Self {
+        JobError::Worker(fault)
+    }
+}
+
+impl From<RolloutError> for JobError {
+    fn from(error: RolloutError) -> Self {
+        JobError::Final(error)
+    }
+}
+
+/// One failure that a fresh worker made good, or tried to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Incident {
+    /// The job, or none while starting ahead of the first.
+    pub job: Option<u64>,
+    /// What happened.
+    pub text: String,
+}
+
+/// How a run over jobs ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RunEnd {
+    /// Every job has been delivered, or the receiver had enough.
+    Complete,
+    /// It was asked to stop first.
+    Stopped,
+}
+
+/// A set of workers for one environment.
+pub struct Pool {
+    options: PoolOptions,
+    logs: PathBuf,
+    _temporary: Option<tempfile::TempDir>,
+    ready: Ready,
+    fallback: Option<String>,
+    slots: Vec<Slot>,
+    incidents: Vec<Incident>,
+}
+
+#[derive(Default)]
+struct Slot {
+    worker: Option<Worker>,
+    generation: u32,
+}
+
+struct Shared<'a> {
+    options: &'a PoolOptions,
+    logs: &'a std::path::Path,
+    ready: Option<&'a Ready>,
+    incidents: Mutex<&'a mut Vec<Incident>>,
+}
+
+struct Progress {
+    next: u64,
+    delivered: u64,
+    halted: bool,
+}
+
+impl Pool {
+    /// Starts all workers at once and waits for their greetings.
+    ///
+    /// # Errors
+    /// Any reason why a worker cannot start.
+    pub fn start(options: PoolOptions) -> Result<Self, RolloutError> {
+        let file = |path: PathBuf| move |source| RolloutError::File { operation: "creating log folder", path, source };
+        let (logs, temporary) = match &options.logs {
+            Some(path) => {
+                std::fs::create_dir_all(path).map_err(file(path.clone()))?;
+                (path.clone(), None)
+            }
+            None => {
+                let made = tempfile::Builder::new().prefix("actrm-workers-").tempdir();
+                let folder = made.map_err(file(std::env::temp_dir()))?;
+                (folder.path().to_owned(), Some(folder))
+            }
+        };
+        let mut incidents = Vec::new();
+        let mut slots: Vec<Slot> = (0..options.workers).map(|_| Slot::default()).collect();
+        let shared = Shared { options: &options, logs: &logs, ready: None, incidents: Mutex::new(&mut incidents) };
+        let results: Vec<Result<(), RolloutError>> = std::thread::scope(|scope| {
+            let threads: Vec<_> = slots
+                .iter_mut()
+                .enumerate()
+                .map(|(index, slot)| {
+                    let shared = &shared;
+                    scope.spawn(move || slot.ensure(index, shared, None).map(|_| ()))
+                })
+                .collect();
+            threads.into_iter().map(|t| t.join().expect("starting does not panic")).collect()
+        });
+        for result in results {
+            result?;
+        }
+        let greetings: Vec<Ready> = slots.iter().filter_map(|s| s.worker.as_ref()).map(|w| w.ready().clone()).collect();
+        let ready = greetings[0].clone();
+        for other in &greetings {
+            same_greeting(&ready, other)?;
+        }
+        let first = slots[0].worker.as_ref();
+        let fallback = first.and_then(|worker| worker.fallback(options.spec.control));
+        Ok(Self { options, logs, _temporary: temporary, ready, fallback, slots, incidents })
+    }
+
+    /// What every worker of this pool said of itself.
+    pub fn ready(&self) -> &Ready {
+        &self.ready
+    }
+
+    /// Why robosuite's own control loop runs although the compiled one was asked for, if so: to be said
+    /// once.
+    pub fn fallback(&self) -> Option<&str> {
+        self.fallback.as_deref()
+    }
+
+    /// The failures so far that fresh workers made good, or tried to.
+    pub fn incidents(&self) -> &[Incident] {
+        &self.incidents
+    }
+
+    /// The ids of the workers' processes that are running now.
+    pub fn process_ids(&self) -> Vec<u32> {
+        self.slots.iter().filter_map(|s| s.worker.as_ref()).map(Worker::process_id).collect()
+    }
+
+    /// Runs `work` for every job on some worker and hands the results to `deliver` in the jobs' order.
+    ///
+    /// `state` makes what one worker's thread keeps between jobs, such as a policy. All of a thread's
+    /// numeric work stays on that thread. `seed_of` names a job's seed in errors.
+    ///
+    /// # Errors
+    /// A failure on our side; a job that no worker could do is delivered as an error instead.
+    pub fn run<S, T: Send>(
+        &mut self,
+        jobs: Range<u64>,
+        seed_of: &(dyn Fn(u64) -> u64 + Sync),
+        state: &(dyn Fn() -> Result<S, RolloutError> + Sync),
+        work: &(dyn Fn(&mut S, &mut Worker, u64) -> Result<T, JobError> + Sync),
+        deliver: &mut dyn FnMut(u64, Result<T, RolloutError>) -> ControlFlow<()>,
+    ) -> Result<RunEnd, RolloutError> {
+        let Self { options, logs, ready, slots, incidents, .. } = self;
+        let stop = Arc::clone(&options.stop);
+        let shared = Shared { options, logs, ready: Some(ready), incidents: Mutex::new(incidents) };
+        let progress = Mutex::new(Progress { next: jobs.start, delivered: jobs.start, halted: false });
+        let moved = Condvar::new();
+        let (sender, receiver) = mpsc::channel::<(u64, Result<T, JobError>)>();
+        let mut failure = None;
+        std::thread::scope(|scope| {
+            for (index, slot) in slots.iter_mut().enumerate() {
+                let (shared, progress, moved, stop) = (&shared, &progress, &moved, &*stop);
+                let (jobs, sender) = (jobs.clone(), sender.clone());
+                scope.spawn(move || {
+                    let inside = || {
+                        let mut kept = None;
+                        while let Some(job) = claim(progress, moved, stop, &jobs) {
+                            let seed = seed_of(job);
+                            let result = slot.attempt(index, shared, job, seed, &mut kept, state, work);
+                            if sender.send((job, result)).is_err() {
+                                break;
+                            }
+                        }
+                    };
+                    // a pool of one thread: matrix products inside do not spread over the cores
+                    match rayon::ThreadPoolBuilder::new().num_threads(1).build() {
+                        Ok(pool) => pool.install(inside),
+                        Err(source) => {
+                            let error = RolloutError::Thread { slot: index, source: Box::new(source) };
+                            let _ = sender.send((jobs.start, Err(JobError::Final(error))));
+                        }
+                    }
+                });
+            }
+            drop(sender);
+            let mut waiting = BTreeMap::new();
+            let mut due = jobs.start;
+            let mut open = true;
+            for (job, result) in receiver {
+                match result {
+                    Ok(value) => drop(waiting.insert(job, Ok(value))),
+                    Err(JobError::Final(error @ RolloutError::Episode { .. })) => {
+                        waiting.insert(job, Err(error));
+                    }
+                    Err(JobError::Final(error)) => {
+                        failure.get_or_insert(error);
+                        open = false;
+                    }
+                    Err(JobError::Worker(_)) => unreachable!("attempt turns faults into errors"),
+                }
+                while let Some(result) = open.then(|| waiting.remove(&due)).flatten() {
+                    open = deliver(due, result).is_continue();
+                    due += 1;
+                }
+                let mut progress = lock(&progress);
+                progress.delivered = due;
+                progress.halted = !open;
+                moved.notify_all();
+            }
+        });
+        if let Some(error) = failure {
+            return Err(error);
+        }
+        let progress = progress.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let complete = progress.halted || progress.delivered >= jobs.end;
+        Ok(if complete { RunEnd::Complete } else { RunEnd::Stopped })
+    }
+
+    /// Asks every worker to end.
+    pub fn close(mut self) {
+        std::thread::scope(|scope| {
+            for slot in &mut self.slots {
+                if let Some(worker) = slot.worker.take() {
+                    scope.spawn(move || worker.close());
+                }
+            }
+        });
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn claim(
+    progress: &Mutex<Progress>,
+    moved: &Condvar,
+    stop: &(dyn Fn() -> bool + Send + Sync),
+    jobs: &Range<u64>,
+) -> Option<u64> {
+    let mut progress = lock(progress);
+    while progress.next >= progress.delivered.saturating_add(LOOK_AHEAD) && !progress.halted && !stop() {
+        // whoever asks to stop notifies nobody: look at it now and then
+        let waited = moved.wait_timeout(progress, Duration::from_millis(100));
+        progress = waited.unwrap_or_else(PoisonError::into_inner).0;
+    }
+    if progress.halted || stop() || progress.next >= jobs.end {
+        return None;
+    }
+    progress.next += 1;
+    Some(progress.next - 1)
+}
+
+impl Slot {
+    /// The slot's worker, started if there is none.
+    fn ensure(&mut self, index: usize, shared: &Shared<'_>, job: Option<u64>) -> Result<&mut Worker, RolloutError> {
+        let mut tries = 0;
+        while self.worker.is_none() {
+            let name = format!("{index}.{}", self.generation);
+            self.generation += 1;
+            tries += 1;
+            match Worker::start(&shared.options.spec, &name, shared.logs) {
+                Ok(worker) => {
+                    if let Some(ready) = shared.ready {
+                        same_greeting(ready, worker.ready())?;
+                    }
+                    self.worker = Some(worker);
+                }
+                Err(StartFailure::Final(error)) => return Err(error),
+                Err(StartFailure::Fault(fault)) => {
+                    lock(&shared.incidents).push(Incident { job, text: fault.to_string() });
+                    if tries >= shared.options.attempts {
+                        return Err(RolloutError::Start {
+                            task: shared.options.spec.task.clone(),
+                            attempts: tries,
+                            fault: Box::new(fault),
+                        });
+                    }
+                }
+            }
+        }
+        Ok(self.worker.as_mut().expect("started above"))
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "the one place where a job meets its worker")]
+    fn attempt<S, T>(
+        &mut self,
+        index: usize,
+        shared: &Shared<'_>,
+        job: u64,
+        seed: u64,
+        kept: &mut Option<S>,
+        state: &(dyn Fn() -> Result<S, RolloutError> + Sync),
+        work: &(dyn Fn(&mut S, &mut Worker, u64) -> Result<T, JobError> + Sync),
+    ) -> Result<T, JobError> {
+        let mut attempts = 0;
+        loop {
+            attempts += 1;
+            let worker = self.ensure(index, shared, Some(job))?;
+            let kept = match kept {
+                Some(kept) => kept,
+                None => kept.insert(state()?),
+            };
+            let fault = match work(kept, worker, job) {
+                Ok(value) => return Ok(value),
+                Err(JobError::Worker(fault)) => fault,
+                Err(error) => return Err(error),
+            };
+            // dropped, and with it the process and its children
+            self.worker = None;
+            lock(&shared.incidents).push(Incident { job: Some(job), text: fault.to_string() });
+            if attempts >= shared.options.attempts {
+                let fault = Box::new(fault);
+                return Err(RolloutError::Episode { seed, attempts, fault }.into());
+            }
+        }
+    }
+}
+
+/// Every worker of a pool must describe the same environment of the same versions.
+fn same_greeting(first: &Ready, other: &Ready) -> Result<(), RolloutError> {
+    if first == other {
+        return Ok(());
+    }
+    let text = |ready: &Ready| serde_json::to_string(ready).unwrap_or_default();
+    Err(RolloutError::Handshake {
+        what: "greeting of another worker of the same pool",
+        expected: text(first),
+        found: text(other),
+    })
+}

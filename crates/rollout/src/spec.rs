@@ -1,0 +1,127 @@
+//! What a worker is to be, and the command that starts one.
+
+use std::ffi::OsString;
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::Duration;
+
+use crate::harness::{Python, cache_folder};
+use crate::message::Control;
+
+/// Runs the worker module, having asked Linux (`prctl(PR_SET_PDEATHSIG, SIGKILL)`) to kill it with us: a
+/// worker that hangs or is stopped would not see its pipe close.
+const BOOT: &str = "import runpy, sys
+if sys.platform == 'linux':
+    import ctypes
+    ctypes.CDLL(None).prctl(1, 9)
+runpy.run_module('actrm_harness.worker', run_name='__main__', alter_sys=True)";
+
+/// What a worker is to run.
+#[derive(Debug, Clone)]
+pub struct WorkerSpec {
+    /// The interpreter.
+    pub python: Python,
+    /// The folder that holds `actrm_harness`.
+    pub harness: PathBuf,
+    /// The task.
+    pub task: String,
+    /// The control loop to ask for; the worker may fall back to robosuite's.
+    pub control: Control,
+    /// A Python module of the user's that registers environments.
+    pub env_module: Option<String>,
+    /// Cameras whose images belong to the observations.
+    pub cameras: Vec<String>,
+    /// Edge of the cameras' images in pixels.
+    pub image_size: usize,
+    /// The most private memory in bytes that a worker may take.
+    pub memory_limit: Option<u64>,
+    /// How long a worker may take.
+    pub limits: TimeLimits,
+}
+
+impl WorkerSpec {
+    /// A worker for `task` with the usual limits.
+    pub fn new(python: Python, harness: PathBuf, task: &str) -> Self {
+        Self {
+            python,
+            harness,
+            task: task.to_owned(),
+            control: Control::Compiled,
+            env_module: None,
+            cameras: Vec::new(),
+            image_size: 84,
+            memory_limit: Some(4 << 30),
+            limits: TimeLimits::default(),
+        }
+    }
+
+    /// The command that starts such a worker.
+    pub(super) fn command(&self) -> Command {
+        let mut command = Command::new(&self.python.path);
+        command.args(["-c", BOOT, "--task", &self.task]);
+        command.args(["--control", self.control.as_str()]);
+        if let Some(module) = &self.env_module {
+            command.args(["--env-module", module]);
+        }
+        if !self.cameras.is_empty() {
+            command.args(["--cameras", &self.cameras.join(",")]);
+            command.args(["--size", &self.image_size.to_string()]);
+        }
+        let mut path = OsString::from(&self.harness);
+        if let Some(rest) = std::env::var_os("PYTHONPATH").filter(|rest| !rest.is_empty()) {
+            path.push(":");
+            path.push(rest);
+        }
+        command.env("PYTHONPATH", path);
+        if std::env::var_os("NUMBA_CACHE_DIR").is_none() {
+            command.env("NUMBA_CACHE_DIR", cache_folder().join("numba"));
+        }
+        if let Some(library) = control_library().filter(|_| self.control == Control::Compiled) {
+            command.env("ACTRM_CONTROL_LIB", library);
+        }
+        // one environment, one core: threads inside numpy would only fight the other workers
+        for name in ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"] {
+            command.env(name, "1");
+        }
+        command.env("PYTHONHASHSEED", "0");
+        command
+    }
+}
+
+/// The library of the compiled control loop: `$ACTRM_CONTROL_LIB`, else beside this program, where a build
+/// puts it, or in the `lib` folder of an installation.
+fn control_library() -> Option<PathBuf> {
+    if let Some(path) = std::env::var_os("ACTRM_CONTROL_LIB").filter(|path| !path.is_empty()) {
+        return Some(PathBuf::from(path));
+    }
+    let name = format!("{}control{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
+    let program = std::env::current_exe().ok()?.canonicalize().ok()?;
+    let folder = program.parent()?;
+    let places = [folder.join(&name), folder.join("..").join(&name), folder.join("../lib").join(&name)];
+    places.into_iter().find(|path| path.is_file())
+}
+
+/// How long a worker may take before it counts as hung.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TimeLimits {
+    /// From the start of the process to its greeting, and for the first request of each kind, when a
+    /// simulator may still compile.
+    pub start: Duration,
+    /// For a reset.
+    pub reset: Duration,
+    /// For a control step or an image.
+    pub step: Duration,
+    /// For a whole scripted or replayed episode.
+    pub episode: Duration,
+}
+
+impl Default for TimeLimits {
+    fn default() -> Self {
+        Self {
+            start: Duration::from_secs(180),
+            reset: Duration::from_secs(60),
+            step: Duration::from_secs(30),
+            episode: Duration::from_secs(300),
+        }
+    }
+}

@@ -1,0 +1,409 @@
+//! One worker: one simulator environment in one process, and the requests that it answers.
+//!
+//! Every answer is checked against the handshake before it is believed. Any method that returns a
+//! [`WorkerFault`] leaves the worker unusable: drop it and start another.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Duration;
+
+use safetensors::Dtype;
+
+use crate::error::{FaultKind, RolloutError, WorkerFault};
+use crate::frame::{Frame, FrameTensor};
+use crate::message::{Control, EpisodeReply, PROTOCOL, Ready, Reply, Request};
+use crate::process::{Limit, Process};
+use crate::recorded::RecordedEpisode;
+use crate::spec::{TimeLimits, WorkerSpec};
+
+/// Observation values by key, flattened row-major.
+pub type Observations = BTreeMap<String, Vec<f64>>;
+
+/// The state that a reset left.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Initial {
+    /// sha256 of the simulator's initial state, in hexadecimal.
+    pub fingerprint: String,
+    /// The group of episodes that this one belongs to, where the task has groups.
+    pub group: Option<String>,
+    /// What the environment shows.
+    pub observations: Observations,
+}
+
+/// What control steps did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stepped {
+    /// The reward of each step that was done; the task done ends them early.
+    pub rewards: Vec<f64>,
+    /// Whether the task is done.
+    pub success: bool,
+    /// What the environment shows after the last of them.
+    pub observations: Observations,
+}
+
+/// An RGB image, row-major from the top.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Image {
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// `height * width * 3` bytes.
+    pub rgb: Vec<u8>,
+}
+
+/// A running worker.
+pub struct Worker {
+    process: Process,
+    name: String,
+    ready: Ready,
+    limits: TimeLimits,
+    next_id: u64,
+    /// Kinds of request answered before, as bits: later ones get the short limit.
+    warm: u8,
+}
+
+/// Why a worker did not start: because of this try, or for good.
+#[derive(Debug)]
+pub(super) enum StartFailure {
+    Fault(WorkerFault),
+    Final(RolloutError),
+}
+
+impl Worker {
+    /// Starts a worker and waits for its greeting. `name` is `slot.generation`.
+    pub(super) fn start(spec: &WorkerSpec, name: &str, logs: &Path) -> Result<Self, StartFailure> {
+        let log = logs.join(format!("worker-{name}.stderr"));
+        let mut process = Process::spawn(spec.command(), &log, spec.memory_limit).map_err(StartFailure::Final)?;
+        let received = process.receive(Limit::of(spec.limits.start)).and_then(|body| {
+            let frame = Frame::decode(&body).map_err(FaultKind::Nonsense)?;
+            frame.parse::<Reply>().map_err(FaultKind::Nonsense)
+        });
+        let fault = |process: &Process, kind| {
+            StartFailure::Fault(WorkerFault {
+                worker: name.to_owned(),
+                phase: "start",
+                kind,
+                stderr: process.stderr_tail(),
+                log: process.log().to_owned(),
+            })
+        };
+        match received {
+            Ok(Reply::Ready(ready)) => {
+                check_handshake(&ready, spec).map_err(StartFailure::Final)?;
+                Ok(Self { process, name: name.to_owned(), ready: *ready, limits: spec.limits, next_id: 0, warm: 0 })
+            }
+            Ok(Reply::Error { kind, message, .. }) => {
+                let refused = RolloutError::Refused { task: spec.task.clone(), kind, message };
+                Err(StartFailure::Final(spec.python.problem().unwrap_or(refused)))
+            }
+            Ok(other) => {
+                let kind = unexpected("ready", &other);
+                Err(fault(&process, kind))
+            }
+            Err(kind @ FaultKind::Died(_)) => match spec.python.problem() {
+                Some(problem) => Err(StartFailure::Final(problem)),
+                None => Err(fault(&process, kind)),
+            },
+            Err(kind) => Err(fault(&process, kind)),
+        }
+    }
+
+    /// What the worker said of itself.
+    pub fn ready(&self) -> &Ready {
+        &self.ready
+    }
+
+    /// Why robosuite's own control loop runs although the compiled one was asked for, if so.
+    pub(super) fn fallback(&self, asked: Control) -> Option<String> {
+        if asked == self.ready.control {
+            return None;
+        }
+        // its stderr has little else to say at this point, and says it in one line
+        let said = std::fs::read_to_string(self.process.log()).unwrap_or_default();
+        let line = said.lines().find(|line| line.contains("compiled control is off"));
+        Some(line.unwrap_or("compiled control is off, robosuite's own loop runs").trim().to_owned())
+    }
+
+    /// The id of its process, which is also its process group's.
+    pub fn process_id(&self) -> u32 {
+        self.process.id()
+    }
+
+    /// Begins the episode of `seed`.
+    ///
+    /// # Errors
+    /// Any failure of the worker.
+    pub fn reset(&mut self, seed: u64) -> Result<Initial, WorkerFault> {
+        self.next_id += 1;
+        let request = Request::Reset { id: self.next_id, seed };
+        let (reply, frame) = self.ask(&request, Vec::new(), self.limits.reset, 1)?;
+        match reply {
+            Reply::Reset { fingerprint, group, .. } => {
+                let observations = self.observations("reset", &frame)?;
+                Ok(Initial { fingerprint, group, observations })
+            }
+            other => Err(self.fault("reset", unexpected("reset", &other))),
+        }
+    }
+
+    /// Runs control steps, one an action, until the task is done: one exchange for all that a policy planned.
+    ///
+    /// # Errors
+    /// Any failure of the worker.
+    pub fn step(&mut self, actions: &[Vec<f64>]) -> Result<Stepped, WorkerFault> {
+        self.next_id += 1;
+        let request = Request::Step { id: self.next_id };
+        let shape = [actions.len(), actions.first().map_or(0, Vec::len)];
+        let tensors = vec![("action", FrameTensor::from_f64(&shape, &actions.concat()))];
+        let (reply, frame) = self.ask(&request, tensors, self.limits.step, 2)?;
+        match reply {
+            Reply::Step { success, .. } => {
+                let rewards = self.rewards(&frame, actions.len(), success).map_err(|kind| self.fault("step", kind))?;
+                let observations = self.observations("step", &frame)?;
+                Ok(Stepped { rewards, success, observations })
+            }
+            other => Err(self.fault("step", unexpected("step", &other))),
+        }
+    }
+
+    /// The rewards of a step's answer: one for each action, fewer only where the task was done before the last.
+    fn rewards(&self, frame: &Frame, actions: usize, success: bool) -> Result<Vec<f64>, FaultKind> {
+        let rewards =
+            frame.tensor("rewards").and_then(|tensor| tensor.to_f64("rewards")).map_err(FaultKind::Nonsense)?;
+        let done = rewards.len();
+        if done == 0 || done > actions || (done < actions && !success) {
+            return Err(FaultKind::Values(format!("rewards: expected {actions} values, found {done}")));
+        }
+        if let Some(reward) = rewards.iter().find(|reward| !reward.is_finite()) {
+            return Err(FaultKind::Values(format!("reward {reward}")));
+        }
+        Ok(rewards)
+    }
+
+    /// Runs a whole scripted episode.
+    ///
+    /// # Errors
+    /// Any failure of the worker.
+    pub fn expert(&mut self, seed: u64) -> Result<RecordedEpisode, WorkerFault> {
+        self.next_id += 1;
+        let request = Request::Expert { id: self.next_id, seed };
+        let (reply, frame) = self.ask(&request, Vec::new(), self.limits.episode, 4)?;
+        match reply {
+            Reply::Expert(reply) => self.recorded("expert", reply, frame),
+            other => Err(self.fault("expert", unexpected("expert", &other))),
+        }
+    }
+
+    /// Replays stored states and returns what the environment shows along them. `ep_meta` is the demonstration's
+    /// attribute of that name, an object: what an environment has to know of an episode beyond its states.
+    ///
+    /// # Errors
+    /// Any failure of the worker.
+    pub fn extract(
+        &mut self,
+        model_file: &str,
+        ep_meta: &serde_json::Value,
+        states: FrameTensor,
+        actions: FrameTensor,
+    ) -> Result<RecordedEpisode, WorkerFault> {
+        self.next_id += 1;
+        let request = Request::Extract { id: self.next_id, model_file, ep_meta };
+        let tensors = vec![("states", states), ("actions", actions)];
+        let (reply, frame) = self.ask(&request, tensors, self.limits.episode, 8)?;
+        match reply {
+            Reply::Extract(reply) => self.recorded("extract", reply, frame),
+            other => Err(self.fault("extract", unexpected("extract", &other))),
+        }
+    }
+
+    /// Renders the present state.
+    ///
+    /// # Errors
+    /// Any failure of the worker.
+    pub fn render(&mut self, camera: &str, height: usize, width: usize) -> Result<Image, WorkerFault> {
+        self.next_id += 1;
+        let request = Request::Render { id: self.next_id, camera, size: [height, width] };
+        let (reply, mut frame) = self.ask(&request, Vec::new(), self.limits.step, 16)?;
+        if !matches!(reply, Reply::Render { .. }) {
+            return Err(self.fault("render", unexpected("render", &reply)));
+        }
+        match frame.tensors.remove("image") {
+            Some(image) if image.dtype == Dtype::U8 && image.shape == [height, width, 3] => {
+                Ok(Image { height, width, rgb: image.bytes })
+            }
+            other => {
+                let found = other.map_or("none".to_owned(), |t| format!("{:?}{:?}", t.dtype, t.shape));
+                let what = format!("image: expected U8[{height}, {width}, 3], found {found}");
+                Err(self.fault("render", FaultKind::Values(what)))
+            }
+        }
+    }
+
+    /// Checks that nothing is left in the pipe: the last answers were the whole of what it wrote.
+    ///
+    /// # Errors
+    /// Bytes that nobody asked for.
+    pub fn check_quiet(&mut self) -> Result<(), WorkerFault> {
+        if self.process.has_unread() {
+            return Err(self.fault("end of episode", FaultKind::Unasked));
+        }
+        Ok(())
+    }
+
+    /// Asks the worker to end and waits for it, a moment.
+    pub fn close(mut self) {
+        self.next_id += 1;
+        let request = Request::Close { id: self.next_id };
+        let _ = self.ask(&request, Vec::new(), Duration::from_secs(2), 32);
+        self.process.finish(Duration::from_secs(2));
+    }
+
+    fn ask(
+        &mut self,
+        request: &Request<'_>,
+        tensors: Vec<(&str, FrameTensor)>,
+        allowed: Duration,
+        kind: u8,
+    ) -> Result<(Reply, Frame), WorkerFault> {
+        let phase = request.name();
+        let exchanged = self.exchange(request, tensors, allowed, kind);
+        let (reply, frame) = exchanged.map_err(|fault| self.fault(phase, fault))?;
+        if let Reply::Error { kind, message, .. } = reply {
+            return Err(self.fault(phase, FaultKind::Reported { kind, message }));
+        }
+        self.warm |= kind;
+        Ok((reply, frame))
+    }
+
+    fn exchange(
+        &mut self,
+        request: &Request<'_>,
+        tensors: Vec<(&str, FrameTensor)>,
+        allowed: Duration,
+        kind: u8,
+    ) -> Result<(Reply, Frame), FaultKind> {
+        if self.process.has_unread() {
+            // either it died, or it wrote without being asked: reading tells which
+            return Err(match self.process.receive(Limit::of(Duration::from_secs(1))) {
+                Err(fault @ FaultKind::Died(_)) => fault,
+                _ => FaultKind::Unasked,
+            });
+        }
+        let mut frame = Frame::new(request).map_err(FaultKind::Nonsense)?;
+        for (name, tensor) in tensors {
+            frame.tensors.insert(name.to_owned(), tensor);
+        }
+        let first = self.warm & kind == 0;
+        let limit = Limit::of(if first { allowed.max(self.limits.start) } else { allowed });
+        let bytes = frame.encode().map_err(FaultKind::Nonsense)?;
+        self.process.send(&bytes, limit)?;
+        let body = self.process.receive(limit)?;
+        let frame = Frame::decode(&body).map_err(FaultKind::Nonsense)?;
+        let reply: Reply = frame.parse().map_err(FaultKind::Nonsense)?;
+        match reply.answers() {
+            ("error" | "closed", None) => {}
+            (_, id) if id == Some(self.next_id) => {}
+            (name, id) => {
+                return Err(FaultKind::Unexpected {
+                    expected: format!("an answer to request {}", self.next_id),
+                    found: format!("{name} to {id:?}"),
+                });
+            }
+        }
+        Ok((reply, frame))
+    }
+
+    fn observations(&self, phase: &'static str, frame: &Frame) -> Result<Observations, WorkerFault> {
+        let mut observations = BTreeMap::new();
+        for (key, shape) in &self.ready.observations {
+            let name = format!("obs/{key}");
+            let values = frame
+                .tensor(&name)
+                .map_err(FaultKind::Nonsense)
+                .and_then(|tensor| {
+                    if tensor.shape != *shape {
+                        let found = &tensor.shape;
+                        return Err(FaultKind::Values(format!("{name}: expected shape {shape:?}, found {found:?}")));
+                    }
+                    if tensor.dtype == Dtype::U8 {
+                        return Ok(None);
+                    }
+                    tensor.to_f64(&name).map(Some).map_err(FaultKind::Nonsense)
+                })
+                .map_err(|kind| self.fault(phase, kind))?;
+            let Some(values) = values else { continue };
+            if let Some(at) = values.iter().position(|value| !value.is_finite()) {
+                let what = format!("{name}[{at}] is {}", values[at]);
+                return Err(self.fault(phase, FaultKind::Values(what)));
+            }
+            observations.insert(key.clone(), values);
+        }
+        Ok(observations)
+    }
+
+    fn recorded(&self, phase: &'static str, reply: EpisodeReply, frame: Frame) -> Result<RecordedEpisode, WorkerFault> {
+        let values = |what: String| self.fault(phase, FaultKind::Values(what));
+        let rows = |name: &str| match frame.tensors.get(name) {
+            Some(tensor) if !tensor.shape.is_empty() => Ok(tensor.shape[0]),
+            _ => Err(values(format!("no array {name:?} in the episode"))),
+        };
+        let steps = rows("actions")?;
+        if let Some(said) = reply.steps.filter(|said| *said != steps) {
+            return Err(values(format!("it says {said} steps and sends {steps} actions")));
+        }
+        for name in frame.tensors.keys() {
+            let found = rows(name)?;
+            if found != steps {
+                return Err(values(format!("{name}: expected {steps} rows, found {found}")));
+            }
+        }
+        Ok(RecordedEpisode { success: reply.success, steps, attrs: reply.attrs, tensors: frame.tensors })
+    }
+
+    fn fault(&self, phase: &'static str, kind: FaultKind) -> WorkerFault {
+        WorkerFault {
+            worker: self.name.clone(),
+            phase,
+            kind,
+            stderr: self.process.stderr_tail(),
+            log: self.process.log().to_owned(),
+        }
+    }
+}
+
+fn unexpected(expected: &str, found: &Reply) -> FaultKind {
+    FaultKind::Unexpected { expected: expected.to_owned(), found: found.answers().0.to_owned() }
+}
+
+fn check_handshake(ready: &Ready, spec: &WorkerSpec) -> Result<(), RolloutError> {
+    let differs = |what, expected: &dyn std::fmt::Display, found: &dyn std::fmt::Display| {
+        Err(RolloutError::Handshake { what, expected: expected.to_string(), found: found.to_string() })
+    };
+    if ready.protocol != PROTOCOL {
+        return differs("protocol version", &PROTOCOL, &ready.protocol);
+    }
+    if ready.task != spec.task {
+        return differs("task", &spec.task, &ready.task);
+    }
+    if ready.action_dim == 0 {
+        return differs("action_dim", &"at least 1", &0);
+    }
+    for (what, bounds) in [("action_low", &ready.action_low), ("action_high", &ready.action_high)] {
+        if bounds.len() != ready.action_dim {
+            return differs(what, &format!("{} values", ready.action_dim), &bounds.len());
+        }
+    }
+    for (low, high) in ready.action_low.iter().zip(&ready.action_high) {
+        if !(low.is_finite() && high.is_finite() && low < high) {
+            return differs("action limits", &"finite, low below high", &format!("{low} and {high}"));
+        }
+    }
+    if ready.observations.is_empty() {
+        return differs("observations", &"at least one", &"none");
+    }
+    if ready.max_steps == 0 {
+        return differs("max_steps", &"at least 1", &0);
+    }
+    Ok(())
+}

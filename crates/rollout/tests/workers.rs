@@ -1,0 +1,307 @@
+//! Workers with a real robosuite behind them: same episode from any worker, and every way to fail.
+
+#![allow(clippy::unwrap_used)]
+
+mod common;
+
+use std::ops::ControlFlow;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::Duration;
+
+use common::{alive, impatient, options, spec, wait_until, wrapped};
+use rollout::{JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, TimeLimits, Worker, video};
+use rustix::process::{Pid, Signal, kill_process};
+
+/// Everything that an episode shows, to the last bit: fingerprint, observations, rewards.
+fn trace(worker: &mut Worker, seed: u64, steps: u32) -> Result<Vec<String>, JobError> {
+    let initial = worker.reset(seed)?;
+    let bits = |observations: &std::collections::BTreeMap<String, Vec<f64>>| {
+        let values = observations.values().flatten().map(|value| value.to_bits());
+        values.fold(0u64, |hash, bits| (hash ^ bits).wrapping_mul(0x0100_0000_01b3).rotate_left(17))
+    };
+    let mut lines = vec![initial.fingerprint.clone(), format!("{:x}", bits(&initial.observations))];
+    for step in 0..steps {
+        let wave = |k: u64| ((seed * 31 + u64::from(step) * 7 + k * 13) % 201) as f64 / 100.0 - 1.0;
+        let action: Vec<f64> = (0..7).map(wave).collect();
+        let stepped = worker.step(&[action])?;
+        lines.push(format!("{:x} {:x}", stepped.rewards[0].to_bits(), bits(&stepped.observations)));
+    }
+    Ok(lines)
+}
+
+fn traces(pool: &mut Pool, seeds: &[u64], steps: u32) -> Vec<(u64, Vec<String>)> {
+    let seed_of = |job: u64| seeds[job as usize];
+    let work = |(): &mut (), worker: &mut Worker, job| trace(worker, seed_of(job), steps);
+    let mut all = Vec::new();
+    let end = pool
+        .run(0..seeds.len() as u64, &seed_of, &|| Ok(()), &work, &mut |job, result| {
+            all.push((seed_of(job), result.unwrap()));
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+    assert_eq!(end, RunEnd::Complete);
+    all
+}
+
+#[test]
+fn an_episode_is_the_same_on_any_worker_in_any_order_after_anything() {
+    let seeds = [10_000, 10_001, 10_002, 10_003];
+    let mut one = Pool::start(options("Lift", 1)).unwrap();
+    let expected = traces(&mut one, &seeds, 12);
+    assert_eq!(expected.iter().map(|(seed, _)| *seed).collect::<Vec<_>>(), seeds, "delivered in order");
+    for (a, b) in expected.iter().zip(&expected[1..]) {
+        assert_ne!(a.1[0], b.1[0], "other seeds begin elsewhere");
+    }
+    // the same worker, now with a history, an episode cut short, and the other way round
+    let reversed: Vec<u64> = seeds.iter().rev().copied().collect();
+    traces(&mut one, &[77], 3);
+    let mut again = traces(&mut one, &reversed, 12);
+    again.reverse();
+    assert_eq!(again, expected);
+    one.close();
+    // other processes, several at once
+    let mut two = Pool::start(options("Lift", 2)).unwrap();
+    let mut again = traces(&mut two, &[10_003, 10_001, 10_000, 10_002], 12);
+    again.sort_by_key(|(seed, _)| *seed);
+    assert_eq!(again, expected);
+    // expert episodes too, and they do not disturb the others
+    let experts = shown(&mut two, 0..3);
+    assert_eq!(traces(&mut two, &seeds, 12), expected);
+    assert!(experts.iter().any(|episode| episode.success));
+    assert_eq!(shown(&mut two, 2..3)[0], experts[2], "an expert's episode depends on its seed alone");
+    assert!(two.incidents().is_empty(), "{:?}", two.incidents());
+}
+
+/// Episodes of the expert.
+fn shown(pool: &mut Pool, attempts: std::ops::Range<u64>) -> Vec<RecordedEpisode> {
+    let work = |(): &mut (), worker: &mut Worker, attempt| Ok(worker.expert(1_000_000 + attempt)?);
+    let mut all = Vec::new();
+    pool.run(attempts, &|attempt| attempt, &|| Ok(()), &work, &mut |_, episode| {
+        all.push(episode.unwrap());
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    all
+}
+
+#[test]
+fn a_killed_worker_s_episode_is_run_again_and_ends_the_same() {
+    let seeds = [10_000, 10_001, 10_002];
+    let mut pool = Pool::start(options("Lift", 1)).unwrap();
+    let expected = traces(&mut pool, &seeds, 8);
+    let killed = AtomicU32::new(0);
+    let work = |(): &mut (), worker: &mut Worker, job: u64| {
+        // twice, in the middle of the second episode
+        if job == 1 && killed.fetch_add(1, Ordering::Relaxed) < 2 {
+            trace(worker, 10_001, 4)?;
+            kill_process(Pid::from_raw(worker.process_id() as i32).unwrap(), Signal::KILL).unwrap();
+        }
+        trace(worker, seeds[job as usize], 8)
+    };
+    let mut all = Vec::new();
+    pool.run(0..3, &|job| seeds[job as usize], &|| Ok(()), &work, &mut |job, result| {
+        all.push((seeds[job as usize], result.unwrap()));
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    assert_eq!(all, expected);
+    assert_eq!(pool.incidents().len(), 2);
+    assert!(pool.incidents()[0].text.contains("signal: 9"), "{}", pool.incidents()[0].text);
+}
+
+#[test]
+fn a_worker_that_always_dies_is_an_error_after_three_and_the_others_go_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut options = options("Lift", 1);
+    options.logs = Some(dir.path().join("logs"));
+    let mut pool = Pool::start(options).unwrap();
+    let work = |(): &mut (), worker: &mut Worker, job: u64| {
+        if job == 0 {
+            kill_process(Pid::from_raw(worker.process_id() as i32).unwrap(), Signal::KILL).unwrap();
+        }
+        trace(worker, 10_000 + job, 1)
+    };
+    let mut results = Vec::new();
+    pool.run(0..2, &|job| 10_000 + job, &|| Ok(()), &work, &mut |_, result| {
+        results.push(result);
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    let error = results[0].as_ref().unwrap_err();
+    assert!(matches!(error, RolloutError::Episode { seed: 10_000, attempts: 3, .. }), "{error}");
+    assert!(error.to_string().contains("no result after 3 workers"), "{error}");
+    assert!(results[1].is_ok());
+    // four workers were started in all, and each has its log
+    assert_eq!(std::fs::read_dir(dir.path().join("logs")).unwrap().count(), 4);
+}
+
+#[test]
+fn a_stopped_worker_is_a_time_out_and_is_killed() {
+    let mut spec = spec("Lift");
+    spec.limits = impatient(TimeLimits::default());
+    let mut pool = Pool::start(PoolOptions::new(spec, 1)).unwrap();
+    let expected = traces(&mut pool, &[10_000], 3);
+    let first = pool.process_ids()[0];
+    let stopped = AtomicBool::new(false);
+    let work = |(): &mut (), worker: &mut Worker, _| {
+        if !stopped.swap(true, Ordering::Relaxed) {
+            trace(worker, 10_000, 2)?;
+            kill_process(Pid::from_raw(first as i32).unwrap(), Signal::STOP).unwrap();
+        }
+        trace(worker, 10_000, 3)
+    };
+    pool.run(0..1, &|_| 10_000, &|| Ok(()), &work, &mut |_, result| {
+        assert_eq!(result.unwrap(), expected[0].1);
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    let text = &pool.incidents()[0].text;
+    assert!(text.contains("no answer within 8.0 s"), "{text}");
+    wait_until("the stopped worker is gone", || !alive(first));
+}
+
+#[test]
+fn dropping_a_pool_leaves_no_process() {
+    let pool = Pool::start(options("Lift", 2)).unwrap();
+    let ids = pool.process_ids();
+    assert!(ids.len() == 2 && ids.iter().all(|&id| alive(id)));
+    drop(pool);
+    wait_until("both workers are gone", || !ids.iter().any(|&id| alive(id)));
+}
+
+#[test]
+fn text_on_stdout_is_noticed_and_never_read_as_an_answer() {
+    let dir = tempfile::tempdir().unwrap();
+    // the first worker prints into the pipe once its environment runs; later ones do not
+    let body = format!(
+        "if mkdir '{}/first' 2>/dev/null; then ( while [ ! -e '{}/go' ]; do sleep 0.02; done; echo Welcome to the simulator; touch '{}/said' ) & fi\nexec \"$PY\" \"$@\"",
+        dir.path().display(),
+        dir.path().display(),
+        dir.path().display()
+    );
+    let mut spec = spec("Lift");
+    spec.python = wrapped(dir.path(), "python", &body);
+    let mut pool = Pool::start(PoolOptions::new(spec, 1)).unwrap();
+    let expected = traces(&mut pool, &[10_000], 2);
+    std::fs::write(dir.path().join("go"), "").unwrap();
+    wait_until("the text is in the pipe", || dir.path().join("said").exists());
+    assert_eq!(traces(&mut pool, &[10_000], 2), expected);
+    let text = &pool.incidents()[0].text;
+    assert!(text.contains("nobody asked for"), "{text}");
+}
+
+#[test]
+fn a_python_without_robosuite_is_one_clear_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut spec = spec("Lift");
+    // -S: without the installed packages
+    spec.python = wrapped(dir.path(), "bare-python", "exec \"$PY\" -S \"$@\"");
+    let error = Pool::start(PoolOptions::new(spec, 1)).err().unwrap().to_string();
+    assert!(error.contains("bare-python") && error.contains("it has no numpy"), "{error}");
+    assert!(error.contains("make venv") && !error.contains('\n'), "{error}");
+}
+
+#[test]
+fn an_unknown_task_is_one_clear_line_that_lists_the_others() {
+    let error = Pool::start(options("Lifft", 1)).err().unwrap().to_string();
+    assert!(error.contains("Lifft") && error.contains("Lift,") && !error.contains('\n'), "{error}");
+}
+
+#[test]
+fn a_worker_that_never_greets_is_reported_after_three_tries() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut spec = spec("Lift");
+    spec.python = wrapped(dir.path(), "python", "echo tried >&2; exec sleep 100");
+    spec.limits.start = Duration::from_millis(300);
+    let error = Pool::start(PoolOptions::new(spec, 1)).err().unwrap().to_string();
+    assert!(error.contains("did not start in 3 tries"), "{error}");
+    assert!(error.contains("no answer within 0.3 s") && error.contains("tried"), "{error}");
+}
+
+#[test]
+fn a_request_to_stop_ends_a_run_after_the_episodes_under_way() {
+    let mut options = options("Lift", 1);
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    options.stop = Arc::new(move || asked.load(Ordering::Relaxed));
+    let mut pool = Pool::start(options).unwrap();
+    let mut delivered = 0;
+    let work = |(): &mut (), worker: &mut Worker, job| trace(worker, 10_000 + job, 1);
+    let end = pool
+        .run(0..1000, &|job| job, &|| Ok(()), &work, &mut |_, result| {
+            result.unwrap();
+            delivered += 1;
+            stop.store(true, Ordering::Relaxed);
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+    assert_eq!(end, RunEnd::Stopped);
+    assert!((1..=2).contains(&delivered), "{delivered}");
+}
+
+/// Steps that go to the worker together are the steps that it does one after the other.
+#[test]
+fn many_actions_in_one_request_are_as_many_requests() {
+    let mut pool = Pool::start(options("Lift", 1)).unwrap();
+    let wave = |k: u64| (0..7).map(|j| ((k * 17 + j * 29) % 101) as f64 / 50.0 - 1.0).collect::<Vec<f64>>();
+    let actions: Vec<Vec<f64>> = (0..9).map(wave).collect();
+    let parts = |sizes: &'static [usize]| {
+        let actions = actions.clone();
+        move |(): &mut (), worker: &mut Worker, _: u64| {
+            worker.reset(10_000)?;
+            let (mut rewards, mut at, mut seen) = (Vec::new(), 0, None);
+            for size in sizes {
+                let stepped = worker.step(&actions[at..at + size])?;
+                rewards.extend(stepped.rewards);
+                seen = Some((stepped.success, stepped.observations));
+                at += size;
+            }
+            Ok((rewards, seen))
+        }
+    };
+    let mut run = |sizes: &'static [usize]| {
+        let mut all = Vec::new();
+        pool.run(0..1, &|job| job, &|| Ok(()), &parts(sizes), &mut |_, result| {
+            all.push(result.unwrap());
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+        all.remove(0)
+    };
+    let single = run(&[1; 9]);
+    assert_eq!(single.0.len(), 9);
+    assert_eq!(run(&[9]), single);
+    assert_eq!(run(&[4, 1, 4]), single);
+}
+
+#[test]
+fn images_become_a_video_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut pool = Pool::start(options("Lift", 1)).unwrap();
+    let work = |(): &mut (), worker: &mut Worker, _| {
+        worker.reset(10_000)?;
+        let mut images = vec![worker.render("agentview", 96, 128)?];
+        for _ in 0..5 {
+            worker.step(&[vec![0.5, 0.0, -0.5, 0.0, 0.0, 0.0, 1.0]])?;
+            images.push(worker.render("agentview", 96, 128)?);
+        }
+        Ok(images)
+    };
+    let mut films = Vec::new();
+    pool.run(0..1, &|job| job, &|| Ok(()), &work, &mut |_, result| {
+        films.push(result.unwrap());
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    let images = films.remove(0);
+    assert_ne!(images[0], images[5], "the arm has moved");
+    let path = dir.path().join("out.mp4");
+    video::write(&common::python(), &path, &images, 20.0).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    assert_eq!(&bytes[4..8], b"ftyp", "an MPEG-4 file begins so");
+    assert!(bytes.len() > 1000, "{}", bytes.len());
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+    let error = video::write(&common::python(), &path, &[], 20.0).unwrap_err().to_string();
+    assert!(error.contains("no images"), "{error}");
+}

@@ -1,0 +1,321 @@
+//! Evaluating a solver on puzzles of the test split, in this process.
+
+use std::collections::BTreeMap;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use arrow::array::{ArrayRef, BooleanArray, RecordBatch, UInt32Array, UInt64Array};
+use models::{ModelError, Rng};
+use parquet::arrow::ArrowWriter;
+use puzzles::{Puzzle, Split, Task};
+use serde::{Deserialize, Serialize};
+
+use zoo::entry::{CONFIG_FILE, training_facts};
+use zoo::results::{EntryIdentity, TrainingFacts};
+use zoo::{ZooError, sha256_hex, write_atomic};
+
+use super::entry::{ProgressPoint, SolverEntry};
+use super::grade::{Baseline, Counts};
+use super::solver::{Solver, Thought, settled};
+use super::walk;
+
+/// Seed of the test puzzles: every solver answers the same ones.
+pub const TEST_SEED: u64 = 20_000;
+/// Seed of the validation puzzles.
+pub(super) const VALID_SEED: u64 = 10_000;
+
+/// Numbers of supervision steps after which answers are graded, as far as an evaluation goes.
+pub const DEPTHS: [usize; 6] = [1, 2, 4, 8, 16, 32];
+
+/// A finished evaluation of a solver.
+pub const RECORD_FILE: &str = "puzzles.json";
+
+const OUTCOMES_FILE: &str = "outcomes.parquet";
+
+/// Puzzles answered at once.
+const BATCH: usize = 50;
+
+/// What to evaluate on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PuzzleEvaluationOptions {
+    /// Another family than the entry's.
+    pub task: Option<Task>,
+    /// Givens of a Sudoku; the fewest that the entry was trained on unless given.
+    pub givens: Option<usize>,
+    /// Number of puzzles.
+    pub puzzles: u64,
+    /// Most supervision steps.
+    pub depth: usize,
+}
+
+/// Everything that an evaluation found, in counts: `puzzles.json`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PuzzleEvaluation {
+    /// Version of this file's layout.
+    pub format: u32,
+    /// The entry.
+    pub entry: EntryIdentity,
+    /// Where it comes from.
+    pub training: TrainingFacts,
+    /// Processor seconds of its training.
+    pub cpu_seconds: f64,
+    /// The experiment that made it.
+    pub experiment: String,
+    /// SHA-256 of its resolved text.
+    pub config_sha256: String,
+    /// The family of puzzles.
+    pub task: String,
+    /// Givens of a Sudoku at least; 0 for mazes.
+    pub givens: usize,
+    /// Seed of the puzzles, which are of the test split.
+    pub seed: u64,
+    /// Most supervision steps that it was given.
+    pub depth: usize,
+    /// Its answers: once its halting head is sure of one that stays the same, or after the last step.
+    pub answers: Counts,
+    /// Supervision steps that these took, or moves of a walker, together.
+    pub steps: u64,
+    /// A walker's successes with moves drawn as it was trained; `answers` has those with its most probable moves.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sampled: Option<Counts>,
+    /// How it did on the way of its training.
+    #[serde(default)]
+    pub progress: Vec<ProgressPoint>,
+    /// Its answers after exactly so many steps.
+    pub by_depth: BTreeMap<usize, Counts>,
+    /// What answers are worth that need no thought.
+    pub baselines: BTreeMap<Baseline, Counts>,
+}
+
+impl PuzzleEvaluation {
+    /// The layout that this program writes.
+    pub const FORMAT: u32 = 1;
+
+    /// Mean supervision steps that an answer took.
+    pub fn mean_steps(&self) -> f64 {
+        self.steps as f64 / self.answers.puzzles.max(1) as f64
+    }
+
+    /// The name of its folder: readable, and different for anything that could change an answer.
+    pub fn folder_name(&self) -> String {
+        let whole = (&self.entry, &self.task, self.givens, self.seed, self.depth, self.answers.puzzles);
+        let hash = sha256_hex(&serde_json::to_vec(&whole).expect("plain fields are always JSON"));
+        format!("{}_{}_test-{}_{}", self.entry, self.task, self.answers.puzzles, &hash[..8])
+    }
+
+    /// Reads a `puzzles.json`.
+    ///
+    /// # Errors
+    /// When it is not one.
+    pub fn read(path: &Path) -> Result<Self, ZooError> {
+        let text = std::fs::read(path).map_err(ZooError::io("read", path))?;
+        let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
+        let record: Self =
+            serde_json::from_slice(&text).map_err(|e| malformed(format!("not a puzzle evaluation: {e}")))?;
+        if record.format != Self::FORMAT {
+            return Err(malformed(format!("format: expected {}, found {}", Self::FORMAT, record.format)));
+        }
+        Ok(record)
+    }
+
+    /// Writes it.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self, path: &Path) -> Result<(), ZooError> {
+        let mut text = serde_json::to_vec_pretty(self).expect("plain fields are always JSON");
+        text.push(b'\n');
+        write_atomic(path, &text)
+    }
+}
+
+/// Graded answers of one set of puzzles.
+pub(super) struct Graded {
+    by_depth: BTreeMap<usize, Counts>,
+    halting: Counts,
+    steps: u64,
+    rows: Vec<Row>,
+}
+
+/// One puzzle's outcome.
+struct Row {
+    exact: bool,
+    valid: bool,
+    steps: usize,
+    cells_right: usize,
+}
+
+impl Graded {
+    /// Counts of the answers given when halted, and the steps these took.
+    pub(super) fn halting(&self) -> (Counts, u64) {
+        (self.halting, self.steps)
+    }
+}
+
+/// Grades `solver` on `puzzles` after each number of steps in `depths` and where it halts, at the latest after `most`.
+pub(super) fn graded(solver: &Solver, puzzles: &[Puzzle], depths: &[usize], most: usize) -> Result<Graded, ModelError> {
+    let mut graded = Graded {
+        by_depth: BTreeMap::new(),
+        halting: Counts::default(),
+        steps: 0,
+        rows: Vec::with_capacity(puzzles.len()),
+    };
+    if let Solver::Walker { net, task } = solver {
+        let walks = walk::walk_all(net.as_ref(), *task, puzzles, None)?;
+        graded.halting = walk::count(puzzles, &walks);
+        graded.steps = walks.iter().map(|walk| walk.moves as u64).sum();
+        graded.rows.extend(puzzles.iter().zip(&walks).map(|(puzzle, walk)| Row {
+            exact: walk.reached && puzzle.distance() == Some(walk.moves),
+            valid: walk.reached,
+            steps: walk.moves,
+            cells_right: 0,
+        }));
+        return Ok(graded);
+    }
+    for batch in puzzles.chunks(BATCH) {
+        let thoughts = solver.think(batch, most)?;
+        for (index, thoughts) in thoughts.iter().enumerate() {
+            if depths.contains(&(index + 1)) {
+                let counts = graded.by_depth.entry(index + 1).or_default();
+                for (puzzle, thought) in batch.iter().zip(thoughts) {
+                    add(counts, puzzle, thought);
+                }
+            }
+        }
+        for (place, puzzle) in batch.iter().enumerate() {
+            let answer = |at: usize| thoughts[at][place].answer.as_slice();
+            let stops = |at: &usize| {
+                let before = at.checked_sub(1).map(answer);
+                settled(thoughts[*at][place].halt, answer(*at), before)
+            };
+            let at = (0..thoughts.len()).find(stops).unwrap_or(thoughts.len() - 1);
+            let thought = &thoughts[at][place];
+            add(&mut graded.halting, puzzle, thought);
+            graded.steps += at as u64 + 1;
+            let grade = puzzle.grade(&thought.answer);
+            let (exact, valid, cells_right) = (grade.exact, grade.valid, grade.cells_right);
+            graded.rows.push(Row { exact, valid, steps: at + 1, cells_right });
+        }
+    }
+    Ok(graded)
+}
+
+fn add(counts: &mut Counts, puzzle: &Puzzle, thought: &Thought) {
+    counts.add(puzzle, &thought.answer, &thought.on_path);
+}
+
+/// Evaluates `entry` and stores the result in a folder of its own under `results`; a finished one is read again.
+///
+/// # Errors
+/// A model that fails, files that cannot be written.
+pub fn evaluate_puzzles(
+    entry: &SolverEntry,
+    results: &Path,
+    options: &PuzzleEvaluationOptions,
+) -> Result<(PathBuf, PuzzleEvaluation), ZooError> {
+    let meta = entry.entry().meta();
+    let own = entry.experiment().task.family()?;
+    let task = options.task.unwrap_or(own);
+    let puzzle = entry.meta();
+    let givens = match task {
+        Task::Maze(_) => 0,
+        Task::Sudoku(_) => options.givens.unwrap_or(puzzle.givens[0]),
+    };
+    let mut record = PuzzleEvaluation {
+        format: PuzzleEvaluation::FORMAT,
+        entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
+        training: TrainingFacts { data_set: format!("puzzles of {}", meta.task), ..training_facts(meta) },
+        cpu_seconds: puzzle.cpu_seconds,
+        experiment: meta.experiment.clone(),
+        config_sha256: meta.files.get(CONFIG_FILE).map_or_else(String::new, |file| file.sha256.clone()),
+        task: task.name().to_owned(),
+        givens,
+        seed: TEST_SEED,
+        depth: if entry.solver().is_recursive() { options.depth } else { 0 },
+        answers: Counts { puzzles: options.puzzles, ..Counts::default() },
+        steps: 0,
+        sampled: None,
+        progress: puzzle.progress.clone(),
+        by_depth: BTreeMap::new(),
+        baselines: BTreeMap::new(),
+    };
+    let folder = results.join(record.folder_name());
+    let path = folder.join(RECORD_FILE);
+    if path.is_file() {
+        return Ok((folder, PuzzleEvaluation::read(&path)?));
+    }
+    let draw = |index| task.numbered(Split::Test, (givens, givens), TEST_SEED, index);
+    let puzzles: Vec<Puzzle> = (0..options.puzzles).map(draw).collect();
+    let failed = |source| ZooError::Model { operation: "evaluate", name: record.entry.to_string(), source };
+    let graded = graded(entry.solver(), &puzzles, &DEPTHS, options.depth).map_err(failed)?;
+    std::fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
+    write_outcomes(&folder.join(OUTCOMES_FILE), &graded.rows)?;
+    record.baselines = match entry.solver() {
+        Solver::Walker { .. } => Baseline::of_walkers(&puzzles),
+        _ => Baseline::grade_all(task, (givens, givens), &puzzles),
+    };
+    if let Solver::Walker { net, task } = entry.solver() {
+        let mut rng = Rng::new(TEST_SEED, "sampled walks");
+        let failed = |source| ZooError::Model { operation: "evaluate", name: record.entry.to_string(), source };
+        let walks = walk::walk_all(net.as_ref(), *task, &puzzles, Some(&mut rng)).map_err(failed)?;
+        record.sampled = Some(walk::count(&puzzles, &walks));
+    }
+    (record.answers, record.steps, record.by_depth) = (graded.halting, graded.steps, graded.by_depth);
+    // last: its presence says that the evaluation is whole
+    record.write(&path)?;
+    Ok((folder, record))
+}
+
+/// Every finished evaluation of a solver under `results`, by folder name.
+///
+/// # Errors
+/// The first one that cannot be read.
+pub fn list_puzzle_evaluations(results: &Path) -> Result<Vec<PuzzleEvaluation>, ZooError> {
+    let entries = match std::fs::read_dir(results) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) => return Err(ZooError::io("read folder", results)(error)),
+    };
+    let mut paths = Vec::new();
+    for entry in entries {
+        let path = entry.map_err(ZooError::io("read folder", results))?.path().join(RECORD_FILE);
+        if path.is_file() {
+            paths.push(path);
+        }
+    }
+    paths.sort();
+    paths.iter().map(|path| PuzzleEvaluation::read(path)).collect()
+}
+
+/// One row a puzzle: `index`, `exact`, `valid`, `steps`, `cells_right`.
+fn write_outcomes(path: &Path, rows: &[Row]) -> Result<(), ZooError> {
+    let failed = |source: Box<dyn std::error::Error + Send + Sync>| ZooError::Table {
+        operation: "write outcomes to",
+        path: path.to_owned(),
+        source,
+    };
+    let flags =
+        |of: fn(&Row) -> bool| -> ArrayRef { Arc::new(BooleanArray::from_iter(rows.iter().map(|r| Some(of(r))))) };
+    let counts = |of: fn(&Row) -> usize| -> ArrayRef {
+        Arc::new(UInt32Array::from_iter_values(rows.iter().map(|row| of(row) as u32)))
+    };
+    let batch = RecordBatch::try_from_iter([
+        ("index", Arc::new(UInt64Array::from_iter_values(0..rows.len() as u64)) as ArrayRef),
+        ("exact", flags(|row| row.exact)),
+        ("valid", flags(|row| row.valid)),
+        ("steps", counts(|row| row.steps)),
+        ("cells_right", counts(|row| row.cells_right)),
+    ])
+    .map_err(|e| failed(Box::new(e)))?;
+    let mut bytes = Vec::new();
+    let written = || -> Result<(), parquet::errors::ParquetError> {
+        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), None)?;
+        writer.write(&batch)?;
+        writer.close()?;
+        Ok(())
+    }();
+    written.map_err(|e| failed(Box::new(e)))?;
+    write_atomic(path, &bytes)
+}

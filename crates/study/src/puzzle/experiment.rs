@@ -1,0 +1,295 @@
+//! Experiments on puzzles: which task, which model, how it learns. `[task] puzzle = "dfs10"` tells them from a robot's.
+
+use std::collections::BTreeMap;
+
+use models::classification::ClassProbability;
+use models::trm::{PuzzleConfig, Release};
+use puzzles::{MazeTask, Task};
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+use zoo::ZooError;
+use zoo::config::{Library, apply_overrides, from_value};
+use zoo::experiment::{Experiment, flatten};
+use zoo::run::TrainSection;
+
+use super::model::SolverConfig;
+use super::solver::Solver;
+use super::walk::{RlKind, RlSection};
+
+/// An experiment of any kind.
+#[derive(Debug, Clone, PartialEq)]
+pub enum AnyExperiment {
+    /// A robot policy from demonstrations.
+    Robot(Box<Experiment>),
+    /// A puzzle solver from puzzles with their answers.
+    Puzzle(Box<PuzzleExperiment>),
+}
+
+impl AnyExperiment {
+    /// Resolves experiment `name` of `library` with dotted `overrides` laid over it.
+    ///
+    /// # Errors
+    /// Unknown experiments, keys and values; combinations that cannot work.
+    pub fn load(library: &Library, name: &str, overrides: &[String]) -> Result<Self, ZooError> {
+        let mut table = library.resolve(name)?;
+        apply_overrides(&mut table, overrides)?;
+        let is_puzzle = table.get("task").and_then(|task| task.get("puzzle")).is_some();
+        Ok(match is_puzzle {
+            true => Self::Puzzle(Box::new(PuzzleExperiment::from_table(table)?)),
+            false => Self::Robot(Box::new(Experiment::from_table(table)?)),
+        })
+    }
+
+    /// The resolved experiment as TOML.
+    pub fn to_toml(&self) -> String {
+        match self {
+            Self::Robot(experiment) => experiment.to_toml(),
+            Self::Puzzle(experiment) => experiment.to_toml(),
+        }
+    }
+
+    /// One sentence on it.
+    pub fn description(&self) -> &str {
+        match self {
+            Self::Robot(experiment) => &experiment.description,
+            Self::Puzzle(experiment) => &experiment.description,
+        }
+    }
+}
+
+/// A resolved experiment on puzzles.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PuzzleExperiment {
+    /// Name of the entry that it makes.
+    pub entry: String,
+    /// One sentence for the model card.
+    pub description: String,
+    /// The puzzles.
+    pub task: PuzzleTask,
+    /// The model.
+    pub model: SolverConfig,
+    /// Its loss and, for a TRM, when a puzzle leaves its slot.
+    pub learning: Learning,
+    /// The training.
+    pub train: TrainSection,
+    /// How a walker learns; absent: the model marks cells and learns from answers.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rl: Option<RlSection>,
+}
+
+/// The same with the model still a table: its type decides which keys it may have.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Sections {
+    entry: String,
+    #[serde(default)]
+    description: String,
+    task: PuzzleTask,
+    model: Table,
+    #[serde(default)]
+    learning: Learning,
+    train: TrainSection,
+    #[serde(default)]
+    rl: Option<RlSection>,
+}
+
+/// `[task]` of a puzzle experiment.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PuzzleTask {
+    /// The family: `dfs10`, `sudoku9`, …
+    pub puzzle: String,
+    /// Fewest and most givens of a Sudoku to train on; tests have the fewest.
+    #[serde(default)]
+    pub givens: [usize; 2],
+    /// Number of different puzzles to train on, over and over; 0 for always new ones.
+    #[serde(default)]
+    pub train_puzzles: u64,
+    /// Number of puzzles of the validation split.
+    #[serde(default = "default_valid_puzzles")]
+    pub valid_puzzles: u64,
+}
+
+fn default_valid_puzzles() -> u64 {
+    100
+}
+
+/// `[learning]`: the loss over cells and the rules of a TRM's carry.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Learning {
+    /// What turns scores into probabilities.
+    pub probability: ClassProbability,
+    /// Weight of the halting loss (TRM).
+    pub halt_weight: f64,
+    /// Probability per step that a solved puzzle leaves its slot; absent: the halting head decides, as in the
+    /// official TRM.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub release_solved: Option<f64>,
+}
+
+impl Default for Learning {
+    fn default() -> Self {
+        Self { probability: ClassProbability::Softmax, halt_weight: 0.1, release_solved: None }
+    }
+}
+
+impl Learning {
+    pub(super) fn puzzle_config(&self, batch_size: usize) -> PuzzleConfig {
+        PuzzleConfig {
+            batch_size,
+            probability: self.probability,
+            halt_weight: self.halt_weight,
+            release: self.release_solved.map_or(Release::Head, Release::Solved),
+            ..PuzzleConfig::default()
+        }
+    }
+}
+
+impl PuzzleTask {
+    /// The family by its name.
+    ///
+    /// # Errors
+    /// [`ZooError::InvalidValue`] listing the families.
+    pub fn family(&self) -> Result<Task, ZooError> {
+        family(&self.puzzle)
+    }
+
+    /// Fewest and most givens.
+    pub fn givens(&self) -> (usize, usize) {
+        (self.givens[0], self.givens[1])
+    }
+}
+
+/// The family of that name, or an error that lists them.
+pub(super) fn family(name: &str) -> Result<Task, ZooError> {
+    Task::by_name(name).ok_or_else(|| {
+        let names: Vec<&str> = Task::all().into_iter().map(|(name, _)| name).collect();
+        ZooError::InvalidValue {
+            key: "task.puzzle".to_owned(),
+            expected: format!("one of {}", names.join(", ")),
+            found: format!("`{name}`"),
+        }
+    })
+}
+
+impl PuzzleExperiment {
+    /// Reads the text of a saved `config.toml`.
+    ///
+    /// # Errors
+    /// As [`AnyExperiment::load`].
+    pub fn from_toml(name: &str, text: &str) -> Result<Self, ZooError> {
+        let table = toml::from_str(text)
+            .map_err(|source| ZooError::ExperimentSyntax { experiment: name.to_owned(), source: Box::new(source) })?;
+        Self::from_table(table)
+    }
+
+    pub(super) fn from_table(table: Table) -> Result<Self, ZooError> {
+        let sections: Sections = from_value(&Value::Table(table), &[])?;
+        let experiment = Self {
+            entry: sections.entry,
+            description: sections.description,
+            task: sections.task,
+            model: SolverConfig::from_table(sections.model)?,
+            learning: sections.learning,
+            train: sections.train,
+            rl: sections.rl,
+        };
+        experiment.check()?;
+        Ok(experiment)
+    }
+
+    /// Its model for `task`, with weights drawn from `seed`.
+    ///
+    /// # Errors
+    /// A configuration that describes no possible model.
+    pub fn build(&self, task: Task, seed: u64) -> Result<Solver, models::ModelError> {
+        match (&self.rl, task) {
+            (None, _) => self.model.build(task, self.learning.probability, seed),
+            (Some(rl), Task::Maze(maze)) => self.model.build_walker(maze, rl.wants_value(), seed),
+            (Some(_), Task::Sudoku(_)) => Err(self.model.misplaced("a maze to walk in")),
+        }
+    }
+
+    fn check(&self) -> Result<(), ZooError> {
+        let invalid = |key: &str, expected: String, found: String| {
+            Err(ZooError::InvalidValue { key: key.to_owned(), expected, found })
+        };
+        zoo::entry::check_name(&self.entry)?;
+        let task = self.task.family()?;
+        let (fewest, most) = self.task.givens();
+        if fewest > most || most > task.cells() {
+            return invalid(
+                "task.givens",
+                format!("two numbers up to {}, rising", task.cells()),
+                format!("[{fewest}, {most}]"),
+            );
+        }
+        if most > 0 && matches!(task, Task::Maze(_)) {
+            return invalid("task.givens", "none: mazes have no givens".to_owned(), format!("[{fewest}, {most}]"));
+        }
+        if self.task.valid_puzzles == 0 {
+            return invalid("task.valid_puzzles", "at least 1".to_owned(), "0".to_owned());
+        }
+        if self.train.accumulation != 1 {
+            return invalid("train.accumulation", "1 for puzzles".to_owned(), self.train.accumulation.to_string());
+        }
+        if let Some(p) = self.learning.release_solved
+            && !(0.0..=1.0).contains(&p)
+        {
+            return invalid("learning.release_solved", "0 to 1".to_owned(), p.to_string());
+        }
+        if let Some(rl) = &self.rl {
+            if rl.episodes == 0 {
+                return invalid("rl.episodes", "at least 1".to_owned(), "0".to_owned());
+            }
+            if rl.mirrored && rl.algorithm != RlKind::Ppo {
+                return invalid(
+                    "rl.mirrored",
+                    "false: only PPO weighs what another policy did".to_owned(),
+                    "true".to_owned(),
+                );
+            }
+            if !matches!(task, Task::Maze(maze) if maze != MazeTask::Original10) {
+                return invalid("task.puzzle", "mazes that have a way, with [rl]".to_owned(), self.task.puzzle.clone());
+            }
+        }
+        self.train.check()
+    }
+
+    /// The resolved experiment as TOML: the same text for the same experiment.
+    pub fn to_toml(&self) -> String {
+        let table = Table::try_from(self).expect("an experiment read from TOML can be written as TOML");
+        toml::to_string_pretty(&table).expect("a table is TOML")
+    }
+
+    /// Dotted keys and values, for comparing two experiments.
+    pub fn flat(&self) -> BTreeMap<String, String> {
+        let mut flat = BTreeMap::new();
+        let table = Table::try_from(self).expect("an experiment read from TOML can be written as TOML");
+        flatten("", &table, &mut flat);
+        flat
+    }
+
+    /// Wraps an error of the model with where it comes from.
+    pub(super) fn model_error(&self, operation: &'static str) -> impl FnOnce(models::ModelError) -> ZooError + use<> {
+        let name = self.entry.clone();
+        move |source| ZooError::Model { operation, name, source }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn every_experiment_built_in_is_sound() {
+        let library = Library::built_in();
+        for name in library.names().unwrap() {
+            let experiment = AnyExperiment::load(&library, &name, &[]).unwrap();
+            assert!(!experiment.description().is_empty(), "{name}");
+        }
+    }
+}

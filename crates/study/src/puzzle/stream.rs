@@ -1,0 +1,96 @@
+//! The puzzles of a training, one after the other: always new ones, or a fixed number in a new order each time around.
+
+use puzzles::{Puzzle, Rng, Split, Task};
+
+use super::experiment::PuzzleExperiment;
+use zoo::ZooError;
+
+/// Where a training's puzzles come from. Its whole state is how many were taken.
+#[derive(Debug)]
+pub(super) struct Stream {
+    task: Task,
+    givens: (usize, usize),
+    seed: u64,
+    fixed: u64,
+    taken: u64,
+    /// The order of the fixed puzzles in one time around, and which.
+    order: (u64, Vec<u64>),
+}
+
+impl Stream {
+    pub(super) fn new(experiment: &PuzzleExperiment, taken: u64) -> Result<Self, ZooError> {
+        Ok(Self {
+            task: experiment.task.family()?,
+            givens: experiment.task.givens(),
+            seed: experiment.train.seed,
+            fixed: experiment.task.train_puzzles,
+            taken,
+            order: (u64::MAX, Vec::new()),
+        })
+    }
+
+    /// How many were taken.
+    pub(super) fn taken(&self) -> u64 {
+        self.taken
+    }
+
+    /// The next `count` puzzles.
+    pub(super) fn take(&mut self, count: usize) -> Vec<Puzzle> {
+        (0..count)
+            .map(|_| {
+                let index = self.next();
+                self.taken += 1;
+                self.task.numbered(Split::Train, self.givens, self.seed, index)
+            })
+            .collect()
+    }
+
+    fn next(&mut self) -> u64 {
+        if self.fixed == 0 {
+            return self.taken;
+        }
+        let around = self.taken / self.fixed;
+        if self.order.0 != around {
+            let mut order: Vec<u64> = (0..self.fixed).collect();
+            // streams from the other end: none is a puzzle's
+            Rng::new(self.seed, u64::MAX - around).shuffle(&mut order);
+            self.order = (around, order);
+        }
+        self.order.1[(self.taken % self.fixed) as usize]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stream(fixed: u64, taken: u64) -> Stream {
+        let task = Task::by_name("maze8-original").expect("a family");
+        Stream { task, givens: (0, 0), seed: 3, fixed, taken, order: (u64::MAX, Vec::new()) }
+    }
+
+    #[test]
+    fn fixed_puzzles_come_once_each_time_around_and_in_another_order() {
+        let mut one = stream(20, 0);
+        let mut first: Vec<u64> = Vec::new();
+        let mut second = Vec::new();
+        for half in [&mut first, &mut second] {
+            for _ in 0..20 {
+                half.push(one.next());
+                one.taken += 1;
+            }
+        }
+        assert_ne!(first, second);
+        first.sort_unstable();
+        second.sort_unstable();
+        assert_eq!((first.clone(), first), (second, (0..20).collect()));
+    }
+
+    #[test]
+    fn a_stream_goes_on_where_it_was() {
+        for fixed in [0, 7] {
+            let all = stream(fixed, 0).take(30);
+            assert_eq!(stream(fixed, 11).take(19), all[11..]);
+        }
+    }
+}

@@ -1,0 +1,221 @@
+//! Solvers and walkers from experiment to leaderboard: short trainings that must reach what is asked of them, the same
+//! bytes through stops, results that are found again.
+
+#![allow(clippy::unwrap_used)]
+
+use std::cell::Cell;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use puzzles::Task;
+use study::puzzle::{
+    AnyExperiment, Baseline, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest, SolverEntry,
+    evaluate_puzzles, list_puzzle_evaluations, puzzle_csv, trace, train_puzzles,
+};
+use zoo::config::Library;
+use zoo::entry::Entry;
+use zoo::run::TrainOutcome;
+
+fn request(root: &Path, name: &str, overrides: &[&str]) -> PuzzleTrainRequest {
+    let overrides: Vec<String> = overrides.iter().map(|o| (*o).to_owned()).collect();
+    let AnyExperiment::Puzzle(experiment) = AnyExperiment::load(&Library::built_in(), name, &overrides).unwrap() else {
+        panic!("{name} is no puzzle experiment")
+    };
+    PuzzleTrainRequest {
+        name: name.to_owned(),
+        experiment: *experiment,
+        runs: root.join("runs"),
+        run: None,
+        resume: false,
+        zoo: root.join("zoo"),
+    }
+}
+
+fn finish(request: &PuzzleTrainRequest) -> Entry {
+    match train_puzzles(request, &|| false, &mut |_| {}).unwrap() {
+        TrainOutcome::Finished { entry, .. } => Entry::open(&request.zoo, &entry).unwrap(),
+        TrainOutcome::Stopped { step, .. } => panic!("stopped after step {step}"),
+    }
+}
+
+fn evaluated(entry: &Entry, root: &Path, puzzles: u64) -> PuzzleEvaluation {
+    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles, depth: 4 };
+    evaluate_puzzles(&SolverEntry::load(entry, None).unwrap(), &root.join("zoo/results"), &options).unwrap().1
+}
+
+/// Trains with few steps and evaluates on 200 test puzzles.
+fn short(name: &str, overrides: &[&str]) -> PuzzleEvaluation {
+    let root = tempfile::tempdir().unwrap();
+    let mut all = vec!["train.validate_every=1000000"];
+    all.extend(overrides);
+    evaluated(&finish(&request(root.path(), name, &all)), root.path(), 200)
+}
+
+#[test]
+fn the_studys_mazes_are_learned_to_their_constant_answers() {
+    for (name, steps, most) in [
+        ("trm_maze8-original", "train.steps=400", 9_922),
+        ("cnn_maze8-original", "train.steps=80", 74_850),
+        ("trm_maze10-original", "train.steps=100", 28_258),
+    ] {
+        let result = short(name, &[steps]);
+        assert_eq!(result.answers.exact, 200, "{name}: {:?}", result.answers);
+        assert!(result.training.parameters <= most, "{name}");
+        // and so does who never looked
+        assert!(result.baselines.values().any(|counts| counts.exact == 200), "{name}");
+    }
+}
+
+#[test]
+fn walkers_learn_the_studys_maze_by_every_algorithm() {
+    for name in ["reinforce_mlp_maze5-rl", "a2c_mlp_maze5-rl", "ppo_mlp_maze5-rl"] {
+        let result = short(name, &[]);
+        assert_eq!(result.answers.exact, 200, "{name}: 8 moves, every time");
+        let sampled = result.sampled.unwrap();
+        let random = result.baselines[&Baseline::Random];
+        // drawn moves succeed far more often than a random walk's 32%
+        assert!(sampled.valid > 150 && random.valid < 100, "{name}: {sampled:?}, {random:?}");
+    }
+}
+
+/// As `short`, with up to 16 supervision steps.
+fn learned(name: &str, overrides: &[&str]) -> PuzzleEvaluation {
+    let root = tempfile::tempdir().unwrap();
+    let mut all = vec!["train.validate_every=1000000", "task.valid_puzzles=5"];
+    all.extend(overrides);
+    let entry = finish(&request(root.path(), name, &all));
+    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles: 200, depth: 16 };
+    evaluate_puzzles(&SolverEntry::load(&entry, None).unwrap(), &root.path().join("zoo/results"), &options).unwrap().1
+}
+
+#[test]
+fn a_short_training_finds_ways_through_perfect_mazes_it_has_not_seen() {
+    let result = learned(
+        "trm_dfs10",
+        &["train.steps=1700", "train.batch_size=16", "model.hidden_size=24", "model.inner_size=48"],
+    );
+    // along the row and then along the column is the way in a quarter of them
+    assert!(result.baselines.values().all(|counts| counts.exact < 70), "{:?}", result.baselines);
+    assert!(result.answers.exact > 90, "{:?}", result.answers);
+    // none of them is a way that ignores the walls
+    assert!(result.answers.detours_valid > 25, "{:?}", result.answers);
+}
+
+#[test]
+fn a_short_training_fills_sudoku_it_has_not_seen() {
+    let result = learned("trm_sudoku4", &["train.steps=900"]);
+    assert!(result.baselines.values().all(|counts| counts.exact == 0), "{:?}", result.baselines);
+    assert!(result.answers.exact > 100, "{:?}", result.answers);
+}
+
+#[test]
+fn a_walker_learns_mazes_with_walls_from_search_and_from_rewards() {
+    let searched = short("search_trm_maze5-walls", &["train.steps=250"]);
+    // half of them are what random moves reach
+    assert!(searched.answers.valid > 140, "{:?}", searched.answers);
+    let rewarded = short("ppo_trm_maze5-walls", &["train.steps=25"]);
+    assert!(rewarded.answers.valid > 100, "{:?}", rewarded.answers);
+}
+
+const TINY_TRM: [&str; 6] = [
+    "model.hidden_size=8",
+    "model.inner_size=8",
+    "train.steps=9",
+    "train.batch_size=4",
+    "train.validate_every=4",
+    "train.checkpoint_every=2",
+];
+const TINY: [&str; 3] = ["train.steps=9", "train.validate_every=4", "train.checkpoint_every=2"];
+
+#[test]
+fn a_run_stopped_anywhere_goes_on_to_the_same_bytes() {
+    for (name, overrides) in [
+        ("trm_sudoku4", TINY_TRM.as_slice()),
+        ("trm_maze8-original", TINY_TRM.as_slice()),
+        ("cnn_open8", &TINY),
+        ("reinforce_trm3_maze5-rl", &TINY),
+        ("ppo_mlp_maze5-walls", &TINY),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        let mut few = overrides.to_vec();
+        few.push("task.valid_puzzles=5");
+        let whole = finish(&request(root.path(), name, &few));
+        let mut request = request(root.path(), name, &few);
+        request.run = Some(root.path().join("interrupted"));
+        let mut outcome = None;
+        for round in 0..12 {
+            let polls = Cell::new(0);
+            let stop = || {
+                polls.set(polls.get() + 1);
+                polls.get() > 2
+            };
+            outcome = Some(train_puzzles(&request, &stop, &mut |_| {}).unwrap());
+            if matches!(outcome, Some(TrainOutcome::Finished { .. })) {
+                assert!(round > 2, "it was interrupted");
+                break;
+            }
+            request.resume = true;
+        }
+        let Some(TrainOutcome::Finished { entry, run, .. }) = outcome else { panic!("{name} never ended") };
+        let entry = Entry::open(&request.zoo, &entry).unwrap();
+        let model = |entry: &Entry| fs::read(entry.folder().join("model.safetensors")).unwrap();
+        assert!(model(&whole) == model(&entry), "{name}: other bytes after interruptions");
+        assert_eq!(whole.meta().content_sha256(), entry.meta().content_sha256());
+        assert!(run.join("metrics.parquet").is_file());
+        // with other settings it does not go on
+        fs::remove_file(run.join("finished.json")).unwrap();
+        request.experiment.train.lr *= 2.0;
+        let error = train_puzzles(&request, &|| false, &mut |_| {}).unwrap_err().to_string();
+        assert!(error.contains("train.lr differs"), "{error}");
+    }
+}
+
+#[test]
+fn an_entry_is_evaluated_once_shown_on_the_board_and_refused_where_it_does_not_fit() {
+    let root = tempfile::tempdir().unwrap();
+    let entry = finish(&request(root.path(), "trm_dfs10", &TINY_TRM));
+    let results: PathBuf = root.path().join("zoo/results");
+    let first = evaluated(&entry, root.path(), 20);
+    assert_eq!(first, evaluated(&entry, root.path(), 20), "a finished one is read again");
+    assert_eq!(list_puzzle_evaluations(&results).unwrap(), std::slice::from_ref(&first));
+    assert_eq!(first.by_depth.keys().copied().collect::<Vec<_>>(), [1, 2, 4]);
+    assert_eq!((first.answers.puzzles, first.task.as_str()), (20, "dfs10"));
+    assert!(puzzle_csv(&[first]).contains("trm-dfs10,1,trm,dfs10"));
+    assert!(entry.card().unwrap().contains("processor time"));
+
+    // shared by all cells, its weights work on larger mazes, but not on Sudoku
+    let task = |name: &str| Task::by_name(name).unwrap();
+    let larger = SolverEntry::load(&entry, Some(task("dfs16"))).unwrap();
+    let seen = trace(&larger, task("dfs16"), 0, 3, 2).unwrap();
+    assert_eq!((seen.side, seen.steps.len(), seen.steps[0].answer.len()), (16, 2, 256));
+    let error = SolverEntry::load(&entry, Some(task("sudoku4"))).err().unwrap().to_string();
+    assert!(error.contains("trm-dfs10@1") && error.contains("5 tokens, 4 answers"), "{error}");
+    let error = entry.load().err().unwrap().to_string();
+    assert!(error.contains("expected a robot policy, found a puzzle solver"), "{error}");
+    let cnn = finish(&request(root.path(), "mlp_maze8-original", &TINY));
+    let error = SolverEntry::load(&cnn, Some(task("dfs10"))).err().unwrap().to_string();
+    assert!(error.contains("expected 8x8, found 10x10"), "{error}");
+}
+
+#[test]
+fn experiments_that_cannot_work_are_refused_by_key() {
+    let error = |name: &str, change: &str| {
+        AnyExperiment::load(&Library::built_in(), name, &[change.to_owned()]).unwrap_err().to_string()
+    };
+    assert!(error("trm_dfs10", "task.puzzle=dfs11").starts_with("key `task.puzzle`: expected one of maze8-original"));
+    assert!(
+        error("trm_dfs10", "model.hiden_size=3")
+            .contains("unknown key `model.hiden_size` (did you mean `hidden_size`?)")
+    );
+    assert!(error("trm_dfs10", "model.type=rnn").contains("key `model.type`: expected one of cnn, conv"));
+    assert!(error("trm_dfs10", "task.givens=[3, 5]").contains("mazes have no givens"));
+    assert!(error("trm_sudoku4", "task.givens=[9, 5]").contains("key `task.givens`"));
+    assert!(error("ppo_mlp_maze5-walls", "task.puzzle=sudoku4").contains("mazes that have a way"));
+    assert!(error("a2c_trm_maze5-walls", "rl.mirrored=true").contains("only PPO"));
+    assert!(error("ppo_mlp_maze5-walls", "rl.algorithm=sarsa").contains("one of a2c, ppo, reinforce, search"));
+    let root = tempfile::tempdir().unwrap();
+    let request = request(root.path(), "trm_dfs10", &["model.mixing=attention", "model.num_heads=5"]);
+    let error = train_puzzles(&request, &|| false, &mut |_| {}).unwrap_err();
+    assert!(error.to_string().contains("cannot build the model of `trm-dfs10`"), "{error}");
+    assert!(!root.path().join("runs").exists(), "nothing is left of a run that never began");
+}
