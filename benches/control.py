@@ -26,12 +26,14 @@ TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 sys.path.insert(0, str(ROOT / "tools" / "harness"))
 os.environ.setdefault("ACTRM_CONTROL_LIB", str(TARGET / "release" / "libcontrol.so"))
 
-from actrm_harness import suite  # noqa: E402
+from actrm_harness.simulators.robosuite import suite  # noqa: E402
 
 suite.prepare()
 
 import numpy as np  # noqa: E402
-from actrm_harness import control, envs, protocol, wire, worker  # noqa: E402
+from actrm_harness import protocol, wire, worker  # noqa: E402
+from actrm_harness.simulators.robosuite import control, envs  # noqa: E402
+from actrm_harness.tasks import TASKS  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
 
 SPEED_BARS = {"Lift": 5.0, "Stack": 5.0, "PickPlaceCan": 3.5, "NutAssemblySquare": 3.0, "Door": 4.5}
@@ -246,7 +248,7 @@ def memory(task: str, _: argparse.Namespace) -> Iterator[Row]:
     ours = next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmRSS"))
     process.stdin.close()
     process.wait()
-    if task in envs.TASKS and task not in SPEED_BARS:
+    if task in TASKS and task not in SPEED_BARS:
         peer = ours
     else:
         plain = subprocess.run([sys.executable, "-c", _PLAIN.format(task=task)], capture_output=True, check=True)

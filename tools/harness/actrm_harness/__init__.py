@@ -1,9 +1,8 @@
-"""The Python side of actrm: one process, one robosuite environment, spoken to over a pipe.
+"""The Python side of actrm: one process, one environment of a simulator, spoken to over a pipe.
 
-`worker` is the program; `wire` and `protocol` are the frames and the messages in them; `suite` is robosuite behind
-types; `envs` makes, seeds, steps and observes an environment and `render` draws it; `tasks` holds environments of our
-own; `experts` are scripted controllers and `episodes` records what they do. Policies, clocks, time-outs and files are
-Rust's business, not this package's.
+`worker` is the program; `wire` and `protocol` are the frames and the messages in them; `tasks` is the table of tasks;
+`simulators` hold a folder for each simulator; `environments` are our own; `experts` are scripted controllers. Policies,
+clocks, time-outs and files are Rust's business, not this package's.
 """
 
 PROTOCOL = 1

@@ -18,20 +18,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from actrm_harness.tasks import TASKS
 from actrm_harness.worker import settle
 
 if TYPE_CHECKING:
-    from actrm_harness.envs import Session
+    from actrm_harness.simulators.robosuite.envs import Session
 
-BARS = {
-    "Lift": 0.95,
-    "Stack": 0.95,
-    "PickPlaceCan": 0.95,
-    "NutAssemblySquare": 0.85,
-    "Door": 0.85,
-    "StackThreeCubes": 0.95,
-    "StackColor": 0.95,
-}
+BARS = {task.name: task.bar for task in TASKS.values() if task.expert is not None}
 
 # A step in which no action of the arm is larger than this is a pause.
 STILL = 0.08
@@ -113,10 +106,10 @@ def play(task: str, loop: str, seeds: list[int], workers: int) -> Iterator[Outco
 
 def _start(task: str, loop: str) -> None:
     global _session  # noqa: PLW0603
-    from actrm_harness import suite
+    from actrm_harness.simulators.robosuite import suite
 
     suite.prepare()
-    from actrm_harness import control, envs
+    from actrm_harness.simulators.robosuite import control, envs
 
     _session = envs.make(task)
     if loop == "compiled":
@@ -126,7 +119,7 @@ def _start(task: str, loop: str) -> None:
 def _play(seed: int) -> Outcome:
     import numpy as np
 
-    from actrm_harness import episodes
+    from actrm_harness.simulators.robosuite import episodes
 
     assert _session is not None, "the pool's initializer made it"
     episode = episodes.expert_episode(_session, seed)

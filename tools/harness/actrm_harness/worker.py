@@ -18,8 +18,8 @@ from actrm_harness import PROTOCOL, protocol, wire
 from actrm_harness.protocol import RequestError, error_message
 
 if TYPE_CHECKING:
-    from actrm_harness.envs import Session
-    from actrm_harness.episodes import Episode
+    from actrm_harness.simulators.robosuite.envs import Session
+    from actrm_harness.simulators.robosuite.episodes import Episode
 
 
 # What has to be set before the interpreter starts. Sets of names must not be ordered by chance (robosuite draws from
@@ -91,10 +91,10 @@ def arguments() -> argparse.Namespace:
 
 def start(args: argparse.Namespace) -> "Session":
     """Import the simulator and make the environment."""
-    from actrm_harness import suite
+    from actrm_harness.simulators.robosuite import suite
 
     suite.prepare()
-    from actrm_harness import envs
+    from actrm_harness.simulators.robosuite import envs
 
     suite.robosuite()
     if args.env_module:
@@ -107,7 +107,7 @@ def start(args: argparse.Namespace) -> "Session":
     cameras = tuple(name for name in args.cameras.split(",") if name)
     session = envs.make(args.task, cameras, args.size)
     if args.control == "compiled":
-        from actrm_harness import control
+        from actrm_harness.simulators.robosuite import control
 
         session.control = control.attach(session.env)
     return session
@@ -117,7 +117,7 @@ def describe(session: "Session") -> protocol.Ready:
     """The handshake: versions, shapes and the environment's arguments."""
     import numpy as np
 
-    from actrm_harness import envs, suite
+    from actrm_harness.simulators.robosuite import envs, suite
 
     low, high = session.env.action_spec
     shapes = {name: list(value.shape) for name, value in envs.reset(session, 0).items()}
@@ -192,7 +192,7 @@ def step_reply(session: "Session", number: int, actions: wire.Array) -> Answer:
 
 def answer_seldom(session: "Session", request: protocol.Request, tensors: wire.Tensors) -> Answer:
     """The reply to a request that is not a step."""
-    from actrm_harness import envs, episodes
+    from actrm_harness.simulators.robosuite import envs, episodes
 
     if isinstance(request, protocol.Reset):
         first = envs.reset(session, request.seed, request.split == "demonstration")
@@ -222,7 +222,7 @@ def answer_seldom(session: "Session", request: protocol.Request, tensors: wire.T
 @cache
 def environments() -> Any:
     """The module `envs`, which is imported late, as it brings the simulator."""
-    return importlib.import_module("actrm_harness.envs")
+    return importlib.import_module("actrm_harness.simulators.robosuite.envs")
 
 
 def episode_reply(kind: str, number: int, episode: "Episode") -> wire.Message:

@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from actrm_harness.experts import EXPERTS, Scene
-from actrm_harness.experts_cubes import LiftExpert
+from actrm_harness.experts.cubes import LiftExpert
+from actrm_harness.experts.parts import Scene
+from actrm_harness.tasks import Task, register
 
 Lift: Any = importlib.import_module("robosuite").environments.manipulation.lift.Lift
 
@@ -32,4 +33,4 @@ class HighExpert(LiftExpert):
         self.top += 0.15
 
 
-EXPERTS["LiftHigh"] = HighExpert
+register(Task("LiftHigh", expert=HighExpert))

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from conftest import LIBRARY, Client
 
-from actrm_harness import suite
+from actrm_harness.simulators.robosuite import suite
 
 suite.prepare()
 
-from actrm_harness import control, envs, episodes  # noqa: E402
-from actrm_harness.control import CompiledControl  # noqa: E402
-from actrm_harness.control_abi import Library  # noqa: E402
+from actrm_harness.simulators.robosuite import control, envs, episodes  # noqa: E402
+from actrm_harness.simulators.robosuite.control import CompiledControl  # noqa: E402
+from actrm_harness.simulators.robosuite.control_abi import Library  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
 
 TASKS = ["Lift", "Stack", "PickPlaceCan", "NutAssemblySquare", "Door"]

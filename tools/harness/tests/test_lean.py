@@ -4,18 +4,19 @@ from typing import Any
 
 import pytest
 
-from actrm_harness import suite
+from actrm_harness.simulators.robosuite import suite
 
 suite.prepare()
 
-from actrm_harness import envs, episodes  # noqa: E402
+from actrm_harness.simulators.robosuite import envs, episodes  # noqa: E402
 
 
 @pytest.fixture
-def kept(monkeypatch: pytest.MonkeyPatch) -> envs.Session:
+def kept() -> envs.Session:
     """A session that keeps its model between episodes."""
-    monkeypatch.setitem(envs.TASKS, "Stack", envs.Task("Stack", soft_reset=True))
-    return envs.make("Stack")
+    session = envs.make("Stack")
+    assert session.task.soft_reset
+    return session
 
 
 def test_the_robots_own_model_is_compiled_when_somebody_looks_at_it(kept: envs.Session) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from conftest import Client, WorkerError, walk
 
-from actrm_harness import envs, episodes, render, suite, wire
+from actrm_harness import wire
+from actrm_harness.simulators.robosuite import envs, episodes, render, suite
 
 suite.prepare()
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from conftest import Client, WorkerError, walk
 
-from actrm_harness import control, envs, episodes, suite
+from actrm_harness.simulators.robosuite import control, envs, episodes, suite
+from actrm_harness.tasks import TASKS
 
 suite.prepare()
 
@@ -27,7 +28,7 @@ def trace(session: envs.Session, seed: int, steps: int = 12) -> list[object]:
     return seen
 
 
-@pytest.mark.parametrize("task", [name for name, task in envs.TASKS.items() if task.soft_reset])
+@pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task.soft_reset])
 def test_a_soft_reset_is_a_hard_reset_bit_for_bit(task: str) -> None:
     """Kept models show the same episodes as models loaded again, after other episodes and after an expert's."""
     soft, hard = envs.make(task), envs.make(task)
@@ -72,7 +73,7 @@ def test_lifts_cube_drawn_anew_gives_the_model_that_loading_gives() -> None:
 
 
 @pytest.mark.usefixtures("library")
-@pytest.mark.parametrize("task", [name for name in envs.TASKS if name != "Lift"])
+@pytest.mark.parametrize("task", [name for name in TASKS if name != "Lift"])
 def test_the_expert_solves_the_task(task: str) -> None:
     """Two seeds each; `actrm_harness.check_experts` counts over 200."""
     session = envs.make(task)

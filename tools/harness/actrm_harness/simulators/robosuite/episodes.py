@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from actrm_harness import envs
-from actrm_harness.envs import Session
-from actrm_harness.experts import Scene, make_expert
+from actrm_harness.experts.parts import Expert, Scene
 from actrm_harness.protocol import RequestError
+from actrm_harness.simulators.robosuite import envs
+from actrm_harness.simulators.robosuite.envs import Session
+from actrm_harness.tasks import find
 from actrm_harness.wire import Array, Tensors
 
 # A demonstration ends this many steps after the task is solved, so that its last actions show how to stay there.
@@ -78,10 +79,9 @@ def expert_episode(session: Session, seed: int, demonstration: bool = True) -> E
     session.foreign_model |= session.xml_forgotten
     recorder = _Recorder(envs.reset(session, seed, demonstration))
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
-    try:
-        expert = make_expert(session.task.name, Scene(env), np.random.default_rng([seed, 1]))
-    except KeyError as error:
-        raise RequestError("no_expert", f"task {session.task.name!r} has no scripted expert") from error
+    if session.task.expert is None:
+        raise RequestError("no_expert", f"task {session.task.name!r} has no scripted expert")
+    expert: Expert = find(session.task.expert)(Scene(env), np.random.default_rng([seed, 1]))
     held = 0
     for _ in range(session.task.max_steps):
         before = envs.state(env)

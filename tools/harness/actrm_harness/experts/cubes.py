@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from actrm_harness.experts import DOWN, Carry, Grasp, Mishaps, Scene, Servo, about_z, hand_yaw
+from actrm_harness.experts.parts import DOWN, Carry, Grasp, Mishaps, Scene, Servo, about_z, hand_yaw
 from actrm_harness.wire import Array
 
 TABLE = 0.8

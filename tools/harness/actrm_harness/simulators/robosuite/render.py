@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from actrm_harness import suite
 from actrm_harness.protocol import RequestError
-from actrm_harness.suite import Sim
+from actrm_harness.simulators.robosuite import suite
+from actrm_harness.simulators.robosuite.suite import Sim
 from actrm_harness.wire import Array
 
 _MAX_GEOMS = 10_000

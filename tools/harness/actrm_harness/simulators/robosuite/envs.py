@@ -7,7 +7,6 @@ it again; for Lift, whose cube robosuite draws when it loads the model, because 
 """
 
 import hashlib
-import importlib
 import json
 import os
 import re
@@ -19,41 +18,16 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
-from actrm_harness import lean, lift_cube, suite
 from actrm_harness.protocol import RequestError
-from actrm_harness.suite import Env
+from actrm_harness.simulators.robosuite import lean, suite
+from actrm_harness.simulators.robosuite.suite import Env
+from actrm_harness.tasks import TASKS, Task, find, row
 from actrm_harness.wire import Array, Tensors
 
 if TYPE_CHECKING:
-    from actrm_harness.render import Renderer
+    from actrm_harness.simulators.robosuite.render import Renderer
 
 CONTROL_FREQ = 20
-DEFAULT_MAX_STEPS = 400
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """What this package knows about an environment beyond its name."""
-
-    name: str
-    soft_reset: bool = False
-    max_steps: int = DEFAULT_MAX_STEPS
-    redraw: Callable[[Env], None] | None = None
-    """What loading the model would draw, drawn into a kept model."""
-
-
-TASKS = {
-    task.name: task
-    for task in (
-        Task("Lift", soft_reset=True, redraw=lift_cube.redraw),
-        Task("Stack", soft_reset=True),
-        Task("PickPlaceCan", soft_reset=True),
-        Task("NutAssemblySquare", soft_reset=True),
-        Task("Door", soft_reset=True),
-        Task("StackThreeCubes", soft_reset=True, max_steps=600),
-        Task("StackColor", soft_reset=True, max_steps=600),
-    )
-}
 
 
 class Control(Protocol):
@@ -98,11 +72,14 @@ class StepResult:
 
 def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Session:
     """Make the environment of a task; RequestError("unknown_task") where there is none of that name."""
-    importlib.import_module("actrm_harness.tasks")
+    for defined_in in sorted(
+        {task.defined_in for task in TASKS.values() if task.defined_in and task.simulator == "robosuite"}
+    ):
+        find(defined_in)
     known = suite.known_environments()
     if task_name not in known:
         raise RequestError("unknown_task", f"unknown task {task_name!r}; known: {', '.join(known)}")
-    task = TASKS.get(task_name, Task(task_name))
+    task = row(task_name)
     kwargs: dict[str, Any] = {
         "robots": "Panda",
         "controller_configs": suite.panda_controller(),
@@ -151,7 +128,7 @@ def reset(session: Session, seed: int, demonstration: bool = False) -> Tensors:
         lean.forget_xml(give_back=False)
         session.xml_forgotten = False
     elif session.task.redraw is not None:
-        session.task.redraw(env)
+        find(session.task.redraw)(env)
     raw = env.reset()
     env.hard_reset = not session.task.soft_reset
     return {**observation(raw), **images(session)}
@@ -198,7 +175,7 @@ def steps_session(session: Session, actions: Array) -> tuple[StepResult, Array]:
 def image(session: Session, camera: str, height: int, width: int) -> Array:
     """What a camera sees now; the OpenGL context is made when the first image is asked for."""
     if session.renderer is None:
-        from actrm_harness.render import Renderer
+        from actrm_harness.simulators.robosuite.render import Renderer
 
         session.renderer = Renderer()
     return session.renderer.image(session.env.sim, camera, height, width)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from actrm_harness.experts import (
+from actrm_harness.experts.parts import (
     CLOSE,
     DOWN,
     OPEN,

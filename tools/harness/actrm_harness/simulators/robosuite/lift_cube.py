@@ -10,7 +10,7 @@ import copy
 import importlib
 from typing import Any
 
-from actrm_harness.suite import Env
+from actrm_harness.simulators.robosuite.suite import Env
 
 _NAME = "cube"
 _SMALLEST, _LARGEST = [0.020] * 3, [0.022] * 3

@@ -1,19 +1,17 @@
-"""What the scripted experts share: the view of the scene, the servo, the variety, and the table of experts.
+"""What the scripted experts share: the view of the scene, the servo and the variety.
 
 An expert is closed-loop: every action follows from what can be observed now, so that it recovers from a push, and so
 that a policy which sees the same observations can learn it. Episodes differ by a `Style` drawn once (speed, height and
 side of the approach), by correlated noise on the command, and by pushes of a few steps that it has to make up for.
 """
 
-import importlib
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import numpy as np
 
-from actrm_harness.suite import Env
+from actrm_harness.simulators.robosuite.suite import Env
 from actrm_harness.wire import Array
 
 # OSC_POSE: an action of 1 asks for 5 cm or 0.5 rad.
@@ -32,9 +30,6 @@ class Expert(Protocol):
     def act(self) -> Array:
         """The action for the current state, before it is clipped to +-1."""
         ...
-
-
-ExpertFactory = Callable[["Scene", np.random.Generator], Expert]
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,27 +302,3 @@ class Carry:
         elif self.released and (distance > lost or abs(float(away[2])) > lost):
             self.released = False
         return self.released
-
-
-def make_expert(task: str, scene: Scene, rng: np.random.Generator) -> Expert:
-    """The expert of a task; KeyError where it has none."""
-    return EXPERTS[task](scene, rng)
-
-
-def _from(module: str, name: str) -> ExpertFactory:
-    def build(scene: Scene, rng: np.random.Generator) -> Expert:
-        factory: object = getattr(importlib.import_module(f"actrm_harness.{module}"), name)
-        return cast(ExpertFactory, factory)(scene, rng)
-
-    return build
-
-
-EXPERTS: dict[str, ExpertFactory] = {
-    "Lift": _from("experts_cubes", "LiftExpert"),
-    "Stack": _from("experts_cubes", "StackExpert"),
-    "StackThreeCubes": _from("experts_cubes", "TowerExpert"),
-    "StackColor": _from("experts_cubes", "TowerExpert"),
-    "PickPlaceCan": _from("experts_objects", "CanExpert"),
-    "NutAssemblySquare": _from("experts_objects", "SquareExpert"),
-    "Door": _from("experts_objects", "DoorExpert"),
-}

@@ -17,9 +17,18 @@ from typing import Any, cast
 
 import numpy as np
 
-from actrm_harness.control_abi import ACTION, DOF, MUJOCO, STATE, Binding, ControlError, Library, mujoco_functions
-from actrm_harness.control_recent import Recent
-from actrm_harness.control_sensors import ContactTest, Sensor, WatchedCache, cheaper
+from actrm_harness.simulators.robosuite.control_abi import (
+    ACTION,
+    DOF,
+    MUJOCO,
+    STATE,
+    Binding,
+    ControlError,
+    Library,
+    mujoco_functions,
+)
+from actrm_harness.simulators.robosuite.control_recent import Recent
+from actrm_harness.simulators.robosuite.control_sensors import ContactTest, Sensor, WatchedCache, cheaper
 from actrm_harness.wire import Array
 
 LIBRARY = "ACTRM_CONTROL_LIB"

@@ -13,7 +13,7 @@ import importlib
 from functools import cache
 from typing import Any
 
-from actrm_harness.control_abi import ControlError, mujoco_library
+from actrm_harness.simulators.robosuite.control_abi import ControlError, mujoco_library
 
 _MODEL = "_compiled_when_asked"
 

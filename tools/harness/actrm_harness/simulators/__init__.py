@@ -1,0 +1,1 @@
+"""The simulators that a worker can hold, one folder each. `tasks` says which of them a task needs."""
