@@ -1,10 +1,10 @@
 //! LeRobot's ACT files as values: its `config.json`, its tensor names, its names of normalisation modes. This is the one
 //! place that knows them; files are read and written in `zoo`.
 
-use crate::act::Config;
 use crate::batch::Dims;
 use crate::error::{ModelError, Result, some_names};
 use crate::layers::{Activation, sinusoid_table};
+use crate::models::act::Config;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
 use crate::params::Params;
 use candle_core::Tensor;
@@ -313,8 +313,8 @@ pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, 
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::act::Act;
     use crate::model::PolicyModel;
+    use crate::models::act::Act;
 
     fn example() -> LerobotAct {
         LerobotAct {

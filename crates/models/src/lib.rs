@@ -5,11 +5,9 @@
 //! slices (`Batch`), weights come in and go out as named tensors (`Params`), progress is returned as numbers. All
 //! randomness is drawn from `Rng`.
 
-pub mod act;
-mod act_fused;
-pub mod actrm;
 pub mod baselines;
 mod batch;
+mod checks;
 pub mod classification;
 mod error;
 mod fused;
@@ -18,25 +16,30 @@ mod kernels;
 pub mod layers;
 mod learner;
 pub mod lerobot;
+mod losses;
 mod model;
+mod models;
 mod normaliser;
 mod optim;
 mod params;
 mod policy;
+mod registry;
 pub mod rl;
 mod rng;
 mod simd;
 mod train;
-pub mod trm;
+mod values;
 
 pub use batch::{Batch, Dims};
 pub use error::{ModelError, Result};
 pub use gradients::{Gradients, ParamLayout};
 pub use learner::{Learner, LearnerMetrics};
-pub use model::{LossParts, LossValues, PolicyConfig, PolicyModel};
+pub use model::{LossParts, LossValues, PolicyModel};
+pub use models::*;
 pub use normaliser::{ACTION, ENVIRONMENT_STATE, Guarded, NormMode, Normaliser, STATE};
 pub use optim::{Optimiser, OptimiserConfig};
 pub use params::{Init, Params};
 pub use policy::{ActionChunk, Actor, Observation, Policy, RecedingHorizon, TemporalEnsemble};
+pub use registry::{PolicyConfig, PolicyType};
 pub use rng::Rng;
 pub use train::{Schedule, StepMetrics, TrainConfig, Trainer, TrainerState};

@@ -1,8 +1,6 @@
 //! What the trainer, the zoo and the policies need of a model.
 
-use crate::act::{self, Act};
-use crate::actrm::{self, Actrm};
-use crate::batch::{Batch, Dims};
+use crate::batch::Batch;
 use crate::error::{ModelError, Result};
 use crate::gradients::Gradients;
 use crate::params::Params;
@@ -82,35 +80,4 @@ pub trait PolicyModel: Send + Sync {
 
     /// Number of actions in a predicted chunk.
     fn action_horizon(&self) -> usize;
-}
-
-/// The configuration of any policy model: `type = "act"` and so on, with the model's own keys beside it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "type", rename_all = "snake_case")]
-pub enum PolicyConfig {
-    /// Action Chunking with Transformers
-    Act(act::Config),
-    /// ACT that reasons recursively
-    Actrm(actrm::Config),
-}
-
-impl PolicyConfig {
-    /// A model with initial weights drawn from `seed`.
-    ///
-    /// # Errors
-    /// A configuration that describes no possible model.
-    pub fn build(&self, dims: &Dims, seed: u64) -> Result<Box<dyn PolicyModel>> {
-        match self {
-            Self::Act(config) => Ok(Box::new(Act::new(config, dims, seed)?)),
-            Self::Actrm(config) => Ok(Box::new(Actrm::new(config, dims, seed)?)),
-        }
-    }
-
-    /// Number of actions in a predicted chunk.
-    pub fn action_horizon(&self) -> usize {
-        match self {
-            Self::Act(config) => config.action_horizon,
-            Self::Actrm(config) => config.action_horizon,
-        }
-    }
 }

@@ -11,7 +11,8 @@ use crate::model::{LossValues, PolicyModel};
 use crate::optim::{Optimiser, OptimiserConfig, flat};
 use crate::rng::Rng;
 use crate::simd::{sum_of_squares, vectorised};
-use candle_core::{DType, Tensor};
+use crate::values::with_values;
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -389,24 +390,6 @@ impl Trainer {
         (self.rng, self.ema) = (rng, ema);
         Ok(())
     }
-}
-
-/// Calls `f` with the values of a contiguous f32 tensor, without a copy.
-pub(crate) fn with_values<R>(tensor: &Tensor, f: impl FnOnce(&[f32]) -> R) -> Result<R> {
-    let tensor = tensor.to_dtype(DType::F32)?.contiguous()?;
-    let (storage, layout) = tensor.storage_and_layout();
-    let candle_core::Storage::Cpu(storage) = &*storage else {
-        let found = "on another device".to_string();
-        return Err(ModelError::Input {
-            operation: "read",
-            object: "tensor",
-            found,
-            expected: "on the CPU".to_string(),
-        });
-    };
-    let values = storage.as_slice::<f32>()?;
-    let from = layout.start_offset();
-    Ok(f(&values[from..from + layout.shape().elem_count()]))
 }
 
 /// All parameters one after the other.

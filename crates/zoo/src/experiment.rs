@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use models::{ACTION, ENVIRONMENT_STATE, ModelError, NormMode, PolicyConfig, STATE};
+use models::{ACTION, ENVIRONMENT_STATE, ModelError, NormMode, PolicyConfig, PolicyType, STATE};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use crate::ZooError;
-use crate::config::{Library, apply_overrides, from_value};
+use crate::config::{Library, apply_overrides, from_value, from_value_as};
 use crate::run::TrainSection;
 
 /// A resolved experiment, as `config.toml` of runs and entries holds it.
@@ -189,9 +189,7 @@ impl Experiment {
 
     /// Kind of policy, as the config names it.
     pub fn policy_type(&self) -> String {
-        let value = Value::try_from(&self.policy).ok();
-        let kind = value.as_ref().and_then(|v| v.get("type")).and_then(Value::as_str);
-        kind.expect("a policy serialises with its type").to_owned()
+        self.policy.policy_type().to_owned()
     }
 
     /// The resolved experiment as TOML: the same text for the same experiment.
@@ -224,21 +222,17 @@ impl Experiment {
 
 /// Reads `[policy]` as the config of the model that its `type` names.
 fn policy(mut table: Table) -> Result<PolicyConfig, ZooError> {
-    const TYPES: [&str; 2] = ["act", "actrm"];
-    let kind = match table.remove("type") {
-        Some(kind) => kind,
-        None => return Err(ZooError::MissingKey { key: "policy.type".to_owned() }),
+    let Some(name) = table.remove("type") else {
+        return Err(ZooError::MissingKey { key: "policy.type".to_owned() });
     };
-    let rest = Value::Table(table);
-    match kind.as_str() {
-        Some("actrm") => Ok(PolicyConfig::Actrm(from_value(&rest, &["policy"])?)),
-        Some("act") => Ok(PolicyConfig::Act(from_value(&rest, &["policy"])?)),
-        _ => Err(ZooError::InvalidValue {
+    let Some(kind) = name.as_str().and_then(PolicyType::named) else {
+        return Err(ZooError::InvalidValue {
             key: "policy.type".to_owned(),
-            expected: format!("one of {}", TYPES.join(", ")),
-            found: kind.to_string(),
-        }),
-    }
+            expected: format!("one of {}", PolicyConfig::TYPES.join(", ")),
+            found: name.to_string(),
+        });
+    };
+    from_value_as(kind, &Value::Table(table), &["policy"])
 }
 
 /// Puts the dotted keys and values of `table` into `flat`.

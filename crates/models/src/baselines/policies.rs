@@ -8,9 +8,9 @@
 use super::dense;
 use crate::error::{ModelError, Result};
 use crate::layers::{LayerNorm, Linear};
+use crate::models::trm::{self, Fused};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use crate::trm::{self, Fused};
 use candle_core::{D, Tensor};
 use serde::{Deserialize, Serialize};
 

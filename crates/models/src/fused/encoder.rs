@@ -2,8 +2,9 @@
 
 use super::attention::{Attention, Side};
 use super::feed_forward::FeedForward;
-use super::{Entry, Grads, Norm, Pass, Residual, Rows, Shape, enter, enter_backward};
+use super::{Entry, Grads, Norm, Pass, Residual, Rows, enter, enter_backward};
 use crate::kernels::{Heads, Start, add};
+use crate::layers::Shape;
 
 /// What an encoder layer's backward pass needs.
 #[derive(Debug)]

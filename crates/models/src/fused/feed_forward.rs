@@ -1,8 +1,8 @@
 //! The feed-forward branch.
 
-use super::{Grads, Pass, Rows, Shape};
+use super::{Grads, Pass, Rows};
 use crate::kernels::{Mat, Start, activate, activate_backward, gemm_with};
-use crate::layers::{Activation, DropoutMask};
+use crate::layers::{Activation, DropoutMask, Shape};
 
 /// What the feed-forward branch's backward pass needs.
 #[derive(Debug)]

@@ -4,7 +4,7 @@ use super::{Grads, Pass};
 use crate::batch::{Batch, Dims};
 use crate::error::Result;
 use crate::kernels::{Mat, Start, gemm};
-use crate::train::with_values;
+use crate::values::with_values;
 
 /// A batch as slices.
 #[derive(Debug)]

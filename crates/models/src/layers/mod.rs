@@ -9,6 +9,9 @@ mod feed_forward;
 mod layer_norm;
 mod linear;
 mod position;
+mod tokens;
+mod transformer;
+mod vae;
 
 pub use attention::{MultiHeadAttention, masked_softmax};
 pub use dropout::{Dropout, DropoutMask, Mode};
@@ -17,3 +20,6 @@ pub use feed_forward::{Activation, FeedForward};
 pub use layer_norm::LayerNorm;
 pub use linear::Linear;
 pub use position::sinusoid_table;
+pub(crate) use tokens::InputTokens;
+pub(crate) use transformer::{Decoder, DecoderLayer, Encoder, LayerInit, Shape};
+pub(crate) use vae::{Vae, kl_divergence, sample};

@@ -14,7 +14,7 @@ use toml::Table;
 use crate::ZooError;
 
 pub use overrides::apply_overrides;
-pub use value::from_value;
+pub use value::{from_value, from_value_as};
 
 /// The name most like `name`, if one is like it: at most a third of its letters differ.
 pub fn nearest(name: &str, names: &[String]) -> Option<String> {

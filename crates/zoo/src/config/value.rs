@@ -5,7 +5,7 @@
 
 use std::fmt::{self, Display};
 
-use serde::de::{self, DeserializeOwned, IntoDeserializer, Unexpected};
+use serde::de::{self, DeserializeOwned, DeserializeSeed, IntoDeserializer, Unexpected};
 use serde::forward_to_deserialize_any;
 use toml::Value;
 
@@ -111,6 +111,18 @@ impl de::Error for Refusal {
 /// [`ZooError::UnknownKey`], [`ZooError::MissingKey`] or [`ZooError::InvalidValue`], each with its path.
 pub fn from_value<T: DeserializeOwned>(value: &Value, prefix: &[&str]) -> Result<T, ZooError> {
     T::deserialize(ValueDeserializer(value)).map_err(|refusal| refusal.into_error(prefix))
+}
+
+/// [`from_value`] with a seed that knows what is to be read.
+///
+/// # Errors
+/// As [`from_value`].
+pub fn from_value_as<S: DeserializeSeed<'static>>(
+    seed: S,
+    value: &Value,
+    prefix: &[&str],
+) -> Result<S::Value, ZooError> {
+    seed.deserialize(ValueDeserializer(value)).map_err(|refusal| refusal.into_error(prefix))
 }
 
 struct ValueDeserializer<'a>(&'a Value);

@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
 use models::{
-    ACTION, ActionChunk, Actor, Dims, ENVIRONMENT_STATE, ModelError, Normaliser, Observation, Policy, PolicyModel,
-    RecedingHorizon, STATE, TemporalEnsemble,
+    ACTION, ActionChunk, Dims, ENVIRONMENT_STATE, ModelError, Normaliser, Observation, Policy, PolicyModel, STATE,
 };
 
 use crate::experiment::Experiment;
@@ -81,19 +80,6 @@ impl LoadedEntry {
             normaliser: Arc::clone(&self.normaliser),
             dims: self.entry.meta().dims,
         }
-    }
-
-    /// A policy for one environment that acts as the experiment's `[rollout]` says.
-    ///
-    /// # Errors
-    /// When `[rollout]` does not go with the policy.
-    pub fn actor(&self) -> Result<Box<dyn Actor>, ZooError> {
-        let rollout = &self.experiment.rollout;
-        let failed = |source| ZooError::Model { operation: "act with", name: self.entry.id().to_string(), source };
-        Ok(match rollout.temporal_ensemble {
-            Some(coefficient) => Box::new(TemporalEnsemble::new(self.policy(), coefficient).map_err(failed)?),
-            None => Box::new(RecedingHorizon::new(self.policy(), rollout.n_action_steps).map_err(failed)?),
-        })
     }
 }
 

@@ -1,11 +1,11 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
 use crate::Dims;
-use crate::actrm::{ReasoningConfig, WarmStart};
 use crate::fused::testing::{
     assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients, move_parameters,
 };
 use crate::layers::Activation;
+use crate::models::actrm::{Config, ReasoningConfig, WarmStart};
 use crate::simd::{Level, at_most};
 
 /// Odd sizes in both designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.

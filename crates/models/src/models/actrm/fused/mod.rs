@@ -1,4 +1,4 @@
-//! ACTRM's training step and thought on `fused` layers: the maths of `actrm.rs`, written out forwards and backwards.
+//! ACTRM's training step and thought on `fused` layers: the maths of `actrm/mod.rs`, written out forwards and backwards.
 //!
 //! Random numbers are drawn in the order in which the composed model draws them, so both see the same noise.
 
@@ -7,14 +7,15 @@ mod over_memory;
 #[cfg(test)]
 mod tests;
 
-use super::{Actrm, Config, Over, WarmStart};
+use super::{Actrm, Over, WarmStart};
 use crate::batch::Batch;
 use crate::error::Result;
-use crate::fused::{AbsoluteError, Data, Grads, Pass, Shape, Tokens, Vae, with_weights};
+use crate::fused::{AbsoluteError, Data, Grads, Pass, Tokens, Vae, with_weights};
 use crate::gradients::Gradients;
+use crate::layers::Shape;
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
-use crate::train::with_values;
+use crate::values::with_values;
 use candle_core::{Device, Tensor};
 use over_actions::OverActions;
 use over_memory::OverMemory;
@@ -109,20 +110,6 @@ fn mean_over_tokens(pass: &mut Pass<'_>, x: &[f32], rows: usize) -> Vec<f32> {
         mean.iter_mut().for_each(|m| *m /= tokens as f32);
     }
     mean
-}
-
-impl Config {
-    /// Of the layers outside the recursion.
-    fn shape(&self) -> Shape {
-        Shape {
-            dim: self.dim_model,
-            heads: self.n_heads,
-            hidden: self.dim_feedforward,
-            activation: self.feedforward_activation,
-            dropout: self.dropout,
-            pre_norm: false,
-        }
-    }
 }
 
 impl Actrm {

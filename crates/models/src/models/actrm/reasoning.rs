@@ -1,7 +1,7 @@
 //! Thinking at inference: step by step, until a rule says stop, with everything on record.
 
 use super::{Actrm, Carry, Over, ReasoningConfig};
-use crate::act;
+use crate::checks::check_shape;
 use crate::error::{ModelError, Result};
 use crate::layers::Mode;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, Normaliser, STATE};
@@ -92,9 +92,7 @@ impl Actrm {
             Over::Memory => self.feature_pos_embed.weight.dim(0)?,
         };
         match start {
-            Some(start) => {
-                act::check_shape("actrm", "warm start", start, &[state.dim(0)?, tokens, self.config.dim_model])
-            }
+            Some(start) => check_shape("actrm", "warm start", start, &[state.dim(0)?, tokens, self.config.dim_model]),
             None => Ok(()),
         }
     }

@@ -5,12 +5,13 @@
 //! in the first round are computed once for the whole batch.
 
 use super::{Carry, Recursion, Step, mean_over_tokens, shaped};
-use crate::actrm::{Actrm, Config};
 use crate::fused::{
-    BlockLayer, Encoder, Grads, Input, Part, Pass, Shape, Tokens, gather, keys_and_values, keys_and_values_backward,
-    scatter, slot,
+    BlockLayer, Encoder, Grads, Input, Part, Pass, Tokens, gather, keys_and_values, keys_and_values_backward, scatter,
+    slot,
 };
 use crate::kernels::add;
+use crate::layers::Shape;
+use crate::models::actrm::{Actrm, Config};
 
 pub(super) struct OverActions<'m> {
     config: &'m Config,

@@ -1,11 +1,11 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
 use crate::Dims;
-use crate::act::Config;
 use crate::fused::testing::{
     assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients, move_parameters,
 };
 use crate::layers::Activation;
+use crate::models::act::Config;
 use crate::simd::{Level, at_most};
 
 /// Odd sizes: no width is a multiple of a vector, chunks are longer and shorter than a register tile.

@@ -1,10 +1,10 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::act::Act;
 use crate::gradients::ParamLayout;
-use crate::model::PolicyConfig;
+use crate::models::act::{self, Act};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::policy::{Observation, Policy};
+use crate::registry::PolicyConfig;
 use crate::train::{TrainConfig, Trainer};
 use std::sync::Arc;
 

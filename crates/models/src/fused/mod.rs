@@ -1,6 +1,6 @@
 //! Transformer layers with hand-written backward passes, on slices.
 //!
-//! The same layers as `layers` and `act` build from candle operations, for training steps and predictions that must be
+//! The same layers as `layers` builds from candle operations, for training steps and predictions that must be
 //! fast. A layer's forward pass consumes its input and returns what its backward pass needs; gradients are added into
 //! buffers found by the parameter's name. Position embeddings are added to queries and keys only, so their projections
 //! are computed once for the batch: `(x + pos) Wᵀ = x Wᵀ + pos Wᵀ`.
@@ -28,7 +28,7 @@ use crate::error::{ModelError, Result};
 use crate::kernels::{
     Mat, Pack, Packed, Pool, Start, add, column_sums, drop_scale, gemm_with, layer_norm, layer_norm_backward, product,
 };
-use crate::layers::{Activation, DropoutMask};
+use crate::layers::{DropoutMask, Shape};
 use crate::params::Params;
 use crate::rng::Rng;
 use crate::simd::vectorised;
@@ -128,17 +128,6 @@ pub(crate) fn with_weights<R>(params: &Params, f: impl FnOnce(&Weights<'_>) -> R
         weights.insert(*name, &storage.as_slice::<f32>()?[from..from + layout.shape().elem_count()]);
     }
     Ok(f(&weights))
-}
-
-/// What all layers of a model share.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Shape {
-    pub(crate) dim: usize,
-    pub(crate) heads: usize,
-    pub(crate) hidden: usize,
-    pub(crate) activation: Activation,
-    pub(crate) dropout: f64,
-    pub(crate) pre_norm: bool,
 }
 
 /// Parameters, shape and workspace of one pass.

@@ -1,20 +1,20 @@
-//! ACT's training step and prediction on `fused` layers: the maths of `act.rs`, written out forwards and backwards.
+//! ACT's training step and prediction on `fused` layers: the maths of `act/mod.rs`, written out forwards and backwards.
 //!
 //! Exact savings over the composed model: of the VAE encoder's last layer only the first token is computed, because
 //! nothing else is read; the first decoder layer's queries, keys and values are computed once for the whole batch,
 //! because its input is zero for every sample.
 
-use crate::act::Act;
+use super::Act;
 use crate::batch::Batch;
 use crate::error::Result;
 use crate::fused::{
-    AbsoluteError, Data, Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Shape, Tokens, Vae, slot, with_weights,
+    AbsoluteError, Data, Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, Vae, slot, with_weights,
 };
 use crate::gradients::Gradients;
 use crate::kernels::add;
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
-use crate::train::with_values;
+use crate::values::with_values;
 use candle_core::{Device, Tensor};
 use std::collections::BTreeMap;
 
@@ -30,18 +30,6 @@ struct Decoded {
 }
 
 impl Act {
-    fn shape(&self) -> Shape {
-        let c = self.config();
-        Shape {
-            dim: c.dim_model,
-            heads: c.n_heads,
-            hidden: c.dim_feedforward,
-            activation: c.feedforward_activation,
-            dropout: c.dropout,
-            pre_norm: c.pre_norm,
-        }
-    }
-
     /// Loss of a training forward pass with the latent's noise `eps`: (b, L), and its gradients added to `into`.
     /// Dropout masks are drawn from `rng`; without it nothing is dropped.
     ///
@@ -59,7 +47,7 @@ impl Act {
         let eps = with_values(eps, <[f32]>::to_vec)?;
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.shape(), space, rng, packed: None };
+                let pass = &mut Pass { weights, shape: self.config().shape(), space, rng, packed: None };
                 self.step(pass, &data, eps, &mut into.views())
             })
         })
@@ -78,7 +66,7 @@ impl Act {
         let packed = self.workspaces.packed(self.params());
         let actions = self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.shape(), space, rng: None, packed: Some(&packed) };
+                let pass = &mut Pass { weights, shape: self.config().shape(), space, rng: None, packed: Some(&packed) };
                 let latent = pass.space.pool.zeros(rows * self.config().latent_dim);
                 let tokens = Tokens::new(self.dims(), (&latent, self.config().latent_dim), &state, &env);
                 let Decoded { encoder, memory, decoder, x, actions } = self.decode_fused(pass, rows, &tokens);
@@ -176,5 +164,5 @@ impl Act {
 }
 
 #[cfg(test)]
-#[path = "act_fused_tests.rs"]
+#[path = "fused_tests.rs"]
 mod tests;

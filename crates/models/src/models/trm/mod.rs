@@ -10,7 +10,7 @@
 //! then go, detached, to the next supervision step: see [`Carry`].
 //!
 //! This file is the model as one reads it, on candle's autograd. Supervision steps run the same
-//! maths in `trm/kernel.rs`, forward and backward by hand; tests hold the two together.
+//! maths in `kernel.rs`, forward and backward by hand; tests hold the two together.
 //!
 //! Deviations from the reference:
 //! - everything is f32 (the reference trains in bf16 with f32 master weights);

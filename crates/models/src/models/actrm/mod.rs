@@ -26,262 +26,33 @@
 //! without gradient.
 //!
 //! This file is the model as one reads it, on candle's autograd. Training steps and thoughts run the same maths with
-//! hand-written backward passes (`actrm/fused.rs`); tests hold the two together.
+//! hand-written backward passes (`fused/`); tests hold the two together.
 
+mod config;
 mod fused;
 mod reasoning;
 #[cfg(test)]
 mod tests;
 
+pub use config::{Config, Over, ReasoningConfig, WarmStart};
 pub use reasoning::{Budget, Reasoning, ReasoningPolicy, ReasoningStep};
 
-use crate::act::{self, Decoder, DecoderLayer, Encoder, InputTokens, LayerInit, Vae, absolute};
 use crate::batch::{Batch, Dims};
+use crate::checks::{check_batch, check_dims, check_observation};
 use crate::classification::binary_cross_entropy;
-use crate::error::{ModelError, Result};
+use crate::error::Result;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
-use crate::layers::{Activation, Embedding, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention, sinusoid_table};
+use crate::layers::{
+    Decoder, DecoderLayer, Embedding, Encoder, FeedForward, InputTokens, LayerInit, LayerNorm, Linear, Mode,
+    MultiHeadAttention, Shape, Vae, kl_divergence, sample, sinusoid_table,
+};
+use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
 use candle_core::{DType, Device, Tensor};
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-
-/// What the recursion refines.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Over {
-    /// The action chunk.
-    #[default]
-    Actions,
-    /// The encoded observation.
-    Memory,
-}
-
-/// Starting the answer from the previous tick's.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct WarmStart {
-    /// Actions executed between two queries: the old answer is moved on by as many.
-    pub shift: usize,
-    /// In training half of each batch starts from the answer to the same observation with this
-    /// much normal noise on it (network units).
-    #[serde(default = "default_noise")]
-    pub noise: f64,
-}
-
-fn default_noise() -> f64 {
-    0.1
-}
-
-/// Options of the recursion.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ReasoningConfig {
-    /// what is refined
-    pub over: Over,
-    /// latent reasoning tokens (`over = "actions"`)
-    pub tokens: usize,
-    /// layers of the shared block
-    pub n_layers: usize,
-    /// hidden width of the shared block's dense part; half of `dim_feedforward` when absent
-    pub dim_feedforward: Option<usize>,
-    /// rounds per supervision step; the last one has gradients
-    pub h_cycles: usize,
-    /// updates of the reasoning per round
-    pub l_cycles: usize,
-    /// supervision steps in training (`over = "memory"`: the most that are drawn)
-    pub supervision_steps: usize,
-    /// most steps at inference; as many as in training when absent
-    pub max_steps: Option<usize>,
-    /// stop once the halting head's probability exceeds this; 1 never stops
-    pub halt_threshold: f64,
-    /// stop once the chunk's mean absolute change falls below this (network units); 0 never stops
-    pub change_threshold: f64,
-    /// stop once this much time has passed; the caller brings the clock
-    pub budget_ms: Option<f64>,
-    /// weight of the halting head's loss
-    pub halt_weight: f64,
-    /// an error that one more step lowers by less than this share counts as not lowered
-    pub halt_margin: f64,
-    /// start from the previous tick's answer (`over = "actions"`)
-    pub warm_start: Option<WarmStart>,
-}
-
-impl Default for ReasoningConfig {
-    fn default() -> Self {
-        Self {
-            over: Over::Actions,
-            tokens: 4,
-            n_layers: 1,
-            dim_feedforward: None,
-            h_cycles: 1,
-            l_cycles: 1,
-            supervision_steps: 3,
-            max_steps: None,
-            halt_threshold: 0.9,
-            change_threshold: 0.005,
-            budget_ms: None,
-            halt_weight: 0.1,
-            halt_margin: 0.02,
-            warm_start: None,
-        }
-    }
-}
-
-impl ReasoningConfig {
-    /// The original's recursion over the memory: 3 x 6 cycles of 4 layers, 16 supervision steps.
-    pub fn original() -> Self {
-        Self {
-            over: Over::Memory,
-            n_layers: 4,
-            h_cycles: 3,
-            l_cycles: 6,
-            supervision_steps: 16,
-            halt_threshold: 1.0,
-            change_threshold: 0.0,
-            ..Self::default()
-        }
-    }
-
-    /// Most steps at inference.
-    pub fn max_steps(&self) -> usize {
-        self.max_steps.unwrap_or(self.supervision_steps)
-    }
-}
-
-/// Options of ACTRM; names shared with ACT mean the same.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Config {
-    /// actions predicted at once
-    pub action_horizon: usize,
-    /// width
-    pub dim_model: usize,
-    /// attention heads
-    pub n_heads: usize,
-    /// hidden width of the feed-forward layers outside the shared block
-    pub dim_feedforward: usize,
-    /// activation of the feed-forward layers
-    pub feedforward_activation: Activation,
-    /// layers that encode the memory before the recursion (`over = "actions"`)
-    pub n_memory_layers: usize,
-    /// layers of the decoder (`over = "memory"`)
-    pub n_decoder_layers: usize,
-    /// train with a latent
-    pub use_vae: bool,
-    /// width of the latent
-    pub latent_dim: usize,
-    /// layers of the VAE encoder
-    pub n_vae_encoder_layers: usize,
-    /// dropout probability outside the recursion
-    pub dropout: f64,
-    /// weight of the KL term
-    pub kl_weight: f64,
-    /// the recursion
-    pub reasoning: ReasoningConfig,
-}
-
-impl Default for Config {
-    fn default() -> Self {
-        let act = act::Config::default();
-        Self {
-            action_horizon: act.action_horizon,
-            dim_model: act.dim_model,
-            n_heads: act.n_heads,
-            dim_feedforward: act.dim_feedforward,
-            feedforward_activation: act.feedforward_activation,
-            n_memory_layers: 1,
-            n_decoder_layers: 1,
-            use_vae: act.use_vae,
-            latent_dim: act.latent_dim,
-            n_vae_encoder_layers: 1,
-            dropout: act.dropout,
-            kl_weight: act.kl_weight,
-            reasoning: ReasoningConfig::default(),
-        }
-    }
-}
-
-impl Config {
-    /// The layers outside the shared block, as ACT's.
-    fn layers(&self) -> act::Config {
-        act::Config {
-            action_horizon: self.action_horizon,
-            pre_norm: false,
-            dim_model: self.dim_model,
-            n_heads: self.n_heads,
-            dim_feedforward: self.dim_feedforward,
-            feedforward_activation: self.feedforward_activation,
-            n_encoder_layers: self.n_memory_layers.max(1),
-            n_decoder_layers: self.n_decoder_layers.max(1),
-            use_vae: self.use_vae,
-            latent_dim: self.latent_dim,
-            n_vae_encoder_layers: self.n_vae_encoder_layers,
-            dropout: self.dropout,
-            kl_weight: self.kl_weight,
-        }
-    }
-
-    /// Hidden width of the shared block's dense part.
-    pub fn block_feedforward(&self) -> usize {
-        self.reasoning.dim_feedforward.unwrap_or(self.dim_feedforward.div_ceil(2))
-    }
-
-    /// Checks that a model with this configuration can exist.
-    ///
-    /// # Errors
-    /// The first field that makes it impossible.
-    pub fn validate(&self) -> Result<()> {
-        self.layers().validate()?;
-        let refuse = |field: &'static str, found: String, expected: &str| {
-            let expected = expected.to_string();
-            Err(ModelError::Config { model: "actrm", field, found, expected })
-        };
-        let r = &self.reasoning;
-        let decoder = if r.over == Over::Memory { self.n_decoder_layers } else { 1 };
-        for (field, value) in [
-            ("n_decoder_layers", decoder),
-            ("reasoning.tokens", r.tokens),
-            ("reasoning.n_layers", r.n_layers),
-            ("reasoning.dim_feedforward", self.block_feedforward()),
-            ("reasoning.h_cycles", r.h_cycles),
-            ("reasoning.l_cycles", r.l_cycles),
-            ("reasoning.supervision_steps", r.supervision_steps),
-            ("reasoning.max_steps", r.max_steps()),
-        ] {
-            if value == 0 {
-                return refuse(field, value.to_string(), "at least 1");
-            }
-        }
-        if !(0.0..=1.0).contains(&r.halt_threshold) {
-            return refuse("reasoning.halt_threshold", r.halt_threshold.to_string(), "0 to 1");
-        }
-        for (field, value) in [
-            ("reasoning.change_threshold", r.change_threshold),
-            ("reasoning.halt_weight", r.halt_weight),
-            ("reasoning.halt_margin", r.halt_margin),
-            ("reasoning.budget_ms", r.budget_ms.unwrap_or(0.0)),
-            ("reasoning.warm_start.noise", r.warm_start.map_or(0.0, |w| w.noise)),
-        ] {
-            if !(value.is_finite() && value >= 0.0) {
-                return refuse(field, value.to_string(), "a finite number, at least 0");
-            }
-        }
-        if let Some(warm) = r.warm_start {
-            if r.over == Over::Memory {
-                return refuse("reasoning.warm_start", "present".into(), "absent with over = \"memory\"");
-            }
-            if warm.shift > self.action_horizon {
-                let most = format!("at most action_horizon, {}", self.action_horizon);
-                return refuse("reasoning.warm_start.shift", warm.shift.to_string(), &most);
-            }
-        }
-        Ok(())
-    }
-}
 
 /// The shared layer of `over = "actions"`: attention to a context, then a dense part.
 #[derive(Debug)]
@@ -388,12 +159,12 @@ impl Actrm {
     /// A configuration or dimensions that describe no possible model.
     pub fn new(config: &Config, dims: &Dims, seed: u64) -> Result<Self> {
         config.validate()?;
-        act::check_dims("actrm", dims)?;
+        check_dims("actrm", dims)?;
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
-        let (dim, layers, r) = (config.dim_model, config.layers(), &config.reasoning);
+        let (dim, shape, r) = (config.dim_model, config.shape(), &config.reasoning);
         let vae = match config.use_vae {
-            true => Some(Vae::new(&mut p, &layers, dims, rng)?),
+            true => Some(Vae::new(&mut p, shape, (config.n_vae_encoder_layers, config.latent_dim), dims, rng)?),
             false => None,
         };
         let env_state = match dims.environment_state {
@@ -406,7 +177,7 @@ impl Actrm {
             Over::Actions => Design::Actions(OverActions {
                 memory_encoder: match config.n_memory_layers {
                     0 => None,
-                    n => Some(Encoder::new(&mut p, "encoder", n, &layers, LayerInit::Xavier, rng)?),
+                    n => Some(Encoder::new(&mut p, "encoder", n, shape, LayerInit::Xavier, rng)?),
                 },
                 latent_pos: Embedding::new(&mut p, "reasoning.latent_pos_embed", r.tokens, dim, rng)?,
                 action_pos: Embedding::new(&mut p, "reasoning.action_pos_embed", config.action_horizon, dim, rng)?,
@@ -416,13 +187,13 @@ impl Actrm {
             }),
             Over::Memory => {
                 // no dropout inside the recursion
-                let quiet = act::Config { dropout: 0.0, ..layers.clone() };
+                let quiet = Shape { dropout: 0.0, ..shape };
                 Design::Memory(OverMemory {
-                    block: Encoder::new(&mut p, "reasoning", r.n_layers, &quiet, LayerInit::Xavier, rng)?,
+                    block: Encoder::new(&mut p, "reasoning", r.n_layers, quiet, LayerInit::Xavier, rng)?,
                     z_init: fixed_values(dim),
                     decoder: Decoder {
                         layers: (0..config.n_decoder_layers)
-                            .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), &layers, rng))
+                            .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), shape, rng))
                             .collect::<Result<_>>()?,
                         norm: LayerNorm::new(&mut p, "decoder.norm", dim, rng)?,
                         pos_embed: Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?,
@@ -573,11 +344,11 @@ impl Actrm {
     }
 
     fn check_inputs(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<()> {
-        act::check_observation("actrm", &self.dims, state, environment_state)
+        check_observation("actrm", &self.dims, state, environment_state)
     }
 
     fn check_batch(&self, batch: &Batch) -> Result<()> {
-        act::check_batch("actrm", &self.dims, self.config.action_horizon, batch)
+        check_batch("actrm", &self.dims, self.config.action_horizon, batch)
     }
 
     /// With warm starts in use, the answer that half of the rows begin with: the model's own, to
@@ -636,7 +407,7 @@ impl PolicyModel for Actrm {
         let sample = match &latent {
             Some(latent) => {
                 let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, &Device::Cpu)?;
-                act::sample(latent, &eps)?
+                sample(latent, &eps)?
             }
             None => Tensor::zeros(shape, DType::F32, &Device::Cpu)?,
         };
@@ -690,7 +461,7 @@ impl PolicyModel for Actrm {
         parts.insert("halt_loss".to_string(), halt.detach());
         total = (total + (halt * self.config.reasoning.halt_weight)?)?;
         if let Some((mu, log_variance)) = &latent {
-            let kld = act::kl_divergence(mu, log_variance, batch.total_rows)?;
+            let kld = kl_divergence(mu, log_variance, batch.total_rows)?;
             parts.insert("kld_loss".to_string(), kld.detach());
             total = (total + (kld * self.config.kl_weight)?)?;
         }

@@ -1,9 +1,10 @@
 //! The recursion over the memory, the original's, and ACT's decoder.
 
 use super::{Carry, Recursion, Step, mean_over_tokens, shaped};
-use crate::actrm::{Actrm, Config, fixed_values};
-use crate::fused::{Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Shape, Tokens, slot};
+use crate::fused::{Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, slot};
 use crate::kernels::add;
+use crate::layers::Shape;
+use crate::models::actrm::{Actrm, Config, fixed_values};
 
 pub(super) struct OverMemory<'m> {
     config: &'m Config,

@@ -1,0 +1,64 @@
+//! The VAE encoder of an action chunk, a sample of its latent and its KL term.
+
+use super::{Embedding, Encoder, LayerInit, Linear, Mode, Shape};
+use crate::batch::{Batch, Dims};
+use crate::error::Result;
+use crate::params::Params;
+use crate::rng::Rng;
+use candle_core::{DType, Tensor};
+
+/// The part that encodes an action chunk into a latent; training only.
+#[derive(Debug)]
+pub(crate) struct Vae {
+    pub(crate) encoder: Encoder,
+    pub(crate) cls_embed: Embedding,
+    pub(crate) robot_state_input_proj: Linear,
+    pub(crate) action_input_proj: Linear,
+    pub(crate) latent_output_proj: Linear,
+}
+
+impl Vae {
+    /// `n_layers` encoder layers and a latent `latent_dim` wide.
+    pub(crate) fn new(
+        p: &mut Params,
+        shape: Shape,
+        (n_layers, latent_dim): (usize, usize),
+        dims: &Dims,
+        rng: &mut Rng,
+    ) -> Result<Self> {
+        let dim = shape.dim;
+        Ok(Self {
+            encoder: Encoder::new(p, "vae_encoder", n_layers, shape, LayerInit::TorchDefault, rng)?,
+            cls_embed: Embedding::new(p, "vae_encoder_cls_embed", 1, dim, rng)?,
+            robot_state_input_proj: Linear::new(p, "vae_encoder_robot_state_input_proj", dims.state, dim, rng)?,
+            action_input_proj: Linear::new(p, "vae_encoder_action_input_proj", dims.action, dim, rng)?,
+            latent_output_proj: Linear::new(p, "vae_encoder_latent_output_proj", dim, 2 * latent_dim, rng)?,
+        })
+    }
+
+    /// actions: (b, C, A), is_pad: (b, C), pos: (1, C + 2, D) -> mean and log-variance of the latent, (b, L) each
+    pub(crate) fn encode(&self, batch: &Batch, pos: &Tensor, mode: &mut Mode<'_>) -> Result<(Tensor, Tensor)> {
+        let (b, dim) = (batch.rows(), self.cls_embed.weight.dim(1)?);
+        let latent = self.latent_output_proj.weight.dim(0)? / 2;
+        let cls = self.cls_embed.weight.reshape((1, 1, dim))?.broadcast_as((b, 1, dim))?;
+        let state = self.robot_state_input_proj.forward(&batch.state)?.unsqueeze(1)?;
+        let actions = self.action_input_proj.forward(&batch.actions)?;
+        let tokens = Tensor::cat(&[&cls.contiguous()?, &state, &actions], 1)?;
+        let always = Tensor::zeros((b, 2), DType::F32, tokens.device())?;
+        let key_pad = Tensor::cat(&[&always, &batch.is_pad], 1)?;
+        let x = self.encoder.forward(&tokens, pos, Some(&key_pad), mode)?;
+        let out = self.latent_output_proj.forward(&x.narrow(1, 0, 1)?.squeeze(1)?)?;
+        Ok((out.narrow(1, 0, latent)?, out.narrow(1, latent, latent)?))
+    }
+}
+
+/// A sample of the latent with noise `eps`: (b, L)
+pub(crate) fn sample((mu, log_variance): &(Tensor, Tensor), eps: &Tensor) -> Result<Tensor> {
+    Ok((mu + (log_variance / 2.0)?.exp()?.mul(eps)?)?)
+}
+
+/// KL(latent ‖ N(0, 1)), summed over the latent and averaged over `total_rows`.
+pub(crate) fn kl_divergence(mu: &Tensor, log_variance: &Tensor, total_rows: usize) -> Result<Tensor> {
+    let terms = ((log_variance + 1.0)? - mu.sqr()? - log_variance.exp()?)?;
+    Ok((terms.sum_all()? * (-0.5 / total_rows.max(1) as f64))?)
+}

@@ -1,0 +1,252 @@
+//! ACTRM's options.
+
+use crate::error::{ModelError, Result};
+use crate::layers::{Activation, Shape};
+use crate::models::act;
+use serde::{Deserialize, Serialize};
+
+/// What the recursion refines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Over {
+    /// The action chunk.
+    #[default]
+    Actions,
+    /// The encoded observation.
+    Memory,
+}
+
+/// Starting the answer from the previous tick's.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WarmStart {
+    /// Actions executed between two queries: the old answer is moved on by as many.
+    pub shift: usize,
+    /// In training half of each batch starts from the answer to the same observation with this
+    /// much normal noise on it (network units).
+    #[serde(default = "default_noise")]
+    pub noise: f64,
+}
+
+fn default_noise() -> f64 {
+    0.1
+}
+
+/// Options of the recursion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ReasoningConfig {
+    /// what is refined
+    pub over: Over,
+    /// latent reasoning tokens (`over = "actions"`)
+    pub tokens: usize,
+    /// layers of the shared block
+    pub n_layers: usize,
+    /// hidden width of the shared block's dense part; half of `dim_feedforward` when absent
+    pub dim_feedforward: Option<usize>,
+    /// rounds per supervision step; the last one has gradients
+    pub h_cycles: usize,
+    /// updates of the reasoning per round
+    pub l_cycles: usize,
+    /// supervision steps in training (`over = "memory"`: the most that are drawn)
+    pub supervision_steps: usize,
+    /// most steps at inference; as many as in training when absent
+    pub max_steps: Option<usize>,
+    /// stop once the halting head's probability exceeds this; 1 never stops
+    pub halt_threshold: f64,
+    /// stop once the chunk's mean absolute change falls below this (network units); 0 never stops
+    pub change_threshold: f64,
+    /// stop once this much time has passed; the caller brings the clock
+    pub budget_ms: Option<f64>,
+    /// weight of the halting head's loss
+    pub halt_weight: f64,
+    /// an error that one more step lowers by less than this share counts as not lowered
+    pub halt_margin: f64,
+    /// start from the previous tick's answer (`over = "actions"`)
+    pub warm_start: Option<WarmStart>,
+}
+
+impl Default for ReasoningConfig {
+    fn default() -> Self {
+        Self {
+            over: Over::Actions,
+            tokens: 4,
+            n_layers: 1,
+            dim_feedforward: None,
+            h_cycles: 1,
+            l_cycles: 1,
+            supervision_steps: 3,
+            max_steps: None,
+            halt_threshold: 0.9,
+            change_threshold: 0.005,
+            budget_ms: None,
+            halt_weight: 0.1,
+            halt_margin: 0.02,
+            warm_start: None,
+        }
+    }
+}
+
+impl ReasoningConfig {
+    /// The original's recursion over the memory: 3 x 6 cycles of 4 layers, 16 supervision steps.
+    pub fn original() -> Self {
+        Self {
+            over: Over::Memory,
+            n_layers: 4,
+            h_cycles: 3,
+            l_cycles: 6,
+            supervision_steps: 16,
+            halt_threshold: 1.0,
+            change_threshold: 0.0,
+            ..Self::default()
+        }
+    }
+
+    /// Most steps at inference.
+    pub fn max_steps(&self) -> usize {
+        self.max_steps.unwrap_or(self.supervision_steps)
+    }
+}
+
+/// Options of ACTRM; names shared with ACT mean the same.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// actions predicted at once
+    pub action_horizon: usize,
+    /// width
+    pub dim_model: usize,
+    /// attention heads
+    pub n_heads: usize,
+    /// hidden width of the feed-forward layers outside the shared block
+    pub dim_feedforward: usize,
+    /// activation of the feed-forward layers
+    pub feedforward_activation: Activation,
+    /// layers that encode the memory before the recursion (`over = "actions"`)
+    pub n_memory_layers: usize,
+    /// layers of the decoder (`over = "memory"`)
+    pub n_decoder_layers: usize,
+    /// train with a latent
+    pub use_vae: bool,
+    /// width of the latent
+    pub latent_dim: usize,
+    /// layers of the VAE encoder
+    pub n_vae_encoder_layers: usize,
+    /// dropout probability outside the recursion
+    pub dropout: f64,
+    /// weight of the KL term
+    pub kl_weight: f64,
+    /// the recursion
+    pub reasoning: ReasoningConfig,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        let act = act::Config::default();
+        Self {
+            action_horizon: act.action_horizon,
+            dim_model: act.dim_model,
+            n_heads: act.n_heads,
+            dim_feedforward: act.dim_feedforward,
+            feedforward_activation: act.feedforward_activation,
+            n_memory_layers: 1,
+            n_decoder_layers: 1,
+            use_vae: act.use_vae,
+            latent_dim: act.latent_dim,
+            n_vae_encoder_layers: 1,
+            dropout: act.dropout,
+            kl_weight: act.kl_weight,
+            reasoning: ReasoningConfig::default(),
+        }
+    }
+}
+
+impl Config {
+    /// Of the layers outside the recursion.
+    pub(super) fn shape(&self) -> Shape {
+        Shape {
+            dim: self.dim_model,
+            heads: self.n_heads,
+            hidden: self.dim_feedforward,
+            activation: self.feedforward_activation,
+            dropout: self.dropout,
+            pre_norm: false,
+        }
+    }
+
+    /// The layers outside the shared block, as ACT's: what is checked there is checked here.
+    fn layers(&self) -> act::Config {
+        act::Config {
+            action_horizon: self.action_horizon,
+            pre_norm: false,
+            dim_model: self.dim_model,
+            n_heads: self.n_heads,
+            dim_feedforward: self.dim_feedforward,
+            feedforward_activation: self.feedforward_activation,
+            n_encoder_layers: self.n_memory_layers.max(1),
+            n_decoder_layers: self.n_decoder_layers.max(1),
+            use_vae: self.use_vae,
+            latent_dim: self.latent_dim,
+            n_vae_encoder_layers: self.n_vae_encoder_layers,
+            dropout: self.dropout,
+            kl_weight: self.kl_weight,
+        }
+    }
+
+    /// Hidden width of the shared block's dense part.
+    pub fn block_feedforward(&self) -> usize {
+        self.reasoning.dim_feedforward.unwrap_or(self.dim_feedforward.div_ceil(2))
+    }
+
+    /// Checks that a model with this configuration can exist.
+    ///
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub fn validate(&self) -> Result<()> {
+        self.layers().validate()?;
+        let refuse = |field: &'static str, found: String, expected: &str| {
+            let expected = expected.to_string();
+            Err(ModelError::Config { model: "actrm", field, found, expected })
+        };
+        let r = &self.reasoning;
+        let decoder = if r.over == Over::Memory { self.n_decoder_layers } else { 1 };
+        for (field, value) in [
+            ("n_decoder_layers", decoder),
+            ("reasoning.tokens", r.tokens),
+            ("reasoning.n_layers", r.n_layers),
+            ("reasoning.dim_feedforward", self.block_feedforward()),
+            ("reasoning.h_cycles", r.h_cycles),
+            ("reasoning.l_cycles", r.l_cycles),
+            ("reasoning.supervision_steps", r.supervision_steps),
+            ("reasoning.max_steps", r.max_steps()),
+        ] {
+            if value == 0 {
+                return refuse(field, value.to_string(), "at least 1");
+            }
+        }
+        if !(0.0..=1.0).contains(&r.halt_threshold) {
+            return refuse("reasoning.halt_threshold", r.halt_threshold.to_string(), "0 to 1");
+        }
+        for (field, value) in [
+            ("reasoning.change_threshold", r.change_threshold),
+            ("reasoning.halt_weight", r.halt_weight),
+            ("reasoning.halt_margin", r.halt_margin),
+            ("reasoning.budget_ms", r.budget_ms.unwrap_or(0.0)),
+            ("reasoning.warm_start.noise", r.warm_start.map_or(0.0, |w| w.noise)),
+        ] {
+            if !(value.is_finite() && value >= 0.0) {
+                return refuse(field, value.to_string(), "a finite number, at least 0");
+            }
+        }
+        if let Some(warm) = r.warm_start {
+            if r.over == Over::Memory {
+                return refuse("reasoning.warm_start", "present".into(), "absent with over = \"memory\"");
+            }
+            if warm.shift > self.action_horizon {
+                let most = format!("at most action_horizon, {}", self.action_horizon);
+                return refuse("reasoning.warm_start.shift", warm.shift.to_string(), &most);
+            }
+        }
+        Ok(())
+    }
+}

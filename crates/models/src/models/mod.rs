@@ -1,0 +1,6 @@
+//! One model, one folder: `mod.rs` is the model as one reads it, `config.rs` its options, `fused` its training step by hand
+//! where it has one.
+
+pub mod act;
+pub mod actrm;
+pub mod trm;

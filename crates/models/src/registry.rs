@@ -1,0 +1,99 @@
+//! The policy models by name. This is the only place where their names stand: another model is a row of the table.
+
+use crate::batch::Dims;
+use crate::error::Result;
+use crate::model::PolicyModel;
+use crate::models::{act, actrm};
+use serde::de::{DeserializeSeed, Deserializer};
+use serde::{Deserialize, Serialize};
+
+/// What each row of the table becomes.
+macro_rules! policies {
+    ($($(#[$doc:meta])* $name:literal => $variant:ident: $module:ident::$model:ident,)+) => {
+        /// The configuration of any policy model: `type = "act"` and so on, with the model's own keys beside it.
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        #[serde(tag = "type")]
+        pub enum PolicyConfig {
+            $($(#[$doc])* #[serde(rename = $name)] $variant($module::Config),)+
+        }
+
+        impl PolicyConfig {
+            /// The names of all types.
+            pub const TYPES: &[&str] = &[$($name),+];
+
+            /// The name of its type.
+            pub fn policy_type(&self) -> &'static str {
+                match self {
+                    $(Self::$variant(_) => $name,)+
+                }
+            }
+
+            /// A model with initial weights drawn from `seed`.
+            ///
+            /// # Errors
+            /// A configuration that describes no possible model.
+            pub fn build(&self, dims: &Dims, seed: u64) -> Result<Box<dyn PolicyModel>> {
+                match self {
+                    $(Self::$variant(config) => Ok(Box::new($module::$model::new(config, dims, seed)?)),)+
+                }
+            }
+
+            /// Number of actions in a predicted chunk.
+            pub fn action_horizon(&self) -> usize {
+                match self {
+                    $(Self::$variant(config) => config.action_horizon,)+
+                }
+            }
+        }
+
+        impl<'de> DeserializeSeed<'de> for PolicyType {
+            type Value = PolicyConfig;
+
+            fn deserialize<D: Deserializer<'de>>(self, keys: D) -> std::result::Result<PolicyConfig, D::Error> {
+                match self.0 {
+                    $($name => $module::Config::deserialize(keys).map(PolicyConfig::$variant),)+
+                    _ => unreachable!("a type is made of a name of the table"),
+                }
+            }
+        }
+    };
+}
+
+policies! {
+    /// Action Chunking with Transformers
+    "act" => Act: act::Act,
+    /// ACT that reasons recursively
+    "actrm" => Actrm: actrm::Actrm,
+}
+
+/// The type of a policy whose own keys are still to be read: with them, as a `DeserializeSeed`, it gives the
+/// [`PolicyConfig`], and what is wrong with a key is said at that key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PolicyType(&'static str);
+
+impl PolicyType {
+    /// The type of this name, if there is one.
+    pub fn named(name: &str) -> Option<Self> {
+        PolicyConfig::TYPES.iter().find(|known| **known == name).map(|known| Self(known))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn every_type_reads_its_keys_with_and_without_its_name() {
+        for name in PolicyConfig::TYPES {
+            let tagged: PolicyConfig =
+                serde_json::from_value(serde_json::json!({"type": name, "action_horizon": 7})).unwrap();
+            let keys = serde_json::json!({"action_horizon": 7});
+            let read = PolicyType::named(name).unwrap().deserialize(keys).unwrap();
+            assert_eq!(read, tagged);
+            assert_eq!((read.policy_type(), read.action_horizon()), (*name, 7));
+            assert_eq!(serde_json::to_value(&read).unwrap()["type"], *name);
+        }
+        assert_eq!(PolicyType::named("atc"), None);
+    }
+}
