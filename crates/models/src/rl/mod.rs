@@ -43,9 +43,8 @@ mod tests;
 
 use crate::baselines::PolicyNet;
 use crate::error::{ModelError, Result};
-use crate::learner::{Learner, LearnerMetrics};
 use crate::rng::Rng;
-use crate::train::TrainConfig;
+use crate::train::{Learner, LearnerMetrics, TrainConfig};
 use advantages::{advantages, standardise};
 use candle_core::{D, Device, Tensor};
 use losses::{Chosen, entropy, log_softmax};

@@ -1,6 +1,8 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::{Dims, PolicyConfig, act};
+use crate::{Batch, Dims, PolicyConfig, PolicyModel, Rng, act};
+use candle_core::Tensor;
+use std::collections::BTreeMap;
 
 const DIMS: Dims = Dims { state: 3, environment_state: 2, action: 2 };
 const HORIZON: usize = 4;

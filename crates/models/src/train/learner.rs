@@ -1,17 +1,15 @@
 //! One optimiser step on any scalar loss: what puzzles and reinforcement learning train with.
 //!
-//! `Trainer` owns a policy model and cuts its batches; here the caller makes the loss, and the rest
-//! is the same: clipping, schedule, optimiser, moving average, and a state that can be saved.
+//! `Trainer` owns a policy model and cuts its batches; here the caller makes the loss, and the rest is the same core.
 
+use super::config::TrainConfig;
+use super::core::{Core, Double};
 use crate::error::{ModelError, Result};
-use crate::gradients::{Gradients, ParamLayout};
-use crate::optim::{Optimiser, flat};
+use crate::gradients::Gradients;
 use crate::params::Params;
 use crate::simd::sum_of_squares;
-use crate::train::TrainConfig;
 use candle_core::{Tensor, Var};
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 /// What a step measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,14 +22,11 @@ pub struct LearnerMetrics {
     pub lr: f64,
 }
 
-/// Optimiser and moving average of a set of parameters.
+/// Trains a set of parameters.
 #[derive(Debug)]
 pub struct Learner {
-    params: Params,
-    config: TrainConfig,
-    optimiser: Optimiser,
+    core: Core<Double>,
     gradients: Gradients,
-    ema: Option<BTreeMap<String, Vec<f32>>>,
 }
 
 impl Learner {
@@ -41,29 +36,18 @@ impl Learner {
     /// # Errors
     /// A configuration out of range.
     pub fn new(params: &Params, config: TrainConfig) -> Result<Self> {
-        config.validate()?;
-        let layout = Arc::new(ParamLayout::new(params));
-        let ema = match config.ema_decay {
-            Some(_) => Some(values(params)?),
-            None => None,
-        };
-        Ok(Self {
-            optimiser: Optimiser::new(config.optimiser, layout.clone()),
-            gradients: Gradients::zeros(layout),
-            params: params.clone(),
-            config,
-            ema,
-        })
+        let core = Core::new(params, config)?;
+        Ok(Self { gradients: Gradients::zeros(core.layout().clone()), core })
     }
 
     /// Steps taken.
     pub fn step_count(&self) -> u64 {
-        self.optimiser.steps()
+        self.core.steps()
     }
 
     /// How it trains.
     pub fn config(&self) -> &TrainConfig {
-        &self.config
+        self.core.config()
     }
 
     /// One step down the gradient of `loss`. After an error the weights are those from before.
@@ -77,39 +61,22 @@ impl Learner {
 
     /// [`Self::step`] that also returns the gradient of a variable which it does not train.
     pub(crate) fn step_with(&mut self, loss: &Tensor, other: Option<&Var>) -> Result<(LearnerMetrics, Option<Tensor>)> {
-        let step = self.step_count();
         let value = loss.to_dtype(candle_core::DType::F32)?.to_scalar::<f32>()?;
-        let not_finite = |tensor: String, value: f32| ModelError::NotFinite { step: step + 1, tensor, value };
         if !value.is_finite() {
-            return Err(not_finite("loss".into(), value));
+            return Err(self.core.not_finite("loss".into(), value));
         }
         let grads = loss.backward()?;
         self.gradients.clear();
-        for (name, var) in self.params.iter() {
+        for (name, var) in self.core.params().iter() {
             let grad = grads.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() })?;
             self.gradients.add_tensor(name, grad)?;
         }
         let grad_norm = sum_of_squares(self.gradients.values()).sqrt();
         if !grad_norm.is_finite() {
-            for (name, span) in self.gradients.layout().iter() {
-                if let Some(&value) = self.gradients.values()[span].iter().find(|x| !x.is_finite()) {
-                    return Err(not_finite(format!("gradient of {name}"), value));
-                }
-            }
-            return Err(not_finite("gradient norm".into(), grad_norm as f32));
+            let fault = self.core.gradient_at_fault(&self.gradients);
+            return Err(fault.unwrap_or_else(|| self.core.not_finite("gradient norm".into(), grad_norm as f32)));
         }
-        let lr = self.config.lr_at(step);
-        let clip = self.config.clip_norm;
-        let scale = if clip > 0.0 { (clip / (grad_norm + 1e-6)).min(1.0) } else { 1.0 };
-        self.optimiser.step(&self.params, &self.gradients, scale as f32, lr)?;
-        if let (Some(ema), Some(decay)) = (&mut self.ema, self.config.ema_decay) {
-            for (name, now) in values(&self.params)? {
-                let mean = ema.get_mut(&name).expect("the moving average has every parameter");
-                for (mean, now) in mean.iter_mut().zip(now) {
-                    *mean = (f64::from(*mean) * decay + f64::from(now) * (1.0 - decay)) as f32;
-                }
-            }
-        }
+        let lr = self.core.step(&self.gradients, grad_norm)?;
         let other = other.and_then(|var| grads.get(var).cloned());
         Ok((LearnerMetrics { loss: value, grad_norm, lr }, other))
     }
@@ -119,15 +86,7 @@ impl Learner {
     /// # Errors
     /// When a tensor operation fails.
     pub fn eval_params(&self) -> Result<BTreeMap<String, Tensor>> {
-        let mut tensors = BTreeMap::new();
-        for (name, var) in self.params.iter() {
-            let tensor = match &self.ema {
-                Some(ema) => Tensor::from_slice(&ema[name], var.dims(), var.device())?,
-                None => var.as_detached_tensor().copy()?,
-            };
-            tensors.insert(name.to_string(), tensor);
-        }
-        Ok(tensors)
+        self.core.eval_params()
     }
 
     /// Everything needed to go on later, copied: `param.<name>`, `moment1.<name>`,
@@ -136,16 +95,7 @@ impl Learner {
     /// # Errors
     /// When a tensor operation fails.
     pub fn state(&self) -> Result<(BTreeMap<String, Tensor>, u64)> {
-        let mut tensors = self.optimiser.state(&self.params)?;
-        for (name, var) in self.params.iter() {
-            tensors.insert(format!("param.{name}"), var.as_detached_tensor().copy()?);
-        }
-        if self.ema.is_some() {
-            for (name, tensor) in self.eval_params()? {
-                tensors.insert(format!("ema.{name}"), tensor);
-            }
-        }
-        Ok((tensors, self.step_count()))
+        Ok((self.core.state()?, self.step_count()))
     }
 
     /// Goes on from [`Self::state`].
@@ -153,33 +103,8 @@ impl Learner {
     /// # Errors
     /// A tensor that is missing or misshapen; nothing is changed then.
     pub fn restore(&mut self, tensors: &BTreeMap<String, Tensor>, step: u64) -> Result<()> {
-        let layout = self.gradients.layout().clone();
-        flat(&layout, "moment1", tensors)?;
-        flat(&layout, "moment2", tensors)?;
-        let ema = match self.ema {
-            None => None,
-            Some(_) => {
-                let all = flat(&layout, "ema", tensors)?;
-                Some(layout.iter().map(|(name, span)| (name.to_string(), all[span].to_vec())).collect())
-            }
-        };
-        let with_prefix = |(name, tensor): (&String, &Tensor)| {
-            let name = name.strip_prefix("param.")?;
-            Some((name.to_string(), tensor.clone()))
-        };
-        self.params.load(&tensors.iter().filter_map(with_prefix).collect())?;
-        self.optimiser.restore(tensors, step)?;
-        self.ema = ema;
-        Ok(())
+        self.core.restore(tensors, step)
     }
-}
-
-/// All parameters as numbers.
-fn values(params: &Params) -> Result<BTreeMap<String, Vec<f32>>> {
-    params
-        .iter()
-        .map(|(name, var)| Ok((name.to_string(), var.as_detached_tensor().flatten_all()?.to_vec1::<f32>()?)))
-        .collect()
 }
 
 #[cfg(test)]

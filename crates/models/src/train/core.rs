@@ -1,0 +1,187 @@
+//! What a step is once its gradient is there: clipping, learning rate, optimiser, moving average; and the state that all
+//! this goes on from, to the bit.
+
+use super::config::TrainConfig;
+use crate::error::{ModelError, Result};
+use crate::gradients::{Gradients, ParamLayout};
+use crate::optim::{Optimiser, flat};
+use crate::params::Params;
+use crate::simd::vectorised;
+use crate::values::with_values;
+use candle_core::Tensor;
+use std::collections::BTreeMap;
+use std::marker::PhantomData;
+use std::sync::Arc;
+
+/// In which precision the moving average is computed; it is kept in f32 either way. Part of what defines a training:
+/// policies have always averaged in f32 and puzzles in f64, and each goes on as it was.
+pub(super) trait Precision {
+    /// `mean = mean * decay + now * (1 - decay)`
+    fn blend(decay: f64, mean: &mut [f32], now: &[f32]);
+}
+
+/// In f32.
+#[derive(Debug)]
+pub(super) struct Single;
+
+/// In f64.
+#[derive(Debug)]
+pub(super) struct Double;
+
+impl Precision for Single {
+    fn blend(decay: f64, mean: &mut [f32], now: &[f32]) {
+        let (keep, take) = (decay as f32, (1.0 - decay) as f32);
+        vectorised(
+            #[inline(always)]
+            || mean.iter_mut().zip(now).for_each(|(e, p)| *e = *e * keep + p * take),
+        );
+    }
+}
+
+impl Precision for Double {
+    fn blend(decay: f64, mean: &mut [f32], now: &[f32]) {
+        for (mean, now) in mean.iter_mut().zip(now) {
+            *mean = (f64::from(*mean) * decay + f64::from(*now) * (1.0 - decay)) as f32;
+        }
+    }
+}
+
+/// Optimiser and moving average of a set of parameters.
+#[derive(Debug)]
+pub(super) struct Core<P> {
+    params: Params,
+    config: TrainConfig,
+    layout: Arc<ParamLayout>,
+    optimiser: Optimiser,
+    /// all parameters one after the other
+    ema: Option<Vec<f32>>,
+    precision: PhantomData<P>,
+}
+
+impl<P: Precision> Core<P> {
+    /// Trains `params`, which share their storage with the model's.
+    pub(super) fn new(params: &Params, config: TrainConfig) -> Result<Self> {
+        config.validate()?;
+        let layout = Arc::new(ParamLayout::new(params));
+        let ema = match config.ema_decay {
+            Some(_) => {
+                let mut values = Vec::with_capacity(layout.len());
+                for (_, var) in params.iter() {
+                    with_values(var.as_tensor(), |v| values.extend_from_slice(v))?;
+                }
+                Some(values)
+            }
+            None => None,
+        };
+        let optimiser = Optimiser::new(config.optimiser, layout.clone());
+        Ok(Self { params: params.clone(), config, layout, optimiser, ema, precision: PhantomData })
+    }
+
+    pub(super) fn config(&self) -> &TrainConfig {
+        &self.config
+    }
+
+    pub(super) fn params(&self) -> &Params {
+        &self.params
+    }
+
+    pub(super) fn layout(&self) -> &Arc<ParamLayout> {
+        &self.layout
+    }
+
+    pub(super) fn set_threads(&mut self, threads: usize) {
+        self.optimiser.set_threads(threads);
+    }
+
+    /// Steps taken.
+    pub(super) fn steps(&self) -> u64 {
+        self.optimiser.steps()
+    }
+
+    /// One step down `gradients`, whose global norm is `grad_norm`; returns its learning rate.
+    pub(super) fn step(&mut self, gradients: &Gradients, grad_norm: f64) -> Result<f64> {
+        let lr = self.config.lr_at(self.steps());
+        let clip = self.config.clip_norm;
+        // torch.nn.utils.clip_grad_norm_'s factor
+        let scale = if clip > 0.0 { (clip / (grad_norm + 1e-6)).min(1.0) } else { 1.0 };
+        self.optimiser.step(&self.params, gradients, scale as f32, lr)?;
+        if let (Some(ema), Some(decay)) = (&mut self.ema, self.config.ema_decay) {
+            let mut rest = ema.as_mut_slice();
+            for (_, var) in self.params.iter() {
+                let (mean, tail) = rest.split_at_mut(var.elem_count());
+                rest = tail;
+                with_values(var.as_tensor(), |now| P::blend(decay, mean, now))?;
+            }
+        }
+        Ok(lr)
+    }
+
+    /// Says which tensor is not finite, in the step that would come next.
+    pub(super) fn not_finite(&self, tensor: String, value: f32) -> ModelError {
+        ModelError::NotFinite { step: self.steps() + 1, tensor, value }
+    }
+
+    /// The first parameter whose gradient is not finite, as an error.
+    pub(super) fn gradient_at_fault(&self, gradients: &Gradients) -> Option<ModelError> {
+        self.layout.iter().find_map(|(name, span)| {
+            let value = gradients.values()[span].iter().copied().find(|x| !x.is_finite())?;
+            Some(self.not_finite(format!("gradient of {name}"), value))
+        })
+    }
+
+    /// The weights to evaluate: the moving average if there is one. Copies.
+    pub(super) fn eval_params(&self) -> Result<BTreeMap<String, Tensor>> {
+        let mut tensors = BTreeMap::new();
+        for ((name, var), (_, span)) in self.params.iter().zip(self.layout.iter()) {
+            let tensor = match &self.ema {
+                Some(ema) => Tensor::from_slice(&ema[span], var.dims(), var.device())?,
+                None => var.as_detached_tensor().copy()?,
+            };
+            tensors.insert(name.to_string(), tensor);
+        }
+        Ok(tensors)
+    }
+
+    /// What the names of the state's tensors begin with.
+    pub(super) fn prefixes(&self) -> Vec<&'static str> {
+        let mut prefixes = vec!["param.", "moment1.", "moment2."];
+        if self.ema.is_some() {
+            prefixes.push("ema.");
+        }
+        prefixes
+    }
+
+    /// Everything needed to go on later beside the number of steps, copied: `param.<name>`, `moment1.<name>`,
+    /// `moment2.<name>` and, with a moving average, `ema.<name>`.
+    pub(super) fn state(&self) -> Result<BTreeMap<String, Tensor>> {
+        let mut tensors = self.optimiser.state(&self.params)?;
+        for (name, var) in self.params.iter() {
+            tensors.insert(format!("param.{name}"), var.as_detached_tensor().copy()?);
+        }
+        if self.ema.is_some() {
+            for (name, tensor) in self.eval_params()? {
+                tensors.insert(format!("ema.{name}"), tensor);
+            }
+        }
+        Ok(tensors)
+    }
+
+    /// Goes on from [`Self::state`] after `steps` steps. Nothing is changed unless everything fits.
+    pub(super) fn restore(&mut self, tensors: &BTreeMap<String, Tensor>, steps: u64) -> Result<()> {
+        let ema = match self.ema {
+            Some(_) => Some(flat(&self.layout, "ema", tensors)?),
+            None => None,
+        };
+        // all checks come before the first change
+        flat(&self.layout, "moment2", tensors)?;
+        flat(&self.layout, "moment1", tensors)?;
+        let with_prefix = |(name, tensor): (&String, &Tensor)| {
+            let name = name.strip_prefix("param.")?;
+            Some((name.to_string(), tensor.clone()))
+        };
+        self.params.load(&tensors.iter().filter_map(with_prefix).collect())?;
+        self.optimiser.restore(tensors, steps)?;
+        self.ema = ema;
+        Ok(())
+    }
+}
