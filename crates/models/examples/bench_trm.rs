@@ -41,12 +41,12 @@ fn ours(mixing: &str, repeats: usize) {
     let tokens: Vec<u32> = (0..batch * len).map(|i| (i * 7 % vocab) as u32).collect();
     let labels: Vec<i64> = tokens.iter().map(|t| i64::from((t + 3) % vocab as u32)).collect();
     let inputs = Tensor::from_vec(tokens, (batch, len), &Device::Cpu).unwrap();
-    let states = model.initial_states(batch).unwrap();
+    let carry = model.initial_carry(batch).unwrap();
     let targets = Tensor::zeros(batch, DType::F32, &Device::Cpu).unwrap();
     let (mut seconds, mut cpu) = (Vec::new(), Vec::new());
     for repeat in 0..=repeats {
         let begun = (Instant::now(), cpu_seconds());
-        let out = model.supervision_step(&states, &inputs, None, Gradient::On).unwrap();
+        let out = model.supervision_step(&carry, &inputs, None, Gradient::On).unwrap();
         let flat = out.logits.reshape((batch * len, vocab)).unwrap();
         let class = cross_entropy(&flat, &labels, ClassProbability::Stablemax).unwrap().mean_all().unwrap();
         let halt = binary_cross_entropy(&out.q_halt, &targets).unwrap().mean_all().unwrap();

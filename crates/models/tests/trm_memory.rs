@@ -38,13 +38,13 @@ fn peak(config: &Config, composed: bool) -> usize {
     let (batch, len) = (8, config.seq_len);
     let tokens: Vec<u32> = (0..batch * len).map(|i| (i % config.vocab_size) as u32).collect();
     let inputs = Tensor::from_vec(tokens, (batch, len), &Device::Cpu).unwrap();
-    let states = model.initial_states(batch).unwrap();
+    let carry = model.initial_carry(batch).unwrap();
     let before = LIVE.load(SeqCst);
     PEAK.store(before, SeqCst);
     let out = if composed {
-        model.supervision_step_composed(&states, &inputs, None, Gradient::On).unwrap()
+        model.supervision_step_composed(&carry, &inputs, None, Gradient::On).unwrap()
     } else {
-        model.supervision_step(&states, &inputs, None, Gradient::On).unwrap()
+        model.supervision_step(&carry, &inputs, None, Gradient::On).unwrap()
     };
     let loss = (out.logits.sqr().unwrap().mean_all().unwrap() + out.q_halt.mean_all().unwrap()).unwrap();
     let gradients = loss.backward().unwrap();

@@ -12,7 +12,7 @@
 mod common;
 
 use candle_core::{DType, Device, Tensor};
-use models::trm::{Config, Gradient, States, StepOutput, Trm};
+use models::trm::{Carry, Config, Gradient, StepOutput, Trm};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -40,15 +40,15 @@ fn check(folder: &Path) {
     let inputs = io["inputs"].to_dtype(DType::U32).unwrap();
     let identifiers = io.get("puzzle_identifiers").map(|t| t.to_dtype(DType::U32).unwrap());
     let mut steps = 0;
-    let start = model.initial_states(inputs.dim(0).unwrap()).unwrap();
+    let start = model.initial_carry(inputs.dim(0).unwrap()).unwrap();
     let [mut on, mut off, mut composed, mut exact, mut reference] = [(); 5].map(|()| start.clone());
     while io.contains_key(&format!("step{steps}.logits")) {
         let ids = identifiers.as_ref();
         let expected = |name: &str| &io[&format!("step{steps}.{name}")];
         let compare = |what: &str, out: &StepOutput, exact: &StepOutput| {
             let parts = |out: &StepOutput| {
-                let StepOutput { logits, q_halt, states } = out.clone();
-                [("logits", logits), ("q_halt_logits", q_halt), ("z_h", states.z_h), ("z_l", states.z_l)]
+                let StepOutput { logits, q_halt, carry } = out.clone();
+                [("logits", logits), ("q_halt_logits", q_halt), ("z_h", carry.z_h), ("z_l", carry.z_l)]
             };
             // one distance for the whole step: a single number may be off by nothing by luck
             let rounding = parts(exact).iter().map(|(name, t)| difference(t, expected(name))).fold(0.0, f64::max);
@@ -65,19 +65,19 @@ fn check(folder: &Path) {
         let exact_out = model.supervision_step_exact(&exact, &inputs, ids).unwrap();
         let out = model.supervision_step(&on, &inputs, ids, Gradient::On).unwrap();
         compare("kernel, with gradient", &out, &exact_out);
-        on = out.states;
+        on = out.carry;
         let out = model.supervision_step(&off, &inputs, ids, Gradient::Off).unwrap();
         compare("kernel, without gradient", &out, &exact_out);
-        off = out.states;
+        off = out.carry;
         let out = model.supervision_step_composed(&composed, &inputs, ids, Gradient::Off).unwrap();
         compare("composed", &out, &exact_out);
-        composed = out.states;
-        exact = exact_out.states;
+        composed = out.carry;
+        exact = exact_out.carry;
 
         let exact_out = model.supervision_step_exact(&reference, &inputs, ids).unwrap();
         let out = model.supervision_step(&reference, &inputs, ids, Gradient::Off).unwrap();
         compare("from the reference's states", &out, &exact_out);
-        reference = States { z_h: expected("z_h").clone(), z_l: expected("z_l").clone() };
+        reference = Carry { z_h: expected("z_h").clone(), z_l: expected("z_l").clone() };
         steps += 1;
     }
     assert!(steps > 0, "{}: no step to compare", folder.display());

@@ -399,12 +399,12 @@ impl PolicyNet for ConvPolicy {
         let agent = planes.narrow(1, 0, 1)?.reshape((batch, height * width, 1))?;
         let x = self.input.forward(&planes.transpose(1, 2)?.contiguous()?)?;
         let zeros = x.zeros_like()?.detach();
-        let states = trm::States { z_h: zeros.clone(), z_l: zeros };
+        let carry = trm::Carry { z_h: zeros.clone(), z_l: zeros };
         let flat = Tensor::cat(
             &self.block.each_ref().map(Tensor::flatten_all).into_iter().collect::<candle_core::Result<Vec<_>>>()?,
             0,
         )?;
-        let h = self.fused.step(&flat, &states, &x, (1, self.cycles - 1), trm::Gradient::On)?.z_h;
+        let h = self.fused.step(&flat, &carry, &x, (1, self.cycles - 1), trm::Gradient::On)?.z_h;
         let here = h.broadcast_mul(&agent)?.sum(1)?;
         let seen = Tensor::cat(&[&here, &h.mean(1)?], D::Minus1)?;
         Ok(PolicyOutput { logits: self.head.forward(&here)?, value: value(self.value.as_ref(), &seen)? })

@@ -99,10 +99,10 @@ impl Solver {
         match self {
             Self::Trm { model, task, probability } => {
                 let inputs = tokens(puzzles)?;
-                let mut states = model.initial_states(puzzles.len())?;
+                let mut carry = model.initial_carry(puzzles.len())?;
                 for _ in 0..steps {
-                    let out = model.supervision_step(&states, &inputs, None, Gradient::Off)?;
-                    states = out.states;
+                    let out = model.supervision_step(&carry, &inputs, None, Gradient::Off)?;
+                    carry = out.carry;
                     let halt = out.q_halt.to_vec1::<f32>()?.into_iter().map(|q| 1.0 / (1.0 + (-q).exp()));
                     thoughts.push(read(*task, *probability, &out.logits, halt.map(Some).collect())?);
                 }

@@ -2,7 +2,7 @@
 
 use super::kernel::{Plan, PlanMix};
 use super::layer::Direction;
-use super::{Config, Gradient, Mixing, States};
+use super::{Carry, Config, Gradient, Mixing};
 use crate::error::Result;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result as CandleResult, Shape, Storage, Tensor};
 use std::sync::{Arc, Mutex};
@@ -53,16 +53,16 @@ impl Fused {
     pub(crate) fn step(
         &self,
         flat: &Tensor,
-        states: &States,
+        carry: &Carry,
         embedded: &Tensor,
         (h_cycles, l_cycles): (usize, usize),
         gradient: Gradient,
-    ) -> Result<States> {
+    ) -> Result<Carry> {
         let threads = candle_core::utils::get_num_threads();
-        let shape = states.z_h.shape().clone();
+        let shape = carry.z_h.shape().clone();
         let embedded = embedded.contiguous()?;
-        let mut z_h = states.z_h.flatten_all()?.to_vec1::<f32>()?;
-        let mut z_l = states.z_l.flatten_all()?.to_vec1::<f32>()?;
+        let mut z_h = carry.z_h.flatten_all()?.to_vec1::<f32>()?;
+        let mut z_l = carry.z_l.flatten_all()?.to_vec1::<f32>()?;
         let quiet = match gradient {
             Gradient::On => h_cycles - 1,
             Gradient::Off => h_cycles,
@@ -93,7 +93,7 @@ impl Fused {
                 embedded.apply_op2(flat, op)?
             }
         };
-        Ok(States { z_h, z_l })
+        Ok(Carry { z_h, z_l })
     }
 }
 

@@ -7,7 +7,7 @@
 //! One small network updates two states: `z_h`, the answer, and `z_l`, the reasoning. A
 //! supervision step runs `h_cycles` rounds of `l_cycles` updates of `z_l` and one of `z_h`; only
 //! the last round keeps a graph, so memory does not grow with the number of rounds. The states
-//! then go, detached, to the next supervision step: see [`Carry`].
+//! then go, detached, to the next supervision step: see [`Slots`].
 //!
 //! This file is the model as one reads it, on candle's autograd. Supervision steps run the same
 //! maths in `kernel.rs`, forward and backward by hand; tests hold the two together.
@@ -20,7 +20,6 @@
 //! - initial states and weights come from our own generator, so equal seeds do not give the
 //!   reference's numbers.
 
-mod carry;
 mod config;
 mod elementwise;
 mod fused;
@@ -28,14 +27,15 @@ mod kernel;
 mod layer;
 mod official;
 mod product;
+mod slots;
 #[cfg(test)]
 mod tests;
 mod train;
 mod weights;
 
-pub use carry::{Carry, Example, Release};
 pub use config::{Config, Mixing, Pooling, Positions};
 pub(crate) use fused::Fused;
+pub use slots::{Example, Release, Slots};
 pub use train::{PuzzleConfig, StepReport, Trainer};
 
 use crate::error::{ModelError, Result};
@@ -45,14 +45,14 @@ use weights::{Mix, Weights};
 
 /// The two states of the recursion, each `(batch, positions, hidden)`.
 #[derive(Debug, Clone)]
-pub struct States {
+pub struct Carry {
     /// The answer.
     pub z_h: Tensor,
     /// The reasoning.
     pub z_l: Tensor,
 }
 
-impl States {
+impl Carry {
     fn detach(&self) -> Self {
         Self { z_h: self.z_h.detach(), z_l: self.z_l.detach() }
     }
@@ -66,7 +66,7 @@ pub struct StepOutput {
     /// `(batch,)`: positive to halt.
     pub q_halt: Tensor,
     /// The states for the next step, detached.
-    pub states: States,
+    pub carry: Carry,
 }
 
 /// Whether a step keeps a graph.
@@ -133,9 +133,9 @@ impl Trm {
     ///
     /// # Errors
     /// When a tensor operation fails.
-    pub fn initial_states(&self, batch: usize) -> Result<States> {
+    pub fn initial_carry(&self, batch: usize) -> Result<Carry> {
         let shape = (batch, self.config.positions_len(), self.config.hidden_size);
-        Ok(States {
+        Ok(Carry {
             z_h: self.h_init.broadcast_as(shape)?.contiguous()?,
             z_l: self.l_init.broadcast_as(shape)?.contiguous()?,
         })
@@ -149,16 +149,16 @@ impl Trm {
     /// missing.
     pub fn supervision_step(
         &self,
-        states: &States,
+        carry: &Carry,
         inputs: &Tensor,
         identifiers: Option<&Tensor>,
         gradient: Gradient,
     ) -> Result<StepOutput> {
-        self.check_step(states, inputs)?;
+        self.check_step(carry, inputs)?;
         let weights = self.weights(gradient);
         let embedded = self.embed(weights, inputs, identifiers)?;
         let cycles = (self.config.h_cycles, self.config.l_cycles);
-        let now = self.fused.step(&weights.flat()?, states, &embedded, cycles, gradient)?;
+        let now = self.fused.step(&weights.flat()?, carry, &embedded, cycles, gradient)?;
         self.read_out(weights, now)
     }
 
@@ -168,12 +168,12 @@ impl Trm {
     /// The same.
     pub fn supervision_step_composed(
         &self,
-        states: &States,
+        carry: &Carry,
         inputs: &Tensor,
         identifiers: Option<&Tensor>,
         gradient: Gradient,
     ) -> Result<StepOutput> {
-        self.composed((self.weights(gradient), &self.frozen), states, inputs, identifiers)
+        self.composed((self.weights(gradient), &self.frozen), carry, inputs, identifiers)
     }
 
     /// A supervision step without gradient in f64. The recursion amplifies rounding, so two
@@ -183,26 +183,26 @@ impl Trm {
     /// The same.
     pub fn supervision_step_exact(
         &self,
-        states: &States,
+        carry: &Carry,
         inputs: &Tensor,
         identifiers: Option<&Tensor>,
     ) -> Result<StepOutput> {
         let weights = self.frozen.map(&|t| Ok(t.to_dtype(DType::F64)?))?;
-        let states = States { z_h: states.z_h.to_dtype(DType::F64)?, z_l: states.z_l.to_dtype(DType::F64)? };
-        self.composed((&weights, &weights), &states, inputs, identifiers)
+        let carry = Carry { z_h: carry.z_h.to_dtype(DType::F64)?, z_l: carry.z_l.to_dtype(DType::F64)? };
+        self.composed((&weights, &weights), &carry, inputs, identifiers)
     }
 
     /// One supervision step, its last round with the first weights, earlier ones with the second.
     fn composed(
         &self,
         (weights, quiet_weights): (&Weights, &Weights),
-        states: &States,
+        carry: &Carry,
         inputs: &Tensor,
         identifiers: Option<&Tensor>,
     ) -> Result<StepOutput> {
-        self.check_step(states, inputs)?;
+        self.check_step(carry, inputs)?;
         let embedded = self.embed(weights, inputs, identifiers)?;
-        let mut now = states.detach();
+        let mut now = carry.detach();
         let quiet = embedded.detach();
         for _ in 1..self.config.h_cycles {
             now = self.round(quiet_weights, &now, &quiet)?;
@@ -218,13 +218,13 @@ impl Trm {
         }
     }
 
-    fn check_step(&self, states: &States, inputs: &Tensor) -> Result<()> {
+    fn check_step(&self, carry: &Carry, inputs: &Tensor) -> Result<()> {
         let (batch, len) = inputs.dims2()?;
         if len != self.config.seq_len {
             return Err(misfit("inputs", &[batch, self.config.seq_len], inputs.dims()));
         }
         let expected = [batch, self.config.positions_len(), self.config.hidden_size];
-        for (name, state) in [("z_h", &states.z_h), ("z_l", &states.z_l)] {
+        for (name, state) in [("z_h", &carry.z_h), ("z_l", &carry.z_l)] {
             if state.dims() != expected {
                 return Err(misfit(name, &expected, state.dims()));
             }
@@ -233,7 +233,7 @@ impl Trm {
     }
 
     /// Answers and halting logits of the states after the last round.
-    fn read_out(&self, weights: &Weights, now: States) -> Result<StepOutput> {
+    fn read_out(&self, weights: &Weights, now: Carry) -> Result<StepOutput> {
         let answer = now.z_h.narrow(1, self.config.prefix_len(), self.config.seq_len)?;
         let pooled = match self.config.pooling {
             Pooling::First => now.z_h.i((.., 0, ..))?.contiguous()?,
@@ -243,7 +243,7 @@ impl Trm {
         Ok(StepOutput {
             logits: linear(&answer.contiguous()?, &weights.lm_head)?,
             q_halt: q.i((.., 0))?,
-            states: now.detach(),
+            carry: now.detach(),
         })
     }
 
@@ -275,15 +275,15 @@ impl Trm {
     }
 
     /// One round: `l_cycles` updates of `z_l`, one of `z_h`.
-    fn round(&self, weights: &Weights, states: &States, embedded: &Tensor) -> Result<States> {
-        let States { z_h, z_l } = states;
+    fn round(&self, weights: &Weights, carry: &Carry, embedded: &Tensor) -> Result<Carry> {
+        let Carry { z_h, z_l } = carry;
         let injected = (z_h + embedded)?;
         let mut z_l = z_l.clone();
         for _ in 0..self.config.l_cycles {
             z_l = self.network(weights, &z_l, &injected)?;
         }
         let z_h = self.network(weights, z_h, &z_l)?;
-        Ok(States { z_h, z_l })
+        Ok(Carry { z_h, z_l })
     }
 
     /// The one network, on `state + injected`.

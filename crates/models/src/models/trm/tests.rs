@@ -56,14 +56,14 @@ fn the_kernel_is_the_composed_model_forward_and_backward() {
         let values = Tensor::from_vec(rng.normals(head.elem_count()), head.shape(), &Device::Cpu).unwrap();
         head.set(&values).unwrap();
         let (inputs, identifiers) = puzzles(&config, 5);
-        let states = model.initial_states(5).unwrap();
-        let fused = model.supervision_step(&states, &inputs, Some(&identifiers), Gradient::On).unwrap();
-        let composed = model.supervision_step_composed(&states, &inputs, Some(&identifiers), Gradient::On).unwrap();
+        let carry = model.initial_carry(5).unwrap();
+        let fused = model.supervision_step(&carry, &inputs, Some(&identifiers), Gradient::On).unwrap();
+        let composed = model.supervision_step_composed(&carry, &inputs, Some(&identifiers), Gradient::On).unwrap();
         for (name, a, b) in [
             ("logits", &fused.logits, &composed.logits),
             ("q", &fused.q_halt, &composed.q_halt),
-            ("z_h", &fused.states.z_h, &composed.states.z_h),
-            ("z_l", &fused.states.z_l, &composed.states.z_l),
+            ("z_h", &fused.carry.z_h, &composed.carry.z_h),
+            ("z_l", &fused.carry.z_l, &composed.carry.z_l),
         ] {
             // rounding grows over the eight calls of the network
             let off = distance(a, b);
@@ -85,10 +85,10 @@ fn the_number_of_threads_does_not_change_the_forward_pass() {
     for config in configs() {
         let model = Trm::new(config.clone(), 3).unwrap();
         let (inputs, identifiers) = puzzles(&config, 7);
-        let states = model.initial_states(7).unwrap();
-        let all = model.supervision_step(&states, &inputs, Some(&identifiers), Gradient::Off).unwrap();
+        let carry = model.initial_carry(7).unwrap();
+        let all = model.supervision_step(&carry, &inputs, Some(&identifiers), Gradient::Off).unwrap();
         // a puzzle by itself: another group, another thread
-        let one = States { z_h: states.z_h.narrow(0, 6, 1).unwrap(), z_l: states.z_l.narrow(0, 6, 1).unwrap() };
+        let one = Carry { z_h: carry.z_h.narrow(0, 6, 1).unwrap(), z_l: carry.z_l.narrow(0, 6, 1).unwrap() };
         let (x, id) = (inputs.narrow(0, 6, 1).unwrap(), identifiers.narrow(0, 6, 1).unwrap());
         let one = model.supervision_step(&one, &x, Some(&id), Gradient::Off).unwrap();
         assert!(distance(&all.logits.narrow(0, 6, 1).unwrap(), &one.logits) < 5e-5);
@@ -171,11 +171,11 @@ fn training_carries_puzzles_and_lowers_the_loss() {
             if step == 0 {
                 assert_eq!(wanted, 8);
             }
-            let kept = trainer.carry().steps().to_vec();
-            let vacant = trainer.carry().vacant();
+            let kept = trainer.slots().steps().to_vec();
+            let vacant = trainer.slots().vacant();
             let report = trainer.step(&examples(&config, wanted, step)).unwrap();
             assert_eq!(report.step, step + 1);
-            for (slot, &steps) in trainer.carry().steps().iter().enumerate() {
+            for (slot, &steps) in trainer.slots().steps().iter().enumerate() {
                 // a slot that kept its puzzle has gone on, a new one has begun
                 let expected = if vacant.contains(&slot) { 1 } else { kept[slot] + 1 };
                 assert_eq!(steps, expected);
@@ -215,7 +215,7 @@ fn a_restored_trainer_goes_on_with_the_same_bits() {
     for ((name, a), (_, b)) in one.eval_tensors().unwrap().iter().zip(&two.eval_tensors().unwrap()) {
         assert_eq!(distance(a, b), 0.0, "{name}");
     }
-    assert_eq!(one.carry().steps(), two.carry().steps());
+    assert_eq!(one.slots().steps(), two.slots().steps());
     let mut broken = tensors.clone();
     broken.remove("carry.z_l");
     let error = two.restore(&broken, &meta).unwrap_err().to_string();

@@ -1,7 +1,7 @@
-//! Training on puzzles: one optimiser step per supervision step, with the carry between them.
+//! Training on puzzles: one optimiser step per supervision step, with the puzzles and their states in slots between them.
 
 use super::weights::PUZZLES;
-use super::{Carry, Example, Gradient, Release, States, StepOutput, Trm};
+use super::{Carry, Example, Gradient, Release, Slots, StepOutput, Trm};
 use crate::classification::{ClassProbability, IGNORE_LABEL, binary_cross_entropy, cross_entropy};
 use crate::error::{ModelError, Result};
 use crate::rng::Rng;
@@ -10,11 +10,11 @@ use candle_core::{DType, Device, Tensor};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// What of the loss and the carry can be chosen; defaults are the reference's.
+/// What of the loss and the slots can be chosen; defaults are the reference's.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PuzzleConfig {
-    /// slots of the carry
+    /// puzzles at a time, one a slot
     pub batch_size: usize,
     /// what turns scores into probabilities
     pub probability: ClassProbability,
@@ -72,7 +72,7 @@ pub struct Trainer {
     model: Trm,
     config: PuzzleConfig,
     learner: Learner,
-    carry: Carry,
+    slots: Slots,
     rng: Rng,
 }
 
@@ -103,8 +103,8 @@ impl Trainer {
         }
         // the puzzle table has its own rule and takes no part in the optimiser
         let learner = Learner::new(&model.params().without(&[PUZZLES]), train)?;
-        let carry = Carry::new(&model, config.batch_size)?;
-        Ok(Self { model, config, learner, carry, rng: Rng::new(seed, "trm train") })
+        let slots = Slots::new(&model, config.batch_size)?;
+        Ok(Self { model, config, learner, slots, rng: Rng::new(seed, "trm train") })
     }
 
     /// The model as it is now.
@@ -118,8 +118,8 @@ impl Trainer {
     }
 
     /// The puzzles and states in progress.
-    pub fn carry(&self) -> &Carry {
-        &self.carry
+    pub fn slots(&self) -> &Slots {
+        &self.slots
     }
 
     /// Steps taken.
@@ -129,7 +129,7 @@ impl Trainer {
 
     /// Puzzles that the next step wants.
     pub fn wanted(&self) -> usize {
-        self.carry.vacant().len()
+        self.slots.vacant().len()
     }
 
     /// One optimiser step. `fresh` holds [`Self::wanted`] puzzles.
@@ -138,13 +138,13 @@ impl Trainer {
     /// A wrong number of puzzles, a puzzle that does not fit, a loss or gradient that is not
     /// finite.
     pub fn step(&mut self, fresh: &[Example]) -> Result<StepReport> {
-        self.carry.admit(&self.model, fresh)?;
-        let (batch, len) = (self.carry.batch(), self.model.config().seq_len);
-        let inputs = self.carry.input_tensor()?;
-        let identifiers = self.carry.identifier_tensor()?;
-        let out = self.model.supervision_step(self.carry.states(), &inputs, Some(&identifiers), Gradient::On)?;
+        self.slots.admit(&self.model, fresh)?;
+        let (batch, len) = (self.slots.batch(), self.model.config().seq_len);
+        let inputs = self.slots.input_tensor()?;
+        let identifiers = self.slots.identifier_tensor()?;
+        let out = self.model.supervision_step(self.slots.carry(), &inputs, Some(&identifiers), Gradient::On)?;
 
-        let grades = grade(&out.logits, &self.carry.labels)?;
+        let grades = grade(&out.logits, &self.slots.labels)?;
         let solved: Vec<bool> = grades.iter().map(|(right, all)| right == all).collect();
         let class_loss = self.class_loss(&out, &grades)?;
         let targets: Vec<f32> = solved.iter().map(|&s| f32::from(u8::from(s))).collect();
@@ -159,12 +159,12 @@ impl Trainer {
         }
 
         let q_halt = out.q_halt.to_vec1::<f32>()?;
-        self.carry.advance(&self.model, out.states, &q_halt, &solved, self.config.release, &mut self.rng);
-        let halted: Vec<u32> = self.carry.vacant().iter().map(|&slot| self.carry.steps()[slot]).collect();
+        self.slots.advance(&self.model, out.carry, &q_halt, &solved, self.config.release, &mut self.rng);
+        let halted: Vec<u32> = self.slots.vacant().iter().map(|&slot| self.slots.steps()[slot]).collect();
         let count = |of: usize| of as f64 / batch as f64;
         let (right, all) = grades.iter().fold((0, 0), |(a, b), (right, all)| (a + right, b + all));
         let agrees = q_halt.iter().zip(&solved).filter(|(q, solved)| (**q > 0.0) == **solved);
-        debug_assert_eq!(self.carry.labels.len(), batch * len);
+        debug_assert_eq!(self.slots.labels.len(), batch * len);
         Ok(StepReport {
             step: self.learner.step_count(),
             loss: metrics.loss,
@@ -186,7 +186,7 @@ impl Trainer {
     fn class_loss(&self, out: &StepOutput, grades: &[(usize, usize)]) -> Result<Tensor> {
         let (batch, len, classes) = out.logits.dims3()?;
         let flat = out.logits.reshape((batch * len, classes))?;
-        let losses = cross_entropy(&flat, &self.carry.labels, self.config.probability)?;
+        let losses = cross_entropy(&flat, &self.slots.labels, self.config.probability)?;
         let per_puzzle = losses.reshape((batch, len))?.sum(1)?;
         let weights: Vec<f64> = grades.iter().map(|(_, all)| 1.0 / ((*all).max(1) * batch) as f64).collect();
         Ok((per_puzzle * Tensor::from_vec(weights, batch, &Device::Cpu)?)?.sum_all()?)
@@ -200,7 +200,7 @@ impl Trainer {
         let scheduled = self.learner.config().lr_at(self.learner.step_count() - 1) / self.learner.config().lr;
         let lr = self.config.puzzle_lr * scheduled;
         let keep = (1.0 - lr * self.config.puzzle_weight_decay) as f32;
-        let used: std::collections::BTreeSet<u32> = self.carry.identifiers.iter().copied().collect();
+        let used: std::collections::BTreeSet<u32> = self.slots.identifiers.iter().copied().collect();
         for row in used {
             let at = row as usize * width..(row as usize + 1) * width;
             for (value, g) in table[at.clone()].iter_mut().zip(&grad[at]) {
@@ -233,19 +233,19 @@ impl Trainer {
                 tensors.insert(format!("fixed.{name}"), tensor.copy()?);
             }
         }
-        let carry = &self.carry;
-        let (batch, len) = (carry.batch(), self.model.config().seq_len);
+        let slots = &self.slots;
+        let (batch, len) = (slots.batch(), self.model.config().seq_len);
         let saved = |tensor: &Tensor| tensor.copy();
-        tensors.insert("carry.z_h".into(), saved(&carry.states.z_h)?);
-        tensors.insert("carry.z_l".into(), saved(&carry.states.z_l)?);
-        tensors.insert("carry.inputs".into(), Tensor::from_slice(&carry.inputs, (batch, len), &Device::Cpu)?);
-        tensors.insert("carry.labels".into(), Tensor::from_slice(&carry.labels, (batch, len), &Device::Cpu)?);
+        tensors.insert("carry.z_h".into(), saved(&slots.carry.z_h)?);
+        tensors.insert("carry.z_l".into(), saved(&slots.carry.z_l)?);
+        tensors.insert("carry.inputs".into(), Tensor::from_slice(&slots.inputs, (batch, len), &Device::Cpu)?);
+        tensors.insert("carry.labels".into(), Tensor::from_slice(&slots.labels, (batch, len), &Device::Cpu)?);
         let meta = Meta {
             step,
             rng: self.rng.state(),
-            steps: carry.steps.clone(),
-            halted: carry.halted.clone(),
-            identifiers: carry.identifiers.clone(),
+            steps: slots.steps.clone(),
+            halted: slots.halted.clone(),
+            identifiers: slots.identifiers.clone(),
         };
         let meta = serde_json::to_value(meta).map_err(|e| misfit(e.to_string()))?;
         Ok((tensors, meta))
@@ -258,7 +258,7 @@ impl Trainer {
     /// A tensor that is missing or misshapen; metadata that cannot be read.
     pub fn restore(&mut self, tensors: &BTreeMap<String, Tensor>, meta: &serde_json::Value) -> Result<()> {
         let meta: Meta = serde_json::from_value(meta.clone()).map_err(|e| misfit(e.to_string()))?;
-        let (batch, len) = (self.carry.batch(), self.model.config().seq_len);
+        let (batch, len) = (self.slots.batch(), self.model.config().seq_len);
         if [meta.steps.len(), meta.halted.len(), meta.identifiers.len()] != [batch; 3] {
             return Err(misfit(format!("{} slots, expected {batch}", meta.steps.len())));
         }
@@ -276,8 +276,8 @@ impl Trainer {
             Ok(tensor.copy()?)
         };
         let state = [batch, self.model.config().positions_len(), self.model.config().hidden_size];
-        let carry = Carry {
-            states: States { z_h: get("carry.z_h", &state)?, z_l: get("carry.z_l", &state)? },
+        let slots = Slots {
+            carry: Carry { z_h: get("carry.z_h", &state)?, z_l: get("carry.z_l", &state)? },
             steps: meta.steps,
             halted: meta.halted,
             inputs: get("carry.inputs", &[batch, len])?.flatten_all()?.to_vec1()?,
@@ -291,7 +291,7 @@ impl Trainer {
         let rng = Rng::from_state(&meta.rng)?;
         self.model.load(&tensors.iter().filter_map(strip).collect())?;
         self.learner.restore(tensors, meta.step)?;
-        (self.carry, self.rng) = (carry, rng);
+        (self.slots, self.rng) = (slots, rng);
         Ok(())
     }
 }

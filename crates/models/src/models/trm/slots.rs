@@ -2,7 +2,7 @@
 //! long it has been thought about. A slot is vacant once its puzzle has halted; the next step
 //! gives it a new puzzle, and the other slots keep theirs.
 
-use super::{States, Trm, misfit};
+use super::{Carry, Trm, misfit};
 use crate::classification::IGNORE_LABEL;
 use crate::error::Result;
 use crate::rng::Rng;
@@ -33,8 +33,8 @@ pub enum Release {
 
 /// The batch's puzzles and states between supervision steps.
 #[derive(Debug, Clone)]
-pub struct Carry {
-    pub(super) states: States,
+pub struct Slots {
+    pub(super) carry: Carry,
     pub(super) steps: Vec<u32>,
     pub(super) halted: Vec<bool>,
     pub(super) inputs: Vec<u32>,
@@ -42,15 +42,15 @@ pub struct Carry {
     pub(super) identifiers: Vec<u32>,
 }
 
-impl Carry {
-    /// A carry of `batch` vacant slots.
+impl Slots {
+    /// `batch` vacant slots.
     ///
     /// # Errors
     /// When a tensor operation fails.
     pub fn new(model: &Trm, batch: usize) -> Result<Self> {
         let len = model.config().seq_len;
         Ok(Self {
-            states: model.initial_states(batch)?,
+            carry: model.initial_carry(batch)?,
             steps: vec![0; batch],
             halted: vec![true; batch],
             inputs: vec![0; batch * len],
@@ -75,8 +75,8 @@ impl Carry {
     }
 
     /// The states, `(batch, positions, hidden)` each.
-    pub fn states(&self) -> &States {
-        &self.states
+    pub fn carry(&self) -> &Carry {
+        &self.carry
     }
 
     /// Gives the vacant slots, in order, the puzzles of `fresh`, and their states the initial
@@ -109,12 +109,12 @@ impl Carry {
             for &slot in &vacant {
                 reset[slot] = 1;
             }
-            let initial = model.initial_states(self.batch())?;
+            let initial = model.initial_carry(self.batch())?;
             let shape = initial.z_h.shape().clone();
             let reset = Tensor::from_vec(reset, (self.batch(), 1, 1), &Device::Cpu)?.broadcast_as(shape)?;
-            self.states = States {
-                z_h: reset.where_cond(&initial.z_h, &self.states.z_h)?,
-                z_l: reset.where_cond(&initial.z_l, &self.states.z_l)?,
+            self.carry = Carry {
+                z_h: reset.where_cond(&initial.z_h, &self.carry.z_h)?,
+                z_l: reset.where_cond(&initial.z_l, &self.carry.z_l)?,
             };
         }
         Ok(())
@@ -135,14 +135,14 @@ impl Carry {
     pub(super) fn advance(
         &mut self,
         model: &Trm,
-        states: States,
+        carry: Carry,
         q_halt: &[f32],
         solved: &[bool],
         release: Release,
         rng: &mut Rng,
     ) {
         let max = model.config().halt_max_steps as u32;
-        self.states = states;
+        self.carry = carry;
         for slot in 0..self.batch() {
             self.steps[slot] += 1;
             let steps = self.steps[slot];
