@@ -10,7 +10,7 @@
 //! then go, detached, to the next supervision step: see [`Slots`].
 //!
 //! This file is the model as one reads it, on candle's autograd. Supervision steps run the same
-//! maths in `kernel.rs`, forward and backward by hand; tests hold the two together.
+//! maths in `fused/`, forward and backward by hand; tests hold the two together.
 //!
 //! Deviations from the reference:
 //! - everything is f32 (the reference trains in bf16 with f32 master weights);
@@ -21,12 +21,8 @@
 //!   reference's numbers.
 
 mod config;
-mod elementwise;
 mod fused;
-mod kernel;
-mod layer;
 mod official;
-mod product;
 mod slots;
 #[cfg(test)]
 mod tests;

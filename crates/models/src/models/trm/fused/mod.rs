@@ -1,10 +1,17 @@
-//! The kernel as an operation of candle's graph: embedded input and flat weights in, `z_h` out.
+//! The TRM's step on plain slices, forward and backward by hand (`kernel.rs`, `layer.rs`), as an operation of candle's graph:
+//! embedded input and flat weights in, `z_h` out.
 
-use super::kernel::{Plan, PlanMix};
-use super::layer::Direction;
+mod elementwise;
+mod kernel;
+mod layer;
+mod plan;
+mod product;
+
 use super::{Carry, Config, Gradient, Mixing};
 use crate::error::Result;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result as CandleResult, Shape, Storage, Tensor};
+use layer::Direction;
+use plan::{Plan, PlanMix};
 use std::sync::{Arc, Mutex};
 
 /// Tapes that are not in use, kept for the next step: fresh memory costs more than the arithmetic.

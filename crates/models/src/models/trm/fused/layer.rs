@@ -1,7 +1,7 @@
 //! One layer of the network, forward and backward, on a few puzzles.
 
 use super::elementwise as ew;
-use super::kernel::{Marks, Plan, PlanMix, Spans};
+use super::plan::{Marks, Plan, PlanMix, Spans};
 use super::product::{Factors, Packed, Rows, Taps, dense, dense_outer, outer, product};
 use std::ops::Range;
 
