@@ -6,7 +6,7 @@
 //! graph, and the embedded answer carries no gradient to the step before. Our one liberty: the
 //! first answer is the uniform one.
 
-use super::{Conv3x3, GridDims, GridModel, channels_last};
+use super::grids::{Conv3x3, GridDims, GridModel, channels_last};
 use crate::error::Result;
 use crate::layers::Linear;
 use crate::params::{Init, Params};

@@ -7,9 +7,9 @@
 //! one [`Episode`] per episode, and hands whole episodes to [`Agent::update`]:
 //!
 //! ```no_run
-//! # use models::{TrainConfig, baselines::PolicyNetConfig, rl::{Agent, Algorithm, Choice, Episode, RlConfig}};
+//! # use models::{TrainConfig, baselines::WalkerConfig, rl::{Agent, Algorithm, Choice, Episode, RlConfig}};
 //! # fn main() -> models::Result<()> {
-//! let net = PolicyNetConfig::Mlp { hidden: vec![128, 128], value: true }.build(25, 4, 0)?;
+//! let net = WalkerConfig::Mlp { hidden: vec![128, 128], value: true }.build(25, 4, 0)?;
 //! let mut agent = Agent::new(net, RlConfig::new(Algorithm::A2c), TrainConfig::default(), 0)?;
 //! let mut episode = Episode::default();
 //! loop {
@@ -41,7 +41,7 @@ mod losses;
 #[cfg(test)]
 mod tests;
 
-use crate::baselines::PolicyNet;
+use crate::baselines::WalkerNet;
 use crate::error::{ModelError, Result};
 use crate::rng::Rng;
 use crate::train::{Learner, LearnerMetrics, TrainConfig};
@@ -289,7 +289,7 @@ pub struct RlMetrics {
 
 /// A policy network in training.
 pub struct Agent {
-    net: Box<dyn PolicyNet>,
+    net: Box<dyn WalkerNet>,
     config: RlConfig,
     learner: Learner,
     rng: Rng,
@@ -322,7 +322,7 @@ impl Agent {
     ///
     /// # Errors
     /// A configuration out of range; a value head with REINFORCE, or none with the others.
-    pub fn new(net: Box<dyn PolicyNet>, config: RlConfig, train: TrainConfig, seed: u64) -> Result<Self> {
+    pub fn new(net: Box<dyn WalkerNet>, config: RlConfig, train: TrainConfig, seed: u64) -> Result<Self> {
         config.check()?;
         let (wants, has) = (!matches!(config.algorithm, Algorithm::Reinforce), net.sizes().2);
         if wants != has {
@@ -340,7 +340,7 @@ impl Agent {
     }
 
     /// The network as it is now.
-    pub fn net(&self) -> &dyn PolicyNet {
+    pub fn net(&self) -> &dyn WalkerNet {
         self.net.as_ref()
     }
 
@@ -553,7 +553,7 @@ struct Meta {
 }
 
 /// Observations `(n, observation)` and previous actions `(n,)` for a network.
-fn inputs(net: &dyn PolicyNet, observations: &[f32], previous: &[u32]) -> Result<(Tensor, Tensor)> {
+fn inputs(net: &dyn WalkerNet, observations: &[f32], previous: &[u32]) -> Result<(Tensor, Tensor)> {
     let (n, (width, actions, _)) = (previous.len(), net.sizes());
     if observations.len() != n * width || n == 0 {
         let (expected, found) = (vec![n.max(1), width], vec![observations.len()]);
@@ -576,7 +576,7 @@ fn inputs(net: &dyn PolicyNet, observations: &[f32], previous: &[u32]) -> Result
 /// # Errors
 /// Lengths that do not fit.
 pub fn decide(
-    net: &dyn PolicyNet,
+    net: &dyn WalkerNet,
     observations: &[f32],
     previous: &[u32],
     mut rng: Option<&mut Rng>,

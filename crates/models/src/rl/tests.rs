@@ -1,6 +1,6 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::baselines::PolicyNetConfig;
+use crate::baselines::WalkerConfig;
 
 fn train(steps: u64, lr: f64) -> TrainConfig {
     TrainConfig {
@@ -23,7 +23,7 @@ fn algorithms() -> [Algorithm; 3] {
 
 fn agent(algorithm: Algorithm, seed: u64) -> Agent {
     let value = !matches!(algorithm, Algorithm::Reinforce);
-    let net = PolicyNetConfig::Mlp { hidden: vec![16], value }.build(5, 2, seed).unwrap();
+    let net = WalkerConfig::Mlp { hidden: vec![16], value }.build(5, 2, seed).unwrap();
     let config = RlConfig { reward_scale: 1.0, ..RlConfig::new(algorithm) };
     Agent::new(net, config, train(1000, 1e-2), seed).unwrap()
 }
@@ -177,7 +177,7 @@ fn sampling_follows_the_policy_and_the_seed() {
 
 #[test]
 fn what_does_not_fit_is_named() {
-    let net = PolicyNetConfig::Mlp { hidden: vec![4], value: true }.build(5, 2, 0).unwrap();
+    let net = WalkerConfig::Mlp { hidden: vec![4], value: true }.build(5, 2, 0).unwrap();
     let error = Agent::new(net, RlConfig::new(Algorithm::Reinforce), train(1, 1e-3), 0).unwrap_err().to_string();
     assert!(error.contains("value head"), "{error}");
     let config = RlConfig { advantage_std_floor: 0.0, ..RlConfig::new(Algorithm::A2c) };

@@ -1,7 +1,7 @@
 //! `[model]` of a puzzle experiment: the recursive model and those that it is compared with.
 
 use models::ModelError;
-use models::baselines::{GridConfig, GridDims, PolicyNetConfig, SmallTrmConfig};
+use models::baselines::{GridConfig, GridDims, SmallTrmConfig, WalkerConfig};
 use models::classification::ClassProbability;
 use models::trm::{self, Mixing, Pooling, Positions};
 use puzzles::{MOVES, MazeTask, Task};
@@ -215,13 +215,13 @@ impl SolverConfig {
     /// The walker of this configuration for mazes of `task`.
     pub(super) fn build_walker(&self, task: MazeTask, value: bool, seed: u64) -> Result<Solver, ModelError> {
         let net = match self {
-            Self::Mlp(MlpSection { hidden }) => PolicyNetConfig::Mlp { hidden: hidden.clone(), value },
+            Self::Mlp(MlpSection { hidden }) => WalkerConfig::Mlp { hidden: hidden.clone(), value },
             &Self::Hierarchical(HierarchicalSection { high, low, cycles, previous_action }) => {
-                PolicyNetConfig::Trm { high, low, cycles, previous_action, value }
+                WalkerConfig::Trm { high, low, cycles, previous_action, value }
             }
             &Self::Conv(ConvSection { hidden, inner, cycles }) => {
                 let (height, width) = (task.side(), task.side());
-                PolicyNetConfig::Conv { channels: 3, height, width, hidden, inner, cycles, value }
+                WalkerConfig::Conv { channels: 3, height, width, hidden, inner, cycles, value }
             }
             _ => return Err(self.misplaced("mlp, hierarchical or conv with [rl]")),
         };

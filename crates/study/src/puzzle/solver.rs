@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use candle_core::{Device, Tensor};
 use models::ModelError;
-use models::baselines::{GridDims, GridModel, PolicyNet};
+use models::baselines::{GridDims, GridModel, WalkerNet};
 use models::classification::ClassProbability;
 use models::trm::{Gradient, Trm};
 use puzzles::{MazeTask, Puzzle, Task};
@@ -34,7 +34,7 @@ pub enum Solver {
     /// A policy that walks through mazes instead of marking cells.
     Walker {
         /// The network.
-        net: Box<dyn PolicyNet>,
+        net: Box<dyn WalkerNet>,
         /// The mazes that it walks in.
         task: MazeTask,
     },

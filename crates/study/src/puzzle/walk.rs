@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use models::baselines::PolicyNet;
+use models::baselines::WalkerNet;
 use models::rl::{Agent, Algorithm, Choice, Decision, Episode, RlConfig};
 use models::{ModelError, Rng, TrainConfig};
 use puzzles::{MOVES, Maze, MazeTask, Puzzle, Split, Symmetry, Walker};
@@ -220,7 +220,7 @@ struct Meta {
 
 impl Learning {
     pub(super) fn new(
-        net: Box<dyn PolicyNet>,
+        net: Box<dyn WalkerNet>,
         section: &RlSection,
         task: MazeTask,
         train: TrainConfig,
@@ -324,7 +324,7 @@ pub(super) struct Walk {
 
 /// Walks every maze once: by the most probable move, or by moves drawn with `rng`.
 pub(super) fn walk_all(
-    net: &dyn PolicyNet,
+    net: &dyn WalkerNet,
     task: MazeTask,
     puzzles: &[Puzzle],
     mut rng: Option<&mut Rng>,

@@ -1,11 +1,11 @@
 //! Networks for the reinforcement half of the puzzle study: an observation vector to action
 //! scores and, where the algorithm wants one, a value.
 //!
-//! Sizes of [`MlpPolicy`] (20,356 on the 5x5 maze) and [`TrmPolicy`] (69,038 for any number of
+//! Sizes of [`MlpWalker`] (20,356 on the 5x5 maze) and [`TrmWalker`] (69,038 for any number of
 //! cycles) are those of acharyaanusha/Tiny-Recursive-Model, `trm_core/trm_rl.py`; the value head
-//! is ours and optional. [`ConvPolicy`] is ours: a small TRM with 3x3 convolutions over the maze.
+//! is ours and optional. [`ConvWalker`] is ours: a small TRM with 3x3 convolutions over the maze.
 
-use super::dense;
+use super::grids::dense;
 use crate::error::{ModelError, Result};
 use crate::layers::{LayerNorm, Linear};
 use crate::models::trm::{self, Fused};
@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 
 /// What a policy network says about a batch of observations.
 #[derive(Debug, Clone)]
-pub struct PolicyOutput {
+pub struct WalkerOutput {
     /// `(batch, actions)`, before the softmax.
     pub logits: Tensor,
     /// `(batch,)`, expected return, if the network has a value head.
@@ -24,7 +24,7 @@ pub struct PolicyOutput {
 }
 
 /// A network that scores actions.
-pub trait PolicyNet: Send + Sync {
+pub trait WalkerNet: Send + Sync {
     /// Its parameters.
     fn params(&self) -> &Params;
 
@@ -36,13 +36,13 @@ pub trait PolicyNet: Send + Sync {
     ///
     /// # Errors
     /// When a shape does not fit, or the previous action is wanted and absent.
-    fn forward(&self, observation: &Tensor, previous_action: Option<&Tensor>) -> Result<PolicyOutput>;
+    fn forward(&self, observation: &Tensor, previous_action: Option<&Tensor>) -> Result<WalkerOutput>;
 }
 
 /// Which policy network, and its sizes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
-pub enum PolicyNetConfig {
+pub enum WalkerConfig {
     /// Dense layers with ReLU.
     Mlp {
         /// Widths of the hidden layers; the study's are 128, 128.
@@ -86,19 +86,19 @@ pub enum PolicyNetConfig {
     },
 }
 
-impl PolicyNetConfig {
+impl WalkerConfig {
     /// Builds the network with weights drawn from `seed`.
     ///
     /// # Errors
     /// When the configuration cannot work.
-    pub fn build(&self, observation: usize, actions: usize, seed: u64) -> Result<Box<dyn PolicyNet>> {
+    pub fn build(&self, observation: usize, actions: usize, seed: u64) -> Result<Box<dyn WalkerNet>> {
         let mut rng = Rng::new(seed, "policy net");
         let rng = &mut rng;
         Ok(match *self {
-            Self::Mlp { ref hidden, value } => Box::new(MlpPolicy::new(observation, actions, hidden, value, rng)?),
+            Self::Mlp { ref hidden, value } => Box::new(MlpWalker::new(observation, actions, hidden, value, rng)?),
             Self::Trm { high, low, cycles, previous_action, value } => {
                 let sizes = TrmPolicySizes { observation, actions, high, low, cycles };
-                Box::new(TrmPolicy::new(sizes, previous_action, value, rng)?)
+                Box::new(TrmWalker::new(sizes, previous_action, value, rng)?)
             }
             Self::Conv { channels, height, width, hidden, inner, cycles, value } => {
                 if channels * height * width != observation {
@@ -118,7 +118,7 @@ impl PolicyNetConfig {
                     });
                 }
                 let grid = (channels, height, width);
-                Box::new(ConvPolicy::new(grid, actions, (hidden, inner, cycles), value, rng)?)
+                Box::new(ConvWalker::new(grid, actions, (hidden, inner, cycles), value, rng)?)
             }
         })
     }
@@ -139,7 +139,7 @@ fn value(head: Option<&Linear>, x: &Tensor) -> Result<Option<Tensor>> {
 
 /// Dense layers.
 #[derive(Debug)]
-pub struct MlpPolicy {
+pub struct MlpWalker {
     params: Params,
     observation: usize,
     layers: Vec<Linear>,
@@ -147,7 +147,7 @@ pub struct MlpPolicy {
     value: Option<Linear>,
 }
 
-impl MlpPolicy {
+impl MlpWalker {
     fn new(observation: usize, actions: usize, hidden: &[usize], with_value: bool, rng: &mut Rng) -> Result<Self> {
         let mut params = Params::new();
         let mut width = observation;
@@ -162,7 +162,7 @@ impl MlpPolicy {
     }
 }
 
-impl PolicyNet for MlpPolicy {
+impl WalkerNet for MlpWalker {
     fn params(&self) -> &Params {
         &self.params
     }
@@ -171,12 +171,12 @@ impl PolicyNet for MlpPolicy {
         (self.observation, out_size(&self.head), self.value.is_some())
     }
 
-    fn forward(&self, observation: &Tensor, _: Option<&Tensor>) -> Result<PolicyOutput> {
+    fn forward(&self, observation: &Tensor, _: Option<&Tensor>) -> Result<WalkerOutput> {
         let mut x = observation.clone();
         for layer in &self.layers {
             x = layer.forward(&x)?.relu()?;
         }
-        Ok(PolicyOutput { logits: self.head.forward(&x)?, value: value(self.value.as_ref(), &x)? })
+        Ok(WalkerOutput { logits: self.head.forward(&x)?, value: value(self.value.as_ref(), &x)? })
     }
 }
 
@@ -219,7 +219,7 @@ struct TrmPolicySizes {
 /// The study's hierarchical policy: per cycle two SwiGLU blocks on the high state, one dense
 /// block on the low one, and a way back up.
 #[derive(Debug)]
-pub struct TrmPolicy {
+pub struct TrmWalker {
     params: Params,
     observation: usize,
     cycles: usize,
@@ -235,7 +235,7 @@ pub struct TrmPolicy {
     value: Option<Linear>,
 }
 
-impl TrmPolicy {
+impl TrmWalker {
     fn new(sizes: TrmPolicySizes, previous_action: bool, with_value: bool, rng: &mut Rng) -> Result<Self> {
         let TrmPolicySizes { observation, actions, high, low, cycles } = sizes;
         if cycles < 2 {
@@ -283,7 +283,7 @@ impl TrmPolicy {
     }
 }
 
-impl PolicyNet for TrmPolicy {
+impl WalkerNet for TrmWalker {
     fn params(&self) -> &Params {
         &self.params
     }
@@ -292,7 +292,7 @@ impl PolicyNet for TrmPolicy {
         (self.observation, out_size(&self.head[1]), self.value.is_some())
     }
 
-    fn forward(&self, observation: &Tensor, previous_action: Option<&Tensor>) -> Result<PolicyOutput> {
+    fn forward(&self, observation: &Tensor, previous_action: Option<&Tensor>) -> Result<WalkerOutput> {
         let observation = match (&self.previous, previous_action) {
             (None, _) => observation.clone(),
             (Some((table, project)), Some(action)) => {
@@ -320,7 +320,7 @@ impl PolicyNet for TrmPolicy {
             let fed = dense(&self.low, &self.low_norm.forward(&low)?)?;
             h = (h + self.up.forward(&(low + fed)?)?)?;
         }
-        Ok(PolicyOutput { logits: dense(&self.head, &h)?, value: value(self.value.as_ref(), &h)? })
+        Ok(WalkerOutput { logits: dense(&self.head, &h)?, value: value(self.value.as_ref(), &h)? })
     }
 }
 
@@ -328,7 +328,7 @@ impl PolicyNet for TrmPolicy {
 /// `net` is `h = rms(h + conv(h))`, `h = rms(h + swiglu(h))`. Scores are read where the agent stands, the value from the
 /// mean as well.
 #[derive(Debug)]
-pub struct ConvPolicy {
+pub struct ConvWalker {
     params: Params,
     grid: (usize, usize, usize),
     cycles: usize,
@@ -340,7 +340,7 @@ pub struct ConvPolicy {
     value: Option<Linear>,
 }
 
-impl ConvPolicy {
+impl ConvWalker {
     fn new(
         grid: (usize, usize, usize),
         actions: usize,
@@ -382,7 +382,7 @@ impl ConvPolicy {
     }
 }
 
-impl PolicyNet for ConvPolicy {
+impl WalkerNet for ConvWalker {
     fn params(&self) -> &Params {
         &self.params
     }
@@ -392,7 +392,7 @@ impl PolicyNet for ConvPolicy {
         (channels * height * width, out_size(&self.head), self.value.is_some())
     }
 
-    fn forward(&self, observation: &Tensor, _: Option<&Tensor>) -> Result<PolicyOutput> {
+    fn forward(&self, observation: &Tensor, _: Option<&Tensor>) -> Result<WalkerOutput> {
         let (channels, height, width) = self.grid;
         let batch = observation.dim(0)?;
         let planes = observation.reshape((batch, channels, height * width))?;
@@ -407,7 +407,7 @@ impl PolicyNet for ConvPolicy {
         let h = self.fused.step(&flat, &carry, &x, (1, self.cycles - 1), trm::Gradient::On)?.z_h;
         let here = h.broadcast_mul(&agent)?.sum(1)?;
         let seen = Tensor::cat(&[&here, &h.mean(1)?], D::Minus1)?;
-        Ok(PolicyOutput { logits: self.head.forward(&here)?, value: value(self.value.as_ref(), &seen)? })
+        Ok(WalkerOutput { logits: self.head.forward(&here)?, value: value(self.value.as_ref(), &seen)? })
     }
 }
 
@@ -417,17 +417,17 @@ mod tests {
     use super::*;
     use candle_core::Device;
 
-    fn study_trm(cycles: usize) -> PolicyNetConfig {
-        PolicyNetConfig::Trm { high: 64, low: 32, cycles, previous_action: true, value: false }
+    fn study_trm(cycles: usize) -> WalkerConfig {
+        WalkerConfig::Trm { high: 64, low: 32, cycles, previous_action: true, value: false }
     }
 
-    fn small_conv() -> PolicyNetConfig {
-        PolicyNetConfig::Conv { channels: 3, height: 5, width: 5, hidden: 20, inner: 32, cycles: 6, value: true }
+    fn small_conv() -> WalkerConfig {
+        WalkerConfig::Conv { channels: 3, height: 5, width: 5, hidden: 20, inner: 32, cycles: 6, value: true }
     }
 
     #[test]
     fn parameter_counts_are_the_studys() {
-        let mlp = PolicyNetConfig::Mlp { hidden: vec![128, 128], value: false };
+        let mlp = WalkerConfig::Mlp { hidden: vec![128, 128], value: false };
         assert_eq!(mlp.build(25, 4, 0).unwrap().params().count(), 20_356);
         for cycles in [3, 5] {
             assert_eq!(study_trm(cycles).build(25, 4, 0).unwrap().params().count(), 69_038);
@@ -438,7 +438,7 @@ mod tests {
 
     #[test]
     fn every_parameter_gets_a_gradient() {
-        let mlp = PolicyNetConfig::Mlp { hidden: vec![16], value: true };
+        let mlp = WalkerConfig::Mlp { hidden: vec![16], value: true };
         for (config, size) in [(mlp, 25), (study_trm(3), 25), (small_conv(), 75)] {
             let net = config.build(size, 4, 1).unwrap();
             let mut rng = Rng::new(1, "observation");
