@@ -1,0 +1,39 @@
+//! Videos of data sets: MP4 files with AV1 or H.264, 8 bits, 4:2:0, as LeRobotDataset v3.0 keeps them.
+//!
+//! [`Video`] opens a file and gives its pictures as RGB bytes, the same that LeRobot's readers (torchcodec and PyAV)
+//! give, bit for bit; [`Encoder`] makes AV1 of pictures and [`Muxer`] a file of it that those readers open. What is not
+//! read (other codecs, 10 bits, 4:4:4, fragments, odd heights) is refused by name.
+//!
+//! Files come from anywhere: every length and place in them is checked before it is used, and memory is bounded. The
+//! AV1 decoder is a translation from C that may abort the process on a damaged stream, so a program that opens what it
+//! did not write runs this in a process of its own.
+//!
+//! It knows nothing of data sets, tensors or processes, and prints nothing.
+
+mod av1;
+mod boxes;
+mod colour;
+mod decode;
+mod demux;
+mod encode;
+mod error;
+mod h264;
+mod mux;
+mod sequence;
+mod table;
+mod video;
+
+pub use demux::Codec;
+pub use encode::{EncodeOptions, Encoder};
+pub use error::{Result, VideoError};
+pub use mux::{Muxer, Rate};
+pub use video::{Frame, Frames, Info, TOLERANCE, Video};
+
+/// One encoded picture: what a sample of a file holds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Sample {
+    /// Its bytes.
+    pub bytes: Vec<u8>,
+    /// Whether it can be decoded without the ones before it.
+    pub key: bool,
+}

@@ -1,0 +1,64 @@
+//! Files that LeRobot wrote, against the pixels that LeRobot reads.
+
+#![allow(clippy::unwrap_used)]
+
+use sha2::{Digest, Sha256};
+use std::path::{Path, PathBuf};
+use video::{Codec, Video, VideoError};
+
+fn fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
+}
+
+fn hashes(name: &str) -> Vec<String> {
+    std::fs::read_to_string(fixture(&format!("{name}.sha256"))).unwrap().lines().map(str::to_owned).collect()
+}
+
+fn hash(rgb: &[u8]) -> String {
+    Sha256::digest(rgb).iter().map(|b| format!("{b:02x}")).collect()
+}
+
+const FILES: [(&str, Codec); 4] = [
+    ("av1_agentview", Codec::Av1),
+    ("av1_robot0_eye_in_hand", Codec::Av1),
+    ("h264_agentview", Codec::H264),
+    ("h264_robot0_eye_in_hand", Codec::H264),
+];
+
+#[test]
+fn every_pixel_is_lerobots() {
+    for (name, codec) in FILES {
+        let video = Video::open(&fixture(&format!("{name}.mp4"))).unwrap();
+        let info = video.info();
+        assert_eq!((info.width, info.height, info.frames, info.codec), (84, 84, 36, codec));
+        assert!((info.fps - 20.0).abs() < 1e-12, "{name}: {}", info.fps);
+        for (i, t) in info.timestamps.iter().enumerate() {
+            assert!((t - i as f64 / 20.0).abs() < 1e-12, "{name}: frame {i} at {t}");
+        }
+        let frames: Vec<_> = video.frames().map(|f| f.unwrap()).collect();
+        assert_eq!(frames.iter().map(|f| f.index).collect::<Vec<_>>(), (0..36).collect::<Vec<_>>());
+        assert_eq!(frames.iter().map(|f| hash(&f.rgb)).collect::<Vec<_>>(), hashes(name), "{name}");
+    }
+}
+
+#[test]
+fn any_frame_is_found_by_its_time_and_by_its_number() {
+    for (name, _) in FILES {
+        let bytes = std::fs::read(fixture(&format!("{name}.mp4"))).unwrap();
+        let (video, expected) = (Video::from_bytes(name, bytes).unwrap(), hashes(name));
+        for i in (0..36).rev() {
+            let frame = video.frame_at(i as f64 / 20.0 + 0.9e-4).unwrap();
+            assert_eq!((frame.index, &hash(&frame.rgb)), (i, &expected[i]), "{name}");
+            let few: Vec<_> = video.range(i..36.min(i + 5)).unwrap().map(|f| hash(&f.unwrap().rgb)).collect();
+            assert_eq!(few, expected[i..36.min(i + 5)], "{name} from {i}");
+        }
+        for seconds in [0.0011, -0.05, 1.8, f64::NAN, f64::INFINITY] {
+            let text = video.frame_at(seconds).map(|f| f.index).unwrap_err().to_string();
+            assert!(text.starts_with(&format!("{name}: no frame at {seconds}")), "{text}");
+            assert!(text.ends_with("there is 36 frames from 0 to 1.75 s"), "{text}");
+        }
+        assert!(matches!(video.range(30..37).map(|_| ()), Err(VideoError::NoSuchFrame { .. })));
+        assert_eq!(video.range(36..36).unwrap().count(), 0);
+        assert!(video.frames().next_into(&mut [0; 7]).unwrap().is_err());
+    }
+}
