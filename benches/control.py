@@ -1,7 +1,7 @@
 """The compiled control loop beside robosuite's own: time of a step and of a reset, what a worker adds to it in time
 and memory, and how far the two loops drift apart.
 
-    .venv/bin/python benches/control.py [--tasks Lift,Door] [--steps 200] [--seeds 3] [--only speed,parity]
+    .venv/bin/python benches/control.py [--tasks Lift,Door] [--steps 200] [--seeds 20] [--only speed,parity]
 
 One process, one core. Times are CPU time of the stepping thread, the loops taking turns step by step on the same
 actions, so that the ratios hold on a busy machine too. Writes target/bench/control.json; the exit code is 1 where a
@@ -67,7 +67,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", default=",".join(SPEED_BARS))
     parser.add_argument("--steps", type=int, default=200, help="timed control steps a task")
-    parser.add_argument("--seeds", type=int, default=3, help="episodes compared a task")
+    parser.add_argument("--seeds", type=int, default=20, help="episodes compared a task")
     parser.add_argument("--only", default=",".join(PARTS), help="parts (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=TARGET / "bench" / "control.json")
     args = parser.parse_args()
@@ -258,13 +258,27 @@ def memory(task: str, _: argparse.Namespace) -> Iterator[Row]:
 
 MARKS = {1: 25, 20: 500, 200: 5000}
 PARITY_BARS: dict[int, float | None] = {25: 1e-14, 500: 1e-12, 5000: None}
+# A run in a thousand misses by chance where both are of one distribution.
+CHANCE = 3.09
+
+
+def further(ours: list[float], theirs: list[float]) -> tuple[float, float]:
+    """Share of the pairs in which ours is the larger, ties as half, and the share that chance does not exceed.
+
+    Mann and Whitney's statistic by its normal approximation, good from 20 values each.
+    """
+    larger = sum((mine > other) + 0.5 * (mine == other) for mine in ours for other in theirs)
+    pairs = len(ours) * len(theirs)
+    return larger / pairs, 0.5 + CHANCE * float(np.sqrt((len(ours) + len(theirs) + 1) / (12 * pairs)))
 
 
 def parity(task: str, args: argparse.Namespace) -> Iterator[Row]:
     """How far joint positions are from robosuite's, and robosuite's from its own after a push of 1 ulp.
 
     Beside the median stands the worst seed. Where contacts are hard an error grows a millionfold in half a second, in
-    robosuite against itself as well: the worst seed meets the bar, or is no further off than 100 times that.
+    robosuite against itself as well: the worst seed meets the bar, or is no further off than 100 times that. After
+    5000 substeps which contact came first decides by orders of magnitude, and no single seed says anything: there the
+    two distributions are compared by ranks.
     """
     plain, other = envs.make(task).env, envs.make(task).env
     compiled = attached(other)
@@ -280,17 +294,23 @@ def parity(task: str, args: argparse.Namespace) -> Iterator[Row]:
             moved[substeps].append(max(float(np.abs(p - expected[substeps]).max()) for p in there))
     for substeps, bar in PARITY_BARS.items():
         mine, theirs = float(np.median(ours[substeps])), float(np.median(moved[substeps]))
-        # which contact comes first decides between the two: orders of magnitude, not digits
-        met = mine <= 100.0 * theirs if bar is None else mine <= bar
-        text = "peer: itself moved by 1 ulp" if bar is None else f"<= {bar:g}"
         ratio = mine / theirs if theirs else float(mine > 0)
-        yield Row(f"{task}: |dqpos| at {substeps} substeps, median of {args.seeds}", "", mine, theirs, ratio, text, met)
-        if bar is not None:
-            worst = int(np.argmax(ours[substeps]))
-            mine, theirs = ours[substeps][worst], moved[substeps][worst]
-            ratio = mine / theirs if theirs else float(mine > 0)
-            work = f"{task}: |dqpos| at {substeps} substeps, worst (seed {worst})"
-            yield Row(work, "", mine, theirs, ratio, f"<= {bar:g} or itself x 100", mine <= max(bar, 100.0 * theirs))
+        work = f"{task}: |dqpos| at {substeps} substeps, median of {args.seeds}"
+        if bar is None:
+            share, most = further(ours[substeps], moved[substeps])
+            text = f"further in {share:.0%} of pairs, <= {most:.0%}"
+            yield Row(work, "", mine, theirs, ratio, text, share <= most)
+            high, peer = (float(np.quantile(each[substeps], 0.9)) for each in (ours, moved))
+            work = f"{task}: |dqpos| at {substeps} substeps, 90% of {args.seeds}"
+            ratio = high / peer if peer else float(high > 0)
+            yield Row(work, "", high, peer, ratio, "aim: itself x 100", high <= 100.0 * peer, aim=True)
+            continue
+        yield Row(work, "", mine, theirs, ratio, f"<= {bar:g}", mine <= bar)
+        worst = int(np.argmax(ours[substeps]))
+        mine, theirs = ours[substeps][worst], moved[substeps][worst]
+        ratio = mine / theirs if theirs else float(mine > 0)
+        work = f"{task}: |dqpos| at {substeps} substeps, worst (seed {worst})"
+        yield Row(work, "", mine, theirs, ratio, f"<= {bar:g} or itself x 100", mine <= max(bar, 100.0 * theirs))
     plain.close()
     other.close()
 

@@ -1,20 +1,31 @@
 #!/usr/bin/env bash
 # Every benchmark, each beside its peers in one run: a table (work, ours, peer, ratio, bar) on the terminal and
-# target/bench/<name>.json. Called by `make bench`, which has built the programs and the peers' .venv-peers.
+# target/bench/<name>.json; one table of all rows at the end. A missed bar stops nothing; the exit code then is 1.
+# Called by `make bench`, which has built the programs and the peers' .venv-peers.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export ACTRM_PEER_PYTHON="$PWD/.venv-peers/bin/python"
 examples=target/release/examples
+names=(puzzles data act trm control evaluation)
 
-for name in ${*:-puzzles data act trm control evaluation}; do
-    printf '\n== %s\n' "$name"
-    case $name in
-    puzzles | data) "$examples/bench_$name" ;;
-    act | trm) "$examples/bench_$name" --peer "$ACTRM_PEER_PYTHON" ;;
-    control | evaluation) .venv/bin/python "benches/$name.py" ;;
-    *)
-        echo "error: no benchmark $name; there are: puzzles data act trm control evaluation" >&2
+for name in "${@:-}"; do
+    if [[ -n $name && " ${names[*]} " != *" $name "* ]]; then
+        echo "error: no benchmark $name; there are: ${names[*]}" >&2
         exit 2
-        ;;
-    esac
+    fi
 done
+
+ended=()
+for name in ${*:-${names[*]}}; do
+    printf '\n== %s\n' "$name"
+    rm -f "target/bench/$name.json"
+    code=0
+    case $name in
+    puzzles | data) "$examples/bench_$name" || code=$? ;;
+    act | trm) "$examples/bench_$name" --peer "$ACTRM_PEER_PYTHON" || code=$? ;;
+    control | evaluation) .venv/bin/python "benches/$name.py" || code=$? ;;
+    esac
+    ended+=("$name=$code")
+done
+printf '\n== all\n'
+.venv/bin/python benches/summary.py "${ended[@]}"

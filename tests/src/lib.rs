@@ -2,7 +2,7 @@
 //! its refusal is checked. The tests themselves lie in `tests/tests/`; each drives the real binaries.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 
 use tempfile::TempDir;
@@ -155,4 +155,71 @@ fn copy(from: &Path, to: &Path) {
             std::fs::copy(entry.path(), target).expect("copied");
         }
     }
+}
+
+/// Sends a signal (`INT`, `TERM`) to a program that a test started.
+///
+/// # Panics
+/// If it cannot be sent.
+pub fn signal(child: &Child, name: &str) {
+    let sent = Command::new("kill").args([&format!("-{name}"), &child.id().to_string()]).status();
+    assert!(sent.expect("kill runs").success(), "no signal to {}", child.id());
+}
+
+/// Runs a shell command in a terminal of this many columns; returns all that was written to it, and its exit code.
+///
+/// # Panics
+/// If there is no `script` to make a terminal.
+pub fn in_terminal(columns: usize, command: &str) -> (String, Option<i32>) {
+    let script = format!("stty cols {columns} rows 40; {command}");
+    let output = Command::new("script")
+        .args(["-qefc", &script, "/dev/null"])
+        .env("SHELL", "/bin/bash")
+        .env("TERM", "xterm")
+        .stdin(Stdio::null())
+        .output()
+        .expect("`script` of util-linux");
+    (String::from_utf8_lossy(&output.stdout).into_owned(), output.status.code())
+}
+
+/// What a terminal shows after a text was written to it: its lines, without blanks at their ends.
+pub fn screen(written: &str) -> Vec<String> {
+    let mut lines: Vec<Vec<char>> = vec![Vec::new()];
+    let (mut row, mut column) = (0_usize, 0_usize);
+    let mut rest = written.chars().peekable();
+    while let Some(c) = rest.next() {
+        match c {
+            '\r' => column = 0,
+            '\n' => row += 1,
+            '\u{1b}' if rest.peek() == Some(&'[') => {
+                rest.next();
+                let mut number = String::new();
+                while rest.peek().is_some_and(|c| !c.is_ascii_alphabetic()) {
+                    number.extend(rest.next());
+                }
+                let count = number.parse::<usize>().ok();
+                match rest.next() {
+                    Some('A') => row = row.saturating_sub(count.unwrap_or(1)),
+                    Some('B') => row += count.unwrap_or(1),
+                    Some('C') => column += count.unwrap_or(1),
+                    Some('G') => column = count.unwrap_or(1) - 1,
+                    Some('K') if count == Some(2) => lines[row].clear(),
+                    Some('K') => lines[row].truncate(column),
+                    Some('J') => {
+                        lines.truncate(row + 1);
+                        lines[row].truncate(column);
+                    }
+                    _ => {}
+                }
+            }
+            _ => {
+                let line = &mut lines[row];
+                line.resize(line.len().max(column + 1), ' ');
+                line[column] = c;
+                column += 1;
+            }
+        }
+        lines.resize(lines.len().max(row + 1), Vec::new());
+    }
+    lines.iter().map(|line| line.iter().collect::<String>().trim_end().to_owned()).collect()
 }

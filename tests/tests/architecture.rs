@@ -42,8 +42,9 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("zoo", &["dataset", "models", "rollout"]),
     ("report", &["zoo"]),
     ("study", &["models", "puzzles", "report", "zoo"]),
-    ("actrm-data", &["dataset", "puzzles", "query", "rollout"]),
-    ("actrm-zoo", &["dataset", "models", "puzzles", "report", "rollout", "study", "zoo"]),
+    ("cli", &["rollout"]),
+    ("actrm-data", &["cli", "dataset", "puzzles", "query", "rollout"]),
+    ("actrm-zoo", &["cli", "dataset", "models", "puzzles", "report", "rollout", "study", "zoo"]),
     ("e2e", &[]),
 ];
 
@@ -76,9 +77,11 @@ fn each_heavy_dependency_has_one_room() {
         ("rav1e", &["video"]),
         ("candle-core", &["models", "zoo", "study"]),
         ("candle-nn", &["models"]),
-        ("clap", &["actrm-data", "actrm-zoo"]),
-        ("anyhow", &["actrm-data", "actrm-zoo"]),
-        ("indicatif", &["actrm-data", "actrm-zoo"]),
+        ("clap", &["cli", "actrm-data", "actrm-zoo"]),
+        ("anyhow", &["cli", "actrm-data", "actrm-zoo"]),
+        ("indicatif", &["cli"]),
+        ("comfy-table", &["cli"]),
+        ("ctrlc", &["cli"]),
     ];
     for (package, names) in dependencies() {
         for (dependency, allowed) in rooms {

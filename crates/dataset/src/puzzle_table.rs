@@ -1,7 +1,6 @@
 //! Puzzles as a Parquet file: one row a puzzle.
 
 use std::fs::File;
-use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
@@ -11,6 +10,7 @@ use arrow::array::{
 };
 use parquet::arrow::ArrowWriter;
 use parquet::basic::Compression;
+use parquet::errors::ParquetError;
 use parquet::file::properties::WriterProperties;
 use puzzles::{Puzzle, Split, Task};
 
@@ -31,6 +31,9 @@ pub struct PuzzleSet {
     pub count: u64,
 }
 
+/// Puzzles that are drawn and encoded at a time: what is in memory does not grow with their number.
+const PART: u64 = 8192;
+
 /// Draws the puzzles of `set` and writes them to `path`: the same bytes for the same set.
 ///
 /// Columns: `index`, `task`, `split`, `seed`, `height`, `width`, `input` and `target` (lists of u8, row by row), `start`
@@ -40,41 +43,41 @@ pub struct PuzzleSet {
 /// # Errors
 /// When the file cannot be written.
 pub fn write_puzzles(set: &PuzzleSet, path: &Path, progress: &mut dyn FnMut(u64)) -> Result<()> {
-    let mut puzzles = Vec::new();
-    for index in 0..set.count {
-        puzzles.push(set.task.numbered(set.split, (set.givens, set.givens), set.seed, index));
-        progress(index + 1);
-    }
-    let failed =
-        |source| DatasetError::Parquet { path: path.to_owned(), operation: "make a table of puzzles for", source };
-    let batch = batch(set, &puzzles).map_err(|e| failed(e.into()))?;
-    let properties = WriterProperties::builder().set_compression(Compression::SNAPPY).build();
-    let mut bytes = Vec::new();
-    let written = || -> std::result::Result<(), parquet::errors::ParquetError> {
-        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties))?;
-        writer.write(&batch)?;
+    let mut draw = |first: u64| -> Vec<Puzzle> {
+        let numbered = |index| set.task.numbered(set.split, (set.givens, set.givens), set.seed, index);
+        let part = first..set.count.min(first + PART);
+        part.map(|index| (numbered(index), progress(index + 1)).0).collect()
+    };
+    let mut write = |file: &mut File| -> std::result::Result<(), ParquetError> {
+        let properties = WriterProperties::builder().set_compression(Compression::SNAPPY).build();
+        let mut writer = ArrowWriter::try_new(file, batch(set, 0, &[])?.schema(), Some(properties))?;
+        for first in (0..set.count).step_by(PART as usize) {
+            writer.write(&batch(set, first, &draw(first))?)?;
+        }
         writer.close()?;
         Ok(())
-    }();
-    written.map_err(failed)?;
-    write(path, &bytes)
-}
-
-/// The whole file or none: a temporary name beside it, fsync, rename.
-fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    };
     let failed = |operation| move |source| DatasetError::Io { path: path.to_owned(), operation, source };
+    // the whole file or none: a temporary name beside it, fsync, rename
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
     let mut file = tempfile::Builder::new()
         .prefix(".tmp-")
         .permissions(std::fs::Permissions::from_mode(0o644))
         .tempfile_in(folder)
         .map_err(failed("create a temporary file beside it"))?;
-    file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(failed("write"))?;
+    let operation = "write puzzles to";
+    write(file.as_file_mut()).map_err(|source| DatasetError::Parquet { path: path.to_owned(), operation, source })?;
+    file.as_file().sync_all().map_err(failed("write"))?;
     file.persist(path).map_err(|e| failed("write")(e.error))?;
     File::open(folder).and_then(|f| f.sync_all()).map_err(failed("sync its folder"))
 }
 
-fn batch(set: &PuzzleSet, puzzles: &[Puzzle]) -> std::result::Result<RecordBatch, arrow::error::ArrowError> {
+/// The rows of `puzzles`, the first of which is number `first`.
+fn batch(
+    set: &PuzzleSet,
+    first: u64,
+    puzzles: &[Puzzle],
+) -> std::result::Result<RecordBatch, arrow::error::ArrowError> {
     let rows = puzzles.len();
     let same = |value: &str| -> ArrayRef { Arc::new(StringArray::from(vec![value; rows])) };
     let side = set.task.side() as u32;
@@ -104,7 +107,7 @@ fn batch(set: &PuzzleSet, puzzles: &[Puzzle]) -> std::result::Result<RecordBatch
         matches!(puzzle, Puzzle::Maze(_)).then(|| position(puzzle, 3))?
     }
     RecordBatch::try_from_iter_with_nullable([
-        ("index", Arc::new(UInt64Array::from_iter_values(0..rows as u64)) as ArrayRef, false),
+        ("index", Arc::new(UInt64Array::from_iter_values(first..first + rows as u64)) as ArrayRef, false),
         ("task", same(set.task.name()), false),
         ("split", same(set.split.name()), false),
         ("seed", Arc::new(UInt64Array::from(vec![set.seed; rows])), false),
@@ -130,6 +133,21 @@ mod tests {
     use super::*;
     use parquet::file::reader::{FileReader, SerializedFileReader};
     use parquet::record::{ListAccessor, RowAccessor};
+
+    #[test]
+    fn parts_are_joined_without_a_seam() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("many");
+        let task = Task::by_name("maze5-walls").unwrap();
+        let set = PuzzleSet { task, split: Split::Train, givens: 0, seed: 1, count: 2 * PART + 5 };
+        let mut told = 0;
+        write_puzzles(&set, &path, &mut |done| told = done).unwrap();
+        assert_eq!(told, set.count);
+        let reader = SerializedFileReader::new(std::fs::File::open(&path).unwrap()).unwrap();
+        let indices: Vec<u64> =
+            reader.get_row_iter(None).unwrap().map(|row| row.unwrap().get_ulong(0).unwrap()).collect();
+        assert_eq!(indices, (0..set.count).collect::<Vec<_>>());
+    }
 
     #[test]
     fn what_is_written_reads_back_and_repeats() {

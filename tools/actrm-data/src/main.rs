@@ -1,11 +1,11 @@
 //! Command line for demonstrations and data sets.
+#![deny(clippy::print_stdout, clippy::print_stderr)]
 
 mod commands;
-mod output;
-mod simulator;
+mod recording;
 mod svg;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser};
 use std::process::ExitCode;
 
 /// Demonstrations for robot learning: look at them, collect them, convert them, check them.
@@ -13,64 +13,25 @@ use std::process::ExitCode;
 /// Reads robomimic-family HDF5 (robomimic, robosuite, MimicGen, LIBERO, robocasa, D4RL, ALOHA) and writes
 /// LeRobotDataset v3.0 directories of Parquet files, from which the original file can be rebuilt.
 #[derive(Parser)]
-#[command(name = "actrm-data", version, propagate_version = true, arg_required_else_help = true)]
+#[command(name = "actrm-data", version, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
 struct Cli {
     #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    Inspect(commands::inspect::Args),
-    Convert(commands::convert::Args),
-    Collect(commands::collect::Args),
-    Extract(commands::extract::Args),
-    Replay(commands::replay::Args),
-    Export(commands::export::Args),
-    Validate(commands::validate::Args),
-    Stats(commands::stats::Args),
-    Query(commands::query::Args),
-    Plot(commands::plot::Args),
-    Puzzle(commands::puzzle::Args),
-    Completions(commands::completions::Args),
+    command: commands::Command,
 }
 
 fn main() -> ExitCode {
     // in a reading process this never returns
     dataset::isolation::serve_if_child();
-    let result = match Cli::parse().command {
-        Command::Inspect(args) => commands::inspect::run(&args),
-        Command::Convert(args) => commands::convert::run(&args),
-        Command::Collect(args) => commands::collect::run(&args),
-        Command::Extract(args) => commands::extract::run(&args),
-        Command::Replay(args) => commands::replay::run(&args),
-        Command::Export(args) => commands::export::run(&args),
-        Command::Validate(args) => commands::validate::run(&args),
-        Command::Stats(args) => commands::stats::run(&args),
-        Command::Query(args) => commands::query::run(&args),
-        Command::Plot(args) => commands::plot::run(&args),
-        Command::Puzzle(args) => commands::puzzle::run(&args),
-        Command::Completions(args) => {
-            use clap::CommandFactory;
-            commands::completions::run(&args, &mut Cli::command())
-        }
-    };
-    match result {
-        Ok(code) => code,
-        Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::FAILURE
-        }
-    }
+    cli::completions::answer(Cli::command);
+    cli::end(Cli::parse().command.run())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::CommandFactory;
 
     #[test]
-    fn the_command_line_is_consistent() {
-        Cli::command().debug_assert();
+    fn the_command_line_is_sound_and_every_command_shows_examples() {
+        cli::every_command_shows_examples(&Cli::command());
     }
 }

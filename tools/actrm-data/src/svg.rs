@@ -85,8 +85,8 @@ fn line(out: &mut String, values: &[f32]) {
         pen_down = v.is_finite();
     }
     let _ = writeln!(out, "<path class=\"line\" d=\"{path}\"/>");
-    label(out, -4.0, 9.0, "end", &crate::output::number(high));
-    label(out, -4.0, HEIGHT, "end", &crate::output::number(low));
+    label(out, -4.0, 9.0, "end", &cli::number(high));
+    label(out, -4.0, HEIGHT, "end", &cli::number(low));
     label(out, 0.0, HEIGHT + 14.0, "start", "0");
     label(out, WIDTH, HEIGHT + 14.0, "end", &values.len().saturating_sub(1).to_string());
 }
@@ -111,8 +111,8 @@ fn histogram(out: &mut String, values: &[f32]) {
         );
     }
     label(out, -4.0, 9.0, "end", &most.to_string());
-    label(out, 0.0, HEIGHT + 14.0, "start", &crate::output::number(low));
-    label(out, WIDTH, HEIGHT + 14.0, "end", &crate::output::number(high));
+    label(out, 0.0, HEIGHT + 14.0, "start", &cli::number(low));
+    label(out, WIDTH, HEIGHT + 14.0, "end", &cli::number(high));
 }
 
 /// Text inside markup.

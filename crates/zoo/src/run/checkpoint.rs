@@ -71,20 +71,20 @@ impl Checkpoint {
         Ok(path)
     }
 
+    /// Steps done at the newest checkpoint of `folder`, as its note says; 0 where there is none yet.
+    ///
+    /// # Errors
+    /// A note that cannot be read.
+    pub fn latest_step(folder: &Path) -> Result<u64, ZooError> {
+        Ok(read_note(folder)?.map_or(0, |latest| latest.step))
+    }
+
     /// The newest checkpoint of `folder`; `None` where there is none yet.
     ///
     /// # Errors
     /// When it is not the file that was written.
     pub fn latest(folder: &Path) -> Result<Option<Self>, ZooError> {
-        let latest_path = folder.join("latest.json");
-        if !latest_path.exists() {
-            return Ok(None);
-        }
-        let text = fs::read_to_string(&latest_path).map_err(ZooError::io("read", &latest_path))?;
-        let latest: Latest = serde_json::from_str(&text).map_err(|e| ZooError::Malformed {
-            path: latest_path.clone(),
-            reason: format!("not a checkpoint note: {e}"),
-        })?;
+        let Some(latest) = read_note(folder)? else { return Ok(None) };
         let path = folder.join(&latest.file);
         let bytes = fs::read(&path).map_err(ZooError::io("read", &path))?;
         let found = sha256_hex(&bytes);
@@ -96,6 +96,17 @@ impl Checkpoint {
             .map_err(|e| ZooError::Malformed { path: path.clone(), reason: format!("not a checkpoint: {e}") })?;
         Ok(Some(Self { step: meta.step, seconds: meta.seconds, tensors, trainer: meta.trainer }))
     }
+}
+
+/// What names the newest checkpoint, where there is one.
+fn read_note(folder: &Path) -> Result<Option<Latest>, ZooError> {
+    let path = folder.join("latest.json");
+    if !path.exists() {
+        return Ok(None);
+    }
+    let text = fs::read_to_string(&path).map_err(ZooError::io("read", &path))?;
+    let malformed = |e| ZooError::Malformed { path, reason: format!("not a checkpoint note: {e}") };
+    serde_json::from_str(&text).map(Some).map_err(malformed)
 }
 
 fn file_name(step: u64) -> String {

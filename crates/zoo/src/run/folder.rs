@@ -5,6 +5,9 @@ use std::path::{Path, PathBuf};
 
 use crate::ZooError;
 
+/// In a run's folder: the command that goes on with it, for people.
+pub const COMMAND_FILE: &str = "command.txt";
+
 /// A run's folder, locked for as long as this value lives.
 #[derive(Debug)]
 pub struct RunFolder {

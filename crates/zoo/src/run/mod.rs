@@ -3,6 +3,7 @@
 mod checkpoint;
 mod data;
 mod folder;
+mod list;
 pub mod loop_parts;
 mod metrics;
 mod sampler;
@@ -13,7 +14,8 @@ mod validation;
 
 pub use checkpoint::Checkpoint;
 pub use data::locate;
-pub use folder::RunFolder;
+pub use folder::{COMMAND_FILE, RunFolder};
+pub use list::{FoundRun, RunState, list_runs};
 pub use metrics::{Metrics, MetricsRow};
 pub use section::{OptimiserKind, TrainSection};
 pub use tensorboard::EventWriter;

@@ -1,16 +1,15 @@
-use crate::output;
-use crate::simulator::{self, CameraArgs, INTERRUPTED, SimulatorArgs};
+use crate::recording::{self, CameraArgs};
 use anyhow::{Context, Result, bail};
+use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop};
 use dataset::shuffle::SplitMix64;
 use dataset::{Array, RobomimicWriter, WriteOptions};
 use rollout::RunEnd;
 use rollout::collection::{Attempt, Collection, CollectionRecord};
 use serde_json::json;
+use std::ffi::OsString;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 /// Share of the demonstrations in the mask `valid`.
@@ -19,6 +18,7 @@ const VALID_SHARE: f64 = 0.1;
 const SEED_STRIDE: u64 = 1_000_000;
 /// Attempts for each demonstration wanted, before giving up on the expert.
 const ATTEMPTS_PER_EPISODE: u64 = 20;
+const GOES_ON: &str = "stopped; the same command goes on where it was";
 
 /// Collect demonstrations of a task from its scripted expert in the simulator.
 ///
@@ -38,7 +38,7 @@ pub struct Args {
     #[arg(long)]
     task: String,
     /// Demonstrations to store
-    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=SEED_STRIDE))]
     episodes: u64,
     /// Seed of the whole collection, 1 or more
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
@@ -63,19 +63,24 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<ExitCode> {
     let start = Instant::now();
-    simulator::refuse_existing(&args.out)?;
-    let stop = Arc::new(AtomicBool::new(false));
-    let mut pool = args.simulator.start(&args.task, &args.cameras.cameras, args.cameras.size, &stop)?;
+    recording::refuse_existing(&args.out)?;
+    let stop = Stop::install(GOES_ON)?;
+    let mut spec = args.simulator.spec(&args.task)?;
+    args.cameras.set(&mut spec);
+    let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
+        cli::note(GOES_ON);
+        return Ok(ExitCode::from(INTERRUPTED));
+    };
     let first = args.seed * SEED_STRIDE;
     let record = CollectionRecord::new(pool.ready(), first, args.simulator.env_module.clone());
     let collection = Collection::open(&attempts_folder(&args.out), &record)?;
     let earlier = collection.count()?;
     if earlier > 0 {
-        eprintln!("note: going on after {earlier} attempts");
+        cli::note(&format!("note: going on after {earlier} attempts"));
     }
 
-    let bar = output::bar("demos").with_message(format!("collecting {}", args.task));
-    bar.set_length(args.episodes);
+    let mut screen = Screen::new();
+    screen.begin(format!("collecting {}", args.task), args.episodes);
     let mut good: Vec<Attempt> = Vec::new();
     let mut attempts = 0_u64;
     let mut failure = None;
@@ -89,11 +94,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 return ControlFlow::Break(());
             }
         }
-        bar.set_position(good.len() as u64);
+        screen.at(good.len() as u64);
         if good.len() as u64 == args.episodes { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
-    bar.finish_and_clear();
-    simulator::close(pool);
+    screen.clear();
+    cli::close(pool);
     let end = end?;
     if let Some(error) = failure {
         return Err(error.into());
@@ -102,7 +107,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         match end {
             RunEnd::Stopped => {
                 let (done, wanted) = (good.len(), args.episodes);
-                eprintln!("stopped after {done} of {wanted} demos; the same command goes on where it was");
+                cli::note(&format!("stopped after {done} of {wanted} demos; the same command goes on where it was"));
                 return Ok(ExitCode::from(INTERRUPTED));
             }
             RunEnd::Complete => {
@@ -124,17 +129,17 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let size = std::fs::metadata(&args.out).map_or(0, |m| m.len());
     let seconds = start.elapsed().as_secs_f64();
     if args.json {
-        output::print_json(&json!({
-            "out": args.out, "task": args.task, "demos": good.len(), "steps": total_steps, "attempts": attempts,
+        cli::print_json(&json!({
+            "out": cli::lossy(&args.out), "task": args.task, "demos": good.len(), "steps": total_steps, "attempts": attempts,
             "expert_success_rate": rate, "first_seed": first, "bytes": size, "seconds": seconds,
         }))?;
     } else {
-        output::print(&format!(
+        cli::print(&format!(
             "{}: {} demos, {} steps, {} in {seconds:.1} s\nexpert: {} of {attempts} attempts succeeded ({:.1}%)\n",
             args.out.display(),
             good.len(),
-            output::count(total_steps),
-            output::bytes(size),
+            cli::count(total_steps),
+            cli::bytes(size),
             good.len(),
             100.0 * rate,
         ))?;
@@ -144,8 +149,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 /// Where attempts are kept until the file is written.
 fn attempts_folder(out: &Path) -> PathBuf {
-    let name = out.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    out.with_file_name(format!(".{name}.attempts"))
+    let mut name = OsString::from(".");
+    name.push(out.file_name().unwrap_or_default());
+    name.push(".attempts");
+    out.with_file_name(name)
 }
 
 /// Writes the file from the attempts that succeeded.
@@ -157,7 +164,7 @@ fn write(args: &Args, collection: &Collection, good: &[Attempt], env_args: &serd
         let id = format!("demo_{index}");
         let episode = collection.get(attempt.index)?;
         let episode = episode.with_context(|| format!("attempt {} is not on disk any more", attempt.index))?;
-        writer.add_demo(&simulator::demo(&id, episode, !args.no_next_obs)?)?;
+        writer.add_demo(&recording::demo(&id, episode, !args.no_next_obs)?)?;
         ids.push(id);
     }
     let total = i64::try_from(good.iter().map(|attempt| attempt.steps).sum::<usize>()).context("number of steps")?;

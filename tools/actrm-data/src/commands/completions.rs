@@ -1,6 +1,5 @@
-use crate::output;
-use anyhow::{Context, Result};
-use clap_complete::Shell;
+use anyhow::Result;
+use cli::completions::{Shell, script};
 use std::process::ExitCode;
 
 /// Print a script that completes this command line in your shell.
@@ -14,9 +13,7 @@ pub struct Args {
     shell: Shell,
 }
 
-pub fn run(args: &Args, command: &mut clap::Command) -> Result<ExitCode> {
-    let mut script = Vec::new();
-    clap_complete::generate(args.shell, command, "actrm-data", &mut script);
-    output::print(&String::from_utf8(script).context("a completion script is text")?)?;
+pub fn run(args: &Args) -> Result<ExitCode> {
+    cli::print(&script(args.shell, "actrm-data")?)?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,4 +1,3 @@
-use crate::output;
 use anyhow::Result;
 use dataset::{ActionKind, ConvertOptions, ImageForm, RotationForm};
 use serde_json::json;
@@ -109,13 +108,13 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         data_file_mb: args.file_size,
     };
     let start = Instant::now();
-    let bar = output::bar("frames").with_message("converting");
-    let report = dataset::convert(&args.source, &args.out, &options, &mut output::advance(&bar));
-    bar.finish_and_clear();
+    let mut screen = cli::Screen::new();
+    let report = dataset::convert(&args.source, &args.out, &options, &mut screen.advance("converting"));
+    screen.clear();
     let report = report?;
     let seconds = start.elapsed().as_secs_f64();
     for note in &report.notes {
-        eprintln!("note: {note}");
+        cli::note(&format!("note: {note}"));
     }
     if args.json {
         let features: serde_json::Map<_, _> = report
@@ -123,8 +122,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             .iter()
             .map(|(name, dtype, shape)| (name.clone(), json!({"dtype": dtype, "shape": shape})))
             .collect();
-        output::print_json(&json!({
-            "source": args.source, "out": args.out, "layout": report.dialect, "episodes": report.episodes,
+        cli::print_json(&json!({
+            "source": cli::lossy(&args.source), "out": cli::lossy(&args.out), "layout": report.dialect, "episodes": report.episodes,
             "frames": report.frames, "tasks": report.tasks, "features": features, "files": report.files,
             "bytes": report.bytes, "fingerprint": report.fingerprint, "seconds": seconds, "notes": report.notes,
         }))?;
@@ -133,17 +132,17 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let rows: Vec<Vec<String>> = report
         .features
         .iter()
-        .map(|(name, dtype, shape)| vec![name.clone(), dtype.clone(), output::shape(shape)])
+        .map(|(name, dtype, shape)| vec![name.clone(), dtype.clone(), cli::shape(shape)])
         .collect();
-    let mut text = output::table(&["column", "type", "shape"], &rows, &[]);
+    let mut text = cli::table(&["column", "type", "shape"], &rows, &[]);
     text.push_str(&format!(
         "{}: {} episodes, {} frames, {} files, {} in {seconds:.2} s\n",
         args.out.display(),
-        output::count(report.episodes),
-        output::count(report.frames),
+        cli::count(report.episodes),
+        cli::count(report.frames),
         report.files,
-        output::bytes(report.bytes),
+        cli::bytes(report.bytes),
     ));
-    output::print(&text)?;
+    cli::print(&text)?;
     Ok(ExitCode::SUCCESS)
 }

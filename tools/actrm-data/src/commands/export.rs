@@ -1,4 +1,3 @@
-use crate::output;
 use anyhow::Result;
 use dataset::WriteOptions;
 use serde_json::json;
@@ -27,19 +26,19 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let bar = output::bar("frames").with_message("exporting");
+    let mut screen = cli::Screen::new();
     let options = WriteOptions { gzip: args.gzip };
-    let report = dataset::export(&args.dir, &args.out, &options, &mut output::advance(&bar));
-    bar.finish_and_clear();
+    let report = dataset::export(&args.dir, &args.out, &options, &mut screen.advance("exporting"));
+    screen.clear();
     let report = report?;
     if args.json {
-        output::print_json(&json!({"out": args.out, "demos": report.demos, "frames": report.frames}))?;
+        cli::print_json(&json!({"out": cli::lossy(&args.out), "demos": report.demos, "frames": report.frames}))?;
     } else {
-        output::print(&format!(
+        cli::print(&format!(
             "{}: {} demos, {} steps\n",
             args.out.display(),
-            output::count(report.demos),
-            output::count(report.frames)
+            cli::count(report.demos),
+            cli::count(report.frames)
         ))?;
     }
     Ok(ExitCode::SUCCESS)

@@ -1,15 +1,13 @@
-use crate::output;
-use crate::simulator::{self, CameraArgs, Recording, SimulatorArgs};
+use crate::recording::{self, CameraArgs, Recording};
 use anyhow::{Context, Result, bail};
+use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop};
 use dataset::{Array, RobomimicWriter, Source, WriteOptions};
-use rollout::RolloutError;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use rollout::RolloutError;
 
 /// Add observations, rewards and dones to a raw robosuite recording by replaying its states.
 ///
@@ -54,12 +52,19 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
     }
     let mut writer = RobomimicWriter::create(&args.out, &WriteOptions { gzip: (args.gzip > 0).then_some(args.gzip) })?;
-    let stop = Arc::new(AtomicBool::new(false));
-    let mut pool = args.simulator.start(&task, &args.cameras.cameras, args.cameras.size, &stop)?;
+    let stop = Stop::install("stopped; nothing was written")?;
+    let out = args.out.clone();
+    stop.last_act(move || recording::remove_unfinished(&out));
+    let mut spec = args.simulator.spec(&task)?;
+    args.cameras.set(&mut spec);
+    let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
+        cli::note("stopped; nothing was written");
+        return Ok(ExitCode::from(INTERRUPTED));
+    };
     let env_args = env_args(plan.env_args.as_ref(), &pool.ready().env_args);
 
-    let bar = output::bar("demos").with_message(format!("replaying {task}"));
-    bar.set_length(plan.demos.len() as u64);
+    let mut screen = Screen::new();
+    screen.begin(format!("replaying {task}"), plan.demos.len() as u64);
     let mut steps = 0_u64;
     let mut done = 0_usize;
     let mut failure: Option<anyhow::Error> = None;
@@ -80,7 +85,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let id = &plan.demos[job as usize].id;
         let outcome = result.map_err(anyhow::Error::from).and_then(|(recorded, episode)| {
             steps += episode.steps as u64;
-            let mut made = simulator::demo(id, episode, !args.no_next_obs)?;
+            let mut made = recording::demo(id, episode, !args.no_next_obs)?;
             // what was recorded stays as it was recorded
             for (name, value) in recorded.attrs {
                 made.attrs.entry(name).or_insert(value);
@@ -90,7 +95,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             done += 1;
             Ok(())
         });
-        bar.set_position(done as u64);
+        screen.at(done as u64);
         match outcome {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
@@ -99,14 +104,15 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             }
         }
     });
-    bar.finish_and_clear();
-    simulator::close(pool);
+    screen.clear();
+    cli::close(pool);
     end?;
     if let Some(error) = failure {
         return Err(error);
     }
     if done != plan.demos.len() {
-        bail!("stopped after {done} of {} demos; nothing was written", plan.demos.len());
+        cli::note(&format!("stopped after {done} of {} demos; nothing was written", plan.demos.len()));
+        return Ok(ExitCode::from(INTERRUPTED));
     }
     writer.set_data_attr("total", &Array::from_i64(Vec::new(), &[steps as i64]))?;
     let text = serde_json::to_string_pretty(&env_args).context("environment arguments")?;
@@ -116,13 +122,13 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     writer.finish()?;
     if args.json {
-        output::print_json(&json!({"out": args.out, "task": task, "demos": done, "steps": steps}))?;
+        cli::print_json(&json!({"out": cli::lossy(&args.out), "task": task, "demos": done, "steps": steps}))?;
     } else {
-        output::print(&format!(
+        cli::print(&format!(
             "{}: {task}, {} demos, {} steps\n",
             args.out.display(),
-            output::count(done),
-            output::count(steps as usize)
+            cli::count(done),
+            cli::count(steps as usize)
         ))?;
     }
     Ok(ExitCode::SUCCESS)

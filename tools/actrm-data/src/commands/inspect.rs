@@ -1,4 +1,3 @@
-use crate::output;
 use anyhow::Result;
 use dataset::{Dataset, Dtype, Source};
 use serde::Serialize;
@@ -32,7 +31,7 @@ pub struct Args {
 /// What is shown, whatever it was read from.
 #[derive(Serialize)]
 struct Summary {
-    path: PathBuf,
+    path: String,
     layout: String,
     bytes: u64,
     env_name: Option<String>,
@@ -74,9 +73,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         false => of_source(args)?,
     };
     if args.json {
-        output::print_json(&summary)?;
+        cli::print_json(&summary)?;
     } else {
-        output::print(&show(&summary))?;
+        cli::print(&show(&summary))?;
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -87,8 +86,8 @@ fn of_source(args: &Args) -> Result<Summary> {
     let mut problems: Vec<String> = plan.problems.iter().map(|p| p.message.clone()).collect();
     let mut ranges: BTreeMap<String, (f64, f64)> = BTreeMap::new();
     if !args.quick {
-        let bar = output::bar("demos").with_message("reading");
-        let mut advance = output::advance(&bar);
+        let mut screen = cli::Screen::new();
+        let mut advance = screen.advance("reading");
         let known: BTreeSet<&str> =
             plan.problems.iter().filter(|p| p.fatal).filter_map(|p| p.demo.as_deref()).collect();
         for (index, demo) in plan.demos.iter().enumerate() {
@@ -107,7 +106,6 @@ fn of_source(args: &Args) -> Result<Summary> {
             }
             advance(index as u64 + 1, plan.demos.len() as u64);
         }
-        bar.finish_and_clear();
     }
     let mut keys: BTreeMap<&str, KeyRow> = BTreeMap::new();
     for demo in &plan.demos {
@@ -137,7 +135,7 @@ fn of_source(args: &Args) -> Result<Summary> {
     tasks.dedup();
     let each = plan.demos.iter().map(|d| DemoRow { id: d.id.clone(), length: d.length, task: d.task.clone() });
     Ok(Summary {
-        path: args.path.clone(),
+        path: cli::lossy(&args.path),
         layout: format!("{} HDF5", plan.dialect.name()),
         bytes: plan.files.iter().map(|(_, size)| size).sum(),
         env_name: plan.env_name.clone(),
@@ -186,7 +184,7 @@ fn of_dataset(args: &Args) -> Result<Summary> {
         false => format!("converted from {} ({}) without the side folder", p.source, p.dialect),
     });
     Ok(Summary {
-        path: args.path.clone(),
+        path: cli::lossy(&args.path),
         layout: format!("LeRobotDataset {}", set.info().codebase_version),
         bytes: folder_bytes(&args.path),
         env_name: set.env().map(|e| e.env_name.clone()),
@@ -222,14 +220,14 @@ fn folder_bytes(path: &Path) -> u64 {
 }
 
 fn show(s: &Summary) -> String {
-    let mut text = format!("{}: {}, {}\n", s.path.display(), s.layout, output::bytes(s.bytes));
+    let mut text = format!("{}: {}, {}\n", s.path, s.layout, cli::bytes(s.bytes));
     let env = s.env_name.as_deref().unwrap_or("not stated");
     let version = s.env_version.as_ref().map_or_else(|| "version not stated".to_owned(), |v| format!("version {v}"));
     text.push_str(&format!("environment: {env}, {version}\n"));
     text.push_str(&format!(
         "demos: {} with {} steps (shortest {}, mean {:.1}, longest {})\n",
-        output::count(s.demos),
-        output::count(s.frames),
+        cli::count(s.demos),
+        cli::count(s.frames),
         s.length_min,
         s.length_mean,
         s.length_max
@@ -241,24 +239,24 @@ fn show(s: &Summary) -> String {
     if !s.tasks.is_empty() {
         text.push_str(&format!("tasks: {}\n", s.tasks.join("; ")));
     }
-    let range = |v: Option<f64>| v.map_or_else(String::new, output::number);
+    let range = |v: Option<f64>| v.map_or_else(String::new, cli::number);
     let rows: Vec<Vec<String>> = s
         .keys
         .iter()
         .map(|k| {
-            let shapes: Vec<String> = k.shapes.iter().map(|shape| output::shape(shape)).collect();
+            let shapes: Vec<String> = k.shapes.iter().map(|shape| cli::shape(shape)).collect();
             let demos = if k.demos == s.demos { "all".to_owned() } else { format!("{} of {}", k.demos, s.demos) };
             vec![k.key.clone(), k.dtype.clone(), shapes.join(" or "), demos, range(k.min), range(k.max)]
         })
         .collect();
-    text.push_str(&output::table(&["key", "type", "shape of a step", "demos", "min", "max"], &rows, &[4, 5]));
+    text.push_str(&cli::table(&["key", "type", "shape of a step", "demos", "min", "max"], &rows, &[4, 5]));
     if !s.each.is_empty() {
         let rows: Vec<Vec<String>> = s
             .each
             .iter()
             .map(|d| vec![d.id.clone(), d.length.to_string(), d.task.clone().unwrap_or_default()])
             .collect();
-        text.push_str(&output::table(&["demo", "steps", "task"], &rows, &[1]));
+        text.push_str(&cli::table(&["demo", "steps", "task"], &rows, &[1]));
     }
     for note in &s.notes {
         text.push_str(&format!("note: {note}\n"));

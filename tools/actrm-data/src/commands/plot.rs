@@ -1,7 +1,7 @@
-use crate::output;
 use crate::svg::{self, Content};
 use anyhow::{Context, Result, bail};
 use dataset::{Dataset, EpisodeMeta};
+use std::ffi::OsString;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -61,7 +61,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         _ => page(&set, episode, &chosen, &heading),
     };
     create(&args.out, &text)?;
-    output::print(&format!("{}: {}\n", args.out.display(), heading))?;
+    cli::print(&format!("{}: {}\n", args.out.display(), heading))?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -118,8 +118,10 @@ fn create(path: &Path, text: &str) -> Result<()> {
         bail!("{}: exists already; choose another path or remove it first", path.display());
     }
     let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let temporary = parent.join(format!(".{name}.partial-{}", std::process::id()));
+    let mut name = OsString::from(".");
+    name.push(path.file_name().unwrap_or_default());
+    name.push(format!(".partial-{}", std::process::id()));
+    let temporary = parent.join(name);
     let write = || -> std::io::Result<()> {
         let mut file = std::fs::File::create(&temporary)?;
         file.write_all(text.as_bytes())?;

@@ -1,4 +1,3 @@
-use crate::output;
 use anyhow::{Result, bail};
 use dataset::{PuzzleSet, write_puzzles};
 use puzzles::{Split, Task};
@@ -60,24 +59,25 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if args.out.exists() {
         bail!("{}: exists already; choose another path or remove it first", args.out.display());
     }
-    let bar = output::bar("puzzles").with_message(args.task.clone());
+    let mut screen = cli::Screen::new();
+    screen.begin(args.task.clone(), args.count);
     let set = PuzzleSet { task, split: args.split, givens: args.givens, seed: args.seed, count: args.count };
-    write_puzzles(&set, &args.out, &mut |done| output::advance(&bar)(done, args.count))?;
-    bar.finish_and_clear();
+    write_puzzles(&set, &args.out, &mut |done| screen.at(done))?;
+    screen.clear();
     let size = std::fs::metadata(&args.out).map_or(0, |m| m.len());
     if args.json {
-        output::print_json(&serde_json::json!({
-            "out": args.out, "task": args.task, "split": args.split.name(), "seed": args.seed, "count": args.count,
+        cli::print_json(&serde_json::json!({
+            "out": cli::lossy(&args.out), "task": args.task, "split": args.split.name(), "seed": args.seed, "count": args.count,
             "bytes": size,
         }))?;
     } else {
-        output::print(&format!(
+        cli::print(&format!(
             "{}: {} puzzles of {} ({}), {}\n",
             args.out.display(),
-            output::count(args.count as usize),
+            cli::count(args.count as usize),
             args.task,
             args.split.name(),
-            output::bytes(size)
+            cli::bytes(size)
         ))?;
     }
     Ok(ExitCode::SUCCESS)

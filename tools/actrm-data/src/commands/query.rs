@@ -1,4 +1,3 @@
-use crate::output;
 use anyhow::Result;
 use dataset::Dataset;
 use std::path::PathBuf;
@@ -38,20 +37,20 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             .into_iter()
             .map(|(table, column, dtype)| vec![table.to_owned(), column, dtype])
             .collect();
-        output::print(&output::table(&["table", "column", "type"], &rows, &[]))?;
+        cli::print(&cli::table(&["table", "column", "type"], &rows, &[]))?;
         return Ok(ExitCode::SUCCESS);
     };
     let result = query::query(&set, sql)?;
     if args.json {
         let list: Vec<serde_json::Map<String, serde_json::Value>> =
             result.rows.iter().map(|row| result.columns.iter().cloned().zip(row.iter().cloned()).collect()).collect();
-        output::print_json(&list)?;
+        cli::print_json(&list)?;
         return Ok(ExitCode::SUCCESS);
     }
     let shown = if args.limit == 0 { result.rows.len() } else { args.limit.min(result.rows.len()) };
     let cell = |v: &serde_json::Value| match v {
         serde_json::Value::String(s) => s.clone(),
-        serde_json::Value::Number(n) if n.is_f64() => output::number(n.as_f64().unwrap_or(f64::NAN)),
+        serde_json::Value::Number(n) if n.is_f64() => cli::number(n.as_f64().unwrap_or(f64::NAN)),
         serde_json::Value::Null => String::new(),
         other => other.to_string(),
     };
@@ -59,10 +58,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let header: Vec<&str> = result.columns.iter().map(String::as_str).collect();
     let numeric: Vec<usize> =
         (0..header.len()).filter(|&c| result.rows.iter().all(|row| row[c].is_number() || row[c].is_null())).collect();
-    let mut text = output::table(&header, &rows, &numeric);
+    let mut text = cli::table(&header, &rows, &numeric);
     if shown < result.rows.len() {
         text.push_str(&format!("{shown} of {} rows; --limit 0 shows all\n", result.rows.len()));
     }
-    output::print(&text)?;
+    cli::print(&text)?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,16 +1,14 @@
-use crate::output;
-use crate::simulator::{self, Recording, SimulatorArgs};
+use crate::recording::{self, Recording};
 use anyhow::{Context, Result, bail};
+use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop};
 use dataset::{Demo, Source, WriteOptions};
-use rollout::video::Encoder;
-use rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
 use safetensors::Dtype;
 use serde_json::json;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use rollout::video::Encoder;
+use rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
 
 /// Steps that a worker is asked to draw at a time.
 const PART: usize = 32;
@@ -47,7 +45,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    simulator::refuse_existing(&args.video)?;
+    recording::refuse_existing(&args.video)?;
     // a data set is taken back to the file that it was made of
     let rebuilt = tempfile::tempdir().context("a folder for the rebuilt file")?;
     let file = match args.input.is_dir() {
@@ -63,13 +61,18 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         bail!("{}: {id}: states: expected {steps} rows, one an action and at least one, found {found}", file.display());
     }
 
-    let stop = Arc::new(AtomicBool::new(false));
-    let mut pool = args.simulator.start(&task, std::slice::from_ref(&args.camera), args.size, &stop)?;
+    let stop = Stop::install("stopped; nothing was written")?;
+    let mut spec = args.simulator.spec(&task)?;
+    (spec.cameras, spec.image_size) = (vec![args.camera.clone()], usize::from(args.size));
+    let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
+        cli::note("stopped; nothing was written");
+        return Ok(ExitCode::from(INTERRUPTED));
+    };
     let size = (usize::from(args.size), usize::from(args.size));
     let rate = pool.ready().control_freq;
     let mut encoder = Encoder::start(&args.simulator.python()?, &args.video, size, rate)?;
-    let bar = output::bar("steps").with_message(format!("drawing {id}"));
-    bar.set_length(steps as u64);
+    let mut screen = Screen::new();
+    screen.begin(format!("drawing {id}"), steps as u64);
     let parts = steps.div_ceil(PART);
     let part = |job: u64| job as usize * PART..steps.min((job as usize + 1) * PART);
     let work = |(): &mut (), worker: &mut Worker, job: u64| {
@@ -88,7 +91,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             images += drawn.len();
             Ok(())
         });
-        bar.set_position(part(job).end as u64);
+        screen.at(part(job).end as u64);
         match drawn {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
@@ -97,32 +100,33 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             }
         }
     });
-    bar.finish_and_clear();
-    simulator::close(pool);
+    screen.clear();
+    cli::close(pool);
     let end = end?;
     if let Some(error) = failure {
         return Err(error.context(format!("{}: {id}", args.input.display())));
     }
     if end == RunEnd::Stopped {
-        bail!("stopped after {images} of {} images; nothing was written", steps + 1);
+        cli::note(&format!("stopped after {images} of {} images; nothing was written", steps + 1));
+        return Ok(ExitCode::from(INTERRUPTED));
     }
     encoder.finish()?;
     if args.json {
-        output::print_json(&json!({
-            "video": args.video, "task": task, "demo": id, "images": images, "rate": rate, "success": success,
+        cli::print_json(&json!({
+            "video": cli::lossy(&args.video), "task": task, "demo": id, "images": images, "rate": rate, "success": success,
         }))?;
     } else {
         let word = if success { "success" } else { "no success" };
-        output::print(&format!("{}: {task} {id}, {images} images at {rate} Hz, {word}\n", args.video.display()))?;
+        cli::print(&format!("{}: {task} {id}, {images} images at {rate} Hz, {word}\n", args.video.display()))?;
     }
     Ok(ExitCode::SUCCESS)
 }
 
 fn rebuild(set: &Path, folder: &Path) -> Result<PathBuf> {
     let file = folder.join("source.hdf5");
-    let bar = output::bar("frames").with_message("rebuilding the recording");
-    let report = dataset::export(set, &file, &WriteOptions::default(), &mut output::advance(&bar));
-    bar.finish_and_clear();
+    let mut screen = Screen::new();
+    let report = dataset::export(set, &file, &WriteOptions::default(), &mut screen.advance("rebuilding the recording"));
+    screen.clear();
     report?;
     Ok(file)
 }

@@ -1,4 +1,3 @@
-use crate::output;
 use anyhow::{Result, bail};
 use dataset::{Dataset, FeatureStats};
 use std::collections::BTreeMap;
@@ -47,9 +46,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
     }
     if args.json {
-        output::print_json(&stats)?;
+        cli::print_json(&stats)?;
     } else {
-        output::print(&show(&set, &stats))?;
+        cli::print(&show(&set, &stats))?;
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -65,10 +64,10 @@ fn show(set: &Dataset, stats: &BTreeMap<String, FeatureStats>) -> String {
             };
             let mut row = vec![if d == 0 { name.clone() } else { String::new() }, dimension];
             let values = [&s.mean, &s.std, &s.min, &s.q01, &s.q50, &s.q99, &s.max];
-            row.extend(values.map(|v| v.get(d).map_or_else(|| "-".to_owned(), |&v| output::number(v))));
+            row.extend(values.map(|v| v.get(d).map_or_else(|| "-".to_owned(), |&v| cli::number(v))));
             rows.push(row);
         }
     }
     let header = ["feature", "dimension", "mean", "std", "min", "1%", "50%", "99%", "max"];
-    output::table(&header, &rows, &[2, 3, 4, 5, 6, 7, 8])
+    cli::table(&header, &rows, &[2, 3, 4, 5, 6, 7, 8])
 }

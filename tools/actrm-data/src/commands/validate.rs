@@ -1,4 +1,3 @@
-use crate::output;
 use anyhow::{Result, bail};
 use dataset::{Check, Source};
 use serde_json::json;
@@ -30,9 +29,9 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<ExitCode> {
     let checks = if args.path.join("meta/info.json").exists() {
-        let bar = output::bar("frames").with_message("checking");
-        let checks = dataset::verify(&args.path, &mut output::advance(&bar));
-        bar.finish_and_clear();
+        let mut screen = cli::Screen::new();
+        let checks = dataset::verify(&args.path, &mut screen.advance("checking"));
+        screen.clear();
         let mut checks = checks?;
         if let Some(source) = &args.source {
             checks.push(dataset::verify_source(&args.path, source)?);
@@ -47,7 +46,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if args.json {
         let list: Vec<_> =
             checks.iter().map(|c| json!({"check": c.name, "ok": c.problem.is_none(), "problem": c.problem})).collect();
-        output::print_json(&json!({"path": args.path, "ok": problems == 0, "checks": list}))?;
+        cli::print_json(&json!({"path": cli::lossy(&args.path), "ok": problems == 0, "checks": list}))?;
     } else {
         let mut text = String::new();
         for check in &checks {
@@ -56,7 +55,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 Some(problem) => text.push_str(&format!("WRONG   {}: {problem}\n", check.name)),
             }
         }
-        output::print(&text)?;
+        cli::print(&text)?;
     }
     Ok(if problems == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
@@ -72,8 +71,8 @@ fn check_source(args: &Args) -> Result<Vec<Check>> {
     note("it opens: a known layout with demos", None);
     let structure: Vec<&str> = plan.problems.iter().map(|p| p.message.as_str()).collect();
     note("demos have what they must have", (!structure.is_empty()).then(|| structure.join("; ")));
-    let bar = output::bar("demos").with_message("reading");
-    let mut advance = output::advance(&bar);
+    let mut screen = cli::Screen::new();
+    let mut advance = screen.advance("reading");
     let mut failed = Vec::new();
     for (index, demo) in plan.demos.iter().enumerate() {
         // large datasets by rows, the rest whole
@@ -93,7 +92,6 @@ fn check_source(args: &Args) -> Result<Vec<Check>> {
         }
         advance(index as u64 + 1, plan.demos.len() as u64);
     }
-    bar.finish_and_clear();
     note("every demo can be read and holds finite actions", (!failed.is_empty()).then(|| failed.join("; ")));
     Ok(checks)
 }

@@ -1,21 +1,19 @@
-//! `actrm-zoo completions`
-
 use std::process::ExitCode;
 
-use clap::{Args, CommandFactory};
-use clap_complete::Shell;
+use cli::completions::{Shell, script};
 
-/// Print a completion script for a shell
-#[derive(Args)]
+/// Print a script that completes this command line in your shell
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo completions bash > ~/.local/share/bash-completion/completions/actrm-zoo
+  actrm-zoo completions zsh > ~/.zfunc/_actrm-zoo
   actrm-zoo completions fish > ~/.config/fish/completions/actrm-zoo.fish")]
-pub struct CompletionsArgs {
+pub struct Args {
     /// Which shell
     shell: Shell,
 }
 
-pub fn cmd_completions(args: &CompletionsArgs) -> anyhow::Result<ExitCode> {
-    clap_complete::generate(args.shell, &mut crate::Cli::command(), "actrm-zoo", &mut std::io::stdout());
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    cli::print(&script(args.shell, "actrm-zoo")?)?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,32 +1,30 @@
-//! `actrm-zoo export`
-
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Args, Subcommand};
+use cli::shown;
 use zoo::lerobot::export;
-use zoo::registry::Registry;
 
-use super::{ZooArgs, shown};
+use crate::places::{ZooArgs, entry_names};
 
 /// Write an entry in the form of another library
-#[derive(Args)]
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo export lerobot lift-act@1 lift-act-lerobot")]
-pub struct ExportArgs {
+pub struct Args {
     #[command(subcommand)]
     to: To,
 }
 
-#[derive(Subcommand)]
+#[derive(clap::Subcommand)]
 enum To {
     Lerobot(LerobotArgs),
 }
 
 /// A checkpoint folder that LeRobot 0.6.1 loads
-#[derive(Args)]
+#[derive(clap::Args)]
 struct LerobotArgs {
     /// Entry: `name` (its newest version) or `name@version`
+    #[arg(add = entry_names())]
     entry: String,
     /// New folder
     folder: PathBuf,
@@ -34,10 +32,10 @@ struct LerobotArgs {
     zoo: ZooArgs,
 }
 
-pub fn cmd_export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let To::Lerobot(args) = &args.to;
-    let entry = Registry::open(&args.zoo.zoo).entry(&args.entry)?;
+    let entry = args.zoo.registry().entry(&args.entry)?;
     export(&entry, &args.folder)?;
-    println!("{} is in {}", entry.id(), shown(&args.folder));
+    cli::print(&format!("{} is in {}\n", entry.id(), shown(&args.folder)))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,29 +1,27 @@
-//! `actrm-zoo import`
-
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Args, Subcommand};
+use cli::shown;
 use zoo::lerobot::{ImportOptions, import};
 
-use super::{ZooArgs, shown};
+use crate::places::ZooArgs;
 
 /// Make an entry of a policy that was trained elsewhere
-#[derive(Args)]
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo import lerobot outputs/train/checkpoints/last/pretrained_model --name lift-theirs --task Lift")]
-pub struct ImportArgs {
+pub struct Args {
     #[command(subcommand)]
     from: From,
 }
 
-#[derive(Subcommand)]
+#[derive(clap::Subcommand)]
 enum From {
     Lerobot(LerobotArgs),
 }
 
 /// A checkpoint folder of LeRobot's ACT
-#[derive(Args)]
+#[derive(clap::Args)]
 struct LerobotArgs {
     /// Folder with config.json, model.safetensors and the two processors
     folder: PathBuf,
@@ -48,11 +46,15 @@ struct LerobotArgs {
     zoo: ZooArgs,
 }
 
-pub fn cmd_import(args: ImportArgs) -> anyhow::Result<ExitCode> {
-    let From::Lerobot(args) = args.from;
-    let options =
-        ImportOptions { name: args.name, task: args.task, state_keys: args.state_keys, env_keys: args.env_keys };
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let From::Lerobot(args) = &args.from;
+    let options = ImportOptions {
+        name: args.name.clone(),
+        task: args.task.clone(),
+        state_keys: args.state_keys.clone(),
+        env_keys: args.env_keys.clone(),
+    };
     let id = import(&args.folder, &options, &args.zoo.zoo)?;
-    println!("{id} is in {}", shown(&args.zoo.zoo));
+    cli::print(&format!("{id} is in {}\n", shown(&args.zoo.zoo)))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,47 +1,51 @@
-//! `actrm-zoo list`
-
 use std::process::ExitCode;
 
-use clap::Args;
-use comfy_table::{Table, presets};
+use cli::{Column, Table, shown};
 use study::puzzle::PuzzleMeta;
 use zoo::entry::Entry;
-use zoo::registry::Registry;
 
-use super::{ConfigArgs, ZooArgs, shown};
+use crate::places::{ConfigArgs, ZooArgs};
 
 /// List the entries of the zoo, or the experiments that can be trained
-#[derive(Args)]
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo list
   actrm-zoo list --zoo my-zoo
   actrm-zoo list --experiments")]
-pub struct ListArgs {
+pub struct Args {
     /// List experiments instead of entries
     #[arg(long)]
     experiments: bool,
+    /// Show all columns, however narrow the terminal is
+    #[arg(long)]
+    wide: bool,
     #[command(flatten)]
     configs: ConfigArgs,
     #[command(flatten)]
     zoo: ZooArgs,
 }
 
-pub fn cmd_list(args: &ListArgs) -> anyhow::Result<ExitCode> {
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.experiments {
-        for name in args.configs.library()?.names()? {
-            println!("{name}");
-        }
+        let names = args.configs.library()?.names()?;
+        cli::print(&names.iter().map(|name| format!("{name}\n")).collect::<String>())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let registry = Registry::open(&args.zoo.zoo);
+    let registry = args.zoo.registry();
     let ids = registry.ids()?;
     if ids.is_empty() {
-        eprintln!("no entries in {}; make one with: actrm-zoo train act_lift", shown(&args.zoo.zoo));
+        cli::note(&format!("no entries in {}; make one with: actrm-zoo train act_lift", shown(&args.zoo.zoo)));
         return Ok(ExitCode::SUCCESS);
     }
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING);
-    table.set_header(["entry", "policy", "task", "parameters", "steps", "minutes", "data"]);
+    let mut table = Table::new(vec![
+        Column::new("entry"),
+        Column::new("policy"),
+        Column::new("task"),
+        Column::new("parameters").right().dispensable(1),
+        Column::new("steps").right().dispensable(2),
+        Column::new("minutes").right().dispensable(3),
+        Column::new("data").dispensable(4),
+    ]);
     let mut failures = Vec::new();
     for id in ids {
         // one bad entry must not hide the others
@@ -55,7 +59,7 @@ pub fn cmd_list(args: &ListArgs) -> anyhow::Result<ExitCode> {
         let meta = entry.meta();
         let training = meta.training.as_ref();
         let number = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
-        table.add_row([
+        table.push(vec![
             id.to_string(),
             meta.policy.clone(),
             meta.task.clone(),
@@ -69,9 +73,9 @@ pub fn cmd_list(args: &ListArgs) -> anyhow::Result<ExitCode> {
             }),
         ]);
     }
-    println!("{}", table.trim_fmt());
+    cli::print(&table.text(args.wide))?;
     for failure in &failures {
-        eprintln!("error: {failure:#}");
+        cli::note(&format!("error: {failure:#}"));
     }
     Ok(if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

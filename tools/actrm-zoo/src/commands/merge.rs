@@ -1,14 +1,12 @@
-//! `actrm-zoo merge`
-
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
-use clap::Args;
+use cli::shown;
 use zoo::results::merge_shards;
 
-use super::{ZooArgs, shown};
+use crate::places::{ResultsArgs, ZooArgs};
 
 /// Between an evaluation's name and the number of its shard.
 const MARK: &str = "_shard-";
@@ -16,25 +14,24 @@ const MARK: &str = "_shard-";
 /// Join the shards of an evaluation that several machines ran
 ///
 /// Shards that differ in entry, protocol, seeds or versions are refused.
-#[derive(Args)]
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo eval lift-act --episodes 200 --shard 1/2
   actrm-zoo eval lift-act --episodes 200 --shard 2/2
   actrm-zoo merge
   actrm-zoo merge zoo/results/*_shard-*")]
-pub struct MergeArgs {
+pub struct Args {
     /// Result folders of all shards of one evaluation (every evaluation's in the folder of results)
     #[arg(value_name = "FOLDER")]
     shards: Vec<PathBuf>,
-    /// Folder of results to put the whole into (`results` in the zoo)
-    #[arg(long, value_name = "DIR")]
-    results: Option<PathBuf>,
+    #[command(flatten)]
+    results: ResultsArgs,
     #[command(flatten)]
     zoo: ZooArgs,
 }
 
-pub fn cmd_merge(args: &MergeArgs) -> anyhow::Result<ExitCode> {
-    let results = args.results.clone().unwrap_or_else(|| args.zoo.zoo.join("results"));
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let results = args.results.folder(&args.zoo);
     let mut groups: BTreeMap<String, Vec<PathBuf>> = BTreeMap::new();
     match args.shards.is_empty() {
         true => {
@@ -51,7 +48,8 @@ pub fn cmd_merge(args: &MergeArgs) -> anyhow::Result<ExitCode> {
     }
     for shards in groups.values() {
         let whole = merge_shards(shards, &results)?;
-        println!("{} of {} episodes succeeded ({})", whole.successes(), whole.episodes.len(), shown(&whole.folder));
+        let (won, all) = (whole.successes(), whole.episodes.len());
+        cli::print(&format!("{won} of {all} episodes succeeded ({})\n", shown(&whole.folder)))?;
     }
     Ok(ExitCode::SUCCESS)
 }

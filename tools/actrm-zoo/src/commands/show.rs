@@ -1,20 +1,16 @@
-//! `actrm-zoo show`
-
 use std::process::ExitCode;
 
-use clap::Args;
-use zoo::registry::Registry;
-
-use super::ZooArgs;
+use crate::places::{ZooArgs, entry_names};
 
 /// Verify an entry and print its model card, its experiment or its provenance
-#[derive(Args)]
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo show lift-act
   actrm-zoo show lift-act@1 --config
   actrm-zoo show lift-act@1 --json")]
-pub struct ShowArgs {
+pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
+    #[arg(add = entry_names())]
     entry: String,
     /// Print the resolved experiment
     #[arg(long, conflicts_with = "json")]
@@ -26,14 +22,14 @@ pub struct ShowArgs {
     zoo: ZooArgs,
 }
 
-pub fn cmd_show(args: &ShowArgs) -> anyhow::Result<ExitCode> {
-    let entry = Registry::open(&args.zoo.zoo).entry(&args.entry)?;
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let entry = args.zoo.registry().entry(&args.entry)?;
     if args.json {
-        println!("{}", serde_json::to_string_pretty(entry.meta())?);
+        cli::print_json(entry.meta())?;
     } else if args.config {
-        print!("{}", entry.config_text()?);
+        cli::print(&entry.config_text()?)?;
     } else {
-        print!("{}", entry.card()?);
+        cli::print(&entry.card()?)?;
     }
     Ok(ExitCode::SUCCESS)
 }

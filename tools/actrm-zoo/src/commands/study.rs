@@ -1,29 +1,26 @@
-//! `actrm-zoo study`
-
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::atomic::Ordering;
 
-use clap::Args;
-use indicatif::ProgressBar;
-use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, run_study, study_page};
+use cli::{INTERRUPTED, Screen, Stop, shown};
+use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, StudyRow, run_study, study_page};
 use zoo::run::TrainEvent;
 use zoo::write_atomic;
 
-use super::{ConfigArgs, shown};
-use crate::{stop, terminal};
+use crate::places::ConfigArgs;
+
+const GOES_ON: &str = "stopped; the same command goes on where it was";
 
 /// Run the puzzle study, as far as it has no results yet, and write its page
 ///
 /// Every row (experiment, seed, test) is one small file in the results folder; Ctrl-C saves a checkpoint and the same
 /// command goes on from it. One thread (RAYON_NUM_THREADS=1) costs the least processor time.
-#[derive(Args)]
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo study --page docs/puzzles.md
   actrm-zoo study --only trm_dfs10 --only trm_open8 --seeds 1
   actrm-zoo study --page-only --page docs/puzzles.md
   actrm-zoo study --list")]
-pub struct StudyArgs {
+pub struct Args {
     /// Folder of results, one file a row
     #[arg(long, value_name = "DIR", default_value = "docs/puzzles")]
     results: PathBuf,
@@ -49,11 +46,10 @@ pub struct StudyArgs {
     configs: ConfigArgs,
 }
 
-pub fn cmd_study(args: &StudyArgs) -> anyhow::Result<ExitCode> {
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.list {
-        for row in STUDY {
-            println!("{} ({} seeds, {} tests)", row.experiment, row.seeds, row.tests.len());
-        }
+        let row = |row: &StudyRow| format!("{} ({} seeds, {} tests)\n", row.experiment, row.seeds, row.tests.len());
+        cli::print(&STUDY.iter().map(row).collect::<String>())?;
         return Ok(ExitCode::SUCCESS);
     }
     if let Some(name) = args.only.iter().find(|name| STUDY.iter().all(|row| row.experiment != **name)) {
@@ -62,7 +58,7 @@ pub fn cmd_study(args: &StudyArgs) -> anyhow::Result<ExitCode> {
     }
     let mut whole = true;
     if !args.page_only {
-        let asked = stop::install()?;
+        let stop = Stop::install(GOES_ON)?;
         let request = StudyRequest {
             library: args.configs.library()?,
             results: args.results.clone(),
@@ -70,38 +66,45 @@ pub fn cmd_study(args: &StudyArgs) -> anyhow::Result<ExitCode> {
             only: args.only.clone(),
             seeds: args.seeds,
         };
-        let mut bar = ProgressBar::hidden();
-        let done = run_study(&request, &|| asked.load(Ordering::SeqCst), &mut |event| on_event(&event, &mut bar));
-        bar.finish_and_clear();
-        whole = done?;
+        let mut screen = Screen::new();
+        let mut printed = Ok(());
+        whole = run_study(&request, &|| stop.asked(), &mut |event| {
+            let one = on_event(&event, &mut screen, &stop);
+            if printed.is_ok() {
+                printed = one;
+            }
+        })?;
+        drop(screen);
+        printed?;
     }
     if let Some(path) = &args.page {
         write_atomic(path, study_page(&args.configs.library()?, &args.results)?.as_bytes())?;
-        println!("{}", shown(path));
+        cli::print(&(shown(path) + "\n"))?;
     }
     if !whole {
-        eprintln!("stopped; the same command goes on where it was");
-        return Ok(ExitCode::from(stop::INTERRUPTED));
+        cli::note(GOES_ON);
+        return Ok(ExitCode::from(INTERRUPTED));
     }
     Ok(ExitCode::SUCCESS)
 }
 
-fn on_event(event: &StudyEvent<'_>, bar: &mut ProgressBar) {
+fn on_event(event: &StudyEvent<'_>, screen: &mut Screen, stop: &Stop) -> anyhow::Result<()> {
     match event {
-        StudyEvent::Begin(experiment, seed) => bar.suspend(|| eprintln!("{experiment}, seed {seed}")),
+        StudyEvent::Begin(experiment, seed) => screen.note(&format!("{experiment}, seed {seed}")),
         StudyEvent::Training(TrainEvent::Begin { from, steps, .. }) => {
-            bar.finish_and_clear();
-            *bar = terminal::bar("train", *steps);
-            bar.set_position(*from);
-            bar.reset_eta();
+            // until its last step a training has a checkpoint to save when it is stopped
+            stop.wait_for_work(from < steps);
+            screen.begin_at("train", *from, *steps);
         }
-        StudyEvent::Training(TrainEvent::Step(row)) => bar.set_position(row.step),
+        StudyEvent::Training(TrainEvent::Step(row)) => screen.at(row.step),
+        StudyEvent::Training(TrainEvent::Saved(_)) => stop.wait_for_work(!screen.is_full()),
         StudyEvent::Training(_) => {}
         StudyEvent::Result(result, there) => {
-            bar.finish_and_clear();
-            println!("{}", line(result, *there));
+            screen.clear();
+            cli::print(&(line(result, *there) + "\n"))?;
         }
     }
+    Ok(())
 }
 
 /// `trm_dfs10 seed 1 on dfs10: right 99.5%, exact 99.5%, 61 CPU s`

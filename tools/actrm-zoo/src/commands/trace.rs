@@ -1,25 +1,23 @@
-//! `actrm-zoo trace`
-
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::Args;
+use cli::shown;
 use study::puzzle::{SolverEntry, trace};
-use zoo::registry::Registry;
 use zoo::write_atomic;
 
-use super::puzzles::family;
-use super::{ZooArgs, shown};
+use crate::places::{ZooArgs, entry_names};
+use crate::puzzles::family;
 
 /// Show what a puzzle solver believed after each step: its grid, how sure it was, whether it would stop
-#[derive(Args)]
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo trace trm-dfs10
   actrm-zoo trace trm-open8@1 --index 7 --svg trace.svg
   actrm-zoo trace trm-dfs10 --task dfs16 --depth 24
   actrm-zoo trace trm-sudoku4 --json")]
-pub struct TraceArgs {
+pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
+    #[arg(add = entry_names())]
     entry: String,
     /// Number of the puzzle in the test split
     #[arg(long, default_value_t = 0)]
@@ -43,8 +41,8 @@ pub struct TraceArgs {
     zoo: ZooArgs,
 }
 
-pub fn cmd_trace(args: &TraceArgs) -> anyhow::Result<ExitCode> {
-    let entry = Registry::open(&args.zoo.zoo).entry(&args.entry)?;
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let entry = args.zoo.registry().entry(&args.entry)?;
     let other = args.task.as_deref().map(family).transpose()?;
     let solver = SolverEntry::load(&entry, other)?;
     let task = match other {
@@ -56,10 +54,10 @@ pub fn cmd_trace(args: &TraceArgs) -> anyhow::Result<ExitCode> {
     match &args.svg {
         Some(path) => {
             write_atomic(path, trace.to_svg().as_bytes())?;
-            println!("{}", shown(path));
+            cli::print(&(shown(path) + "\n"))?;
         }
-        None if args.json => println!("{}", serde_json::to_string_pretty(&trace)?),
-        None => print!("{}", trace.to_text()),
+        None if args.json => cli::print_json(&trace)?,
+        None => cli::print(&trace.to_text())?,
     }
     Ok(ExitCode::SUCCESS)
 }

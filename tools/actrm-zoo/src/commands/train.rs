@@ -1,22 +1,20 @@
-//! `actrm-zoo train`
-
-use std::path::PathBuf;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::atomic::Ordering;
 
 use anyhow::{Context, bail};
-use clap::Args;
-use indicatif::ProgressBar;
+use cli::{INTERRUPTED, Screen, Stop, command_line, shown};
 use study::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
-use zoo::run::{MetricsRow, TrainEvent, TrainOutcome, TrainRequest, train};
+use zoo::run::{COMMAND_FILE, MetricsRow, TrainEvent, TrainOutcome, TrainRequest, train};
+use zoo::write_atomic;
 
-use super::{ConfigArgs, ZooArgs, shown};
-use crate::{stop, terminal};
+use crate::places::{ConfigArgs, ZooArgs, experiment_names};
 
 /// Train an experiment and put the result into the zoo
 ///
 /// Ctrl-C saves a checkpoint; `--resume` goes on from it to the same bytes that an uninterrupted training gives.
-#[derive(Args)]
+/// `actrm-zoo runs` lists what can go on, with the command that does it.
+#[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo train act_lift
   actrm-zoo train act_lift train.steps=2000 policy.dim_model=256
@@ -24,8 +22,9 @@ use crate::{stop, terminal};
   actrm-zoo train act_lift --resume
   actrm-zoo train trm_dfs10 train.seed=2
   actrm-zoo train act_lift --print-config")]
-pub struct TrainArgs {
+pub struct Args {
     /// Experiment, by name (`actrm-zoo list --experiments`)
+    #[arg(add = experiment_names())]
     experiment: String,
     /// Changes to it: `train.steps=5000`, `task.name=Stack`
     #[arg(value_name = "KEY=VALUE")]
@@ -51,84 +50,100 @@ pub struct TrainArgs {
     zoo: ZooArgs,
 }
 
-pub fn cmd_train(args: &TrainArgs) -> anyhow::Result<ExitCode> {
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let library = args.configs.library()?;
     let experiment = AnyExperiment::load(&library, &args.experiment, &args.overrides)
         .with_context(|| format!("experiment `{}`", args.experiment))?;
     if args.print_config {
-        print!("{}", experiment.to_toml());
+        cli::print(&experiment.to_toml())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let asked = stop::install()?;
-    let mut bar = ProgressBar::hidden();
-    let stop = || asked.load(Ordering::SeqCst);
+    let asked = Stop::install("stopped before the first step")?;
+    let mut screen = Screen::new();
+    let stop = || asked.asked();
     let (name, runs, run) = (args.experiment.clone(), args.runs.clone(), args.run.clone());
     let (resume, zoo) = (args.resume, args.zoo.zoo.clone());
+    // the error of a file that is for people only must not end a training
+    let mut unwritten = None;
+    let mut on_event = |event: TrainEvent<'_>| {
+        if let TrainEvent::Folder(folder) = &event {
+            let text = format!("{}\n", going_on(args, folder));
+            unwritten = write_atomic(&folder.join(COMMAND_FILE), text.as_bytes()).err();
+        }
+        show(&event, &mut screen, &asked);
+    };
     let outcome = match experiment {
         AnyExperiment::Robot(experiment) => {
             let data = args.data.clone();
             let request = TrainRequest { name, experiment: *experiment, data, runs, run, resume, zoo };
-            train(&request, &stop, &mut |event| on_event(&event, &mut bar))
+            train(&request, &stop, &mut on_event)
         }
         AnyExperiment::Puzzle(experiment) => {
             if args.data.is_some() {
                 bail!("--data: experiment `{name}` draws its own puzzles");
             }
             let request = PuzzleTrainRequest { name, experiment: *experiment, runs, run, resume, zoo };
-            train_puzzles(&request, &stop, &mut |event| on_event(&event, &mut bar))
+            train_puzzles(&request, &stop, &mut on_event)
         }
     };
-    bar.finish_and_clear();
+    drop(screen);
+    if let Some(error) = unwritten {
+        cli::note(&format!("note: {error}"));
+    }
     match outcome? {
         TrainOutcome::Finished { entry, run, minutes } => {
-            println!(
-                "{entry} is in {} after {minutes:.1} minutes of training (run {})",
-                shown(&args.zoo.zoo),
-                shown(&run)
-            );
+            let (zoo, run) = (shown(&args.zoo.zoo), shown(&run));
+            cli::print(&format!("{entry} is in {zoo} after {minutes:.1} minutes of training (run {run})\n"))?;
             Ok(ExitCode::SUCCESS)
         }
         TrainOutcome::Stopped { step, run } => {
-            eprintln!(
-                "stopped after step {step}; go on with: actrm-zoo train {} --resume --run {}",
-                args.experiment,
-                shown(&run)
-            );
-            Ok(ExitCode::from(stop::INTERRUPTED))
+            cli::note(&format!("stopped after step {step}; go on with: {}", going_on(args, &run)));
+            Ok(ExitCode::from(INTERRUPTED))
         }
     }
 }
 
-fn on_event(event: &TrainEvent<'_>, bar: &mut ProgressBar) {
+/// The command that goes on with the run in `folder`: everything that was asked for, wherever it came from.
+fn going_on(args: &Args, folder: &Path) -> String {
+    let mut words: Vec<OsString> = ["actrm-zoo", "train", &args.experiment].map(OsString::from).to_vec();
+    words.extend(args.overrides.iter().map(OsString::from));
+    let mut option = |name: &str, path: &Path| words.extend([name.into(), path.as_os_str().to_owned()]);
+    if let Some(data) = &args.data {
+        option("--data", data);
+    }
+    if let Some(configs) = &args.configs.configs {
+        option("--configs", configs);
+    }
+    option("--zoo", &args.zoo.zoo);
+    option("--run", folder);
+    words.push("--resume".into());
+    command_line(&words)
+}
+
+fn show(event: &TrainEvent<'_>, screen: &mut Screen, stop: &Stop) {
     match event {
-        TrainEvent::Folder(path) => eprintln!("run folder: {}", shown(path)),
-        TrainEvent::Converting(done, total) => {
-            if bar.length() != Some(*total) || bar.is_hidden() {
-                bar.finish_and_clear();
-                *bar = terminal::bar("convert", *total);
-            }
-            bar.set_position(*done);
-        }
-        TrainEvent::Note(note) => bar.suspend(|| eprintln!("note: {note}")),
+        TrainEvent::Folder(path) => screen.note(&format!("run folder: {}", shown(path))),
+        TrainEvent::Converting(done, total) => screen.advance("convert")(*done, *total),
+        TrainEvent::Note(note) => screen.note(&format!("note: {note}")),
         TrainEvent::Begin { from, steps, parameters, windows } => {
-            bar.finish_and_clear();
+            // from here on there is a checkpoint to save first
+            stop.wait_for_work(from < steps);
+            screen.clear();
             let examples = match windows {
                 0 => "puzzles drawn as they are needed".to_owned(),
                 n => format!("{n} examples"),
             };
-            eprintln!("{parameters} parameters, {examples}, {steps} steps");
+            screen.note(&format!("{parameters} parameters, {examples}, {steps} steps"));
             if *from > 0 {
-                eprintln!("resumed after step {from}");
+                screen.note(&format!("resumed after step {from}"));
             }
-            *bar = terminal::bar("train", *steps);
-            bar.set_position(*from);
-            bar.reset_eta();
+            screen.begin_at("train", *from, *steps);
         }
         TrainEvent::Step(row) => {
-            bar.set_position(row.step);
-            bar.set_message(summary(row));
+            screen.at(row.step);
+            screen.message(&summary(row));
         }
-        TrainEvent::Saved(_) => {}
+        TrainEvent::Saved(_) => stop.wait_for_work(!screen.is_full()),
     }
 }
 

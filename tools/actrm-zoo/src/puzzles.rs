@@ -1,4 +1,4 @@
-//! What `eval` does with an entry that solves puzzles.
+//! Puzzles on the command line: their families, and what `eval` does with an entry that solves them.
 
 use std::path::Path;
 

@@ -1,29 +1,9 @@
-//! What the commands that run the simulator share: their options, its start and end, and what its workers record as a
-//! demo in robomimic's layout.
+//! What the commands that run the simulator share: cameras, and what its workers record as a demo in robomimic's layout.
 
 use anyhow::{Context, Result, bail};
 use dataset::{Array, Demo, Dtype};
-use rollout::{FrameTensor, Pool, PoolOptions, RecordedEpisode, WorkerSpec};
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-
-/// Exit code of a program that an interrupt ended, as shells have it.
-pub const INTERRUPTED: u8 = 130;
-
-/// Options of every command that runs the simulator.
-#[derive(clap::Args)]
-pub struct SimulatorArgs {
-    /// Simulators at once [default: one a core]
-    #[arg(long)]
-    pub workers: Option<usize>,
-    /// Python module of your own that registers environments
-    #[arg(long, value_name = "MODULE")]
-    pub env_module: Option<String>,
-    /// Python with robosuite [default: $ACTRM_PYTHON, else .venv/bin/python here or above, else python3]
-    #[arg(long)]
-    pub python: Option<PathBuf>,
-}
+use rollout::{FrameTensor, RecordedEpisode, WorkerSpec};
+use std::path::Path;
 
 /// Cameras whose images are observed, and their size.
 #[derive(clap::Args)]
@@ -36,42 +16,12 @@ pub struct CameraArgs {
     pub size: u16,
 }
 
-impl SimulatorArgs {
-    /// The Python to use.
-    pub fn python(&self) -> Result<rollout::Python> {
-        Ok(rollout::find_python(self.python.as_deref())?)
+impl CameraArgs {
+    /// Has a worker draw what these cameras see.
+    pub fn set(&self, spec: &mut WorkerSpec) {
+        spec.cameras.clone_from(&self.cameras);
+        spec.image_size = usize::from(self.size);
     }
-
-    /// Starts the workers. Ctrl-C sets `stop`; a second one ends the program at once.
-    pub fn start(&self, task: &str, cameras: &[String], size: u16, stop: &Arc<AtomicBool>) -> Result<Pool> {
-        let raise = Arc::clone(stop);
-        ctrlc::set_handler(move || {
-            if raise.swap(true, Ordering::SeqCst) {
-                std::process::exit(i32::from(INTERRUPTED));
-            }
-        })
-        .context("cannot catch ctrl-C")?;
-        let mut spec = WorkerSpec::new(self.python()?, rollout::harness_folder()?, task);
-        spec.cameras = cameras.to_vec();
-        spec.image_size = usize::from(size);
-        spec.env_module.clone_from(&self.env_module);
-        let workers = self.workers.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-        let stop = Arc::clone(stop);
-        let stopped = Arc::new(move || stop.load(Ordering::SeqCst));
-        let pool = Pool::start(PoolOptions { stop: stopped, ..PoolOptions::new(spec, workers) })?;
-        if let Some(why) = pool.fallback() {
-            eprintln!("note: {why}");
-        }
-        Ok(pool)
-    }
-}
-
-/// Says what went wrong on the way, and ends the workers.
-pub fn close(pool: Pool) {
-    for incident in pool.incidents() {
-        eprintln!("note: {}", incident.text);
-    }
-    pool.close();
 }
 
 /// Refuses to begin long work whose result would have no place.
@@ -79,6 +29,21 @@ pub fn refuse_existing(out: &Path) -> Result<()> {
     match out.symlink_metadata() {
         Ok(_) => Err(dataset::DatasetError::OutputExists { path: out.to_owned() }.into()),
         Err(_) => Ok(()),
+    }
+}
+
+/// Removes the unfinished files that a writer of `out` keeps beside it.
+pub fn remove_unfinished(out: &Path) {
+    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let begins = format!(".{}.", out.file_name().unwrap_or_default().to_string_lossy());
+    let Ok(items) = std::fs::read_dir(folder) else { return };
+    for item in items.flatten() {
+        let name = item.file_name();
+        let name = name.to_string_lossy();
+        if name.starts_with(&begins) && name.ends_with(".part") {
+            // what stays is as a killed program leaves it
+            let _ = std::fs::remove_file(item.path());
+        }
     }
 }
 

@@ -1,0 +1,79 @@
+//! Where the zoo and the experiments are, and the names in them for completion.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use clap_complete::engine::{ArgValueCandidates, CompletionCandidate};
+use cli::completions::{candidates, given};
+use zoo::config::Library;
+use zoo::registry::Registry;
+
+/// Where the zoo is.
+#[derive(Args)]
+pub struct ZooArgs {
+    /// Folder of the zoo
+    #[arg(long, value_name = "DIR", default_value = "zoo", env = "ACTRM_ZOO_DIR")]
+    pub zoo: PathBuf,
+}
+
+impl ZooArgs {
+    /// Its entries.
+    pub fn registry(&self) -> Registry {
+        Registry::open(&self.zoo)
+    }
+}
+
+/// Where results are.
+#[derive(Args)]
+pub struct ResultsArgs {
+    /// Folder of results (`results` in the zoo)
+    #[arg(long, value_name = "DIR")]
+    results: Option<PathBuf>,
+}
+
+impl ResultsArgs {
+    /// The folder that was named, or the zoo's.
+    pub fn folder(&self, zoo: &ZooArgs) -> PathBuf {
+        self.results.clone().unwrap_or_else(|| zoo.zoo.join("results"))
+    }
+}
+
+/// Where experiments are.
+#[derive(Args)]
+pub struct ConfigArgs {
+    /// Folder of experiment files that come before those built in
+    #[arg(long, value_name = "DIR", env = "ACTRM_CONFIGS")]
+    pub configs: Option<PathBuf>,
+}
+
+impl ConfigArgs {
+    /// The experiments.
+    pub fn library(&self) -> anyhow::Result<Library> {
+        library(self.configs.as_deref())
+    }
+}
+
+fn library(folder: Option<&Path>) -> anyhow::Result<Library> {
+    Ok(match folder {
+        Some(folder) => Library::with_folder(folder)?,
+        None => Library::built_in(),
+    })
+}
+
+/// Completes names of entries, with and without version, of the zoo that the line names.
+pub fn entry_names() -> ArgValueCandidates {
+    ArgValueCandidates::new(|| {
+        let folder = given("--zoo").or_else(|| std::env::var_os("ACTRM_ZOO_DIR")).unwrap_or_else(|| "zoo".into());
+        let ids = Registry::open(Path::new(&folder)).ids().unwrap_or_default();
+        candidates(ids.iter().map(ToString::to_string))
+    })
+}
+
+/// Completes names of experiments.
+pub fn experiment_names() -> ArgValueCandidates {
+    ArgValueCandidates::new(|| -> Vec<CompletionCandidate> {
+        let folder = given("--configs").or_else(|| std::env::var_os("ACTRM_CONFIGS"));
+        let names = library(folder.as_deref().map(Path::new)).and_then(|library| Ok(library.names()?));
+        candidates(names.unwrap_or_default())
+    })
+}

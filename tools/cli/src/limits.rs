@@ -1,0 +1,90 @@
+//! Sizes on the command line that no machine has room or time for: refused before any work.
+
+use anyhow::{Result, bail};
+
+/// Most episodes of one command.
+pub const MOST_EPISODES: u64 = 1_000_000;
+/// Most control steps of one episode: days of a simulator.
+pub const MOST_STEPS: u64 = 1_000_000;
+/// What a worker takes with a scene of robosuite, in bytes: between 200 and 450 MB, by task.
+const WORKER_BYTES: u64 = 300_000_000;
+
+/// The seeds `start..start + count` as far as they are numbers.
+///
+/// # Errors
+/// Where the last one would be beyond the largest number.
+pub fn check_seeds(start: u64, count: u64) -> Result<()> {
+    if start.checked_add(count).is_none() {
+        bail!("--seed-start {start}: expected room for {count} seeds, the largest is {}", u64::MAX);
+    }
+    Ok(())
+}
+
+/// A coefficient of temporal ensembling: weights are `exp(-coefficient * age)`, with ages up to `horizon`.
+///
+/// # Errors
+/// Where it is no number, or a weight would overflow or leave one action alone.
+pub fn check_coefficient(coefficient: f64, horizon: usize) -> Result<()> {
+    // beyond 10 the oldest prediction alone counts; exp(700) is near the largest number
+    let least = -(700.0 / horizon.max(1) as f64).min(10.0);
+    if !(least..=10.0).contains(&coefficient) {
+        bail!("--temporal-ensemble: expected a finite number from {least:.1} to 10, found {coefficient}");
+    }
+    Ok(())
+}
+
+/// How many simulators to start: one a core unless another number was asked for.
+///
+/// # Errors
+/// Where memory has no room for them.
+pub fn workers(asked: Option<usize>) -> Result<usize> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let Some(asked) = asked else { return Ok(cores) };
+    if asked == 0 {
+        bail!("--workers 0: expected at least 1");
+    }
+    if let Some(there) = available_memory().filter(|_| asked > cores) {
+        let needed = (asked as u64).saturating_mul(WORKER_BYTES);
+        if needed > there {
+            bail!(
+                "--workers {asked}: need about {} of memory ({} each), {} are free",
+                crate::bytes(needed),
+                crate::bytes(WORKER_BYTES),
+                crate::bytes(there)
+            );
+        }
+    }
+    Ok(asked)
+}
+
+/// Memory that can be had, in bytes, where the system tells.
+pub fn available_memory() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?.checked_mul(1024)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn what_is_usual_passes_and_what_is_absurd_does_not() {
+        check_seeds(10_000, 1_000_000).unwrap();
+        check_seeds(u64::MAX - 1, 1).unwrap();
+        assert!(check_seeds(u64::MAX, 1).unwrap_err().to_string().contains("--seed-start"));
+        for fine in [0.01, -0.01, 0.0, 10.0] {
+            check_coefficient(fine, 100).unwrap();
+        }
+        for wrong in [1e308, -1e308, f64::NAN, f64::INFINITY, -8.0] {
+            assert!(check_coefficient(wrong, 100).unwrap_err().to_string().contains("finite"), "{wrong}");
+        }
+        assert!((-(0.0_f64)..=10.0).contains(&0.0));
+        workers(None).unwrap();
+        workers(Some(1)).unwrap();
+        let error = workers(Some(usize::MAX)).unwrap_err().to_string();
+        assert!(error.contains("--workers") && error.contains("memory"), "{error}");
+        assert!(workers(Some(0)).is_err());
+    }
+}
