@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use e2e::{data, lift, listing, refused, succeeds, text};
+use e2e::{data, lift, listing, refused, succeeds, text, train_lift};
 use tempfile::TempDir;
 
 /// A folder with a damaged copy of the shipped demonstrations, `bad.hdf5`.
@@ -116,6 +116,45 @@ fn nan_in_actions() {
         }),
         &["demo_11", "actions", "NaN"],
     );
+}
+
+#[test]
+fn masks_that_name_demos_which_are_not_there() {
+    // as robomimic's `dataset_states_to_obs --n 5` leaves a file: the first demos, and the masks of them all
+    let (folder, file) = edited(|demos| {
+        let ids = demos.member_names().expect("listable");
+        let mut numbers: Vec<u32> = ids.iter().filter_map(|id| id.strip_prefix("demo_")?.parse().ok()).collect();
+        numbers.sort_unstable();
+        for number in &numbers[5..] {
+            demos.unlink(&format!("demo_{number}")).expect("there");
+        }
+        let lengths = numbers[..5].iter().map(|n| {
+            let demo = demos.group(&format!("demo_{n}")).expect("there");
+            demo.attr("num_samples").expect("there").read_scalar::<i64>().expect("a number")
+        });
+        let total: i64 = lengths.sum();
+        demos.attr("total").expect("there").write_scalar(&total).expect("writable");
+    });
+    let at = |name: &str| folder.path().join(name);
+    let told = succeeds(&mut data(["convert", text(&file), text(&at("set"))]));
+    let told = String::from_utf8_lossy(&told.stdout).into_owned() + &String::from_utf8_lossy(&told.stderr);
+    assert!(told.contains("mask/train: ") && told.contains(" demos it names are not in the file"), "{told}");
+    succeeds(&mut data(["validate", text(&at("set"))]));
+    train_lift(&at("set"), &at("zoo"), &at("runs"));
+    succeeds(&mut data(["export", text(&at("set")), text(&at("again.hdf5"))]));
+    let masks = |path: &Path| {
+        let group = hdf5::File::open(path).expect("it opens").group("mask").expect("there are masks");
+        let names = group.member_names().expect("listable");
+        let read = |name: &String| {
+            let mask = group.dataset(name).expect("there");
+            let ids = mask.read_raw::<hdf5::types::FixedAscii<64>>().expect("names of demos");
+            (name.clone(), mask.dtype().expect("a type").size(), ids)
+        };
+        names.iter().map(read).collect::<Vec<_>>()
+    };
+    let (before, after) = (masks(&file), masks(&at("again.hdf5")));
+    assert_eq!(before, after);
+    assert!(before.iter().map(|(_, _, ids)| ids.len()).sum::<usize>() > 5, "{before:?}");
 }
 
 #[test]

@@ -243,15 +243,19 @@ pub enum InputError {
         found: String,
     },
 
-    /// A mask names a demo that the file does not have.
-    #[error("{path}: mask/{mask}: names {demo}, which is not in the file", path = path.display())]
-    UnknownMaskDemo {
+    /// A mask names demos that the file does not have.
+    #[error("{path}: mask/{mask}: {count} of the {named} demos it names are not in the file: {demos}", path = path.display())]
+    UnknownMaskDemos {
         /// The file.
         path: PathBuf,
         /// The mask.
         mask: String,
-        /// The demo that is not there.
-        demo: String,
+        /// Demos that it names.
+        named: usize,
+        /// Those that are not there.
+        count: usize,
+        /// Their ids, or the first of them.
+        demos: String,
     },
 
     /// An element type, link or storage that is not read.

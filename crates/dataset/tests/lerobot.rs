@@ -326,6 +326,35 @@ fn pictures_that_are_not_colour_stay_beside_and_are_named() {
     assert!(report.features.iter().all(|(name, ..)| name != "observation.state"));
 }
 
+/// The mask as stored.
+fn mask(path: &Path, name: &str) -> Array {
+    Source::open(path).unwrap().root().unwrap().datasets[&format!("mask/{name}")].clone()
+}
+
+#[test]
+fn a_file_cut_down_by_robomimic_keeps_the_masks_of_the_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let (file, out, back) = (dir.path().join("a.hdf5"), dir.path().join("set"), dir.path().join("b.hdf5"));
+    // what `dataset_states_to_obs --n 2` leaves of robomimic's own file: the first demos, and every mask as it was
+    let (mut root, demos) = content(&fixture());
+    root.inner_attrs.get_mut("data").unwrap().insert("total".to_owned(), Array::from_i64(vec![], &[112]));
+    let mut writer = RobomimicWriter::create(&file, &WriteOptions::default()).unwrap();
+    writer.set_root(&root).unwrap();
+    for demo in &demos[..2] {
+        writer.add_demo(demo).unwrap();
+    }
+    writer.finish().unwrap();
+    assert!(mask(&file, "train").to_strings().unwrap().contains(&"demo_3".to_owned()));
+    let report = convert(&file, &out, &ConvertOptions::default(), &mut quiet).unwrap();
+    let notes: Vec<&str> = report.notes.iter().filter_map(|n| n.split_once("hdf5: ")).map(|(_, n)| n).collect();
+    assert_eq!(notes, ["mask/train: 1 of the 3 demos it names are not in the file: demo_3"]);
+    let set = Dataset::open(&out).unwrap();
+    assert_eq!(set.split("train"), Some(vec![0, 1]));
+    assert!(verify(&out, &mut quiet).unwrap().iter().all(|c| c.problem.is_none()));
+    export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
+    assert_eq!(content(&back), content(&file));
+}
+
 /// Options for files without an environment.
 fn options() -> ConvertOptions {
     ConvertOptions { fps: Some(20.0), ..ConvertOptions::default() }
@@ -397,6 +426,44 @@ fn any_array() -> impl Strategy<Value = Array> {
             }
         }
     })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 24, failure_persistence: None, ..ProptestConfig::default() })]
+    #[test]
+    fn any_mask_comes_back(
+        count in 1_usize..5,
+        masks in prop::collection::btree_map("[a-z0-9_]{1,8}", (prop::collection::vec(0_usize..9, 0..7), any::<bool>()), 1..4),
+    ) {
+        let dir = tempfile::tempdir().unwrap();
+        let (file, out, back) = (dir.path().join("a.hdf5"), dir.path().join("set"), dir.path().join("b.hdf5"));
+        let mut writer = RobomimicWriter::create(&file, &WriteOptions::default()).unwrap();
+        let demos: Vec<Demo> = (0..count).map(|i| synthetic(2 * i, 2, false)).collect();
+        let mut root = Demo::default();
+        for (name, (numbers, fixed)) in &masks {
+            let ids: Vec<String> = numbers.iter().map(|n| format!("demo_{n}")).collect();
+            let array = if *fixed { Array::from_fixed_strings(&ids) } else { Array::from_strings(vec![ids.len()], &ids) };
+            root.datasets.insert(format!("mask/{name}"), array);
+        }
+        writer.set_root(&root).unwrap();
+        for demo in &demos {
+            writer.add_demo(demo).unwrap();
+        }
+        writer.finish().unwrap();
+        let report = convert(&file, &out, &options(), &mut quiet).unwrap();
+        let set = Dataset::open(&out).unwrap();
+        for (name, (numbers, _)) in &masks {
+            // demos 0, 2, 4, ... are there, as episodes 0, 1, 2, ...
+            let there = |n: &&usize| **n % 2 == 0 && **n / 2 < count;
+            let mut episodes: Vec<usize> = numbers.iter().filter(there).map(|n| n / 2).collect();
+            episodes.sort_unstable();
+            prop_assert_eq!(set.split(name).unwrap(), &*episodes);
+            let told = report.notes.iter().any(|n| n.contains(&format!("mask/{name}: ")));
+            prop_assert_eq!(told, episodes.len() < numbers.len());
+        }
+        export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
+        prop_assert_eq!(content(&back), content(&file));
+    }
 }
 
 proptest! {

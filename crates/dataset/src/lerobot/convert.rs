@@ -3,6 +3,7 @@
 //! Threads read and encode row groups; this thread splices them into files in order and collects what the
 //! episodes say about themselves. The bytes written do not depend on the number of threads.
 
+use super::check;
 use super::encode::{ColumnSummary, GroupOutput, Job, PartSummary, PictureSummary};
 use super::features::{ConvertOptions, Mapping};
 use super::fingerprint::Fingerprint;
@@ -192,7 +193,7 @@ impl Conversion<'_> {
         files.push(meta::write_tasks(self.root, &frames.tasks)?);
         files.push(meta::write_episodes(self.root, &frames.tasks, &statistical, &frames.rows)?);
         files.push(meta::write_stats(self.root, &statistical, &frames.stats)?);
-        let info = self.info(&frames.tasks, &frames.fingerprint, source_sha256)?;
+        let info = check::sealed(self.info(&frames.tasks, &frames.fingerprint, source_sha256), self.root)?;
         files.push(meta::write_json(self.root, "meta/info.json", &info)?);
         if self.options.lossless {
             files.push(side::write_manifest(self.root, &files)?);
@@ -222,22 +223,15 @@ impl Conversion<'_> {
         })
     }
 
-    fn info(&self, tasks: &[String], fingerprint: &str, source_sha256: String) -> Result<Info> {
+    fn info(&self, tasks: &[String], fingerprint: &str, source_sha256: String) -> Info {
         let plan = self.plan;
-        let mut masks = BTreeMap::new();
-        for (name, demos) in &plan.masks {
-            let mut episodes = Vec::with_capacity(demos.len());
-            for demo in demos {
-                let unknown = || InputError::UnknownMaskDemo {
-                    path: self.source.to_path_buf(),
-                    mask: name.clone(),
-                    demo: demo.clone(),
-                };
-                episodes.push(plan.position(demo).ok_or_else(unknown)?);
-            }
+        // demos that a mask names and the file lacks are a note; the side folder keeps the mask as it is
+        let masks = plan.masks.iter().map(|(name, demos)| {
+            let mut episodes: Vec<usize> = demos.iter().filter_map(|demo| plan.position(demo)).collect();
             episodes.sort_unstable();
-            masks.insert(name.clone(), episodes);
-        }
+            (name.clone(), episodes)
+        });
+        let masks: BTreeMap<String, Vec<usize>> = masks.collect();
         let robots = plan.env_args.as_ref().and_then(|args| args.get("env_kwargs")?.get("robots").cloned());
         let robot_type = match robots {
             Some(serde_json::Value::String(name)) => Some(name),
@@ -247,7 +241,7 @@ impl Conversion<'_> {
             }
             _ => None,
         };
-        Ok(Info {
+        Info {
             codebase_version: info::CODEBASE_VERSION.to_owned(),
             robot_type,
             total_episodes: plan.demos.len(),
@@ -277,8 +271,9 @@ impl Conversion<'_> {
                 demos: plan.demos.iter().map(|d| d.id.clone()).collect(),
                 masks,
                 lossless: self.options.lossless,
+                seal: None,
             }),
-        })
+        }
     }
 }
 

@@ -183,6 +183,9 @@ pub struct Provenance {
     pub masks: BTreeMap<String, Vec<usize>>,
     /// Whether the side folder is there.
     pub lossless: bool,
+    /// sha256 of everything else in `info.json`, so that an edited number does not train other weights in silence.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seal: Option<String>,
 }
 
 /// Which action a data set holds.

@@ -1,5 +1,6 @@
 //! LeRobotDataset v3.0 directories: written from demonstrations, opened for training.
 
+mod check;
 mod convert;
 mod encode;
 mod export;

@@ -1,7 +1,8 @@
 //! An opened data set: everything but pictures in memory, ready for training.
 
+use super::check;
 use super::fingerprint::{Fingerprint, INDEX_COLUMNS};
-use super::info::{Info, Provenance};
+use super::info::{Feature, Info, Provenance};
 use super::meta::parse_stats;
 use super::read;
 use super::values::Values;
@@ -284,12 +285,11 @@ impl Dataset {
 
 /// A JSON file.
 pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
-    let text = std::fs::read(path).map_err(|source| DatasetError::Io {
-        path: path.to_path_buf(),
-        operation: "read it",
-        source,
-    })?;
-    serde_json::from_slice(&text).map_err(|source| DatasetError::Json { path: path.to_path_buf(), source })
+    serde_json::from_slice(&read_file(path)?).map_err(|source| DatasetError::Json { path: path.to_path_buf(), source })
+}
+
+fn read_file(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_path_buf(), operation: "read it", source })
 }
 
 /// `meta/info.json`, checked for a version that is understood.
@@ -310,7 +310,9 @@ pub(crate) fn read_info(root: &Path) -> Result<Info> {
             found: found.to_owned(),
         });
     }
-    let info: Info = read_json(&path)?;
+    let text = read_file(&path)?;
+    let info: Info =
+        serde_json::from_slice(&text).map_err(|source| DatasetError::Json { path: path.clone(), source })?;
     if !info.codebase_version.starts_with("v3.") {
         return Err(DatasetError::BadDataset {
             path,
@@ -319,6 +321,7 @@ pub(crate) fn read_info(root: &Path) -> Result<Info> {
             found: info.codebase_version,
         });
     }
+    check::info(&path, &text, &info)?;
     Ok(info)
 }
 
@@ -337,10 +340,10 @@ fn read_stats(root: &Path) -> Result<BTreeMap<String, FeatureStats>> {
 }
 
 fn read_tasks(root: &Path, info: &Info) -> Result<Vec<String>> {
-    if info.total_tasks == 0 {
+    let path = root.join("meta/tasks.parquet");
+    if info.total_tasks == 0 && !path.exists() {
         return Ok(Vec::new());
     }
-    let path = root.join("meta/tasks.parquet");
     // pandas calls an index without a name `__index_level_0__`
     let (rows, arrays) = match read::columns(&path, &["task_index", "task"]) {
         Err(DatasetError::NotInDataset { .. }) => read::columns(&path, &["task_index", "__index_level_0__"])?,
@@ -352,8 +355,8 @@ fn read_tasks(root: &Path, info: &Info) -> Result<Vec<String>> {
         return Err(DatasetError::BadDataset {
             path,
             object: "column task_index".to_owned(),
-            expected: format!("0 to {}, in order", info.total_tasks.saturating_sub(1)),
-            found: format!("{:?}", &indices[..indices.len().min(10)]),
+            expected: format!("{} tasks from 0 on, in order, as info.json says", info.total_tasks),
+            found: format!("{rows}: {:?}", &indices[..indices.len().min(10)]),
         });
     }
     Ok(texts)
@@ -410,24 +413,33 @@ pub(crate) fn read_episodes(root: &Path, info: &Info) -> Result<Vec<EpisodeMeta>
 
 fn read_columns(root: &Path, info: &Info, episodes: &[EpisodeMeta]) -> Result<BTreeMap<String, Resident>> {
     // whole numbers do not fit f32; the index columns follow from the episodes
-    let wanted: Vec<(&str, usize)> = info
+    let wanted: Vec<(&str, &Feature)> = info
         .features
         .0
         .iter()
         .filter(|(name, f)| !INDEX_COLUMNS.contains(&name.as_str()) && !f.is_visual() && f.dtype != "string")
-        .map(|(name, f)| (name.as_str(), f.dim()))
+        .map(|(name, f)| (name.as_str(), f))
         .collect();
     let mut names: Vec<&str> = wanted.iter().map(|(name, _)| *name).collect();
     names.push("episode_index");
+    let timed = info.features.get("timestamp").is_some();
+    if timed {
+        names.push("timestamp");
+    }
     let mut pieces: Vec<Vec<Resident>> = wanted.iter().map(|_| Vec::new()).collect();
     let mut row = 0;
     let mut episode = 0;
     for path in read::files(root, "data")? {
         let (rows, arrays) = read::columns(&path, &names)?;
-        for ((name, dim), (array, out)) in wanted.iter().zip(arrays.iter().zip(&mut pieces)) {
-            out.push(read::numbers(&path, name, array, *dim)?);
+        for ((name, feature), (array, out)) in wanted.iter().zip(arrays.iter().zip(&mut pieces)) {
+            check::stored_as(&path, name, &feature.dtype, array.data_type())?;
+            out.push(read::numbers(&path, name, array, feature.dim())?);
         }
         let owners = read::integers(&path, "episode_index", &arrays[wanted.len()])?;
+        if timed {
+            let times = read::numbers(&path, "timestamp", &arrays[wanted.len() + 1], 1)?;
+            check::rate(&path, info.fps, episodes, row, &times.data)?;
+        }
         for &owner in owners.iter() {
             while episodes.get(episode).is_some_and(|e| row >= e.to) {
                 episode += 1;
@@ -453,12 +465,12 @@ fn read_columns(root: &Path, info: &Info, episodes: &[EpisodeMeta]) -> Result<BT
         });
     }
     let mut columns = BTreeMap::new();
-    for ((name, dim), mut files) in wanted.into_iter().zip(pieces) {
+    for ((name, feature), mut files) in wanted.into_iter().zip(pieces) {
         let data = match files.len() {
             1 => files.swap_remove(0).data,
             _ => ScalarBuffer::from(files.iter().flat_map(|f| f.data.iter().copied()).collect::<Vec<f32>>()),
         };
-        columns.insert(name.to_owned(), Resident { data, dim });
+        columns.insert(name.to_owned(), Resident { data, dim: feature.dim() });
     }
     Ok(columns)
 }

@@ -357,7 +357,7 @@ fn ragged_keys_masks_and_totals_are_problems_not_failures() {
         messages,
         [
             "data: attribute total: expected 6, the steps of all demos, found 9",
-            "mask/train: names demo_7, which is not in the file",
+            "mask/train: 1 of the 2 demos it names are not in the file: demo_7",
             "demo_1: obs/object: expected float64 [3] per step as in demo_0, found float32 [4] per step",
             "demo_0: no obs/extra; found it in demo_1; here actions, dones, obs/object, rewards",
         ]

@@ -310,9 +310,16 @@ fn masks(file: &Walked, out: &mut Draft) -> Result<(), InputError> {
             out.problems.push(problem(None, None, false, error));
             continue;
         };
-        for id in ids.iter().filter(|id| !known.contains(*id)) {
-            let demo = one_line(id);
-            let error = InputError::UnknownMaskDemo { path: file.path.clone(), mask: name.clone(), demo };
+        // robomimic's own `dataset_states_to_obs --n 3` copies the masks of the whole file
+        let absent: Vec<String> = ids.iter().filter(|id| !known.contains(*id)).map(|id| one_line(id)).collect();
+        if !absent.is_empty() {
+            let error = InputError::UnknownMaskDemos {
+                path: file.path.clone(),
+                mask: name.clone(),
+                named: ids.len(),
+                count: absent.len(),
+                demos: list(absent.iter().map(String::as_str)),
+            };
             out.problems.push(problem(None, None, false, error));
         }
         out.masks.insert(name, ids);
