@@ -33,6 +33,7 @@ suite.prepare()
 import numpy as np  # noqa: E402
 from actrm_harness import protocol, wire, worker  # noqa: E402
 from actrm_harness.simulators.robosuite import control, envs  # noqa: E402
+from actrm_harness.simulators.robosuite.simulation import Robosuite  # noqa: E402
 from actrm_harness.tasks import TASKS  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
 
@@ -192,6 +193,7 @@ def framing(task: str, args: argparse.Namespace) -> Iterator[Row]:
     session = envs.make(task)
     compiled = attached(session.env)
     session.control = compiled
+    simulation = Robosuite(session)
     for count in (PLANNED, 1):
         envs.reset(session, 1)
         whole: list[float] = []
@@ -206,7 +208,7 @@ def framing(task: str, args: argparse.Namespace) -> Iterator[Row]:
                 before = time.thread_time()
                 frame = wire.read_frame(request)
                 assert frame is not None
-                reply = worker.answer(session, protocol.parse_request(frame[0]), frame[1])
+                reply = worker.answer(simulation, protocol.parse_request(frame[0]), frame[1])
                 wire.write_frame(nothing, *reply)
                 whole.append((time.thread_time() - before) / count)
                 for action in actions[index + count : index + 2 * count]:

@@ -47,12 +47,13 @@ class TimedControl:
 
 
 def start(args: Any) -> Any:
-    """The session, with a clock around its control loop."""
-    session = _start(args)
+    """The simulation, with a clock around its control loop."""
+    simulation = _start(args)
+    session = simulation.session
     if session.control is None:
         raise SystemExit("benches/timed_worker.py: the compiled loop could not be attached")
     session.control = TimedControl(session.control)
-    return session
+    return simulation
 
 
 def run(requests: Any, replies: Any) -> int:

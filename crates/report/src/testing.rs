@@ -33,6 +33,8 @@ pub(crate) fn sample(name: &str, version: u32, count: u64) -> EvaluationRecord {
             task: "Lift".into(),
             env_name: "Lift".into(),
             env_module: None,
+            env_module_sha256: None,
+            env_args_sha256: None,
             control: Control::Robosuite,
             max_steps: 400,
         },

@@ -52,7 +52,7 @@ impl CollectionRecord {
             control: ready.control,
             env_module,
             env_args: ready.env_args.clone(),
-            versions: ready.versions(),
+            versions: ready.versions.clone(),
         }
     }
 }

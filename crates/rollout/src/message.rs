@@ -1,4 +1,4 @@
-//! The messages of worker protocol version 1, as the harness speaks it.
+//! The messages of worker protocol version 2, as the harness speaks it.
 //!
 //! A worker greets with [`Ready`] (or an error) unasked; every request after that carries an `id`
 //! that its reply repeats.
@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 /// The protocol version that this program speaks.
-pub const PROTOCOL: u32 = 1;
+pub const PROTOCOL: u32 = 2;
 
 /// Which loop runs a control step inside the simulator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -18,6 +18,8 @@ pub enum Control {
     Robosuite,
     /// The compiled loop of `crates/control`.
     Compiled,
+    /// The loop of a simulator that has one only.
+    Own,
 }
 
 impl Control {
@@ -26,6 +28,7 @@ impl Control {
         match self {
             Control::Robosuite => "robosuite",
             Control::Compiled => "compiled",
+            Control::Own => "own",
         }
     }
 }
@@ -42,6 +45,7 @@ impl std::str::FromStr for Control {
         match word {
             "robosuite" => Ok(Control::Robosuite),
             "compiled" => Ok(Control::Compiled),
+            "own" => Ok(Control::Own),
             other => Err(format!("control {other:?}: expected \"robosuite\" or \"compiled\"")),
         }
     }
@@ -52,17 +56,18 @@ impl std::str::FromStr for Control {
 pub struct Ready {
     /// Protocol version; must be [`PROTOCOL`].
     pub protocol: u32,
-    /// robosuite's version.
-    pub robosuite: String,
-    /// MuJoCo's version.
-    pub mujoco: String,
-    /// The interpreter's version.
-    pub python: String,
-    /// numpy's version.
-    #[serde(default)]
-    pub numpy: String,
+    /// The simulator, by its name.
+    pub simulator: String,
+    /// The simulator's version under its name, and those of what it stands on: what a result depends on.
+    pub versions: BTreeMap<String, String>,
     /// The task, as asked for.
     pub task: String,
+    /// sha256 of the environment module's source, where one was named.
+    #[serde(default)]
+    pub module_sha256: Option<String>,
+    /// sha256 of the environment's arguments, where they are not the task's usual ones.
+    #[serde(default)]
+    pub env_args_sha256: Option<String>,
     /// The environment's class name.
     pub env_name: String,
     /// The loop really used, which may differ from the one asked for.
@@ -85,12 +90,9 @@ pub struct Ready {
 }
 
 impl Ready {
-    /// The versions that a result depends on, sorted by name.
-    pub fn versions(&self) -> BTreeMap<String, String> {
-        [("mujoco", &self.mujoco), ("numpy", &self.numpy), ("python", &self.python), ("robosuite", &self.robosuite)]
-            .into_iter()
-            .map(|(name, version)| (name.to_owned(), version.clone()))
-            .collect()
+    /// The simulator's own version.
+    pub fn simulator_version(&self) -> Option<&str> {
+        self.versions.get(&self.simulator).map(String::as_str)
     }
 }
 
@@ -243,7 +245,7 @@ mod tests {
 
     #[test]
     fn control_words_round_trip() {
-        for control in [Control::Robosuite, Control::Compiled] {
+        for control in [Control::Robosuite, Control::Compiled, Control::Own] {
             assert_eq!(control.as_str().parse::<Control>().unwrap(), control);
         }
         assert!("fast".parse::<Control>().unwrap_err().contains("expected"));

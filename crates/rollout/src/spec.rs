@@ -29,6 +29,8 @@ pub struct WorkerSpec {
     pub control: Control,
     /// A Python module of the user's that registers environments.
     pub env_module: Option<String>,
+    /// robomimic's `env_args`, for an environment other than the task's usual one: other robots or controllers.
+    pub env_args: Option<serde_json::Value>,
     /// Cameras whose images belong to the observations.
     pub cameras: Vec<String>,
     /// Edge of the cameras' images in pixels.
@@ -48,6 +50,7 @@ impl WorkerSpec {
             task: task.to_owned(),
             control: Control::Compiled,
             env_module: None,
+            env_args: None,
             cameras: Vec::new(),
             image_size: 84,
             memory_limit: Some(4 << 30),
@@ -62,6 +65,9 @@ impl WorkerSpec {
         command.args(["--control", self.control.as_str()]);
         if let Some(module) = &self.env_module {
             command.args(["--env-module", module]);
+        }
+        if let Some(env_args) = &self.env_args {
+            command.args(["--env-args", &env_args.to_string()]);
         }
         if !self.cameras.is_empty() {
             command.args(["--cameras", &self.cameras.join(",")]);

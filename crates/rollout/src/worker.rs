@@ -94,8 +94,9 @@ impl Worker {
                 Ok(Self { process, name: name.to_owned(), ready: *ready, limits: spec.limits, next_id: 0, warm: 0 })
             }
             Ok(Reply::Error { kind, message, .. }) => {
-                let refused = RolloutError::Refused { task: spec.task.clone(), kind, message };
-                Err(StartFailure::Final(spec.python.problem().unwrap_or(refused)))
+                let refused = RolloutError::Refused { task: spec.task.clone(), kind: kind.clone(), message };
+                let problem = (kind == "missing_module").then(|| spec.python.problem()).flatten();
+                Err(StartFailure::Final(problem.unwrap_or(refused)))
             }
             Ok(other) => {
                 let kind = unexpected("ready", &other);
@@ -116,7 +117,7 @@ impl Worker {
 
     /// Why robosuite's own control loop runs although the compiled one was asked for, if so.
     pub(super) fn fallback(&self, asked: Control) -> Option<String> {
-        if asked == self.ready.control {
+        if asked == self.ready.control || self.ready.control == Control::Own {
             return None;
         }
         // its stderr has little else to say at this point, and says it in one line

@@ -259,11 +259,13 @@ pub enum ZooError {
     },
     /// The entry was trained on demonstrations of another simulator generation.
     #[error(
-        "entry {entry} was trained on data of robosuite {recorded}, this is robosuite {running}: another generation, in which policies fail in silence; --force evaluates all the same"
+        "entry {entry} was trained on data of {simulator} {recorded}, this is {simulator} {running}: another generation, in which policies fail in silence; --force evaluates all the same"
     )]
     SimulatorGeneration {
         /// The entry.
         entry: String,
+        /// The simulator.
+        simulator: String,
         /// The version recorded with the data set, or `unknown`.
         recorded: String,
         /// The version that the worker runs.

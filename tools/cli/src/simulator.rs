@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
+use serde_json::Value;
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, find_python, harness_folder};
 
 use crate::{Screen, Stop, limits, note};
@@ -37,6 +38,19 @@ impl SimulatorArgs {
     pub fn spec(&self, task: &str) -> Result<WorkerSpec> {
         let mut spec = WorkerSpec::new(self.python()?, harness_folder()?, task);
         spec.env_module.clone_from(&self.env_module);
+        Ok(spec)
+    }
+
+    /// The same for an environment that was recorded with robomimic's `env_args`: its robots, its controllers, its module.
+    ///
+    /// # Errors
+    /// No Python, no harness.
+    pub fn recorded_spec(&self, task: &str, env_args: Option<&Value>) -> Result<WorkerSpec> {
+        let mut spec = self.spec(task)?;
+        if spec.env_module.is_none() {
+            spec.env_module = env_args.and_then(|args| Some(args.get("env_module")?.get("name")?.as_str()?.to_owned()));
+        }
+        spec.env_args = env_args.filter(|args| args.get("env_kwargs").is_some()).cloned();
         Ok(spec)
     }
 

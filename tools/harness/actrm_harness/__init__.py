@@ -5,4 +5,4 @@
 clocks, time-outs and files are Rust's business, not this package's.
 """
 
-PROTOCOL = 1
+PROTOCOL = 2

@@ -1,4 +1,4 @@
-"""The messages of worker protocol 1, as dataclasses. They travel as JSON beside the tensors of a frame (`wire`).
+"""The messages of worker protocol 2, as dataclasses. They travel as JSON beside the tensors of a frame (`wire`).
 
 docs/worker_protocol.md describes them with their replies. A field with a default may be left out.
 """
@@ -14,11 +14,14 @@ class Ready:
     """Sent unasked after start: what this worker is and what its environment takes and gives."""
 
     protocol: int
-    robosuite: str
-    mujoco: str
-    python: str
-    numpy: str
+    simulator: str
+    versions: dict[str, str]
+    """The simulator's version under its name, and those of what it stands on."""
     task: str
+    module_sha256: str | None
+    """What the environment module says, where one was named."""
+    env_args_sha256: str | None
+    """What the environment's arguments are, where they are not the task's usual ones."""
     env_name: str
     control: str
     control_freq: int

@@ -7,12 +7,14 @@ adds a row with `register`. Nothing here imports a simulator: what a row names i
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 DEFAULT_MAX_STEPS = 400
 
 PACKAGE = "actrm_harness"
+
+PANDAS = {"robots": ["Panda", "Panda"]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +32,8 @@ class Task:
     max_steps: int = DEFAULT_MAX_STEPS
     soft_reset: bool = False
     """Whether the model may be kept between episodes."""
+    arguments: dict[str, Any] = field(default_factory=dict[str, Any])
+    """What the environment's class is given beside the usual."""
     redraw: str | None = None
     """The place of a function that draws into a kept model what loading the model would draw."""
 
@@ -58,6 +62,9 @@ TASKS = {
             soft_reset=True,
             max_steps=600,
         ),
+        Task("TwoArmLift", arguments=PANDAS),
+        Task("TwoArmHandover", arguments=PANDAS),
+        Task("TwoArmTransport", arguments=PANDAS, max_steps=700),
     )
 }
 

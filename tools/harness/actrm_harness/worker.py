@@ -7,20 +7,16 @@ can get into the stream.
 
 import argparse
 import importlib
+import json
 import os
 import platform
 import sys
 import traceback
-from functools import cache
-from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn, cast
 
-from actrm_harness import PROTOCOL, protocol, wire
+from actrm_harness import PROTOCOL, protocol, simulators, source, tasks, wire
 from actrm_harness.protocol import RequestError, error_message
-
-if TYPE_CHECKING:
-    from actrm_harness.simulators.robosuite.envs import Session
-    from actrm_harness.simulators.robosuite.episodes import Episode
-
+from actrm_harness.simulators import Episode, Simulation, Stored
 
 # What has to be set before the interpreter starts. Sets of names must not be ordered by chance (robosuite draws from
 # one), and one thread a library keeps their buffers small: a worker computes on one core.
@@ -57,8 +53,8 @@ def run(requests: BinaryIO, replies: BinaryIO) -> int:
     """Start and serve; the exit code."""
     args = arguments()
     try:
-        session = start(args)
-        wire.write_frame(replies, protocol.ready_message(describe(session)))
+        simulation = start(args)
+        wire.write_frame(replies, protocol.ready_message(describe(args, simulation)))
     except RequestError as error:
         wire.write_frame(replies, error_message(error.kind, str(error)))
         return 1
@@ -71,7 +67,7 @@ def run(requests: BinaryIO, replies: BinaryIO) -> int:
         wire.write_frame(replies, error_message("start_failed", f"{type(error).__name__}: {error}"))
         return 1
     try:
-        return serve(session, requests, replies)
+        return serve(simulation, requests, replies)
     except BrokenPipeError:
         return 1
 
@@ -79,24 +75,20 @@ def run(requests: BinaryIO, replies: BinaryIO) -> int:
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="actrm_harness.worker", description=__doc__)
-    parser.add_argument("--task", required=True, help="environment name, as robosuite knows it")
+    parser.add_argument("--task", required=True, help="a task of the table, or an environment of the simulator")
     parser.add_argument(
         "--control", default="compiled", choices=["robosuite", "compiled"], help="the inner loop (default: %(default)s)"
     )
     parser.add_argument("--env-module", help="Python module to import first: it registers further environments")
+    parser.add_argument("--env-args", help="robomimic's env_args as JSON: robots and controllers other than the usual")
     parser.add_argument("--cameras", default="", help="cameras to observe, separated by commas")
     parser.add_argument("--size", type=int, default=84, help="height and width of camera images")
     return parser.parse_args()
 
 
-def start(args: argparse.Namespace) -> "Session":
+def start(args: argparse.Namespace) -> Simulation:
     """Import the simulator and make the environment."""
-    from actrm_harness.simulators.robosuite import suite
-
-    suite.prepare()
-    from actrm_harness.simulators.robosuite import envs
-
-    suite.robosuite()
+    simulators.prepare(tasks.row(args.task).simulator)
     if args.env_module:
         try:
             importlib.import_module(args.env_module)
@@ -105,42 +97,53 @@ def start(args: argparse.Namespace) -> "Session":
                 "env_module", f"cannot import environment module {args.env_module!r}: {error}"
             ) from error
     cameras = tuple(name for name in args.cameras.split(",") if name)
-    session = envs.make(args.task, cameras, args.size)
-    if args.control == "compiled":
-        from actrm_harness.simulators.robosuite import control
-
-        session.control = control.attach(session.env)
-    return session
-
-
-def describe(session: "Session") -> protocol.Ready:
-    """The handshake: versions, shapes and the environment's arguments."""
-    import numpy as np
-
-    from actrm_harness.simulators.robosuite import envs, suite
-
-    low, high = session.env.action_spec
-    shapes = {name: list(value.shape) for name, value in envs.reset(session, 0).items()}
-    return protocol.Ready(
-        protocol=PROTOCOL,
-        robosuite=suite.robosuite().__version__,
-        mujoco=suite.mujoco().__version__,
-        python=platform.python_version(),
-        numpy=np.__version__,
-        task=session.task.name,
-        env_name=session.task.name,
-        control="robosuite" if session.control is None else "compiled",
-        control_freq=int(session.env.control_freq),
-        max_steps=session.task.max_steps,
-        action_dim=int(low.shape[0]),
-        action_low=low.tolist(),
-        action_high=high.tolist(),
-        observations=shapes,
-        env_args=session.env_args,
+    return simulators.start(
+        simulators.Options(tasks.row(args.task), args.control, cameras, args.size, env_args(args.env_args))
     )
 
 
-def serve(session: "Session", requests: BinaryIO, replies: BinaryIO) -> int:
+def env_args(text: str | None) -> dict[str, Any] | None:
+    """Robomimic's `env_args` from the command line."""
+    if text is None:
+        return None
+    try:
+        found: object = json.loads(text)
+    except ValueError as error:
+        raise RequestError("env_args", f"env_args are not JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise RequestError("env_args", f"env_args must be an object, got {text[:60]!r}")
+    return cast("dict[str, Any]", found)
+
+
+def describe(args: argparse.Namespace, simulation: Simulation) -> protocol.Ready:
+    """The handshake: versions, shapes and the environment's arguments."""
+    task = tasks.row(args.task)
+    found = simulation.describe()
+    arguments, sha256 = found.env_args, None
+    if args.env_module:
+        sha256 = source.digest(args.env_module)
+        # robomimic's readers take what they know of it
+        arguments = {**arguments, "env_module": {"name": args.env_module, "sha256": sha256}}
+    return protocol.Ready(
+        protocol=PROTOCOL,
+        simulator=task.simulator,
+        versions=found.versions,
+        task=task.name,
+        module_sha256=sha256,
+        env_args_sha256=found.unusual,
+        env_name=found.env_name,
+        control=found.control,
+        control_freq=found.control_freq,
+        max_steps=task.max_steps,
+        action_dim=int(found.action_low.shape[0]),
+        action_low=found.action_low.tolist(),
+        action_high=found.action_high.tolist(),
+        observations=found.observations,
+        env_args=arguments,
+    )
+
+
+def serve(simulation: Simulation, requests: BinaryIO, replies: BinaryIO) -> int:
     """Answer requests until the stream ends or asks to close; the exit code."""
     while True:
         try:
@@ -158,7 +161,7 @@ def serve(session: "Session", requests: BinaryIO, replies: BinaryIO) -> int:
             if isinstance(request, protocol.Close):
                 wire.write_frame(replies, {"type": "closed", "id": request.id})
                 return 0
-            reply, data = answer(session, request, tensors)
+            reply, data = answer(simulation, request, tensors)
         except RequestError as error:
             reply, data = error_message(error.kind, str(error), number), {}
         except Exception as error:
@@ -170,62 +173,48 @@ def serve(session: "Session", requests: BinaryIO, replies: BinaryIO) -> int:
 Answer = tuple[wire.Message, wire.Tensors]
 
 
-def answer(session: "Session", request: protocol.Request, tensors: wire.Tensors) -> Answer:
+def answer(simulation: Simulation, request: protocol.Request, tensors: wire.Tensors) -> Answer:
     """The reply to one request."""
     # first what is asked most, between two steps of physics
     if isinstance(request, protocol.Step):
-        return step_reply(session, request.id, tensor(tensors, "action"))
-    return answer_seldom(session, request, tensors)
-
-
-def step_reply(session: "Session", number: int, actions: wire.Array) -> Answer:
-    """Do one action, or one after the other until the task is solved; what the last one led to, and all rewards."""
-    envs = environments()
-    checked = envs.check_actions(session.env, actions)
-    if not len(checked):
-        raise RequestError("bad_action", f"step: no action in a tensor of shape {actions.shape}")
-    envs.slim(session)
-    result, rewards = envs.steps_session(session, checked)
-    reply = {"type": "step", "id": number, "reward": result.reward, "success": result.success}
-    return reply, {"rewards": rewards, **{f"obs/{name}": value for name, value in result.observation.items()}}
-
-
-def answer_seldom(session: "Session", request: protocol.Request, tensors: wire.Tensors) -> Answer:
-    """The reply to a request that is not a step."""
-    from actrm_harness.simulators.robosuite import envs, episodes
-
+        stepped = simulation.step(tensor(tensors, "action"))
+        reply: wire.Message = {
+            "type": "step",
+            "id": request.id,
+            "reward": float(stepped.rewards[-1]),
+            "success": stepped.success,
+        }
+        return reply, {"rewards": stepped.rewards, **observed(stepped.observation)}
     if isinstance(request, protocol.Reset):
-        first = envs.reset(session, request.seed, request.split == "demonstration")
-        ep_meta = session.env.get_ep_meta()
+        first = simulation.reset(request.seed, request.split == "demonstration")
         reply = {
             "type": "reset",
             "id": request.id,
-            "fingerprint": envs.fingerprint(session.env),
+            "fingerprint": first.fingerprint,
             "split": request.split,
-            "group": ep_meta.get("group"),
-            "ep_meta": ep_meta,
+            "group": first.ep_meta.get("group"),
+            "ep_meta": first.ep_meta,
         }
-        return reply, {f"obs/{name}": value for name, value in first.items()}
+        return reply, observed(first.observation)
     if isinstance(request, protocol.Expert):
-        episode = episodes.expert_episode(session, request.seed, request.split == "demonstration")
+        episode = simulation.expert(request.seed, request.split == "demonstration")
         return episode_reply("expert", request.id, episode), episode.tensors
     if isinstance(request, protocol.Extract):
-        states, actions = tensor(tensors, "states"), tensor(tensors, "actions")
-        episode = episodes.extract(session, states, actions, request.model_file, request.ep_meta)
+        stored = Stored(tensor(tensors, "states"), tensor(tensors, "actions"), request.model_file, request.ep_meta)
+        episode = simulation.extract(stored)
         return episode_reply("extract", request.id, episode), episode.tensors
     if isinstance(request, protocol.Render):
-        image = envs.image(session, request.camera, *request.size)
+        image = simulation.image(request.camera, *request.size)
         return {"type": "render", "id": request.id}, {"image": image}
     raise RequestError("unknown_request", f"request {request!r} cannot be answered")
 
 
-@cache
-def environments() -> Any:
-    """The module `envs`, which is imported late, as it brings the simulator."""
-    return importlib.import_module("actrm_harness.simulators.robosuite.envs")
+def observed(observation: wire.Tensors) -> wire.Tensors:
+    """Observations, under the names that they travel by."""
+    return {f"obs/{name}": value for name, value in observation.items()}
 
 
-def episode_reply(kind: str, number: int, episode: "Episode") -> wire.Message:
+def episode_reply(kind: str, number: int, episode: Episode) -> wire.Message:
     """The message that goes with a recorded episode's tensors."""
     return {
         "type": kind,

@@ -386,6 +386,8 @@ impl<'a> Run<'a> {
             task: experiment.task.puzzle.clone(),
             env_name: None,
             env_version: None,
+            env_module: None,
+            env_args: None,
             parameters: self.solver.parameters(),
             state_keys: Vec::new(),
             env_keys: Vec::new(),

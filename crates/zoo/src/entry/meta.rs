@@ -33,6 +33,12 @@ pub struct EntryMeta {
     pub env_name: Option<String>,
     /// Version of the simulator that recorded the demonstrations.
     pub env_version: Option<String>,
+    /// The user's module that registers the environment, as the demonstrations were recorded with it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub env_module: Option<ModuleMeta>,
+    /// robomimic's arguments of the demonstrations' environment: its robots and controllers.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub env_args: Option<serde_json::Value>,
     /// Number of weights.
     pub parameters: u64,
     /// Observation keys that make `observation.state`, in order.
@@ -55,6 +61,22 @@ pub struct EntryMeta {
     pub versions: BTreeMap<String, String>,
     /// Every other file of the entry.
     pub files: BTreeMap<String, FileMeta>,
+}
+
+/// A Python module that registers environments.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct ModuleMeta {
+    /// Its name, as Python imports it.
+    pub name: String,
+    /// SHA-256 of its source.
+    pub sha256: String,
+}
+
+impl ModuleMeta {
+    /// The module that `env_args` name, if they do.
+    pub fn of(env_args: &serde_json::Value) -> Option<Self> {
+        serde_json::from_value(env_args.get("env_module")?.clone()).ok()
+    }
 }
 
 /// The demonstrations behind an entry.

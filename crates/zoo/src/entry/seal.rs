@@ -124,6 +124,8 @@ pub(crate) mod tests {
                 task: "Lift".to_owned(),
                 env_name: Some("Lift".to_owned()),
                 env_version: Some("1.5.2".to_owned()),
+                env_module: None,
+                env_args: None,
                 parameters: 12,
                 state_keys: vec!["robot0_eef_pos".to_owned()],
                 env_keys: vec!["object".to_owned()],

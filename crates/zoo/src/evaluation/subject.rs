@@ -39,7 +39,7 @@ impl Subject<'_> {
     /// [`ZooError::SimulatorGeneration`] and [`ZooError::UnfitEntry`].
     pub fn record(&self, ready: &Ready, options: &EvaluationOptions) -> Result<EvaluationRecord, ZooError> {
         if !options.force {
-            check_generation(&self.entry, self.env_version.as_deref(), &ready.robosuite)?;
+            check_generation(&self.entry, self.env_version.as_deref(), &ready.simulator, ready.simulator_version())?;
         }
         self.check_dims(ready)?;
         Ok(EvaluationRecord {
@@ -51,13 +51,15 @@ impl Subject<'_> {
                 task: ready.task.clone(),
                 env_name: ready.env_name.clone(),
                 env_module: options.env_module.clone(),
+                env_module_sha256: ready.module_sha256.clone(),
+                env_args_sha256: ready.env_args_sha256.clone(),
                 control: ready.control,
                 max_steps: self.max_steps.unwrap_or(ready.max_steps),
             },
             execution: self.execution,
             seeds: options.seeds,
             shard: options.shard,
-            versions: ready.versions(),
+            versions: ready.versions.clone(),
         })
     }
 
@@ -105,20 +107,27 @@ impl Subject<'_> {
     }
 }
 
-/// robosuite's generation: major and minor version.
+/// A simulator's generation: major and minor version.
 fn generation(version: &str) -> Option<(u32, u32)> {
     let mut parts = version.split('.');
     Some((parts.next()?.trim().parse().ok()?, parts.next()?.trim().parse().ok()?))
 }
 
-fn check_generation(entry: &EntryIdentity, recorded: Option<&str>, running: &str) -> Result<(), ZooError> {
-    if recorded.is_some_and(|r| generation(r).is_some() && generation(r) == generation(running)) {
+fn check_generation(
+    entry: &EntryIdentity,
+    recorded: Option<&str>,
+    simulator: &str,
+    running: Option<&str>,
+) -> Result<(), ZooError> {
+    let runs = running.and_then(generation);
+    if recorded.is_some_and(|r| generation(r).is_some() && generation(r) == runs) {
         return Ok(());
     }
     Err(ZooError::SimulatorGeneration {
         entry: entry.to_string(),
         recorded: recorded.unwrap_or("unknown (none is recorded)").to_owned(),
-        running: running.to_owned(),
+        simulator: simulator.to_owned(),
+        running: running.unwrap_or("of an unknown version").to_owned(),
     })
 }
 
@@ -130,7 +139,7 @@ mod tests {
     #[test]
     fn generations_are_major_and_minor() {
         let entry = EntryIdentity { name: "a".into(), version: 1, hash: String::new() };
-        let check = |recorded| check_generation(&entry, recorded, "1.5.2");
+        let check = |recorded| check_generation(&entry, recorded, "robosuite", Some("1.5.2"));
         check(Some("1.5.2")).unwrap();
         check(Some("1.5.0")).unwrap();
         for other in [Some("1.4.1"), Some("2.5.2"), Some(""), None] {

@@ -93,6 +93,8 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             task: options.task.clone(),
             env_name: None,
             env_version: None,
+            env_module: None,
+            env_args: None,
             parameters: model.params().count() as u64,
             state_keys: experiment.data.state_keys.clone(),
             env_keys: experiment.data.env_keys.clone(),

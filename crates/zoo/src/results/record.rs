@@ -19,6 +19,12 @@ pub struct Protocol {
     pub env_name: String,
     /// The module of the user's that registers the environment, if any.
     pub env_module: Option<String>,
+    /// sha256 of that module's source; older evaluations do not record it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub env_module_sha256: Option<String>,
+    /// sha256 of the environment's arguments (robots, controllers), where they are not the task's usual ones.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub env_args_sha256: Option<String>,
     /// The control loop that was really used.
     pub control: Control,
     /// Control steps after which an episode counts as failed.
@@ -277,6 +283,8 @@ pub(crate) mod tests {
                 task: "Lift".into(),
                 env_name: "Lift".into(),
                 env_module: None,
+                env_module_sha256: None,
+                env_args_sha256: None,
                 control: Control::Robosuite,
                 max_steps: 400,
             },
@@ -312,11 +320,13 @@ pub(crate) mod tests {
     #[test]
     fn whatever_can_change_an_outcome_changes_the_folder() {
         let first = sample("a", 1, 20);
-        let changes: [fn(&mut EvaluationRecord); 8] = [
+        let changes: [fn(&mut EvaluationRecord); 10] = [
             |r| r.entry.hash = "0".repeat(64),
             |r| r.entry.version = 2,
             |r| r.protocol.max_steps = 401,
             |r| r.protocol.control = Control::Compiled,
+            |r| r.protocol.env_module_sha256 = Some("0".repeat(64)),
+            |r| r.protocol.env_args_sha256 = Some("0".repeat(64)),
             |r| r.execution = Execution::RecedingHorizon { n_action_steps: 4 },
             |r| r.seeds.count = 21,
             |r| drop(r.versions.insert("mujoco".into(), "3.3.8".into())),

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use candle_core::Tensor;
-use dataset::WindowBatch;
+use dataset::{EnvMeta, WindowBatch};
 use models::{
     ACTION, Batch, Dims, ENVIRONMENT_STATE, ModelError, Normaliser, PolicyModel, STATE, Trainer, TrainerState,
 };
 use serde::{Deserialize, Serialize};
 
-use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta, TrainingMeta};
+use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta, ModuleMeta, TrainingMeta};
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors, write_atomic};
 
@@ -176,8 +176,7 @@ fn train_in(
     if !run.go(stop, on_event)? {
         return Ok(TrainOutcome::Stopped { step: run.step, run: folder.path().to_owned() });
     }
-    let env = dataset.env().map(|env| (env.env_name.clone(), env.env_version.clone()));
-    let draft = run.draft(&request.name, env)?;
+    let draft = run.draft(&request.name, dataset.env())?;
     let minutes = run.seconds() / 60.0;
     let entry = draft.seal(&request.zoo)?;
     let finished = serde_json::json!({"entry": entry.to_string(), "minutes": minutes, "steps": run.step});
@@ -353,11 +352,10 @@ impl<'a> Run<'a> {
     }
 
     /// The entry that this run has earned.
-    fn draft(&mut self, name: &str, env: Option<(String, Option<String>)>) -> Result<EntryDraft, ZooError> {
+    fn draft(&mut self, name: &str, env: Option<&EnvMeta>) -> Result<EntryDraft, ZooError> {
         let (experiment, demonstrations) = (self.experiment, self.demonstrations);
         self.take_evaluated()?;
         let section = &experiment.train;
-        let (env_name, env_version) = env.map_or((None, None), |(name, version)| (Some(name), version));
         let weights = self.evaluated.params().tensors();
         let dims = demonstrations.dims;
         let policy = experiment.policy_type();
@@ -369,8 +367,10 @@ impl<'a> Run<'a> {
             experiment: name.to_owned(),
             policy: policy.clone(),
             task: experiment.task.name.clone(),
-            env_name,
-            env_version,
+            env_name: env.map(|env| env.env_name.clone()),
+            env_version: env.and_then(|env| env.env_version.clone()),
+            env_module: env.and_then(|env| ModuleMeta::of(&env.env_args)),
+            env_args: env.map(|env| env.env_args.clone()).filter(serde_json::Value::is_object),
             parameters: self.evaluated.params().count() as u64,
             state_keys: experiment.data.state_keys.clone(),
             env_keys: experiment.data.env_keys.clone(),

@@ -55,7 +55,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let stop = Stop::install("stopped; nothing was written")?;
     let out = args.out.clone();
     stop.last_act(move || recording::remove_unfinished(&out));
-    let mut spec = args.simulator.spec(&task)?;
+    let mut spec = args.simulator.recorded_spec(&task, plan.env_args.as_ref())?;
     args.cameras.set(&mut spec);
     let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
         cli::note("stopped; nothing was written");

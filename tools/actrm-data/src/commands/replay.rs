@@ -52,7 +52,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         true => rebuild(&args.input, rebuilt.path())?,
         false => args.input.clone(),
     };
-    let (task, recorded) = read(args, &file)?;
+    let (task, env_args, recorded) = read(args, &file)?;
     let id = recorded.id.clone();
     let recording = Recording::of(&recorded).with_context(|| args.input.display().to_string())?;
     let steps = rows(&recording.actions);
@@ -62,7 +62,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
 
     let stop = Stop::install("stopped; nothing was written")?;
-    let mut spec = args.simulator.spec(&task)?;
+    let mut spec = args.simulator.recorded_spec(&task, env_args.as_ref())?;
     (spec.cameras, spec.image_size) = (vec![args.camera.clone()], usize::from(args.size));
     let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
         cli::note("stopped; nothing was written");
@@ -131,8 +131,8 @@ fn rebuild(set: &Path, folder: &Path) -> Result<PathBuf> {
     Ok(file)
 }
 
-/// The task and the demo that was asked for, with what replaying needs.
-fn read(args: &Args, file: &Path) -> Result<(String, Demo)> {
+/// The task, its environment's arguments and the demo that was asked for, with what replaying needs.
+fn read(args: &Args, file: &Path) -> Result<(String, Option<serde_json::Value>, Demo)> {
     let shown = args.input.display();
     let source = Source::open_guarded(file)?;
     let plan = source.plan();
@@ -151,7 +151,7 @@ fn read(args: &Args, file: &Path) -> Result<(String, Demo)> {
         }
     }
     let demo = source.read_demo_where(index, &|key| key == "states" || key == "actions")?;
-    Ok((task, demo))
+    Ok((task, plan.env_args.clone(), demo))
 }
 
 fn rows(tensor: &FrameTensor) -> usize {

@@ -9,7 +9,7 @@ use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits, shown};
 use report::{LeaderboardRow, wilson_interval};
 use rollout::{Control, Pool, video};
-use zoo::entry::{EntryId, LoadedEntry};
+use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, FIRST_SEED, Progress, Subject, View, evaluate, film};
 use zoo::registry::Registry;
 use zoo::results::{Execution, ResultsFolder, Seeds, Shard, StoredEvaluation};
@@ -114,20 +114,23 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let stop = Stop::install(GOES_ON)?;
     // one bad entry must not keep the others from being evaluated
     let mut failures: Vec<anyhow::Error> = Vec::new();
-    // one set of simulators serves all entries of a task
-    let mut by_task: BTreeMap<String, Vec<LoadedEntry>> = BTreeMap::new();
+    // one set of simulators serves all entries of an environment
+    let mut by_environment: BTreeMap<EnvironmentKey, Vec<LoadedEntry>> = BTreeMap::new();
     for id in ids {
         match open(args, &registry, &id).with_context(|| format!("entry {id}")) {
-            Ok(Some((task, loaded))) => by_task.entry(task).or_default().push(loaded),
+            Ok(Some(loaded)) => {
+                let environment = EnvironmentKey::of(args, loaded.entry().meta());
+                by_environment.entry(environment).or_default().push(loaded);
+            }
             Ok(None) => {}
             Err(error) => failures.push(error),
         }
     }
-    for (task, entries) in &by_task {
+    for (environment, entries) in &by_environment {
         if stop.asked() {
             break;
         }
-        if let Err(error) = evaluate_task(args, task, entries, &stop, &mut failures) {
+        if let Err(error) = evaluate_on(args, environment, entries, &stop, &mut failures) {
             failures.push(error);
         }
     }
@@ -141,23 +144,56 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// An entry with the task that its policy is to be evaluated on; one that solves puzzles is evaluated at once.
-fn open(args: &Args, registry: &Registry, id: &EntryId) -> anyhow::Result<Option<(String, LoadedEntry)>> {
+/// What simulators are started for.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct EnvironmentKey {
+    task: String,
+    env_module: Option<String>,
+    /// As JSON text.
+    env_args: Option<String>,
+}
+
+impl EnvironmentKey {
+    /// The environment of an entry's demonstrations, unless the command line says otherwise.
+    fn of(args: &Args, meta: &EntryMeta) -> Self {
+        let recorded = || meta.env_module.as_ref().map(|module| module.name.clone());
+        let env_module = args.simulator.env_module.clone().or_else(recorded);
+        match args.task.clone().filter(|task| *task != meta.task) {
+            // another task's environment has arguments of its own
+            Some(task) => Self { task, env_module, env_args: None },
+            None => {
+                let env_args = meta.env_args.as_ref().map(serde_json::Value::to_string);
+                Self { task: meta.task.clone(), env_module, env_args }
+            }
+        }
+    }
+}
+
+/// Says so where the demonstrations were recorded by other rules than the evaluation will play by.
+fn note_other_module(meta: &EntryMeta, running: Option<&str>) {
+    if let (Some(module), Some(running)) = (&meta.env_module, running)
+        && module.sha256 != running
+    {
+        let (id, name) = (meta.id(), &module.name);
+        cli::note(&format!("note: {id}: {name} is not as it was when its demonstrations were recorded"));
+    }
+}
+
+/// An entry whose policy is to be evaluated; one that solves puzzles is evaluated at once.
+fn open(args: &Args, registry: &Registry, id: &EntryId) -> anyhow::Result<Option<LoadedEntry>> {
     let entry = registry.entry(&id.to_string())?;
     if !entry.meta().is_robot_policy() {
         let line = evaluate_solver(&entry, args.task.as_deref(), &args.puzzles, &args.results.folder(&args.zoo))?;
         cli::print(&(line + "\n"))?;
         return Ok(None);
     }
-    let loaded = entry.load()?;
-    let task = args.task.clone().unwrap_or_else(|| loaded.entry().meta().task.clone());
-    Ok(Some((task, loaded)))
+    Ok(Some(entry.load()?))
 }
 
-/// Evaluates the entries of a task on one set of simulators.
-fn evaluate_task(
+/// Evaluates the entries of an environment on one set of simulators.
+fn evaluate_on(
     args: &Args,
-    task: &str,
+    environment: &EnvironmentKey,
     entries: &[LoadedEntry],
     stop: &Stop,
     failures: &mut Vec<anyhow::Error>,
@@ -173,12 +209,18 @@ fn evaluate_task(
     if subjects.is_empty() {
         return Ok(());
     }
-    let mut spec = args.simulator.spec(task)?;
+    let task = &environment.task;
+    let env_args = environment.env_args.as_deref().map(serde_json::from_str).transpose()?;
+    let mut spec = args.simulator.recorded_spec(task, env_args.as_ref())?;
+    spec.env_module.clone_from(&environment.env_module);
     spec.control = args.control;
     spec.limits.step = Duration::from_secs(args.step_timeout);
     let Some(mut pool) = args.simulator.start(spec, args.worker_logs.clone(), stop)? else { return Ok(()) };
+    for entry in entries {
+        note_other_module(entry.entry().meta(), pool.ready().module_sha256.as_deref());
+    }
     for subject in &subjects {
-        if let Err(error) = evaluate_entry(args, subject, &mut pool, stop) {
+        if let Err(error) = evaluate_entry(args, environment, subject, &mut pool, stop) {
             failures.push(error);
         }
         if stop.asked() {
@@ -214,11 +256,17 @@ fn subject(args: &Args, loaded: &LoadedEntry) -> anyhow::Result<Subject<'static>
 }
 
 /// Evaluates one entry and films it, as far as nobody asks to stop.
-fn evaluate_entry(args: &Args, subject: &Subject<'_>, pool: &mut Pool, stop: &Stop) -> anyhow::Result<()> {
+fn evaluate_entry(
+    args: &Args,
+    environment: &EnvironmentKey,
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+    stop: &Stop,
+) -> anyhow::Result<()> {
     let options = EvaluationOptions {
         seeds: Seeds { start: args.seed, count: args.episodes },
         shard: args.shard,
-        env_module: args.simulator.env_module.clone(),
+        env_module: environment.env_module.clone(),
         force: args.force,
     };
     let results = args.results.folder(&args.zoo);

@@ -1,1 +1,126 @@
-"""The simulators that a worker can hold, one folder each. `tasks` says which of them a task needs."""
+"""The simulators that a worker can hold, one folder each, and what a worker asks of one.
+
+A row of `tasks` names its simulator: a module of this package, or any other module that Python finds, with a
+function `start(options: Options) -> Simulation`. Importing that module must not import the simulator: `start` does. A
+function `prepare()`, if there is one, sets what has to be set before anybody imports the simulator.
+"""
+
+import importlib
+import importlib.util
+from dataclasses import dataclass, field
+from typing import Any, Protocol, cast
+
+from actrm_harness.tasks import Task
+from actrm_harness.wire import Array, Tensors
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What a worker was told to be."""
+
+    task: Task
+    control: str = "compiled"
+    cameras: tuple[str, ...] = ()
+    size: int = 84
+    env_args: dict[str, Any] | None = None
+    """robomimic's `env_args` of an environment that is not the task's usual one: other robots or controllers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What an environment takes and gives, and what it runs on."""
+
+    env_name: str
+    control: str
+    control_freq: int
+    action_low: Array
+    action_high: Array
+    observations: dict[str, list[int]]
+    versions: dict[str, str]
+    """The simulator's version, under its name, and those of what it stands on."""
+    env_args: dict[str, Any] = field(default_factory=dict[str, Any])
+    unusual: str | None = None
+    """SHA-256 of the environment's arguments, where they are not the task's usual ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Initial:
+    """What a reset left."""
+
+    observation: Tensors
+    fingerprint: str
+    """SHA-256 of the initial state."""
+    ep_meta: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Stepped:
+    """What control steps led to."""
+
+    observation: Tensors
+    rewards: Array
+    """Of each step that was done; success ends them early."""
+    success: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One recorded episode and the attributes of its demo."""
+
+    success: bool
+    steps: int
+    attrs: dict[str, str]
+    tensors: Tensors
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """A stored episode: robomimic's arrays, and what its attributes say."""
+
+    states: Array
+    actions: Array
+    model_file: str
+    ep_meta: dict[str, Any]
+
+
+class Simulation(Protocol):
+    """One environment of a simulator. What cannot be done is a `RequestError`."""
+
+    def describe(self) -> Description:
+        """What it is; before anything else is asked."""
+        ...
+
+    def reset(self, seed: int, demonstration: bool) -> Initial:
+        """Begin the episode of `seed`, which depends on the seed alone."""
+        ...
+
+    def step(self, actions: Array) -> Stepped:
+        """Do one action, or one a row until the task is solved."""
+        ...
+
+    def expert(self, seed: int, demonstration: bool) -> Episode:
+        """One whole episode of the task's scripted expert."""
+        ...
+
+    def extract(self, stored: Stored) -> Episode:
+        """What stored states look like."""
+        ...
+
+    def image(self, camera: str, height: int, width: int) -> Array:
+        """What a camera sees now: U8 of (height, width, 3)."""
+        ...
+
+
+def start(options: Options) -> Simulation:
+    """Start the simulator that the task's row names."""
+    return cast(Simulation, _module(options.task.simulator).start(options))
+
+
+def prepare(simulator: str) -> None:
+    """Set what has to be set before anybody imports this simulator."""
+    getattr(_module(simulator), "prepare", lambda: None)()
+
+
+def _module(simulator: str) -> Any:
+    own = f"{__name__}.{simulator}"
+    return importlib.import_module(own if importlib.util.find_spec(own) else simulator)

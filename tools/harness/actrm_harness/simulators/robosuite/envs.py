@@ -59,6 +59,8 @@ class Session:
     renderer: "Renderer | None" = None
     foreign_model: bool = False
     xml_forgotten: bool = False
+    unusual: str | None = None
+    """SHA-256 of the arguments, where they are not the task's usual ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +72,17 @@ class StepResult:
     success: bool
 
 
-def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Session:
-    """Make the environment of a task; RequestError("unknown_task") where there is none of that name."""
+# What this package decides whatever recorded arguments say: what is drawn, and when an episode ends.
+_DECIDED = ("camera_", "render", "has_", "hard_reset", "horizon", "seed", "env_lang")
+
+
+def make(
+    task_name: str, cameras: tuple[str, ...] = (), size: int = 84, env_args: dict[str, Any] | None = None
+) -> Session:
+    """Make the environment of a task; RequestError("unknown_task") where there is none of that name.
+
+    `env_args` are robomimic's: robots, controllers and whatever else they say take the place of the task's usual ones.
+    """
     for defined_in in sorted(
         {task.defined_in for task in TASKS.values() if task.defined_in and task.simulator == "robosuite"}
     ):
@@ -80,10 +91,15 @@ def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Sessi
     if task_name not in known:
         raise RequestError("unknown_task", f"unknown task {task_name!r}; known: {', '.join(known)}")
     task = row(task_name)
-    kwargs: dict[str, Any] = {
-        "robots": "Panda",
-        "controller_configs": suite.panda_controller(),
-        "reward_shaping": False,
+    usual = arguments(task, {})
+    kwargs = usual if env_args is None else arguments(task, recorded(env_args))
+    unusual = None
+    if kwargs != usual:
+        unusual = hashlib.sha256(json.dumps(kwargs, sort_keys=True).encode()).hexdigest()
+        # what keeping the model leaves in place, and what an expert can do, is known of the usual robot only
+        task = replace(task, soft_reset=False, expert=None)
+    # in robomimic's order
+    kwargs |= {
         "has_renderer": False,
         "has_offscreen_renderer": bool(cameras),
         "ignore_done": True,
@@ -93,7 +109,7 @@ def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Sessi
     }
     if cameras:
         kwargs |= {"camera_names": list(cameras), "camera_heights": size, "camera_widths": size}
-    env_args: dict[str, Any] = {
+    described: dict[str, Any] = {
         "env_name": task_name,
         "env_version": suite.robosuite().__version__,
         "type": 1,
@@ -102,13 +118,42 @@ def make(task_name: str, cameras: tuple[str, ...] = (), size: int = 84) -> Sessi
     lean.prepare()
     # Images are drawn by `render`, so that an episode is the same with cameras and without.
     kwargs |= {"has_offscreen_renderer": False, "use_camera_obs": False}
-    env = cast(
-        Env,
-        suite.robosuite().make(
-            task_name, **kwargs, control_freq=CONTROL_FREQ, hard_reset=not task.soft_reset, renderer="mujoco", seed=0
-        ),
-    )
-    return Session(env=env, task=task, env_args=env_args, cameras=cameras, image_size=size)
+    kwargs.setdefault("control_freq", CONTROL_FREQ)
+    try:
+        env = suite.robosuite().make(task_name, **kwargs, hard_reset=not task.soft_reset, renderer="mujoco", seed=0)
+    except (TypeError, KeyError, AssertionError, ValueError) as error:
+        if env_args is None:
+            raise
+        raise RequestError("env_args", f"{task_name} cannot be made of these env_args: {error!r}") from error
+    return Session(env=cast(Env, env), task=task, env_args=described, cameras=cameras, image_size=size, unusual=unusual)
+
+
+def arguments(task: Task, given: dict[str, Any]) -> dict[str, Any]:
+    """What the environment's class is given: the task's own arguments, overlaid by the given ones."""
+    wanted: dict[str, Any] = {"robots": "Panda", **task.arguments, **given}
+    robots = wanted["robots"]
+    single = robots if isinstance(robots, str) else robots[0]
+    if isinstance(robots, list) and len(cast("list[str]", robots)) == 1:
+        robots = single
+    controllers = suite.controllers(wanted.get("controller_configs"), single)
+    others = {name: value for name, value in wanted.items() if name not in ("robots", "controller_configs")}
+    return {"robots": robots, "controller_configs": controllers, "reward_shaping": False, **others}
+
+
+def recorded(env_args: dict[str, Any]) -> dict[str, Any]:
+    """The arguments in robomimic's `env_args` that decide what happens; RequestError where they are none."""
+    kwargs = env_args.get("env_kwargs")
+    if not isinstance(kwargs, dict):
+        raise RequestError("env_args", f"env_args have no env_kwargs; they have {sorted(env_args)}")
+    found = {
+        name: value
+        for name, value in cast("dict[str, Any]", kwargs).items()
+        if not name.startswith(_DECIDED) and name not in ("ignore_done", "use_object_obs", "use_camera_obs")
+    }
+    if found.get("control_freq") == CONTROL_FREQ:
+        # said by some files and not by others
+        del found["control_freq"]
+    return found
 
 
 def reset(session: Session, seed: int, demonstration: bool = False) -> Tensors:
@@ -247,6 +292,8 @@ def check_actions(env: Env, actions: Array) -> Array:
         raise RequestError("bad_action", f"action must be F64 of shape ({width},), got {actions.dtype} {actions.shape}")
     if not np.isfinite(rows).all():
         raise RequestError("bad_action", f"action has values that are not finite: {actions.tolist()}")
+    if not len(rows):
+        raise RequestError("bad_action", f"no action in a tensor of shape {actions.shape}")
     return rows.copy()
 
 

@@ -6,13 +6,13 @@ is solved, and in the last step.
 """
 
 import json
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from actrm_harness.experts.parts import Expert, Scene
 from actrm_harness.protocol import RequestError
+from actrm_harness.simulators import Episode
 from actrm_harness.simulators.robosuite import envs
 from actrm_harness.simulators.robosuite.envs import Session
 from actrm_harness.tasks import find
@@ -23,16 +23,6 @@ STEPS_AFTER_SUCCESS = 10
 
 # What a demonstration keeps of the observations: sines, cosines and accelerations of joints follow from the rest.
 LEFT_OUT = ("_joint_pos_cos", "_joint_pos_sin", "_joint_acc", "_eef_quat_site")
-
-
-@dataclass(frozen=True, slots=True)
-class Episode:
-    """One recorded episode and the attributes of its demo."""
-
-    success: bool
-    steps: int
-    attrs: dict[str, str]
-    tensors: Tensors
 
 
 class _Recorder:

@@ -102,8 +102,25 @@ def known_environments() -> list[str]:
 
 def panda_controller() -> dict[str, Any]:
     """Robosuite's default controller configuration of the Panda: BASIC with OSC_POSE and the gripper."""
-    controllers = importlib.import_module("robosuite.controllers")
-    return cast("dict[str, Any]", controllers.load_composite_controller_config(controller=None, robot="Panda"))
+    return _default_controller("Panda")
+
+
+def controllers(config: Any, robot: str) -> Any:
+    """A controller configuration, or one for each robot, in the form that robosuite 1.5 wants; None: the default.
+
+    Files of robomimic that are older than robosuite 1.5 hold the configuration of the arms alone.
+    """
+    if config is None:
+        return _default_controller(robot)
+    if isinstance(config, list):
+        return [controllers(each, robot) for each in cast("list[Any]", config)]
+    factory = importlib.import_module("robosuite.controllers.composite.composite_controller_factory")
+    return factory.refactor_composite_controller_config(config, robot, ["right"])
+
+
+def _default_controller(robot: str) -> dict[str, Any]:
+    module = importlib.import_module("robosuite.controllers")
+    return cast("dict[str, Any]", module.load_composite_controller_config(controller=None, robot=robot))
 
 
 def package_dir() -> str:

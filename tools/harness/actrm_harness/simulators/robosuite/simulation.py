@@ -1,0 +1,70 @@
+"""An environment of robosuite, as the worker asks for it."""
+
+import platform
+from dataclasses import dataclass
+
+import numpy as np
+
+from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped, Stored
+from actrm_harness.simulators.robosuite import control, envs, episodes, suite
+from actrm_harness.wire import Array
+
+
+@dataclass(slots=True)
+class Robosuite:
+    """A session, and what can be asked of it."""
+
+    session: envs.Session
+
+    @staticmethod
+    def start(options: Options) -> "Robosuite":
+        """Make the environment and attach the compiled control loop where it is wanted and known."""
+        session = envs.make(options.task.name, options.cameras, options.size, options.env_args)
+        if options.control == "compiled":
+            session.control = control.attach(session.env)
+        return Robosuite(session)
+
+    def describe(self) -> Description:
+        """Versions, shapes and the environment's arguments."""
+        env = self.session.env
+        low, high = env.action_spec
+        return Description(
+            env_name=self.session.task.name,
+            control="robosuite" if self.session.control is None else "compiled",
+            control_freq=int(env.control_freq),
+            action_low=low,
+            action_high=high,
+            observations={name: list(value.shape) for name, value in envs.reset(self.session, 0).items()},
+            versions={
+                "robosuite": suite.robosuite().__version__,
+                "mujoco": suite.mujoco().__version__,
+                "python": platform.python_version(),
+                "numpy": np.__version__,
+            },
+            env_args=self.session.env_args,
+            unusual=self.session.unusual,
+        )
+
+    def reset(self, seed: int, demonstration: bool) -> Initial:
+        """Begin the episode of `seed`."""
+        first = envs.reset(self.session, seed, demonstration)
+        return Initial(first, envs.fingerprint(self.session.env), self.session.env.get_ep_meta())
+
+    def step(self, actions: Array) -> Stepped:
+        """Do one action, or one a row until the task is solved."""
+        checked = envs.check_actions(self.session.env, actions)
+        envs.slim(self.session)
+        result, rewards = envs.steps_session(self.session, checked)
+        return Stepped(result.observation, rewards, result.success)
+
+    def expert(self, seed: int, demonstration: bool) -> Episode:
+        """One whole episode of the task's scripted expert."""
+        return episodes.expert_episode(self.session, seed, demonstration)
+
+    def extract(self, stored: Stored) -> Episode:
+        """What stored states look like."""
+        return episodes.extract(self.session, stored.states, stored.actions, stored.model_file, stored.ep_meta)
+
+    def image(self, camera: str, height: int, width: int) -> Array:
+        """What a camera sees now."""
+        return envs.image(self.session, camera, height, width)

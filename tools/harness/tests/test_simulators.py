@@ -1,0 +1,130 @@
+"""What the worker asks of a simulator: other robots, and another simulator altogether."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Client, WorkerError, walk
+
+HERE = Path(__file__).resolve().parent
+PATHS = {"PYTHONPATH": f"{HERE}:{HERE.parent}"}
+
+
+def env_args(**kwargs: object) -> str:
+    return json.dumps({"env_name": "any", "type": 1, "env_kwargs": kwargs})
+
+
+OLD_CONTROLLER: dict[str, Any] = {
+    "type": "OSC_POSE",
+    "input_max": 1,
+    "input_min": -1,
+    "output_max": [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],
+    "output_min": [-0.05, -0.05, -0.05, -0.5, -0.5, -0.5],
+    "kp": 150,
+    "damping": 1,
+    "impedance_mode": "fixed",
+    "kp_limits": [0, 300],
+    "damping_limits": [0, 10],
+    "position_limits": None,
+    "orientation_limits": None,
+    "uncouple_pos_ori": True,
+    "control_delta": True,
+    "interpolation": None,
+    "ramp_ratio": 0.2,
+}
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "width", "robots"),
+    [
+        ("TwoArmLift", None, 14, ["Panda", "Panda"]),
+        ("TwoArmLift", env_args(robots=["Panda", "Sawyer"], env_configuration="parallel"), 14, ["Panda", "Sawyer"]),
+        ("Lift", env_args(robots=["Sawyer"]), 7, "Sawyer"),
+        ("Lift", env_args(robots="IIWA", gripper_types="PandaGripper"), 7, "IIWA"),
+        ("Lift", env_args(robots=["Panda"], controller_configs=OLD_CONTROLLER, has_renderer=True), 7, "Panda"),
+    ],
+)
+def test_robots_are_what_env_args_say(task: str, arguments: str | None, width: int, robots: object) -> None:
+    """They start, and an episode depends on its seed alone, on robosuite's own loop where the compiled one is not."""
+    given = [] if arguments is None else ["--env-args", arguments]
+    client = Client("--task", task, *given)
+    ready = client.ready
+    assert (ready["action_dim"], ready["control"]) == (width, "robosuite")
+    assert ready["env_args"]["env_kwargs"]["robots"] == robots
+    assert (ready["env_args_sha256"] is None) == (arguments is None)
+    assert ready["env_args"]["env_kwargs"]["has_renderer"] is False
+    several = isinstance(robots, list)
+    assert ("robot1_eef_pos" in ready["observations"]) == several
+    seen: list[list[bytes]] = []
+    for _ in range(2):
+        message, first = client.ask("reset", seed=3)
+        seen.append([message["fingerprint"].encode(), first["obs/object"].tobytes()])
+        for action in walk(1, 3, width):
+            seen[-1].append(client.step(action)[1]["obs/robot0_eef_pos"].tobytes())
+        client.ask("reset", seed=4)
+    assert seen[0] == seen[1] and len(set(seen[0])) == len(seen[0])
+    with pytest.raises(WorkerError, match="no scripted expert"):
+        client.ask("expert", seed=0)
+    client.close()
+
+
+def test_env_args_of_the_usual_environment_change_nothing(lift: Client) -> None:
+    """What a file that we collected says of its environment leads to the environment that it was collected in."""
+    same = Client("--task", "Lift", "--env-args", json.dumps(lift.ready["env_args"]))
+    assert same.ready == lift.ready
+    assert same.ask("reset", seed=5)[0]["fingerprint"] == lift.ask("reset", seed=5)[0]["fingerprint"]
+    assert same.ask("expert", seed=1_000_000)[0]["success"]
+    same.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[]", "must be an object"),
+        ("{", "not JSON"),
+        ('{"env_name": "Lift"}', "no env_kwargs"),
+        (env_args(robots="Pandda"), "cannot be made"),
+        (env_args(colour="red"), "cannot be made"),
+    ],
+)
+def test_env_args_that_make_no_environment_are_one_line(text: str, words: str) -> None:
+    from test_worker import start_error
+
+    message, code = start_error("--task", "Lift", "--env-args", text)
+    assert (message["kind"], code) == ("env_args", 1), message
+    assert words in message["message"]
+
+
+def test_another_simulator_is_a_module() -> None:
+    """The worker, its protocol and its checks are the same, and nothing of robosuite is asked for."""
+    client = Client("--task", "Slide", "--env-module", "toy_simulator", env=PATHS)
+    ready = client.ready
+    assert (ready["simulator"], ready["versions"], ready["max_steps"]) == ("toy_simulator", {"toy": "0.1"}, 30)
+    assert ready["control"] == "own" and ready["env_args"]["env_module"]["sha256"] == ready["module_sha256"]
+    client.ask("reset", seed=1)
+    message, data = client.ask("step", {"action": -np.ones((30, 1))})
+    assert message["success"] and 9 <= len(data["rewards"]) <= 20 and data["rewards"][-1] == 1.0
+    with pytest.raises(WorkerError, match="nobody knows how"):
+        client.ask("expert", seed=0)
+    client.close()
+
+
+def test_a_modules_sum_says_what_it_says(tmp_path: Path) -> None:
+    """With what it imports from beside it; not with what merely lies there."""
+
+    def digest() -> str:
+        client = Client("--task", "Slide", "--env-module", "changed", env={"PYTHONPATH": f"{tmp_path}:{HERE.parent}"})
+        client.close()
+        return client.ready["module_sha256"]
+
+    (tmp_path / "changed.py").write_text((HERE / "toy_simulator.py").read_text() + "\nimport rules\nrules.show()\n")
+    (tmp_path / "rules.py").write_text("def show() -> None: ...\n")
+    first = digest()
+    (tmp_path / "unused.py").write_text("HEIGHT = 0.2\n")
+    assert digest() == first and len(first) == 64
+    (tmp_path / "rules.py").write_text("HEIGHT = 0.2\ndef show() -> None: ...\n")
+    second = digest()
+    (tmp_path / "changed.py").write_text((tmp_path / "changed.py").read_text() + "# another\n")
+    assert len({first, second, digest()}) == 3
