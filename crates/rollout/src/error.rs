@@ -79,6 +79,12 @@ pub enum RolloutError {
         /// What it said.
         found: String,
     },
+    /// The user wanted an end while a worker was awaited.
+    #[error("stopped while waiting for the simulator of task {task:?}")]
+    Stopped {
+        /// The task.
+        task: String,
+    },
     /// No worker could be started, after several tries.
     #[error("worker for task {task:?} did not start in {attempts} tries: {fault}")]
     Start {
@@ -221,6 +227,9 @@ pub enum FaultKind {
     /// It did not answer in time.
     #[error("no answer within {:.1} s", .0.as_secs_f64())]
     TimedOut(Duration),
+    /// The user wanted an end, and it was not waited for any longer.
+    #[error("stopped by request")]
+    Stopped,
     /// It wrote bytes that are not a frame.
     #[error("nonsense in the pipe: {0}")]
     Nonsense(FrameError),

@@ -13,11 +13,13 @@ mod error;
 mod files;
 mod frame;
 mod harness;
+mod logs;
 mod message;
 mod pool;
 mod process;
 mod recorded;
 mod spec;
+mod stop;
 pub mod video;
 mod worker;
 

@@ -7,9 +7,11 @@ use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
-use crate::error::{RolloutError, WorkerFault};
+use crate::error::{FaultKind, RolloutError, WorkerFault};
+use crate::logs::LogFolder;
 use crate::message::Ready;
 use crate::spec::WorkerSpec;
+use crate::stop::Stop;
 use crate::worker::{StartFailure, Worker};
 
 /// How far workers may run ahead of the next result to deliver, in jobs.
@@ -27,7 +29,7 @@ pub struct PoolOptions {
     pub attempts: u32,
     /// Where workers' stderr goes; a temporary folder if none is named.
     pub logs: Option<PathBuf>,
-    /// Says whether to stop after the jobs that are under way.
+    /// Says whether to stop: workers that are starting at once, jobs that are under way within a second.
     pub stop: Arc<dyn Fn() -> bool + Send + Sync>,
 }
 
@@ -81,7 +83,8 @@ pub enum RunEnd {
 pub struct Pool {
     options: PoolOptions,
     logs: PathBuf,
-    _temporary: Option<tempfile::TempDir>,
+    _temporary: Option<LogFolder>,
+    stop: Stop,
     ready: Ready,
     fallback: Option<String>,
     slots: Vec<Slot>,
@@ -97,6 +100,7 @@ struct Slot {
 struct Shared<'a> {
     options: &'a PoolOptions,
     logs: &'a std::path::Path,
+    stop: &'a Stop,
     ready: Option<&'a Ready>,
     incidents: Mutex<&'a mut Vec<Incident>>,
 }
@@ -111,7 +115,7 @@ impl Pool {
     /// Starts all workers at once and waits for their greetings.
     ///
     /// # Errors
-    /// Any reason why a worker cannot start.
+    /// Any reason why a worker cannot start; [`RolloutError::Stopped`] if the options ask for an end meanwhile.
     pub fn start(options: PoolOptions) -> Result<Self, RolloutError> {
         let file = |path: PathBuf| move |source| RolloutError::File { operation: "creating log folder", path, source };
         let (logs, temporary) = match &options.logs {
@@ -120,14 +124,15 @@ impl Pool {
                 (path.clone(), None)
             }
             None => {
-                let made = tempfile::Builder::new().prefix("actrm-workers-").tempdir();
-                let folder = made.map_err(file(std::env::temp_dir()))?;
-                (folder.path().to_owned(), Some(folder))
+                let folder = LogFolder::make()?;
+                (folder.path(), Some(folder))
             }
         };
         let mut incidents = Vec::new();
         let mut slots: Vec<Slot> = (0..options.workers).map(|_| Slot::default()).collect();
-        let shared = Shared { options: &options, logs: &logs, ready: None, incidents: Mutex::new(&mut incidents) };
+        let stop = Stop::new(Arc::clone(&options.stop));
+        let shared =
+            Shared { options: &options, logs: &logs, stop: &stop, ready: None, incidents: Mutex::new(&mut incidents) };
         let results: Vec<Result<(), RolloutError>> = std::thread::scope(|scope| {
             let threads: Vec<_> = slots
                 .iter_mut()
@@ -149,7 +154,7 @@ impl Pool {
         }
         let first = slots[0].worker.as_ref();
         let fallback = first.and_then(|worker| worker.fallback(options.spec.control));
-        Ok(Self { options, logs, _temporary: temporary, ready, fallback, slots, incidents })
+        Ok(Self { options, logs, _temporary: temporary, stop, ready, fallback, slots, incidents })
     }
 
     /// What every worker of this pool said of itself.
@@ -188,21 +193,20 @@ impl Pool {
         work: &(dyn Fn(&mut S, &mut Worker, u64) -> Result<T, JobError> + Sync),
         deliver: &mut dyn FnMut(u64, Result<T, RolloutError>) -> ControlFlow<()>,
     ) -> Result<RunEnd, RolloutError> {
-        let Self { options, logs, ready, slots, incidents, .. } = self;
-        let stop = Arc::clone(&options.stop);
-        let shared = Shared { options, logs, ready: Some(ready), incidents: Mutex::new(incidents) };
+        let Self { options, logs, stop, ready, slots, incidents, .. } = self;
+        let shared = Shared { options, logs, stop, ready: Some(ready), incidents: Mutex::new(incidents) };
         let progress = Mutex::new(Progress { next: jobs.start, delivered: jobs.start, halted: false });
         let moved = Condvar::new();
         let (sender, receiver) = mpsc::channel::<(u64, Result<T, JobError>)>();
         let mut failure = None;
         std::thread::scope(|scope| {
             for (index, slot) in slots.iter_mut().enumerate() {
-                let (shared, progress, moved, stop) = (&shared, &progress, &moved, &*stop);
+                let (shared, progress, moved) = (&shared, &progress, &moved);
                 let (jobs, sender) = (jobs.clone(), sender.clone());
                 scope.spawn(move || {
                     let inside = || {
                         let mut kept = None;
-                        while let Some(job) = claim(progress, moved, stop, &jobs) {
+                        while let Some(job) = claim(progress, moved, shared.stop, &jobs) {
                             let seed = seed_of(job);
                             let result = slot.attempt(index, shared, job, seed, &mut kept, state, work);
                             if sender.send((job, result)).is_err() {
@@ -230,6 +234,8 @@ impl Pool {
                     Err(JobError::Final(error @ RolloutError::Episode { .. })) => {
                         waiting.insert(job, Err(error));
                     }
+                    // what was under way is not done, and nothing has failed
+                    Err(JobError::Final(RolloutError::Stopped { .. })) => {}
                     Err(JobError::Final(error)) => {
                         failure.get_or_insert(error);
                         open = false;
@@ -270,19 +276,14 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn claim(
-    progress: &Mutex<Progress>,
-    moved: &Condvar,
-    stop: &(dyn Fn() -> bool + Send + Sync),
-    jobs: &Range<u64>,
-) -> Option<u64> {
+fn claim(progress: &Mutex<Progress>, moved: &Condvar, stop: &Stop, jobs: &Range<u64>) -> Option<u64> {
     let mut progress = lock(progress);
-    while progress.next >= progress.delivered.saturating_add(LOOK_AHEAD) && !progress.halted && !stop() {
+    while progress.next >= progress.delivered.saturating_add(LOOK_AHEAD) && !progress.halted && !stop.asked() {
         // whoever asks to stop notifies nobody: look at it now and then
         let waited = moved.wait_timeout(progress, Duration::from_millis(100));
         progress = waited.unwrap_or_else(PoisonError::into_inner).0;
     }
-    if progress.halted || stop() || progress.next >= jobs.end {
+    if progress.halted || stop.asked() || progress.next >= jobs.end {
         return None;
     }
     progress.next += 1;
@@ -297,7 +298,7 @@ impl Slot {
             let name = format!("{index}.{}", self.generation);
             self.generation += 1;
             tries += 1;
-            match Worker::start(&shared.options.spec, &name, shared.logs) {
+            match Worker::start(&shared.options.spec, &name, shared.logs, shared.stop) {
                 Ok(worker) => {
                     if let Some(ready) = shared.ready {
                         same_greeting(ready, worker.ready())?;
@@ -344,6 +345,10 @@ impl Slot {
                 Err(JobError::Worker(fault)) => fault,
                 Err(error) => return Err(error),
             };
+            if matches!(fault.kind, FaultKind::Stopped) {
+                self.worker = None;
+                return Err(RolloutError::Stopped { task: shared.options.spec.task.clone() }.into());
+            }
             // dropped, and with it the process and its children
             self.worker = None;
             lock(&shared.incidents).push(Incident { job: Some(job), text: fault.to_string() });

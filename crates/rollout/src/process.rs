@@ -16,6 +16,7 @@ use rustix::process::{Pid, Resource, Rlimit, Signal, kill_process_group, prlimit
 
 use crate::error::{FaultKind, RolloutError};
 use crate::frame::checked_length;
+use crate::stop::Stop;
 
 /// How much of a worker's stderr an error shows.
 const TAIL_LINES: usize = 6;
@@ -68,7 +69,7 @@ impl Process {
     }
 
     /// Writes all of `bytes` before `deadline`.
-    pub(super) fn send(&mut self, bytes: &[u8], limit: Limit) -> Result<(), FaultKind> {
+    pub(super) fn send(&mut self, bytes: &[u8], limit: Limit<'_>) -> Result<(), FaultKind> {
         let mut rest = bytes;
         while !rest.is_empty() {
             let Some(stdin) = &mut self.stdin else {
@@ -88,7 +89,7 @@ impl Process {
     }
 
     /// Reads one length-prefixed body before `deadline`.
-    pub(super) fn receive(&mut self, limit: Limit) -> Result<Vec<u8>, FaultKind> {
+    pub(super) fn receive(&mut self, limit: Limit<'_>) -> Result<Vec<u8>, FaultKind> {
         let mut prefix = [0u8; 8];
         self.fill(&mut prefix, limit)?;
         let length = checked_length(prefix).map_err(FaultKind::Nonsense)?;
@@ -102,7 +103,7 @@ impl Process {
         Ok(body)
     }
 
-    fn fill(&mut self, target: &mut [u8], limit: Limit) -> Result<(), FaultKind> {
+    fn fill(&mut self, target: &mut [u8], limit: Limit<'_>) -> Result<(), FaultKind> {
         let mut filled = 0;
         while filled < target.len() {
             match self.stdout.read(&mut target[filled..]) {
@@ -202,16 +203,25 @@ fn spawn_for_good(command: Command) -> std::io::Result<Child> {
 }
 
 /// A moment until which one exchange may last.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Limit {
+#[derive(Clone, Copy)]
+pub(super) struct Limit<'a> {
     allowed: Duration,
     until: Instant,
+    stop: Option<&'a Stop>,
 }
 
-impl Limit {
+/// How often somebody who waits looks whether an end was asked for.
+const LOOK: Duration = Duration::from_millis(100);
+
+impl<'a> Limit<'a> {
     /// `allowed` from now on.
     pub(super) fn of(allowed: Duration) -> Self {
-        Self { allowed, until: Instant::now() + allowed }
+        Self { allowed, until: Instant::now() + allowed, stop: None }
+    }
+
+    /// Waits no longer than until `stop` is due.
+    pub(super) fn unless(self, stop: &'a Stop) -> Self {
+        Self { stop: Some(stop), ..self }
     }
 
     /// Waits until `fd` is ready.
@@ -221,6 +231,10 @@ impl Limit {
             if left.is_zero() {
                 return Err(FaultKind::TimedOut(self.allowed));
             }
+            if self.stop.is_some_and(Stop::due) {
+                return Err(FaultKind::Stopped);
+            }
+            let left = if self.stop.is_some() { left.min(LOOK) } else { left };
             let timeout = Timespec {
                 tv_sec: i64::try_from(left.as_secs()).unwrap_or(i64::MAX),
                 tv_nsec: i64::from(left.subsec_nanos()),
@@ -247,7 +261,7 @@ mod tests {
         (dir, process)
     }
 
-    fn within(milliseconds: u64) -> Limit {
+    fn within(milliseconds: u64) -> Limit<'static> {
         Limit::of(Duration::from_millis(milliseconds))
     }
 
@@ -280,6 +294,24 @@ mod tests {
     fn silence_is_a_time_out() {
         let (_dir, mut process) = shell("sleep 60");
         let fault = process.receive(within(50)).unwrap_err();
+        assert!(matches!(fault, FaultKind::TimedOut(_)), "{fault}");
+    }
+
+    #[test]
+    fn a_request_to_stop_ends_waiting() {
+        let (_dir, mut process) = shell("sleep 60");
+        let begun = Instant::now();
+        let stop = Stop::new(std::sync::Arc::new(move || begun.elapsed() > Duration::from_millis(200)));
+        let at_once = stop.at_once();
+        let fault = process.receive(within(20_000).unless(&at_once)).unwrap_err();
+        assert!(matches!(fault, FaultKind::Stopped), "{fault}");
+        assert!(begun.elapsed() < Duration::from_secs(1), "{:?}", begun.elapsed());
+        // an episode under way has a moment more
+        let fault = process.receive(within(20_000).unless(&stop)).unwrap_err();
+        assert!(matches!(fault, FaultKind::Stopped), "{fault}");
+        assert!(begun.elapsed() > Duration::from_millis(1000), "{:?}", begun.elapsed());
+        let never = Stop::never();
+        let fault = process.receive(within(50).unless(&never)).unwrap_err();
         assert!(matches!(fault, FaultKind::TimedOut(_)), "{fault}");
     }
 

@@ -15,6 +15,7 @@ use crate::message::{Control, EpisodeReply, PROTOCOL, Ready, Reply, Request};
 use crate::process::{Limit, Process};
 use crate::recorded::RecordedEpisode;
 use crate::spec::{TimeLimits, WorkerSpec};
+use crate::stop::Stop;
 
 /// Observation values by key, flattened row-major.
 pub type Observations = BTreeMap<String, Vec<f64>>;
@@ -58,6 +59,7 @@ pub struct Worker {
     name: String,
     ready: Ready,
     limits: TimeLimits,
+    stop: Stop,
     next_id: u64,
     /// Kinds of request answered before, as bits: later ones get the short limit.
     warm: u8,
@@ -72,10 +74,10 @@ pub(super) enum StartFailure {
 
 impl Worker {
     /// Starts a worker and waits for its greeting. `name` is `slot.generation`.
-    pub(super) fn start(spec: &WorkerSpec, name: &str, logs: &Path) -> Result<Self, StartFailure> {
+    pub(super) fn start(spec: &WorkerSpec, name: &str, logs: &Path, stop: &Stop) -> Result<Self, StartFailure> {
         let log = logs.join(format!("worker-{name}.stderr"));
         let mut process = Process::spawn(spec.command(), &log, spec.memory_limit).map_err(StartFailure::Final)?;
-        let received = process.receive(Limit::of(spec.limits.start)).and_then(|body| {
+        let received = process.receive(Limit::of(spec.limits.start).unless(&stop.at_once())).and_then(|body| {
             let frame = Frame::decode(&body).map_err(FaultKind::Nonsense)?;
             frame.parse::<Reply>().map_err(FaultKind::Nonsense)
         });
@@ -91,7 +93,8 @@ impl Worker {
         match received {
             Ok(Reply::Ready(ready)) => {
                 check_handshake(&ready, spec).map_err(StartFailure::Final)?;
-                Ok(Self { process, name: name.to_owned(), ready: *ready, limits: spec.limits, next_id: 0, warm: 0 })
+                let (name, stop, limits) = (name.to_owned(), stop.clone(), spec.limits);
+                Ok(Self { process, name, ready: *ready, limits, stop, next_id: 0, warm: 0 })
             }
             Ok(Reply::Error { kind, message, .. }) => {
                 let refused = RolloutError::Refused { task: spec.task.clone(), kind: kind.clone(), message };
@@ -102,6 +105,7 @@ impl Worker {
                 let kind = unexpected("ready", &other);
                 Err(fault(&process, kind))
             }
+            Err(FaultKind::Stopped) => Err(StartFailure::Final(RolloutError::Stopped { task: spec.task.clone() })),
             Err(kind @ FaultKind::Died(_)) => match spec.python.problem() {
                 Some(problem) => Err(StartFailure::Final(problem)),
                 None => Err(fault(&process, kind)),
@@ -296,7 +300,7 @@ impl Worker {
             frame.tensors.insert(name.to_owned(), tensor);
         }
         let first = self.warm & kind == 0;
-        let limit = Limit::of(if first { allowed.max(self.limits.start) } else { allowed });
+        let limit = Limit::of(if first { allowed.max(self.limits.start) } else { allowed }).unless(&self.stop);
         let bytes = frame.encode().map_err(FaultKind::Nonsense)?;
         self.process.send(&bytes, limit)?;
         let body = self.process.receive(limit)?;

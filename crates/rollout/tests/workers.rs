@@ -7,7 +7,7 @@ mod common;
 use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use common::{alive, impatient, options, spec, wait_until, wrapped};
 use rollout::{JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, TimeLimits, Worker, video};
@@ -217,6 +217,73 @@ fn a_worker_that_never_greets_is_reported_after_three_tries() {
     let error = Pool::start(PoolOptions::new(spec, 1)).err().unwrap().to_string();
     assert!(error.contains("did not start in 3 tries"), "{error}");
     assert!(error.contains("no answer within 0.3 s") && error.contains("tried"), "{error}");
+}
+
+#[test]
+fn other_robots_are_started_as_env_args_say() {
+    let mut options = options("TwoArmLift", 1);
+    let usual = Pool::start(options.clone()).unwrap().ready().clone();
+    assert_eq!((usual.simulator.as_str(), usual.action_dim), ("robosuite", 14));
+    assert_eq!((usual.simulator_version(), &usual.env_args_sha256), (Some("1.5.2"), &None));
+    let env_args = serde_json::json!({"env_name": "TwoArmLift", "env_kwargs": {"robots": ["Sawyer", "Panda"]}});
+    options.spec.env_args = Some(env_args);
+    let mut pool = Pool::start(options).unwrap();
+    assert_eq!(pool.ready().env_args["env_kwargs"]["robots"][0], "Sawyer");
+    assert!(pool.ready().env_args_sha256.is_some() && pool.fallback().unwrap().contains("compiled control is off"));
+    let step = |(): &mut (), worker: &mut Worker, job: u64| -> Result<usize, JobError> {
+        worker.reset(job)?;
+        Ok(worker.step(&[vec![0.1; 14]])?.observations["robot1_joint_pos"].len())
+    };
+    let mut seen = Vec::new();
+    let end = pool.run(0..2, &|job| job, &|| Ok(()), &step, &mut |_, joints| {
+        seen.push(joints.unwrap());
+        ControlFlow::Continue(())
+    });
+    assert_eq!((end.unwrap(), seen), (RunEnd::Complete, vec![7, 7]));
+}
+
+#[test]
+fn a_request_to_stop_ends_a_start_at_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut options = options("Lift", 2);
+    options.spec.python = wrapped(dir.path(), "python", "echo $$ >> \"$(dirname \"$0\")/ids\"; exec sleep 100");
+    let begun = Instant::now();
+    options.stop = Arc::new(move || begun.elapsed() > Duration::from_millis(500));
+    let error = Pool::start(options).err().unwrap();
+    assert!(matches!(error, RolloutError::Stopped { .. }), "{error}");
+    assert!(begun.elapsed() < Duration::from_millis(2000), "{:?}", begun.elapsed());
+    let ids = std::fs::read_to_string(dir.path().join("ids")).unwrap();
+    for id in ids.lines().map(|line| line.trim().parse().unwrap()) {
+        wait_until("the starting worker is gone", || !alive(id));
+    }
+}
+
+#[test]
+fn a_request_to_stop_ends_a_long_episode_within_two_seconds() {
+    let mut options = options("Lift", 1);
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    options.stop = Arc::new(move || asked.load(Ordering::Relaxed));
+    let mut pool = Pool::start(options).unwrap();
+    let since = std::sync::Mutex::new(None);
+    let endless = |(): &mut (), worker: &mut Worker, job: u64| -> Result<(), JobError> {
+        worker.reset(job)?;
+        stop.store(true, Ordering::Relaxed);
+        since.lock().unwrap().get_or_insert_with(Instant::now);
+        loop {
+            // far more steps than two seconds hold
+            worker.step(&vec![vec![0.0; 7]; 10_000])?;
+        }
+    };
+    let mut delivered = 0;
+    let end = pool.run(0..10, &|job| job, &|| Ok(()), &endless, &mut |_, _| {
+        delivered += 1;
+        ControlFlow::Continue(())
+    });
+    assert_eq!((end.unwrap(), delivered), (RunEnd::Stopped, 0));
+    let waited = since.lock().unwrap().unwrap().elapsed();
+    assert!(waited < Duration::from_secs(2), "{waited:?}");
+    assert!(pool.incidents().is_empty(), "{:?}", pool.incidents());
 }
 
 #[test]
