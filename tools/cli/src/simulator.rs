@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
-use serde_json::Value;
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, find_python, harness_folder};
+use serde_json::Value;
 
 use crate::{Screen, Stop, limits, note};
 
