@@ -225,7 +225,9 @@ fn options(images: ImageForm) -> ConvertOptions {
 /// Samples a second of random batches over the whole set, on this thread.
 fn windows(set: &Dataset) -> Result<f64, AnyError> {
     let episodes = (0..set.episodes().len()).collect();
-    let windows = set.windows(&WindowSpec { action_horizon: 32, episodes })?;
+    let observation = [dataset::STATE, dataset::ENVIRONMENT_STATE].map(str::to_owned);
+    let observation = observation.into_iter().filter(|name| set.column(name).is_some()).collect();
+    let windows = set.windows(&WindowSpec { observation, n_obs_steps: 1, action_horizon: 32, episodes })?;
     let mut batch = WindowBatch::default();
     let mut samples = 0_usize;
     let mut checksum = 0.0_f32;

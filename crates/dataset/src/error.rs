@@ -181,6 +181,17 @@ pub enum InputError {
         found: String,
     },
 
+    /// A list of observation keys that cannot become a column.
+    #[error("{path}: {column}: {reason}", path = path.display())]
+    ObservationKeys {
+        /// The file.
+        path: PathBuf,
+        /// The column.
+        column: String,
+        /// What is wrong.
+        reason: String,
+    },
+
     /// A dataset of a demo has another length than the demo.
     #[error("{path}: {demo}: {key}: expected {expected} steps, found {found}", path = path.display())]
     WrongLength {

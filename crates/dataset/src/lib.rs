@@ -12,6 +12,7 @@
 #![allow(clippy::result_large_err)]
 
 mod error;
+mod keys;
 mod lerobot;
 mod plan;
 mod puzzle_table;
@@ -23,8 +24,10 @@ mod tree;
 mod windows;
 
 pub use error::{DatasetError, InputError, Result};
+pub use keys::KeyItem;
 pub use lerobot::{
-    ACTION, ActionKind, ActionProvenance, Check, Column, ConvertOptions, ConvertReport, Dataset, ENVIRONMENT_STATE,
+    ACTION, ActionKind, ActionProvenance, Check, Column, ConvertOptions, ConvertReport, Dataset, ENTITY_PREFIX,
+    ENVIRONMENT_STATE,
     EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info, Provenance, RotationForm, STATE, convert,
     export, verify, verify_source,
 };

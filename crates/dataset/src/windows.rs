@@ -1,6 +1,7 @@
-//! Training windows: the observation at a frame and the `action_horizon` actions that follow it.
+//! Training windows: the observations up to a frame and the `action_horizon` actions that follow it.
 //!
-//! Window `i` starts at frame `t` of an episode and holds the actions of frames `t .. t + action_horizon`.
+//! Window `i` starts at frame `t` of an episode and holds the actions of frames `t .. t + action_horizon`, and of each
+//! column of the observation the frames `t - n_obs_steps + 1 ..= t`. Before the episode its first frame is repeated.
 //! Past the end of the episode the last action is repeated and flagged in `is_pad`, as LeRobot's
 //! `delta_timestamps` and robomimic's padded sequences have it. Gathering a batch copies rows out of
 //! columns that stay in memory; it allocates nothing once the batch has been used.
@@ -11,6 +12,10 @@ use arrow::buffer::ScalarBuffer;
 /// Which windows to make.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WindowSpec {
+    /// Columns of the observation, in order.
+    pub observation: Vec<String>,
+    /// Observations in a window, at least one: that of its frame and those before it.
+    pub n_obs_steps: usize,
     /// Number of actions in a window, at least one.
     pub action_horizon: usize,
     /// Episodes to take windows from, by episode index; every frame of them starts one window.
@@ -25,24 +30,30 @@ pub(crate) struct Resident {
 }
 
 impl Resident {
-    pub(crate) fn empty() -> Self {
-        Self { data: ScalarBuffer::from(Vec::new()), dim: 0 }
-    }
-
     fn row(&self, frame: usize) -> &[f32] {
         &self.data[frame * self.dim..(frame + 1) * self.dim]
     }
 }
 
+/// Where a window lies, as rows of the columns.
+#[derive(Debug, Clone, Copy)]
+struct Span {
+    /// first frame of the episode
+    begin: u32,
+    /// the window's frame
+    frame: u32,
+    /// the frame after the episode's last
+    end: u32,
+}
+
 /// The windows of some episodes. Owns (shares) the columns, so that it outlives its data set.
 #[derive(Debug, Clone)]
 pub struct Windows {
-    state: Resident,
-    environment_state: Resident,
+    observation: Vec<(String, Resident)>,
     action: Resident,
+    n_obs_steps: usize,
     action_horizon: usize,
-    /// First frame of each window and the end of its episode, as rows of the columns.
-    spans: Vec<(u32, u32)>,
+    spans: Vec<Span>,
 }
 
 /// One batch of windows, row-major. Reuse one value: `gather` resizes it only when the batch size changes.
@@ -50,31 +61,36 @@ pub struct Windows {
 pub struct WindowBatch {
     /// Number of windows.
     pub n: usize,
-    /// `(n, state_dim)`
-    pub state: Vec<f32>,
-    /// `(n, environment_state_dim)`; empty when the data set has no environment state.
-    pub environment_state: Vec<f32>,
+    /// By column, in the order asked for: `(n, n_obs_steps, dim)`, oldest first.
+    pub observation: Vec<(String, Vec<f32>)>,
     /// `(n, action_horizon, action_dim)`
     pub actions: Vec<f32>,
     /// `(n, action_horizon)`; true where the last action of the episode is repeated.
     pub is_pad: Vec<bool>,
 }
 
+impl WindowBatch {
+    /// Values of a column of the observation.
+    pub fn column(&self, name: &str) -> Option<&[f32]> {
+        self.observation.iter().find(|(n, _)| n == name).map(|(_, values)| values.as_slice())
+    }
+}
+
 impl Windows {
     /// `ranges` are the `(from, to)` rows of the chosen episodes, checked by the caller to lie in the columns.
     pub(crate) fn new(
-        state: Resident,
-        environment_state: Resident,
+        observation: Vec<(String, Resident)>,
         action: Resident,
-        action_horizon: usize,
+        (n_obs_steps, action_horizon): (usize, usize),
         ranges: &[(usize, usize)],
     ) -> Self {
         let total = ranges.iter().map(|(from, to)| to - from).sum();
         let mut spans = Vec::with_capacity(total);
         for &(from, to) in ranges {
-            spans.extend((from as u32..to as u32).map(|frame| (frame, to as u32)));
+            let (begin, end) = (from as u32, to as u32);
+            spans.extend((begin..end).map(|frame| Span { begin, frame, end }));
         }
-        Self { state, environment_state, action, action_horizon, spans }
+        Self { observation, action, n_obs_steps, action_horizon, spans }
     }
 
     /// Number of windows: one a frame.
@@ -87,19 +103,19 @@ impl Windows {
         self.spans.is_empty()
     }
 
+    /// Observations in a window.
+    pub fn n_obs_steps(&self) -> usize {
+        self.n_obs_steps
+    }
+
     /// Actions in a window.
     pub fn action_horizon(&self) -> usize {
         self.action_horizon
     }
 
-    /// Length of `observation.state`.
-    pub fn state_dim(&self) -> usize {
-        self.state.dim
-    }
-
-    /// Length of `observation.environment_state`; zero when there is none.
-    pub fn environment_state_dim(&self) -> usize {
-        self.environment_state.dim
+    /// Columns of the observation with their lengths, in order.
+    pub fn observation(&self) -> impl Iterator<Item = (&str, usize)> {
+        self.observation.iter().map(|(name, column)| (name.as_str(), column.dim))
     }
 
     /// Length of `action`.
@@ -121,17 +137,28 @@ impl Windows {
     pub fn gather(&self, indices: &[u32], batch: &mut WindowBatch) {
         let (n, horizon, width) = (indices.len(), self.action_horizon, self.action.dim);
         batch.n = n;
-        batch.state.resize(n * self.state.dim, 0.0);
-        batch.environment_state.resize(n * self.environment_state.dim, 0.0);
+        let named = batch.observation.iter().map(|(name, _)| name).eq(self.observation.iter().map(|(name, _)| name));
+        if !named {
+            batch.observation = self.observation.iter().map(|(name, _)| (name.clone(), Vec::new())).collect();
+        }
+        for ((_, values), (_, column)) in batch.observation.iter_mut().zip(&self.observation) {
+            values.resize(n * self.n_obs_steps * column.dim, 0.0);
+            let mut rows = values.chunks_exact_mut(column.dim.max(1));
+            for &index in indices {
+                let span = self.spans[index as usize];
+                for step in 0..self.n_obs_steps {
+                    // before an episode there is its first frame
+                    let before = (self.n_obs_steps - 1 - step).min((span.frame - span.begin) as usize);
+                    let row = rows.next().expect("one a window and step");
+                    row.copy_from_slice(column.row(span.frame as usize - before));
+                }
+            }
+        }
         batch.actions.resize(n * horizon * width, 0.0);
         batch.is_pad.resize(n * horizon, false);
         for (i, &index) in indices.iter().enumerate() {
-            let (frame, end) = self.spans[index as usize];
+            let Span { frame, end, .. } = self.spans[index as usize];
             let (frame, end) = (frame as usize, end as usize);
-            copy_row(&mut batch.state, i, self.state.row(frame));
-            if self.environment_state.dim > 0 {
-                copy_row(&mut batch.environment_state, i, self.environment_state.row(frame));
-            }
             let real = horizon.min(end - frame);
             let actions = &mut batch.actions[i * horizon * width..(i + 1) * horizon * width];
             let (head, tail) = actions.split_at_mut(real * width);
@@ -145,10 +172,6 @@ impl Windows {
             flags[real..].fill(true);
         }
     }
-}
-
-fn copy_row(out: &mut [f32], i: usize, row: &[f32]) {
-    out[i * row.len()..(i + 1) * row.len()].copy_from_slice(row);
 }
 
 #[cfg(test)]
@@ -177,12 +200,15 @@ mod tests {
         #[test]
         fn windows_agree_with_clamped_indexing(
             lengths in prop::collection::vec(1_usize..12, 1..8),
-            horizon in 1_usize..20,
-            dims in (1_usize..4, 0_usize..4, 1_usize..4),
+            (horizon, n_obs_steps) in (1_usize..20, 1_usize..6),
+            dims in prop::collection::vec(1_usize..4, 0..4),
+            action_dim in 1_usize..4,
             picks in prop::collection::vec(any::<prop::sample::Index>(), 1..40),
         ) {
             let rows: usize = lengths.iter().sum();
-            let (state, env, action) = (column(rows, dims.0, 0.25), column(rows, dims.1, 0.5), column(rows, dims.2, 0.75));
+            let action = column(rows, action_dim, 0.75);
+            let observed: Vec<(String, Resident)> =
+                dims.iter().enumerate().map(|(i, &dim)| (format!("c{i}"), column(rows, dim, i as f32 / 8.0))).collect();
             let mut ranges = Vec::new();
             let mut from = 0;
             for (i, &length) in lengths.iter().enumerate() {
@@ -191,34 +217,49 @@ mod tests {
                 }
                 from += length;
             }
-            let frames: Vec<(usize, usize)> = ranges.iter().flat_map(|&(a, b)| (a..b).map(move |f| (f, b))).collect();
-            let windows = Windows::new(state.clone(), env.clone(), action.clone(), horizon, &ranges);
+            let frames: Vec<(usize, usize, usize)> =
+                ranges.iter().flat_map(|&(a, b)| (a..b).map(move |f| (a, f, b))).collect();
+            let windows = Windows::new(observed.clone(), action.clone(), (n_obs_steps, horizon), &ranges);
             prop_assert_eq!(windows.len(), frames.len());
             let indices: Vec<u32> = picks.iter().map(|p| p.index(frames.len()) as u32).collect();
             // a batch that held something else before must not leak it
-            let mut batch = WindowBatch { n: 1, state: vec![9.0; 99], environment_state: vec![9.0; 3], actions: vec![9.0; 7], is_pad: vec![true; 200] };
+            let mut batch = WindowBatch {
+                n: 1,
+                observation: vec![("c0".to_owned(), vec![9.0; 99])],
+                actions: vec![9.0; 7],
+                is_pad: vec![true; 200],
+            };
             windows.gather(&indices, &mut batch);
             prop_assert_eq!(batch.n, indices.len());
-            let (mut s, mut e, mut a, mut p) = (vec![], vec![], vec![], vec![]);
+            let (mut a, mut p) = (vec![], vec![]);
             for &i in &indices {
-                let (frame, end) = frames[i as usize];
-                s.extend_from_slice(state.row(frame));
-                e.extend_from_slice(env.row(frame));
+                let (_, frame, end) = frames[i as usize];
                 let (actions, pad) = naive(&action, frame, end, horizon);
                 a.extend(actions);
                 p.extend(pad);
             }
-            prop_assert_eq!(&batch.state, &s);
-            prop_assert_eq!(&batch.environment_state, &e);
             prop_assert_eq!(&batch.actions, &a);
             prop_assert_eq!(&batch.is_pad, &p);
+            prop_assert_eq!(batch.observation.len(), observed.len());
+            for (name, column) in &observed {
+                // step k of T is frame t - (T - 1 - k), clamped to the first of the episode
+                let mut seen = Vec::new();
+                for &i in &indices {
+                    let (begin, frame, _) = frames[i as usize];
+                    for k in 0..n_obs_steps {
+                        let at = (frame as i64 - (n_obs_steps - 1 - k) as i64).max(begin as i64);
+                        seen.extend_from_slice(column.row(at as usize));
+                    }
+                }
+                prop_assert_eq!(batch.column(name).unwrap(), &seen);
+            }
         }
     }
 
     #[test]
     fn an_epoch_visits_every_window_once_in_its_own_order() {
         let c = column(30, 2, 0.0);
-        let windows = Windows::new(c.clone(), Resident::empty(), c, 4, &[(0, 10), (20, 30)]);
+        let windows = Windows::new(vec![("c".to_owned(), c.clone())], c, (1, 4), &[(0, 10), (20, 30)]);
         let mut first = windows.shuffled(3, 0);
         assert_eq!(first, windows.shuffled(3, 0));
         assert_ne!(first, windows.shuffled(3, 1));

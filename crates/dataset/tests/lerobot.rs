@@ -240,7 +240,13 @@ fn windows_of_a_split_come_in_a_seeded_order() {
     let out = dir.path().join("set");
     convert(&fixture(), &out, &ConvertOptions::default(), &mut quiet).unwrap();
     let set = Dataset::open(&out).unwrap();
-    let windows = set.windows(&WindowSpec { action_horizon: 16, episodes: vec![0, 2] }).unwrap();
+    let spec = WindowSpec {
+        observation: vec!["observation.state".to_owned()],
+        n_obs_steps: 1,
+        action_horizon: 16,
+        episodes: vec![0, 2],
+    };
+    let windows = set.windows(&spec).unwrap();
     let lengths: Vec<usize> = set.episodes().iter().map(|e| e.length).collect();
     assert_eq!(windows.len(), lengths[0] + lengths[2]);
     let mut batch = WindowBatch::default();
@@ -249,8 +255,12 @@ fn windows_of_a_split_come_in_a_seeded_order() {
     assert_eq!(batch.is_pad.iter().filter(|&&p| p).count(), 15);
     let last = &set.column("action").unwrap().data[(lengths[0] - 1) * 7..lengths[0] * 7];
     assert!(batch.actions.chunks_exact(7).all(|a| a == last));
-    assert!(set.windows(&WindowSpec { action_horizon: 0, episodes: vec![0] }).is_err());
-    assert!(set.windows(&WindowSpec { action_horizon: 4, episodes: vec![7] }).is_err());
+    let refused = |spec: WindowSpec| set.windows(&spec).unwrap_err().to_string();
+    assert!(refused(WindowSpec { action_horizon: 0, ..spec.clone() }).contains("window of 0 actions"));
+    assert!(refused(WindowSpec { n_obs_steps: 0, ..spec.clone() }).contains("window of 0 observations"));
+    assert!(refused(WindowSpec { episodes: vec![7], ..spec.clone() }).contains("episode 7"));
+    let error = refused(WindowSpec { observation: vec!["observation.entity.cube".to_owned()], ..spec });
+    assert!(error.contains("column observation.entity.cube") && error.contains("observation.state"), "{error}");
     let (two, three) = (set.subset(&[0, 1, 2], 2, 5).unwrap(), set.subset(&[0, 1, 2], 3, 5).unwrap());
     assert!(two.iter().all(|e| three.contains(e)) && two.len() == 2);
     assert!(set.subset(&[0], 2, 5).is_err());

@@ -1,28 +1,14 @@
 //! A batch of training windows in network units.
 
 use crate::error::{ModelError, Result};
+use crate::features::{Features, Signature, Values, ValuesRef};
 use candle_core::{Device, Tensor};
-use serde::{Deserialize, Serialize};
 
-/// Sizes that the data set fixes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Dims {
-    /// numbers in the robot's own state
-    pub state: usize,
-    /// numbers in the environment's state; 0 if there is none
-    pub environment_state: usize,
-    /// numbers in an action
-    pub action: usize,
-}
-
-/// Windows as tensors, all f32.
+/// Windows as tensors.
 #[derive(Debug, Clone)]
 pub struct Batch {
-    /// (b, S)
-    pub state: Tensor,
-    /// (b, E)
-    pub environment_state: Option<Tensor>,
+    /// (b, …) each as [`Signature::batch_shape`] says; f32, pictures u8
+    pub observation: Features<Tensor>,
     /// (b, H, A)
     pub actions: Tensor,
     /// (b, H): 1 where the step lies beyond the end of its episode, else 0
@@ -36,41 +22,30 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// From row-major slices: `state` n*S, `environment_state` n*E (empty if E = 0), `actions` n*H*A, `is_pad` n*H.
+    /// From row-major values: those of the signature's features, `actions` n*H*A, `is_pad` n*H.
     ///
     /// # Errors
-    /// A slice of the wrong length, or an empty batch.
-    pub fn from_slices(
-        dims: &Dims,
+    /// Values of the wrong length, by name, or an empty batch.
+    pub fn new(
+        signature: &Signature,
         action_horizon: usize,
-        state: &[f32],
-        environment_state: &[f32],
-        actions: &[f32],
+        mut observation: Features<Values>,
+        actions: Vec<f32>,
         is_pad: &[bool],
     ) -> Result<Self> {
         let n = is_pad.len() / action_horizon.max(1);
-        let check = |object: &'static str, found: usize, expected: &[usize]| {
-            if found == expected.iter().product::<usize>() && found > 0 {
-                return Ok(());
-            }
-            Err(ModelError::Shape { operation: "batch", object, expected: expected.to_vec(), found: vec![found] })
-        };
         check("is_pad", is_pad.len(), &[n, action_horizon])?;
-        check("state", state.len(), &[n, dims.state])?;
-        if dims.environment_state > 0 || !environment_state.is_empty() {
-            check("environment_state", environment_state.len(), &[n, dims.environment_state])?;
+        check("actions", actions.len(), &[n, action_horizon, signature.action_dim])?;
+        let mut tensors = Features::new();
+        for spec in &signature.observation {
+            let values = observation.take("batch", &spec.name)?;
+            tensors.insert(&spec.name, tensor(&spec.name, values, &signature.batch_shape(spec, n))?);
         }
-        check("actions", actions.len(), &[n, action_horizon, dims.action])?;
         let dev = &Device::Cpu;
         let pad: Vec<f32> = is_pad.iter().map(|&p| if p { 1.0 } else { 0.0 }).collect();
-        let environment_state = match dims.environment_state {
-            0 => None,
-            e => Some(Tensor::from_slice(environment_state, (n, e), dev)?),
-        };
         Ok(Self {
-            state: Tensor::from_slice(state, (n, dims.state), dev)?,
-            environment_state,
-            actions: Tensor::from_slice(actions, (n, action_horizon, dims.action), dev)?,
+            observation: tensors,
+            actions: Tensor::from_vec(actions, (n, action_horizon, signature.action_dim), dev)?,
             is_pad: Tensor::from_vec(pad, (n, action_horizon), dev)?,
             total_rows: n,
             total_valid_steps: is_pad.iter().filter(|&&p| !p).count(),
@@ -78,9 +53,29 @@ impl Batch {
         })
     }
 
+    /// The same from borrowed values.
+    ///
+    /// # Errors
+    /// As [`Batch::new`].
+    pub fn from_slices(
+        signature: &Signature,
+        action_horizon: usize,
+        observation: &Features<ValuesRef<'_>>,
+        actions: &[f32],
+        is_pad: &[bool],
+    ) -> Result<Self> {
+        let owned = observation.map(|_, values| values.to_owned());
+        Self::new(signature, action_horizon, owned, actions.to_vec(), is_pad)
+    }
+
     /// Rows in this shard.
     pub fn rows(&self) -> usize {
-        self.state.dims().first().copied().unwrap_or(0)
+        self.actions.dims().first().copied().unwrap_or(0)
+    }
+
+    /// Where its tensors are.
+    pub fn device(&self) -> &Device {
+        self.actions.device()
     }
 
     /// Cuts the batch into at most `n` shards of consecutive rows whose losses add up to the loss of the whole.
@@ -92,8 +87,7 @@ impl Batch {
                 let (from, to) = (rows * i / n, rows * (i + 1) / n);
                 let cut = |t: &Tensor| t.narrow(0, from, to - from)?.contiguous();
                 Ok(Self {
-                    state: cut(&self.state)?,
-                    environment_state: self.environment_state.as_ref().map(cut).transpose()?,
+                    observation: self.observation.try_map(|_, tensor| cut(tensor))?,
                     actions: cut(&self.actions)?,
                     is_pad: cut(&self.is_pad)?,
                     ..self.clone()
@@ -103,30 +97,60 @@ impl Batch {
     }
 }
 
+fn check(name: &str, found: usize, expected: &[usize]) -> Result<()> {
+    if found == expected.iter().product::<usize>() && found > 0 {
+        return Ok(());
+    }
+    let (operation, name) = ("batch", name.to_string());
+    Err(ModelError::FeatureShape { operation, name, expected: expected.to_vec(), found: vec![found] })
+}
+
+/// Values of feature `name` as a tensor of this shape.
+pub(crate) fn tensor(name: &str, values: Values, shape: &[usize]) -> Result<Tensor> {
+    check(name, values.as_ref().len(), shape)?;
+    Ok(match values {
+        Values::F32(values) => Tensor::from_vec(values, shape, &Device::Cpu)?,
+        Values::U8(values) => Tensor::from_vec(values, shape, &Device::Cpu)?,
+    })
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::features::FeatureSpec;
+    use crate::normaliser::STATE;
 
     #[test]
     fn shards_cover_the_rows_and_keep_the_totals() {
-        let dims = Dims { state: 2, environment_state: 1, action: 1 };
+        let signature = Signature::low_dimensional(2, 1, 1);
         let state: Vec<f32> = (0..10).map(|x| x as f32).collect();
         let mut pad = [false; 15];
         pad[4] = true;
-        let batch = Batch::from_slices(&dims, 3, &state, &[0.0; 5], &[0.0; 15], &pad).unwrap();
+        let observation = Features::of_slices(&state, &[0.0; 5]);
+        let batch = Batch::from_slices(&signature, 3, &observation, &[0.0; 15], &pad).unwrap();
         assert_eq!((batch.rows(), batch.total_rows, batch.total_valid_steps), (5, 5, 14));
         let shards = batch.shards(2).unwrap();
         assert_eq!(shards.iter().map(Batch::rows).collect::<Vec<_>>(), [2, 3]);
-        assert_eq!(shards[1].state.to_vec2::<f32>().unwrap()[0], [4.0, 5.0]);
+        assert_eq!(shards[1].observation.get(STATE).unwrap().to_vec2::<f32>().unwrap()[0], [4.0, 5.0]);
         assert_eq!(shards[1].total_valid_steps, 14);
         assert_eq!(batch.shards(9).unwrap().len(), 5);
     }
 
     #[test]
-    fn a_wrong_length_names_the_slice() {
-        let dims = Dims { state: 2, environment_state: 0, action: 1 };
-        let error = Batch::from_slices(&dims, 3, &[0.0; 3], &[], &[0.0; 3], &[false; 3]).unwrap_err();
-        assert!(error.to_string().contains("state"), "{error}");
+    fn a_wrong_length_and_a_missing_feature_are_named() {
+        let mut signature = Signature::low_dimensional(2, 0, 1);
+        let make = |signature: &Signature, state: &[f32]| {
+            let observation = Features::of_slices(state, &[]);
+            Batch::from_slices(signature, 3, &observation, &[0.0; 3], &[false; 3]).map(|batch| batch.observation)
+        };
+        let error = make(&signature, &[0.0; 3]).unwrap_err().to_string();
+        assert_eq!(error, "batch: observation.state has shape [3], expected [1, 2]");
+        signature.n_obs_steps = 3;
+        let observation = make(&signature, &[0.0; 6]).unwrap();
+        assert_eq!(observation.get(STATE).unwrap().dims(), [1, 3, 2]);
+        signature.observation.push(FeatureSpec::entity("cube", 3, "cube", false));
+        let error = make(&signature, &[0.0; 6]).unwrap_err().to_string();
+        assert_eq!(error, "batch: feature observation.entity.cube is missing; given: observation.state");
     }
 }

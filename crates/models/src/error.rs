@@ -67,6 +67,52 @@ pub enum ModelError {
         /// what was expected
         expected: String,
     },
+    /// A feature of an observation that is needed and not there.
+    #[error("{operation}: feature {name} is missing; given: {given}")]
+    MissingFeature {
+        /// what was being done
+        operation: &'static str,
+        /// the feature
+        name: String,
+        /// the names that were given (shortened)
+        given: String,
+    },
+    /// A feature of the wrong shape or length.
+    #[error("{operation}: {name} has shape {found:?}, expected {expected:?}")]
+    FeatureShape {
+        /// what was being done
+        operation: &'static str,
+        /// the feature
+        name: String,
+        /// expected shape
+        expected: Vec<usize>,
+        /// found shape
+        found: Vec<usize>,
+    },
+    /// A feature whose values are of another type than its kind has.
+    #[error("feature {name} of kind {kind} holds {found}, expected {expected}")]
+    FeatureType {
+        /// the feature
+        name: String,
+        /// its kind
+        kind: &'static str,
+        /// what it holds
+        found: &'static str,
+        /// what it should hold
+        expected: &'static str,
+    },
+    /// A feature of a kind that a model has no way to read.
+    #[error("{model} cannot read feature {feature} of kind {kind}; it reads {reads}")]
+    UnreadableFeature {
+        /// the model
+        model: &'static str,
+        /// the feature
+        feature: String,
+        /// its kind
+        kind: &'static str,
+        /// the kinds that the model reads
+        reads: String,
+    },
     /// A statistic that normalisation needs.
     #[error("statistic {name} is missing; given: {given}")]
     MissingStatistic {

@@ -267,6 +267,7 @@ impl Conversion<'_> {
                 env_args: plan.env_args.clone(),
                 state_keys: self.mapping.state_keys.clone(),
                 env_keys: self.mapping.env_keys.clone(),
+                entities: self.mapping.entities.clone(),
                 action: self.mapping.action.clone(),
                 demos: plan.demos.iter().map(|d| d.id.clone()).collect(),
                 masks,

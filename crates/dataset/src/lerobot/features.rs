@@ -2,6 +2,7 @@
 
 use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm};
 use crate::error::{DatasetError, InputError, Result};
+use crate::keys::KeyItem;
 use crate::plan::{DemoPlan, KeyPlan, Plan};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -14,6 +15,9 @@ const STATE_DEFAULTS: [&[&str]; 4] = [
     &["qpos"],
     &["flat"],
 ];
+
+/// What the names of columns of entities begin with.
+pub const ENTITY_PREFIX: &str = "observation.entity.";
 
 /// Default key of `observation.environment_state`.
 const ENV_DEFAULT: &str = "object";
@@ -40,6 +44,9 @@ pub struct ConvertOptions {
     /// Observation keys of `observation.environment_state`; `None` takes `object` where it is there, an empty list makes
     /// no such column.
     pub env_keys: Option<Vec<String>>,
+    /// Observation keys of `observation.entity.<name>`, by name: vectors of one thing each, as a model that reads
+    /// entities wants them. They may overlap the others.
+    pub entities: BTreeMap<String, Vec<String>>,
     /// Frames a second; `None` takes the control frequency that the source states.
     pub fps: Option<f64>,
     /// How images are stored.
@@ -61,6 +68,7 @@ impl Default for ConvertOptions {
         Self {
             state_keys: None,
             env_keys: None,
+            entities: BTreeMap::new(),
             fps: None,
             images: ImageForm::default(),
             actions: ActionKind::default(),
@@ -75,8 +83,8 @@ impl Default for ConvertOptions {
 /// Where the values of a column come from.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Origin {
-    /// Datasets side by side, each with its width.
-    Concat(Vec<(String, usize)>),
+    /// Observations side by side, each with the widths of the datasets that it reads, by key.
+    Concat(Vec<(KeyItem, BTreeMap<String, usize>)>),
     /// The action dataset.
     Action { key: String, width: usize, rotation: RotationForm },
     /// `rewards` as float.
@@ -128,6 +136,7 @@ pub(crate) struct Mapping {
     pub fps: f64,
     pub state_keys: Vec<String>,
     pub env_keys: Vec<String>,
+    pub entities: BTreeMap<String, Vec<String>>,
     pub action: ActionProvenance,
     /// What was taken for granted.
     pub notes: Vec<String>,
@@ -149,6 +158,9 @@ impl Mapping {
                 columns.push(chooser.concat(name, keys)?);
             }
         }
+        for (name, keys) in &options.entities {
+            columns.push(chooser.concat(&format!("{ENTITY_PREFIX}{name}"), keys)?);
+        }
         columns.extend(chooser.images()?);
         let (action, provenance) = chooser.action(options)?;
         columns.push(action);
@@ -156,7 +168,8 @@ impl Mapping {
         columns.extend(index_columns());
         let mut notes = chooser.pictures_left_out(options.lossless);
         let fps = chooser.fps(options, &mut notes)?;
-        Ok(Self { columns, fps, state_keys, env_keys, action: provenance, notes })
+        let entities = options.entities.clone();
+        Ok(Self { columns, fps, state_keys, env_keys, entities, action: provenance, notes })
     }
 
     /// The columns as `info.json` lists them.
@@ -212,13 +225,19 @@ impl Chooser<'_> {
         let mut parts = Vec::with_capacity(keys.len());
         let mut names = Vec::new();
         for key in keys {
-            let path = format!("obs/{key}");
-            let width = self.width_everywhere(&path)?;
-            names.extend((0..width).map(|i| match width {
-                1 => key.clone(),
-                _ => format!("{key}_{i}"),
-            }));
-            parts.push((path, width));
+            let unfit = |reason: String| DatasetError::from(InputError::ObservationKeys {
+                path: self.plan.path.clone(),
+                column: name.to_owned(),
+                reason,
+            });
+            let item: KeyItem = key.parse().map_err(unfit)?;
+            let mut widths = BTreeMap::new();
+            for key in item.keys() {
+                widths.insert(key.to_owned(), self.width_everywhere(&format!("obs/{key}"))?);
+            }
+            let width = item.width(|key| widths.get(key).copied()).map_err(unfit)?;
+            names.extend(item.names(width));
+            parts.push((item, widths));
         }
         Ok(Column {
             name: name.to_owned(),

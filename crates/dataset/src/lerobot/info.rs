@@ -175,6 +175,9 @@ pub struct Provenance {
     pub state_keys: Vec<String>,
     /// Observation keys that make up `observation.environment_state`, in order.
     pub env_keys: Vec<String>,
+    /// Observation keys that make up `observation.entity.<name>`, in order, by name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub entities: BTreeMap<String, Vec<String>>,
     /// Where `action` came from: `actions`, `actions_abs`, and its rotation representation.
     pub action: ActionProvenance,
     /// Demo id of each episode.

@@ -21,7 +21,7 @@ mod work;
 
 pub use convert::{ConvertReport, convert};
 pub use export::{ExportReport, export};
-pub use features::{ConvertOptions, ImageForm};
+pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm};
 pub use info::{ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm};
 pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};
 pub use verify::{Check, verify, verify_source};

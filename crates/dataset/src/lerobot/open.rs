@@ -250,16 +250,20 @@ impl Dataset {
 
     /// Windows over some episodes.
     pub fn windows(&self, spec: &WindowSpec) -> Result<Windows> {
-        if spec.action_horizon == 0 {
-            return Err(DatasetError::NotInDataset {
-                path: self.root.clone(),
-                wanted: "window of 0 actions".to_owned(),
-                found: "1 or more to ask for".to_owned(),
-            });
+        for (count, of) in [(spec.action_horizon, "actions"), (spec.n_obs_steps, "observations")] {
+            if count == 0 {
+                return Err(DatasetError::NotInDataset {
+                    path: self.root.clone(),
+                    wanted: format!("window of 0 {of}"),
+                    found: "1 or more to ask for".to_owned(),
+                });
+            }
         }
         let ranges = self.ranges(&spec.episodes)?;
-        let environment_state = self.columns.get(ENVIRONMENT_STATE).cloned().unwrap_or_else(Resident::empty);
-        Ok(Windows::new(self.required(STATE)?, environment_state, self.required(ACTION)?, spec.action_horizon, &ranges))
+        let columns = spec.observation.iter().map(|name| Ok((name.clone(), self.required(name)?)));
+        let observation = columns.collect::<Result<_>>()?;
+        let lengths = (spec.n_obs_steps, spec.action_horizon);
+        Ok(Windows::new(observation, self.required(ACTION)?, lengths, &ranges))
     }
 
     fn required(&self, name: &str) -> Result<Resident> {

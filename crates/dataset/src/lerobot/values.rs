@@ -3,10 +3,12 @@
 use super::features::{Column, IndexColumn, Mapping, Origin};
 use super::info::RotationForm;
 use crate::error::{DatasetError, InputError, Result};
+use crate::keys::KeyItem;
 use crate::rotation;
 use crate::stats::FeatureStats;
 use crate::tree::{Array, Demo};
 use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// One episode's values of one column.
@@ -91,7 +93,7 @@ pub(crate) fn column_values(path: &Path, column: &Column, demo: &Demo, fps: f64,
     let length = position.length;
     let single = |key: &str| numbers(path, demo, key, 1, length);
     Ok(match &column.origin {
-        Origin::Concat(parts) => Values::F32(concat(path, demo, parts, length)?),
+        Origin::Concat(parts) => Values::F32(concat(path, demo, parts, column.dim(), length)?),
         Origin::Action { key, width, rotation } => {
             let stored = numbers(path, demo, key, *width, length)?;
             Values::F32(match rotation {
@@ -126,16 +128,30 @@ pub(crate) fn index_values(index: IndexColumn, fps: f64, position: Position) -> 
     }
 }
 
-fn concat(path: &Path, demo: &Demo, parts: &[(String, usize)], length: usize) -> Result<Vec<f32>> {
-    let total: usize = parts.iter().map(|(_, width)| width).sum();
-    let mut out = vec![0.0; total * length];
-    let mut offset = 0;
-    for (key, width) in parts {
-        let part = numbers(path, demo, key, *width, length)?;
-        for (row, values) in out.chunks_exact_mut(total).zip(part.chunks_exact(*width)) {
-            row[offset..offset + width].copy_from_slice(values);
+fn concat(
+    path: &Path,
+    demo: &Demo,
+    parts: &[(KeyItem, BTreeMap<String, usize>)],
+    width: usize,
+    length: usize,
+) -> Result<Vec<f32>> {
+    let mut out = vec![0.0; width * length];
+    let (mut offset, mut row) = (0, Vec::new());
+    for (item, widths) in parts {
+        let mut datasets = Vec::with_capacity(widths.len());
+        for (key, &width) in widths {
+            datasets.push((key, width, numbers(path, demo, &format!("obs/{key}"), width, length)?));
         }
-        offset += width;
+        for (step, out) in out.chunks_exact_mut(width).enumerate() {
+            let values_of = |key: &str| {
+                let (_, width, values) = datasets.iter().find(|(name, ..)| *name == key)?;
+                Some(&values[step * width..(step + 1) * width])
+            };
+            row.clear();
+            item.append(values_of, &mut row).expect("the datasets of the item were just taken out");
+            out[offset..offset + row.len()].copy_from_slice(&row);
+        }
+        offset += row.len();
     }
     Ok(out)
 }

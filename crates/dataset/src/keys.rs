@@ -1,0 +1,219 @@
+//! Lists of observation keys, as experiments and conversions name them.
+//!
+//! An item of a list is a key (`cube_pos`), a part of one (`goal_rgb[0:3]`), or the difference of two of those
+//! (`cube_pos - robot0_eef_pos`). The same item gives the same numbers whether it is read out of a file or out of a
+//! simulator: values become f32 first.
+
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+
+/// A key, or some of its numbers.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Term {
+    key: String,
+    /// the numbers from the first to before the second
+    range: Option<(usize, usize)>,
+}
+
+impl Term {
+    fn parse(text: &str) -> Result<Self, String> {
+        let text = text.trim();
+        let Some(open) = text.find('[') else {
+            let good = !text.is_empty() && !text.contains(']');
+            return good.then(|| Self { key: text.to_owned(), range: None }).ok_or_else(|| "a key".to_owned());
+        };
+        let range = text[open + 1..].strip_suffix(']').and_then(|inside| inside.split_once(':'));
+        let numbers = range.and_then(|(a, b)| Some((a.trim().parse().ok()?, b.trim().parse().ok()?)));
+        match numbers {
+            Some((from, to)) if from < to && open > 0 => {
+                Ok(Self { key: text[..open].to_owned(), range: Some((from, to)) })
+            }
+            _ => Err("key[from:to] with from below to".to_owned()),
+        }
+    }
+
+    fn width(&self, of_key: usize) -> Result<usize, String> {
+        match self.range {
+            None => Ok(of_key),
+            Some((from, to)) if to <= of_key => Ok(to - from),
+            Some(_) => Err(format!("{self}: {} has {of_key} numbers", self.key)),
+        }
+    }
+
+    fn of<'v>(&self, values: &'v [f32]) -> &'v [f32] {
+        match self.range {
+            None => values,
+            Some((from, to)) => &values[from..to],
+        }
+    }
+}
+
+impl fmt::Display for Term {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.range {
+            None => f.write_str(&self.key),
+            Some((from, to)) => write!(f, "{}[{from}:{to}]", self.key),
+        }
+    }
+}
+
+/// One item of a list of observation keys.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct KeyItem {
+    plus: Term,
+    minus: Option<Term>,
+}
+
+impl KeyItem {
+    /// The keys that it reads.
+    pub fn keys(&self) -> impl Iterator<Item = &str> {
+        std::iter::once(&self.plus).chain(&self.minus).map(|term| term.key.as_str())
+    }
+
+    /// How many numbers it gives, where `width_of` tells how many a key has.
+    ///
+    /// # Errors
+    /// In words: a key or a part that is not there, a difference of unequal lengths.
+    pub fn width(&self, width_of: impl Fn(&str) -> Option<usize>) -> Result<usize, String> {
+        let width = |term: &Term| term.width(width_of(&term.key).ok_or_else(|| format!("{self}: no {}", term.key))?);
+        let plus = width(&self.plus)?;
+        match self.minus.as_ref().map(width).transpose()? {
+            Some(minus) if minus != plus => Err(format!("{self}: {plus} numbers minus {minus}")),
+            _ => Ok(plus),
+        }
+    }
+
+    /// Appends its numbers to `out`, where `values_of` gives the numbers of a key; `None`, with nothing appended, if a key
+    /// is not there.
+    ///
+    /// # Panics
+    /// If a key has fewer numbers than when the width was asked for.
+    pub fn append<'v>(&self, values_of: impl Fn(&str) -> Option<&'v [f32]>, out: &mut Vec<f32>) -> Option<()> {
+        let plus = self.plus.of(values_of(&self.plus.key)?);
+        match &self.minus {
+            None => out.extend_from_slice(plus),
+            Some(minus) => {
+                let minus = minus.of(values_of(&minus.key)?);
+                out.extend(plus.iter().zip(minus).map(|(a, b)| a - b));
+            }
+        }
+        Some(())
+    }
+
+    /// Names of its numbers, as a column lists them.
+    pub(crate) fn names(&self, width: usize) -> impl Iterator<Item = String> {
+        let from = match (&self.minus, self.plus.range) {
+            (None, Some((from, _))) => from,
+            _ => 0,
+        };
+        let (whole, base) = match &self.minus {
+            None => (self.plus.range.is_none(), self.plus.key.clone()),
+            Some(_) => (true, self.to_string()),
+        };
+        (0..width).map(move |i| match width {
+            1 if whole => base.clone(),
+            _ => format!("{base}_{}", from + i),
+        })
+    }
+}
+
+impl FromStr for KeyItem {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parsed = match text.split_once(" - ") {
+            None => Term::parse(text).map(|plus| Self { plus, minus: None }),
+            Some((plus, minus)) => {
+                Term::parse(plus).and_then(|plus| Ok(Self { plus, minus: Some(Term::parse(minus)?) }))
+            }
+        };
+        parsed.map_err(|expected| format!("`{text}`: expected {expected}"))
+    }
+}
+
+impl TryFrom<String> for KeyItem {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl From<KeyItem> for String {
+    fn from(item: KeyItem) -> Self {
+        item.to_string()
+    }
+}
+
+impl fmt::Display for KeyItem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.minus {
+            None => self.plus.fmt(f),
+            Some(minus) => write!(f, "{} - {minus}", self.plus),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn item(text: &str) -> KeyItem {
+        text.parse().unwrap()
+    }
+
+    fn values(key: &str) -> Option<&'static [f32]> {
+        match key {
+            "a" => Some(&[1.0, 2.0, 3.0]),
+            "b" => Some(&[10.0, 20.0, 30.0, 40.0]),
+            "one" => Some(&[7.0]),
+            _ => None,
+        }
+    }
+
+    fn read(text: &str) -> Result<Vec<f32>, String> {
+        let item = item(text);
+        let width = item.width(|key| values(key).map(<[f32]>::len))?;
+        let mut out = Vec::new();
+        item.append(values, &mut out).unwrap();
+        assert_eq!((out.len(), item.names(width).count()), (width, width));
+        Ok(out)
+    }
+
+    #[test]
+    fn items_are_keys_parts_and_differences() {
+        assert_eq!(read("a").unwrap(), [1.0, 2.0, 3.0]);
+        assert_eq!(read("b[1:3]").unwrap(), [20.0, 30.0]);
+        assert_eq!(read("b[0:3] - a").unwrap(), [9.0, 18.0, 27.0]);
+        assert_eq!(read("a[2:3] - one").unwrap(), [-4.0]);
+        assert_eq!(item("b[1:3] - a[0:2]").keys().collect::<Vec<_>>(), ["b", "a"]);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_named() {
+        assert_eq!(read("b[2:5]").unwrap_err(), "b[2:5]: b has 4 numbers");
+        assert_eq!(read("b - a").unwrap_err(), "b - a: 4 numbers minus 3");
+        assert_eq!(read("a - c").unwrap_err(), "a - c: no c");
+        for bad in ["", "a[", "a[1]", "a[3:3]", "[0:2]", "a - ", "a]"] {
+            let message = bad.parse::<KeyItem>().unwrap_err();
+            assert!(message.starts_with(&format!("`{bad}`: expected ")), "{message}");
+        }
+    }
+
+    #[test]
+    fn items_are_written_as_they_are_read() {
+        for text in ["a", "b[1:3]", "b[0:3] - a"] {
+            assert_eq!(item(text).to_string(), text);
+            assert_eq!(serde_json::from_str::<KeyItem>(&format!("\"{text}\"")).unwrap(), item(text));
+        }
+        let names = |text: &str, width| item(text).names(width).collect::<Vec<_>>();
+        assert_eq!(names("a", 3), ["a_0", "a_1", "a_2"]);
+        assert_eq!(names("one", 1), ["one"]);
+        assert_eq!(names("b[1:3]", 2), ["b_1", "b_2"]);
+        assert_eq!(names("b[1:2]", 1), ["b_1"]);
+        assert_eq!(names("a[0:2] - b[2:4]", 2), ["a[0:2] - b[2:4]_0", "a[0:2] - b[2:4]_1"]);
+    }
+}
