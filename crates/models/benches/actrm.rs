@@ -7,15 +7,16 @@
 use candle_core::{Device, Tensor};
 use models::act::{self, Act};
 use models::actrm::{self, Actrm};
-use models::{Dims, PolicyModel};
+use models::{Features, PolicyModel, Signature};
 use std::time::Instant;
 
 fn main() {
     let args: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with("--")).collect();
     let repeats: usize = args.first().map_or(30, |n| n.parse().unwrap());
-    let dims = Dims { state: 9, environment_state: 10, action: 7 };
+    let signature = Signature::low_dimensional(9, 10, 7);
     let state = Tensor::from_vec(vec![0.3f32; 9], (1, 9), &Device::Cpu).unwrap();
     let env = Tensor::from_vec(vec![-0.2f32; 10], (1, 10), &Device::Cpu).unwrap();
+    let observation = Features::low_dimensional(state, Some(env));
     for (dim_model, dim_feedforward, action_horizon) in [(128, 512, 16), (256, 1024, 32), (512, 3200, 100)] {
         let act = act::Config { dim_model, dim_feedforward, action_horizon, ..act::Config::default() };
         let mut ours = actrm::Config { dim_model, dim_feedforward, action_horizon, ..actrm::Config::default() };
@@ -23,12 +24,12 @@ fn main() {
         ours.reasoning.halt_threshold = 1.0;
         ours.reasoning.change_threshold = 0.0;
         let models: [Box<dyn PolicyModel>; 2] =
-            [Box::new(Act::new(&act, &dims, 0).unwrap()), Box::new(Actrm::new(&ours, &dims, 0).unwrap())];
+            [Box::new(Act::new(&act, &signature, 0).unwrap()), Box::new(Actrm::new(&ours, &signature, 0).unwrap())];
         let mut seconds = [Vec::new(), Vec::new()];
         for _ in 0..repeats {
             for (model, seconds) in models.iter().zip(&mut seconds) {
                 let begun = Instant::now();
-                model.predict(&state, Some(&env)).unwrap();
+                model.predict(&observation).unwrap();
                 seconds.push(begun.elapsed().as_secs_f64());
             }
         }

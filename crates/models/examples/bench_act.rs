@@ -9,13 +9,12 @@
 #![allow(clippy::unwrap_used)]
 
 use models::actrm::{Actrm, Over, ReasoningConfig};
-use models::{Batch, Dims, LossParts, PolicyConfig, PolicyModel, Rng, TrainConfig, Trainer, act, actrm};
+use models::{Batch, Features, LossParts, PolicyConfig, PolicyModel, Rng, Signature, TrainConfig, Trainer, act, actrm};
 use serde_json::json;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Instant;
 
-const DIMS: Dims = Dims { state: 9, environment_state: 10, action: 7 };
 const BATCH: usize = 64;
 /// Predictions of one measurement: a few tenths of a second, as the system counts CPU time in steps of milliseconds.
 fn repeats(size: &str) -> usize {
@@ -60,15 +59,19 @@ fn original_plan() -> ReasoningConfig {
     ReasoningConfig { over: Over::Memory, h_cycles, l_cycles, supervision_steps: 1, ..ReasoningConfig::original() }
 }
 
+fn signature() -> Signature {
+    Signature::low_dimensional(9, 10, 7)
+}
+
 fn batch(size: &str) -> Batch {
     let mut rng = Rng::new(1, "bench");
     let h = sizes(size).2;
     let (s, e, a) = (rng.normals(BATCH * 9), rng.normals(BATCH * 10), rng.normals(BATCH * h * 7));
-    Batch::from_slices(&DIMS, h, &s, &e, &a, &vec![false; BATCH * h]).unwrap()
+    Batch::from_slices(&signature(), h, &Features::of_slices(&s, &e), &a, &vec![false; BATCH * h]).unwrap()
 }
 
 fn trainer(config: &PolicyConfig, threads: usize) -> Trainer {
-    let mut trainer = Trainer::new(config.build(&DIMS, 1).unwrap(), TrainConfig::default(), 1).unwrap();
+    let mut trainer = Trainer::new(config.build(&signature(), 1).unwrap(), TrainConfig::default(), 1).unwrap();
     trainer.set_threads(threads);
     trainer
 }
@@ -208,7 +211,7 @@ impl Bench {
         }
         let name = format!("ACT predict {size}, batch 1");
         if self.wants(&name) {
-            let model = act_config(size).build(&DIMS, 1).unwrap();
+            let model = act_config(size).build(&signature(), 1).unwrap();
             let mut peer = self.python.as_deref().map(Peer::start);
             let theirs = peer.as_mut().map(|peer| || peer.timed("predict", size, 1, repeats(size)));
             self.in_turns(&name, Some(0.6), false, || predictions(model.as_ref(), size, repeats(size)), theirs);
@@ -219,9 +222,9 @@ impl Bench {
     /// ACTRM's predictions beside ACT's and the original's plan.
     fn actrm(&mut self, size: &str) {
         let name = format!("ACTRM predict {size} (peer: our ACT)");
-        let ours = PolicyConfig::Actrm(actrm_config(size, full_depth())).build(&DIMS, 1).unwrap();
+        let ours = PolicyConfig::Actrm(actrm_config(size, full_depth())).build(&signature(), 1).unwrap();
         if self.wants(&name) {
-            let act = act_config(size).build(&DIMS, 1).unwrap();
+            let act = act_config(size).build(&signature(), 1).unwrap();
             let theirs = Some(|| predictions(act.as_ref(), size, repeats(size)));
             self.in_turns(&name, Some(2.0), false, || predictions(ours.as_ref(), size, repeats(size)), theirs);
         }
@@ -235,7 +238,7 @@ impl Bench {
         // on our own layers the plan is as fast as it can be made: what remains is what the design saves
         let name = format!("ACTRM predict {size} (peer: {ORIGINAL_CALLS} calls of our encoder)");
         if self.wants(&name) {
-            let plan = PolicyConfig::Actrm(actrm_config(size, original_plan())).build(&DIMS, 1).unwrap();
+            let plan = PolicyConfig::Actrm(actrm_config(size, original_plan())).build(&signature(), 1).unwrap();
             let theirs = Some(|| predictions(plan.as_ref(), size, 1));
             self.in_turns(&name, None, false, || predictions(ours.as_ref(), size, repeats(size)), theirs);
         }
@@ -262,7 +265,7 @@ impl Bench {
             return;
         }
         let config = actrm_config(size, reasoning);
-        let composed = Actrm::new(&config, &DIMS, 1).unwrap();
+        let composed = Actrm::new(&config, &signature(), 1).unwrap();
         let (batch, mut trainer) = (batch(size), trainer(&PolicyConfig::Actrm(config), 1));
         let ours = || timed(1, &mut || drop(trainer.step(&batch).unwrap()));
         // the composed model's gradients only: what the optimiser costs is in ours
@@ -295,9 +298,8 @@ impl Bench {
 
 fn predictions(model: &dyn PolicyModel, size: &str, times: usize) -> Cost {
     let batch = batch(size);
-    let one = |t: &candle_core::Tensor| t.narrow(0, 0, 1).unwrap().contiguous().unwrap();
-    let (state, env) = (one(&batch.state), batch.environment_state.as_ref().map(one));
-    timed(times, &mut || drop(model.predict(&state, env.as_ref()).unwrap()))
+    let one = batch.observation.map(|_, t| t.narrow(0, 0, 1).unwrap().contiguous().unwrap());
+    timed(times, &mut || drop(model.predict(&one).unwrap()))
 }
 
 /// Bytes that this process had in memory at its fullest.

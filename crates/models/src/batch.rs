@@ -64,7 +64,7 @@ impl Batch {
         actions: &[f32],
         is_pad: &[bool],
     ) -> Result<Self> {
-        let owned = observation.map(|_, values| values.to_owned());
+        let owned = observation.map(|_, values| values.to_values());
         Self::new(signature, action_horizon, owned, actions.to_vec(), is_pad)
     }
 

@@ -1,7 +1,8 @@
 //! Checks of what comes into a model, each naming what does not fit.
 
-use crate::batch::{Batch, Dims};
+use crate::batch::Batch;
 use crate::error::{ModelError, Result};
+use crate::features::{FeatureKind, Features, Signature};
 use candle_core::Tensor;
 
 pub(crate) fn check_shape(
@@ -17,42 +18,54 @@ pub(crate) fn check_shape(
     Err(ModelError::Shape { operation, object, expected, found })
 }
 
-/// Checks that there is something to see and something to do.
-pub(crate) fn check_dims(model: &'static str, dims: &Dims) -> Result<()> {
-    for (field, size) in [("dims.state", dims.state), ("dims.action", dims.action)] {
-        if size == 0 {
-            let expected = "at least 1".to_string();
-            return Err(ModelError::Config { model, field, found: "0".to_string(), expected });
-        }
+/// Checks that a model which reads `reads`, and a state in any case, can be built for the signature.
+pub(crate) fn check_signature(model: &'static str, signature: &Signature, reads: &[FeatureKind]) -> Result<()> {
+    signature.check(model, reads)?;
+    if signature.of_kind(FeatureKind::State).next().is_none() {
+        let names: Vec<&str> = signature.observation.iter().map(|spec| spec.name.as_str()).collect();
+        let found = if names.is_empty() { "empty".to_string() } else { names.join(", ") };
+        let expected = "a feature of kind state among others".to_string();
+        return Err(ModelError::Config { model, field: "observation", found, expected });
     }
     Ok(())
 }
 
-/// Checks a batch of windows against the model's sizes.
-pub(crate) fn check_batch(operation: &'static str, dims: &Dims, action_horizon: usize, batch: &Batch) -> Result<()> {
-    check_observation(operation, dims, &batch.state, batch.environment_state.as_ref())?;
-    let expected = [batch.rows(), action_horizon, dims.action];
+/// Checks a batch of windows against the model's signature.
+pub(crate) fn check_batch(
+    operation: &'static str,
+    signature: &Signature,
+    action_horizon: usize,
+    batch: &Batch,
+) -> Result<()> {
+    let rows = check_observation(operation, signature, &batch.observation)?;
+    let expected = [rows, action_horizon, signature.action_dim];
     check_shape(operation, "actions", &batch.actions, &expected)?;
     check_shape(operation, "is_pad", &batch.is_pad, &expected[..2])
 }
 
-/// Checks `state: (b, S)` and `environment_state: (b, E)` against the model's sizes.
+/// Checks that the features are the signature's, each (b, …) in its shape; returns b.
 pub(crate) fn check_observation(
     operation: &'static str,
-    dims: &Dims,
-    state: &Tensor,
-    environment_state: Option<&Tensor>,
-) -> Result<()> {
-    let b = state.dims().first().copied().unwrap_or(0).max(1);
-    check_shape(operation, "state", state, &[b, dims.state])?;
-    match (environment_state, dims.environment_state) {
-        (None, 0) => Ok(()),
-        (Some(env), e) if e > 0 => check_shape(operation, "environment_state", env, &[b, e]),
-        (given, e) => Err(ModelError::Input {
-            operation,
-            object: "environment_state",
-            found: given.map_or("absent".to_string(), |t| format!("{:?}", t.dims())),
-            expected: if e == 0 { "absent".to_string() } else { format!("[{b}, {e}]") },
-        }),
+    signature: &Signature,
+    observation: &Features<Tensor>,
+) -> Result<usize> {
+    let rows = observation.iter().next().and_then(|(_, tensor)| tensor.dims().first().copied()).unwrap_or(0).max(1);
+    for spec in &signature.observation {
+        let tensor = observation.require(operation, &spec.name)?;
+        let expected = signature.batch_shape(spec, rows);
+        if tensor.dims() != expected {
+            let (name, found) = (spec.name.clone(), tensor.dims().to_vec());
+            return Err(ModelError::FeatureShape { operation, name, expected, found });
+        }
     }
+    if let Some(name) = observation.names().find(|name| signature.get(name).is_none()) {
+        let names: Vec<&str> = signature.observation.iter().map(|spec| spec.name.as_str()).collect();
+        return Err(ModelError::Input {
+            operation,
+            object: "observation",
+            found: format!("with feature {name}"),
+            expected: format!("{} alone", names.join(", ")),
+        });
+    }
+    Ok(rows)
 }

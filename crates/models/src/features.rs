@@ -277,7 +277,7 @@ impl<T> Features<T> {
     }
 
     /// The same names with other values.
-    pub fn map<U>(&self, mut f: impl FnMut(&str, &T) -> U) -> Features<U> {
+    pub fn map<'s, U>(&'s self, mut f: impl FnMut(&'s str, &'s T) -> U) -> Features<U> {
         Features(self.0.iter().map(|(name, value)| (name.clone(), f(name, value))).collect())
     }
 
@@ -285,7 +285,10 @@ impl<T> Features<T> {
     ///
     /// # Errors
     /// What `f` gives.
-    pub fn try_map<U, E>(&self, mut f: impl FnMut(&str, &T) -> std::result::Result<U, E>) -> std::result::Result<Features<U>, E> {
+    pub fn try_map<U, E>(
+        &self,
+        mut f: impl FnMut(&str, &T) -> std::result::Result<U, E>,
+    ) -> std::result::Result<Features<U>, E> {
         let pairs = self.0.iter().map(|(name, value)| Ok((name.clone(), f(name, value)?)));
         Ok(Features(pairs.collect::<std::result::Result<_, E>>()?))
     }
@@ -361,7 +364,7 @@ impl ValuesRef<'_> {
     }
 
     /// A copy.
-    pub fn to_owned(self) -> Values {
+    pub fn to_values(self) -> Values {
         match self {
             Self::F32(values) => Values::F32(values.to_vec()),
             Self::U8(values) => Values::U8(values.to_vec()),

@@ -1,8 +1,8 @@
 //! LeRobot's ACT files as values: its `config.json`, its tensor names, its names of normalisation modes. This is the one
 //! place that knows them; files are read and written in `zoo`.
 
-use crate::batch::Dims;
 use crate::error::{ModelError, Result, some_names};
+use crate::features::{FeatureKind, Signature};
 use crate::layers::{Activation, sinusoid_table};
 use crate::models::act::Config;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
@@ -44,7 +44,7 @@ pub struct LerobotAct {
     /// the model
     pub config: Config,
     /// its inputs and outputs
-    pub dims: Dims,
+    pub signature: Signature,
     /// actions executed before the next prediction
     pub n_action_steps: usize,
     /// temporal ensembling instead
@@ -212,7 +212,7 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
     config.validate()?;
     Ok(LerobotAct {
         config,
-        dims: Dims { state, environment_state: env, action },
+        signature: Signature::low_dimensional(state, env, action),
         n_action_steps: keys.n_action_steps,
         temporal_ensemble_coeff: keys.temporal_ensemble_coeff,
         modes,
@@ -220,11 +220,25 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
 }
 
 /// Writes a `config.json` that LeRobot 0.6.1 loads.
-pub fn write_config(act: &LerobotAct) -> Value {
-    let (c, d) = (&act.config, &act.dims);
-    let mut inputs = json!({ STATE: { "type": "STATE", "shape": [d.state] } });
-    if d.environment_state > 0 {
-        inputs[ENVIRONMENT_STATE] = json!({ "type": "ENV", "shape": [d.environment_state] });
+///
+/// # Errors
+/// What LeRobot's ACT cannot read: entities, a history.
+pub fn write_config(act: &LerobotAct) -> Result<Value> {
+    let c = &act.config;
+    let mut inputs = json!({});
+    for spec in &act.signature.observation {
+        let kind = match spec.kind {
+            FeatureKind::State => "STATE",
+            FeatureKind::EnvironmentState => "ENV",
+            FeatureKind::Entity | FeatureKind::Image => {
+                let expected = "features that LeRobot's ACT reads here: state and environment_state";
+                return Err(refuse("input_features", format!("{} of kind {}", spec.name, spec.kind), expected));
+            }
+        };
+        inputs[&spec.name] = json!({ "type": kind, "shape": spec.shape });
+    }
+    if act.signature.n_obs_steps != 1 {
+        return Err(refuse("n_obs_steps", act.signature.n_obs_steps.to_string(), "1"));
     }
     let mut mapping = Map::from_iter([("VISUAL".to_string(), json!("MEAN_STD"))]);
     for (feature, kind) in [(STATE, "STATE"), (ENVIRONMENT_STATE, "ENV"), (ACTION, "ACTION")] {
@@ -232,11 +246,11 @@ pub fn write_config(act: &LerobotAct) -> Value {
             mapping.insert(kind.to_string(), json!(mode_name(*mode)));
         }
     }
-    json!({
+    Ok(json!({
         "type": "act",
         "n_obs_steps": 1,
         "input_features": inputs,
-        "output_features": { ACTION: { "type": "ACTION", "shape": [d.action] } },
+        "output_features": { ACTION: { "type": "ACTION", "shape": [act.signature.action_dim] } },
         "device": "cpu",
         "normalization_mapping": mapping,
         "chunk_size": c.action_horizon,
@@ -254,7 +268,7 @@ pub fn write_config(act: &LerobotAct) -> Value {
         "n_vae_encoder_layers": c.n_vae_encoder_layers,
         "dropout": c.dropout,
         "kl_weight": c.kl_weight,
-    })
+    }))
 }
 
 /// Loads the tensors of a LeRobot `model.safetensors` into the parameters of an ACT: the name set must be exactly the
@@ -313,6 +327,7 @@ pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, 
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::features::FeatureSpec;
     use crate::model::PolicyModel;
     use crate::models::act::Act;
 
@@ -326,7 +341,7 @@ mod tests {
                 pre_norm: true,
                 ..Default::default()
             },
-            dims: Dims { state: 3, environment_state: 2, action: 2 },
+            signature: Signature::low_dimensional(3, 2, 2),
             n_action_steps: 4,
             temporal_ensemble_coeff: None,
             modes: BTreeMap::from([
@@ -340,8 +355,8 @@ mod tests {
     #[test]
     fn config_and_tensors_come_back() {
         let one = example();
-        assert_eq!(read_config(&write_config(&one)).unwrap(), one);
-        let (a, b) = (Act::new(&one.config, &one.dims, 1).unwrap(), Act::new(&one.config, &one.dims, 2).unwrap());
+        assert_eq!(read_config(&write_config(&one).unwrap()).unwrap(), one);
+        let [a, b] = [1, 2].map(|seed| Act::new(&one.config, &one.signature, seed).unwrap());
         let tensors = tensors_out(a.params(), &one.config).unwrap();
         let load_into_b = |tensors: &BTreeMap<String, Tensor>| load_tensors(b.params(), &one.config, tensors);
         load_into_b(&tensors).unwrap();
@@ -364,7 +379,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_run_is_refused_by_name() {
-        let good = write_config(&example());
+        let good = write_config(&example()).unwrap();
         for (field, value, named) in [
             ("type", json!("diffusion"), "diffusion"),
             ("n_obs_steps", json!(2), "n_obs_steps"),
@@ -381,5 +396,16 @@ mod tests {
             let error = read_config(&bad).unwrap_err().to_string();
             assert!(error.contains(named), "{error}");
         }
+    }
+
+    #[test]
+    fn what_lerobot_cannot_read_is_not_written() {
+        let mut entities = example();
+        entities.signature.observation.push(FeatureSpec::entity("cube", 3, "cube", false));
+        let error = write_config(&entities).unwrap_err().to_string();
+        assert!(error.contains("observation.entity.cube of kind entity"), "{error}");
+        let mut history = example();
+        history.signature.n_obs_steps = 2;
+        assert!(write_config(&history).unwrap_err().to_string().contains("n_obs_steps is 2"));
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::batch::Batch;
 use crate::error::{ModelError, Result};
+use crate::features::{Features, Signature};
 use crate::gradients::Gradients;
 use crate::params::Params;
 use crate::rng::Rng;
@@ -57,6 +58,12 @@ pub trait PolicyModel: Send + Sync {
     /// Its parameters.
     fn params(&self) -> &Params;
 
+    /// What it is fed and what it gives.
+    fn signature(&self) -> &Signature;
+
+    /// Why its training step runs on candle's autograd; `None` where a step by hand covers it.
+    fn composed_because(&self) -> Option<String>;
+
     /// Training forward pass. Sums over the rows of `batch` are divided by `batch.total_rows` or
     /// `batch.total_valid_steps`, so that the losses of shards add up.
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts>;
@@ -66,18 +73,34 @@ pub trait PolicyModel: Send + Sync {
     /// # Errors
     /// `NoGradient` if the loss does not reach a parameter.
     fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
-        let loss = self.loss(batch, rng)?;
-        let grads = loss.total.backward()?;
-        for (name, var) in self.params().iter() {
-            let grad = grads.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() })?;
-            into.add_tensor(name, grad)?;
-        }
-        LossValues::from_parts(&loss)
+        autograd(self, batch, rng, into)
     }
 
-    /// state: (b, S), environment_state: (b, E) -> (b, action_horizon, A), all in network units
-    fn predict(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor>;
+    /// The signature's features, (b, …) each -> (b, action_horizon, A), all in network units
+    fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor>;
 
     /// Number of actions in a predicted chunk.
     fn action_horizon(&self) -> usize;
+}
+
+/// Loss, and its gradient from candle's backward pass added to `into`.
+pub(crate) fn autograd<M: PolicyModel + ?Sized>(
+    model: &M,
+    batch: &Batch,
+    rng: &mut Rng,
+    into: &mut Gradients,
+) -> Result<LossValues> {
+    let loss = model.loss(batch, rng)?;
+    let grads = loss.total.backward()?;
+    for (name, var) in model.params().iter() {
+        let grad = grads.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() })?;
+        into.add_tensor(name, grad)?;
+    }
+    LossValues::from_parts(&loss)
+}
+
+/// Words for a feature that no step by hand covers.
+pub(crate) fn not_by_hand(signature: &Signature) -> Option<String> {
+    let spec = crate::fused::uncovered(signature)?;
+    Some(format!("the step by hand does not cover feature {} of kind {}", spec.name, spec.kind))
 }

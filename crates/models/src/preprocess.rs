@@ -54,7 +54,7 @@ impl Preprocess {
         let mut seen = Features::new();
         for spec in &self.signature.observation {
             let values = observation.require("batch", &spec.name)?;
-            seen.insert(&spec.name, self.normalised(spec, values.to_owned())?);
+            seen.insert(&spec.name, self.normalised(spec, values.to_values())?);
         }
         let mut actions = actions.to_vec();
         self.normaliser.normalise(ACTION, &mut actions)?;
@@ -242,10 +242,7 @@ mod tests {
         observation.insert(STATE, vec![0.0; 3].into());
         assert_eq!(error(&[observation.clone()]), "predict: observation.state has shape [3], expected [2]");
         observation.insert(STATE, Values::U8(vec![0; 2]));
-        assert_eq!(
-            error(&[observation]),
-            "feature observation.state of kind state holds bytes, expected numbers"
-        );
+        assert_eq!(error(&[observation]), "feature observation.state of kind state holds bytes, expected numbers");
         let given = "predict: feature observation.entity.a is missing; given: observation.state";
         assert_eq!(error(&[Observation::of_state(vec![0.0; 2], vec![])]), given);
         // a feature that the signature does not have is left alone

@@ -1,7 +1,7 @@
 //! The policy models by name. This is the only place where their names stand: another model is a row of the table.
 
-use crate::batch::Dims;
 use crate::error::Result;
+use crate::features::{FeatureKind, Signature};
 use crate::model::PolicyModel;
 use crate::models::{act, actrm};
 use serde::de::{DeserializeSeed, Deserializer};
@@ -28,13 +28,20 @@ macro_rules! policies {
                 }
             }
 
+            /// The kinds of features that its models read.
+            pub fn reads(&self) -> &'static [FeatureKind] {
+                match self {
+                    $(Self::$variant(_) => $module::READS,)+
+                }
+            }
+
             /// A model with initial weights drawn from `seed`.
             ///
             /// # Errors
-            /// A configuration that describes no possible model.
-            pub fn build(&self, dims: &Dims, seed: u64) -> Result<Box<dyn PolicyModel>> {
+            /// A configuration that describes no possible model, or a feature that it cannot read.
+            pub fn build(&self, signature: &Signature, seed: u64) -> Result<Box<dyn PolicyModel>> {
                 match self {
-                    $(Self::$variant(config) => Ok(Box::new($module::$model::new(config, dims, seed)?)),)+
+                    $(Self::$variant(config) => Ok(Box::new($module::$model::new(config, signature, seed)?)),)+
                 }
             }
 

@@ -7,7 +7,7 @@ mod common;
 use candle_core::{DType, Device, Tensor};
 use models::act::Act;
 use models::layers::Mode;
-use models::{Batch, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
+use models::{Batch, Features, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ struct Fixture {
 fn read(folder: &Path) -> Fixture {
     let config = std::fs::read_to_string(folder.join("config.json")).unwrap();
     let lerobot = lerobot::read_config(&serde_json::from_str(&config).unwrap()).unwrap();
-    let act = Act::new(&lerobot.config, &lerobot.dims, 0).unwrap();
+    let act = Act::new(&lerobot.config, &lerobot.signature, 0).unwrap();
     let load = |file: &str| candle_core::safetensors::load(folder.join(file), &Device::Cpu).unwrap();
     let tensors: BTreeMap<_, _> = load("model.safetensors").into_iter().collect();
     lerobot::load_tensors(act.params(), &lerobot.config, &tensors).unwrap();
@@ -48,8 +48,10 @@ impl Fixture {
     fn batch(&self) -> Batch {
         let pad: Vec<f32> = self.get("pad").flatten_all().unwrap().to_vec1().unwrap();
         Batch {
-            state: self.get("state"),
-            environment_state: self.io.contains_key("env").then(|| self.get("env")),
+            observation: Features::low_dimensional(
+                self.get("state"),
+                self.io.contains_key("env").then(|| self.get("env")),
+            ),
             actions: self.get("action"),
             is_pad: self.get("pad"),
             total_rows: self.get("state").dim(0).unwrap(),
@@ -71,9 +73,8 @@ impl Fixture {
 fn inference_is_lerobots() {
     for f in fixtures() {
         let batch = f.batch();
-        let env = batch.environment_state.as_ref();
-        f.same("inference", &f.act.predict(&batch.state, env).unwrap(), &f.get("out_infer"));
-        f.same("composed inference", &f.act.predict_composed(&batch.state, env).unwrap(), &f.get("out_infer"));
+        f.same("inference", &f.act.predict(&batch.observation).unwrap(), &f.get("out_infer"));
+        f.same("composed inference", &f.act.predict_composed(&batch.observation).unwrap(), &f.get("out_infer"));
     }
 }
 

@@ -225,11 +225,13 @@ impl Chooser<'_> {
         let mut parts = Vec::with_capacity(keys.len());
         let mut names = Vec::new();
         for key in keys {
-            let unfit = |reason: String| DatasetError::from(InputError::ObservationKeys {
-                path: self.plan.path.clone(),
-                column: name.to_owned(),
-                reason,
-            });
+            let unfit = |reason: String| {
+                DatasetError::from(InputError::ObservationKeys {
+                    path: self.plan.path.clone(),
+                    column: name.to_owned(),
+                    reason,
+                })
+            };
             let item: KeyItem = key.parse().map_err(unfit)?;
             let mut widths = BTreeMap::new();
             for key in item.keys() {

@@ -20,7 +20,7 @@ pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_an
 pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::Encoder;
 pub(crate) use loss::AbsoluteError;
-pub(crate) use observation::{Data, Tokens};
+pub(crate) use observation::{Data, Tokens, inputs, positions_backward, uncovered};
 pub(crate) use vae::Vae;
 
 use crate::error::{ModelError, Result};

@@ -1,7 +1,8 @@
 //! What the tests of fused models share: the composed model and finite differences as oracles.
 #![allow(clippy::unwrap_used)]
 
-use crate::batch::{Batch, Dims};
+use crate::batch::Batch;
+use crate::features::{FeatureSpec, Features, Signature, Values};
 use crate::gradients::{Gradients, ParamLayout};
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
@@ -19,14 +20,37 @@ pub(crate) fn move_parameters(model: &dyn PolicyModel) {
 }
 
 /// Random windows, some of them padded.
-pub(crate) fn batch(dims: &Dims, horizon: usize, rows: usize, seed: u64) -> Batch {
+pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u64) -> Batch {
     let mut rng = Rng::new(seed, "batch");
-    let (s, e) = (rng.normals(rows * dims.state), rng.normals(rows * dims.environment_state));
-    let a = rng.normals(rows * horizon * dims.action);
+    let mut observation = Features::new();
+    for spec in &signature.observation {
+        observation.insert(&spec.name, Values::F32(rng.normals(rows * signature.n_obs_steps * spec.width())));
+    }
+    let a = rng.normals(rows * horizon * signature.action_dim);
     let pad: Vec<bool> = (0..rows * horizon).map(|i| i / horizon % 2 == 1 && i % horizon > horizon / 2).collect();
-    let mut batch = Batch::from_slices(dims, horizon, &s, &e, &a, &pad).unwrap();
+    let mut batch = Batch::new(signature, horizon, observation, a, &pad).unwrap();
     batch.seed = seed;
     batch
+}
+
+/// What models are tried on: with and without an environment state, with a history, and with entities in two groups, of
+/// which one has positions.
+pub(crate) struct Signatures {
+    pub(crate) plain: Signature,
+    pub(crate) no_env: Signature,
+    pub(crate) entities: Signature,
+    pub(crate) history: Signature,
+}
+
+pub(crate) fn signatures() -> Signatures {
+    let (plain, no_env) = (Signature::low_dimensional(3, 2, 2), Signature::low_dimensional(3, 0, 2));
+    let cube = |name: &str| FeatureSpec::entity(name, 5, "cube", false);
+    let goal = |name: &str| FeatureSpec::entity(name, 2, "goal", true);
+    let mut entities = no_env.clone();
+    entities.observation.extend([cube("cube0"), cube("cube1"), cube("cube2"), goal("goal0"), goal("goal1")]);
+    let mut history = Signature { n_obs_steps: 3, ..plain.clone() };
+    history.observation.extend([cube("cube0"), cube("cube1")]);
+    Signatures { plain, no_env, entities, history }
 }
 
 /// Loss and gradients as the trainer gets them.

@@ -1,7 +1,6 @@
 //! The VAE encoder of an action chunk, its sample and its KL term.
 
 use super::{Data, Encoder, Grads, Pass, slot};
-use crate::batch::Dims;
 use crate::kernels::add;
 
 /// Sizes of the encoder, and its fixed positions.
@@ -9,7 +8,6 @@ use crate::kernels::add;
 pub(crate) struct Vae<'a> {
     pub(crate) n_layers: usize,
     pub(crate) latent_dim: usize,
-    pub(crate) dims: &'a Dims,
     /// (H + 2, D)
     pub(crate) positions: &'a [f32],
 }
@@ -39,7 +37,7 @@ impl Vae<'_> {
         let tokens = self.positions.len() / dim;
         let horizon = tokens - 2;
         let cls = pass.weight("vae_encoder_cls_embed", ".weight");
-        let state = pass.linear("vae_encoder_robot_state_input_proj", &data.state);
+        let state = pass.linear("vae_encoder_robot_state_input_proj", data.state());
         let actions = pass.linear("vae_encoder_action_input_proj", &data.actions);
         let mut x = pass.take(b * tokens * dim);
         let mut key_pad = pass.space.pool.zeros(b * tokens);
@@ -108,8 +106,14 @@ impl Vae<'_> {
             state[i * dim..(i + 1) * dim].copy_from_slice(&x[dim..2 * dim]);
             actions[i * horizon * dim..(i + 1) * horizon * dim].copy_from_slice(&x[2 * dim..]);
         }
-        pass.linear_backward("vae_encoder_robot_state_input_proj", &data.state, &state, self.dims.state, grads);
-        pass.linear_backward("vae_encoder_action_input_proj", &data.actions, &actions, self.dims.action, grads);
+        pass.linear_backward("vae_encoder_robot_state_input_proj", data.state(), &state, data.state().len() / b, grads);
+        pass.linear_backward(
+            "vae_encoder_action_input_proj",
+            &data.actions,
+            &actions,
+            data.actions.len() / (b * horizon),
+            grads,
+        );
         for buffer in [state, actions, x, cls, latent, grad] {
             pass.give(buffer);
         }

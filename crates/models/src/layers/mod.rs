@@ -20,6 +20,8 @@ pub use feed_forward::{Activation, FeedForward};
 pub use layer_norm::LayerNorm;
 pub use linear::Linear;
 pub use position::sinusoid_table;
-pub(crate) use tokens::InputTokens;
+pub(crate) use tokens::{
+    ENTITY_POSITIONS, FEATURE_POSITIONS, InputTokens, LATENT, Position, TokenLayout, environment_state,
+};
 pub(crate) use transformer::{Decoder, DecoderLayer, Encoder, LayerInit, Shape};
 pub(crate) use vae::{Vae, kl_divergence, sample};

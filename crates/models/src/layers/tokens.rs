@@ -1,30 +1,245 @@
-//! Observations as tokens.
+//! Observations as tokens: one for the latent, one for each feature, through a dense layer each; entities of one group
+//! share theirs.
+//!
+//! Names of parameters are LeRobot's; it has no entities. A history of observations is one token: its steps lie side by
+//! side in the token's input.
 
-use super::Linear;
+use super::{Embedding, Linear};
 use crate::error::Result;
-use candle_core::Tensor;
+use crate::features::{FeatureKind, Features, Signature};
+use crate::params::Params;
+use crate::rng::Rng;
+use candle_core::{DType, Tensor};
 
-/// Observations as tokens, a dense layer each.
+/// The latent's projection.
+pub(crate) const LATENT: &str = "encoder_latent_input_proj";
+/// Positions of latent, state and environment state.
+pub(crate) const FEATURE_POSITIONS: &str = "encoder_1d_feature_pos_embed";
+/// Positions of the entities that have one.
+pub(crate) const ENTITY_POSITIONS: &str = "encoder_entity_pos_embed";
+
+/// Where a token's position comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Position {
+    /// a row of [`FEATURE_POSITIONS`]
+    Feature(usize),
+    /// a row of [`ENTITY_POSITIONS`]
+    Entity(usize),
+    /// it has none: zeros
+    Nowhere,
+}
+
+/// One feature's token.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct TokenSpec {
+    /// name of the feature
+    pub(crate) feature: String,
+    /// its kind
+    pub(crate) kind: FeatureKind,
+    /// prefix of its projection's parameters; the same for all entities of a group
+    pub(crate) prefix: String,
+    /// numbers that it reads
+    pub(crate) width: usize,
+    /// its position
+    pub(crate) position: Position,
+}
+
+/// The tokens after the latent's: state, environment state, entities.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct TokenLayout {
+    pub(crate) tokens: Vec<TokenSpec>,
+}
+
+impl TokenLayout {
+    /// Of a signature that was checked.
+    pub(crate) fn new(signature: &Signature) -> Self {
+        let mut specs: Vec<_> = signature.observation.iter().collect();
+        specs.sort_by_key(|spec| spec.kind);
+        // the latent has the first row
+        let (mut features, mut entities) = (1, 0);
+        let next = |rows: &mut usize| {
+            *rows += 1;
+            *rows - 1
+        };
+        let tokens = specs.into_iter().map(|spec| TokenSpec {
+            feature: spec.name.clone(),
+            kind: spec.kind,
+            prefix: match spec.kind {
+                FeatureKind::State => "encoder_robot_state_input_proj".to_string(),
+                FeatureKind::EnvironmentState => "encoder_env_state_input_proj".to_string(),
+                FeatureKind::Entity | FeatureKind::Image => format!("encoder_entity_input_proj.{}", spec.group()),
+            },
+            width: signature.n_obs_steps * spec.width(),
+            position: match (spec.kind, spec.position) {
+                (FeatureKind::State | FeatureKind::EnvironmentState, _) => Position::Feature(next(&mut features)),
+                (FeatureKind::Entity | FeatureKind::Image, true) => Position::Entity(next(&mut entities)),
+                (FeatureKind::Entity | FeatureKind::Image, false) => Position::Nowhere,
+            },
+        });
+        Self { tokens: tokens.collect() }
+    }
+
+    /// Tokens with the latent's.
+    pub(crate) fn len(&self) -> usize {
+        1 + self.tokens.len()
+    }
+
+    fn rows(&self, of: fn(Position) -> bool) -> usize {
+        self.tokens.iter().filter(|token| of(token.position)).count()
+    }
+
+    /// Rows of [`FEATURE_POSITIONS`].
+    pub(crate) fn feature_rows(&self) -> usize {
+        1 + self.rows(|position| matches!(position, Position::Feature(_)))
+    }
+
+    /// Rows of [`ENTITY_POSITIONS`].
+    pub(crate) fn entity_rows(&self) -> usize {
+        self.rows(|position| matches!(position, Position::Entity(_)))
+    }
+
+    fn of_kind(&self, kind: FeatureKind) -> impl Iterator<Item = &TokenSpec> {
+        self.tokens.iter().filter(move |token| token.kind == kind)
+    }
+
+    /// The state's token.
+    pub(crate) fn state(&self) -> &TokenSpec {
+        self.of_kind(FeatureKind::State).next().expect("a checked signature has a state")
+    }
+}
+
+/// The environment state's projection, where there is one. It is drawn before the others.
+pub(crate) fn environment_state(
+    p: &mut Params,
+    layout: &TokenLayout,
+    dim: usize,
+    rng: &mut Rng,
+) -> Result<Option<Linear>> {
+    let token = layout.of_kind(FeatureKind::EnvironmentState).next();
+    token.map(|token| Linear::new(p, &token.prefix, token.width, dim, rng)).transpose()
+}
+
+/// Observations as tokens.
 #[derive(Debug)]
 pub(crate) struct InputTokens {
-    pub(crate) latent: Linear,
-    pub(crate) robot_state: Linear,
-    pub(crate) env_state: Option<Linear>,
+    layout: TokenLayout,
+    latent: Linear,
+    /// one for each token of the layout; those of a group share their weights
+    projections: Vec<Linear>,
+    feature_positions: Embedding,
+    entity_positions: Option<Embedding>,
 }
 
 impl InputTokens {
-    /// latent: (b, L), state: (b, S), environment_state: (b, E) -> (b, M, D)
-    pub(crate) fn forward(
-        &self,
-        latent: &Tensor,
-        state: &Tensor,
-        environment_state: Option<&Tensor>,
-    ) -> Result<Tensor> {
-        let mut tokens =
-            vec![self.latent.forward(latent)?.unsqueeze(1)?, self.robot_state.forward(state)?.unsqueeze(1)?];
-        if let (Some(layer), Some(env)) = (&self.env_state, environment_state) {
-            tokens.push(layer.forward(env)?.unsqueeze(1)?);
+    /// `env_state` is the layout's [`environment_state`].
+    pub(crate) fn new(
+        p: &mut Params,
+        layout: TokenLayout,
+        latent_dim: usize,
+        dim: usize,
+        env_state: Option<Linear>,
+        rng: &mut Rng,
+    ) -> Result<Self> {
+        let latent = Linear::new(p, LATENT, latent_dim, dim, rng)?;
+        let mut made: Vec<(&str, Linear)> = Vec::new();
+        for token in layout.of_kind(FeatureKind::State) {
+            made.push((&token.prefix, Linear::new(p, &token.prefix, token.width, dim, rng)?));
+        }
+        let feature_positions = Embedding::new(p, FEATURE_POSITIONS, layout.feature_rows(), dim, rng)?;
+        for token in layout.of_kind(FeatureKind::EnvironmentState) {
+            made.extend(env_state.clone().map(|layer| (token.prefix.as_str(), layer)));
+        }
+        for token in layout.of_kind(FeatureKind::Entity) {
+            if made.iter().all(|(prefix, _)| *prefix != token.prefix) {
+                made.push((&token.prefix, Linear::new(p, &token.prefix, token.width, dim, rng)?));
+            }
+        }
+        let entity_positions = match layout.entity_rows() {
+            0 => None,
+            rows => Some(Embedding::new(p, ENTITY_POSITIONS, rows, dim, rng)?),
+        };
+        let layer = |prefix: &str| made.iter().find(|(name, _)| *name == prefix).map(|(_, layer)| layer.clone());
+        let projections = layout.tokens.iter();
+        let projections = projections.map(|token| layer(&token.prefix).expect("one was made for every token"));
+        let projections = projections.collect();
+        Ok(Self { layout, latent, projections, feature_positions, entity_positions })
+    }
+
+    /// Which tokens.
+    pub(crate) fn layout(&self) -> &TokenLayout {
+        &self.layout
+    }
+
+    /// latent: (b, L), the features of the observation -> (b, M, D)
+    pub(crate) fn forward(&self, latent: &Tensor, observation: &Features<Tensor>) -> Result<Tensor> {
+        let mut tokens = vec![self.latent.forward(latent)?.unsqueeze(1)?];
+        for (token, layer) in self.layout.tokens.iter().zip(&self.projections) {
+            let values = observation.require("tokens", &token.feature)?.flatten_from(1)?;
+            tokens.push(layer.forward(&values)?.unsqueeze(1)?);
         }
         Ok(Tensor::cat(&tokens, 1)?)
+    }
+
+    /// (1, M, D)
+    pub(crate) fn positions(&self) -> Result<Tensor> {
+        let features = &self.feature_positions.weight;
+        if self.layout.len() == self.layout.feature_rows() {
+            return Ok(features.unsqueeze(0)?);
+        }
+        let (_, dim) = features.dims2()?;
+        let mut rows = vec![features.narrow(0, 0, 1)?];
+        for token in &self.layout.tokens {
+            rows.push(match (token.position, &self.entity_positions) {
+                (Position::Feature(row), _) => features.narrow(0, row, 1)?,
+                (Position::Entity(row), Some(entities)) => entities.weight.narrow(0, row, 1)?,
+                (Position::Entity(_) | Position::Nowhere, _) => Tensor::zeros((1, dim), DType::F32, features.device())?,
+            });
+        }
+        Ok(Tensor::cat(&rows, 0)?.unsqueeze(0)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::features::FeatureSpec;
+
+    #[test]
+    fn tokens_come_by_kind_and_share_projections_by_group() {
+        let observation = vec![
+            FeatureSpec::entity("cube0", 3, "cube", false),
+            FeatureSpec::environment_state(4),
+            FeatureSpec::entity("goal0", 2, "goal", true),
+            FeatureSpec::state(5),
+            FeatureSpec::entity("cube1", 3, "cube", false),
+            FeatureSpec::entity("goal1", 2, "goal", true),
+        ];
+        let layout = TokenLayout::new(&Signature { observation, n_obs_steps: 2, action_dim: 1 });
+        let seen: Vec<_> = layout.tokens.iter().map(|t| (t.prefix.as_str(), t.width, t.position)).collect();
+        assert_eq!(
+            seen,
+            [
+                ("encoder_robot_state_input_proj", 10, Position::Feature(1)),
+                ("encoder_env_state_input_proj", 8, Position::Feature(2)),
+                ("encoder_entity_input_proj.cube", 6, Position::Nowhere),
+                ("encoder_entity_input_proj.goal", 4, Position::Entity(0)),
+                ("encoder_entity_input_proj.cube", 6, Position::Nowhere),
+                ("encoder_entity_input_proj.goal", 4, Position::Entity(1)),
+            ]
+        );
+        assert_eq!((layout.len(), layout.feature_rows(), layout.entity_rows()), (7, 3, 2));
+        assert_eq!(layout.state().feature, "observation.state");
+
+        let (mut p, rng) = (Params::new(), &mut Rng::new(1, "init"));
+        let env_state = environment_state(&mut p, &layout, 8, rng).unwrap();
+        let tokens = InputTokens::new(&mut p, layout, 3, 8, env_state, rng).unwrap();
+        let positions = tokens.positions().unwrap().squeeze(0).unwrap().to_vec2::<f32>().unwrap();
+        let rows = |name: &str| p.get(name).unwrap().to_vec2::<f32>().unwrap();
+        let (features, entities) =
+            (rows("encoder_1d_feature_pos_embed.weight"), rows("encoder_entity_pos_embed.weight"));
+        assert_eq!(positions[..3], features);
+        assert_eq!((&positions[4], &positions[6]), (&entities[0], &entities[1]));
+        assert!(positions[3].iter().chain(&positions[5]).all(|x| *x == 0.0));
     }
 }

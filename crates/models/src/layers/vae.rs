@@ -1,7 +1,8 @@
 //! The VAE encoder of an action chunk, a sample of its latent and its KL term.
 
+use super::tokens::TokenLayout;
 use super::{Embedding, Encoder, LayerInit, Linear, Mode, Shape};
-use crate::batch::{Batch, Dims};
+use crate::batch::Batch;
 use crate::error::Result;
 use crate::params::Params;
 use crate::rng::Rng;
@@ -10,6 +11,8 @@ use candle_core::{DType, Tensor};
 /// The part that encodes an action chunk into a latent; training only.
 #[derive(Debug)]
 pub(crate) struct Vae {
+    /// the feature that it reads
+    state: String,
     pub(crate) encoder: Encoder,
     pub(crate) cls_embed: Embedding,
     pub(crate) robot_state_input_proj: Linear,
@@ -23,15 +26,16 @@ impl Vae {
         p: &mut Params,
         shape: Shape,
         (n_layers, latent_dim): (usize, usize),
-        dims: &Dims,
+        (layout, action_dim): (&TokenLayout, usize),
         rng: &mut Rng,
     ) -> Result<Self> {
-        let dim = shape.dim;
+        let (dim, state) = (shape.dim, layout.state());
         Ok(Self {
+            state: state.feature.clone(),
             encoder: Encoder::new(p, "vae_encoder", n_layers, shape, LayerInit::TorchDefault, rng)?,
             cls_embed: Embedding::new(p, "vae_encoder_cls_embed", 1, dim, rng)?,
-            robot_state_input_proj: Linear::new(p, "vae_encoder_robot_state_input_proj", dims.state, dim, rng)?,
-            action_input_proj: Linear::new(p, "vae_encoder_action_input_proj", dims.action, dim, rng)?,
+            robot_state_input_proj: Linear::new(p, "vae_encoder_robot_state_input_proj", state.width, dim, rng)?,
+            action_input_proj: Linear::new(p, "vae_encoder_action_input_proj", action_dim, dim, rng)?,
             latent_output_proj: Linear::new(p, "vae_encoder_latent_output_proj", dim, 2 * latent_dim, rng)?,
         })
     }
@@ -41,7 +45,8 @@ impl Vae {
         let (b, dim) = (batch.rows(), self.cls_embed.weight.dim(1)?);
         let latent = self.latent_output_proj.weight.dim(0)? / 2;
         let cls = self.cls_embed.weight.reshape((1, 1, dim))?.broadcast_as((b, 1, dim))?;
-        let state = self.robot_state_input_proj.forward(&batch.state)?.unsqueeze(1)?;
+        let state = batch.observation.require("latent", &self.state)?.flatten_from(1)?;
+        let state = self.robot_state_input_proj.forward(&state)?.unsqueeze(1)?;
         let actions = self.action_input_proj.forward(&batch.actions)?;
         let tokens = Tensor::cat(&[&cls.contiguous()?, &state, &actions], 1)?;
         let always = Tensor::zeros((b, 2), DType::F32, tokens.device())?;

@@ -9,15 +9,7 @@ pub use receding_horizon::RecedingHorizon;
 pub use temporal_ensemble::TemporalEnsemble;
 
 use crate::error::{ModelError, Result};
-
-/// One observation in raw units.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Observation {
-    /// the robot's own state
-    pub state: Vec<f32>,
-    /// the rest of the world; empty if the policy does not see it
-    pub environment_state: Vec<f32>,
-}
+use crate::features::Observation;
 
 /// Actions for the next steps in raw units, row-major `(action_horizon, action_dim)`.
 #[derive(Debug, Clone, PartialEq)]

@@ -1,10 +1,9 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::{Batch, Dims, PolicyConfig, PolicyModel, Rng, act};
+use crate::{Batch, Features, PolicyConfig, PolicyModel, Rng, Signature, act};
 use candle_core::Tensor;
 use std::collections::BTreeMap;
 
-const DIMS: Dims = Dims { state: 3, environment_state: 2, action: 2 };
 const HORIZON: usize = 4;
 
 fn model(seed: u64) -> Box<dyn PolicyModel> {
@@ -18,14 +17,14 @@ fn model(seed: u64) -> Box<dyn PolicyModel> {
         latent_dim: 3,
         ..Default::default()
     };
-    PolicyConfig::Act(config).build(&DIMS, seed).unwrap()
+    PolicyConfig::Act(config).build(&Signature::low_dimensional(3, 2, 2), seed).unwrap()
 }
 
 fn batch(seed: u64, rows: usize) -> Batch {
     let mut rng = Rng::new(seed, "test data");
     let pad: Vec<bool> = (0..rows * HORIZON).map(|i| i % HORIZON > 1 && i % 3 == 0).collect();
     let (s, e, a) = (rng.normals(rows * 3), rng.normals(rows * 2), rng.normals(rows * HORIZON * 2));
-    Batch::from_slices(&DIMS, HORIZON, &s, &e, &a, &pad).unwrap()
+    Batch::from_slices(&Signature::low_dimensional(3, 2, 2), HORIZON, &Features::of_slices(&s, &e), &a, &pad).unwrap()
 }
 
 fn config() -> TrainConfig {
@@ -69,10 +68,11 @@ fn predictions_use_the_weights_as_they_are_now() {
             "type": kind, "action_horizon": HORIZON, "dim_model": 16, "n_heads": 2, "dim_feedforward": 24,
         });
         let config: PolicyConfig = serde_json::from_value(config).unwrap();
-        let mut trainer = Trainer::new(config.build(&DIMS, 1).unwrap(), self::config(), 5).unwrap();
+        let mut trainer =
+            Trainer::new(config.build(&Signature::low_dimensional(3, 2, 2), 1).unwrap(), self::config(), 5).unwrap();
         let batch = batch(0, 5);
         let predict = |model: &dyn PolicyModel| {
-            let chunk = model.predict(&batch.state, batch.environment_state.as_ref()).unwrap();
+            let chunk = model.predict(&batch.observation).unwrap();
             chunk.flatten_all().unwrap().to_vec1::<f32>().unwrap()
         };
         let before = predict(trainer.model());
@@ -81,7 +81,7 @@ fn predictions_use_the_weights_as_they_are_now() {
         let after = predict(trainer.model());
         assert_ne!(before, after, "{kind}");
         // a model that never predicted before knows no other weights
-        let fresh = config.build(&DIMS, 2).unwrap();
+        let fresh = config.build(&Signature::low_dimensional(3, 2, 2), 2).unwrap();
         let now: BTreeMap<_, _> = trainer.model().params().tensors();
         fresh.params().load(&now).unwrap();
         assert_eq!(predict(fresh.as_ref()), after, "{kind}");
@@ -167,7 +167,7 @@ fn accumulation_gives_the_gradient_of_the_whole_batch() {
         ..Default::default()
     };
     let run = |accumulation: usize| {
-        let model = PolicyConfig::Act(still.clone()).build(&DIMS, 1).unwrap();
+        let model = PolicyConfig::Act(still.clone()).build(&Signature::low_dimensional(3, 2, 2), 1).unwrap();
         let mut trainer = Trainer::new(model, TrainConfig { accumulation, ..config() }, 5).unwrap();
         trainer.step(&batch(3, 8)).unwrap()
     };

@@ -173,14 +173,9 @@ impl Trainer {
     fn not_finite(&self, batch: &Batch, loss: &LossValues) -> Result<ModelError> {
         let bad = |values: &[f32]| values.iter().copied().find(|x| !x.is_finite());
         let found = |tensor: String, value: f32| self.core.not_finite(tensor, value);
-        let data = [
-            ("batch.state", Some(&batch.state)),
-            ("batch.environment_state", batch.environment_state.as_ref()),
-            ("batch.actions", Some(&batch.actions)),
-        ];
-        for (name, tensor) in data {
-            if let Some(value) = tensor.map(|t| with_values(t, bad)).transpose()?.flatten() {
-                return Ok(found(name.to_string(), value));
+        for (name, tensor) in batch.observation.iter().chain([("actions", &batch.actions)]) {
+            if let Some(value) = with_values(tensor, bad)? {
+                return Ok(found(format!("batch.{name}"), value));
             }
         }
         for (name, var) in self.model.params().iter() {

@@ -7,8 +7,10 @@
 use super::Act;
 use crate::batch::Batch;
 use crate::error::Result;
+use crate::features::Features;
 use crate::fused::{
-    AbsoluteError, Data, Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, Vae, slot, with_weights,
+    AbsoluteError, Data, Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, Vae, inputs, positions_backward,
+    slot, with_weights,
 };
 use crate::gradients::Gradients;
 use crate::kernels::add;
@@ -43,7 +45,7 @@ impl Act {
         into: &mut Gradients,
     ) -> Result<LossValues> {
         self.check_batch(batch)?;
-        let data = Data::of(batch)?;
+        let data = Data::of(batch, self.tokens.layout())?;
         let eps = with_values(eps, <[f32]>::to_vec)?;
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
@@ -53,22 +55,16 @@ impl Act {
         })
     }
 
-    /// state: (b, S), environment_state: (b, E) -> (b, C, A)
-    pub(crate) fn fused_predict(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {
-        self.check_inputs(state, environment_state)?;
-        let rows = state.dim(0)?;
-        let values = |t: &Tensor| with_values(t, <[f32]>::to_vec);
-        let env = match environment_state {
-            Some(env) => values(env)?,
-            None => Vec::new(),
-        };
-        let state = values(state)?;
+    /// The features of the observation -> (b, C, A)
+    pub(crate) fn fused_predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        let rows = self.check_inputs(observation)?;
+        let inputs = inputs(self.tokens.layout(), observation)?;
         let packed = self.workspaces.packed(self.params());
         let actions = self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass { weights, shape: self.config().shape(), space, rng: None, packed: Some(&packed) };
                 let latent = pass.space.pool.zeros(rows * self.config().latent_dim);
-                let tokens = Tokens::new(self.dims(), (&latent, self.config().latent_dim), &state, &env);
+                let tokens = Tokens::new(self.tokens.layout(), (&latent, self.config().latent_dim), &inputs);
                 let Decoded { encoder, memory, decoder, x, actions } = self.decode_fused(pass, rows, &tokens);
                 let out = actions.clone();
                 encoder.free(pass);
@@ -79,12 +75,12 @@ impl Act {
                 out
             })
         })?;
-        Ok(Tensor::from_vec(actions, (rows, self.config().action_horizon, self.dims().action), &Device::Cpu)?)
+        Ok(Tensor::from_vec(actions, (rows, self.config().action_horizon, self.signature.action_dim), &Device::Cpu)?)
     }
 
     fn decode_fused(&self, pass: &mut Pass<'_>, rows: usize, tokens: &Tokens<'_>) -> Decoded {
         let x = tokens.forward(pass);
-        let pos = pass.weight("encoder_1d_feature_pos_embed", ".weight");
+        let pos = &*tokens.positions(pass);
         let (memory, encoder) = Encoder::forward(pass, "encoder", self.config().n_encoder_layers, x, pos, None, false);
         let query_pos = pass.weight("decoder_pos_embed", ".weight");
         let from = Memory { x: &memory, pos, batch: rows };
@@ -106,8 +102,7 @@ impl Act {
         let dim = pass.shape.dim;
         pass.linear_backward("action_head", &done.x, grad, dim, grads);
         let x = pass.linear_input("action_head", grad, dim);
-        let (pos, query_pos) =
-            (pass.weight("encoder_1d_feature_pos_embed", ".weight"), pass.weight("decoder_pos_embed", ".weight"));
+        let (pos, query_pos) = (&*tokens.positions(pass), pass.weight("decoder_pos_embed", ".weight"));
         let mut memory = pass.space.pool.zeros(done.memory.len());
         let mut memory_pos = pass.space.pool.zeros(pos.len());
         let mut query = pass.space.pool.zeros(query_pos.len());
@@ -115,7 +110,7 @@ impl Act {
         let mut into = DecoderGrads { memory: &mut memory, memory_pos: &mut memory_pos, query_pos: &mut query };
         done.decoder.backward(pass, x, query_pos, from, &mut into, grads);
         let x = done.encoder.backward(pass, memory, pos, Some(&mut memory_pos), grads);
-        add(slot(grads, "encoder_1d_feature_pos_embed", ".weight"), &memory_pos);
+        positions_backward(tokens.layout(), dim, &memory_pos, grads);
         add(slot(grads, "decoder_pos_embed", ".weight"), &query);
         let latent = tokens.backward(pass, &x, grads);
         for buffer in [x, memory_pos, query, done.memory, done.x, done.actions] {
@@ -130,7 +125,6 @@ impl Act {
         let vae = Vae {
             n_layers: config.n_vae_encoder_layers,
             latent_dim: config.latent_dim,
-            dims: self.dims(),
             positions: self.position_table(),
         };
         let (latent, encoded) = match config.use_vae {
@@ -140,7 +134,7 @@ impl Act {
             }
             false => (pass.space.pool.zeros(rows * config.latent_dim), None),
         };
-        let tokens = Tokens::new(self.dims(), (&latent, config.latent_dim), &data.state, &data.environment_state);
+        let tokens = Tokens::new(self.tokens.layout(), (&latent, config.latent_dim), &data.inputs);
         let decoded = self.decode_fused(pass, rows, &tokens);
 
         let entries = data.total_entries as f32;

@@ -1,15 +1,16 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::Dims;
+use crate::features::{FeatureKind, FeatureSpec, Signature};
 use crate::fused::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients, move_parameters,
+    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients,
+    move_parameters, signatures,
 };
 use crate::layers::Activation;
 use crate::models::act::Config;
 use crate::simd::{Level, at_most};
 
 /// Odd sizes: no width is a multiple of a vector, chunks are longer and shorter than a register tile.
-fn configs() -> Vec<(Config, Dims, usize)> {
+fn configs() -> Vec<(Config, Signature, usize)> {
     let base = Config {
         action_horizon: 5,
         dim_model: 12,
@@ -21,23 +22,25 @@ fn configs() -> Vec<(Config, Dims, usize)> {
         dropout: 0.2,
         ..Default::default()
     };
-    let dims = Dims { state: 3, environment_state: 2, action: 2 };
-    let no_env = Dims { environment_state: 0, ..dims };
+    let Signatures { plain, no_env, entities, history } = signatures();
     let gelu = Config { feedforward_activation: Activation::Gelu, ..base.clone() };
     vec![
-        (base.clone(), dims, 3),
-        (Config { pre_norm: true, n_decoder_layers: 2, ..base.clone() }, dims, 4),
+        (base.clone(), plain.clone(), 3),
+        (Config { pre_norm: true, n_decoder_layers: 2, ..base.clone() }, plain.clone(), 4),
+        (base.clone(), entities.clone(), 3),
+        (Config { pre_norm: true, n_decoder_layers: 2, ..base.clone() }, entities, 2),
+        (base.clone(), history, 4),
         (Config { n_decoder_layers: 3, action_horizon: 17, n_vae_encoder_layers: 1, ..gelu.clone() }, no_env, 2),
-        (Config { pre_norm: true, use_vae: false, ..gelu }, dims, 1),
-        (Config { dim_model: 35, n_heads: 1, dim_feedforward: 70, action_horizon: 1, dropout: 0.0, ..base }, dims, 5),
+        (Config { pre_norm: true, use_vae: false, ..gelu }, plain.clone(), 1),
+        (Config { dim_model: 35, n_heads: 1, dim_feedforward: 70, action_horizon: 1, dropout: 0.0, ..base }, plain, 5),
     ]
 }
 
 fn cases() -> impl Iterator<Item = (Act, Batch, String)> {
-    configs().into_iter().map(|(config, dims, rows)| {
-        let act = Act::new(&config, &dims, 1).unwrap();
+    configs().into_iter().map(|(config, signature, rows)| {
+        let act = Act::new(&config, &signature, 1).unwrap();
         move_parameters(&act);
-        (act, batch(&dims, config.action_horizon, rows, 3), format!("{config:?}"))
+        (act, batch(&signature, config.action_horizon, rows, 3), format!("{config:?}"))
     })
 }
 
@@ -51,10 +54,9 @@ fn the_fused_step_is_the_composed_one_with_dropout() {
 #[test]
 fn the_fused_prediction_is_the_composed_one() {
     for (act, batch, what) in cases() {
-        let env = batch.environment_state.as_ref();
-        let want = act.predict_composed(&batch.state, env).unwrap();
+        let want = act.predict_composed(&batch.observation).unwrap();
         for level in Level::ALL {
-            let got = at_most(level, || act.fused_predict(&batch.state, env).unwrap());
+            let got = at_most(level, || act.fused_predict(&batch.observation).unwrap());
             let off = (got - &want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
             assert!(off < 1e-5, "{off} {level:?} {what}");
         }
@@ -75,4 +77,53 @@ fn the_same_seed_gives_the_same_bits_in_any_workspace() {
     let (first, second) = (gradients(&act, &batch), gradients(&act, &batch));
     assert_eq!(bits(&first.1), bits(&second.1));
     assert_eq!(first.0, second.0);
+}
+
+/// Entities of one group without positions are a set: their order changes nothing. With positions it does.
+#[test]
+fn the_chunk_does_not_depend_on_the_order_of_a_group() {
+    let (config, signature, rows) =
+        configs().into_iter().find(|(_, s, _)| s.get("observation.entity.goal0").is_some()).unwrap();
+    let act = Act::new(&config, &signature, 1).unwrap();
+    move_parameters(&act);
+    let batch = batch(&signature, config.action_horizon, rows, 3);
+    let chunk = |swapped: Option<[&str; 2]>| {
+        let mut observation = batch.observation.clone();
+        if let Some([a, b]) = swapped.map(|names| names.map(|name| format!("observation.entity.{name}"))) {
+            let (x, y) = (observation.get(&a).unwrap().clone(), observation.get(&b).unwrap().clone());
+            observation.insert(&a, y);
+            observation.insert(&b, x);
+        }
+        act.predict(&observation).unwrap()
+    };
+    let off =
+        |other: Tensor| (other - chunk(None)).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+    assert!(off(chunk(Some(["cube0", "cube2"]))) < 1e-5);
+    assert!(off(chunk(Some(["goal0", "goal1"]))) > 1e-3);
+}
+
+#[test]
+fn features_that_act_cannot_read_are_refused_by_name() {
+    let config = configs().remove(0).0;
+    let error = |signature: Signature| Act::new(&config, &signature, 1).unwrap_err().to_string();
+    let mut signature = Signature::low_dimensional(3, 2, 2);
+    let picture = FeatureSpec {
+        name: "observation.images.front".to_string(),
+        kind: FeatureKind::Image,
+        shape: vec![8, 8, 3],
+        ..FeatureSpec::state(1)
+    };
+    signature.observation.push(picture.clone());
+    assert_eq!(
+        error(signature.clone()),
+        "act cannot read feature observation.images.front of kind image; it reads state, environment_state, entity"
+    );
+    assert_eq!(
+        crate::model::not_by_hand(&signature).unwrap(),
+        "the step by hand does not cover feature observation.images.front of kind image"
+    );
+    signature.observation = vec![FeatureSpec::environment_state(2)];
+    let expected =
+        "config of act: observation is observation.environment_state, expected a feature of kind state among others";
+    assert_eq!(error(signature), expected);
 }

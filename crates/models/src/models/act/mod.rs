@@ -5,8 +5,12 @@
 //! `model.`, which belongs to its file format.
 //!
 //! Training: the VAE encoder reads `[cls, state, actions…]` and gives the mean and log-variance of a latent. The encoder
-//! reads `[latent, state, environment state]`; the decoder's queries are learned positions, one per action of the chunk.
+//! reads `[latent, state, environment state, entities…]`; the decoder's queries are learned positions, one per action of the chunk.
 //! Loss: L1 over the steps that are not padding, plus `kl_weight` times KL(latent ‖ N(0, 1)). Inference: latent = 0.
+//!
+//! Entities are ours: a token each, through a projection that entities of one group share, without a position unless one
+//! was asked for; without positions the chunk does not depend on the order of a group. Of a history (`n_obs_steps`) each
+//! token reads all steps side by side.
 //!
 //! Deviations: none in the maths. `feedforward_activation = "glu"` is refused: LeRobot accepts it in its configuration,
 //! but its layer then cannot run (`glu` halves the width that `linear2` expects). Images are not supported.
@@ -19,21 +23,25 @@ mod fused;
 
 pub use config::Config;
 
-use crate::batch::{Batch, Dims};
-use crate::checks::{check_batch, check_dims, check_observation};
+use crate::batch::Batch;
+use crate::checks::{check_batch, check_observation, check_signature};
 use crate::error::Result;
+use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
-    Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Mode, Vae, kl_divergence,
-    sample, sinusoid_table,
+    Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Mode, TokenLayout, Vae,
+    environment_state, kl_divergence, sample, sinusoid_table,
 };
 use crate::losses::absolute;
-use crate::model::{LossParts, LossValues, PolicyModel};
+use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
 use crate::params::Params;
 use crate::rng::Rng;
 use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
+
+/// The kinds of features that it reads.
+pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
 
 /// What the training forward pass gives.
 #[derive(Debug)]
@@ -48,13 +56,12 @@ pub struct TrainOutput {
 #[derive(Debug)]
 pub struct Act {
     config: Config,
-    dims: Dims,
+    signature: Signature,
     params: Params,
     pub(crate) vae: Option<Vae>,
     pub(crate) encoder: Encoder,
     pub(crate) decoder: Decoder,
     pub(crate) tokens: InputTokens,
-    pub(crate) encoder_1d_feature_pos_embed: Embedding,
     pub(crate) action_head: Linear,
     pub(crate) workspaces: Workspaces,
     /// (1, action_horizon + 2, D), fixed
@@ -68,15 +75,19 @@ impl Act {
     /// elsewhere.
     ///
     /// # Errors
-    /// A configuration or dimensions that describe no possible model.
-    pub fn new(config: &Config, dims: &Dims, seed: u64) -> Result<Self> {
+    /// A configuration or a signature that describes no possible model.
+    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
         config.validate()?;
-        check_dims("act", dims)?;
+        check_signature("act", signature, READS)?;
+        let layout = TokenLayout::new(signature);
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
         let (dim, shape) = (config.dim_model, config.shape());
         let vae = match config.use_vae {
-            true => Some(Vae::new(&mut p, shape, (config.n_vae_encoder_layers, config.latent_dim), dims, rng)?),
+            true => {
+                let (of_vae, io) = ((config.n_vae_encoder_layers, config.latent_dim), (&layout, signature.action_dim));
+                Some(Vae::new(&mut p, shape, of_vae, io, rng)?)
+            }
             false => None,
         };
         let encoder = Encoder::new(&mut p, "encoder", config.n_encoder_layers, shape, LayerInit::Xavier, rng)?;
@@ -84,30 +95,23 @@ impl Act {
         let layers = (0..config.n_decoder_layers)
             .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), shape, rng))
             .collect::<Result<_>>()?;
-        let env_state = match dims.environment_state {
-            0 => None,
-            e => Some(Linear::new(&mut p, "encoder_env_state_input_proj", e, dim, rng)?),
-        };
-        let n_tokens = 2 + usize::from(env_state.is_some());
+        let env_state = environment_state(&mut p, &layout, dim, rng)?;
         let norm = LayerNorm::new(&mut p, "decoder.norm", dim, rng)?;
-        let latent = Linear::new(&mut p, "encoder_latent_input_proj", config.latent_dim, dim, rng)?;
-        let robot_state = Linear::new(&mut p, "encoder_robot_state_input_proj", dims.state, dim, rng)?;
-        let feature_pos = Embedding::new(&mut p, "encoder_1d_feature_pos_embed", n_tokens, dim, rng)?;
+        let tokens = InputTokens::new(&mut p, layout, config.latent_dim, dim, env_state, rng)?;
         let pos_embed = Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?;
         let table = sinusoid_table(config.action_horizon + 2, dim)?;
         Ok(Self {
             vae,
             encoder,
             decoder: Decoder { layers, norm, pos_embed },
-            tokens: InputTokens { latent, robot_state, env_state },
-            encoder_1d_feature_pos_embed: feature_pos,
-            action_head: Linear::new(&mut p, "action_head", dim, dims.action, rng)?,
+            tokens,
+            action_head: Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?,
             workspaces: Workspaces::default(),
             position_table: table.flatten_all()?.to_vec1()?,
             vae_encoder_pos_enc: table,
             params: p,
             config: config.clone(),
-            dims: *dims,
+            signature: signature.clone(),
         })
     }
 
@@ -121,21 +125,10 @@ impl Act {
         &self.position_table
     }
 
-    /// Sizes of its inputs and outputs.
-    pub fn dims(&self) -> &Dims {
-        &self.dims
-    }
-
-    /// latent: (b, L), state: (b, S), environment_state: (b, E) -> (b, C, A)
-    fn decode(
-        &self,
-        latent: &Tensor,
-        state: &Tensor,
-        environment_state: Option<&Tensor>,
-        mode: &mut Mode<'_>,
-    ) -> Result<Tensor> {
-        let tokens = self.tokens.forward(latent, state, environment_state)?;
-        let pos = self.encoder_1d_feature_pos_embed.weight.unsqueeze(0)?;
+    /// latent: (b, L), the features of the observation -> (b, C, A)
+    fn decode(&self, latent: &Tensor, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
+        let tokens = self.tokens.forward(latent, observation)?;
+        let pos = self.tokens.positions()?;
         let memory = self.encoder.forward(&tokens, &pos, None, mode)?;
         self.action_head.forward(&self.decoder.forward(&memory, &pos, mode)?)
     }
@@ -154,7 +147,7 @@ impl Act {
             Some(latent) => sample(latent, eps)?,
             None => eps.zeros_like()?,
         };
-        let actions = self.decode(&sample, &batch.state, batch.environment_state.as_ref(), mode)?;
+        let actions = self.decode(&sample, &batch.observation, mode)?;
         Ok(TrainOutput { actions, latent })
     }
 
@@ -176,18 +169,18 @@ impl Act {
     }
 
     pub(crate) fn check_batch(&self, batch: &Batch) -> Result<()> {
-        check_batch("act", &self.dims, self.config.action_horizon, batch)
+        check_batch("act", &self.signature, self.config.action_horizon, batch)
     }
 
-    pub(crate) fn check_inputs(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<()> {
-        check_observation("act", &self.dims, state, environment_state)
+    pub(crate) fn check_inputs(&self, observation: &Features<Tensor>) -> Result<usize> {
+        check_observation("act", &self.signature, observation)
     }
 
     /// The prediction on candle's autograd; `predict` runs the same maths faster.
-    pub fn predict_composed(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {
-        self.check_inputs(state, environment_state)?;
-        let latent = Tensor::zeros((state.dim(0)?, self.config.latent_dim), DType::F32, state.device())?;
-        self.decode(&latent, state, environment_state, &mut Mode::Eval)
+    pub fn predict_composed(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        let rows = self.check_inputs(observation)?;
+        let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
+        self.decode(&latent, observation, &mut Mode::Eval)
     }
 }
 
@@ -196,21 +189,35 @@ impl PolicyModel for Act {
         &self.params
     }
 
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn composed_because(&self) -> Option<String> {
+        not_by_hand(&self.signature)
+    }
+
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         let shape = (batch.rows(), self.config.latent_dim);
-        let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.state.device())?;
+        let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.device())?;
         let output = self.train_forward(batch, &eps, &mut Mode::Train(rng))?;
         self.loss_of(&output, batch)
     }
 
     fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        if self.composed_because().is_some() {
+            return autograd(self, batch, rng, into);
+        }
         let shape = (batch.rows(), self.config.latent_dim);
-        let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.state.device())?;
+        let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.device())?;
         self.fused_gradients(batch, &eps, Some(rng), into)
     }
 
-    fn predict(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {
-        self.fused_predict(state, environment_state)
+    fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        match self.composed_because() {
+            Some(_) => self.predict_composed(observation),
+            None => self.fused_predict(observation),
+        }
     }
 
     fn action_horizon(&self) -> usize {

@@ -6,7 +6,7 @@
 //!
 //! **`reasoning.over = "actions"`** (default, our own): `y`, one token per action of the chunk,
 //! is the answer; `z`, a few latent tokens, is the reasoning. The memory (latent, robot state,
-//! environment state) is encoded once per observation. One small block, shared by everything,
+//! environment state, entities) is encoded once per observation. One small block, shared by everything,
 //! updates `z` (`l_cycles` times) and then `y`, each by attending to `[z, y, memory]`. A
 //! supervision step is `h_cycles` such rounds; after it `y` is decoded into a chunk by one dense
 //! layer, so every depth has an answer and the policy can stop at any of them.
@@ -37,22 +37,26 @@ mod tests;
 pub use config::{Config, Over, ReasoningConfig, WarmStart};
 pub use reasoning::{Budget, Reasoning, ReasoningPolicy, ReasoningStep};
 
-use crate::batch::{Batch, Dims};
-use crate::checks::{check_batch, check_dims, check_observation};
+use crate::batch::Batch;
+use crate::checks::{check_batch, check_observation, check_signature};
 use crate::classification::binary_cross_entropy;
 use crate::error::Result;
+use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
     Decoder, DecoderLayer, Embedding, Encoder, FeedForward, InputTokens, LayerInit, LayerNorm, Linear, Mode,
-    MultiHeadAttention, Shape, Vae, kl_divergence, sample, sinusoid_table,
+    MultiHeadAttention, Shape, TokenLayout, Vae, environment_state, kl_divergence, sample, sinusoid_table,
 };
 use crate::losses::absolute;
-use crate::model::{LossParts, LossValues, PolicyModel};
+use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
+
+/// The kinds of features that it reads.
+pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
 
 /// The shared layer of `over = "actions"`: attention to a context, then a dense part.
 #[derive(Debug)]
@@ -137,7 +141,7 @@ struct Step {
 #[derive(Debug)]
 pub struct Actrm {
     config: Config,
-    dims: Dims,
+    signature: Signature,
     params: Params,
     vae: Option<Vae>,
     /// (1, H + 2, D), fixed
@@ -145,7 +149,6 @@ pub struct Actrm {
     /// the same as a slice
     vae_positions: Vec<f32>,
     tokens: InputTokens,
-    feature_pos_embed: Embedding,
     design: Design,
     action_head: Linear,
     halt_head: Linear,
@@ -156,22 +159,22 @@ impl Actrm {
     /// Initial weights as ACT's: xavier-uniform matrices in the layers, torch's defaults elsewhere.
     ///
     /// # Errors
-    /// A configuration or dimensions that describe no possible model.
-    pub fn new(config: &Config, dims: &Dims, seed: u64) -> Result<Self> {
+    /// A configuration or a signature that describes no possible model.
+    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
         config.validate()?;
-        check_dims("actrm", dims)?;
+        check_signature("actrm", signature, READS)?;
+        let layout = TokenLayout::new(signature);
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
         let (dim, shape, r) = (config.dim_model, config.shape(), &config.reasoning);
         let vae = match config.use_vae {
-            true => Some(Vae::new(&mut p, shape, (config.n_vae_encoder_layers, config.latent_dim), dims, rng)?),
+            true => {
+                let (of_vae, io) = ((config.n_vae_encoder_layers, config.latent_dim), (&layout, signature.action_dim));
+                Some(Vae::new(&mut p, shape, of_vae, io, rng)?)
+            }
             false => None,
         };
-        let env_state = match dims.environment_state {
-            0 => None,
-            e => Some(Linear::new(&mut p, "encoder_env_state_input_proj", e, dim, rng)?),
-        };
-        let tokens = 2 + usize::from(env_state.is_some());
+        let env_state = environment_state(&mut p, &layout, dim, rng)?;
         let positions = sinusoid_table(config.action_horizon + 2, dim)?;
         let design = match r.over {
             Over::Actions => Design::Actions(OverActions {
@@ -205,19 +208,14 @@ impl Actrm {
             vae,
             vae_positions: positions.flatten_all()?.to_vec1()?,
             vae_pos_enc: positions,
-            tokens: InputTokens {
-                latent: Linear::new(&mut p, "encoder_latent_input_proj", config.latent_dim, dim, rng)?,
-                robot_state: Linear::new(&mut p, "encoder_robot_state_input_proj", dims.state, dim, rng)?,
-                env_state,
-            },
-            feature_pos_embed: Embedding::new(&mut p, "encoder_1d_feature_pos_embed", tokens, dim, rng)?,
+            tokens: InputTokens::new(&mut p, layout, config.latent_dim, dim, env_state, rng)?,
             design,
-            action_head: Linear::new(&mut p, "action_head", dim, dims.action, rng)?,
+            action_head: Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?,
             halt_head: Linear::new(&mut p, "halt_head", dim, 1, rng)?,
             workspaces: Workspaces::default(),
             params: p,
             config: config.clone(),
-            dims: *dims,
+            signature: signature.clone(),
         })
     }
 
@@ -226,21 +224,10 @@ impl Actrm {
         &self.config
     }
 
-    /// Sizes of its inputs and outputs.
-    pub fn dims(&self) -> &Dims {
-        &self.dims
-    }
-
     /// What the recursion reads, made once per observation: (b, M, D).
-    fn memory(
-        &self,
-        latent: &Tensor,
-        state: &Tensor,
-        environment_state: Option<&Tensor>,
-        mode: &mut Mode<'_>,
-    ) -> Result<Tensor> {
-        let tokens = self.tokens.forward(latent, state, environment_state)?;
-        let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
+    fn memory(&self, latent: &Tensor, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
+        let tokens = self.tokens.forward(latent, observation)?;
+        let pos = self.tokens.positions()?;
         match &self.design {
             Design::Actions(OverActions { memory_encoder: Some(encoder), .. }) => {
                 let memory = encoder.forward(&tokens, &pos, None, mode)?;
@@ -254,14 +241,14 @@ impl Actrm {
     /// The states before the first step.
     fn start(&self, batch: usize, memory: &Tensor) -> Result<Carry> {
         let dim = self.config.dim_model;
-        let zeros = |n: usize| Tensor::zeros((batch, n, dim), DType::F32, &Device::Cpu);
+        let zeros = |n: usize| Tensor::zeros((batch, n, dim), DType::F32, memory.device());
         Ok(match &self.design {
             Design::Actions(_) => {
                 Carry { answer: zeros(self.config.action_horizon)?, reasoning: zeros(self.config.reasoning.tokens)? }
             }
             Design::Memory(design) => {
                 let [h, l] = &design.z_init;
-                let all = |z: &[f32]| Tensor::from_slice(z, z.len(), &Device::Cpu)?.broadcast_as(memory.shape());
+                let all = |z: &[f32]| Tensor::from_slice(z, z.len(), memory.device())?.broadcast_as(memory.shape());
                 Carry { answer: all(h)?.contiguous()?, reasoning: all(l)?.contiguous()? }
             }
         })
@@ -280,7 +267,7 @@ impl Actrm {
         let chunk = self.action_head.forward(&match &self.design {
             Design::Actions(_) => carry.answer.clone(),
             Design::Memory(design) => {
-                let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
+                let pos = self.tokens.positions()?;
                 design.decoder.forward(&carry.answer, &pos, mode)?
             }
         })?;
@@ -310,7 +297,7 @@ impl Actrm {
                 answer = settle(design.update(&y, &[&z, &y, memory])?);
             }
             Design::Memory(design) => {
-                let pos = self.feature_pos_embed.weight.unsqueeze(0)?;
+                let pos = self.tokens.positions()?;
                 let update = |x: &Tensor| design.block.forward(x, &pos, None, &mut Mode::Eval);
                 let injected = (&answer + memory)?;
                 for _ in 0..self.config.reasoning.l_cycles {
@@ -343,12 +330,12 @@ impl Actrm {
         (0..steps).map(|i| weight(i) / total).collect()
     }
 
-    fn check_inputs(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<()> {
-        check_observation("actrm", &self.dims, state, environment_state)
+    fn check_inputs(&self, observation: &Features<Tensor>) -> Result<usize> {
+        check_observation("actrm", &self.signature, observation)
     }
 
     fn check_batch(&self, batch: &Batch) -> Result<()> {
-        check_batch("actrm", &self.dims, self.config.action_horizon, batch)
+        check_batch("actrm", &self.signature, self.config.action_horizon, batch)
     }
 
     /// With warm starts in use, the answer that half of the rows begin with: the model's own, to
@@ -358,16 +345,18 @@ impl Actrm {
             let noise = Tensor::from_vec(rng.normals(x.elem_count()), x.shape(), x.device())?;
             Ok((x + (noise * warm.noise)?)?)
         };
-        let state = noisy(&batch.state)?;
-        let environment_state = batch.environment_state.as_ref().map(&mut noisy).transpose()?;
-        let latent = Tensor::zeros((batch.rows(), self.config.latent_dim), DType::F32, &Device::Cpu)?;
-        let memory = self.memory(&latent, &state, environment_state.as_ref(), &mut Mode::Eval)?.detach();
+        let mut observation = Features::new();
+        for token in &self.tokens.layout().tokens {
+            observation.insert(&token.feature, noisy(batch.observation.require("warm start", &token.feature)?)?);
+        }
+        let latent = Tensor::zeros((batch.rows(), self.config.latent_dim), DType::F32, batch.device())?;
+        let memory = self.memory(&latent, &observation, &mut Mode::Eval)?.detach();
         let mut thought = carry.clone();
         for _ in 0..self.config.reasoning.supervision_steps {
             thought = self.step(&memory, &thought, &mut Mode::Eval)?.carry.detach();
         }
         let warm: Vec<f32> = (0..batch.rows()).map(|_| if rng.uniform() < 0.5 { 1.0 } else { 0.0 }).collect();
-        let warm = Tensor::from_vec(warm, (batch.rows(), 1, 1), &Device::Cpu)?;
+        let warm = Tensor::from_vec(warm, (batch.rows(), 1, 1), batch.device())?;
         Ok(thought.answer.broadcast_mul(&warm)?)
     }
 }
@@ -396,6 +385,14 @@ impl PolicyModel for Actrm {
         &self.params
     }
 
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn composed_because(&self) -> Option<String> {
+        not_by_hand(&self.signature)
+    }
+
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         self.check_batch(batch)?;
         let rows = batch.rows();
@@ -406,13 +403,12 @@ impl PolicyModel for Actrm {
         };
         let sample = match &latent {
             Some(latent) => {
-                let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, &Device::Cpu)?;
+                let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.device())?;
                 sample(latent, &eps)?
             }
-            None => Tensor::zeros(shape, DType::F32, &Device::Cpu)?,
+            None => Tensor::zeros(shape, DType::F32, batch.device())?,
         };
-        let environment_state = batch.environment_state.as_ref();
-        let memory = self.memory(&sample, &batch.state, environment_state, &mut Mode::Train(rng))?;
+        let memory = self.memory(&sample, &batch.observation, &mut Mode::Train(rng))?;
         let mut carry = self.start(rows, &memory)?;
         if let Some(warm) = self.config.reasoning.warm_start {
             carry.answer = self.warm_answers(batch, warm, &carry, rng)?;
@@ -438,7 +434,7 @@ impl PolicyModel for Actrm {
             |chunk: &Tensor| -> Result<Tensor> { Ok(absolute(&(chunk - &batch.actions)?)?.broadcast_mul(&valid)?) };
         let entries = (batch.total_valid_steps * a).max(1) as f64;
         let mut parts = BTreeMap::new();
-        let mut total = Tensor::zeros((), DType::F32, &Device::Cpu)?;
+        let mut total = Tensor::zeros((), DType::F32, batch.device())?;
         let mut row_errors = Vec::with_capacity(steps + 1);
         for (chunk, weight) in chunks.iter().zip(self.step_weights(steps)) {
             let error = errors(chunk)?;
@@ -451,7 +447,7 @@ impl PolicyModel for Actrm {
         }
         row_errors.push(errors(&beyond)?.sum((1, 2))?);
 
-        let mut halt = Tensor::zeros((), DType::F32, &Device::Cpu)?;
+        let mut halt = Tensor::zeros((), DType::F32, batch.device())?;
         let still = 1.0 - self.config.reasoning.halt_margin;
         for (i, logit) in halts.iter().enumerate() {
             let target = row_errors[i + 1].ge(&(&row_errors[i] * still)?)?.to_dtype(DType::F32)?;
@@ -469,11 +465,14 @@ impl PolicyModel for Actrm {
     }
 
     fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
-        self.fused_gradients(batch, rng, into)
+        match self.composed_because() {
+            Some(_) => autograd(self, batch, rng, into),
+            None => self.fused_gradients(batch, rng, into),
+        }
     }
 
-    fn predict(&self, state: &Tensor, environment_state: Option<&Tensor>) -> Result<Tensor> {
-        Ok(self.reason(state, environment_state, None, &mut |_| false)?.chunk)
+    fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        Ok(self.reason(observation, None, &mut |_| false)?.chunk)
     }
 
     fn action_horizon(&self) -> usize {

@@ -3,10 +3,12 @@
 use super::{Actrm, Carry, Over, ReasoningConfig};
 use crate::checks::check_shape;
 use crate::error::{ModelError, Result};
+use crate::features::{Features, Observation};
 use crate::layers::Mode;
-use crate::normaliser::{ACTION, ENVIRONMENT_STATE, Normaliser, STATE};
-use crate::policy::{ActionChunk, Observation, Policy};
-use candle_core::{DType, Device, Tensor};
+use crate::model::PolicyModel;
+use crate::policy::{ActionChunk, Policy};
+use crate::preprocess::Preprocess;
+use candle_core::{DType, Tensor};
 use std::sync::Arc;
 
 /// One supervision step as it happened.
@@ -35,7 +37,7 @@ pub struct Reasoning {
 }
 
 impl Actrm {
-    /// Thinks about observations in network units: state (b, S), environment_state (b, E). `start`
+    /// Thinks about observations in network units: the signature's features, (b, …) each. `start`
     /// is the answer state to begin from, (b, H, D) (`over = "actions"`). After each step
     /// `should_stop` gets the number of steps done and ends the thought by returning true.
     ///
@@ -45,14 +47,16 @@ impl Actrm {
     /// Inputs of the wrong shape.
     pub fn reason(
         &self,
-        state: &Tensor,
-        environment_state: Option<&Tensor>,
+        observation: &Features<Tensor>,
         start: Option<&Tensor>,
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
-        self.check_thought(state, environment_state, start)?;
-        let mut thought = Thought::new(&self.config.reasoning, state.dim(0)?, should_stop);
-        let answer = self.think(state, environment_state, start, &mut |chunk, logits| thought.step(chunk, &logits))?;
+        if self.composed_because().is_some() {
+            return self.reason_composed(observation, start, should_stop);
+        }
+        let rows = self.check_thought(observation, start)?;
+        let mut thought = Thought::new(&self.config.reasoning, rows, should_stop);
+        let answer = self.think(observation, rows, start, &mut |chunk, logits| thought.step(chunk, &logits))?;
         thought.end(answer)
     }
 
@@ -62,15 +66,13 @@ impl Actrm {
     /// Inputs of the wrong shape.
     pub fn reason_composed(
         &self,
-        state: &Tensor,
-        environment_state: Option<&Tensor>,
+        observation: &Features<Tensor>,
         start: Option<&Tensor>,
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
-        self.check_thought(state, environment_state, start)?;
-        let rows = state.dim(0)?;
-        let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, &Device::Cpu)?;
-        let memory = self.memory(&latent, state, environment_state, &mut Mode::Eval)?.detach();
+        let rows = self.check_thought(observation, start)?;
+        let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
+        let memory = self.memory(&latent, observation, &mut Mode::Eval)?.detach();
         let mut carry = self.start(rows, &memory)?;
         if let Some(start) = start {
             carry.answer = start.clone();
@@ -85,16 +87,17 @@ impl Actrm {
         }
     }
 
-    fn check_thought(&self, state: &Tensor, environment_state: Option<&Tensor>, start: Option<&Tensor>) -> Result<()> {
-        self.check_inputs(state, environment_state)?;
+    /// The number of rows.
+    fn check_thought(&self, observation: &Features<Tensor>, start: Option<&Tensor>) -> Result<usize> {
+        let rows = self.check_inputs(observation)?;
         let tokens = match self.config.reasoning.over {
             Over::Actions => self.config.action_horizon,
-            Over::Memory => self.feature_pos_embed.weight.dim(0)?,
+            Over::Memory => self.tokens.layout().len(),
         };
-        match start {
-            Some(start) => check_shape("actrm", "warm start", start, &[state.dim(0)?, tokens, self.config.dim_model]),
-            None => Ok(()),
+        if let Some(start) = start {
+            check_shape("actrm", "warm start", start, &[rows, tokens, self.config.dim_model])?;
         }
+        Ok(rows)
     }
 }
 
@@ -158,7 +161,7 @@ pub trait Budget: Send {
 /// the warm start.
 pub struct ReasoningPolicy {
     model: Arc<Actrm>,
-    normaliser: Arc<Normaliser>,
+    preprocess: Arc<Preprocess>,
     budget: Option<Box<dyn Budget>>,
     last: Option<Reasoning>,
 }
@@ -166,7 +169,7 @@ pub struct ReasoningPolicy {
 impl ReasoningPolicy {
     /// # Errors
     /// If the configuration has a `budget_ms` and no clock is given.
-    pub fn new(model: Arc<Actrm>, normaliser: Arc<Normaliser>, budget: Option<Box<dyn Budget>>) -> Result<Self> {
+    pub fn new(model: Arc<Actrm>, preprocess: Arc<Preprocess>, budget: Option<Box<dyn Budget>>) -> Result<Self> {
         if let (Some(ms), None) = (model.config.reasoning.budget_ms, &budget) {
             return Err(ModelError::Input {
                 operation: "actrm policy",
@@ -175,7 +178,7 @@ impl ReasoningPolicy {
                 expected: format!("one, for reasoning.budget_ms = {ms}"),
             });
         }
-        Ok(Self { model, normaliser, budget, last: None })
+        Ok(Self { model, preprocess, budget, last: None })
     }
 
     /// The thought behind the last prediction.
@@ -190,36 +193,24 @@ impl ReasoningPolicy {
         };
         let tokens = self.model.config.action_horizon as u32;
         let moved: Vec<u32> = (0..tokens).map(|i| (i + warm.shift as u32).min(tokens - 1)).collect();
-        let moved = Tensor::new(moved, &Device::Cpu)?;
+        let moved = Tensor::new(moved, last.answer.device())?;
         Ok(Some(last.answer.index_select(&moved, 1)?))
-    }
-
-    fn row(&self, feature: &str, values: &[f32]) -> Result<Tensor> {
-        let mut values = values.to_vec();
-        self.normaliser.normalise(feature, &mut values)?;
-        let len = values.len();
-        Ok(Tensor::from_vec(values, (1, len), &Device::Cpu)?)
     }
 }
 
 impl Policy for ReasoningPolicy {
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
-        let state = self.row(STATE, &observation.state)?;
-        let environment_state = match self.model.dims.environment_state {
-            0 => None,
-            _ => Some(self.row(ENVIRONMENT_STATE, &observation.environment_state)?),
-        };
+        let seen = self.preprocess.observation(std::slice::from_ref(observation))?;
         let start = self.warm_start()?;
         let mut budget = self.budget.as_mut().zip(self.model.config.reasoning.budget_ms);
         if let Some((clock, _)) = &mut budget {
             clock.begin();
         }
         let mut should_stop = |_: usize| budget.as_mut().is_some_and(|(clock, ms)| clock.is_spent(*ms));
-        let reasoning = self.model.reason(&state, environment_state.as_ref(), start.as_ref(), &mut should_stop)?;
-        let mut actions = reasoning.chunk.flatten_all()?.to_vec1::<f32>()?;
-        self.normaliser.unnormalise(ACTION, &mut actions)?;
+        let reasoning = self.model.reason(&seen, start.as_ref(), &mut should_stop)?;
+        let chunk = self.preprocess.chunk(&reasoning.chunk)?;
         self.last = Some(reasoning);
-        ActionChunk::new(actions, self.model.config.action_horizon, self.model.dims.action)
+        Ok(chunk)
     }
 
     fn reset(&mut self) {

@@ -1,14 +1,19 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
+use crate::features::{Features, Observation};
 use crate::gradients::ParamLayout;
 use crate::models::act::{self, Act};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
-use crate::policy::{Observation, Policy};
+use crate::policy::Policy;
+use crate::preprocess::Preprocess;
 use crate::registry::PolicyConfig;
 use crate::train::{TrainConfig, Trainer};
+use candle_core::Device;
 use std::sync::Arc;
 
-const DIMS: Dims = Dims { state: 9, environment_state: 10, action: 7 };
+fn signature() -> Signature {
+    Signature::low_dimensional(9, 10, 7)
+}
 
 fn small(reasoning: ReasoningConfig) -> Config {
     Config {
@@ -41,7 +46,7 @@ fn batch(config: &Config, rows: usize, seed: u64) -> Batch {
         })
         .collect();
     let is_pad: Vec<bool> = (0..rows * h).map(|i| i % h == h - 1 && (i / h).is_multiple_of(3)).collect();
-    Batch::from_slices(&DIMS, h, &state, &env, &actions, &is_pad).unwrap()
+    Batch::from_slices(&signature(), h, &Features::of_slices(&state, &env), &actions, &is_pad).unwrap()
 }
 
 fn value(t: &Tensor) -> f32 {
@@ -54,8 +59,8 @@ fn it_has_at_most_half_of_acts_parameters() {
     for (dim_model, dim_feedforward, action_horizon) in sizes {
         let act = act::Config { dim_model, dim_feedforward, action_horizon, ..act::Config::default() };
         let ours = Config { dim_model, dim_feedforward, action_horizon, ..Config::default() };
-        let act = Act::new(&act, &DIMS, 0).unwrap().params().count();
-        let ours = Actrm::new(&ours, &DIMS, 0).unwrap().params().count();
+        let act = Act::new(&act, &signature(), 0).unwrap().params().count();
+        let ours = Actrm::new(&ours, &signature(), 0).unwrap().params().count();
         assert!(2 * ours <= act, "{ours} against {act} at width {dim_model}");
     }
 }
@@ -63,7 +68,7 @@ fn it_has_at_most_half_of_acts_parameters() {
 #[test]
 fn every_parameter_gets_a_gradient() {
     for config in designs() {
-        let model = Actrm::new(&config, &DIMS, 1).unwrap();
+        let model = Actrm::new(&config, &signature(), 1).unwrap();
         // off the zeros that biases start from, which hide gradients behind them
         let mut rng = Rng::new(7, "noise");
         for (_, var) in model.params().iter() {
@@ -90,7 +95,7 @@ fn every_parameter_gets_a_gradient() {
 fn shards_add_up_to_the_batch() {
     for config in designs() {
         let config = Config { use_vae: false, ..config };
-        let model = Actrm::new(&config, &DIMS, 1).unwrap();
+        let model = Actrm::new(&config, &signature(), 1).unwrap();
         let batch = batch(&config, 7, 3);
         let whole = value(&model.loss(&batch, &mut Rng::new(0, "loss")).unwrap().total);
         let shards = batch.shards(3).unwrap();
@@ -107,17 +112,16 @@ fn training_lowers_the_error_on_new_observations_and_depth_helps() {
         let held_out = batch(&config, 64, 99);
         // the error at each depth, against that of always answering zero
         let errors = |model: &dyn PolicyModel, weights: &BTreeMap<String, Tensor>| -> Vec<f32> {
-            let trained = Actrm::new(&config, &DIMS, 1).unwrap();
+            let trained = Actrm::new(&config, &signature(), 1).unwrap();
             assert_eq!(model.params().count(), trained.params().count());
             trained.params().load(weights).unwrap();
-            let env = held_out.environment_state.as_ref();
-            let thought = trained.reason(&held_out.state, env, None, &mut |_| false).unwrap();
+            let thought = trained.reason(&held_out.observation, None, &mut |_| false).unwrap();
             let mean = |t: &Tensor| value(&t.abs().unwrap().mean_all().unwrap());
             let zero = mean(&held_out.actions);
             thought.steps.iter().map(|s| mean(&(&s.chunk - &held_out.actions).unwrap()) / zero).collect()
         };
         let settings = TrainConfig { steps: 500, lr: 5e-3, ema_decay: Some(0.98), ..TrainConfig::default() };
-        let model = Box::new(Actrm::new(&config, &DIMS, 1).unwrap());
+        let model = Box::new(Actrm::new(&config, &signature(), 1).unwrap());
         let mut trainer = Trainer::new(model, settings, 1).unwrap();
         for step in 0..500 {
             trainer.step(&batch(&config, 32, step)).unwrap();
@@ -139,13 +143,12 @@ fn a_rows_thought_does_not_depend_on_its_neighbours() {
         config.reasoning.max_steps = Some(6);
         config.reasoning.change_threshold = 0.05;
         config.reasoning.halt_threshold = 0.7;
-        let model = Actrm::new(&config, &DIMS, 5).unwrap();
+        let model = Actrm::new(&config, &signature(), 5).unwrap();
         let batch = batch(&config, 5, 1);
-        let env = batch.environment_state.clone().unwrap();
-        let all = model.reason(&batch.state, Some(&env), None, &mut |_| false).unwrap();
+        let all = model.reason(&batch.observation, None, &mut |_| false).unwrap();
         for row in 0..5 {
-            let one = (batch.state.narrow(0, row, 1).unwrap(), env.narrow(0, row, 1).unwrap());
-            let one = model.reason(&one.0, Some(&one.1), None, &mut |_| false).unwrap();
+            let one = batch.observation.map(|_, values| values.narrow(0, row, 1).unwrap());
+            let one = model.reason(&one, None, &mut |_| false).unwrap();
             assert_eq!(one.depth[0], all.depth[row]);
             let other = all.chunk.narrow(0, row, 1).unwrap();
             let off = value(&(&one.chunk - other).unwrap().abs().unwrap().max_all().unwrap());
@@ -162,10 +165,9 @@ fn every_rule_stops_the_thought() {
             config.reasoning.change_threshold = change;
             config.reasoning.halt_threshold = halt;
             config.reasoning.max_steps = Some(max);
-            let model = Actrm::new(&config, &DIMS, 5).unwrap();
+            let model = Actrm::new(&config, &signature(), 5).unwrap();
             let batch = batch(&config, 2, 1);
-            let env = batch.environment_state.as_ref();
-            model.reason(&batch.state, env, None, &mut |done| done >= stop_at).unwrap()
+            model.reason(&batch.observation, None, &mut |done| done >= stop_at).unwrap()
         };
         assert_eq!(think(0.0, 1.0, 5, 99).depth, [5, 5]);
         assert_eq!(think(0.0, 1.0, 5, 2).depth, [2, 2]);
@@ -181,14 +183,15 @@ fn every_rule_stops_the_thought() {
     }
 }
 
-fn identity() -> Arc<Normaliser> {
+fn identity() -> Arc<Preprocess> {
     let modes = [STATE, ENVIRONMENT_STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
-    Arc::new(Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap())
+    let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
+    Arc::new(Preprocess::new(signature(), normaliser).unwrap())
 }
 
 fn observation(seed: u64) -> Observation {
     let mut rng = Rng::new(seed, "observation");
-    Observation { state: rng.normals(9), environment_state: rng.normals(10) }
+    Observation::of_state(rng.normals(9), rng.normals(10))
 }
 
 struct Fake(f64);
@@ -211,7 +214,7 @@ fn the_policy_keeps_to_its_budget_and_starts_warm() {
     config.reasoning.change_threshold = 0.0;
     config.reasoning.budget_ms = Some(3.0);
     config.reasoning.warm_start = Some(WarmStart { shift: 2, noise: 0.1 });
-    let model = Arc::new(Actrm::new(&config, &DIMS, 5).unwrap());
+    let model = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
     assert!(ReasoningPolicy::new(Arc::clone(&model), identity(), None).is_err());
     let mut policy = ReasoningPolicy::new(Arc::clone(&model), identity(), Some(Box::new(Fake(0.0)))).unwrap();
     let first = policy.predict(&observation(1)).unwrap();
@@ -233,7 +236,7 @@ fn impossible_configurations_name_the_field() {
     let with = |change: &dyn Fn(&mut Config)| {
         let mut config = small(ReasoningConfig::default());
         change(&mut config);
-        Actrm::new(&config, &DIMS, 0).unwrap_err().to_string()
+        Actrm::new(&config, &signature(), 0).unwrap_err().to_string()
     };
     for (error, field) in [
         (with(&|c| c.n_heads = 3), "n_heads"),

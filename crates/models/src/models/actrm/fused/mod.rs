@@ -10,7 +10,8 @@ mod tests;
 use super::{Actrm, Over, WarmStart};
 use crate::batch::Batch;
 use crate::error::Result;
-use crate::fused::{AbsoluteError, Data, Grads, Pass, Tokens, Vae, with_weights};
+use crate::features::Features;
+use crate::fused::{AbsoluteError, Data, Grads, Pass, Tokens, Vae, inputs, with_weights};
 use crate::gradients::Gradients;
 use crate::layers::Shape;
 use crate::model::{LossValues, PolicyModel};
@@ -116,7 +117,7 @@ impl Actrm {
     /// Loss of a training forward pass, and its gradients added to `into`.
     pub(super) fn fused_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
         self.check_batch(batch)?;
-        let data = Data::of(batch)?;
+        let data = Data::of(batch, self.tokens.layout())?;
         let steps = self.steps_of(batch);
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
@@ -142,7 +143,6 @@ impl Actrm {
         let vae = Vae {
             n_layers: config.n_vae_encoder_layers,
             latent_dim: config.latent_dim,
-            dims: &self.dims,
             positions: &self.vae_positions,
         };
         let (latent, encoded) = match config.use_vae {
@@ -156,7 +156,7 @@ impl Actrm {
             }
             false => (pass.space.pool.zeros(rows * config.latent_dim), None),
         };
-        let tokens = Tokens::new(&self.dims, (&latent, config.latent_dim), &data.state, &data.environment_state);
+        let tokens = Tokens::new(self.tokens.layout(), (&latent, config.latent_dim), &data.inputs);
         let mut recursion = R::observe(self, pass, &tokens, rows);
         let answer = config.reasoning.warm_start.map(|warm| self.warm_answers_fused::<R>(pass, data, warm));
         let start = Carry { answer, reasoning: None };
@@ -233,11 +233,9 @@ impl Actrm {
             let rng = pass.rng.as_mut().expect("a training step has a generator");
             x.iter().zip(rng.normals(x.len())).map(|(x, noise)| x + noise * warm.noise as f32).collect()
         };
-        let state = noisy(&data.state);
-        let environment_state =
-            if self.dims.environment_state > 0 { noisy(&data.environment_state) } else { Vec::new() };
+        let inputs: Vec<Vec<f32>> = data.inputs.iter().map(|values| noisy(values)).collect();
         let latent = vec![0.0; data.rows * self.config.latent_dim];
-        let tokens = Tokens::new(&self.dims, (&latent, self.config.latent_dim), &state, &environment_state);
+        let tokens = Tokens::new(self.tokens.layout(), (&latent, self.config.latent_dim), &inputs);
         let mut answer = quietly(pass, |pass| {
             let recursion = R::observe(self, pass, &tokens, data.rows);
             let mut carry = Carry::default();
@@ -264,21 +262,20 @@ impl Actrm {
     /// chunk, (b, H, A), and halting logits, returns true; returns the last answer state.
     pub(super) fn think(
         &self,
-        state: &Tensor,
-        environment_state: Option<&Tensor>,
+        observation: &Features<Tensor>,
+        rows: usize,
         start: Option<&Tensor>,
         on_step: &mut dyn FnMut(Tensor, Vec<f32>) -> Result<bool>,
     ) -> Result<Tensor> {
-        let values = |t: Option<&Tensor>| t.map(|t| with_values(t, <[f32]>::to_vec)).transpose();
-        let (state, env) = (values(Some(state))?.unwrap_or_default(), values(environment_state)?.unwrap_or_default());
-        let start = values(start)?;
+        let inputs = inputs(self.tokens.layout(), observation)?;
+        let start = start.map(|start| with_values(start, <[f32]>::to_vec)).transpose()?;
         let packed = self.workspaces.packed(self.params());
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: None, packed: Some(&packed) };
                 match self.config.reasoning.over {
-                    Over::Actions => self.think_with::<OverActions<'_>>(pass, (&state, &env), start, on_step),
-                    Over::Memory => self.think_with::<OverMemory<'_>>(pass, (&state, &env), start, on_step),
+                    Over::Actions => self.think_with::<OverActions<'_>>(pass, (&inputs, rows), start, on_step),
+                    Over::Memory => self.think_with::<OverMemory<'_>>(pass, (&inputs, rows), start, on_step),
                 }
             })
         })?
@@ -287,16 +284,15 @@ impl Actrm {
     fn think_with<'m, R: Recursion<'m>>(
         &'m self,
         pass: &mut Pass<'_>,
-        (state, env): (&[f32], &[f32]),
+        (inputs, rows): (&[Vec<f32>], usize),
         start: Option<Vec<f32>>,
         on_step: &mut dyn FnMut(Tensor, Vec<f32>) -> Result<bool>,
     ) -> Result<Tensor> {
-        let rows = state.len() / self.dims.state;
         let latent = pass.space.pool.zeros(rows * self.config.latent_dim);
-        let tokens = Tokens::new(&self.dims, (&latent, self.config.latent_dim), state, env);
+        let tokens = Tokens::new(self.tokens.layout(), (&latent, self.config.latent_dim), inputs);
         let recursion = R::observe(self, pass, &tokens, rows);
         let mut carry = Carry { answer: start, reasoning: None };
-        let shape = (rows, self.config.action_horizon, self.dims.action);
+        let shape = (rows, self.config.action_horizon, self.signature.action_dim);
         loop {
             let step = recursion.step(pass, &carry);
             let logits = step.halt_logits(pass);

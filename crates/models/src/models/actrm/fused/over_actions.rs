@@ -6,8 +6,8 @@
 
 use super::{Carry, Recursion, Step, mean_over_tokens, shaped};
 use crate::fused::{
-    BlockLayer, Encoder, Grads, Input, Part, Pass, Tokens, gather, keys_and_values, keys_and_values_backward, scatter,
-    slot,
+    BlockLayer, Encoder, Grads, Input, Part, Pass, Tokens, gather, keys_and_values, keys_and_values_backward,
+    positions_backward, scatter, slot,
 };
 use crate::kernels::add;
 use crate::layers::Shape;
@@ -201,7 +201,7 @@ impl<'m> Recursion<'m> for OverActions<'m> {
 
     fn observe(model: &'m Actrm, pass: &mut Pass<'_>, tokens: &Tokens<'_>, rows: usize) -> Self {
         let config = &model.config;
-        let pos = pass.weight("encoder_1d_feature_pos_embed", ".weight");
+        let pos = &*tokens.positions(pass);
         let (mut memory, mut encoder) = (tokens.forward(pass), None);
         if config.n_memory_layers > 0 {
             let (out, done) = Encoder::forward(pass, "encoder", config.n_memory_layers, memory, pos, None, false);
@@ -275,7 +275,7 @@ impl<'m> Recursion<'m> for OverActions<'m> {
     }
 
     fn finish(mut self, pass: &mut Pass<'_>, tokens: &Tokens<'_>, grads: &mut Grads<'_>) -> Vec<f32> {
-        let pos = pass.weight("encoder_1d_feature_pos_embed", ".weight");
+        let pos = &*tokens.positions(pass);
         let mut grad = pass.space.pool.zeros(self.memory.len());
         for (i, kv_grad) in std::mem::take(&mut self.memory_kv_grad).into_iter().enumerate() {
             keys_and_values_backward(pass, &attention_prefix(i), &self.memory, &kv_grad, &mut grad, grads);
@@ -286,7 +286,7 @@ impl<'m> Recursion<'m> for OverActions<'m> {
         if let Some(encoder) = self.encoder.take() {
             grad = encoder.backward(pass, grad, pos, Some(&mut pos_grad), grads);
         }
-        add(slot(grads, "encoder_1d_feature_pos_embed", ".weight"), &pos_grad);
+        positions_backward(tokens.layout(), self.config.dim_model, &pos_grad, grads);
         let latent = tokens.backward(pass, &grad, grads);
         pass.give(grad);
         pass.give(pos_grad);

@@ -1,9 +1,9 @@
 //! The recursion over the memory, the original's, and ACT's decoder.
 
 use super::{Carry, Recursion, Step, mean_over_tokens, shaped};
-use crate::fused::{Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, slot};
+use crate::fused::{Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, positions_backward, slot};
 use crate::kernels::add;
-use crate::layers::Shape;
+use crate::layers::{Shape, TokenLayout};
 use crate::models::actrm::{Actrm, Config, fixed_values};
 
 pub(super) struct OverMemory<'m> {
@@ -12,6 +12,9 @@ pub(super) struct OverMemory<'m> {
     /// the observation's tokens, (b, M, D)
     tokens: Vec<f32>,
     tokens_grad: Vec<f32>,
+    layout: &'m TokenLayout,
+    /// their positions, (M, D)
+    positions: Vec<f32>,
     /// what `z_h` and `z_l` begin with, (D)
     start: [Vec<f32>; 2],
 }
@@ -36,10 +39,9 @@ impl OverMemory<'_> {
 
     /// The block over the sum of two states.
     fn update(&self, pass: &mut Pass<'_>, a: &[f32], b: &[f32]) -> (Vec<f32>, Encoder) {
-        let pos = pass.weight("encoder_1d_feature_pos_embed", ".weight");
         let mut x = pass.space.pool.copy(a);
         add(&mut x, b);
-        Encoder::forward(pass, "reasoning", self.config.reasoning.n_layers, x, pos, None, false)
+        Encoder::forward(pass, "reasoning", self.config.reasoning.n_layers, x, &self.positions, None, false)
     }
 
     /// A copy of a state, or what it begins with in every token.
@@ -77,9 +79,11 @@ impl<'m> Recursion<'m> for OverMemory<'m> {
 
     fn observe(model: &'m Actrm, pass: &mut Pass<'_>, tokens: &Tokens<'_>, rows: usize) -> Self {
         let config = &model.config;
+        let positions = tokens.positions(pass).into_owned();
         let tokens = tokens.forward(pass);
         let tokens_grad = pass.space.pool.zeros(tokens.len());
-        Self { config, rows, tokens, tokens_grad, start: fixed_values(config.dim_model) }
+        let start = fixed_values(config.dim_model);
+        Self { config, rows, tokens, tokens_grad, layout: model.tokens.layout(), positions, start }
     }
 
     fn step(&self, pass: &mut Pass<'_>, carry: &Carry) -> Step<Trace> {
@@ -95,9 +99,8 @@ impl<'m> Recursion<'m> for OverMemory<'m> {
             (after, updates)
         });
         let answer = after.answer.as_ref().expect("a round leaves an answer");
-        let (pos, query_pos) =
-            (pass.weight("encoder_1d_feature_pos_embed", ".weight"), pass.weight("decoder_pos_embed", ".weight"));
-        let memory = Memory { x: answer, pos, batch: self.rows };
+        let query_pos = pass.weight("decoder_pos_embed", ".weight");
+        let memory = Memory { x: answer, pos: &self.positions, batch: self.rows };
         let (decoded, decoder) = Decoder::forward(pass, self.config.n_decoder_layers, query_pos, memory);
         let chunk = pass.linear("action_head", &decoded);
         let read = mean_over_tokens(pass, answer, self.rows);
@@ -115,12 +118,12 @@ impl<'m> Recursion<'m> for OverMemory<'m> {
     ) -> Carry {
         let Step { carry, chunk, read, trace: Trace { mut updates, decoder, decoded } } = step;
         let dim = pass.shape.dim;
-        let (pos, query_pos) =
-            (pass.weight("encoder_1d_feature_pos_embed", ".weight"), pass.weight("decoder_pos_embed", ".weight"));
+        let query_pos = pass.weight("decoder_pos_embed", ".weight");
         pass.linear_backward("action_head", &decoded, chunk_grad, dim, grads);
         let x = pass.linear_input("action_head", chunk_grad, dim);
         let answer = carry.answer.as_ref().expect("a step leaves an answer");
         let mut answer_grad = pass.space.pool.zeros(answer.len());
+        let pos = &self.positions;
         let (mut pos_grad, mut query_grad) = (pass.space.pool.zeros(pos.len()), pass.space.pool.zeros(query_pos.len()));
         let mut into = DecoderGrads { memory: &mut answer_grad, memory_pos: &mut pos_grad, query_pos: &mut query_grad };
         let memory = Memory { x: answer, pos, batch: self.rows };
@@ -137,7 +140,7 @@ impl<'m> Recursion<'m> for OverMemory<'m> {
             }
             pass.give(grad);
         });
-        add(slot(grads, "encoder_1d_feature_pos_embed", ".weight"), &pos_grad);
+        positions_backward(self.layout, dim, &pos_grad, grads);
         carry.free(pass);
         carry_grad.free(pass);
         for buffer in [pos_grad, query_grad, chunk, read, decoded] {

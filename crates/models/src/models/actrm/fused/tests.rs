@@ -1,17 +1,17 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::Dims;
+use crate::features::Signature;
 use crate::fused::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients, move_parameters,
+    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients,
+    move_parameters, signatures,
 };
 use crate::layers::Activation;
 use crate::models::actrm::{Config, ReasoningConfig, WarmStart};
 use crate::simd::{Level, at_most};
 
 /// Odd sizes in both designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
-fn configs() -> Vec<(Config, Dims, usize)> {
-    let dims = Dims { state: 3, environment_state: 2, action: 2 };
-    let no_env = Dims { environment_state: 0, ..dims };
+fn configs() -> Vec<(Config, Signature, usize)> {
+    let Signatures { plain, no_env, entities, history } = signatures();
     let base = Config {
         action_horizon: 5,
         dim_model: 12,
@@ -40,34 +40,46 @@ fn configs() -> Vec<(Config, Dims, usize)> {
     let warm = Some(WarmStart { shift: 1, noise: 0.1 });
     let gelu = Activation::Gelu;
     vec![
-        (reasoning(&|_| ()), dims, 3),
-        (Config { action_horizon: 17, feedforward_activation: gelu, ..reasoning(&|r| r.n_layers = 2) }, no_env, 2),
-        (Config { n_memory_layers: 0, use_vae: false, ..reasoning(&|r| r.l_cycles = 3) }, dims, 4),
-        (reasoning(&|r| (r.h_cycles, r.l_cycles, r.n_layers) = (3, 2, 2)), dims, 1),
-        (Config { n_memory_layers: 2, n_vae_encoder_layers: 2, ..reasoning(&|r| r.warm_start = warm) }, dims, 5),
+        (reasoning(&|_| ()), plain.clone(), 3),
+        (reasoning(&|r| r.warm_start = warm), entities.clone(), 3),
+        (reasoning(&|_| ()), history.clone(), 2),
+        (memory(&|r| r.supervision_steps = 2), entities, 2),
+        (memory(&|_| ()), history, 2),
         (
-            Config { dim_model: 35, n_heads: 1, action_horizon: 1, dropout: 0.0, ..reasoning(&|r| r.tokens = 1) },
-            dims,
+            Config { action_horizon: 17, feedforward_activation: gelu, ..reasoning(&|r| r.n_layers = 2) },
+            no_env.clone(),
+            2,
+        ),
+        (Config { n_memory_layers: 0, use_vae: false, ..reasoning(&|r| r.l_cycles = 3) }, plain.clone(), 4),
+        (reasoning(&|r| (r.h_cycles, r.l_cycles, r.n_layers) = (3, 2, 2)), plain.clone(), 1),
+        (
+            Config { n_memory_layers: 2, n_vae_encoder_layers: 2, ..reasoning(&|r| r.warm_start = warm) },
+            plain.clone(),
             5,
         ),
-        (memory(&|_| ()), dims, 3),
+        (
+            Config { dim_model: 35, n_heads: 1, action_horizon: 1, dropout: 0.0, ..reasoning(&|r| r.tokens = 1) },
+            plain.clone(),
+            5,
+        ),
+        (memory(&|_| ()), plain.clone(), 3),
         (Config { n_decoder_layers: 2, feedforward_activation: gelu, ..memory(&|r| r.n_layers = 1) }, no_env, 2),
-        (Config { use_vae: false, action_horizon: 13, ..memory(&|r| r.h_cycles = 1) }, dims, 4),
+        (Config { use_vae: false, action_horizon: 13, ..memory(&|r| r.h_cycles = 1) }, plain, 4),
     ]
 }
 
-fn model(config: &Config, dims: &Dims) -> Actrm {
-    let model = Actrm::new(config, dims, 1).unwrap();
+fn model(config: &Config, signature: &Signature) -> Actrm {
+    let model = Actrm::new(config, signature, 1).unwrap();
     move_parameters(&model);
     model
 }
 
 #[test]
 fn the_fused_step_is_the_composed_one_with_dropout() {
-    for (config, dims, rows) in configs() {
-        let model = model(&config, &dims);
+    for (config, signature, rows) in configs() {
+        let model = model(&config, &signature);
         for seed in [3, 4] {
-            let batch = batch(&dims, config.action_horizon, rows, seed);
+            let batch = batch(&signature, config.action_horizon, rows, seed);
             assert_the_step_is_the_composed_one(&model, &batch, &format!("{config:?}"));
         }
     }
@@ -75,17 +87,16 @@ fn the_fused_step_is_the_composed_one_with_dropout() {
 
 #[test]
 fn the_fused_thought_is_the_composed_one() {
-    for (mut config, dims, rows) in configs() {
+    for (mut config, signature, rows) in configs() {
         config.reasoning.max_steps = Some(4);
         config.reasoning.change_threshold = 0.05;
-        let model = model(&config, &dims);
-        let batch = batch(&dims, config.action_horizon, rows, 3);
-        let env = batch.environment_state.as_ref();
-        let first = model.reason_composed(&batch.state, env, None, &mut |_| false).unwrap();
+        let model = model(&config, &signature);
+        let batch = batch(&signature, config.action_horizon, rows, 3);
+        let first = model.reason_composed(&batch.observation, None, &mut |_| false).unwrap();
         for start in [None, Some(&first.answer)] {
-            let want = model.reason_composed(&batch.state, env, start, &mut |_| false).unwrap();
+            let want = model.reason_composed(&batch.observation, start, &mut |_| false).unwrap();
             for level in Level::ALL {
-                let got = at_most(level, || model.reason(&batch.state, env, start, &mut |_| false).unwrap());
+                let got = at_most(level, || model.reason(&batch.observation, start, &mut |_| false).unwrap());
                 let same = |a: &Tensor, b: &Tensor| {
                     let off = (a - b).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
                     assert!(off < 1e-5, "{off} {level:?} {config:?}");
@@ -104,7 +115,7 @@ fn the_fused_thought_is_the_composed_one() {
 
 #[test]
 fn the_fused_gradient_is_the_slope_of_the_loss() {
-    for (mut config, dims, rows) in configs() {
+    for (mut config, signature, rows) in configs() {
         // what the reference leaves without gradient on purpose: earlier rounds, earlier carries over the memory, what
         // the halting head reads, and warm answers
         config.reasoning.h_cycles = 1;
@@ -113,15 +124,15 @@ fn the_fused_gradient_is_the_slope_of_the_loss() {
         if config.reasoning.over == Over::Memory {
             config.reasoning.supervision_steps = 1;
         }
-        let batch = batch(&dims, config.action_horizon, rows, 3);
-        assert_the_gradient_is_the_slope(&model(&config, &dims), &batch, &format!("{config:?}"));
+        let batch = batch(&signature, config.action_horizon, rows, 3);
+        assert_the_gradient_is_the_slope(&model(&config, &signature), &batch, &format!("{config:?}"));
     }
 }
 
 #[test]
 fn the_same_seed_gives_the_same_bits_in_any_workspace() {
-    for (config, dims, rows) in configs() {
-        let (model, batch) = (model(&config, &dims), batch(&dims, config.action_horizon, rows, 3));
+    for (config, signature, rows) in configs() {
+        let (model, batch) = (model(&config, &signature), batch(&signature, config.action_horizon, rows, 3));
         let (first, second) = (gradients(&model, &batch), gradients(&model, &batch));
         assert_eq!(first.0, second.0);
         assert!(first.1.values().iter().zip(second.1.values()).all(|(a, b)| a.to_bits() == b.to_bits()));
@@ -131,9 +142,9 @@ fn the_same_seed_gives_the_same_bits_in_any_workspace() {
 #[test]
 fn rounds_without_gradient_need_no_memory() {
     let buffers = |h_cycles: usize| {
-        let (mut config, dims, rows) = configs().remove(0);
+        let (mut config, signature, rows) = configs().remove(0);
         config.reasoning.h_cycles = h_cycles;
-        let (model, batch) = (model(&config, &dims), batch(&dims, config.action_horizon, rows, 3));
+        let (model, batch) = (model(&config, &signature), batch(&signature, config.action_horizon, rows, 3));
         gradients(&model, &batch);
         model.workspaces.with(|space| space.pool.numbers())
     };
@@ -142,12 +153,12 @@ fn rounds_without_gradient_need_no_memory() {
 
 #[test]
 fn steps_need_no_more_memory_than_the_first() {
-    for (config, dims, rows) in configs() {
-        let model = model(&config, &dims);
-        let batch = batch(&dims, config.action_horizon, rows, 3);
+    for (config, signature, rows) in configs() {
+        let model = model(&config, &signature);
+        let batch = batch(&signature, config.action_horizon, rows, 3);
         let held = || {
             gradients(&model, &batch);
-            model.reason(&batch.state, batch.environment_state.as_ref(), None, &mut |_| false).unwrap();
+            model.reason(&batch.observation, None, &mut |_| false).unwrap();
             model.workspaces.with(|space| space.pool.numbers())
         };
         let first = held();
