@@ -328,6 +328,14 @@ pub enum ValuesRef<'a> {
 }
 
 impl Values {
+    /// The numbers; `None` for a picture.
+    pub fn numbers(&self) -> Option<&[f32]> {
+        match self {
+            Self::F32(values) => Some(values),
+            Self::U8(_) => None,
+        }
+    }
+
     /// The same values, borrowed.
     pub fn as_ref(&self) -> ValuesRef<'_> {
         match self {

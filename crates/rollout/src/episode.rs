@@ -68,14 +68,14 @@ impl EpisodePlan {
     /// [`RolloutError::ObservationKey`] for a key that the environment does not give.
     pub fn new<'k>(
         ready: &Ready,
-        keys: impl IntoIterator<Item = &'k String>,
+        keys: impl IntoIterator<Item = &'k str>,
         max_steps: usize,
     ) -> Result<Self, RolloutError> {
         for key in keys {
             if !ready.observations.contains_key(key) {
                 let available: Vec<&str> = ready.observations.keys().map(String::as_str).collect();
                 return Err(RolloutError::ObservationKey {
-                    key: key.clone(),
+                    key: key.to_owned(),
                     task: ready.task.clone(),
                     available: available.join(", "),
                 });

@@ -25,7 +25,7 @@ fn main() -> Result<(), AnyError> {
             let list = observation[key].as_array().ok_or_else(|| format!("an observation has no list {key}"))?;
             list.iter().map(|v| v.as_f64().map(|v| v as f32).ok_or_else(|| format!("{key}: {v}").into())).collect()
         };
-        let asked = Observation { state: numbers("state")?, environment_state: numbers("environment_state")? };
+        let asked = Observation::of_state(numbers("state")?, numbers("environment_state")?);
         let chunk = policy.predict(&asked)?;
         chunks.push(chunk.actions.chunks_exact(chunk.action_dim).map(<[f32]>::to_vec).collect::<Vec<_>>());
     }

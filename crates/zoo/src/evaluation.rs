@@ -138,7 +138,7 @@ pub fn run_episodes(
     store: &(dyn Fn(EpisodeRecord, EpisodeTiming) -> Result<(), ()> + Sync),
     deliver: &mut dyn FnMut(Result<EpisodeRecord, RolloutError>),
 ) -> Result<(), RolloutError> {
-    let plan = EpisodePlan::new(pool.ready(), subject.keys(), max_steps)?;
+    let plan = EpisodePlan::new(pool.ready(), subject.keys.keys(), max_steps)?;
     let seed_of = |job: u64| seeds[usize::try_from(job).expect("a job is an index of seeds")];
     let failed = |seed, operation, source| RolloutError::Policy { seed, step: 0, operation, source };
     let state = || {
@@ -189,7 +189,7 @@ pub fn film(
 ) -> Result<(), RolloutError> {
     let max_steps = subject.max_steps.unwrap_or(pool.ready().max_steps);
     let task = &pool.ready().task.clone();
-    let plan = EpisodePlan::new(pool.ready(), subject.keys(), max_steps)?;
+    let plan = EpisodePlan::new(pool.ready(), subject.keys.keys(), max_steps)?;
     let seed_of = |job: u64| seeds[usize::try_from(job).expect("a job is an index of seeds")];
     let state = || {
         subject.agent().map_err(|source| {

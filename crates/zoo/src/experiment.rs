@@ -1,14 +1,20 @@
 //! An experiment: what is trained, on which demonstrations, how, and how the result acts.
 
+mod entities;
+
 use std::collections::BTreeMap;
 
-use models::{ACTION, ENVIRONMENT_STATE, ModelError, NormMode, PolicyConfig, PolicyType, STATE};
+use models::{
+    ACTION, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureKind, ModelError, NormMode, PolicyConfig, PolicyType, STATE,
+    Signature,
+};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::ZooError;
+pub use self::entities::EntitySection;
 use crate::config::{Library, apply_overrides, from_value, from_value_as};
 use crate::run::TrainSection;
+use crate::{FeatureKeys, ZooError};
 
 /// A resolved experiment, as `config.toml` of runs and entries holds it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -66,6 +72,9 @@ pub struct DataSection {
     pub state_keys: Vec<String>,
     /// Observation keys that make `observation.environment_state`, in order; may be empty.
     pub env_keys: Vec<String>,
+    /// Things that are a token each, by name.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub entities: BTreeMap<String, EntitySection>,
     /// Mask of the episodes to train on; a data set without masks is trained on whole.
     pub train_mask: String,
     /// Mask of the episodes to validate on.
@@ -79,9 +88,62 @@ impl Default for DataSection {
             path: String::new(),
             state_keys: owned(&["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]),
             env_keys: owned(&["object"]),
+            entities: BTreeMap::new(),
             train_mask: "train".to_owned(),
             valid_mask: "valid".to_owned(),
         }
+    }
+}
+
+impl DataSection {
+    /// Which observation keys make which feature.
+    ///
+    /// # Errors
+    /// The setting whose keys cannot be read.
+    pub fn feature_keys(&self) -> Result<FeatureKeys, ZooError> {
+        let mut keys = FeatureKeys::default();
+        let mut add = |setting: String, feature: &str, of: &[String]| {
+            let expected = "observation keys, parts of them (key[0:3]) and differences (a - b)".to_owned();
+            keys.insert(feature, of).map_err(|found| ZooError::InvalidValue { key: setting, expected, found })
+        };
+        add("data.state_keys".to_owned(), STATE, &self.state_keys)?;
+        if !self.env_keys.is_empty() {
+            add("data.env_keys".to_owned(), ENVIRONMENT_STATE, &self.env_keys)?;
+        }
+        for (name, entity) in &self.entities {
+            add(format!("data.entities.{name}"), &format!("{ENTITY_PREFIX}{name}"), &entity.keys)?;
+        }
+        Ok(keys)
+    }
+
+    fn check(&self, reads: &[FeatureKind]) -> Result<(), ZooError> {
+        let invalid = |key: String, expected: &str, found: String| {
+            Err(ZooError::InvalidValue { key, expected: expected.to_owned(), found })
+        };
+        if self.state_keys.is_empty() {
+            return invalid("data.state_keys".to_owned(), "at least one key", "none".to_owned());
+        }
+        let good = |word: &str| {
+            !word.is_empty() && word.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
+        };
+        for (name, entity) in &self.entities {
+            let key = format!("data.entities.{name}");
+            for word in [name.as_str(), entity.group_of(name)] {
+                if !good(word) {
+                    return invalid(key, "names of lower-case letters, digits and _", format!("`{word}`"));
+                }
+            }
+            if entity.keys.is_empty() {
+                return invalid(key, "at least one key", "none".to_owned());
+            }
+        }
+        if !self.entities.is_empty() && !reads.contains(&FeatureKind::Entity) {
+            let kinds: Vec<&str> = reads.iter().map(|kind| kind.name()).collect();
+            let expected = format!("none: this policy reads {}", kinds.join(", "));
+            let names: Vec<&str> = self.entities.keys().map(String::as_str).collect();
+            return invalid("data.entities".to_owned(), &expected, names.join(", "));
+        }
+        self.feature_keys().map(|_| ())
     }
 }
 
@@ -95,19 +157,32 @@ pub struct NormalisationSection {
     pub state: NormMode,
     /// Of `observation.environment_state`.
     pub environment_state: NormMode,
+    /// Of entities.
+    #[serde(skip_serializing_if = "is_default")]
+    pub entities: NormMode,
     /// Of `action`.
     pub action: NormMode,
 }
 
 impl NormalisationSection {
-    /// The modes by feature name; without an environment state there is none for it.
-    pub fn modes(&self, has_environment_state: bool) -> BTreeMap<String, NormMode> {
-        let mut modes = BTreeMap::from([(STATE.to_owned(), self.state), (ACTION.to_owned(), self.action)]);
-        if has_environment_state {
-            modes.insert(ENVIRONMENT_STATE.to_owned(), self.environment_state);
+    /// The modes of the actions and of the signature's features, by name; pictures have none.
+    pub fn modes(&self, signature: &Signature) -> BTreeMap<String, NormMode> {
+        let mut modes = BTreeMap::from([(ACTION.to_owned(), self.action)]);
+        for spec in &signature.observation {
+            let mode = match spec.kind {
+                FeatureKind::State => self.state,
+                FeatureKind::EnvironmentState => self.environment_state,
+                FeatureKind::Entity => self.entities,
+                FeatureKind::Image => continue,
+            };
+            modes.insert(spec.name.clone(), mode);
         }
         modes
     }
+}
+
+fn is_default(mode: &NormMode) -> bool {
+    *mode == NormMode::default()
 }
 
 /// `[rollout]`
@@ -181,9 +256,7 @@ impl Experiment {
             let expected = "1, because rollout.temporal_ensemble asks at every step".to_owned();
             return invalid("rollout.n_action_steps", expected, steps.to_string());
         }
-        if self.data.state_keys.is_empty() {
-            return invalid("data.state_keys", "at least one key".to_owned(), "none".to_owned());
-        }
+        self.data.check(self.policy.reads())?;
         self.train.check()
     }
 
@@ -301,5 +374,32 @@ mod tests {
         assert!(error(&["train.batch_size=0"]).starts_with("key `train.batch_size`: expected at least 1"));
         assert!(error(&["entry=Lift"]).starts_with("entry name `Lift`"));
         assert!(error(&["data.state_keys=[]"]).starts_with("key `data.state_keys`"));
+    }
+
+    #[test]
+    fn entities_are_lists_or_tables() {
+        let experiment = load(&[
+            "data.entities.cube0=['a', 'a - b']",
+            "data.entities.goal={keys = ['c[0:3]'], group = 'places', position = true}",
+        ])
+        .unwrap();
+        let entities = &experiment.data.entities;
+        assert_eq!((entities["cube0"].group_of("cube0"), entities["cube0"].position), ("cube", false));
+        assert_eq!((entities["goal"].group_of("goal"), entities["goal"].position), ("places", true));
+        let keys = experiment.data.feature_keys().unwrap();
+        assert_eq!(keys.of("observation.entity.cube0"), ["a", "a - b"]);
+        assert_eq!(Experiment::from_toml("x", &experiment.to_toml()).unwrap(), experiment);
+        let error = |o: &str| load(&[o]).unwrap_err();
+        assert_eq!(
+            error("data.entities.cube=['a[']"),
+            "key `data.entities.cube`: expected observation keys, parts of them (key[0:3]) and differences (a - b), \
+             found `a[`: expected key[from:to] with from below to"
+        );
+        assert!(
+            error("data.entities.cube={keys=['a'], grup='x'}").starts_with("unknown key `data.entities.cube.grup`")
+        );
+        assert!(error("data.entities.Cube=['a']").contains("lower-case letters, digits and _, found `Cube`"));
+        assert!(error("data.entities.cube=[]").contains("at least one key"));
+        assert!(error("data.entities.cube=3").contains("a list of observation keys, or a table"));
     }
 }

@@ -12,6 +12,7 @@ pub mod config;
 pub mod entry;
 mod error;
 pub mod experiment;
+mod feature_keys;
 mod files;
 pub mod lerobot;
 pub mod registry;
@@ -23,6 +24,7 @@ pub mod evaluation;
 pub mod results;
 
 pub use error::ZooError;
+pub use feature_keys::FeatureKeys;
 pub use files::{sha256_file, sha256_hex, write_atomic};
 
 /// Versions of the software that makes entries and results, by name.

@@ -10,12 +10,12 @@ use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
 use std::time::Duration;
 
 use common::{impatient, options, spec, worker_processes, wrapped};
-use models::{ActionChunk, Dims, ModelError, Observation, Policy};
+use models::{ActionChunk, ENVIRONMENT_STATE, ModelError, Observation, Policy, STATE, Signature};
 use rollout::{Pool, PoolOptions, RolloutError, TimeLimits};
 use rustix::process::{Pid, Signal, kill_process};
-use zoo::ZooError;
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate};
 use zoo::results::{EntryIdentity, Execution, Seeds, Shard, StoredEvaluation, TrainingFacts, merge_shards};
+use zoo::{FeatureKeys, ZooError};
 
 /// The test that strikes at workers finds them among this process' children: meanwhile no other test may have any.
 static WORKERS: RwLock<()> = RwLock::new(());
@@ -33,7 +33,8 @@ struct Grasper {
 
 impl Policy for Grasper {
     fn predict(&mut self, seen: &Observation) -> Result<ActionChunk, ModelError> {
-        let (hand, cube) = (&seen.state[..3], &seen.environment_state[..3]);
+        let numbers = |name: &str| Ok::<_, ModelError>(seen.require("grasp", name)?.numbers().unwrap());
+        let (hand, cube) = (&numbers(STATE)?[..3], &numbers(ENVIRONMENT_STATE)?[..3]);
         let off = [cube[0] - hand[0], cube[1] - hand[1], cube[2] - hand[2]];
         let aside = off[0].hypot(off[1]);
         let near = aside < 0.012 && off[2].abs() < 0.012;
@@ -57,7 +58,9 @@ impl Policy for Grasper {
 }
 
 fn subject() -> Subject<'static> {
-    let keys = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect();
+    let mut keys = FeatureKeys::default();
+    keys.insert(STATE, &["robot0_eef_pos", "robot0_gripper_qpos"].map(str::to_owned)).unwrap();
+    keys.insert(ENVIRONMENT_STATE, &["object".to_owned()]).unwrap();
     Subject {
         entry: EntryIdentity { name: "grasper".into(), version: 1, hash: "ab".repeat(32) },
         training: TrainingFacts {
@@ -73,11 +76,10 @@ fn subject() -> Subject<'static> {
         },
         task: "Lift".into(),
         env_version: Some("1.5.1".into()),
-        state_keys: keys(&["robot0_eef_pos", "robot0_gripper_qpos"]),
-        env_keys: keys(&["object"]),
+        keys,
         execution: Execution::RecedingHorizon { n_action_steps: 2 },
         max_steps: Some(45),
-        dims: Dims { state: 5, environment_state: 10, action: 7 },
+        signature: Signature::low_dimensional(5, 10, 7),
         policy: Box::new(|| Ok(Box::new(Grasper::default()))),
     }
 }
@@ -252,11 +254,13 @@ fn what_does_not_fit_is_refused_before_anything_is_written() {
     };
     let error = refuse(|s| s.env_version = Some("1.4.1".into()));
     assert!(error.contains("robosuite 1.4.1") && error.contains("--force"), "{error}");
-    let error = refuse(|s| s.env_keys = vec!["objekt".into()]);
+    let error = refuse(|s| s.keys.insert(ENVIRONMENT_STATE, &["objekt".into()]).unwrap());
     assert!(error.contains("\"objekt\"") && error.contains("object,"), "{error}");
-    let error = refuse(|s| s.dims.state = 9);
-    assert!(error.contains("length of the state: expected 9, found 5"), "{error}");
-    let error = refuse(|s| s.dims.action = 8);
+    let error = refuse(|s| s.keys.insert(STATE, &["robot0_eef_pos[1:4]".into()]).unwrap());
+    assert!(error.contains("robot0_eef_pos[1:4]: robot0_eef_pos has 3 numbers"), "{error}");
+    let error = refuse(|s| s.signature = Signature::low_dimensional(9, 10, 7));
+    assert!(error.contains("length of observation.state: expected 9, found 5"), "{error}");
+    let error = refuse(|s| s.signature.action_dim = 8);
     assert!(error.contains("length of an action: expected 8, found 7"), "{error}");
     assert!(!results.exists());
     // a policy that gives what is no action ends the evaluation with an error that says where

@@ -38,7 +38,7 @@ fn difference(entry: &Entry, folder: &Path) -> f32 {
     assert_eq!(rows.len(), 5);
     let mut largest = 0.0_f32;
     for ((state, env), expected) in rows {
-        let observation = Observation { state: state.to_vec(), environment_state: env.to_vec() };
+        let observation = Observation::of_state(state.to_vec(), env.to_vec());
         let chunk = policy.predict(&observation).unwrap();
         assert_eq!((chunk.action_horizon, chunk.action_dim), (8, 7));
         for (got, expected) in chunk.actions.iter().zip(expected) {

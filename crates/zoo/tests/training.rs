@@ -100,11 +100,11 @@ fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
 
     // a policy of it answers in the units of the environment
     let mut policy = one.load().unwrap().policy();
-    let observation = Observation { state: vec![0.1; 9], environment_state: vec![0.1; 10] };
+    let observation = Observation::of_state(vec![0.1; 9], vec![0.1; 10]);
     let chunk = policy.predict(&observation).unwrap();
     assert_eq!((chunk.action_horizon, chunk.action_dim), (16, 7));
     assert!(chunk.actions.iter().all(|a| a.is_finite()));
-    assert!(policy.predict(&Observation { state: vec![0.1; 8], ..observation }).is_err());
+    assert!(policy.predict(&Observation::of_state(vec![0.1; 8], vec![0.1; 10])).is_err());
 }
 
 #[test]

@@ -202,6 +202,26 @@ impl Dataset {
         Ok(all)
     }
 
+    /// Statistics over several columns of one length together, as if each frame of each were a frame; `None` over no
+    /// frames.
+    pub fn pooled_statistics(&self, columns: &[String], episodes: &[usize]) -> Result<Option<FeatureStats>> {
+        let ranges = self.ranges(episodes)?;
+        let residents = columns.iter().map(|name| self.required(name)).collect::<Result<Vec<_>>>()?;
+        let Some(first) = residents.first() else { return Ok(None) };
+        if let Some((name, other)) = columns.iter().zip(&residents).find(|(_, column)| column.dim != first.dim) {
+            return Err(DatasetError::NotInDataset {
+                path: self.root.clone(),
+                wanted: format!("column {name} of {} numbers, as {}", first.dim, columns[0]),
+                found: format!("{} numbers", other.dim),
+            });
+        }
+        let pieces: Vec<&[f32]> = residents
+            .iter()
+            .flat_map(|column| ranges.iter().map(|&(from, to)| &column.data[from * column.dim..to * column.dim]))
+            .collect();
+        Ok(FeatureStats::of_rows(&pieces, first.dim))
+    }
+
     /// sha256 of the content in hexadecimal: the same for the same demonstrations and choice of columns, however
     /// they are stored. For sets that LeRobot wrote it covers the numeric columns.
     pub fn fingerprint(&self) -> &str {

@@ -8,7 +8,7 @@ use std::time::Instant;
 use candle_core::Tensor;
 use models::classification::cross_entropy;
 use models::trm::{Example, Trainer as TrmTrainer};
-use models::{Dims, Learner, ModelError};
+use models::{Learner, ModelError, Signature};
 use puzzles::{Puzzle, Split, Task};
 use serde::{Deserialize, Serialize};
 
@@ -389,9 +389,8 @@ impl<'a> Run<'a> {
             env_module: None,
             env_args: None,
             parameters: self.solver.parameters(),
-            state_keys: Vec::new(),
-            env_keys: Vec::new(),
-            dims: Dims { state: 0, environment_state: 0, action: 0 },
+            signature: Signature::default(),
+            keys: zoo::FeatureKeys::default(),
             data: None,
             kind: Some(SOLVER.to_owned()),
             section: Some(serde_json::to_value(&puzzle).expect("plain fields are always JSON")),

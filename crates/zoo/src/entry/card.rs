@@ -34,8 +34,9 @@ fn render_into(meta: &EntryMeta, words: &CardWords, card: &mut String) -> std::f
     row("experiment", meta.experiment.clone())?;
     row("parameters", grouped(meta.parameters))?;
     if meta.is_robot_policy() {
-        row("observation.state", keys(&meta.state_keys))?;
-        row("observation.environment_state", keys(&meta.env_keys))?;
+        for spec in &meta.signature.observation {
+            row(&spec.name, keys(&meta.keys.of(&spec.name)))?;
+        }
     }
     for (what, value) in &words.rows {
         row(what, value.clone())?;

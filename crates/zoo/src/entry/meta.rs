@@ -2,15 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use models::Dims;
+use models::Signature;
 use serde::{Deserialize, Serialize};
 
-use crate::sha256_hex;
+use crate::{FeatureKeys, sha256_hex};
 
 use super::EntryId;
-
-/// Version of the form of `entry.json`.
-pub(super) const FORMAT: u32 = 1;
 
 /// Everything recorded about an entry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -41,12 +38,10 @@ pub struct EntryMeta {
     pub env_args: Option<serde_json::Value>,
     /// Number of weights.
     pub parameters: u64,
-    /// Observation keys that make `observation.state`, in order.
-    pub state_keys: Vec<String>,
-    /// Observation keys that make `observation.environment_state`, in order.
-    pub env_keys: Vec<String>,
-    /// Lengths of the features.
-    pub dims: Dims,
+    /// The features that it reads, and the length of its actions.
+    pub signature: Signature,
+    /// Observation keys that make the features, in order.
+    pub keys: FeatureKeys,
     /// The demonstrations; `None` for an imported entry.
     pub data: Option<DataMeta>,
     /// What it is, if no robot policy.

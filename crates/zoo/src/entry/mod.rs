@@ -5,6 +5,7 @@
 //! holds the SHA-256 of the other four and of itself. A version is never rewritten.
 
 mod card;
+mod format;
 mod id;
 mod meta;
 mod open;

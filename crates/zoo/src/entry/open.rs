@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use crate::{ZooError, sha256_file};
 
-use super::meta::{FORMAT, self_hashes};
+use super::format::upgrade;
+use super::meta::self_hashes;
 use super::{CARD_FILE, CONFIG_FILE, ENTRY_FILE, EntryId, EntryMeta, MODEL_FILE, NORMALISER_FILE};
 
 /// An entry whose files are the ones that were written.
@@ -49,10 +50,9 @@ impl Entry {
         if expected != found {
             return Err(ZooError::Tampered { path, expected, found });
         }
-        let meta: EntryMeta = serde_json::from_slice(&text).map_err(|e| malformed(format!("not an entry: {e}")))?;
-        if meta.format != FORMAT {
-            return Err(malformed(format!("format: expected {FORMAT}, found {}", meta.format)));
-        }
+        let not_an_entry = |e: serde_json::Error| malformed(format!("not an entry: {e}"));
+        let value = upgrade(serde_json::from_slice(&text).map_err(not_an_entry)?).map_err(malformed)?;
+        let meta: EntryMeta = serde_json::from_value(value).map_err(not_an_entry)?;
         if meta.id() != *id {
             return Err(malformed(format!("expected entry {id}, found {}", meta.id())));
         }

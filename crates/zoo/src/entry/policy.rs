@@ -2,10 +2,7 @@
 
 use std::sync::Arc;
 
-use candle_core::{Device, Tensor};
-use models::{
-    ACTION, ActionChunk, Dims, ENVIRONMENT_STATE, ModelError, Normaliser, Observation, Policy, PolicyModel, STATE,
-};
+use models::{ActionChunk, ModelError, Normaliser, Observation, Policy, PolicyModel, Preprocess};
 
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors};
@@ -18,7 +15,7 @@ pub struct LoadedEntry {
     entry: Entry,
     experiment: Experiment,
     model: Arc<dyn PolicyModel>,
-    normaliser: Arc<Normaliser>,
+    preprocess: Arc<Preprocess>,
 }
 
 impl Entry {
@@ -41,14 +38,16 @@ impl Entry {
             let name = self.id().to_string();
             move |source| ZooError::Model { operation, name, source }
         };
-        let dims = self.meta().dims;
-        let model = experiment.policy.build(&dims, 0).map_err(failed("build the policy of"))?;
+        let signature = self.meta().signature.clone();
+        let model = experiment.policy.build(&signature, 0).map_err(failed("build the policy of"))?;
         let (weights, _) = tensors::read(&self.folder().join(MODEL_FILE))?;
         model.params().load(&weights).map_err(failed("load the weights of"))?;
         let (statistics, _) = tensors::read(&self.folder().join(NORMALISER_FILE))?;
-        let modes = experiment.normalisation.modes(dims.environment_state > 0);
-        let normaliser = Normaliser::new(&modes, &statistics).map_err(failed("load the normaliser of"))?;
-        Ok(LoadedEntry { entry: self.clone(), experiment, model: model.into(), normaliser: Arc::new(normaliser) })
+        let modes = experiment.normalisation.modes(&signature);
+        let preprocess = Normaliser::new(&modes, &statistics)
+            .and_then(|normaliser| Preprocess::new(signature, normaliser))
+            .map_err(failed("load the normaliser of"))?;
+        Ok(LoadedEntry { entry: self.clone(), experiment, model: model.into(), preprocess: Arc::new(preprocess) })
     }
 }
 
@@ -68,18 +67,14 @@ impl LoadedEntry {
         &self.model
     }
 
-    /// The statistics.
-    pub fn normaliser(&self) -> &Arc<Normaliser> {
-        &self.normaliser
+    /// Raw values to what the network reads, and back.
+    pub fn preprocess(&self) -> &Arc<Preprocess> {
+        &self.preprocess
     }
 
     /// A policy for one environment; it shares the weights with all others.
     pub fn policy(&self) -> EntryPolicy {
-        EntryPolicy {
-            model: Arc::clone(&self.model),
-            normaliser: Arc::clone(&self.normaliser),
-            dims: self.entry.meta().dims,
-        }
+        EntryPolicy { model: Arc::clone(&self.model), preprocess: Arc::clone(&self.preprocess) }
     }
 }
 
@@ -87,37 +82,13 @@ impl LoadedEntry {
 #[derive(Clone)]
 pub struct EntryPolicy {
     model: Arc<dyn PolicyModel>,
-    normaliser: Arc<Normaliser>,
-    dims: Dims,
-}
-
-impl EntryPolicy {
-    fn input(&self, feature: &'static str, values: &[f32], dim: usize) -> Result<Tensor, ModelError> {
-        if values.len() != dim {
-            return Err(ModelError::Shape {
-                operation: "predict",
-                object: feature,
-                expected: vec![dim],
-                found: vec![values.len()],
-            });
-        }
-        let mut values = values.to_vec();
-        self.normaliser.normalise(feature, &mut values)?;
-        Ok(Tensor::from_vec(values, (1, dim), &Device::Cpu)?)
-    }
+    preprocess: Arc<Preprocess>,
 }
 
 impl Policy for EntryPolicy {
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk, ModelError> {
-        let state = self.input(STATE, &observation.state, self.dims.state)?;
-        let environment_state = match self.dims.environment_state {
-            0 => None,
-            dim => Some(self.input(ENVIRONMENT_STATE, &observation.environment_state, dim)?),
-        };
-        let chunk = self.model.predict(&state, environment_state.as_ref())?;
-        let mut actions = chunk.flatten_all()?.to_vec1::<f32>()?;
-        self.normaliser.unnormalise(ACTION, &mut actions)?;
-        ActionChunk::new(actions, self.model.action_horizon(), self.dims.action)
+        let seen = self.preprocess.observation(std::slice::from_ref(observation))?;
+        self.preprocess.chunk(&self.model.predict(&seen)?)
     }
 
     fn reset(&mut self) {}

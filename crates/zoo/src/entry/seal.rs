@@ -9,7 +9,8 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 use crate::files::sync_folder;
 use crate::{ZooError, sha256_hex};
 
-use super::meta::{FORMAT, seal_text};
+use super::format::FORMAT;
+use super::meta::seal_text;
 use super::{
     CARD_FILE, CONFIG_FILE, CardWords, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE, NORMALISER_FILE, card, id,
 };
@@ -127,9 +128,13 @@ pub(crate) mod tests {
                 env_module: None,
                 env_args: None,
                 parameters: 12,
-                state_keys: vec!["robot0_eef_pos".to_owned()],
-                env_keys: vec!["object".to_owned()],
-                dims: models::Dims { state: 9, environment_state: 10, action: 7 },
+                signature: models::Signature::low_dimensional(9, 10, 7),
+                keys: {
+                    let mut keys = crate::FeatureKeys::default();
+                    keys.insert(models::STATE, &["robot0_eef_pos".to_owned()]).unwrap();
+                    keys.insert(models::ENVIRONMENT_STATE, &["object".to_owned()]).unwrap();
+                    keys
+                },
                 data: Some(DataMeta {
                     name: "lift.hdf5".to_owned(),
                     fingerprint: "f".repeat(64),

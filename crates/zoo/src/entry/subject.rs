@@ -31,14 +31,13 @@ impl LoadedEntry {
             training: training_facts(meta),
             task: meta.task.clone(),
             env_version: meta.env_version.clone(),
-            state_keys: meta.state_keys.clone(),
-            env_keys: meta.env_keys.clone(),
+            keys: meta.keys.clone(),
             execution: match rollout.temporal_ensemble {
                 Some(coefficient) => Execution::TemporalEnsemble { coefficient },
                 None => Execution::RecedingHorizon { n_action_steps: rollout.n_action_steps },
             },
             max_steps: rollout.max_steps,
-            dims: meta.dims,
+            signature: meta.signature.clone(),
             policy: Box::new(move || Ok(Box::new(policy.clone()))),
         }
     }

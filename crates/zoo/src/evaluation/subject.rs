@@ -1,12 +1,12 @@
 //! What is evaluated: an entry's policy with all that an evaluation has to know of it.
 
-use models::{Actor, ModelError, Policy, RecedingHorizon, TemporalEnsemble};
+use models::{Actor, ModelError, Policy, RecedingHorizon, Signature, TemporalEnsemble};
 use rollout::{EpisodePlan, Ready};
 
 use super::EvaluationOptions;
 use super::agent::{PolicyAgent, QueryTimes, Timed};
-use crate::ZooError;
 use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, TrainingFacts};
+use crate::{FeatureKeys, ZooError};
 
 /// The entry under evaluation, as far as an evaluation needs to know it.
 pub struct Subject<'a> {
@@ -18,16 +18,14 @@ pub struct Subject<'a> {
     pub task: String,
     /// The simulator's version that its data set records.
     pub env_version: Option<String>,
-    /// Keys of the state, in order.
-    pub state_keys: Vec<String>,
-    /// Keys of the environment's state, in order.
-    pub env_keys: Vec<String>,
+    /// Observation keys of the features, in order.
+    pub keys: FeatureKeys,
     /// How predictions become actions.
     pub execution: Execution,
     /// The cap on an episode, if the entry sets one; the task's own otherwise.
     pub max_steps: Option<usize>,
-    /// Expected lengths of state, environment state and action.
-    pub dims: models::Dims,
+    /// Expected features and length of the action.
+    pub signature: Signature,
     /// Makes a policy of its own for one environment.
     pub policy: Box<dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a>,
 }
@@ -41,7 +39,7 @@ impl Subject<'_> {
         if !options.force {
             check_generation(&self.entry, self.env_version.as_deref(), &ready.simulator, ready.simulator_version())?;
         }
-        self.check_dims(ready)?;
+        self.check_signature(ready)?;
         Ok(EvaluationRecord {
             format: EvaluationRecord::FORMAT,
             entry: self.entry.clone(),
@@ -63,33 +61,26 @@ impl Subject<'_> {
         })
     }
 
-    fn check_dims(&self, ready: &Ready) -> Result<(), ZooError> {
-        let size = |keys: &[String]| -> usize {
-            let shapes = keys.iter().filter_map(|key| ready.observations.get(key));
-            shapes.map(|shape| shape.iter().product::<usize>()).sum()
-        };
-        EpisodePlan::new(ready, self.keys(), 1)?;
-        for (what, expected, found) in [
-            ("length of the state", self.dims.state, size(&self.state_keys)),
-            ("length of the environment's state", self.dims.environment_state, size(&self.env_keys)),
-            ("length of an action", self.dims.action, ready.action_dim),
-        ] {
+    fn check_signature(&self, ready: &Ready) -> Result<(), ZooError> {
+        EpisodePlan::new(ready, self.keys.keys(), 1)?;
+        let features = self.signature.observation.iter().map(|spec| {
+            let found = self.keys.width(&spec.name, ready).map_or_else(|reason| reason, |width| width.to_string());
+            (format!("length of {}", spec.name), spec.width().to_string(), found)
+        });
+        let action =
+            ("length of an action".to_owned(), self.signature.action_dim.to_string(), ready.action_dim.to_string());
+        for (what, expected, found) in features.chain([action]) {
             if expected != found {
                 return Err(ZooError::UnfitEntry {
                     entry: self.entry.to_string(),
                     task: ready.task.clone(),
-                    what: what.to_owned(),
-                    expected: expected.to_string(),
-                    found: found.to_string(),
+                    what,
+                    expected,
+                    found,
                 });
             }
         }
         Ok(())
-    }
-
-    /// The observations that it reads.
-    pub fn keys(&self) -> impl Iterator<Item = &String> {
-        self.state_keys.iter().chain(&self.env_keys)
     }
 
     /// An agent of its own for one environment, and where its queries' durations go.
@@ -103,7 +94,7 @@ impl Subject<'_> {
             Execution::RecedingHorizon { n_action_steps } => Box::new(RecedingHorizon::new(policy, n_action_steps)?),
             Execution::TemporalEnsemble { coefficient } => Box::new(TemporalEnsemble::new(policy, coefficient)?),
         };
-        Ok((PolicyAgent::new(actor, &self.state_keys, &self.env_keys), times))
+        Ok((PolicyAgent::new(actor, self.keys.clone()), times))
     }
 }
 

@@ -29,16 +29,17 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
         });
     };
     let (meta, rollout) = (entry.meta(), &experiment.rollout);
+    let model_error = || experiment.model_error("export");
     let config = lerobot::write_config(&LerobotAct {
         config: act.clone(),
-        dims: meta.dims,
+        signature: meta.signature.clone(),
         n_action_steps: rollout.n_action_steps,
         temporal_ensemble_coeff: rollout.temporal_ensemble,
-        modes: experiment.normalisation.modes(meta.dims.environment_state > 0),
-    });
-    let model_error = || experiment.model_error("export");
+        modes: experiment.normalisation.modes(&meta.signature),
+    })
+    .map_err(model_error())?;
     let weights = lerobot::tensors_out(loaded.model().params(), act).map_err(model_error())?;
-    let statistics = loaded.normaliser().tensors().map_err(model_error())?;
+    let statistics = loaded.preprocess().normaliser().tensors().map_err(model_error())?;
 
     let (inputs, outputs) = (&config["input_features"], &config["output_features"]);
     let norm_map: BTreeMap<String, String> =

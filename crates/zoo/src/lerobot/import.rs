@@ -5,7 +5,7 @@ use std::path::Path;
 
 use candle_core::Tensor;
 use models::lerobot::{self, LerobotAct};
-use models::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, PolicyConfig, STATE};
+use models::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, PolicyConfig, Preprocess};
 
 use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta};
 use crate::experiment::{DataSection, Experiment, NormalisationSection, RolloutSection, TaskSection};
@@ -34,7 +34,7 @@ pub struct ImportOptions {
 /// Files, keys, tensors or statistics that are missing, extra or misshapen, each by name.
 pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<EntryId, ZooError> {
     let config_path = folder.join(CONFIG_FILE);
-    let LerobotAct { config: act, dims, n_action_steps, temporal_ensemble_coeff, .. } =
+    let LerobotAct { config: act, signature, n_action_steps, temporal_ensemble_coeff, .. } =
         lerobot::read_config(&config::read(&config_path)?).map_err(config::misfit(&config_path))?;
 
     let before = step(folder, PREPROCESSOR, "normalizer_processor")?;
@@ -42,6 +42,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     let normalisation = NormalisationSection {
         state: before.mode("STATE")?,
         environment_state: before.mode("ENV")?,
+        entities: NormMode::default(),
         action: after.mode("ACTION")?,
     };
     // observations as they go in, actions as they come out
@@ -55,9 +56,9 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
         task: TaskSection { name: options.task.clone() },
         data: DataSection {
             state_keys: options.state_keys.clone(),
-            env_keys: match dims.environment_state {
-                0 => Vec::new(),
-                _ => options.env_keys.clone(),
+            env_keys: match signature.get(ENVIRONMENT_STATE) {
+                None => Vec::new(),
+                Some(_) => options.env_keys.clone(),
             },
             ..DataSection::default()
         },
@@ -68,18 +69,16 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     };
     experiment.check()?;
 
-    let model = experiment.policy.build(&dims, 0).map_err(experiment.model_error("build the policy of"))?;
+    let model = experiment.policy.build(&signature, 0).map_err(experiment.model_error("build the policy of"))?;
     let model_path = folder.join(MODEL_FILE);
     let (weights, _) = tensors::read(&model_path)?;
     lerobot::load_tensors(model.params(), &act, &weights).map_err(config::misfit(&model_path))?;
-    let modes = experiment.normalisation.modes(dims.environment_state > 0);
-    let normaliser = Normaliser::new(&modes, &statistics).map_err(experiment.model_error("take the statistics of"))?;
-    let lengths = [(STATE, dims.state), (ENVIRONMENT_STATE, dims.environment_state), (ACTION, dims.action)];
-    for (feature, dim) in lengths.into_iter().filter(|(_, dim)| *dim > 0) {
-        normaliser.normalise(feature, &mut vec![0.0; dim]).map_err(experiment.model_error("normalise for"))?;
-    }
+    let modes = experiment.normalisation.modes(&signature);
+    let preprocess = Normaliser::new(&modes, &statistics)
+        .and_then(|normaliser| Preprocess::new(signature, normaliser))
+        .map_err(experiment.model_error("take the statistics of"))?;
 
-    let statistics = normaliser.tensors().map_err(experiment.model_error("store the normaliser of"))?;
+    let statistics = preprocess.normaliser().tensors().map_err(experiment.model_error("store the normaliser of"))?;
     let about = serde_json::json!({"format": 1, "policy": experiment.policy_type()});
     let draft = EntryDraft {
         card: CardWords::default(),
@@ -96,9 +95,8 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             env_module: None,
             env_args: None,
             parameters: model.params().count() as u64,
-            state_keys: experiment.data.state_keys.clone(),
-            env_keys: experiment.data.env_keys.clone(),
-            dims,
+            signature: preprocess.signature().clone(),
+            keys: experiment.data.feature_keys()?,
             data: None,
             kind: None,
             section: None,

@@ -4,12 +4,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use candle_core::{Device, Tensor};
-use dataset::{ConvertOptions, Dataset, FeatureStats, WindowSpec, Windows};
-use models::{Dims, Normaliser};
+use dataset::{ConvertOptions, Dataset, FeatureStats, WindowBatch, WindowSpec, Windows};
+use models::{
+    Batch, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureSpec, Normaliser, Preprocess, STATE, Signature, ValuesRef,
+};
 
 use crate::ZooError;
 use crate::entry::DataMeta;
-use crate::experiment::Experiment;
+use crate::experiment::{EntitySection, Experiment};
 
 /// Folder of the run that a converted HDF5 file goes to.
 pub(super) const CONVERTED: &str = "data";
@@ -78,6 +80,7 @@ pub(super) fn open(
     let options = ConvertOptions {
         state_keys: Some(experiment.data.state_keys.clone()),
         env_keys: Some(experiment.data.env_keys.clone()),
+        entities: experiment.data.entities.iter().map(|(name, e)| (name.clone(), e.keys.clone())).collect(),
         ..ConvertOptions::default()
     };
     dataset::convert(path, &folder, &options, progress)
@@ -89,8 +92,7 @@ pub(super) fn open(
 pub(super) struct Demonstrations {
     pub train: Windows,
     pub valid: Option<Windows>,
-    pub normaliser: Normaliser,
-    pub dims: Dims,
+    pub preprocess: Preprocess,
     pub meta: DataMeta,
     /// What a user should know: a missing mask, constant dimensions.
     pub notes: Vec<String>,
@@ -107,13 +109,19 @@ pub(super) fn prepare(
     let failed = |source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) };
     let mut notes = Vec::new();
     if let Some(provenance) = dataset.provenance() {
-        let keys = [
-            ("state_keys", &experiment.data.state_keys, &provenance.state_keys),
-            ("env_keys", &experiment.data.env_keys, &provenance.env_keys),
+        let none = Vec::new();
+        let named = [
+            ("data.state_keys".to_owned(), &experiment.data.state_keys, &provenance.state_keys),
+            ("data.env_keys".to_owned(), &experiment.data.env_keys, &provenance.env_keys),
         ];
-        for (key, expected, found) in keys {
+        let entities = experiment.data.entities.iter().map(|(name, entity)| {
+            let found = provenance.entities.get(name).unwrap_or(&none);
+            (format!("data.entities.{name}"), &entity.keys, found)
+        });
+        for (key, expected, found) in named.into_iter().chain(entities) {
             if expected != found {
-                return Err(unfit(format!("data.{key}: expected {}, found {}", expected.join(", "), found.join(", "))));
+                let found = if found.is_empty() { "none".to_owned() } else { found.join(", ") };
+                return Err(unfit(format!("{key}: expected {}, found {found}", expected.join(", "))));
             }
         }
     }
@@ -134,9 +142,18 @@ pub(super) fn prepare(
         )));
     }
 
-    let statistics = tensors(&dataset.statistics_of(&train).map_err(failed)?).map_err(|e| unfit(e.to_string()))?;
+    let observation = observed(dataset, experiment);
+    let mut statistics = dataset.statistics_of(&train).map_err(failed)?;
+    for columns in groups(&experiment.data.entities) {
+        let pooled = dataset.pooled_statistics(&columns, &train).map_err(failed)?;
+        statistics.extend(pooled.into_iter().flat_map(|stats| columns.iter().map(move |c| (c.clone(), stats.clone()))));
+    }
+    let statistics = tensors(&statistics).map_err(|e| unfit(e.to_string()))?;
     let action_horizon = experiment.policy.action_horizon();
-    let windows = |episodes: Vec<usize>| dataset.windows(&WindowSpec { action_horizon, episodes }).map_err(failed);
+    let windows = |episodes: Vec<usize>| {
+        let spec = WindowSpec { observation: observation.clone(), n_obs_steps: 1, action_horizon, episodes };
+        dataset.windows(&spec).map_err(failed)
+    };
     let meta = DataMeta {
         name: name.to_owned(),
         fingerprint: dataset.fingerprint().to_owned(),
@@ -149,9 +166,8 @@ pub(super) fn prepare(
         true => None,
         false => Some(windows(valid)?),
     };
-    let dims =
-        Dims { state: train.state_dim(), environment_state: train.environment_state_dim(), action: train.action_dim() };
-    let modes = experiment.normalisation.modes(dims.environment_state > 0);
+    let signature = signature(&train, experiment);
+    let modes = experiment.normalisation.modes(&signature);
     let mut normaliser =
         Normaliser::new(&modes, &statistics).map_err(experiment.model_error("take the statistics for"))?;
     for guarded in normaliser.guard_constant() {
@@ -160,7 +176,57 @@ pub(super) fn prepare(
             guarded.feature, guarded.dim, guarded.spread
         ));
     }
-    Ok(Demonstrations { train, valid, normaliser, dims, meta, notes })
+    let preprocess =
+        Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
+    Ok(Demonstrations { train, valid, preprocess, meta, notes })
+}
+
+/// The columns that the experiment's observation is made of.
+fn observed(dataset: &Dataset, experiment: &Experiment) -> Vec<String> {
+    let mut columns = vec![STATE.to_owned()];
+    // a set that LeRobot wrote may lack it
+    if !experiment.data.env_keys.is_empty() && dataset.column(ENVIRONMENT_STATE).is_some() {
+        columns.push(ENVIRONMENT_STATE.to_owned());
+    }
+    columns.extend(experiment.data.entities.keys().map(|name| format!("{ENTITY_PREFIX}{name}")));
+    columns
+}
+
+/// The columns of each group of entities.
+fn groups(entities: &BTreeMap<String, EntitySection>) -> impl Iterator<Item = Vec<String>> + use<> {
+    let mut groups: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for (name, entity) in entities {
+        groups.entry(entity.group_of(name).to_owned()).or_default().push(format!("{ENTITY_PREFIX}{name}"));
+    }
+    groups.into_values()
+}
+
+/// What the windows show, as a policy sees it.
+fn signature(windows: &Windows, experiment: &Experiment) -> Signature {
+    let spec = |(column, width): (&str, usize)| match column {
+        STATE => FeatureSpec::state(width),
+        ENVIRONMENT_STATE => FeatureSpec::environment_state(width),
+        column => {
+            let name = column.strip_prefix(ENTITY_PREFIX).unwrap_or(column);
+            let entity = experiment.data.entities.get(name).cloned().unwrap_or_default();
+            FeatureSpec::entity(name, width, entity.group_of(name), entity.position)
+        }
+    };
+    let observation = windows.observation().map(spec).collect();
+    Signature { observation, n_obs_steps: windows.n_obs_steps(), action_dim: windows.action_dim() }
+}
+
+/// Turns gathered windows into a batch in network units.
+pub(super) fn batch(
+    windows: &WindowBatch,
+    demonstrations: &Demonstrations,
+    experiment: &Experiment,
+) -> Result<Batch, ZooError> {
+    let observation = windows.observation.iter().map(|(name, values)| (name.clone(), ValuesRef::F32(values))).collect();
+    demonstrations
+        .preprocess
+        .batch(experiment.policy.action_horizon(), &observation, &windows.actions, &windows.is_pad)
+        .map_err(experiment.model_error("make a batch for"))
 }
 
 fn tensors(statistics: &BTreeMap<String, FeatureStats>) -> candle_core::Result<BTreeMap<String, Tensor>> {

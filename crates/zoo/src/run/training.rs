@@ -6,9 +6,7 @@ use std::time::Instant;
 
 use candle_core::Tensor;
 use dataset::{EnvMeta, WindowBatch};
-use models::{
-    ACTION, Batch, Dims, ENVIRONMENT_STATE, ModelError, Normaliser, PolicyModel, STATE, Trainer, TrainerState,
-};
+use models::{ModelError, PolicyModel, Trainer, TrainerState};
 use serde::{Deserialize, Serialize};
 
 use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta, ModuleMeta, TrainingMeta};
@@ -157,7 +155,7 @@ fn train_in(
         Some(_) => {}
         None => {
             // an impossible policy is refused before anything is kept
-            let built = experiment.policy.build(&demonstrations.dims, experiment.train.seed);
+            let built = experiment.policy.build(demonstrations.preprocess.signature(), experiment.train.seed);
             built.map_err(experiment.model_error("build the policy of"))?;
             let note = RunNote {
                 experiment: request.name.clone(),
@@ -233,7 +231,7 @@ impl<'a> Run<'a> {
     ) -> Result<Self, ZooError> {
         let section = &experiment.train;
         let build = || {
-            let model = experiment.policy.build(&demonstrations.dims, section.seed);
+            let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed);
             model.map_err(experiment.model_error("build the policy of"))
         };
         let mut trainer = Trainer::new(build()?, section.trainer_config(), section.seed)
@@ -249,6 +247,9 @@ impl<'a> Run<'a> {
         let events_path = folder.path().join("events.out.tfevents.0.actrm");
         let events = EventWriter::create(&events_path, metrics.rows(), wall_time())?;
         let evaluated = build()?;
+        if let Some(reason) = evaluated.composed_because() {
+            on_event(TrainEvent::Note(&format!("training steps run on candle's autograd: {reason}")));
+        }
         on_event(TrainEvent::Begin {
             from: step,
             steps: section.steps,
@@ -287,8 +288,7 @@ impl<'a> Run<'a> {
             }
             let indices = sampler.batch(self.step);
             self.demonstrations.train.gather(&indices, &mut windows);
-            let batch =
-                normalised(&mut windows, &self.demonstrations.normaliser, &self.demonstrations.dims, self.experiment)?;
+            let batch = data::batch(&windows, self.demonstrations, self.experiment)?;
             let done = self.trainer.step(&batch).map_err(|source| self.step_error(source))?;
             self.step += 1;
             samples += indices.len() as u64;
@@ -357,7 +357,9 @@ impl<'a> Run<'a> {
         self.take_evaluated()?;
         let section = &experiment.train;
         let weights = self.evaluated.params().tensors();
-        let dims = demonstrations.dims;
+        let signature = demonstrations.preprocess.signature().clone();
+        let mut keys = experiment.data.feature_keys()?;
+        keys.retain(|feature| signature.get(feature).is_some());
         let policy = experiment.policy_type();
         let meta = EntryMeta {
             format: 0,
@@ -372,9 +374,8 @@ impl<'a> Run<'a> {
             env_module: env.and_then(|env| ModuleMeta::of(&env.env_args)),
             env_args: env.map(|env| env.env_args.clone()).filter(serde_json::Value::is_object),
             parameters: self.evaluated.params().count() as u64,
-            state_keys: experiment.data.state_keys.clone(),
-            env_keys: experiment.data.env_keys.clone(),
-            dims,
+            signature,
+            keys,
             data: Some(demonstrations.meta.clone()),
             kind: None,
             section: None,
@@ -389,8 +390,11 @@ impl<'a> Run<'a> {
             versions: crate::versions(),
             files: BTreeMap::new(),
         };
-        let statistics =
-            demonstrations.normaliser.tensors().map_err(experiment.model_error("store the normaliser of"))?;
+        let statistics = demonstrations
+            .preprocess
+            .normaliser()
+            .tensors()
+            .map_err(experiment.model_error("store the normaliser of"))?;
         let about = serde_json::json!({"format": 1, "policy": policy});
         Ok(EntryDraft {
             card: CardWords::default(),
@@ -404,33 +408,6 @@ impl<'a> Run<'a> {
             )?,
         })
     }
-}
-
-/// Turns gathered windows into a batch in network units.
-pub(super) fn normalised(
-    windows: &mut WindowBatch,
-    normaliser: &Normaliser,
-    dims: &Dims,
-    experiment: &Experiment,
-) -> Result<Batch, ZooError> {
-    normaliser
-        .normalise(STATE, &mut windows.state)
-        .and_then(|()| match dims.environment_state {
-            0 => Ok(()),
-            _ => normaliser.normalise(ENVIRONMENT_STATE, &mut windows.environment_state),
-        })
-        .and_then(|()| normaliser.normalise(ACTION, &mut windows.actions))
-        .and_then(|()| {
-            Batch::from_slices(
-                dims,
-                experiment.policy.action_horizon(),
-                &windows.state,
-                &windows.environment_state,
-                &windows.actions,
-                &windows.is_pad,
-            )
-        })
-        .map_err(experiment.model_error("make a batch for"))
 }
 
 /// The first tensor with a value that no training recovers from.

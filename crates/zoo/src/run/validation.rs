@@ -7,8 +7,7 @@ use models::{Batch, ModelError, PolicyModel};
 use crate::ZooError;
 use crate::experiment::Experiment;
 
-use super::data::Demonstrations;
-use super::training::normalised;
+use super::data::{self, Demonstrations};
 
 /// Windows used, evenly spread; more would cost time and tell the same.
 const MOST_WINDOWS: usize = 512;
@@ -28,7 +27,7 @@ pub(super) fn validation_loss(
     let mut gathered = WindowBatch::default();
     for chunk in indices.chunks(BATCH) {
         windows.gather(chunk, &mut gathered);
-        let batch = normalised(&mut gathered, &demonstrations.normaliser, &demonstrations.dims, experiment)?;
+        let batch = data::batch(&gathered, demonstrations, experiment)?;
         let (error, entries) = absolute_error(model, &batch).map_err(experiment.model_error("validate"))?;
         sum += error;
         count += entries;
@@ -38,7 +37,7 @@ pub(super) fn validation_loss(
 
 /// Sum of absolute errors and the number of entries it is over.
 fn absolute_error(model: &dyn PolicyModel, batch: &Batch) -> Result<(f64, f64), ModelError> {
-    let predicted = model.predict(&batch.state, batch.environment_state.as_ref())?;
+    let predicted = model.predict(&batch.observation)?;
     let valid: Tensor = (1.0 - &batch.is_pad)?.unsqueeze(2)?;
     let error = (predicted - &batch.actions)?.abs()?.broadcast_mul(&valid)?;
     let action_dim = batch.actions.dim(2)? as f64;

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 /// Convert demonstrations into a LeRobotDataset v3.0 directory.
 ///
-/// Columns: observation.state, observation.environment_state, observation.images.<camera>, action, next.reward,
+/// Columns: observation.state, observation.environment_state, observation.entity.<name>, observation.images.<camera>, action, next.reward,
 /// next.done, next.success, and the five index columns. What the format has no place for is kept in the side folder
 /// `actrm/`, from which `actrm-data export` rebuilds the source; so are pictures that are not 8-bit colour (depth, grey,
 /// RGBA, encoded JPEG), and a note says so. OUT appears whole or not at all.
@@ -16,6 +16,7 @@ use std::time::Instant;
   actrm-data convert data/lift.hdf5 lift
   actrm-data convert image.hdf5 set --images ppm --jobs 2
   actrm-data convert can.hdf5 can --state-keys robot0_eef_pos,robot0_gripper_qpos --env-keys object
+  actrm-data convert stack.hdf5 stack --entity \"a=cubeA_pos,cubeA_pos - robot0_eef_pos\"
   actrm-data convert square.hdf5 square --actions absolute --rotation 6d")]
 pub struct Args {
     /// HDF5 file, or a folder with one file an episode
@@ -29,6 +30,10 @@ pub struct Args {
     /// there is one]
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     env_keys: Option<Vec<String>>,
+    /// An entity: observation.entity.NAME of these observation keys, of parts of them (key[0:3]) and of differences
+    /// ("a - b"). May be given again
+    #[arg(long = "entity", value_name = "NAME=KEYS", value_parser = entity)]
+    entities: Vec<(String, Vec<String>)>,
     /// Frames a second [default: the control frequency that the file states]
     #[arg(long, allow_negative_numbers = true)]
     fps: Option<f64>,
@@ -79,6 +84,12 @@ fn keys(given: &[String]) -> Vec<String> {
     given.iter().filter(|key| !key.is_empty()).cloned().collect()
 }
 
+/// `cube0=cube0_pos,cube0_pos - robot0_eef_pos`
+fn entity(text: &str) -> Result<(String, Vec<String>), String> {
+    let (name, items) = text.split_once('=').ok_or("expected NAME=KEYS")?;
+    Ok((name.to_owned(), items.split(',').map(|item| item.trim().to_owned()).collect()))
+}
+
 fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(v) if v.is_finite() && v > 0.0 => Ok(v),
@@ -90,6 +101,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let options = ConvertOptions {
         state_keys: args.state_keys.as_deref().map(keys),
         env_keys: args.env_keys.as_deref().map(keys),
+        entities: args.entities.iter().cloned().collect(),
         fps: args.fps,
         images: match args.images {
             Images::Png => ImageForm::Png,
