@@ -211,6 +211,64 @@ fn an_existing_output_and_a_wrong_input_leave_everything_as_it_was() {
 }
 
 #[test]
+fn entities_are_columns_of_keys_their_parts_and_differences() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("set");
+    let list = |keys: &[&str]| keys.iter().map(|key| (*key).to_owned()).collect::<Vec<_>>();
+    let with = |name: &str, keys: &[&str]| ConvertOptions {
+        entities: BTreeMap::from([(name.to_owned(), list(keys))]),
+        ..ConvertOptions::default()
+    };
+    let mut options = with("cube", &["object[0:3]", "object[0:3] - robot0_eef_pos"]);
+    options.entities.insert("hand".to_owned(), list(&["robot0_eef_pos", "robot0_gripper_qpos[1:2]"]));
+    convert(&fixture(), &out, &options, &mut quiet).unwrap();
+    let set = Dataset::open(&out).unwrap();
+    let (_, demos) = content(&fixture());
+    let (cube, hand) = (set.column("observation.entity.cube").unwrap(), set.column("observation.entity.hand").unwrap());
+    assert_eq!((cube.dim, hand.dim, set.column("observation.state").unwrap().dim), (6, 4, 9));
+    for (episode, demo) in set.episodes().iter().zip(&demos) {
+        let numbers = |key: &str| demo.datasets[key].to_f32().unwrap();
+        let (object, pos, grip) =
+            (numbers("obs/object"), numbers("obs/robot0_eef_pos"), numbers("obs/robot0_gripper_qpos"));
+        for t in 0..episode.length {
+            let (at, place) = (episode.from + t, &object[t * 10..t * 10 + 3]);
+            let away: Vec<f32> = place.iter().zip(&pos[t * 3..]).map(|(a, b)| a - b).collect();
+            assert_eq!(cube.data[at * 6..at * 6 + 6], [place, &away].concat());
+            assert_eq!(hand.data[at * 4..at * 4 + 4], [&pos[t * 3..t * 3 + 3], &grip[t * 2 + 1..t * 2 + 2]].concat());
+        }
+    }
+    assert_eq!(set.provenance().unwrap().entities, options.entities);
+    let names = &set.info().features.get("observation.entity.hand").unwrap().names;
+    assert_eq!(
+        names,
+        &serde_json::json!(["robot0_eef_pos_0", "robot0_eef_pos_1", "robot0_eef_pos_2", "robot0_gripper_qpos_1"])
+    );
+    // statistics over several columns together
+    let columns = list(&["observation.entity.hand", "observation.entity.hand"]);
+    let alone = set.statistics_of(&[0, 1]).unwrap().remove("observation.entity.hand").unwrap();
+    let pooled = set.pooled_statistics(&columns, &[0, 1]).unwrap().unwrap();
+    assert_eq!((pooled.count, &pooled.min, &pooled.max), (2 * alone.count, &alone.min, &alone.max));
+    let unequal = list(&["observation.entity.hand", "observation.entity.cube"]);
+    let refused = set.pooled_statistics(&unequal, &[0]).unwrap_err().to_string();
+    assert!(refused.contains("observation.entity.cube of 4 numbers"), "{refused}");
+    // it is a data set like any other: it verifies, and the source comes back
+    assert!(verify(&out, &mut quiet).unwrap().iter().all(|c| c.problem.is_none()));
+    let other = dir.path().join("other");
+    for (keys, named) in [
+        (&["object[3:11]"][..], "observation.entity.cube: object[3:11]: object has 10 numbers"),
+        (&["object - robot0_eef_pos"], "object - robot0_eef_pos: 10 numbers minus 3"),
+        (&["object[3"], "`object[3`: expected key[from:to] with from below to"),
+        (&["cube"], "obs/cube"),
+        (&[], "observation.entity.cube: no keys"),
+    ] {
+        let refused = convert(&fixture(), &other, &with("cube", keys), &mut quiet).unwrap_err().to_string();
+        assert!(refused.contains(named), "{refused}");
+    }
+    let refused = convert(&fixture(), &other, &with("a/b", &["object"]), &mut quiet).unwrap_err().to_string();
+    assert!(refused.contains("observation.entity.a/b: a name of letters, digits"), "{refused}");
+}
+
+#[test]
 fn rotations_in_six_numbers_come_back() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("set");

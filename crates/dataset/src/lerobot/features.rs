@@ -159,7 +159,18 @@ impl Mapping {
             }
         }
         for (name, keys) in &options.entities {
-            columns.push(chooser.concat(&format!("{ENTITY_PREFIX}{name}"), keys)?);
+            let column = format!("{ENTITY_PREFIX}{name}");
+            let good = !name.is_empty() && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
+            let reason = match (good, keys.is_empty()) {
+                (false, _) => "a name of letters, digits and _ is expected",
+                (true, true) => "no keys",
+                (true, false) => {
+                    columns.push(chooser.concat(&column, keys)?);
+                    continue;
+                }
+            };
+            let (path, reason) = (plan.path.clone(), reason.to_owned());
+            return Err(InputError::ObservationKeys { path, column, reason }.into());
         }
         columns.extend(chooser.images()?);
         let (action, provenance) = chooser.action(options)?;
