@@ -36,6 +36,9 @@ impl Batch {
         let n = is_pad.len() / action_horizon.max(1);
         check("is_pad", is_pad.len(), &[n, action_horizon])?;
         check("actions", actions.len(), &[n, action_horizon, signature.action_dim])?;
+        for spec in &signature.observation {
+            observation.require("batch", &spec.name)?;
+        }
         let mut tensors = Features::new();
         for spec in &signature.observation {
             let values = observation.take("batch", &spec.name)?;
