@@ -47,10 +47,15 @@ venv: .venv/.complete ## Python with robosuite, in .venv
 build: .venv/.complete ## the programs, in target/release
 	@$(CARGO) build $(CARGO_FLAGS) --workspace --all-targets
 
+# What the demonstration runs, and no more: no tests, no benchmarks, no SQL.
+.PHONY: programs
+programs: .venv/.complete
+	@$(CARGO) build $(CARGO_FLAGS) -p actrm-data -p actrm-zoo -p control
+
 # ---- the main job ---------------------------------------------------------------------------------------------
 
 .PHONY: demo
-demo: build ## the whole line: demonstrations, data set, training, evaluation, leaderboard (in out/demo)
+demo: programs ## the whole line: demonstrations, data set, training, evaluation, leaderboard (in out/demo)
 	@tools/demo.sh
 
 .PHONY: study-robots

@@ -4,6 +4,8 @@
 use std::collections::BTreeMap;
 use std::process::Command;
 
+use e2e::root;
+
 /// For each of our packages, the packages (ours and others) that it depends on, test dependencies left out.
 fn dependencies() -> BTreeMap<String, Vec<String>> {
     let output = Command::new(env!("CARGO"))
@@ -43,7 +45,8 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("report", &["zoo"]),
     ("study", &["models", "puzzles", "report", "zoo"]),
     ("cli", &["rollout"]),
-    ("actrm-data", &["cli", "dataset", "puzzles", "query", "rollout"]),
+    ("actrm-data", &["cli", "dataset", "puzzles", "rollout"]),
+    ("actrm-query", &["cli", "dataset", "query"]),
     ("actrm-zoo", &["cli", "dataset", "models", "puzzles", "report", "rollout", "study", "zoo"]),
     ("e2e", &[]),
 ];
@@ -77,8 +80,8 @@ fn each_heavy_dependency_has_one_room() {
         ("rav1e", &["video"]),
         ("candle-core", &["models", "zoo", "study"]),
         ("candle-nn", &["models"]),
-        ("clap", &["cli", "actrm-data", "actrm-zoo"]),
-        ("anyhow", &["cli", "actrm-data", "actrm-zoo"]),
+        ("clap", &["cli", "actrm-data", "actrm-query", "actrm-zoo"]),
+        ("anyhow", &["cli", "actrm-data", "actrm-query", "actrm-zoo"]),
         ("indicatif", &["cli"]),
         ("comfy-table", &["cli"]),
         ("ctrlc", &["cli"]),
@@ -91,4 +94,24 @@ fn each_heavy_dependency_has_one_room() {
             );
         }
     }
+}
+
+#[test]
+fn the_programs_alone_are_compiled_as_they_are_with_everything() {
+    let makefile = std::fs::read_to_string(root().join("Makefile")).expect("there is a Makefile");
+    let line = makefile.lines().find(|line| line.contains("$(CARGO) build") && line.contains("-p actrm-data"));
+    let selection: Vec<&str> =
+        line.and_then(|l| Some(l.split_at(l.find("-p ")?).1)).expect("`make demo` builds").split(' ').collect();
+    // each dependency with its features; another set of them is another compilation
+    let resolved = |selection: &[&str], kinds: &str| -> std::collections::BTreeSet<String> {
+        let mut cargo = Command::new(env!("CARGO"));
+        cargo.args(["tree", "--locked", "--offline", "--prefix", "none", "--no-dedupe", "--format", "{p} {f}"]);
+        let output = cargo.args(["-e", kinds]).args(selection).current_dir(root()).output().expect("cargo runs");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8_lossy(&output.stdout).lines().filter(|line| !line.is_empty()).map(str::to_owned).collect()
+    };
+    let (alone, everything) = (resolved(&selection, "normal,build"), resolved(&["--workspace"], "normal,build,dev"));
+    assert!(alone.len() > 100 && alone.len() < everything.len(), "{} of {}", alone.len(), everything.len());
+    let twice: Vec<&String> = alone.difference(&everything).collect();
+    assert!(twice.is_empty(), "name these features in tools/cli, or they are compiled twice: {twice:#?}");
 }

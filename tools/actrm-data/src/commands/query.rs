@@ -1,7 +1,10 @@
-use anyhow::Result;
-use dataset::Dataset;
+use anyhow::{Context, Result, bail};
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
-use std::process::ExitCode;
+use std::process::{Command, ExitCode};
+
+/// The program that has the SQL engine, beside this one: it takes longer to compile than all the rest.
+const PROGRAM: &str = "actrm-query";
 
 /// Ask a data set in SQL.
 ///
@@ -31,37 +34,14 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let set = Dataset::open(&args.dir)?;
-    let Some(sql) = &args.sql else {
-        let rows: Vec<Vec<String>> = query::tables(&set)?
-            .into_iter()
-            .map(|(table, column, dtype)| vec![table.to_owned(), column, dtype])
-            .collect();
-        cli::print(&cli::table(&["table", "column", "type"], &rows, &[]))?;
-        return Ok(ExitCode::SUCCESS);
-    };
-    let result = query::query(&set, sql)?;
-    if args.json {
-        let list: Vec<serde_json::Map<String, serde_json::Value>> =
-            result.rows.iter().map(|row| result.columns.iter().cloned().zip(row.iter().cloned()).collect()).collect();
-        cli::print_json(&list)?;
-        return Ok(ExitCode::SUCCESS);
+    let program = std::env::current_exe().context("cannot find this program")?.with_file_name(PROGRAM);
+    if !program.is_file() {
+        bail!("{}: expected the program that answers queries, found nothing (`make build` builds it)", program.display());
     }
-    let shown = if args.limit == 0 { result.rows.len() } else { args.limit.min(result.rows.len()) };
-    let cell = |v: &serde_json::Value| match v {
-        serde_json::Value::String(s) => s.clone(),
-        serde_json::Value::Number(n) if n.is_f64() => cli::number(n.as_f64().unwrap_or(f64::NAN)),
-        serde_json::Value::Null => String::new(),
-        other => other.to_string(),
-    };
-    let rows: Vec<Vec<String>> = result.rows[..shown].iter().map(|row| row.iter().map(cell).collect()).collect();
-    let header: Vec<&str> = result.columns.iter().map(String::as_str).collect();
-    let numeric: Vec<usize> =
-        (0..header.len()).filter(|&c| result.rows.iter().all(|row| row[c].is_number() || row[c].is_null())).collect();
-    let mut text = cli::table(&header, &rows, &numeric);
-    if shown < result.rows.len() {
-        text.push_str(&format!("{shown} of {} rows; --limit 0 shows all\n", result.rows.len()));
-    }
-    cli::print(&text)?;
-    Ok(ExitCode::SUCCESS)
+    let mut command = Command::new(&program);
+    command.args(["--limit", &args.limit.to_string()]).args(args.json.then_some("--json"));
+    // what follows is no option, whatever it begins with
+    command.arg("--").arg(&args.dir).args(&args.sql);
+    // on success this process is that program from here on
+    Err(command.exec()).with_context(|| format!("cannot start {}", program.display()))
 }
