@@ -40,10 +40,11 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("dataset", &["puzzles", "video"]),
     ("query", &["dataset"]),
     ("zoo", &["dataset", "models", "rollout"]),
+    ("recording", &["dataset", "rollout"]),
     ("report", &["zoo"]),
-    ("study", &["models", "puzzles", "report", "zoo"]),
+    ("study", &["models", "puzzles", "recording", "report", "rollout", "zoo"]),
     ("cli", &["rollout"]),
-    ("actrm-data", &["cli", "dataset", "puzzles", "query", "rollout"]),
+    ("actrm-data", &["cli", "dataset", "puzzles", "query", "recording", "rollout"]),
     ("actrm-zoo", &["cli", "dataset", "models", "puzzles", "report", "rollout", "study", "zoo"]),
     ("e2e", &[]),
 ];
