@@ -1,8 +1,8 @@
 //! Command line for demonstrations and data sets.
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
+mod cameras;
 mod commands;
-mod recording;
 mod svg;
 
 use clap::{CommandFactory, Parser};

@@ -1,7 +1,7 @@
-use crate::recording::{self, Recording};
 use anyhow::{Context, Result, bail};
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop};
 use dataset::{Demo, Source, WriteOptions};
+use recording::Recording;
 use safetensors::Dtype;
 use serde_json::json;
 use std::ops::{ControlFlow, Range};
@@ -54,7 +54,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     };
     let (task, env_args, recorded) = read(args, &file)?;
     let id = recorded.id.clone();
-    let recording = Recording::of(&recorded).with_context(|| args.input.display().to_string())?;
+    let recording = Recording::of(&args.input, &recorded)?;
     let steps = rows(&recording.actions);
     if steps == 0 || rows(&recording.states) != steps {
         let found = rows(&recording.states);
