@@ -11,7 +11,7 @@ use e2e::{data, lift, listing, succeeds, text, zoo};
 const SETTINGS: [&str; 9] = [
     "policy.dim_model=32",
     "policy.dim_feedforward=48",
-    "policy.reasoning.warm_start={ shift = 8 }",
+    "policy.reasoning.warm_start={ noise = 0.1 }",
     "train.steps=40",
     "train.batch_size=12",
     "train.accumulation=3",

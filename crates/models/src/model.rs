@@ -5,10 +5,13 @@ use crate::error::{ModelError, Result};
 use crate::features::{Features, Signature};
 use crate::gradients::Gradients;
 use crate::params::Params;
+use crate::policy::{Clock, Policy};
+use crate::preprocess::Preprocess;
 use crate::rng::Rng;
 use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// A loss and the parts it is made of, each averaged over the whole batch.
 #[derive(Debug, Clone)]
@@ -78,6 +81,22 @@ pub trait PolicyModel: Send + Sync {
 
     /// The signature's features, (b, …) each -> (b, action_horizon, A), all in network units
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor>;
+
+    /// [`Self::predict`] with a generator, for models that draw their actions; the others predict.
+    ///
+    /// # Errors
+    /// As [`Self::predict`].
+    fn sample(&self, observation: &Features<Tensor>, _rng: &mut Rng) -> Result<Tensor> {
+        self.predict(observation)
+    }
+
+    /// A policy for one environment: it shares the weights, its episode's state is its own.
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy>;
+
+    /// Whether what its policies do depends on how long they take: the same episode may then end otherwise next time.
+    fn depends_on_time(&self) -> bool {
+        false
+    }
 
     /// Number of actions in a predicted chunk.
     fn action_horizon(&self) -> usize;

@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::features::{FeatureKind, Signature};
 use crate::model::PolicyModel;
-use crate::models::{act, actrm};
+use crate::models::{act, actrm, bc};
 use serde::de::{DeserializeSeed, Deserializer};
 use serde::{Deserialize, Serialize};
 
@@ -71,6 +71,8 @@ policies! {
     "act" => Act: act::Act,
     /// ACT that reasons recursively
     "actrm" => Actrm: actrm::Actrm,
+    /// Behaviour cloning with a multi-layer perceptron
+    "bc" => Bc: bc::Bc,
 }
 
 /// The type of a policy whose own keys are still to be read: with them, as a `DeserializeSeed`, it gives the

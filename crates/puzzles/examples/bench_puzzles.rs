@@ -5,11 +5,11 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use puzzles::{MazeTask, Rng, Split, SudokuTask};
+use puzzles::{MazeTask, PuzzleRng, Split, SudokuTask};
 
 /// Puzzles a second, over at least half a second.
-fn rate(mut make: impl FnMut(&mut Rng)) -> f64 {
-    let mut rng = Rng::new(1, 0);
+fn rate(mut make: impl FnMut(&mut PuzzleRng)) -> f64 {
+    let mut rng = PuzzleRng::new(1, 0);
     let begin = Instant::now();
     let mut made = 0.0;
     while begin.elapsed().as_secs_f64() < 0.5 {

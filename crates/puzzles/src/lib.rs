@@ -18,7 +18,7 @@ mod walker;
 
 pub use grid::{Grid, RIGHT_DOWN_LEFT_UP};
 pub use maze::{Maze, MazeTask};
-pub use rng::Rng;
+pub use rng::PuzzleRng;
 pub use split::{Split, fingerprint};
 pub use sudoku::{Sudoku, SudokuTask};
 pub use symmetry::Symmetry;

@@ -5,7 +5,7 @@
 //! random start and goal, solvable only, splits that share no maze.
 
 use crate::grid::Grid;
-use crate::rng::Rng;
+use crate::rng::PuzzleRng;
 use crate::split::{Split, fingerprint};
 
 /// One maze with its answer.
@@ -83,7 +83,7 @@ impl MazeTask {
     }
 
     /// A maze of this family, whatever its split.
-    pub fn draw(self, rng: &mut Rng) -> Maze {
+    pub fn draw(self, rng: &mut PuzzleRng) -> Maze {
         match self {
             Self::Original8 => original8(rng),
             Self::Original10 => original10(rng),
@@ -96,7 +96,7 @@ impl MazeTask {
 
     /// A maze of this family that belongs to `split`. Mazes with the same walls always belong to the same one; the
     /// original tasks have no splits (the study drew training and test mazes alike).
-    pub fn draw_from(self, split: Split, rng: &mut Rng) -> Maze {
+    pub fn draw_from(self, split: Split, rng: &mut PuzzleRng) -> Maze {
         loop {
             let maze = self.draw(rng);
             if self.split_of(maze.grid.walls()).is_none_or(|its| its == split) {
@@ -117,7 +117,7 @@ fn solved(grid: Grid, start: usize, goal: usize) -> Maze {
     Maze { grid, start, goal, path }
 }
 
-fn original8(rng: &mut Rng) -> Maze {
+fn original8(rng: &mut PuzzleRng) -> Maze {
     let mut grid = Grid::filled(8, 8, false);
     for _ in 0..rng.between(5, 14) {
         let (row, column) = (rng.between(1, 6), rng.between(1, 6));
@@ -130,7 +130,7 @@ fn original8(rng: &mut Rng) -> Maze {
 }
 
 /// Walls of a depth-first ("recursive backtracker") maze: rooms at odd rows and columns below `side - 1`.
-fn carve(side: usize, rng: &mut Rng) -> Grid {
+fn carve(side: usize, rng: &mut PuzzleRng) -> Grid {
     const TWO_STEPS: [(isize, isize); 4] = [(0, 2), (2, 0), (0, -2), (-2, 0)];
     let mut grid = Grid::filled(side, side, true);
     let first = grid.cell(1, 1);
@@ -169,14 +169,14 @@ fn empty5() -> Maze {
     solved(grid, start, goal)
 }
 
-fn original10(rng: &mut Rng) -> Maze {
+fn original10(rng: &mut PuzzleRng) -> Maze {
     let mut grid = carve(10, rng);
     let (start, goal) = (grid.cell(1, 1), grid.cell(8, 8));
     grid.set_wall(goal, false);
     solved(grid, start, goal)
 }
 
-fn perfect(side: usize, rng: &mut Rng) -> Maze {
+fn perfect(side: usize, rng: &mut PuzzleRng) -> Maze {
     let grid = carve(side, rng);
     let free: Vec<usize> = (0..grid.len()).filter(|&cell| !grid.is_wall(cell)).collect();
     let start = rng.below(free.len());
@@ -184,7 +184,7 @@ fn perfect(side: usize, rng: &mut Rng) -> Maze {
     solved(grid, free[start], free[goal])
 }
 
-fn scattered(side: usize, fewest: usize, most: usize, rng: &mut Rng) -> Maze {
+fn scattered(side: usize, fewest: usize, most: usize, rng: &mut PuzzleRng) -> Maze {
     loop {
         let mut grid = Grid::filled(side, side, false);
         for _ in 0..rng.between(fewest, most) {
@@ -208,7 +208,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     fn draw(task: MazeTask, count: usize) -> Vec<Maze> {
-        let mut rng = Rng::new(11, 0);
+        let mut rng = PuzzleRng::new(11, 0);
         (0..count).map(|_| task.draw(&mut rng)).collect()
     }
 
@@ -262,7 +262,7 @@ mod tests {
     fn splits_share_no_maze() {
         let mut seen: Vec<BTreeSet<Grid>> = Vec::new();
         for split in Split::ALL {
-            let mut rng = Rng::new(5, 0);
+            let mut rng = PuzzleRng::new(5, 0);
             seen.push((0..3000).map(|_| MazeTask::Dfs10.draw_from(split, &mut rng).grid).collect());
         }
         assert!(seen.iter().all(|mazes| mazes.len() > 15), "{:?}", seen.iter().map(BTreeSet::len).collect::<Vec<_>>());

@@ -5,9 +5,9 @@ use rand_chacha::rand_core::{RngCore, SeedableRng};
 
 /// ChaCha8 with a seed and a stream: the same pair gives the same puzzles on every machine.
 #[derive(Clone, Debug)]
-pub struct Rng(ChaCha8Rng);
+pub struct PuzzleRng(ChaCha8Rng);
 
-impl Rng {
+impl PuzzleRng {
     /// A generator for `seed`; different `stream`s of one seed are independent.
     pub fn new(seed: u64, stream: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -51,7 +51,7 @@ mod tests {
     #[test]
     fn numbers_are_even_and_repeatable() {
         let mut counts = [0_usize; 7];
-        let mut rng = Rng::new(3, 0);
+        let mut rng = PuzzleRng::new(3, 0);
         for _ in 0..70_000 {
             counts[rng.below(7)] += 1;
         }
@@ -60,7 +60,7 @@ mod tests {
         let draw = |seed, stream| {
             (0..4)
                 .map({
-                    let mut r = Rng::new(seed, stream);
+                    let mut r = PuzzleRng::new(seed, stream);
                     move |_| r.below(1000)
                 })
                 .collect::<Vec<_>>()
@@ -73,7 +73,7 @@ mod tests {
     #[test]
     fn a_shuffle_keeps_every_item() {
         let mut items: Vec<usize> = (0..50).collect();
-        Rng::new(0, 0).shuffle(&mut items);
+        PuzzleRng::new(0, 0).shuffle(&mut items);
         assert_ne!(items, (0..50).collect::<Vec<_>>());
         items.sort_unstable();
         assert_eq!(items, (0..50).collect::<Vec<_>>());

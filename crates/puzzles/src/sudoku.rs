@@ -1,7 +1,7 @@
 //! Sudoku of 4×4, 6×6 and 9×9: an exact solver that counts solutions, a generator of full grids, and puzzles with a
 //! unique solution whose difficulty is the number of givens.
 
-use crate::rng::Rng;
+use crate::rng::PuzzleRng;
 use crate::split::{Split, fingerprint};
 
 /// Size of a Sudoku: rows, columns and digits `1..=side`, in boxes of `box_rows` × `box_columns`.
@@ -187,7 +187,7 @@ impl SudokuTask {
     }
 
     /// A full grid, found by filling cells with random candidates.
-    pub fn full_grid(self, rng: &mut Rng) -> Vec<u8> {
+    pub fn full_grid(self, rng: &mut PuzzleRng) -> Vec<u8> {
         let mut board = Board::new(self, &vec![0; self.cells()]).expect("an empty board contradicts nothing");
         // A random first row: the fewest-candidates rule would otherwise start in the same corner every time.
         let mut digits: Vec<u8> = (1..=self.side() as u8).collect();
@@ -215,7 +215,7 @@ impl SudokuTask {
 
     /// A puzzle with a unique solution and at least `givens` cells given: cells are emptied in random order while the
     /// solution stays unique, until `givens` are left or no further cell can go. Its solution belongs to `split`.
-    pub fn draw_from(self, split: Split, givens: usize, rng: &mut Rng) -> Sudoku {
+    pub fn draw_from(self, split: Split, givens: usize, rng: &mut PuzzleRng) -> Sudoku {
         let solution = loop {
             let full = self.full_grid(rng);
             if Split::of(fingerprint(full.iter().map(|&digit| u64::from(digit)))) == split {
@@ -260,14 +260,14 @@ impl SudokuTask {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rng::Rng;
+    use crate::rng::PuzzleRng;
     use proptest::prelude::*;
     use std::collections::BTreeSet;
 
     #[test]
     fn there_are_288_grids_of_four() {
         assert_eq!(SudokuTask::FOUR.count_solutions(&[0; 16], usize::MAX), 288);
-        let mut rng = Rng::new(0, 0);
+        let mut rng = PuzzleRng::new(0, 0);
         let drawn: BTreeSet<Vec<u8>> = (0..5000).map(|_| SudokuTask::FOUR.full_grid(&mut rng)).collect();
         assert_eq!(drawn.len(), 288, "every one of them is drawn");
     }
@@ -299,7 +299,7 @@ mod tests {
     fn the_splits_share_no_solution() {
         let drawn: Vec<BTreeSet<Vec<u8>>> = Split::ALL
             .map(|split| {
-                let mut rng = Rng::new(1, split as u64);
+                let mut rng = PuzzleRng::new(1, split as u64);
                 (0..2000).map(|_| SudokuTask::FOUR.draw_from(split, 16, &mut rng).solution).collect()
             })
             .into();
@@ -313,7 +313,7 @@ mod tests {
         fn puzzles_have_their_solution_and_no_other(seed: u64, size in 0_usize..3, tight in 0_usize..2) {
             let (_, task) = SudokuTask::ALL[size];
             let givens = [[8, 18, 36], [0, 0, 0]][tight][size];
-            let sudoku = task.draw_from(Split::Test, givens, &mut Rng::new(seed, 0));
+            let sudoku = task.draw_from(Split::Test, givens, &mut PuzzleRng::new(seed, 0));
             prop_assert!(task.is_solved(&sudoku.solution));
             prop_assert!(sudoku.givens() >= givens);
             prop_assert_eq!(task.count_solutions(&sudoku.puzzle, 2), 1);

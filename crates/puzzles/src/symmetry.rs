@@ -56,7 +56,7 @@ impl Symmetry {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{MazeTask, Rng, Walker};
+    use crate::{MazeTask, PuzzleRng, Walker};
     use std::collections::BTreeSet;
 
     #[test]
@@ -70,7 +70,7 @@ mod tests {
 
     #[test]
     fn a_walk_in_the_mirror_is_the_walks_mirror_image() {
-        let mut rng = Rng::new(4, 0);
+        let mut rng = PuzzleRng::new(4, 0);
         for symmetry in Symmetry::all() {
             let maze = MazeTask::Walls5.draw(&mut rng);
             let mut mirrored = maze.clone();

@@ -2,7 +2,7 @@
 //! answer is worth.
 
 use crate::maze::{Maze, MazeTask};
-use crate::rng::Rng;
+use crate::rng::PuzzleRng;
 use crate::split::{Split, fingerprint};
 use crate::sudoku::{Sudoku, SudokuTask};
 
@@ -73,7 +73,7 @@ impl Task {
 
     /// A puzzle of this family that belongs to `split`. Of a Sudoku a number of cells that is drawn from `givens`
     /// (fewest, most) is kept, more where fewer would leave a second solution; mazes have no givens.
-    pub fn draw(self, split: Split, (fewest, most): (usize, usize), rng: &mut Rng) -> Puzzle {
+    pub fn draw(self, split: Split, (fewest, most): (usize, usize), rng: &mut PuzzleRng) -> Puzzle {
         match self {
             Self::Maze(task) => Puzzle::Maze(task.draw_from(split, rng)),
             Self::Sudoku(task) => {
@@ -85,7 +85,7 @@ impl Task {
 
     /// Puzzle number `index` of a split: the same for the same seed, whatever was drawn before.
     pub fn numbered(self, split: Split, givens: (usize, usize), seed: u64, index: u64) -> Puzzle {
-        self.draw(split, givens, &mut Rng::new(seed, index))
+        self.draw(split, givens, &mut PuzzleRng::new(seed, index))
     }
 }
 

@@ -4,7 +4,7 @@
 //! distance), reaching the goal earns 10 more, a move that cannot be made costs 0.5 and changes nothing.
 
 use crate::maze::{Maze, MazeTask};
-use crate::rng::Rng;
+use crate::rng::PuzzleRng;
 use crate::split::Split;
 
 /// Up, down, left, right: the actions, by number.
@@ -35,11 +35,11 @@ pub struct Walker {
 impl Walker {
     /// The study's `maze5-rl`: an empty 5×5 grid, from (0,0) to (4,4).
     pub fn empty5() -> Self {
-        Self::new(MazeTask::Empty5.draw(&mut Rng::new(0, 0)))
+        Self::new(MazeTask::Empty5.draw(&mut PuzzleRng::new(0, 0)))
     }
 
     /// `maze5-walls`: random walls, start and goal, from one of the splits.
-    pub fn walls5(split: Split, rng: &mut Rng) -> Self {
+    pub fn walls5(split: Split, rng: &mut PuzzleRng) -> Self {
         Self::new(MazeTask::Walls5.draw_from(split, rng))
     }
 
@@ -141,7 +141,7 @@ mod tests {
     #[test]
     fn a_uniform_walk_reaches_the_goal_as_often_as_exact_analysis_says() {
         // 0.323 by dynamic programming over the uniform policy
-        let mut rng = Rng::new(0, 0);
+        let mut rng = PuzzleRng::new(0, 0);
         let episodes = 20_000;
         let reached = (0..episodes)
             .filter(|_| {
@@ -160,7 +160,7 @@ mod tests {
 
     #[test]
     fn planes_show_walker_walls_and_goal() {
-        let walker = Walker::walls5(Split::Train, &mut Rng::new(2, 0));
+        let walker = Walker::walls5(Split::Train, &mut PuzzleRng::new(2, 0));
         let planes = walker.observe_planes();
         assert_eq!(
             planes.iter().filter(|&&x| x == 1.0).count(),

@@ -27,8 +27,8 @@ pub trait Agent: Send {
         Ok(vec![self.act(observations)?])
     }
 
-    /// Forgets the episode.
-    fn reset(&mut self);
+    /// Forgets the episode and begins that of `seed`.
+    fn reset(&mut self, seed: u64);
 }
 
 /// How an episode is run and when it ends.
@@ -122,7 +122,7 @@ impl EpisodePlan {
         mut watch: Option<Watch<'_>>,
     ) -> Result<Outcome, JobError> {
         let begun = Instant::now();
-        agent.reset();
+        agent.reset(seed);
         let Initial { fingerprint, group, mut observations } = worker.reset(seed)?;
         let mut simulator = begun.elapsed();
         if let Some(watch) = &mut watch {

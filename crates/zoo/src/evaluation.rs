@@ -4,7 +4,9 @@
 //! number of workers, the order, what ran before, or what had to be run again.
 
 mod agent;
+mod clock;
 mod subject;
+mod trace;
 
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -14,7 +16,9 @@ use std::time::Duration;
 use rollout::{EpisodePlan, FaultKind, Image, JobError, Pool, RolloutError, Worker, WorkerFault};
 
 pub use self::agent::{PolicyAgent, QueryTimes};
+pub use self::clock::WallClock;
 pub use self::subject::Subject;
+pub use self::trace::{PolicyTrace, TracedQuery, TracedThought, trace};
 use crate::ZooError;
 use crate::results::{EpisodeRecord, EpisodeTiming, ResultsFolder, Seeds, Shard, StoredEvaluation};
 

@@ -52,7 +52,7 @@ impl Policy for Grasper {
         ActionChunk::new([action; 3].concat(), 3, 7)
     }
 
-    fn reset(&mut self) {
+    fn reset(&mut self, _seed: u64) {
         self.closed = 0;
     }
 }
@@ -78,6 +78,7 @@ fn subject() -> Subject<'static> {
         env_version: Some("1.5.1".into()),
         keys,
         execution: Execution::RecedingHorizon { n_action_steps: 2 },
+        time_decides: false,
         max_steps: Some(45),
         signature: Signature::low_dimensional(5, 10, 7),
         policy: Box::new(|| Ok(Box::new(Grasper::default()))),
@@ -271,7 +272,7 @@ fn what_does_not_fit_is_refused_before_anything_is_written() {
                 fn predict(&mut self, _: &Observation) -> Result<ActionChunk, ModelError> {
                     ActionChunk::new([0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0, 0.0].repeat(2), 2, 7)
                 }
-                fn reset(&mut self) {}
+                fn reset(&mut self, _seed: u64) {}
             }
             Ok(Box::new(Broken))
         });

@@ -3,4 +3,5 @@
 
 pub mod act;
 pub mod actrm;
+pub mod bc;
 pub mod trm;

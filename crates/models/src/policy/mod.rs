@@ -45,20 +45,72 @@ impl ActionChunk {
     }
 }
 
-/// A policy with the state of one episode; weights are shared behind it.
+/// The clock of whoever runs a policy: models have none of their own.
+pub trait Clock: Send {
+    /// Milliseconds since a moment that stays the same.
+    fn milliseconds(&mut self) -> f64;
+}
+
+/// One step of the thought behind a prediction.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ThoughtStep {
+    /// the answer at this depth, raw units
+    pub chunk: ActionChunk,
+    /// mean absolute change of the answer since the step before, in network units; the first step has none
+    pub change: Option<f32>,
+    /// the halting head's probability that another step would not help
+    pub halt: f32,
+    /// time that the step took, by the caller's clock
+    pub milliseconds: f64,
+}
+
+/// A policy with the state of one episode: the last observations, a generator, the previous thought. Weights are shared
+/// behind it.
 pub trait Policy: Send {
     /// Actions from this observation on.
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk>;
-    /// Forgets the episode.
-    fn reset(&mut self);
+
+    /// Observations that it sees at once: the present one and those of the steps before it.
+    fn n_obs_steps(&self) -> usize {
+        1
+    }
+
+    /// Shows it a step at which it is not asked; needed of the last `n_obs_steps - 1` before a query.
+    fn observe(&mut self, _observation: &Observation) {}
+
+    /// Tells it that so many actions of its last chunk are on their way.
+    fn executed(&mut self, _actions: usize) {}
+
+    /// Forgets the episode and begins another; what it draws from now on depends on `seed` only.
+    fn reset(&mut self, seed: u64);
+
+    /// What it thought at the last query, step by step; nothing if it does not think.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    fn thought(&self) -> Result<Vec<ThoughtStep>> {
+        Ok(Vec::new())
+    }
 }
 
 impl<P: Policy + ?Sized> Policy for Box<P> {
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
         (**self).predict(observation)
     }
-    fn reset(&mut self) {
-        (**self).reset();
+    fn n_obs_steps(&self) -> usize {
+        (**self).n_obs_steps()
+    }
+    fn observe(&mut self, observation: &Observation) {
+        (**self).observe(observation);
+    }
+    fn executed(&mut self, actions: usize) {
+        (**self).executed(actions);
+    }
+    fn reset(&mut self, seed: u64) {
+        (**self).reset(seed);
+    }
+    fn thought(&self) -> Result<Vec<ThoughtStep>> {
+        (**self).thought()
     }
 }
 
@@ -71,8 +123,8 @@ pub trait Actor: Send {
     fn act_ahead(&mut self, observation: &Observation) -> Result<Vec<Vec<f32>>> {
         Ok(vec![self.act(observation)?])
     }
-    /// Forgets the episode.
-    fn reset(&mut self);
+    /// Forgets the episode and begins that of `seed`.
+    fn reset(&mut self, seed: u64);
 }
 
 #[cfg(test)]

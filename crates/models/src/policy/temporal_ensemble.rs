@@ -30,16 +30,12 @@ impl<P: Policy> TemporalEnsemble<P> {
         }
         Ok(Self { policy, coefficient, ahead: VecDeque::new() })
     }
-
-    /// The wrapped policy.
-    pub fn policy(&self) -> &P {
-        &self.policy
-    }
 }
 
 impl<P: Policy> Actor for TemporalEnsemble<P> {
     fn act(&mut self, observation: &Observation) -> Result<Vec<f32>> {
         let chunk = self.policy.predict(observation)?;
+        self.policy.executed(1);
         let weight = |i: usize| (-self.coefficient * i as f64).exp();
         let total = |n: usize| (0..n).map(weight).sum::<f64>();
         for (i, row) in chunk.rows().enumerate() {
@@ -58,9 +54,9 @@ impl<P: Policy> Actor for TemporalEnsemble<P> {
         Ok(now.into_iter().map(|x| x as f32).collect())
     }
 
-    fn reset(&mut self) {
+    fn reset(&mut self, seed: u64) {
         self.ahead.clear();
-        self.policy.reset();
+        self.policy.reset(seed);
     }
 }
 
@@ -103,7 +99,7 @@ mod tests {
         let mut actor = TemporalEnsemble::new(Tape { chunks, dim: 1, at: 0 }, 0.01).unwrap();
         let first = actor.act(&Observation::default()).unwrap();
         actor.act(&Observation::default()).unwrap();
-        actor.reset();
+        actor.reset(0);
         assert_eq!(actor.act(&Observation::default()).unwrap(), first);
     }
 }

@@ -18,7 +18,7 @@ impl Policy for Tape {
         let horizon = actions.len() / self.dim;
         ActionChunk::new(actions, horizon, self.dim)
     }
-    fn reset(&mut self) {
+    fn reset(&mut self, _seed: u64) {
         self.at = 0;
     }
 }

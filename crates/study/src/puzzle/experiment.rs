@@ -70,7 +70,7 @@ pub struct PuzzleExperiment {
     /// The model.
     pub model: SolverConfig,
     /// Its loss and, for a TRM, when a puzzle leaves its slot.
-    pub learning: Learning,
+    pub learning: LearningSection,
     /// The training.
     pub train: TrainSection,
     /// How a walker learns; absent: the model marks cells and learns from answers.
@@ -88,7 +88,7 @@ struct Sections {
     task: PuzzleTask,
     model: Table,
     #[serde(default)]
-    learning: Learning,
+    learning: LearningSection,
     train: TrainSection,
     #[serde(default)]
     rl: Option<RlSection>,
@@ -118,7 +118,7 @@ fn default_valid_puzzles() -> u64 {
 /// `[learning]`: the loss over cells and the rules of a TRM's carry.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Learning {
+pub struct LearningSection {
     /// What turns scores into probabilities.
     pub probability: ClassProbability,
     /// Weight of the halting loss (TRM).
@@ -129,13 +129,13 @@ pub struct Learning {
     pub release_solved: Option<f64>,
 }
 
-impl Default for Learning {
+impl Default for LearningSection {
     fn default() -> Self {
         Self { probability: ClassProbability::Softmax, halt_weight: 0.1, release_solved: None }
     }
 }
 
-impl Learning {
+impl LearningSection {
     pub(super) fn puzzle_config(&self, batch_size: usize) -> PuzzleConfig {
         PuzzleConfig {
             batch_size,

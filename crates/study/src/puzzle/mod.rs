@@ -27,7 +27,7 @@ pub use evaluation::{
     DEPTHS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, TEST_SEED, evaluate_puzzles,
     list_puzzle_evaluations,
 };
-pub use experiment::{AnyExperiment, Learning, PuzzleExperiment, PuzzleTask};
+pub use experiment::{AnyExperiment, LearningSection, PuzzleExperiment, PuzzleTask};
 pub use grade::{Baseline, Counts};
 pub use model::{
     CnnSection, ConvSection, HierarchicalSection, MlpSection, SolverConfig, TransformerSection, TrmSection,

@@ -1,6 +1,6 @@
 //! The puzzles of a training, one after the other: always new ones, or a fixed number in a new order each time around.
 
-use puzzles::{Puzzle, Rng, Split, Task};
+use puzzles::{Puzzle, PuzzleRng, Split, Task};
 
 use super::experiment::PuzzleExperiment;
 use zoo::ZooError;
@@ -53,7 +53,7 @@ impl Stream {
         if self.order.0 != around {
             let mut order: Vec<u64> = (0..self.fixed).collect();
             // streams from the other end: none is a puzzle's
-            Rng::new(self.seed, u64::MAX - around).shuffle(&mut order);
+            PuzzleRng::new(self.seed, u64::MAX - around).shuffle(&mut order);
             self.order = (around, order);
         }
         self.order.1[(self.taken % self.fixed) as usize]

@@ -84,7 +84,7 @@ pub fn train_puzzles(
 /// Who learns: a TRM with its carry, or a model that answers at once.
 enum Student {
     Trm(Box<TrmTrainer>),
-    Walker(Box<walk::Learning>),
+    Walker(Box<walk::WalkerTraining>),
     Grid { solver: Box<Solver>, learner: Box<Learner>, batch: usize },
 }
 
@@ -100,7 +100,7 @@ impl Student {
             Solver::Walker { net, task } => {
                 let rl = experiment.rl.as_ref().expect("a walker is built from [rl]");
                 let numbers = (section.batch_size, section.seed);
-                Self::Walker(Box::new(walk::Learning::new(net, rl, task, section.trainer_config(), numbers)?))
+                Self::Walker(Box::new(walk::WalkerTraining::new(net, rl, task, section.trainer_config(), numbers)?))
             }
             Solver::Grid { ref model, .. } => {
                 let learner = Box::new(Learner::new(model.params(), section.trainer_config())?);

@@ -204,7 +204,7 @@ fn first_moves(maze: &Maze, at: usize) -> [f32; MOVES.len()] {
 }
 
 /// A walker in training.
-pub(super) struct Learning {
+pub(super) struct WalkerTraining {
     agent: Agent,
     section: RlSection,
     task: MazeTask,
@@ -218,7 +218,7 @@ struct Meta {
     recent: VecDeque<bool>,
 }
 
-impl Learning {
+impl WalkerTraining {
     pub(super) fn new(
         net: Box<dyn WalkerNet>,
         section: &RlSection,
@@ -358,7 +358,7 @@ pub(super) fn count(puzzles: &[Puzzle], walks: &[Walk]) -> Counts {
 
 /// What a walker without any preference achieves.
 pub(super) fn random_walks(puzzles: &[Puzzle]) -> Counts {
-    let mut rng = puzzles::Rng::new(0, 0);
+    let mut rng = puzzles::PuzzleRng::new(0, 0);
     let walk = |puzzle: &Puzzle| {
         let mut walker = Walker::new(maze(puzzle)?.clone());
         loop {
@@ -407,7 +407,7 @@ mod tests {
         for index in 0..40 {
             let puzzle = Task::Maze(task).numbered(Split::Train, (0, 0), 1, index);
             let maze = maze(&puzzle).unwrap();
-            let mut rng = puzzles::Rng::new(7, index);
+            let mut rng = puzzles::PuzzleRng::new(7, index);
             let mut drawn = |seen: &[f32], _: &[u32]| {
                 let decision = |_| Decision { action: rng.below(4) as u32, log_prob: -1.4, value: 0.5 };
                 Ok((0..seen.len() / observation_len(task)).map(decision).collect())

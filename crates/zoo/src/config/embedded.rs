@@ -29,6 +29,7 @@ pub(super) const FILES: &[(&str, &str)] = &[
     ("actrm_stack", include_str!("../../../../configs/actrm_stack.toml")),
     ("actrm_stackcolor", include_str!("../../../../configs/actrm_stackcolor.toml")),
     ("actrm_stackthreecubes", include_str!("../../../../configs/actrm_stackthreecubes.toml")),
+    ("bc_lift", include_str!("../../../../configs/bc_lift.toml")),
     ("cnn_maze8-original", include_str!("../../../../configs/cnn_maze8-original.toml")),
     ("cnn_open8", include_str!("../../../../configs/cnn_open8.toml")),
     ("mlp_maze8-original", include_str!("../../../../configs/mlp_maze8-original.toml")),

@@ -17,7 +17,7 @@ pub use card::{CardWords, grouped};
 pub use id::{EntryId, EntryRequest, check_name};
 pub use meta::{CurvePoint, DataMeta, EntryMeta, FileMeta, ModuleMeta, TrainingMeta};
 pub use open::Entry;
-pub use policy::{EntryPolicy, LoadedEntry};
+pub use policy::LoadedEntry;
 pub use seal::EntryDraft;
 #[cfg(test)]
 pub(crate) use seal::tests::draft as test_draft;

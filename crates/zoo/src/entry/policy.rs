@@ -1,9 +1,10 @@
-//! An entry as a policy: shared weights, one small state an environment.
+//! An entry's weights in memory, and policies that share them.
 
 use std::sync::Arc;
 
-use models::{ActionChunk, ModelError, Normaliser, Observation, Policy, PolicyModel, Preprocess};
+use models::{Normaliser, Policy, PolicyModel, Preprocess};
 
+use crate::evaluation::WallClock;
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors};
 
@@ -72,24 +73,8 @@ impl LoadedEntry {
         &self.preprocess
     }
 
-    /// A policy for one environment; it shares the weights with all others.
-    pub fn policy(&self) -> EntryPolicy {
-        EntryPolicy { model: Arc::clone(&self.model), preprocess: Arc::clone(&self.preprocess) }
+    /// A policy for one environment, with a state of its own; it shares the weights with all others.
+    pub fn policy(&self) -> Box<dyn Policy> {
+        Arc::clone(&self.model).policy(Arc::clone(&self.preprocess), Box::new(WallClock::new()))
     }
-}
-
-/// One environment's policy: raw observation in, raw action chunk out.
-#[derive(Clone)]
-pub struct EntryPolicy {
-    model: Arc<dyn PolicyModel>,
-    preprocess: Arc<Preprocess>,
-}
-
-impl Policy for EntryPolicy {
-    fn predict(&mut self, observation: &Observation) -> Result<ActionChunk, ModelError> {
-        let seen = self.preprocess.observation(std::slice::from_ref(observation))?;
-        self.preprocess.chunk(&self.model.predict(&seen)?)
-    }
-
-    fn reset(&mut self) {}
 }

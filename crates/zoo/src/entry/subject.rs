@@ -24,7 +24,7 @@ pub fn training_facts(meta: &EntryMeta) -> TrainingFacts {
 impl LoadedEntry {
     /// What an evaluation needs to know.
     pub fn subject(&self) -> Subject<'static> {
-        let policy = self.policy();
+        let this = self.clone();
         let (meta, rollout) = (self.entry().meta(), &self.experiment().rollout);
         Subject {
             entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
@@ -38,7 +38,8 @@ impl LoadedEntry {
             },
             max_steps: rollout.max_steps,
             signature: meta.signature.clone(),
-            policy: Box::new(move || Ok(Box::new(policy.clone()))),
+            time_decides: self.model().depends_on_time(),
+            policy: Box::new(move || Ok(this.policy())),
         }
     }
 }

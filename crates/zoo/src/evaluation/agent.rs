@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use models::{ActionChunk, Actor, ModelError, Observation, Policy};
+use models::{ActionChunk, Actor, ModelError, Observation, Policy, ThoughtStep};
 use rollout::{Agent, AgentError, Observations};
 
 use crate::FeatureKeys;
@@ -30,8 +30,8 @@ impl Agent for PolicyAgent {
         Ok(self.actor.act_ahead(&self.keys.observe(observations))?)
     }
 
-    fn reset(&mut self) {
-        self.actor.reset();
+    fn reset(&mut self, seed: u64) {
+        self.actor.reset(seed);
     }
 }
 
@@ -67,7 +67,23 @@ impl Policy for Timed {
         predicted
     }
 
-    fn reset(&mut self) {
-        self.policy.reset();
+    fn n_obs_steps(&self) -> usize {
+        self.policy.n_obs_steps()
+    }
+
+    fn observe(&mut self, observation: &Observation) {
+        self.policy.observe(observation);
+    }
+
+    fn executed(&mut self, actions: usize) {
+        self.policy.executed(actions);
+    }
+
+    fn reset(&mut self, seed: u64) {
+        self.policy.reset(seed);
+    }
+
+    fn thought(&self) -> Result<Vec<ThoughtStep>, ModelError> {
+        self.policy.thought()
     }
 }

@@ -26,6 +26,8 @@ pub struct Subject<'a> {
     pub max_steps: Option<usize>,
     /// Expected features and length of the action.
     pub signature: Signature,
+    /// Whether its policies think by the clock, so that an episode may end otherwise next time.
+    pub time_decides: bool,
     /// Makes a policy of its own for one environment.
     pub policy: Box<dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a>,
 }
@@ -55,6 +57,7 @@ impl Subject<'_> {
                 max_steps: self.max_steps.unwrap_or(ready.max_steps),
             },
             execution: self.execution,
+            time_decides: self.time_decides,
             seeds: options.seeds,
             shard: options.shard,
             versions: ready.versions.clone(),
@@ -89,12 +92,17 @@ impl Subject<'_> {
     /// The policy cannot be built.
     pub fn agent(&self) -> Result<(PolicyAgent, QueryTimes), ModelError> {
         let times = QueryTimes::default();
-        let policy = Timed::new((self.policy)()?, times.clone());
+        let agent = self.acting(Timed::new((self.policy)()?, times.clone()))?;
+        Ok((agent, times))
+    }
+
+    /// `policy` acting as the execution says.
+    pub(super) fn acting(&self, policy: impl Policy + 'static) -> Result<PolicyAgent, ModelError> {
         let actor: Box<dyn Actor> = match self.execution {
             Execution::RecedingHorizon { n_action_steps } => Box::new(RecedingHorizon::new(policy, n_action_steps)?),
             Execution::TemporalEnsemble { coefficient } => Box::new(TemporalEnsemble::new(policy, coefficient)?),
         };
-        Ok((PolicyAgent::new(actor, self.keys.clone()), times))
+        Ok(PolicyAgent::new(actor, self.keys.clone()))
     }
 }
 

@@ -17,3 +17,4 @@ pub use merge::merge_shards;
 pub use record::{
     EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Execution, Protocol, Seeds, Shard, TrainingFacts,
 };
+pub(crate) use tables::write_table;

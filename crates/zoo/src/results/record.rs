@@ -177,6 +177,9 @@ pub struct EvaluationRecord {
     pub protocol: Protocol,
     /// How predictions become actions.
     pub execution: Execution,
+    /// Whether the policy thinks by the clock: its episodes may end otherwise next time. Others repeat exactly.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub time_decides: bool,
     /// The episodes' seeds.
     pub seeds: Seeds,
     /// The part of them that is here, if not all.
@@ -289,6 +292,7 @@ pub(crate) mod tests {
                 max_steps: 400,
             },
             execution: Execution::RecedingHorizon { n_action_steps: 8 },
+            time_decides: false,
             seeds: Seeds { start: 10_000, count },
             shard: None,
             versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),

@@ -26,8 +26,12 @@ fn table_error<E: std::error::Error + Send + Sync + 'static>(
     move |source| ZooError::Table { operation, path, source: Box::new(source) }
 }
 
-fn write(path: &Path, columns: Vec<(&str, ArrayRef)>) -> Result<(), ZooError> {
-    let columns = columns.into_iter().map(|(name, array)| (name, array, false));
+/// Writes whole columns as a table; those with values missing may have none.
+pub(crate) fn write_table(path: &Path, columns: Vec<(&str, ArrayRef)>) -> Result<(), ZooError> {
+    let columns = columns.into_iter().map(|(name, array)| {
+        let nullable = array.null_count() > 0;
+        (name, array, nullable)
+    });
     let batch = RecordBatch::try_from_iter_with_nullable(columns).map_err(table_error("build table", path))?;
     let level = ZstdLevel::try_new(3).map_err(table_error("set up compression of", path))?;
     let properties = WriterProperties::builder().set_compression(Compression::ZSTD(level)).build();
@@ -119,7 +123,7 @@ pub(super) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), Z
         let groups = all.iter().map(|e| e.group.as_deref().unwrap_or_default());
         columns.push(("group", Arc::new(StringArray::from_iter_values(groups))));
     }
-    write(path, columns)
+    write_table(path, columns)
 }
 
 /// Reads the outcomes.
@@ -158,7 +162,7 @@ pub(super) fn write_timings(path: &Path, timings: &[EpisodeTiming]) -> Result<()
         queries.values().append_slice(&timing.inference_ms);
         queries.append(true);
     }
-    write(
+    write_table(
         path,
         vec![
             ("seed", Arc::new(UInt64Array::from_iter_values(timings.iter().map(|t| t.seed)))),

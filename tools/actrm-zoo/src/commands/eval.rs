@@ -320,6 +320,9 @@ fn run_missing(
 
 /// Runs a finished evaluation once more beside itself and compares; whether it was stopped.
 fn again(subject: &Subject<'_>, pool: &mut Pool, results: &Path, options: &EvaluationOptions) -> anyhow::Result<bool> {
+    if subject.time_decides {
+        bail!("entry {}: it thinks by the clock, so its episodes may end otherwise: nothing to compare", subject.entry);
+    }
     let record = subject.record(pool.ready(), options)?;
     let folder = results.join(record.folder_name());
     if StoredEvaluation::read(&folder).ok().flatten().is_none() {
@@ -379,6 +382,9 @@ fn summary(evaluation: &StoredEvaluation) -> String {
     let mut text = format!("{} on {}: {}", row.entry, row.task, rate(row.successes, row.episodes));
     if let Some(steps) = row.mean_steps_to_success() {
         text.push_str(&format!(", mean {steps:.1} steps to success"));
+    }
+    if evaluation.record.time_decides {
+        text.push_str("\n  it thinks by the clock: these episodes may end otherwise next time");
     }
     for (group, counts) in &row.groups {
         text.push_str(&format!("\n  {group}: {}", rate(counts.successes, counts.episodes)));

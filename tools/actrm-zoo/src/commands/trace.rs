@@ -1,40 +1,60 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use cli::shown;
+use anyhow::{Context, bail};
+use cli::{INTERRUPTED, SimulatorArgs, Stop, shown};
+use rollout::Control;
 use study::puzzle::{SolverEntry, trace};
+use zoo::entry::Entry;
+use zoo::evaluation::{self, FIRST_SEED};
 use zoo::write_atomic;
 
 use crate::places::{ZooArgs, entry_names};
 use crate::puzzles::family;
 
-/// Show what a puzzle solver believed after each step: its grid, how sure it was, whether it would stop
+/// Show what an entry thought, step by step: a puzzle solver about a puzzle, a robot policy in an episode
+///
+/// Of a puzzle: the grid, how sure the solver was of each cell, whether it would stop. Of an episode: every query and every
+/// step of the thought behind it, with the answer's change, the halting head's probability and the time.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo trace trm-dfs10
   actrm-zoo trace trm-open8@1 --index 7 --svg trace.svg
   actrm-zoo trace trm-dfs10 --task dfs16 --depth 24
-  actrm-zoo trace trm-sudoku4 --json")]
+  actrm-zoo trace trm-sudoku4 --json
+  actrm-zoo trace lift-actrm --seed 10003
+  actrm-zoo trace lift-actrm --seed 10003 --parquet trace.parquet")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
     entry: String,
-    /// Number of the puzzle in the test split
-    #[arg(long, default_value_t = 0)]
-    index: u64,
-    /// Most supervision steps
-    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u64).range(1..=1000))]
-    depth: u64,
-    /// Another family of puzzles than the entry's
+    /// Number of the puzzle in the test split [default: 0]
+    #[arg(long)]
+    index: Option<u64>,
+    /// Most supervision steps on a puzzle [default: 8]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1000))]
+    depth: Option<u64>,
+    /// Another task, or family of puzzles, than the entry's
     #[arg(long)]
     task: Option<String>,
     /// Givens of a Sudoku (the fewest that the solver was trained on)
     #[arg(long, value_name = "N")]
     givens: Option<usize>,
+    /// Seed of the episode [default: the first that evaluations use]
+    #[arg(long, value_name = "SEED")]
+    seed: Option<u64>,
+    /// Write an episode's answers, every action of them, to this file too
+    #[arg(long, value_name = "FILE")]
+    parquet: Option<PathBuf>,
+    /// Control loop inside the simulator: `compiled` or `robosuite`
+    #[arg(long, default_value_t = Control::Compiled)]
+    control: Control,
+    #[command(flatten)]
+    simulator: SimulatorArgs,
     /// Print JSON instead of text
     #[arg(long)]
     json: bool,
-    /// Write a strip of pictures to this file instead
+    /// Write a strip of pictures of a puzzle to this file instead
     #[arg(long, value_name = "FILE", conflicts_with = "json")]
     svg: Option<PathBuf>,
     #[command(flatten)]
@@ -43,14 +63,69 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let entry = args.zoo.registry().entry(&args.entry)?;
+    match entry.meta().is_robot_policy() {
+        true => trace_policy(args, &entry),
+        false => trace_solver(args, &entry),
+    }
+}
+
+/// Options that mean nothing for this kind of entry are not passed over.
+fn refuse(entry: &Entry, kind: &str, options: &[(&str, bool)]) -> anyhow::Result<()> {
+    match options.iter().find(|(_, given)| *given) {
+        Some((option, _)) => bail!("{option} means nothing for {}, {kind}", entry.id()),
+        None => Ok(()),
+    }
+}
+
+fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
+    let of_puzzles = [
+        ("--index", args.index.is_some()),
+        ("--depth", args.depth.is_some()),
+        ("--givens", args.givens.is_some()),
+        ("--svg", args.svg.is_some()),
+        ("--workers", args.simulator.workers.is_some()),
+    ];
+    refuse(entry, "a robot policy of which one episode is shown", &of_puzzles)?;
+    let subject = entry.load()?.subject();
+    let stop = Stop::install("stopped")?;
+    let SimulatorArgs { env_module, python, .. } = &args.simulator;
+    let one = SimulatorArgs { workers: Some(1), env_module: env_module.clone(), python: python.clone() };
+    let mut spec = one.spec(args.task.as_deref().unwrap_or(&subject.task))?;
+    spec.control = args.control;
+    let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
+    let traced = evaluation::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED));
+    cli::close(pool);
+    let Some(traced) = traced.with_context(|| format!("entry {}", entry.id()))? else {
+        return Ok(ExitCode::from(INTERRUPTED));
+    };
+    if let Some(path) = &args.parquet {
+        traced.write_parquet(path)?;
+    }
+    match args.json {
+        true => cli::print_json(&traced)?,
+        false => cli::print(&traced.to_text())?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn trace_solver(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
+    let of_episodes = [
+        ("--seed", args.seed.is_some()),
+        ("--parquet", args.parquet.is_some()),
+        ("--control", args.control != Control::Compiled),
+        ("--workers", args.simulator.workers.is_some()),
+        ("--env-module", args.simulator.env_module.is_some()),
+    ];
+    refuse(entry, "a puzzle solver", &of_episodes)?;
     let other = args.task.as_deref().map(family).transpose()?;
-    let solver = SolverEntry::load(&entry, other)?;
+    let solver = SolverEntry::load(entry, other)?;
     let task = match other {
         Some(task) => task,
         None => solver.experiment().task.family()?,
     };
     let givens = args.givens.unwrap_or(solver.experiment().task.givens().0);
-    let trace = trace(&solver, task, givens, args.index, usize::try_from(args.depth)?)?;
+    let depth = usize::try_from(args.depth.unwrap_or(8))?;
+    let trace = trace(&solver, task, givens, args.index.unwrap_or(0), depth)?;
     match &args.svg {
         Some(path) => {
             write_atomic(path, trace.to_svg().as_bytes())?;

@@ -25,6 +25,7 @@ pub use config::Config;
 
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation, check_signature};
+use crate::chunk_policy::ChunkPolicy;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
@@ -36,9 +37,12 @@ use crate::layers::{
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
 use crate::params::Params;
+use crate::policy::{Clock, Policy};
+use crate::preprocess::Preprocess;
 use crate::rng::Rng;
 use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// The kinds of features that it reads.
 pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
@@ -218,6 +222,10 @@ impl PolicyModel for Act {
             Some(_) => self.predict_composed(observation),
             None => self.fused_predict(observation),
         }
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        Box::new(ChunkPolicy::new(self, preprocess))
     }
 
     fn action_horizon(&self) -> usize {

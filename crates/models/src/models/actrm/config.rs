@@ -16,12 +16,10 @@ pub enum Over {
     Memory,
 }
 
-/// Starting the answer from the previous tick's.
+/// Starting the answer from the previous query's, moved on by the actions executed since.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WarmStart {
-    /// Actions executed between two queries: the old answer is moved on by as many.
-    pub shift: usize,
     /// In training half of each batch starts from the answer to the same observation with this
     /// much normal noise on it (network units).
     #[serde(default = "default_noise")]
@@ -62,7 +60,7 @@ pub struct ReasoningConfig {
     pub halt_weight: f64,
     /// an error that one more step lowers by less than this share counts as not lowered
     pub halt_margin: f64,
-    /// start from the previous tick's answer (`over = "actions"`)
+    /// start from the previous query's answer (`over = "actions"`)
     pub warm_start: Option<WarmStart>,
 }
 
@@ -238,14 +236,8 @@ impl Config {
                 return refuse(field, value.to_string(), "a finite number, at least 0");
             }
         }
-        if let Some(warm) = r.warm_start {
-            if r.over == Over::Memory {
-                return refuse("reasoning.warm_start", "present".into(), "absent with over = \"memory\"");
-            }
-            if warm.shift > self.action_horizon {
-                let most = format!("at most action_horizon, {}", self.action_horizon);
-                return refuse("reasoning.warm_start.shift", warm.shift.to_string(), &most);
-            }
+        if r.warm_start.is_some() && r.over == Over::Memory {
+            return refuse("reasoning.warm_start", "present".into(), "absent with over = \"memory\"");
         }
         Ok(())
     }

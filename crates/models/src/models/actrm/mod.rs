@@ -35,7 +35,7 @@ mod reasoning;
 mod tests;
 
 pub use config::{Config, Over, ReasoningConfig, WarmStart};
-pub use reasoning::{Budget, Reasoning, ReasoningPolicy, ReasoningStep};
+pub use reasoning::{Reasoning, ReasoningPolicy, ReasoningStep};
 
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation, check_signature};
@@ -51,9 +51,12 @@ use crate::layers::{
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
 use crate::params::{Init, Params};
+use crate::policy::{Clock, Policy};
+use crate::preprocess::Preprocess;
 use crate::rng::Rng;
 use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// The kinds of features that it reads.
 pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
@@ -473,6 +476,14 @@ impl PolicyModel for Actrm {
 
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
         Ok(self.reason(observation, None, &mut |_| false)?.chunk)
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        Box::new(ReasoningPolicy::new(self, preprocess, clock))
+    }
+
+    fn depends_on_time(&self) -> bool {
+        self.config.reasoning.budget_ms.is_some()
     }
 
     fn action_horizon(&self) -> usize {

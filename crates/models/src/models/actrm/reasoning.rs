@@ -1,12 +1,13 @@
 //! Thinking at inference: step by step, until a rule says stop, with everything on record.
 
-use super::{Actrm, Carry, Over, ReasoningConfig};
+use super::{Actrm, Carry, Config, Over, ReasoningConfig};
 use crate::checks::check_shape;
-use crate::error::{ModelError, Result};
+use crate::error::Result;
 use crate::features::{Features, Observation};
+use crate::history::History;
 use crate::layers::Mode;
 use crate::model::PolicyModel;
-use crate::policy::{ActionChunk, Policy};
+use crate::policy::{ActionChunk, Clock, Policy, ThoughtStep};
 use crate::preprocess::Preprocess;
 use candle_core::{DType, Tensor};
 use std::sync::Arc;
@@ -122,7 +123,9 @@ impl<'a> Thought<'a> {
             Some(before) => (&chunk - &before.chunk)?.abs()?.mean((1, 2))?.to_vec1::<f32>()?,
             None => vec![f32::INFINITY; halt.len()],
         };
-        let last = done == self.rules.max_steps() || (self.should_stop)(done);
+        // asked of every step: it is how the caller times them
+        let stop = (self.should_stop)(done);
+        let last = stop || done == self.rules.max_steps();
         for ((depth, change), halt) in self.depth.iter_mut().zip(&change).zip(&halt) {
             let settled =
                 f64::from(*change) < self.rules.change_threshold || f64::from(*halt) > self.rules.halt_threshold;
@@ -149,71 +152,86 @@ impl<'a> Thought<'a> {
     }
 }
 
-/// The caller's clock: told that a thought begins, and asked after each step whether time is up.
-pub trait Budget: Send {
-    /// A thought begins.
-    fn begin(&mut self);
-    /// Whether `budget_ms` have passed since.
-    fn is_spent(&mut self, budget_ms: f64) -> bool;
-}
-
-/// ACTRM as a policy of one environment, in raw units: keeps the last thought, for traces and for
-/// the warm start.
+/// ACTRM as a policy of one environment, in raw units: keeps the last thought, for traces and for the warm start.
 pub struct ReasoningPolicy {
     model: Arc<Actrm>,
     preprocess: Arc<Preprocess>,
-    budget: Option<Box<dyn Budget>>,
+    clock: Box<dyn Clock>,
+    history: History,
     last: Option<Reasoning>,
+    /// actions executed since
+    executed: usize,
+    /// of the last thought's steps, in milliseconds
+    times: Vec<f64>,
 }
 
 impl ReasoningPolicy {
-    /// # Errors
-    /// If the configuration has a `budget_ms` and no clock is given.
-    pub fn new(model: Arc<Actrm>, preprocess: Arc<Preprocess>, budget: Option<Box<dyn Budget>>) -> Result<Self> {
-        if let (Some(ms), None) = (model.config.reasoning.budget_ms, &budget) {
-            return Err(ModelError::Input {
-                operation: "actrm policy",
-                object: "clock",
-                found: "absent".into(),
-                expected: format!("one, for reasoning.budget_ms = {ms}"),
-            });
-        }
-        Ok(Self { model, preprocess, budget, last: None })
+    /// Shares `model` with others. `clock` tells when `budget_ms` are spent, and how long steps took.
+    pub fn new(model: Arc<Actrm>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Self {
+        let history = History::new(preprocess.signature().n_obs_steps);
+        Self { model, preprocess, clock, history, last: None, executed: 0, times: Vec::new() }
     }
 
     /// The thought behind the last prediction.
     pub fn last_reasoning(&self) -> Option<&Reasoning> {
         self.last.as_ref()
     }
+}
 
-    /// The previous answer, moved on by the actions executed since; the last token fills the end.
-    fn warm_start(&self) -> Result<Option<Tensor>> {
-        let (Some(warm), Some(last)) = (self.model.config.reasoning.warm_start, &self.last) else {
-            return Ok(None);
-        };
-        let tokens = self.model.config.action_horizon as u32;
-        let moved: Vec<u32> = (0..tokens).map(|i| (i + warm.shift as u32).min(tokens - 1)).collect();
-        let moved = Tensor::new(moved, last.answer.device())?;
-        Ok(Some(last.answer.index_select(&moved, 1)?))
-    }
+/// The previous answer, moved on by the actions executed since; the last token fills the end.
+fn warm_start(config: &Config, last: Option<&Reasoning>, executed: usize) -> Result<Option<Tensor>> {
+    let (Some(_), Some(last)) = (config.reasoning.warm_start, last) else {
+        return Ok(None);
+    };
+    let tokens = config.action_horizon;
+    let moved: Vec<u32> = (0..tokens).map(|i| (i + executed).min(tokens - 1) as u32).collect();
+    let moved = Tensor::new(moved, last.answer.device())?;
+    Ok(Some(last.answer.index_select(&moved, 1)?))
 }
 
 impl Policy for ReasoningPolicy {
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
-        let seen = self.preprocess.observation(std::slice::from_ref(observation))?;
-        let start = self.warm_start()?;
-        let mut budget = self.budget.as_mut().zip(self.model.config.reasoning.budget_ms);
-        if let Some((clock, _)) = &mut budget {
-            clock.begin();
-        }
-        let mut should_stop = |_: usize| budget.as_mut().is_some_and(|(clock, ms)| clock.is_spent(*ms));
+        let (clock, budget) = (&mut self.clock, self.model.config.reasoning.budget_ms);
+        let begun = clock.milliseconds();
+        let seen = self.history.see(&self.preprocess, observation)?;
+        let start = warm_start(&self.model.config, self.last.as_ref(), self.executed)?;
+        let (mut before, mut times) = (begun, Vec::new());
+        let mut should_stop = |_: usize| {
+            let now = clock.milliseconds();
+            times.push(now - std::mem::replace(&mut before, now));
+            budget.is_some_and(|budget| now - begun >= budget)
+        };
         let reasoning = self.model.reason(&seen, start.as_ref(), &mut should_stop)?;
         let chunk = self.preprocess.chunk(&reasoning.chunk)?;
-        self.last = Some(reasoning);
+        (self.last, self.executed, self.times) = (Some(reasoning), 0, times);
         Ok(chunk)
     }
 
-    fn reset(&mut self) {
-        self.last = None;
+    fn n_obs_steps(&self) -> usize {
+        self.history.steps()
+    }
+
+    fn observe(&mut self, observation: &Observation) {
+        self.history.observe(observation);
+    }
+
+    fn executed(&mut self, actions: usize) {
+        self.executed += actions;
+    }
+
+    fn reset(&mut self, _seed: u64) {
+        self.history.clear();
+        (self.last, self.executed) = (None, 0);
+    }
+
+    fn thought(&self) -> Result<Vec<ThoughtStep>> {
+        let steps = self.last.iter().flat_map(|last| &last.steps).zip(&self.times);
+        steps
+            .map(|(step, &milliseconds)| {
+                let change = step.change.first().copied().filter(|change| change.is_finite());
+                let halt = step.halt.first().copied().unwrap_or_default();
+                Ok(ThoughtStep { chunk: self.preprocess.chunk(&step.chunk)?, change, halt, milliseconds })
+            })
+            .collect()
     }
 }

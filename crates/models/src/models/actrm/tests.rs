@@ -194,15 +194,33 @@ fn observation(seed: u64) -> Observation {
     Observation::of_state(rng.normals(9), rng.normals(10))
 }
 
-struct Fake(f64);
+/// A millisecond passes between two looks at it.
+struct Ticking(f64);
 
-impl Budget for Fake {
-    fn begin(&mut self) {
-        self.0 = 0.0;
-    }
-    fn is_spent(&mut self, budget_ms: f64) -> bool {
+impl Clock for Ticking {
+    fn milliseconds(&mut self) -> f64 {
         self.0 += 1.0;
-        self.0 >= budget_ms
+        self.0
+    }
+}
+
+fn ticking() -> Box<dyn Clock> {
+    Box::new(Ticking(0.0))
+}
+
+#[test]
+fn without_warm_start_and_budget_the_policy_predicts() {
+    for config in designs() {
+        let model = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
+        assert!(!model.depends_on_time());
+        let mut policy = Arc::clone(&model).policy(identity(), ticking());
+        for seed in 0..3 {
+            let chunk = policy.predict(&observation(seed)).unwrap();
+            let seen = identity().observation(&[observation(seed)]).unwrap();
+            let predicted = model.predict(&seen).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            let bits = |x: &[f32]| x.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+            assert_eq!(bits(&chunk.actions), bits(&predicted));
+        }
     }
 }
 
@@ -213,17 +231,37 @@ fn the_policy_keeps_to_its_budget_and_starts_warm() {
     config.reasoning.halt_threshold = 1.0;
     config.reasoning.change_threshold = 0.0;
     config.reasoning.budget_ms = Some(3.0);
-    config.reasoning.warm_start = Some(WarmStart { shift: 2, noise: 0.1 });
+    config.reasoning.warm_start = Some(WarmStart { noise: 0.1 });
     let model = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
-    assert!(ReasoningPolicy::new(Arc::clone(&model), identity(), None).is_err());
-    let mut policy = ReasoningPolicy::new(Arc::clone(&model), identity(), Some(Box::new(Fake(0.0)))).unwrap();
+    assert!(model.depends_on_time());
+    let mut policy = ReasoningPolicy::new(Arc::clone(&model), identity(), ticking());
+    assert!(policy.thought().unwrap().is_empty());
     let first = policy.predict(&observation(1)).unwrap();
     assert_eq!((first.action_horizon, first.action_dim), (5, 7));
     assert_eq!(policy.last_reasoning().unwrap().depth, [3]);
+    // every step is on record, the last is what is executed
+    let thought = policy.thought().unwrap();
+    assert_eq!(thought.iter().map(|step| step.milliseconds).collect::<Vec<_>>(), [1.0; 3]);
+    assert_eq!(thought[2].chunk, first);
+    assert_eq!(thought.iter().map(|step| step.change.is_some()).collect::<Vec<_>>(), [false, true, true]);
     let warm = policy.predict(&observation(1)).unwrap();
     assert_ne!(warm, first, "the second thought starts from the first");
-    policy.reset();
+    // what was executed in between moves the start
+    let after = |actions: usize| {
+        let mut policy = Arc::clone(&model).policy(identity(), ticking());
+        policy.predict(&observation(1)).unwrap();
+        policy.executed(actions);
+        policy.predict(&observation(1)).unwrap()
+    };
+    assert_eq!(after(0), warm);
+    assert_ne!(after(2), warm);
+    policy.reset(7);
     assert_eq!(policy.predict(&observation(1)).unwrap(), first);
+    // more time, another answer
+    config.reasoning.budget_ms = Some(6.0);
+    let patient = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
+    let longer = patient.policy(identity(), ticking()).predict(&observation(1)).unwrap();
+    assert_ne!(longer, first);
     // and the model trains with warm starts
     let mut batch = batch(&config, 4, 0);
     batch.seed = 1;
@@ -243,7 +281,6 @@ fn impossible_configurations_name_the_field() {
         (with(&|c| c.reasoning.tokens = 0), "reasoning.tokens"),
         (with(&|c| c.reasoning.max_steps = Some(0)), "reasoning.max_steps"),
         (with(&|c| c.reasoning.halt_threshold = 1.5), "reasoning.halt_threshold"),
-        (with(&|c| c.reasoning.warm_start = Some(WarmStart { shift: 9, noise: 0.0 })), "warm_start.shift"),
     ] {
         assert!(error.contains(field), "{error}");
     }

@@ -37,7 +37,7 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         change(&mut reasoning);
         Config { reasoning, ..base.clone() }
     };
-    let warm = Some(WarmStart { shift: 1, noise: 0.1 });
+    let warm = Some(WarmStart { noise: 0.1 });
     let gelu = Activation::Gelu;
     vec![
         (reasoning(&|_| ()), plain.clone(), 3),

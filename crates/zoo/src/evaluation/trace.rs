@@ -1,0 +1,308 @@
+//! What a policy did and thought in one episode, query by query: as text, as JSON and as a Parquet table.
+
+use std::fmt::Write as _;
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use arrow::array::{ArrayRef, BooleanArray, Float64Array, Float64Builder, ListBuilder, UInt32Array, UInt64Array};
+use models::{ActionChunk, ModelError, Observation, Policy, ThoughtStep};
+use rollout::{EpisodePlan, Outcome, Pool, RolloutError, Worker};
+use serde::Serialize;
+
+use super::Subject;
+use super::agent::PolicyAgent;
+use crate::ZooError;
+use crate::results::write_table;
+
+/// One episode of a policy.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PolicyTrace {
+    /// The entry, `name@version`.
+    pub entry: String,
+    /// The task.
+    pub task: String,
+    /// The episode's seed.
+    pub seed: u64,
+    /// Whether the task was done.
+    pub success: bool,
+    /// Control steps done.
+    pub steps: usize,
+    /// Sum of the rewards.
+    pub total_reward: f64,
+    /// Every time that the policy was asked.
+    pub queries: Vec<TracedQuery>,
+}
+
+/// One query of a policy.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TracedQuery {
+    /// Control steps done before it.
+    pub step: usize,
+    /// Actions of its answer that were executed, or went into the average that was.
+    pub executed: usize,
+    /// How long it took.
+    pub milliseconds: f64,
+    /// What it thought, step by step; the last answer is the one that counts. A policy that does not think has one.
+    pub thought: Vec<TracedThought>,
+}
+
+/// The answer after one step of a thought.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TracedThought {
+    /// The chunk: actions in the environment's units, in order of time.
+    pub actions: Vec<Vec<f32>>,
+    /// Mean absolute change since the step before, in the network's units; the first has none.
+    pub change: Option<f32>,
+    /// The probability that the policy gave another step not to help; absent if it does not think.
+    pub halt: Option<f32>,
+    /// How long the step took.
+    pub milliseconds: f64,
+}
+
+/// The queries of an episode under way, shared with the policy that fills them.
+type Queries = Arc<Mutex<Vec<TracedQuery>>>;
+
+/// A policy whose queries are kept.
+struct Traced {
+    policy: Box<dyn Policy>,
+    queries: Queries,
+    step: usize,
+}
+
+fn rows(chunk: &ActionChunk) -> Vec<Vec<f32>> {
+    chunk.rows().map(<[f32]>::to_vec).collect()
+}
+
+impl Policy for Traced {
+    fn predict(&mut self, observation: &Observation) -> Result<ActionChunk, ModelError> {
+        let asked = Instant::now();
+        let chunk = self.policy.predict(observation)?;
+        let milliseconds = asked.elapsed().as_secs_f64() * 1e3;
+        let of = |step: ThoughtStep| {
+            let ThoughtStep { chunk, change, halt, milliseconds } = step;
+            TracedThought { actions: rows(&chunk), change, halt: Some(halt), milliseconds }
+        };
+        let mut thought: Vec<TracedThought> = self.policy.thought()?.into_iter().map(of).collect();
+        if thought.is_empty() {
+            thought.push(TracedThought { actions: rows(&chunk), change: None, halt: None, milliseconds });
+        }
+        let query = TracedQuery { step: self.step, executed: 0, milliseconds, thought };
+        self.queries.lock().unwrap_or_else(PoisonError::into_inner).push(query);
+        Ok(chunk)
+    }
+
+    fn n_obs_steps(&self) -> usize {
+        self.policy.n_obs_steps()
+    }
+
+    fn observe(&mut self, observation: &Observation) {
+        self.policy.observe(observation);
+    }
+
+    fn executed(&mut self, actions: usize) {
+        self.step += actions;
+        if let Some(query) = self.queries.lock().unwrap_or_else(PoisonError::into_inner).last_mut() {
+            query.executed += actions;
+        }
+        self.policy.executed(actions);
+    }
+
+    fn reset(&mut self, seed: u64) {
+        self.step = 0;
+        self.queries.lock().unwrap_or_else(PoisonError::into_inner).clear();
+        self.policy.reset(seed);
+    }
+
+    fn thought(&self) -> Result<Vec<ThoughtStep>, ModelError> {
+        self.policy.thought()
+    }
+}
+
+/// Runs the episode of `seed` as an evaluation would and keeps what the policy thought; nothing if it was stopped.
+///
+/// # Errors
+/// As for an evaluation.
+pub fn trace(subject: &Subject<'_>, pool: &mut Pool, seed: u64) -> Result<Option<PolicyTrace>, RolloutError> {
+    let (task, max_steps) = (pool.ready().task.clone(), subject.max_steps.unwrap_or(pool.ready().max_steps));
+    let plan = EpisodePlan::new(pool.ready(), subject.keys.keys(), max_steps)?;
+    let state = || {
+        let queries = Queries::default();
+        let traced = |policy| Traced { policy, queries: Arc::clone(&queries), step: 0 };
+        let made = (subject.policy)().and_then(|policy| subject.acting(traced(policy)));
+        let operation = "building the policy";
+        let made =
+            made.map_err(|source| RolloutError::Policy { seed, step: 0, operation, source: Box::new(source) })?;
+        Ok((made, queries))
+    };
+    let work = |(agent, queries): &mut (PolicyAgent, Queries), worker: &mut Worker, _| {
+        let outcome = plan.run(worker, agent, seed, None)?;
+        let queries = std::mem::take(&mut *queries.lock().unwrap_or_else(PoisonError::into_inner));
+        Ok((outcome, queries))
+    };
+    let mut ended: Option<Result<(Outcome, Vec<TracedQuery>), RolloutError>> = None;
+    pool.run(0..1, &|_| seed, &state, &work, &mut |_, result| {
+        ended = Some(result);
+        ControlFlow::Continue(())
+    })?;
+    let Some(ended) = ended else { return Ok(None) };
+    let (outcome, mut queries) = ended?;
+    for query in &mut queries {
+        // the last of what was planned ahead is not executed where the episode ends before
+        query.executed = query.executed.min(outcome.steps.saturating_sub(query.step));
+    }
+    Ok(Some(PolicyTrace {
+        entry: subject.entry.to_string(),
+        task,
+        seed,
+        success: outcome.success,
+        steps: outcome.steps,
+        total_reward: outcome.total_reward,
+        queries,
+    }))
+}
+
+impl PolicyTrace {
+    /// As text: a line for each step of a thought, with the first action of its answer.
+    pub fn to_text(&self) -> String {
+        let how = if self.success { "success" } else { "failure" };
+        let mut text = format!(
+            "{} on {}, seed {}: {how} after {} steps, return {:.2}, asked {} times\n\n",
+            self.entry,
+            self.task,
+            self.seed,
+            self.steps,
+            self.total_reward,
+            self.queries.len()
+        );
+        text.push_str("  step  thought   change   halt       ms  executed  first action\n");
+        for query in &self.queries {
+            for (at, thought) in query.thought.iter().enumerate() {
+                let last = at + 1 == query.thought.len();
+                let step = if at == 0 { query.step.to_string() } else { String::new() };
+                let executed = if last { query.executed.to_string() } else { String::new() };
+                let change = thought.change.map_or("-".to_owned(), |change| format!("{change:.4}"));
+                let halt = thought.halt.map_or("-".to_owned(), |halt| format!("{halt:.3}"));
+                let first = thought.actions.first().map_or(&[][..], Vec::as_slice);
+                let action: Vec<String> = first.iter().map(|x| format!("{x:+.3}")).collect();
+                let _ = writeln!(
+                    text,
+                    "{step:>6}  {:>7}  {change:>7}  {halt:>5}  {:>7.3}  {executed:>8}  {}",
+                    at + 1,
+                    thought.milliseconds,
+                    action.join(" ")
+                );
+            }
+        }
+        text
+    }
+
+    /// As a table with a row for each action of each answer: `step` of the query, `thought` from 1, `ahead` from 0,
+    /// `executed`, `change`, `halt`, `milliseconds` of the thought's step, `action`.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn write_parquet(&self, path: &Path) -> Result<(), ZooError> {
+        let rows: Vec<_> = self
+            .queries
+            .iter()
+            .flat_map(|query| {
+                let thoughts = query.thought.len();
+                query.thought.iter().enumerate().flat_map(move |(at, thought)| {
+                    let last = at + 1 == thoughts;
+                    let actions = thought.actions.iter().enumerate();
+                    actions.map(move |(ahead, action)| {
+                        (query.step, at + 1, ahead, last && ahead < query.executed, thought, action)
+                    })
+                })
+            })
+            .collect();
+        let whole = |x: usize| u32::try_from(x).unwrap_or(u32::MAX);
+        let mut actions = ListBuilder::new(Float64Builder::new());
+        for (.., action) in &rows {
+            actions.values().append_slice(&action.iter().map(|&x| f64::from(x)).collect::<Vec<_>>());
+            actions.append(true);
+        }
+        let numbers = |of: &dyn Fn(&TracedThought) -> Option<f64>| -> ArrayRef {
+            Arc::new(rows.iter().map(|(_, _, _, _, thought, _)| of(thought)).collect::<Float64Array>())
+        };
+        let seeds = std::iter::repeat_n(self.seed, rows.len());
+        let columns: Vec<(&str, ArrayRef)> = vec![
+            ("seed", Arc::new(UInt64Array::from_iter_values(seeds))),
+            ("step", Arc::new(UInt32Array::from_iter_values(rows.iter().map(|row| whole(row.0))))),
+            ("thought", Arc::new(UInt32Array::from_iter_values(rows.iter().map(|row| whole(row.1))))),
+            ("ahead", Arc::new(UInt32Array::from_iter_values(rows.iter().map(|row| whole(row.2))))),
+            ("executed", Arc::new(rows.iter().map(|row| Some(row.3)).collect::<BooleanArray>())),
+            ("change", numbers(&|thought| thought.change.map(f64::from))),
+            ("halt", numbers(&|thought| thought.halt.map(f64::from))),
+            ("milliseconds", numbers(&|thought| Some(thought.milliseconds))),
+            ("action", Arc::new(actions.finish())),
+        ];
+        write_table(path, columns)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use arrow::array::AsArray;
+    use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+
+    use super::*;
+
+    fn sample() -> PolicyTrace {
+        let thought = |first: f32, change, halt| TracedThought {
+            actions: vec![vec![first, -1.0], vec![0.5, 0.25]],
+            change,
+            halt,
+            milliseconds: 0.25,
+        };
+        PolicyTrace {
+            entry: "lift-actrm@1".into(),
+            task: "Lift".into(),
+            seed: 7,
+            success: true,
+            steps: 3,
+            total_reward: 1.0,
+            queries: vec![
+                TracedQuery {
+                    step: 0,
+                    executed: 2,
+                    milliseconds: 0.5,
+                    thought: vec![thought(0.125, None, Some(0.1)), thought(0.25, Some(0.0625), Some(0.95))],
+                },
+                TracedQuery { step: 2, executed: 1, milliseconds: 0.25, thought: vec![thought(1.0, None, None)] },
+            ],
+        }
+    }
+
+    #[test]
+    fn text_has_a_line_for_each_step_of_a_thought() {
+        let text = sample().to_text();
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(lines[0], "lift-actrm@1 on Lift, seed 7: success after 3 steps, return 1.00, asked 2 times");
+        assert_eq!(lines[2], "  step  thought   change   halt       ms  executed  first action");
+        assert_eq!(lines[3], "     0        1        -  0.100    0.250            +0.125 -1.000");
+        assert_eq!(lines[4], "               2   0.0625  0.950    0.250         2  +0.250 -1.000");
+        assert_eq!(lines[5], "     2        1        -      -    0.250         1  +1.000 -1.000");
+    }
+
+    #[test]
+    fn the_table_has_a_row_for_each_action() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("trace.parquet");
+        sample().write_parquet(&path).unwrap();
+        let reader = ParquetRecordBatchReaderBuilder::try_new(std::fs::File::open(&path).unwrap()).unwrap();
+        let batch = reader.build().unwrap().next().unwrap().unwrap();
+        assert_eq!(batch.num_rows(), 6);
+        let executed = batch.column_by_name("executed").unwrap().as_boolean();
+        let executed: Vec<bool> = executed.iter().map(|x| x.unwrap()).collect();
+        assert_eq!(executed, [false, false, true, true, true, false]);
+        let halt = batch.column_by_name("halt").unwrap();
+        assert_eq!(halt.null_count(), 2);
+        let actions = batch.column_by_name("action").unwrap().as_list::<i32>();
+        let last = actions.value(4);
+        assert_eq!(last.as_primitive::<arrow::datatypes::Float64Type>().values()[..], [1.0, -1.0]);
+    }
+}
