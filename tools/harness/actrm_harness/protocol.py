@@ -44,7 +44,7 @@ class Reset:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Control steps; the tensor "action" is one action, or one a row, done in order until the task is solved."""
+    """Control steps; the tensor "action" is one action, or one a row, done until the task is solved or lost."""
 
     id: int
 

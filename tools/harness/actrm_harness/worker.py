@@ -183,6 +183,7 @@ def answer(simulation: Simulation, request: protocol.Request, tensors: wire.Tens
             "id": request.id,
             "reward": float(stepped.rewards[-1]),
             "success": stepped.success,
+            "failure": stepped.failure,
         }
         return reply, {"rewards": stepped.rewards, **observed(stepped.observation)}
     if isinstance(request, protocol.Reset):

@@ -59,8 +59,10 @@ class Stepped:
 
     observation: Tensors
     rewards: Array
-    """Of each step that was done; success ends them early."""
+    """Of each step that was done; success and failure end them early."""
     success: bool
+    failure: str | None = None
+    """In a word why the task can no longer be solved, where that is known: the episode ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,7 @@ class Simulation(Protocol):
         ...
 
     def step(self, actions: Array) -> Stepped:
-        """Do one action, or one a row until the task is solved."""
+        """Do one action, or one a row until the task is solved or lost."""
         ...
 
     def expert(self, seed: int, demonstration: bool) -> Episode:

@@ -70,6 +70,8 @@ class StepResult:
     observation: Tensors
     reward: float
     success: bool
+    failure: str | None = None
+    """In a word why the task can no longer be solved, where the environment says so: the episode ends."""
 
 
 # What this package decides whatever recorded arguments say: what is drawn, and when an episode ends.
@@ -176,7 +178,7 @@ def reset(session: Session, seed: int, demonstration: bool = False) -> Tensors:
         find(session.task.redraw)(env)
     raw = env.reset()
     env.hard_reset = not session.task.soft_reset
-    return {**observation(raw), **images(session)}
+    return {**observation(env, raw), **images(session)}
 
 
 def slim(session: Session) -> None:
@@ -195,14 +197,14 @@ def step_session(session: Session, action: Array) -> StepResult:
 
 
 def steps_session(session: Session, actions: Array) -> tuple[StepResult, Array]:
-    """Control steps, one after the other until the task is solved: what the last one led to, and all rewards.
+    """Control steps, one after the other until the task is solved or lost: what the last one led to, and all rewards.
 
     What is seen between them is not looked at, nor observed where that is known to change nothing.
     """
     env, control = session.env, session.control
     raw: dict[str, Array] = {}
     rewards: list[float] = []
-    solved = False
+    solved, lost = False, None
     blind = len(actions) - 1 if _ours(env) else 0
     with judged_once(env) as begin_step:
         for index, action in enumerate(actions):
@@ -211,10 +213,11 @@ def steps_session(session: Session, actions: Array) -> tuple[StepResult, Array]:
             raw, reward, _, _ = env.step(action) if control is None else control.step(action, look)
             rewards.append(float(reward))
             solved = success(env)
-            if solved:
+            lost = None if solved else failure(env)
+            if solved or lost is not None:
                 raw = raw if look or control is None else control.look()
                 break
-    return StepResult({**observation(raw), **images(session)}, rewards[-1], solved), np.array(rewards)
+    return StepResult({**observation(env, raw), **images(session)}, rewards[-1], solved, lost), np.array(rewards)
 
 
 def image(session: Session, camera: str, height: int, width: int) -> Array:
@@ -236,7 +239,8 @@ def step(env: Env, action: Array, control: Control | None) -> StepResult:
     """One control step, through robosuite's loop or through `control`."""
     with judged_once(env):
         raw, reward, _, _ = env.step(action) if control is None else control.step(action)
-        return StepResult(observation(raw), float(reward), success(env))
+        solved = success(env)
+        return StepResult(observation(env, raw), float(reward), solved, None if solved else failure(env))
 
 
 _JUDGES = ("_check_success", "staged_rewards")
@@ -284,6 +288,12 @@ def success(env: Env) -> bool:
     return bool(env._check_success())  # pyright: ignore[reportPrivateUsage]
 
 
+def failure(env: Env) -> str | None:
+    """In a word why the task can no longer be solved; most environments never give up."""
+    judge = getattr(env, "failure", None)
+    return None if judge is None else judge()
+
+
 def check_actions(env: Env, actions: Array) -> Array:
     """The actions, one or a row each, as rows of float64; RequestError where they are none."""
     width = env.action_dim
@@ -297,17 +307,21 @@ def check_actions(env: Env, actions: Array) -> Array:
     return rows.copy()
 
 
-def observation(raw: dict[str, Array]) -> Tensors:
+def observation(env: Env, raw: dict[str, Array]) -> Tensors:
     """Robosuite's observations under robomimic's names.
 
     "object-state" becomes "object"; the robot's own values keep their names; the separate values that "object-state"
-    joins and the joined robot state are left out.
+    joins and the joined robot state are left out. An environment of ours may give its separate values too
+    (`parts`), so that a policy can tell its things apart, and leave out what joins them (`joined`).
     """
     kept: Tensors = {}
+    parts: frozenset[str] = getattr(env, "parts", frozenset())
+    joined: bool = getattr(env, "joined", True)
     for name, value in raw.items():
         if name == "object-state":
-            kept["object"] = np.asarray(value, dtype=np.float64)
-        elif _of_robot(name):
+            if joined:
+                kept["object"] = np.asarray(value, dtype=np.float64)
+        elif name in parts or _of_robot(name):
             kept[name] = np.asarray(value, dtype=np.float64)
     return kept
 

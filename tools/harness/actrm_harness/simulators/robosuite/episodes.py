@@ -79,7 +79,7 @@ def expert_episode(session: Session, seed: int, demonstration: bool = True) -> E
         result = envs.step_session(session, action)
         recorder.add(before, action, result)
         held = held + 1 if result.success else 0
-        if held > STEPS_AFTER_SUCCESS:
+        if held > STEPS_AFTER_SUCCESS or result.failure is not None:
             break
     return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors())
 
@@ -127,7 +127,7 @@ def _put(session: Session, flat: Array) -> Tensors:
     env = session.env
     env.sim.set_state_from_flattened(flat)
     env.sim.forward()
-    seen = envs.observation(env._get_observations(force_update=True))  # pyright: ignore[reportPrivateUsage]
+    seen = envs.observation(env, env._get_observations(force_update=True))  # pyright: ignore[reportPrivateUsage]
     return {**seen, **envs.images(session)}
 
 

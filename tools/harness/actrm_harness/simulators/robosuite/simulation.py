@@ -51,11 +51,11 @@ class Robosuite:
         return Initial(first, envs.fingerprint(self.session.env), self.session.env.get_ep_meta())
 
     def step(self, actions: Array) -> Stepped:
-        """Do one action, or one a row until the task is solved."""
+        """Do one action, or one a row until the task is solved or lost."""
         checked = envs.check_actions(self.session.env, actions)
         envs.slim(self.session)
         result, rewards = envs.steps_session(self.session, checked)
-        return Stepped(result.observation, rewards, result.success)
+        return Stepped(result.observation, rewards, result.success, result.failure)
 
     def expert(self, seed: int, demonstration: bool) -> Episode:
         """One whole episode of the task's scripted expert."""
