@@ -18,6 +18,10 @@ pub enum DatasetError {
         path: PathBuf,
     },
 
+    /// Pictures could not be encoded.
+    #[error(transparent)]
+    Video(#[from] video::VideoError),
+
     /// A file operation failed.
     #[error("{path}: cannot {operation}", path = path.display())]
     Io {
@@ -293,6 +297,15 @@ pub enum InputError {
         limit: u64,
     },
 
+    /// A video cannot be used; the text names the file, what was expected and what was found.
+    #[error("{text}")]
+    Video {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        text: String,
+    },
+
     /// A demo, key or range that was asked for does not exist.
     #[error("{path}: no {wanted}; there is {found}", path = path.display())]
     NoSuch {
@@ -311,8 +324,8 @@ pub enum InputError {
         path: PathBuf,
     },
 
-    /// The reading process ended without an answer: the file crashed the HDF5 library.
-    #[error("{path}: damaged: the HDF5 library {how} while it was to {during}", path = path.display())]
+    /// The reading process ended without an answer: the file crashed the library that reads its kind.
+    #[error("{path}: damaged: the process that reads it {how} while it was to {during}", path = path.display())]
     ReaderDied {
         /// The file.
         path: PathBuf,

@@ -26,13 +26,13 @@ mod windows;
 pub use error::{DatasetError, InputError, Result};
 pub use keys::KeyItem;
 pub use lerobot::{
-    ACTION, ActionKind, ActionProvenance, Check, Column, ConvertOptions, ConvertReport, Dataset, ENTITY_PREFIX,
-    ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info, Provenance,
-    RotationForm, STATE, convert, export, verify, verify_source,
+    ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset,
+    ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info, Pictures, Provenance,
+    RotationForm, STATE, VideoOptions, VideoProvenance, convert, export, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};
-pub use source::{RobomimicWriter, Source, WriteOptions, isolation};
+pub use source::{RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};
 pub use windows::{WindowBatch, WindowSpec, Windows};

@@ -7,7 +7,7 @@ use super::check;
 use super::encode::{ColumnSummary, GroupOutput, Job, PartSummary, PictureSummary};
 use super::features::{ConvertOptions, Mapping};
 use super::fingerprint::Fingerprint;
-use super::info::{self, Info, Provenance};
+use super::info::{self, Info, Provenance, VideoProvenance};
 use super::meta::{self, EpisodeRow};
 use super::schema::{self, CREATED_BY};
 use super::shards::{GroupEncoder, Place, ShardWriter, WrittenFile};
@@ -15,6 +15,7 @@ use super::side::{self, SideEncoder, SideOutput, SideWriter};
 use super::staging::Staging;
 use super::values::{Values, stats_of};
 use super::verify::hash_source;
+use super::videos::{self, VideoWriter};
 use super::work::{self, Part};
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::Plan;
@@ -109,6 +110,7 @@ impl Conversion<'_> {
             source: input,
             mapping: self.mapping,
             images: self.options.images,
+            video: self.options.video.as_ref(),
             encoder: &encoder,
             task_of: &task_of,
         };
@@ -117,7 +119,7 @@ impl Conversion<'_> {
         let mut shards = ShardWriter::new(self.root, "data", &encoder, limit, info::FILES_PER_FOLDER);
         let side = match self.options.lossless {
             true => {
-                let side = SideEncoder::new(self.root, self.plan, &self.mapping.columns)?;
+                let side = SideEncoder::new(self.root, self.plan, &self.mapping.columns, self.options.video.as_ref())?;
                 Some((side, side::object_encoder(self.root)?, input.root()?))
             }
             false => None,
@@ -128,7 +130,9 @@ impl Conversion<'_> {
             }
             None => None,
         };
-        let mut collected = Collected::new(self.mapping, &tasks);
+        let video_limit = (self.options.video_file_mb * f64::from(1 << 20)) as u64;
+        let films = VideoWriter::new(self.root, video_limit, &self.mapping.columns, self.mapping.fps)?;
+        let mut collected = Collected::new(self.mapping, &tasks, films);
         let total = self.plan.frames() as u64;
         let mut done = 0;
         progress(0, total);
@@ -145,7 +149,7 @@ impl Conversion<'_> {
                 done += output.group.rows as u64;
                 let place = shards.append(output.group, begins)?;
                 for part in output.parts {
-                    collected.add(part, place, &task_of);
+                    collected.add(part, place, &task_of)?;
                 }
                 if let (Some(writer), Some(beside)) = (&mut side_writer, beside) {
                     writer.append(beside)?;
@@ -158,7 +162,8 @@ impl Conversion<'_> {
         if let Some(writer) = side_writer {
             files.extend(writer.finish()?);
         }
-        let (rows, stats, fingerprint) = collected.finish();
+        let (rows, stats, fingerprint, films) = collected.finish();
+        files.extend(films.finish()?);
         Ok(Frames { tasks, rows, stats, fingerprint, files })
     }
 
@@ -177,6 +182,11 @@ impl Conversion<'_> {
             task_of.push(index);
         }
         (tasks, task_of)
+    }
+
+    /// Whether any column becomes videos.
+    fn films(&self) -> bool {
+        self.mapping.columns.iter().any(|c| c.feature.dtype == "video")
     }
 
     fn jobs(&self) -> usize {
@@ -249,11 +259,11 @@ impl Conversion<'_> {
             total_tasks: tasks.len(),
             chunks_size: info::FILES_PER_FOLDER,
             data_files_size_in_mb: self.options.data_file_mb,
-            video_files_size_in_mb: 200.0,
+            video_files_size_in_mb: self.options.video_file_mb,
             fps: self.mapping.fps,
             splits: BTreeMap::from([("train".to_owned(), format!("0:{}", plan.demos.len()))]),
             data_path: info::DATA_PATH.to_owned(),
-            video_path: None,
+            video_path: self.films().then(|| videos::VIDEO_PATH.to_owned()),
             features: self.mapping.features(),
             actrm: Some(Provenance {
                 format: 1,
@@ -273,6 +283,13 @@ impl Conversion<'_> {
                 masks,
                 lossless: self.options.lossless,
                 seal: None,
+                video: self.options.video.filter(|_| self.films()).map(|v| VideoProvenance {
+                    encoder: videos::ENCODER.to_owned(),
+                    speed: v.speed,
+                    quantizer: v.quantizer,
+                    key_interval: v.key_interval,
+                    side_pictures: v.side_pictures && self.options.lossless,
+                }),
             }),
         }
     }
@@ -290,10 +307,11 @@ struct Collected<'a> {
     open: Option<(Vec<ColumnSummary>, BTreeMap<usize, PictureSummary>)>,
     fingerprint: Fingerprint,
     tasks: &'a [String],
+    films: VideoWriter<'a>,
 }
 
 impl<'a> Collected<'a> {
-    fn new(mapping: &'a Mapping, tasks: &'a [String]) -> Self {
+    fn new(mapping: &'a Mapping, tasks: &'a [String], films: VideoWriter<'a>) -> Self {
         Self {
             mapping,
             rows: Vec::new(),
@@ -302,10 +320,11 @@ impl<'a> Collected<'a> {
             open: None,
             fingerprint: Fingerprint::new(&mapping.features(), mapping.fps),
             tasks,
+            films,
         }
     }
 
-    fn add(&mut self, summary: PartSummary, place: Place, task_of: &[usize]) {
+    fn add(&mut self, summary: PartSummary, place: Place, task_of: &[usize]) -> Result<()> {
         let part = summary.part;
         if part.begins() {
             self.rows.push(EpisodeRow {
@@ -314,6 +333,7 @@ impl<'a> Collected<'a> {
                 task_index: task_of[part.episode],
                 place,
                 stats: BTreeMap::new(),
+                videos: BTreeMap::new(),
             });
             self.open = Some((summary.values, summary.pictures));
         } else if let Some((_, pictures)) = &mut self.open {
@@ -321,18 +341,19 @@ impl<'a> Collected<'a> {
                 pictures.entry(column).or_default().extend(next);
             }
         }
-        if part.ends() {
-            self.close(&part);
-        }
+        if part.ends() { self.close(&part) } else { Ok(()) }
     }
 
-    fn close(&mut self, part: &Part) {
-        let Some((columns, mut pictures)) = self.open.take() else { return };
+    fn close(&mut self, part: &Part) -> Result<()> {
+        let Some((columns, mut pictures)) = self.open.take() else { return Ok(()) };
         let row = self.rows.last_mut().expect("an open episode has its row");
         self.fingerprint.episode(part.length, &self.tasks[row.task_index]);
         for (index, (column, summary)) in self.mapping.columns.iter().zip(columns).enumerate() {
             let (stats, digest) = match pictures.remove(&index) {
                 Some(found) => {
+                    if column.feature.dtype == "video" {
+                        row.videos.insert(column.name.clone(), self.films.append(index, &found.samples)?);
+                    }
                     let digest = found.digest();
                     let total = self.totals.entry(index).or_default();
                     total.add_counts(&found.histograms, found.sampled);
@@ -348,9 +369,10 @@ impl<'a> Collected<'a> {
             }
             self.values[index].push(summary.values);
         }
+        Ok(())
     }
 
-    fn finish(self) -> (Vec<EpisodeRow>, BTreeMap<String, FeatureStats>, String) {
+    fn finish(self) -> (Vec<EpisodeRow>, BTreeMap<String, FeatureStats>, String, VideoWriter<'a>) {
         let mut stats = BTreeMap::new();
         for (index, column) in self.mapping.columns.iter().enumerate() {
             let of_column = match self.totals.get(&index) {
@@ -361,6 +383,6 @@ impl<'a> Collected<'a> {
                 stats.insert(column.name.clone(), of_column);
             }
         }
-        (self.rows, stats, self.fingerprint.finish())
+        (self.rows, stats, self.fingerprint.finish(), self.films)
     }
 }

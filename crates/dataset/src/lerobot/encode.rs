@@ -1,15 +1,16 @@
 //! One row group of the data files: read from the source, turned into Arrow arrays, compressed.
 
-use super::features::{Column, ImageForm, Mapping, Origin};
+use super::features::{Column, ImageForm, Mapping, Origin, VideoOptions};
 use super::images;
 use super::schema::{element, image_fields};
 use super::shards::{EncodedGroup, GroupEncoder};
 use super::values::{Position, Values, episode_values};
+use super::videos::Camera;
 use super::work::{Part, is_bulk};
 use crate::error::{DatasetError, InputError, Result};
 use crate::source::Source;
 use crate::stats::FeatureStats;
-use crate::tree::Demo;
+use crate::tree::{Array, Demo};
 use arrow::array::{
     ArrayRef, BinaryArray, BooleanArray, FixedSizeListArray, Float32Array, Int64Array, StringArray, StructArray,
 };
@@ -26,6 +27,7 @@ pub(crate) struct Job<'a> {
     pub source: &'a Source,
     pub mapping: &'a Mapping,
     pub images: ImageForm,
+    pub video: Option<&'a VideoOptions>,
     pub encoder: &'a GroupEncoder,
     /// Task of each episode.
     pub task_of: &'a [usize],
@@ -34,8 +36,10 @@ pub(crate) struct Job<'a> {
 /// Pictures of one column over the rows of a part.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct PictureSummary {
-    /// sha256 of each picture's pixels.
+    /// sha256 of each picture's pixels, as a reader will get them.
     pub digests: Vec<[u8; 32]>,
+    /// Each picture as a sample of a video, where they become one.
+    pub samples: Vec<video::Sample>,
     /// Histogram of each channel over the sampled pixels of the sampled pictures.
     pub histograms: Vec<[u64; 256]>,
     /// Pictures sampled.
@@ -106,12 +110,18 @@ impl Job<'_> {
             .collect();
         let mut arrays: Vec<ArrayRef> = Vec::with_capacity(self.mapping.columns.len());
         for (index, column) in self.mapping.columns.iter().enumerate() {
-            arrays.push(match &column.origin {
-                Origin::Image { key, height, width } => {
-                    self.pictures(index, key, *height, *width, loaded, &mut summaries)?
+            match (&column.origin, self.video) {
+                (Origin::Image { key, height, width }, None) => {
+                    arrays.push(self.pictures(index, key, *height, *width, loaded, &mut summaries)?);
                 }
-                _ => number_array(column, index, loaded),
-            });
+                (Origin::Image { key, height, width }, Some(options)) => {
+                    for (l, summary) in loaded.iter().zip(&mut summaries) {
+                        let film = self.film(column, options, key, (*height, *width), l)?;
+                        summary.pictures.insert(index, film);
+                    }
+                }
+                _ => arrays.push(number_array(column, index, loaded)),
+            }
         }
         let failed = |source| DatasetError::Parquet {
             path: self.path.to_path_buf(),
@@ -148,18 +158,8 @@ impl Job<'_> {
         let mut names = Vec::new();
         for (l, summary) in loaded.iter().zip(summaries) {
             let rows = l.part.rows.clone();
-            let array = self.source.read_rows(l.part.episode, key, rows.start, rows.len())?;
+            let array = self.pixels(l, key, height, width)?;
             let size = height * width * 3;
-            if array.bytes.len() != size * rows.len() {
-                return Err(InputError::WrongShape {
-                    path: self.path.to_path_buf(),
-                    demo: l.demo.id.clone(),
-                    key: key.to_owned(),
-                    expected: format!("{} images of {height} x {width} x 3", rows.len()),
-                    found: format!("{} {:?}", array.dtype, array.shape),
-                }
-                .into());
-            }
             let sampled = sample(l.part.length);
             let mut pictures = PictureSummary { histograms: vec![[0; 256]; 3], ..PictureSummary::default() };
             for (frame, pixels) in rows.zip(array.bytes.chunks_exact(size)) {
@@ -184,6 +184,47 @@ impl Job<'_> {
         let bytes = BinaryArray::new(offsets, files.into(), None);
         let columns: Vec<ArrayRef> = vec![Arc::new(bytes), Arc::new(StringArray::from_iter_values(names))];
         Ok(Arc::new(StructArray::new(image_fields(), columns, None)))
+    }
+
+    /// The pictures of a part, as many bytes as they must have.
+    fn pixels(&self, l: &Loaded, key: &str, height: usize, width: usize) -> Result<Array> {
+        let rows = &l.part.rows;
+        let array = self.source.read_rows(l.part.episode, key, rows.start, rows.len())?;
+        if array.bytes.len() == height * width * 3 * rows.len() {
+            return Ok(array);
+        }
+        Err(InputError::WrongShape {
+            path: self.path.to_path_buf(),
+            demo: l.demo.id.clone(),
+            key: key.to_owned(),
+            expected: format!("{} images of {height} x {width} x 3", rows.len()),
+            found: format!("{} {:?}", array.dtype, array.shape),
+        }
+        .into())
+    }
+
+    /// Encodes the pictures of a part as video; the statistics are those of the pictures as they were recorded, as
+    /// LeRobot's are.
+    fn film(
+        &self,
+        column: &Column,
+        options: &VideoOptions,
+        key: &str,
+        (height, width): (usize, usize),
+        l: &Loaded,
+    ) -> Result<PictureSummary> {
+        let array = self.pixels(l, key, height, width)?;
+        let sampled = sample(l.part.length);
+        let mut summary = PictureSummary { histograms: vec![[0; 256]; 3], ..PictureSummary::default() };
+        let mut camera = Camera::new(column, self.mapping.fps, options)?;
+        for (frame, pixels) in l.part.rows.clone().zip(array.bytes.chunks_exact(height * width * 3)) {
+            camera.push(pixels)?;
+            if sampled.binary_search(&frame).is_ok() {
+                add_to_histograms(&mut summary, height, width, pixels);
+            }
+        }
+        (summary.samples, summary.digests) = camera.finish()?;
+        Ok(summary)
     }
 }
 
@@ -269,6 +310,7 @@ impl PictureSummary {
     /// Joins the next part of the same episode.
     pub(crate) fn extend(&mut self, next: Self) {
         self.digests.extend(next.digests);
+        self.samples.extend(next.samples);
         self.add_counts(&next.histograms, next.sampled);
     }
 

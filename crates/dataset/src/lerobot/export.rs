@@ -43,6 +43,14 @@ pub fn export(
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<ExportReport> {
     let info = read_info(root)?;
+    let of_side = info.actrm.as_ref().filter(|p| p.lossless);
+    if of_side.and_then(|p| p.video.as_ref()).is_some_and(|v| !v.side_pictures) {
+        return Err(DatasetError::NotInDataset {
+            path: root.to_path_buf(),
+            wanted: "exact pictures to rebuild the file from".to_owned(),
+            found: "video of them only (converted with --no-side-pictures)".to_owned(),
+        });
+    }
     let layout = side_folder(root, &info)?;
     let episodes = read_episodes(root, &info)?;
     let demos = info.actrm.as_ref().map_or(&[][..], |p| &p.demos);

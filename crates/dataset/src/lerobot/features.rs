@@ -35,6 +35,26 @@ pub enum ImageForm {
     Ppm,
 }
 
+/// How pictures become videos.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct VideoOptions {
+    /// 0 (slow, small) to 10.
+    pub speed: u8,
+    /// 1 (large, nearly exact) to 255.
+    pub quantizer: u8,
+    /// Frames from a key frame to the next.
+    pub key_interval: u16,
+    /// Keep the exact pictures in the side folder.
+    pub side_pictures: bool,
+}
+
+impl Default for VideoOptions {
+    fn default() -> Self {
+        let video::EncodeOptions { speed, quantizer, key_interval } = video::EncodeOptions::default();
+        Self { speed, quantizer, key_interval, side_pictures: true }
+    }
+}
+
 /// What a conversion may be told; the defaults are robomimic's.
 #[derive(Debug, Clone)]
 pub struct ConvertOptions {
@@ -51,6 +71,8 @@ pub struct ConvertOptions {
     pub fps: Option<f64>,
     /// How images are stored.
     pub images: ImageForm,
+    /// Store pictures as AV1 videos, which are not exact, instead of images.
+    pub video: Option<VideoOptions>,
     /// Which actions to take.
     pub actions: ActionKind,
     /// How to write the rotation part of actions.
@@ -61,6 +83,8 @@ pub struct ConvertOptions {
     pub jobs: usize,
     /// Size at which a data file is closed, in MiB.
     pub data_file_mb: f64,
+    /// Size at which a video file is closed, in MiB.
+    pub video_file_mb: f64,
 }
 
 impl Default for ConvertOptions {
@@ -71,11 +95,13 @@ impl Default for ConvertOptions {
             entities: BTreeMap::new(),
             fps: None,
             images: ImageForm::default(),
+            video: None,
             actions: ActionKind::default(),
             rotation: RotationForm::default(),
             lossless: true,
             jobs: 0,
             data_file_mb: 100.0,
+            video_file_mb: 200.0,
         }
     }
 }
@@ -180,7 +206,38 @@ impl Mapping {
         let mut notes = chooser.pictures_left_out(options.lossless);
         let fps = chooser.fps(options, &mut notes)?;
         let entities = options.entities.clone();
-        Ok(Self { columns, fps, state_keys, env_keys, entities, action: provenance, notes })
+        let mut mapping = Self { columns, fps, state_keys, env_keys, entities, action: provenance, notes };
+        if let Some(video) = &options.video {
+            mapping.film(video, options.lossless);
+        }
+        Ok(mapping)
+    }
+
+    /// Makes videos of the columns of images.
+    fn film(&mut self, options: &VideoOptions, lossless: bool) {
+        let exact = lossless && options.side_pictures;
+        for column in &mut self.columns {
+            let Origin::Image { height, width, .. } = column.origin else { continue };
+            column.feature.dtype = "video".to_owned();
+            let fps = if self.fps.fract() == 0.0 { json!(self.fps as i64) } else { json!(self.fps) };
+            column.feature.info = Some(json!({
+                "video.height": height, "video.width": width, "video.codec": "av1", "video.pix_fmt": "yuv420p",
+                "video.fps": fps, "video.channels": 3, "has_audio": false, "video.g": options.key_interval,
+                "video.video_backend": "rav1e",
+                "video.extra_options": {"speed": options.speed, "quantizer": options.quantizer},
+                "is_depth_map": false,
+            }));
+            let fate = match exact {
+                true => "the side folder keeps the exact ones",
+                false if lossless => {
+                    "the exact ones are left out (--no-side-pictures), so the source cannot be rebuilt"
+                }
+                false => "the exact ones are left out (--no-lossless)",
+            };
+            let note =
+                format!("{} is AV1 video: its pictures are close to the recording's, not equal; {fate}", column.name);
+            self.notes.push(note);
+        }
     }
 
     /// The columns as `info.json` lists them.
@@ -254,7 +311,7 @@ impl Chooser<'_> {
         }
         Ok(Column {
             name: name.to_owned(),
-            feature: Feature { dtype: "float32".to_owned(), shape: vec![names.len()], names: json!(names) },
+            feature: Feature { dtype: "float32".to_owned(), shape: vec![names.len()], names: json!(names), info: None },
             origin: Origin::Concat(parts),
         })
     }
@@ -277,7 +334,7 @@ impl Chooser<'_> {
         let names: Vec<String> = (0..width).map(|i| format!("action_{i}")).collect();
         let column = Column {
             name: "action".to_owned(),
-            feature: Feature { dtype: "float32".to_owned(), shape: vec![width], names: json!(names) },
+            feature: Feature { dtype: "float32".to_owned(), shape: vec![width], names: json!(names), info: None },
             origin: Origin::Action { key: key.to_owned(), width: stored, rotation: options.rotation },
         };
         let provenance = ActionProvenance { key: key.to_owned(), kind: options.actions, rotation: options.rotation };
@@ -315,6 +372,7 @@ impl Chooser<'_> {
                     dtype: "image".to_owned(),
                     shape: vec![height, width, 3],
                     names: json!(["height", "width", "channels"]),
+                    info: None,
                 },
                 origin: Origin::Image { key: path.clone(), height, width },
             });
@@ -348,7 +406,7 @@ impl Chooser<'_> {
     fn outcomes(&self) -> Result<Vec<Column>> {
         let scalar = |name: &str, dtype: &str, origin| Column {
             name: name.to_owned(),
-            feature: Feature { dtype: dtype.to_owned(), shape: vec![1], names: Value::Null },
+            feature: Feature { dtype: dtype.to_owned(), shape: vec![1], names: Value::Null, info: None },
             origin,
         };
         let mut columns = Vec::new();
@@ -481,7 +539,7 @@ fn index_columns() -> Vec<Column> {
     .into_iter()
     .map(|(name, dtype, index)| Column {
         name: name.to_owned(),
-        feature: Feature { dtype: dtype.to_owned(), shape: vec![1], names: Value::Null },
+        feature: Feature { dtype: dtype.to_owned(), shape: vec![1], names: Value::Null, info: None },
         origin: Origin::Index(index),
     })
     .collect()

@@ -46,7 +46,7 @@ pub struct Info {
     /// Where frames lie.
     #[serde(default = "data_path")]
     pub data_path: String,
-    /// Where videos lie; none are written.
+    /// Where videos lie; null without any.
     #[serde(default)]
     pub video_path: Option<String>,
     /// The columns, in their order in the data files.
@@ -90,6 +90,9 @@ pub struct Feature {
     /// Names of the entries: a list, a dictionary or null.
     #[serde(default)]
     pub names: Value,
+    /// What LeRobot says about a video feature: codec, rate, size.
+    #[serde(default, alias = "video_info", skip_serializing_if = "Option::is_none")]
+    pub info: Option<Value>,
 }
 
 impl Feature {
@@ -189,6 +192,24 @@ pub struct Provenance {
     /// sha256 of everything else in `info.json`, so that an edited number does not train other weights in silence.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seal: Option<String>,
+    /// How pictures were encoded, where they are videos.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub video: Option<VideoProvenance>,
+}
+
+/// How the pictures of a data set were made videos.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct VideoProvenance {
+    /// Name and version of the encoder.
+    pub encoder: String,
+    /// Its speed, 0 to 10.
+    pub speed: u8,
+    /// Its quantizer, 1 to 255.
+    pub quantizer: u8,
+    /// Frames from a key frame to the next.
+    pub key_interval: u16,
+    /// Whether the exact pictures are in the side folder.
+    pub side_pictures: bool,
 }
 
 /// Which action a data set holds.

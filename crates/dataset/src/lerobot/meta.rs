@@ -2,6 +2,7 @@
 
 use super::schema::{element, writer_properties};
 use super::shards::{GroupEncoder, HashingFile, Place, WrittenFile, write_parquet};
+use super::videos::Stretch;
 use crate::error::{DatasetError, Result};
 use crate::stats::FeatureStats;
 use arrow::array::{
@@ -31,6 +32,8 @@ pub(crate) struct EpisodeRow {
     pub place: Place,
     /// Statistics of each feature that has them, by name.
     pub stats: BTreeMap<String, FeatureStats>,
+    /// Where the video of each camera is that has one, by name.
+    pub videos: BTreeMap<String, Stretch>,
 }
 
 fn write(
@@ -118,6 +121,17 @@ fn episode_columns(
         ("dataset_from_index".to_owned(), ints(&|_, row| row.from)),
         ("dataset_to_index".to_owned(), ints(&|_, row| row.from + row.length)),
     ];
+    for (name, _) in features.iter().filter(|(name, _)| rows.iter().all(|r| r.videos.contains_key(name))) {
+        let seconds = |f: &dyn Fn(&Stretch) -> f64| -> ArrayRef {
+            Arc::new(Float64Array::from_iter_values(rows.iter().map(|row| f(&row.videos[name]))))
+        };
+        columns.extend([
+            (format!("videos/{name}/chunk_index"), ints(&|_, row| row.videos[name].folder)),
+            (format!("videos/{name}/file_index"), ints(&|_, row| row.videos[name].file)),
+            (format!("videos/{name}/from_timestamp"), seconds(&|s| s.from)),
+            (format!("videos/{name}/to_timestamp"), seconds(&|s| s.to)),
+        ]);
+    }
     for (feature, is_image) in features {
         for (name, get) in STATISTICS {
             let mut values = Float64Builder::new();

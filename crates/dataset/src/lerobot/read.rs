@@ -180,6 +180,17 @@ pub(crate) fn integers(path: &Path, name: &str, array: &ArrayRef) -> Result<Scal
     Ok(longs.values().clone())
 }
 
+/// A column of one number a row, in full precision.
+pub(crate) fn doubles(path: &Path, name: &str, array: &ArrayRef) -> Result<ScalarBuffer<f64>> {
+    let column = BadColumn { path, name };
+    if array.null_count() > 0 || !array.data_type().is_numeric() {
+        return Err(column.because("numbers", format!("{} with {} nulls", array.data_type(), array.null_count())));
+    }
+    let cast = cast(array, &DataType::Float64).map_err(|e| column.because("numbers", e.to_string()))?;
+    let doubles = cast.as_any().downcast_ref::<arrow::array::Float64Array>().expect("a column of doubles");
+    Ok(doubles.values().clone())
+}
+
 /// A column of texts.
 pub(crate) fn texts(path: &Path, name: &str, array: &ArrayRef) -> Result<Vec<String>> {
     let column = BadColumn { path, name };

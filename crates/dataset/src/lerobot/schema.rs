@@ -16,8 +16,13 @@ pub(crate) const CREATED_BY: &str = concat!("actrm ", env!("CARGO_PKG_VERSION"))
 
 /// The Arrow schema of the data files.
 pub(crate) fn data_schema(features: &Features) -> SchemaRef {
-    let fields: Fields = features.0.iter().map(|(name, f)| Field::new(name, data_type(f), false)).collect();
+    let fields: Fields = in_files(features).map(|(name, f)| Field::new(name, data_type(f), false)).collect();
     Arc::new(Schema::new(fields))
+}
+
+/// The columns that data files have: videos lie beside them.
+fn in_files(features: &Features) -> impl Iterator<Item = &(String, Feature)> {
+    features.0.iter().filter(|(_, f)| f.dtype != "video")
 }
 
 fn data_type(feature: &Feature) -> DataType {
@@ -46,7 +51,7 @@ pub(crate) fn image_fields() -> Fields {
 /// The `huggingface` entry of a data file.
 pub(crate) fn huggingface_metadata(features: &Features) -> KeyValue {
     let mut map = Map::new();
-    for (name, f) in &features.0 {
+    for (name, f) in in_files(features) {
         let value = json!({"dtype": f.dtype, "_type": "Value"});
         let described = match (f.dtype.as_str(), f.dim()) {
             ("image", _) => json!({"_type": "Image"}),

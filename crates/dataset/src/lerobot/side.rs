@@ -10,7 +10,7 @@
 //! - `actrm/manifest.json`: sha256 of every other file of the data set.
 
 use super::encode::{Job, Loaded};
-use super::features::Origin;
+use super::features::{Origin, VideoOptions};
 use super::schema::{element, writer_properties};
 use super::shards::{EncodedGroup, GroupEncoder, ShardWriter, WrittenFile};
 use super::work::{BULK_ROW_BYTES, Part};
@@ -168,11 +168,12 @@ impl SideColumn {
 }
 
 /// Decides what becomes a column, from the plan alone.
-fn layout(plan: &Plan, pictures: &BTreeMap<String, String>) -> Layout {
+fn layout(plan: &Plan, pictures: &BTreeMap<String, String>, left_out: &BTreeSet<String>) -> Layout {
     let mut columns: BTreeMap<&str, SideColumn> = BTreeMap::new();
     for demo in &plan.demos {
         for (path, key) in &demo.keys {
-            if columns.contains_key(path.as_str()) || pictures.contains_key(path) || base_of(demo, path).is_some() {
+            let elsewhere = pictures.contains_key(path) || left_out.contains(path);
+            if columns.contains_key(path.as_str()) || elsewhere || base_of(demo, path).is_some() {
                 continue;
             }
             if let Some(column) = column_of(path, key, demo.length) {
@@ -204,6 +205,8 @@ pub(crate) struct SideEncoder {
     frames: GroupEncoder,
     /// Image column of each dataset that became one.
     pictures: BTreeMap<String, String>,
+    /// Datasets of pictures that are videos only.
+    left_out: BTreeSet<String>,
 }
 
 /// What the side folder gets from one row group of frames.
@@ -215,18 +218,30 @@ pub(crate) struct SideOutput {
 }
 
 impl SideEncoder {
-    pub(crate) fn new(root: &Path, plan: &Plan, job_columns: &[super::features::Column]) -> Result<Self> {
-        let pictures: BTreeMap<String, String> = job_columns
-            .iter()
-            .filter_map(|c| match &c.origin {
-                Origin::Image { key, .. } => Some((key.clone(), c.name.clone())),
-                _ => None,
-            })
-            .collect();
-        let layout = layout(plan, &pictures);
+    pub(crate) fn new(
+        root: &Path,
+        plan: &Plan,
+        job_columns: &[super::features::Column],
+        video: Option<&VideoOptions>,
+    ) -> Result<Self> {
+        let (mut pictures, mut left_out) = (BTreeMap::new(), BTreeSet::new());
+        for column in job_columns {
+            match (&column.origin, video) {
+                (Origin::Image { key, .. }, None) => {
+                    pictures.insert(key.clone(), column.name.clone());
+                }
+                (Origin::Image { key, .. }, Some(options)) if !options.side_pictures => {
+                    left_out.insert(key.replacen("obs/", "next_obs/", 1));
+                    left_out.insert(key.clone());
+                }
+                // video is not exact: the recording is kept like any other dataset
+                _ => {}
+            }
+        }
+        let layout = layout(plan, &pictures, &left_out);
         let fields: Vec<Field> = layout.columns.iter().map(SideColumn::field).collect();
         let frames = encoder(root, Schema::new(fields))?;
-        Ok(Self { layout, frames, pictures })
+        Ok(Self { layout, frames, pictures, left_out })
     }
 
     /// The encoder that the shards of the frames need.
@@ -332,8 +347,8 @@ impl SideEncoder {
                 .map(|c| c.path.as_str())
                 .collect();
             for (path, key) in &demo.keys {
-                if columns.contains(path.as_str()) || self.pictures.contains_key(path) || base_of(demo, path).is_some()
-                {
+                let elsewhere = self.pictures.contains_key(path) || self.left_out.contains(path);
+                if columns.contains(path.as_str()) || elsewhere || base_of(demo, path).is_some() {
                     continue;
                 }
                 let array = match l.demo.datasets.get(path) {
@@ -345,6 +360,7 @@ impl SideEncoder {
         }
         for (path, key) in &demo.keys {
             if let Some(base) = base_of(demo, path)
+                && !self.left_out.contains(path)
                 && !self.layout.columns.iter().any(|c| c.path == *path && c.fits(&key.dtype, &key.shape, demo.length))
             {
                 objects.push(self.shifted(job, l, path, key, base)?);

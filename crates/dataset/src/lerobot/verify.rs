@@ -5,6 +5,7 @@ use super::export::{Rows, picture_pixels};
 use super::fingerprint::Fingerprint;
 use super::info::Info;
 use super::open::{Dataset, read_json};
+use super::pictures::{Film, places};
 use super::schema;
 use super::side::{MANIFEST_FILE, Manifest};
 use crate::error::{DatasetError, Result};
@@ -103,8 +104,7 @@ pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Che
     note("every number is finite", not_finite(&dataset));
     note("statistics follow from the frames", statistics_problem(&dataset)?);
     note("splits name episodes", split_problem(&dataset));
-    let pictures = dataset.info().features.0.iter().any(|(_, f)| f.dtype == "image");
-    if pictures {
+    if dataset.cameras().next().is_some() {
         note("pictures decode and have the content recorded", picture_problem(&dataset, progress)?);
     } else if dataset.provenance().is_some() {
         // opening compared it
@@ -195,6 +195,11 @@ fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u64)) -> Res
         };
         cursors.insert(name.as_str(), (Rows::open(root, "data", Some(name), 32)?, height, width));
     }
+    let mut films = Vec::new();
+    for (name, _) in info.features.0.iter().filter(|(_, f)| f.dtype == "video") {
+        let (_, height, width) = dataset.camera(name)?;
+        films.push((name.as_str(), places(dataset, name)?, Film::new(info.fps, (height, width)), height * width * 3));
+    }
     let mut fingerprint = Fingerprint::new(&info.features, info.fps);
     let mut pixels = Vec::new();
     for episode in dataset.episodes() {
@@ -213,6 +218,15 @@ fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u64)) -> Res
                 summary.digests.extend(frames.map(|p| <[u8; 32]>::from(Sha256::digest(p))));
             }
             fingerprint.column(name, summary.digest());
+        }
+        for (name, places, film, size) in &mut films {
+            pixels.clear();
+            pixels.resize(episode.length * *size, 0);
+            if let Err(e) = film.read(episode, &places[episode.index], &mut pixels) {
+                return Ok(Some(format!("{name}: episode {}: {}", episode.index, in_full(&e))));
+            }
+            let digests = pixels.chunks_exact(*size).map(|p| Sha256::digest(p).into()).collect();
+            fingerprint.column(name, PictureSummary { digests, ..PictureSummary::default() }.digest());
         }
         progress(episode.to as u64, dataset.frames() as u64);
     }

@@ -1,5 +1,5 @@
-//! Parsing in a process of its own. libhdf5 is C and crashes on hostile files; here it can crash, hang or eat
-//! memory alone. The program starts itself again, the child opens the file and answers requests over its standard
+//! Parsing in a process of its own. libhdf5 is C and crashes on hostile files, and so does a video decoder that was
+//! translated from C; here they can crash, hang or eat memory alone. The program starts itself again, the child opens the file and answers requests over its standard
 //! streams, under limits that it sets on itself first.
 
 use std::io::{Read, Write};
@@ -15,12 +15,15 @@ use serde::{Deserialize, Serialize};
 
 use super::codec::{Taker, put_array, put_demo};
 use super::local::{Backend, Local};
+use super::video;
 use crate::error::InputError;
 use crate::plan::Plan;
 use crate::tree::{Array, Demo};
 
-/// Set in the reading process: the file that it is to open.
+/// Set in a process that reads demonstrations: the file that it is to open.
 const PATH_VARIABLE: &str = "ACTRM_HDF5_READER";
+/// Set in a process that reads a video: the file that it is to open.
+pub(super) const VIDEO_VARIABLE: &str = "ACTRM_VIDEO_READER";
 /// Address space of the reading process, program text included.
 const MEMORY: u64 = 900 << 20;
 /// How long the reading process may compute, or sleep, without a word. Waiting for its turn on a busy machine, or for
@@ -36,10 +39,10 @@ const BYTES_PER_CPU_SECOND: u64 = 256 << 10;
 /// The longest answer.
 const MAX_ANSWER: u64 = 384 << 20;
 
-const PLAN: u8 = b'P';
+pub(super) const PLAN: u8 = b'P';
 const DEMO: u8 = b'D';
-const ARRAY: u8 = b'A';
-const ERROR: u8 = b'E';
+pub(super) const ARRAY: u8 = b'A';
+pub(super) const ERROR: u8 = b'E';
 const BEAT: u8 = b'.';
 
 static ARMED: AtomicBool = AtomicBool::new(false);
@@ -47,13 +50,14 @@ static ARMED: AtomicBool = AtomicBool::new(false);
 /// First statement of `main`: in a reading process this serves its parent and never returns; in any other it
 /// arms [`super::Source::open_isolated`] and returns at once.
 pub fn serve_if_child() {
-    match std::env::var_os(PATH_VARIABLE) {
-        Some(path) => {
+    type Serve = fn(&Path) -> std::io::Result<()>;
+    for (variable, serve) in [(PATH_VARIABLE, serve as Serve), (VIDEO_VARIABLE, video::serve)] {
+        if let Some(path) = std::env::var_os(variable) {
             let code = if serve(&PathBuf::from(path)).is_ok() { 0 } else { 1 };
             std::process::exit(code);
         }
-        None => ARMED.store(true, Ordering::Relaxed),
     }
+    ARMED.store(true, Ordering::Relaxed);
 }
 
 /// Whether [`serve_if_child`] has been called.
@@ -68,8 +72,13 @@ enum Request {
     Rows { index: usize, key: String, first: usize, count: usize },
 }
 
-impl Request {
+/// What a reading process can be asked.
+pub(super) trait Ask: Serialize {
     /// What it asks for, for messages.
+    fn words(&self) -> String;
+}
+
+impl Ask for Request {
     fn words(&self) -> String {
         match self {
             Self::Root => "read what belongs to no demo".to_owned(),
@@ -85,13 +94,18 @@ impl Request {
 
 // ---- the reading process ----
 
-fn limit_self(bytes: u64) -> std::io::Result<()> {
+/// Bounds the memory and the processor time of this process; the latter may be raised up to `maximum`.
+pub(super) fn limit_self(cpu_seconds: u64, maximum: Option<u64>) -> std::io::Result<()> {
     let set =
         |resource, value| rustix::process::setrlimit(resource, Rlimit { current: Some(value), maximum: Some(value) });
     set(Resource::Core, 0)?;
     set(Resource::As, MEMORY)?;
-    set(Resource::Cpu, CPU_SECONDS + bytes / BYTES_PER_CPU_SECOND)?;
-    Ok(())
+    limit_cpu(cpu_seconds, maximum)
+}
+
+/// Bounds the processor time of this process, up to what may be set later.
+pub(super) fn limit_cpu(seconds: u64, maximum: Option<u64>) -> std::io::Result<()> {
+    Ok(rustix::process::setrlimit(Resource::Cpu, Rlimit { current: Some(seconds), maximum })?)
 }
 
 fn source_bytes(path: &Path) -> u64 {
@@ -103,7 +117,8 @@ fn source_bytes(path: &Path) -> u64 {
 }
 
 fn serve(path: &Path) -> std::io::Result<()> {
-    limit_self(source_bytes(path))?;
+    let seconds = CPU_SECONDS + source_bytes(path) / BYTES_PER_CPU_SECOND;
+    limit_self(seconds, Some(seconds))?;
     let mut out = std::io::stdout().lock();
     let _ = rustix::pipe::fcntl_setpipe_size(&out, 1 << 20);
     let mut beat_out = std::io::stdout();
@@ -125,13 +140,7 @@ fn serve(path: &Path) -> std::io::Result<()> {
     };
     let mut requests = std::io::stdin().lock();
     let mut body = Vec::new();
-    loop {
-        let mut length = [0; 8];
-        if requests.read_exact(&mut length).is_err() {
-            return Ok(()); // the parent is done
-        }
-        let mut text = vec![0; usize::try_from(u64::from_le_bytes(length)).unwrap_or(0)];
-        requests.read_exact(&mut text)?;
+    while let Some(text) = next_request(&mut requests)? {
         body.clear();
         let (kind, failed) = match serde_json::from_slice(&text)? {
             Request::Root => (DEMO, local.root().map(|root| put_demo(&mut body, &root)).err()),
@@ -156,9 +165,22 @@ fn serve(path: &Path) -> std::io::Result<()> {
             Some(error) => send(&mut out, ERROR, &serde_json::to_vec(&error)?)?,
         }
     }
+    Ok(())
 }
 
-fn send(out: &mut impl Write, kind: u8, body: &[u8]) -> std::io::Result<()> {
+/// The text of the next request; `None` when the parent is done.
+pub(super) fn next_request(requests: &mut impl Read) -> std::io::Result<Option<Vec<u8>>> {
+    let mut length = [0; 8];
+    if requests.read_exact(&mut length).is_err() {
+        return Ok(None);
+    }
+    let mut text = vec![0; usize::try_from(u64::from_le_bytes(length)).unwrap_or(0)];
+    requests.read_exact(&mut text)?;
+    Ok(Some(text))
+}
+
+/// Sends one answer.
+pub(super) fn send(out: &mut impl Write, kind: u8, body: &[u8]) -> std::io::Result<()> {
     let mut head = [kind; 9];
     head[1..].copy_from_slice(&(body.len() as u64).to_le_bytes());
     out.write_all(&head)?;
@@ -196,13 +218,18 @@ enum Failure {
 impl Remote {
     /// Starts a reading process on a file or folder and takes its plan.
     pub fn open(path: &Path) -> Result<(Self, Plan), InputError> {
+        Self::start(path, PATH_VARIABLE)
+    }
+
+    /// Starts a process that reads `path` as the variable says, and takes what it says unasked.
+    pub(super) fn start<T: serde::de::DeserializeOwned>(path: &Path, variable: &str) -> Result<(Self, T), InputError> {
         let cannot = |reason: String| InputError::ReaderStart { path: path.to_owned(), reason };
         if !armed() {
             return Err(cannot("the program has not called isolation::serve_if_child".to_owned()));
         }
         // the link in /proc outlives a program that is replaced on disk while it runs
         let mut child = Command::new("/proc/self/exe")
-            .env(PATH_VARIABLE, path)
+            .env(variable, path)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
@@ -211,15 +238,15 @@ impl Remote {
         let requests = child.stdin.take().expect("stdin is a pipe");
         let answers = child.stdout.take().expect("stdout is a pipe");
         let remote = Self { path: path.to_owned(), state: Mutex::new(State::Alive { child, requests, answers }) };
-        let (kind, body) = remote.exchange(None)?;
-        match serde_json::from_slice::<Plan>(&body) {
+        let (kind, body) = remote.exchange::<Request>(None)?;
+        match serde_json::from_slice::<T>(&body) {
             Ok(plan) if kind == PLAN => Ok((remote, plan)),
             _ => Err(cannot("its first answer is no plan".to_owned())),
         }
     }
 
     /// Sends a request and takes the answer; `None` takes the answer that comes unasked.
-    fn exchange(&self, request: Option<&Request>) -> Result<(u8, Vec<u8>), InputError> {
+    pub(super) fn exchange<R: Ask>(&self, request: Option<&R>) -> Result<(u8, Vec<u8>), InputError> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let failure = match &mut *state {
             State::Ended(error) => return Err(error.clone()),
@@ -234,7 +261,7 @@ impl Remote {
                 }
             }
         };
-        let during = request.map_or_else(|| "open the file".to_owned(), Request::words);
+        let during = request.map_or_else(|| "open the file".to_owned(), Ask::words);
         let path = self.path.clone();
         if let Failure::Answered(error) = failure {
             return Err(error);

@@ -5,6 +5,7 @@ mod dialect;
 pub mod isolation;
 mod local;
 mod value;
+mod video;
 mod walk;
 mod writer;
 
@@ -19,6 +20,7 @@ use crate::tree::{Array, Demo, Dtype};
 use local::{Backend, Local};
 
 pub(crate) use local::files;
+pub use video::{VideoFile, VideoInfo};
 pub use writer::{RobomimicWriter, WriteOptions};
 
 /// The most that [`Source::read_demo`] reads at once.

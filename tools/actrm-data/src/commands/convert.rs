@@ -1,5 +1,5 @@
 use anyhow::Result;
-use dataset::{ActionKind, ConvertOptions, ImageForm, RotationForm};
+use dataset::{ActionKind, ConvertOptions, ImageForm, RotationForm, VideoOptions};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -15,6 +15,7 @@ use std::time::Instant;
 #[command(after_help = "Examples:
   actrm-data convert data/lift.hdf5 lift
   actrm-data convert image.hdf5 set --images ppm --jobs 2
+  actrm-data convert image.hdf5 set --video
   actrm-data convert can.hdf5 can --state-keys robot0_eef_pos,robot0_gripper_qpos --env-keys object
   actrm-data convert stack.hdf5 stack --entity \"a=cubeA_pos,cubeA_pos - robot0_eef_pos\"
   actrm-data convert square.hdf5 square --actions absolute --rotation 6d")]
@@ -40,6 +41,18 @@ pub struct Args {
     /// How to store images
     #[arg(long, value_enum, default_value_t = Images::Png)]
     images: Images,
+    /// Store pictures as AV1 videos: small, and close to the recording's, not equal; the side folder keeps the exact ones
+    #[arg(long, conflicts_with = "images")]
+    video: bool,
+    /// With --video: 1 (large, nearly exact) to 255 (small)
+    #[arg(long, value_name = "N", default_value_t = VideoOptions::default().quantizer, requires = "video", value_parser = clap::value_parser!(u8).range(1..))]
+    quantizer: u8,
+    /// With --video: 0 (slow, small) to 10
+    #[arg(long, value_name = "N", default_value_t = VideoOptions::default().speed, requires = "video", value_parser = clap::value_parser!(u8).range(..=10))]
+    video_speed: u8,
+    /// With --video: leave the exact pictures out of the side folder: smaller, but the source cannot be rebuilt
+    #[arg(long, requires = "video")]
+    no_side_pictures: bool,
     /// Which actions to take: as the controller got them, or absolute poses (actions_abs)
     #[arg(long, value_enum, default_value_t = Actions::Delta)]
     actions: Actions,
@@ -52,6 +65,9 @@ pub struct Args {
     /// Size at which a data file is closed, in MiB
     #[arg(long, value_name = "MIB", default_value_t = 100.0, value_parser = positive)]
     file_size: f64,
+    /// Size at which a video file is closed, in MiB
+    #[arg(long, value_name = "MIB", default_value_t = 200.0, requires = "video", value_parser = positive)]
+    video_file_size: f64,
     /// Threads [default: one a core]
     #[arg(long, default_value_t = 0, hide_default_value = true)]
     jobs: usize,
@@ -115,9 +131,16 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             Rotation::AxisAngle => RotationForm::AxisAngle,
             Rotation::SixD => RotationForm::SixD,
         },
+        video: args.video.then(|| VideoOptions {
+            speed: args.video_speed,
+            quantizer: args.quantizer,
+            side_pictures: !args.no_side_pictures,
+            ..VideoOptions::default()
+        }),
         lossless: !args.no_lossless,
         jobs: args.jobs,
         data_file_mb: args.file_size,
+        video_file_mb: args.video_file_size,
     };
     let start = Instant::now();
     let mut screen = cli::Screen::new();

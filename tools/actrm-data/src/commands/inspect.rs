@@ -58,6 +58,20 @@ struct KeyRow {
     demos: usize,
     min: Option<f64>,
     max: Option<f64>,
+    /// Codec, rate and files of a feature that is video.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    video: Option<VideoRow>,
+}
+
+#[derive(Serialize)]
+struct VideoRow {
+    codecs: Vec<String>,
+    /// Width and height as the files have them.
+    sizes: Vec<(usize, usize)>,
+    fps: Vec<f64>,
+    frames: usize,
+    files: usize,
+    bytes: u64,
 }
 
 #[derive(Serialize)]
@@ -117,6 +131,7 @@ fn of_source(args: &Args) -> Result<Summary> {
                 demos: 0,
                 min: ranges.get(path).map(|r| r.0),
                 max: ranges.get(path).map(|r| r.1),
+                video: None,
             });
             row.demos += 1;
             // a step's shape where there is one row a step, the whole shape otherwise
@@ -166,14 +181,23 @@ fn of_dataset(args: &Args) -> Result<Summary> {
         let least = stats.min.iter().copied().fold(f64::INFINITY, f64::min);
         Some((least, stats.max.iter().copied().fold(f64::NEG_INFINITY, f64::max)))
     };
-    let keys = set.info().features.0.iter().map(|(name, feature)| KeyRow {
-        key: name.clone(),
-        dtype: feature.dtype.clone(),
-        shapes: vec![feature.shape.clone()],
-        demos: lengths.len(),
-        min: ranges(name).map(|r| r.0),
-        max: ranges(name).map(|r| r.1),
-    });
+    let mut problems = Vec::new();
+    let mut keys = Vec::new();
+    for (name, feature) in &set.info().features.0 {
+        let video = match feature.dtype.as_str() {
+            "video" => videos(&set, name).map_err(|e| problems.push(format!("{name}: {e}"))).ok(),
+            _ => None,
+        };
+        keys.push(KeyRow {
+            key: name.clone(),
+            dtype: feature.dtype.clone(),
+            shapes: vec![feature.shape.clone()],
+            demos: lengths.len(),
+            min: ranges(name).map(|r| r.0),
+            max: ranges(name).map(|r| r.1),
+            video,
+        });
+    }
     let each = set.episodes().iter().map(|e| DemoRow {
         id: e.demo.clone().unwrap_or_else(|| format!("episode {}", e.index)),
         length: e.length,
@@ -194,7 +218,7 @@ fn of_dataset(args: &Args) -> Result<Summary> {
         length_min: lengths.iter().copied().min().unwrap_or(0),
         length_mean: set.frames() as f64 / lengths.len().max(1) as f64,
         length_max: lengths.iter().copied().max().unwrap_or(0),
-        keys: keys.collect(),
+        keys,
         masks: set
             .split_names()
             .into_iter()
@@ -202,9 +226,27 @@ fn of_dataset(args: &Args) -> Result<Summary> {
             .collect(),
         tasks: set.tasks().to_vec(),
         notes: lossless.into_iter().chain([format!("fingerprint {}", set.fingerprint())]).collect(),
-        problems: Vec::new(),
+        problems,
         each: if args.demos { each.collect() } else { Vec::new() },
     })
+}
+
+/// What a camera's files say.
+fn videos(set: &Dataset, name: &str) -> Result<VideoRow, dataset::DatasetError> {
+    let files = set.video_files(name)?;
+    let mut row =
+        VideoRow { codecs: Vec::new(), sizes: Vec::new(), fps: Vec::new(), frames: 0, files: files.len(), bytes: 0 };
+    for file in files {
+        row.codecs.push(file.info.codec);
+        row.sizes.push((file.info.width, file.info.height));
+        row.fps.push(file.info.fps);
+        row.frames += file.info.frames;
+        row.bytes += std::fs::metadata(&file.path).map_or(0, |m| m.len());
+    }
+    row.codecs.dedup();
+    row.sizes.dedup();
+    row.fps.dedup();
+    Ok(row)
 }
 
 fn folder_bytes(path: &Path) -> u64 {
@@ -257,6 +299,19 @@ fn show(s: &Summary) -> String {
             .map(|d| vec![d.id.clone(), d.length.to_string(), d.task.clone().unwrap_or_default()])
             .collect();
         text.push_str(&cli::table(&["demo", "steps", "task"], &rows, &[1]));
+    }
+    for (key, video) in s.keys.iter().filter_map(|k| Some((&k.key, k.video.as_ref()?))) {
+        let sizes: Vec<String> = video.sizes.iter().map(|(width, height)| format!("{width} x {height}")).collect();
+        let rates: Vec<String> = video.fps.iter().map(|&fps| cli::number(fps)).collect();
+        text.push_str(&format!(
+            "video: {key}: {}, {}, {} frames a second, {} frames in {} files, {}\n",
+            video.codecs.join(" or "),
+            sizes.join(" or "),
+            rates.join(" or "),
+            cli::count(video.frames),
+            video.files,
+            cli::bytes(video.bytes)
+        ));
     }
     for note in &s.notes {
         text.push_str(&format!("note: {note}\n"));

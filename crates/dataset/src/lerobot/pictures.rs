@@ -1,0 +1,269 @@
+//! Pictures of an opened data set: image columns and videos, decoded into bytes in memory.
+
+use super::export::Rows;
+use super::images;
+use super::info::{Feature, Info};
+use super::open::{Dataset, EpisodeMeta};
+use super::read;
+use crate::error::{DatasetError, Result};
+use crate::source::{VideoFile, VideoInfo};
+use arrow::array::{Array, ArrayRef, BinaryArray, StructArray};
+use arrow::datatypes::DataType;
+use rayon::prelude::*;
+use std::path::{Component, Path, PathBuf};
+
+/// Pictures that are unpacked from a column at once.
+const ROWS: usize = 256;
+/// LeRobot's tolerance for the time of a frame, in seconds.
+const TOLERANCE: f64 = 1e-4;
+
+/// All pictures of one camera, a picture a frame of the data set, in its order.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Pictures {
+    /// Rows of a picture.
+    pub height: usize,
+    /// Pixels in a row.
+    pub width: usize,
+    /// Picture after picture: rows from the top, pixels from the left, red, green and blue.
+    pub data: Vec<u8>,
+}
+
+impl Pictures {
+    /// Bytes of a picture.
+    pub fn picture_bytes(&self) -> usize {
+        self.height * self.width * 3
+    }
+
+    /// The picture of a frame of the data set.
+    pub fn frame(&self, frame: usize) -> &[u8] {
+        let size = self.picture_bytes();
+        &self.data[frame * size..(frame + 1) * size]
+    }
+}
+
+/// A file of one camera's videos.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraFile {
+    /// Where it lies.
+    pub path: PathBuf,
+    /// What it says about itself.
+    pub info: VideoInfo,
+}
+
+impl Dataset {
+    /// Names of the features that are pictures, in the order of `info.json`.
+    pub fn cameras(&self) -> impl Iterator<Item = &str> {
+        self.info().features.0.iter().filter(|(_, f)| f.is_visual()).map(|(name, _)| name.as_str())
+    }
+
+    /// Decodes all pictures of a camera into memory, with as many threads as there are cores. The bytes are those that
+    /// LeRobot reads.
+    pub fn pictures(&self, name: &str) -> Result<Pictures> {
+        let (feature, height, width) = self.camera(name)?;
+        let size = height * width * 3;
+        let mut data = vec![0; self.frames() * size];
+        match feature.dtype.as_str() {
+            "video" => self.film(name, (height, width), &mut data)?,
+            _ => self.unpack(name, (height, width), &mut data)?,
+        }
+        Ok(Pictures { height, width, data })
+    }
+
+    /// The files that a camera's videos lie in, each opened; none for an image column.
+    pub fn video_files(&self, name: &str) -> Result<Vec<CameraFile>> {
+        let (feature, ..) = self.camera(name)?;
+        if feature.dtype != "video" {
+            return Ok(Vec::new());
+        }
+        let mut paths: Vec<PathBuf> = places(self, name)?.into_iter().map(|p| p.path).collect();
+        paths.sort();
+        paths.dedup();
+        let open = |path: PathBuf| Ok(CameraFile { info: VideoFile::open(&path)?.info().clone(), path });
+        paths.into_iter().map(open).collect()
+    }
+
+    /// A feature of pictures with its height and width.
+    pub(crate) fn camera(&self, name: &str) -> Result<(&Feature, usize, usize)> {
+        let found = self.info().features.get(name).filter(|f| f.is_visual());
+        let feature = found.ok_or_else(|| DatasetError::NotInDataset {
+            path: self.root().to_path_buf(),
+            wanted: format!("camera {name}"),
+            found: match self.cameras().collect::<Vec<_>>().join(", ") {
+                none if none.is_empty() => "no camera".to_owned(),
+                names => names,
+            },
+        })?;
+        match feature.shape.as_slice() {
+            &[height, width, 3] if height > 0 && width > 0 => Ok((feature, height, width)),
+            shape => Err(DatasetError::BadDataset {
+                path: self.root().join("meta/info.json"),
+                object: name.to_owned(),
+                expected: "pictures of shape [height, width, 3]".to_owned(),
+                found: format!("{shape:?}"),
+            }),
+        }
+    }
+
+    /// Videos: episodes lie one after the other in files, so each thread takes a run of episodes.
+    fn film(&self, name: &str, (height, width): (usize, usize), data: &mut [u8]) -> Result<()> {
+        let size = height * width * 3;
+        let places = places(self, name)?;
+        let mut tasks = Vec::with_capacity(places.len());
+        let mut rest = data;
+        for (episode, place) in self.episodes().iter().zip(&places) {
+            let (mine, after) = rest.split_at_mut(episode.length * size);
+            tasks.push((episode, place, mine));
+            rest = after;
+        }
+        let run = tasks.len().div_ceil(rayon::current_num_threads()).max(1);
+        tasks.par_chunks_mut(run).try_for_each(|run| {
+            let mut film = Film::new(self.info().fps, (height, width));
+            run.iter_mut().try_for_each(|(episode, place, out)| film.read(episode, place, out))
+        })
+    }
+
+    /// Image columns: row groups one after the other, their pictures on all threads.
+    fn unpack(&self, name: &str, (height, width): (usize, usize), data: &mut [u8]) -> Result<()> {
+        let size = height * width * 3;
+        let mut rows = Rows::open(self.root(), "data", Some(name), ROWS)?;
+        for block in data.chunks_mut(ROWS * size) {
+            let mut files = Vec::new();
+            for batch in rows.take(block.len() / size)? {
+                files.push(self.files(name, batch.column(0))?);
+            }
+            let files: Vec<&[u8]> = files.iter().flat_map(|f| f.iter()).flatten().collect();
+            let pairs = files.par_iter().zip(block.par_chunks_mut(size)).enumerate();
+            pairs.try_for_each(|(i, (file, out))| {
+                let mut pixels = Vec::with_capacity(size);
+                images::decode(file, height, width, &mut pixels).map_err(|found| self.bad(name, i, found))?;
+                out.copy_from_slice(&pixels);
+                Ok::<(), DatasetError>(())
+            })?;
+        }
+        Ok(())
+    }
+
+    fn bad(&self, name: &str, row: usize, found: String) -> DatasetError {
+        DatasetError::BadDataset {
+            path: self.root().join("data"),
+            object: format!("column {name}, picture {row} of a block of {ROWS}"),
+            expected: "a PNG or PPM picture of the size that info.json says".to_owned(),
+            found,
+        }
+    }
+
+    /// Pictures of a column as files.
+    fn files(&self, name: &str, column: &ArrayRef) -> Result<BinaryArray> {
+        let inner = match column.as_any().downcast_ref::<StructArray>() {
+            Some(fields) => fields.column_by_name("bytes").ok_or_else(|| self.bad(name, 0, "no bytes".to_owned()))?,
+            None => column,
+        };
+        let cast = arrow::compute::cast(inner, &DataType::Binary).map_err(|e| self.bad(name, 0, e.to_string()))?;
+        let files = cast.as_any().downcast_ref::<BinaryArray>().expect("a binary column");
+        match files.null_count() {
+            0 => Ok(files.clone()),
+            nulls => Err(self.bad(name, 0, format!("{nulls} nulls"))),
+        }
+    }
+}
+
+/// Where an episode's pictures lie in a camera's files.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct VideoPlace {
+    pub path: PathBuf,
+    /// Seconds from the file's beginning to the episode's.
+    pub from: f64,
+}
+
+/// The places of all episodes of one camera.
+pub(crate) fn places(dataset: &Dataset, name: &str) -> Result<Vec<VideoPlace>> {
+    let (root, info) = (dataset.root(), dataset.info());
+    let mut places = Vec::with_capacity(dataset.episodes().len());
+    let column = |what: &str| format!("videos/{name}/{what}");
+    let names = [column("chunk_index"), column("file_index"), column("from_timestamp")];
+    for path in read::files(root, "meta/episodes")? {
+        let (rows, arrays) = read::columns(&path, &names.each_ref().map(String::as_str))?;
+        let chunk = read::integers(&path, &names[0], &arrays[0])?;
+        let file = read::integers(&path, &names[1], &arrays[1])?;
+        let from = read::doubles(&path, &names[2], &arrays[2])?;
+        for row in 0..rows {
+            let relative = relative(info, name, chunk[row], file[row]).ok_or_else(|| DatasetError::BadDataset {
+                path: root.join("meta/info.json"),
+                object: "video_path".to_owned(),
+                expected: "a path inside the data set with video_key, chunk_index and file_index".to_owned(),
+                found: format!("{:?} for chunk {} and file {}", info.video_path, chunk[row], file[row]),
+            })?;
+            places.push(VideoPlace { path: root.join(relative), from: from[row] });
+        }
+    }
+    Ok(places)
+}
+
+/// Fills in `video_path`, which is in Python's format language.
+fn relative(info: &Info, name: &str, chunk: i64, file: i64) -> Option<PathBuf> {
+    let (chunk, file) = (u32::try_from(chunk).ok()?, u32::try_from(file).ok()?);
+    let text = info.video_path.as_ref()?.replace("{video_key}", name);
+    let text =
+        text.replace("{chunk_index:03d}", &format!("{chunk:03}")).replace("{file_index:03d}", &format!("{file:03}"));
+    let path = Path::new(&text);
+    let inside = path.components().all(|c| matches!(c, Component::Normal(_))) && !text.contains('{');
+    inside.then(|| path.to_path_buf())
+}
+
+/// Reads episodes of one camera, keeping the file open that it read last.
+pub(crate) struct Film {
+    fps: f64,
+    size: (usize, usize),
+    open: Option<(PathBuf, VideoFile)>,
+}
+
+impl Film {
+    pub fn new(fps: f64, size: (usize, usize)) -> Self {
+        Self { fps, size, open: None }
+    }
+
+    /// Fills `out` with the pictures of an episode, once each of them is known to be shown when it should.
+    pub fn read(&mut self, episode: &EpisodeMeta, place: &VideoPlace, out: &mut [u8]) -> Result<()> {
+        if self.open.as_ref().is_none_or(|(path, _)| *path != place.path) {
+            self.open = None;
+            self.open = Some((place.path.clone(), VideoFile::open(&place.path)?));
+        }
+        let (_, file) = self.open.as_ref().expect("it was just opened");
+        let info = file.info();
+        let bad = |object: String, expected: String, found: String| DatasetError::BadDataset {
+            path: place.path.clone(),
+            object,
+            expected,
+            found,
+        };
+        let (height, width) = self.size;
+        if (info.height, info.width) != self.size {
+            let found = format!("{} x {}", info.height, info.width);
+            return Err(bad("pictures".to_owned(), format!("{height} x {width}, as info.json says"), found));
+        }
+        if episode.length == 0 {
+            return Ok(());
+        }
+        let what = |i: usize| format!("frame {i} of episode {}", episode.index);
+        let last = info.seconds(info.frames.saturating_sub(1)).unwrap_or(0.0);
+        let first = info.frame_at(place.from).ok_or_else(|| {
+            let found = format!("{} frames up to {last} s", info.frames);
+            bad(what(0), format!("a frame within {TOLERANCE} s of {} s", place.from), found)
+        })?;
+        for i in 0..episode.length {
+            let due = place.from + i as f64 / self.fps;
+            match info.seconds(first + i) {
+                Some(shown) if (shown - due).abs() <= TOLERANCE => {}
+                shown => {
+                    let found = shown.map_or_else(|| format!("the end after {last} s"), |s| format!("one at {s} s"));
+                    return Err(bad(what(i), format!("a frame within {TOLERANCE} s of {due} s"), found));
+                }
+            }
+        }
+        let size = height * width * 3;
+        file.read(first..first + episode.length, &mut |frame, rgb| {
+            out[(frame - first) * size..(frame - first + 1) * size].copy_from_slice(rgb);
+        })?;
+        Ok(())
+    }
+}
