@@ -27,8 +27,8 @@ pub use error::{DatasetError, InputError, Result};
 pub use keys::KeyItem;
 pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset,
-    ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info, Pictures, Provenance,
-    RotationForm, STATE, VideoOptions, VideoProvenance, convert, export, verify, verify_source,
+    ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info, Pictures,
+    Provenance, RotationForm, STATE, VideoOptions, VideoProvenance, convert, export, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};
