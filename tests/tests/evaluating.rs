@@ -102,6 +102,61 @@ fn a_finished_evaluation_runs_again_to_the_same_outcomes() {
 }
 
 #[test]
+fn part_of_a_finished_evaluation_can_be_run_again() {
+    let (_folder, entries) = copied_zoo();
+    succeeds(&mut eval(&entries, "3", &[]));
+    assert!(said(&mut eval(&entries, "2", &["--again"])).contains("2 of 3 episodes run again, every outcome the same"));
+    refused(&mut eval(&entries, "4", &["--again"]), &["nothing to run again", "10000-10003", "stored: 10000-10002"]);
+    assert_eq!(listing(&entries.join("results")).len(), 1);
+    // under another version of what was there: run, compared, and told
+    let record = result(&entries.join("results"), "lift-act").join("evaluation.json");
+    let text = fs::read_to_string(&record).expect("a record");
+    let numpy = text.split("\"numpy\": \"").nth(1).and_then(|rest| rest.split('"').next()).expect("numpy's version");
+    let changed = text.replace(&format!("\"numpy\": \"{numpy}\""), "\"numpy\": \"1.0.0\"");
+    fs::write(&record, changed).expect("writable");
+    let output = succeeds(&mut eval(&entries, "2", &["--again"]));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("every outcome the same"));
+    let note = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(note.contains("numpy 1.0.0") && note.contains(numpy), "{note}");
+}
+
+#[test]
+fn more_episodes_run_only_what_is_missing_and_none_starts_no_simulator() {
+    let (_folder, entries) = copied_zoo();
+    succeeds(&mut eval(&entries, "3", &[]));
+    let logs = entries.join("logs");
+    let line = said(&mut eval(&entries, "5", &["--workers", "1", "--worker-logs", text(&logs)]));
+    assert!(!line.contains("evaluated before"), "{line}");
+    let straight = entries.join("straight");
+    assert_eq!(said(&mut eval(&entries, "5", &["--results", text(&straight)])), line);
+    assert_eq!(outcomes(&result(&entries.join("results"), "10004")), outcomes(&result(&straight, "10004")));
+    assert_eq!(listing(&logs).len(), 1, "{:?}", listing(&logs));
+    // shown again: no worker has a log
+    let none = entries.join("none");
+    let shown = said(&mut eval(&entries, "5", &["--workers", "1", "--worker-logs", text(&none)]));
+    assert_eq!(shown, line.replace('\n', " (evaluated before; --again runs it again)\n"));
+    assert!(listing(&none).is_empty(), "{:?}", listing(&none));
+}
+
+#[test]
+fn one_bad_entry_does_not_keep_the_others_from_being_evaluated() {
+    let (folder, entries) = copied_zoo();
+    for _ in 0..2 {
+        train_lift(&trained().join("lift"), &entries, &folder.path().join("runs"));
+    }
+    let model = entries.join("lift-act/2/model.safetensors");
+    let mut bytes = fs::read(&model).expect("a model");
+    bytes[3000] ^= 4;
+    fs::write(&model, bytes).expect("writable");
+    let mut command = zoo(["eval", "--all-versions", "--episodes", "1", "--max-steps", "2", "--zoo", text(&entries)]);
+    let output = command.output().expect("it runs");
+    let (out, error) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert_eq!(output.status.code(), Some(1), "{error}");
+    assert!(out.contains("lift-act@1 on") && out.contains("lift-act@3 on") && !out.contains("lift-act@2"), "{out}");
+    assert!(error.contains("error: entry lift-act@2") && error.contains("model.safetensors"), "{error}");
+}
+
+#[test]
 fn another_way_to_act_is_another_evaluation() {
     let (_folder, entries) = copied_zoo();
     succeeds(&mut eval(&entries, "1", &[]));

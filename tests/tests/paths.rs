@@ -4,7 +4,7 @@ use std::ffi::{OsStr, OsString};
 use std::os::unix::ffi::OsStrExt;
 use std::process::{Command, Output};
 
-use e2e::{data, lift, zoo};
+use e2e::{data, lift, text, zoo};
 
 fn ran(command: &mut Command) -> Output {
     let output = command.output().expect("the program starts");
@@ -37,19 +37,14 @@ fn every_command_works_in_a_folder_whose_name_is_not_utf8() {
     let outer = tempfile::tempdir().expect("a temporary folder");
     let folder = outer.path().join(OsStr::from_bytes(b"caf\xe9 \xff"));
     std::fs::create_dir(&folder).expect("creatable");
-    std::fs::copy(lift(), folder.join("lift.hdf5")).expect("copied");
     let folder = folder.as_os_str();
     for arguments in [
-        &["inspect", "@/lift.hdf5"][..],
-        &["inspect", "@/lift.hdf5", "--json"],
-        &["validate", "@/lift.hdf5", "--json"],
-        &["convert", "@/lift.hdf5", "@/set", "--json"],
-        &["validate", "@/set", "--source", "@/lift.hdf5", "--json"],
+        &["convert", text(&lift()), "@/set", "--json"][..],
+        &["validate", "@/set", "--source", text(&lift()), "--json"],
         &["inspect", "@/set", "--json"],
         &["stats", "@/set", "--json"],
         &["query", "@/set", "SELECT demo FROM episodes", "--json"],
         &["plot", "@/set", "--out", "@/set.svg"],
-        &["export", "@/set", "@/again.hdf5", "--json"],
         &["puzzle", "open8", "@/open8.parquet", "--count", "5", "--json"],
     ] {
         works(folder, data, arguments);
@@ -57,7 +52,7 @@ fn every_command_works_in_a_folder_whose_name_is_not_utf8() {
     let places = ["--zoo", "@/zoo", "--runs", "@/runs"];
     let small = ["train", "act_lift", "train.steps=1", "--data"];
     works(folder, zoo, &[&small[..], &["@/set"], &places].concat());
-    works(folder, zoo, &[&small[..], &["@/lift.hdf5"], &places].concat());
+    works(folder, zoo, &[&small[..], &[text(&lift())], &places].concat());
     for arguments in [
         &["list", "--zoo", "@/zoo"][..],
         &["show", "lift-act", "--json", "--zoo", "@/zoo"],
@@ -69,6 +64,29 @@ fn every_command_works_in_a_folder_whose_name_is_not_utf8() {
     ] {
         works(folder, zoo, arguments);
     }
+}
+
+#[test]
+fn an_hdf5_file_there_is_refused_in_one_line_because_its_library_cannot_open_it() {
+    let outer = tempfile::tempdir().expect("a temporary folder");
+    let (set, folder) = (outer.path().join("set"), outer.path().join(OsStr::from_bytes(b"caf\xe9")));
+    std::fs::create_dir(&folder).expect("creatable");
+    let (file, new) = (folder.join("lift.hdf5"), folder.join("new.hdf5"));
+    std::fs::copy(lift(), &file).expect("copied");
+    e2e::succeeds(&mut data(["convert", text(&lift()), text(&set)]));
+    let refused = |command: &mut Command| {
+        let output = ran(command);
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{command:?}: {error}");
+        assert!(error.contains("UTF-8") && error.lines().count() == 1, "{command:?}: {error}");
+    };
+    refused(data(["inspect"]).arg(&file));
+    refused(data(["validate"]).arg(&file));
+    refused(data(["convert"]).arg(&file).arg(outer.path().join("other")));
+    refused(data(["export", text(&set)]).arg(&new));
+    refused(zoo(["train", "act_lift", "--runs", text(&outer.path().join("runs")), "--data"]).arg(&file));
+    assert_eq!(e2e::listing(&folder), ["lift.hdf5"]);
+    assert_eq!(e2e::listing(outer.path()).len(), 2);
 }
 
 #[test]

@@ -154,6 +154,7 @@ impl Pool {
         }
         let first = slots[0].worker.as_ref();
         let fallback = first.and_then(|worker| worker.fallback(options.spec.control));
+        crate::greeting::remember(&options.spec, &ready);
         Ok(Self { options, logs, _temporary: temporary, stop, ready, fallback, slots, incidents })
     }
 

@@ -233,6 +233,21 @@ pub enum ZooError {
         /// The evaluation's folder.
         folder: PathBuf,
     },
+    /// There is no finished evaluation to compare with.
+    #[error(
+        "entry {entry}: nothing to run again: no finished evaluation in {} holds the seeds {seeds} under this protocol; stored: {}",
+        results.display(), if stored.is_empty() { "none".to_owned() } else { stored.join(", ") }
+    )]
+    NothingToCompare {
+        /// The entry.
+        entry: String,
+        /// The seeds that were asked for.
+        seeds: String,
+        /// The folder of results.
+        results: PathBuf,
+        /// Seeds of the evaluations of this entry under this protocol.
+        stored: Vec<String>,
+    },
     /// What is stored and what was found now are not the same.
     #[error("results in {}: {what} differs: stored {expected}, now {found}", folder.display())]
     ResultsDiffer {

@@ -3,6 +3,7 @@
 //! An episode's outcome depends on task, seed, entry and protocol. It does not depend on the worker, the
 //! number of workers, the order, what ran before, or what had to be run again.
 
+mod again;
 mod agent;
 mod clock;
 mod subject;
@@ -13,8 +14,9 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use rollout::{EpisodePlan, FaultKind, Image, JobError, Pool, RolloutError, Worker, WorkerFault};
+use rollout::{EpisodePlan, FaultKind, Image, JobError, Pool, Ready, RolloutError, Worker, WorkerFault};
 
+pub use self::again::{Again, evaluate_again};
 pub use self::agent::{PolicyAgent, QueryTimes};
 pub use self::clock::WallClock;
 pub use self::subject::Subject;
@@ -75,6 +77,21 @@ pub enum Progress<'a> {
     Episode(&'a EpisodeRecord),
 }
 
+/// The evaluation that `subject` would get from workers that greet like this, if it is finished already.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn finished(
+    subject: &Subject<'_>,
+    ready: &Ready,
+    results: &Path,
+    options: &EvaluationOptions,
+) -> Result<Option<StoredEvaluation>, ZooError> {
+    let record = subject.record(ready, options)?;
+    let stored = StoredEvaluation::read_if_there(&results.join(record.folder_name()))?;
+    Ok(stored.filter(|stored| stored.record == record))
+}
+
 /// Runs the episodes that have no outcome yet on `pool` and puts each on disk when it is done.
 ///
 /// # Errors
@@ -88,7 +105,8 @@ pub fn evaluate(
     progress: &mut dyn FnMut(Progress<'_>),
 ) -> Result<EvaluationEnd, ZooError> {
     let record = subject.record(pool.ready(), options)?;
-    let folder = ResultsFolder::open(results, &record)?;
+    let mut folder = ResultsFolder::open(results, &record)?;
+    folder.adopt(results)?;
     let missing = folder.missing();
     let total = record.own_seeds().len() as u64;
     progress(Progress::Begin { done: total - missing.len() as u64, total, folder: folder.path() });

@@ -262,6 +262,11 @@ impl Source {
 
 fn exists(path: &Path) -> Result<(), InputError> {
     match std::fs::metadata(path) {
+        // libhdf5's binding takes text
+        Ok(_) if path.to_str().is_none() => {
+            let reason = "the HDF5 library takes paths in UTF-8 only; link it under another name".to_owned();
+            Err(InputError::Unreadable { path: path.to_owned(), reason })
+        }
         Ok(_) => Ok(()),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Err(InputError::NotFound { path: path.to_owned() }),
         Err(e) => Err(InputError::Unreadable { path: path.to_owned(), reason: e.to_string() }),

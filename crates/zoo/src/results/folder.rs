@@ -1,6 +1,6 @@
 //! One evaluation's folder: its life from the first episode to the last.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -59,6 +59,14 @@ impl StoredEvaluation {
         Ok(Some(Self { folder: folder.to_owned(), record, episodes, timings }))
     }
 
+    /// As [`StoredEvaluation::read`]; `None` also where there is no such folder.
+    ///
+    /// # Errors
+    /// As [`StoredEvaluation::read`].
+    pub fn read_if_there(folder: &Path) -> Result<Option<Self>, ZooError> {
+        if folder.join(RECORD).exists() { Self::read(folder) } else { Ok(None) }
+    }
+
     /// How many episodes succeeded.
     pub fn successes(&self) -> u64 {
         self.episodes.iter().filter(|episode| episode.success).count() as u64
@@ -70,6 +78,15 @@ impl StoredEvaluation {
 /// # Errors
 /// The first evaluation that cannot be read.
 pub fn list_evaluations(results: &Path) -> Result<Vec<StoredEvaluation>, ZooError> {
+    let mut all = Vec::new();
+    for folder in evaluation_folders(results)? {
+        all.extend(StoredEvaluation::read(&folder)?);
+    }
+    Ok(all)
+}
+
+/// Folders of evaluations under `results`, finished or not, by name.
+pub(crate) fn evaluation_folders(results: &Path) -> Result<Vec<PathBuf>, ZooError> {
     let entries = match fs::read_dir(results) {
         Ok(entries) => entries,
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
@@ -83,11 +100,7 @@ pub fn list_evaluations(results: &Path) -> Result<Vec<StoredEvaluation>, ZooErro
         }
     }
     folders.sort();
-    let mut all = Vec::new();
-    for folder in folders {
-        all.extend(StoredEvaluation::read(&folder)?);
-    }
-    Ok(all)
+    Ok(folders)
 }
 
 fn read_record(folder: &Path) -> Result<EvaluationRecord, ZooError> {
@@ -187,6 +200,38 @@ impl ResultsFolder {
     /// The seeds that have no outcome yet, ascending.
     pub fn missing(&self) -> Vec<u64> {
         self.record.own_seeds().into_iter().filter(|seed| !self.done.contains_key(seed)).collect()
+    }
+
+    /// Takes over outcomes of finished evaluations under `results` that differ in nothing but their seeds: an outcome
+    /// depends on the episode's own seed alone. Evaluations that cannot be read are passed over; whoever lists them
+    /// names them.
+    ///
+    /// # Errors
+    /// A journal that cannot be written.
+    pub fn adopt(&mut self, results: &Path) -> Result<(), ZooError> {
+        if self.is_finished() || self.missing().is_empty() {
+            return Ok(());
+        }
+        for folder in evaluation_folders(results)? {
+            let same = |other: &EvaluationRecord| {
+                let seeds = |record: &EvaluationRecord| EvaluationRecord {
+                    seeds: self.record.seeds,
+                    shard: self.record.shard,
+                    ..record.clone()
+                };
+                seeds(other) == self.record
+            };
+            if !read_record(&folder).is_ok_and(|other| same(&other)) {
+                continue;
+            }
+            let Ok(Some(stored)) = StoredEvaluation::read(&folder) else { continue };
+            let missing: BTreeSet<u64> = self.missing().into_iter().collect();
+            let rows = stored.episodes.into_iter().zip(stored.timings);
+            for (episode, timing) in rows.filter(|(episode, _)| missing.contains(&episode.seed)) {
+                self.add(episode, timing)?;
+            }
+        }
+        Ok(())
     }
 
     /// Puts a finished episode on disk.
@@ -350,6 +395,28 @@ pub(crate) mod tests {
         other.steps += 1;
         let error = again.add(other, timing).unwrap_err().to_string();
         assert!(error.contains("outcome of seed 10001 differs"), "{error}");
+    }
+
+    #[test]
+    fn an_evaluation_takes_over_what_a_smaller_one_has_and_ends_in_the_same_bytes() {
+        let dir = tempfile::tempdir().unwrap();
+        let (grown, straight) = (dir.path().join("grown"), dir.path().join("straight"));
+        finished(&grown, &sample("a", 1, 10));
+        let mut shard = sample("a", 1, 30);
+        shard.shard = Some(super::super::Shard { index: 2, count: 2 });
+        finished(&grown, &shard);
+        let mut other = sample("a", 1, 12);
+        other.protocol.max_steps += 1;
+        finished(&grown, &other);
+        finished(&grown, &sample("b", 1, 12));
+        let mut folder = ResultsFolder::open(&grown, &sample("a", 1, 14)).unwrap();
+        folder.adopt(&grown).unwrap();
+        // ten of the first, the odd ones of the second
+        assert_eq!(folder.missing(), [10_010, 10_012]);
+        drop(folder);
+        let (grown, straight) = (finished(&grown, &sample("a", 1, 14)), finished(&straight, &sample("a", 1, 14)));
+        let read = |stored: &StoredEvaluation| fs::read(stored.folder.join(OUTCOMES)).unwrap();
+        assert_eq!(read(&grown), read(&straight));
     }
 
     #[test]

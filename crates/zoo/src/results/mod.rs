@@ -12,6 +12,7 @@ mod merge;
 mod record;
 mod tables;
 
+pub(crate) use folder::evaluation_folders;
 pub use folder::{ResultsFolder, StoredEvaluation, list_evaluations};
 pub use merge::merge_shards;
 pub use record::{

@@ -93,6 +93,7 @@ pub enum TrainOutcome {
 #[serde(deny_unknown_fields)]
 struct RunNote {
     experiment: String,
+    #[serde(with = "crate::files::any_path")]
     data: PathBuf,
     /// Set once the data is open.
     fingerprint: String,

@@ -8,16 +8,20 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits, shown};
 use report::{LeaderboardRow, wilson_interval};
-use rollout::{Control, Pool, video};
+use rollout::{Control, Pool, remembered_greeting, video};
 use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
-use zoo::evaluation::{EvaluationEnd, EvaluationOptions, FIRST_SEED, Progress, Subject, View, evaluate, film};
+use zoo::evaluation::{
+    EvaluationEnd, EvaluationOptions, FIRST_SEED, Progress, Subject, View, evaluate, evaluate_again, film, finished,
+};
 use zoo::registry::Registry;
-use zoo::results::{Execution, ResultsFolder, Seeds, Shard, StoredEvaluation};
+use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
 use crate::places::{ResultsArgs, ZooArgs, entry_names};
 use crate::puzzles::{PuzzleArgs, evaluate_solver};
 
 const GOES_ON: &str = "stopped; the same command goes on where it was";
+/// Behind the line of an evaluation for which nothing was run.
+const THERE: &str = " (evaluated before; --again runs it again)";
 
 /// Evaluate entries: policies in simulation, one episode a seed; puzzle solvers here, on test puzzles
 ///
@@ -198,29 +202,37 @@ fn evaluate_on(
     stop: &Stop,
     failures: &mut Vec<anyhow::Error>,
 ) -> anyhow::Result<()> {
-    let mut subjects = Vec::new();
-    for loaded in entries {
-        let id = loaded.entry().id();
-        match subject(args, loaded).with_context(|| format!("entry {id}")) {
-            Ok(subject) => subjects.push(subject),
-            Err(error) => failures.push(error),
-        }
-    }
-    if subjects.is_empty() {
-        return Ok(());
-    }
     let task = &environment.task;
     let env_args = environment.env_args.as_deref().map(serde_json::from_str).transpose()?;
     let mut spec = args.simulator.recorded_spec(task, env_args.as_ref())?;
     spec.env_module.clone_from(&environment.env_module);
     spec.control = args.control;
     spec.limits.step = Duration::from_secs(args.step_timeout);
+    let (results, options) = (args.results.folder(&args.zoo), options(args, environment));
+    // a finished evaluation is shown without starting a simulator
+    let remembered = (!args.again && args.video == 0).then(|| remembered_greeting(&spec)).flatten();
+    let mut subjects = Vec::new();
+    for loaded in entries {
+        let id = loaded.entry().id();
+        let there = subject(args, loaded).and_then(|subject| match &remembered {
+            Some(ready) => Ok((finished(&subject, ready, &results, &options)?, subject)),
+            None => Ok((None, subject)),
+        });
+        match there.with_context(|| format!("entry {id}")) {
+            Ok((Some(evaluation), _)) => cli::print(&(summary(&evaluation) + THERE + "\n"))?,
+            Ok((None, subject)) => subjects.push(subject),
+            Err(error) => failures.push(error),
+        }
+    }
+    if subjects.is_empty() {
+        return Ok(());
+    }
     let Some(mut pool) = args.simulator.start(spec, args.worker_logs.clone(), stop)? else { return Ok(()) };
     for entry in entries {
         note_other_module(entry.entry().meta(), pool.ready().module_sha256.as_deref());
     }
     for subject in &subjects {
-        if let Err(error) = evaluate_entry(args, environment, subject, &mut pool, stop) {
+        if let Err(error) = evaluate_entry(args, &options, subject, &mut pool, stop) {
             failures.push(error);
         }
         if stop.asked() {
@@ -255,24 +267,27 @@ fn subject(args: &Args, loaded: &LoadedEntry) -> anyhow::Result<Subject<'static>
     Ok(subject)
 }
 
-/// Evaluates one entry and films it, as far as nobody asks to stop.
-fn evaluate_entry(
-    args: &Args,
-    environment: &EnvironmentKey,
-    subject: &Subject<'_>,
-    pool: &mut Pool,
-    stop: &Stop,
-) -> anyhow::Result<()> {
-    let options = EvaluationOptions {
+fn options(args: &Args, environment: &EnvironmentKey) -> EvaluationOptions {
+    EvaluationOptions {
         seeds: Seeds { start: args.seed, count: args.episodes },
         shard: args.shard,
         env_module: environment.env_module.clone(),
         force: args.force,
-    };
+    }
+}
+
+/// Evaluates one entry and films it, as far as nobody asks to stop.
+fn evaluate_entry(
+    args: &Args,
+    options: &EvaluationOptions,
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+    stop: &Stop,
+) -> anyhow::Result<()> {
     let results = args.results.folder(&args.zoo);
     let stopped = match args.again {
-        false => run_missing(subject, pool, &results, &options)?.is_none(),
-        true => again(subject, pool, &results, &options)?,
+        false => run_missing(subject, pool, &results, options)?.is_none(),
+        true => again(subject, pool, &results, options)?,
     };
     if !stopped && args.video > 0 && !stop.asked() {
         videos(args, subject, pool)?;
@@ -290,8 +305,12 @@ fn run_missing(
     let id = subject.entry.to_string();
     let mut screen = Screen::new();
     let mut successes = 0_u64;
+    let mut there = "";
     let end = evaluate(subject, pool, results, options, &mut |progress| match progress {
         Progress::Begin { done, total, .. } => {
+            if done == total {
+                there = THERE;
+            }
             screen.begin_at("eval", done, total);
             screen.message(&id);
         }
@@ -304,7 +323,7 @@ fn run_missing(
     drop(screen);
     match end.with_context(|| format!("entry {id}"))? {
         EvaluationEnd::Complete(evaluation) => {
-            cli::print(&(summary(&evaluation) + "\n"))?;
+            cli::print(&(summary(&evaluation) + there + "\n"))?;
             Ok(Some(evaluation))
         }
         EvaluationEnd::Stopped { done, total } => {
@@ -318,25 +337,34 @@ fn run_missing(
     }
 }
 
-/// Runs a finished evaluation once more beside itself and compares; whether it was stopped.
+/// Runs episodes of a finished evaluation once more and compares; whether it was stopped.
 fn again(subject: &Subject<'_>, pool: &mut Pool, results: &Path, options: &EvaluationOptions) -> anyhow::Result<bool> {
     if subject.time_decides {
         bail!("entry {}: it thinks by the clock, so its episodes may end otherwise: nothing to compare", subject.entry);
     }
-    let record = subject.record(pool.ready(), options)?;
-    let folder = results.join(record.folder_name());
-    if StoredEvaluation::read(&folder).ok().flatten().is_none() {
-        bail!("entry {}: nothing to run again: no finished evaluation {}", subject.entry, shown(&folder));
+    let id = subject.entry.to_string();
+    let mut screen = Screen::new();
+    let mut advance = screen.advance("again");
+    let end = evaluate_again(subject, pool, results, options, &mut advance);
+    drop(advance);
+    drop(screen);
+    let again = end?;
+    if let Some(error) = again.errors.into_iter().next() {
+        return Err(anyhow::Error::new(error).context(format!("entry {id}: an episode could not be run again")));
     }
-    let beside = results.join(format!(".again-{}", std::process::id()));
-    let now = run_missing(subject, pool, &beside, options);
-    fs::remove_dir_all(&beside).with_context(|| format!("removing {}", shown(&beside)))?;
-    let Some(now) = now? else { return Ok(true) };
-    let mut before = ResultsFolder::open(results, &record)?;
-    for (episode, timing) in now.episodes.iter().zip(&now.timings) {
-        before.add(episode.clone(), timing.clone())?;
+    for (name, stored, now) in &again.versions {
+        cli::note(&format!("note: {id}: evaluated with {name} {stored}, run again with {name} {now}"));
     }
-    cli::print(&format!("{}: {} episodes run again, every outcome the same\n", subject.entry, now.episodes.len()))?;
+    if let Some((stored, now)) = again.different.first() {
+        let (count, of, seed) = (again.different.len(), again.episodes, stored.seed);
+        bail!("entry {id}: {count} of {of} outcomes differ, the first of seed {seed}: stored {stored:?}, now {now:?}");
+    }
+    if again.episodes < again.wanted {
+        cli::note(&format!("{id}: {} of {} episodes run again, every outcome the same", again.episodes, again.wanted));
+        return Ok(true);
+    }
+    let of = if again.stored > again.wanted { format!(" of {}", again.stored) } else { String::new() };
+    cli::print(&format!("{id}: {}{of} episodes run again, every outcome the same\n", again.episodes))?;
     Ok(false)
 }
 

@@ -62,7 +62,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
     let mut text = String::new();
     if !rows.is_empty() {
-        text.push_str(&table(&TABLE_COLUMNS, to_table(&rows).into_iter().map(Vec::from), args.wide));
+        let mut columns = TABLE_COLUMNS.to_vec();
+        columns.insert(2, "protocol");
+        let cells = to_table(&rows).into_iter().zip(&rows).map(|(cells, row)| {
+            let mut cells = Vec::from(cells);
+            cells.insert(2, row.protocol.clone());
+            cells
+        });
+        text.push_str(&table(&columns, cells, args.wide));
     }
     if !puzzles.is_empty() {
         text.push_str(&table(&PUZZLE_COLUMNS, puzzle_table(&puzzles).into_iter().map(Vec::from), args.wide));

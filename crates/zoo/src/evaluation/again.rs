@@ -1,0 +1,112 @@
+//! Running again what was evaluated before, to see that every outcome is the same.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use rollout::{Pool, RolloutError};
+
+use super::{EvaluationOptions, Subject, run_episodes};
+use crate::ZooError;
+use crate::results::{EpisodeRecord, EvaluationRecord, StoredEvaluation, evaluation_folders};
+
+/// How running again ended.
+#[derive(Debug)]
+pub struct Again {
+    /// Episodes that were run again.
+    pub episodes: u64,
+    /// Episodes that were asked for.
+    pub wanted: u64,
+    /// Episodes that are stored there.
+    pub stored: u64,
+    /// Outcomes that are not the same: stored and now.
+    pub different: Vec<(EpisodeRecord, EpisodeRecord)>,
+    /// Versions that are not the same: name, stored and now.
+    pub versions: Vec<(String, String, String)>,
+    /// Episodes that no worker could run.
+    pub errors: Vec<RolloutError>,
+}
+
+/// Runs the first of a stored evaluation's episodes again, as many as are asked for, and compares; writes nothing.
+///
+/// The same entry, protocol, execution and seeds decide which evaluation is meant; one under other versions of the
+/// simulator will do where there is none under these.
+///
+/// # Errors
+/// [`ZooError::NothingToCompare`] where no finished evaluation holds these seeds, [`ZooError::ResultsDiffer`] where it is
+/// of another entry under the same name; as an evaluation otherwise.
+pub fn evaluate_again(
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+    results: &Path,
+    options: &EvaluationOptions,
+    progress: &mut dyn FnMut(u64, u64),
+) -> Result<Again, ZooError> {
+    let record = subject.record(pool.ready(), options)?;
+    let stored = find(results, &record)?;
+    if stored.record.training != record.training {
+        let text = |record: &EvaluationRecord| serde_json::to_string(&record.training).unwrap_or_default();
+        return Err(ZooError::ResultsDiffer {
+            folder: stored.folder,
+            what: "evaluation.json".to_owned(),
+            expected: text(&stored.record),
+            found: text(&record),
+        });
+    }
+    let before: BTreeMap<u64, EpisodeRecord> = stored.episodes.into_iter().map(|e| (e.seed, e)).collect();
+    let seeds = record.own_seeds();
+    let wanted = seeds.len() as u64;
+    let mut again = Again {
+        episodes: 0,
+        wanted,
+        stored: before.len() as u64,
+        different: Vec::new(),
+        versions: differences(&stored.record, &record),
+        errors: Vec::new(),
+    };
+    progress(0, wanted);
+    run_episodes(subject, pool, record.protocol.max_steps, &seeds, &|_, _| Ok(()), &mut |result| match result {
+        Ok(now) => {
+            again.episodes += 1;
+            progress(again.episodes, wanted);
+            if let Some(before) = before.get(&now.seed).filter(|before| **before != now) {
+                again.different.push((before.clone(), now));
+            }
+        }
+        Err(error) => again.errors.push(error),
+    })?;
+    Ok(again)
+}
+
+/// The finished evaluation that holds the seeds of `record`.
+fn find(results: &Path, record: &EvaluationRecord) -> Result<StoredEvaluation, ZooError> {
+    // the one of exactly this record is read first, so that damage there is told
+    if let Some(stored) = StoredEvaluation::read_if_there(&results.join(record.folder_name()))? {
+        return Ok(stored);
+    }
+    let seeds = record.own_seeds();
+    let same = |other: &EvaluationRecord| {
+        (&other.entry, &other.protocol, &other.execution) == (&record.entry, &record.protocol, &record.execution)
+    };
+    // whoever lists evaluations names the ones that cannot be read
+    let read = |folder: PathBuf| StoredEvaluation::read(&folder).ok().flatten().filter(|stored| same(&stored.record));
+    let all: Vec<StoredEvaluation> = evaluation_folders(results)?.into_iter().filter_map(read).collect();
+    let holds = |stored: &StoredEvaluation| {
+        let own = stored.record.own_seeds();
+        seeds.iter().all(|seed| own.binary_search(seed).is_ok())
+    };
+    let found =
+        all.iter().filter(|stored| holds(stored)).max_by_key(|stored| stored.record.versions == record.versions);
+    found.cloned().ok_or_else(|| ZooError::NothingToCompare {
+        entry: record.entry.to_string(),
+        seeds: record.seeds.to_string(),
+        results: results.to_owned(),
+        stored: all.iter().map(|stored| stored.record.seeds.to_string()).collect(),
+    })
+}
+
+fn differences(stored: &EvaluationRecord, now: &EvaluationRecord) -> Vec<(String, String, String)> {
+    let names = stored.versions.keys().chain(now.versions.keys().filter(|name| !stored.versions.contains_key(*name)));
+    let of =
+        |record: &EvaluationRecord, name: &str| record.versions.get(name).cloned().unwrap_or_else(|| "none".into());
+    names.map(|name| (name.clone(), of(stored, name), of(now, name))).filter(|(_, stored, now)| stored != now).collect()
+}

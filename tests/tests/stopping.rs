@@ -1,0 +1,124 @@
+//! Ctrl-C and SIGTERM, once, at any time: the program ends within two seconds, says how to go on, and that works.
+
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use e2e::{copied_zoo, data, listing, program, signal, succeeds, text, trained, zoo};
+
+/// Two seconds, and what a crowded machine takes to notice.
+const SOON: Duration = Duration::from_secs(4);
+
+fn started(command: &mut Command) -> Child {
+    command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it starts")
+}
+
+/// Ends by exit code 130 soon after one signal; returns what it said on standard error.
+fn ends(mut child: Child, name: &str) -> String {
+    let begin = Instant::now();
+    signal(&child, name);
+    while child.try_wait().expect("a child").is_none() {
+        assert!(begin.elapsed() < Duration::from_secs(60), "{name}: still there after a minute");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let took = begin.elapsed();
+    let output = child.wait_with_output().expect("its output");
+    let error = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(130), "{name}: {:?}: {error}", output.status);
+    assert!(took < SOON, "{name}: it took {took:?}: {error}");
+    error
+}
+
+/// Worker processes whose parent is this process.
+fn workers(of: u32) -> usize {
+    let parent = of.to_string();
+    let output = Command::new("pgrep").args(["-P", &parent]).output().expect("pgrep");
+    String::from_utf8_lossy(&output.stdout).lines().count()
+}
+
+#[test]
+fn one_signal_ends_a_program_that_starts_its_simulators() {
+    let (folder, entries) = copied_zoo();
+    let out = folder.path().join("out.hdf5");
+    for (name, wait) in [("INT", 50), ("TERM", 50), ("INT", 1500)] {
+        for mut command in [
+            zoo(["eval", "lift-act@1", "--episodes", "3", "--workers", "2", "--zoo", text(&entries)]),
+            data(["collect", "--task", "Lift", "--episodes", "3", "--workers", "2", "--out", text(&out)]),
+        ] {
+            let child = started(&mut command);
+            let id = child.id();
+            // from the first worker's start on
+            let until = Instant::now() + Duration::from_secs(120);
+            while workers(id) == 0 {
+                assert!(Instant::now() < until, "no simulator within two minutes");
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            std::thread::sleep(Duration::from_millis(wait));
+            let error = ends(child, name);
+            assert!(error.contains("the same command goes on"), "{error}");
+        }
+    }
+    assert!(!out.exists());
+    assert!(!listing(folder.path()).iter().any(|name| name.ends_with(".part")), "{:?}", listing(folder.path()));
+}
+
+/// A training that would take hours, into a zoo and with settings of its own.
+fn long_training(folder: &Path) -> Command {
+    let (set, entries, runs) = (trained().join("lift"), folder.join("a zoo's"), folder.join("runs"));
+    let mut command = zoo(["train", "act_lift", "train.steps=1000000", "train.batch_size=2", "policy.dim_model=32"]);
+    command.args(["--data", text(&set), "--zoo", text(&entries), "--runs", text(&runs)]);
+    command
+}
+
+#[test]
+fn a_stopped_training_says_the_command_that_goes_on_and_runs_lists_it() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = folder.path();
+    let runs = folder.join("runs");
+    let listed = || {
+        let output = succeeds(&mut zoo(["runs", "--runs", text(&runs), "--json"]));
+        serde_json::from_slice::<serde_json::Value>(&output.stdout).expect("JSON")
+    };
+    assert_eq!(listed(), serde_json::json!([]));
+    let child = started(&mut long_training(folder));
+    let until = Instant::now() + Duration::from_secs(120);
+    while !runs.join("act_lift/001/metrics.csv").exists() {
+        assert!(Instant::now() < until, "no step within two minutes");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert_eq!((&listed()[0]["state"], &listed()[0]["steps"]), (&"training".into(), &1_000_000.into()));
+    let error = ends(child, "TERM");
+    let hint = error.lines().find_map(|line| line.split_once("go on with: ")).expect("a hint").1.to_owned();
+
+    let run = listed()[0].clone();
+    assert_eq!((&run["state"], &run["command"]), (&"stopped".into(), &hint.clone().into()));
+    assert!(run["step"].as_u64().is_some_and(|step| step > 0), "{run}");
+    let table = String::from_utf8(succeeds(&mut zoo(["runs", "--runs", text(&runs)])).stdout).expect("text");
+    assert!(table.contains("stopped") && table.contains(&hint), "{table}");
+
+    // pasted into a shell it goes on, with the same settings, into the same zoo
+    let programs = Path::new(program("actrm-zoo").get_program()).parent().expect("a folder").to_owned();
+    let path = format!("{}:{}", programs.display(), std::env::var("PATH").expect("a PATH"));
+    let mut resumed = Command::new("bash");
+    resumed.args(["-c", &format!("exec {hint}")]).env("PATH", path).current_dir("/");
+    let child = started(&mut resumed);
+    let before = run["step"].as_u64();
+    let until = Instant::now() + Duration::from_secs(120);
+    while listed()[0]["state"] != "training" {
+        assert!(Instant::now() < until, "it does not go on");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    std::thread::sleep(Duration::from_secs(2));
+    let error = ends(child, "INT");
+    assert!(error.contains("resumed after step") && error.contains(&hint), "{error}");
+    assert!(listed()[0]["step"].as_u64() >= before, "{:?}", listed());
+    assert_eq!(listing(&runs.join("act_lift")), ["001"]);
+}
+
+#[test]
+fn a_signal_while_demonstrations_are_read_ends_a_training_that_never_began() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let child = started(&mut long_training(folder.path()));
+    std::thread::sleep(Duration::from_millis(30));
+    ends(child, "INT");
+}
