@@ -26,6 +26,7 @@ mod registry;
 pub mod rl;
 mod rng;
 mod simd;
+mod size;
 mod train;
 mod values;
 
@@ -40,4 +41,5 @@ pub use params::{Init, Params};
 pub use policy::{ActionChunk, Actor, Observation, Policy, RecedingHorizon, TemporalEnsemble};
 pub use registry::{PolicyConfig, PolicyType};
 pub use rng::Rng;
+pub use size::Size;
 pub use train::{Learner, LearnerMetrics, Schedule, StepMetrics, TrainConfig, Trainer, TrainerState};
