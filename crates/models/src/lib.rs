@@ -30,6 +30,7 @@ mod registry;
 pub mod rl;
 mod rng;
 mod simd;
+mod size;
 mod train;
 mod values;
 
@@ -48,4 +49,5 @@ pub use policy::{ActionChunk, Actor, Clock, Policy, RecedingHorizon, TemporalEns
 pub use preprocess::Preprocess;
 pub use registry::{PolicyConfig, PolicyType};
 pub use rng::Rng;
+pub use size::Size;
 pub use train::{Learner, LearnerMetrics, Schedule, StepMetrics, TrainConfig, Trainer, TrainerState};

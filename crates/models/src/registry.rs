@@ -4,6 +4,7 @@ use crate::error::Result;
 use crate::features::{FeatureKind, Signature};
 use crate::model::PolicyModel;
 use crate::models::{act, actrm, bc};
+use crate::size::Size;
 use serde::de::{DeserializeSeed, Deserializer};
 use serde::{Deserialize, Serialize};
 
@@ -42,6 +43,23 @@ macro_rules! policies {
             pub fn build(&self, signature: &Signature, seed: u64) -> Result<Box<dyn PolicyModel>> {
                 match self {
                     $(Self::$variant(config) => Ok(Box::new($module::$model::new(config, signature, seed)?)),)+
+                }
+            }
+
+            /// How large the model will be.
+            pub fn size(&self) -> Size {
+                match self {
+                    $(Self::$variant(config) => config.size(),)+
+                }
+            }
+
+            /// Checks that a model with this configuration can exist.
+            ///
+            /// # Errors
+            /// The first field that makes it impossible.
+            pub fn validate(&self) -> Result<()> {
+                match self {
+                    $(Self::$variant(config) => config.validate(),)+
                 }
             }
 

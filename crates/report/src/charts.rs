@@ -4,8 +4,9 @@ use std::fmt::Write as _;
 
 use zoo::results::StoredEvaluation;
 
-use crate::html::{Curve, escape};
+use crate::html::escape;
 use crate::leaderboard::LeaderboardRow;
+use crate::page::Curve;
 
 /// Colours of the training curves, in order, readable on light and dark ground.
 const COLOURS: [&str; 8] = ["#2f62c8", "#d9772b", "#1f8f5f", "#a14fb8", "#c8452f", "#128c9c", "#8a7a1f", "#6b7480"];
@@ -29,22 +30,22 @@ pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
     }
     for (index, row) in rows.iter().enumerate() {
         let y = 16.0 + step * (index as f64 + 0.5);
-        let (low, high) = row.interval();
-        let (low_x, high_x, rate_x) = (scale(low), scale(high), scale(row.success_rate()));
-        let name = escape(&row.entry.to_string());
+        let (low, high) = row.counts.interval();
+        let (low_x, high_x, rate_x) = (scale(low), scale(high), scale(row.counts.rate()));
+        let name = escape(&row.record().entry.to_string());
         let _ = write!(
             svg,
             r##"<g><title>{name}: {}/{}, 95% interval {:.1}% to {:.1}%</title><text class="label" x="0" y="{:.1}">{name}</text><line x1="{low_x:.1}" x2="{high_x:.1}" y1="{y:.1}" y2="{y:.1}" stroke="var(--good-soft)" stroke-width="12" stroke-linecap="round"/><circle cx="{rate_x:.1}" cy="{y:.1}" r="5.5" fill="var(--good)"/><text x="{:.1}" y="{:.1}" text-anchor="end">{}/{} · {}</text></g>"##,
-            row.successes,
-            row.episodes,
+            row.counts.successes,
+            row.counts.episodes,
             low * 1e2,
             high * 1e2,
             y + 4.0,
             WIDTH,
             y + 4.0,
-            row.successes,
-            row.episodes,
-            row.percent(),
+            row.counts.successes,
+            row.counts.episodes,
+            row.counts.percent(),
         );
     }
     svg.push_str("</svg>");

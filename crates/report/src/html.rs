@@ -1,190 +1,26 @@
-//! The report: one HTML file with everything in it, for a reader who has nothing but a browser.
-//!
-//! A pure function of results and training curves: no clock, no network, the same bytes for the same
-//! input.
+//! Tables as HTML, and text made safe for it.
 
-use std::collections::BTreeMap;
-use std::fmt::Write as _;
+use crate::column::Column;
 
-use zoo::results::StoredEvaluation;
-
-use crate::charts;
-use crate::leaderboard::{Counts, LeaderboardRow, count_text, rank};
-use crate::wilson::wilson_interval;
-
-/// An entry's training loss over optimiser steps.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Curve {
-    /// The entry, `name@version`.
-    pub entry: String,
-    /// Step and loss, ascending by step.
-    pub points: Vec<(u64, f64)>,
-}
-
-/// The report over all whole evaluations as HTML, and after them `section`: HTML of other evaluations, or nothing.
-pub fn to_html(evaluations: &[StoredEvaluation], curves: &[Curve], section: &str) -> String {
-    let rows = rank(evaluations);
-    let mut groups: BTreeMap<(&str, &str), Vec<&LeaderboardRow>> = BTreeMap::new();
-    for row in &rows {
-        groups.entry((&row.task, &row.protocol)).or_default().push(row);
-    }
-    let mut html = String::new();
-    html.push_str("<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n");
-    html.push_str("<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n");
-    let _ = writeln!(html, "<title>actrm leaderboard</title>\n<style>\n{}</style>\n</head>", include_str!("style.css"));
-    let _ = writeln!(html, "<body>\n{}\n<main>\n<h1>Leaderboard</h1>", charts::patterns());
-    let episodes: u64 = rows.iter().map(|row| row.episodes).sum();
-    let _ = writeln!(
-        html,
-        "<p class=\"lead\">{} evaluations, {} episodes. Entries are ranked by success rate inside a task and \
-         protocol; bars are 95% Wilson intervals. Where intervals overlap widely, these \
-         episodes do not decide between the entries.</p>",
-        rows.len(),
-        episodes
-    );
-    if rows.is_empty() && section.is_empty() {
-        html.push_str("<p>No finished evaluation yet.</p>\n");
-    }
-    for ((task, protocol), rows) in &groups {
-        let _ = writeln!(
-            html,
-            "<h2>{}</h2>\n<p class=\"lead\">Protocol <code>{}</code></p>",
-            escape(task),
-            escape(protocol)
-        );
-        let _ = writeln!(html, "<div class=\"card\">{}</div>", charts::intervals(rows));
-        let _ = writeln!(html, "<div class=\"card\">{}</div>", table(rows));
-        html.push_str("<div class=\"card\">\n<h3 style=\"margin-top:0\">Episodes by seed: bar height is steps taken, hatched bars failed</h3>\n");
-        for row in rows {
-            for evaluation in of_row(evaluations, row) {
-                let _ = writeln!(
-                    html,
-                    "<div class=\"strip\"><p><b>{}</b> {}/{} · seeds {}</p>{}</div>",
-                    escape(&row.entry.to_string()),
-                    row.successes,
-                    row.episodes,
-                    row.seeds,
-                    charts::strip(evaluation)
-                );
-            }
-        }
-        html.push_str("</div>\n");
-        let names: Vec<String> = rows.iter().map(|row| row.entry.to_string()).collect();
-        let mut shown: Vec<&Curve> = curves.iter().filter(|curve| names.contains(&curve.entry)).collect();
-        shown.sort_by(|a, b| a.entry.cmp(&b.entry));
-        let drawn = charts::curves(&shown);
-        if !drawn.is_empty() {
-            let _ = writeln!(
-                html,
-                "<div class=\"card\">\n<h3 style=\"margin-top:0\">Training loss over optimiser steps</h3>\n{drawn}</div>"
-            );
-        }
-        html.push_str("<div class=\"card\">\n<h3 style=\"margin-top:0\">Where these numbers come from</h3>\n");
-        for row in rows {
-            html.push_str(&provenance(row));
-        }
-        html.push_str("</div>\n");
-    }
-    html.push_str(section);
-    let _ = writeln!(
-        html,
-        "<footer>Made by <code>actrm-zoo leaderboard</code> {} from the results in the zoo; nothing here is loaded \
-         from elsewhere.</footer>\n</main>\n</body>\n</html>",
-        env!("CARGO_PKG_VERSION")
-    );
-    html
-}
-
-fn of_row<'a>(
-    evaluations: &'a [StoredEvaluation],
-    row: &'a LeaderboardRow,
-) -> impl Iterator<Item = &'a StoredEvaluation> {
-    evaluations.iter().filter(move |evaluation| {
-        let record = &evaluation.record;
-        record.shard.is_none()
-            && record.entry == row.entry
-            && record.seeds == row.seeds
-            && record.execution == row.execution
-            && record.versions == row.versions
-            && record.protocol.id() == row.protocol
-    })
-}
-
-fn table(rows: &[&LeaderboardRow]) -> String {
-    let mut html = String::from(
-        "<table><thead><tr><th>entry</th><th>policy</th><th>success</th><th>rate</th><th>95% interval</th>\
-         <th>return</th><th>steps to success</th><th>parameters</th><th>inference ms<br>median / p95</th>\
-         <th>training</th><th>data</th></tr></thead><tbody>\n",
-    );
-    let optional = |value: Option<f64>, digits| value.map_or("–".to_owned(), |v| format!("{v:.digits$}"));
+/// Every column that pages show; the lines of a cell after its first are small.
+pub fn table<'r, R: 'static>(columns: &[Column<R>], rows: impl IntoIterator<Item = &'r R>) -> String {
+    let shown: Vec<(&Column<R>, &str)> = columns.iter().filter_map(|c| Some((c, c.page_heading()?))).collect();
+    let mut html = String::from("<table><thead><tr>");
+    shown.iter().for_each(|(_, heading)| html.push_str(&format!("<th>{}</th>", escape(heading).replace('\n', "<br>"))));
+    html.push_str("</tr></thead><tbody>\n");
     for row in rows {
-        let (low, high) = row.interval();
-        let t = &row.training;
-        let _ = writeln!(
-            html,
-            "<tr><td class=\"name\">{}</td><td>{}</td><td>{}/{}{}</td><td>{:.1}%</td><td>{:.1}–{:.1}%</td><td>{}</td>\
-             <td>{}</td><td>{}</td><td>{:.2} / {:.2}</td><td>{} steps<br><small>{:.1} min</small></td>\
-             <td>{}<br><small>{} demos</small></td></tr>",
-            escape(&row.entry.to_string()),
-            escape(&t.policy),
-            row.successes,
-            row.episodes,
-            groups(row),
-            row.success_rate() * 1e2,
-            low * 1e2,
-            high * 1e2,
-            optional(row.mean_return(), 2),
-            optional(row.mean_steps_to_success(), 1),
-            count_text(t.parameters),
-            row.inference_ms.0,
-            row.inference_ms.1,
-            t.steps,
-            t.minutes,
-            escape(&t.data_set),
-            t.demos
-        );
+        html.push_str("<tr>");
+        shown.iter().for_each(|(column, _)| html.push_str(&format!("<td>{}</td>", cell(&column.shown(row)))));
+        html.push_str("</tr>\n");
     }
     html.push_str("</tbody></table>");
     html
 }
 
-/// A line for each group of episodes, with its interval.
-fn groups(row: &LeaderboardRow) -> String {
-    let line = |(name, counts): (&String, &Counts)| {
-        let (low, high) = wilson_interval(counts.successes, counts.episodes);
-        let (name, Counts { successes, episodes }) = (escape(name), counts);
-        format!("<br><small>{name} {successes}/{episodes} ({:.0}–{:.0}%)</small>", low * 1e2, high * 1e2)
-    };
-    row.groups.iter().map(line).collect()
-}
-
-fn provenance(row: &LeaderboardRow) -> String {
-    let t = &row.training;
-    let facts = [
-        ("entry hash", format!("<code>{}</code>", escape(&row.entry.hash))),
-        (
-            "data set",
-            format!(
-                "{}, {} demos, recorded in simulator {}, <code>{}</code>",
-                escape(&t.data_set),
-                t.demos,
-                escape(t.data_simulator.as_deref().unwrap_or("unknown")),
-                escape(&t.data_fingerprint)
-            ),
-        ),
-        (
-            "training",
-            format!("{} steps in {:.1} min, seed {}, {} parameters", t.steps, t.minutes, t.seed, t.parameters),
-        ),
-        ("execution", escape(&row.execution_text())),
-        ("seeds", row.seeds.to_string()),
-        ("versions", escape(&row.versions_text())),
-    ];
-    let mut html = format!("<details><summary>{}</summary><dl>", escape(&row.entry.to_string()));
-    for (name, value) in facts {
-        let _ = write!(html, "<dt>{name}</dt><dd>{value}</dd>");
-    }
-    html.push_str("</dl></details>\n");
+fn cell(text: &str) -> String {
+    let mut lines = text.lines();
+    let mut html = escape(lines.next().unwrap_or_default());
+    lines.for_each(|line| html.push_str(&format!("<br><small>{}</small>", escape(line))));
     html
 }
 
@@ -202,56 +38,4 @@ pub fn escape(text: &str) -> String {
         }
     }
     out
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::*;
-    use crate::testing::{finished, sample};
-    use zoo::results::list_evaluations;
-
-    fn page() -> String {
-        let dir = tempfile::tempdir().unwrap();
-        finished(dir.path(), &sample("lift-act", 1, 20));
-        finished(dir.path(), &sample("<b>&\"", 2, 5));
-        let mut stack = sample("stack-act", 1, 10);
-        stack.protocol.task = "Stack".into();
-        finished(dir.path(), &stack);
-        let points = (0..=500).step_by(10).map(|step| (step, 2.0 * (-(step as f64) / 120.0).exp() + 0.03)).collect();
-        let curves = [Curve { entry: "lift-act@1".into(), points }];
-        to_html(&list_evaluations(dir.path()).unwrap(), &curves, "")
-    }
-
-    #[test]
-    fn the_page_reads_like_this() {
-        insta::assert_snapshot!("report_html", page());
-    }
-
-    #[test]
-    fn the_page_is_self_contained_and_escapes_names() {
-        let html = page();
-        for outside in ["http://", "https://", "<script", "<link", "@import", " src="] {
-            assert!(!html.contains(outside), "{outside}");
-        }
-        assert!(!html.contains("<b>&\""));
-        assert!(html.contains("&lt;b&gt;&amp;&quot;@2"));
-        assert_eq!(html, page());
-    }
-
-    #[test]
-    fn groups_of_episodes_are_shown_apart() {
-        let dir = tempfile::tempdir().unwrap();
-        let mut evaluation = finished(dir.path(), &sample("color", 1, 20));
-        for (k, episode) in evaluation.episodes.iter_mut().enumerate() {
-            episode.group = Some(if k < 15 { "seen" } else { "unseen" }.to_owned());
-        }
-        let html = to_html(&[evaluation], &[], "");
-        assert!(html.contains("16/20<br><small>seen 12/15 (55–93%)</small><br><small>unseen 4/5 (38–96%)</small>"));
-    }
-
-    #[test]
-    fn no_result_is_a_page_that_says_so() {
-        assert!(to_html(&[], &[], "").contains("No finished evaluation yet"));
-    }
 }

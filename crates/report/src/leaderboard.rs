@@ -1,44 +1,79 @@
-//! The leaderboard: one row an evaluation, ranked inside its task and protocol.
+//! The leaderboard: one row an evaluation, ranked inside its task and protocol, and the list of its columns.
 //!
-//! A row stores counts and sums; rates are derived. The same results give the same rows, and the same
+//! A row holds what was measured and counts; rates are derived. The same results give the same rows, and the same
 //! rows the same bytes.
 
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
-use zoo::results::{EntryIdentity, Execution, Seeds, StoredEvaluation, TrainingFacts};
+use zoo::results::{EvaluationRecord, Execution, StoredEvaluation};
 
-use crate::wilson::wilson_interval;
+use crate::column::{Column, number, text};
+use crate::statistics::{mean, quantile, wilson_interval};
+
+/// The statistics of the leaderboard, in their order: everything that writes it walks this list.
+pub const COLUMNS: &[Column<LeaderboardRow>] = &[
+    text(|row: &LeaderboardRow| row.record().entry.to_string()).table("entry").page("entry").left().kept(),
+    text(|row: &LeaderboardRow| row.record().entry.name.clone()).csv("entry"),
+    text(|row: &LeaderboardRow| row.record().entry.version.to_string()).csv("version"),
+    text(|row: &LeaderboardRow| row.record().training.policy.clone()).csv("policy").page("policy"),
+    text(|row: &LeaderboardRow| row.task().to_owned()).csv("task").table("task").left().kept(),
+    text(|row: &LeaderboardRow| row.record().protocol.id()).csv("protocol").table("protocol"),
+    text(LeaderboardRow::execution_text).csv("execution"),
+    text(|row: &LeaderboardRow| row.counts.successes.to_string()).csv("successes"),
+    text(|row: &LeaderboardRow| row.counts.episodes.to_string()).csv("episodes"),
+    text(LeaderboardRow::success_text).table("success").kept(),
+    text(LeaderboardRow::success_intervals_text).page("success"),
+    number(|row: &LeaderboardRow| Some(row.counts.rate()), 4, 4).csv("success_rate"),
+    number(|row: &LeaderboardRow| Some(row.counts.interval().0), 4, 4).csv("ci95_low"),
+    number(|row: &LeaderboardRow| Some(row.counts.interval().1), 4, 4).csv("ci95_high"),
+    text(|row: &LeaderboardRow| format!("{} [{}]", row.counts.percent(), row.counts.interval_text(0, '-')))
+        .table("rate [95%]")
+        .kept(),
+    text(|row: &LeaderboardRow| format!("{:.1}%", row.counts.rate() * 1e2)).page("rate"),
+    text(|row: &LeaderboardRow| format!("{}%", row.counts.interval_text(1, '–'))).page("95% interval"),
+    number(LeaderboardRow::mean_return, 4, 2).csv("mean_return").table("return").page("return"),
+    number(LeaderboardRow::mean_steps_to_success, 2, 1)
+        .csv("mean_steps_to_success")
+        .table("steps")
+        .page("steps to success"),
+    text(|row: &LeaderboardRow| row.record().training.parameters.to_string()).csv("parameters"),
+    text(|row: &LeaderboardRow| count_text(row.record().training.parameters)).table("params").page("parameters"),
+    number(|row: &LeaderboardRow| Some(row.inference_ms(0.5)), 3, 3).csv("inference_ms_median"),
+    number(|row: &LeaderboardRow| Some(row.inference_ms(0.95)), 3, 3).csv("inference_ms_p95"),
+    text(|row: &LeaderboardRow| format!("{:.1} / {:.1}", row.inference_ms(0.5), row.inference_ms(0.95)))
+        .table("ms med/p95"),
+    text(|row: &LeaderboardRow| format!("{:.2} / {:.2}", row.inference_ms(0.5), row.inference_ms(0.95)))
+        .page("inference ms\nmedian / p95"),
+    text(|row: &LeaderboardRow| row.record().training.steps.to_string()).csv("training_steps"),
+    number(|row: &LeaderboardRow| Some(row.record().training.minutes), 2, 2).csv("training_minutes"),
+    text(|row: &LeaderboardRow| row.trained_text(", ")).table("trained"),
+    text(|row: &LeaderboardRow| row.trained_text("\n")).page("training"),
+    text(|row: &LeaderboardRow| row.record().training.data_set.clone()).csv("data_set"),
+    text(|row: &LeaderboardRow| row.record().training.demos.to_string()).csv("demos"),
+    text(|row: &LeaderboardRow| format!("{} {}", row.record().training.demos, row.record().training.data_set))
+        .table("demos"),
+    text(|row: &LeaderboardRow| format!("{}\n{} demos", row.record().training.data_set, row.record().training.demos))
+        .page("data"),
+    text(LeaderboardRow::versions_text).csv("versions"),
+    text(|row: &LeaderboardRow| row.record().seeds.to_string()).csv("seeds").table("seeds"),
+    text(|row: &LeaderboardRow| row.record().training.seed.to_string()).csv("training_seed"),
+    text(|row: &LeaderboardRow| row.record().entry.hash.clone()).csv("entry_hash"),
+    text(|row: &LeaderboardRow| row.record().training.data_fingerprint.clone()).csv("data_fingerprint"),
+    text(LeaderboardRow::groups_text).csv("groups"),
+];
 
 /// One entry's evaluation under one protocol.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LeaderboardRow {
-    /// The entry.
-    pub entry: EntryIdentity,
-    /// Where it comes from.
-    pub training: TrainingFacts,
-    /// The task.
-    pub task: String,
-    /// The protocol's name.
-    pub protocol: String,
-    /// How predictions became actions.
-    pub execution: Execution,
-    /// Episodes in which the task was done.
-    pub successes: u64,
-    /// Episodes run.
-    pub episodes: u64,
-    /// Both for each group of episodes, where the task has groups.
+    /// What was measured, episode by episode.
+    pub evaluation: StoredEvaluation,
+    /// Successes among all episodes.
+    pub counts: Counts,
+    /// The same for each group of episodes, where the task has groups.
     pub groups: BTreeMap<String, Counts>,
-    /// Sum of all episodes' returns.
-    pub return_sum: f64,
-    /// Sum of the steps of the successful episodes.
-    pub success_steps: u64,
-    /// Duration of a policy query in milliseconds: median and 95th percentile.
-    pub inference_ms: (f64, f64),
-    /// The episodes' seeds.
-    pub seeds: Seeds,
-    /// Versions of the simulator and what it stands on.
-    pub versions: BTreeMap<String, String>,
+    /// Durations of all queries in milliseconds, ascending.
+    queries: Vec<f64>,
 }
 
 /// Episodes in which the task was done, of those that were run.
@@ -50,45 +85,20 @@ pub struct Counts {
     pub episodes: u64,
 }
 
-impl LeaderboardRow {
-    /// The row of a finished evaluation.
-    pub fn new(evaluation: &StoredEvaluation) -> Self {
-        let StoredEvaluation { record, episodes, timings, .. } = evaluation;
-        let queries: Vec<f64> = timings.iter().flat_map(|t| t.inference_ms.iter().copied()).collect();
-        let won = || episodes.iter().filter(|episode| episode.success);
-        let mut groups: BTreeMap<String, Counts> = BTreeMap::new();
-        for episode in episodes {
-            if let Some(group) = &episode.group {
-                let counts = groups.entry(group.clone()).or_default();
-                counts.episodes += 1;
-                counts.successes += u64::from(episode.success);
-            }
-        }
-        Self {
-            groups,
-            entry: record.entry.clone(),
-            training: record.training.clone(),
-            task: record.protocol.task.clone(),
-            protocol: record.protocol.id(),
-            execution: record.execution,
-            successes: won().count() as u64,
-            episodes: episodes.len() as u64,
-            return_sum: episodes.iter().map(|episode| episode.total_reward).sum(),
-            success_steps: won().map(|episode| u64::from(episode.steps)).sum(),
-            inference_ms: (quantile(&queries, 0.5), quantile(&queries, 0.95)),
-            seeds: record.seeds,
-            versions: record.versions.clone(),
-        }
+impl Counts {
+    fn add(&mut self, success: bool) {
+        self.episodes += 1;
+        self.successes += u64::from(success);
     }
 
     /// Share of successful episodes; 0 for none.
-    pub fn success_rate(&self) -> f64 {
-        ratio(self.successes as f64, self.episodes).unwrap_or(0.0)
+    pub fn rate(&self) -> f64 {
+        self.successes as f64 / self.episodes.max(1) as f64
     }
 
     /// The success rate in whole percents, in tenths where those would say that all or none succeeded.
     pub fn percent(&self) -> String {
-        let rate = self.success_rate() * 1e2;
+        let rate = self.rate() * 1e2;
         let whole = format!("{rate:.0}");
         let some = 0 < self.successes && self.successes < self.episodes;
         if some && (whole == "0" || whole == "100") {
@@ -102,25 +112,72 @@ impl LeaderboardRow {
         wilson_interval(self.successes, self.episodes)
     }
 
+    /// The interval in percents: `58-92`.
+    fn interval_text(&self, digits: usize, to: char) -> String {
+        let (low, high) = self.interval();
+        format!("{:.digits$}{to}{:.digits$}", low * 1e2, high * 1e2)
+    }
+}
+
+impl std::fmt::Display for Counts {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}/{}", self.successes, self.episodes)
+    }
+}
+
+impl LeaderboardRow {
+    /// The row of a finished evaluation.
+    pub fn new(evaluation: &StoredEvaluation) -> Self {
+        let (mut counts, mut groups) = (Counts::default(), BTreeMap::<String, Counts>::new());
+        for episode in &evaluation.episodes {
+            counts.add(episode.success);
+            if let Some(group) = &episode.group {
+                groups.entry(group.clone()).or_default().add(episode.success);
+            }
+        }
+        let mut queries: Vec<f64> = evaluation.timings.iter().flat_map(|t| t.inference_ms.iter().copied()).collect();
+        queries.sort_by(f64::total_cmp);
+        Self { evaluation: evaluation.clone(), counts, groups, queries }
+    }
+
+    /// What the evaluation depended on.
+    pub fn record(&self) -> &EvaluationRecord {
+        &self.evaluation.record
+    }
+
+    /// The task.
+    pub fn task(&self) -> &str {
+        &self.record().protocol.task
+    }
+
+    /// The `q`-quantile of a query's duration in milliseconds.
+    pub fn inference_ms(&self, q: f64) -> f64 {
+        quantile(&self.queries, q).unwrap_or(0.0)
+    }
+
     /// Mean return of an episode.
     pub fn mean_return(&self) -> Option<f64> {
-        ratio(self.return_sum, self.episodes)
+        mean(self.evaluation.episodes.iter().map(|episode| episode.total_reward))
     }
 
     /// Mean number of control steps to success, over the successful episodes.
     pub fn mean_steps_to_success(&self) -> Option<f64> {
-        ratio(self.success_steps as f64, self.successes)
+        mean(self.steps_to_success())
+    }
+
+    fn steps_to_success(&self) -> impl Iterator<Item = f64> {
+        self.evaluation.episodes.iter().filter(|episode| episode.success).map(|episode| f64::from(episode.steps))
     }
 
     /// `mujoco 3.3.7, robosuite 1.5.2, ...`
     pub fn versions_text(&self) -> String {
-        let each: Vec<String> = self.versions.iter().map(|(name, v)| format!("{name} {v}")).collect();
+        let each: Vec<String> = self.record().versions.iter().map(|(name, v)| format!("{name} {v}")).collect();
         each.join(", ")
     }
 
     /// `8 steps` or `ensemble 0.01`.
     pub fn execution_text(&self) -> String {
-        match self.execution {
+        match self.record().execution {
             Execution::RecedingHorizon { n_action_steps } => format!("{n_action_steps} steps"),
             Execution::TemporalEnsemble { coefficient } => format!("ensemble {coefficient}"),
         }
@@ -128,29 +185,62 @@ impl LeaderboardRow {
 
     /// `seen 52/66, unseen 20/34`; nothing where the task has no groups.
     pub fn groups_text(&self) -> String {
-        let each: Vec<String> =
-            self.groups.iter().map(|(name, c)| format!("{name} {}/{}", c.successes, c.episodes)).collect();
+        let each: Vec<String> = self.groups.iter().map(|(name, counts)| format!("{name} {counts}")).collect();
         each.join(", ")
+    }
+
+    /// `72/100`, and below it each group's.
+    fn success_text(&self) -> String {
+        let groups = self.groups.iter().map(|(name, counts)| format!("\n{name} {counts}"));
+        self.counts.to_string() + &groups.collect::<String>()
+    }
+
+    /// `72/100`, and below it each group's with its interval.
+    fn success_intervals_text(&self) -> String {
+        let line =
+            |(name, counts): (&String, &Counts)| format!("\n{name} {counts} ({}%)", counts.interval_text(0, '–'));
+        self.counts.to_string() + &self.groups.iter().map(line).collect::<String>()
+    }
+
+    fn trained_text(&self, between: &str) -> String {
+        let training = &self.record().training;
+        format!("{} steps{between}{:.1} min", training.steps, training.minutes)
+    }
+
+    /// `lift-act@1 on Lift: 20 of 20 (100.0%, 95% interval 83.9-100.0), mean 44.7 steps to success`, and a line for each
+    /// group of episodes.
+    pub fn summary(&self) -> String {
+        let rate = |counts: &Counts| {
+            let (rate, interval) = (counts.rate() * 1e2, counts.interval_text(1, '-'));
+            format!("{} of {} ({rate:.1}%, 95% interval {interval})", counts.successes, counts.episodes)
+        };
+        let mut text = format!("{} on {}: {}", self.record().entry, self.task(), rate(&self.counts));
+        if let Some(steps) = self.mean_steps_to_success() {
+            text.push_str(&format!(", mean {steps:.1} steps to success"));
+        }
+        if self.record().time_decides {
+            text.push_str("\n  it thinks by the clock: these episodes may end otherwise next time");
+        }
+        for (group, counts) in &self.groups {
+            text.push_str(&format!("\n  {group}: {}", rate(counts)));
+        }
+        text
     }
 
     /// Best first; ties by what does not change.
     fn order(&self, other: &Self) -> Ordering {
-        let group = |row: &Self| (row.task.clone(), row.protocol.clone());
-        let rate = |row: &Self| u128::from(row.successes);
-        let better = rate(other) * u128::from(self.episodes.max(1));
+        let group = |row: &Self| (row.task().to_owned(), row.record().protocol.id());
+        let share = |one: &Self, two: &Self| u128::from(one.counts.successes) * u128::from(two.counts.episodes.max(1));
+        let seeds = |row: &Self| (row.record().seeds.start, row.record().seeds.count);
         group(self)
             .cmp(&group(other))
-            .then(better.cmp(&(rate(self) * u128::from(other.episodes.max(1)))))
-            .then(other.episodes.cmp(&self.episodes))
-            .then_with(|| self.entry.cmp(&other.entry))
-            .then_with(|| (self.seeds.start, self.seeds.count).cmp(&(other.seeds.start, other.seeds.count)))
-            .then_with(|| self.versions.cmp(&other.versions))
+            .then(share(other, self).cmp(&share(self, other)))
+            .then(other.counts.episodes.cmp(&self.counts.episodes))
+            .then_with(|| self.record().entry.cmp(&other.record().entry))
+            .then_with(|| seeds(self).cmp(&seeds(other)))
+            .then_with(|| self.record().versions.cmp(&other.record().versions))
             .then_with(|| self.execution_text().cmp(&other.execution_text()))
     }
-}
-
-fn ratio(sum: f64, count: u64) -> Option<f64> {
-    (count > 0).then(|| sum / count as f64)
 }
 
 /// The rows of all whole evaluations (shards wait until they are merged), best first in each task.
@@ -159,129 +249,6 @@ pub fn rank(evaluations: &[StoredEvaluation]) -> Vec<LeaderboardRow> {
     let mut rows: Vec<LeaderboardRow> = whole.map(LeaderboardRow::new).collect();
     rows.sort_by(LeaderboardRow::order);
     rows
-}
-
-/// The columns of [`to_csv`].
-pub const CSV_COLUMNS: [&str; 26] = [
-    "entry",
-    "version",
-    "policy",
-    "task",
-    "protocol",
-    "execution",
-    "successes",
-    "episodes",
-    "success_rate",
-    "ci95_low",
-    "ci95_high",
-    "mean_return",
-    "mean_steps_to_success",
-    "parameters",
-    "inference_ms_median",
-    "inference_ms_p95",
-    "training_steps",
-    "training_minutes",
-    "data_set",
-    "demos",
-    "versions",
-    "seeds",
-    "training_seed",
-    "entry_hash",
-    "data_fingerprint",
-    "groups",
-];
-
-/// The leaderboard as CSV (RFC 4180, `\n` line ends): one row an evaluation, every column of the record.
-pub fn to_csv(rows: &[LeaderboardRow]) -> String {
-    let mut text = CSV_COLUMNS.join(",");
-    text.push('\n');
-    for row in rows {
-        let (low, high) = row.interval();
-        let t = &row.training;
-        let optional = |value: Option<f64>, digits| value.map_or(String::new(), |v| format!("{v:.digits$}"));
-        let cells: [String; CSV_COLUMNS.len()] = [
-            row.entry.name.clone(),
-            row.entry.version.to_string(),
-            t.policy.clone(),
-            row.task.clone(),
-            row.protocol.clone(),
-            row.execution_text(),
-            row.successes.to_string(),
-            row.episodes.to_string(),
-            format!("{:.4}", row.success_rate()),
-            format!("{low:.4}"),
-            format!("{high:.4}"),
-            optional(row.mean_return(), 4),
-            optional(row.mean_steps_to_success(), 2),
-            t.parameters.to_string(),
-            format!("{:.3}", row.inference_ms.0),
-            format!("{:.3}", row.inference_ms.1),
-            t.steps.to_string(),
-            format!("{:.2}", t.minutes),
-            t.data_set.clone(),
-            t.demos.to_string(),
-            row.versions_text(),
-            row.seeds.to_string(),
-            t.seed.to_string(),
-            row.entry.hash.clone(),
-            t.data_fingerprint.clone(),
-            row.groups_text(),
-        ];
-        let quoted: Vec<String> = cells.iter().map(|cell| quote(cell)).collect();
-        text.push_str(&quoted.join(","));
-        text.push('\n');
-    }
-    text
-}
-
-fn quote(cell: &str) -> String {
-    if cell.contains(['"', ',', '\n', '\r']) { format!("\"{}\"", cell.replace('"', "\"\"")) } else { cell.to_owned() }
-}
-
-/// The columns of [`to_table`].
-pub const TABLE_COLUMNS: [&str; 11] =
-    ["entry", "task", "success", "rate [95%]", "return", "steps", "params", "ms med/p95", "trained", "demos", "seeds"];
-
-/// The leaderboard in short, for a terminal: cells in the order of [`TABLE_COLUMNS`].
-pub fn to_table(rows: &[LeaderboardRow]) -> Vec<[String; TABLE_COLUMNS.len()]> {
-    let optional = |value: Option<f64>, digits| value.map_or("-".to_owned(), |v| format!("{v:.digits$}"));
-    rows.iter()
-        .map(|row| {
-            let (low, high) = row.interval();
-            [
-                row.entry.to_string(),
-                row.task.clone(),
-                success_text(row),
-                format!("{} [{:.0}-{:.0}]", row.percent(), low * 1e2, high * 1e2),
-                optional(row.mean_return(), 2),
-                optional(row.mean_steps_to_success(), 1),
-                count_text(row.training.parameters),
-                format!("{:.1} / {:.1}", row.inference_ms.0, row.inference_ms.1),
-                format!("{} steps, {:.1} min", row.training.steps, row.training.minutes),
-                format!("{} {}", row.training.demos, row.training.data_set),
-                row.seeds.to_string(),
-            ]
-        })
-        .collect()
-}
-
-/// The leaderboard as a Markdown table, with the columns of [`TABLE_COLUMNS`].
-pub fn to_markdown(rows: &[LeaderboardRow]) -> String {
-    let line = |cells: &[String]| {
-        let escaped: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|").replace('\n', "<br>")).collect();
-        format!("| {} |\n", escaped.join(" | "))
-    };
-    let mut text = line(&TABLE_COLUMNS.map(str::to_owned));
-    text.push_str(&line(&TABLE_COLUMNS.map(|_| "---".to_owned())));
-    to_table(rows).iter().for_each(|cells| text.push_str(&line(cells)));
-    text
-}
-
-/// `72/100`, and below it each group's.
-fn success_text(row: &LeaderboardRow) -> String {
-    let groups = row.groups_text().replace(", ", "\n");
-    let total = format!("{}/{}", row.successes, row.episodes);
-    if groups.is_empty() { total } else { format!("{total}\n{groups}") }
 }
 
 /// `9,922` stays as it is, `1500000` becomes `1.50M`.
@@ -293,51 +260,23 @@ pub fn count_text(count: u64) -> String {
     }
 }
 
-/// The `q`-quantile of `values` by linear interpolation; 0 for none.
-fn quantile(values: &[f64], q: f64) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let at = q * (sorted.len() - 1) as f64;
-    let (below, share) = (at.floor() as usize, at.fract());
-    let above = (below + 1).min(sorted.len() - 1);
-    sorted[below] + (sorted[above] - sorted[below]) * share
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::column::cells;
     use crate::testing::{finished, sample};
+    use crate::{csv, markdown};
     use zoo::results::{Shard, list_evaluations};
 
     #[test]
-    fn quantiles_interpolate_as_numpy_s() {
-        let values = [4.0, 1.0, 3.0, 2.0];
-        assert_eq!(quantile(&values, 0.5), 2.5);
-        assert!((quantile(&values, 0.95) - 3.85).abs() < 1e-12);
-        assert_eq!(quantile(&values, 0.0), 1.0);
-        assert_eq!(quantile(&values, 1.0), 4.0);
-        assert_eq!(quantile(&[7.0], 0.95), 7.0);
-        assert_eq!(quantile(&[], 0.5), 0.0);
-    }
-
-    #[test]
     fn a_rate_is_not_rounded_to_all_or_none() {
-        let dir = tempfile::tempdir().unwrap();
-        let mut row = board(dir.path()).remove(0);
-        row.episodes = 200;
         let texts = [(0, "0%"), (1, "0.5%"), (2, "1%"), (151, "76%"), (198, "99%"), (199, "99.5%"), (200, "100%")];
         for (successes, text) in texts {
-            row.successes = successes;
-            assert_eq!(row.percent(), text);
+            assert_eq!(Counts { successes, episodes: 200 }.percent(), text);
         }
-        (row.successes, row.episodes) = (99_999, 100_000);
-        assert_eq!(row.percent(), "99.9%");
-        (row.successes, row.episodes) = (1, 100_000);
-        assert_eq!(row.percent(), "0.1%");
+        assert_eq!(Counts { successes: 99_999, episodes: 100_000 }.percent(), "99.9%");
+        assert_eq!(Counts { successes: 1, episodes: 100_000 }.percent(), "0.1%");
     }
 
     fn board(folder: &std::path::Path) -> Vec<LeaderboardRow> {
@@ -358,19 +297,19 @@ mod tests {
     fn csv_and_table_read_like_this() {
         let dir = tempfile::tempdir().unwrap();
         let rows = board(dir.path());
-        insta::assert_snapshot!("leaderboard_csv", to_csv(&rows));
-        let table: Vec<String> = to_table(&rows).iter().map(|cells| cells.join(" | ")).collect();
+        insta::assert_snapshot!("leaderboard_csv", csv::table(COLUMNS, &rows));
+        let table: Vec<String> = cells(COLUMNS, &rows).rows.iter().map(|cells| cells.join(" | ")).collect();
         insta::assert_snapshot!("leaderboard_table", table.join("\n"));
     }
 
     #[test]
     fn the_order_of_the_folders_does_not_matter() {
         let dir = tempfile::tempdir().unwrap();
-        let expected = to_csv(&board(dir.path()));
+        let expected = csv::table(COLUMNS, &board(dir.path()));
         let mut all = list_evaluations(dir.path()).unwrap();
         for _ in 0..all.len() {
             all.rotate_left(1);
-            assert_eq!(to_csv(&rank(&all)), expected);
+            assert_eq!(csv::table(COLUMNS, &rank(&all)), expected);
         }
     }
 
@@ -384,23 +323,23 @@ mod tests {
         let row = LeaderboardRow::new(&evaluation);
         // the sample fails for every fifth seed
         assert_eq!(row.groups_text(), "seen 12/15, unseen 4/5");
-        assert_eq!(to_table(std::slice::from_ref(&row))[0][2], "16/20\nseen 12/15\nunseen 4/5");
-        assert!(to_markdown(std::slice::from_ref(&row)).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
-        assert!(to_csv(&[row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\""));
+        assert_eq!(cells(COLUMNS, [&row]).rows[0][2], "16/20\nseen 12/15\nunseen 4/5");
+        assert!(markdown::table(COLUMNS, [&row]).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
+        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\""));
     }
 
     #[test]
     fn rates_are_derived_from_counts() {
         let dir = tempfile::tempdir().unwrap();
         let rows = board(dir.path());
-        let row = rows.iter().find(|row| row.entry.to_string() == "lift-act@1").unwrap();
+        let row = rows.iter().find(|row| row.record().entry.to_string() == "lift-act@1").unwrap();
         // the sample fails for every fifth seed
-        assert_eq!((row.successes, row.episodes), (16, 20));
-        assert_eq!(row.success_rate(), 0.8);
+        assert_eq!((row.counts.successes, row.counts.episodes), (16, 20));
+        assert_eq!(row.counts.rate(), 0.8);
         assert_eq!(row.mean_return(), Some(0.8));
         let steps: u64 = (10_000..10_020).filter(|s| s % 5 != 0).map(|s| 40 + s % 7).sum();
         assert_eq!(row.mean_steps_to_success(), Some(steps as f64 / 16.0));
-        let none = rows.iter().find(|row| row.task == "Stack").unwrap();
-        assert_eq!((none.successes, none.mean_steps_to_success()), (0, None));
+        let none = rows.iter().find(|row| row.task() == "Stack").unwrap();
+        assert_eq!((none.counts.successes, none.mean_steps_to_success()), (0, None));
     }
 }

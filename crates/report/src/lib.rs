@@ -1,17 +1,22 @@
 //! What readers see of a zoo's results: statistics, the leaderboard, and the forms that it is written in.
 //!
+//! A table is a list of columns ([`column`]); [`csv`], [`markdown`] and [`html`] each write any such list, and so do
+//! the programs to a terminal.
+//!
 //! Pure functions of results: no file, no clock, the same bytes for the same evaluations. What this crate is not: it
 //! runs nothing and knows no kind of entry but robot policies; other kinds bring their own section (`study`).
 
 mod charts;
-mod html;
+pub mod column;
+pub mod csv;
+pub mod html;
 mod leaderboard;
+pub mod markdown;
+mod page;
+mod statistics;
 #[cfg(test)]
 mod testing;
-mod wilson;
 
-pub use html::{Curve, escape, to_html};
-pub use leaderboard::{
-    CSV_COLUMNS, Counts, LeaderboardRow, TABLE_COLUMNS, count_text, rank, to_csv, to_markdown, to_table,
-};
-pub use wilson::wilson_interval;
+pub use leaderboard::{COLUMNS, Counts, LeaderboardRow, count_text, rank};
+pub use page::{Curve, to_html};
+pub use statistics::{mean, quantile, wilson_interval};

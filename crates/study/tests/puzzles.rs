@@ -8,9 +8,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use puzzles::Task;
+use report::csv;
 use study::puzzle::{
-    AnyExperiment, Baseline, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest, SolverEntry,
-    evaluate_puzzles, list_puzzle_evaluations, puzzle_csv, trace, train_puzzles,
+    AnyExperiment, Baseline, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest,
+    SolverEntry, evaluate_puzzles, list_puzzle_evaluations, trace, train_puzzles,
 };
 use zoo::config::Library;
 use zoo::entry::Entry;
@@ -180,7 +181,7 @@ fn an_entry_is_evaluated_once_shown_on_the_board_and_refused_where_it_does_not_f
     assert_eq!(list_puzzle_evaluations(&results).unwrap(), std::slice::from_ref(&first));
     assert_eq!(first.by_depth.keys().copied().collect::<Vec<_>>(), [1, 2, 4]);
     assert_eq!((first.answers.puzzles, first.task.as_str()), (20, "dfs10"));
-    assert!(puzzle_csv(&[first]).contains("trm-dfs10,1,trm,dfs10"));
+    assert!(csv::table(PUZZLE_COLUMNS, [&first]).contains("trm-dfs10,1,trm,dfs10"));
     assert!(entry.card().unwrap().contains("processor time"));
 
     // shared by all cells, its weights work on larger mazes, but not on Sudoku

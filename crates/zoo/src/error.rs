@@ -48,6 +48,26 @@ pub enum ZooError {
         /// Every experiment there is.
         available: Vec<String>,
     },
+    /// Not a name that an experiment can have.
+    #[error("experiment name `{name}`: {reason}")]
+    ExperimentName {
+        /// The name.
+        name: String,
+        /// The rule it breaks.
+        reason: &'static str,
+    },
+    /// A training would take more memory than there is.
+    #[error(
+        "experiment `{experiment}` needs at least {needed} of memory, {available} are there; lower the policy's sizes or train.batch_size, or raise train.accumulation"
+    )]
+    TooLarge {
+        /// The experiment.
+        experiment: String,
+        /// What its weights and a batch take.
+        needed: String,
+        /// What may still be taken.
+        available: String,
+    },
     /// An experiment file is not TOML.
     #[error("experiment `{experiment}` is not valid TOML")]
     ExperimentSyntax {

@@ -75,9 +75,9 @@ pub struct DataSection {
     /// Things that are a token each, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub entities: BTreeMap<String, EntitySection>,
-    /// Mask of the episodes to train on; a data set without masks is trained on whole.
+    /// Mask of the episodes to train on; a data set without masks is trained on whole, and so is any with "" here.
     pub train_mask: String,
-    /// Mask of the episodes to validate on.
+    /// Mask of the episodes to validate on; "" for none.
     pub valid_mask: String,
 }
 
@@ -256,6 +256,10 @@ impl Experiment {
             let expected = "1, because rollout.temporal_ensemble asks at every step".to_owned();
             return invalid("rollout.n_action_steps", expected, steps.to_string());
         }
+        if self.rollout.max_steps == Some(0) {
+            return invalid("rollout.max_steps", "at least 1".to_owned(), "0".to_owned());
+        }
+        self.policy.validate().map_err(self.model_error("build the policy of"))?;
         self.data.check(self.policy.reads())?;
         self.train.check()
     }
@@ -284,12 +288,6 @@ impl Experiment {
     pub(crate) fn model_error(&self, operation: &'static str) -> impl FnOnce(ModelError) -> ZooError + use<> {
         let name = self.entry.clone();
         move |source| ZooError::Model { operation, name, source }
-    }
-
-    /// The same for what the tensor library refuses.
-    pub(crate) fn tensor_error(&self, operation: &'static str) -> impl FnOnce(candle_core::Error) -> ZooError + use<> {
-        let wrap = self.model_error(operation);
-        move |source| wrap(ModelError::Tensor(source))
     }
 }
 
@@ -371,6 +369,8 @@ mod tests {
         );
         assert!(error(&["rollout.temporal_ensemble=0.01"]).starts_with("key `rollout.n_action_steps`: expected 1, "));
         assert!(load(&["rollout.temporal_ensemble=0.01", "rollout.n_action_steps=1"]).is_ok());
+        assert_eq!(error(&["rollout.max_steps=0"]), "key `rollout.max_steps`: expected at least 1, found 0");
+        assert_eq!(error(&["policy.kl_weight=-1"]), "cannot build the policy of `lift-act`");
         assert!(error(&["train.batch_size=0"]).starts_with("key `train.batch_size`: expected at least 1"));
         assert!(error(&["entry=Lift"]).starts_with("entry name `Lift`"));
         assert!(error(&["data.state_keys=[]"]).starts_with("key `data.state_keys`"));

@@ -210,6 +210,67 @@ fn a_run_goes_on_only_with_what_it_began_with() {
 }
 
 #[test]
+fn a_run_killed_after_its_entry_appeared_finds_it_again() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let mut request = request(root.path(), &data, &[]);
+    let entry = finish(&request);
+    let run = root.path().join("runs/act_lift/001");
+    // what is left when the process dies between the two
+    fs::remove_file(run.join("finished.json")).unwrap();
+    request.resume = true;
+    let again = finish(&request);
+    assert_eq!(again.id(), entry.id());
+    assert_eq!(Registry::open(&request.zoo).ids().unwrap(), [entry.id()]);
+    assert!(run.join("finished.json").is_file());
+
+    // the version is another run's: this one still gets its own
+    fs::remove_file(run.join("finished.json")).unwrap();
+    fs::remove_dir_all(entry.folder()).unwrap();
+    let mut other = request.clone();
+    (other.resume, other.run) = (false, Some(root.path().join("other")));
+    assert_eq!(finish(&other).id(), entry.id());
+    let own = finish(&request);
+    assert_eq!(own.id().version, 2);
+    assert!(model(&own) == model(&entry));
+}
+
+#[test]
+fn what_cannot_end_well_is_refused_before_a_run_is_begun() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let refused = |request: &TrainRequest| {
+        let error = train(request, &|| false, &mut |_| {}).unwrap_err().to_string();
+        assert!(!request.runs.exists(), "{error}");
+        error
+    };
+    let huge = refused(&request(root.path(), &data, &["train.batch_size=100000000"]));
+    assert!(huge.starts_with("experiment `lift-act` needs at least "), "{huge}");
+    let up = refused(&TrainRequest { name: "../c/up".to_owned(), ..request(root.path(), &data, &[]) });
+    assert!(up.starts_with("experiment name `../c/up`"), "{up}");
+    // nobody may make a file there, not even root
+    let read_only = refused(&TrainRequest { zoo: "/proc/zoo".into(), ..request(root.path(), &data, &[]) });
+    assert_eq!(read_only, "cannot write into /proc");
+}
+
+#[test]
+fn a_mask_that_is_not_there_is_an_error_that_lists_those_that_are() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let refused = |change: &str| {
+        let request = request(root.path(), &data, &[change]);
+        train(&request, &|| false, &mut |_| {}).unwrap_err().to_string()
+    };
+    let typo = refused("data.valid_mask=vaild");
+    assert!(typo.contains("data.valid_mask: no mask `vaild`; there is train, valid"), "{typo}");
+    let typo = refused("data.train_mask=trian");
+    assert!(typo.contains("data.train_mask: no mask `trian`; there is train, valid"), "{typo}");
+    // none asked for: none held out
+    let entry = finish(&request(root.path(), &data, &["data.valid_mask=\"\""]));
+    assert_eq!(entry.meta().data.as_ref().unwrap().valid_episodes, 0);
+}
+
+#[test]
 fn data_that_does_not_serve_is_refused_before_anything_is_trained() {
     let root = tempfile::tempdir().unwrap();
     let data = demonstrations(root.path());

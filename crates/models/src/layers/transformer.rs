@@ -5,6 +5,7 @@ use super::{Activation, Dropout, Embedding, FeedForward, LayerNorm, Mode, MultiH
 use crate::error::Result;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
+use crate::size::Size;
 use candle_core::{DType, Tensor};
 
 /// What all transformer layers of a model share.
@@ -16,6 +17,18 @@ pub(crate) struct Shape {
     pub(crate) activation: Activation,
     pub(crate) dropout: f64,
     pub(crate) pre_norm: bool,
+}
+
+impl Shape {
+    /// Of one layer with `attentions` attentions, run over `tokens` tokens.
+    pub(crate) fn size(&self, attentions: usize, tokens: usize) -> Size {
+        let (dim, hidden, attentions) = (self.dim as f64, self.hidden as f64, attentions as f64);
+        let (tokens, heads) = (tokens as f64, self.heads as f64);
+        Size {
+            weights: 4.0 * attentions * dim * dim + 2.0 * dim * hidden,
+            activations: tokens * (4.0 * attentions * dim + hidden) + heads * tokens * tokens,
+        }
+    }
 }
 
 /// One encoder layer: self-attention and feed-forward, each with a residual.

@@ -4,7 +4,9 @@ use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use report::{count_text, escape, wilson_interval};
+use report::column::{Column, number, text};
+use report::html::{self, escape};
+use report::{count_text, wilson_interval};
 
 use super::evaluation::PuzzleEvaluation;
 use super::grade::Counts;
@@ -63,116 +65,85 @@ fn best_baseline(row: &PuzzleEvaluation, of: fn(&Counts) -> u64) -> String {
     )
 }
 
-/// The columns of [`puzzle_table`].
-pub const PUZZLE_COLUMNS: [&str; 12] = [
-    "entry",
-    "task",
-    "right [95%]",
-    "exact",
-    "walk",
-    "detours right",
-    "no thought: right",
-    "cells / no thought",
-    "steps",
-    "params",
-    "trained",
-    "seed",
+/// The statistics of the puzzles' board, in their order: everything that writes it walks this list.
+pub const PUZZLE_COLUMNS: &[Column<PuzzleEvaluation>] = &[
+    text(|row: &PuzzleEvaluation| row.entry.to_string()).table("entry").page("entry").left().kept(),
+    text(|row: &PuzzleEvaluation| row.entry.name.clone()).csv("entry"),
+    text(|row: &PuzzleEvaluation| row.entry.version.to_string()).csv("version"),
+    text(|row: &PuzzleEvaluation| row.training.policy.clone()).csv("policy").page("model"),
+    text(|row: &PuzzleEvaluation| row.task.clone()).csv("task"),
+    text(task_text).table("task").left().kept(),
+    text(|row: &PuzzleEvaluation| row.givens.to_string()).csv("givens"),
+    text(|row: &PuzzleEvaluation| row.answers.puzzles.to_string()).csv("puzzles"),
+    text(|row: &PuzzleEvaluation| row.answers.valid.to_string()).csv("right"),
+    text(|row: &PuzzleEvaluation| format!("{}/{}", row.answers.valid, row.answers.puzzles)).page("right"),
+    text(|row: &PuzzleEvaluation| rate(row.answers.valid, row.answers.puzzles)).table("right [95%]").kept(),
+    number(|row: &PuzzleEvaluation| Some(interval(row).0), 4, 4).csv("ci95_low"),
+    number(|row: &PuzzleEvaluation| Some(interval(row).1), 4, 4).csv("ci95_high"),
+    text(|row: &PuzzleEvaluation| format!("{:.1}–{:.1}%", interval(row).0 * 1e2, interval(row).1 * 1e2))
+        .page("95% interval"),
+    text(|row: &PuzzleEvaluation| row.answers.exact.to_string()).csv("exact").page("exact"),
+    text(|row: &PuzzleEvaluation| percent(row.answers.share(row.answers.exact))).table("exact"),
+    text(|row: &PuzzleEvaluation| row.answers.walk.to_string()).csv("walk").page("walk"),
+    text(walk_text).table("walk"),
+    text(|row: &PuzzleEvaluation| row.answers.detours.to_string()).csv("detours"),
+    text(|row: &PuzzleEvaluation| row.answers.detours_valid.to_string()).csv("detours_right"),
+    text(detours_text).table("detours right").page("detours right"),
+    text(|row: &PuzzleEvaluation| best_baseline(row, |counts| counts.valid))
+        .table("no thought: right")
+        .page("without thought"),
+    text(cells_text).table("cells / no thought"),
+    text(|row: &PuzzleEvaluation| row.answers.cells.to_string()).csv("cells"),
+    text(|row: &PuzzleEvaluation| row.answers.cells_right.to_string()).csv("cells_right"),
+    text(|row: &PuzzleEvaluation| row.steps.to_string()).csv("steps"),
+    number(|row: &PuzzleEvaluation| Some(row.mean_steps()), 1, 1).table("steps").page("steps"),
+    text(|row: &PuzzleEvaluation| row.depth.to_string()).csv("depth"),
+    text(|row: &PuzzleEvaluation| row.training.parameters.to_string()).csv("parameters"),
+    text(|row: &PuzzleEvaluation| count_text(row.training.parameters)).table("params").page("parameters"),
+    text(|row: &PuzzleEvaluation| row.training.steps.to_string()).csv("training_steps"),
+    number(|row: &PuzzleEvaluation| Some(row.cpu_seconds), 1, 1).csv("training_cpu_seconds"),
+    text(|row: &PuzzleEvaluation| format!("{} steps, {:.0} cpu s", row.training.steps, row.cpu_seconds))
+        .table("trained"),
+    text(|row: &PuzzleEvaluation| format!("{} steps\n{:.0} cpu s", row.training.steps, row.cpu_seconds))
+        .page("training"),
+    text(|row: &PuzzleEvaluation| row.training.seed.to_string()).csv("training_seed").table("seed"),
+    text(|row: &PuzzleEvaluation| most_of_baselines(row, |counts| counts.valid)).csv("best_baseline_right"),
+    text(|row: &PuzzleEvaluation| most_of_baselines(row, |counts| counts.cells_right)).csv("best_baseline_cells_right"),
+    text(|row: &PuzzleEvaluation| row.entry.hash.clone()).csv("entry_hash"),
+    text(depths_text).page("right after steps"),
 ];
 
-/// The rows in short, for a terminal: cells in the order of [`PUZZLE_COLUMNS`].
-pub fn puzzle_table(rows: &[PuzzleEvaluation]) -> Vec<[String; PUZZLE_COLUMNS.len()]> {
-    rows.iter()
-        .map(|row| {
-            let a = &row.answers;
-            let cells = match a.cells {
-                0 => "-".to_owned(),
-                _ => format!("{} / {}", percent(a.cell_accuracy()), best_baseline(row, |counts| counts.cells_right)),
-            };
-            let maze = a.walk > 0 || a.detours > 0;
-            [
-                row.entry.to_string(),
-                task_text(row),
-                rate(a.valid, a.puzzles),
-                percent(a.share(a.exact)),
-                if maze { percent(a.share(a.walk)) } else { "-".to_owned() },
-                if a.detours > 0 { percent(a.detours_valid as f64 / a.detours as f64) } else { "-".to_owned() },
-                best_baseline(row, |counts| counts.valid),
-                cells,
-                format!("{:.1}", row.mean_steps()),
-                count_text(row.training.parameters),
-                format!("{} steps, {:.0} cpu s", row.training.steps, row.cpu_seconds),
-                row.training.seed.to_string(),
-            ]
-        })
-        .collect()
+fn interval(row: &PuzzleEvaluation) -> (f64, f64) {
+    wilson_interval(row.answers.valid, row.answers.puzzles)
 }
 
-/// The columns of [`puzzle_csv`].
-pub const PUZZLE_CSV_COLUMNS: [&str; 24] = [
-    "entry",
-    "version",
-    "policy",
-    "task",
-    "givens",
-    "puzzles",
-    "right",
-    "ci95_low",
-    "ci95_high",
-    "exact",
-    "walk",
-    "detours",
-    "detours_right",
-    "cells",
-    "cells_right",
-    "steps",
-    "depth",
-    "parameters",
-    "training_steps",
-    "training_cpu_seconds",
-    "training_seed",
-    "best_baseline_right",
-    "best_baseline_cells_right",
-    "entry_hash",
-];
+fn walk_text(row: &PuzzleEvaluation) -> String {
+    let answers = &row.answers;
+    if answers.walk > 0 || answers.detours > 0 { percent(answers.share(answers.walk)) } else { "-".to_owned() }
+}
 
-/// The rows as CSV: counts, and the 95% Wilson interval of the share of right answers.
-pub fn puzzle_csv(rows: &[PuzzleEvaluation]) -> String {
-    let mut text = PUZZLE_CSV_COLUMNS.join(",");
-    text.push('\n');
-    for row in rows {
-        let a = &row.answers;
-        let (low, high) = wilson_interval(a.valid, a.puzzles);
-        let most = |of: fn(&Counts) -> u64| row.baselines.values().map(of).max().unwrap_or(0).to_string();
-        let cells: [String; PUZZLE_CSV_COLUMNS.len()] = [
-            row.entry.name.clone(),
-            row.entry.version.to_string(),
-            row.training.policy.clone(),
-            row.task.clone(),
-            row.givens.to_string(),
-            a.puzzles.to_string(),
-            a.valid.to_string(),
-            format!("{low:.4}"),
-            format!("{high:.4}"),
-            a.exact.to_string(),
-            a.walk.to_string(),
-            a.detours.to_string(),
-            a.detours_valid.to_string(),
-            a.cells.to_string(),
-            a.cells_right.to_string(),
-            row.steps.to_string(),
-            row.depth.to_string(),
-            row.training.parameters.to_string(),
-            row.training.steps.to_string(),
-            format!("{:.1}", row.cpu_seconds),
-            row.training.seed.to_string(),
-            most(|counts| counts.valid),
-            most(|counts| counts.cells_right),
-            row.entry.hash.clone(),
-        ];
-        text.push_str(&cells.join(","));
-        text.push('\n');
+/// `47/50 (94.0%)`
+fn detours_text(row: &PuzzleEvaluation) -> String {
+    let (right, of) = (row.answers.detours_valid, row.answers.detours);
+    if of == 0 { "-".to_owned() } else { format!("{right}/{of} ({})", percent(right as f64 / of as f64)) }
+}
+
+/// Cells that are right, and the most that an answer without thought has.
+fn cells_text(row: &PuzzleEvaluation) -> String {
+    if row.answers.cells == 0 {
+        return "-".to_owned();
     }
-    text
+    format!("{} / {}", percent(row.answers.cell_accuracy()), best_baseline(row, |counts| counts.cells_right))
+}
+
+fn most_of_baselines(row: &PuzzleEvaluation, of: fn(&Counts) -> u64) -> String {
+    row.baselines.values().map(of).max().unwrap_or(0).to_string()
+}
+
+/// `1: 47.5%`, and so on line by line.
+fn depths_text(row: &PuzzleEvaluation) -> String {
+    let line = |(depth, counts): (&usize, &Counts)| format!("{depth}: {}", percent(counts.share(counts.valid)));
+    row.by_depth.iter().map(line).collect::<Vec<_>>().join(", ")
 }
 
 /// The puzzles' part of the report, as HTML; nothing where there are none.
@@ -188,45 +159,10 @@ pub fn puzzle_section(evaluations: &[PuzzleEvaluation]) -> String {
             html,
             "<h2>{}</h2>\n<p class=\"lead\">Puzzles of the test split, answered in this program. Right: any shortest path, \
              or the solution. Exact: cell by cell the stored answer. Without thought: the best of the answers that do not \
-             look at the walls.</p>\n<div class=\"card\"><table><thead><tr><th>entry</th><th>model</th><th>right</th>\
-             <th>95% interval</th><th>exact</th><th>walk</th><th>detours right</th><th>without thought</th>\
-             <th>steps</th><th>parameters</th><th>training</th><th>right after steps</th></tr></thead><tbody>",
-            escape(&task)
+             look at the walls.</p>\n<div class=\"card\">{}</div>",
+            escape(&task),
+            html::table(PUZZLE_COLUMNS, rows)
         );
-        for row in rows {
-            let a = &row.answers;
-            let (low, high) = wilson_interval(a.valid, a.puzzles);
-            let depths: Vec<String> = row
-                .by_depth
-                .iter()
-                .map(|(depth, counts)| format!("{depth}: {}", percent(counts.share(counts.valid))))
-                .collect();
-            let detours = match a.detours {
-                0 => "–".to_owned(),
-                n => format!("{}/{n}", a.detours_valid),
-            };
-            let _ = writeln!(
-                html,
-                "<tr><td class=\"name\">{}</td><td>{}</td><td>{}/{}</td><td>{:.1}–{:.1}%</td><td>{}</td><td>{}</td>\
-                 <td>{detours}</td><td>{}</td><td>{:.1}</td><td>{}</td><td>{} steps<br><small>{:.0} cpu s</small></td>\
-                 <td><small>{}</small></td></tr>",
-                escape(&row.entry.to_string()),
-                escape(&row.training.policy),
-                a.valid,
-                a.puzzles,
-                low * 1e2,
-                high * 1e2,
-                a.exact,
-                a.walk,
-                escape(&best_baseline(row, |counts| counts.valid)),
-                row.mean_steps(),
-                count_text(row.training.parameters),
-                row.training.steps,
-                row.cpu_seconds,
-                depths.join(", ")
-            );
-        }
-        html.push_str("</tbody></table></div>\n");
     }
     html
 }
@@ -236,6 +172,8 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::puzzle::grade::Baseline;
+    use report::column::cells;
+    use report::csv;
     use zoo::results::{EntryIdentity, TrainingFacts};
 
     fn row(name: &str, valid: u64, task: &str) -> PuzzleEvaluation {
@@ -284,13 +222,26 @@ mod tests {
         let rows = rank_puzzles(&[row("b", 150, "open8"), row("a", 190, "open8"), row("c", 10, "dfs10")]);
         let names: Vec<&str> = rows.iter().map(|row| row.entry.name.as_str()).collect();
         assert_eq!(names, ["c", "a", "b"]);
-        let table = puzzle_table(&rows);
-        assert_eq!(table[1][2], "95.0% [91.0-97.3]");
-        assert_eq!(table[1][6], "46.0% (straight)");
-        assert_eq!(table[1][8], "2.5");
-        let csv = puzzle_csv(&rows);
+        let table = cells(PUZZLE_COLUMNS, &rows);
+        let cell = |heading: &str| {
+            let at = table.headings.iter().position(|(found, _)| *found == heading).unwrap();
+            table.rows[1][at].as_str()
+        };
+        assert_eq!(cell("right [95%]"), "95.0% [91.0-97.3]");
+        assert_eq!(cell("no thought: right"), "46.0% (straight)");
+        assert_eq!(cell("detours right"), "47/50 (94.0%)");
+        assert_eq!(cell("steps"), "2.5");
+        let csv = csv::table(PUZZLE_COLUMNS, &rows);
         assert_eq!(csv.lines().count(), 4);
-        assert!(csv.lines().all(|line| line.split(',').count() == PUZZLE_CSV_COLUMNS.len()));
+        assert!(
+            csv.starts_with("entry,version,policy,task,givens,puzzles,right,ci95_low,ci95_high,exact,walk,detours,")
+        );
+        assert!(
+            csv.contains(
+                "a,1,trm,open8,0,200,190,0.9104,0.9726,190,190,50,47,12800,12000,500,16,9922,500,61.3,1,92,0,"
+            ),
+            "{csv}"
+        );
         let html = puzzle_section(&rows);
         assert!(html.contains("<td>190/200</td>") && html.contains("1: 47.5%, 2: 95.0%"), "{html}");
         assert_eq!(puzzle_section(&[]), "");

@@ -20,7 +20,7 @@ mod trace;
 mod training;
 mod walk;
 
-pub use board::{PUZZLE_COLUMNS, PUZZLE_CSV_COLUMNS, puzzle_csv, puzzle_section, puzzle_table, rank_puzzles};
+pub use board::{PUZZLE_COLUMNS, puzzle_section, rank_puzzles};
 pub use cpu::cpu_seconds;
 pub use entry::{ProgressPoint, PuzzleMeta, SOLVER, SolverEntry};
 pub use evaluation::{

@@ -1,6 +1,7 @@
 //! `[model]` of a puzzle experiment: the recursive model and those that it is compared with.
 
 use models::ModelError;
+use models::Size;
 use models::baselines::{GridConfig, GridDims, SmallTrmConfig, WalkerConfig};
 use models::classification::ClassProbability;
 use models::trm::{self, Mixing, Pooling, Positions};
@@ -171,6 +172,23 @@ impl SolverConfig {
                 });
             }
         })
+    }
+
+    /// How large the model for a grid of `cells` will be: the widest layers alone.
+    pub fn size(&self, cells: usize) -> Size {
+        let (width, inner, layers) = match self {
+            Self::Trm(section) => (section.hidden_size, section.inner_size, section.layers),
+            Self::Transformer(section) => (section.dim, section.feedforward, section.layers),
+            Self::Cnn(section) => section.channels.iter().max().map_or((0, 0, 0), |&widest| (widest, 0, 1)),
+            Self::Mlp(section) => {
+                // not cell by cell: one vector a puzzle
+                let weights = section.hidden.windows(2).map(|pair| pair[0] as f64 * pair[1] as f64).sum();
+                return Size { weights, activations: cells as f64 };
+            }
+            _ => (0, 0, 0),
+        };
+        let (width, inner, layers) = (width as f64, inner as f64, layers as f64);
+        Size { weights: layers * width * inner, activations: layers * cells as f64 * (width + inner) }
     }
 
     /// The name that `type` gives it.

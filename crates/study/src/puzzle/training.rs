@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 use candle_core::Tensor;
 use models::classification::cross_entropy;
@@ -13,8 +12,8 @@ use puzzles::{Puzzle, Split, Task};
 use serde::{Deserialize, Serialize};
 
 use zoo::entry::{CardWords, EntryDraft, EntryMeta, TrainingMeta, grouped};
-use zoo::run::{Checkpoint, Metrics, MetricsRow, RunFolder, TrainEvent, TrainOutcome, loop_parts};
-use zoo::{ZooError, tensors, write_atomic};
+use zoo::run::{Checkpoint, MetricsRow, Place, Settings, TrainEvent, TrainOutcome, TrainSection, Training};
+use zoo::{ZooError, tensors};
 
 use super::cpu::cpu_seconds;
 use super::entry::{ProgressPoint, PuzzleMeta, SOLVER};
@@ -41,6 +40,33 @@ pub struct PuzzleTrainRequest {
     pub zoo: PathBuf,
 }
 
+impl Settings for PuzzleExperiment {
+    fn read(name: &str, text: &str) -> Result<Self, ZooError> {
+        Self::from_toml(name, text)
+    }
+
+    fn text(&self) -> String {
+        self.to_toml()
+    }
+
+    fn values(&self) -> BTreeMap<String, String> {
+        self.flat()
+    }
+
+    fn section(&self) -> &TrainSection {
+        &self.train
+    }
+
+    fn entry(&self) -> &str {
+        &self.entry
+    }
+
+    fn least_bytes(&self) -> f64 {
+        let cells = self.task.family().map_or(0, Task::cells);
+        self.model.size(cells).training_bytes(self.train.batch_size)
+    }
+}
+
 /// Trains, or goes on training, until all steps are done or `stop` says so.
 ///
 /// # Errors
@@ -50,35 +76,9 @@ pub fn train_puzzles(
     stop: &dyn Fn() -> bool,
     on_event: &mut dyn FnMut(TrainEvent<'_>),
 ) -> Result<TrainOutcome, ZooError> {
-    let folder = loop_parts::open_folder(&request.name, &request.runs, request.run.as_deref(), request.resume)?;
-    let experiment = &request.experiment;
-    if request.resume {
-        let path = folder.config_path();
-        let text = std::fs::read_to_string(&path).map_err(ZooError::io("read", &path))?;
-        let saved = PuzzleExperiment::from_toml(&request.name, &text)?;
-        loop_parts::same_settings(folder.path(), &saved.flat(), &experiment.flat())?;
-    }
-    let started = Run::start(experiment, &folder, on_event);
-    let mut run = match started {
-        Ok(run) => run,
-        Err(error) => {
-            if !folder.config_path().exists() {
-                folder.discard();
-            }
-            return Err(error);
-        }
-    };
-    if !request.resume {
-        write_atomic(&folder.config_path(), experiment.to_toml().as_bytes())?;
-    }
-    if !run.go(stop, on_event)? {
-        return Ok(TrainOutcome::Stopped { step: run.step, run: folder.path().to_owned() });
-    }
-    let minutes = run.seconds() / 60.0;
-    let entry = run.draft(&request.name)?.seal(&request.zoo)?;
-    let finished = serde_json::json!({"entry": entry.to_string(), "minutes": minutes, "steps": run.step});
-    write_atomic(&folder.finished_path(), format!("{finished:#}\n").as_bytes())?;
-    Ok(TrainOutcome::Finished { entry, run: folder.path().to_owned(), minutes })
+    let PuzzleTrainRequest { name, experiment, runs, run, resume, zoo } = request.clone();
+    let place = Place { name, runs, run, resume, zoo };
+    zoo::run::run(&place, &experiment, |_, _| PuzzleTraining::new(&experiment), stop, on_event)
 }
 
 /// Who learns: a TRM with its carry, or a model that answers at once.
@@ -213,128 +213,34 @@ struct State {
     student: serde_json::Value,
 }
 
-struct Run<'a> {
+/// A solver that learns from puzzles.
+struct PuzzleTraining<'a> {
     experiment: &'a PuzzleExperiment,
-    folder: &'a RunFolder,
     task: Task,
     student: Student,
     stream: Stream,
     /// Carries the weights that are validated and sealed.
     solver: Solver,
     valid: Vec<Puzzle>,
-    metrics: Metrics,
-    events: zoo::run::EventWriter,
-    step: u64,
-    /// Seconds on the clock and of the processor in earlier sessions.
-    before: (f64, f64),
-    started: (Instant, f64),
-    last_checkpoint: Option<PathBuf>,
+    /// Processor seconds of earlier sessions, and of this process when this one began.
+    cpu: (f64, f64),
 }
 
-impl<'a> Run<'a> {
-    fn start(
-        experiment: &'a PuzzleExperiment,
-        folder: &'a RunFolder,
-        on_event: &mut dyn FnMut(TrainEvent<'_>),
-    ) -> Result<Self, ZooError> {
-        let (section, task) = (&experiment.train, experiment.task.family()?);
-        let built = experiment.build(task, section.seed);
+impl<'a> PuzzleTraining<'a> {
+    fn new(experiment: &'a PuzzleExperiment) -> Result<Self, ZooError> {
+        let task = experiment.task.family()?;
+        let built = experiment.build(task, experiment.train.seed);
         let solver = built.map_err(experiment.model_error("build the model of"))?;
-        let mut student = Student::new(experiment, task).map_err(experiment.model_error("set up the training of"))?;
-        let (mut step, mut before, mut taken, mut last_checkpoint) = (0, (0.0, 0.0), 0, None);
-        if let Some(checkpoint) = Checkpoint::latest(&folder.checkpoints())? {
-            let path = Checkpoint::path(&folder.checkpoints(), checkpoint.step);
-            let state: State = serde_json::from_value(checkpoint.trainer).map_err(|e| ZooError::Malformed {
-                path: path.clone(),
-                reason: format!("not a checkpoint of a puzzle training: {e}"),
-            })?;
-            (step, before, taken) = (checkpoint.step, (checkpoint.seconds, state.cpu), state.taken);
-            last_checkpoint = Some(path);
-            let restored = student.restore(&checkpoint.tensors, &state.student);
-            restored.map_err(experiment.model_error("restore the checkpoint of"))?;
-        }
-        let metrics = Metrics::open(folder.path().join("metrics.csv"), step)?;
-        let events_path = folder.path().join("events.out.tfevents.0.actrm");
-        let events = zoo::run::EventWriter::create(&events_path, metrics.rows(), loop_parts::wall_time())?;
+        let student = Student::new(experiment, task).map_err(experiment.model_error("set up the training of"))?;
         let givens = experiment.task.givens();
         let valid = 0..experiment.task.valid_puzzles;
         let valid = valid.map(|index| task.numbered(Split::Valid, givens, VALID_SEED, index)).collect();
-        on_event(TrainEvent::Folder(folder.path()));
-        on_event(TrainEvent::Begin {
-            from: step,
-            steps: section.steps,
-            parameters: solver.parameters(),
-            windows: experiment.task.train_puzzles,
-        });
-        Ok(Self {
-            stream: Stream::new(experiment, taken)?,
-            experiment,
-            folder,
-            task,
-            student,
-            solver,
-            valid,
-            metrics,
-            events,
-            step,
-            before,
-            started: (Instant::now(), cpu_seconds()),
-            last_checkpoint,
-        })
-    }
-
-    fn seconds(&self) -> f64 {
-        self.before.0 + self.started.0.elapsed().as_secs_f64()
+        let stream = Stream::new(experiment, 0)?;
+        Ok(Self { experiment, task, student, stream, solver, valid, cpu: (0.0, cpu_seconds()) })
     }
 
     fn cpu(&self) -> f64 {
-        self.before.1 + cpu_seconds() - self.started.1
-    }
-
-    /// Steps until all are done (true) or `stop` says so (false). Either way a checkpoint is written.
-    fn go(&mut self, stop: &dyn Fn() -> bool, on_event: &mut dyn FnMut(TrainEvent<'_>)) -> Result<bool, ZooError> {
-        let section = &self.experiment.train;
-        while self.step < section.steps {
-            if stop() {
-                self.save(on_event)?;
-                return Ok(false);
-            }
-            let puzzles = self.stream.take(self.student.wanted());
-            let mut values = self.student.step(self.task, &puzzles).map_err(|source| match source {
-                ModelError::NotFinite { step, tensor, value } => {
-                    let checkpoint = self.last_checkpoint.clone();
-                    ZooError::NotFinite { step, tensor, value: f64::from(value), checkpoint }
-                }
-                other => self.experiment.model_error("train")(other),
-            })?;
-            self.step += 1;
-            let last = self.step == section.steps;
-            let validate = last || self.step.is_multiple_of(section.validate_every);
-            values.insert("cpu_seconds".to_owned(), self.cpu());
-            values.insert("seen".to_owned(), self.stream.taken() as f64);
-            if validate {
-                // not part of what training costs
-                let before = cpu_seconds();
-                self.take_evaluated()?;
-                let depth = self.depth();
-                let (counts, _) = graded(&self.solver, &self.valid, &[depth], depth)
-                    .map_err(self.experiment.model_error("validate"))?
-                    .halting();
-                values.insert("valid_exact".to_owned(), counts.share(counts.exact));
-                values.insert("valid_valid".to_owned(), counts.share(counts.valid));
-                self.started.1 += cpu_seconds() - before;
-            }
-            let row = MetricsRow { step: self.step, values };
-            on_event(TrainEvent::Step(&row));
-            if validate || self.step.is_multiple_of(section.log_every) {
-                self.events.push(&row, loop_parts::wall_time())?;
-                self.metrics.push(row)?;
-            }
-            if last || self.step.is_multiple_of(section.checkpoint_every) {
-                self.save(on_event)?;
-            }
-        }
-        Ok(true)
+        self.cpu.0 + cpu_seconds() - self.cpu.1
     }
 
     /// Supervision steps of a validation: those of training.
@@ -349,23 +255,66 @@ impl<'a> Run<'a> {
         let taken = self.student.evaluated().and_then(|weights| self.solver.load(&weights));
         taken.map_err(self.experiment.model_error("take the weights of"))
     }
+}
 
-    fn save(&mut self, on_event: &mut dyn FnMut(TrainEvent<'_>)) -> Result<(), ZooError> {
-        let state = self.student.state().map_err(self.experiment.model_error("save the training of"))?;
-        let trainer = State { taken: self.stream.taken(), cpu: self.cpu(), student: state.1 };
-        let trainer = serde_json::to_value(trainer).expect("numbers and JSON become JSON");
-        let checkpoint = Checkpoint { step: self.step, seconds: self.seconds(), tensors: state.0, trainer };
-        let path = checkpoint.save(&self.folder.checkpoints())?;
-        self.metrics.write_parquet(&self.folder.path().join("metrics.parquet"))?;
-        on_event(TrainEvent::Saved(&path));
-        self.last_checkpoint = Some(path);
-        Ok(())
+impl Training for PuzzleTraining<'_> {
+    fn parameters(&self) -> u64 {
+        self.solver.parameters()
     }
 
-    /// The entry that this run has earned.
-    fn draft(&mut self, name: &str) -> Result<EntryDraft, ZooError> {
+    fn examples(&self) -> u64 {
+        self.experiment.task.train_puzzles
+    }
+
+    fn threads(&self) -> usize {
+        candle_core::utils::get_num_threads()
+    }
+
+    fn step(&mut self, _: u64) -> Result<BTreeMap<String, f64>, ZooError> {
+        let puzzles = self.stream.take(self.student.wanted());
+        let done = self.student.step(self.task, &puzzles);
+        let mut values = done.map_err(self.experiment.model_error("train"))?;
+        values.insert("cpu_seconds".to_owned(), self.cpu());
+        values.insert("seen".to_owned(), self.stream.taken() as f64);
+        Ok(values)
+    }
+
+    fn validate(&mut self) -> Result<BTreeMap<String, f64>, ZooError> {
+        // not part of what training costs
+        let before = cpu_seconds();
         self.take_evaluated()?;
-        let (experiment, section) = (self.experiment, &self.experiment.train);
+        let depth = self.depth();
+        let (counts, _) = graded(&self.solver, &self.valid, &[depth], depth)
+            .map_err(self.experiment.model_error("validate"))?
+            .halting();
+        self.cpu.1 += cpu_seconds() - before;
+        Ok([
+            ("valid_exact".to_owned(), counts.share(counts.exact)),
+            ("valid_valid".to_owned(), counts.share(counts.valid)),
+        ]
+        .into())
+    }
+
+    fn state(&self) -> Result<(BTreeMap<String, Tensor>, serde_json::Value), ZooError> {
+        let (tensors, student) = self.student.state().map_err(self.experiment.model_error("save the training of"))?;
+        let state = State { taken: self.stream.taken(), cpu: self.cpu(), student };
+        Ok((tensors, serde_json::to_value(state).expect("numbers and JSON become JSON")))
+    }
+
+    fn restore(&mut self, checkpoint: Checkpoint, path: &Path) -> Result<(), ZooError> {
+        let state: State = serde_json::from_value(checkpoint.trainer).map_err(|e| ZooError::Malformed {
+            path: path.to_owned(),
+            reason: format!("not a checkpoint of a puzzle training: {e}"),
+        })?;
+        self.stream = Stream::new(self.experiment, state.taken)?;
+        self.cpu.0 = state.cpu;
+        let restored = self.student.restore(&checkpoint.tensors, &state.student);
+        restored.map_err(self.experiment.model_error("restore the checkpoint of"))
+    }
+
+    fn draft(&mut self, name: &str, training: TrainingMeta, rows: &[MetricsRow]) -> Result<EntryDraft, ZooError> {
+        self.take_evaluated()?;
+        let experiment = self.experiment;
         let kind = experiment.model.kind();
         let puzzle = PuzzleMeta {
             givens: experiment.task.givens,
@@ -374,7 +323,7 @@ impl<'a> Run<'a> {
                 fixed => fixed.min(self.stream.taken()),
             },
             cpu_seconds: self.cpu(),
-            progress: self.metrics.rows().iter().filter_map(progress).collect(),
+            progress: rows.iter().filter_map(progress).collect(),
         };
         let meta = EntryMeta {
             format: 0,
@@ -394,14 +343,7 @@ impl<'a> Run<'a> {
             data: None,
             kind: Some(SOLVER.to_owned()),
             section: Some(serde_json::to_value(&puzzle).expect("plain fields are always JSON")),
-            training: Some(TrainingMeta {
-                steps: self.step,
-                batch_size: section.batch_size as u64,
-                seed: section.seed,
-                minutes: self.seconds() / 60.0,
-                threads: candle_core::utils::get_num_threads() as u64,
-                curve: loop_parts::curve(self.metrics.rows()),
-            }),
+            training: Some(training),
             versions: zoo::versions(),
             files: BTreeMap::new(),
         };

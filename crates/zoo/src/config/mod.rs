@@ -26,6 +26,22 @@ pub fn nearest(name: &str, names: &[String]) -> Option<String> {
         .map(|(_, n)| n.clone())
 }
 
+/// Refuses names that are not the plain name of a file: an experiment's folder of runs is called like it.
+///
+/// # Errors
+/// [`ZooError::ExperimentName`].
+pub fn check_experiment_name(name: &str) -> Result<(), ZooError> {
+    const LONGEST: usize = 200;
+    let refuse = |reason| Err(ZooError::ExperimentName { name: name.to_owned(), reason });
+    if name.is_empty() || name == "." || name == ".." || name.contains(['/', '\\', '\0']) {
+        return refuse("expected the plain name of a file, without its folder");
+    }
+    if name.len() > LONGEST {
+        return refuse("expected at most 200 bytes");
+    }
+    Ok(())
+}
+
 /// Where experiments come from: a folder, if the user has one, and then those built in.
 #[derive(Debug, Clone, Default)]
 pub struct Library {
@@ -98,6 +114,7 @@ impl Library {
     }
 
     fn read(&self, name: &str) -> Result<Table, ZooError> {
+        check_experiment_name(name)?;
         let text = match self.folder.as_ref().map(|f| f.join(format!("{name}.toml"))) {
             Some(path) if path.is_file() => std::fs::read_to_string(&path).map_err(ZooError::io("read", path))?,
             _ => match embedded::FILES.iter().find(|(n, _)| *n == name) {
@@ -155,6 +172,20 @@ mod tests {
         assert_eq!(table, expected);
         let names = library.names().unwrap();
         assert!(names.contains(&"c".to_owned()) && !names.contains(&"_a".to_owned()));
+    }
+
+    #[test]
+    fn a_name_with_a_folder_is_refused_before_any_file_is_opened() {
+        let (folder, library) = library(&[("up", "x = 1"), ("down", "extends = '../up'")]);
+        let inner = folder.path().join("inner");
+        std::fs::create_dir(&inner).unwrap();
+        let below = Library::with_folder(&inner).unwrap();
+        for name in ["../up", "/etc/passwd", "", ".."] {
+            let error = below.resolve(name).unwrap_err().to_string();
+            assert!(error.starts_with(&format!("experiment name `{name}`: expected the plain name")), "{error}");
+        }
+        assert!(library.resolve("down").unwrap_err().to_string().contains("`../up`"));
+        assert!(library.resolve(&"x".repeat(300)).unwrap_err().to_string().ends_with("at most 200 bytes"));
     }
 
     #[test]

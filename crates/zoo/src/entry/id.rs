@@ -6,7 +6,9 @@ use std::str::FromStr;
 use crate::ZooError;
 
 /// Names that stand for something else inside a zoo's folder.
-const RESERVED: [&str; 2] = ["results", "runs"];
+const RESERVED: [&str; 6] = ["results", "runs", "videos", "report.html", "leaderboard.csv", "leaderboard_puzzles.csv"];
+/// The longest name: file systems take 255 bytes, and results' folders are called after it and more.
+const LONGEST: usize = 100;
 
 /// One version of one entry.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -67,6 +69,9 @@ pub fn check_name(name: &str) -> Result<(), ZooError> {
     if RESERVED.contains(&name) {
         return refuse("the zoo uses this name itself");
     }
+    if name.len() > LONGEST {
+        return refuse("at most 100 letters");
+    }
     if !name.starts_with(|c: char| c.is_ascii_lowercase() || c.is_ascii_digit()) || !name.chars().all(allowed) {
         return refuse("lower-case letters, digits, `-`, `_` and `.` only, beginning with a letter or digit");
     }
@@ -87,8 +92,25 @@ mod tests {
 
     #[test]
     fn what_is_not_a_name_is_refused() {
-        for text in ["", "@1", "a@", "a@0", "a@x", "a@-1", "../x", "A", "a/b", ".hidden", "results", "a b"] {
+        for text in [
+            "",
+            "@1",
+            "a@",
+            "a@0",
+            "a@x",
+            "a@-1",
+            "../x",
+            "A",
+            "a/b",
+            ".hidden",
+            "results",
+            "a b",
+            "videos",
+            "report.html",
+        ] {
             assert!(text.parse::<EntryRequest>().is_err(), "{text}");
         }
+        assert!(check_name(&"x".repeat(100)).is_ok());
+        assert!(check_name(&"x".repeat(300)).unwrap_err().to_string().ends_with("at most 100 letters"));
     }
 }

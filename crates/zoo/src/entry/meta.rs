@@ -90,7 +90,7 @@ pub struct DataMeta {
 }
 
 /// How an entry was trained.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct TrainingMeta {
     /// Optimiser steps.
     pub steps: u64,

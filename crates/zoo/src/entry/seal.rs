@@ -38,7 +38,20 @@ impl EntryDraft {
     ///
     /// # Errors
     /// When the name is not one an entry can have or the folder cannot be written.
-    pub fn seal(mut self, zoo: &Path) -> Result<EntryId, ZooError> {
+    pub fn seal(self, zoo: &Path) -> Result<EntryId, ZooError> {
+        self.seal_noting(zoo, &mut |_, _| Ok(()))
+    }
+
+    /// The same; `note` is told the entry's name and the SHA-256 of its `entry.json` before the entry appears, so that
+    /// a caller that is killed after that can tell it from another's.
+    ///
+    /// # Errors
+    /// As [`EntryDraft::seal`], and what `note` refuses.
+    pub fn seal_noting(
+        mut self,
+        zoo: &Path,
+        note: &mut dyn FnMut(&EntryId, &str) -> Result<(), ZooError>,
+    ) -> Result<EntryId, ZooError> {
         id::check_name(&self.meta.name)?;
         let parent = zoo.join(&self.meta.name);
         fs::create_dir_all(&parent).map_err(ZooError::io("create folder", &parent))?;
@@ -66,8 +79,10 @@ impl EntryDraft {
             write_synced(&staging.path().join(name), bytes)?;
             self.meta.files.insert(name.to_owned(), FileMeta { bytes: bytes.len() as u64, sha256: sha256_hex(bytes) });
         }
-        write_synced(&staging.path().join(ENTRY_FILE), seal_text(&self.meta).as_bytes())?;
+        let text = seal_text(&self.meta);
+        write_synced(&staging.path().join(ENTRY_FILE), text.as_bytes())?;
         sync_folder(staging.path())?;
+        note(&self.meta.id(), &sha256_hex(text.as_bytes()))?;
         let target = parent.join(self.meta.version.to_string());
         renameat_with(CWD, staging.path(), CWD, &target, RenameFlags::NOREPLACE)
             .map_err(|e| ZooError::io("create entry", &target)(e.into()))?;

@@ -11,7 +11,7 @@ use models::{
 
 use crate::ZooError;
 use crate::entry::DataMeta;
-use crate::experiment::{EntitySection, Experiment};
+use crate::experiment::{DataSection, EntitySection, Experiment};
 
 /// Folder of the run that a converted HDF5 file goes to.
 pub(super) const CONVERTED: &str = "data";
@@ -126,19 +126,39 @@ pub(super) fn prepare(
         }
     }
     let all: Vec<usize> = (0..dataset.episodes().len()).collect();
+    let usual = DataSection::default();
     let mask = &experiment.data.train_mask;
-    let train = dataset.split(mask).unwrap_or_else(|| {
-        notes.push(format!("no mask `{mask}`: training on all {} episodes", all.len()));
-        all
-    });
+    let there = dataset.split_names();
+    let train = match dataset.split(mask) {
+        Some(episodes) => episodes,
+        None if mask.is_empty() => all,
+        None if *mask != usual.train_mask || !there.is_empty() => {
+            return Err(unfit(no_mask("train_mask", mask, &there)));
+        }
+        None => {
+            notes.push(format!("no mask `{mask}`: training on all {} episodes", all.len()));
+            all
+        }
+    };
     if train.is_empty() {
         return Err(unfit(format!("mask `{mask}`: expected at least one episode, found none")));
     }
-    let valid: Vec<usize> = dataset.split(&experiment.data.valid_mask).unwrap_or_default();
+    let held_out = &experiment.data.valid_mask;
+    let valid: Vec<usize> = match dataset.split(held_out) {
+        Some(episodes) => episodes,
+        None if held_out.is_empty() => Vec::new(),
+        None if *held_out != usual.valid_mask || there.iter().any(|name| name != mask) => {
+            return Err(unfit(no_mask("valid_mask", held_out, &there)));
+        }
+        None => {
+            notes.push(format!("no mask `{held_out}`: no episode is held out for validation"));
+            Vec::new()
+        }
+    };
     if let Some(both) = valid.iter().find(|episode| train.contains(episode)) {
         return Err(unfit(format!(
             "masks `{mask}` and `{}` share episode {both}: a validation on training data says nothing",
-            experiment.data.valid_mask
+            held_out
         )));
     }
 
@@ -227,6 +247,12 @@ pub(super) fn batch(
         .preprocess
         .batch(experiment.policy.action_horizon(), &observation, &windows.actions, &windows.is_pad)
         .map_err(experiment.model_error("make a batch for"))
+}
+
+/// A mask that was asked for and is not there.
+fn no_mask(key: &str, mask: &str, there: &[&str]) -> String {
+    let there = if there.is_empty() { "no mask".to_owned() } else { there.join(", ") };
+    format!("data.{key}: no mask `{mask}`; there is {there} (data.{key}=\"\" asks for none)")
 }
 
 fn tensors(statistics: &BTreeMap<String, FeatureStats>) -> candle_core::Result<BTreeMap<String, Tensor>> {

@@ -95,7 +95,7 @@ impl RunFolder {
 
     /// Removes what a run that never began has put here, and the folders that are empty without it. Files of others
     /// stay, and so does the folder then.
-    pub fn discard(&self) {
+    pub(super) fn discard(&self) {
         // whatever cannot be removed is not worth hiding the error that led here
         let _ = fs::remove_file(self.path.join("lock"));
         let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));
@@ -119,6 +119,11 @@ impl RunFolder {
     /// Written last; its presence says that the run is finished.
     pub fn finished_path(&self) -> PathBuf {
         self.path.join("finished.json")
+    }
+
+    /// The entry that the run is about to get.
+    pub(super) fn sealing_path(&self) -> PathBuf {
+        self.path.join("sealing.json")
     }
 
     /// Where checkpoints go.

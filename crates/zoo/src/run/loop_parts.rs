@@ -14,10 +14,7 @@ use super::metrics::MetricsRow;
 const CURVE_POINTS: usize = 50;
 
 /// The folder of a training: `run` exactly, or the next or latest one of experiment `name` under `runs`.
-///
-/// # Errors
-/// As [`RunFolder`]'s functions.
-pub fn open_folder(name: &str, runs: &Path, run: Option<&Path>, resume: bool) -> Result<RunFolder, ZooError> {
+pub(super) fn open_folder(name: &str, runs: &Path, run: Option<&Path>, resume: bool) -> Result<RunFolder, ZooError> {
     match (run, resume) {
         (Some(path), true) => RunFolder::resume(path),
         (Some(path), false) => RunFolder::fresh(path),
@@ -27,10 +24,7 @@ pub fn open_folder(name: &str, runs: &Path, run: Option<&Path>, resume: bool) ->
 }
 
 /// Refuses to go on with other settings than the run began with, naming the first that differs.
-///
-/// # Errors
-/// [`ZooError::ResumeMismatch`].
-pub fn same_settings(
+pub(super) fn same_settings(
     folder: &Path,
     saved: &BTreeMap<String, String>,
     asked: &BTreeMap<String, String>,
@@ -51,7 +45,7 @@ pub fn same_settings(
 }
 
 /// At most 50 rows, evenly thinned; the last always stays.
-pub fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
+pub(super) fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
     let stride = rows.len().div_ceil(CURVE_POINTS).max(1);
     let point = |row: &MetricsRow| {
         let loss = *row.values.get("loss")?;
@@ -61,7 +55,7 @@ pub fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
 }
 
 /// Seconds since 1970.
-pub fn wall_time() -> f64 {
+pub(super) fn wall_time() -> f64 {
     SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
 }
 

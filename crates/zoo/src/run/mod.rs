@@ -1,13 +1,15 @@
-//! Training runs: a folder, checkpoints, metrics, and the loop that makes an entry.
+//! Training runs: a folder, checkpoints, metrics, the loop that makes an entry, and what it trains on demonstrations.
 
 mod checkpoint;
 mod data;
 mod folder;
 mod list;
-pub mod loop_parts;
+mod loop_parts;
 mod metrics;
+mod preflight;
 mod sampler;
 mod section;
+mod session;
 mod tensorboard;
 mod training;
 mod validation;
@@ -18,5 +20,6 @@ pub use folder::{COMMAND_FILE, RunFolder};
 pub use list::{FoundRun, RunState, list_runs};
 pub use metrics::{Metrics, MetricsRow};
 pub use section::{OptimiserKind, TrainSection};
+pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, run};
 pub use tensorboard::EventWriter;
-pub use training::{TrainEvent, TrainOutcome, TrainRequest, train};
+pub use training::{TrainRequest, train};

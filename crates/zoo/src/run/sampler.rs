@@ -5,27 +5,26 @@
 use dataset::Windows;
 
 /// Cuts the stream of shuffled epochs into batches of one size.
-pub(super) struct Sampler<'a> {
-    windows: &'a Windows,
+pub(super) struct Sampler {
     seed: u64,
     batch_size: u64,
     epoch: Option<(u64, Vec<u32>)>,
 }
 
-impl<'a> Sampler<'a> {
-    pub fn new(windows: &'a Windows, seed: u64, batch_size: usize) -> Self {
-        Self { windows, seed, batch_size: batch_size as u64, epoch: None }
+impl Sampler {
+    pub fn new(seed: u64, batch_size: usize) -> Self {
+        Self { seed, batch_size: batch_size as u64, epoch: None }
     }
 
-    /// The windows of step `step`, counted from 0.
-    pub fn batch(&mut self, step: u64) -> Vec<u32> {
-        let size = self.windows.len() as u64;
-        positions(step, self.batch_size, size).map(|(epoch, position)| self.order(epoch)[position]).collect()
+    /// The ones of `windows` that make step `step`, counted from 0.
+    pub fn batch(&mut self, windows: &Windows, step: u64) -> Vec<u32> {
+        let size = windows.len() as u64;
+        positions(step, self.batch_size, size).map(|(epoch, position)| self.order(windows, epoch)[position]).collect()
     }
 
-    fn order(&mut self, epoch: u64) -> &[u32] {
+    fn order(&mut self, windows: &Windows, epoch: u64) -> &[u32] {
         if self.epoch.as_ref().is_none_or(|(number, _)| *number != epoch) {
-            self.epoch = Some((epoch, self.windows.shuffled(self.seed, epoch)));
+            self.epoch = Some((epoch, windows.shuffled(self.seed, epoch)));
         }
         &self.epoch.as_ref().expect("it was just set").1
     }

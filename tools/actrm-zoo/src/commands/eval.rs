@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits, shown};
-use report::{LeaderboardRow, wilson_interval};
+use report::LeaderboardRow;
 use rollout::{Control, Pool, remembered_greeting, video};
 use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
 use zoo::evaluation::{
@@ -219,7 +219,7 @@ fn evaluate_on(
             None => Ok((None, subject)),
         });
         match there.with_context(|| format!("entry {id}")) {
-            Ok((Some(evaluation), _)) => cli::print(&(summary(&evaluation) + THERE + "\n"))?,
+            Ok((Some(evaluation), _)) => cli::print(&(LeaderboardRow::new(&evaluation).summary() + THERE + "\n"))?,
             Ok((None, subject)) => subjects.push(subject),
             Err(error) => failures.push(error),
         }
@@ -323,7 +323,7 @@ fn run_missing(
     drop(screen);
     match end.with_context(|| format!("entry {id}"))? {
         EvaluationEnd::Complete(evaluation) => {
-            cli::print(&(summary(&evaluation) + there + "\n"))?;
+            cli::print(&(LeaderboardRow::new(&evaluation).summary() + there + "\n"))?;
             Ok(Some(evaluation))
         }
         EvaluationEnd::Stopped { done, total } => {
@@ -396,26 +396,4 @@ fn videos(args: &Args, subject: &Subject<'_>, pool: &mut Pool) -> anyhow::Result
     })?;
     drop(screen);
     failure.map_or(Ok(()), Err)
-}
-
-/// `lift-act@1 on Lift: 20 of 20 (100.0%, 95% interval 83.9-100.0), mean 44.7 steps to success`, and a line for each
-/// group of episodes.
-fn summary(evaluation: &StoredEvaluation) -> String {
-    let row = LeaderboardRow::new(evaluation);
-    let rate = |successes: u64, episodes: u64| {
-        let (low, high) = wilson_interval(successes, episodes);
-        let (rate, low, high) = (100.0 * successes as f64 / episodes.max(1) as f64, 100.0 * low, 100.0 * high);
-        format!("{successes} of {episodes} ({rate:.1}%, 95% interval {low:.1}-{high:.1})")
-    };
-    let mut text = format!("{} on {}: {}", row.entry, row.task, rate(row.successes, row.episodes));
-    if let Some(steps) = row.mean_steps_to_success() {
-        text.push_str(&format!(", mean {steps:.1} steps to success"));
-    }
-    if evaluation.record.time_decides {
-        text.push_str("\n  it thinks by the clock: these episodes may end otherwise next time");
-    }
-    for (group, counts) in &row.groups {
-        text.push_str(&format!("\n  {group}: {}", rate(counts.successes, counts.episodes)));
-    }
-    text
 }

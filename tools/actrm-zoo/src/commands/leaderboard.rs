@@ -2,9 +2,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use cli::{Column, Table, shown};
-use report::{Curve, TABLE_COLUMNS, rank, to_csv, to_html, to_markdown, to_table};
-use study::puzzle::{PUZZLE_COLUMNS, list_puzzle_evaluations, puzzle_csv, puzzle_section, puzzle_table, rank_puzzles};
+use cli::{Table, shown};
+use report::column::{Align, Column};
+use report::{COLUMNS, Curve, csv, markdown, rank, to_html};
+use study::puzzle::{PUZZLE_COLUMNS, list_puzzle_evaluations, puzzle_section, rank_puzzles};
 use zoo::results::list_evaluations;
 use zoo::write_atomic;
 
@@ -51,29 +52,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         written.push(shown(&path) + "\n");
         Ok(())
     };
-    write(out.join("leaderboard.csv"), to_csv(&rows))?;
+    write(out.join("leaderboard.csv"), csv::table(COLUMNS, &rows))?;
     write(out.join("report.html"), to_html(&evaluations, &curves(args)?, &puzzle_section(&puzzles)))?;
     if !puzzles.is_empty() {
-        write(out.join("leaderboard_puzzles.csv"), puzzle_csv(&puzzles))?;
+        write(out.join("leaderboard_puzzles.csv"), csv::table(PUZZLE_COLUMNS, &puzzles))?;
     }
     if let Some(file) = &args.markdown {
-        write(file.clone(), to_markdown(&rows))?;
+        write(file.clone(), markdown::table(COLUMNS, &rows))?;
     }
 
-    let mut text = String::new();
-    if !rows.is_empty() {
-        let mut columns = TABLE_COLUMNS.to_vec();
-        columns.insert(2, "protocol");
-        let cells = to_table(&rows).into_iter().zip(&rows).map(|(cells, row)| {
-            let mut cells = Vec::from(cells);
-            cells.insert(2, row.protocol.clone());
-            cells
-        });
-        text.push_str(&table(&columns, cells, args.wide));
-    }
-    if !puzzles.is_empty() {
-        text.push_str(&table(&PUZZLE_COLUMNS, puzzle_table(&puzzles).into_iter().map(Vec::from), args.wide));
-    }
+    let text = table(COLUMNS, &rows, args.wide) + &table(PUZZLE_COLUMNS, &puzzles, args.wide);
     cli::print(&(text + &written.concat()))?;
     Ok(ExitCode::SUCCESS)
 }
@@ -92,14 +80,20 @@ fn curves(args: &Args) -> anyhow::Result<Vec<Curve>> {
     Ok(curves)
 }
 
-/// What says most stays longest where the terminal is narrow.
-fn table(columns: &[&str], rows: impl Iterator<Item = Vec<String>>, wide: bool) -> String {
-    const KEPT: [&str; 5] = ["entry", "task", "success", "rate [95%]", "right"];
-    let column = |(place, name): (usize, &&str)| match KEPT.contains(name) {
-        true => Column::new(*name),
-        false => Column::new(*name).dispensable(u8::try_from(place).unwrap_or(u8::MAX)),
+/// What says most stays longest where the terminal is narrow; nothing without rows.
+fn table<R: 'static>(columns: &[Column<R>], rows: &[R], wide: bool) -> String {
+    if rows.is_empty() {
+        return String::new();
+    }
+    let shown: Vec<(&Column<R>, &str)> = columns.iter().filter_map(|c| Some((c, c.table_heading()?))).collect();
+    let column = |(place, (column, heading)): (usize, &(&Column<R>, &str))| {
+        let made = match column.align() {
+            Align::Left => cli::Column::new(*heading),
+            Align::Right => cli::Column::new(*heading).right(),
+        };
+        if column.is_kept() { made } else { made.dispensable(u8::try_from(place).unwrap_or(u8::MAX)) }
     };
-    let mut table = Table::new(columns.iter().enumerate().map(column).collect());
-    rows.for_each(|row| table.push(row));
+    let mut table = Table::new(shown.iter().enumerate().map(column).collect());
+    rows.iter().for_each(|row| table.push(shown.iter().map(|(column, _)| column.shown(row)).collect()));
     table.text(wide)
 }

@@ -2,6 +2,7 @@
 
 use crate::error::{ModelError, Result};
 use crate::layers::{Activation, Shape};
+use crate::size::Size;
 use serde::{Deserialize, Serialize};
 
 /// ACT's options; defaults are LeRobot's.
@@ -69,6 +70,14 @@ impl Config {
         }
     }
 
+    /// How large the model will be.
+    pub fn size(&self) -> Size {
+        let (shape, horizon) = (self.shape(), self.action_horizon);
+        let embeddings = Size { weights: 2.0 * horizon as f64 * self.dim_model as f64, activations: 0.0 };
+        let vae = if self.use_vae { shape.size(1, horizon) * self.n_vae_encoder_layers } else { Size::default() };
+        shape.size(1, 2) * self.n_encoder_layers + shape.size(2, horizon) * self.n_decoder_layers + vae + embeddings
+    }
+
     /// Checks that a model with this configuration can exist.
     ///
     /// # Errors
@@ -99,8 +108,8 @@ impl Config {
         if !(0.0..1.0).contains(&self.dropout) {
             return refuse("dropout", self.dropout.to_string(), "at least 0 and below 1");
         }
-        if !self.kl_weight.is_finite() {
-            return refuse("kl_weight", self.kl_weight.to_string(), "a finite number");
+        if !self.kl_weight.is_finite() || self.kl_weight < 0.0 {
+            return refuse("kl_weight", self.kl_weight.to_string(), "a number from 0");
         }
         if self.feedforward_activation == Activation::Glu {
             return refuse(

@@ -3,6 +3,7 @@
 use crate::error::{ModelError, Result};
 use crate::layers::{Activation, Shape};
 use crate::models::act;
+use crate::size::Size;
 use serde::{Deserialize, Serialize};
 
 /// What the recursion refines.
@@ -189,6 +190,16 @@ impl Config {
             dropout: self.dropout,
             kl_weight: self.kl_weight,
         }
+    }
+
+    /// How large the model will be.
+    pub fn size(&self) -> Size {
+        let block = Shape { hidden: self.block_feedforward(), ..self.shape() };
+        let tokens = if self.reasoning.over == Over::Actions { self.action_horizon } else { self.reasoning.tokens };
+        let block = block.size(1, tokens) * self.reasoning.n_layers;
+        // the weights are shared by all steps, the last round of each keeps its activations
+        let steps = Size { weights: block.weights, ..block * self.reasoning.supervision_steps };
+        self.layers().size() + steps
     }
 
     /// Hidden width of the shared block's dense part.

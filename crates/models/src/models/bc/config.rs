@@ -1,6 +1,7 @@
 //! BC's options.
 
 use crate::error::{ModelError, Result};
+use crate::size::Size;
 use serde::{Deserialize, Serialize};
 
 /// What is minimised over the steps that are not padding.
@@ -33,6 +34,16 @@ impl Default for Config {
 }
 
 impl Config {
+    /// How large the model will be: its hidden layers, and at least one number in and one out.
+    pub fn size(&self) -> Size {
+        let widths: Vec<f64> = self.hidden.iter().map(|&width| width as f64).collect();
+        let between: f64 = widths.windows(2).map(|pair| pair[0] * pair[1]).sum();
+        let ends =
+            widths.first().copied().unwrap_or(1.0) + widths.last().copied().unwrap_or(1.0) * self.action_horizon as f64;
+        let outputs = self.action_horizon as f64;
+        Size { weights: between + ends, activations: widths.iter().sum::<f64>() + outputs }
+    }
+
     /// Checks that a model with this configuration can exist.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! The interval around a success rate.
+//! What is computed of a list of numbers.
 
 /// 97.5% quantile of the standard normal distribution.
 const Z: f64 = 1.959_963_984_540_054;
@@ -19,6 +19,24 @@ pub fn wilson_interval(successes: u64, trials: u64) -> (f64, f64) {
     let low = if successes == 0 { 0.0 } else { (centre - half).max(0.0) };
     let high = if successes == trials { 1.0 } else { (centre + half).min(1.0) };
     (low, high)
+}
+
+/// The mean; none of none.
+pub fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (mut sum, mut count) = (0.0, 0_u64);
+    for value in values {
+        sum += value;
+        count += 1;
+    }
+    (count > 0).then(|| sum / count as f64)
+}
+
+/// The `q`-quantile of ascending `values` by linear interpolation; none of none.
+pub fn quantile(values: &[f64], q: f64) -> Option<f64> {
+    let at = q * values.len().checked_sub(1)? as f64;
+    let (below, share) = (at.floor() as usize, at.fract());
+    let above = (below + 1).min(values.len() - 1);
+    Some(values[below] + (values[above] - values[below]) * share)
 }
 
 #[cfg(test)]
@@ -52,5 +70,17 @@ mod tests {
             }
         }
         assert_eq!(wilson_interval(0, 0), (0.0, 1.0));
+    }
+
+    #[test]
+    fn quantiles_interpolate_as_numpy_s() {
+        let values = [1.0, 2.0, 3.0, 4.0];
+        assert_eq!(quantile(&values, 0.5), Some(2.5));
+        assert!((quantile(&values, 0.95).expect("of four") - 3.85).abs() < 1e-12);
+        assert_eq!(quantile(&values, 0.0), Some(1.0));
+        assert_eq!(quantile(&values, 1.0), Some(4.0));
+        assert_eq!(quantile(&[7.0], 0.95), Some(7.0));
+        assert_eq!(quantile(&[], 0.5), None);
+        assert_eq!((mean([1.0, 2.0].into_iter()), mean(std::iter::empty())), (Some(1.5), None));
     }
 }

@@ -1,0 +1,81 @@
+//! How large a model will be, told from its options before anything is built.
+
+use std::ops::{Add, Mul};
+
+/// A model's size in numbers: rather less than it will take, so that nothing is refused that would have gone.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Size {
+    /// weights
+    pub weights: f64,
+    /// numbers that one sample leaves behind for the backward pass
+    pub activations: f64,
+}
+
+/// Bytes of a number.
+const NUMBER: f64 = 4.0;
+/// Copies of the weights in a training: themselves, the gradient, two moments.
+const COPIES: f64 = 4.0;
+
+impl Size {
+    /// Bytes that a training takes with `samples` at once.
+    pub fn training_bytes(&self, samples: usize) -> f64 {
+        NUMBER * (COPIES * self.weights + self.activations * samples as f64)
+    }
+}
+
+impl Add for Size {
+    type Output = Self;
+    fn add(self, other: Self) -> Self {
+        Self { weights: self.weights + other.weights, activations: self.activations + other.activations }
+    }
+}
+
+impl Mul<usize> for Size {
+    type Output = Self;
+    fn mul(self, times: usize) -> Self {
+        Self { weights: self.weights * times as f64, activations: self.activations * times as f64 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use crate::{FeatureSpec, PolicyConfig, Signature};
+
+    fn config(kind: &str, keys: serde_json::Value) -> PolicyConfig {
+        let mut keys = keys;
+        keys["type"] = kind.into();
+        serde_json::from_value(keys).unwrap()
+    }
+
+    #[test]
+    fn the_size_told_is_below_the_real_one_and_near_it() {
+        let observation = vec![FeatureSpec::state(9), FeatureSpec::environment_state(10)];
+        let signature = Signature { observation, n_obs_steps: 1, action_dim: 7 };
+        let wide = serde_json::json!({"dim_model": 128, "n_heads": 4, "dim_feedforward": 256, "action_horizon": 16});
+        let deep = serde_json::json!({"dim_model": 32, "n_heads": 4, "dim_feedforward": 64, "action_horizon": 100});
+        let layers = serde_json::json!({"hidden": [1024, 1024], "action_horizon": 16});
+        for kind in PolicyConfig::TYPES {
+            for keys in if *kind == "bc" { vec![&layers] } else { vec![&wide, &deep] } {
+                let config = config(kind, keys.clone());
+                let told = config.size().weights;
+                let real = config.build(&signature, 1).unwrap().params().count() as f64;
+                assert!(0.5 * real < told && told <= real, "{kind} {keys}: {told} of {real}");
+            }
+        }
+    }
+
+    #[test]
+    fn absurd_options_have_absurd_sizes() {
+        let bytes = |keys, samples| config("act", keys).size().training_bytes(samples);
+        assert!(bytes(serde_json::json!({}), 64) < 8e9);
+        assert!(bytes(serde_json::json!({}), 100_000_000) > 1e14);
+        for (key, value) in
+            [("dim_model", 1_000_000_000_u64), ("n_encoder_layers", 100_000), ("action_horizon", 1_000_000_000)]
+        {
+            let mut keys = serde_json::json!({});
+            keys[key] = value.into();
+            assert!(bytes(keys, 64) > 1e12, "{key}");
+        }
+    }
+}

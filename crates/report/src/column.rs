@@ -1,0 +1,162 @@
+//! A statistic of a table: one value, and the forms of the table that show it.
+//!
+//! A table is a list of columns. Whatever writes one (terminal, CSV, Markdown, HTML) walks the same list, so that a
+//! statistic is added in one place.
+
+/// Which side of its column a value stands on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Align {
+    /// Words.
+    Left,
+    /// Numbers.
+    Right,
+}
+
+/// How a row gives a column's value.
+enum Value<R: 'static> {
+    /// As it is to be written. In tables for people, lines after the first say something beside it.
+    Text(fn(&R) -> String),
+    /// A number, where there is one, with its decimal places in CSV and in tables for people.
+    Number(fn(&R) -> Option<f64>, usize, usize),
+}
+
+/// One statistic of rows of type `R`.
+pub struct Column<R: 'static> {
+    value: Value<R>,
+    align: Align,
+    kept: bool,
+    csv: Option<&'static str>,
+    table: Option<&'static str>,
+    page: Option<&'static str>,
+}
+
+/// A column of words, in no form yet.
+pub const fn text<R>(value: fn(&R) -> String) -> Column<R> {
+    Column { value: Value::Text(value), align: Align::Right, kept: false, csv: None, table: None, page: None }
+}
+
+/// A column of numbers, in no form yet: `exact` decimal places in CSV, `shown` in tables for people.
+pub const fn number<R>(value: fn(&R) -> Option<f64>, exact: usize, shown: usize) -> Column<R> {
+    Column {
+        value: Value::Number(value, exact, shown),
+        align: Align::Right,
+        kept: false,
+        csv: None,
+        table: None,
+        page: None,
+    }
+}
+
+impl<R> Column<R> {
+    /// In CSV, under this name.
+    pub const fn csv(self, name: &'static str) -> Self {
+        Self { csv: Some(name), ..self }
+    }
+
+    /// In the terminal and in Markdown, under this heading.
+    pub const fn table(self, heading: &'static str) -> Self {
+        Self { table: Some(heading), ..self }
+    }
+
+    /// In HTML, under this heading.
+    pub const fn page(self, heading: &'static str) -> Self {
+        Self { page: Some(heading), ..self }
+    }
+
+    /// Aligned to the left.
+    pub const fn left(self) -> Self {
+        Self { align: Align::Left, ..self }
+    }
+
+    /// Shown however narrow the terminal is.
+    pub const fn kept(self) -> Self {
+        Self { kept: true, ..self }
+    }
+
+    /// Whether it is shown however narrow the terminal is.
+    pub fn is_kept(&self) -> bool {
+        self.kept
+    }
+
+    /// The side that its values stand on.
+    pub fn align(&self) -> Align {
+        self.align
+    }
+
+    /// Its name in CSV, if it is there.
+    pub fn csv_name(&self) -> Option<&'static str> {
+        self.csv
+    }
+
+    /// Its heading in the terminal and in Markdown, if it is there.
+    pub fn table_heading(&self) -> Option<&'static str> {
+        self.table
+    }
+
+    /// Its heading in HTML, if it is there.
+    pub fn page_heading(&self) -> Option<&'static str> {
+        self.page
+    }
+
+    /// The row's value for machines; empty where there is none.
+    pub fn exact(&self, row: &R) -> String {
+        match self.value {
+            Value::Text(of) => of(row),
+            Value::Number(of, digits, _) => of(row).map_or(String::new(), |value| format!("{value:.digits$}")),
+        }
+    }
+
+    /// The row's value for people; `-` where there is none.
+    pub fn shown(&self, row: &R) -> String {
+        match self.value {
+            Value::Text(of) => of(row),
+            Value::Number(of, _, digits) => of(row).map_or("-".to_owned(), |value| format!("{value:.digits$}")),
+        }
+    }
+}
+
+/// A table for a terminal: its headings with their sides, and its cells row by row.
+pub struct Cells {
+    /// The headings.
+    pub headings: Vec<(&'static str, Align)>,
+    /// The cells of each row.
+    pub rows: Vec<Vec<String>>,
+}
+
+/// What a terminal shows of `rows`.
+pub fn cells<'r, R: 'static>(columns: &[Column<R>], rows: impl IntoIterator<Item = &'r R>) -> Cells {
+    let shown = || columns.iter().filter_map(|column| Some((column, column.table_heading()?)));
+    Cells {
+        headings: shown().map(|(column, heading)| (heading, column.align())).collect(),
+        rows: rows.into_iter().map(|row| shown().map(|(column, _)| column.shown(row)).collect()).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{csv, html, markdown};
+
+    const COLUMNS: &[Column<(&str, Option<f64>)>] = &[
+        text(|row: &(&str, Option<f64>)| row.0.to_owned()).csv("name").table("who").page("who").left(),
+        number(|row: &(&str, Option<f64>)| row.1, 3, 1).csv("value").table("value").page("value"),
+        text(|_| "inner".to_owned()),
+    ];
+
+    /// One list, every form: nothing but the list says what there is.
+    #[test]
+    fn each_form_shows_what_the_list_says() {
+        let rows = [("a|b", Some(1.25)), ("<c>, \"d\"\nmore", None)];
+        assert_eq!(csv::table(COLUMNS, &rows), "name,value\na|b,1.250\n\"<c>, \"\"d\"\"\nmore\",\n");
+        assert_eq!(
+            markdown::table(COLUMNS, &rows),
+            "| who | value |\n| --- | ---: |\n| a\\|b | 1.2 |\n| <c>, \"d\"<br>more | - |\n"
+        );
+        let page = html::table(COLUMNS, &rows);
+        assert!(page.contains("<tr><th>who</th><th>value</th></tr>"), "{page}");
+        assert!(page.contains("<td>&lt;c&gt;, &quot;d&quot;<br><small>more</small></td><td>-</td>"), "{page}");
+        let cells = cells(COLUMNS, &rows);
+        assert_eq!(cells.headings, [("who", Align::Left), ("value", Align::Right)]);
+        assert_eq!(cells.rows[0], ["a|b", "1.2"]);
+    }
+}
