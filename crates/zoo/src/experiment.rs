@@ -75,6 +75,9 @@ pub struct DataSection {
     /// Things that are a token each, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub entities: BTreeMap<String, EntitySection>,
+    /// Items of the lists above that are permuted alike in training, by the name of the symmetry.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub symmetries: BTreeMap<String, Vec<String>>,
     /// Mask of the episodes to train on; a data set without masks is trained on whole.
     pub train_mask: String,
     /// Mask of the episodes to validate on.
@@ -89,6 +92,7 @@ impl Default for DataSection {
             state_keys: owned(&["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]),
             env_keys: owned(&["object"]),
             entities: BTreeMap::new(),
+            symmetries: BTreeMap::new(),
             train_mask: "train".to_owned(),
             valid_mask: "valid".to_owned(),
         }
@@ -143,7 +147,18 @@ impl DataSection {
             let names: Vec<&str> = self.entities.keys().map(String::as_str).collect();
             return invalid("data.entities".to_owned(), &expected, names.join(", "));
         }
-        self.feature_keys().map(|_| ())
+        let keys = self.feature_keys()?;
+        for (name, items) in &self.symmetries {
+            let key = format!("data.symmetries.{name}");
+            if items.is_empty() {
+                return invalid(key, "at least one item", "none".to_owned());
+            }
+            let known: Vec<String> = keys.features().flat_map(|feature| keys.of(feature)).collect();
+            if let Some(item) = items.iter().find(|item| !known.contains(item)) {
+                return invalid(key, &format!("items of the lists of keys: {}", known.join(", ")), format!("`{item}`"));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -400,6 +415,12 @@ mod tests {
         );
         assert!(error("data.entities.Cube=['a']").contains("lower-case letters, digits and _, found `Cube`"));
         assert!(error("data.entities.cube=[]").contains("at least one key"));
+        assert!(load(&["data.symmetries.axes=['robot0_eef_pos', 'object']"]).is_ok());
+        let message = error("data.symmetries.axes=['robot0_eef_pos', 'cube_rgb']");
+        assert!(
+            message.contains("key `data.symmetries.axes`") && message.ends_with("object, found `cube_rgb`"),
+            "{message}"
+        );
         assert!(error("data.entities.cube=3").contains("a list of observation keys, or a table"));
     }
 }

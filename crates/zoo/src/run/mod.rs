@@ -8,6 +8,7 @@ pub mod loop_parts;
 mod metrics;
 mod sampler;
 mod section;
+mod symmetry;
 mod tensorboard;
 mod training;
 mod validation;

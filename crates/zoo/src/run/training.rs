@@ -289,6 +289,7 @@ impl<'a> Run<'a> {
             }
             let indices = sampler.batch(self.step);
             self.demonstrations.train.gather(&indices, &mut windows);
+            self.demonstrations.symmetries.apply(self.step, &mut windows);
             let batch = data::batch(&windows, self.demonstrations, self.experiment)?;
             let done = self.trainer.step(&batch).map_err(|source| self.step_error(source))?;
             self.step += 1;
