@@ -78,6 +78,9 @@ pub struct DataSection {
     /// Items of the lists above that are permuted alike in training, by the name of the symmetry.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub symmetries: BTreeMap<String, Vec<String>>,
+    /// Observations that the policy sees at once: the present one and those before it.
+    #[serde(skip_serializing_if = "is_one")]
+    pub n_obs_steps: usize,
     /// Mask of the episodes to train on; a data set without masks is trained on whole.
     pub train_mask: String,
     /// Mask of the episodes to validate on.
@@ -93,11 +96,15 @@ impl Default for DataSection {
             env_keys: owned(&["object"]),
             entities: BTreeMap::new(),
             symmetries: BTreeMap::new(),
+            n_obs_steps: 1,
             train_mask: "train".to_owned(),
             valid_mask: "valid".to_owned(),
         }
     }
 }
+
+/// The longest history.
+const MOST_OBS_STEPS: usize = 1000;
 
 impl DataSection {
     /// Which observation keys make which feature.
@@ -126,6 +133,11 @@ impl DataSection {
         };
         if self.state_keys.is_empty() {
             return invalid("data.state_keys".to_owned(), "at least one key", "none".to_owned());
+        }
+        // more is no history of a robot, and would be read into memory for every window
+        if !(1..=MOST_OBS_STEPS).contains(&self.n_obs_steps) {
+            let expected = format!("1 to {MOST_OBS_STEPS}");
+            return invalid("data.n_obs_steps".to_owned(), &expected, self.n_obs_steps.to_string());
         }
         let good = |word: &str| {
             !word.is_empty() && word.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
@@ -194,6 +206,10 @@ impl NormalisationSection {
         }
         modes
     }
+}
+
+fn is_one(count: &usize) -> bool {
+    *count == 1
 }
 
 fn is_default(mode: &NormMode) -> bool {
@@ -389,6 +405,7 @@ mod tests {
         assert!(error(&["train.batch_size=0"]).starts_with("key `train.batch_size`: expected at least 1"));
         assert!(error(&["entry=Lift"]).starts_with("entry name `Lift`"));
         assert!(error(&["data.state_keys=[]"]).starts_with("key `data.state_keys`"));
+        assert_eq!(error(&["data.n_obs_steps=0"]), "key `data.n_obs_steps`: expected 1 to 1000, found 0");
     }
 
     #[test]

@@ -176,6 +176,27 @@ fn entities_are_trained_on_sealed_and_asked_for_again() {
     assert!(refused.to_string().contains(expected), "{refused}");
 }
 
+#[test]
+fn a_history_is_trained_on_and_kept_at_inference() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let entry = finish(&request(root.path(), &data, &["data.n_obs_steps=3"]));
+    assert_eq!(entry.meta().signature.n_obs_steps, 3);
+    let observation = |x: f32| Observation::of_state(vec![x; 9], vec![-x; 10]);
+    let after = |past: &[f32]| {
+        let mut policy = entry.load().unwrap().policy();
+        assert_eq!(policy.n_obs_steps(), 3);
+        past.iter().for_each(|&x| policy.observe(&observation(x)));
+        policy.predict(&observation(0.1)).unwrap().actions
+    };
+    // the first observation is repeated before the episode, and what is older than three steps is forgotten
+    assert_eq!(after(&[]), after(&[0.1, 0.1]));
+    assert_ne!(after(&[]), after(&[0.2]));
+    assert_eq!(after(&[0.2]), after(&[0.2, 0.2]));
+    assert_eq!(after(&[0.9, 0.3, 0.2]), after(&[0.3, 0.2]));
+    assert_ne!(after(&[0.3, 0.2]), after(&[0.2, 0.3]));
+}
+
 /// Entries sealed in the first form of `entry.json`.
 #[test]
 fn shipped_entries_open_and_answer() {

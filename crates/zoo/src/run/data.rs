@@ -154,7 +154,12 @@ pub(super) fn prepare(
     let statistics = tensors(&statistics).map_err(|e| unfit(e.to_string()))?;
     let action_horizon = experiment.policy.action_horizon();
     let windows = |episodes: Vec<usize>| {
-        let spec = WindowSpec { observation: observation.clone(), n_obs_steps: 1, action_horizon, episodes };
+        let spec = WindowSpec {
+            observation: observation.clone(),
+            n_obs_steps: experiment.data.n_obs_steps,
+            action_horizon,
+            episodes,
+        };
         dataset.windows(&spec).map_err(failed)
     };
     let meta = DataMeta {
