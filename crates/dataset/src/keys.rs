@@ -102,6 +102,19 @@ impl KeyItem {
         Some(())
     }
 
+    /// How many numbers each of `items` has in a column made of them, by the names of the column's numbers; `None` if the
+    /// names are not those of such a column.
+    pub fn widths(items: &[Self], names: &[String]) -> Option<Vec<usize>> {
+        let mut rest = names;
+        let mut widths = Vec::with_capacity(items.len());
+        for item in items {
+            let width = (1..=rest.len()).rev().find(|&width| item.names(width).eq(rest[..width].iter().cloned()))?;
+            widths.push(width);
+            rest = &rest[width..];
+        }
+        rest.is_empty().then_some(widths)
+    }
+
     /// Names of its numbers, as a column lists them.
     pub(crate) fn names(&self, width: usize) -> impl Iterator<Item = String> {
         let from = match (&self.minus, self.plus.range) {
@@ -210,6 +223,12 @@ mod tests {
             assert_eq!(serde_json::from_str::<KeyItem>(&format!("\"{text}\"")).unwrap(), item(text));
         }
         let names = |text: &str, width| item(text).names(width).collect::<Vec<_>>();
+        let items = ["a", "one", "b[1:3]", "b[0:3] - a", "a"].map(item);
+        let widths = [3, 1, 2, 3, 3];
+        let mut listed: Vec<String> = items.iter().zip(widths).flat_map(|(item, width)| item.names(width)).collect();
+        assert_eq!(KeyItem::widths(&items, &listed).unwrap(), widths);
+        listed[4] = "c_1".to_owned();
+        assert_eq!(KeyItem::widths(&items, &listed), None);
         assert_eq!(names("a", 3), ["a_0", "a_1", "a_2"]);
         assert_eq!(names("one", 1), ["one"]);
         assert_eq!(names("b[1:3]", 2), ["b_1", "b_2"]);

@@ -61,6 +61,8 @@ pub struct Windows {
 pub struct WindowBatch {
     /// Number of windows.
     pub n: usize,
+    /// Observations in each.
+    pub n_obs_steps: usize,
     /// By column, in the order asked for: `(n, n_obs_steps, dim)`, oldest first.
     pub observation: Vec<(String, Vec<f32>)>,
     /// `(n, action_horizon, action_dim)`
@@ -136,7 +138,7 @@ impl Windows {
     /// When an index is not below [`Windows::len`].
     pub fn gather(&self, indices: &[u32], batch: &mut WindowBatch) {
         let (n, horizon, width) = (indices.len(), self.action_horizon, self.action.dim);
-        batch.n = n;
+        (batch.n, batch.n_obs_steps) = (n, self.n_obs_steps);
         let named = batch.observation.iter().map(|(name, _)| name).eq(self.observation.iter().map(|(name, _)| name));
         if !named {
             batch.observation = self.observation.iter().map(|(name, _)| (name.clone(), Vec::new())).collect();
@@ -225,6 +227,7 @@ mod tests {
             // a batch that held something else before must not leak it
             let mut batch = WindowBatch {
                 n: 1,
+                n_obs_steps: 9,
                 observation: vec![("c0".to_owned(), vec![9.0; 99])],
                 actions: vec![9.0; 7],
                 is_pad: vec![true; 200],

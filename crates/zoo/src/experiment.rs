@@ -75,6 +75,12 @@ pub struct DataSection {
     /// Things that are a token each, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub entities: BTreeMap<String, EntitySection>,
+    /// Items of the lists above that are permuted alike in training, by the name of the symmetry.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub symmetries: BTreeMap<String, Vec<String>>,
+    /// Observations that the policy sees at once: the present one and those before it.
+    #[serde(skip_serializing_if = "is_one")]
+    pub n_obs_steps: usize,
     /// Mask of the episodes to train on; a data set without masks is trained on whole, and so is any with "" here.
     pub train_mask: String,
     /// Mask of the episodes to validate on; "" for none.
@@ -89,11 +95,16 @@ impl Default for DataSection {
             state_keys: owned(&["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]),
             env_keys: owned(&["object"]),
             entities: BTreeMap::new(),
+            symmetries: BTreeMap::new(),
+            n_obs_steps: 1,
             train_mask: "train".to_owned(),
             valid_mask: "valid".to_owned(),
         }
     }
 }
+
+/// The longest history.
+const MOST_OBS_STEPS: usize = 1000;
 
 impl DataSection {
     /// Which observation keys make which feature.
@@ -123,6 +134,11 @@ impl DataSection {
         if self.state_keys.is_empty() {
             return invalid("data.state_keys".to_owned(), "at least one key", "none".to_owned());
         }
+        // more is no history of a robot, and would be read into memory for every window
+        if !(1..=MOST_OBS_STEPS).contains(&self.n_obs_steps) {
+            let expected = format!("1 to {MOST_OBS_STEPS}");
+            return invalid("data.n_obs_steps".to_owned(), &expected, self.n_obs_steps.to_string());
+        }
         let good = |word: &str| {
             !word.is_empty() && word.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
         };
@@ -143,7 +159,18 @@ impl DataSection {
             let names: Vec<&str> = self.entities.keys().map(String::as_str).collect();
             return invalid("data.entities".to_owned(), &expected, names.join(", "));
         }
-        self.feature_keys().map(|_| ())
+        let keys = self.feature_keys()?;
+        for (name, items) in &self.symmetries {
+            let key = format!("data.symmetries.{name}");
+            if items.is_empty() {
+                return invalid(key, "at least one item", "none".to_owned());
+            }
+            let known: Vec<String> = keys.features().flat_map(|feature| keys.of(feature)).collect();
+            if let Some(item) = items.iter().find(|item| !known.contains(item)) {
+                return invalid(key, &format!("items of the lists of keys: {}", known.join(", ")), format!("`{item}`"));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -179,6 +206,10 @@ impl NormalisationSection {
         }
         modes
     }
+}
+
+fn is_one(count: &usize) -> bool {
+    *count == 1
 }
 
 fn is_default(mode: &NormMode) -> bool {
@@ -374,6 +405,7 @@ mod tests {
         assert!(error(&["train.batch_size=0"]).starts_with("key `train.batch_size`: expected at least 1"));
         assert!(error(&["entry=Lift"]).starts_with("entry name `Lift`"));
         assert!(error(&["data.state_keys=[]"]).starts_with("key `data.state_keys`"));
+        assert_eq!(error(&["data.n_obs_steps=0"]), "key `data.n_obs_steps`: expected 1 to 1000, found 0");
     }
 
     #[test]
@@ -400,6 +432,12 @@ mod tests {
         );
         assert!(error("data.entities.Cube=['a']").contains("lower-case letters, digits and _, found `Cube`"));
         assert!(error("data.entities.cube=[]").contains("at least one key"));
+        assert!(load(&["data.symmetries.axes=['robot0_eef_pos', 'object']"]).is_ok());
+        let message = error("data.symmetries.axes=['robot0_eef_pos', 'cube_rgb']");
+        assert!(
+            message.contains("key `data.symmetries.axes`") && message.ends_with("object, found `cube_rgb`"),
+            "{message}"
+        );
         assert!(error("data.entities.cube=3").contains("a list of observation keys, or a table"));
     }
 }

@@ -33,6 +33,11 @@ impl FeatureKeys {
         self.0.get(feature).into_iter().flatten().map(KeyItem::to_string).collect()
     }
 
+    /// The items of a feature; none if there is no such feature.
+    pub fn items(&self, feature: &str) -> &[KeyItem] {
+        self.0.get(feature).map_or(&[], Vec::as_slice)
+    }
+
     /// The features, sorted.
     pub fn features(&self) -> impl Iterator<Item = &str> {
         self.0.keys().map(String::as_str)

@@ -107,6 +107,116 @@ fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
     assert!(policy.predict(&Observation::of_state(vec![0.1; 8], vec![0.1; 10])).is_err());
 }
 
+/// Both kinds of policy, with two things cut out of `object` in place of the environment's state.
+#[test]
+fn entities_are_trained_on_sealed_and_asked_for_again() {
+    const ENTITIES: [&str; 4] = [
+        "data.env_keys=[]",
+        "data.entities.thing0=['object[0:3]', 'object[0:3] - robot0_eef_pos']",
+        "data.entities.thing1=['robot0_eef_pos', 'object[7:10]']",
+        "data.symmetries.axes=['object[0:3]', 'object[7:10]']",
+    ];
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let actrm = ["policy.type=actrm", "policy.reasoning.tokens=2", "entry=thinking"];
+    for extra in [&[][..], &actrm] {
+        let extra: Vec<&str> = ENTITIES.iter().chain(extra).copied().collect();
+        let mut request = request(root.path(), &data, &[]);
+        let overrides = SMALL.iter().filter(|o| extra.len() == ENTITIES.len() || !o.contains("n_encoder_layers"));
+        let overrides: Vec<String> = overrides.chain(&extra).map(|o| (*o).to_owned()).collect();
+        let name = if extra.len() == ENTITIES.len() { "act_lift" } else { "actrm_lift" };
+        request.experiment = Experiment::load(&Library::built_in(), name, &overrides).unwrap();
+        let mut notes = Vec::new();
+        let outcome = train(&request, &|| false, &mut |event| {
+            if let TrainEvent::Note(note) = event {
+                notes.push(note.to_owned());
+            }
+        });
+        let TrainOutcome::Finished { entry, .. } = outcome.unwrap() else { panic!("not finished") };
+        assert!(notes.iter().all(|note| !note.contains("autograd")), "{notes:?}");
+        let entry = Entry::open(&request.zoo, &entry).unwrap();
+        let meta = entry.meta();
+        let names: Vec<&str> = meta.signature.observation.iter().map(|spec| spec.name.as_str()).collect();
+        assert_eq!(names, ["observation.state", "observation.entity.thing0", "observation.entity.thing1"]);
+        assert!(meta.signature.observation[1..].iter().all(|spec| spec.group() == "thing" && spec.width() == 6));
+        assert_eq!(meta.keys.of(names[2]), ["robot0_eef_pos", "object[7:10]"]);
+        assert!(entry.card().unwrap().contains("object[0:3], object[0:3] - robot0_eef_pos"));
+
+        // one group, one set of statistics
+        let (statistics, _) = zoo::tensors::read(&entry.folder().join("normaliser.safetensors")).unwrap();
+        let of = |name: &str, statistic: &str| statistics[&format!("{name}.{statistic}")].to_vec1::<f32>().unwrap();
+        assert_eq!(of(names[1], "mean"), of(names[2], "mean"));
+        assert_eq!(of(names[1], "std"), of(names[2], "std"));
+
+        let mut policy = entry.load().unwrap().policy();
+        let mut observation = Observation::of_state(vec![0.1; 9], Vec::new());
+        let error = policy.predict(&observation).unwrap_err().to_string();
+        assert!(error.contains("observation.entity.thing0 is missing"), "{error}");
+        observation.insert(names[1], vec![0.1; 6].into());
+        observation.insert(names[2], (0..6).map(|i| i as f32).collect::<Vec<_>>().into());
+        let chunk = policy.predict(&observation).unwrap();
+        // the things of a group are a set
+        let mut swapped = observation.clone();
+        swapped.insert(names[1], observation.get(names[2]).unwrap().clone());
+        swapped.insert(names[2], observation.get(names[1]).unwrap().clone());
+        let other = policy.predict(&swapped).unwrap();
+        for (a, b) in chunk.actions.iter().zip(&other.actions) {
+            assert!((a - b).abs() < 1e-4, "{a} {b}");
+        }
+    }
+    // the symmetry is at work: without it other weights come out
+    let weights = |extra: &[&str]| model(&finish(&request(root.path(), &data, extra)));
+    assert!(weights(&ENTITIES) != weights(&ENTITIES[..3]));
+    assert!(weights(&ENTITIES) == weights(&ENTITIES));
+    // a data set without them is refused by name
+    let converted = root.path().join("set");
+    dataset::convert(&data, &converted, &dataset::ConvertOptions::default(), &mut |_, _| {}).unwrap();
+    let refused = train(&request(root.path(), &converted, &ENTITIES[1..3]), &|| false, &mut |_| {}).unwrap_err();
+    let expected = "data.entities.thing0: expected object[0:3], object[0:3] - robot0_eef_pos, found none";
+    assert!(refused.to_string().contains(expected), "{refused}");
+}
+
+#[test]
+fn a_history_is_trained_on_and_kept_at_inference() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let entry = finish(&request(root.path(), &data, &["data.n_obs_steps=3"]));
+    assert_eq!(entry.meta().signature.n_obs_steps, 3);
+    let observation = |x: f32| Observation::of_state(vec![x; 9], vec![-x; 10]);
+    let after = |past: &[f32]| {
+        let mut policy = entry.load().unwrap().policy();
+        assert_eq!(policy.n_obs_steps(), 3);
+        past.iter().for_each(|&x| policy.observe(&observation(x)));
+        policy.predict(&observation(0.1)).unwrap().actions
+    };
+    // the first observation is repeated before the episode, and what is older than three steps is forgotten
+    assert_eq!(after(&[]), after(&[0.1, 0.1]));
+    assert_ne!(after(&[]), after(&[0.2]));
+    assert_eq!(after(&[0.2]), after(&[0.2, 0.2]));
+    assert_eq!(after(&[0.9, 0.3, 0.2]), after(&[0.3, 0.2]));
+    assert_ne!(after(&[0.3, 0.2]), after(&[0.2, 0.3]));
+}
+
+/// Entries sealed in the first form of `entry.json`.
+#[test]
+fn shipped_entries_open_and_answer() {
+    let registry = Registry::open(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo"));
+    let ids = registry.ids().unwrap();
+    assert!(ids.len() >= 6, "{ids:?}");
+    for id in ids {
+        let loaded = registry.entry(&id.to_string()).unwrap().load().unwrap();
+        let signature = &loaded.entry().meta().signature;
+        assert_eq!(signature.action_dim, 7, "{id}");
+        let observation = signature.observation.iter();
+        let observation: Observation =
+            observation.map(|spec| (spec.name.clone(), vec![0.1; spec.width()].into())).collect();
+        assert_eq!(observation.len(), 2, "{id}");
+        assert!(signature.observation.iter().all(|spec| !loaded.entry().meta().keys.of(&spec.name).is_empty()));
+        let chunk = loaded.policy().predict(&observation).unwrap();
+        assert!(chunk.actions.iter().all(|a| a.is_finite()), "{id}");
+    }
+}
+
 #[test]
 fn a_run_stopped_anywhere_goes_on_to_the_same_bytes() {
     let root = tempfile::tempdir().unwrap();

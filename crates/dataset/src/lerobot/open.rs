@@ -183,6 +183,12 @@ impl Dataset {
         self.columns.keys().map(String::as_str)
     }
 
+    /// Names of a column's numbers, where it lists them.
+    pub fn names(&self, column: &str) -> Vec<String> {
+        let names = self.info.features.get(column).and_then(|feature| feature.names.as_array());
+        names.into_iter().flatten().filter_map(|name| name.as_str().map(str::to_owned)).collect()
+    }
+
     /// Statistics over all episodes as they are stored; empty where the directory has none.
     pub fn stats(&self) -> &BTreeMap<String, FeatureStats> {
         &self.stats

@@ -13,6 +13,8 @@ use crate::ZooError;
 use crate::entry::DataMeta;
 use crate::experiment::{DataSection, EntitySection, Experiment};
 
+use super::symmetry::Symmetries;
+
 /// Folder of the run that a converted HDF5 file goes to.
 pub(super) const CONVERTED: &str = "data";
 
@@ -93,6 +95,7 @@ pub(super) struct Demonstrations {
     pub train: Windows,
     pub valid: Option<Windows>,
     pub preprocess: Preprocess,
+    pub symmetries: Symmetries,
     pub meta: DataMeta,
     /// What a user should know: a missing mask, constant dimensions.
     pub notes: Vec<String>,
@@ -171,7 +174,12 @@ pub(super) fn prepare(
     let statistics = tensors(&statistics).map_err(|e| unfit(e.to_string()))?;
     let action_horizon = experiment.policy.action_horizon();
     let windows = |episodes: Vec<usize>| {
-        let spec = WindowSpec { observation: observation.clone(), n_obs_steps: 1, action_horizon, episodes };
+        let spec = WindowSpec {
+            observation: observation.clone(),
+            n_obs_steps: experiment.data.n_obs_steps,
+            action_horizon,
+            episodes,
+        };
         dataset.windows(&spec).map_err(failed)
     };
     let meta = DataMeta {
@@ -198,7 +206,8 @@ pub(super) fn prepare(
     }
     let preprocess =
         Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
-    Ok(Demonstrations { train, valid, preprocess, meta, notes })
+    let symmetries = Symmetries::new(experiment, dataset, path)?;
+    Ok(Demonstrations { train, valid, preprocess, symmetries, meta, notes })
 }
 
 /// The columns that the experiment's observation is made of.

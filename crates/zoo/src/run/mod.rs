@@ -10,6 +10,7 @@ mod preflight;
 mod sampler;
 mod section;
 mod session;
+mod symmetry;
 mod tensorboard;
 mod training;
 mod validation;

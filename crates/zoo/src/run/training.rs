@@ -222,6 +222,7 @@ impl Training for PolicyTraining<'_> {
         let train = &self.demonstrations.train;
         let indices = self.sampler.batch(train, step);
         train.gather(indices.as_slice(), &mut self.windows);
+        self.demonstrations.symmetries.apply(step, &mut self.windows);
         let batch = data::batch(&self.windows, &self.demonstrations, self.experiment)?;
         let done = self.trainer.step(&batch).map_err(self.experiment.model_error("train"))?;
         self.rate.1 += indices.len() as u64;
