@@ -43,7 +43,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("query", &["dataset"]),
     ("zoo", &["dataset", "models", "rollout"]),
     ("recording", &["dataset", "rollout"]),
-    ("report", &["zoo"]),
+    ("report", &["models", "zoo"]),
     ("study", &["models", "puzzles", "recording", "report", "rollout", "zoo"]),
     ("cli", &["rollout"]),
     ("actrm-data", &["cli", "dataset", "puzzles", "recording", "rollout"]),

@@ -13,7 +13,7 @@ pub mod html;
 mod leaderboard;
 pub mod markdown;
 mod page;
-mod statistics;
+pub mod statistics;
 #[cfg(test)]
 mod testing;
 

@@ -4,3 +4,4 @@
 //! optimiser (`models`), no puzzle (`puzzles`), and neither reads the command line nor prints (`tools`).
 
 pub mod puzzle;
+pub mod robots;

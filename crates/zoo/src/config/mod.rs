@@ -84,33 +84,44 @@ impl Library {
         Ok(names)
     }
 
-    /// The table of experiment `name` with everything it extends merged beneath it.
+    /// The table of experiment `name` with everything it extends merged beneath it: one experiment, or a list of them, of
+    /// which later ones lie over earlier ones.
     ///
     /// Tables merge key by key; anything else is replaced by the extending file.
     ///
     /// # Errors
     /// When a file is unknown, not TOML, or extends itself.
     pub fn resolve(&self, name: &str) -> Result<Table, ZooError> {
-        let mut chain = vec![name.to_owned()];
+        self.resolve_below(name, &mut Vec::new())
+    }
+
+    /// The same for an experiment that those of `chain` extend.
+    fn resolve_below(&self, name: &str, chain: &mut Vec<String>) -> Result<Table, ZooError> {
+        let cycle = chain.iter().any(|seen| seen == name);
+        chain.push(name.to_owned());
+        if cycle {
+            return Err(ZooError::ExtendsCycle { chain: chain.clone() });
+        }
         let mut table = self.read(name)?;
-        while let Some(parent) = table.remove("extends") {
+        let parents = match table.remove("extends") {
+            None => Vec::new(),
+            Some(toml::Value::Array(parents)) => parents,
+            Some(parent) => vec![parent],
+        };
+        let mut merged = Table::new();
+        for parent in parents {
             let Some(parent) = parent.as_str() else {
                 return Err(ZooError::InvalidValue {
                     key: "extends".to_owned(),
-                    expected: "the name of an experiment".to_owned(),
+                    expected: "the name of an experiment, or a list of names".to_owned(),
                     found: parent.to_string(),
                 });
             };
-            let cycle = chain.iter().any(|seen| seen == parent);
-            chain.push(parent.to_owned());
-            if cycle {
-                return Err(ZooError::ExtendsCycle { chain });
-            }
-            let mut merged = self.read(parent)?;
-            merge(&mut merged, table);
-            table = merged;
+            merge(&mut merged, self.resolve_below(parent, chain)?);
         }
-        Ok(table)
+        merge(&mut merged, table);
+        chain.pop();
+        Ok(merged)
     }
 
     fn read(&self, name: &str) -> Result<Table, ZooError> {
@@ -134,7 +145,7 @@ impl Library {
     }
 }
 
-/// Lays `above` over `below`. An `extends` of `below` survives only where `above` has none left.
+/// Lays `above` over `below`.
 fn merge(below: &mut Table, above: Table) {
     for (key, value) in above {
         match (below.get_mut(&key), value) {
@@ -186,6 +197,21 @@ mod tests {
         }
         assert!(library.resolve("down").unwrap_err().to_string().contains("`../up`"));
         assert!(library.resolve(&"x".repeat(300)).unwrap_err().to_string().ends_with("at most 200 bytes"));
+    }
+
+    #[test]
+    fn of_several_that_are_extended_the_later_ones_win() {
+        let (_folder, library) = library(&[
+            ("_base", "x = 1\ny = 1"),
+            ("_policy", "extends = '_base'\ny = 2\nz = 2"),
+            ("_task", "z = 3"),
+            ("e", "extends = ['_policy', '_task']\nw = 4"),
+            ("f", "extends = ['_policy', 5]"),
+        ]);
+        let table = library.resolve("e").unwrap();
+        let value = |key: &str| table[key].as_integer().unwrap();
+        assert_eq!([value("x"), value("y"), value("z"), value("w")], [1, 2, 3, 4]);
+        assert!(library.resolve("f").unwrap_err().to_string().contains("or a list of names, found 5"));
     }
 
     #[test]

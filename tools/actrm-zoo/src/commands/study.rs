@@ -1,7 +1,8 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use cli::{INTERRUPTED, Screen, Stop, shown};
+use study::robots::{CellResult, RobotEvent, RobotStudyRequest, Study, robot_page, run_robot_study};
 use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, StudyRow, run_study, study_page};
 use zoo::run::TrainEvent;
 use zoo::write_atomic;
@@ -10,24 +11,37 @@ use crate::places::ConfigArgs;
 
 const GOES_ON: &str = "stopped; the same command goes on where it was";
 
-/// Run the puzzle study, as far as it has no results yet, and write its page
+/// Run a study, as far as it has no results yet, and write its page
 ///
-/// Every row (experiment, seed, test) is one small file in the results folder; Ctrl-C saves a checkpoint and the same
-/// command goes on from it. One thread (RAYON_NUM_THREADS=1) costs the least processor time.
+/// A study file says what is trained on which demonstrations with how many seeds, what it is tested on, and what is
+/// compared; without one it is the puzzle study. Every training's result on a test is one small file in the study's results
+/// folder; Ctrl-C saves checkpoints and the same command goes on from them. One thread (RAYON_NUM_THREADS=1) costs the
+/// least processor time.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
+  actrm-zoo study studies/thinking.toml --jobs 2
+  actrm-zoo study studies/thinking.toml --page-only
   actrm-zoo study --page docs/puzzles.md
   actrm-zoo study --only trm_dfs10 --only trm_open8 --seeds 1
   actrm-zoo study --page-only --page docs/puzzles.md
   actrm-zoo study --list")]
 pub struct Args {
-    /// Folder of results, one file a row
+    /// Study of robot policies; its results and its page lie where it says
+    #[arg(conflicts_with_all = ["results", "page", "seeds"])]
+    study: Option<PathBuf>,
+    /// Trainings at once, of a study of robot policies
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64), requires = "study")]
+    jobs: u16,
+    /// Python with robosuite, for a study of robot policies
+    #[arg(long, value_name = "PATH", env = "ACTRM_PYTHON")]
+    python: Option<PathBuf>,
+    /// Folder of results, one file a row [puzzles]
     #[arg(long, value_name = "DIR", default_value = "docs/puzzles")]
     results: PathBuf,
-    /// Folder for runs and entries
+    /// Folder for demonstrations, runs and entries
     #[arg(long, value_name = "DIR", default_value = "out/study")]
     work: PathBuf,
-    /// Only this experiment; may be repeated
+    /// Only this experiment (of robot policies: cells whose name holds this); may be repeated
     #[arg(long, value_name = "EXPERIMENT")]
     only: Vec<String>,
     /// Only the seeds up to this
@@ -37,7 +51,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE")]
     page: Option<PathBuf>,
     /// Run nothing
-    #[arg(long, requires = "page")]
+    #[arg(long)]
     page_only: bool,
     /// List the experiments of the study and end
     #[arg(long)]
@@ -47,6 +61,12 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if let Some(file) = &args.study {
+        return robots(args, file);
+    }
+    if args.page_only && args.page.is_none() {
+        anyhow::bail!("--page-only: expected --page FILE beside it, or a study file, which names its page");
+    }
     if args.list {
         let row = |row: &StudyRow| format!("{} ({} seeds, {} tests)\n", row.experiment, row.seeds, row.tests.len());
         cli::print(&STUDY.iter().map(row).collect::<String>())?;
@@ -86,6 +106,68 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::from(INTERRUPTED));
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// A study of robot policies.
+fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
+    let study = Study::open(file)?;
+    if args.list {
+        let line = |cell: &study::robots::Cell| format!("{}: {}\n", cell.name(), cell.tests.join(", "));
+        cli::print(&study::robots::cells(&study).iter().map(line).collect::<String>())?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let mut whole = true;
+    if !args.page_only {
+        let stop = Stop::install(GOES_ON)?;
+        stop.wait_for_work(true);
+        let request = RobotStudyRequest {
+            study: study.clone(),
+            library: args.configs.library()?,
+            work: args.work.join(file.file_stem().unwrap_or_default()),
+            only: args.only.clone(),
+            jobs: usize::from(args.jobs),
+            python: rollout::find_python(args.python.as_deref())?,
+            stop: stop.flag(),
+        };
+        let mut screen = Screen::new();
+        screen.begin("results", 1);
+        let mut printed = Ok(());
+        whole = run_robot_study(&request, &mut |event| match event {
+            RobotEvent::Done(done, total) => screen.begin_at("results", done as u64, total as u64),
+            RobotEvent::Collecting(name, done, all) => screen.message(&format!("{name}: {done} of {all} demonstrations")),
+            RobotEvent::Training(cell, step, steps) => screen.message(&format!("{cell}: step {step} of {steps}")),
+            RobotEvent::Testing(cell, test) => screen.message(&format!("{cell}: {test}")),
+            RobotEvent::Result(result) => {
+                let one = screen.print(&(cell_line(result) + "\n"));
+                if printed.is_ok() {
+                    printed = one;
+                }
+            }
+        })?;
+        drop(screen);
+        printed?;
+    }
+    write_atomic(&study.page, robot_page(&study, file)?.as_bytes())?;
+    cli::print(&(shown(&study.page) + "\n"))?;
+    if !whole {
+        cli::note(GOES_ON);
+        return Ok(ExitCode::from(INTERRUPTED));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// `k6 on pickchain-200, seed 1, chain: 171 of 200, 2.9 minutes`
+fn cell_line(result: &CellResult) -> String {
+    let won = result.episodes.iter().filter(|episode| episode.success).count();
+    format!(
+        "{} on {}, seed {}, {}: {won} of {}, {:.1} minutes",
+        result.arm,
+        result.data,
+        result.seed,
+        result.test,
+        result.episodes.len(),
+        result.training.minutes
+    )
 }
 
 fn on_event(event: &StudyEvent<'_>, screen: &mut Screen, stop: &Stop) -> anyhow::Result<()> {

@@ -1,4 +1,16 @@
-//! What is computed of a list of numbers.
+//! What a list of numbers says: means, intervals, tests, and comparisons of many.
+//!
+//! Counts and outcomes come in, numbers go out; nothing here knows an entry or a file.
+
+mod bootstrap;
+mod multiple;
+mod paired;
+mod sequential;
+
+pub use bootstrap::{Difference, Estimate, difference, hierarchical, interquartile};
+pub use multiple::{Distinct, holm, pairs};
+pub use paired::{Paired, barnard};
+pub use sequential::EProcess;
 
 /// 97.5% quantile of the standard normal distribution.
 const Z: f64 = 1.959_963_984_540_054;
@@ -37,6 +49,18 @@ pub fn quantile(values: &[f64], q: f64) -> Option<f64> {
     let (below, share) = (at.floor() as usize, at.fract());
     let above = (below + 1).min(values.len() - 1);
     Some(values[below] + (values[above] - values[below]) * share)
+}
+
+/// ln(k!) for k = 0 … n.
+fn log_factorials(n: u64) -> Vec<f64> {
+    let mut logs = Vec::with_capacity(n as usize + 1);
+    let mut sum = 0.0;
+    logs.push(sum);
+    for k in 1..=n {
+        sum += (k as f64).ln();
+        logs.push(sum);
+    }
+    logs
 }
 
 #[cfg(test)]

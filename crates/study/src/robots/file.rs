@@ -1,0 +1,229 @@
+//! The study file.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use zoo::ZooError;
+
+/// A study, as its TOML file has it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Study {
+    /// The page's heading.
+    pub title: String,
+    /// What the page says before its numbers, in Markdown.
+    #[serde(default)]
+    pub introduction: String,
+    /// Folder of results, one file a training and test.
+    pub results: PathBuf,
+    /// The page.
+    pub page: PathBuf,
+    /// Demonstrations, by name.
+    pub data: BTreeMap<String, Data>,
+    /// What is trained, by name.
+    pub arms: BTreeMap<String, Arm>,
+    /// What is tested, by name.
+    pub tests: BTreeMap<String, Test>,
+    /// What is run, what decides most first.
+    pub cells: Vec<CellRow>,
+    /// Which arms are compared, the primary ones first.
+    #[serde(default)]
+    pub comparisons: Vec<Comparison>,
+}
+
+/// Demonstrations of the scripted expert.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Data {
+    /// The task.
+    pub task: String,
+    /// How many that succeeded.
+    pub episodes: u64,
+    /// The collection's seed.
+    #[serde(default = "one")]
+    pub seed: u64,
+}
+
+/// One kind of policy under study.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Arm {
+    /// The experiment.
+    pub experiment: String,
+    /// Dotted settings laid over it.
+    #[serde(default)]
+    pub set: Vec<String>,
+    /// What the page calls it.
+    pub label: String,
+}
+
+/// Episodes that no training has seen.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Test {
+    /// The task.
+    pub task: String,
+    /// Episodes.
+    pub episodes: u64,
+    /// Seed of the first; the others count up.
+    pub seed_start: u64,
+}
+
+/// Trainings of some arms on the same demonstrations.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellRow {
+    /// The arms, each trained once for a seed before the next seed is begun.
+    pub arms: Vec<String>,
+    /// The demonstrations.
+    pub data: String,
+    /// Trainings of each arm; their seeds are 1 to this.
+    pub seeds: u64,
+    /// What each training is tested on.
+    pub tests: Vec<String>,
+}
+
+/// Two arms whose difference is a question of the study.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Comparison {
+    /// The question, in words.
+    pub question: String,
+    /// The arm expected to be better.
+    pub first: String,
+    /// The other.
+    pub second: String,
+    /// The demonstrations of both.
+    pub data: String,
+    /// The test of both.
+    pub test: String,
+    /// Only episodes of these groups; of all where empty.
+    #[serde(default)]
+    pub groups: Vec<String>,
+}
+
+fn one() -> u64 {
+    1
+}
+
+impl Study {
+    /// Reads and checks a study file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, an unknown key, a name that stands for nothing.
+    pub fn open(path: &Path) -> Result<Self, ZooError> {
+        let text = std::fs::read_to_string(path).map_err(|source| ZooError::Io {
+            operation: "read",
+            path: path.to_owned(),
+            source,
+        })?;
+        let study: Self = toml::from_str(&text).map_err(|source| ZooError::ExperimentSyntax {
+            experiment: path.display().to_string(),
+            source: Box::new(source),
+        })?;
+        study.check()?;
+        Ok(study)
+    }
+
+    fn check(&self) -> Result<(), ZooError> {
+        let arms = |key: String, name: &str| known(key, name, &self.arms);
+        let data = |key: String, name: &str| known(key, name, &self.data);
+        let tests = |key: String, name: &str| known(key, name, &self.tests);
+        for (i, row) in self.cells.iter().enumerate() {
+            row.arms.iter().try_for_each(|name| arms(format!("cells[{i}].arms"), name))?;
+            data(format!("cells[{i}].data"), &row.data)?;
+            row.tests.iter().try_for_each(|name| tests(format!("cells[{i}].tests"), name))?;
+        }
+        for (i, comparison) in self.comparisons.iter().enumerate() {
+            arms(format!("comparisons[{i}].first"), &comparison.first)?;
+            arms(format!("comparisons[{i}].second"), &comparison.second)?;
+            data(format!("comparisons[{i}].data"), &comparison.data)?;
+            tests(format!("comparisons[{i}].test"), &comparison.test)?;
+        }
+        for (kind, names) in [
+            ("data", self.data.keys().collect::<Vec<_>>()),
+            ("arms", self.arms.keys().collect()),
+            ("tests", self.tests.keys().collect()),
+        ] {
+            if let Some(name) = names.iter().find(|name| !is_plain(name)) {
+                return Err(ZooError::InvalidValue {
+                    key: format!("{kind}.{name}"),
+                    expected: "a name of lower-case letters, digits and hyphens".to_owned(),
+                    found: (*name).clone(),
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Names become parts of file and entry names.
+fn is_plain(name: &str) -> bool {
+    !name.is_empty() && name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-')
+}
+
+fn known<T>(key: String, name: &str, there: &BTreeMap<String, T>) -> Result<(), ZooError> {
+    if there.contains_key(name) {
+        return Ok(());
+    }
+    let names: Vec<&str> = there.keys().map(String::as_str).collect();
+    Err(ZooError::InvalidValue { key, expected: format!("one of {}", names.join(", ")), found: name.to_owned() })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    const TEXT: &str = r#"
+        title = "T"
+        results = "docs/t"
+        page = "docs/t.md"
+        [data.lift]
+        task = "Lift"
+        episodes = 10
+        [arms.act]
+        experiment = "act_lift"
+        label = "ACT"
+        [tests.lift]
+        task = "Lift"
+        episodes = 5
+        seed_start = 40000
+        [[cells]]
+        arms = ["act"]
+        data = "lift"
+        seeds = 2
+        tests = ["lift"]
+    "#;
+
+    fn open(text: &str) -> Result<Study, String> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("study.toml");
+        std::fs::write(&path, text).unwrap();
+        Study::open(&path).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn names_that_stand_for_nothing_are_named() {
+        let study = open(TEXT).unwrap();
+        assert_eq!(study.data["lift"].seed, 1);
+        let error = open(&TEXT.replace("arms = [\"act\"]", "arms = [\"atc\"]")).unwrap_err();
+        assert_eq!(error, "key `cells[0].arms`: expected one of act, found atc");
+        let error = open(&TEXT.replace("[arms.act]", "[arms.Act_1]")).unwrap_err();
+        assert!(error.contains("cells[0].arms") || error.contains("arms.Act_1"), "{error}");
+        assert!(open(&TEXT.replace("seeds = 2", "seed = 2")).unwrap_err().contains("seed"));
+    }
+
+    #[test]
+    fn every_study_that_is_shipped_is_sound() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../studies");
+        let mut studies = 0;
+        for file in std::fs::read_dir(folder).unwrap() {
+            let study = Study::open(&file.unwrap().path()).unwrap();
+            assert!(!study.cells.is_empty());
+            studies += 1;
+        }
+        assert!(studies > 0);
+    }
+}

@@ -1,0 +1,128 @@
+//! What came of a training on a test.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use zoo::results::{EntryIdentity, Protocol, Seeds, StoredEvaluation, TrainingFacts};
+use zoo::{ZooError, write_atomic};
+
+use super::cells::Cell;
+use super::file::{Arm, Data, Test};
+
+/// One training's outcomes on one test, with all that they depend on.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellResult {
+    /// Version of this form.
+    pub format: u32,
+    /// Name of the arm.
+    pub arm: String,
+    /// The arm as it was.
+    pub arm_definition: Arm,
+    /// Name of the demonstrations.
+    pub data: String,
+    /// The demonstrations as they were collected.
+    pub data_definition: Data,
+    /// Name of the test.
+    pub test: String,
+    /// The test as it was.
+    pub test_definition: Test,
+    /// The training's seed.
+    pub seed: u64,
+    /// sha256 of the resolved experiment without its entry's name, its data's path and its seed.
+    pub settings: String,
+    /// The entry.
+    pub entry: EntryIdentity,
+    /// Where it comes from.
+    pub training: TrainingFacts,
+    /// The rules of the evaluation.
+    pub protocol: Protocol,
+    /// The episodes' seeds.
+    pub seeds: Seeds,
+    /// Versions of the simulator and what it stands on.
+    pub versions: BTreeMap<String, String>,
+    /// Median duration of a query in milliseconds.
+    pub query_ms: f64,
+    /// Every episode, by seed.
+    pub episodes: Vec<EpisodeOutcome>,
+}
+
+/// How an episode ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpisodeOutcome {
+    /// Its seed.
+    pub seed: u64,
+    /// Whether the task was done.
+    pub success: bool,
+    /// Control steps.
+    pub steps: u32,
+    /// The part of the report that it belongs to.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub group: Option<String>,
+}
+
+impl CellResult {
+    /// The result of `evaluation`.
+    pub(super) fn new(
+        cell: &Cell,
+        (arm, data): (&Arm, &Data),
+        (test, definition): (&str, &Test),
+        settings: String,
+        evaluation: &StoredEvaluation,
+    ) -> Self {
+        let mut times: Vec<f64> = evaluation.timings.iter().flat_map(|t| t.inference_ms.iter().copied()).collect();
+        times.sort_by(f64::total_cmp);
+        let record = &evaluation.record;
+        Self {
+            format: 1,
+            arm: cell.arm.clone(),
+            arm_definition: arm.clone(),
+            data: cell.data.clone(),
+            data_definition: data.clone(),
+            test: test.to_owned(),
+            test_definition: definition.clone(),
+            seed: cell.seed,
+            settings,
+            entry: record.entry.clone(),
+            training: record.training.clone(),
+            protocol: record.protocol.clone(),
+            seeds: record.seeds,
+            versions: record.versions.clone(),
+            query_ms: times.get(times.len() / 2).copied().unwrap_or_default(),
+            episodes: evaluation
+                .episodes
+                .iter()
+                .map(|e| EpisodeOutcome { seed: e.seed, success: e.success, steps: e.steps, group: e.group.clone() })
+                .collect(),
+        }
+    }
+
+    /// Reads a result; nothing where there is no such file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or is no result.
+    pub fn read(path: &Path) -> Result<Option<Self>, ZooError> {
+        let text = match std::fs::read_to_string(path) {
+            Ok(text) => text,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(source) => return Err(ZooError::Io { operation: "read", path: path.to_owned(), source }),
+        };
+        let result = serde_json::from_str(&text)
+            .map_err(|source| ZooError::Malformed { path: path.to_owned(), reason: source.to_string() })?;
+        Ok(Some(result))
+    }
+
+    /// Writes it.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn write(&self, path: &Path) -> Result<(), ZooError> {
+        let mut text = serde_json::to_string(self).expect("plain fields are always JSON");
+        // a line an episode: small files that a version control system can compare
+        text = text.replace("{\"seed\":", "\n{\"seed\":").replace("\"episodes\":[\n", "\"episodes\":[\n");
+        text.push('\n');
+        write_atomic(path, text.as_bytes())
+    }
+}
