@@ -37,6 +37,9 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
         .csv("mean_steps_to_success")
         .table("steps")
         .page("steps to success"),
+    number(|row: &LeaderboardRow| quantile(&row.steps_to_success(), 0.5), 1, 1)
+        .csv("median_steps_to_success")
+        .page("median steps"),
     text(|row: &LeaderboardRow| row.record().training.parameters.to_string()).csv("parameters"),
     text(|row: &LeaderboardRow| count_text(row.record().training.parameters)).table("params").page("parameters"),
     number(|row: &LeaderboardRow| Some(row.inference_ms(0.5)), 3, 3).csv("inference_ms_median"),
