@@ -37,6 +37,9 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
         .csv("mean_steps_to_success")
         .table("steps")
         .page("steps to success"),
+    number(|row: &LeaderboardRow| quantile(&row.steps_to_success(), 0.5), 1, 1)
+        .csv("median_steps_to_success")
+        .page("median steps"),
     text(|row: &LeaderboardRow| row.record().training.parameters.to_string()).csv("parameters"),
     text(|row: &LeaderboardRow| count_text(row.record().training.parameters)).table("params").page("parameters"),
     number(|row: &LeaderboardRow| Some(row.inference_ms(0.5)), 3, 3).csv("inference_ms_median"),
@@ -162,11 +165,15 @@ impl LeaderboardRow {
 
     /// Mean number of control steps to success, over the successful episodes.
     pub fn mean_steps_to_success(&self) -> Option<f64> {
-        mean(self.steps_to_success())
+        mean(self.steps_to_success().into_iter())
     }
 
-    fn steps_to_success(&self) -> impl Iterator<Item = f64> {
-        self.evaluation.episodes.iter().filter(|episode| episode.success).map(|episode| f64::from(episode.steps))
+    /// Control steps of the successful episodes, ascending.
+    fn steps_to_success(&self) -> Vec<f64> {
+        let won = self.evaluation.episodes.iter().filter(|episode| episode.success);
+        let mut steps: Vec<f64> = won.map(|episode| f64::from(episode.steps)).collect();
+        steps.sort_by(f64::total_cmp);
+        steps
     }
 
     /// `mujoco 3.3.7, robosuite 1.5.2, ...`
@@ -323,7 +330,7 @@ mod tests {
         let row = LeaderboardRow::new(&evaluation);
         // the sample fails for every fifth seed
         assert_eq!(row.groups_text(), "seen 12/15, unseen 4/5");
-        assert_eq!(cells(COLUMNS, [&row]).rows[0][2], "16/20\nseen 12/15\nunseen 4/5");
+        assert_eq!(cells(COLUMNS, [&row]).rows[0][3], "16/20\nseen 12/15\nunseen 4/5");
         assert!(markdown::table(COLUMNS, [&row]).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
         assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\""));
     }
