@@ -45,11 +45,11 @@ impl DropoutMask {
     }
 
     /// The mask of a whole tensor: 0 or `scale()`.
-    pub fn tensor(self, shape: &[usize]) -> Result<Tensor> {
+    pub fn tensor(self, shape: &[usize], device: &Device) -> Result<Tensor> {
         let scale = self.scale();
         let values: Vec<f32> =
             (0..shape.iter().product::<usize>()).map(|i| if self.keeps(i as u32) { scale } else { 0.0 }).collect();
-        Ok(Tensor::from_vec(values, shape, &Device::Cpu)?)
+        Ok(Tensor::from_vec(values, shape, device)?)
     }
 }
 
@@ -72,7 +72,7 @@ impl Dropout {
     /// x: any shape -> the same
     pub fn forward(&self, x: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
         match self.mask(mode) {
-            Some(mask) => Ok(x.mul(&mask.tensor(x.dims())?)?),
+            Some(mask) => Ok(x.mul(&mask.tensor(x.dims(), x.device())?)?),
             None => Ok(x.clone()),
         }
     }

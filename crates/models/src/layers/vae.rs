@@ -51,7 +51,7 @@ impl Vae {
         let tokens = Tensor::cat(&[&cls.contiguous()?, &state, &actions], 1)?;
         let always = Tensor::zeros((b, 2), DType::F32, tokens.device())?;
         let key_pad = Tensor::cat(&[&always, &batch.is_pad], 1)?;
-        let x = self.encoder.forward(&tokens, pos, Some(&key_pad), mode)?;
+        let x = self.encoder.forward(&tokens, &pos.to_device(tokens.device())?, Some(&key_pad), mode)?;
         let out = self.latent_output_proj.forward(&x.narrow(1, 0, 1)?.squeeze(1)?)?;
         Ok((out.narrow(1, 0, latent)?, out.narrow(1, latent, latent)?))
     }
