@@ -1,5 +1,10 @@
 //! Fixture folders: this repository's, and everybody's own below the directory that `ACTRM_PARITY_DIR` names.
 #![allow(clippy::unwrap_used)]
+// every test program uses a part of it
+#![allow(dead_code)]
+
+pub mod npz;
+pub mod recipe;
 
 use std::path::{Path, PathBuf};
 
