@@ -136,6 +136,24 @@ impl Params {
         self.buffers.iter().map(|(k, v)| (k.as_str(), v))
     }
 
+    /// Sets the values of a buffer.
+    ///
+    /// # Errors
+    /// If there is no such buffer, or it has another shape.
+    pub fn set_buffer(&self, name: &str, values: &Tensor) -> Result<()> {
+        let Some(buffer) = self.buffers.get(name) else {
+            let given = some_names(self.buffers.keys());
+            return Err(ModelError::MissingTensor { name: name.to_string(), given });
+        };
+        if values.dims() != buffer.dims() {
+            let (name, expected, found) = (name.to_string(), buffer.dims().to_vec(), values.dims().to_vec());
+            return Err(ModelError::MisshapenTensor { name, expected, found });
+        }
+        buffer.set(&values.to_dtype(DType::F32)?.contiguous()?)?;
+        self.changed();
+        Ok(())
+    }
+
     /// Everything that is saved: parameters, then buffers.
     pub fn all(&self) -> impl Iterator<Item = (&str, &Var)> {
         self.iter().chain(self.buffers())

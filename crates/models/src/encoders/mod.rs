@@ -6,11 +6,13 @@
 //! `fused/vision.rs` runs the same maths on slices.
 
 mod config;
+mod look;
 mod position;
 mod resnet;
 mod spatial_softmax;
 
 pub use config::{Architecture, ImageNorm, Normalisation, TokenKind, VisionConfig};
+pub use look::Look;
 pub use position::position_table;
 pub(crate) use resnet::EPS;
 pub use resnet::{ResNet, ResNetShape};
@@ -30,6 +32,10 @@ pub const PROJECTION: &str = "encoder_img_feat_input_proj";
 pub const KEYPOINTS: &str = "encoder_img_keypoints";
 /// Prefix of the layer between keypoints and token.
 pub const KEYPOINT_PROJECTION: &str = "encoder_img_keypoint_input_proj";
+/// Mean of the pictures of each camera, (cameras, 3), on the scale from 0 to 1: a buffer.
+pub const PICTURE_MEAN: &str = "encoder_img_mean";
+/// Standard deviation of the same.
+pub const PICTURE_STD: &str = "encoder_img_std";
 /// Name of the positions of keypoint tokens, one a camera.
 pub const CAMERA_EMBED: &str = "encoder_img_camera_embed";
 
@@ -48,27 +54,36 @@ enum Head {
 /// Backbone and tokens of all cameras.
 #[derive(Debug)]
 pub struct ImageEncoder {
+    config: VisionConfig,
     backbone: ResNet,
     head: Head,
+    /// of the cameras' pictures
+    given: Vec<Size>,
+    /// of what is seen of them
     sizes: Vec<Size>,
+    /// (cameras, 3)
+    mean: Tensor,
+    std: Tensor,
 }
 
 impl ImageEncoder {
-    /// For cameras of these sizes, in order, and tokens of width `dim`.
+    /// For cameras whose pictures have these sizes, in order, and tokens of width `dim`.
     ///
     /// # Errors
     /// A configuration or a size that describes no possible network.
-    pub fn new(params: &mut Params, config: &VisionConfig, sizes: &[Size], dim: usize, rng: &mut Rng) -> Result<Self> {
+    pub fn new(params: &mut Params, config: &VisionConfig, given: &[Size], dim: usize, rng: &mut Rng) -> Result<Self> {
         config.validate()?;
-        if sizes.is_empty() || sizes.iter().any(|&(h, w)| h == 0 || w == 0) {
+        if given.is_empty() || given.iter().any(|&(h, w)| h == 0 || w == 0) {
             let expected = "one size a camera, at least 1 x 1".to_string();
-            return Err(ModelError::Config {
-                model: "vision",
-                field: "cameras",
-                found: format!("{sizes:?}"),
-                expected,
-            });
+            return Err(ModelError::Config { model: "vision", field: "cameras", found: format!("{given:?}"), expected });
         }
+        let sizes = given.iter().map(|&size| config.seen(size)).collect::<Result<Vec<_>>>()?;
+        let (mean, std) = look::statistics(config.normalise);
+        let mut buffer = |name: &str, values: [f32; 3]| {
+            let values = Tensor::from_vec(values.repeat(given.len()), (given.len(), 3), &Device::Cpu)?;
+            params.insert_buffer(name, values)
+        };
+        let (mean, std) = (buffer(PICTURE_MEAN, mean)?, buffer(PICTURE_STD, std)?);
         let shape = config.shape();
         let backbone = ResNet::new(params, &format!("{BACKBONE}."), &shape, rng)?;
         let channels = shape.channels_out();
@@ -100,7 +115,8 @@ impl ImageEncoder {
                 )?,
             },
         };
-        Ok(Self { backbone, head, sizes: sizes.to_vec() })
+        params.set_rate(&format!("{BACKBONE}."), config.backbone_rate());
+        Ok(Self { config: config.clone(), backbone, head, given: given.to_vec(), sizes, mean, std })
     }
 
     /// The network in front of the tokens.
@@ -108,9 +124,22 @@ impl ImageEncoder {
         &self.backbone
     }
 
-    /// Sizes of the cameras' pictures.
+    /// Sizes of what is seen of the cameras' pictures.
     pub fn sizes(&self) -> &[Size] {
         &self.sizes
+    }
+
+    /// Sets what the pictures of each camera are normalised by, on the scale from 0 to 1.
+    ///
+    /// # Errors
+    /// Another number of cameras, or parameters without cameras.
+    pub fn set_statistics(params: &Params, mean: &[[f32; 3]], std: &[[f32; 3]]) -> Result<()> {
+        for (name, rows) in [(PICTURE_MEAN, mean), (PICTURE_STD, std)] {
+            let values = Tensor::from_vec(rows.concat(), (rows.len(), 3), &Device::Cpu)?;
+            params.set_buffer(name, &values)?;
+        }
+        params.changed();
+        Ok(())
     }
 
     /// Tokens of each camera.

@@ -21,10 +21,8 @@ pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_an
 pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::Encoder;
 pub(crate) use loss::AbsoluteError;
-pub(crate) use observation::{Data, Tokens, inputs, positions_backward, uncovered};
+pub(crate) use observation::{Data, Inputs, Tokens, inputs, positions_backward, uncovered};
 pub(crate) use vae::Vae;
-#[allow(unused_imports)] // until the models read pictures
-pub(crate) use vision::{Eyes, Looked};
 
 use crate::error::{ModelError, Result};
 

@@ -316,11 +316,6 @@ pub(crate) struct Eyes<'a> {
 pub(crate) struct Looked(Vec<Seen>);
 
 impl Eyes<'_> {
-    /// Tokens of all cameras.
-    pub(crate) fn tokens(&self) -> usize {
-        self.sizes.iter().map(|&size| self.cells(size)).sum()
-    }
-
     fn cells(&self, size: Size) -> usize {
         let (h, w) = self.shape.map_size(size);
         h * w
