@@ -12,7 +12,8 @@ use models::act::Act;
 use models::layers::Mode;
 use models::lerobot::{self, LerobotAct};
 use models::{
-    Batch, FeatureKind, Features, Gradients, LossValues, OptimiserConfig, ParamLayout, PolicyModel, Schedule, TrainConfig,
+    Batch, FeatureKind, Features, Gradients, LossValues, OptimiserConfig, ParamLayout, PolicyModel, Schedule,
+    TrainConfig,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -61,7 +62,8 @@ fn read(folder: &Path) -> Fixture {
     match weights.exists() {
         true => lerobot::load_tensors(act.params(), &lerobot.config, &safetensors(&weights)).unwrap(),
         false => {
-            let ours = |(name, _): &(&str, &candle_core::Var)| *name != "encoder_img_mean" && *name != "encoder_img_std";
+            let ours =
+                |(name, _): &(&str, &candle_core::Var)| *name != "encoder_img_mean" && *name != "encoder_img_std";
             let mut tensors = act.params().tensors();
             for (name, var) in act.params().all().filter(ours) {
                 tensors.insert(name.to_string(), recipe::tensor(&format!("model.{name}"), var.dims()));
@@ -126,7 +128,9 @@ impl Fixture {
         for (name, _) in self.act.params().iter() {
             let (got, full) = (of(name), format!("model.{name}"));
             match &whole {
-                Some(whole) => close(&format!("{} {way}: {name}", self.name), &got, &values(&whole[&full]), OF_GRADIENTS),
+                Some(whole) => {
+                    close(&format!("{} {way}: {name}", self.name), &got, &values(&whole[&full]), OF_GRADIENTS)
+                }
                 None => assert_probes(&probes, &full, &got, f64::from(OF_GRADIENTS), &format!("{} {way}", self.name)),
             }
         }

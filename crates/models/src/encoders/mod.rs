@@ -18,11 +18,12 @@ pub(crate) use resnet::EPS;
 pub use resnet::{ResNet, ResNetShape};
 pub use spatial_softmax::SpatialSoftmax;
 
-use crate::error::{ModelError, Result};
+use crate::error::{ModelError, Result, some_names};
 use crate::layers::Linear;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
 use candle_core::{DType, Device, Tensor};
+use std::collections::BTreeMap;
 
 /// Prefix of the backbone's tensors, LeRobot's.
 pub const BACKBONE: &str = "backbone";
@@ -75,7 +76,12 @@ impl ImageEncoder {
         config.validate()?;
         if given.is_empty() || given.iter().any(|&(h, w)| h == 0 || w == 0) {
             let expected = "one size a camera, at least 1 x 1".to_string();
-            return Err(ModelError::Config { model: "vision", field: "cameras", found: format!("{given:?}"), expected });
+            return Err(ModelError::Config {
+                model: "vision",
+                field: "cameras",
+                found: format!("{given:?}"),
+                expected,
+            });
         }
         let sizes = given.iter().map(|&size| config.seen(size)).collect::<Result<Vec<_>>>()?;
         let (mean, std) = look::statistics(config.normalise);
@@ -140,6 +146,28 @@ impl ImageEncoder {
         }
         params.changed();
         Ok(())
+    }
+
+    /// Takes the backbone's weights from `tensors` under torchvision's names; what a classifier has besides is left alone.
+    /// A GroupNorm keeps its own weights: those of a batch norm mean something else.
+    ///
+    /// # Errors
+    /// A tensor that is missing or misshapen.
+    pub fn load_backbone(params: &Params, norm: ImageNorm, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
+        let mut all = params.tensors();
+        let prefix = format!("{BACKBONE}.");
+        for (name, value) in all.iter_mut() {
+            let Some(theirs) = name.strip_prefix(&prefix) else { continue };
+            if norm == ImageNorm::Group && value.dims().len() == 1 {
+                continue;
+            }
+            let given = tensors.get(theirs).ok_or_else(|| ModelError::MissingTensor {
+                name: theirs.to_string(),
+                given: some_names(tensors.keys()),
+            })?;
+            *value = given.clone();
+        }
+        params.load(&all)
     }
 
     /// Tokens of each camera.

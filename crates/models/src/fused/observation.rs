@@ -86,11 +86,7 @@ pub(crate) struct Tokens<'a> {
 
 impl<'a> Tokens<'a> {
     /// latent: (b, L), the inputs in the layout's order
-    pub(crate) fn new(
-        layout: &'a TokenLayout,
-        (latent, latent_dim): (&'a [f32], usize),
-        inputs: &'a Inputs,
-    ) -> Self {
+    pub(crate) fn new(layout: &'a TokenLayout, (latent, latent_dim): (&'a [f32], usize), inputs: &'a Inputs) -> Self {
         let features = layout.tokens.iter().zip(&inputs.vectors);
         let features = features.map(|(token, values)| (token.prefix.as_str(), values.as_slice(), token.width));
         let all = std::iter::once((LATENT, latent, latent_dim)).chain(features).collect();

@@ -254,6 +254,11 @@ impl InputTokens {
         Ok(seen)
     }
 
+    /// How pictures are seen, if there are any.
+    pub(crate) fn vision(&self) -> Option<&VisionConfig> {
+        self.layout.cameras.as_ref().map(|cameras| &cameras.config)
+    }
+
     /// Why the step by hand does not cover its pictures, if it does not.
     pub(crate) fn composed_because(&self) -> Option<String> {
         let cameras = self.layout.cameras.as_ref()?;

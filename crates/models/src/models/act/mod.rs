@@ -29,6 +29,7 @@ pub use config::Config;
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation, check_signature};
 use crate::chunk_policy::ChunkPolicy;
+use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
@@ -243,5 +244,9 @@ impl PolicyModel for Act {
 
     fn action_horizon(&self) -> usize {
         self.config.action_horizon
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.tokens.vision()
     }
 }

@@ -40,6 +40,7 @@ pub use reasoning::{Reasoning, ReasoningPolicy, ReasoningStep};
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation, check_signature};
 use crate::classification::binary_cross_entropy;
+use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
@@ -498,5 +499,9 @@ impl PolicyModel for Actrm {
 
     fn action_horizon(&self) -> usize {
         self.config.action_horizon
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.tokens.vision()
     }
 }
