@@ -354,11 +354,10 @@ impl WithSimd for Windows<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // sums fill the registers: 24 of 32, 12 of 16
+        // sums fill the registers: 24 of 32, 12 of 16; twelve hide the time of an addition
         match (S::F32_LANES >= 16, self.output <= S::F32_LANES) {
-            (true, true) => windows::<S, 24, 1>(simd, self),
+            (_, true) => windows::<S, 12, 1>(simd, self),
             (true, false) => windows::<S, 12, 2>(simd, self),
-            (false, true) => windows::<S, 12, 1>(simd, self),
             (false, false) => windows::<S, 6, 2>(simd, self),
         }
     }
@@ -375,18 +374,19 @@ fn windows<S: Simd, const R: usize, const V: usize>(simd: S, w: Windows<'_>) {
             let columns = nr.min(output - j0);
             for places in block[..count].chunks(R) {
                 // the last windows of a block may be few
-                if places.len() * 2 <= R && R == 24 {
-                    tile::<S, 12, V>(simd, &grid, x, panel, places, (j0, columns), add, out);
-                } else if places.len() * 2 <= R && R == 12 {
-                    tile::<S, 6, V>(simd, &grid, x, panel, places, (j0, columns), add, out);
-                } else {
-                    tile::<S, R, V>(simd, &grid, x, panel, places, (j0, columns), add, out);
+                match places.len() {
+                    0..=6 if R == 12 => tile::<S, 6, V>(simd, &grid, x, panel, places, (j0, columns), add, out),
+                    _ => tile::<S, R, V>(simd, &grid, x, panel, places, (j0, columns), add, out),
                 }
             }
         }
     }
 }
 
+/// Steps that run without a check between them.
+const STRIDE: usize = 16;
+
+/// Nothing here may panic: sums would have to be in memory at every step, for whoever looks at them then.
 #[allow(clippy::too_many_arguments)] // where from, where to
 #[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
 #[inline(always)]
@@ -405,11 +405,29 @@ fn tile<S: Simd, const R: usize, const V: usize>(
     // beyond the last window it is read again
     let starts: [usize; R] = std::array::from_fn(|r| places[r.min(places.len() - 1)].0);
     for (s, part) in panel.chunks_exact(grid.length * V * lanes).enumerate() {
-        let lines: [&[f32]; R] = std::array::from_fn(|r| &x[starts[r] + s * grid.apart..][..grid.length]);
+        let line = |r: usize| x.get(starts[r] + s * grid.apart..).and_then(|line| line.get(..grid.length));
+        let mut lines: [&[f32]; R] = std::array::from_fn(|r| line(r).unwrap_or(&[]));
         let (part, _) = S::as_simd_f32s(part);
-        for (p, b) in (0..grid.length).zip(part.chunks_exact(V)) {
+        let mut columns = part.chunks_exact(V);
+        for _ in 0..grid.length / STRIDE {
+            let steps: [&[f32; STRIDE]; R] = std::array::from_fn(|r| {
+                let (head, tail) = lines[r].split_first_chunk().unwrap_or((&[0.0; STRIDE], &[]));
+                lines[r] = tail;
+                head
+            });
+            for p in 0..STRIDE {
+                let Some(b) = columns.next() else { break };
+                for r in 0..R {
+                    let a = simd.splat_f32s(steps[r][p]);
+                    for v in 0..V {
+                        sums[r][v] = simd.mul_add_e_f32s(a, b[v], sums[r][v]);
+                    }
+                }
+            }
+        }
+        for (p, b) in columns.enumerate() {
             for r in 0..R {
-                let a = simd.splat_f32s(lines[r][p]);
+                let a = simd.splat_f32s(lines[r].get(p).copied().unwrap_or(0.0));
                 for v in 0..V {
                     sums[r][v] = simd.mul_add_e_f32s(a, b[v], sums[r][v]);
                 }
@@ -489,6 +507,7 @@ fn weights<S: Simd, const R: usize, const V: usize>(simd: S, w: WeightGradient<'
     }
 }
 
+/// As in [`tile`] nothing may panic.
 #[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
 #[inline(always)]
 fn weight_tile<S: Simd, const R: usize, const V: usize>(
@@ -502,8 +521,10 @@ fn weight_tile<S: Simd, const R: usize, const V: usize>(
     let wide = V * S::F32_LANES;
     let mut sums = [[simd.splat_f32s(0.0); V]; R];
     for &(from, to) in places {
-        let (b, _) = S::as_simd_f32s(&x[from + at..][..wide]);
-        let a = &grad[to + o0..][..R];
+        let (b, a) = (x.get(from + at..).and_then(|x| x.get(..wide)), grad.get(to + o0..));
+        let (Some(b), Some(a)) = (b, a.and_then(|a| a.first_chunk::<R>())) else { continue };
+        let (b, _) = S::as_simd_f32s(b);
+        let Some(b) = b.first_chunk::<V>() else { continue };
         for r in 0..R {
             let a = simd.splat_f32s(a[r]);
             for v in 0..V {
