@@ -74,9 +74,9 @@ impl Subject<'_> {
             (format!("length of {}", spec.name), spec.width().to_string(), found)
         });
         let way = |fast: bool| if fast { "without reflections" } else { "with reflections" }.to_owned();
-        let drawn = self.fast_render.map(|fast| {
-            ("pictures drawn".to_owned(), way(fast), way(CamerasMeta::draws_fast(&ready.env_args)))
-        });
+        let drawn = self
+            .fast_render
+            .map(|fast| ("pictures drawn".to_owned(), way(fast), way(CamerasMeta::draws_fast(&ready.env_args))));
         let action =
             ("length of an action".to_owned(), self.signature.action_dim.to_string(), ready.action_dim.to_string());
         for (what, expected, found) in features.chain(drawn).chain([action]) {

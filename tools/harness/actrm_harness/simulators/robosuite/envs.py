@@ -135,7 +135,15 @@ def make(
         if env_args is None:
             raise
         raise RequestError("env_args", f"{task_name} cannot be made of these env_args: {error!r}") from error
-    return Session(env=cast(Env, env), task=task, env_args=described, cameras=cameras, image_size=size, unusual=unusual, fast_render=fast_render)
+    return Session(
+        env=cast(Env, env),
+        task=task,
+        env_args=described,
+        cameras=cameras,
+        image_size=size,
+        unusual=unusual,
+        fast_render=fast_render,
+    )
 
 
 def arguments(task: Task, given: dict[str, Any]) -> dict[str, Any]:
