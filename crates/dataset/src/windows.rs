@@ -297,4 +297,20 @@ mod tests {
         first.sort_unstable();
         assert_eq!(first, (0..20).collect::<Vec<u32>>());
     }
+
+    #[test]
+    fn pictures_come_with_the_observations_they_were_seen_with() {
+        let pictures = Pictures { height: 1, width: 2, data: (0..5 * 6).collect() };
+        let windows = Windows::new(vec![("c".into(), column(5, 1, 0.0))], column(5, 1, 0.0), (2, 1), &[(0, 2), (2, 5)])
+            .with_pictures("front", Arc::new(pictures.clone()));
+        assert_eq!(windows.pictures().collect::<Vec<_>>(), [("front", (1, 2))]);
+        let mut batch = WindowBatch::default();
+        windows.gather(&[2, 4, 1], &mut batch);
+        let (name, bytes) = &batch.pictures[0];
+        let frames: Vec<&[u8]> = bytes.chunks_exact(6).collect();
+        // before an episode its first frame is repeated
+        let expected = [2, 2, 3, 4, 0, 1].map(|frame| pictures.frame(frame));
+        assert_eq!((name.as_str(), frames.as_slice()), ("front", &expected[..]));
+        assert_eq!(batch.column("c").unwrap(), [2.0, 2.0, 3.0, 4.0, 0.0, 1.0]);
+    }
 }

@@ -174,7 +174,7 @@ impl<'a> PolicyTraining<'a> {
         let build = || {
             let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed);
             let model = model.map_err(experiment.model_error("build the policy of"))?;
-            super::eyes::open(model.as_ref(), demonstrations, experiment)?;
+            super::eyes::open(model.as_ref(), &demonstrations, experiment)?;
             Ok(model)
         };
         let trainer = Trainer::new(build()?, section.trainer_config(), section.seed)
