@@ -6,8 +6,10 @@
 //! `delta_timestamps` and robomimic's padded sequences have it. Gathering a batch copies rows out of
 //! columns that stay in memory; it allocates nothing once the batch has been used.
 
+use crate::lerobot::Pictures;
 use crate::shuffle::SplitMix64;
 use arrow::buffer::ScalarBuffer;
+use std::sync::Arc;
 
 /// Which windows to make.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,6 +52,7 @@ struct Span {
 #[derive(Debug, Clone)]
 pub struct Windows {
     observation: Vec<(String, Resident)>,
+    pictures: Vec<(String, Arc<Pictures>)>,
     action: Resident,
     n_obs_steps: usize,
     action_horizon: usize,
@@ -65,6 +68,8 @@ pub struct WindowBatch {
     pub n_obs_steps: usize,
     /// By column, in the order asked for: `(n, n_obs_steps, dim)`, oldest first.
     pub observation: Vec<(String, Vec<f32>)>,
+    /// By camera, in the order in which they were added: `(n, n_obs_steps, height, width, 3)`, oldest first.
+    pub pictures: Vec<(String, Vec<u8>)>,
     /// `(n, action_horizon, action_dim)`
     pub actions: Vec<f32>,
     /// `(n, action_horizon)`; true where the last action of the episode is repeated.
@@ -92,7 +97,19 @@ impl Windows {
             let (begin, end) = (from as u32, to as u32);
             spans.extend((begin..end).map(|frame| Span { begin, frame, end }));
         }
-        Self { observation, action, n_obs_steps, action_horizon, spans }
+        Self { observation, pictures: Vec::new(), action, n_obs_steps, action_horizon, spans }
+    }
+
+    /// The same windows with the pictures of a camera of the same data set, which stay in memory and are shared.
+    #[must_use]
+    pub fn with_pictures(mut self, camera: &str, pictures: Arc<Pictures>) -> Self {
+        self.pictures.push((camera.to_owned(), pictures));
+        self
+    }
+
+    /// Cameras with height and width of their pictures, in order.
+    pub fn pictures(&self) -> impl Iterator<Item = (&str, (usize, usize))> {
+        self.pictures.iter().map(|(name, pictures)| (name.as_str(), (pictures.height, pictures.width)))
     }
 
     /// Number of windows: one a frame.
@@ -143,17 +160,28 @@ impl Windows {
         if !named {
             batch.observation = self.observation.iter().map(|(name, _)| (name.clone(), Vec::new())).collect();
         }
+        // before an episode there is its first frame
+        let frames = |index: u32| {
+            let span = self.spans[index as usize];
+            let before = move |step: usize| (self.n_obs_steps - 1 - step).min((span.frame - span.begin) as usize);
+            (0..self.n_obs_steps).map(move |step| span.frame as usize - before(step))
+        };
         for ((_, values), (_, column)) in batch.observation.iter_mut().zip(&self.observation) {
             values.resize(n * self.n_obs_steps * column.dim, 0.0);
-            let mut rows = values.chunks_exact_mut(column.dim.max(1));
-            for &index in indices {
-                let span = self.spans[index as usize];
-                for step in 0..self.n_obs_steps {
-                    // before an episode there is its first frame
-                    let before = (self.n_obs_steps - 1 - step).min((span.frame - span.begin) as usize);
-                    let row = rows.next().expect("one a window and step");
-                    row.copy_from_slice(column.row(span.frame as usize - before));
-                }
+            let rows = values.chunks_exact_mut(column.dim.max(1));
+            for (row, frame) in rows.zip(indices.iter().flat_map(|&index| frames(index))) {
+                row.copy_from_slice(column.row(frame));
+            }
+        }
+        let named = batch.pictures.iter().map(|(name, _)| name).eq(self.pictures.iter().map(|(name, _)| name));
+        if !named {
+            batch.pictures = self.pictures.iter().map(|(name, _)| (name.clone(), Vec::new())).collect();
+        }
+        for ((_, values), (_, pictures)) in batch.pictures.iter_mut().zip(&self.pictures) {
+            values.resize(n * self.n_obs_steps * pictures.picture_bytes(), 0);
+            let rows = values.chunks_exact_mut(pictures.picture_bytes().max(1));
+            for (row, frame) in rows.zip(indices.iter().flat_map(|&index| frames(index))) {
+                row.copy_from_slice(pictures.frame(frame));
             }
         }
         batch.actions.resize(n * horizon * width, 0.0);
@@ -268,5 +296,21 @@ mod tests {
         assert_ne!(first, windows.shuffled(3, 1));
         first.sort_unstable();
         assert_eq!(first, (0..20).collect::<Vec<u32>>());
+    }
+
+    #[test]
+    fn pictures_come_with_the_observations_they_were_seen_with() {
+        let pictures = Pictures { height: 1, width: 2, data: (0..5 * 6).collect() };
+        let windows = Windows::new(vec![("c".into(), column(5, 1, 0.0))], column(5, 1, 0.0), (2, 1), &[(0, 2), (2, 5)])
+            .with_pictures("front", Arc::new(pictures.clone()));
+        assert_eq!(windows.pictures().collect::<Vec<_>>(), [("front", (1, 2))]);
+        let mut batch = WindowBatch::default();
+        windows.gather(&[2, 4, 1], &mut batch);
+        let (name, bytes) = &batch.pictures[0];
+        let frames: Vec<&[u8]> = bytes.chunks_exact(6).collect();
+        // before an episode its first frame is repeated
+        let expected = [2, 2, 3, 4, 0, 1].map(|frame| pictures.frame(frame));
+        assert_eq!((name.as_str(), frames.as_slice()), ("front", &expected[..]));
+        assert_eq!(batch.column("c").unwrap(), [2.0, 2.0, 3.0, 4.0, 0.0, 1.0]);
     }
 }

@@ -85,6 +85,12 @@ impl FeatureSpec {
         }
     }
 
+    /// A picture of `height` by `width` pixels of three colours, under its whole name.
+    pub fn image(name: &str, height: usize, width: usize) -> Self {
+        let shape = vec![height, width, 3];
+        Self { name: name.to_string(), kind: FeatureKind::Image, shape, group: None, position: false }
+    }
+
     /// Number of values of one step.
     pub fn width(&self) -> usize {
         self.shape.iter().product()

@@ -1,24 +1,29 @@
 //! LeRobot's ACT files as values: its `config.json`, its tensor names, its names of normalisation modes. This is the one
 //! place that knows them; files are read and written in `zoo`.
 
+use crate::encoders::{Architecture, ImageEncoder, ImageNorm, PICTURE_MEAN, PICTURE_STD, TokenKind, VisionConfig};
 use crate::error::{ModelError, Result, some_names};
-use crate::features::{FeatureKind, Signature};
+use crate::features::{FeatureKind, FeatureSpec, Signature};
 use crate::layers::{Activation, sinusoid_table};
 use crate::models::act::Config;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
 use crate::params::Params;
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
 /// The prefix of every tensor in LeRobot's files.
 const PREFIX: &str = "model.";
+/// Channels of the first layer of torchvision's networks.
+const LEROBOTS_WIDTH: usize = 64;
+/// Buffers of ours that stand among LeRobot's statistics, not among its weights.
+const OF_PICTURES: [&str; 2] = [PICTURE_MEAN, PICTURE_STD];
 /// LeRobot saves this fixed table with the weights.
 const POSITION_BUFFER: &str = "vae_encoder_pos_enc";
 
-/// Keys that LeRobot knows and that do not matter to a low-dimensional policy at rest.
-const OF_NO_MATTER: [&str; 17] = [
+/// Keys that LeRobot knows and that do not matter to a policy at rest.
+const OF_NO_MATTER: [&str; 15] = [
     "type",
     "device",
     "use_amp",
@@ -30,9 +35,8 @@ const OF_NO_MATTER: [&str; 17] = [
     "license",
     "pretrained_path",
     "pretrained_revision",
-    "vision_backbone",
+    // whose weights it began with; those in the file are what counts
     "pretrained_backbone_weights",
-    "replace_final_stride_with_dilation",
     "optimizer_lr",
     "optimizer_weight_decay",
     "optimizer_lr_backbone",
@@ -73,6 +77,8 @@ struct Keys {
     temporal_ensemble_coeff: Option<f64>,
     dropout: f64,
     kl_weight: f64,
+    vision_backbone: String,
+    replace_final_stride_with_dilation: bool,
     normalization_mapping: BTreeMap<String, String>,
     input_features: BTreeMap<String, FeatureKeys>,
     output_features: BTreeMap<String, FeatureKeys>,
@@ -106,6 +112,8 @@ impl Default for Keys {
             temporal_ensemble_coeff: None,
             dropout: config.dropout,
             kl_weight: config.kl_weight,
+            vision_backbone: "resnet18".to_string(),
+            replace_final_stride_with_dilation: false,
             normalization_mapping: BTreeMap::from(mapping),
             input_features: BTreeMap::new(),
             output_features: BTreeMap::new(),
@@ -142,7 +150,8 @@ fn refuse(field: &'static str, found: impl Into<String>, expected: &str) -> Mode
 /// Reads a `config.json`.
 ///
 /// # Errors
-/// Another type of policy, images, several observation steps, a missing feature, or a configuration that is impossible.
+/// Another type of policy, another image encoder than ResNet18 and ResNet34, several observation steps, a missing feature,
+/// or a configuration that is impossible.
 pub fn read_config(config: &Value) -> Result<LerobotAct> {
     let kind = config.get("type").and_then(Value::as_str).unwrap_or("absent");
     if kind != "act" {
@@ -156,17 +165,20 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
     if keys.n_obs_steps != 1 {
         return Err(refuse("n_obs_steps", keys.n_obs_steps.to_string(), "1"));
     }
-    let (mut state, mut env) = (0, 0);
+    let (mut state, mut env, mut pictures) = (0, 0, Vec::new());
     for (name, feature) in &keys.input_features {
-        let size = match feature.shape[..] {
-            [n] => n,
-            _ => return Err(refuse("input_features", format!("{name} of shape {:?}", feature.shape), "one dimension")),
-        };
-        match (feature.kind.as_str(), name.as_str()) {
-            ("STATE", STATE) => state = size,
-            ("ENV", ENVIRONMENT_STATE) => env = size,
-            (kind, _) => {
-                let expected = "observation.state of type STATE and observation.environment_state of type ENV";
+        match (feature.kind.as_str(), name.as_str(), &feature.shape[..]) {
+            ("STATE", STATE, &[n]) => state = n,
+            ("ENV", ENVIRONMENT_STATE, &[n]) => env = n,
+            ("VISUAL", name, &[3, height, width]) => pictures.push(FeatureSpec::image(name, height, width)),
+            ("VISUAL", name, shape) => {
+                return Err(refuse("input_features", format!("{name} of shape {shape:?}"), "3 colours, height, width"));
+            }
+            ("STATE", STATE, shape) | ("ENV", ENVIRONMENT_STATE, shape) => {
+                return Err(refuse("input_features", format!("{name} of shape {shape:?}"), "one dimension"));
+            }
+            (kind, _, _) => {
+                let expected = "observation.state of type STATE, observation.environment_state of type ENV, pictures of type VISUAL";
                 return Err(refuse("input_features", format!("{name} of type {kind}"), expected));
             }
         }
@@ -208,34 +220,88 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
         n_vae_encoder_layers: keys.n_vae_encoder_layers,
         dropout: keys.dropout,
         kl_weight: keys.kl_weight,
+        vision: if pictures.is_empty() { None } else { Some(vision(&keys)?) },
     };
     config.validate()?;
+    let mut signature = Signature::low_dimensional(state, env, action);
+    signature.observation.extend(pictures);
     Ok(LerobotAct {
         config,
-        signature: Signature::low_dimensional(state, env, action),
+        signature,
         n_action_steps: keys.n_action_steps,
         temporal_ensemble_coeff: keys.temporal_ensemble_coeff,
         modes,
     })
 }
 
+/// The image encoder that LeRobot builds: torchvision's by name. A narrow one, which somebody put among torchvision's under
+/// a name like `resnet18_w8`, has as many channels in its first layer.
+fn vision(keys: &Keys) -> Result<VisionConfig> {
+    let name = keys.vision_backbone.as_str();
+    let (name, width) = match name.split_once("_w").map(|(name, width)| (name, width.parse())) {
+        Some((name, Ok(width))) => (name, width),
+        _ => (name, LEROBOTS_WIDTH),
+    };
+    let encoder = match name {
+        "resnet18" => Architecture::Resnet18,
+        "resnet34" => Architecture::Resnet34,
+        _ => return Err(refuse("vision_backbone", &keys.vision_backbone, "resnet18 or resnet34")),
+    };
+    if keys.replace_final_stride_with_dilation {
+        return Err(refuse("replace_final_stride_with_dilation", "true", "false: basic blocks are not dilated"));
+    }
+    let norm = ImageNorm::Frozen;
+    // what normalises pictures comes with the statistics
+    Ok(VisionConfig { encoder, width, norm, lr_backbone: Some(1.0), ..VisionConfig::default() })
+}
+
+/// Writes what LeRobot builds an image encoder from, or says what it cannot hold.
+fn write_vision(vision: &VisionConfig, into: &mut Value) -> Result<()> {
+    let cannot = |field: &'static str, found: String, expected: &str| {
+        Err(ModelError::Config { model: "LeRobot act", field, found, expected: expected.to_string() })
+    };
+    if vision.norm != ImageNorm::Frozen {
+        return cannot("vision.norm", "group".to_string(), "frozen: LeRobot's ACT has no other norm");
+    }
+    if vision.width != LEROBOTS_WIDTH {
+        let expected = format!("{LEROBOTS_WIDTH}: LeRobot takes torchvision's networks");
+        return cannot("vision.width", vision.width.to_string(), &expected);
+    }
+    if let Some(side) = vision.crop {
+        return cannot("vision.crop", side.to_string(), "none: LeRobot's ACT does not crop");
+    }
+    if vision.tokens != TokenKind::Map {
+        return cannot("vision.tokens", "keypoints".to_string(), "map: LeRobot's ACT has no keypoints");
+    }
+    let name = match vision.encoder {
+        Architecture::Resnet18 => "resnet18",
+        Architecture::Resnet34 => "resnet34",
+    };
+    into["vision_backbone"] = json!(name);
+    // null, or LeRobot asks the network for ImageNet's weights before it reads ours
+    into["pretrained_backbone_weights"] = Value::Null;
+    into["replace_final_stride_with_dilation"] = json!(false);
+    Ok(())
+}
+
 /// Writes a `config.json` that LeRobot 0.6.1 loads.
 ///
 /// # Errors
-/// What LeRobot's ACT cannot read: entities, a history.
+/// What LeRobot's ACT cannot hold: entities, a history, a crop, GroupNorm, a narrow network.
 pub fn write_config(act: &LerobotAct) -> Result<Value> {
     let c = &act.config;
     let mut inputs = json!({});
     for spec in &act.signature.observation {
-        let kind = match spec.kind {
-            FeatureKind::State => "STATE",
-            FeatureKind::EnvironmentState => "ENV",
-            FeatureKind::Entity | FeatureKind::Image => {
-                let expected = "features that LeRobot's ACT reads here: state and environment_state";
+        let (kind, shape) = match (spec.kind, &spec.shape[..]) {
+            (FeatureKind::State, shape) => ("STATE", shape.to_vec()),
+            (FeatureKind::EnvironmentState, shape) => ("ENV", shape.to_vec()),
+            (FeatureKind::Image, &[height, width, colours]) => ("VISUAL", vec![colours, height, width]),
+            (FeatureKind::Entity | FeatureKind::Image, _) => {
+                let expected = "features that LeRobot's ACT reads: state, environment_state and image";
                 return Err(refuse("input_features", format!("{} of kind {}", spec.name, spec.kind), expected));
             }
         };
-        inputs[&spec.name] = json!({ "type": kind, "shape": spec.shape });
+        inputs[&spec.name] = json!({ "type": kind, "shape": shape });
     }
     if act.signature.n_obs_steps != 1 {
         return Err(refuse("n_obs_steps", act.signature.n_obs_steps.to_string(), "1"));
@@ -246,7 +312,7 @@ pub fn write_config(act: &LerobotAct) -> Result<Value> {
             mapping.insert(kind.to_string(), json!(mode_name(*mode)));
         }
     }
-    Ok(json!({
+    let mut config = json!({
         "type": "act",
         "n_obs_steps": 1,
         "input_features": inputs,
@@ -268,7 +334,11 @@ pub fn write_config(act: &LerobotAct) -> Result<Value> {
         "n_vae_encoder_layers": c.n_vae_encoder_layers,
         "dropout": c.dropout,
         "kl_weight": c.kl_weight,
-    }))
+    });
+    if act.signature.of_kind(FeatureKind::Image).next().is_some() {
+        write_vision(c.vision.as_ref().unwrap_or(&VisionConfig::default()), &mut config)?;
+    }
+    Ok(config)
 }
 
 /// Loads the tensors of a LeRobot `model.safetensors` into the parameters of an ACT: the name set must be exactly the
@@ -306,7 +376,59 @@ pub fn load_tensors(params: &Params, config: &Config, tensors: &BTreeMap<String,
             });
         }
     }
+    // what normalises pictures is not among LeRobot's weights; `load_statistics` takes it
+    for (name, buffer) in params.buffers().filter(|(name, _)| OF_PICTURES.contains(name)) {
+        own.insert(name.to_string(), buffer.as_detached_tensor());
+    }
     params.load(&own)
+}
+
+/// Takes what normalises pictures from LeRobot's statistics, `<feature>.mean` and `.std` of shape (3, 1, 1) each; pictures
+/// without statistics pass as they are, as they do there.
+///
+/// # Errors
+/// Statistics of another shape.
+pub fn load_statistics(
+    params: &Params,
+    signature: &Signature,
+    mapping: &BTreeMap<String, String>,
+    statistics: &BTreeMap<String, Tensor>,
+) -> Result<()> {
+    let (mut means, mut stds) = (Vec::new(), Vec::new());
+    let mode = mode_of(mapping, "VISUAL")?;
+    for spec in signature.of_kind(FeatureKind::Image) {
+        if mode == NormMode::MinMax {
+            return Err(refuse("normalization mapping", "VISUAL MIN_MAX", "MEAN_STD or IDENTITY"));
+        }
+        let of = |statistic: &str, otherwise: f32| -> Result<[f32; 3]> {
+            let name = format!("{}.{statistic}", spec.name);
+            let Some(tensor) = statistics.get(&name).filter(|_| mode == NormMode::MeanStd) else {
+                return Ok([otherwise; 3]);
+            };
+            let values = tensor.to_dtype(DType::F32)?.flatten_all()?.to_vec1::<f32>()?;
+            let (expected, found) = (vec![3, 1, 1], tensor.dims().to_vec());
+            values.try_into().map_err(|_: Vec<f32>| ModelError::MisshapenTensor { name, expected, found })
+        };
+        means.push(of("mean", 0.0)?);
+        stds.push(of("std", 1.0)?);
+    }
+    if means.is_empty() { Ok(()) } else { ImageEncoder::set_statistics(params, &means, &stds) }
+}
+
+/// What normalises pictures, as LeRobot's statistics: `<feature>.mean` and `.std`, (3, 1, 1) each.
+///
+/// # Errors
+/// If the tensor library fails.
+pub fn statistics_out(params: &Params, signature: &Signature) -> Result<BTreeMap<String, Tensor>> {
+    let mut statistics = BTreeMap::new();
+    for (buffer, statistic) in OF_PICTURES.iter().zip(["mean", "std"]) {
+        let Some((_, values)) = params.buffers().find(|(name, _)| name == buffer) else { continue };
+        for (i, spec) in signature.of_kind(FeatureKind::Image).enumerate() {
+            let row = values.as_tensor().get(i)?.copy()?.reshape((3, 1, 1))?;
+            statistics.insert(format!("{}.{statistic}", spec.name), row);
+        }
+    }
+    Ok(statistics)
 }
 
 /// The tensors of a LeRobot `model.safetensors` for the parameters of an ACT.
@@ -314,7 +436,8 @@ pub fn load_tensors(params: &Params, config: &Config, tensors: &BTreeMap<String,
 /// # Errors
 /// If the tensor library fails.
 pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, Tensor>> {
-    let named = params.tensors().into_iter().map(|(name, t)| (format!("{PREFIX}{name}"), t));
+    let named = params.tensors().into_iter().filter(|(name, _)| !OF_PICTURES.contains(&name.as_str()));
+    let named = named.map(|(name, t)| (format!("{PREFIX}{name}"), t));
     let mut tensors: BTreeMap<String, Tensor> = named.collect();
     if config.use_vae {
         let table = sinusoid_table(config.action_horizon + 2, config.dim_model)?;

@@ -1,6 +1,7 @@
 //! What the trainer, the zoo and the policies need of a model.
 
 use crate::batch::Batch;
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::features::{Features, Signature};
 use crate::gradients::Gradients;
@@ -100,6 +101,11 @@ pub trait PolicyModel: Send + Sync {
 
     /// Number of actions in a predicted chunk.
     fn action_horizon(&self) -> usize;
+
+    /// How it sees pictures, if it does.
+    fn vision(&self) -> Option<&VisionConfig> {
+        None
+    }
 }
 
 /// Loss, and its gradient from candle's backward pass added to `into`.

@@ -148,7 +148,7 @@ impl Optimiser {
         self.threads = threads.max(1);
     }
 
-    /// One update of `params` with `grads * grad_scale`; parameters are updated in place.
+    /// One update of `params` with `grads * grad_scale`, each at its own rate relative to `lr`; in place.
     ///
     /// # Errors
     /// If `params` are not those of the layout.
@@ -168,7 +168,8 @@ impl Optimiser {
 
         let (mut first, mut second) = (self.first.as_mut_slice(), self.second.as_mut_slice());
         let mut work: Vec<(&Var, InPlace<'_>)> = Vec::new();
-        for ((_, var), (_, span)) in params.iter().zip(self.layout.iter()) {
+        for ((name, var), (_, span)) in params.iter().zip(self.layout.iter()) {
+            let update = Update { lr: lr * params.rate(name), ..update };
             let (m, rest) = first.split_at_mut(span.len());
             first = rest;
             let (v, rest) = second.split_at_mut(span.len());

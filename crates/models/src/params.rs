@@ -72,10 +72,14 @@ impl Init {
     }
 }
 
-/// A model's parameters by name. Cloning shares the storage.
+/// A model's parameters by name, and its buffers: numbers that belong to the weights and are never trained. Cloning shares
+/// the storage.
 #[derive(Debug, Clone, Default)]
 pub struct Params {
     vars: BTreeMap<String, Var>,
+    buffers: BTreeMap<String, Var>,
+    /// learning rates relative to the others'
+    rates: BTreeMap<String, f64>,
     version: Arc<AtomicU64>,
 }
 
@@ -98,23 +102,77 @@ impl Params {
     /// # Errors
     /// If the name is taken.
     pub fn insert(&mut self, name: &str, values: Tensor) -> Result<Tensor> {
-        if self.vars.contains_key(name) {
-            return Err(ModelError::State { object: "parameters", detail: format!("{name} exists already") });
-        }
-        let var = Var::from_tensor(&values.contiguous()?)?;
+        let var = self.new_var(name, &values)?;
         let tensor = var.as_tensor().clone();
         self.vars.insert(name.to_string(), var);
         Ok(tensor)
     }
 
-    /// Names in order.
+    /// Adds `name` with values that are saved and loaded like parameters and never trained.
+    ///
+    /// # Errors
+    /// If the name is taken.
+    pub fn insert_buffer(&mut self, name: &str, values: Tensor) -> Result<Tensor> {
+        let var = self.new_var(name, &values)?;
+        let tensor = var.as_tensor().clone();
+        self.buffers.insert(name.to_string(), var);
+        Ok(tensor)
+    }
+
+    fn new_var(&self, name: &str, values: &Tensor) -> Result<Var> {
+        if self.vars.contains_key(name) || self.buffers.contains_key(name) {
+            return Err(ModelError::State { object: "parameters", detail: format!("{name} exists already") });
+        }
+        Ok(Var::from_tensor(&values.contiguous()?)?)
+    }
+
+    /// Names of parameters and buffers, each in order.
     pub fn names(&self) -> impl Iterator<Item = &str> {
-        self.vars.keys().map(String::as_str)
+        self.vars.keys().chain(self.buffers.keys()).map(String::as_str)
+    }
+
+    /// Buffers in the order of their names.
+    pub fn buffers(&self) -> impl Iterator<Item = (&str, &Var)> {
+        self.buffers.iter().map(|(k, v)| (k.as_str(), v))
+    }
+
+    /// Sets the values of a buffer.
+    ///
+    /// # Errors
+    /// If there is no such buffer, or it has another shape.
+    pub fn set_buffer(&self, name: &str, values: &Tensor) -> Result<()> {
+        let Some(buffer) = self.buffers.get(name) else {
+            let given = some_names(self.buffers.keys());
+            return Err(ModelError::MissingTensor { name: name.to_string(), given });
+        };
+        if values.dims() != buffer.dims() {
+            let (name, expected, found) = (name.to_string(), buffer.dims().to_vec(), values.dims().to_vec());
+            return Err(ModelError::MisshapenTensor { name, expected, found });
+        }
+        buffer.set(&values.to_dtype(DType::F32)?.contiguous()?)?;
+        self.changed();
+        Ok(())
+    }
+
+    /// Everything that is saved: parameters, then buffers.
+    pub fn all(&self) -> impl Iterator<Item = (&str, &Var)> {
+        self.iter().chain(self.buffers())
     }
 
     /// Names and variables in order. After setting a value say so with [`Self::changed`].
     pub fn iter(&self) -> impl Iterator<Item = (&str, &Var)> {
         self.vars.iter().map(|(k, v)| (k.as_str(), v))
+    }
+
+    /// Learning rate of every parameter whose name begins with `prefix`, relative to the others'.
+    pub fn set_rate(&mut self, prefix: &str, rate: f64) {
+        let names = self.vars.keys().filter(|name| name.starts_with(prefix));
+        self.rates.extend(names.map(|name| (name.clone(), rate)));
+    }
+
+    /// Learning rate of a parameter relative to the others': 1 unless set.
+    pub fn rate(&self, name: &str) -> f64 {
+        self.rates.get(name).copied().unwrap_or(1.0)
     }
 
     /// One variable. After setting its value say so with [`Self::changed`].
@@ -136,17 +194,17 @@ impl Params {
     pub fn without(&self, names: &[&str]) -> Self {
         let kept = self.vars.iter().filter(|(name, _)| !names.contains(&name.as_str()));
         let vars = kept.map(|(name, var)| (name.clone(), var.clone())).collect();
-        Self { vars, version: self.version.clone() }
+        Self { vars, buffers: self.buffers.clone(), rates: self.rates.clone(), version: self.version.clone() }
     }
 
-    /// Number of scalar parameters.
+    /// Number of scalar parameters, without buffers.
     pub fn count(&self) -> usize {
         self.vars.values().map(|v| v.elem_count()).sum()
     }
 
-    /// The current values, sharing the storage: copy them before the next update if they must stay.
+    /// The current values of everything, sharing the storage: copy them before the next update if they must stay.
     pub fn tensors(&self) -> BTreeMap<String, Tensor> {
-        self.vars.iter().map(|(k, v)| (k.clone(), v.as_detached_tensor())).collect()
+        self.all().map(|(k, v)| (k.to_string(), v.as_detached_tensor())).collect()
     }
 
     /// Takes all values from `tensors`, whose names and shapes must be exactly those of the model.
@@ -155,22 +213,24 @@ impl Params {
     /// # Errors
     /// The first name that is missing, extra or misshapen.
     pub fn load(&self, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
-        for (name, var) in &self.vars {
-            let given = tensors
-                .get(name)
-                .ok_or_else(|| ModelError::MissingTensor { name: name.clone(), given: some_names(tensors.keys()) })?;
+        for (name, var) in self.all() {
+            let given = tensors.get(name).ok_or_else(|| ModelError::MissingTensor {
+                name: name.to_string(),
+                given: some_names(tensors.keys()),
+            })?;
             if given.dims() != var.dims() {
                 return Err(ModelError::MisshapenTensor {
-                    name: name.clone(),
+                    name: name.to_string(),
                     expected: var.dims().to_vec(),
                     found: given.dims().to_vec(),
                 });
             }
         }
-        if let Some(name) = tensors.keys().find(|k| !self.vars.contains_key(*k)) {
-            return Err(ModelError::ExtraTensor { name: name.clone(), known: some_names(self.vars.keys()) });
+        if let Some(name) = tensors.keys().find(|k| !self.vars.contains_key(*k) && !self.buffers.contains_key(*k)) {
+            let known = some_names(self.vars.keys().chain(self.buffers.keys()));
+            return Err(ModelError::ExtraTensor { name: name.clone(), known });
         }
-        for (name, var) in &self.vars {
+        for (name, var) in self.all() {
             var.set(&tensors[name].to_dtype(DType::F32)?.contiguous()?)?;
         }
         self.changed();
@@ -214,6 +274,24 @@ mod tests {
         assert_eq!(params.count(), 9);
         let mut rng = Rng::new(0, "init");
         assert!(params.create("a", &[1], Init::Zeros, &mut rng).is_err());
+    }
+
+    #[test]
+    fn buffers_are_saved_and_loaded_and_not_trained() {
+        let mut params = two();
+        params.insert_buffer("norm.mean", Tensor::new(&[1f32, 2.0], &Device::Cpu).unwrap()).unwrap();
+        assert!(params.insert_buffer("a", Tensor::new(&[1f32], &Device::Cpu).unwrap()).is_err());
+        assert_eq!(params.count(), 9);
+        assert!(params.iter().all(|(name, _)| name != "norm.mean"));
+        let mut tensors = params.tensors();
+        let other = two();
+        assert!(matches!(other.load(&tensors), Err(ModelError::ExtraTensor { name, .. }) if name == "norm.mean"));
+        tensors.insert("norm.mean".into(), Tensor::new(&[3f32, 4.0], &Device::Cpu).unwrap());
+        params.load(&tensors).unwrap();
+        let (_, mean) = params.buffers().next().unwrap();
+        assert_eq!(mean.to_vec1::<f32>().unwrap(), [3.0, 4.0]);
+        tensors.remove("norm.mean");
+        assert!(matches!(params.load(&tensors), Err(ModelError::MissingTensor { name, .. }) if name == "norm.mean"));
     }
 
     #[test]

@@ -35,6 +35,8 @@ pub struct WorkerSpec {
     pub cameras: Vec<String>,
     /// Edge of the cameras' images in pixels.
     pub image_size: usize,
+    /// Draw without reflections and multisampling: a third of the time, and other pixels.
+    pub fast_render: bool,
     /// The most private memory in bytes that a worker may take.
     pub memory_limit: Option<u64>,
     /// How long a worker may take.
@@ -53,6 +55,7 @@ impl WorkerSpec {
             env_args: None,
             cameras: Vec::new(),
             image_size: 84,
+            fast_render: false,
             memory_limit: Some(4 << 30),
             limits: TimeLimits::default(),
         }
@@ -72,6 +75,9 @@ impl WorkerSpec {
         if !self.cameras.is_empty() {
             command.args(["--cameras", &self.cameras.join(",")]);
             command.args(["--size", &self.image_size.to_string()]);
+            if self.fast_render {
+                command.arg("--fast-render");
+            }
         }
         let mut path = OsString::from(&self.harness);
         if let Some(rest) = std::env::var_os("PYTHONPATH").filter(|rest| !rest.is_empty()) {

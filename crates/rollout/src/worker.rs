@@ -17,8 +17,37 @@ use crate::recorded::RecordedEpisode;
 use crate::spec::{TimeLimits, WorkerSpec};
 use crate::stop::Stop;
 
-/// Observation values by key, flattened row-major.
-pub type Observations = BTreeMap<String, Vec<f64>>;
+/// What an environment shows.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Observations {
+    /// Numbers by key, flattened row-major.
+    values: BTreeMap<String, Vec<f64>>,
+    /// Bytes of pictures by key: rows from the top, red, green and blue.
+    pictures: BTreeMap<String, Vec<u8>>,
+}
+
+impl Observations {
+    /// The numbers of a key.
+    pub fn get(&self, key: &str) -> Option<&Vec<f64>> {
+        self.values.get(key)
+    }
+
+    /// All numbers, by key.
+    pub fn numbers(&self) -> &BTreeMap<String, Vec<f64>> {
+        &self.values
+    }
+
+    /// The bytes of a key's picture.
+    pub fn picture(&self, key: &str) -> Option<&[u8]> {
+        self.pictures.get(key).map(Vec::as_slice)
+    }
+}
+
+impl<const N: usize> From<[(String, Vec<f64>); N]> for Observations {
+    fn from(values: [(String, Vec<f64>); N]) -> Self {
+        Self { values: values.into(), pictures: BTreeMap::new() }
+    }
+}
 
 /// The state that a reset left.
 #[derive(Debug, Clone, PartialEq)]
@@ -144,10 +173,10 @@ impl Worker {
     pub fn reset(&mut self, seed: u64) -> Result<Initial, WorkerFault> {
         self.next_id += 1;
         let request = Request::Reset { id: self.next_id, seed };
-        let (reply, frame) = self.ask(&request, Vec::new(), self.limits.reset, 1)?;
+        let (reply, mut frame) = self.ask(&request, Vec::new(), self.limits.reset, 1)?;
         match reply {
             Reply::Reset { fingerprint, group, .. } => {
-                let observations = self.observations("reset", &frame)?;
+                let observations = self.observations("reset", &mut frame)?;
                 Ok(Initial { fingerprint, group, observations })
             }
             other => Err(self.fault("reset", unexpected("reset", &other))),
@@ -163,12 +192,12 @@ impl Worker {
         let request = Request::Step { id: self.next_id };
         let shape = [actions.len(), actions.first().map_or(0, Vec::len)];
         let tensors = vec![("action", FrameTensor::from_f64(&shape, &actions.concat()))];
-        let (reply, frame) = self.ask(&request, tensors, self.limits.step, 2)?;
+        let (reply, mut frame) = self.ask(&request, tensors, self.limits.step, 2)?;
         match reply {
             Reply::Step { success, failure, .. } => {
                 let over = success || failure.is_some();
                 let rewards = self.rewards(&frame, actions.len(), over).map_err(|kind| self.fault("step", kind))?;
-                let observations = self.observations("step", &frame)?;
+                let observations = self.observations("step", &mut frame)?;
                 Ok(Stepped { rewards, success, failure, observations })
             }
             other => Err(self.fault("step", unexpected("step", &other))),
@@ -322,8 +351,9 @@ impl Worker {
         Ok((reply, frame))
     }
 
-    fn observations(&self, phase: &'static str, frame: &Frame) -> Result<Observations, WorkerFault> {
-        let mut observations = BTreeMap::new();
+    /// Takes the observations out of a reply; pictures are moved, not copied.
+    fn observations(&self, phase: &'static str, frame: &mut Frame) -> Result<Observations, WorkerFault> {
+        let mut observations = Observations::default();
         for (key, shape) in &self.ready.observations {
             let name = format!("obs/{key}");
             let values = frame
@@ -340,12 +370,16 @@ impl Worker {
                     tensor.to_f64(&name).map(Some).map_err(FaultKind::Nonsense)
                 })
                 .map_err(|kind| self.fault(phase, kind))?;
-            let Some(values) = values else { continue };
+            let Some(values) = values else {
+                let picture = frame.tensors.remove(&name).map(|tensor| tensor.bytes);
+                observations.pictures.insert(key.clone(), picture.unwrap_or_default());
+                continue;
+            };
             if let Some(at) = values.iter().position(|value| !value.is_finite()) {
                 let what = format!("{name}[{at}] is {}", values[at]);
                 return Err(self.fault(phase, FaultKind::Values(what)));
             }
-            observations.insert(key.clone(), values);
+            observations.values.insert(key.clone(), values);
         }
         Ok(observations)
     }

@@ -20,12 +20,12 @@ fn trace(worker: &mut Worker, seed: u64, steps: u32) -> Result<Vec<String>, JobE
         let values = observations.values().flatten().map(|value| value.to_bits());
         values.fold(0u64, |hash, bits| (hash ^ bits).wrapping_mul(0x0100_0000_01b3).rotate_left(17))
     };
-    let mut lines = vec![initial.fingerprint.clone(), format!("{:x}", bits(&initial.observations))];
+    let mut lines = vec![initial.fingerprint.clone(), format!("{:x}", bits(initial.observations.numbers()))];
     for step in 0..steps {
         let wave = |k: u64| ((seed * 31 + u64::from(step) * 7 + k * 13) % 201) as f64 / 100.0 - 1.0;
         let action: Vec<f64> = (0..7).map(wave).collect();
         let stepped = worker.step(&[action])?;
-        lines.push(format!("{:x} {:x}", stepped.rewards[0].to_bits(), bits(&stepped.observations)));
+        lines.push(format!("{:x} {:x}", stepped.rewards[0].to_bits(), bits(stepped.observations.numbers())));
     }
     Ok(lines)
 }

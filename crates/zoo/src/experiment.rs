@@ -16,6 +16,11 @@ use crate::config::{Library, apply_overrides, from_value, from_value_as};
 use crate::run::TrainSection;
 use crate::{FeatureKeys, ZooError};
 
+/// What the name of a camera's feature begins with, LeRobot's.
+pub(crate) const PICTURE_PREFIX: &str = "observation.images.";
+/// What a camera's observation key ends in, robomimic's.
+pub(crate) const PICTURE_SUFFIX: &str = "_image";
+
 /// A resolved experiment, as `config.toml` of runs and entries holds it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Experiment {
@@ -81,6 +86,9 @@ pub struct DataSection {
     /// Observations that the policy sees at once: the present one and those before it.
     #[serde(skip_serializing_if = "is_one")]
     pub n_obs_steps: usize,
+    /// Cameras whose pictures are seen, by the simulator's names.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<String>,
     /// Mask of the episodes to train on; a data set without masks is trained on whole, and so is any with "" here.
     pub train_mask: String,
     /// Mask of the episodes to validate on; "" for none.
@@ -97,6 +105,7 @@ impl Default for DataSection {
             entities: BTreeMap::new(),
             symmetries: BTreeMap::new(),
             n_obs_steps: 1,
+            cameras: Vec::new(),
             train_mask: "train".to_owned(),
             valid_mask: "valid".to_owned(),
         }
@@ -123,6 +132,13 @@ impl DataSection {
         }
         for (name, entity) in &self.entities {
             add(format!("data.entities.{name}"), &format!("{ENTITY_PREFIX}{name}"), &entity.keys)?;
+        }
+        for camera in &self.cameras {
+            add(
+                "data.cameras".to_owned(),
+                &format!("{PICTURE_PREFIX}{camera}"),
+                &[format!("{camera}{PICTURE_SUFFIX}")],
+            )?;
         }
         Ok(keys)
     }
@@ -158,6 +174,19 @@ impl DataSection {
             let expected = format!("none: this policy reads {}", kinds.join(", "));
             let names: Vec<&str> = self.entities.keys().map(String::as_str).collect();
             return invalid("data.entities".to_owned(), &expected, names.join(", "));
+        }
+        if let Some(camera) =
+            self.cameras.iter().find(|camera| !camera.chars().all(|c| c.is_ascii_alphanumeric() || c == '_'))
+        {
+            return invalid("data.cameras".to_owned(), "names of letters, digits and _", format!("`{camera}`"));
+        }
+        if let Some(twice) = self.cameras.iter().enumerate().find(|(i, camera)| self.cameras[..*i].contains(camera)) {
+            return invalid("data.cameras".to_owned(), "every camera once", format!("`{}` twice", twice.1));
+        }
+        if !self.cameras.is_empty() && !reads.contains(&FeatureKind::Image) {
+            let kinds: Vec<&str> = reads.iter().map(|kind| kind.name()).collect();
+            let expected = format!("none: this policy reads {}", kinds.join(", "));
+            return invalid("data.cameras".to_owned(), &expected, self.cameras.join(", "));
         }
         let keys = self.feature_keys()?;
         for (name, items) in &self.symmetries {

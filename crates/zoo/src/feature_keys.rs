@@ -69,7 +69,12 @@ impl FeatureKeys {
             items.iter().try_for_each(|item| item.append(values_of, &mut values))?;
             Some(Values::F32(values))
         };
-        self.0.iter().filter_map(|(name, items)| Some((name.clone(), feature(items)?))).collect()
+        let picture = |items: &Vec<KeyItem>| match items.as_slice() {
+            [item] => observations.picture(&item.to_string()).map(|bytes| Values::U8(bytes.to_vec())),
+            _ => None,
+        };
+        let seen = |items| picture(items).or_else(|| feature(items));
+        self.0.iter().filter_map(|(name, items)| Some((name.clone(), seen(items)?))).collect()
     }
 }
 

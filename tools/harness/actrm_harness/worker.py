@@ -83,6 +83,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--env-args", help="robomimic's env_args as JSON: robots and controllers other than the usual")
     parser.add_argument("--cameras", default="", help="cameras to observe, separated by commas")
     parser.add_argument("--size", type=int, default=84, help="height and width of camera images")
+    parser.add_argument("--fast-render", action="store_true", help="draw without reflections and multisampling")
     return parser.parse_args()
 
 
@@ -98,7 +99,9 @@ def start(args: argparse.Namespace) -> Simulation:
             ) from error
     cameras = tuple(name for name in args.cameras.split(",") if name)
     return simulators.start(
-        simulators.Options(tasks.row(args.task), args.control, cameras, args.size, env_args(args.env_args))
+        simulators.Options(
+            tasks.row(args.task), args.control, cameras, args.size, args.fast_render, env_args(args.env_args)
+        )
     )
 
 

@@ -148,3 +148,21 @@ def test_where_nothing_can_draw_the_error_names_a_package(
     with pytest.raises(envs.RequestError, match="libosmesa6") as caught:
         envs.image(session, "agentview", 32, 32)
     assert caught.value.kind == "no_renderer"
+
+
+def test_fast_rendering_changes_pixels_and_nothing_else() -> None:
+    """Fewer reflections, the same episode; the environment's arguments say how its pictures were drawn."""
+    drawn: dict[bool, wire.Tensors] = {}
+    for fast in (False, True):
+        session = envs.make("Lift", ("agentview", "robot0_eye_in_hand"), 48, fast_render=fast)
+        envs.reset(session, 5)
+        assert session.env_args.get("fast_render", False) is fast
+        for action in walk(1, 2):
+            result = envs.step_session(session, action)
+        drawn[fast] = result.observation
+    for name, full in drawn[False].items():
+        if name.endswith("_image"):
+            off = np.abs(full.astype(int) - drawn[True][name].astype(int))
+            assert 0 < off.mean() < 3, name
+        else:
+            assert np.array_equal(full, drawn[True][name]), name

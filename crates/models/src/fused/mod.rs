@@ -15,12 +15,13 @@ mod observation;
 #[cfg(test)]
 pub(crate) mod testing;
 mod vae;
+mod vision;
 
 pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_and_values_backward, scatter};
 pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::Encoder;
 pub(crate) use loss::AbsoluteError;
-pub(crate) use observation::{Data, Tokens, inputs, positions_backward, uncovered};
+pub(crate) use observation::{Data, Inputs, Tokens, inputs, positions_backward, uncovered};
 pub(crate) use vae::Vae;
 
 use crate::error::{ModelError, Result};
@@ -106,6 +107,16 @@ impl PackedWeights {
         self.fixed.lock().unwrap_or_else(PoisonError::into_inner).insert(name, values);
     }
 
+    /// What `make` makes of the weights alone, made once; not copied.
+    fn made_once(&self, name: &str, make: impl FnOnce() -> Vec<f32>) -> Arc<Vec<f32>> {
+        if let Some(kept) = self.kept(name) {
+            return kept;
+        }
+        let values = Arc::new(make());
+        self.fixed.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_string(), values.clone());
+        values
+    }
+
     /// The decoder's first layer before the memory, made once.
     fn begun(&self, make: impl FnOnce() -> decoder::Begun) -> &decoder::Begun {
         self.begun.get_or_init(make)
@@ -115,9 +126,9 @@ impl PackedWeights {
 /// Rows up to which a product reads the weights as they are.
 const UNPACKED_ROWS: usize = 4;
 
-/// Calls `f` with all parameters as slices.
+/// Calls `f` with all parameters and buffers as slices.
 pub(crate) fn with_weights<R>(params: &Params, f: impl FnOnce(&Weights<'_>) -> R) -> Result<R> {
-    let guards: Vec<_> = params.iter().map(|(name, var)| (name, var.as_tensor().storage_and_layout())).collect();
+    let guards: Vec<_> = params.all().map(|(name, var)| (name, var.as_tensor().storage_and_layout())).collect();
     let mut weights = BTreeMap::new();
     for (name, (storage, layout)) in &guards {
         let Storage::Cpu(storage) = &**storage else {

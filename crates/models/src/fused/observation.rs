@@ -1,5 +1,6 @@
 //! A shard of a batch as slices, and the tokens that observations become.
 
+use super::vision::{Eyes, Looked};
 use super::{Grads, Pass, slot};
 use crate::batch::Batch;
 use crate::error::Result;
@@ -9,19 +10,33 @@ use crate::layers::{ENTITY_POSITIONS, FEATURE_POSITIONS, LATENT, Position, Token
 use crate::values::with_values;
 use candle_core::Tensor;
 use std::borrow::Cow;
+use std::cell::RefCell;
 
 /// The kinds of features that the steps by hand cover.
-const COVERED: [FeatureKind; 3] = [FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+const COVERED: [FeatureKind; 4] =
+    [FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
 
 /// The first feature that no step by hand covers: a model that reads it runs on candle's autograd.
 pub(crate) fn uncovered(signature: &Signature) -> Option<&FeatureSpec> {
     signature.observation.iter().find(|spec| !COVERED.contains(&spec.kind))
 }
 
-/// An observation's features as slices, in the layout's order: (b, width) each.
-pub(crate) fn inputs(layout: &TokenLayout, observation: &Features<Tensor>) -> Result<Vec<Vec<f32>>> {
+/// An observation's features as slices, in the layout's order.
+#[derive(Debug, Default)]
+pub(crate) struct Inputs {
+    /// (b, width) each
+    pub(crate) vectors: Vec<Vec<f32>>,
+    /// (b, H, W, 3) each, as the network reads them
+    pub(crate) pictures: Vec<Vec<f32>>,
+}
+
+/// An observation's features as slices; pictures have been looked at.
+pub(crate) fn inputs(layout: &TokenLayout, observation: &Features<Tensor>) -> Result<Inputs> {
     let values = |name: &str| with_values(observation.require("tokens", name)?, <[f32]>::to_vec);
-    layout.tokens.iter().map(|token| values(&token.feature)).collect()
+    let vectors = layout.tokens.iter().map(|token| values(&token.feature)).collect::<Result<_>>()?;
+    let cameras = layout.cameras.iter().flat_map(|cameras| &cameras.features);
+    let pictures = cameras.map(|name| values(name)).collect::<Result<_>>()?;
+    Ok(Inputs { vectors, pictures })
 }
 
 /// A batch as slices.
@@ -29,7 +44,7 @@ pub(crate) fn inputs(layout: &TokenLayout, observation: &Features<Tensor>) -> Re
 pub(crate) struct Data {
     pub(crate) rows: usize,
     /// as [`inputs`] gives them; the state is the first
-    pub(crate) inputs: Vec<Vec<f32>>,
+    pub(crate) inputs: Inputs,
     /// (b, H, A)
     pub(crate) actions: Vec<f32>,
     /// (b, H) of 0/1
@@ -55,31 +70,37 @@ impl Data {
 
     /// (b, S)
     pub(crate) fn state(&self) -> &[f32] {
-        self.inputs.first().expect("a checked signature has a state")
+        self.inputs.vectors.first().expect("a checked signature has a state")
     }
 }
 
-/// The inputs that become one token each, in order: parameter prefix, values (b, width), width.
+/// What becomes tokens.
 pub(crate) struct Tokens<'a> {
+    /// one token each, in order: parameter prefix, values (b, width), width
     inputs: Vec<(&'a str, &'a [f32], usize)>,
     layout: &'a TokenLayout,
+    pictures: &'a [Vec<f32>],
+    /// what the backward pass needs of the pictures, between the two passes
+    looked: RefCell<Option<Looked>>,
 }
 
 impl<'a> Tokens<'a> {
     /// latent: (b, L), the inputs in the layout's order
-    pub(crate) fn new(
-        layout: &'a TokenLayout,
-        (latent, latent_dim): (&'a [f32], usize),
-        inputs: &'a [Vec<f32>],
-    ) -> Self {
-        let features = layout.tokens.iter().zip(inputs);
+    pub(crate) fn new(layout: &'a TokenLayout, (latent, latent_dim): (&'a [f32], usize), inputs: &'a Inputs) -> Self {
+        let features = layout.tokens.iter().zip(&inputs.vectors);
         let features = features.map(|(token, values)| (token.prefix.as_str(), values.as_slice(), token.width));
-        Self { inputs: std::iter::once((LATENT, latent, latent_dim)).chain(features).collect(), layout }
+        let all = std::iter::once((LATENT, latent, latent_dim)).chain(features).collect();
+        Self { inputs: all, layout, pictures: &inputs.pictures, looked: RefCell::new(None) }
+    }
+
+    fn eyes(&self) -> Option<Eyes<'a>> {
+        let cameras = self.layout.cameras.as_ref()?;
+        Some(Eyes { shape: &cameras.shape, sizes: &cameras.seen })
     }
 
     /// -> (b, tokens, D)
     pub(crate) fn forward(&self, pass: &mut Pass<'_>) -> Vec<f32> {
-        let (dim, tokens) = (pass.shape.dim, self.inputs.len());
+        let (dim, tokens) = (pass.shape.dim, self.layout.len());
         let rows = self.rows();
         let mut x = pass.take(rows * tokens * dim);
         for (i, &(prefix, values, width)) in self.inputs.iter().enumerate() {
@@ -87,12 +108,23 @@ impl<'a> Tokens<'a> {
             let (a, w) = (Mat::rows(values, width), Mat::rows(w, width).t());
             gemm((rows, dim, width), a, w, Start::Bias(bias), &mut x[i * dim..], tokens * dim, &mut pass.space.pack);
         }
+        if let Some(eyes) = self.eyes() {
+            let looked = eyes.forward(pass, self.pictures, &mut x, (self.layout.vectors(), tokens));
+            match pass.packed {
+                // a prediction has no backward pass
+                Some(_) => looked.free(pass),
+                None => *self.looked.borrow_mut() = Some(looked),
+            }
+        }
         x
     }
 
     /// grad: (b, tokens, D) -> that of the latent, (b, L)
     pub(crate) fn backward(&self, pass: &mut Pass<'_>, grad: &[f32], grads: &mut Grads<'_>) -> Vec<f32> {
-        let (dim, tokens) = (pass.shape.dim, self.inputs.len());
+        let (dim, tokens) = (pass.shape.dim, self.layout.len());
+        if let (Some(eyes), Some(looked)) = (self.eyes(), self.looked.take()) {
+            eyes.backward(pass, looked, grad, (self.layout.vectors(), tokens), grads);
+        }
         let mut latent = Vec::new();
         let mut token = pass.take(self.rows() * dim);
         for (i, &(prefix, values, width)) in self.inputs.iter().enumerate() {
@@ -117,6 +149,9 @@ impl<'a> Tokens<'a> {
         }
         let mut all = vec![0.0; self.layout.len() * dim];
         all[..dim].copy_from_slice(&features[..dim]);
+        if let Some(cameras) = &self.layout.cameras {
+            all[self.layout.vectors() * dim..].copy_from_slice(&cameras.positions);
+        }
         for (token, all) in self.layout.tokens.iter().zip(all[dim..].chunks_exact_mut(dim)) {
             match token.position {
                 Position::Feature(row) => all.copy_from_slice(&features[row * dim..(row + 1) * dim]),

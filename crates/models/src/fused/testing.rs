@@ -2,7 +2,8 @@
 #![allow(clippy::unwrap_used)]
 
 use crate::batch::Batch;
-use crate::features::{FeatureSpec, Features, Signature, Values};
+use crate::encoders::VisionConfig;
+use crate::features::{FeatureKind, FeatureSpec, Features, Signature, Values};
 use crate::gradients::{Gradients, ParamLayout};
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
@@ -24,7 +25,12 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
     let mut rng = Rng::new(seed, "batch");
     let mut observation = Features::new();
     for spec in &signature.observation {
-        observation.insert(&spec.name, Values::F32(rng.normals(rows * signature.n_obs_steps * spec.width())));
+        let n = rows * signature.n_obs_steps * spec.width();
+        let values = match spec.kind {
+            FeatureKind::Image => Values::U8((0..n).map(|_| rng.below(256) as u8).collect()),
+            _ => Values::F32(rng.normals(n)),
+        };
+        observation.insert(&spec.name, values);
     }
     let a = rng.normals(rows * horizon * signature.action_dim);
     let pad: Vec<bool> = (0..rows * horizon).map(|i| i / horizon % 2 == 1 && i % horizon > horizon / 2).collect();
@@ -33,13 +39,19 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
     batch
 }
 
-/// What models are tried on: with and without an environment state, with a history, and with entities in two groups, of
-/// which one has positions.
+/// What models are tried on: with and without an environment state, with a history, with entities in two groups, of which
+/// one has positions, and with pictures of three cameras.
 pub(crate) struct Signatures {
     pub(crate) plain: Signature,
     pub(crate) no_env: Signature,
     pub(crate) entities: Signature,
     pub(crate) history: Signature,
+    pub(crate) pictures: Signature,
+}
+
+/// Eyes for the pictures: parts at random, colours changed, tokens of all maps.
+pub(crate) fn eyes() -> VisionConfig {
+    VisionConfig { width: 8, crop: Some(33), shift: 1, jitter: 0.2, ..VisionConfig::default() }
 }
 
 pub(crate) fn signatures() -> Signatures {
@@ -50,7 +62,11 @@ pub(crate) fn signatures() -> Signatures {
     entities.observation.extend([cube("cube0"), cube("cube1"), cube("cube2"), goal("goal0"), goal("goal1")]);
     let mut history = Signature { n_obs_steps: 3, ..plain.clone() };
     history.observation.extend([cube("cube0"), cube("cube1")]);
-    Signatures { plain, no_env, entities, history }
+    let mut pictures = plain.clone();
+    pictures.observation.extend(["a", "b"].map(|name| FeatureSpec::image(name, 40, 36)));
+    pictures.observation.push(FeatureSpec::image("c", 34, 34));
+    pictures.observation.push(cube("cube0"));
+    Signatures { plain, no_env, entities, history, pictures }
 }
 
 /// Loss and gradients as the trainer gets them.

@@ -5,7 +5,8 @@
 //! side in the token's input.
 
 use super::{Embedding, Linear};
-use crate::error::Result;
+use crate::encoders::{ImageEncoder, ResNetShape, Size, TokenKind, VisionConfig, position_table};
+use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
 use crate::params::Params;
 use crate::rng::Rng;
@@ -44,16 +45,79 @@ pub(crate) struct TokenSpec {
     pub(crate) position: Position,
 }
 
-/// The tokens after the latent's: state, environment state, entities.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// The cameras of a signature, and the tokens that their pictures become.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Cameras {
+    pub(crate) config: VisionConfig,
+    /// the network
+    pub(crate) shape: ResNetShape,
+    /// names of the features
+    pub(crate) features: Vec<String>,
+    /// sizes of their pictures
+    pub(crate) given: Vec<Size>,
+    /// sizes of what is seen of them
+    pub(crate) seen: Vec<Size>,
+    /// tokens of all cameras
+    pub(crate) tokens: usize,
+    /// fixed positions of the tokens, (tokens, D); empty where they are learned
+    pub(crate) positions: Vec<f32>,
+}
+
+impl Cameras {
+    fn new(signature: &Signature, config: &VisionConfig, dim: usize) -> Result<Option<Self>> {
+        let specs: Vec<_> = signature.of_kind(FeatureKind::Image).collect();
+        if specs.is_empty() {
+            return Ok(None);
+        }
+        config.validate()?;
+        let refuse = |field: &'static str, found: String, expected: &str| {
+            Err(ModelError::Config { model: "vision", field, found, expected: expected.to_string() })
+        };
+        if signature.n_obs_steps != 1 {
+            return refuse("n_obs_steps", signature.n_obs_steps.to_string(), "1 with pictures");
+        }
+        let (mut given, mut seen) = (Vec::new(), Vec::new());
+        for spec in &specs {
+            let &[h, w, 3] = spec.shape.as_slice() else {
+                let found = format!("{} of shape {:?}", spec.name, spec.shape);
+                return refuse("observation", found, "height, width and 3 colours");
+            };
+            given.push((h, w));
+            seen.push(config.seen((h, w))?);
+        }
+        let shape = config.shape();
+        let (mut tokens, mut positions) = (specs.len(), Vec::new());
+        if config.tokens == TokenKind::Map {
+            tokens = 0;
+            for &size in &seen {
+                let (h, w) = shape.map_size(size);
+                tokens += h * w;
+                positions.extend(position_table(dim, (h, w)));
+            }
+        }
+        let features = specs.iter().map(|spec| spec.name.clone()).collect();
+        Ok(Some(Self { config: config.clone(), shape, features, given, seen, tokens, positions }))
+    }
+}
+
+/// The tokens after the latent's: state, environment state, entities, then pictures.
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TokenLayout {
+    /// one token a feature
     pub(crate) tokens: Vec<TokenSpec>,
+    pub(crate) cameras: Option<Cameras>,
 }
 
 impl TokenLayout {
-    /// Of a signature that was checked.
-    pub(crate) fn new(signature: &Signature) -> Self {
-        let mut specs: Vec<_> = signature.observation.iter().collect();
+    /// Of a signature that was checked, for tokens of width `dim`; pictures are seen as `vision` says.
+    pub(crate) fn new(signature: &Signature, vision: Option<&VisionConfig>, dim: usize) -> Result<Self> {
+        let cameras = Cameras::new(signature, vision.unwrap_or(&VisionConfig::default()), dim)?;
+        if vision.is_some() && cameras.is_none() {
+            let names: Vec<&str> = signature.observation.iter().map(|spec| spec.name.as_str()).collect();
+            let (found, expected) = (names.join(", "), "a feature of kind image".to_string());
+            return Err(ModelError::Config { model: "vision", field: "observation", found, expected });
+        }
+        let mut specs: Vec<_> = signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image).collect();
         specs.sort_by_key(|spec| spec.kind);
         // the latent has the first row
         let (mut features, mut entities) = (1, 0);
@@ -76,12 +140,17 @@ impl TokenLayout {
                 (FeatureKind::Entity | FeatureKind::Image, false) => Position::Nowhere,
             },
         });
-        Self { tokens: tokens.collect() }
+        Ok(Self { tokens: tokens.collect(), cameras })
     }
 
-    /// Tokens with the latent's.
-    pub(crate) fn len(&self) -> usize {
+    /// Tokens with the latent's, without those of pictures.
+    pub(crate) fn vectors(&self) -> usize {
         1 + self.tokens.len()
+    }
+
+    /// All tokens.
+    pub(crate) fn len(&self) -> usize {
+        self.vectors() + self.cameras.as_ref().map_or(0, |cameras| cameras.tokens)
     }
 
     fn rows(&self, of: fn(Position) -> bool) -> usize {
@@ -128,6 +197,7 @@ pub(crate) struct InputTokens {
     projections: Vec<Linear>,
     feature_positions: Embedding,
     entity_positions: Option<Embedding>,
+    eyes: Option<ImageEncoder>,
 }
 
 impl InputTokens {
@@ -162,7 +232,38 @@ impl InputTokens {
         let projections = layout.tokens.iter();
         let projections = projections.map(|token| layer(&token.prefix).expect("one was made for every token"));
         let projections = projections.collect();
-        Ok(Self { layout, latent, projections, feature_positions, entity_positions })
+        let eyes = match &layout.cameras {
+            Some(cameras) => Some(ImageEncoder::new(p, &cameras.config, &cameras.given, dim, rng)?),
+            None => None,
+        };
+        Ok(Self { layout, latent, projections, feature_positions, entity_positions, eyes })
+    }
+
+    /// The observation with pictures as the network reads them: random parts in training, with `rng`. What was looked at
+    /// already stays.
+    pub(crate) fn look(&self, observation: &Features<Tensor>, mut rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
+        let mut seen = observation.clone();
+        if let (Some(eyes), Some(cameras)) = (&self.eyes, &self.layout.cameras) {
+            for (i, name) in cameras.features.iter().enumerate() {
+                let pictures = observation.require("see", name)?;
+                if pictures.dtype() == DType::U8 {
+                    seen.insert(name, eyes.look(i, pictures, rng.as_deref_mut())?);
+                }
+            }
+        }
+        Ok(seen)
+    }
+
+    /// How pictures are seen, if there are any.
+    pub(crate) fn vision(&self) -> Option<&VisionConfig> {
+        self.layout.cameras.as_ref().map(|cameras| &cameras.config)
+    }
+
+    /// Why the step by hand does not cover its pictures, if it does not.
+    pub(crate) fn composed_because(&self) -> Option<String> {
+        let cameras = self.layout.cameras.as_ref()?;
+        let keypoints = cameras.config.tokens != TokenKind::Map;
+        keypoints.then(|| "the step by hand does not cover tokens of keypoints".to_string())
     }
 
     /// Which tokens.
@@ -176,6 +277,10 @@ impl InputTokens {
         for (token, layer) in self.layout.tokens.iter().zip(&self.projections) {
             let values = observation.require("tokens", &token.feature)?.flatten_from(1)?;
             tokens.push(layer.forward(&values)?.unsqueeze(1)?);
+        }
+        if let (Some(eyes), Some(cameras)) = (&self.eyes, &self.layout.cameras) {
+            let pictures = cameras.features.iter().map(|name| Ok(observation.require("tokens", name)?.clone()));
+            tokens.push(eyes.forward(&pictures.collect::<Result<Vec<_>>>()?)?);
         }
         Ok(Tensor::cat(&tokens, 1)?)
     }
@@ -194,6 +299,9 @@ impl InputTokens {
                 (Position::Entity(row), Some(entities)) => entities.weight.narrow(0, row, 1)?,
                 (Position::Entity(_) | Position::Nowhere, _) => Tensor::zeros((1, dim), DType::F32, features.device())?,
             });
+        }
+        if let Some(eyes) = &self.eyes {
+            rows.push(eyes.positions()?);
         }
         Ok(Tensor::cat(&rows, 0)?.unsqueeze(0)?)
     }
@@ -215,7 +323,8 @@ mod tests {
             FeatureSpec::entity("cube1", 3, "cube", false),
             FeatureSpec::entity("goal1", 2, "goal", true),
         ];
-        let layout = TokenLayout::new(&Signature { observation, n_obs_steps: 2, action_dim: 1 });
+        let signature = Signature { observation, n_obs_steps: 2, action_dim: 1 };
+        let layout = TokenLayout::new(&signature, None, 8).unwrap();
         let seen: Vec<_> = layout.tokens.iter().map(|t| (t.prefix.as_str(), t.width, t.position)).collect();
         assert_eq!(
             seen,

@@ -139,6 +139,9 @@ impl<P: Precision> Core<P> {
             };
             tensors.insert(name.to_string(), tensor);
         }
+        for (name, var) in self.params.buffers() {
+            tensors.insert(name.to_string(), var.as_detached_tensor().copy()?);
+        }
         Ok(tensors)
     }
 
@@ -155,7 +158,7 @@ impl<P: Precision> Core<P> {
     /// `moment2.<name>` and, with a moving average, `ema.<name>`.
     pub(super) fn state(&self) -> Result<BTreeMap<String, Tensor>> {
         let mut tensors = self.optimiser.state(&self.params)?;
-        for (name, var) in self.params.iter() {
+        for (name, var) in self.params.all() {
             tensors.insert(format!("param.{name}"), var.as_detached_tensor().copy()?);
         }
         if self.ema.is_some() {

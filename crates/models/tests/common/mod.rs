@@ -1,5 +1,10 @@
 //! Fixture folders: this repository's, and everybody's own below the directory that `ACTRM_PARITY_DIR` names.
 #![allow(clippy::unwrap_used)]
+// every test program uses a part of it
+#![allow(dead_code)]
+
+pub mod npz;
+pub mod recipe;
 
 use std::path::{Path, PathBuf};
 
@@ -7,6 +12,16 @@ use std::path::{Path, PathBuf};
 pub const ACT: [&str; 3] = ["config.json", "model.safetensors", "io.npz"];
 /// A folder is a fixture of the official TRM if it holds these files.
 pub const TRM: [&str; 3] = ["config.json", "model.safetensors", "io.safetensors"];
+
+/// A folder is a fixture of LeRobot's ACT with cameras if it holds these files and its configuration has pictures.
+pub const SEEING_ACT: [&str; 2] = ["config.json", "io.npz"];
+/// A folder is a fixture of an image encoder alone if it holds these files.
+pub const ENCODER: [&str; 3] = ["note.txt", "model.safetensors", "io.npz"];
+
+/// Whether a LeRobot configuration reads pictures.
+fn sees(config: &str) -> bool {
+    config.contains(r#""type": "VISUAL""#)
+}
 
 /// All fixtures of one kind, in order: those below `tests/fixtures`, which are `shipped` in number, and those below
 /// `ACTRM_PARITY_DIR`, at any depth. A folder there with weights that is neither kind is an error, not passed over.
@@ -26,11 +41,13 @@ fn walk(folder: &Path, kind: &[&str], found: &mut Vec<PathBuf>) {
     let mut entries: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
     entries.sort();
     let holds = |files: &[&str]| files.iter().all(|file| folder.join(file).is_file());
-    if holds(kind) {
+    // the same files with pictures are the business of `vision_parity.rs`
+    let sees = std::fs::read_to_string(folder.join("config.json")).is_ok_and(|text| sees(&text));
+    if holds(kind) && sees == (kind == SEEING_ACT) {
         found.push(folder.to_path_buf());
     } else if holds(&["model.safetensors"]) {
-        let known = holds(&ACT) || holds(&TRM);
-        assert!(known, "{}: expected {ACT:?} or {TRM:?}, found {entries:?}", folder.display());
+        let known = holds(&ACT) || holds(&TRM) || holds(&ENCODER);
+        assert!(known, "{}: expected {ACT:?}, {TRM:?} or {ENCODER:?}, found {entries:?}", folder.display());
     }
     entries.iter().filter(|path| path.is_dir()).for_each(|path| walk(path, kind, found));
 }

@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use models::Signature;
+use models::{FeatureKind, Signature};
 use serde::{Deserialize, Serialize};
 
-use crate::{FeatureKeys, sha256_hex};
+use crate::experiment::PICTURE_SUFFIX;
+use crate::{FeatureKeys, ZooError, sha256_hex};
 
 use super::EntryId;
 
@@ -74,6 +75,27 @@ impl ModuleMeta {
     }
 }
 
+/// Cameras that a policy sees through.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct CamerasMeta {
+    /// The simulator's names of them, in order.
+    pub names: Vec<String>,
+    /// Side of their pictures, in pixels.
+    pub size: usize,
+    /// Whether they were drawn without reflections and multisampling.
+    pub fast_render: bool,
+}
+
+/// Key in `env_args` that says so.
+const FAST_RENDER: &str = "fast_render";
+
+impl CamerasMeta {
+    /// Whether the environment with these arguments draws without reflections and multisampling.
+    pub fn draws_fast(env_args: &serde_json::Value) -> bool {
+        env_args.get(FAST_RENDER).and_then(serde_json::Value::as_bool).unwrap_or(false)
+    }
+}
+
 /// The demonstrations behind an entry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DataMeta {
@@ -128,6 +150,32 @@ pub struct FileMeta {
 }
 
 impl EntryMeta {
+    /// The cameras that it sees through; `None` if it sees no pictures.
+    ///
+    /// # Errors
+    /// Pictures that no worker draws: of several sizes, or not square.
+    pub fn cameras(&self) -> Result<Option<CamerasMeta>, ZooError> {
+        let mut names = Vec::new();
+        let mut sizes = Vec::new();
+        for spec in self.signature.of_kind(FeatureKind::Image) {
+            let key = self.keys.of(&spec.name).concat();
+            names.push(key.strip_suffix(PICTURE_SUFFIX).unwrap_or(&key).to_owned());
+            sizes.extend(spec.shape.iter().take(2).copied());
+        }
+        let Some(&size) = sizes.first() else { return Ok(None) };
+        if sizes.iter().any(|other| *other != size) {
+            return Err(ZooError::UnfitEntry {
+                entry: self.id().to_string(),
+                task: self.task.clone(),
+                what: "pictures".to_owned(),
+                expected: "square and all of one size".to_owned(),
+                found: format!("{sizes:?}"),
+            });
+        }
+        let fast_render = self.env_args.as_ref().is_some_and(CamerasMeta::draws_fast);
+        Ok(Some(CamerasMeta { names, size, fast_render }))
+    }
+
     /// Whether it is a policy for a robot's task.
     pub fn is_robot_policy(&self) -> bool {
         self.kind.is_none() && self.section.is_none()

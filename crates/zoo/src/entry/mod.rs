@@ -15,7 +15,7 @@ mod subject;
 
 pub use card::{CardWords, grouped};
 pub use id::{EntryId, EntryRequest, check_name};
-pub use meta::{CurvePoint, DataMeta, EntryMeta, FileMeta, ModuleMeta, TrainingMeta};
+pub use meta::{CamerasMeta, CurvePoint, DataMeta, EntryMeta, FileMeta, ModuleMeta, TrainingMeta};
 pub use open::Entry;
 pub use policy::LoadedEntry;
 pub use seal::EntryDraft;

@@ -3,7 +3,9 @@
 use crate::evaluation::Subject;
 use crate::results::{EntryIdentity, Execution, TrainingFacts};
 
-use super::{EntryMeta, LoadedEntry};
+use models::FeatureKind;
+
+use super::{CamerasMeta, EntryMeta, LoadedEntry};
 
 /// Where an entry comes from, as results record it.
 pub fn training_facts(meta: &EntryMeta) -> TrainingFacts {
@@ -39,6 +41,11 @@ impl LoadedEntry {
             max_steps: rollout.max_steps,
             signature: meta.signature.clone(),
             time_decides: self.model().depends_on_time(),
+            fast_render: meta
+                .signature
+                .of_kind(FeatureKind::Image)
+                .next()
+                .map(|_| meta.env_args.as_ref().is_some_and(CamerasMeta::draws_fast)),
             policy: Box::new(move || Ok(this.policy())),
         }
     }

@@ -5,6 +5,7 @@ use rollout::{EpisodePlan, Ready};
 
 use super::EvaluationOptions;
 use super::agent::{PolicyAgent, QueryTimes, Timed};
+use crate::entry::CamerasMeta;
 use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, TrainingFacts};
 use crate::{FeatureKeys, ZooError};
 
@@ -28,6 +29,8 @@ pub struct Subject<'a> {
     pub signature: Signature,
     /// Whether its policies think by the clock, so that an episode may end otherwise next time.
     pub time_decides: bool,
+    /// Of a policy that sees pictures: whether those it learned from were drawn without reflections and multisampling.
+    pub fast_render: Option<bool>,
     /// Makes a policy of its own for one environment.
     pub policy: Box<dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a>,
 }
@@ -70,9 +73,13 @@ impl Subject<'_> {
             let found = self.keys.width(&spec.name, ready).map_or_else(|reason| reason, |width| width.to_string());
             (format!("length of {}", spec.name), spec.width().to_string(), found)
         });
+        let way = |fast: bool| if fast { "without reflections" } else { "with reflections" }.to_owned();
+        let drawn = self
+            .fast_render
+            .map(|fast| ("pictures drawn".to_owned(), way(fast), way(CamerasMeta::draws_fast(&ready.env_args))));
         let action =
             ("length of an action".to_owned(), self.signature.action_dim.to_string(), ready.action_dim.to_string());
-        for (what, expected, found) in features.chain([action]) {
+        for (what, expected, found) in features.chain(drawn).chain([action]) {
             if expected != found {
                 return Err(ZooError::UnfitEntry {
                     entry: self.entry.to_string(),

@@ -39,7 +39,9 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
     })
     .map_err(model_error())?;
     let weights = lerobot::tensors_out(loaded.model().params(), act).map_err(model_error())?;
-    let statistics = loaded.preprocess().normaliser().tensors().map_err(model_error())?;
+    let mut statistics = loaded.preprocess().normaliser().tensors().map_err(model_error())?;
+    let of_pictures = lerobot::statistics_out(loaded.model().params(), &meta.signature).map_err(model_error())?;
+    statistics.extend(of_pictures);
 
     let (inputs, outputs) = (&config["input_features"], &config["output_features"]);
     let norm_map: BTreeMap<String, String> =

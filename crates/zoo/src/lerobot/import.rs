@@ -5,10 +5,13 @@ use std::path::Path;
 
 use candle_core::Tensor;
 use models::lerobot::{self, LerobotAct};
-use models::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, PolicyConfig, Preprocess};
+use models::{
+    ACTION, ENVIRONMENT_STATE, FeatureKind, FeatureSpec, ModelError, NormMode, Normaliser, PolicyConfig, Preprocess,
+    Signature,
+};
 
 use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta};
-use crate::experiment::{DataSection, Experiment, NormalisationSection, RolloutSection, TaskSection};
+use crate::experiment::{DataSection, Experiment, NormalisationSection, PICTURE_PREFIX, RolloutSection, TaskSection};
 use crate::run::TrainSection;
 use crate::{ZooError, tensors};
 
@@ -46,7 +49,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
         action: after.mode("ACTION")?,
     };
     // observations as they go in, actions as they come out
-    let mut statistics = before.statistics;
+    let mut statistics = before.statistics.clone();
     statistics.retain(|name, _| !name.starts_with(ACTION));
     statistics.extend(after.statistics.into_iter().filter(|(name, _)| name.starts_with(ACTION)));
 
@@ -60,6 +63,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
                 None => Vec::new(),
                 Some(_) => options.env_keys.clone(),
             },
+            cameras: cameras(&signature).map_err(config::misfit(&config_path))?,
             ..DataSection::default()
         },
         normalisation,
@@ -73,6 +77,8 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     let model_path = folder.join(MODEL_FILE);
     let (weights, _) = tensors::read(&model_path)?;
     lerobot::load_tensors(model.params(), &act, &weights).map_err(config::misfit(&model_path))?;
+    lerobot::load_statistics(model.params(), &signature, &before.config.norm_map, &before.statistics)
+        .map_err(config::misfit(&model_path))?;
     let modes = experiment.normalisation.modes(&signature);
     let preprocess = Normaliser::new(&modes, &statistics)
         .and_then(|normaliser| Preprocess::new(signature, normaliser))
@@ -109,6 +115,20 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
         normaliser: tensors::to_bytes(&model_path, &statistics, &serde_json::json!({"format": 1}))?,
     };
     draft.seal(zoo)
+}
+
+/// The simulator's names of the cameras: what their features are called after LeRobot's prefix.
+fn cameras(signature: &Signature) -> Result<Vec<String>, ModelError> {
+    let name = |spec: &FeatureSpec| match spec.name.strip_prefix(PICTURE_PREFIX) {
+        Some(camera) => Ok(camera.to_owned()),
+        None => Err(ModelError::Input {
+            operation: "import",
+            object: "picture",
+            found: spec.name.clone(),
+            expected: format!("{PICTURE_PREFIX}<camera>"),
+        }),
+    };
+    signature.of_kind(FeatureKind::Image).map(name).collect()
 }
 
 /// The normalising step of a processor.

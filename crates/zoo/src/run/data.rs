@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
 use dataset::{ConvertOptions, Dataset, FeatureStats, WindowBatch, WindowSpec, Windows};
@@ -11,7 +12,7 @@ use models::{
 
 use crate::ZooError;
 use crate::entry::DataMeta;
-use crate::experiment::{DataSection, EntitySection, Experiment};
+use crate::experiment::{DataSection, EntitySection, Experiment, PICTURE_PREFIX};
 
 use super::symmetry::Symmetries;
 
@@ -96,6 +97,8 @@ pub(super) struct Demonstrations {
     pub valid: Option<Windows>,
     pub preprocess: Preprocess,
     pub symmetries: Symmetries,
+    /// Mean and standard deviation of each camera's colours, on the scale from 0 to 1, where the data set has them.
+    pub picture_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
     pub meta: DataMeta,
     /// What a user should know: a missing mask, constant dimensions.
     pub notes: Vec<String>,
@@ -189,11 +192,19 @@ pub(super) fn prepare(
         train_frames: train.iter().map(|e| dataset.episodes()[*e].length as u64).sum(),
         valid_episodes: valid.len() as u64,
     };
-    let train = windows(train)?;
-    let valid = match valid.is_empty() {
+    let mut train = windows(train)?;
+    let mut valid = match valid.is_empty() {
         true => None,
         false => Some(windows(valid)?),
     };
+    let mut picture_statistics = Vec::new();
+    for camera in &experiment.data.cameras {
+        let name = format!("{PICTURE_PREFIX}{camera}");
+        let pictures = Arc::new(dataset.pictures(&name).map_err(failed)?);
+        train = train.with_pictures(&name, Arc::clone(&pictures));
+        valid = valid.map(|valid| valid.with_pictures(&name, pictures));
+        picture_statistics.push(dataset.stats().get(&name).and_then(colours));
+    }
     let signature = signature(&train, experiment);
     let modes = experiment.normalisation.modes(&signature);
     let mut normaliser =
@@ -207,7 +218,17 @@ pub(super) fn prepare(
     let preprocess =
         Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
     let symmetries = Symmetries::new(experiment, dataset, path)?;
-    Ok(Demonstrations { train, valid, preprocess, symmetries, meta, notes })
+    let picture_statistics = picture_statistics.into_iter().collect();
+    Ok(Demonstrations { train, valid, preprocess, symmetries, picture_statistics, meta, notes })
+}
+
+/// Mean and standard deviation of three colours.
+fn colours(stats: &FeatureStats) -> Option<([f32; 3], [f32; 3])> {
+    let three = |values: &[f64]| -> Option<[f32; 3]> {
+        let values: Vec<f32> = values.iter().map(|&x| x as f32).collect();
+        values.try_into().ok()
+    };
+    Some((three(&stats.mean)?, three(&stats.std)?))
 }
 
 /// The columns that the experiment's observation is made of.
@@ -241,7 +262,8 @@ fn signature(windows: &Windows, experiment: &Experiment) -> Signature {
             FeatureSpec::entity(name, width, entity.group_of(name), entity.position)
         }
     };
-    let observation = windows.observation().map(spec).collect();
+    let pictures = windows.pictures().map(|(camera, (height, width))| FeatureSpec::image(camera, height, width));
+    let observation = windows.observation().map(spec).chain(pictures).collect();
     Signature { observation, n_obs_steps: windows.n_obs_steps(), action_dim: windows.action_dim() }
 }
 
@@ -251,7 +273,9 @@ pub(super) fn batch(
     demonstrations: &Demonstrations,
     experiment: &Experiment,
 ) -> Result<Batch, ZooError> {
-    let observation = windows.observation.iter().map(|(name, values)| (name.clone(), ValuesRef::F32(values))).collect();
+    let numbers = windows.observation.iter().map(|(name, values)| (name.clone(), ValuesRef::F32(values)));
+    let pictures = windows.pictures.iter().map(|(name, values)| (name.clone(), ValuesRef::U8(values)));
+    let observation = numbers.chain(pictures).collect();
     demonstrations
         .preprocess
         .batch(experiment.policy.action_horizon(), &observation, &windows.actions, &windows.is_pad)

@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod data;
+mod eyes;
 mod folder;
 mod list;
 mod loop_parts;

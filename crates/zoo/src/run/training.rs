@@ -173,7 +173,9 @@ impl<'a> PolicyTraining<'a> {
         let section = &experiment.train;
         let build = || {
             let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed);
-            model.map_err(experiment.model_error("build the policy of"))
+            let model = model.map_err(experiment.model_error("build the policy of"))?;
+            super::eyes::open(model.as_ref(), &demonstrations, experiment)?;
+            Ok::<_, ZooError>(model)
         };
         let trainer = Trainer::new(build()?, section.trainer_config(), section.seed)
             .map_err(experiment.model_error("set up the training of"))?;

@@ -9,7 +9,8 @@ use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits, shown};
 use report::LeaderboardRow;
 use rollout::{Control, Pool, remembered_greeting, video};
-use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
+use zoo::ZooError;
+use zoo::entry::{CamerasMeta, EntryId, EntryMeta, LoadedEntry};
 use zoo::evaluation::{
     EvaluationEnd, EvaluationOptions, FIRST_SEED, Progress, Subject, View, evaluate, evaluate_again, film, finished,
 };
@@ -123,8 +124,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     for id in ids {
         match open(args, &registry, &id).with_context(|| format!("entry {id}")) {
             Ok(Some(loaded)) => {
-                let environment = EnvironmentKey::of(args, loaded.entry().meta());
-                by_environment.entry(environment).or_default().push(loaded);
+                match EnvironmentKey::of(args, loaded.entry().meta()) {
+                    Ok(environment) => by_environment.entry(environment).or_default().push(loaded),
+                    Err(error) => failures.push(error.into()),
+                }
             }
             Ok(None) => {}
             Err(error) => failures.push(error),
@@ -155,21 +158,23 @@ struct EnvironmentKey {
     env_module: Option<String>,
     /// As JSON text.
     env_args: Option<String>,
+    cameras: Option<CamerasMeta>,
 }
 
 impl EnvironmentKey {
     /// The environment of an entry's demonstrations, unless the command line says otherwise.
-    fn of(args: &Args, meta: &EntryMeta) -> Self {
+    fn of(args: &Args, meta: &EntryMeta) -> Result<Self, ZooError> {
         let recorded = || meta.env_module.as_ref().map(|module| module.name.clone());
         let env_module = args.simulator.env_module.clone().or_else(recorded);
-        match args.task.clone().filter(|task| *task != meta.task) {
+        let cameras = meta.cameras()?;
+        Ok(match args.task.clone().filter(|task| *task != meta.task) {
             // another task's environment has arguments of its own
-            Some(task) => Self { task, env_module, env_args: None },
+            Some(task) => Self { task, env_module, env_args: None, cameras },
             None => {
                 let env_args = meta.env_args.as_ref().map(serde_json::Value::to_string);
-                Self { task: meta.task.clone(), env_module, env_args }
+                Self { task: meta.task.clone(), env_module, env_args, cameras }
             }
-        }
+        })
     }
 }
 
@@ -206,6 +211,10 @@ fn evaluate_on(
     let env_args = environment.env_args.as_deref().map(serde_json::from_str).transpose()?;
     let mut spec = args.simulator.recorded_spec(task, env_args.as_ref())?;
     spec.env_module.clone_from(&environment.env_module);
+    if let Some(cameras) = &environment.cameras {
+        spec.cameras.clone_from(&cameras.names);
+        (spec.image_size, spec.fast_render) = (cameras.size, cameras.fast_render);
+    }
     spec.control = args.control;
     spec.limits.step = Duration::from_secs(args.step_timeout);
     let (results, options) = (args.results.folder(&args.zoo), options(args, environment));

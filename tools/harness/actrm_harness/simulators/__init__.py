@@ -22,6 +22,8 @@ class Options:
     control: str = "compiled"
     cameras: tuple[str, ...] = ()
     size: int = 84
+    fast_render: bool = False
+    """Draw without reflections and multisampling: a third of the time, and other pixels."""
     env_args: dict[str, Any] | None = None
     """robomimic's `env_args` of an environment that is not the task's usual one: other robots or controllers."""
 

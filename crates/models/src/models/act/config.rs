@@ -1,5 +1,6 @@
 //! ACT's options.
 
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::layers::{Activation, Shape};
 use crate::size::Size;
@@ -35,6 +36,9 @@ pub struct Config {
     pub dropout: f64,
     /// weight of the KL term
     pub kl_weight: f64,
+    /// how pictures are seen, if there are any
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<VisionConfig>,
 }
 
 impl Default for Config {
@@ -53,6 +57,7 @@ impl Default for Config {
             n_vae_encoder_layers: 4,
             dropout: 0.1,
             kl_weight: 10.0,
+            vision: None,
         }
     }
 }
@@ -118,6 +123,6 @@ impl Config {
                 "relu or gelu (glu halves the width that linear2 expects)",
             );
         }
-        Ok(())
+        self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)
     }
 }

@@ -45,7 +45,8 @@ impl Act {
         into: &mut Gradients,
     ) -> Result<LossValues> {
         self.check_batch(batch)?;
-        let data = Data::of(batch, self.tokens.layout())?;
+        let observation = self.tokens.look(&batch.observation, None)?;
+        let data = Data::of(&Batch { observation, ..batch.clone() }, self.tokens.layout())?;
         let eps = with_values(eps, <[f32]>::to_vec)?;
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
@@ -58,7 +59,7 @@ impl Act {
     /// The features of the observation -> (b, C, A)
     pub(crate) fn fused_predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
         let rows = self.check_inputs(observation)?;
-        let inputs = inputs(self.tokens.layout(), observation)?;
+        let inputs = inputs(self.tokens.layout(), &self.tokens.look(observation, None)?)?;
         let packed = self.workspaces.packed(self.params());
         let actions = self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {

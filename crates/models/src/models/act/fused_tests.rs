@@ -1,8 +1,9 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::features::{FeatureKind, FeatureSpec, Signature};
+use crate::encoders::{ImageNorm, TokenKind, VisionConfig};
+use crate::features::{FeatureSpec, Signature};
 use crate::fused::testing::{
-    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients,
+    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
 use crate::layers::Activation;
@@ -22,7 +23,7 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         dropout: 0.2,
         ..Default::default()
     };
-    let Signatures { plain, no_env, entities, history } = signatures();
+    let Signatures { plain, no_env, entities, history, .. } = signatures();
     let gelu = Config { feedforward_activation: Activation::Gelu, ..base.clone() };
     vec![
         (base.clone(), plain.clone(), 3),
@@ -44,16 +45,29 @@ fn cases() -> impl Iterator<Item = (Act, Batch, String)> {
     })
 }
 
+/// With pictures, whose network has too many kinks for slopes.
+fn seeing() -> impl Iterator<Item = (Act, Batch, String)> {
+    let (first, _, _) = configs().swap_remove(0);
+    let frozen = VisionConfig { norm: ImageNorm::Frozen, crop: None, ..eyes() };
+    [eyes(), frozen].into_iter().map(move |vision| {
+        let config = Config { vision: Some(vision), ..first.clone() };
+        let signature = signatures().pictures;
+        let act = Act::new(&config, &signature, 1).unwrap();
+        move_parameters(&act);
+        (act, batch(&signature, config.action_horizon, 3, 3), format!("{config:?}"))
+    })
+}
+
 #[test]
 fn the_fused_step_is_the_composed_one_with_dropout() {
-    for (act, batch, what) in cases() {
+    for (act, batch, what) in cases().chain(seeing()) {
         assert_the_step_is_the_composed_one(&act, &batch, &what);
     }
 }
 
 #[test]
 fn the_fused_prediction_is_the_composed_one() {
-    for (act, batch, what) in cases() {
+    for (act, batch, what) in cases().chain(seeing()) {
         let want = act.predict_composed(&batch.observation).unwrap();
         for level in Level::ALL {
             let got = at_most(level, || act.fused_predict(&batch.observation).unwrap());
@@ -107,21 +121,23 @@ fn features_that_act_cannot_read_are_refused_by_name() {
     let config = configs().remove(0).0;
     let error = |signature: Signature| Act::new(&config, &signature, 1).unwrap_err().to_string();
     let mut signature = Signature::low_dimensional(3, 2, 2);
-    let picture = FeatureSpec {
-        name: "observation.images.front".to_string(),
-        kind: FeatureKind::Image,
-        shape: vec![8, 8, 3],
-        ..FeatureSpec::state(1)
-    };
-    signature.observation.push(picture.clone());
-    assert_eq!(
-        error(signature.clone()),
-        "act cannot read feature observation.images.front of kind image; it reads state, environment_state, entity"
-    );
-    assert_eq!(
-        crate::model::not_by_hand(&signature).unwrap(),
-        "the step by hand does not cover feature observation.images.front of kind image"
-    );
+    let front = "observation.images.front";
+    signature.observation.push(FeatureSpec { shape: vec![8, 8, 4], ..FeatureSpec::image(front, 8, 8) });
+    let expected = "observation.images.front of shape [8, 8, 4], expected height, width and 3 colours";
+    assert_eq!(error(signature.clone()), format!("config of vision: observation is {expected}"));
+    signature.observation[2] = FeatureSpec::image(front, 8, 8);
+    let with = |vision: VisionConfig| Config { vision: Some(vision), ..config.clone() };
+    let small = Act::new(&with(VisionConfig { crop: Some(9), ..eyes() }), &signature, 1).unwrap_err().to_string();
+    assert_eq!(small, "config of vision: crop is 9, expected at most the picture's side, 8");
+    // what no step by hand covers runs composed, and says so
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, crop: None, ..eyes() };
+    let act = Act::new(&with(keypoints), &signature, 1).unwrap();
+    assert_eq!(act.composed_because().unwrap(), "the step by hand does not cover tokens of keypoints");
+    let batch = batch(&signature, config.action_horizon, 2, 1);
+    assert!(gradients(&act, &batch).1.values().iter().all(|g| g.is_finite()));
+    signature.n_obs_steps = 2;
+    assert!(error(signature.clone()).contains("n_obs_steps is 2, expected 1 with pictures"));
+    signature.n_obs_steps = 1;
     signature.observation = vec![FeatureSpec::environment_state(2)];
     let expected =
         "config of act: observation is observation.environment_state, expected a feature of kind state among others";

@@ -1,19 +1,22 @@
 //! ACT, Action Chunking with Transformers: a conditional VAE whose decoder predicts a chunk of actions at once.
 //!
 //! Paper: Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", arXiv 2304.13705.
-//! Reference: `ACTPolicy` of LeRobot 0.6.1 on low-dimensional observations; tensor names are its own, less the prefix
+//! Reference: `ACTPolicy` of LeRobot 0.6.1; tensor names are its own, less the prefix
 //! `model.`, which belongs to its file format.
 //!
 //! Training: the VAE encoder reads `[cls, state, actions…]` and gives the mean and log-variance of a latent. The encoder
-//! reads `[latent, state, environment state, entities…]`; the decoder's queries are learned positions, one per action of the chunk.
+//! reads `[latent, state, environment state, entities…, pictures…]`; the decoder's queries are learned positions, one per action of the chunk.
 //! Loss: L1 over the steps that are not padding, plus `kl_weight` times KL(latent ‖ N(0, 1)). Inference: latent = 0.
 //!
 //! Entities are ours: a token each, through a projection that entities of one group share, without a position unless one
 //! was asked for; without positions the chunk does not depend on the order of a group. Of a history (`n_obs_steps`) each
 //! token reads all steps side by side.
 //!
+//! Pictures are tokens after all others, one a cell of a feature map (`encoders`), in the order of the cameras; as in
+//! LeRobot nothing tells cameras apart.
+//!
 //! Deviations: none in the maths. `feedforward_activation = "glu"` is refused: LeRobot accepts it in its configuration,
-//! but its layer then cannot run (`glu` halves the width that `linear2` expects). Images are not supported.
+//! but its layer then cannot run (`glu` halves the width that `linear2` expects).
 //!
 //! This file is the model as one reads it, on candle's autograd. Training steps and predictions run the same maths with
 //! hand-written backward passes (`fused.rs`); tests hold the two together.
@@ -26,6 +29,7 @@ pub use config::Config;
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation, check_signature};
 use crate::chunk_policy::ChunkPolicy;
+use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
@@ -45,7 +49,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
-pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+pub const READS: &[FeatureKind] =
+    &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
 
 /// What the training forward pass gives.
 #[derive(Debug)]
@@ -83,7 +88,7 @@ impl Act {
     pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
         config.validate()?;
         check_signature("act", signature, READS)?;
-        let layout = TokenLayout::new(signature);
+        let layout = TokenLayout::new(signature, config.vision.as_ref(), config.dim_model)?;
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
         let (dim, shape) = (config.dim_model, config.shape());
@@ -143,6 +148,7 @@ impl Act {
     /// Inputs of the wrong shape.
     pub fn train_forward(&self, batch: &Batch, eps: &Tensor, mode: &mut Mode<'_>) -> Result<TrainOutput> {
         self.check_batch(batch)?;
+        let observation = self.tokens.look(&batch.observation, None)?;
         let latent = match &self.vae {
             Some(vae) => Some(vae.encode(batch, &self.vae_encoder_pos_enc, mode)?),
             None => None,
@@ -151,7 +157,7 @@ impl Act {
             Some(latent) => sample(latent, eps)?,
             None => eps.zeros_like()?,
         };
-        let actions = self.decode(&sample, &batch.observation, mode)?;
+        let actions = self.decode(&sample, &observation, mode)?;
         Ok(TrainOutput { actions, latent })
     }
 
@@ -184,7 +190,13 @@ impl Act {
     pub fn predict_composed(&self, observation: &Features<Tensor>) -> Result<Tensor> {
         let rows = self.check_inputs(observation)?;
         let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
-        self.decode(&latent, observation, &mut Mode::Eval)
+        self.decode(&latent, &self.tokens.look(observation, None)?, &mut Mode::Eval)
+    }
+
+    /// The batch with pictures as the network reads them in training.
+    fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
+        self.check_batch(batch)?;
+        Ok(Batch { observation: self.tokens.look(&batch.observation, Some(rng))?, ..batch.clone() })
     }
 }
 
@@ -198,10 +210,11 @@ impl PolicyModel for Act {
     }
 
     fn composed_because(&self) -> Option<String> {
-        not_by_hand(&self.signature)
+        not_by_hand(&self.signature).or_else(|| self.tokens.composed_because())
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
+        let batch = &self.looked_at(batch, rng)?;
         let shape = (batch.rows(), self.config.latent_dim);
         let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.device())?;
         let output = self.train_forward(batch, &eps, &mut Mode::Train(rng))?;
@@ -212,6 +225,7 @@ impl PolicyModel for Act {
         if self.composed_because().is_some() {
             return autograd(self, batch, rng, into);
         }
+        let batch = &self.looked_at(batch, rng)?;
         let shape = (batch.rows(), self.config.latent_dim);
         let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.device())?;
         self.fused_gradients(batch, &eps, Some(rng), into)
@@ -230,5 +244,9 @@ impl PolicyModel for Act {
 
     fn action_horizon(&self) -> usize {
         self.config.action_horizon
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.tokens.vision()
     }
 }

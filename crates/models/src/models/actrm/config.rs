@@ -1,5 +1,6 @@
 //! ACTRM's options.
 
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::layers::{Activation, Shape};
 use crate::models::act;
@@ -137,6 +138,9 @@ pub struct Config {
     pub kl_weight: f64,
     /// the recursion
     pub reasoning: ReasoningConfig,
+    /// how pictures are seen, if there are any
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<VisionConfig>,
 }
 
 impl Default for Config {
@@ -156,6 +160,7 @@ impl Default for Config {
             dropout: act.dropout,
             kl_weight: act.kl_weight,
             reasoning: ReasoningConfig::default(),
+            vision: None,
         }
     }
 }
@@ -189,6 +194,7 @@ impl Config {
             n_vae_encoder_layers: self.n_vae_encoder_layers,
             dropout: self.dropout,
             kl_weight: self.kl_weight,
+            vision: self.vision.clone(),
         }
     }
 

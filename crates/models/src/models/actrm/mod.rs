@@ -6,7 +6,7 @@
 //!
 //! **`reasoning.over = "actions"`** (default, our own): `y`, one token per action of the chunk,
 //! is the answer; `z`, a few latent tokens, is the reasoning. The memory (latent, robot state,
-//! environment state, entities) is encoded once per observation. One small block, shared by everything,
+//! environment state, entities, pictures) is encoded once per observation. One small block, shared by everything,
 //! updates `z` (`l_cycles` times) and then `y`, each by attending to `[z, y, memory]`. A
 //! supervision step is `h_cycles` such rounds; after it `y` is decoded into a chunk by one dense
 //! layer, so every depth has an answer and the policy can stop at any of them.
@@ -40,6 +40,7 @@ pub use reasoning::{Reasoning, ReasoningPolicy, ReasoningStep};
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation, check_signature};
 use crate::classification::binary_cross_entropy;
+use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
@@ -59,7 +60,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
-pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+pub const READS: &[FeatureKind] =
+    &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
 
 /// The shared layer of `over = "actions"`: attention to a context, then a dense part.
 #[derive(Debug)]
@@ -166,7 +168,7 @@ impl Actrm {
     pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
         config.validate()?;
         check_signature("actrm", signature, READS)?;
-        let layout = TokenLayout::new(signature);
+        let layout = TokenLayout::new(signature, config.vision.as_ref(), config.dim_model)?;
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
         let (dim, shape, r) = (config.dim_model, config.shape(), &config.reasoning);
@@ -341,6 +343,12 @@ impl Actrm {
         check_batch("actrm", &self.signature, self.config.action_horizon, batch)
     }
 
+    /// The batch with pictures as the network reads them in training.
+    fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
+        self.check_batch(batch)?;
+        Ok(Batch { observation: self.tokens.look(&batch.observation, Some(rng))?, ..batch.clone() })
+    }
+
     /// With warm starts in use, the answer that half of the rows begin with: the model's own, to
     /// the same observation under noise.
     fn warm_answers(&self, batch: &Batch, warm: WarmStart, carry: &Carry, rng: &mut Rng) -> Result<Tensor> {
@@ -351,6 +359,9 @@ impl Actrm {
         let mut observation = Features::new();
         for token in &self.tokens.layout().tokens {
             observation.insert(&token.feature, noisy(batch.observation.require("warm start", &token.feature)?)?);
+        }
+        for camera in self.tokens.layout().cameras.iter().flat_map(|cameras| &cameras.features) {
+            observation.insert(camera, batch.observation.require("warm start", camera)?.clone());
         }
         let latent = Tensor::zeros((batch.rows(), self.config.latent_dim), DType::F32, batch.device())?;
         let memory = self.memory(&latent, &observation, &mut Mode::Eval)?.detach();
@@ -393,11 +404,11 @@ impl PolicyModel for Actrm {
     }
 
     fn composed_because(&self) -> Option<String> {
-        not_by_hand(&self.signature)
+        not_by_hand(&self.signature).or_else(|| self.tokens.composed_because())
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
-        self.check_batch(batch)?;
+        let batch = &self.looked_at(batch, rng)?;
         let rows = batch.rows();
         let shape = (rows, self.config.latent_dim);
         let latent = match &self.vae {
@@ -488,5 +499,9 @@ impl PolicyModel for Actrm {
 
     fn action_horizon(&self) -> usize {
         self.config.action_horizon
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.tokens.vision()
     }
 }

@@ -73,7 +73,8 @@ impl Actrm {
     ) -> Result<Reasoning> {
         let rows = self.check_thought(observation, start)?;
         let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
-        let memory = self.memory(&latent, observation, &mut Mode::Eval)?.detach();
+        let observation = self.tokens.look(observation, None)?;
+        let memory = self.memory(&latent, &observation, &mut Mode::Eval)?.detach();
         let mut carry = self.start(rows, &memory)?;
         if let Some(start) = start {
             carry.answer = start.clone();

@@ -55,6 +55,7 @@ class Session:
     env_args: dict[str, Any]
     cameras: tuple[str, ...] = ()
     image_size: int = 84
+    fast_render: bool = False
     control: Control | None = None
     renderer: "Renderer | None" = None
     foreign_model: bool = False
@@ -79,7 +80,12 @@ _DECIDED = ("camera_", "render", "has_", "hard_reset", "horizon", "seed", "env_l
 
 
 def make(
-    task_name: str, cameras: tuple[str, ...] = (), size: int = 84, env_args: dict[str, Any] | None = None
+    task_name: str,
+    cameras: tuple[str, ...] = (),
+    size: int = 84,
+    env_args: dict[str, Any] | None = None,
+    *,
+    fast_render: bool = False,
 ) -> Session:
     """Make the environment of a task; RequestError("unknown_task") where there is none of that name.
 
@@ -117,6 +123,8 @@ def make(
         "type": 1,
         "env_kwargs": json.loads(json.dumps(kwargs)),
     }
+    if cameras and fast_render:
+        described["fast_render"] = True
     lean.prepare()
     # Images are drawn by `render`, so that an episode is the same with cameras and without.
     kwargs |= {"has_offscreen_renderer": False, "use_camera_obs": False}
@@ -127,7 +135,15 @@ def make(
         if env_args is None:
             raise
         raise RequestError("env_args", f"{task_name} cannot be made of these env_args: {error!r}") from error
-    return Session(env=cast(Env, env), task=task, env_args=described, cameras=cameras, image_size=size, unusual=unusual)
+    return Session(
+        env=cast(Env, env),
+        task=task,
+        env_args=described,
+        cameras=cameras,
+        image_size=size,
+        unusual=unusual,
+        fast_render=fast_render,
+    )
 
 
 def arguments(task: Task, given: dict[str, Any]) -> dict[str, Any]:
@@ -222,17 +238,25 @@ def steps_session(session: Session, actions: Array) -> tuple[StepResult, Array]:
 
 def image(session: Session, camera: str, height: int, width: int) -> Array:
     """What a camera sees now; the OpenGL context is made when the first image is asked for."""
-    if session.renderer is None:
-        from actrm_harness.simulators.robosuite.render import Renderer
-
-        session.renderer = Renderer()
-    return session.renderer.image(session.env.sim, camera, height, width)
+    return renderer(session).images(session.env.sim, (camera,), height, width)[0]
 
 
 def images(session: Session) -> Tensors:
     """What the session's cameras see now, under robomimic's names."""
+    if not session.cameras:
+        return {}
     size = session.image_size
-    return {f"{camera}_image": image(session, camera, size, size) for camera in session.cameras}
+    seen = renderer(session).images(session.env.sim, session.cameras, size, size)
+    return {f"{camera}_image": pixels for camera, pixels in zip(session.cameras, seen, strict=True)}
+
+
+def renderer(session: Session) -> "Renderer":
+    """What draws the session, made when it is asked for."""
+    if session.renderer is None:
+        from actrm_harness.simulators.robosuite.render import Renderer
+
+        session.renderer = Renderer(fast=session.fast_render)
+    return session.renderer
 
 
 def step(env: Env, action: Array, control: Control | None) -> StepResult:

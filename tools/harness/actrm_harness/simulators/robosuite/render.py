@@ -10,6 +10,7 @@ import ctypes
 import ctypes.util
 import importlib
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,13 @@ _EGL_PLATFORM_DEVICE = 0x313F
 
 
 class Renderer:
-    """Draws a simulation's cameras; the model's textures and meshes are loaded again when the model changes."""
+    """Draws a simulation's cameras; the model's textures and meshes are loaded again when the model changes.
 
-    def __init__(self) -> None:
+    `fast` draws without reflections and multisampling, which takes a third of the time where a processor draws.
+    """
+
+    def __init__(self, fast: bool = False) -> None:
+        self._fast = fast
         self._gl: Any = _gl_context()
         self._model: Any = None
         self._context: Any = None
@@ -45,22 +50,30 @@ class Renderer:
 
     def image(self, sim: Sim, camera: str, height: int, width: int) -> Array:
         """Draw what `camera` sees: uint8 of (height, width, 3), upright."""
+        return self.images(sim, (camera,), height, width)[0]
+
+    def images(self, sim: Sim, cameras: Sequence[str], height: int, width: int) -> list[Array]:
+        """Draw what each of `cameras` sees, of one scene: uint8 of (height, width, 3) each, upright."""
         mujoco = suite.mujoco()
-        cameras: tuple[str, ...] = sim.model.camera_names
-        if camera not in cameras:
-            raise RequestError("unknown_camera", f"unknown camera {camera!r}; known: {', '.join(sorted(cameras))}")
+        known: tuple[str, ...] = sim.model.camera_names
+        for camera in cameras:
+            if camera not in known:
+                raise RequestError("unknown_camera", f"unknown camera {camera!r}; known: {', '.join(sorted(known))}")
         self.make_current()
         self._load(sim.model._model, height, width)
-        self._camera.fixedcamid = sim.model.camera_name2id(camera)
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(
-            self._model, sim.data._data, self._options, mujoco.MjvPerturb(), self._camera, everything, self._scene
-        )
+        data, everything = sim.data._data, mujoco.mjtCatBit.mjCAT_ALL
         viewport = mujoco.MjrRect(0, 0, width, height)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
-        mujoco.mjr_render(viewport, self._scene, self._context)
-        mujoco.mjr_readPixels(pixels, None, viewport, self._context)
-        return np.ascontiguousarray(pixels[::-1])
+        drawn: list[Array] = []
+        for camera in cameras:
+            self._camera.fixedcamid = sim.model.camera_name2id(camera)
+            mujoco.mjv_updateScene(
+                self._model, data, self._options, mujoco.MjvPerturb(), self._camera, everything, self._scene
+            )
+            mujoco.mjr_render(viewport, self._scene, self._context)
+            mujoco.mjr_readPixels(pixels, None, viewport, self._context)
+            drawn.append(np.ascontiguousarray(pixels[::-1]))
+        return drawn
 
     def _load(self, model: Any, height: int, width: int) -> None:
         fits = self._context is not None and width <= self._context.offWidth and height <= self._context.offHeight
@@ -70,11 +83,15 @@ class Renderer:
         if self._context is not None:
             self._context.free()
         view = model.vis.global_
+        if self._fast:
+            model.vis.quality.offsamples = 0
         view.offwidth, view.offheight = max(width, view.offwidth), max(height, view.offheight)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         if model is not self._model:
             self._scene = mujoco.MjvScene(model, maxgeom=_MAX_GEOMS)
+            if self._fast:
+                self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._model = model
 
 

@@ -19,7 +19,9 @@ class Robosuite:
     @staticmethod
     def start(options: Options) -> "Robosuite":
         """Make the environment and attach the compiled control loop where it is wanted and known."""
-        session = envs.make(options.task.name, options.cameras, options.size, options.env_args)
+        session = envs.make(
+            options.task.name, options.cameras, options.size, options.env_args, fast_render=options.fast_render
+        )
         if options.control == "compiled":
             session.control = control.attach(session.env)
         return Robosuite(session)

@@ -11,7 +11,7 @@ use super::{Actrm, Over, WarmStart};
 use crate::batch::Batch;
 use crate::error::Result;
 use crate::features::Features;
-use crate::fused::{AbsoluteError, Data, Grads, Pass, Tokens, Vae, inputs, with_weights};
+use crate::fused::{AbsoluteError, Data, Grads, Inputs, Pass, Tokens, Vae, inputs, with_weights};
 use crate::gradients::Gradients;
 use crate::layers::Shape;
 use crate::model::{LossValues, PolicyModel};
@@ -116,7 +116,7 @@ fn mean_over_tokens(pass: &mut Pass<'_>, x: &[f32], rows: usize) -> Vec<f32> {
 impl Actrm {
     /// Loss of a training forward pass, and its gradients added to `into`.
     pub(super) fn fused_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
-        self.check_batch(batch)?;
+        let batch = &self.looked_at(batch, rng)?;
         let data = Data::of(batch, self.tokens.layout())?;
         let steps = self.steps_of(batch);
         self.workspaces.with(|space| {
@@ -233,7 +233,8 @@ impl Actrm {
             let rng = pass.rng.as_mut().expect("a training step has a generator");
             x.iter().zip(rng.normals(x.len())).map(|(x, noise)| x + noise * warm.noise as f32).collect()
         };
-        let inputs: Vec<Vec<f32>> = data.inputs.iter().map(|values| noisy(values)).collect();
+        let vectors = data.inputs.vectors.iter().map(|values| noisy(values)).collect();
+        let inputs = Inputs { vectors, pictures: data.inputs.pictures.clone() };
         let latent = vec![0.0; data.rows * self.config.latent_dim];
         let tokens = Tokens::new(self.tokens.layout(), (&latent, self.config.latent_dim), &inputs);
         let mut answer = quietly(pass, |pass| {
@@ -267,7 +268,7 @@ impl Actrm {
         start: Option<&Tensor>,
         on_step: &mut dyn FnMut(Tensor, Vec<f32>) -> Result<bool>,
     ) -> Result<Tensor> {
-        let inputs = inputs(self.tokens.layout(), observation)?;
+        let inputs = inputs(self.tokens.layout(), &self.tokens.look(observation, None)?)?;
         let start = start.map(|start| with_values(start, <[f32]>::to_vec)).transpose()?;
         let packed = self.workspaces.packed(self.params());
         self.workspaces.with(|space| {
@@ -284,7 +285,7 @@ impl Actrm {
     fn think_with<'m, R: Recursion<'m>>(
         &'m self,
         pass: &mut Pass<'_>,
-        (inputs, rows): (&[Vec<f32>], usize),
+        (inputs, rows): (&Inputs, usize),
         start: Option<Vec<f32>>,
         on_step: &mut dyn FnMut(Tensor, Vec<f32>) -> Result<bool>,
     ) -> Result<Tensor> {

@@ -2,7 +2,7 @@
 use super::*;
 use crate::features::Signature;
 use crate::fused::testing::{
-    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients,
+    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
 use crate::layers::Activation;
@@ -11,7 +11,7 @@ use crate::simd::{Level, at_most};
 
 /// Odd sizes in both designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
 fn configs() -> Vec<(Config, Signature, usize)> {
-    let Signatures { plain, no_env, entities, history } = signatures();
+    let Signatures { plain, no_env, entities, history, .. } = signatures();
     let base = Config {
         action_horizon: 5,
         dim_model: 12,
@@ -74,9 +74,18 @@ fn model(config: &Config, signature: &Signature) -> Actrm {
     model
 }
 
+/// With pictures, in both designs; their network has too many kinks for slopes.
+fn seeing() -> Vec<(Config, Signature, usize)> {
+    let all = configs();
+    let of = |over: Over| all.iter().find(|(config, ..)| config.reasoning.over == over && config.use_vae);
+    let designs = [Over::Actions, Over::Memory].into_iter().filter_map(of);
+    designs.map(|(config, ..)| (Config { vision: Some(eyes()), ..config.clone() }, signatures().pictures, 2)).collect()
+}
+
 #[test]
 fn the_fused_step_is_the_composed_one_with_dropout() {
-    for (config, signature, rows) in configs() {
+    assert_eq!(seeing().len(), 2);
+    for (config, signature, rows) in configs().into_iter().chain(seeing()) {
         let model = model(&config, &signature);
         for seed in [3, 4] {
             let batch = batch(&signature, config.action_horizon, rows, seed);
@@ -87,7 +96,7 @@ fn the_fused_step_is_the_composed_one_with_dropout() {
 
 #[test]
 fn the_fused_thought_is_the_composed_one() {
-    for (mut config, signature, rows) in configs() {
+    for (mut config, signature, rows) in configs().into_iter().chain(seeing()) {
         config.reasoning.max_steps = Some(4);
         config.reasoning.change_threshold = 0.05;
         let model = model(&config, &signature);

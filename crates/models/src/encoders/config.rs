@@ -1,0 +1,165 @@
+//! `[policy.vision]`: how pictures are seen.
+
+use super::ResNetShape;
+use crate::error::{ModelError, Result};
+use serde::{Deserialize, Serialize};
+
+/// Blocks of the network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "snake_case")]
+pub enum Architecture {
+    /// 2, 2, 2, 2
+    #[default]
+    Resnet18,
+    /// 3, 4, 6, 3
+    Resnet34,
+}
+
+/// What follows a convolution.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "snake_case")]
+pub enum ImageNorm {
+    /// GroupNorm: for networks that begin with random weights
+    #[default]
+    Group,
+    /// batch norm whose statistics stay as they came with the weights; normalises nothing without any
+    Frozen,
+}
+
+/// What pictures are normalised by, after division by 255.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "snake_case")]
+pub enum Normalisation {
+    /// mean and standard deviation of ImageNet's pictures, a channel
+    #[default]
+    Imagenet,
+    /// those of the data set
+    Dataset,
+    /// nothing: 0 to 1
+    Unit,
+}
+
+/// What becomes of a feature map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "snake_case")]
+pub enum TokenKind {
+    /// a token a cell, with fixed positions
+    #[default]
+    Map,
+    /// one token a camera: where so many keypoints are
+    Keypoints {
+        /// keypoints
+        count: usize,
+    },
+}
+
+/// Options of an image encoder.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct VisionConfig {
+    /// the network
+    pub encoder: Architecture,
+    /// channels of its first layer
+    pub width: usize,
+    /// what follows its convolutions
+    pub norm: ImageNorm,
+    /// what becomes of its feature map
+    pub tokens: TokenKind,
+    /// side of the square that is cut out of a picture: at random in training, from the middle otherwise
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub crop: Option<usize>,
+    /// pixels by which a picture is moved at random in training, its border repeated
+    pub shift: usize,
+    /// how far brightness, contrast and saturation are changed at random in training: factors from 1 - jitter to 1 + jitter
+    pub jitter: f64,
+    /// what pictures are normalised by
+    pub normalise: Normalisation,
+    /// file of torchvision's weights to begin with
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub weights: Option<String>,
+    /// learning rate of the network relative to the rest; absent: 1, or 0.1 with weights
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lr_backbone: Option<f64>,
+}
+
+impl Default for VisionConfig {
+    fn default() -> Self {
+        Self {
+            encoder: Architecture::Resnet18,
+            width: 16,
+            norm: ImageNorm::Group,
+            tokens: TokenKind::Map,
+            crop: None,
+            shift: 0,
+            jitter: 0.0,
+            normalise: Normalisation::Imagenet,
+            weights: None,
+            lr_backbone: None,
+        }
+    }
+}
+
+impl VisionConfig {
+    /// Checks that an encoder with this configuration can exist.
+    ///
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub fn validate(&self) -> Result<()> {
+        let refuse = |field: &'static str, found: String, expected: &str| {
+            Err(ModelError::Config { model: "vision", field, found, expected: expected.to_string() })
+        };
+        // narrower ones are for tests and imported files
+        if self.width == 0 || self.width > 512 || !self.width.is_multiple_of(4) {
+            return refuse("width", self.width.to_string(), "16, 32 or 64 (any multiple of 4 up to 512)");
+        }
+        if self.norm == ImageNorm::Group && self.width > 16 && !self.width.is_multiple_of(16) {
+            return refuse("width", self.width.to_string(), "a multiple of 16 with norm = \"group\"");
+        }
+        if let TokenKind::Keypoints { count: 0 } = self.tokens {
+            return refuse("tokens.keypoints.count", "0".to_string(), "at least 1");
+        }
+        if self.crop == Some(0) {
+            return refuse("crop", "0".to_string(), "a side of at least 1, or nothing");
+        }
+        if !(0.0..1.0).contains(&self.jitter) {
+            return refuse("jitter", self.jitter.to_string(), "at least 0 and below 1");
+        }
+        if let Some(lr) = self.lr_backbone
+            && !(lr.is_finite() && lr >= 0.0)
+        {
+            return refuse("lr_backbone", lr.to_string(), "a share of the learning rate, 0 or more");
+        }
+        Ok(())
+    }
+
+    /// The network it describes.
+    pub fn shape(&self) -> ResNetShape {
+        let blocks = match self.encoder {
+            Architecture::Resnet18 => [2, 2, 2, 2],
+            Architecture::Resnet34 => [3, 4, 6, 3],
+        };
+        ResNetShape { blocks, width: self.width, norm: self.norm }
+    }
+
+    /// Size of what the network sees of a picture.
+    ///
+    /// # Errors
+    /// A crop that is larger than the picture.
+    pub fn seen(&self, (h, w): (usize, usize)) -> Result<(usize, usize)> {
+        match self.crop {
+            None => Ok((h, w)),
+            Some(side) if side <= h.min(w) => Ok((side, side)),
+            Some(side) => Err(ModelError::Config {
+                model: "vision",
+                field: "crop",
+                found: side.to_string(),
+                expected: format!("at most the picture's side, {}", h.min(w)),
+            }),
+        }
+    }
+
+    /// Learning rate of the backbone as a share of the rest's.
+    pub fn backbone_rate(&self) -> f64 {
+        self.lr_backbone.unwrap_or(if self.weights.is_some() { 0.1 } else { 1.0 })
+    }
+}

@@ -1,0 +1,206 @@
+//! From bytes to what the network reads: a part of the picture, its colours changed a little in training, normalised.
+
+use super::config::{Normalisation, VisionConfig};
+use super::{ImageEncoder, Size};
+use crate::error::{ModelError, Result};
+use crate::rng::Rng;
+use candle_core::{DType, Device, Tensor};
+
+/// ImageNet's mean and standard deviation of red, green and blue, of numbers from 0 to 1.
+const IMAGENET: ([f32; 3], [f32; 3]) = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]);
+/// Added to standard deviations, LeRobot's.
+const EPS: f32 = 1e-8;
+
+/// What pictures are normalised by before anything else is known: mean and standard deviation.
+pub(crate) fn statistics(normalise: Normalisation) -> ([f32; 3], [f32; 3]) {
+    match normalise {
+        Normalisation::Imagenet | Normalisation::Dataset => IMAGENET,
+        Normalisation::Unit => ([0.0; 3], [1.0; 3]),
+    }
+}
+
+/// How one picture is looked at.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Look {
+    /// row of the picture that becomes the first; may lie outside
+    pub top: isize,
+    /// column of the picture that becomes the first; may lie outside
+    pub left: isize,
+    /// factors of brightness, contrast and saturation
+    pub colour: [f32; 3],
+}
+
+impl Look {
+    /// The middle of the picture, as it is.
+    pub fn centre((h, w): Size, (seen_h, seen_w): Size) -> Self {
+        Self { top: ((h - seen_h) / 2) as isize, left: ((w - seen_w) / 2) as isize, colour: [1.0; 3] }
+    }
+
+    /// A random part of the picture in random colours.
+    pub fn draw(config: &VisionConfig, (h, w): Size, (seen_h, seen_w): Size, rng: &mut Rng) -> Self {
+        let mut place = |room: usize| match room + 2 * config.shift {
+            0 => 0,
+            all => rng.below(all as u64 + 1) as isize - config.shift as isize,
+        };
+        let (top, left) = (place(h - seen_h), place(w - seen_w));
+        let mut factor = || match config.jitter {
+            0.0 => 1.0,
+            jitter => 1.0 + (2.0 * rng.uniform() - 1.0) * jitter as f32,
+        };
+        Self { top, left, colour: [factor(), factor(), factor()] }
+    }
+
+    /// Whether training looks differently each time.
+    pub fn is_random(config: &VisionConfig) -> bool {
+        config.crop.is_some() || config.shift > 0 || config.jitter > 0.0
+    }
+
+    /// picture: (h, w, 3) -> out: (seen_h, seen_w, 3), normalised. Beyond the picture its border is repeated.
+    pub fn take(
+        &self,
+        picture: &[u8],
+        (h, w): Size,
+        (_, seen_w): Size,
+        (mean, std): ([f32; 3], [f32; 3]),
+        out: &mut [f32],
+    ) {
+        let plain = self.colour == [1.0; 3];
+        // all values that a byte can have
+        let table: Vec<[f32; 3]> = (0..256u16)
+            .map(|x| {
+                let x = f32::from(x) / 255.0;
+                if plain { std::array::from_fn(|c| (x - mean[c]) / (std[c] + EPS)) } else { [x; 3] }
+            })
+            .collect();
+        for (y, line) in out.chunks_exact_mut(seen_w * 3).enumerate() {
+            let row = (self.top + y as isize).clamp(0, h as isize - 1) as usize;
+            let row = &picture[row * w * 3..(row + 1) * w * 3];
+            for (x, pixel) in line.chunks_exact_mut(3).enumerate() {
+                let column = (self.left + x as isize).clamp(0, w as isize - 1) as usize;
+                for c in 0..3 {
+                    pixel[c] = table[usize::from(row[column * 3 + c])][c];
+                }
+            }
+        }
+        if !plain {
+            self.recolour(out);
+            for pixel in out.chunks_exact_mut(3) {
+                for c in 0..3 {
+                    pixel[c] = (pixel[c] - mean[c]) / (std[c] + EPS);
+                }
+            }
+        }
+    }
+
+    /// Brightness, contrast, saturation, in this order and as torchvision defines them; numbers from 0 to 1.
+    fn recolour(&self, x: &mut [f32]) {
+        let [brightness, contrast, saturation] = self.colour;
+        let grey = |p: &[f32]| 0.299 * p[0] + 0.587 * p[1] + 0.114 * p[2];
+        x.iter_mut().for_each(|x| *x = (*x * brightness).clamp(0.0, 1.0));
+        let pixels = (x.len() / 3).max(1) as f64;
+        let mean = (x.chunks_exact(3).map(|p| f64::from(grey(p))).sum::<f64>() / pixels) as f32;
+        for pixel in x.chunks_exact_mut(3) {
+            pixel.iter_mut().for_each(|x| *x = (mean + contrast * (*x - mean)).clamp(0.0, 1.0));
+            let grey = grey(pixel);
+            pixel.iter_mut().for_each(|x| *x = (grey + saturation * (*x - grey)).clamp(0.0, 1.0));
+        }
+    }
+}
+
+impl ImageEncoder {
+    /// What the network reads of one camera's pictures, (b, H, W, 3) of bytes: random parts drawn from `rng`, or without
+    /// it their middle -> (b, H', W', 3).
+    ///
+    /// # Errors
+    /// Another size of picture, or no bytes.
+    pub fn look(&self, camera: usize, pictures: &Tensor, rng: Option<&mut Rng>) -> Result<Tensor> {
+        let (size, seen) = (self.given[camera], self.sizes[camera]);
+        let rows = pictures.dims().first().copied().unwrap_or(0);
+        if pictures.dims() != [rows, size.0, size.1, 3] {
+            let (expected, found) = (vec![rows, size.0, size.1, 3], pictures.dims().to_vec());
+            return Err(ModelError::Shape { operation: "see", object: "picture", expected, found });
+        }
+        if pictures.dtype() != DType::U8 {
+            let (found, expected) = (format!("{:?}", pictures.dtype()), "bytes".to_string());
+            return Err(ModelError::Input { operation: "see", object: "picture", found, expected });
+        }
+        let bytes = pictures.contiguous()?;
+        let (storage, layout) = bytes.storage_and_layout();
+        let candle_core::Storage::Cpu(storage) = &*storage else {
+            let (found, expected) = ("on another device".to_string(), "on the CPU".to_string());
+            return Err(ModelError::Input { operation: "see", object: "picture", found, expected });
+        };
+        let from = layout.start_offset();
+        let bytes = &storage.as_slice::<u8>()?[from..from + layout.shape().elem_count()];
+        let row_of = |t: &Tensor| -> Result<[f32; 3]> {
+            let row = t.get(camera)?.to_vec1::<f32>()?;
+            Ok([row[0], row[1], row[2]])
+        };
+        let of_camera = (row_of(&self.mean)?, row_of(&self.std)?);
+        let mut rng = rng.filter(|_| Look::is_random(&self.config));
+        let mut out = vec![0.0; rows * seen.0 * seen.1 * 3];
+        for (picture, out) in bytes.chunks_exact(size.0 * size.1 * 3).zip(out.chunks_exact_mut(seen.0 * seen.1 * 3)) {
+            let look = match &mut rng {
+                Some(rng) => Look::draw(&self.config, size, seen, rng),
+                None => Look::centre(size, seen),
+            };
+            look.take(picture, size, seen, of_camera, out);
+        }
+        Ok(Tensor::from_vec(out, (rows, seen.0, seen.1, 3), &Device::Cpu)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn picture((h, w): Size) -> Vec<u8> {
+        (0..h * w * 3).map(|i| (i * 7 % 251) as u8).collect()
+    }
+
+    #[test]
+    fn the_middle_is_robomimics_and_normalised_as_lerobot_does() {
+        let (size, seen) = ((84, 84), (76, 76));
+        let look = Look::centre(size, seen);
+        assert_eq!((look.top, look.left), (4, 4));
+        let bytes = picture(size);
+        let mut out = vec![0.0; 76 * 76 * 3];
+        look.take(&bytes, size, seen, IMAGENET, &mut out);
+        let x = f32::from(bytes[((4 + 10) * 84 + 4 + 20) * 3 + 1]) / 255.0;
+        assert_eq!(out[(10 * 76 + 20) * 3 + 1], (x - 0.456) / (0.224 + 1e-8));
+    }
+
+    #[test]
+    fn random_parts_cover_all_places_and_repeat_with_the_seed() {
+        let config = VisionConfig { crop: Some(6), shift: 1, jitter: 0.2, ..VisionConfig::default() };
+        let draw = |seed| {
+            let mut rng = Rng::new(seed, "look");
+            (0..500).map(|_| Look::draw(&config, (8, 9), (6, 6), &mut rng)).collect::<Vec<_>>()
+        };
+        let looks = draw(1);
+        assert_eq!(looks, draw(1));
+        assert_ne!(looks, draw(2));
+        let (tops, lefts): (Vec<isize>, Vec<isize>) = looks.iter().map(|l| (l.top, l.left)).unzip();
+        assert_eq!((tops.iter().min(), tops.iter().max()), (Some(&-1), Some(&3)));
+        assert_eq!((lefts.iter().min(), lefts.iter().max()), (Some(&-1), Some(&4)));
+        assert!(looks.iter().flat_map(|l| l.colour).all(|f| (0.8..=1.2).contains(&f)));
+        // the border is repeated
+        let (bytes, mut out) = (picture((8, 9)), vec![0.0; 36 * 3]);
+        let look = Look { top: -1, left: 0, colour: [1.0; 3] };
+        look.take(&bytes, (8, 9), (6, 6), ([0.0; 3], [1.0; 3]), &mut out);
+        assert_eq!(out[..18], out[18..36]);
+    }
+
+    #[test]
+    fn colours_change_and_stay_colours() {
+        let mut x = vec![0.2, 0.5, 0.9, 0.0, 1.0, 0.3];
+        let grey = |p: &[f32]| 0.299 * p[0] + 0.587 * p[1] + 0.114 * p[2];
+        Look { top: 0, left: 0, colour: [1.0, 1.0, 0.0] }.recolour(&mut x);
+        let expected = [grey(&[0.2, 0.5, 0.9]); 3];
+        assert!(x[..3].iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{x:?}");
+        let mut x = vec![0.2, 0.5, 0.9];
+        Look { top: 0, left: 0, colour: [2.0, 1.0, 1.0] }.recolour(&mut x);
+        assert!(x.iter().zip([0.4, 1.0, 1.0]).all(|(a, b)| (a - b).abs() < 1e-6), "{x:?}");
+    }
+}

@@ -1,0 +1,237 @@
+//! From a picture to tokens: what ACT and its relatives see with.
+//!
+//! An encoder reads pictures that are normalised already, (b, H, W, 3), and gives every camera either one token a cell of
+//! its feature map (ACT, LeRobot) or one token of keypoints. All cameras go through the same network. Convolutions and
+//! their tensors are torchvision's and LeRobot's by name and order. This is the readable form on candle's autograd;
+//! `fused/vision.rs` runs the same maths on slices.
+
+mod config;
+mod look;
+mod position;
+mod resnet;
+mod spatial_softmax;
+
+pub use config::{Architecture, ImageNorm, Normalisation, TokenKind, VisionConfig};
+pub use look::Look;
+pub use position::position_table;
+pub(crate) use resnet::EPS;
+pub use resnet::{ResNet, ResNetShape};
+pub use spatial_softmax::SpatialSoftmax;
+
+use crate::error::{ModelError, Result, some_names};
+use crate::layers::Linear;
+use crate::params::{Init, Params};
+use crate::rng::Rng;
+use candle_core::{DType, Device, Tensor};
+use std::collections::BTreeMap;
+
+/// Prefix of the backbone's tensors, LeRobot's.
+pub const BACKBONE: &str = "backbone";
+/// Prefix of the layer between feature map and tokens, LeRobot's.
+pub const PROJECTION: &str = "encoder_img_feat_input_proj";
+/// Prefix of the layer that chooses keypoints.
+pub const KEYPOINTS: &str = "encoder_img_keypoints";
+/// Prefix of the layer between keypoints and token.
+pub const KEYPOINT_PROJECTION: &str = "encoder_img_keypoint_input_proj";
+/// Mean of the pictures of each camera, (cameras, 3), on the scale from 0 to 1: a buffer.
+pub const PICTURE_MEAN: &str = "encoder_img_mean";
+/// Standard deviation of the same.
+pub const PICTURE_STD: &str = "encoder_img_std";
+/// Name of the positions of keypoint tokens, one a camera.
+pub const CAMERA_EMBED: &str = "encoder_img_camera_embed";
+
+/// Height and width of a picture as the network gets it.
+pub type Size = (usize, usize);
+
+/// What is made of a feature map.
+#[derive(Debug)]
+enum Head {
+    /// a dense layer for every cell
+    Map { weight: Tensor, bias: Tensor, tables: Vec<Tensor> },
+    /// where each keypoint is
+    Keypoints { softmax: SpatialSoftmax, project: Linear, embed: Tensor },
+}
+
+/// Backbone and tokens of all cameras.
+#[derive(Debug)]
+pub struct ImageEncoder {
+    config: VisionConfig,
+    backbone: ResNet,
+    head: Head,
+    /// of the cameras' pictures
+    given: Vec<Size>,
+    /// of what is seen of them
+    sizes: Vec<Size>,
+    /// (cameras, 3)
+    mean: Tensor,
+    std: Tensor,
+}
+
+impl ImageEncoder {
+    /// For cameras whose pictures have these sizes, in order, and tokens of width `dim`.
+    ///
+    /// # Errors
+    /// A configuration or a size that describes no possible network.
+    pub fn new(params: &mut Params, config: &VisionConfig, given: &[Size], dim: usize, rng: &mut Rng) -> Result<Self> {
+        config.validate()?;
+        if given.is_empty() || given.iter().any(|&(h, w)| h == 0 || w == 0) {
+            let expected = "one size a camera, at least 1 x 1".to_string();
+            return Err(ModelError::Config {
+                model: "vision",
+                field: "cameras",
+                found: format!("{given:?}"),
+                expected,
+            });
+        }
+        let sizes = given.iter().map(|&size| config.seen(size)).collect::<Result<Vec<_>>>()?;
+        let (mean, std) = look::statistics(config.normalise);
+        let mut buffer = |name: &str, values: [f32; 3]| {
+            let values = Tensor::from_vec(values.repeat(given.len()), (given.len(), 3), &Device::Cpu)?;
+            params.insert_buffer(name, values)
+        };
+        let (mean, std) = (buffer(PICTURE_MEAN, mean)?, buffer(PICTURE_STD, std)?);
+        let shape = config.shape();
+        let backbone = ResNet::new(params, &format!("{BACKBONE}."), &shape, rng)?;
+        let channels = shape.channels_out();
+        let head = match config.tokens {
+            TokenKind::Map => {
+                if !dim.is_multiple_of(4) {
+                    let expected = "a multiple of 4, for positions in two dimensions".to_string();
+                    let found = dim.to_string();
+                    return Err(ModelError::Config { model: "vision", field: "dim_model", found, expected });
+                }
+                let bound = 1.0 / (channels as f64).sqrt();
+                let uniform = Init::Uniform { bound };
+                let weight = params.create(&format!("{PROJECTION}.weight"), &[dim, channels, 1, 1], uniform, rng)?;
+                let bias = params.create(&format!("{PROJECTION}.bias"), &[dim], uniform, rng)?;
+                let table = |&size: &Size| {
+                    let (h, w) = shape.map_size(size);
+                    Ok(Tensor::from_vec(position_table(dim, (h, w)), (h * w, dim), &Device::Cpu)?)
+                };
+                Head::Map { weight, bias, tables: sizes.iter().map(table).collect::<Result<_>>()? }
+            }
+            TokenKind::Keypoints { count } => Head::Keypoints {
+                softmax: SpatialSoftmax::new(params, KEYPOINTS, channels, count, rng)?,
+                project: Linear::new(params, KEYPOINT_PROJECTION, 2 * count, dim, rng)?,
+                embed: params.create(
+                    &format!("{CAMERA_EMBED}.weight"),
+                    &[sizes.len(), dim],
+                    Init::Normal { std: 1.0 },
+                    rng,
+                )?,
+            },
+        };
+        params.set_rate(&format!("{BACKBONE}."), config.backbone_rate());
+        Ok(Self { config: config.clone(), backbone, head, given: given.to_vec(), sizes, mean, std })
+    }
+
+    /// The network in front of the tokens.
+    pub fn backbone(&self) -> &ResNet {
+        &self.backbone
+    }
+
+    /// Sizes of what is seen of the cameras' pictures.
+    pub fn sizes(&self) -> &[Size] {
+        &self.sizes
+    }
+
+    /// Sets what the pictures of each camera are normalised by, on the scale from 0 to 1.
+    ///
+    /// # Errors
+    /// Another number of cameras, or parameters without cameras.
+    pub fn set_statistics(params: &Params, mean: &[[f32; 3]], std: &[[f32; 3]]) -> Result<()> {
+        for (name, rows) in [(PICTURE_MEAN, mean), (PICTURE_STD, std)] {
+            let values = Tensor::from_vec(rows.concat(), (rows.len(), 3), &Device::Cpu)?;
+            params.set_buffer(name, &values)?;
+        }
+        params.changed();
+        Ok(())
+    }
+
+    /// Takes the backbone's weights from `tensors` under torchvision's names; what a classifier has besides is left alone.
+    /// A GroupNorm keeps its own weights: those of a batch norm mean something else.
+    ///
+    /// # Errors
+    /// A tensor that is missing or misshapen.
+    pub fn load_backbone(params: &Params, norm: ImageNorm, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
+        let mut all = params.tensors();
+        let prefix = format!("{BACKBONE}.");
+        for (name, value) in all.iter_mut() {
+            let Some(theirs) = name.strip_prefix(&prefix) else { continue };
+            if norm == ImageNorm::Group && value.dims().len() == 1 {
+                continue;
+            }
+            let given = tensors.get(theirs).ok_or_else(|| ModelError::MissingTensor {
+                name: theirs.to_string(),
+                given: some_names(tensors.keys()),
+            })?;
+            *value = given.clone();
+        }
+        params.load(&all)
+    }
+
+    /// Tokens of each camera.
+    pub fn tokens(&self) -> Vec<usize> {
+        match &self.head {
+            Head::Map { .. } => self
+                .sizes
+                .iter()
+                .map(|&size| {
+                    let (h, w) = self.backbone.shape().map_size(size);
+                    h * w
+                })
+                .collect(),
+            Head::Keypoints { .. } => vec![1; self.sizes.len()],
+        }
+    }
+
+    /// Positions of all tokens: (T, D). Fixed for map tokens, learned for keypoints.
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn positions(&self) -> Result<Tensor> {
+        match &self.head {
+            Head::Map { tables, .. } => Ok(Tensor::cat(tables, 0)?),
+            Head::Keypoints { embed, .. } => Ok(embed.clone()),
+        }
+    }
+
+    /// pictures: one (b, H, W, 3) a camera, normalised -> (b, T, D)
+    ///
+    /// # Errors
+    /// Another number of cameras or another size of picture.
+    pub fn forward(&self, pictures: &[Tensor]) -> Result<Tensor> {
+        self.check(pictures)?;
+        let mut tokens = Vec::with_capacity(pictures.len());
+        for x in pictures {
+            // torch's order: channels before rows
+            let map = self.backbone.forward(&x.to_dtype(DType::F32)?.permute((0, 3, 1, 2))?.contiguous()?)?;
+            tokens.push(match &self.head {
+                Head::Map { weight, bias, .. } => {
+                    let (b, c, h, w) = map.dims4()?;
+                    let rows = map.permute((0, 2, 3, 1))?.reshape((b * h * w, c))?;
+                    let dim = weight.dim(0)?;
+                    rows.matmul(&weight.reshape((dim, c))?.t()?)?.broadcast_add(bias)?.reshape((b, h * w, dim))?
+                }
+                Head::Keypoints { softmax, project, .. } => project.forward(&softmax.forward(&map)?)?.unsqueeze(1)?,
+            });
+        }
+        Ok(Tensor::cat(&tokens, 1)?)
+    }
+
+    /// Checks number and sizes of the pictures.
+    pub(crate) fn check(&self, pictures: &[Tensor]) -> Result<()> {
+        if pictures.len() != self.sizes.len() {
+            let (found, expected) = (pictures.len().to_string(), self.sizes.len().to_string());
+            return Err(ModelError::Input { operation: "see", object: "number of cameras", found, expected });
+        }
+        let b = pictures.first().map_or(Ok(0), |x| x.dim(0))?;
+        for (x, &(h, w)) in pictures.iter().zip(&self.sizes) {
+            if x.dims() != [b, h, w, 3] {
+                let (expected, found) = (vec![b, h, w, 3], x.dims().to_vec());
+                return Err(ModelError::Shape { operation: "see", object: "picture", expected, found });
+            }
+        }
+        Ok(())
+    }
+}

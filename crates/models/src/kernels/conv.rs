@@ -1,0 +1,540 @@
+//! Convolutions as products over windows, without copies of the windows.
+//!
+//! Pictures lie pixel after pixel with all channels of a pixel side by side, in a frame of zeros as wide as the padding.
+//! A window is then a few stretches of memory that follow each other at equal distances, and a product can read the
+//! stretches of a dozen windows where they are. Forward pass, gradient of the input and gradient of the weights are all
+//! such products. Sums run in an order that depends on the sizes alone.
+
+use crate::simd::dispatch;
+use pulp::{Simd, WithSimd};
+
+/// Numbers behind a picture that may be read and are not used.
+pub(crate) const TAIL: usize = 64;
+/// Windows of a block: what it reads stays in the second-level cache while all outputs are made of it.
+const BLOCK: usize = 240;
+
+/// Pictures in frames of zeros.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Frame {
+    pub(crate) pictures: usize,
+    pub(crate) height: usize,
+    pub(crate) width: usize,
+    pub(crate) channels: usize,
+    /// zeros on every side
+    pub(crate) border: usize,
+}
+
+impl Frame {
+    /// Numbers of a row with its borders.
+    pub(crate) fn row(&self) -> usize {
+        (self.width + 2 * self.border) * self.channels
+    }
+
+    /// Numbers of a picture with its borders.
+    pub(crate) fn picture(&self) -> usize {
+        (self.height + 2 * self.border) * self.row()
+    }
+
+    /// Numbers of all pictures, and some that are never used.
+    pub(crate) fn len(&self) -> usize {
+        self.pictures * self.picture() + TAIL
+    }
+
+    /// Numbers of all pictures without borders.
+    pub(crate) fn inside(&self) -> usize {
+        self.pixels() * self.channels
+    }
+
+    /// Pixels of all pictures.
+    pub(crate) fn pixels(&self) -> usize {
+        self.pictures * self.height * self.width
+    }
+
+    /// Where row `y` of picture `n` begins inside the border.
+    #[inline(always)]
+    pub(crate) fn at(&self, n: usize, y: usize) -> usize {
+        n * self.picture() + (y + self.border) * self.row() + self.border * self.channels
+    }
+
+    /// Writes the zeros of the border and of the tail.
+    pub(crate) fn clear_border(&self, x: &mut [f32]) {
+        let (row, side) = (self.row(), self.border * self.channels);
+        let end = self.pictures * self.picture();
+        for picture in x[..end].chunks_exact_mut(self.picture().max(1)) {
+            picture[..self.border * row].fill(0.0);
+            let below = (self.border + self.height) * row;
+            picture[below..].fill(0.0);
+            for line in picture[self.border * row..below].chunks_exact_mut(row) {
+                line[..side].fill(0.0);
+                line[row - side..].fill(0.0);
+            }
+        }
+        x[end..].fill(0.0);
+    }
+}
+
+/// A convolution without bias, padded by half its kernel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Conv {
+    /// what it reads
+    pub(crate) input: Frame,
+    /// channels that it makes
+    pub(crate) output: usize,
+    /// 1, 3 or 7
+    pub(crate) kernel: usize,
+    /// 1 or 2
+    pub(crate) stride: usize,
+}
+
+/// Places of a grid of windows: `start + picture * n + row * y + column * x`.
+#[derive(Debug, Clone, Copy)]
+struct Places {
+    start: usize,
+    picture: usize,
+    row: usize,
+    column: usize,
+}
+
+/// A product over windows: where they are, what they are made of, where results go.
+#[derive(Debug, Clone, Copy)]
+struct Grid {
+    pictures: usize,
+    rows: usize,
+    columns: usize,
+    from: Places,
+    to: Places,
+    /// stretches of a window, how far apart they begin, how long they are
+    stretches: usize,
+    apart: usize,
+    length: usize,
+}
+
+/// Places of a block of windows and of their results.
+type Block = [(usize, usize); BLOCK];
+
+impl Grid {
+    fn windows(&self) -> usize {
+        self.pictures * self.rows * self.columns
+    }
+
+    fn depth(&self) -> usize {
+        self.stretches * self.length
+    }
+
+    /// Fills `block` with the windows from number `first` on; returns how many there are.
+    #[inline(always)]
+    fn block(&self, first: usize, block: &mut Block) -> usize {
+        let count = BLOCK.min(self.windows() - first);
+        let (mut x, rest) = (first % self.columns, first / self.columns);
+        let (mut y, mut n) = (rest % self.rows, rest / self.rows);
+        for place in &mut block[..count] {
+            let at = |p: &Places| p.start + p.picture * n + p.row * y + p.column * x;
+            *place = (at(&self.from), at(&self.to));
+            x += 1;
+            if x == self.columns {
+                (x, y) = (0, y + 1);
+            }
+            if y == self.rows {
+                (y, n) = (0, n + 1);
+            }
+        }
+        count
+    }
+}
+
+impl Conv {
+    fn padding(&self) -> usize {
+        self.kernel / 2
+    }
+
+    /// What it makes, in a frame of `border`.
+    pub(crate) fn made(&self, border: usize) -> Frame {
+        let Frame { pictures, height, width, .. } = self.input;
+        let (height, width) = (height.div_ceil(self.stride), width.div_ceil(self.stride));
+        Frame { pictures, height, width, channels: self.output, border }
+    }
+
+    /// Numbers of its weights.
+    pub(crate) fn weights(&self) -> usize {
+        self.output * self.input.channels * self.kernel * self.kernel
+    }
+
+    /// Windows of the input, results one after the other.
+    fn forward_grid(&self) -> Grid {
+        let (x, made) = (self.input, self.made(0));
+        let c = x.channels;
+        let inset = x.border - self.padding();
+        Grid {
+            pictures: x.pictures,
+            rows: made.height,
+            columns: made.width,
+            from: Places {
+                start: inset * (x.row() + c),
+                picture: x.picture(),
+                row: self.stride * x.row(),
+                column: self.stride * c,
+            },
+            to: Places { start: 0, picture: made.picture(), row: made.row(), column: made.channels },
+            stretches: self.kernel,
+            apart: x.row(),
+            length: self.kernel * c,
+        }
+    }
+
+    /// The input's gradient as products over windows of the output's, which lies in `grad`: with a stride of two, pixels of
+    /// even and odd rows and columns are reached by different weights. With each grid come the kernel's rows and columns that
+    /// meet the window's stretches and pixels, in this order.
+    fn backward_grids(&self, grad: Frame) -> Vec<(Grid, Vec<usize>, Vec<usize>)> {
+        let (x, g) = (self.input, grad);
+        let (pad, s) = (self.padding(), self.stride);
+        // an input row 2 i + parity meets the kernel's rows `ky` of the outputs `first + 0..`
+        let taps = |parity: usize| -> (Vec<usize>, usize) {
+            let taps: Vec<usize> = (0..self.kernel).rev().filter(|ky| (parity + pad + s - ky % s) % s == 0).collect();
+            // the output of the first tap, counted with the border: (parity + pad - ky) / s, which may be negative
+            let first = taps.first().map_or(0, |&ky| g.border * s + parity + pad - ky) / s;
+            (taps, first)
+        };
+        let mut grids = Vec::new();
+        for py in 0..s.min(x.height) {
+            for px in 0..s.min(x.width) {
+                let ((ys, y0), (xs, x0)) = (taps(py), taps(px));
+                if ys.is_empty() || xs.is_empty() {
+                    continue;
+                }
+                let grid = Grid {
+                    pictures: x.pictures,
+                    rows: (x.height - py).div_ceil(s),
+                    columns: (x.width - px).div_ceil(s),
+                    from: Places {
+                        start: y0 * g.row() + x0 * g.channels,
+                        picture: g.picture(),
+                        row: g.row(),
+                        column: g.channels,
+                    },
+                    to: Places {
+                        start: (py * x.width + px) * x.channels,
+                        picture: x.height * x.width * x.channels,
+                        row: s * x.width * x.channels,
+                        column: s * x.channels,
+                    },
+                    stretches: ys.len(),
+                    apart: g.row(),
+                    length: xs.len() * g.channels,
+                };
+                grids.push((grid, ys, xs));
+            }
+        }
+        grids
+    }
+
+    /// Border that the output's gradient needs around it.
+    pub(crate) fn grad_border(&self) -> usize {
+        self.padding().min(1)
+    }
+
+    /// Numbers of the panels of both directions.
+    pub(crate) fn panel_len(&self) -> (usize, usize) {
+        let per = self.kernel * self.kernel;
+        let wide = |n: usize| n.next_multiple_of(panel_width(n));
+        (per * self.input.channels * wide(self.output), per * self.output * wide(self.input.channels))
+    }
+
+    /// w: (O, I, k, k) -> panels of the forward pass
+    pub(crate) fn pack(&self, w: &[f32], panels: &mut [f32]) {
+        let (c, per) = (self.input.channels, self.kernel * self.kernel);
+        let nr = panel_width(self.output);
+        for (j0, panel) in (0..self.output).step_by(nr).zip(panels.chunks_exact_mut(per * c * nr)) {
+            let columns = nr.min(self.output - j0);
+            for i in 0..c {
+                for tap in 0..per {
+                    let line = &mut panel[(tap * c + i) * nr..][..nr];
+                    let from = (j0 * c + i) * per + tap;
+                    for (to, w) in line[..columns].iter_mut().zip(w[from..].iter().step_by(c * per)) {
+                        *to = *w;
+                    }
+                    line[columns..].fill(0.0);
+                }
+            }
+        }
+    }
+
+    /// w: (O, I, k, k) -> panels of the input's gradient, one after the other for each of its grids
+    pub(crate) fn pack_backward(&self, w: &[f32], panels: &mut [f32]) {
+        let (c, o, k) = (self.input.channels, self.output, self.kernel);
+        let nr = panel_width(c);
+        let mut rest = panels;
+        for (grid, ys, xs) in self.backward_grids(self.made(self.grad_border())) {
+            let depth = grid.depth();
+            let (mine, others) = rest.split_at_mut(depth * c.next_multiple_of(nr));
+            rest = others;
+            for (j0, panel) in (0..c).step_by(nr).zip(mine.chunks_exact_mut(depth * nr)) {
+                let columns = nr.min(c - j0);
+                let taps = ys.iter().flat_map(|y| xs.iter().map(move |x| y * k + x));
+                for (tap, lines) in taps.zip(panel.chunks_exact_mut(o * nr)) {
+                    for (from, line) in lines.chunks_exact_mut(nr).enumerate() {
+                        let from = (from * c + j0) * k * k + tap;
+                        for (to, w) in line[..columns].iter_mut().zip(w[from..].iter().step_by(k * k)) {
+                            *to = *w;
+                        }
+                        line[columns..].fill(0.0);
+                    }
+                }
+            }
+        }
+    }
+
+    /// x: the input's frame -> out: (pixels, O)
+    pub(crate) fn forward(&self, x: &[f32], panels: &[f32], out: &mut [f32]) {
+        self.run(self.forward_grid(), x, panels, self.output, false, out);
+    }
+
+    /// grad: the output's gradient in a frame of `grad_border`, `panels` of `pack_backward` -> that of the input, (pixels, I);
+    /// with `add` added to what is there. Pixels that no output sees are written only without `add`.
+    pub(crate) fn backward(&self, grad: &[f32], panels: &[f32], add: bool, out: &mut [f32]) {
+        let grids = self.backward_grids(self.made(self.grad_border()));
+        if !add && grids.len() < self.stride.min(self.input.height) * self.stride.min(self.input.width) {
+            out.fill(0.0);
+        }
+        let c = self.input.channels;
+        let mut rest = panels;
+        for (grid, _, _) in grids {
+            let (mine, others) = rest.split_at(grid.depth() * c.next_multiple_of(panel_width(c)));
+            rest = others;
+            self.run(grid, grad, mine, c, add, out);
+        }
+    }
+
+    fn run(&self, grid: Grid, x: &[f32], panels: &[f32], output: usize, add: bool, out: &mut [f32]) {
+        dispatch(Windows { grid, x, panels, output, add, out });
+    }
+
+    /// x: the input's frame, grad: as in `backward`; adds the gradient of the weights to `into`: (O, I, k, k). `turned` is
+    /// scratch of as many numbers.
+    pub(crate) fn weight_gradient(&self, x: &[f32], grad: &[f32], turned: &mut [f32], into: &mut [f32]) {
+        let mut grid = self.forward_grid();
+        let g = self.made(self.grad_border());
+        grid.to = Places { start: g.at(0, 0), picture: g.picture(), row: g.row(), column: g.channels };
+        turned.fill(0.0);
+        dispatch(WeightGradient { grid, x, grad, output: self.output, into: turned });
+        let (c, per) = (self.input.channels, self.kernel * self.kernel);
+        for (to, from) in into.chunks_exact_mut(c * per).zip(turned.chunks_exact(c * per)) {
+            for (i, to) in to.chunks_exact_mut(per).enumerate() {
+                to.iter_mut().zip(from[i..].iter().step_by(c)).for_each(|(to, x)| *to += x);
+            }
+        }
+    }
+}
+
+/// Columns of a panel for `n` columns in all: one vector if that is enough, else two.
+fn panel_width(n: usize) -> usize {
+    struct Lanes;
+    impl WithSimd for Lanes {
+        type Output = usize;
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, _: S) -> usize {
+            S::F32_LANES
+        }
+    }
+    let lanes = dispatch(Lanes);
+    if n <= lanes { lanes } else { 2 * lanes }
+}
+
+/// `out[to] = sum over the window of x times panels`
+struct Windows<'a> {
+    grid: Grid,
+    x: &'a [f32],
+    panels: &'a [f32],
+    output: usize,
+    add: bool,
+    out: &'a mut [f32],
+}
+
+impl WithSimd for Windows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        // sums fill the registers: 24 of 32, 12 of 16; twelve hide the time of an addition
+        match (S::F32_LANES >= 16, self.output <= S::F32_LANES) {
+            (_, true) => windows::<S, 12, 1>(simd, self),
+            (true, false) => windows::<S, 12, 2>(simd, self),
+            (false, false) => windows::<S, 6, 2>(simd, self),
+        }
+    }
+}
+
+#[inline(always)]
+fn windows<S: Simd, const R: usize, const V: usize>(simd: S, w: Windows<'_>) {
+    let Windows { grid, x, panels, output, add, out } = w;
+    let nr = V * S::F32_LANES;
+    let mut block: Block = [(0, 0); BLOCK];
+    for first in (0..grid.windows()).step_by(BLOCK) {
+        let count = grid.block(first, &mut block);
+        for (j0, panel) in (0..output).step_by(nr).zip(panels.chunks_exact(grid.depth() * nr)) {
+            let columns = nr.min(output - j0);
+            for places in block[..count].chunks(R) {
+                // the last windows of a block may be few
+                match places.len() {
+                    0..=6 if R == 12 => tile::<S, 6, V>(simd, &grid, x, panel, places, (j0, columns), add, out),
+                    _ => tile::<S, R, V>(simd, &grid, x, panel, places, (j0, columns), add, out),
+                }
+            }
+        }
+    }
+}
+
+/// Steps that run without a check between them.
+const STRIDE: usize = 16;
+
+/// Nothing here may panic: sums would have to be in memory at every step, for whoever looks at them then.
+#[allow(clippy::too_many_arguments)] // where from, where to
+#[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
+#[inline(always)]
+fn tile<S: Simd, const R: usize, const V: usize>(
+    simd: S,
+    grid: &Grid,
+    x: &[f32],
+    panel: &[f32],
+    places: &[(usize, usize)],
+    (j0, columns): (usize, usize),
+    add: bool,
+    out: &mut [f32],
+) {
+    let lanes = S::F32_LANES;
+    let mut sums = [[simd.splat_f32s(0.0); V]; R];
+    // beyond the last window it is read again
+    let starts: [usize; R] = std::array::from_fn(|r| places[r.min(places.len() - 1)].0);
+    for (s, part) in panel.chunks_exact(grid.length * V * lanes).enumerate() {
+        let line = |r: usize| x.get(starts[r] + s * grid.apart..).and_then(|line| line.get(..grid.length));
+        let mut lines: [&[f32]; R] = std::array::from_fn(|r| line(r).unwrap_or(&[]));
+        let (part, _) = S::as_simd_f32s(part);
+        let mut columns = part.chunks_exact(V);
+        for _ in 0..grid.length / STRIDE {
+            let steps: [&[f32; STRIDE]; R] = std::array::from_fn(|r| {
+                let (head, tail) = lines[r].split_first_chunk().unwrap_or((&[0.0; STRIDE], &[]));
+                lines[r] = tail;
+                head
+            });
+            for p in 0..STRIDE {
+                let Some(b) = columns.next() else { break };
+                for r in 0..R {
+                    let a = simd.splat_f32s(steps[r][p]);
+                    for v in 0..V {
+                        sums[r][v] = simd.mul_add_e_f32s(a, b[v], sums[r][v]);
+                    }
+                }
+            }
+        }
+        for (p, b) in columns.enumerate() {
+            for r in 0..R {
+                let a = simd.splat_f32s(lines[r].get(p).copied().unwrap_or(0.0));
+                for v in 0..V {
+                    sums[r][v] = simd.mul_add_e_f32s(a, b[v], sums[r][v]);
+                }
+            }
+        }
+    }
+    let mut buffer = [0f32; 64];
+    for (&(_, to), sums) in places.iter().zip(&sums) {
+        let line = &mut out[to + j0..][..columns];
+        if columns == V * lanes {
+            let (line, _) = S::as_mut_simd_f32s(line);
+            for v in 0..V {
+                line[v] = if add { simd.add_f32s(line[v], sums[v]) } else { sums[v] };
+            }
+        } else {
+            let (whole, _) = S::as_mut_simd_f32s(&mut buffer[..V * lanes]);
+            whole.copy_from_slice(sums);
+            for (to, &sum) in line.iter_mut().zip(&buffer) {
+                *to = if add { *to + sum } else { sum };
+            }
+        }
+    }
+}
+
+/// `into[o][depth] += sum over windows of grad[to][o] * x[window][depth]`
+struct WeightGradient<'a> {
+    grid: Grid,
+    x: &'a [f32],
+    grad: &'a [f32],
+    output: usize,
+    into: &'a mut [f32],
+}
+
+impl WithSimd for WeightGradient<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        if S::F32_LANES >= 16 { weights::<S, 8, 3>(simd, self) } else { weights::<S, 4, 3>(simd, self) }
+    }
+}
+
+#[inline(always)]
+fn weights<S: Simd, const R: usize, const V: usize>(simd: S, w: WeightGradient<'_>) {
+    let WeightGradient { grid, x, grad, output, into } = w;
+    let (lanes, depth) = (S::F32_LANES, grid.depth());
+    let wide = V * lanes;
+    let mut block: Block = [(0, 0); BLOCK];
+    for first in (0..grid.windows()).step_by(BLOCK) {
+        let count = grid.block(first, &mut block);
+        for o0 in (0..output).step_by(R) {
+            let channels = R.min(output - o0);
+            for s in 0..grid.stretches {
+                for p0 in (0..grid.length).step_by(wide) {
+                    let at = s * grid.apart + p0;
+                    let sums = match channels == R {
+                        true => weight_tile::<S, R, V>(simd, x, grad, &block[..count], at, o0),
+                        false => {
+                            let mut some = [[simd.splat_f32s(0.0); V]; R];
+                            for (r, sums) in some.iter_mut().enumerate().take(channels) {
+                                [*sums] = weight_tile::<S, 1, V>(simd, x, grad, &block[..count], at, o0 + r);
+                            }
+                            some
+                        }
+                    };
+                    let columns = wide.min(grid.length - p0);
+                    let mut buffer = [0f32; 64];
+                    for (r, sums) in sums.iter().enumerate().take(channels) {
+                        let (whole, _) = S::as_mut_simd_f32s(&mut buffer[..wide]);
+                        whole.copy_from_slice(sums);
+                        let line = &mut into[(o0 + r) * depth + s * grid.length + p0..][..columns];
+                        line.iter_mut().zip(&buffer).for_each(|(to, sum)| *to += sum);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// As in [`tile`] nothing may panic.
+#[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
+#[inline(always)]
+fn weight_tile<S: Simd, const R: usize, const V: usize>(
+    simd: S,
+    x: &[f32],
+    grad: &[f32],
+    places: &[(usize, usize)],
+    at: usize,
+    o0: usize,
+) -> [[S::f32s; V]; R] {
+    let wide = V * S::F32_LANES;
+    let mut sums = [[simd.splat_f32s(0.0); V]; R];
+    for &(from, to) in places {
+        let (b, a) = (x.get(from + at..).and_then(|x| x.get(..wide)), grad.get(to + o0..));
+        let (Some(b), Some(a)) = (b, a.and_then(|a| a.first_chunk::<R>())) else { continue };
+        let (b, _) = S::as_simd_f32s(b);
+        let Some(b) = b.first_chunk::<V>() else { continue };
+        for r in 0..R {
+            let a = simd.splat_f32s(a[r]);
+            for v in 0..V {
+                sums[r][v] = simd.mul_add_e_f32s(a, b[v], sums[r][v]);
+            }
+        }
+    }
+    sums
+}
+
+#[cfg(test)]
+#[path = "conv_tests.rs"]
+mod tests;

@@ -1,0 +1,122 @@
+#![allow(clippy::unwrap_used)]
+use super::*;
+use crate::rng::Rng;
+use crate::simd::{Level, at_most};
+
+/// What a convolution is by its definition, in f64: (n, h, w, c) and (O, I, k, k) -> (n, oh, ow, O).
+fn naive(conv: &Conv, x: &[f32], w: &[f32]) -> Vec<f64> {
+    let (f, made, k) = (conv.input, conv.made(0), conv.kernel);
+    let mut out = vec![0.0; made.inside()];
+    each(conv, |to, from, weight| out[to] += f64::from(x[from]) * f64::from(w[weight]));
+    assert_eq!((f.channels * made.channels * k * k, w.len()), (w.len(), conv.weights()));
+    out
+}
+
+/// Calls `f(output, input, weight)` for every product of the definition.
+fn each(conv: &Conv, mut f: impl FnMut(usize, usize, usize)) {
+    let (x, made, k) = (conv.input, conv.made(0), conv.kernel);
+    for n in 0..x.pictures {
+        for oy in 0..made.height {
+            for ox in 0..made.width {
+                for (ky, kx) in (0..k * k).map(|t| (t / k, t % k)) {
+                    let (y, x0) = (oy * conv.stride + ky, ox * conv.stride + kx);
+                    let pad = k / 2;
+                    if y < pad || x0 < pad || y - pad >= x.height || x0 - pad >= x.width {
+                        continue;
+                    }
+                    let pixel = (n * x.height + y - pad) * x.width + x0 - pad;
+                    for o in 0..conv.output {
+                        for i in 0..x.channels {
+                            let to = ((n * made.height + oy) * made.width + ox) * conv.output + o;
+                            f(to, pixel * x.channels + i, ((o * x.channels + i) * k + ky) * k + kx);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn framed(frame: &Frame, values: &[f32]) -> Vec<f32> {
+    let mut x = vec![f32::NAN; frame.len()];
+    frame.clear_border(&mut x);
+    let row = frame.width * frame.channels;
+    for (r, line) in values.chunks_exact(row).enumerate() {
+        let at = frame.at(r / frame.height, r % frame.height);
+        x[at..at + row].copy_from_slice(line);
+    }
+    x
+}
+
+fn close(got: &[f32], want: &[f64], what: &str) {
+    assert_eq!(got.len(), want.len(), "{what}");
+    let scale = want.iter().fold(1e-3f64, |m, x| m.max(x.abs()));
+    for (i, (g, w)) in got.iter().zip(want).enumerate() {
+        assert!((f64::from(*g) - w).abs() < 1e-5 * scale, "{what} [{i}]: {g} {w}");
+    }
+}
+
+/// Odd and even sizes, channels above and below a vector, pictures smaller than the kernel.
+fn cases() -> Vec<Conv> {
+    let mut all = Vec::new();
+    for (pictures, height, width, channels, output, kernel, stride) in [
+        (2, 9, 7, 3, 5, 7, 2),
+        (1, 12, 12, 3, 16, 7, 2),
+        (3, 5, 6, 4, 7, 3, 1),
+        (2, 5, 6, 16, 16, 3, 1),
+        (2, 6, 5, 16, 33, 3, 2),
+        (1, 1, 1, 5, 4, 3, 2),
+        (1, 2, 1, 17, 48, 3, 1),
+        (2, 7, 4, 19, 9, 1, 2),
+        (1, 3, 3, 8, 70, 1, 1),
+        (1, 18, 17, 2, 40, 3, 2),
+    ] {
+        for border in [kernel / 2, 3] {
+            let input = Frame { pictures, height, width, channels, border };
+            all.push(Conv { input, output, kernel, stride });
+        }
+    }
+    all
+}
+
+#[test]
+fn all_three_products_are_those_of_the_definition() {
+    for conv in cases() {
+        let what = format!("{conv:?}");
+        let mut rng = Rng::new(1, "conv");
+        let (x, w) = (rng.normals(conv.input.inside()), rng.normals(conv.weights()));
+        let grad = rng.normals(conv.made(0).inside());
+        let (mut dx, mut dw) = (vec![0f64; x.len()], vec![0f64; w.len()]);
+        each(&conv, |to, from, weight| {
+            dx[from] += f64::from(grad[to]) * f64::from(w[weight]);
+            dw[weight] += f64::from(grad[to]) * f64::from(x[from]);
+        });
+        for level in Level::ALL {
+            at_most(level, || {
+                let frame = framed(&conv.input, &x);
+                let mut panels = vec![f32::NAN; conv.panel_len().0];
+                conv.pack(&w, &mut panels);
+                let mut out = vec![f32::NAN; conv.made(0).inside()];
+                conv.forward(&frame, &panels, &mut out);
+                close(&out, &naive(&conv, &x, &w), &what);
+
+                let g = framed(&conv.made(conv.grad_border()), &grad);
+                let mut turned = vec![f32::NAN; w.len()];
+                let mut into = vec![0.5; w.len()];
+                conv.weight_gradient(&frame, &g, &mut turned, &mut into);
+                close(&into, &dw.iter().map(|x| x + 0.5).collect::<Vec<_>>(), &what);
+
+                if conv.kernel < 7 {
+                    let mut panels = vec![f32::NAN; conv.panel_len().1];
+                    conv.pack_backward(&w, &mut panels);
+                    let mut got = vec![f32::NAN; x.len()];
+                    conv.backward(&g, &panels, false, &mut got);
+                    close(&got, &dx, &what);
+                    got.fill(2.0);
+                    conv.backward(&g, &panels, true, &mut got);
+                    close(&got, &dx.iter().map(|x| x + 2.0).collect::<Vec<_>>(), &what);
+                }
+            });
+        }
+    }
+}
