@@ -257,6 +257,7 @@ mod tests {
                 n: 1,
                 n_obs_steps: 9,
                 observation: vec![("c0".to_owned(), vec![9.0; 99])],
+                pictures: vec![("old".to_owned(), vec![9; 3])],
                 actions: vec![9.0; 7],
                 is_pad: vec![true; 200],
             };
@@ -271,6 +272,7 @@ mod tests {
             }
             prop_assert_eq!(&batch.actions, &a);
             prop_assert_eq!(&batch.is_pad, &p);
+            prop_assert!(batch.pictures.is_empty());
             prop_assert_eq!(batch.observation.len(), observed.len());
             for (name, column) in &observed {
                 // step k of T is frame t - (T - 1 - k), clamped to the first of the episode
