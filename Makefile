@@ -93,8 +93,8 @@ study-puzzles: build ## the puzzle study, as far as it has not been run (hours),
 MUTATIONS ?= 2000
 SEED ?= 1
 .PHONY: fuzz
-fuzz: .venv/.complete ## damaged HDF5 files through the reader: data or an error, in time (MUTATIONS=2000 SEED=1)
-	@ACTRM_MUTATIONS=$(MUTATIONS) ACTRM_MUTATION_SEED=$(SEED) $(CARGO) test $(CARGO_FLAGS) --workspace --test hostile
+fuzz: .venv/.complete ## damaged HDF5 files and videos through the reader: data or an error, in time (MUTATIONS=2000 SEED=1)
+	@ACTRM_MUTATIONS=$(MUTATIONS) ACTRM_MUTATION_SEED=$(SEED) $(CARGO) test $(CARGO_FLAGS) --workspace --test hostile --test hostile_videos
 
 .PHONY: bench-memory
 bench-memory: build ## memory that converting a 3 GB image file takes (needs 6 GB of disk; target/bench/memory.json)
