@@ -45,14 +45,21 @@ fn observations_are_those_of_robomimics_own_extraction() {
     for id in ["demo_1", "demo_2", "demo_3"] {
         let group = |file: &hdf5::File| file.group(&format!("data/{id}")).expect("the demo is there");
         let (a, b) = (group(&ours), group(&theirs));
-        for key in ["states", "actions", "rewards"] {
-            assert_eq!(numbers(&a, key), numbers(&b, key), "{id} {key}");
+        let members = |demo: &hdf5::Group, name: &str| demo.group(name).expect("there").member_names().expect("listed");
+        for name in ["obs", "next_obs", "action_dict"] {
+            assert_eq!(members(&a, name), members(&b, name), "{id} {name}");
         }
-        for key in a.group("obs").expect("there").member_names().expect("listed") {
+        let parts = members(&b, "action_dict").into_iter().map(|name| format!("action_dict/{name}"));
+        for key in ["states", "actions", "rewards", "dones"].map(str::to_owned).into_iter().chain(parts) {
+            assert_eq!(numbers(&a, &key), numbers(&b, &key), "{id} {key}");
+        }
+        for key in members(&b, "obs") {
             for folder in ["obs", "next_obs"] {
                 let key = format!("{folder}/{key}");
                 let (x, y) = (numbers(&a, &key), numbers(&b, &key));
                 assert_eq!(x.len(), y.len(), "{id} {key}");
+                let kind = |demo: &hdf5::Group| demo.dataset(&key).expect("there").dtype().expect("typed").size();
+                assert_eq!(kind(&a), kind(&b), "{id} {key}");
                 // the same simulator on the same states; another processor may round the last digits otherwise
                 let far = x.iter().zip(&y).map(|(x, y)| (x - y).abs()).fold(0.0, f64::max);
                 assert!(far < 1e-6, "{id} {key}: {far}");

@@ -14,6 +14,9 @@ use serde_json::Value;
 use crate::demo::{Recording, demo};
 use crate::error::{RecordingError, Result};
 
+/// What is looked up in the simulator; all else of a demo, such as `action_dict`, stays as it was recorded.
+const COMPUTED: [&str; 4] = ["obs", "next_obs", "rewards", "dones"];
+
 /// What to extract and where to put it.
 #[derive(Debug, Clone)]
 pub struct ExtractOptions {
@@ -88,7 +91,7 @@ pub fn extract(
             let operation = "reading the recording";
             RolloutError::Policy { seed: job, step: 0, operation, source }
         };
-        let wanted = |key: &str| key == "states" || key == "actions";
+        let wanted = |key: &str| !COMPUTED.iter().any(|name| key == *name || key.starts_with(&format!("{name}/")));
         let recorded = source.read_demo_where(job as usize, &wanted).map_err(|error| failed(error.into()))?;
         let Recording { model, ep_meta, states, actions } =
             Recording::of(&options.raw, &recorded).map_err(|error| failed(error.into()))?;

@@ -215,7 +215,7 @@ impl LeaderboardRow {
     }
 
     /// `lift-act@1 on Lift: 20 of 20 (100.0%, 95% interval 83.9-100.0), mean 44.7 steps to success`, and a line for each
-    /// group of episodes.
+    /// group of episodes; `wrong in 3` where the environment ended episodes with that word.
     pub fn summary(&self) -> String {
         let rate = |counts: &Counts| {
             let (rate, interval) = (counts.rate() * 1e2, counts.interval_text(1, '-'));
@@ -228,10 +228,28 @@ impl LeaderboardRow {
         if self.record().time_decides {
             text.push_str("\n  it thinks by the clock: these episodes may end otherwise next time");
         }
+        let lost = |group: Option<&String>| {
+            let failures = self.failures(group).into_iter();
+            failures.map(|(word, count)| format!(", {word} in {count}")).collect::<String>()
+        };
+        if self.groups.is_empty() {
+            text.push_str(&lost(None));
+        }
         for (group, counts) in &self.groups {
-            text.push_str(&format!("\n  {group}: {}", rate(counts)));
+            text.push_str(&format!("\n  {group}: {}{}", rate(counts), lost(Some(group))));
         }
         text
+    }
+
+    /// How many episodes, of a group or of all, the environment ended with which word.
+    pub fn failures(&self, group: Option<&String>) -> BTreeMap<&str, u64> {
+        let mut counts = BTreeMap::new();
+        for episode in self.evaluation.episodes.iter().filter(|e| group.is_none() || e.group.as_ref() == group) {
+            if let Some(word) = &episode.failure {
+                *counts.entry(word.as_str()).or_default() += 1;
+            }
+        }
+        counts
     }
 
     /// Best first; ties by what does not change.
@@ -333,6 +351,12 @@ mod tests {
         assert_eq!(cells(COLUMNS, [&row]).rows[0][3], "16/20\nseen 12/15\nunseen 4/5");
         assert!(markdown::table(COLUMNS, [&row]).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
         assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\""));
+        assert!(!row.summary().contains(" in "), "{}", row.summary());
+        for (k, episode) in evaluation.episodes.iter_mut().enumerate().filter(|(_, episode)| !episode.success) {
+            episode.failure = Some(if k < 5 { "late" } else { "wrong" }.to_owned());
+        }
+        let summary = LeaderboardRow::new(&evaluation).summary();
+        assert!(summary.contains("late in 1, wrong in 2\n") && summary.ends_with(", wrong in 1"), "{summary}");
     }
 
     #[test]

@@ -58,6 +58,7 @@ pub(crate) fn finished(results: &Path, record: &EvaluationRecord) -> StoredEvalu
             total_reward: if success { 1.0 } else { 0.0 },
             fingerprint: format!("{seed:064x}"),
             group: None,
+            failure: None,
         };
         let timing = EpisodeTiming {
             seed,

@@ -55,6 +55,8 @@ pub struct Outcome {
     pub fingerprint: String,
     /// The group of episodes that this one belongs to, where the task has groups.
     pub group: Option<String>,
+    /// In a word why the episode was lost before the cap, where the environment says so.
+    pub failure: Option<String>,
     /// Time spent waiting for the simulator.
     pub simulator: Duration,
     /// Time of the whole episode.
@@ -128,8 +130,8 @@ impl EpisodePlan {
         if let Some(watch) = &mut watch {
             watch(worker)?;
         }
-        let (mut success, mut steps, mut total_reward) = (false, 0, 0.0);
-        while !success && steps < self.max_steps {
+        let (mut success, mut failure, mut steps, mut total_reward) = (false, None, 0, 0.0);
+        while !success && failure.is_none() && steps < self.max_steps {
             let planned = match watch.is_some() {
                 true => agent.act(&observations).map(|one| vec![one]),
                 false => agent.act_ahead(&observations),
@@ -146,10 +148,10 @@ impl EpisodePlan {
                 simulator += asked.elapsed();
                 steps += stepped.rewards.len();
                 total_reward = stepped.rewards.iter().fold(total_reward, |sum, reward| sum + reward);
-                success = stepped.success;
+                (success, failure) = (stepped.success, stepped.failure);
                 observations = stepped.observations;
             }
-            if let Some(found) = unusable.filter(|_| !success) {
+            if let Some(found) = unusable.filter(|_| !success && failure.is_none()) {
                 let expected = format!("{} finite values", self.action_low.len());
                 return Err(RolloutError::Action { seed, step: steps, expected, found }.into());
             }
@@ -158,7 +160,7 @@ impl EpisodePlan {
             }
         }
         worker.check_quiet()?;
-        Ok(Outcome { success, steps, total_reward, fingerprint, group, simulator, wall: begun.elapsed() })
+        Ok(Outcome { success, steps, total_reward, fingerprint, group, failure, simulator, wall: begun.elapsed() })
     }
 }
 

@@ -161,6 +161,9 @@ pub(crate) enum Reply {
     Step {
         id: u64,
         success: bool,
+        /// In a word why the task can no longer be solved, where the environment says so.
+        #[serde(default)]
+        failure: Option<String>,
     },
     Expert(EpisodeReply),
     Extract(EpisodeReply),

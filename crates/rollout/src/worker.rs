@@ -34,10 +34,12 @@ pub struct Initial {
 /// What control steps did.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stepped {
-    /// The reward of each step that was done; the task done ends them early.
+    /// The reward of each step that was done; the task done or lost ends them early.
     pub rewards: Vec<f64>,
     /// Whether the task is done.
     pub success: bool,
+    /// In a word why it can no longer be done, where the environment says so: the episode is over.
+    pub failure: Option<String>,
     /// What the environment shows after the last of them.
     pub observations: Observations,
 }
@@ -152,7 +154,7 @@ impl Worker {
         }
     }
 
-    /// Runs control steps, one an action, until the task is done: one exchange for all that a policy planned.
+    /// Runs control steps, one an action, until the task is done or lost: one exchange for all that a policy planned.
     ///
     /// # Errors
     /// Any failure of the worker.
@@ -163,21 +165,22 @@ impl Worker {
         let tensors = vec![("action", FrameTensor::from_f64(&shape, &actions.concat()))];
         let (reply, frame) = self.ask(&request, tensors, self.limits.step, 2)?;
         match reply {
-            Reply::Step { success, .. } => {
-                let rewards = self.rewards(&frame, actions.len(), success).map_err(|kind| self.fault("step", kind))?;
+            Reply::Step { success, failure, .. } => {
+                let over = success || failure.is_some();
+                let rewards = self.rewards(&frame, actions.len(), over).map_err(|kind| self.fault("step", kind))?;
                 let observations = self.observations("step", &frame)?;
-                Ok(Stepped { rewards, success, observations })
+                Ok(Stepped { rewards, success, failure, observations })
             }
             other => Err(self.fault("step", unexpected("step", &other))),
         }
     }
 
-    /// The rewards of a step's answer: one for each action, fewer only where the task was done before the last.
-    fn rewards(&self, frame: &Frame, actions: usize, success: bool) -> Result<Vec<f64>, FaultKind> {
+    /// The rewards of a step's answer: one for each action, fewer only where the episode was over before the last.
+    fn rewards(&self, frame: &Frame, actions: usize, over: bool) -> Result<Vec<f64>, FaultKind> {
         let rewards =
             frame.tensor("rewards").and_then(|tensor| tensor.to_f64("rewards")).map_err(FaultKind::Nonsense)?;
         let done = rewards.len();
-        if done == 0 || done > actions || (done < actions && !success) {
+        if done == 0 || done > actions || (done < actions && !over) {
             return Err(FaultKind::Values(format!("rewards: expected {actions} values, found {done}")));
         }
         if let Some(reward) = rewards.iter().find(|reward| !reward.is_finite()) {

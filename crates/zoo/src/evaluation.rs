@@ -178,6 +178,7 @@ pub fn run_episodes(
             total_reward: outcome.total_reward,
             fingerprint: outcome.fingerprint,
             group: outcome.group,
+            failure: outcome.failure,
         };
         let milliseconds = |duration: Duration| (duration.as_secs_f64() * 1e6).round() / 1e3;
         let timing = EpisodeTiming {

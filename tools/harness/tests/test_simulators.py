@@ -79,6 +79,18 @@ def test_env_args_of_the_usual_environment_change_nothing(lift: Client) -> None:
     same.close()
 
 
+def test_parts_that_the_robot_lacks_make_no_difference(lift: Client) -> None:
+    """Robosuite's own recordings list controllers for a left arm, a head and legs."""
+    config = lift.ready["env_args"]["env_kwargs"]["controller_configs"]
+    right = config["body_parts"]["right"]
+    more = {**config, "body_parts": {"right": right, "left": right, "head": {**right, "type": "JOINT_POSITION"}}}
+    client = Client(
+        "--task", "Lift", "--env-args", env_args(robots=["Panda"], controller_configs=more, control_freq=20)
+    )
+    assert client.ready["env_args_sha256"] is None
+    client.close()
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

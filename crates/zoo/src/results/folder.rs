@@ -342,6 +342,7 @@ pub(crate) mod tests {
             total_reward: if success { 1.0 } else { 0.0 },
             fingerprint: format!("{seed:064x}"),
             group: None,
+            failure: None,
         };
         let timing = EpisodeTiming {
             seed,

@@ -227,6 +227,9 @@ pub struct EpisodeRecord {
     /// The group of episodes that this one belongs to, where the task has groups, such as `seen` and `unseen`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub group: Option<String>,
+    /// In a word why it was lost before the cap, where the environment says so, such as `wrong`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
 }
 
 /// How one episode went on the clock, to the microsecond.
@@ -353,7 +356,7 @@ pub(crate) mod tests {
         fn an_episode_survives_the_journal_to_the_last_bit(seed: u64, bits: u64, steps: u32) {
             let total_reward = f64::from_bits(bits);
             prop_assume!(total_reward.is_finite());
-            let record = EpisodeRecord { seed, success: true, steps, total_reward, fingerprint: "ab".into(), group: None };
+            let record = EpisodeRecord { seed, success: true, steps, total_reward, fingerprint: "ab".into(), group: None, failure: None };
             let text = serde_json::to_string(&record).unwrap();
             let back: EpisodeRecord = serde_json::from_str(&text).unwrap();
             prop_assert_eq!(back.total_reward.to_bits(), bits);

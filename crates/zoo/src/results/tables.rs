@@ -109,7 +109,7 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// Writes the outcomes. The column `group` is there only where a task has groups; empty text is none.
+/// Writes the outcomes. The columns `group` and `failure` are there only where a task has them; empty text is none.
 pub(super) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), ZooError> {
     let fingerprints = all.iter().map(|e| &e.fingerprint);
     let mut columns: Vec<(&str, ArrayRef)> = vec![
@@ -119,9 +119,13 @@ pub(super) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), Z
         ("return", Arc::new(Float64Array::from_iter_values(all.iter().map(|e| e.total_reward)))),
         ("fingerprint", Arc::new(StringArray::from_iter_values(fingerprints))),
     ];
-    if all.iter().any(|e| e.group.is_some()) {
-        let groups = all.iter().map(|e| e.group.as_deref().unwrap_or_default());
-        columns.push(("group", Arc::new(StringArray::from_iter_values(groups))));
+    let words: [(&str, fn(&EpisodeRecord) -> Option<&str>); 2] =
+        [("group", |e| e.group.as_deref()), ("failure", |e| e.failure.as_deref())];
+    for (name, word) in words {
+        if all.iter().any(|e| word(e).is_some()) {
+            let texts = all.iter().map(|e| word(e).unwrap_or_default());
+            columns.push((name, Arc::new(StringArray::from_iter_values(texts))));
+        }
     }
     write_table(path, columns)
 }
@@ -135,19 +139,23 @@ pub(super) fn read_episodes(path: &Path) -> Result<Vec<EpisodeRecord>, ZooError>
     let fingerprint = columns.text("fingerprint")?;
     let (steps, returns) = (columns.u32("steps")?, columns.f64("return")?);
     let seeds = columns.u64("seed")?;
-    let groups = match columns.has("group") {
-        true => columns.text("group")?,
-        false => vec![String::new(); seeds.len()],
+    let words = |name: &str| -> Result<Vec<Option<String>>, ZooError> {
+        if !columns.has(name) {
+            return Ok(vec![None; seeds.len()]);
+        }
+        Ok(columns.text(name)?.into_iter().map(|word| Some(word).filter(|word| !word.is_empty())).collect())
     };
-    let rows = seeds.into_iter().zip(success).zip(steps).zip(returns).zip(fingerprint).zip(groups);
+    let words = words("group")?.into_iter().zip(words("failure")?);
+    let rows = seeds.into_iter().zip(success).zip(steps).zip(returns).zip(fingerprint).zip(words);
     Ok(rows
-        .map(|(((((seed, success), steps), total_reward), fingerprint), group)| EpisodeRecord {
+        .map(|(((((seed, success), steps), total_reward), fingerprint), (group, failure))| EpisodeRecord {
             seed,
             success,
             steps,
             total_reward,
             fingerprint,
-            group: Some(group).filter(|group| !group.is_empty()),
+            group,
+            failure,
         })
         .collect())
 }
@@ -208,6 +216,7 @@ mod tests {
                 total_reward: 0.1 * k as f64,
                 fingerprint: format!("{k:064x}"),
                 group: None,
+                failure: None,
             })
             .collect()
     }
@@ -221,6 +230,7 @@ mod tests {
             if count == 3000 {
                 for (k, episode) in all.iter_mut().enumerate() {
                     episode.group = [None, Some("seen".to_owned()), Some("unseen".to_owned())][k % 3].clone();
+                    episode.failure = [None, Some("wrong".to_owned())][k % 2].clone();
                 }
             }
             write_episodes(&a, &all).unwrap();

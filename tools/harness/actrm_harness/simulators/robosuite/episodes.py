@@ -21,13 +21,18 @@ from actrm_harness.wire import Array, Tensors
 # A demonstration ends this many steps after the task is solved, so that its last actions show how to stay there.
 STEPS_AFTER_SUCCESS = 10
 
-# What a demonstration keeps of the observations: sines, cosines and accelerations of joints follow from the rest.
+# What an expert's demonstration leaves out of the observations, because it follows from the rest. Stored states are
+# shown whole, as robomimic shows them.
 LEFT_OUT = ("_joint_pos_cos", "_joint_pos_sin", "_joint_acc", "_eef_quat_site")
+
+# What robosuite computes in single precision, and robomimic stores so.
+SINGLE = ("_eef_quat_site",)
 
 
 class _Recorder:
-    def __init__(self, first: Tensors) -> None:
-        self.observations = [_kept(first)]
+    def __init__(self, first: Tensors, whole: bool) -> None:
+        self.whole = whole
+        self.observations = [self.kept(first)]
         self.states: list[Array] = []
         self.actions: list[Array] = []
         self.rewards: list[float] = []
@@ -38,7 +43,14 @@ class _Recorder:
         self.actions.append(action)
         self.rewards.append(result.reward)
         self.successes.append(result.success)
-        self.observations.append(_kept(result.observation))
+        self.observations.append(self.kept(result.observation))
+
+    def kept(self, observation: Tensors) -> Tensors:
+        if not self.whole:
+            return {name: value for name, value in observation.items() if not name.endswith(LEFT_OUT)}
+        return {
+            name: value.astype(np.float32) if name.endswith(SINGLE) else value for name, value in observation.items()
+        }
 
     def tensors(self) -> Tensors:
         dones = np.array(self.successes, dtype=np.int64)
@@ -56,10 +68,6 @@ class _Recorder:
         return tensors
 
 
-def _kept(observation: Tensors) -> Tensors:
-    return {name: value for name, value in observation.items() if not name.endswith(LEFT_OUT)}
-
-
 def expert_episode(session: Session, seed: int, demonstration: bool = True) -> Episode:
     """One episode of the task's expert; its noise has a generator of its own, drawn from the same seed.
 
@@ -67,7 +75,7 @@ def expert_episode(session: Session, seed: int, demonstration: bool = True) -> E
     """
     env = session.env
     session.foreign_model |= session.xml_forgotten
-    recorder = _Recorder(envs.reset(session, seed, demonstration))
+    recorder = _Recorder(envs.reset(session, seed, demonstration), whole=False)
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
     if session.task.expert is None:
         raise RequestError("no_expert", f"task {session.task.name!r} has no scripted expert")
@@ -111,7 +119,7 @@ def extract(
     if width != expected:
         raise RequestError("bad_request", f"extract: states have {width} values, the model has {expected}")
     env.sim.reset()
-    recorder = _Recorder(_put(session, states[0]))
+    recorder = _Recorder(_put(session, states[0]), whole=True)
     for index in range(steps):
         if index + 1 < steps:
             seen = _put(session, states[index + 1])

@@ -115,7 +115,13 @@ def controllers(config: Any, robot: str) -> Any:
     if isinstance(config, list):
         return [controllers(each, robot) for each in cast("list[Any]", config)]
     factory = importlib.import_module("robosuite.controllers.composite.composite_controller_factory")
-    return factory.refactor_composite_controller_config(config, robot, ["right"])
+    config = dict(factory.refactor_composite_controller_config(config, robot, ["right"]))
+    default = _default_controller(robot)
+    if robot == "Panda" and "body_parts" in config:
+        # robosuite's own recordings list legs, torso and head too, and robosuite passes over what a robot lacks
+        parts = cast("dict[str, Any]", config["body_parts"])
+        config["body_parts"] = {name: part for name, part in parts.items() if name in default["body_parts"]}
+    return config
 
 
 def _default_controller(robot: str) -> dict[str, Any]:
