@@ -75,19 +75,22 @@ fn a_report_is_a_function_of_results() {
 #[test]
 fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
     let reader = ["crates/dataset/src/source/isolation.rs"];
-    for room in ["dataset", "query", "zoo", "study"] {
+    for room in ["dataset", "query", "recording", "video", "zoo", "study"] {
         assert_eq!(said(&format!("crates/{room}/src"), PROCESSES, &reader), [""; 0]);
     }
     assert!(!said("crates/rollout/src", PROCESSES, &[]).is_empty(), "the test finds what it looks for");
-    for tool in ["actrm-data", "actrm-zoo"] {
-        assert_eq!(said(&format!("tools/{tool}/src"), &["Command::new"], &[]), [""; 0]);
+    // what asks in SQL becomes another program, in the same process
+    let becomes = ["tools/actrm-data/src/commands/query.rs"];
+    for tool in ["actrm-data", "actrm-query", "actrm-zoo"] {
+        assert_eq!(said(&format!("tools/{tool}/src"), &["Command::new"], &becomes), [""; 0]);
     }
 }
 
 #[test]
 fn only_tools_print_and_read_arguments() {
-    for room in ["dataset", "query", "rollout", "zoo", "report", "study"] {
-        let reader = ["crates/dataset/src/source/isolation.rs"];
+    for room in ["dataset", "query", "recording", "rollout", "video", "zoo", "report", "study"] {
+        // both speak to the program that started them
+        let reader = ["crates/dataset/src/source/isolation.rs", "crates/dataset/src/source/video.rs"];
         let words: Vec<&str> = [PRINTING, &["env::args"]].concat();
         assert_eq!(said(&format!("crates/{room}/src"), &words, &reader), [""; 0]);
     }
