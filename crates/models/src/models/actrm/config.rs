@@ -205,7 +205,13 @@ impl Config {
         let block = block.size(1, tokens) * self.reasoning.n_layers;
         // the weights are shared by all steps, the last round of each keeps its activations
         let steps = Size { weights: block.weights, ..block * self.reasoning.supervision_steps };
-        self.layers().size() + steps
+        // over actions there is no decoder, over the memory no encoder beside the block
+        let (encoder, decoder) = match self.reasoning.over {
+            Over::Actions => (self.n_memory_layers, 0),
+            Over::Memory => (0, self.n_decoder_layers),
+        };
+        let around = act::Config { n_encoder_layers: encoder, n_decoder_layers: decoder, ..self.layers() };
+        around.size() + steps
     }
 
     /// Hidden width of the shared block's dense part.
