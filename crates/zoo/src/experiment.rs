@@ -464,7 +464,7 @@ mod tests {
         assert!(load(&["data.symmetries.axes=['robot0_eef_pos', 'object']"]).is_ok());
         let message = error("data.symmetries.axes=['robot0_eef_pos', 'cube_rgb']");
         assert!(
-            message.contains("key `data.symmetries.axes`") && message.ends_with("object, found `cube_rgb`"),
+            message.contains("key `data.symmetries.axes`") && message.ends_with("gripper_qpos, found `cube_rgb`"),
             "{message}"
         );
         assert!(error("data.entities.cube=3").contains("a list of observation keys, or a table"));

@@ -284,7 +284,7 @@ mod tests {
         assert_eq!(lines[0], "lift-actrm@1 on Lift, seed 7: success after 3 steps, return 1.00, asked 2 times");
         assert_eq!(lines[2], "  step  thought   change   halt       ms  executed  first action");
         assert_eq!(lines[3], "     0        1        -  0.100    0.250            +0.125 -1.000");
-        assert_eq!(lines[4], "               2   0.0625  0.950    0.250         2  +0.250 -1.000");
+        assert_eq!(lines[4], "              2   0.0625  0.950    0.250         2  +0.250 -1.000");
         assert_eq!(lines[5], "     2        1        -      -    0.250         1  +1.000 -1.000");
     }
 
