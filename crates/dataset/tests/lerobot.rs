@@ -522,7 +522,7 @@ proptest! {
         let set = Dataset::open(&out).unwrap();
         for (name, (numbers, _)) in &masks {
             // demos 0, 2, 4, ... are there, as episodes 0, 1, 2, ...
-            let there = |n: &&usize| **n % 2 == 0 && **n / 2 < count;
+            let there = |n: &&usize| n.is_multiple_of(2) && **n / 2 < count;
             let mut episodes: Vec<usize> = numbers.iter().filter(there).map(|n| n / 2).collect();
             episodes.sort_unstable();
             prop_assert_eq!(set.split(name).unwrap(), &*episodes);

@@ -149,7 +149,7 @@ fn moov(name: &str, bytes: &Bytes) -> Result<Vec<u8>> {
             let found = format!("{size} bytes at byte {at}");
             return Err(bad_box(name, &name_of(kind), format!("{before} bytes or more"), found));
         }
-        let end = at.checked_add(size).unwrap_or(u64::MAX);
+        let end = at.saturating_add(size);
         if end > length {
             let object = format!("box {}", name_of(kind));
             return Err(VideoError::Truncated { name: name.to_owned(), object, expected: end, found: length });

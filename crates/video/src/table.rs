@@ -142,7 +142,7 @@ fn offsets(name: &str, stbl: &[u8], sizes: &[u32], file_bytes: u64) -> Result<Ve
         let left = sizes.len() - offsets.len();
         for _ in 0..(samples as usize).min(left) {
             let number = offsets.len();
-            let end = at.checked_add(u64::from(sizes[number])).unwrap_or(u64::MAX);
+            let end = at.saturating_add(u64::from(sizes[number]));
             if end > file_bytes {
                 return Err(VideoError::Truncated {
                     name: name.to_owned(),
