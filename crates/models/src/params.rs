@@ -231,7 +231,8 @@ impl Params {
             return Err(ModelError::ExtraTensor { name: name.clone(), known });
         }
         for (name, var) in self.all() {
-            var.set(&tensors[name].to_dtype(DType::F32)?.contiguous()?)?;
+            // copied, because a variable cannot be set to itself
+            var.set(&tensors[name].to_dtype(DType::F32)?.copy()?)?;
         }
         self.changed();
         Ok(())

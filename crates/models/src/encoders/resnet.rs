@@ -79,10 +79,19 @@ impl Conv {
         Ok(Self { weight: params.create(&format!("{name}.weight"), &shape, Init::Normal { std }, rng)?, stride })
     }
 
-    /// (b, C, h, w) -> (b, C', h / stride, w / stride)
+    /// (b, C, h, w) -> (b, C', h / stride, w / stride). What no window reaches is cut off first: candle's backward pass wants
+    /// as much left over in width as in height.
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let padding = self.weight.dim(2)? / 2;
-        Ok(x.conv2d(&self.weight, padding, self.stride, 1, 1)?)
+        let kernel = self.weight.dim(2)?;
+        let before = kernel / 2;
+        let mut x = x.clone();
+        for axis in [2, 3] {
+            let size = x.dim(axis)?;
+            let reached = (size.div_ceil(self.stride) - 1) * self.stride + kernel;
+            let after = reached.saturating_sub(before + size);
+            x = x.pad_with_zeros(axis, before, after)?.narrow(axis, 0, reached)?;
+        }
+        Ok(x.contiguous()?.conv2d(&self.weight, 0, self.stride, 1, 1)?)
     }
 }
 
