@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use models::Signature;
 use serde::{Deserialize, Serialize};
 
+use crate::results::Seeds;
 use crate::{FeatureKeys, sha256_hex};
 
 use super::EntryId;
@@ -87,6 +88,9 @@ pub struct DataMeta {
     pub train_frames: u64,
     /// Episodes held out for validation.
     pub valid_episodes: u64,
+    /// The simulator's seeds that the demonstrations were recorded with, where the data set says.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seeds: Option<Seeds>,
 }
 
 /// How an entry was trained.
