@@ -144,7 +144,10 @@ pub fn copied_zoo() -> (TempDir, PathBuf) {
 }
 
 /// Copy a folder with everything in it.
-fn copy(from: &Path, to: &Path) {
+///
+/// # Panics
+/// If that fails.
+pub fn copy(from: &Path, to: &Path) {
     std::fs::create_dir(to).expect("creatable");
     for entry in std::fs::read_dir(from).expect("readable") {
         let entry = entry.expect("readable");

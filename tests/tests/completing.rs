@@ -53,7 +53,7 @@ fn bash_completes_commands_options_and_names() {
     let data_offers = |line: &str| offered(folder, &scripts[1], line);
 
     let commands = zoo_offers("actrm-zoo ");
-    for command in ["train", "runs", "eval", "leaderboard", "list", "show"] {
+    for command in ["train", "runs", "eval", "leaderboard", "list", "show", "verify"] {
         assert!(commands.iter().any(|word| word == command), "{command}: {commands:?}");
         // whatever stands after a command
         let options = zoo_offers(&format!("actrm-zoo {command} --"));

@@ -166,6 +166,10 @@ fn write(
     let env_args = serde_json::to_string_pretty(env_args).expect("JSON is always text");
     writer.set_data_attr("total", &Array::from_i64(Vec::new(), &[total]))?;
     writer.set_data_attr("env_args", &Array::from_str(&env_args))?;
+    // an evaluation of a policy that learned from these must not begin as they did; failed attempts count, too
+    let first_seed = options.seed * CollectOptions::SEED_STRIDE;
+    let last = good.last().map_or(0, |attempt| attempt.index);
+    writer.set_data_attr("seeds", &Array::from_str(&format!("{first_seed}-{}", first_seed + last)))?;
     let (train, valid) = masks(&ids, options.seed);
     writer.set_mask("train", &train)?;
     writer.set_mask("valid", &valid)?;

@@ -27,9 +27,13 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     number(|row: &LeaderboardRow| Some(row.counts.rate()), 4, 4).csv("success_rate"),
     number(|row: &LeaderboardRow| Some(row.counts.interval().0), 4, 4).csv("ci95_low"),
     number(|row: &LeaderboardRow| Some(row.counts.interval().1), 4, 4).csv("ci95_high"),
-    text(|row: &LeaderboardRow| format!("{} [{}]", row.counts.percent(), row.counts.interval_text(0, '-')))
-        .table("rate [95%]")
-        .kept(),
+    text(|row: &LeaderboardRow| {
+        format!("{} [{}]{}", row.counts.percent(), row.counts.interval_text(0, '-'), row.too_few_text())
+    })
+    .table("rate [95%]")
+    .kept(),
+    text(|row: &LeaderboardRow| row.rank.map_or(String::new(), |rank| rank.to_string())).csv("rank").table("rank"),
+    text(|row: &LeaderboardRow| row.rank.map_or(TOO_FEW.to_owned(), |rank| rank.to_string())).page("rank"),
     text(|row: &LeaderboardRow| format!("{:.1}%", row.counts.rate() * 1e2)).page("rate"),
     text(|row: &LeaderboardRow| format!("{}%", row.counts.interval_text(1, '–'))).page("95% interval"),
     number(LeaderboardRow::mean_return, 4, 2).csv("mean_return").table("return").page("return"),
@@ -59,12 +63,17 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     text(|row: &LeaderboardRow| format!("{}\n{} demos", row.record().training.data_set, row.record().training.demos))
         .page("data"),
     text(LeaderboardRow::versions_text).csv("versions"),
-    text(|row: &LeaderboardRow| row.record().seeds.to_string()).csv("seeds").table("seeds"),
+    text(LeaderboardRow::seeds_text).csv("seeds").table("seeds"),
     text(|row: &LeaderboardRow| row.record().training.seed.to_string()).csv("training_seed"),
     text(|row: &LeaderboardRow| row.record().entry.hash.clone()).csv("entry_hash"),
     text(|row: &LeaderboardRow| row.record().training.data_fingerprint.clone()).csv("data_fingerprint"),
     text(LeaderboardRow::groups_text).csv("groups"),
 ];
+
+/// With fewer episodes a row stands last in its protocol and has no rank.
+pub const FEWEST_TO_RANK: u64 = 20;
+
+const TOO_FEW: &str = "too few to rank";
 
 /// One entry's evaluation under one protocol.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,6 +84,9 @@ pub struct LeaderboardRow {
     pub counts: Counts,
     /// The same for each group of episodes, where the task has groups.
     pub groups: BTreeMap<String, Counts>,
+    /// Its place in its task and protocol, by the lower end of the interval; equal counts share one. `None` for a row of
+    /// too few episodes, and for one that was not ranked with others.
+    pub rank: Option<u64>,
     /// Durations of all queries in milliseconds, ascending.
     queries: Vec<f64>,
 }
@@ -140,7 +152,7 @@ impl LeaderboardRow {
         }
         let mut queries: Vec<f64> = evaluation.timings.iter().flat_map(|t| t.inference_ms.iter().copied()).collect();
         queries.sort_by(f64::total_cmp);
-        Self { evaluation: evaluation.clone(), counts, groups, queries }
+        Self { evaluation: evaluation.clone(), counts, groups, rank: None, queries }
     }
 
     /// What the evaluation depended on.
@@ -194,6 +206,21 @@ impl LeaderboardRow {
     pub fn groups_text(&self) -> String {
         let each: Vec<String> = self.groups.iter().map(|(name, counts)| format!("{name} {counts}")).collect();
         each.join(", ")
+    }
+
+    fn too_few(&self) -> bool {
+        self.counts.episodes < FEWEST_TO_RANK
+    }
+
+    /// A second line for a row of too few episodes.
+    fn too_few_text(&self) -> String {
+        if self.too_few() { format!("\n{TOO_FEW}") } else { String::new() }
+    }
+
+    /// `10000-10099`, and whether the entry has seen some of them.
+    fn seeds_text(&self) -> String {
+        let seen = if self.record().demonstrated { " (some demonstrated)" } else { "" };
+        format!("{}{seen}", self.record().seeds)
     }
 
     /// `72/100`, and below it each group's.
@@ -252,14 +279,20 @@ impl LeaderboardRow {
         counts
     }
 
-    /// Best first; ties by what does not change.
+    /// Rows that are ranked against each other agree in this.
+    fn group(&self) -> (String, String) {
+        (self.task().to_owned(), self.record().protocol.id())
+    }
+
+    /// Best first: by what the success rate is at least, so that 1 of 1 does not come before 199 of 200. Too few episodes
+    /// come last; ties by what does not change.
     fn order(&self, other: &Self) -> Ordering {
-        let group = |row: &Self| (row.task().to_owned(), row.record().protocol.id());
-        let share = |one: &Self, two: &Self| u128::from(one.counts.successes) * u128::from(two.counts.episodes.max(1));
         let seeds = |row: &Self| (row.record().seeds.start, row.record().seeds.count);
-        group(self)
-            .cmp(&group(other))
-            .then(share(other, self).cmp(&share(self, other)))
+        let least = |row: &Self| row.counts.interval().0;
+        self.group()
+            .cmp(&other.group())
+            .then(self.too_few().cmp(&other.too_few()))
+            .then(least(other).total_cmp(&least(self)))
             .then(other.counts.episodes.cmp(&self.counts.episodes))
             .then_with(|| self.record().entry.cmp(&other.record().entry))
             .then_with(|| seeds(self).cmp(&seeds(other)))
@@ -268,11 +301,18 @@ impl LeaderboardRow {
     }
 }
 
-/// The rows of all whole evaluations (shards wait until they are merged), best first in each task.
+/// The rows of all whole evaluations (shards wait until they are merged), best first in each task and protocol.
 pub fn rank(evaluations: &[StoredEvaluation]) -> Vec<LeaderboardRow> {
     let whole = evaluations.iter().filter(|evaluation| evaluation.record.shard.is_none());
     let mut rows: Vec<LeaderboardRow> = whole.map(LeaderboardRow::new).collect();
     rows.sort_by(LeaderboardRow::order);
+    let mut place = 0;
+    for at in 0..rows.len() {
+        let before = at.checked_sub(1).map(|at| &rows[at]).filter(|before| before.group() == rows[at].group());
+        place = if before.is_some() { place + 1 } else { 1 };
+        let same = before.filter(|before| before.counts == rows[at].counts).and_then(|before| before.rank);
+        rows[at].rank = if rows[at].too_few() { None } else { Some(same.unwrap_or(place)) };
+    }
     rows
 }
 
@@ -336,6 +376,42 @@ mod tests {
             all.rotate_left(1);
             assert_eq!(csv::table(COLUMNS, &rank(&all)), expected);
         }
+    }
+
+    #[test]
+    fn ranks_go_by_what_the_rate_is_at_least_and_few_episodes_have_none() {
+        let dir = tempfile::tempdir().unwrap();
+        let stored = |name: &str, successes: u64, episodes: u64| {
+            let mut stored = finished(dir.path(), &sample(name, 1, episodes));
+            stored.episodes.iter_mut().enumerate().for_each(|(k, e)| e.success = (k as u64) < successes);
+            stored
+        };
+        let all = [
+            stored("one-of-one", 1, 1),
+            stored("all-of-nineteen", 19, 19),
+            stored("all-of-twenty", 20, 20),
+            stored("none", 0, 200),
+            stored("same-as-best", 199, 200),
+            stored("best", 199, 200),
+            stored("half", 100, 200),
+        ];
+        let ranked: Vec<(String, Option<u64>)> =
+            rank(&all).into_iter().map(|row| (row.record().entry.name.clone(), row.rank)).collect();
+        let expected = [
+            ("best", Some(1)),
+            ("same-as-best", Some(1)),
+            ("all-of-twenty", Some(3)),
+            ("half", Some(4)),
+            ("none", Some(5)),
+            ("all-of-nineteen", None),
+            ("one-of-one", None),
+        ];
+        assert_eq!(ranked, expected.map(|(name, rank)| (name.to_owned(), rank)));
+        assert!(rank(&all)[5].too_few_text().contains("too few to rank"));
+        // another protocol begins anew
+        let mut other = all[3].clone();
+        other.record.protocol.max_steps = 500;
+        assert!(rank(&[all[5].clone(), other]).iter().all(|row| row.rank == Some(1)));
     }
 
     #[test]

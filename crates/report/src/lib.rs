@@ -17,6 +17,6 @@ pub mod statistics;
 #[cfg(test)]
 mod testing;
 
-pub use leaderboard::{COLUMNS, Counts, LeaderboardRow, count_text, rank};
+pub use leaderboard::{COLUMNS, Counts, FEWEST_TO_RANK, LeaderboardRow, count_text, rank};
 pub use page::{Curve, to_html};
 pub use statistics::{mean, quantile, wilson_interval};

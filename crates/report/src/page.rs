@@ -36,8 +36,8 @@ pub fn to_html(evaluations: &[StoredEvaluation], curves: &[Curve], section: &str
     let episodes: u64 = rows.iter().map(|row| row.counts.episodes).sum();
     let _ = writeln!(
         html,
-        "<p class=\"lead\">{} evaluations, {} episodes. Entries are ranked by success rate inside a task and \
-         protocol; bars are 95% Wilson intervals. Where intervals overlap widely, these \
+        "<p class=\"lead\">{} evaluations, {} episodes. Entries are ranked inside a task and protocol by what their \
+         success rate is at least, the lower end of its interval; bars are 95% Wilson intervals. Where intervals overlap widely, these \
          episodes do not decide between the entries.</p>",
         rows.len(),
         episodes

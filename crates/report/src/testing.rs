@@ -40,6 +40,7 @@ pub(crate) fn sample(name: &str, version: u32, count: u64) -> EvaluationRecord {
         },
         execution: Execution::RecedingHorizon { n_action_steps: 8 },
         time_decides: false,
+        demonstrated: false,
         seeds: Seeds { start: 10_000, count },
         shard: None,
         versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),

@@ -11,10 +11,12 @@ use puzzles::Task;
 use report::csv;
 use study::puzzle::{
     AnyExperiment, Baseline, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest,
-    SolverEntry, evaluate_puzzles, list_puzzle_evaluations, trace, train_puzzles,
+    RECORD_FILE, SolverEntry, audit_puzzles, evaluate_puzzles, list_puzzle_evaluations, trace, train_puzzles,
 };
 use zoo::config::Library;
 use zoo::entry::Entry;
+use zoo::registry::Registry;
+use zoo::results::KnownEntries;
 use zoo::run::TrainOutcome;
 
 fn request(root: &Path, name: &str, overrides: &[&str]) -> PuzzleTrainRequest {
@@ -179,6 +181,16 @@ fn an_entry_is_evaluated_once_shown_on_the_board_and_refused_where_it_does_not_f
     let first = evaluated(&entry, root.path(), 20);
     assert_eq!(first, evaluated(&entry, root.path(), 20), "a finished one is read again");
     assert_eq!(list_puzzle_evaluations(&results).unwrap(), std::slice::from_ref(&first));
+    let entries = KnownEntries::open(&Registry::open(&root.path().join("zoo"))).unwrap();
+    let board = || audit_puzzles(&results, &entries).unwrap();
+    assert_eq!((board().standing, board().left_out.len()), (vec![first.clone()], 0));
+    let record = results.join(first.folder_name()).join(RECORD_FILE);
+    let honest = std::fs::read_to_string(&record).unwrap();
+    std::fs::write(&record, honest.replacen("\"steps\": ", "\"steps\": 1", 1)).unwrap();
+    assert!(board().standing.is_empty());
+    let reason = board().left_out[0].reason.to_string();
+    assert!(reason.contains("puzzles.json: sha256 does not match"), "{reason}");
+    std::fs::write(&record, honest).unwrap();
     assert_eq!(first.by_depth.keys().copied().collect::<Vec<_>>(), [1, 2, 4]);
     assert_eq!((first.answers.puzzles, first.task.as_str()), (20, "dfs10"));
     assert!(csv::table(PUZZLE_COLUMNS, [&first]).contains("trm-dfs10,1,trm,dfs10"));

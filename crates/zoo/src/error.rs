@@ -280,6 +280,39 @@ pub enum ZooError {
         /// What was found.
         found: String,
     },
+    /// A finished evaluation without a seal: it was made before there were seals, or its seal was taken away.
+    #[error(
+        "results in {}: not sealed, so nothing says that they are as they were measured; run all of its episodes again with `eval --again`, which seals them where every outcome is the same",
+        folder.display()
+    )]
+    Unsealed {
+        /// The evaluation's folder.
+        folder: PathBuf,
+    },
+    /// A result does not fit its folder, its seal or its entry.
+    #[error("results in {}: {what}: expected {expected}, found {found}", folder.display())]
+    UnfitResult {
+        /// The evaluation's folder.
+        folder: PathBuf,
+        /// What does not fit.
+        what: String,
+        /// What the seal, the entry or the record says.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+    /// Demonstrations that the entry was trained on began as the evaluation's episodes would.
+    #[error(
+        "entry {entry}: the seeds {seeds} were asked for, and its demonstrations used {demonstrations}: it has seen these episodes; --force evaluates all the same, and the row then says so"
+    )]
+    DemonstrationSeeds {
+        /// The entry.
+        entry: String,
+        /// The seeds that were asked for.
+        seeds: String,
+        /// The demonstrations' seeds.
+        demonstrations: String,
+    },
     /// Shards that are not parts of one evaluation.
     #[error("cannot merge {}: {what}: expected {expected}, found {found}", folder.display())]
     Merge {

@@ -36,7 +36,7 @@ pub struct EvaluationOptions {
     pub shard: Option<Shard>,
     /// The module of the user's that registers the environment.
     pub env_module: Option<String>,
-    /// Evaluate although the demonstrations are of another simulator generation.
+    /// Evaluate although the demonstrations are of another simulator generation, or used the same seeds.
     pub force: bool,
 }
 

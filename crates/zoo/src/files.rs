@@ -45,15 +45,44 @@ fn hex(digest: &[u8]) -> String {
 /// # Errors
 /// When the folder is not there or cannot be written to.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), ZooError> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    stage(path, bytes)?.persist(path).map_err(|e| ZooError::io("write", path)(e.error))?;
+    sync_folder(parent(path))
+}
+
+/// Replaces several files: all are written under temporary names before the first takes its place, so that a full disk or
+/// a folder that cannot be written leaves all of them as they were.
+///
+/// # Errors
+/// As [`write_atomic`]; a path that is a folder.
+pub fn write_together(files: &[(std::path::PathBuf, Vec<u8>)]) -> Result<(), ZooError> {
+    let mut staged = Vec::new();
+    for (path, bytes) in files {
+        if path.is_dir() {
+            return Err(ZooError::io("write", path)(std::io::ErrorKind::IsADirectory.into()));
+        }
+        staged.push((path, stage(path, bytes)?));
+    }
+    for (path, file) in staged {
+        file.persist(path).map_err(|e| ZooError::io("write", path)(e.error))?;
+        sync_folder(parent(path))?;
+    }
+    Ok(())
+}
+
+fn parent(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
+}
+
+/// A synced file with `bytes` beside `path`.
+fn stage(path: &Path, bytes: &[u8]) -> Result<tempfile::NamedTempFile, ZooError> {
+    let folder = parent(path);
     let mut file = tempfile::Builder::new()
         .prefix(".tmp-")
         .permissions(mode(0o644))
         .tempfile_in(folder)
         .map_err(ZooError::io("create a temporary file in", folder))?;
     file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(ZooError::io("write", path))?;
-    file.persist(path).map_err(|e| ZooError::io("write", path)(e.error))?;
-    sync_folder(folder)
+    Ok(file)
 }
 
 /// A path in JSON: as text, or as a list of bytes where it is not UTF-8.
@@ -120,6 +149,21 @@ mod tests {
         write_atomic(&path, b"two").unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"two");
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn files_that_belong_together_are_all_new_or_all_old() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        write_together(&[(at("a"), b"one".to_vec()), (at("b"), b"two".to_vec())]).unwrap();
+        fs::create_dir(at("c")).unwrap();
+        for refused in [at("c"), at("nowhere/d")] {
+            let error = write_together(&[(at("a"), b"new".to_vec()), (refused.clone(), Vec::new())]).unwrap_err();
+            assert!(error.to_string().contains(refused.parent().unwrap().to_str().unwrap()), "{error}");
+            assert_eq!(fs::read(at("a")).unwrap(), b"one");
+        }
+        assert_eq!(fs::read(at("b")).unwrap(), b"two");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 3, "nothing else is left");
     }
 
     #[test]

@@ -25,7 +25,7 @@ pub mod results;
 
 pub use error::ZooError;
 pub use feature_keys::FeatureKeys;
-pub use files::{sha256_file, sha256_hex, write_atomic};
+pub use files::{sha256_file, sha256_hex, write_atomic, write_together};
 
 /// Versions of the software that makes entries and results, by name.
 pub fn versions() -> std::collections::BTreeMap<String, String> {

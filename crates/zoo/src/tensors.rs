@@ -106,6 +106,23 @@ pub fn read(path: &Path) -> Result<Contents, ZooError> {
     from_bytes(path, &bytes)
 }
 
+/// Refuses values that are no finite numbers.
+///
+/// # Errors
+/// [`ZooError::Malformed`] with the file, the first such tensor and the place in it.
+pub fn check_finite(path: &Path, tensors: &BTreeMap<String, Tensor>) -> Result<(), ZooError> {
+    for (name, tensor) in tensors {
+        let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
+        let values = tensor.flatten_all().and_then(|flat| flat.to_dtype(DType::F64)?.to_vec1::<f64>());
+        let values = values.map_err(|e| malformed(format!("tensor `{name}`: {e}")))?;
+        if let Some(place) = values.iter().position(|value| !value.is_finite()) {
+            let value = values[place];
+            return Err(malformed(format!("tensor `{name}`: expected finite numbers, found {value} at place {place}")));
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -131,6 +148,16 @@ mod tests {
             assert_eq!(raw(tensor).unwrap(), raw(&back[name]).unwrap(), "{name}");
             assert_eq!(tensor.dims(), back[name].dims());
         }
+    }
+
+    #[test]
+    fn a_value_that_is_no_number_is_named() {
+        let device = &Device::Cpu;
+        let mut tensors = BTreeMap::from([("a".to_owned(), Tensor::new(&[1_i64, i64::MAX], device).unwrap())]);
+        check_finite(Path::new("x"), &tensors).unwrap();
+        tensors.insert("b".to_owned(), Tensor::new(&[[0.0_f32, f32::NAN]], device).unwrap());
+        let error = check_finite(Path::new("x"), &tensors).unwrap_err().to_string();
+        assert_eq!(error, "x: tensor `b`: expected finite numbers, found NaN at place 1");
     }
 
     #[test]

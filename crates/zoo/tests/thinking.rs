@@ -50,6 +50,7 @@ fn subject(reasoning: ReasoningConfig) -> Subject<'static> {
             demos: 0,
         },
         task: "Lift".into(),
+        demonstrations: None,
         env_version: Some("1.5.1".into()),
         keys,
         execution: Execution::RecedingHorizon { n_action_steps: 4 },

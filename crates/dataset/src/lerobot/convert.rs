@@ -275,6 +275,7 @@ impl Conversion<'_> {
                 env_name: plan.env_name.clone(),
                 env_version: plan.env_version.clone(),
                 env_args: plan.env_args.clone(),
+                seeds: plan.texts.get("data/seeds").cloned(),
                 state_keys: self.mapping.state_keys.clone(),
                 env_keys: self.mapping.env_keys.clone(),
                 entities: self.mapping.entities.clone(),

@@ -174,6 +174,9 @@ pub struct Provenance {
     pub env_version: Option<String>,
     /// The environment's arguments as the source has them.
     pub env_args: Option<Value>,
+    /// The simulator's seeds that the demos were recorded with, `FIRST-LAST`, where the source states them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seeds: Option<String>,
     /// Observation keys that make up `observation.state`, in order.
     pub state_keys: Vec<String>,
     /// Observation keys that make up `observation.environment_state`, in order.

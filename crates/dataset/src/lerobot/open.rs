@@ -60,6 +60,8 @@ pub struct EnvMeta {
     pub env_version: Option<String>,
     /// Its arguments; null where the source has none.
     pub env_args: serde_json::Value,
+    /// The seeds that the demonstrations were recorded with, `FIRST-LAST`, where the source states them.
+    pub seeds: Option<String>,
 }
 
 /// A numeric column in memory.
@@ -86,6 +88,7 @@ impl Dataset {
                 env_name,
                 env_version: p.env_version.clone(),
                 env_args: p.env_args.clone().unwrap_or(serde_json::Value::Null),
+                seeds: p.seeds.clone(),
             })
         });
         let mut dataset =

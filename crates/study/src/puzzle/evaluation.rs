@@ -12,7 +12,9 @@ use puzzles::{Puzzle, Split, Task};
 use serde::{Deserialize, Serialize};
 
 use zoo::entry::{CONFIG_FILE, training_facts};
-use zoo::results::{EntryIdentity, TrainingFacts};
+use zoo::results::{
+    Audit, EntryIdentity, KnownEntries, SEAL_FILE, Seal, TrainingFacts, check_folder_name, result_folders,
+};
 use zoo::{ZooError, sha256_hex, write_atomic};
 
 use super::entry::{ProgressPoint, SolverEntry};
@@ -243,8 +245,9 @@ pub fn evaluate_puzzles(
     };
     let folder = results.join(record.folder_name());
     let path = folder.join(RECORD_FILE);
-    if path.is_file() {
-        return Ok((folder, PuzzleEvaluation::read(&path)?));
+    // without a seal it was made before there were seals, or not to its end: made again
+    if let Some(stored) = read_sealed(&folder)? {
+        return Ok((folder, stored));
     }
     let draw = |index| task.numbered(Split::Test, (givens, givens), TEST_SEED, index);
     let puzzles: Vec<Puzzle> = (0..options.puzzles).map(draw).collect();
@@ -263,9 +266,53 @@ pub fn evaluate_puzzles(
         record.sampled = Some(walk::count(&puzzles, &walks));
     }
     (record.answers, record.steps, record.by_depth) = (graded.halting, graded.steps, graded.by_depth);
-    // last: its presence says that the evaluation is whole
     record.write(&path)?;
+    // last: its presence says that the evaluation is whole
+    seal(&folder, &record)?.write(&folder)?;
     Ok((folder, record))
+}
+
+/// The seal that an evaluation in `folder` has now.
+fn seal(folder: &Path, record: &PuzzleEvaluation) -> Result<Seal, ZooError> {
+    let rules = (&record.task, record.givens, record.seed, record.depth, record.answers.puzzles);
+    let protocol = sha256_hex(&serde_json::to_vec(&rules).expect("plain fields are always JSON"));
+    Seal::of(folder, &record.folder_name(), &record.entry, &protocol, &[OUTCOMES_FILE, RECORD_FILE])
+}
+
+/// The evaluation in `folder` if it has a seal, which then is whole.
+fn read_sealed(folder: &Path) -> Result<Option<PuzzleEvaluation>, ZooError> {
+    let path = folder.join(RECORD_FILE);
+    if !path.is_file() || !folder.join(SEAL_FILE).is_file() {
+        return Ok(None);
+    }
+    let record = PuzzleEvaluation::read(&path)?;
+    Ok(seal(folder, &record)?.check(folder)?.then_some(record))
+}
+
+/// Every finished evaluation of a solver under `results` that stands, and what does not: sealed, in its own folder, of an
+/// entry of the zoo that says the same of its training.
+///
+/// # Errors
+/// A folder of results that cannot be listed.
+pub fn audit_puzzles(results: &Path, entries: &KnownEntries) -> Result<Audit<PuzzleEvaluation>, ZooError> {
+    let standing = |folder: &Path| {
+        let record = read_sealed(folder)?.ok_or_else(|| ZooError::UnfitResult {
+            folder: folder.to_owned(),
+            what: "seal".to_owned(),
+            expected: "one (evaluating again makes it)".to_owned(),
+            found: "none".to_owned(),
+        })?;
+        check_folder_name(folder, &record.folder_name())?;
+        entries.check(folder, &record.entry, &record.training)?;
+        Ok(Some(record))
+    };
+    let mut audit = Audit::default();
+    for folder in result_folders(results)? {
+        if folder.join(RECORD_FILE).is_file() {
+            audit.add(&folder, standing(&folder));
+        }
+    }
+    Ok(audit)
 }
 
 /// Every finished evaluation of a solver under `results`, by folder name.

@@ -24,7 +24,7 @@ pub use board::{PUZZLE_COLUMNS, puzzle_section, rank_puzzles};
 pub use cpu::cpu_seconds;
 pub use entry::{ProgressPoint, PuzzleMeta, SOLVER, SolverEntry};
 pub use evaluation::{
-    DEPTHS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, TEST_SEED, evaluate_puzzles,
+    DEPTHS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, TEST_SEED, audit_puzzles, evaluate_puzzles,
     list_puzzle_evaluations,
 };
 pub use experiment::{AnyExperiment, LearningSection, PuzzleExperiment, PuzzleTask};

@@ -201,7 +201,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("study.toml");
         std::fs::write(&path, text).unwrap();
-        Study::open(&path).map_err(|e| e.to_string())
+        Study::open(&path).map_err(|e| match std::error::Error::source(&e) {
+            Some(source) => format!("{e}: {source}"),
+            None => e.to_string(),
+        })
     }
 
     #[test]

@@ -6,6 +6,7 @@ use models::{FeatureKind, Signature};
 use serde::{Deserialize, Serialize};
 
 use crate::experiment::PICTURE_SUFFIX;
+use crate::results::Seeds;
 use crate::{FeatureKeys, ZooError, sha256_hex};
 
 use super::EntryId;
@@ -109,6 +110,9 @@ pub struct DataMeta {
     pub train_frames: u64,
     /// Episodes held out for validation.
     pub valid_episodes: u64,
+    /// The simulator's seeds that the demonstrations were recorded with, where the data set says.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seeds: Option<Seeds>,
 }
 
 /// How an entry was trained.

@@ -156,6 +156,7 @@ pub(crate) mod tests {
                     train_episodes: 45,
                     train_frames: 2000,
                     valid_episodes: 5,
+                    seeds: None,
                 }),
                 kind: None,
                 section: None,

@@ -32,6 +32,7 @@ impl LoadedEntry {
             entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
             training: training_facts(meta),
             task: meta.task.clone(),
+            demonstrations: meta.data.as_ref().and_then(|data| data.seeds),
             env_version: meta.env_version.clone(),
             keys: meta.keys.clone(),
             execution: match rollout.temporal_ensemble {

@@ -24,9 +24,12 @@ pub struct Again {
     pub versions: Vec<(String, String, String)>,
     /// Episodes that no worker could run.
     pub errors: Vec<RolloutError>,
+    /// Whether the stored evaluation had no seal and has one now: all of its episodes were run, every outcome the same.
+    pub sealed: bool,
 }
 
-/// Runs the first of a stored evaluation's episodes again, as many as are asked for, and compares; writes nothing.
+/// Runs the first of a stored evaluation's episodes again, as many as are asked for, and compares; writes nothing
+/// but a seal, where there is none yet and every episode was found to be the same.
 ///
 /// The same entry, protocol, execution and seeds decide which evaluation is meant; one under other versions of the
 /// simulator will do where there is none under these.
@@ -52,7 +55,7 @@ pub fn evaluate_again(
             found: text(&record),
         });
     }
-    let before: BTreeMap<u64, EpisodeRecord> = stored.episodes.into_iter().map(|e| (e.seed, e)).collect();
+    let before: BTreeMap<u64, EpisodeRecord> = stored.episodes.iter().cloned().map(|e| (e.seed, e)).collect();
     let seeds = record.own_seeds();
     let wanted = seeds.len() as u64;
     let mut again = Again {
@@ -62,6 +65,7 @@ pub fn evaluate_again(
         different: Vec::new(),
         versions: differences(&stored.record, &record),
         errors: Vec::new(),
+        sealed: false,
     };
     progress(0, wanted);
     run_episodes(subject, pool, record.protocol.max_steps, &seeds, &|_, _| Ok(()), &mut |result| match result {
@@ -74,6 +78,11 @@ pub fn evaluate_again(
         }
         Err(error) => again.errors.push(error),
     })?;
+    let every = again.episodes == again.stored && again.different.is_empty() && again.errors.is_empty();
+    if every && !stored.sealed {
+        stored.seal()?;
+        again.sealed = true;
+    }
     Ok(again)
 }
 

@@ -6,7 +6,7 @@ use rollout::{EpisodePlan, Ready};
 use super::EvaluationOptions;
 use super::agent::{PolicyAgent, QueryTimes, Timed};
 use crate::entry::CamerasMeta;
-use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, TrainingFacts};
+use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, Seeds, TrainingFacts};
 use crate::{FeatureKeys, ZooError};
 
 /// The entry under evaluation, as far as an evaluation needs to know it.
@@ -17,6 +17,8 @@ pub struct Subject<'a> {
     pub training: TrainingFacts,
     /// The task it was trained for.
     pub task: String,
+    /// The seeds of its demonstrations, where its data set records them.
+    pub demonstrations: Option<Seeds>,
     /// The simulator's version that its data set records.
     pub env_version: Option<String>,
     /// Observation keys of the features, in order.
@@ -39,10 +41,18 @@ impl Subject<'_> {
     /// Everything that the outcome will depend on.
     ///
     /// # Errors
-    /// [`ZooError::SimulatorGeneration`] and [`ZooError::UnfitEntry`].
+    /// [`ZooError::SimulatorGeneration`], [`ZooError::DemonstrationSeeds`] and [`ZooError::UnfitEntry`].
     pub fn record(&self, ready: &Ready, options: &EvaluationOptions) -> Result<EvaluationRecord, ZooError> {
         if !options.force {
             check_generation(&self.entry, self.env_version.as_deref(), &ready.simulator, ready.simulator_version())?;
+        }
+        let demonstrated = self.demonstrations.filter(|seeds| seeds.overlap(&options.seeds));
+        if let (Some(demonstrations), false) = (demonstrated, options.force) {
+            return Err(ZooError::DemonstrationSeeds {
+                entry: self.entry.to_string(),
+                seeds: options.seeds.to_string(),
+                demonstrations: demonstrations.to_string(),
+            });
         }
         self.check_signature(ready)?;
         Ok(EvaluationRecord {
@@ -61,6 +71,7 @@ impl Subject<'_> {
             },
             execution: self.execution,
             time_decides: self.time_decides,
+            demonstrated: demonstrated.is_some(),
             seeds: options.seeds,
             shard: options.shard,
             versions: ready.versions.clone(),

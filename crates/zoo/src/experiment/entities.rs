@@ -1,9 +1,11 @@
 //! `[data.entities]`: observation keys grouped into things, a token each.
 //!
-//!     [data.entities]
-//!     cube0 = ["cube0_pos", "cube0_pos - robot0_eef_pos"]
-//!     cube1 = ["cube1_pos", "cube1_pos - robot0_eef_pos"]
-//!     goal0 = { keys = ["goal_rgb[0:3]"], group = "place", position = true }
+//! ```toml
+//! [data.entities]
+//! cube0 = ["cube0_pos", "cube0_pos - robot0_eef_pos"]
+//! cube1 = ["cube1_pos", "cube1_pos - robot0_eef_pos"]
+//! goal0 = { keys = ["goal_rgb[0:3]"], group = "place", position = true }
+//! ```
 //!
 //! Entities of one group share their projection and their statistics. A group that is not named is the entity's name
 //! without the digits at its end: `cube` here.

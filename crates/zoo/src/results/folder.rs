@@ -8,13 +8,16 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::record::{EpisodeRecord, EpisodeTiming, EvaluationRecord};
+use super::seal::{SEAL_FILE, seal_of};
 use super::tables;
 use crate::ZooError;
 use crate::files::{sync_folder, write_atomic};
 
-const RECORD: &str = "evaluation.json";
-const OUTCOMES: &str = "outcomes.parquet";
+pub(super) const RECORD: &str = "evaluation.json";
+pub(super) const OUTCOMES: &str = "outcomes.parquet";
 const TIMINGS: &str = "timings.parquet";
+/// What a seal covers.
+const SEALED: [&str; 3] = [RECORD, OUTCOMES, TIMINGS];
 const JOURNAL: &str = "journal.jsonl";
 const LOCK: &str = "lock";
 
@@ -29,18 +32,26 @@ pub struct StoredEvaluation {
     pub episodes: Vec<EpisodeRecord>,
     /// Timings, by seed.
     pub timings: Vec<EpisodeTiming>,
+    /// Whether the folder has a seal, which then was found whole. Evaluations made before there were seals have none.
+    pub sealed: bool,
 }
 
 impl StoredEvaluation {
     /// Reads a finished evaluation; `None` if it is still under way.
     ///
     /// # Errors
-    /// Files that are missing, damaged or do not belong together.
+    /// Files that are missing, damaged, not as they were sealed, or do not belong together.
     pub fn read(folder: &Path) -> Result<Option<Self>, ZooError> {
         let record = read_record(folder)?;
         let outcomes = folder.join(OUTCOMES);
-        if !outcomes.exists() {
+        let sealed = folder.join(SEAL_FILE).exists();
+        // a journal beside tables without a seal: killed while they were written, and written again from it
+        if !sealed && (!outcomes.exists() || folder.join(JOURNAL).exists()) {
             return Ok(None);
+        }
+        // before anything is read from the tables
+        if sealed {
+            seal_of(folder, &record, &SEALED)?.check(folder)?;
         }
         let episodes = tables::read_episodes(&outcomes)?;
         let timings = tables::read_timings(&folder.join(TIMINGS))?;
@@ -56,7 +67,7 @@ impl StoredEvaluation {
                 return Err(ZooError::Malformed { path, reason });
             }
         }
-        Ok(Some(Self { folder: folder.to_owned(), record, episodes, timings }))
+        Ok(Some(Self { folder: folder.to_owned(), record, episodes, timings, sealed }))
     }
 
     /// As [`StoredEvaluation::read`]; `None` also where there is no such folder.
@@ -65,6 +76,14 @@ impl StoredEvaluation {
     /// As [`StoredEvaluation::read`].
     pub fn read_if_there(folder: &Path) -> Result<Option<Self>, ZooError> {
         if folder.join(RECORD).exists() { Self::read(folder) } else { Ok(None) }
+    }
+
+    /// Seals what was made before there were seals. For whoever has run every episode again and found each the same.
+    ///
+    /// # Errors
+    /// Files that cannot be read or written.
+    pub fn seal(&self) -> Result<(), ZooError> {
+        seal_of(&self.folder, &self.record, &SEALED)?.write(&self.folder)
     }
 
     /// How many episodes succeeded.
@@ -87,6 +106,13 @@ pub fn list_evaluations(results: &Path) -> Result<Vec<StoredEvaluation>, ZooErro
 
 /// Folders of evaluations under `results`, finished or not, by name.
 pub(crate) fn evaluation_folders(results: &Path) -> Result<Vec<PathBuf>, ZooError> {
+    let mut folders = result_folders(results)?;
+    folders.retain(|folder| folder.join(RECORD).is_file());
+    Ok(folders)
+}
+
+/// Whatever folders are under `results`, by name.
+pub fn result_folders(results: &Path) -> Result<Vec<PathBuf>, ZooError> {
     let entries = match fs::read_dir(results) {
         Ok(entries) => entries,
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
@@ -95,7 +121,7 @@ pub(crate) fn evaluation_folders(results: &Path) -> Result<Vec<PathBuf>, ZooErro
     let mut folders = Vec::new();
     for entry in entries {
         let path = entry.map_err(ZooError::io("read folder", results))?.path();
-        if path.join(RECORD).is_file() {
+        if path.is_dir() {
             folders.push(path);
         }
     }
@@ -225,6 +251,9 @@ impl ResultsFolder {
                 continue;
             }
             let Ok(Some(stored)) = StoredEvaluation::read(&folder) else { continue };
+            if !stored.sealed {
+                continue;
+            }
             let missing: BTreeSet<u64> = self.missing().into_iter().collect();
             let rows = stored.episodes.into_iter().zip(stored.timings);
             for (episode, timing) in rows.filter(|(episode, _)| missing.contains(&episode.seed)) {
@@ -277,8 +306,9 @@ impl ResultsFolder {
             }
             let (episodes, timings): (Vec<_>, Vec<_>) = self.done.values().cloned().unzip();
             tables::write_timings(&self.folder.join(TIMINGS), &timings)?;
-            // the last one: its presence says that the evaluation is whole
             tables::write_episodes(&self.folder.join(OUTCOMES), &episodes)?;
+            // the last one: its presence says that the evaluation is whole
+            seal_of(&self.folder, &self.record, &SEALED)?.write(&self.folder)?;
             let journal = self.folder.join(JOURNAL);
             fs::remove_file(&journal).map_err(ZooError::io("remove", &journal))?;
             sync_folder(&self.folder)?;

@@ -26,6 +26,9 @@ pub fn merge_shards(shards: &[PathBuf], results: &Path) -> Result<StoredEvaluati
     for folder in shards {
         let part = StoredEvaluation::read(folder)?
             .ok_or_else(|| refuse(folder, "state", "a finished evaluation".into(), "one under way".into()))?;
+        if !part.sealed {
+            return Err(ZooError::Unsealed { folder: folder.clone() });
+        }
         let Some(shard) = part.record.shard else {
             return Err(refuse(folder, "shard", "a part, such as 1/2".into(), "the whole".into()));
         };

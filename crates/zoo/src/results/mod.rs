@@ -4,18 +4,23 @@
 //! - `outcomes.parquet`: the outcome of every episode, sorted by seed. Depends on nothing but what
 //!   `evaluation.json` says: two evaluations of the same entry give the same bytes.
 //! - `timings.parquet`: how long things took. Never the same twice.
+//! - `seal.json`: written last: the entry's hash, the protocol and the hash of each of these files.
 //! - `journal.jsonl`: episodes as they finish, while an evaluation is under way; an interrupted one goes
 //!   on from it.
 
+mod audit;
 mod folder;
 mod merge;
 mod record;
+mod seal;
 mod tables;
 
+pub use audit::{Audit, KnownEntries, LeftOut, audit, check_folder_name};
 pub(crate) use folder::evaluation_folders;
-pub use folder::{ResultsFolder, StoredEvaluation, list_evaluations};
+pub use folder::{ResultsFolder, StoredEvaluation, list_evaluations, result_folders};
 pub use merge::merge_shards;
 pub use record::{
     EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Execution, Protocol, Seeds, Shard, TrainingFacts,
 };
+pub use seal::{SEAL_FILE, Seal};
 pub(crate) use tables::write_table;

@@ -121,6 +121,24 @@ impl Seeds {
     pub fn iter(&self) -> std::ops::Range<u64> {
         self.start..self.start.saturating_add(self.count)
     }
+
+    /// Whether some seed is in both.
+    pub fn overlap(&self, other: &Self) -> bool {
+        self.iter().start.max(other.start) < self.iter().end.min(other.iter().end)
+    }
+}
+
+impl std::str::FromStr for Seeds {
+    type Err = String;
+    /// Reads what it is written as: `10000-10099`, or `7` for one.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (first, last) = text.split_once('-').unwrap_or((text, text));
+        let parsed = first.trim().parse::<u64>().ok().zip(last.trim().parse::<u64>().ok());
+        match parsed.and_then(|(first, last)| Some((first, last.checked_sub(first)?.checked_add(1)?))) {
+            Some((start, count)) => Ok(Self { start, count }),
+            None => Err(format!("seeds {text:?}: expected FIRST-LAST, such as 1000000-1000049")),
+        }
+    }
 }
 
 impl std::fmt::Display for Seeds {
@@ -180,6 +198,9 @@ pub struct EvaluationRecord {
     /// Whether the policy thinks by the clock: its episodes may end otherwise next time. Others repeat exactly.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub time_decides: bool,
+    /// Whether demonstrations of the entry used some of these seeds: it has seen how those episodes begin.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub demonstrated: bool,
     /// The episodes' seeds.
     pub seeds: Seeds,
     /// The part of them that is here, if not all.
@@ -296,6 +317,7 @@ pub(crate) mod tests {
             },
             execution: Execution::RecedingHorizon { n_action_steps: 8 },
             time_decides: false,
+            demonstrated: false,
             seeds: Seeds { start: 10_000, count },
             shard: None,
             versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),

@@ -1,8 +1,10 @@
 //! `[data.symmetries]`: numbers of an observation that mean the same in any order, permuted at random in every training
 //! sample, alike wherever they stand. Validation sees the observations as they are.
 //!
-//!     [data.symmetries]
-//!     colour = ["cube0_rgb", "cube1_rgb", "goal_rgb[0:3]", "goal_rgb[3:6]"]
+//! ```toml
+//! [data.symmetries]
+//! colour = ["cube0_rgb", "cube1_rgb", "goal_rgb[0:3]", "goal_rgb[3:6]"]
+//! ```
 //!
 //! One order of the three channels is drawn for a sample, and all four vectors are put into it. A batch depends on the
 //! seed and the step alone, so that a resumed run needs no state of this.

@@ -23,6 +23,12 @@ use crate::puzzles::{PuzzleArgs, evaluate_solver};
 const GOES_ON: &str = "stopped; the same command goes on where it was";
 /// Behind the line of an evaluation for which nothing was run.
 const THERE: &str = " (evaluated before; --again runs it again)";
+/// The same for one without a seal.
+const UNSEALED: &str = " (evaluated before there were seals: the leaderboard leaves it out until --again seals it)";
+
+fn there(evaluation: &StoredEvaluation) -> &'static str {
+    if evaluation.sealed { THERE } else { UNSEALED }
+}
 
 /// Evaluate entries: policies in simulation, one episode a seed; puzzle solvers here, on test puzzles
 ///
@@ -75,7 +81,7 @@ pub struct Args {
     /// Only this part of the episodes, for several machines
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Evaluate although the demonstrations were recorded in another simulator generation
+    /// Evaluate although the demonstrations were recorded in another simulator generation, or with these seeds
     #[arg(long)]
     force: bool,
     /// Run finished evaluations again, and fail where an outcome is not the same
@@ -223,12 +229,12 @@ fn evaluate_on(
     let mut subjects = Vec::new();
     for loaded in entries {
         let id = loaded.entry().id();
-        let there = subject(args, loaded).and_then(|subject| match &remembered {
+        let done = subject(args, loaded).and_then(|subject| match &remembered {
             Some(ready) => Ok((finished(&subject, ready, &results, &options)?, subject)),
             None => Ok((None, subject)),
         });
-        match there.with_context(|| format!("entry {id}")) {
-            Ok((Some(evaluation), _)) => cli::print(&(LeaderboardRow::new(&evaluation).summary() + THERE + "\n"))?,
+        match done.with_context(|| format!("entry {id}")) {
+            Ok((Some(evaluation), _)) => cli::print(&(LeaderboardRow::new(&evaluation).summary() + there(&evaluation) + "\n"))?,
             Ok((None, subject)) => subjects.push(subject),
             Err(error) => failures.push(error),
         }
@@ -314,12 +320,10 @@ fn run_missing(
     let id = subject.entry.to_string();
     let mut screen = Screen::new();
     let mut successes = 0_u64;
-    let mut there = "";
+    let mut before = false;
     let end = evaluate(subject, pool, results, options, &mut |progress| match progress {
         Progress::Begin { done, total, .. } => {
-            if done == total {
-                there = THERE;
-            }
+            before = done == total;
             screen.begin_at("eval", done, total);
             screen.message(&id);
         }
@@ -332,6 +336,7 @@ fn run_missing(
     drop(screen);
     match end.with_context(|| format!("entry {id}"))? {
         EvaluationEnd::Complete(evaluation) => {
+            let there = if before { there(&evaluation) } else { "" };
             cli::print(&(LeaderboardRow::new(&evaluation).summary() + there + "\n"))?;
             Ok(Some(evaluation))
         }
@@ -367,6 +372,9 @@ fn again(subject: &Subject<'_>, pool: &mut Pool, results: &Path, options: &Evalu
     if let Some((stored, now)) = again.different.first() {
         let (count, of, seed) = (again.different.len(), again.episodes, stored.seed);
         bail!("entry {id}: {count} of {of} outcomes differ, the first of seed {seed}: stored {stored:?}, now {now:?}");
+    }
+    if again.sealed {
+        cli::note(&format!("{id}: its results had no seal, and have one now"));
     }
     if again.episodes < again.wanted {
         cli::note(&format!("{id}: {} of {} episodes run again, every outcome the same", again.episodes, again.wanted));

@@ -5,13 +5,18 @@ use anyhow::Context;
 use cli::{Table, shown};
 use report::column::{Align, Column};
 use report::{COLUMNS, Curve, csv, markdown, rank, to_html};
-use study::puzzle::{PUZZLE_COLUMNS, list_puzzle_evaluations, puzzle_section, rank_puzzles};
-use zoo::results::list_evaluations;
-use zoo::write_atomic;
+use study::puzzle::{PUZZLE_COLUMNS, audit_puzzles, puzzle_section, rank_puzzles};
+use zoo::results::{KnownEntries, audit};
+use zoo::entry::Entry;
+use zoo::{ZooError, write_together};
 
 use crate::places::{ResultsArgs, ZooArgs};
 
 /// Rank all evaluations: tables here, leaderboard.csv, leaderboard_puzzles.csv and report.html in the zoo
+///
+/// Ranks go by the lower end of the 95% interval; a row of fewer than 20 episodes has none. Results that are not as they
+/// were sealed, without a seal, in a folder of another name, or of an entry that is not in the zoo or says otherwise, are
+/// named and left out; the others are ranked, and the exit code is 1.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo leaderboard
@@ -35,9 +40,17 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let results = args.results.folder(&args.zoo);
-    let evaluations = list_evaluations(&results)?;
-    let puzzles = rank_puzzles(&list_puzzle_evaluations(&results)?);
-    if evaluations.is_empty() && puzzles.is_empty() {
+    let entries = KnownEntries::open(&args.zoo.registry())?;
+    let (robots, solvers) = (audit(&results, &entries)?, audit_puzzles(&results, &entries)?);
+    let mut failures: Vec<String> = entries.bad().map(|(id, error)| failure(&format!("entry {id}"), error)).collect();
+    let left_out = robots.left_out.iter().chain(&solvers.left_out);
+    failures.extend(left_out.map(|left| failure(&format!("left out: {}", shown(&left.folder)), &left.reason)));
+    let end = || {
+        failures.iter().for_each(|failure| cli::note(failure));
+        if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    };
+    let (evaluations, puzzles) = (robots.standing, rank_puzzles(&solvers.standing));
+    if evaluations.is_empty() && puzzles.is_empty() && failures.is_empty() {
         cli::note(&format!("no evaluations in {}; make one with: actrm-zoo eval --all", shown(&results)));
         return Ok(ExitCode::SUCCESS);
     }
@@ -46,38 +59,46 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // first the files: whoever reads the tables may go away before their end
     let out = args.out.as_ref().unwrap_or(&args.zoo.zoo);
     std::fs::create_dir_all(out).with_context(|| format!("creating {}", shown(out)))?;
-    let mut written = Vec::new();
-    let mut write = |path: PathBuf, text: String| -> anyhow::Result<()> {
-        write_atomic(&path, text.as_bytes())?;
-        written.push(shown(&path) + "\n");
-        Ok(())
-    };
-    write(out.join("leaderboard.csv"), csv::table(COLUMNS, &rows))?;
-    write(out.join("report.html"), to_html(&evaluations, &curves(args)?, &puzzle_section(&puzzles)))?;
+    let mut files = vec![
+        (out.join("leaderboard.csv"), csv::table(COLUMNS, &rows).into_bytes()),
+        (
+            out.join("report.html"),
+            to_html(&evaluations, &curves(&entries), &puzzle_section(&puzzles)).into_bytes(),
+        ),
+    ];
     if !puzzles.is_empty() {
-        write(out.join("leaderboard_puzzles.csv"), csv::table(PUZZLE_COLUMNS, &puzzles))?;
+        files.push((out.join("leaderboard_puzzles.csv"), csv::table(PUZZLE_COLUMNS, &puzzles).into_bytes()));
     }
     if let Some(file) = &args.markdown {
-        write(file.clone(), markdown::table(COLUMNS, &rows))?;
+        files.push((file.clone(), markdown::table(COLUMNS, &rows).into_bytes()));
     }
+    // all of them or none: a table beside a report of other results would be worse than an old pair
+    write_together(&files)?;
 
+    let written: String = files.iter().map(|(path, _)| shown(path) + "\n").collect();
     let text = table(COLUMNS, &rows, args.wide) + &table(PUZZLE_COLUMNS, &puzzles, args.wide);
-    cli::print(&(text + &written.concat()))?;
-    Ok(ExitCode::SUCCESS)
+    cli::print(&(text + &written))?;
+    Ok(end())
+}
+
+/// One line for what is wrong with `object`.
+fn failure(object: &str, error: &ZooError) -> String {
+    let mut text = format!("error: {object}: {error}");
+    let mut cause = std::error::Error::source(error);
+    while let Some(error) = cause {
+        text.push_str(&format!(": {error}"));
+        cause = error.source();
+    }
+    text
 }
 
 /// Training curves of the entries that are in this zoo.
-fn curves(args: &Args) -> anyhow::Result<Vec<Curve>> {
-    let registry = args.zoo.registry();
-    let mut curves = Vec::new();
-    for id in registry.ids()? {
-        let entry = registry.entry(&id.to_string())?;
-        if let Some(training) = &entry.meta().training {
-            let points = training.curve.iter().map(|p| (p.step, p.loss)).collect();
-            curves.push(Curve { entry: id.to_string(), points });
-        }
-    }
-    Ok(curves)
+fn curves(entries: &KnownEntries) -> Vec<Curve> {
+    let curve = |entry: &Entry| {
+        let points = entry.meta().training.as_ref()?.curve.iter().map(|p| (p.step, p.loss)).collect();
+        Some(Curve { entry: entry.id().to_string(), points })
+    };
+    entries.good().filter_map(curve).collect()
 }
 
 /// What says most stays longest where the terminal is narrow; nothing without rows.

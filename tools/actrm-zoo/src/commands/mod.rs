@@ -1,5 +1,5 @@
 //! One file a command: its arguments, whose doc comment is its help, and what it does.
 
 cli::commands! {
-    train, runs, eval, merge, leaderboard, list, show, trace, study, import, export, completions,
+    train, runs, eval, merge, leaderboard, list, show, verify, trace, study, import, export, completions,
 }

@@ -1,0 +1,104 @@
+use std::collections::BTreeMap;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use cli::shown;
+use study::puzzle::{SolverEntry, audit_puzzles};
+use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE};
+use zoo::results::{KnownEntries, LeftOut, audit};
+use zoo::tensors;
+
+use crate::places::{ResultsArgs, ZooArgs, entry_names};
+
+/// Check entries and their results: every hash and seal, and with --deep every tensor
+///
+/// A result has to be as it was sealed, in the folder that its record belongs in, and of an entry in the zoo that says the
+/// same of its training. Hashes tell damage and edits; that a result was measured, `eval --again` shows.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-zoo verify
+  actrm-zoo verify lift-act stack-act@1 --deep
+  actrm-zoo verify --zoo my-zoo --results elsewhere")]
+pub struct Args {
+    /// Entries: `name` (its newest version) or `name@version` (all, with whatever lies in the folder of results)
+    #[arg(add = entry_names())]
+    entries: Vec<String>,
+    /// Also build each network and compare the names and shapes of its tensors; all values have to be finite
+    #[arg(long)]
+    deep: bool,
+    #[command(flatten)]
+    results: ResultsArgs,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let (registry, results) = (args.zoo.registry(), args.results.folder(&args.zoo));
+    let entries = KnownEntries::open(&registry)?;
+    let ids: Vec<EntryId> = match args.entries.is_empty() {
+        true => registry.ids()?,
+        false => args.entries.iter().map(|name| registry.resolve(name)).collect::<Result<_, _>>()?,
+    };
+    let (robots, solvers) = (audit(&results, &entries)?, audit_puzzles(&results, &entries)?);
+    let mut whole: BTreeMap<(String, u32), usize> = BTreeMap::new();
+    let of_robots = robots.standing.iter().map(|stored| &stored.record.entry);
+    for entry in of_robots.chain(solvers.standing.iter().map(|record| &record.entry)) {
+        *whole.entry((entry.name.clone(), entry.version)).or_default() += 1;
+    }
+    let mut failures = Vec::new();
+    let mut text = String::new();
+    for id in &ids {
+        match check(id, &entries, args.deep).with_context(|| format!("entry {id}")) {
+            Ok(count) => {
+                let results = whole.get(&(id.name.clone(), id.version)).copied().unwrap_or_default();
+                text.push_str(&format!("{id}: {count} files and {results} results are as they were made\n"));
+            }
+            Err(error) => failures.push(error),
+        }
+    }
+    for LeftOut { folder, reason } in robots.left_out.into_iter().chain(solvers.left_out) {
+        let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        // a folder is called after its entry; asked for nothing in particular, all that is wrong is told
+        if args.entries.is_empty() || ids.iter().any(|id| name.starts_with(&format!("{id}_"))) {
+            failures.push(anyhow::Error::new(reason).context(format!("result {}", shown(&folder))));
+        }
+    }
+    cli::print(&text)?;
+    for failure in &failures {
+        cli::note(&format!("error: {failure:#}"));
+    }
+    if ids.is_empty() && failures.is_empty() {
+        cli::note(&format!("no entries in {}; make one with: actrm-zoo train act_lift", shown(&args.zoo.zoo)));
+    }
+    Ok(if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// How many files an entry has, all of which are what was written.
+fn check(id: &EntryId, entries: &KnownEntries, deep: bool) -> anyhow::Result<usize> {
+    let entry = match entries.get(id) {
+        Some(entry) => entry,
+        None => {
+            let bad = entries.bad().find(|(bad, _)| *bad == id);
+            anyhow::bail!("{}", bad.map_or_else(|| "not in the zoo".to_owned(), |(_, error)| error.to_string()))
+        }
+    };
+    if deep {
+        deep_check(entry)?;
+    }
+    // entry.json is hashed in itself
+    Ok(entry.meta().files.len() + 1)
+}
+
+fn deep_check(entry: &Entry) -> anyhow::Result<()> {
+    for name in [MODEL_FILE, NORMALISER_FILE] {
+        let path = entry.folder().join(name);
+        let (values, _) = tensors::read(&path)?;
+        tensors::check_finite(&path, &values)?;
+    }
+    // names and shapes are compared where the network is built
+    match entry.meta().is_robot_policy() {
+        true => drop(entry.load()?),
+        false => drop(SolverEntry::load(entry, None)?),
+    }
+    Ok(())
+}
