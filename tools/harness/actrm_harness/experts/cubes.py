@@ -12,6 +12,15 @@ CLEAR = 0.055
 TURNS = tuple(np.radians(side * degrees) for degrees in range(0, 91, 6) for side in (1, -1))
 
 
+# A cube that is held by two of its edges is 5.7 cm wide.
+OFF = (0.062, 0.076)
+
+# What befalls the builder of towers: how often a cube is set down beside its place, and how far.
+TOWER_MISHAPS = Mishaps(pushed=80.0, fumbled=250.0)
+CLUMSY = 0.12
+BESIDE = (0.02, 0.032)
+
+
 def clear_yaw(here: Array, others: list[Array]) -> float:
     """The least turn of a hand at a cube that keeps its fingers clear of the other cubes, whichever way the cube lies.
 
@@ -52,8 +61,7 @@ class StackExpert:
         self.scene = scene
         self.servo = Servo(scene, rng, pace=1.3, mishaps=Mishaps(pushed=15.0))
         self.grasp = Grasp(scene, self.servo.style)
-        # a cube that is held by two of its edges is 5.7 cm wide
-        self.carry = Carry(scene, self.grasp, TABLE + rng.uniform(0.12, 0.14), off=(0.062, 0.076))
+        self.carry = Carry(scene, self.grasp, TABLE + rng.uniform(0.12, 0.14), OFF)
 
     def act(self) -> Array:
         """The action for the current state."""
@@ -73,20 +81,32 @@ class StackExpert:
 
 
 class TowerExpert:
-    """Build a tower of three cubes in the order that the environment asks for."""
+    """Build a tower of three cubes in the order that the environment asks for.
+
+    Little is forgiven here, so its demonstrations show how to make up for errors: the hand is pushed and its fingers
+    fumble (`Mishaps`), and in some episodes a cube is set down so far beside its place that it falls, now and then
+    with what it was put on.
+    """
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4)
+        self.servo = Servo(scene, rng, pace=1.4, mishaps=TOWER_MISHAPS)
         self.grasp = Grasp(scene, self.servo.style)
         order: tuple[str, ...] = scene.task.order
         self.order = tuple(f"{name}_main" for name in order)
         rise = rng.uniform(0.12, 0.14)
-        # a cube that is held by two of its edges is 5.7 cm wide
-        off = (0.062, 0.076)
-        self.carries = [Carry(scene, self.grasp, TABLE + rise + 0.04 * level, off) for level in range(2)]
+        self.carries = [Carry(scene, self.grasp, TABLE + rise + 0.04 * level, OFF) for level in range(2)]
         self.level = 0
         self.above = TABLE + rise + 0.12
+        self.beside = self._draw_beside(rng)
+
+    def _draw_beside(self, rng: np.random.Generator) -> list[Array]:
+        """How far beside their places the cubes are set down the first time, a level each; mostly not at all."""
+        beside: list[Array] = []
+        for _ in range(2):
+            bad, angle, far = rng.random() < CLUMSY, rng.uniform(0, 2 * np.pi), rng.uniform(*BESIDE)
+            beside.append(np.array([far * np.cos(angle), far * np.sin(angle), 0.0]) * bad)
+        return beside
 
     def act(self) -> Array:
         """The action for the current state."""
@@ -98,11 +118,14 @@ class TowerExpert:
         level = self.level
         cube, below = (top, middle) if level else (middle, bottom)
         carry = self.carries[level]
-        thing, goal = scene.body(cube), scene.body(below) + np.array([0.0, 0.0, 0.041])
+        thing, goal = scene.body(cube), scene.body(below) + np.array([0.0, 0.0, 0.041]) + self.beside[level]
         hand = hand_yaw(scene.hand_rotation)
         turn = hand
         if carry.update(thing, goal, flat=0.01, height=0.006):
             target, grip = carry.let_go()
+            if scene.gap > OFF[1]:
+                # from the second time on with care
+                self.beside[level] = np.zeros(3)
         else:
             turn = self._grip_yaw(cube)
             target, grip = self.grasp.reach(thing, turn - hand)
