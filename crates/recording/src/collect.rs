@@ -196,10 +196,6 @@ mod tests {
     #[test]
     fn masks_split_the_demos_once_and_by_seed() {
         let ids: Vec<String> = (0..50).map(|i| format!("demo_{i}")).collect();
-        // an evaluation of a policy that learned from these must not begin as they did; failed attempts count, too
-        let first_seed = options.seed * CollectOptions::SEED_STRIDE;
-        let last = good.last().map_or(0, |attempt| attempt.index);
-        writer.set_data_attr("seeds", &Array::from_str(&format!("{first_seed}-{}", first_seed + last)))?;
         let (train, valid) = masks(&ids, 1);
         assert_eq!((train.len(), valid.len()), (45, 5));
         let mut all: Vec<String> = train.iter().chain(&valid).cloned().collect();
