@@ -42,6 +42,16 @@ fn killed_and_run_again_it_writes_the_same_bytes_and_leaves_nothing_else() {
     assert!(fs::read(&straight).expect("a file") == fs::read(&again).expect("a file"), "the files differ");
     assert_eq!(listing(folder.path()), ["again.hdf5", "straight.hdf5"]);
     refused(&mut collect(&again, &[]), &["again.hdf5", "exists"]);
+
+    // the seeds that its attempts used go with the demonstrations, so that no evaluation begins as they did
+    let set = folder.path().join("set");
+    succeeds(&mut data(["convert", text(&straight), text(&set)]));
+    let info = fs::read(set.join("meta/info.json")).expect("a data set");
+    let info: serde_json::Value = serde_json::from_slice(&info).expect("JSON");
+    let seeds = info["actrm"]["seeds"].as_str().expect("the seeds are recorded");
+    let (first, last) = seeds.split_once('-').expect("FIRST-LAST");
+    assert_eq!(first, "1000000");
+    assert!((1_000_002..1_000_100).contains(&last.parse::<u64>().expect("a seed")), "{seeds}");
 }
 
 #[test]

@@ -13,10 +13,10 @@ use study::puzzle::{
     AnyExperiment, Baseline, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest,
     RECORD_FILE, SolverEntry, audit_puzzles, evaluate_puzzles, list_puzzle_evaluations, trace, train_puzzles,
 };
+use zoo::audit::KnownEntries;
 use zoo::config::Library;
 use zoo::entry::Entry;
 use zoo::registry::Registry;
-use zoo::results::KnownEntries;
 use zoo::run::TrainOutcome;
 
 fn request(root: &Path, name: &str, overrides: &[&str]) -> PuzzleTrainRequest {

@@ -20,6 +20,7 @@ pub mod run;
 pub mod tensors;
 
 // evaluations
+pub mod audit;
 pub mod evaluation;
 pub mod results;
 

@@ -280,9 +280,18 @@ fn what_does_not_fit_is_refused_before_anything_is_written() {
         });
     });
     assert!(error.contains("seed 10000, step 0: action: expected 7 finite values, found NaN at index 2"), "{error}");
+    // episodes that begin as its demonstrations did are no test
+    let error = refuse(|s| s.demonstrations = Some(Seeds { start: 9_990, count: 11 }));
+    assert!(error.contains("seeds 10000") && error.contains("used 9990-10000"), "{error}");
     // forced, the other generation is evaluated
     let forced = EvaluationOptions { force: true, ..wanted(1) };
     let other = Subject { env_version: None, ..subject() };
     let end: Result<EvaluationEnd, ZooError> = evaluate(&other, &mut pool, &results, &forced, &mut |_| {});
     assert!(matches!(end.unwrap(), EvaluationEnd::Complete(_)));
+    // the result says that they were no test; beside those seeds it is one
+    for (start, told) in [(9_990, true), (10_001, false)] {
+        let other = Subject { demonstrations: Some(Seeds { start, count: 11 }), ..subject() };
+        assert_eq!(other.record(pool.ready(), &forced).unwrap().demonstrated, told);
+        assert_eq!(other.record(pool.ready(), &wanted(1)).is_err(), told);
+    }
 }

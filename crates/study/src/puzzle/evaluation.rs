@@ -11,10 +11,9 @@ use parquet::arrow::ArrowWriter;
 use puzzles::{Puzzle, Split, Task};
 use serde::{Deserialize, Serialize};
 
+use zoo::audit::{Audit, KnownEntries, check_folder_name};
 use zoo::entry::{CONFIG_FILE, training_facts};
-use zoo::results::{
-    Audit, EntryIdentity, KnownEntries, SEAL_FILE, Seal, TrainingFacts, check_folder_name, result_folders,
-};
+use zoo::results::{EntryIdentity, SEAL_FILE, Seal, TrainingFacts, result_folders};
 use zoo::{ZooError, sha256_hex, write_atomic};
 
 use super::entry::{ProgressPoint, SolverEntry};

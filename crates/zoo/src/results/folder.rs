@@ -13,8 +13,8 @@ use super::tables;
 use crate::ZooError;
 use crate::files::{sync_folder, write_atomic};
 
-pub(super) const RECORD: &str = "evaluation.json";
-pub(super) const OUTCOMES: &str = "outcomes.parquet";
+pub(crate) const RECORD: &str = "evaluation.json";
+pub(crate) const OUTCOMES: &str = "outcomes.parquet";
 const TIMINGS: &str = "timings.parquet";
 /// What a seal covers.
 const SEALED: [&str; 3] = [RECORD, OUTCOMES, TIMINGS];

@@ -8,15 +8,13 @@
 //! - `journal.jsonl`: episodes as they finish, while an evaluation is under way; an interrupted one goes
 //!   on from it.
 
-mod audit;
 mod folder;
 mod merge;
 mod record;
 mod seal;
 mod tables;
 
-pub use audit::{Audit, KnownEntries, LeftOut, audit, check_folder_name};
-pub(crate) use folder::evaluation_folders;
+pub(crate) use folder::{OUTCOMES, RECORD, evaluation_folders};
 pub use folder::{ResultsFolder, StoredEvaluation, list_evaluations, result_folders};
 pub use merge::merge_shards;
 pub use record::{
@@ -24,3 +22,11 @@ pub use record::{
 };
 pub use seal::{SEAL_FILE, Seal};
 pub(crate) use tables::write_table;
+
+/// What tests elsewhere in this crate build on.
+#[cfg(test)]
+pub(crate) mod testing {
+    pub(crate) use super::folder::tests::finished;
+    pub(crate) use super::record::tests::sample;
+    pub(crate) use super::tables::write_episodes;
+}

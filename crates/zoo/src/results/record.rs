@@ -347,6 +347,19 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn seeds_are_read_as_they_are_written_and_compared() {
+        let seeds = |start, count| Seeds { start, count };
+        for all in [seeds(7, 1), seeds(1_000_000, 50), seeds(0, u64::MAX)] {
+            assert_eq!(all.to_string().parse(), Ok(all));
+        }
+        for wrong in ["", "a-b", "5-4", "-1", "1-2-3"] {
+            assert!(wrong.parse::<Seeds>().is_err(), "{wrong}");
+        }
+        assert!(seeds(10, 5).overlap(&seeds(14, 1)) && seeds(14, 1).overlap(&seeds(10, 5)));
+        assert!(!seeds(10, 5).overlap(&seeds(15, 5)) && !seeds(10, 0).overlap(&seeds(5, 10)));
+    }
+
+    #[test]
     fn whatever_can_change_an_outcome_changes_the_folder() {
         let first = sample("a", 1, 20);
         let changes: [fn(&mut EvaluationRecord); 10] = [

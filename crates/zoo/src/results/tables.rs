@@ -110,7 +110,7 @@ impl<'a> Columns<'a> {
 }
 
 /// Writes the outcomes. The columns `group` and `failure` are there only where a task has them; empty text is none.
-pub(super) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), ZooError> {
+pub(crate) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), ZooError> {
     let fingerprints = all.iter().map(|e| &e.fingerprint);
     let mut columns: Vec<(&str, ArrayRef)> = vec![
         ("seed", Arc::new(UInt64Array::from_iter_values(all.iter().map(|e| e.seed)))),

@@ -6,7 +6,7 @@ use cli::{Table, shown};
 use report::column::{Align, Column};
 use report::{COLUMNS, Curve, csv, markdown, rank, to_html};
 use study::puzzle::{PUZZLE_COLUMNS, audit_puzzles, puzzle_section, rank_puzzles};
-use zoo::results::{KnownEntries, audit};
+use zoo::audit::{KnownEntries, audit};
 use zoo::entry::Entry;
 use zoo::{ZooError, write_together};
 

@@ -5,7 +5,7 @@ use anyhow::Context;
 use cli::shown;
 use study::puzzle::{SolverEntry, audit_puzzles};
 use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE};
-use zoo::results::{KnownEntries, LeftOut, audit};
+use zoo::audit::{KnownEntries, LeftOut, audit};
 use zoo::tensors;
 
 use crate::places::{ResultsArgs, ZooArgs, entry_names};
