@@ -407,7 +407,7 @@ pub fn load_statistics(
             };
             let values = tensor.to_dtype(DType::F32)?.flatten_all()?.to_vec1::<f32>()?;
             let (expected, found) = (vec![3, 1, 1], tensor.dims().to_vec());
-            values.try_into().map_err(|_: Vec<f32>| ModelError::MisshapenTensor { name, expected, found })
+            values.try_into().map_err(|_given: Vec<f32>| ModelError::MisshapenTensor { name, expected, found })
         };
         means.push(of("mean", 0.0)?);
         stds.push(of("std", 1.0)?);

@@ -189,7 +189,8 @@ impl Conv {
         let (pad, s) = (self.padding(), self.stride);
         // an input row 2 i + parity meets the kernel's rows `ky` of the outputs `first + 0..`
         let taps = |parity: usize| -> (Vec<usize>, usize) {
-            let taps: Vec<usize> = (0..self.kernel).rev().filter(|ky| (parity + pad + s - ky % s) % s == 0).collect();
+            let taps: Vec<usize> =
+                (0..self.kernel).rev().filter(|ky| (parity + pad + s - ky % s).is_multiple_of(s)).collect();
             // the output of the first tap, counted with the border: (parity + pad - ky) / s, which may be negative
             let first = taps.first().map_or(0, |&ky| g.border * s + parity + pad - ky) / s;
             (taps, first)

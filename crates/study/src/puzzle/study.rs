@@ -261,7 +261,7 @@ fn run_row(
 
 fn evaluate(entry: &Entry, task: Option<Task>, test: &StudyTest, results: &Path) -> Result<PuzzleEvaluation, ZooError> {
     let options = PuzzleEvaluationOptions { task, givens: test.givens, puzzles: STUDY_PUZZLES, depth: test.depth };
-    Ok(evaluate_puzzles(&SolverEntry::load(&entry, task)?, results, &options)?.1)
+    Ok(evaluate_puzzles(&SolverEntry::load(entry, task)?, results, &options)?.1)
 }
 
 /// The entry of a run that has finished.

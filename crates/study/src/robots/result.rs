@@ -121,7 +121,7 @@ impl CellResult {
     pub fn write(&self, path: &Path) -> Result<(), ZooError> {
         let mut text = serde_json::to_string(self).expect("plain fields are always JSON");
         // a line an episode: small files that a version control system can compare
-        text = text.replace("{\"seed\":", "\n{\"seed\":").replace("\"episodes\":[\n", "\"episodes\":[\n");
+        text = text.replace("{\"seed\":", "\n{\"seed\":");
         text.push('\n');
         write_atomic(path, text.as_bytes())
     }

@@ -119,8 +119,8 @@ pub(crate) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), Z
         ("return", Arc::new(Float64Array::from_iter_values(all.iter().map(|e| e.total_reward)))),
         ("fingerprint", Arc::new(StringArray::from_iter_values(fingerprints))),
     ];
-    let words: [(&str, fn(&EpisodeRecord) -> Option<&str>); 2] =
-        [("group", |e| e.group.as_deref()), ("failure", |e| e.failure.as_deref())];
+    type Word = fn(&EpisodeRecord) -> Option<&str>;
+    let words: [(&str, Word); 2] = [("group", |e| e.group.as_deref()), ("failure", |e| e.failure.as_deref())];
     for (name, word) in words {
         if all.iter().any(|e| word(e).is_some()) {
             let texts = all.iter().map(|e| word(e).unwrap_or_default());
