@@ -157,8 +157,7 @@ def test_fast_rendering_changes_pixels_and_nothing_else() -> None:
         session = envs.make("Lift", ("agentview", "robot0_eye_in_hand"), 48, fast_render=fast)
         envs.reset(session, 5)
         assert session.env_args.get("fast_render", False) is fast
-        for action in walk(1, 2):
-            result = envs.step_session(session, action)
+        *_, result = [envs.step_session(session, action) for action in walk(1, 2)]
         drawn[fast] = result.observation
     for name, full in drawn[False].items():
         if name.endswith("_image"):
