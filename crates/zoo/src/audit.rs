@@ -281,7 +281,7 @@ mod tests {
 
     #[test]
     fn forged_results_are_left_out_with_the_reason() {
-        let (zoo, folder, record) = zoo();
+        let (zoo, folder, _) = zoo();
         let results = zoo.path().join("results");
         let path = folder.join(RECORD);
         let original = fs::read_to_string(&path).unwrap();
