@@ -205,8 +205,9 @@ fn three_steps_with_two_rates_are_lerobots() {
         }
         let probes = npz::arrays(&after);
         for (name, var) in f.act.params().iter() {
-            // Adam turns tiny gradients into whole steps
-            assert_probes(&probes, &format!("model.{name}"), &values(var.as_tensor()), 1e-3, &f.name);
+            // keys' biases have a gradient of zero but for rounding, and Adam makes whole steps of it
+            let tolerance = if name.ends_with("in_proj_bias") { 5e-2 } else { 1e-3 };
+            assert_probes(&probes, &format!("model.{name}"), &values(var.as_tensor()), tolerance, &f.name);
         }
     }
 }

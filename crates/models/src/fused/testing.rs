@@ -101,7 +101,8 @@ pub(crate) fn assert_the_step_is_the_composed_one(model: &dyn PolicyModel, batch
             let mut twice = grads.clone();
             model.accumulate_gradients(batch, &mut Rng::new(4, "step"), &mut twice).unwrap();
             for (a, b) in twice.values().iter().zip(grads.values()) {
-                assert!((a - 2.0 * b).abs() <= 1e-5 * b.abs().max(1e-2), "{a} {b} {what}");
+                // added to what is there, sums of many terms round otherwise
+                assert!((a - 2.0 * b).abs() <= 1e-4 * b.abs().max(1e-2), "{a} {b} {what}");
             }
         });
     }

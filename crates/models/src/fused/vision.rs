@@ -274,7 +274,8 @@ fn convolve(pass: &mut Pass<'_>, name: &str, conv: &Conv, x: &[f32]) -> Vec<f32>
     let make = |panels: &mut [f32]| conv.pack(weight, panels);
     match pass.packed {
         Some(packed) => {
-            let panels = packed.made_once(name, || {
+            // panels are as wide as the vectors of the instruction set that reads them
+            let panels = packed.made_once(&format!("{name} in panels of {}", conv.panel_width()), || {
                 let mut panels = vec![0.0; conv.panel_len().0];
                 make(&mut panels);
                 panels

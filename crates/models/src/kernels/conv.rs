@@ -233,6 +233,11 @@ impl Conv {
         self.padding().min(1)
     }
 
+    /// Columns of a panel of the forward pass.
+    pub(crate) fn panel_width(&self) -> usize {
+        panel_width(self.output)
+    }
+
     /// Numbers of the panels of both directions.
     pub(crate) fn panel_len(&self) -> (usize, usize) {
         let per = self.kernel * self.kernel;

@@ -166,7 +166,7 @@ def recorded(env_args: dict[str, Any]) -> dict[str, Any]:
     found = {
         name: value
         for name, value in cast("dict[str, Any]", kwargs).items()
-        if not name.startswith(_DECIDED) and name not in ("ignore_done", "use_object_obs", "use_camera_obs")
+        if not name.startswith(_DECIDED) and name not in ("env_name", "ignore_done", "use_object_obs", "use_camera_obs")
     }
     if found.get("control_freq") == CONTROL_FREQ:
         # said by some files and not by others
