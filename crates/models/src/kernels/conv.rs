@@ -414,31 +414,35 @@ fn tile<S: Simd, const R: usize, const V: usize>(
         let line = |r: usize| x.get(starts[r] + s * grid.apart..).and_then(|line| line.get(..grid.length));
         let mut lines: [&[f32]; R] = std::array::from_fn(|r| line(r).unwrap_or(&[]));
         let (part, _) = S::as_simd_f32s(part);
-        let mut columns = part.chunks_exact(V);
-        for _ in 0..grid.length / STRIDE {
+        let mut blocks = part.chunks_exact(STRIDE * V);
+        for block in &mut blocks {
             let steps: [&[f32; STRIDE]; R] = std::array::from_fn(|r| {
                 let (head, tail) = lines[r].split_first_chunk().unwrap_or((&[0.0; STRIDE], &[]));
                 lines[r] = tail;
                 head
             });
-            for p in 0..STRIDE {
-                let Some(b) = columns.next() else { break };
+            // sums of its own for every block: these stay in registers
+            let mut own = sums;
+            for (p, b) in (0..STRIDE).zip(block.chunks_exact(V)) {
                 for r in 0..R {
                     let a = simd.splat_f32s(steps[r][p]);
                     for v in 0..V {
-                        sums[r][v] = simd.mul_add_e_f32s(a, b[v], sums[r][v]);
+                        own[r][v] = simd.mul_add_e_f32s(a, b[v], own[r][v]);
                     }
                 }
             }
+            sums = own;
         }
-        for (p, b) in columns.enumerate() {
+        let mut own = sums;
+        for (p, b) in blocks.remainder().chunks_exact(V).enumerate() {
             for r in 0..R {
                 let a = simd.splat_f32s(lines[r].get(p).copied().unwrap_or(0.0));
                 for v in 0..V {
-                    sums[r][v] = simd.mul_add_e_f32s(a, b[v], sums[r][v]);
+                    own[r][v] = simd.mul_add_e_f32s(a, b[v], own[r][v]);
                 }
             }
         }
+        sums = own;
     }
     let mut buffer = [0f32; 64];
     for (&(_, to), sums) in places.iter().zip(&sums) {
@@ -526,17 +530,22 @@ fn weight_tile<S: Simd, const R: usize, const V: usize>(
 ) -> [[S::f32s; V]; R] {
     let wide = V * S::F32_LANES;
     let mut sums = [[simd.splat_f32s(0.0); V]; R];
-    for &(from, to) in places {
-        let (b, a) = (x.get(from + at..).and_then(|x| x.get(..wide)), grad.get(to + o0..));
-        let (Some(b), Some(a)) = (b, a.and_then(|a| a.first_chunk::<R>())) else { continue };
-        let (b, _) = S::as_simd_f32s(b);
-        let Some(b) = b.first_chunk::<V>() else { continue };
-        for r in 0..R {
-            let a = simd.splat_f32s(a[r]);
-            for v in 0..V {
-                sums[r][v] = simd.mul_add_e_f32s(a, b[v], sums[r][v]);
+    for some in places.chunks(STRIDE) {
+        // as in `tile`
+        let mut own = sums;
+        for &(from, to) in some {
+            let (b, a) = (x.get(from + at..).and_then(|x| x.get(..wide)), grad.get(to + o0..));
+            let (Some(b), Some(a)) = (b, a.and_then(|a| a.first_chunk::<R>())) else { continue };
+            let (b, _) = S::as_simd_f32s(b);
+            let Some(b) = b.first_chunk::<V>() else { continue };
+            for r in 0..R {
+                let a = simd.splat_f32s(a[r]);
+                for v in 0..V {
+                    own[r][v] = simd.mul_add_e_f32s(a, b[v], own[r][v]);
+                }
             }
         }
+        sums = own;
     }
     sums
 }
