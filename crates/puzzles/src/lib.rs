@@ -13,6 +13,7 @@ mod rng;
 mod split;
 mod sudoku;
 mod symmetry;
+mod table;
 mod task;
 mod walker;
 
@@ -22,5 +23,6 @@ pub use rng::PuzzleRng;
 pub use split::{Split, fingerprint};
 pub use sudoku::{Sudoku, SudokuTask};
 pub use symmetry::Symmetry;
+pub use table::table_mazes;
 pub use task::{Grade, Puzzle, Task};
 pub use walker::{MAX_MOVES, MOVES, Moved, Walker};

@@ -49,6 +49,9 @@ class OnTable:
         """The objects, by name."""
         raise NotImplementedError
 
+    def furnish(self, arena: Any, robot: Any) -> None:
+        """Add what does not move to the scene, or something to the robot; nothing, mostly."""
+
     def arrange(self) -> None:
         """Draw an episode: put the things in their places, and whatever else there is to draw."""
         raise NotImplementedError
@@ -89,6 +92,7 @@ class OnTable:
         )
         arena.set_origin([0, 0, 0])
         self.things = self.make_things()
+        self.furnish(arena, robot)
         self.model = _Stack.ManipulationTask(
             mujoco_arena=arena, mujoco_robots=[robot], mujoco_objects=list(self.things.values())
         )
