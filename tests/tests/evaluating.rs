@@ -98,6 +98,7 @@ fn a_finished_evaluation_runs_again_to_the_same_outcomes() {
     let record = result(&results, "lift-act").join("evaluation.json");
     let changed = fs::read_to_string(&record).expect("a record").replace("\"demos\": 45", "\"demos\": 44");
     fs::write(&record, changed).expect("writable");
+    fs::remove_file(record.with_file_name("seal.json")).expect("results made before seals have none");
     refused(&mut eval(&entries, "2", &["--again"]), &["evaluation.json differs", "44", "45"]);
 }
 
@@ -114,6 +115,7 @@ fn part_of_a_finished_evaluation_can_be_run_again() {
     let numpy = text.split("\"numpy\": \"").nth(1).and_then(|rest| rest.split('"').next()).expect("numpy's version");
     let changed = text.replace(&format!("\"numpy\": \"{numpy}\""), "\"numpy\": \"1.0.0\"");
     fs::write(&record, changed).expect("writable");
+    fs::remove_file(record.with_file_name("seal.json")).expect("results made before seals have none");
     let output = succeeds(&mut eval(&entries, "2", &["--again"]));
     assert!(String::from_utf8_lossy(&output.stdout).contains("every outcome the same"));
     let note = String::from_utf8_lossy(&output.stderr).into_owned();

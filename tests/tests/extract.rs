@@ -45,7 +45,11 @@ fn observations_are_those_of_robomimics_own_extraction() {
     for id in ["demo_1", "demo_2", "demo_3"] {
         let group = |file: &hdf5::File| file.group(&format!("data/{id}")).expect("the demo is there");
         let (a, b) = (group(&ours), group(&theirs));
-        let members = |demo: &hdf5::Group, name: &str| demo.group(name).expect("there").member_names().expect("listed");
+        let members = |demo: &hdf5::Group, name: &str| {
+            let mut names = demo.group(name).expect("there").member_names().expect("listed");
+            names.sort();
+            names
+        };
         for name in ["obs", "next_obs", "action_dict"] {
             assert_eq!(members(&a, name), members(&b, name), "{id} {name}");
         }
