@@ -108,7 +108,9 @@ fn the_fused_thought_is_the_composed_one() {
                 let got = at_most(level, || model.reason(&batch.observation, start, &mut |_| false).unwrap());
                 let same = |a: &Tensor, b: &Tensor| {
                     let off = (a - b).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
-                    assert!(off < 1e-5, "{off} {level:?} {config:?}");
+                    // through a network for pictures and four rounds of thought
+                    let tolerance = if config.vision.is_some() { 3e-5 } else { 1e-5 };
+                    assert!(off < tolerance, "{off} {level:?} {config:?}");
                 };
                 assert_eq!((got.steps.len(), &got.depth), (want.steps.len(), &want.depth), "{config:?}");
                 for (got, want) in got.steps.iter().zip(&want.steps) {
