@@ -73,16 +73,16 @@ def test_a_recorded_episode_is_not_corrupted(monkeypatch: pytest.MonkeyPatch) ->
     session = envs.make("Lift", ("agentview",), 48)
     session.task = dataclasses.replace(session.task, max_steps=3)
     expected = episodes.expert_episode(session, 4).tensors["obs/agentview_image"]
-    look = envs.image
+    look = envs.images
 
-    def disturbed(*arguments: Any) -> wire.Array:
+    def disturbed(*arguments: Any) -> wire.Tensors:
         other = render.Renderer()
         other.image(session.env.sim, "frontview", 48, 48)
         del other
         gc.collect()
         return look(*arguments)
 
-    monkeypatch.setattr(envs, "image", disturbed)
+    monkeypatch.setattr(envs, "images", disturbed)
     assert np.array_equal(episodes.expert_episode(session, 4).tensors["obs/agentview_image"], expected)
     # without the cure it would be
     monkeypatch.setattr(session.renderer, "make_current", do_nothing)
