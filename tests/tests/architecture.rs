@@ -45,7 +45,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("recording", &["dataset", "rollout"]),
     ("report", &["models", "zoo"]),
     ("study", &["models", "puzzles", "recording", "report", "rollout", "zoo"]),
-    ("cli", &["rollout"]),
+    ("cli", &["rollout", "video"]),
     ("actrm-data", &["cli", "dataset", "puzzles", "recording", "rollout"]),
     ("actrm-query", &["cli", "dataset", "query"]),
     ("actrm-zoo", &["cli", "dataset", "models", "puzzles", "report", "rollout", "study", "zoo"]),

@@ -30,9 +30,9 @@ pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
     }
     for (index, row) in rows.iter().enumerate() {
         let y = 16.0 + step * (index as f64 + 0.5);
-        let (low, high) = row.counts.interval();
+        let (low, high) = row.interval;
         let (low_x, high_x, rate_x) = (scale(low), scale(high), scale(row.counts.rate()));
-        let name = escape(&row.record().entry.to_string());
+        let name = escape(&row.name());
         let _ = write!(
             svg,
             r##"<g><title>{name}: {}/{}, 95% interval {:.1}% to {:.1}%</title><text class="label" x="0" y="{:.1}">{name}</text><line x1="{low_x:.1}" x2="{high_x:.1}" y1="{y:.1}" y2="{y:.1}" stroke="var(--good-soft)" stroke-width="12" stroke-linecap="round"/><circle cx="{rate_x:.1}" cy="{y:.1}" r="5.5" fill="var(--good)"/><text x="{:.1}" y="{:.1}" text-anchor="end">{}/{} · {}</text></g>"##,
@@ -45,7 +45,91 @@ pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
             y + 4.0,
             row.counts.successes,
             row.counts.episodes,
-            row.counts.percent(),
+            row.counts.percent(0),
+        );
+    }
+    svg.push_str("</svg>");
+    svg
+}
+
+/// Success against a query's duration, the number of weights and the minutes of training: three pictures, each with a line
+/// through the rows that no other one beats at no higher cost.
+pub(super) fn costs(rows: &[&LeaderboardRow]) -> String {
+    type Cost = fn(&LeaderboardRow) -> f64;
+    let measures: [(&str, Cost); 3] = [
+        ("median query, ms", |row| row.inference_ms().0),
+        ("weights", |row| row.record().training.parameters as f64),
+        ("minutes of training", LeaderboardRow::minutes),
+    ];
+    let drawn: String = measures.iter().map(|(name, cost)| cost_chart(rows, name, cost)).collect();
+    format!("<div class=\"costs\">{drawn}</div>")
+}
+
+fn cost_chart(rows: &[&LeaderboardRow], name: &str, cost: &dyn Fn(&LeaderboardRow) -> f64) -> String {
+    let points: Vec<(f64, &LeaderboardRow)> =
+        rows.iter().map(|row| (cost(row), *row)).filter(|(x, _)| x.is_finite() && *x > 0.0).collect();
+    let low = points.iter().map(|(x, _)| *x).fold(f64::INFINITY, f64::min);
+    let high = points.iter().map(|(x, _)| *x).fold(0.0, f64::max);
+    if points.is_empty() {
+        return String::new();
+    }
+    let (width, height, left, bottom) = (330.0, 230.0, 44.0, 190.0);
+    // some room on either side, so that equal costs stand in the middle
+    let (from, to) = (low.log10() - 0.15, high.log10() + 0.15);
+    let x_of = |x: f64| left + (x.log10() - from) / (to - from) * (width - left - 14.0);
+    let y_of = |rate: f64| 14.0 + (1.0 - rate) * (bottom - 14.0);
+    let mut svg = format!(
+        r#"<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" aria-label="Success against {}">"#,
+        escape(name)
+    );
+    for percent in [0, 50, 100] {
+        let y = y_of(f64::from(percent) / 1e2);
+        let _ = write!(
+            svg,
+            r#"<line class="grid" x1="{left}" x2="{width}" y1="{y:.1}" y2="{y:.1}"/><text x="{:.1}" y="{:.1}" text-anchor="end">{percent}%</text>"#,
+            left - 6.0,
+            y + 4.0
+        );
+    }
+    for (x, anchor) in [(low, "start"), (high, "end")] {
+        if anchor == "end" && (high / low) < 1.05 {
+            break;
+        }
+        let text = if x >= 1e4 { crate::count_text(x as u64) } else { format!("{x:.1}") };
+        let _ =
+            write!(svg, r#"<text x="{:.1}" y="{:.1}" text-anchor="{anchor}">{text}</text>"#, x_of(x), bottom + 16.0);
+    }
+    let _ =
+        write!(svg, r#"<text class="label" x="{left}" y="{:.1}">{} (logarithmic)</text>"#, bottom + 34.0, escape(name));
+    let mut sorted = points.clone();
+    sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.counts.rate().total_cmp(&a.1.counts.rate())));
+    let mut best = -1.0;
+    let mut front = Vec::new();
+    for (x, row) in sorted {
+        if row.counts.rate() > best {
+            best = row.counts.rate();
+            front.push(format!("{:.1},{:.1}", x_of(x), y_of(best)));
+        }
+    }
+    let _ = write!(
+        svg,
+        r#"<polyline points="{}" fill="none" stroke="var(--faint)" stroke-dasharray="3 3"/>"#,
+        front.join(" ")
+    );
+    let mut policies: Vec<&str> = rows.iter().map(|row| row.policy()).collect();
+    policies.sort_unstable();
+    policies.dedup();
+    for (x, row) in points {
+        let colour = COLOURS[policies.iter().position(|policy| *policy == row.policy()).unwrap_or(0) % COLOURS.len()];
+        let _ = write!(
+            svg,
+            r#"<circle cx="{:.1}" cy="{:.1}" r="5" fill="{colour}" fill-opacity=".75"><title>{} ({}): {}, {x:.2} {}</title></circle>"#,
+            x_of(x),
+            y_of(row.counts.rate()),
+            escape(&row.name()),
+            escape(row.policy()),
+            row.counts.percent(1),
+            escape(name)
         );
     }
     svg.push_str("</svg>");
@@ -93,6 +177,17 @@ pub(super) fn strip(evaluation: &StoredEvaluation) -> String {
 /// The pattern of failed episodes; once a page.
 pub(super) fn patterns() -> &'static str {
     r##"<svg width="0" height="0" aria-hidden="true" style="position:absolute"><defs><pattern id="failed" width="5" height="5" patternUnits="userSpaceOnUse" patternTransform="rotate(45)"><rect width="5" height="5" fill="var(--bad)" fill-opacity=".25"/><rect width="2.5" height="5" fill="var(--bad)"/></pattern></defs></svg>"##
+}
+
+/// Training curves as a picture of their own, which looks alike wherever it is shown.
+pub fn curves_svg(of: &[Curve]) -> String {
+    let style = "<style>text{font:12px sans-serif;fill:#5b6470}.grid{stroke:#e3e7ec}</style>";
+    let drawn = curves(&of.iter().collect::<Vec<_>>());
+    if drawn.is_empty() {
+        return "<svg xmlns=\"http://www.w3.org/2000/svg\"></svg>\n".to_owned();
+    }
+    let drawn = drawn.replacen("<svg ", "<svg xmlns=\"http://www.w3.org/2000/svg\" ", 1);
+    drawn.replacen('>', &format!(">{style}"), 1) + "\n"
 }
 
 /// Training loss over optimiser steps, logarithmic.

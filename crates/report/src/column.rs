@@ -18,6 +18,21 @@ enum Value<R: 'static> {
     Text(fn(&R) -> String),
     /// A number, where there is one, with its decimal places in CSV and in tables for people.
     Number(fn(&R) -> Option<f64>, usize, usize),
+    /// A whole number, where there is one.
+    Count(fn(&R) -> Option<u64>),
+}
+
+/// A value for machines that tell numbers from words.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Datum {
+    /// Words.
+    Text(String),
+    /// A number as CSV has it, rounded alike.
+    Number(f64),
+    /// A whole number.
+    Count(u64),
+    /// No value.
+    None,
 }
 
 /// One statistic of rows of type `R`.
@@ -37,14 +52,13 @@ pub const fn text<R>(value: fn(&R) -> String) -> Column<R> {
 
 /// A column of numbers, in no form yet: `exact` decimal places in CSV, `shown` in tables for people.
 pub const fn number<R>(value: fn(&R) -> Option<f64>, exact: usize, shown: usize) -> Column<R> {
-    Column {
-        value: Value::Number(value, exact, shown),
-        align: Align::Right,
-        kept: false,
-        csv: None,
-        table: None,
-        page: None,
-    }
+    let value = Value::Number(value, exact, shown);
+    Column { value, align: Align::Right, kept: false, csv: None, table: None, page: None }
+}
+
+/// A column of whole numbers, in no form yet.
+pub const fn count<R>(value: fn(&R) -> Option<u64>) -> Column<R> {
+    Column { value: Value::Count(value), align: Align::Right, kept: false, csv: None, table: None, page: None }
 }
 
 impl<R> Column<R> {
@@ -103,6 +117,16 @@ impl<R> Column<R> {
         match self.value {
             Value::Text(of) => of(row),
             Value::Number(of, digits, _) => of(row).map_or(String::new(), |value| format!("{value:.digits$}")),
+            Value::Count(of) => of(row).map_or(String::new(), |value| value.to_string()),
+        }
+    }
+
+    /// The same as a number where it is one.
+    pub fn datum(&self, row: &R) -> Datum {
+        match self.value {
+            Value::Text(of) => Datum::Text(of(row)),
+            Value::Number(..) => self.exact(row).parse().map_or(Datum::None, Datum::Number),
+            Value::Count(of) => of(row).map_or(Datum::None, Datum::Count),
         }
     }
 
@@ -111,6 +135,7 @@ impl<R> Column<R> {
         match self.value {
             Value::Text(of) => of(row),
             Value::Number(of, _, digits) => of(row).map_or("-".to_owned(), |value| format!("{value:.digits$}")),
+            Value::Count(of) => of(row).map_or("-".to_owned(), |value| value.to_string()),
         }
     }
 }
@@ -135,11 +160,12 @@ pub fn cells<'r, R: 'static>(columns: &[Column<R>], rows: impl IntoIterator<Item
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{csv, html, markdown};
+    use crate::{csv, html, json, markdown};
 
     const COLUMNS: &[Column<(&str, Option<f64>)>] = &[
         text(|row: &(&str, Option<f64>)| row.0.to_owned()).csv("name").table("who").page("who").left(),
         number(|row: &(&str, Option<f64>)| row.1, 3, 1).csv("value").table("value").page("value"),
+        count(|row: &(&str, Option<f64>)| row.1.map(|_| 7)).csv("whole"),
         text(|_| "inner".to_owned()),
     ];
 
@@ -147,14 +173,17 @@ mod tests {
     #[test]
     fn each_form_shows_what_the_list_says() {
         let rows = [("a|b", Some(1.25)), ("<c>, \"d\"\nmore", None)];
-        assert_eq!(csv::table(COLUMNS, &rows), "name,value\na|b,1.250\n\"<c>, \"\"d\"\"\nmore\",\n");
+        assert_eq!(csv::table(COLUMNS, &rows), "name,value,whole\na|b,1.250,7\n\"<c>, \"\"d\"\"\nmore\",,\n");
         assert_eq!(
             markdown::table(COLUMNS, &rows),
             "| who | value |\n| --- | ---: |\n| a\\|b | 1.2 |\n| <c>, \"d\"<br>more | - |\n"
         );
         let page = html::table(COLUMNS, &rows);
-        assert!(page.contains("<tr><th>who</th><th>value</th></tr>"), "{page}");
+        assert!(page.contains("<tr><th scope=\"col\">who</th><th scope=\"col\">value</th></tr>"), "{page}");
         assert!(page.contains("<td>&lt;c&gt;, &quot;d&quot;<br><small>more</small></td><td>-</td>"), "{page}");
+        let json = json::rows(COLUMNS, &rows);
+        assert_eq!(json[0], serde_json::json!({"name": "a|b", "value": 1.25, "whole": 7}));
+        assert_eq!((&json[1]["value"], &json[1]["whole"]), (&serde_json::Value::Null, &serde_json::Value::Null));
         let cells = cells(COLUMNS, &rows);
         assert_eq!(cells.headings, [("who", Align::Left), ("value", Align::Right)]);
         assert_eq!(cells.rows[0], ["a|b", "1.2"]);

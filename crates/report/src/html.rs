@@ -4,12 +4,25 @@ use crate::column::Column;
 
 /// Every column that pages show; the lines of a cell after its first are small.
 pub fn table<'r, R: 'static>(columns: &[Column<R>], rows: impl IntoIterator<Item = &'r R>) -> String {
+    table_of(columns, rows, "", &|_| String::new())
+}
+
+/// The same with a name, and with attributes for each row's element, which are HTML already.
+pub fn table_of<'r, R: 'static>(
+    columns: &[Column<R>],
+    rows: impl IntoIterator<Item = &'r R>,
+    id: &str,
+    attributes: &dyn Fn(&R) -> String,
+) -> String {
     let shown: Vec<(&Column<R>, &str)> = columns.iter().filter_map(|c| Some((c, c.page_heading()?))).collect();
-    let mut html = String::from("<table><thead><tr>");
-    shown.iter().for_each(|(_, heading)| html.push_str(&format!("<th>{}</th>", escape(heading).replace('\n', "<br>"))));
+    let id = if id.is_empty() { String::new() } else { format!(" id=\"{}\"", escape(id)) };
+    let mut html = format!("<table{id}><thead><tr>");
+    shown.iter().for_each(|(_, heading)| {
+        html.push_str(&format!("<th scope=\"col\">{}</th>", escape(heading).replace('\n', "<br>")));
+    });
     html.push_str("</tr></thead><tbody>\n");
     for row in rows {
-        html.push_str("<tr>");
+        html.push_str(&format!("<tr{}>", attributes(row)));
         shown.iter().for_each(|(column, _)| html.push_str(&format!("<td>{}</td>", cell(&column.shown(row)))));
         html.push_str("</tr>\n");
     }

@@ -1,15 +1,18 @@
 //! What readers see of a zoo's results: statistics, the leaderboard, and the forms that it is written in.
 //!
-//! A table is a list of columns ([`column`]); [`csv`], [`markdown`] and [`html`] each write any such list, and so do
+//! A table is a list of columns ([`column`]); [`csv`], [`json`], [`markdown`] and [`html`] each write any such list, and so do
 //! the programs to a terminal.
 //!
 //! Pure functions of results: no file, no clock, the same bytes for the same evaluations. What this crate is not: it
 //! runs nothing and knows no kind of entry but robot policies; other kinds bring their own section (`study`).
 
+mod across;
 mod charts;
 pub mod column;
+pub mod comparison;
 pub mod csv;
 pub mod html;
+pub mod json;
 mod leaderboard;
 pub mod markdown;
 mod page;
@@ -17,6 +20,8 @@ pub mod statistics;
 #[cfg(test)]
 mod testing;
 
-pub use leaderboard::{COLUMNS, Counts, FEWEST_TO_RANK, LeaderboardRow, count_text, rank};
+pub use across::{ACROSS_COLUMNS, AcrossTasks, across_tasks};
+pub use charts::curves_svg;
+pub use leaderboard::{Bound, COLUMNS, Counts, FEWEST_TO_RANK, LeaderboardRow, Reading, count_text, rank};
 pub use page::{Curve, to_html};
-pub use statistics::{mean, quantile, wilson_interval};
+pub use statistics::{mean, percent, quantile, wilson_interval};

@@ -1,16 +1,16 @@
 //! The report: one HTML file with everything in it, for a reader who has nothing but a browser.
 //!
-//! A pure function of results and training curves: no clock, no network, the same bytes for the same
-//! input.
+//! First one table over all tasks, a policy a row; then every row with its details. A pure function of results and
+//! training curves: no clock, no network, the same bytes for the same input. Without scripts everything is there; the
+//! script sorts, filters and copies.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use zoo::results::StoredEvaluation;
-
+use crate::across::{ACROSS_COLUMNS, across_tasks, speaking};
 use crate::charts;
 use crate::html::{self, escape};
-use crate::leaderboard::{COLUMNS, LeaderboardRow, rank};
+use crate::leaderboard::{COLUMNS, LeaderboardRow, group, interval_text};
 
 /// An entry's training loss over optimiser steps.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,75 +21,255 @@ pub struct Curve {
     pub points: Vec<(u64, f64)>,
 }
 
-/// The report over all whole evaluations as HTML, and after them `section`: HTML of other evaluations, or nothing.
-pub fn to_html(evaluations: &[StoredEvaluation], curves: &[Curve], section: &str) -> String {
-    let rows = rank(evaluations);
-    let mut groups: BTreeMap<(String, String), Vec<&LeaderboardRow>> = BTreeMap::new();
-    for row in &rows {
-        groups.entry((row.task().to_owned(), row.record().protocol.id())).or_default().push(row);
+/// Rows whose episodes, curves and origin are drawn; a page with ten thousand of them would be of no use.
+const MOST_DETAILED: usize = 200;
+
+/// Rows of a task that stand in its chart of intervals.
+const MOST_DRAWN: usize = 60;
+
+/// The report over ranked rows as HTML, and after them `section`: HTML of other evaluations, or nothing.
+pub fn to_html(rows: &[LeaderboardRow], curves: &[Curve], section: &str) -> String {
+    let mut groups: BTreeMap<(String, String, String), Vec<&LeaderboardRow>> = BTreeMap::new();
+    for row in rows {
+        groups.entry(group(row)).or_default().push(row);
     }
     let mut html = String::new();
     html.push_str("<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n");
     html.push_str("<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n");
+    html.push_str("<link rel=\"icon\" href=\"data:,\">\n");
     let _ = writeln!(html, "<title>actrm leaderboard</title>\n<style>\n{}</style>\n</head>", include_str!("style.css"));
     let _ = writeln!(html, "<body>\n{}\n<main>\n<h1>Leaderboard</h1>", charts::patterns());
     let episodes: u64 = rows.iter().map(|row| row.counts.episodes).sum();
-    let _ = writeln!(
-        html,
-        "<p class=\"lead\">{} evaluations, {} episodes. Entries are ranked inside a task and protocol by what their \
-         success rate is at least, the lower end of its interval; bars are 95% Wilson intervals. Where intervals overlap widely, these \
-         episodes do not decide between the entries.</p>",
-        rows.len(),
-        episodes
-    );
-    if rows.is_empty() && section.is_empty() {
-        html.push_str("<p>No finished evaluation yet.</p>\n");
-    }
-    for ((task, protocol), rows) in &groups {
+    let trainings: usize = rows.iter().map(LeaderboardRow::n_trainings).sum();
+    if rows.is_empty() {
+        html.push_str(if section.is_empty() { "<p>No finished evaluation yet.</p>\n" } else { "" });
+    } else {
         let _ = writeln!(
             html,
-            "<h2>{}</h2>\n<p class=\"lead\">Protocol <code>{}</code></p>",
-            escape(task),
-            escape(protocol)
+            "<p class=\"lead\">{} evaluations of {} trainings, {} episodes. Rows of a task and protocol that share a letter \
+             cannot be told apart by these episodes.</p>",
+            rows.len(),
+            trainings,
+            episodes
         );
-        let _ = writeln!(html, "<div class=\"card\">{}</div>", charts::intervals(rows));
-        let _ = writeln!(html, "<div class=\"card\">{}</div>", html::table(COLUMNS, rows.iter().copied()));
-        html.push_str("<div class=\"card\">\n<h3 style=\"margin-top:0\">Episodes by seed: bar height is steps taken, hatched bars failed</h3>\n");
-        for row in rows {
-            let _ = writeln!(
-                html,
-                "<div class=\"strip\"><p><b>{}</b> {} · seeds {}</p>{}</div>",
-                escape(&row.record().entry.to_string()),
-                row.counts,
-                row.record().seeds,
-                charts::strip(&row.evaluation)
-            );
-        }
-        html.push_str("</div>\n");
-        let names: Vec<String> = rows.iter().map(|row| row.record().entry.to_string()).collect();
-        let mut shown: Vec<&Curve> = curves.iter().filter(|curve| names.contains(&curve.entry)).collect();
-        shown.sort_by(|a, b| a.entry.cmp(&b.entry));
-        let drawn = charts::curves(&shown);
-        if !drawn.is_empty() {
-            let _ = writeln!(
-                html,
-                "<div class=\"card\">\n<h3 style=\"margin-top:0\">Training loss over optimiser steps</h3>\n{drawn}</div>"
-            );
-        }
-        html.push_str("<div class=\"card\">\n<h3 style=\"margin-top:0\">Where these numbers come from</h3>\n");
-        for row in rows {
-            html.push_str(&provenance(row));
-        }
-        html.push_str("</div>\n");
+        html.push_str(&overview(rows));
+        html.push_str(&all_rows(rows));
+        contents(&groups, section, &mut html);
+    }
+    let mut left = MOST_DETAILED;
+    for rows in groups.values() {
+        task(rows, curves, &mut left, &mut html);
     }
     html.push_str(section);
     let _ = writeln!(
         html,
-        "<footer>Made by <code>actrm-zoo leaderboard</code> {} from the results in the zoo; nothing here is loaded \
-         from elsewhere.</footer>\n</main>\n</body>\n</html>",
-        env!("CARGO_PKG_VERSION")
+        "<footer>Intervals are 95%: Wilson's for one training; for several a bootstrap over trainings and episodes. Ranks go \
+         by the lower end. Letters and ranges of ranks: exact McNemar tests on equal seeds (Barnard's on others, a bootstrap \
+         between families), Holm's correction over the whole table. Made by <code>actrm-zoo leaderboard</code> {} from the \
+         results in the zoo; nothing here is loaded from elsewhere.</footer>\n</main>\n<script>\n{}</script>\n</body>\n</html>",
+        env!("CARGO_PKG_VERSION"),
+        include_str!("page.js")
     );
     html
+}
+
+/// The first screen: a policy a row, a task a column, in each cell the rate, its interval and the group.
+fn overview(rows: &[LeaderboardRow]) -> String {
+    let table = speaking(rows);
+    let tasks: BTreeMap<&str, String> =
+        table.values().flatten().map(|(task, row)| (task.as_str(), row.protocol_text())).collect();
+    let mut html = String::from(
+        "<div class=\"card\" role=\"region\" aria-label=\"Policies by task\" tabindex=\"0\"><table id=\"overview\">\
+         <caption>The first row of each kind of policy in each task: success, 95% interval, group. Choosing it by its \
+         success flatters it a little.</caption><thead><tr><th scope=\"col\">policy</th>",
+    );
+    for (task, protocol) in &tasks {
+        let _ = write!(html, "<th scope=\"col\">{}<br><small>{}</small></th>", escape(task), escape(protocol));
+    }
+    html.push_str("</tr></thead><tbody>\n");
+    for (policy, of) in &table {
+        let _ = write!(html, "<tr><th scope=\"row\">{}</th>", escape(policy));
+        for task in tasks.keys() {
+            let Some(row) = of.get(*task) else {
+                html.push_str("<td>–</td>");
+                continue;
+            };
+            let place = row.standing.as_ref().map_or(row.unranked_text(), |standing| standing.letters.as_str());
+            let _ = write!(
+                html,
+                "<td><a href=\"#{}\">{}</a> <span class=\"group\">{}</span><br><small>{}%{}</small></td>",
+                anchor(row),
+                row.counts.percent(1),
+                escape(place),
+                interval_text(row.interval, 0, '–'),
+                if row.n_trainings() > 1 { format!(", {} trainings", row.n_trainings()) } else { String::new() }
+            );
+        }
+        html.push_str("</tr>\n");
+    }
+    html.push_str("</tbody></table></div>\n");
+    let across = across_tasks(rows);
+    if !across.is_empty() {
+        let _ = writeln!(
+            html,
+            "<h2 id=\"across\">Across tasks</h2>\n<p class=\"lead\">The interquartile mean of the success rates, with a \
+             bootstrap that draws trainings within each task.</p>\n<div class=\"card\" role=\"region\" aria-label=\"Across \
+             tasks\" tabindex=\"0\">{}</div>",
+            html::table(ACROSS_COLUMNS, &across)
+        );
+    }
+    html
+}
+
+/// Every row, with what filters and sorts them.
+fn all_rows(rows: &[LeaderboardRow]) -> String {
+    let choice = |name: &str, of: &dyn Fn(&LeaderboardRow) -> String| {
+        let mut values: Vec<String> = rows.iter().map(of).collect();
+        values.sort();
+        values.dedup();
+        let options: String = values.iter().map(|value| format!("<option>{}</option>", escape(value))).collect();
+        format!(
+            "<label>{name} <select data-filter=\"{name}\"><option value=\"\">all</option>{options}</select></label>\n"
+        )
+    };
+    let attributes = |row: &LeaderboardRow| {
+        format!(
+            " id=\"{}\" data-task=\"{}\" data-policy=\"{}\" data-protocol=\"{}\"",
+            anchor(row),
+            escape(row.task()),
+            escape(row.policy()),
+            escape(&row.protocol_text())
+        )
+    };
+    format!(
+        "<h2 id=\"rows\">All rows</h2>\n<form class=\"tools\" role=\"search\" aria-label=\"Filter rows\">\n{}{}{}<label>entry \
+         <input type=\"search\" data-filter=\"text\" placeholder=\"any\"></label>\n<button type=\"button\" id=\"copy\">Copy \
+         as CSV</button>\n<output id=\"shown\" aria-live=\"polite\"></output>\n</form>\n<div class=\"card\" role=\"region\" \
+         aria-label=\"All rows\" tabindex=\"0\">{}</div>\n",
+        choice("task", &|row| row.task().to_owned()),
+        choice("policy", &|row| row.policy().to_owned()),
+        choice("protocol", &LeaderboardRow::protocol_text),
+        html::table_of(COLUMNS, rows, "all", &attributes)
+    )
+}
+
+fn contents(groups: &BTreeMap<(String, String, String), Vec<&LeaderboardRow>>, section: &str, html: &mut String) {
+    html.push_str("<nav aria-label=\"Contents\"><ul class=\"contents\">");
+    for rows in groups.values() {
+        let (task, protocol) = (escape(rows[0].task()), escape(&rows[0].protocol_text()));
+        let _ = write!(html, "<li><a href=\"#{}\">{task}</a> <small>{protocol}</small></li>", heading(rows[0]));
+    }
+    if !section.is_empty() {
+        html.push_str("<li><a href=\"#puzzles\">Puzzles</a></li>");
+    }
+    html.push_str("</ul></nav>\n");
+}
+
+/// A task under one protocol: its chart, what success costs, and each row's details while there is room.
+fn task(rows: &[&LeaderboardRow], curves: &[Curve], left: &mut usize, html: &mut String) {
+    let _ = writeln!(
+        html,
+        "<section>\n<h2 id=\"{}\">{}</h2>\n<p class=\"lead\">Protocol <code>{}</code></p>",
+        heading(rows[0]),
+        escape(rows[0].task()),
+        escape(&rows[0].protocol_text())
+    );
+    let drawn = &rows[..rows.len().min(MOST_DRAWN)];
+    let more = match rows.len() - drawn.len() {
+        0 => String::new(),
+        more => format!("<p class=\"lead\">and {more} more rows in the table above</p>"),
+    };
+    let _ = writeln!(html, "{}{more}", card("Success rates with their intervals", &charts::intervals(drawn)));
+    if rows.len() > 1 {
+        let costs = charts::costs(drawn);
+        let _ = writeln!(html, "{}", card("Success against what it costs", &costs));
+    }
+    for row in rows {
+        if *left == 0 {
+            break;
+        }
+        *left -= 1;
+        details(row, curves, html);
+    }
+    html.push_str("</section>\n");
+}
+
+fn card(title: &str, content: &str) -> String {
+    format!(
+        "<div class=\"card\" role=\"region\" aria-label=\"{0}\" tabindex=\"0\">\n<h3>{0}</h3>\n{content}</div>",
+        escape(title)
+    )
+}
+
+/// What lies behind a row: each training's episodes, its curve, and where it comes from.
+fn details(row: &LeaderboardRow, curves: &[Curve], html: &mut String) {
+    let _ = writeln!(
+        html,
+        "<details class=\"row\" id=\"details-{}\"><summary>{} <small>{}, {} [{}%]</small></summary>",
+        anchor(row),
+        escape(&row.name()),
+        row.counts,
+        row.counts.percent(1),
+        interval_text(row.interval, 1, '–')
+    );
+    let _ = writeln!(html, "<p><a href=\"#{}\">in the table</a></p>", anchor(row));
+    let trainings = row.details();
+    if trainings.len() > 1 {
+        let _ = writeln!(html, "{}", card("Each training", &html::table(COLUMNS, &trainings)));
+    }
+    html.push_str("<div class=\"card\">\n<h3>Episodes by seed: bar height is steps taken, hatched bars failed</h3>\n");
+    for training in &trainings {
+        let strips: String = training.evaluations().map(charts::strip).collect();
+        let _ = writeln!(
+            html,
+            "<div class=\"strip\"><p><b>{}</b> {} · seeds {}</p>{strips}{}</div>",
+            escape(&training.name()),
+            training.counts,
+            training.record().seeds,
+            failed(training)
+        );
+    }
+    html.push_str("</div>\n");
+    let names: Vec<String> = trainings.iter().map(LeaderboardRow::name).collect();
+    let mut shown: Vec<&Curve> = curves.iter().filter(|curve| names.contains(&curve.entry)).collect();
+    shown.sort_by(|a, b| a.entry.cmp(&b.entry));
+    let drawn = charts::curves(&shown);
+    if !drawn.is_empty() {
+        let _ = writeln!(html, "{}", card("Training loss over optimiser steps", &drawn));
+    }
+    html.push_str("<div class=\"card\">\n<h3>Where these numbers come from</h3>\n");
+    trainings.iter().for_each(|training| html.push_str(&provenance(training)));
+    html.push_str("</div>\n</details>\n");
+}
+
+/// The first seeds that failed, with the command that shows one.
+fn failed(row: &LeaderboardRow) -> String {
+    const SHOWN: usize = 12;
+    let seeds: Vec<u64> =
+        row.evaluations().flat_map(|one| &one.episodes).filter(|e| !e.success).map(|e| e.seed).collect();
+    let Some(first) = seeds.first() else { return String::new() };
+    let listed: Vec<String> = seeds.iter().take(SHOWN).map(u64::to_string).collect();
+    let more = seeds.len().saturating_sub(SHOWN);
+    format!(
+        "<p>Failed: {}{}. Watch one: <code>actrm-zoo eval {} --seed-start {first} --episodes 1 --video 1</code></p>",
+        listed.join(", "),
+        if more > 0 { format!(" and {more} more") } else { String::new() },
+        escape(&row.name())
+    )
+}
+
+/// A name for links: letters, digits and hyphens of what tells a row from the others.
+fn anchor(row: &LeaderboardRow) -> String {
+    slug(&format!("{} {} {} {}", row.name(), row.protocol_text(), row.record().seeds, row.execution_text()))
+}
+
+fn heading(row: &LeaderboardRow) -> String {
+    slug(&format!("task {} {}", row.task(), row.protocol_text()))
+}
+
+fn slug(text: &str) -> String {
+    let word = |c: char| if c.is_ascii_alphanumeric() || "._@*".contains(c) { c.to_ascii_lowercase() } else { '-' };
+    escape(&text.chars().map(word).collect::<String>())
 }
 
 fn provenance(row: &LeaderboardRow) -> String {
@@ -111,22 +291,35 @@ fn provenance(row: &LeaderboardRow) -> String {
             format!("{} steps in {:.1} min, seed {}, {} parameters", t.steps, t.minutes, t.seed, t.parameters),
         ),
         ("execution", escape(&row.execution_text())),
-        ("seeds", row.record().seeds.to_string()),
+        ("rules", format!("<code>{}</code>", escape(&row.record().protocol.id()))),
+        ("seeds", escape(&row.seeds_text())),
         ("versions", escape(&row.versions_text())),
+        (
+            "run it again",
+            format!(
+                "<code>actrm-zoo eval {} --seed-start {} --episodes {} --again</code>",
+                escape(&row.name()),
+                row.record().seeds.start,
+                row.record().seeds.count
+            ),
+        ),
     ];
-    let mut html = format!("<details><summary>{}</summary><dl>", escape(&row.record().entry.to_string()));
+    let mut html = format!("<h4>{}</h4><dl>", escape(&row.name()));
     for (name, value) in facts {
         let _ = write!(html, "<dt>{name}</dt><dd>{value}</dd>");
     }
-    html.push_str("</dl></details>\n");
+    html.push_str("</dl>\n");
     html
 }
 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use std::time::Instant;
+
     use super::*;
     use crate::testing::{finished, sample};
+    use crate::{Reading, rank};
     use zoo::results::list_evaluations;
 
     fn page() -> String {
@@ -138,7 +331,7 @@ mod tests {
         finished(dir.path(), &stack);
         let points = (0..=500).step_by(10).map(|step| (step, 2.0 * (-(step as f64) / 120.0).exp() + 0.03)).collect();
         let curves = [Curve { entry: "lift-act@1".into(), points }];
-        to_html(&list_evaluations(dir.path()).unwrap(), &curves, "")
+        to_html(&rank(&list_evaluations(dir.path()).unwrap(), &Reading::default()), &curves, "")
     }
 
     #[test]
@@ -149,12 +342,29 @@ mod tests {
     #[test]
     fn the_page_is_self_contained_and_escapes_names() {
         let html = page();
-        for outside in ["http://", "https://", "<script", "<link", "@import", " src="] {
+        for outside in ["http://", "https://", "<script ", "@import", " src=", "fetch(", "XMLHttp"] {
             assert!(!html.contains(outside), "{outside}");
         }
         assert!(!html.contains("<b>&\""));
         assert!(html.contains("&lt;b&gt;&amp;&quot;@2"));
         assert_eq!(html, page());
+    }
+
+    #[test]
+    fn every_link_of_the_page_leads_somewhere_and_no_name_is_given_twice() {
+        let html = page();
+        let parts = |before: &str| -> Vec<String> {
+            html.split(before).skip(1).map(|rest| rest.split('"').next().unwrap_or_default().to_owned()).collect()
+        };
+        let (links, mut names) = (parts("href=\"#"), parts(" id=\""));
+        assert!(links.len() > 5, "{links:?}");
+        for link in links {
+            assert!(names.contains(&link), "{link} of {names:?}");
+        }
+        names.sort();
+        let all = names.len();
+        names.dedup();
+        assert_eq!(names.len(), all, "{names:?}");
     }
 
     #[test]
@@ -164,12 +374,38 @@ mod tests {
         for (k, episode) in evaluation.episodes.iter_mut().enumerate() {
             episode.group = Some(if k < 15 { "seen" } else { "unseen" }.to_owned());
         }
-        let html = to_html(&[evaluation], &[], "");
+        let html = to_html(&rank(&[evaluation], &Reading::default()), &[], "");
         assert!(html.contains("16/20<br><small>seen 12/15 (55–93%)</small><br><small>unseen 4/5 (38–96%)</small>"));
     }
 
     #[test]
     fn no_result_is_a_page_that_says_so() {
         assert!(to_html(&[], &[], "").contains("No finished evaluation yet"));
+        assert!(!to_html(&[], &[], "<h2 id=\"puzzles\">x</h2>").contains("No finished"));
+    }
+
+    /// Ten thousand results over fifty tasks. The bound is for a machine that does other work beside.
+    #[test]
+    fn ten_thousand_results_are_a_page_in_seconds() {
+        let dir = tempfile::tempdir().unwrap();
+        let one = finished(dir.path(), &sample("a", 1, 40));
+        let all: Vec<_> = (0..10_000_u32)
+            .map(|k| {
+                let mut other = one.clone();
+                other.record.entry.name = format!("entry-{}", k / 50);
+                other.record.protocol.task = format!("Task{}", k % 50);
+                for episode in &mut other.episodes {
+                    episode.success = (episode.seed * 7919 + u64::from(k / 50) * 104_729) % 200 < u64::from(k / 50);
+                }
+                other
+            })
+            .collect();
+        let begin = Instant::now();
+        let rows = rank(&all, &Reading::default());
+        let html = to_html(&rows, &[], "");
+        let took = begin.elapsed();
+        assert_eq!(rows.len(), 10_000);
+        assert!(html.len() < 40_000_000, "{} bytes", html.len());
+        assert!(took.as_secs_f64() < 15.0, "{took:?}");
     }
 }

@@ -147,14 +147,6 @@ pub enum RolloutError {
         /// What the thread library said.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// A video could not be written.
-    #[error("video {}: {problem}", path.display())]
-    Video {
-        /// The file.
-        path: PathBuf,
-        /// What went wrong.
-        problem: String,
-    },
     /// A stored attempt of a collection is not one that was written.
     #[error("{}: not an attempt: {problem}", path.display())]
     Attempt {

@@ -21,7 +21,6 @@ mod process;
 mod recorded;
 mod spec;
 mod stop;
-pub mod video;
 mod worker;
 
 pub use episode::{Agent, AgentError, EpisodePlan, Outcome, Watch};

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use common::{alive, impatient, options, spec, wait_until, wrapped};
-use rollout::{JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, TimeLimits, Worker, video};
+use rollout::{JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, TimeLimits, Worker};
 use rustix::process::{Pid, Signal, kill_process};
 
 /// Everything that an episode shows, to the last bit: fingerprint, observations, rewards.
@@ -343,8 +343,7 @@ fn many_actions_in_one_request_are_as_many_requests() {
 }
 
 #[test]
-fn images_become_a_video_file() {
-    let dir = tempfile::tempdir().unwrap();
+fn images_are_drawn_of_every_step() {
     let mut pool = Pool::start(options("Lift", 1)).unwrap();
     let work = |(): &mut (), worker: &mut Worker, _| {
         worker.reset(10_000)?;
@@ -363,12 +362,5 @@ fn images_become_a_video_file() {
     .unwrap();
     let images = films.remove(0);
     assert_ne!(images[0], images[5], "the arm has moved");
-    let path = dir.path().join("out.mp4");
-    video::write(&common::python(), &path, &images, 20.0).unwrap();
-    let bytes = std::fs::read(&path).unwrap();
-    assert_eq!(&bytes[4..8], b"ftyp", "an MPEG-4 file begins so");
-    assert!(bytes.len() > 1000, "{}", bytes.len());
-    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
-    let error = video::write(&common::python(), &path, &[], 20.0).unwrap_err().to_string();
-    assert!(error.contains("no images"), "{error}");
+    assert!(images.iter().all(|image| (image.height, image.width, image.rgb.len()) == (96, 128, 96 * 128 * 3)));
 }

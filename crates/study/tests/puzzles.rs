@@ -11,7 +11,8 @@ use puzzles::Task;
 use report::csv;
 use study::puzzle::{
     AnyExperiment, Baseline, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest,
-    RECORD_FILE, SolverEntry, audit_puzzles, evaluate_puzzles, list_puzzle_evaluations, trace, train_puzzles,
+    RECORD_FILE, SolverEntry, TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again,
+    list_puzzle_evaluations, trace, train_puzzles,
 };
 use zoo::audit::KnownEntries;
 use zoo::config::Library;
@@ -42,8 +43,24 @@ fn finish(request: &PuzzleTrainRequest) -> Entry {
 }
 
 fn evaluated(entry: &Entry, root: &Path, puzzles: u64) -> PuzzleEvaluation {
-    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles, depth: 4 };
-    evaluate_puzzles(&SolverEntry::load(entry, None).unwrap(), &root.join("zoo/results"), &options).unwrap().1
+    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles, depth: 4, seed: TEST_SEED };
+    evaluate_puzzles(&SolverEntry::load(entry, None).unwrap(), &root.join("zoo/results"), &options).unwrap().record
+}
+
+#[test]
+fn answers_are_the_same_again_and_a_fresh_stream_is_another_evaluation() {
+    let root = tempfile::tempdir().unwrap();
+    let entry = finish(&request(root.path(), "trm_maze8-original", &["train.steps=2", "train.validate_every=1000000"]));
+    let (solver, results) = (SolverEntry::load(&entry, None).unwrap(), root.path().join("zoo/results"));
+    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles: 20, depth: 2, seed: TEST_SEED };
+    let error = evaluate_puzzles_again(&solver, &results, &options).unwrap_err().to_string();
+    assert!(error.contains("nothing to run again"), "{error}");
+    let first = evaluate_puzzles(&solver, &results, &options).unwrap();
+    let second = evaluate_puzzles(&solver, &results, &options).unwrap();
+    assert!(!first.was_there && second.was_there && first.record == second.record);
+    assert_eq!(evaluate_puzzles_again(&solver, &results, &options).unwrap().record, first.record);
+    let fresh = evaluate_puzzles(&solver, &results, &PuzzleEvaluationOptions { seed: 7, ..options.clone() }).unwrap();
+    assert!(!fresh.was_there && fresh.folder != first.folder && fresh.record.seed == 7);
 }
 
 /// Trains with few steps and evaluates on 200 test puzzles.
@@ -87,8 +104,10 @@ fn learned(name: &str, overrides: &[&str]) -> PuzzleEvaluation {
     let mut all = vec!["train.validate_every=1000000", "task.valid_puzzles=5"];
     all.extend(overrides);
     let entry = finish(&request(root.path(), name, &all));
-    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles: 200, depth: 16 };
-    evaluate_puzzles(&SolverEntry::load(&entry, None).unwrap(), &root.path().join("zoo/results"), &options).unwrap().1
+    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles: 200, depth: 16, seed: TEST_SEED };
+    evaluate_puzzles(&SolverEntry::load(&entry, None).unwrap(), &root.path().join("zoo/results"), &options)
+        .unwrap()
+        .record
 }
 
 #[test]

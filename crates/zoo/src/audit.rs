@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use crate::ZooError;
-use crate::entry::{Entry, EntryId, EntryMeta, training_facts};
+use crate::entry::{Entry, EntryId, EntryMeta, Families, training_facts};
 use crate::registry::Registry;
 use crate::results::{EntryIdentity, OUTCOMES, RECORD, SEAL_FILE, StoredEvaluation, TrainingFacts, result_folders};
 
@@ -69,6 +69,11 @@ impl KnownEntries {
     /// Those that are what was written, by name and version.
     pub fn good(&self) -> impl Iterator<Item = &Entry> {
         self.opened.values().filter_map(|entry| entry.as_ref().ok())
+    }
+
+    /// The families among those.
+    pub fn families(&self) -> Families {
+        Families::of(self.good())
     }
 
     /// Those that are not, with the reason.

@@ -214,6 +214,24 @@ pub enum ZooError {
         /// Every `name@version` there is.
         available: Vec<String>,
     },
+    /// No version of that entry has this alias.
+    #[error("entry `{name}`: no alias `{alias}`; aliases: latest{}; set one with: actrm-zoo alias {name}@VERSION {alias}", known.iter().map(|k| format!(", {k}")).collect::<String>())]
+    UnknownAlias {
+        /// The entry's name.
+        name: String,
+        /// The alias that was asked for.
+        alias: String,
+        /// Aliases that there are, `best = 3`.
+        known: Vec<String>,
+    },
+    /// An entry that something else stands on.
+    #[error("entry {entry}: not removed, because {} of it: {}", if users.len() == 1 { "this is" } else { "these are" }, users.join(", "))]
+    InUse {
+        /// The entry.
+        entry: String,
+        /// Results and aliases of it.
+        users: Vec<String>,
+    },
     /// Not a name an entry can have.
     #[error("entry name `{name}`: {reason}")]
     EntryName {
@@ -300,6 +318,14 @@ pub enum ZooError {
         expected: String,
         /// What is there.
         found: String,
+    },
+    /// A named protocol that is not there, or a file that is none.
+    #[error("protocol `{name}`: {reason}")]
+    Protocol {
+        /// Its name.
+        name: String,
+        /// What is wrong, and what was expected.
+        reason: String,
     },
     /// Demonstrations that the entry was trained on began as the evaluation's episodes would.
     #[error(

@@ -22,6 +22,7 @@ pub mod tensors;
 // evaluations
 pub mod audit;
 pub mod evaluation;
+pub mod protocols;
 pub mod results;
 
 pub use error::ZooError;

@@ -86,6 +86,36 @@ fn what_is_exported_comes_back_the_same() {
     }
 }
 
+#[test]
+fn an_entry_that_went_out_and_in_still_says_what_it_was_trained_on() {
+    let root = tempfile::tempdir().unwrap();
+    let (zoo, out) = (root.path().join("zoo"), root.path().join("exported"));
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
+    let first = Entry::open(&shipped, &zoo::entry::EntryId { name: "lift-act".to_owned(), version: 1 }).unwrap();
+    export(&first, &out).unwrap();
+    let again = |name: &str| {
+        let options = ImportOptions { name: name.to_owned(), ..options() };
+        Entry::open(&zoo, &import(&out, &options, &zoo).unwrap()).unwrap()
+    };
+    let (before, after) = (first.meta(), again("back").meta().clone());
+    assert!(before.data.is_some() && before.training.is_some() && before.env_version.is_some());
+    assert_eq!((&after.data, &after.training), (&before.data, &before.training));
+    assert_eq!((&after.env_name, &after.env_version), (&before.env_name, &before.env_version));
+    assert!(after.experiment.contains("act_lift, exported to LeRobot as lift-act@1"), "{}", after.experiment);
+    let other_task = ImportOptions { task: "Stack".to_owned(), ..options() };
+    let error = import(&out, &other_task, &zoo).unwrap_err().to_string();
+    assert!(error.contains("--task") && error.contains("Lift"), "{error}");
+    // trained further elsewhere: the weights are others, and of other origin
+    let model = out.join("model.safetensors");
+    let mut bytes = fs::read(&model).unwrap();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 1;
+    fs::write(&model, bytes).unwrap();
+    let trained_further = again("further").meta().clone();
+    assert_eq!((trained_further.data, trained_further.training), (None, None));
+    assert_eq!(trained_further.experiment, "imported from LeRobot");
+}
+
 /// A copy of a fixture in which one file was changed, and the error that importing it gives.
 fn refusal(change: impl Fn(&Path)) -> String {
     let root = tempfile::tempdir().unwrap();

@@ -7,6 +7,7 @@
 mod commands;
 mod places;
 mod puzzles;
+mod simulation;
 
 use std::process::ExitCode;
 

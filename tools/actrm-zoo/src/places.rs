@@ -6,6 +6,7 @@ use clap::Args;
 use clap_complete::engine::{ArgValueCandidates, CompletionCandidate};
 use cli::completions::{candidates, given};
 use zoo::config::Library;
+use zoo::protocols::Protocols;
 use zoo::registry::Registry;
 
 /// Where the zoo is.
@@ -50,6 +51,24 @@ impl ConfigArgs {
     /// The experiments.
     pub fn library(&self) -> anyhow::Result<Library> {
         library(self.configs.as_deref())
+    }
+}
+
+/// Where named protocols are.
+#[derive(Args)]
+pub struct ProtocolArgs {
+    /// Folder of protocol files beside those built in
+    #[arg(long, value_name = "DIR", env = "ACTRM_PROTOCOLS")]
+    protocols: Option<PathBuf>,
+}
+
+impl ProtocolArgs {
+    /// The protocols.
+    pub fn protocols(&self) -> anyhow::Result<Protocols> {
+        Ok(match &self.protocols {
+            Some(folder) => Protocols::with_folder(folder)?,
+            None => Protocols::built_in(),
+        })
     }
 }
 

@@ -6,7 +6,11 @@ use anyhow::bail;
 use clap::Args;
 use puzzles::Task;
 use report::wilson_interval;
-use study::puzzle::{PuzzleEvaluationOptions, SolverEntry, evaluate_puzzles};
+use serde_json::{Value, json};
+use study::puzzle::{
+    EvaluatedPuzzles, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, TEST_SEED, evaluate_puzzles,
+    evaluate_puzzles_again,
+};
 use zoo::entry::Entry;
 
 /// How solvers are evaluated.
@@ -34,8 +38,16 @@ pub fn family(name: &str) -> anyhow::Result<Task> {
     }
 }
 
-/// Evaluates a solver; the line to show.
-pub fn evaluate_solver(entry: &Entry, task: Option<&str>, args: &PuzzleArgs, results: &Path) -> anyhow::Result<String> {
+/// Evaluates a solver, or `again` compares with what is stored; the line to show and the same as data. `seed` is another
+/// than that of the puzzles that every solver answers.
+pub fn evaluate_solver(
+    entry: &Entry,
+    task: Option<&str>,
+    args: &PuzzleArgs,
+    seed: Option<u64>,
+    again: bool,
+    results: &Path,
+) -> anyhow::Result<(String, Value)> {
     let task = task.map(family).transpose()?;
     let solver = SolverEntry::load(entry, task)?;
     let options = PuzzleEvaluationOptions {
@@ -43,17 +55,23 @@ pub fn evaluate_solver(entry: &Entry, task: Option<&str>, args: &PuzzleArgs, res
         givens: args.givens,
         puzzles: args.puzzles,
         depth: usize::try_from(args.depth)?,
+        seed: seed.unwrap_or(TEST_SEED),
     };
-    let (_, record) = evaluate_puzzles(&solver, results, &options)?;
+    if again {
+        let puzzles = evaluate_puzzles_again(&solver, results, &options)?.record.answers.puzzles;
+        let line = format!("{}: {puzzles} puzzles answered again, every answer the same", entry.id());
+        return Ok((line, json!({"entry": entry.id().to_string(), "run_again": puzzles, "different": 0})));
+    }
+    let EvaluatedPuzzles { folder, record, was_there } = evaluate_puzzles(&solver, results, &options)?;
     let counts = &record.answers;
     let (low, high) = wilson_interval(counts.valid, counts.puzzles);
     let mut text = format!(
-        "{} on {}: {} of {} right ({:.1}%, 95% interval {:.1}-{:.1}), {} exact",
+        "{} on {}: {} of {} right ({}%, 95% interval {:.1}-{:.1}), {} exact",
         record.entry,
         record.task,
         counts.valid,
         counts.puzzles,
-        100.0 * counts.share(counts.valid),
+        report::percent(counts.valid, counts.puzzles, 1),
         100.0 * low,
         100.0 * high,
         counts.exact
@@ -62,5 +80,11 @@ pub fn evaluate_solver(entry: &Entry, task: Option<&str>, args: &PuzzleArgs, res
         text.push_str(&format!(", without thought {} ({})", best.valid, baseline.name()));
     }
     text.push_str(&format!(", mean {:.1} steps", record.mean_steps()));
-    Ok(text)
+    if was_there {
+        text.push_str(" (evaluated before; --again runs it again)");
+    }
+    let mut value = report::json::object(PUZZLE_COLUMNS, &record);
+    value.insert("evaluated_before".to_owned(), was_there.into());
+    value.insert("folder".to_owned(), cli::lossy(&folder).into());
+    Ok((text, value.into()))
 }

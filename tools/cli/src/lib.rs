@@ -3,12 +3,14 @@
 //! Text for people goes through [`print()`], [`note`] and [`Screen`]: a reader that has gone ends the output and nothing
 //! else, names from files cannot command the terminal, a full disk is an error and no panic. [`Stop`] is Ctrl-C,
 //! [`SimulatorArgs`] starts the simulators, [`limits`] refuses absurd sizes before any work, [`completions`] speaks with
-//! shells, and [`commands!`] lists a program's commands, each named once.
+//! shells, [`film()`] makes videos for people, and [`commands!`] lists a program's commands,
+//! each named once.
 //!
 //! What this crate is not: it holds no logic of data, training or evaluation; those are the libraries'.
 
 mod command;
 pub mod completions;
+mod film;
 pub mod limits;
 mod output;
 mod screen;
@@ -18,6 +20,7 @@ mod table;
 mod text;
 
 pub use command::{end, every_command_shows_examples};
+pub use film::{Film, film};
 pub use output::{note, print, print_json};
 pub use screen::Screen;
 pub use simulator::{SimulatorArgs, close};

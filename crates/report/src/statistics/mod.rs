@@ -22,15 +22,28 @@ pub fn wilson_interval(successes: u64, trials: u64) -> (f64, f64) {
     if trials == 0 {
         return (0.0, 1.0);
     }
-    let n = trials as f64;
-    let p = successes as f64 / n;
+    let (low, high) = wilson(successes as f64, trials as f64);
+    // rounding must not leave a bound beyond what it bounds
+    (if successes == 0 { 0.0 } else { low }, if successes == trials { 1.0 } else { high })
+}
+
+/// The same for a mean number of successes, which may lie between two whole ones.
+fn wilson(successes: f64, n: f64) -> (f64, f64) {
+    let p = successes / n;
     let z2 = Z * Z;
     let centre = (p + z2 / (2.0 * n)) / (1.0 + z2 / n);
     let half = Z / (1.0 + z2 / n) * (p * (1.0 - p) / n + z2 / (4.0 * n * n)).sqrt();
-    // rounding must not leave a bound beyond what it bounds
-    let low = if successes == 0 { 0.0 } else { (centre - half).max(0.0) };
-    let high = if successes == trials { 1.0 } else { (centre + half).min(1.0) };
-    (low, high)
+    ((centre - half).max(0.0), (centre + half).min(1.0))
+}
+
+/// A share in percent, with `digits` decimal places and more where those would say that all or none succeeded: 6,597 of
+/// 6,600 is `99.95`, never `100.0`.
+pub fn percent(part: u64, of: u64, digits: usize) -> String {
+    let rate = part as f64 / of.max(1) as f64 * 1e2;
+    let some = 0 < part && part < of;
+    let text = |digits: usize| format!("{rate:.digits$}");
+    let edge = |text: &str| text.parse::<f64>().is_ok_and(|shown| shown == 0.0 || shown == 100.0);
+    (digits..12).map(text).find(|text| !some || !edge(text)).unwrap_or_else(|| text(12))
 }
 
 /// The mean; none of none.
@@ -94,6 +107,37 @@ mod tests {
             }
         }
         assert_eq!(wilson_interval(0, 0), (0.0, 1.0));
+    }
+
+    #[test]
+    fn edges_agree_with_statsmodels() {
+        // statsmodels.stats.proportion.proportion_confint(k, n, method="wilson")
+        for (successes, trials, low, high) in [
+            (0, 1, 0.0, 0.793_450_685_622_762_6),
+            (1, 1, 0.206_549_314_377_237_4, 1.0),
+            (0, 100, 0.0, 0.036_993_498_206_985_68),
+            (100, 100, 0.963_006_501_793_014_3, 1.0),
+            (1, 2, 0.094_531_205_734_230_74, 0.905_468_794_265_769_3),
+        ] {
+            let (l, h) = wilson_interval(successes, trials);
+            assert!((l - low).abs() < 1e-12 && (h - high).abs() < 1e-12, "{successes}/{trials}: {l} {h}");
+        }
+    }
+
+    #[test]
+    fn a_share_is_not_rounded_to_all_or_none() {
+        for (part, of, digits, text) in [
+            (6_597, 6_600, 1, "99.95"),
+            (6_600, 6_600, 1, "100.0"),
+            (0, 6_600, 1, "0.0"),
+            (1, 6_600, 1, "0.02"),
+            (199, 200, 0, "99.5"),
+            (151, 200, 0, "76"),
+            (1, 1_000_000_000, 0, "0.0000001"),
+            (0, 0, 1, "0.0"),
+        ] {
+            assert_eq!(percent(part, of, digits), text, "{part}/{of}");
+        }
     }
 
     #[test]

@@ -4,11 +4,11 @@ use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use report::column::{Column, number, text};
+use report::column::{Column, count, number, text};
 use report::html::{self, escape};
 use report::{count_text, wilson_interval};
 
-use super::evaluation::PuzzleEvaluation;
+use super::evaluation::{PuzzleEvaluation, TEST_SEED};
 use super::grade::Counts;
 
 /// Best first inside each task; ties by what does not change.
@@ -19,7 +19,7 @@ pub fn rank_puzzles(evaluations: &[PuzzleEvaluation]) -> Vec<PuzzleEvaluation> {
 }
 
 fn order(one: &PuzzleEvaluation, two: &PuzzleEvaluation) -> Ordering {
-    let group = |row: &PuzzleEvaluation| (row.task.clone(), row.givens);
+    let group = |row: &PuzzleEvaluation| (row.task.clone(), row.givens, row.seed);
     let share = |row: &PuzzleEvaluation, other: &PuzzleEvaluation| {
         u128::from(row.answers.valid) * u128::from(other.answers.puzzles.max(1))
     };
@@ -32,16 +32,21 @@ fn order(one: &PuzzleEvaluation, two: &PuzzleEvaluation) -> Ordering {
         .then_with(|| (one.depth, one.answers.puzzles).cmp(&(two.depth, two.answers.puzzles)))
 }
 
-/// `open8`, `sudoku9, 36 givens`.
+/// `open8`, `sudoku9, 36 givens`; of other puzzles than those that every solver answers, `open8, seed 7`.
 fn task_text(row: &PuzzleEvaluation) -> String {
-    match row.givens {
+    let mut text = match row.givens {
         0 => row.task.clone(),
         givens => format!("{}, {givens} givens", row.task),
+    };
+    if row.seed != TEST_SEED {
+        text.push_str(&format!(", seed {}", row.seed));
     }
+    text
 }
 
-fn percent(share: f64) -> String {
-    format!("{:.1}%", 100.0 * share)
+/// `98.3%`; of some but not all never `0.0%` or `100.0%`.
+fn percent(part: u64, of: u64) -> String {
+    report::percent(part, of, 1) + "%"
 }
 
 /// `98.3% [97.1-99.1]`
@@ -50,7 +55,7 @@ fn rate(part: u64, of: u64) -> String {
         return "-".to_owned();
     }
     let (low, high) = wilson_interval(part, of);
-    format!("{} [{:.1}-{:.1}]", percent(part as f64 / of as f64), 100.0 * low, 100.0 * high)
+    format!("{} [{:.1}-{:.1}]", percent(part, of), 100.0 * low, 100.0 * high)
 }
 
 /// The baseline that gets most answers right, and most cells: what a row's numbers have to be compared with.
@@ -60,7 +65,7 @@ fn best_baseline(row: &PuzzleEvaluation, of: fn(&Counts) -> u64) -> String {
         || "-".to_owned(),
         |(name, counts)| {
             let all = if of(counts) == counts.cells_right { counts.cells } else { counts.puzzles };
-            format!("{} ({})", percent(of(counts) as f64 / all.max(1) as f64), name.name())
+            format!("{} ({})", percent(of(counts), all), name.name())
         },
     )
 }
@@ -69,47 +74,48 @@ fn best_baseline(row: &PuzzleEvaluation, of: fn(&Counts) -> u64) -> String {
 pub const PUZZLE_COLUMNS: &[Column<PuzzleEvaluation>] = &[
     text(|row: &PuzzleEvaluation| row.entry.to_string()).table("entry").page("entry").left().kept(),
     text(|row: &PuzzleEvaluation| row.entry.name.clone()).csv("entry"),
-    text(|row: &PuzzleEvaluation| row.entry.version.to_string()).csv("version"),
+    count(|row: &PuzzleEvaluation| Some(u64::from(row.entry.version))).csv("version"),
     text(|row: &PuzzleEvaluation| row.training.policy.clone()).csv("policy").page("model"),
     text(|row: &PuzzleEvaluation| row.task.clone()).csv("task"),
     text(task_text).table("task").left().kept(),
-    text(|row: &PuzzleEvaluation| row.givens.to_string()).csv("givens"),
-    text(|row: &PuzzleEvaluation| row.answers.puzzles.to_string()).csv("puzzles"),
-    text(|row: &PuzzleEvaluation| row.answers.valid.to_string()).csv("right"),
+    count(|row: &PuzzleEvaluation| Some(row.givens as u64)).csv("givens"),
+    count(|row: &PuzzleEvaluation| Some(row.answers.puzzles)).csv("puzzles"),
+    count(|row: &PuzzleEvaluation| Some(row.answers.valid)).csv("right"),
     text(|row: &PuzzleEvaluation| format!("{}/{}", row.answers.valid, row.answers.puzzles)).page("right"),
     text(|row: &PuzzleEvaluation| rate(row.answers.valid, row.answers.puzzles)).table("right [95%]").kept(),
     number(|row: &PuzzleEvaluation| Some(interval(row).0), 4, 4).csv("ci95_low"),
     number(|row: &PuzzleEvaluation| Some(interval(row).1), 4, 4).csv("ci95_high"),
     text(|row: &PuzzleEvaluation| format!("{:.1}–{:.1}%", interval(row).0 * 1e2, interval(row).1 * 1e2))
         .page("95% interval"),
-    text(|row: &PuzzleEvaluation| row.answers.exact.to_string()).csv("exact").page("exact"),
-    text(|row: &PuzzleEvaluation| percent(row.answers.share(row.answers.exact))).table("exact"),
-    text(|row: &PuzzleEvaluation| row.answers.walk.to_string()).csv("walk").page("walk"),
+    count(|row: &PuzzleEvaluation| Some(row.answers.exact)).csv("exact").page("exact"),
+    text(|row: &PuzzleEvaluation| percent(row.answers.exact, row.answers.puzzles)).table("exact"),
+    count(|row: &PuzzleEvaluation| Some(row.answers.walk)).csv("walk").page("walk"),
     text(walk_text).table("walk"),
-    text(|row: &PuzzleEvaluation| row.answers.detours.to_string()).csv("detours"),
-    text(|row: &PuzzleEvaluation| row.answers.detours_valid.to_string()).csv("detours_right"),
+    count(|row: &PuzzleEvaluation| Some(row.answers.detours)).csv("detours"),
+    count(|row: &PuzzleEvaluation| Some(row.answers.detours_valid)).csv("detours_right"),
     text(detours_text).table("detours right").page("detours right"),
     text(|row: &PuzzleEvaluation| best_baseline(row, |counts| counts.valid))
         .table("no thought: right")
         .page("without thought"),
     text(cells_text).table("cells / no thought"),
-    text(|row: &PuzzleEvaluation| row.answers.cells.to_string()).csv("cells"),
-    text(|row: &PuzzleEvaluation| row.answers.cells_right.to_string()).csv("cells_right"),
-    text(|row: &PuzzleEvaluation| row.steps.to_string()).csv("steps"),
+    count(|row: &PuzzleEvaluation| Some(row.answers.cells)).csv("cells"),
+    count(|row: &PuzzleEvaluation| Some(row.answers.cells_right)).csv("cells_right"),
+    count(|row: &PuzzleEvaluation| Some(row.steps)).csv("steps"),
     number(|row: &PuzzleEvaluation| Some(row.mean_steps()), 1, 1).table("steps").page("steps"),
-    text(|row: &PuzzleEvaluation| row.depth.to_string()).csv("depth"),
-    text(|row: &PuzzleEvaluation| row.training.parameters.to_string()).csv("parameters"),
+    count(|row: &PuzzleEvaluation| Some(row.depth as u64)).csv("depth"),
+    count(|row: &PuzzleEvaluation| Some(row.training.parameters)).csv("parameters"),
     text(|row: &PuzzleEvaluation| count_text(row.training.parameters)).table("params").page("parameters"),
-    text(|row: &PuzzleEvaluation| row.training.steps.to_string()).csv("training_steps"),
+    count(|row: &PuzzleEvaluation| Some(row.training.steps)).csv("training_steps"),
     number(|row: &PuzzleEvaluation| Some(row.cpu_seconds), 1, 1).csv("training_cpu_seconds"),
     text(|row: &PuzzleEvaluation| format!("{} steps, {:.0} cpu s", row.training.steps, row.cpu_seconds))
         .table("trained"),
     text(|row: &PuzzleEvaluation| format!("{} steps\n{:.0} cpu s", row.training.steps, row.cpu_seconds))
         .page("training"),
-    text(|row: &PuzzleEvaluation| row.training.seed.to_string()).csv("training_seed").table("seed"),
+    count(|row: &PuzzleEvaluation| Some(row.training.seed)).csv("training_seed").table("seed"),
     text(|row: &PuzzleEvaluation| most_of_baselines(row, |counts| counts.valid)).csv("best_baseline_right"),
     text(|row: &PuzzleEvaluation| most_of_baselines(row, |counts| counts.cells_right)).csv("best_baseline_cells_right"),
     text(|row: &PuzzleEvaluation| row.entry.hash.clone()).csv("entry_hash"),
+    count(|row: &PuzzleEvaluation| Some(row.seed)).csv("seed"),
     text(depths_text).page("right after steps"),
 ];
 
@@ -119,13 +125,13 @@ fn interval(row: &PuzzleEvaluation) -> (f64, f64) {
 
 fn walk_text(row: &PuzzleEvaluation) -> String {
     let answers = &row.answers;
-    if answers.walk > 0 || answers.detours > 0 { percent(answers.share(answers.walk)) } else { "-".to_owned() }
+    if answers.walk > 0 || answers.detours > 0 { percent(answers.walk, answers.puzzles) } else { "-".to_owned() }
 }
 
 /// `47/50 (94.0%)`
 fn detours_text(row: &PuzzleEvaluation) -> String {
     let (right, of) = (row.answers.detours_valid, row.answers.detours);
-    if of == 0 { "-".to_owned() } else { format!("{right}/{of} ({})", percent(right as f64 / of as f64)) }
+    if of == 0 { "-".to_owned() } else { format!("{right}/{of} ({})", percent(right, of)) }
 }
 
 /// Cells that are right, and the most that an answer without thought has.
@@ -133,7 +139,11 @@ fn cells_text(row: &PuzzleEvaluation) -> String {
     if row.answers.cells == 0 {
         return "-".to_owned();
     }
-    format!("{} / {}", percent(row.answers.cell_accuracy()), best_baseline(row, |counts| counts.cells_right))
+    format!(
+        "{} / {}",
+        percent(row.answers.cells_right, row.answers.cells),
+        best_baseline(row, |counts| counts.cells_right)
+    )
 }
 
 fn most_of_baselines(row: &PuzzleEvaluation, of: fn(&Counts) -> u64) -> String {
@@ -142,7 +152,7 @@ fn most_of_baselines(row: &PuzzleEvaluation, of: fn(&Counts) -> u64) -> String {
 
 /// `1: 47.5%`, and so on line by line.
 fn depths_text(row: &PuzzleEvaluation) -> String {
-    let line = |(depth, counts): (&usize, &Counts)| format!("{depth}: {}", percent(counts.share(counts.valid)));
+    let line = |(depth, counts): (&usize, &Counts)| format!("{depth}: {}", percent(counts.valid, counts.puzzles));
     row.by_depth.iter().map(line).collect::<Vec<_>>().join(", ")
 }
 
@@ -154,10 +164,13 @@ pub fn puzzle_section(evaluations: &[PuzzleEvaluation]) -> String {
         groups.entry(task_text(row)).or_default().push(row);
     }
     let mut html = String::new();
+    if !groups.is_empty() {
+        html.push_str("<h2 id=\"puzzles\">Puzzles</h2>\n");
+    }
     for (task, rows) in groups {
         let _ = writeln!(
             html,
-            "<h2>{}</h2>\n<p class=\"lead\">Puzzles of the test split, answered in this program. Right: any shortest path, \
+            "<h3>{}</h3>\n<p class=\"lead\">Puzzles of the test split, answered in this program. Right: any shortest path, \
              or the solution. Exact: cell by cell the stored answer. Without thought: the best of the answers that do not \
              look at the walls.</p>\n<div class=\"card\">{}</div>",
             escape(&task),

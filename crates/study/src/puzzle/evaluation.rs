@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use zoo::audit::{Audit, KnownEntries, check_folder_name};
 use zoo::entry::{CONFIG_FILE, training_facts};
 use zoo::results::{EntryIdentity, SEAL_FILE, Seal, TrainingFacts, result_folders};
-use zoo::{ZooError, sha256_hex, write_atomic};
+use zoo::{ZooError, sha256_file, sha256_hex, write_atomic};
 
 use super::entry::{ProgressPoint, SolverEntry};
 use super::grade::{Baseline, Counts};
@@ -48,6 +48,8 @@ pub struct PuzzleEvaluationOptions {
     pub puzzles: u64,
     /// Most supervision steps.
     pub depth: usize,
+    /// Seed of the puzzles: [`TEST_SEED`] for those that every solver answers, another for a fresh stream of the same split.
+    pub seed: u64,
 }
 
 /// Everything that an evaluation found, in counts: `puzzles.json`.
@@ -207,15 +209,8 @@ fn add(counts: &mut Counts, puzzle: &Puzzle, thought: &Thought) {
     counts.add(puzzle, &thought.answer, &thought.on_path);
 }
 
-/// Evaluates `entry` and stores the result in a folder of its own under `results`; a finished one is read again.
-///
-/// # Errors
-/// A model that fails, files that cannot be written.
-pub fn evaluate_puzzles(
-    entry: &SolverEntry,
-    results: &Path,
-    options: &PuzzleEvaluationOptions,
-) -> Result<(PathBuf, PuzzleEvaluation), ZooError> {
+/// An evaluation before it was run: what it depends on.
+fn plan(entry: &SolverEntry, options: &PuzzleEvaluationOptions) -> Result<(Task, PuzzleEvaluation), ZooError> {
     let meta = entry.entry().meta();
     let own = entry.experiment().task.family()?;
     let task = options.task.unwrap_or(own);
@@ -224,7 +219,7 @@ pub fn evaluate_puzzles(
         Task::Maze(_) => 0,
         Task::Sudoku(_) => options.givens.unwrap_or(puzzle.givens[0]),
     };
-    let mut record = PuzzleEvaluation {
+    let record = PuzzleEvaluation {
         format: PuzzleEvaluation::FORMAT,
         entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
         training: TrainingFacts { data_set: format!("puzzles of {}", meta.task), ..training_facts(meta) },
@@ -233,7 +228,7 @@ pub fn evaluate_puzzles(
         config_sha256: meta.files.get(CONFIG_FILE).map_or_else(String::new, |file| file.sha256.clone()),
         task: task.name().to_owned(),
         givens,
-        seed: TEST_SEED,
+        seed: options.seed,
         depth: if entry.solver().is_recursive() { options.depth } else { 0 },
         answers: Counts { puzzles: options.puzzles, ..Counts::default() },
         steps: 0,
@@ -242,33 +237,104 @@ pub fn evaluate_puzzles(
         by_depth: BTreeMap::new(),
         baselines: BTreeMap::new(),
     };
-    let folder = results.join(record.folder_name());
-    let path = folder.join(RECORD_FILE);
-    // without a seal it was made before there were seals, or not to its end: made again
-    if let Some(stored) = read_sealed(&folder)? {
-        return Ok((folder, stored));
-    }
-    let draw = |index| task.numbered(Split::Test, (givens, givens), TEST_SEED, index);
-    let puzzles: Vec<Puzzle> = (0..options.puzzles).map(draw).collect();
-    let failed = |source| ZooError::Model { operation: "evaluate", name: record.entry.to_string(), source };
+    Ok((task, record))
+}
+
+/// Runs what `record` plans: fills it in, and gives one row a puzzle.
+fn run(
+    entry: &SolverEntry,
+    task: Task,
+    record: &mut PuzzleEvaluation,
+    options: &PuzzleEvaluationOptions,
+) -> Result<Vec<Row>, ZooError> {
+    let (givens, seed) = ((record.givens, record.givens), record.seed);
+    let puzzles: Vec<Puzzle> =
+        (0..options.puzzles).map(|index| task.numbered(Split::Test, givens, seed, index)).collect();
+    let name = record.entry.to_string();
+    let failed = |source| ZooError::Model { operation: "evaluate", name: name.clone(), source };
     let graded = graded(entry.solver(), &puzzles, &DEPTHS, options.depth).map_err(failed)?;
-    std::fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
-    write_outcomes(&folder.join(OUTCOMES_FILE), &graded.rows)?;
     record.baselines = match entry.solver() {
         Solver::Walker { .. } => Baseline::of_walkers(&puzzles),
-        _ => Baseline::grade_all(task, (givens, givens), &puzzles),
+        _ => Baseline::grade_all(task, givens, &puzzles),
     };
     if let Solver::Walker { net, task } = entry.solver() {
-        let mut rng = Rng::new(TEST_SEED, "sampled walks");
-        let failed = |source| ZooError::Model { operation: "evaluate", name: record.entry.to_string(), source };
+        let mut rng = Rng::new(seed, "sampled walks");
         let walks = walk::walk_all(net.as_ref(), *task, &puzzles, Some(&mut rng)).map_err(failed)?;
         record.sampled = Some(walk::count(&puzzles, &walks));
     }
     (record.answers, record.steps, record.by_depth) = (graded.halting, graded.steps, graded.by_depth);
-    record.write(&path)?;
+    Ok(graded.rows)
+}
+
+/// A finished evaluation of a solver.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EvaluatedPuzzles {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// What it found.
+    pub record: PuzzleEvaluation,
+    /// Whether it was there already, so that nothing had to be answered.
+    pub was_there: bool,
+}
+
+/// Evaluates `entry` and stores the result in a folder of its own under `results`; a finished one is read again.
+///
+/// # Errors
+/// A model that fails, files that cannot be written.
+pub fn evaluate_puzzles(
+    entry: &SolverEntry,
+    results: &Path,
+    options: &PuzzleEvaluationOptions,
+) -> Result<EvaluatedPuzzles, ZooError> {
+    let (task, mut record) = plan(entry, options)?;
+    let folder = results.join(record.folder_name());
+    // without a seal it was made before there were seals, or not to its end: made again
+    if let Some(record) = read_sealed(&folder)? {
+        return Ok(EvaluatedPuzzles { folder, record, was_there: true });
+    }
+    let rows = run(entry, task, &mut record, options)?;
+    std::fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
+    write_outcomes(&folder.join(OUTCOMES_FILE), &rows)?;
+    record.write(&folder.join(RECORD_FILE))?;
     // last: its presence says that the evaluation is whole
     seal(&folder, &record)?.write(&folder)?;
-    Ok((folder, record))
+    Ok(EvaluatedPuzzles { folder, record, was_there: false })
+}
+
+/// Answers the puzzles of a stored evaluation once more and compares every count and every puzzle's outcome.
+///
+/// # Errors
+/// [`ZooError::NothingToCompare`] where none is stored, [`ZooError::ResultsDiffer`] naming what is not the same; as
+/// [`evaluate_puzzles`].
+pub fn evaluate_puzzles_again(
+    entry: &SolverEntry,
+    results: &Path,
+    options: &PuzzleEvaluationOptions,
+) -> Result<EvaluatedPuzzles, ZooError> {
+    let (task, mut now) = plan(entry, options)?;
+    let folder = results.join(now.folder_name());
+    let Some(stored) = read_sealed(&folder)? else {
+        return Err(ZooError::NothingToCompare {
+            entry: now.entry.to_string(),
+            seeds: format!("of {} puzzles from seed {}", options.puzzles, options.seed),
+            results: results.to_owned(),
+            stored: Vec::new(),
+        });
+    };
+    let rows = run(entry, task, &mut now, options)?;
+    let bytes = outcomes_bytes(&folder, &rows)?;
+    let path = folder.join(OUTCOMES_FILE);
+    let differs = |what: &str, expected: String, found: String| {
+        Err(ZooError::ResultsDiffer { folder: folder.clone(), what: what.to_owned(), expected, found })
+    };
+    let text = |record: &PuzzleEvaluation| serde_json::to_string(record).unwrap_or_default();
+    if stored != now {
+        return differs(RECORD_FILE, text(&stored), text(&now));
+    }
+    if std::fs::read(&path).map_err(ZooError::io("read", &path))? != bytes {
+        return differs(OUTCOMES_FILE, sha256_file(&path)?, sha256_hex(&bytes));
+    }
+    Ok(EvaluatedPuzzles { folder, record: stored, was_there: true })
 }
 
 /// The seal that an evaluation in `folder` has now.
@@ -337,6 +403,11 @@ pub fn list_puzzle_evaluations(results: &Path) -> Result<Vec<PuzzleEvaluation>, 
 
 /// One row a puzzle: `index`, `exact`, `valid`, `steps`, `cells_right`.
 fn write_outcomes(path: &Path, rows: &[Row]) -> Result<(), ZooError> {
+    write_atomic(path, &outcomes_bytes(path, rows)?)
+}
+
+/// The same as the bytes of the file at `path`.
+fn outcomes_bytes(path: &Path, rows: &[Row]) -> Result<Vec<u8>, ZooError> {
     let failed = |source: Box<dyn std::error::Error + Send + Sync>| ZooError::Table {
         operation: "write outcomes to",
         path: path.to_owned(),
@@ -363,5 +434,5 @@ fn write_outcomes(path: &Path, rows: &[Row]) -> Result<(), ZooError> {
         Ok(())
     }();
     written.map_err(|e| failed(Box::new(e)))?;
-    write_atomic(path, &bytes)
+    Ok(bytes)
 }

@@ -49,6 +49,14 @@ impl AnyExperiment {
         }
     }
 
+    /// Name of the entry that it makes.
+    pub fn entry(&self) -> &str {
+        match self {
+            Self::Robot(experiment) => &experiment.entry,
+            Self::Puzzle(experiment) => &experiment.entry,
+        }
+    }
+
     /// One sentence on it.
     pub fn description(&self) -> &str {
         match self {

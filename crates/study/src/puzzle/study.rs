@@ -15,7 +15,7 @@ use zoo::run::{TrainEvent, TrainOutcome};
 use zoo::{ZooError, sha256_hex};
 
 use super::entry::SolverEntry;
-use super::evaluation::{PuzzleEvaluation, PuzzleEvaluationOptions, evaluate_puzzles};
+use super::evaluation::{PuzzleEvaluation, PuzzleEvaluationOptions, TEST_SEED, evaluate_puzzles};
 use super::experiment::{AnyExperiment, PuzzleExperiment};
 use super::training::{PuzzleTrainRequest, train_puzzles};
 
@@ -260,8 +260,9 @@ fn run_row(
 }
 
 fn evaluate(entry: &Entry, task: Option<Task>, test: &StudyTest, results: &Path) -> Result<PuzzleEvaluation, ZooError> {
-    let options = PuzzleEvaluationOptions { task, givens: test.givens, puzzles: STUDY_PUZZLES, depth: test.depth };
-    Ok(evaluate_puzzles(&SolverEntry::load(entry, task)?, results, &options)?.1)
+    let (givens, depth) = (test.givens, test.depth);
+    let options = PuzzleEvaluationOptions { task, givens, puzzles: STUDY_PUZZLES, depth, seed: TEST_SEED };
+    Ok(evaluate_puzzles(&SolverEntry::load(entry, task)?, results, &options)?.record)
 }
 
 /// The entry of a run that has finished.

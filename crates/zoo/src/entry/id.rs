@@ -25,19 +25,36 @@ impl Display for EntryId {
     }
 }
 
-/// What a user asks for: `name` (its newest version) or `name@version`.
+/// What a user asks for: `name` or `name@latest` (its newest version), `name@version` or `name@alias`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EntryRequest {
     /// The entry's name.
     pub name: String,
     /// The version, or the newest.
     pub version: Option<u32>,
+    /// A name for a version, if one was given instead.
+    pub alias: Option<String>,
+}
+
+/// The alias that always is the newest version.
+pub const LATEST: &str = "latest";
+
+/// Refuses what cannot be an alias: it must not look like a version.
+pub fn check_alias(alias: &str) -> Result<(), ZooError> {
+    let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
+    let sound = alias.starts_with(|c: char| c.is_ascii_lowercase()) && alias.chars().all(allowed) && alias.len() <= 32;
+    if sound {
+        return Ok(());
+    }
+    let reason = "what follows `@` is a version, a number from 1, or an alias of lower-case letters, digits and `-`";
+    Err(ZooError::EntryName { name: format!("@{alias}"), reason })
 }
 
 impl Display for EntryRequest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.name)?;
-        self.version.map_or(Ok(()), |v| write!(f, "@{v}"))
+        self.version.map_or(Ok(()), |v| write!(f, "@{v}"))?;
+        self.alias.as_ref().map_or(Ok(()), |alias| write!(f, "@{alias}"))
     }
 }
 
@@ -45,20 +62,22 @@ impl FromStr for EntryRequest {
     type Err = ZooError;
 
     fn from_str(text: &str) -> Result<Self, ZooError> {
-        let (name, version) = match text.split_once('@') {
-            None => (text, None),
+        let (name, version, alias) = match text.split_once('@') {
+            None => (text, None, None),
+            Some((name, LATEST)) => (name, None, None),
             Some((name, version)) => match version.parse::<u32>() {
-                Ok(number) if number > 0 => (name, Some(number)),
+                Ok(number) if number > 0 => (name, Some(number), None),
                 _ => {
-                    return Err(ZooError::EntryName {
-                        name: text.to_owned(),
-                        reason: "the version after `@` is a number from 1",
-                    });
+                    check_alias(version).map_err(|error| match error {
+                        ZooError::EntryName { reason, .. } => ZooError::EntryName { name: text.to_owned(), reason },
+                        other => other,
+                    })?;
+                    (name, None, Some(version.to_owned()))
                 }
             },
         };
         check_name(name)?;
-        Ok(Self { name: name.to_owned(), version })
+        Ok(Self { name: name.to_owned(), version, alias })
     }
 }
 
@@ -85,7 +104,8 @@ mod tests {
 
     #[test]
     fn requests_read_back() {
-        for text in ["lift-act", "lift-act@1", "a_b.c@4000000000"] {
+        assert_eq!("lift-act@latest".parse::<EntryRequest>().unwrap(), "lift-act".parse().unwrap());
+        for text in ["lift-act", "lift-act@1", "a_b.c@4000000000", "lift-act@best"] {
             assert_eq!(text.parse::<EntryRequest>().unwrap().to_string(), text);
         }
     }
@@ -97,7 +117,9 @@ mod tests {
             "@1",
             "a@",
             "a@0",
-            "a@x",
+            "a@X",
+            "a@1x",
+            "a@x@1",
             "a@-1",
             "../x",
             "A",

@@ -5,6 +5,7 @@
 //! holds the SHA-256 of the other four and of itself. A version is never rewritten.
 
 mod card;
+mod family;
 mod format;
 mod id;
 mod meta;
@@ -14,13 +15,15 @@ mod seal;
 mod subject;
 
 pub use card::{CardWords, grouped};
-pub use id::{EntryId, EntryRequest, check_name};
+pub use family::{Families, key as family_of, member_name};
+pub use id::{EntryId, EntryRequest, LATEST, check_alias, check_name};
 pub use meta::{CamerasMeta, CurvePoint, DataMeta, EntryMeta, FileMeta, ModuleMeta, TrainingMeta};
 pub use open::Entry;
 pub use policy::LoadedEntry;
 pub use seal::EntryDraft;
 #[cfg(test)]
 pub(crate) use seal::tests::draft as test_draft;
+pub(crate) use seal::{REMOVED, lock_name};
 pub use subject::training_facts;
 
 /// The weights.

@@ -15,6 +15,9 @@ use super::{
     CARD_FILE, CONFIG_FILE, CardWords, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE, NORMALISER_FILE, card, id,
 };
 
+/// What a version leaves behind that was removed: it is never given again.
+pub(crate) const REMOVED: &str = ".removed-";
+
 /// An entry before it has a version.
 #[derive(Debug, Clone)]
 pub struct EntryDraft {
@@ -55,9 +58,7 @@ impl EntryDraft {
         id::check_name(&self.meta.name)?;
         let parent = zoo.join(&self.meta.name);
         fs::create_dir_all(&parent).map_err(ZooError::io("create folder", &parent))?;
-        let lock_path = parent.join(".lock");
-        let lock = File::create(&lock_path).map_err(ZooError::io("create", &lock_path))?;
-        lock.lock().map_err(ZooError::io("lock", &lock_path))?;
+        let _lock = lock_name(&parent)?;
         let newest = sweep(&parent)?;
 
         self.meta.format = FORMAT;
@@ -93,6 +94,14 @@ impl EntryDraft {
     }
 }
 
+/// Holds the name whose versions are in `parent` until it is dropped: others wait.
+pub(crate) fn lock_name(parent: &Path) -> Result<File, ZooError> {
+    let path = parent.join(".lock");
+    let lock = File::create(&path).map_err(ZooError::io("create", &path))?;
+    lock.lock().map_err(ZooError::io("lock", &path))?;
+    Ok(lock)
+}
+
 fn write_synced(path: &Path, bytes: &[u8]) -> Result<(), ZooError> {
     use std::io::Write;
     File::create(path)
@@ -112,7 +121,7 @@ fn sweep(parent: &Path) -> Result<u32, ZooError> {
         let name = name.to_string_lossy();
         if name.starts_with(".tmp-") {
             fs::remove_dir_all(item.path()).map_err(ZooError::io("remove", item.path()))?;
-        } else if let Ok(version) = name.parse::<u32>() {
+        } else if let Ok(version) = name.strip_prefix(REMOVED).unwrap_or(&name).parse::<u32>() {
             newest = newest.max(version);
         }
     }

@@ -9,9 +9,10 @@ use serde_json::{Value, json};
 
 use crate::entry::Entry;
 use crate::files::sync_folder;
-use crate::{ZooError, tensors, write_atomic};
+use crate::{ZooError, sha256_file, tensors, write_atomic};
 
 use super::config::{NormaliserStep, Pipeline, Step};
+use super::provenance::{self, PROVENANCE};
 use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR};
 
 /// Writes `entry` into the new folder `out`.
@@ -83,6 +84,7 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
     let put = |name: &str, bytes: &[u8]| write_atomic(&staging.path().join(name), bytes);
     put(MODEL_FILE, &tensors::to_bytes(out, &weights, &about)?)?;
     put(CONFIG_FILE, pretty(&config).as_bytes())?;
+    put(PROVENANCE, provenance::text(meta, &sha256_file(&staging.path().join(MODEL_FILE))?).as_bytes())?;
     for pipeline in [&before, &after] {
         put(&format!("{}.json", pipeline.name), pretty(&to_json(pipeline)).as_bytes())?;
         for file in pipeline.steps.iter().filter_map(|s| s.state_file.as_ref()) {

@@ -16,6 +16,7 @@ use crate::run::TrainSection;
 use crate::{ZooError, tensors};
 
 use super::config::{self, NormaliserStep, Pipeline};
+use super::provenance;
 use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR};
 
 /// What the checkpoint does not say about itself.
@@ -86,6 +87,15 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
 
     let statistics = preprocess.normaliser().tensors().map_err(experiment.model_error("store the normaliser of"))?;
     let about = serde_json::json!({"format": 1, "policy": experiment.policy_type()});
+    let origin = provenance::read(folder)?;
+    if let Some(origin) = origin.as_ref().filter(|origin| origin.task != options.task) {
+        return Err(ZooError::InvalidValue {
+            key: "--task".to_owned(),
+            expected: format!("{}, which the entry was trained for that was exported", origin.task),
+            found: options.task.clone(),
+        });
+    }
+    let of_origin = origin.as_ref();
     let draft = EntryDraft {
         card: CardWords::default(),
         meta: EntryMeta {
@@ -93,20 +103,23 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             name: options.name.clone(),
             version: 0,
             description: experiment.description.clone(),
-            experiment: "imported from LeRobot".to_owned(),
+            experiment: match of_origin {
+                Some(origin) => format!("{}, exported to LeRobot as {} and imported", origin.experiment, origin.id()),
+                None => "imported from LeRobot".to_owned(),
+            },
             policy: experiment.policy_type(),
             task: options.task.clone(),
-            env_name: None,
-            env_version: None,
-            env_module: None,
-            env_args: None,
+            env_name: of_origin.and_then(|origin| origin.env_name.clone()),
+            env_version: of_origin.and_then(|origin| origin.env_version.clone()),
+            env_module: of_origin.and_then(|origin| origin.env_module.clone()),
+            env_args: of_origin.and_then(|origin| origin.env_args.clone()),
             parameters: model.params().count() as u64,
             signature: preprocess.signature().clone(),
             keys: experiment.data.feature_keys()?,
-            data: None,
+            data: of_origin.and_then(|origin| origin.data.clone()),
             kind: None,
             section: None,
-            training: None,
+            training: of_origin.and_then(|origin| origin.training.clone()),
             versions: crate::versions(),
             files: BTreeMap::new(),
         },

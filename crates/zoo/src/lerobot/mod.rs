@@ -7,6 +7,7 @@
 mod config;
 mod export;
 mod import;
+mod provenance;
 
 pub use export::export;
 pub use import::{ImportOptions, import};

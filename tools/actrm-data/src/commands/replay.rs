@@ -1,5 +1,5 @@
 use anyhow::{Context, Result, bail};
-use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop};
+use cli::{Film, INTERRUPTED, Screen, SimulatorArgs, Stop};
 use dataset::{Demo, Source, WriteOptions};
 use recording::Recording;
 use safetensors::Dtype;
@@ -7,7 +7,6 @@ use serde_json::json;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use rollout::video::Encoder;
 use rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
 
 /// Steps that a worker is asked to draw at a time.
@@ -17,7 +16,7 @@ const PART: usize = 32;
 ///
 /// Works for robomimic files and raw robosuite recordings, which hold the states, and for converted data sets with
 /// their side folder `actrm/`, from which the states are taken back. Nothing is simulated but what follows the last
-/// action. Drawing needs EGL or OSMesa; the encoder comes with Python's opencv-python-headless.
+/// action. Drawing needs EGL or OSMesa.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data replay lift.hdf5 --demo 3 --video lift_3.mp4
@@ -28,13 +27,13 @@ pub struct Args {
     /// Demonstration: its number or its name
     #[arg(long, value_name = "DEMO")]
     demo: String,
-    /// Video to create (MPEG-4)
+    /// Video to create (AV1 in MP4)
     #[arg(long, value_name = "OUT")]
     video: PathBuf,
     /// Camera
     #[arg(long, value_name = "NAME", default_value = "agentview")]
     camera: String,
-    /// Side of the images, in pixels
+    /// Side of the images, in pixels: an even number
     #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=1024))]
     size: u16,
     #[command(flatten)]
@@ -70,7 +69,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     };
     let size = (usize::from(args.size), usize::from(args.size));
     let rate = pool.ready().control_freq;
-    let mut encoder = Encoder::start(&args.simulator.python()?, &args.video, size, rate)?;
+    let mut film = Film::begin(&args.video, size, rate)?;
     let mut screen = Screen::new();
     screen.begin(format!("drawing {id}"), steps as u64);
     let parts = steps.div_ceil(PART);
@@ -87,7 +86,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let drawn = result.map_err(anyhow::Error::from).and_then(|episode| {
             success |= episode.success;
             let drawn = pictures(&args.camera, size, &episode, last)?;
-            drawn.iter().try_for_each(|image| encoder.push(image))?;
+            drawn.iter().try_for_each(|image| film.push(image))?;
             images += drawn.len();
             Ok(())
         });
@@ -110,7 +109,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         cli::note(&format!("stopped after {images} of {} images; nothing was written", steps + 1));
         return Ok(ExitCode::from(INTERRUPTED));
     }
-    encoder.finish()?;
+    film.finish()?;
     if args.json {
         cli::print_json(&json!({
             "video": cli::lossy(&args.video), "task": task, "demo": id, "images": images, "rate": rate, "success": success,

@@ -1,24 +1,24 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
-use std::time::Duration;
 
 use anyhow::{Context, bail};
-use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits, shown};
-use report::LeaderboardRow;
-use rollout::{Control, Pool, remembered_greeting, video};
-use zoo::ZooError;
-use zoo::entry::{CamerasMeta, EntryId, EntryMeta, LoadedEntry};
-use zoo::evaluation::{
-    EvaluationEnd, EvaluationOptions, FIRST_SEED, Progress, Subject, View, evaluate, evaluate_again, film, finished,
-};
+use clap::ValueEnum;
+use cli::{INTERRUPTED, Screen, Stop, limits, shown};
+use report::{COLUMNS, LeaderboardRow, json};
+use rollout::{Pool, remembered_greeting};
+use serde_json::{Value, json};
+use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
+use zoo::evaluation::{EvaluationOptions, FIRST_SEED, Subject, View, evaluate_again, film, finished};
+use zoo::protocols::{Block, NamedProtocol};
 use zoo::registry::Registry;
 use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
-use crate::places::{ResultsArgs, ZooArgs, entry_names};
+use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 use crate::puzzles::{PuzzleArgs, evaluate_solver};
+use crate::simulation::{EnvironmentKey, Evaluated, RunArgs, run_missing};
 
 const GOES_ON: &str = "stopped; the same command goes on where it was";
 /// Behind the line of an evaluation for which nothing was run.
@@ -38,6 +38,7 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
 #[command(after_help = "Examples:
   actrm-zoo eval lift-act --episodes 50
   actrm-zoo eval lift-act@1 stack-act --episodes 100 --workers 2
+  actrm-zoo eval 'lift-act-s*' --protocol lift-v1
   actrm-zoo eval --all --episodes 20
   actrm-zoo eval trm-dfs10 --puzzles 600
   actrm-zoo eval trm-dfs10 --task dfs16 --depth 32
@@ -45,7 +46,7 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval lift-act --episodes 50 --again
   actrm-zoo eval lift-act --episodes 200 --shard 2/8")]
 pub struct Args {
-    /// Entries: `name` (its newest version) or `name@version`
+    /// Entries: `name` (its newest version), `name@version`, or with a `*` every name that fits
     #[arg(required_unless_present_any = ["all", "all_versions"], add = entry_names())]
     entries: Vec<String>,
     /// The newest version of every entry of the zoo
@@ -54,16 +55,20 @@ pub struct Args {
     /// Every version of every entry of the zoo
     #[arg(long, conflicts_with = "entries")]
     all_versions: bool,
-    /// Episodes an entry
-    #[arg(long, default_value_t = 20,
-        value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
-    episodes: u64,
-    /// Seed of the first episode; the others count up from it
-    #[arg(long = "seed-start", alias = "seed", value_name = "SEED", default_value_t = FIRST_SEED)]
-    seed: u64,
-    /// Control steps after which an episode has failed (the entry's or the task's own cap)
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_STEPS))]
-    max_steps: Option<u64>,
+    /// A named protocol: its seeds, cap and control loop [protocols: those of `protocols/`]
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["episodes", "seed", "max_steps", "control", "shard"])]
+    protocol: Option<String>,
+    /// Which of the protocol's seeds: `test` for reporting, `dev` for choosing
+    #[arg(long, value_name = "BLOCK", default_value = "test", requires = "protocol")]
+    block: BlockArg,
+    #[command(flatten)]
+    protocols: ProtocolArgs,
+    /// Episodes an entry [default: 20]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    episodes: Option<u64>,
+    /// Seed of the first episode, the others count up from it [default: 10000]; of a solver, seed of the puzzles
+    #[arg(long = "seed-start", alias = "seed", value_name = "SEED")]
+    seed: Option<u64>,
     /// Actions that are executed before the policy is asked again (the entry's)
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     n_action_steps: Option<u64>,
@@ -71,19 +76,10 @@ pub struct Args {
     #[arg(long, value_name = "C", conflicts_with = "n_action_steps", allow_negative_numbers = true)]
     temporal_ensemble: Option<f64>,
     #[command(flatten)]
-    simulator: SimulatorArgs,
-    /// Another task than the entry's
-    #[arg(long)]
-    task: Option<String>,
-    /// Control loop inside the simulator: `compiled` or `robosuite`
-    #[arg(long, default_value_t = Control::Compiled)]
-    control: Control,
+    run: RunArgs,
     /// Only this part of the episodes, for several machines
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Evaluate although the demonstrations were recorded in another simulator generation, or with these seeds
-    #[arg(long)]
-    force: bool,
     /// Run finished evaluations again, and fail where an outcome is not the same
     #[arg(long)]
     again: bool,
@@ -93,15 +89,12 @@ pub struct Args {
     /// Camera of the videos
     #[arg(long, value_name = "NAME", default_value = "agentview")]
     camera: String,
-    /// Side of the videos in pixels
+    /// Side of the videos in pixels: an even number
     #[arg(long, value_name = "PIXELS", default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=2048))]
     video_size: u16,
-    /// Seconds without an answer after which a worker counts as hung
-    #[arg(long, value_name = "S", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
-    step_timeout: u64,
-    /// Keep what workers say on standard error in this folder
-    #[arg(long, value_name = "DIR")]
-    worker_logs: Option<PathBuf>,
+    /// Print what came of it as JSON, with the names of the leaderboard's columns
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     results: ResultsArgs,
     #[command(flatten)]
@@ -110,31 +103,88 @@ pub struct Args {
     zoo: ZooArgs,
 }
 
+/// A block of a named protocol, on the command line.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum BlockArg {
+    Test,
+    Dev,
+}
+
+impl From<BlockArg> for Block {
+    fn from(block: BlockArg) -> Self {
+        match block {
+            BlockArg::Test => Self::Test,
+            BlockArg::Dev => Self::Dev,
+        }
+    }
+}
+
+/// What is said of each evaluation: a line at once, or all of it as JSON at the end.
+struct Says {
+    as_json: bool,
+    all: Vec<Value>,
+}
+
+impl Says {
+    fn say(&mut self, line: &str, value: Value) -> anyhow::Result<()> {
+        match self.as_json {
+            true => self.all.push(value),
+            false => cli::print(line)?,
+        }
+        Ok(())
+    }
+
+    fn evaluation(&mut self, evaluation: &StoredEvaluation, was_there: bool) -> anyhow::Result<()> {
+        let row = LeaderboardRow::new(evaluation);
+        let mut value = json::object(COLUMNS, &row);
+        value.insert("evaluated_before".to_owned(), was_there.into());
+        value.insert("sealed".to_owned(), evaluation.sealed.into());
+        value.insert("folder".to_owned(), cli::lossy(&evaluation.folder).into());
+        let there = if was_there { there(evaluation) } else { "" };
+        self.say(&(row.summary() + there + "\n"), value.into())
+    }
+}
+
+/// The seeds and rules that were asked for.
+struct Asked<'a> {
+    seeds: Seeds,
+    protocol: Option<&'a NamedProtocol>,
+}
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    limits::check_seeds(args.seed, args.episodes)?;
-    limits::workers(args.simulator.workers)?;
+    let protocols = args.protocols.protocols()?;
+    let protocol = args.protocol.as_deref().map(|name| protocols.get(name)).transpose()?;
+    let seeds = match protocol {
+        Some(protocol) => protocol.seeds(args.block.into()),
+        None => Seeds { start: args.seed.unwrap_or(FIRST_SEED), count: args.episodes.unwrap_or(20) },
+    };
+    let asked = Asked { seeds, protocol };
+    limits::check_seeds(seeds.start, seeds.count)?;
+    limits::workers(args.run.simulator.workers)?;
     let registry = args.zoo.registry();
-    let ids = match (args.all_versions, args.all) {
+    let ids: Vec<EntryId> = match (args.all_versions, args.all) {
         (true, _) => registry.ids()?,
         (false, true) => registry.newest()?,
-        (false, false) => args.entries.iter().map(|name| registry.resolve(name)).collect::<Result<_, _>>()?,
+        (false, false) => {
+            let each = args.entries.iter().map(|name| registry.matching(name));
+            each.collect::<Result<Vec<_>, _>>()?.concat()
+        }
     };
     if ids.is_empty() {
         bail!("no entries in {}; make one with: actrm-zoo train act_lift", shown(&args.zoo.zoo));
     }
     let stop = Stop::install(GOES_ON)?;
+    let mut says = Says { as_json: args.json, all: Vec::new() };
     // one bad entry must not keep the others from being evaluated
     let mut failures: Vec<anyhow::Error> = Vec::new();
     // one set of simulators serves all entries of an environment
     let mut by_environment: BTreeMap<EnvironmentKey, Vec<LoadedEntry>> = BTreeMap::new();
     for id in ids {
-        match open(args, &registry, &id).with_context(|| format!("entry {id}")) {
-            Ok(Some(loaded)) => {
-                match EnvironmentKey::of(args, loaded.entry().meta()) {
-                    Ok(environment) => by_environment.entry(environment).or_default().push(loaded),
-                    Err(error) => failures.push(error.into()),
-                }
-            }
+        match open(args, &asked, &registry, &id, &mut says).with_context(|| format!("entry {id}")) {
+            Ok(Some(loaded)) => match EnvironmentKey::of(&args.run, loaded.entry().meta()) {
+                Ok(environment) => by_environment.entry(environment).or_default().push(loaded),
+                Err(error) => failures.push(error.into()),
+            },
             Ok(None) => {}
             Err(error) => failures.push(error),
         }
@@ -143,9 +193,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         if stop.asked() {
             break;
         }
-        if let Err(error) = evaluate_on(args, environment, entries, &stop, &mut failures) {
+        if let Err(error) = evaluate_on(args, &asked, environment, entries, &stop, (&mut says, &mut failures)) {
             failures.push(error);
         }
+    }
+    if says.as_json {
+        cli::print_json(&says.all)?;
     }
     if stop.asked() {
         cli::note(GOES_ON);
@@ -155,33 +208,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         cli::note(&format!("error: {failure:#}"));
     }
     Ok(if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
-}
-
-/// What simulators are started for.
-#[derive(Clone, PartialEq, Eq, PartialOrd, Ord)]
-struct EnvironmentKey {
-    task: String,
-    env_module: Option<String>,
-    /// As JSON text.
-    env_args: Option<String>,
-    cameras: Option<CamerasMeta>,
-}
-
-impl EnvironmentKey {
-    /// The environment of an entry's demonstrations, unless the command line says otherwise.
-    fn of(args: &Args, meta: &EntryMeta) -> Result<Self, ZooError> {
-        let recorded = || meta.env_module.as_ref().map(|module| module.name.clone());
-        let env_module = args.simulator.env_module.clone().or_else(recorded);
-        let cameras = meta.cameras()?;
-        Ok(match args.task.clone().filter(|task| *task != meta.task) {
-            // another task's environment has arguments of its own
-            Some(task) => Self { task, env_module, env_args: None, cameras },
-            None => {
-                let env_args = meta.env_args.as_ref().map(serde_json::Value::to_string);
-                Self { task: meta.task.clone(), env_module, env_args, cameras }
-            }
-        })
-    }
 }
 
 /// Says so where the demonstrations were recorded by other rules than the evaluation will play by.
@@ -195,46 +221,65 @@ fn note_other_module(meta: &EntryMeta, running: Option<&str>) {
 }
 
 /// An entry whose policy is to be evaluated; one that solves puzzles is evaluated at once.
-fn open(args: &Args, registry: &Registry, id: &EntryId) -> anyhow::Result<Option<LoadedEntry>> {
+fn open(
+    args: &Args,
+    asked: &Asked<'_>,
+    registry: &Registry,
+    id: &EntryId,
+    says: &mut Says,
+) -> anyhow::Result<Option<LoadedEntry>> {
     let entry = registry.entry(&id.to_string())?;
-    if !entry.meta().is_robot_policy() {
-        let line = evaluate_solver(&entry, args.task.as_deref(), &args.puzzles, &args.results.folder(&args.zoo))?;
-        cli::print(&(line + "\n"))?;
-        return Ok(None);
+    if entry.meta().is_robot_policy() {
+        let task = args.run.task.as_ref().unwrap_or(&entry.meta().task);
+        if let Some(protocol) = asked.protocol.filter(|protocol| protocol.task != *task) {
+            bail!("protocol {}: task: expected {}, found {task}", protocol.name, protocol.task);
+        }
+        return Ok(Some(entry.load()?));
     }
-    Ok(Some(entry.load()?))
+    // what says how robots are run; with --all it is meant for the others
+    let named = !args.all && !args.all_versions;
+    let of_robots = [
+        ("--protocol", args.protocol.is_some()),
+        ("--episodes", args.episodes.is_some()),
+        ("--max-steps", args.run.max_steps.is_some()),
+        ("--n-action-steps", args.n_action_steps.is_some()),
+        ("--temporal-ensemble", args.temporal_ensemble.is_some()),
+        ("--shard", args.shard.is_some()),
+        ("--video", args.video > 0),
+    ];
+    if let Some((option, _)) = of_robots.iter().find(|(_, given)| *given && named) {
+        bail!("{option}: expected a robot policy, found a solver of puzzles, which takes --puzzles, --depth, --givens, --seed-start and --again");
+    }
+    let (task, results) = (args.run.task.as_deref(), args.results.folder(&args.zoo));
+    // seeds of episodes are no seeds of puzzles where both kinds are evaluated
+    let seed = args.seed.filter(|_| named);
+    let (line, value) = evaluate_solver(&entry, task, &args.puzzles, seed, args.again, &results)?;
+    says.say(&(line + "\n"), value)?;
+    Ok(None)
 }
 
 /// Evaluates the entries of an environment on one set of simulators.
 fn evaluate_on(
     args: &Args,
+    asked: &Asked<'_>,
     environment: &EnvironmentKey,
     entries: &[LoadedEntry],
     stop: &Stop,
-    failures: &mut Vec<anyhow::Error>,
+    (says, failures): (&mut Says, &mut Vec<anyhow::Error>),
 ) -> anyhow::Result<()> {
-    let task = &environment.task;
-    let env_args = environment.env_args.as_deref().map(serde_json::from_str).transpose()?;
-    let mut spec = args.simulator.recorded_spec(task, env_args.as_ref())?;
-    spec.env_module.clone_from(&environment.env_module);
-    if let Some(cameras) = &environment.cameras {
-        spec.cameras.clone_from(&cameras.names);
-        (spec.image_size, spec.fast_render) = (cameras.size, cameras.fast_render);
-    }
-    spec.control = args.control;
-    spec.limits.step = Duration::from_secs(args.step_timeout);
-    let (results, options) = (args.results.folder(&args.zoo), options(args, environment));
+    let spec = environment.spec(&args.run, asked.protocol.map_or(args.run.control, |protocol| protocol.control))?;
+    let (results, options) = (args.results.folder(&args.zoo), options(args, asked, environment));
     // a finished evaluation is shown without starting a simulator
     let remembered = (!args.again && args.video == 0).then(|| remembered_greeting(&spec)).flatten();
     let mut subjects = Vec::new();
     for loaded in entries {
         let id = loaded.entry().id();
-        let done = subject(args, loaded).and_then(|subject| match &remembered {
+        let done = subject(args, asked, loaded).and_then(|subject| match &remembered {
             Some(ready) => Ok((finished(&subject, ready, &results, &options)?, subject)),
             None => Ok((None, subject)),
         });
         match done.with_context(|| format!("entry {id}")) {
-            Ok((Some(evaluation), _)) => cli::print(&(LeaderboardRow::new(&evaluation).summary() + there(&evaluation) + "\n"))?,
+            Ok((Some(evaluation), _)) => says.evaluation(&evaluation, true)?,
             Ok((None, subject)) => subjects.push(subject),
             Err(error) => failures.push(error),
         }
@@ -242,12 +287,12 @@ fn evaluate_on(
     if subjects.is_empty() {
         return Ok(());
     }
-    let Some(mut pool) = args.simulator.start(spec, args.worker_logs.clone(), stop)? else { return Ok(()) };
+    let Some(mut pool) = args.run.simulator.start(spec, args.run.worker_logs.clone(), stop)? else { return Ok(()) };
     for entry in entries {
         note_other_module(entry.entry().meta(), pool.ready().module_sha256.as_deref());
     }
     for subject in &subjects {
-        if let Err(error) = evaluate_entry(args, &options, subject, &mut pool, stop) {
+        if let Err(error) = evaluate_entry((args, asked), &options, subject, &mut pool, stop, says) {
             failures.push(error);
         }
         if stop.asked() {
@@ -257,15 +302,19 @@ fn evaluate_on(
     let incidents = pool.incidents().len();
     pool.close();
     if incidents > 0 {
-        cli::note(&format!("note: {incidents} worker failures on {task}; the episodes were run again"));
+        cli::note(&format!("note: {incidents} worker failures on {}; the episodes were run again", environment.task));
     }
     Ok(())
 }
 
 /// The entry as the command line wants it to act.
-fn subject(args: &Args, loaded: &LoadedEntry) -> anyhow::Result<Subject<'static>> {
+fn subject(args: &Args, asked: &Asked<'_>, loaded: &LoadedEntry) -> anyhow::Result<Subject<'static>> {
     let mut subject = loaded.subject();
-    if let Some(max_steps) = args.max_steps {
+    if let Some(protocol) = asked.protocol {
+        subject.max_steps = Some(protocol.max_steps);
+        subject.execution = protocol.execution.unwrap_or(subject.execution);
+    }
+    if let Some(max_steps) = args.run.max_steps {
         subject.max_steps = Some(usize::try_from(max_steps)?);
     }
     if let Some(n_action_steps) = args.n_action_steps {
@@ -279,80 +328,61 @@ fn subject(args: &Args, loaded: &LoadedEntry) -> anyhow::Result<Subject<'static>
         limits::check_coefficient(coefficient, loaded.experiment().policy.action_horizon())?;
         subject.execution = Execution::TemporalEnsemble { coefficient };
     }
+    if let Some((protocol, fixed)) = asked.protocol.and_then(|protocol| Some((protocol, protocol.execution?)))
+        && fixed != subject.execution
+    {
+        bail!("protocol {}: execution: expected {fixed:?}, found {:?}", protocol.name, subject.execution);
+    }
     Ok(subject)
 }
 
-fn options(args: &Args, environment: &EnvironmentKey) -> EvaluationOptions {
+fn options(args: &Args, asked: &Asked<'_>, environment: &EnvironmentKey) -> EvaluationOptions {
     EvaluationOptions {
-        seeds: Seeds { start: args.seed, count: args.episodes },
+        seeds: asked.seeds,
         shard: args.shard,
         env_module: environment.env_module.clone(),
-        force: args.force,
+        force: args.run.force,
     }
 }
 
 /// Evaluates one entry and films it, as far as nobody asks to stop.
 fn evaluate_entry(
-    args: &Args,
+    (args, asked): (&Args, &Asked<'_>),
     options: &EvaluationOptions,
     subject: &Subject<'_>,
     pool: &mut Pool,
     stop: &Stop,
+    says: &mut Says,
 ) -> anyhow::Result<()> {
     let results = args.results.folder(&args.zoo);
     let stopped = match args.again {
-        false => run_missing(subject, pool, &results, options)?.is_none(),
-        true => again(subject, pool, &results, options)?,
+        false => match run_missing(subject, pool, &results, options)? {
+            None => true,
+            Some(Evaluated { evaluation, was_there }) => {
+                if let Some(protocol) = asked.protocol.filter(|protocol| protocol.block_of(&evaluation.record).is_none()) {
+                    let (id, name, versions) = (&evaluation.record.entry, &protocol.name, &evaluation.record.versions);
+                    cli::note(&format!("note: {id}: not of {name}, which fixes {:?}: found {versions:?}", protocol.versions));
+                }
+                says.evaluation(&evaluation, was_there)?;
+                false
+            }
+        },
+        true => again(subject, pool, &results, options, says)?,
     };
     if !stopped && args.video > 0 && !stop.asked() {
-        videos(args, subject, pool)?;
+        videos(args, options.seeds, subject, pool)?;
     }
     Ok(())
 }
 
-/// Runs what has no outcome yet and says how it went; nothing if it was stopped.
-fn run_missing(
+/// Runs episodes of a finished evaluation once more and compares; whether it was stopped.
+fn again(
     subject: &Subject<'_>,
     pool: &mut Pool,
     results: &Path,
     options: &EvaluationOptions,
-) -> anyhow::Result<Option<Box<StoredEvaluation>>> {
-    let id = subject.entry.to_string();
-    let mut screen = Screen::new();
-    let mut successes = 0_u64;
-    let mut before = false;
-    let end = evaluate(subject, pool, results, options, &mut |progress| match progress {
-        Progress::Begin { done, total, .. } => {
-            before = done == total;
-            screen.begin_at("eval", done, total);
-            screen.message(&id);
-        }
-        Progress::Episode(episode) => {
-            successes += u64::from(episode.success);
-            screen.step();
-            screen.message(&format!("{id}: {successes} successes"));
-        }
-    });
-    drop(screen);
-    match end.with_context(|| format!("entry {id}"))? {
-        EvaluationEnd::Complete(evaluation) => {
-            let there = if before { there(&evaluation) } else { "" };
-            cli::print(&(LeaderboardRow::new(&evaluation).summary() + there + "\n"))?;
-            Ok(Some(evaluation))
-        }
-        EvaluationEnd::Stopped { done, total } => {
-            cli::note(&format!("{id}: {done} of {total} episodes done"));
-            Ok(None)
-        }
-        EvaluationEnd::Failed { done, errors } => {
-            let first = errors.into_iter().next().context("an evaluation failed without saying why")?;
-            Err(anyhow::Error::new(first).context(format!("entry {id}: {done} episodes done, others could not be run")))
-        }
-    }
-}
-
-/// Runs episodes of a finished evaluation once more and compares; whether it was stopped.
-fn again(subject: &Subject<'_>, pool: &mut Pool, results: &Path, options: &EvaluationOptions) -> anyhow::Result<bool> {
+    says: &mut Says,
+) -> anyhow::Result<bool> {
     if subject.time_decides {
         bail!("entry {}: it thinks by the clock, so its episodes may end otherwise: nothing to compare", subject.entry);
     }
@@ -381,19 +411,26 @@ fn again(subject: &Subject<'_>, pool: &mut Pool, results: &Path, options: &Evalu
         return Ok(true);
     }
     let of = if again.stored > again.wanted { format!(" of {}", again.stored) } else { String::new() };
-    cli::print(&format!("{id}: {}{of} episodes run again, every outcome the same\n", again.episodes))?;
+    let versions: Vec<Value> =
+        again.versions.iter().map(|(name, stored, now)| json!({"name": name, "stored": stored, "now": now})).collect();
+    says.say(
+        &format!("{id}: {}{of} episodes run again, every outcome the same\n", again.episodes),
+        json!({
+            "entry": id, "run_again": again.episodes, "stored": again.stored, "different": 0, "other_versions": versions,
+            "sealed_now": again.sealed,
+        }),
+    )?;
     Ok(false)
 }
 
 /// Films the first episodes; the path of each video is printed.
-fn videos(args: &Args, subject: &Subject<'_>, pool: &mut Pool) -> anyhow::Result<()> {
+fn videos(args: &Args, seeds: Seeds, subject: &Subject<'_>, pool: &mut Pool) -> anyhow::Result<()> {
     let folder = args.zoo.zoo.join("videos").join(subject.entry.to_string());
     fs::create_dir_all(&folder).with_context(|| format!("creating {}", shown(&folder)))?;
-    let count = args.video.min(args.episodes);
-    let seeds: Vec<u64> = (args.seed..args.seed.saturating_add(count)).collect();
+    let count = args.video.min(seeds.count);
+    let seeds: Vec<u64> = seeds.iter().take(usize::try_from(count)?).collect();
     let (side, rate) = (usize::from(args.video_size), pool.ready().control_freq);
     let view = View { camera: args.camera.clone(), height: side, width: side };
-    let python = args.simulator.python()?;
     let task = pool.ready().task.clone();
     let mut screen = Screen::new();
     screen.begin("film", count);
@@ -402,8 +439,16 @@ fn videos(args: &Args, subject: &Subject<'_>, pool: &mut Pool) -> anyhow::Result
         let word = if success { "success" } else { "failure" };
         let path = folder.join(format!("{task}-{seed}-{word}.mp4"));
         screen.step();
-        let written = video::write(&python, &path, &images, rate).map_err(anyhow::Error::from);
-        match written.and_then(|()| screen.print(&(shown(&path) + "\n"))) {
+        let line = shown(&path);
+        let written = cli::film(&path, &images, rate).and_then(|()| match args.json {
+            // JSON alone is on standard output
+            true => {
+                screen.note(&line);
+                Ok(())
+            }
+            false => screen.print(&(line + "\n")),
+        });
+        match written {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
                 failure = Some(error);

@@ -4,23 +4,28 @@ use std::process::ExitCode;
 use anyhow::Context;
 use cli::{Table, shown};
 use report::column::{Align, Column};
-use report::{COLUMNS, Curve, csv, markdown, rank, to_html};
+use report::{ACROSS_COLUMNS, COLUMNS, Curve, LeaderboardRow, Reading, across_tasks, csv, json, markdown, rank, to_html};
 use study::puzzle::{PUZZLE_COLUMNS, audit_puzzles, puzzle_section, rank_puzzles};
 use zoo::audit::{KnownEntries, audit};
 use zoo::entry::Entry;
 use zoo::{ZooError, write_together};
 
-use crate::places::{ResultsArgs, ZooArgs};
+use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs};
 
 /// Rank all evaluations: tables here, leaderboard.csv, leaderboard_puzzles.csv and report.html in the zoo
 ///
-/// Ranks go by the lower end of the 95% interval; a row of fewer than 20 episodes has none. Results that are not as they
+/// A family (trainings that differ in their seed alone, as `train --seeds` makes them) is one row, with an interval that
+/// holds the chance of training. Ranks go by the lower end of the 95% interval; a row of fewer than 20 episodes has none.
+/// Rows of a task and protocol that share a letter cannot be told apart: exact McNemar tests on equal seeds (Barnard's where
+/// seeds differ, a bootstrap between families), Holm's correction over the whole table. Results that are not as they
 /// were sealed, without a seal, in a folder of another name, or of an entry that is not in the zoo or says otherwise, are
 /// named and left out; the others are ranked, and the exit code is 1.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo leaderboard
   actrm-zoo leaderboard --zoo my-zoo --out public
+  actrm-zoo leaderboard --trainings
+  actrm-zoo leaderboard --json
   actrm-zoo leaderboard --markdown RESULTS.md")]
 pub struct Args {
     #[command(flatten)]
@@ -31,9 +36,17 @@ pub struct Args {
     /// Also write the table as Markdown
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
+    /// Show each training of a family below it
+    #[arg(long)]
+    trainings: bool,
+    /// Print the rows as JSON instead of tables, with the names of the CSV's columns
+    #[arg(long)]
+    json: bool,
     /// Show all columns, however narrow the terminal is
     #[arg(long)]
     wide: bool,
+    #[command(flatten)]
+    protocols: ProtocolArgs,
     #[command(flatten)]
     zoo: ZooArgs,
 }
@@ -50,22 +63,29 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
     };
     let (evaluations, puzzles) = (robots.standing, rank_puzzles(&solvers.standing));
-    if evaluations.is_empty() && puzzles.is_empty() && failures.is_empty() {
+    if evaluations.is_empty() && puzzles.is_empty() && failures.is_empty() && !args.json {
         cli::note(&format!("no evaluations in {}; make one with: actrm-zoo eval --all", shown(&results)));
         return Ok(ExitCode::SUCCESS);
     }
-    let rows = rank(&evaluations);
+    let reading = Reading { families: entries.families(), protocols: args.protocols.protocols()? };
+    let rows = rank(&evaluations, &reading);
+    let across = across_tasks(&rows);
 
     // first the files: whoever reads the tables may go away before their end
     let out = args.out.as_ref().unwrap_or(&args.zoo.zoo);
     std::fs::create_dir_all(out).with_context(|| format!("creating {}", shown(out)))?;
+    let page = to_html(&rows, &curves(&entries), &puzzle_section(&puzzles));
     let mut files = vec![
         (out.join("leaderboard.csv"), csv::table(COLUMNS, &rows).into_bytes()),
-        (
-            out.join("report.html"),
-            to_html(&evaluations, &curves(&entries), &puzzle_section(&puzzles)).into_bytes(),
-        ),
+        (out.join("report.html"), page.into_bytes()),
     ];
+    let details: Vec<LeaderboardRow> = rows.iter().flat_map(LeaderboardRow::details).collect();
+    if details.len() > rows.len() {
+        files.push((out.join("leaderboard_trainings.csv"), csv::table(COLUMNS, &details).into_bytes()));
+    }
+    if !across.is_empty() {
+        files.push((out.join("leaderboard_across.csv"), csv::table(ACROSS_COLUMNS, &across).into_bytes()));
+    }
     if !puzzles.is_empty() {
         files.push((out.join("leaderboard_puzzles.csv"), csv::table(PUZZLE_COLUMNS, &puzzles).into_bytes()));
     }
@@ -75,10 +95,36 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // all of them or none: a table beside a report of other results would be worse than an old pair
     write_together(&files)?;
 
+    if args.json {
+        cli::print_json(&serde_json::json!({
+            "rows": json::rows(COLUMNS, &rows),
+            "trainings": json::rows(COLUMNS, &details),
+            "across_tasks": json::rows(ACROSS_COLUMNS, &across),
+            "puzzles": json::rows(PUZZLE_COLUMNS, &puzzles),
+            "left_out": failures,
+        }))?;
+        return Ok(end());
+    }
     let written: String = files.iter().map(|(path, _)| shown(path) + "\n").collect();
-    let text = table(COLUMNS, &rows, args.wide) + &table(PUZZLE_COLUMNS, &puzzles, args.wide);
-    cli::print(&(text + &written))?;
+    let told = if args.trainings { with_trainings(&rows) } else { rows };
+    let mut tables = vec![
+        table(COLUMNS, &told, args.wide),
+        table(ACROSS_COLUMNS, &across, args.wide),
+        table(PUZZLE_COLUMNS, &puzzles, args.wide),
+        written,
+    ];
+    tables.retain(|table| !table.is_empty());
+    cli::print(&tables.join("\n"))?;
     Ok(end())
+}
+
+/// The rows, each family followed by its trainings.
+fn with_trainings(rows: &[LeaderboardRow]) -> Vec<LeaderboardRow> {
+    let with = |row: &LeaderboardRow| {
+        let details = if row.n_trainings() > 1 { row.details() } else { Vec::new() };
+        std::iter::once(row.clone()).chain(details).collect::<Vec<_>>()
+    };
+    rows.iter().flat_map(with).collect()
 }
 
 /// One line for what is wrong with `object`.

@@ -1,6 +1,8 @@
 use std::process::ExitCode;
 
+use anyhow::Context;
 use cli::{Column, Table, shown};
+use serde_json::Value;
 use study::puzzle::PuzzleMeta;
 use zoo::entry::Entry;
 
@@ -11,11 +13,15 @@ use crate::places::{ConfigArgs, ZooArgs};
 #[command(after_help = "Examples:
   actrm-zoo list
   actrm-zoo list --zoo my-zoo
+  actrm-zoo list --json
   actrm-zoo list --experiments")]
 pub struct Args {
     /// List experiments instead of entries
     #[arg(long)]
     experiments: bool,
+    /// As JSON: what each entry says of itself, without its training curve
+    #[arg(long)]
+    json: bool,
     /// Show all columns, however narrow the terminal is
     #[arg(long)]
     wide: bool,
@@ -28,12 +34,16 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.experiments {
         let names = args.configs.library()?.names()?;
+        if args.json {
+            cli::print_json(&names)?;
+            return Ok(ExitCode::SUCCESS);
+        }
         cli::print(&names.iter().map(|name| format!("{name}\n")).collect::<String>())?;
         return Ok(ExitCode::SUCCESS);
     }
     let registry = args.zoo.registry();
     let ids = registry.ids()?;
-    if ids.is_empty() {
+    if ids.is_empty() && !args.json {
         cli::note(&format!("no entries in {}; make one with: actrm-zoo train act_lift", shown(&args.zoo.zoo)));
         return Ok(ExitCode::SUCCESS);
     }
@@ -47,6 +57,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Column::new("data").dispensable(4),
     ]);
     let mut failures = Vec::new();
+    let mut all = Vec::new();
     for id in ids {
         // one bad entry must not hide the others
         let entry = match Entry::open_meta(registry.folder(), &id) {
@@ -57,6 +68,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             }
         };
         let meta = entry.meta();
+        if args.json {
+            all.push(json(&entry)?);
+            continue;
+        }
         let training = meta.training.as_ref();
         let number = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
         table.push(vec![
@@ -73,9 +88,23 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             }),
         ]);
     }
-    cli::print(&table.text(args.wide))?;
+    match args.json {
+        true => cli::print_json(&all)?,
+        false => cli::print(&table.text(args.wide))?,
+    }
     for failure in &failures {
         cli::note(&format!("error: {failure:#}"));
     }
     Ok(if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// `entry.json` without the curve, and with the hash that results know the entry by.
+fn json(entry: &Entry) -> anyhow::Result<Value> {
+    let mut value = serde_json::to_value(entry.meta()).context("cannot write JSON")?;
+    if let Some(training) = value.get_mut("training").and_then(Value::as_object_mut) {
+        training.remove("curve");
+    }
+    value["entry"] = entry.id().to_string().into();
+    value["content_sha256"] = entry.meta().content_sha256().into();
+    Ok(value)
 }

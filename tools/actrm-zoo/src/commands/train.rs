@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, Stop, command_line, shown};
 use study::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
+use zoo::entry::member_name;
 use zoo::run::{COMMAND_FILE, MetricsRow, TrainEvent, TrainOutcome, TrainRequest, train};
 use zoo::write_atomic;
 
@@ -14,12 +15,17 @@ use crate::places::{ConfigArgs, ZooArgs, experiment_names};
 ///
 /// Ctrl-C saves a checkpoint; `--resume` goes on from it to the same bytes that an uninterrupted training gives.
 /// `actrm-zoo runs` lists what can go on, with the command that does it.
+///
+/// `--seeds 1..8` trains eight times, with the seeds 1 to 8, one entry each (`lift-act-s1` to `lift-act-s8`): a family,
+/// which the leaderboard shows as one row with the chance of training in its interval. The same command goes on where it
+/// was; what is trained already is not trained again.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo train act_lift
   actrm-zoo train act_lift train.steps=2000 policy.dim_model=256
   actrm-zoo train act_lift --data demos.hdf5 --zoo my-zoo
   actrm-zoo train act_lift --resume
+  actrm-zoo train act_lift --seeds 1..8
   actrm-zoo train trm_dfs10 train.seed=2
   actrm-zoo train act_lift --print-config")]
 pub struct Args {
@@ -41,6 +47,9 @@ pub struct Args {
     /// Go on with the latest run of this experiment, or with the one in --run
     #[arg(long)]
     resume: bool,
+    /// One training with each of these seeds: `1..8` (both ends included), `3` or `1,4,7`
+    #[arg(long, value_name = "SEEDS", conflicts_with_all = ["run", "resume"])]
+    seeds: Option<TrainingSeeds>,
     /// Print the resolved experiment and end
     #[arg(long)]
     print_config: bool,
@@ -50,27 +59,111 @@ pub struct Args {
     zoo: ZooArgs,
 }
 
+/// Seeds of trainings.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct TrainingSeeds(Vec<u64>);
+
+impl std::str::FromStr for TrainingSeeds {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        const MOST: u64 = 1000;
+        let wrong = || format!("seeds {text:?}: expected `1..8` (both ends included), `3` or `1,4,7`");
+        let number = |text: &str| text.trim().parse::<u64>().map_err(|e| format!("{}: {e}", wrong()));
+        let mut seeds = Vec::new();
+        for part in text.split(',') {
+            let (first, last) = part.split_once("..").unwrap_or((part, part));
+            let (first, last) = (number(first)?, number(last)?);
+            if last < first || last - first >= MOST {
+                return Err(format!("{}, rising, at most {MOST}", wrong()));
+            }
+            seeds.extend(first..=last);
+        }
+        seeds.sort_unstable();
+        match seeds.windows(2).any(|pair| pair[0] == pair[1]) {
+            true => Err(format!("seeds {text:?}: expected each seed once")),
+            false => Ok(Self(seeds)),
+        }
+    }
+}
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let library = args.configs.library()?;
-    let experiment = AnyExperiment::load(&library, &args.experiment, &args.overrides)
-        .with_context(|| format!("experiment `{}`", args.experiment))?;
+    let load = |overrides: &[String]| {
+        AnyExperiment::load(&library, &args.experiment, overrides)
+            .with_context(|| format!("experiment `{}`", args.experiment))
+    };
+    let experiment = load(&args.overrides)?;
     if args.print_config {
         cli::print(&experiment.to_toml())?;
         return Ok(ExitCode::SUCCESS);
     }
     let asked = Stop::install("stopped before the first step")?;
+    let Some(TrainingSeeds(seeds)) = &args.seeds else {
+        let one = One { run: args.run.clone(), resume: args.resume, seeded: false };
+        return train_one(args, experiment, &one, &asked);
+    };
+    if let Some(set) = args.overrides.iter().find(|set| set.starts_with("train.seed=") || set.starts_with("entry=")) {
+        bail!("--seeds: expected no `{set}` beside it: every training has a seed and an entry of its own");
+    }
+    // other settings are another family, with runs of its own
+    let settings = zoo::sha256_hex(format!("{}\n{:?}", experiment.to_toml(), args.data).as_bytes());
+    for &seed in seeds {
+        let name = member_name(experiment.entry(), seed);
+        let overrides: Vec<String> =
+            args.overrides.iter().cloned().chain([format!("train.seed={seed}"), format!("entry={name}")]).collect();
+        let run = args.runs.join(&args.experiment).join(format!("{}-s{seed}", &settings[..8]));
+        if let Some(entry) = finished_entry(&run)? {
+            // of another zoo, or removed: it has to be trained again, which only the user can decide
+            let id = args.zoo.registry().resolve(&entry).with_context(|| {
+                format!("seed {seed}: {} is finished and made {entry}; remove that folder to train it again", shown(&run))
+            })?;
+            cli::print(&format!("{id} is in {} already (run {})\n", shown(&args.zoo.zoo), shown(&run)))?;
+            continue;
+        }
+        let one = One { resume: run.join("config.toml").is_file(), run: Some(run), seeded: true };
+        let code = train_one(args, load(&overrides)?, &one, &asked)?;
+        if code != ExitCode::SUCCESS {
+            return Ok(code);
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The entry that the run in `folder` made, if it is finished.
+fn finished_entry(folder: &Path) -> anyhow::Result<Option<String>> {
+    let path = folder.join("finished.json");
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let text = std::fs::read(&path).with_context(|| format!("reading {}", shown(&path)))?;
+    let note: serde_json::Value =
+        serde_json::from_slice(&text).with_context(|| format!("{}: expected the note of a finished run", shown(&path)))?;
+    match note["entry"].as_str() {
+        Some(entry) => Ok(Some(entry.to_owned())),
+        None => bail!("{}: entry: expected its name, found {}", shown(&path), note["entry"]),
+    }
+}
+
+/// One training: where it takes place, and whether it is one of several.
+struct One {
+    run: Option<PathBuf>,
+    resume: bool,
+    seeded: bool,
+}
+
+fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) -> anyhow::Result<ExitCode> {
     let mut screen = Screen::new();
     let stop = || asked.asked();
-    let (name, runs, run) = (args.experiment.clone(), args.runs.clone(), args.run.clone());
-    let (resume, zoo) = (args.resume, args.zoo.zoo.clone());
+    let (name, runs, run) = (args.experiment.clone(), args.runs.clone(), one.run.clone());
+    let (resume, zoo) = (one.resume, args.zoo.zoo.clone());
     // the error of a file that is for people only must not end a training
     let mut unwritten = None;
     let mut on_event = |event: TrainEvent<'_>| {
         if let TrainEvent::Folder(folder) = &event {
-            let text = format!("{}\n", going_on(args, folder));
+            let text = format!("{}\n", going_on(args, folder, one.seeded));
             unwritten = write_atomic(&folder.join(COMMAND_FILE), text.as_bytes()).err();
         }
-        show(&event, &mut screen, &asked);
+        show(&event, &mut screen, asked);
     };
     let outcome = match experiment {
         AnyExperiment::Robot(experiment) => {
@@ -97,14 +190,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Ok(ExitCode::SUCCESS)
         }
         TrainOutcome::Stopped { step, run } => {
-            cli::note(&format!("stopped after step {step}; go on with: {}", going_on(args, &run)));
+            cli::note(&format!("stopped after step {step}; go on with: {}", going_on(args, &run, one.seeded)));
             Ok(ExitCode::from(INTERRUPTED))
         }
     }
 }
 
 /// The command that goes on with the run in `folder`: everything that was asked for, wherever it came from.
-fn going_on(args: &Args, folder: &Path) -> String {
+fn going_on(args: &Args, folder: &Path, seeded: bool) -> String {
     let mut words: Vec<OsString> = ["actrm-zoo", "train", &args.experiment].map(OsString::from).to_vec();
     words.extend(args.overrides.iter().map(OsString::from));
     let mut option = |name: &str, path: &Path| words.extend([name.into(), path.as_os_str().to_owned()]);
@@ -115,8 +208,18 @@ fn going_on(args: &Args, folder: &Path) -> String {
         option("--configs", configs);
     }
     option("--zoo", &args.zoo.zoo);
-    option("--run", folder);
-    words.push("--resume".into());
+    match &args.seeds {
+        // the other trainings belong to it
+        Some(TrainingSeeds(seeds)) if seeded => {
+            option("--runs", &args.runs);
+            let seeds: Vec<String> = seeds.iter().map(u64::to_string).collect();
+            words.extend(["--seeds".into(), seeds.join(",").into()]);
+        }
+        _ => {
+            option("--run", folder);
+            words.push("--resume".into());
+        }
+    }
     command_line(&words)
 }
 
@@ -171,4 +274,21 @@ fn summary(row: &MetricsRow) -> String {
         text.push_str(&format!(" valid {valid:.4}"));
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn seeds_are_ranges_and_lists() {
+        let read = |text: &str| text.parse::<TrainingSeeds>().map(|seeds| seeds.0);
+        assert_eq!(read("1..8").unwrap(), (1..=8).collect::<Vec<_>>());
+        assert_eq!(read("7,1..3").unwrap(), [1, 2, 3, 7]);
+        assert_eq!(read("5").unwrap(), [5]);
+        for wrong in ["", "a", "8..1", "1..", "1,1", "1..3,2", "0..18446744073709551615", "-1"] {
+            assert!(read(wrong).unwrap_err().contains("seeds"), "{wrong}");
+        }
+    }
 }

@@ -1,0 +1,273 @@
+//! The leaderboard: a row a training or a family of them, ranked inside its task and protocol, and the list of its columns.
+//!
+//! A row holds what was measured and counts; rates are derived. The same results give the same rows, and the same
+//! rows the same bytes.
+
+mod columns;
+mod rank;
+mod row;
+
+pub use columns::{COLUMNS, count_text};
+pub(crate) use rank::group;
+pub use rank::{Reading, rank};
+pub(crate) use row::interval_text;
+pub use row::{Bound, Counts, FEWEST_TO_RANK, LeaderboardRow};
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::column::cells;
+    use crate::testing::{finished, sample};
+    use crate::{csv, markdown};
+    use zoo::protocols::{Block, Protocols};
+    use zoo::results::{Execution, Seeds, Shard, StoredEvaluation, list_evaluations};
+
+    /// The rows where no entry is of a family.
+    fn rank(evaluations: &[StoredEvaluation]) -> Vec<LeaderboardRow> {
+        super::rank(evaluations, &Reading::default())
+    }
+
+    #[test]
+    fn a_rate_is_not_rounded_to_all_or_none() {
+        let texts = [(0, "0%"), (1, "0.5%"), (2, "1%"), (151, "76%"), (198, "99%"), (199, "99.5%"), (200, "100%")];
+        for (successes, text) in texts {
+            assert_eq!(Counts { successes, episodes: 200 }.percent(0), text);
+        }
+        assert_eq!(Counts { successes: 6_597, episodes: 6_600 }.percent(1), "99.95%");
+    }
+
+    fn board(folder: &std::path::Path) -> Vec<LeaderboardRow> {
+        for (name, version, count) in [("lift-act", 1, 20), ("lift-act", 2, 4), ("lift, \"b\"", 1, 20)] {
+            finished(folder, &sample(name, version, count));
+        }
+        let mut shard = sample("lift-act", 3, 20);
+        shard.shard = Some(Shard { index: 1, count: 2 });
+        finished(folder, &shard);
+        let mut none = sample("none", 1, 1);
+        none.protocol.task = "Stack".into();
+        none.execution = Execution::TemporalEnsemble { coefficient: 0.01 };
+        finished(folder, &none);
+        rank(&list_evaluations(folder).unwrap())
+    }
+
+    #[test]
+    fn csv_and_table_read_like_this() {
+        let dir = tempfile::tempdir().unwrap();
+        let rows = board(dir.path());
+        insta::assert_snapshot!("leaderboard_csv", csv::table(COLUMNS, &rows));
+        let table: Vec<String> = cells(COLUMNS, &rows).rows.iter().map(|cells| cells.join(" | ")).collect();
+        insta::assert_snapshot!("leaderboard_table", table.join("\n"));
+    }
+
+    #[test]
+    fn the_order_of_the_folders_does_not_matter() {
+        let dir = tempfile::tempdir().unwrap();
+        let expected = csv::table(COLUMNS, &board(dir.path()));
+        let mut all = list_evaluations(dir.path()).unwrap();
+        for _ in 0..all.len() {
+            all.rotate_left(1);
+            assert_eq!(csv::table(COLUMNS, &rank(&all)), expected);
+        }
+    }
+
+    #[test]
+    fn ranks_go_by_what_the_rate_is_at_least_and_few_episodes_have_none() {
+        let dir = tempfile::tempdir().unwrap();
+        let stored = |name: &str, successes: u64, episodes: u64| {
+            let mut stored = finished(dir.path(), &sample(name, 1, episodes));
+            stored.episodes.iter_mut().enumerate().for_each(|(k, e)| e.success = (k as u64) < successes);
+            stored
+        };
+        let all = [
+            stored("one-of-one", 1, 1),
+            stored("all-of-nineteen", 19, 19),
+            stored("all-of-twenty", 20, 20),
+            stored("none", 0, 200),
+            stored("same-as-best", 199, 200),
+            stored("best", 199, 200),
+            stored("half", 100, 200),
+        ];
+        let ranked: Vec<(String, Option<u64>)> =
+            rank(&all).into_iter().map(|row| (row.record().entry.name.clone(), row.rank)).collect();
+        let expected = [
+            ("best", Some(1)),
+            ("same-as-best", Some(1)),
+            ("all-of-twenty", Some(3)),
+            ("half", Some(4)),
+            ("none", Some(5)),
+            ("all-of-nineteen", None),
+            ("one-of-one", None),
+        ];
+        assert_eq!(ranked, expected.map(|(name, rank)| (name.to_owned(), rank)));
+        assert!(rank(&all)[5].rate_text().contains("too few to rank"));
+        // another protocol begins anew
+        let mut other = all[3].clone();
+        other.record.protocol.max_steps = 500;
+        assert!(rank(&[all[5].clone(), other]).iter().all(|row| row.rank == Some(1)));
+    }
+
+    #[test]
+    fn groups_are_counted_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut evaluation = finished(dir.path(), &sample("color", 1, 20));
+        for (k, episode) in evaluation.episodes.iter_mut().enumerate() {
+            episode.group = Some(if k < 15 { "seen" } else { "unseen" }.to_owned());
+        }
+        let row = LeaderboardRow::new(&evaluation);
+        // the sample fails for every fifth seed
+        assert_eq!(row.groups_text(), "seen 12/15, unseen 4/5");
+        assert_eq!(cells(COLUMNS, [&row]).rows[0][3], "16/20\nseen 12/15\nunseen 4/5");
+        assert!(markdown::table(COLUMNS, [&row]).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
+        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\""));
+        assert!(!row.summary().contains(" in "), "{}", row.summary());
+        for (k, episode) in evaluation.episodes.iter_mut().enumerate().filter(|(_, episode)| !episode.success) {
+            episode.failure = Some(if k < 5 { "late" } else { "wrong" }.to_owned());
+        }
+        let summary = LeaderboardRow::new(&evaluation).summary();
+        assert!(summary.contains("late in 1, wrong in 2\n") && summary.ends_with(", wrong in 1"), "{summary}");
+    }
+
+    #[test]
+    fn rates_are_derived_from_counts() {
+        let dir = tempfile::tempdir().unwrap();
+        let rows = board(dir.path());
+        let row = rows.iter().find(|row| row.record().entry.to_string() == "lift-act@1").unwrap();
+        // the sample fails for every fifth seed
+        assert_eq!((row.counts.successes, row.counts.episodes), (16, 20));
+        assert_eq!(row.counts.rate(), 0.8);
+        assert_eq!(row.mean_return(), Some(0.8));
+        let steps: u64 = (10_000..10_020).filter(|s| s % 5 != 0).map(|s| 40 + s % 7).sum();
+        assert_eq!(row.mean_steps_to_success(), Some(steps as f64 / 16.0));
+        let none = rows.iter().find(|row| row.task() == "Stack").unwrap();
+        assert_eq!((none.counts.successes, none.mean_steps_to_success()), (0, None));
+    }
+
+    /// `name@1`, trained with `seed`, of the family `key`; `won` of 40 episodes succeed, the first ones.
+    fn trained(folder: &std::path::Path, name: &str, seed: u64, won: usize) -> StoredEvaluation {
+        let mut record = sample(name, 1, 40);
+        record.training.seed = seed;
+        let mut stored = finished(folder, &record);
+        stored.episodes.iter_mut().enumerate().for_each(|(k, episode)| episode.success = k < won);
+        stored
+    }
+
+    #[test]
+    fn a_family_is_one_row_with_each_training_in_the_details() {
+        let dir = tempfile::tempdir().unwrap();
+        let all = [
+            trained(dir.path(), "lift-act-s2", 2, 30),
+            trained(dir.path(), "lift-act-s10", 10, 20),
+            trained(dir.path(), "lift-act-s1", 1, 36),
+            trained(dir.path(), "other", 1, 5),
+        ];
+        let mut reading = Reading::default();
+        for name in ["lift-act-s1", "lift-act-s2", "lift-act-s10"] {
+            reading.families.insert(name, 1, "key".to_owned());
+        }
+        let rows = super::rank(&all, &reading);
+        let names: Vec<String> = rows.iter().map(LeaderboardRow::name).collect();
+        assert_eq!(names, ["lift-act-s*@1", "other@1"]);
+        let row = &rows[0];
+        assert_eq!((row.n_trainings(), row.counts), (3, Counts { successes: 86, episodes: 120 }));
+        assert_eq!((row.median_rate(), row.each_text(" ").as_str()), (0.75, "36 30 20"));
+        // wider than the episodes alone would have it
+        let (low, high) = row.counts.interval();
+        assert!(row.interval.0 < low && high < row.interval.1, "{:?}", row.interval);
+        assert!(row.rate_text().contains("\n3 trainings, median 75%"), "{}", row.rate_text());
+        let details: Vec<(String, u64)> = row.details().iter().map(|one| (one.name(), one.counts.successes)).collect();
+        assert_eq!(
+            details,
+            [("lift-act-s1@1", 36), ("lift-act-s2@1", 30), ("lift-act-s10@1", 20)].map(|(n, k)| (n.to_owned(), k))
+        );
+        let line = csv::table(COLUMNS, &rows).lines().nth(1).unwrap().to_owned();
+        assert!(
+            line.starts_with("lift-act-s,1,act,Lift,") && line.contains(",3,86,120,36 30 20,0.7167,0.7500,"),
+            "{line}"
+        );
+        // versions of one name that differ in their seed
+        let mut versions = all[..2].to_vec();
+        for (k, version) in versions.iter_mut().enumerate() {
+            version.record.entry.name = "lift-act".to_owned();
+            version.record.entry.version = 2 - k as u32;
+            reading.families.insert("lift-act", 2 - k as u32, "another".to_owned());
+        }
+        assert_eq!(super::rank(&versions, &reading)[0].name(), "lift-act@2,1");
+        // trainings on other seeds are rows of their own
+        let mut other = all[0].clone();
+        other.record.seeds = Seeds { start: 20_000, count: 40 };
+        assert_eq!(super::rank(&[all[2].clone(), other], &reading).len(), 2);
+    }
+
+    #[test]
+    fn what_cannot_be_told_apart_shares_a_letter() {
+        let dir = tempfile::tempdir().unwrap();
+        let all = [("a", 40), ("b", 38), ("c", 20), ("d", 19)].map(|(name, won)| trained(dir.path(), name, 1, won));
+        let rows = rank(&all);
+        let told: Vec<(String, String)> =
+            rows.iter().map(|row| (row.name(), row.standing.clone().unwrap().letters)).collect();
+        let expected = [("a@1", "a"), ("b@1", "a"), ("c@1", "b"), ("d@1", "b")];
+        assert_eq!(told, expected.map(|(name, letter)| (name.to_owned(), letter.to_owned())));
+        assert_eq!(rows[1].standing.as_ref().unwrap().ranks, (1, 2));
+        assert_eq!(rows[3].standing.as_ref().unwrap().ranks, (3, 4));
+    }
+
+    #[test]
+    fn floors_and_ceilings_stand_in_the_table_without_a_rank() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut all = [("learned", 20), ("random", 1), ("expert", 40), ("worse", 10)]
+            .map(|(name, won)| trained(dir.path(), name, 1, won));
+        all[1].record.training.policy = "random".to_owned();
+        all[2].record.training.policy = "expert".to_owned();
+        let rows = rank(&all);
+        let told: Vec<(String, Option<u64>, &str)> =
+            rows.iter().map(|row| (row.name(), row.rank, row.unranked_text())).collect();
+        let expected = [
+            ("expert@1", None, "ceiling"),
+            ("learned@1", Some(1), ""),
+            ("worse@1", Some(2), ""),
+            ("random@1", None, "floor"),
+        ];
+        assert_eq!(told, expected.map(|(name, rank, word)| (name.to_owned(), rank, word)));
+        assert!(rows[0].standing.is_none() && rows[1].standing.is_some());
+    }
+
+    #[test]
+    fn blocks_of_a_protocol_are_told_apart_and_ranked_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let with = |name: &str, seeds: Seeds| {
+            let mut record = sample(name, 1, seeds.count);
+            record.seeds = seeds;
+            record.protocol.control = rollout::Control::Compiled;
+            finished(dir.path(), &record)
+        };
+        let (dev, test) = (Seeds { start: 10_000, count: 100 }, Seeds { start: 40_000, count: 200 });
+        let all = [with("a", dev), with("a", test), with("b", test), with("a", Seeds { start: 10_000, count: 120 })];
+        let reading = Reading { protocols: Protocols::built_in(), ..Reading::default() };
+        let rows = super::rank(&all, &reading);
+        let told: Vec<(String, String, Option<u64>)> =
+            rows.iter().map(|row| (row.name(), row.protocol_text(), row.rank)).collect();
+        let id = all[0].record.protocol.id();
+        let expected = [
+            ("a@1", id.as_str(), 1),
+            ("a@1", "lift-v1 dev", 1),
+            ("a@1", "lift-v1 test", 1),
+            ("b@1", "lift-v1 test", 1),
+        ];
+        assert_eq!(told, expected.map(|(name, protocol, rank)| (name.to_owned(), protocol.to_owned(), Some(rank))));
+        assert_eq!(rows[2].named, Some(("lift-v1".to_owned(), Block::Test)));
+    }
+
+    #[test]
+    fn a_row_that_another_one_holds_is_left_out() {
+        let dir = tempfile::tempdir().unwrap();
+        let all = [10, 12, 30].map(|count| finished(dir.path(), &sample("a", 1, count)));
+        let rows = rank(&all);
+        assert_eq!(rows.iter().map(|row| row.counts.episodes).collect::<Vec<_>>(), [30]);
+        // under other rules, or of another entry, it stays
+        let mut other = all[0].clone();
+        other.record.protocol.max_steps += 1;
+        let another = finished(dir.path(), &sample("b", 1, 10));
+        assert_eq!(rank(&[all[2].clone(), other, another]).len(), 3);
+    }
+}

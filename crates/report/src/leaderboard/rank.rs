@@ -1,0 +1,124 @@
+//! Evaluations to rows: families joined, ranked inside their task and protocol, compared with each other.
+
+use std::cmp::Ordering;
+use std::collections::BTreeMap;
+
+use zoo::entry::Families;
+use zoo::protocols::Protocols;
+use zoo::results::{EntryIdentity, StoredEvaluation};
+
+use super::row::LeaderboardRow;
+use crate::comparison::standings;
+
+/// How evaluations are read: which entries are trainings of one family, and which protocols have names.
+#[derive(Debug, Clone, Default)]
+pub struct Reading {
+    /// The families of the zoo's entries.
+    pub families: Families,
+    /// Named protocols.
+    pub protocols: Protocols,
+}
+
+/// The rows of all whole evaluations (shards wait until they are merged), best first in each task and protocol.
+///
+/// Evaluations of one family under the same protocol on the same seeds are one row. A row whose seeds and trainings are all
+/// in another one is left out, unless they are the block of a named protocol.
+pub fn rank(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<LeaderboardRow> {
+    let mut rows = without_parts(joined(evaluations, reading));
+    rows.sort_by(order);
+    let mut place = 0;
+    for at in 0..rows.len() {
+        let before = at.checked_sub(1).map(|at| &rows[at]).filter(|before| group(before) == group(&rows[at]));
+        // bounds take no place
+        place = match before {
+            None => 1,
+            Some(before) if before.bound().is_some() => place,
+            Some(_) => place + 1,
+        };
+        let same = before.filter(|before| before.counts == rows[at].counts).and_then(|before| before.rank);
+        let ranked = !rows[at].too_few() && rows[at].bound().is_none();
+        rows[at].rank = ranked.then_some(same.unwrap_or(place));
+    }
+    compare_all(&mut rows);
+    rows
+}
+
+/// Rows that are ranked against each other agree in this: task, rules, and the named block of seeds.
+pub(crate) fn group(row: &LeaderboardRow) -> (String, String, String) {
+    let block = row.named.as_ref().map_or(String::new(), |(name, block)| format!("{name} {block}"));
+    (row.task().to_owned(), block, row.record().protocol.id())
+}
+
+/// Trainings of one family that were run alike become one row.
+fn joined(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<LeaderboardRow> {
+    let mut alike: BTreeMap<String, Vec<StoredEvaluation>> = BTreeMap::new();
+    for evaluation in evaluations.iter().filter(|evaluation| evaluation.record.shard.is_none()) {
+        let record = &evaluation.record;
+        let who = reading.families.key(&record.entry).map_or_else(|| format!("entry {}", record.entry), str::to_owned);
+        let how = (&record.protocol, &record.execution, record.seeds, &record.versions);
+        let marks = (record.time_decides, record.demonstrated);
+        alike.entry(format!("{who} {how:?} {marks:?}")).or_default().push(evaluation.clone());
+    }
+    let row = |trainings: Vec<StoredEvaluation>| {
+        let mut row = LeaderboardRow::of(trainings);
+        row.family = reading.families.key(&row.record().entry).map(str::to_owned);
+        row.named = reading.protocols.block_of(row.record());
+        row
+    };
+    alike.into_values().map(row).collect()
+}
+
+/// Leaves out what another row holds already.
+fn without_parts(rows: Vec<LeaderboardRow>) -> Vec<LeaderboardRow> {
+    let within = |part: &LeaderboardRow, whole: &LeaderboardRow| {
+        let (a, b) = (part.record(), whole.record());
+        let seeds = b.seeds.start <= a.seeds.start && a.seeds.iter().end <= b.seeds.iter().end && a.seeds != b.seeds;
+        let rules = (&a.protocol, &a.execution, &a.versions) == (&b.protocol, &b.execution, &b.versions);
+        let entries = part.evaluations().all(|one| whole.evaluations().any(|two| one.record.entry == two.record.entry));
+        seeds && rules && part.named.is_none() && entries
+    };
+    let mut holding: BTreeMap<EntryIdentity, Vec<usize>> = BTreeMap::new();
+    for (at, row) in rows.iter().enumerate() {
+        row.evaluations().for_each(|one| holding.entry(one.record.entry.clone()).or_default().push(at));
+    }
+    let is_part = |row: &LeaderboardRow| holding[&row.record().entry].iter().any(|&other| within(row, &rows[other]));
+    let kept: Vec<bool> = rows.iter().map(|row| !is_part(row)).collect();
+    rows.into_iter().zip(kept).filter_map(|(row, kept)| kept.then_some(row)).collect()
+}
+
+/// Letters and ranks of every row that has a rank, corrected over the whole table.
+fn compare_all(rows: &mut [LeaderboardRow]) {
+    let mut groups: Vec<Vec<usize>> = Vec::new();
+    for at in 0..rows.len() {
+        if rows[at].rank.is_none() {
+            continue;
+        }
+        match groups.last_mut().filter(|places| group(&rows[places[0]]) == group(&rows[at])) {
+            Some(places) => places.push(at),
+            None => groups.push(vec![at]),
+        }
+    }
+    let compared: Vec<Vec<&LeaderboardRow>> =
+        groups.iter().map(|places| places.iter().map(|&at| &rows[at]).collect()).collect();
+    let found = standings(&compared);
+    for (places, standings) in groups.into_iter().zip(found) {
+        for (at, standing) in places.into_iter().zip(standings) {
+            rows[at].standing = standing;
+        }
+    }
+}
+
+/// Best first: by what the success rate is at least, so that 1 of 1 does not come before 199 of 200. Bounds stand around
+/// the others, too few episodes come last; ties by what does not change.
+fn order(one: &LeaderboardRow, two: &LeaderboardRow) -> Ordering {
+    let seeds = |row: &LeaderboardRow| (row.record().seeds.start, row.record().seeds.count);
+    group(one)
+        .cmp(&group(two))
+        .then(one.too_few().cmp(&two.too_few()))
+        .then(two.interval.0.total_cmp(&one.interval.0))
+        .then(two.counts.episodes.cmp(&one.counts.episodes))
+        .then_with(|| one.record().entry.cmp(&two.record().entry))
+        .then_with(|| seeds(one).cmp(&seeds(two)))
+        .then_with(|| one.record().versions.cmp(&two.record().versions))
+        .then_with(|| one.execution_text().cmp(&two.execution_text()))
+}

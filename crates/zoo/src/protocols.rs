@@ -1,0 +1,283 @@
+//! Named protocols: what an evaluation has to keep to so that its numbers may stand beside others' under that name.
+//!
+//! A file of `protocols/` says the task, the cap on an episode, the control loop, the simulator's versions and two blocks
+//! of seeds: `dev` for choosing, `test` for reporting. The best of many, chosen on the seeds that it is reported on, looks
+//! better than it is. Its name ends in its version; a file that was used is never changed.
+//!
+//! Whether an evaluation is of a protocol is read off its record: nothing has to be claimed, and evaluations that were
+//! made before there were names have them, too.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use rollout::Control;
+use serde::Deserialize;
+
+use crate::ZooError;
+use crate::config::{from_value, nearest};
+use crate::results::{EvaluationRecord, Execution, Seeds};
+
+/// The files of `protocols/`, built into the binary.
+const BUILT_IN: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/protocols.rs"));
+
+/// Which of a protocol's seeds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Block {
+    /// For reporting.
+    Test,
+    /// For choosing.
+    Dev,
+}
+
+impl std::fmt::Display for Block {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Test => "test",
+            Self::Dev => "dev",
+        })
+    }
+}
+
+/// One protocol.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NamedProtocol {
+    /// Its name with its version: `lift-v1`.
+    pub name: String,
+    /// The task.
+    pub task: String,
+    /// Control steps after which an episode counts as failed.
+    pub max_steps: usize,
+    /// The control loop.
+    pub control: Control,
+    /// How predictions become actions, if the protocol says; each entry's own way otherwise.
+    pub execution: Option<Execution>,
+    /// Seeds for choosing.
+    pub dev: Seeds,
+    /// Seeds for reporting.
+    pub test: Seeds,
+    /// Versions of the simulator and what it stands on, as far as they are fixed.
+    pub versions: BTreeMap<String, String>,
+}
+
+/// The file's own form.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Text {
+    task: String,
+    max_steps: usize,
+    control: String,
+    #[serde(default)]
+    execution: Option<Execution>,
+    dev: String,
+    test: String,
+    #[serde(default)]
+    versions: BTreeMap<String, String>,
+}
+
+impl NamedProtocol {
+    /// Reads the text of the file called `name`.
+    ///
+    /// # Errors
+    /// [`ZooError::Protocol`]: a name without a version, text that is no protocol, blocks that overlap.
+    pub fn read(name: &str, text: &str) -> Result<Self, ZooError> {
+        let refuse = |reason: String| Err(ZooError::Protocol { name: name.to_owned(), reason });
+        let version = name.rsplit_once("-v").and_then(|(_, version)| version.parse::<u32>().ok());
+        if version.is_none_or(|version| version == 0) {
+            return refuse("expected a name that ends in its version, such as lift-v1".to_owned());
+        }
+        let table: toml::Table = match toml::from_str(text) {
+            Ok(table) => table,
+            Err(error) => return refuse(error.to_string().trim_end().replace('\n', "; ")),
+        };
+        let read: Text = from_value(&toml::Value::Table(table), &[name])?;
+        let seeds = |key: &str, text: &str| {
+            text.parse::<Seeds>()
+                .map_err(|reason| ZooError::Protocol { name: name.to_owned(), reason: format!("{key}: {reason}") })
+        };
+        let (dev, test) = (seeds("dev", &read.dev)?, seeds("test", &read.test)?);
+        if dev.overlap(&test) {
+            return refuse(format!("test: expected seeds that are none of dev, {dev}, found {test}"));
+        }
+        let Ok(control) = read.control.parse() else {
+            return refuse(format!("control: expected compiled or robosuite, found {}", read.control));
+        };
+        let Text { task, max_steps, execution, versions, .. } = read;
+        Ok(Self { name: name.to_owned(), task, max_steps, control, execution, dev, test, versions })
+    }
+
+    /// The seeds of a block.
+    pub fn seeds(&self, block: Block) -> Seeds {
+        match block {
+            Block::Dev => self.dev,
+            Block::Test => self.test,
+        }
+    }
+
+    /// The block that an evaluation ran, whole and by these rules; nothing for any other.
+    pub fn block_of(&self, record: &EvaluationRecord) -> Option<Block> {
+        let rules = &record.protocol;
+        let same = (rules.task == self.task && rules.max_steps == self.max_steps && rules.control == self.control)
+            // the task's own environment
+            && rules.env_module.is_none()
+            && rules.env_args_sha256.is_none()
+            && self.execution.is_none_or(|execution| execution == record.execution)
+            && self.versions.iter().all(|(name, version)| record.versions.get(name) == Some(version));
+        let whole = |block: &Block| self.seeds(*block) == record.seeds;
+        [Block::Test, Block::Dev].into_iter().find(whole).filter(|_| same && record.shard.is_none())
+    }
+}
+
+/// Named protocols, sorted by name.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Protocols(Vec<NamedProtocol>);
+
+impl Protocols {
+    /// Those built into the binary.
+    ///
+    /// # Panics
+    /// If one of them cannot be read; a test reads them.
+    pub fn built_in() -> Self {
+        let read = |(name, text): &(&str, &str)| NamedProtocol::read(name, text).expect("a test reads every one");
+        Self(BUILT_IN.iter().map(read).collect())
+    }
+
+    /// Those built in and the files of `folder`, which must have names of their own.
+    ///
+    /// # Errors
+    /// Files that are no protocols; a name that is built in with another text.
+    pub fn with_folder(folder: &Path) -> Result<Self, ZooError> {
+        let mut all = Self::built_in();
+        let mut paths = Vec::new();
+        for item in std::fs::read_dir(folder).map_err(ZooError::io("open folder of protocols", folder))? {
+            paths.push(item.map_err(ZooError::io("read folder", folder))?.path());
+        }
+        paths.sort();
+        for path in paths.into_iter().filter(|path| path.extension().is_some_and(|extension| extension == "toml")) {
+            all.add(&path)?;
+        }
+        all.0.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(all)
+    }
+
+    fn add(&mut self, path: &Path) -> Result<(), ZooError> {
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let text = std::fs::read_to_string(path).map_err(ZooError::io("read", path))?;
+        let read = NamedProtocol::read(&name, &text)?;
+        match self.0.iter().find(|known| known.name == name) {
+            Some(known) if *known == read => Ok(()),
+            Some(_) => {
+                let reason =
+                    format!("{} says otherwise than the one built in; another rule is another version", path.display());
+                Err(ZooError::Protocol { name, reason })
+            }
+            None => {
+                self.0.push(read);
+                Ok(())
+            }
+        }
+    }
+
+    /// Every one.
+    pub fn iter(&self) -> impl Iterator<Item = &NamedProtocol> {
+        self.0.iter()
+    }
+
+    /// The protocol of that name.
+    ///
+    /// # Errors
+    /// [`ZooError::Protocol`] with what there is.
+    pub fn get(&self, name: &str) -> Result<&NamedProtocol, ZooError> {
+        self.0.iter().find(|protocol| protocol.name == name).ok_or_else(|| {
+            let names: Vec<String> = self.0.iter().map(|protocol| protocol.name.clone()).collect();
+            let hint = nearest(name, &names).map_or(String::new(), |near| format!(" (did you mean `{near}`?)"));
+            let reason = format!("there is none of that name{hint}; protocols: {}", names.join(", "));
+            ZooError::Protocol { name: name.to_owned(), reason }
+        })
+    }
+
+    /// The protocol and the block that an evaluation ran, if it is one of these.
+    pub fn block_of(&self, record: &EvaluationRecord) -> Option<(String, Block)> {
+        self.0.iter().find_map(|protocol| Some((protocol.name.clone(), protocol.block_of(record)?)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::results::testing::sample;
+
+    const LIFT: &str = "task = 'Lift'\nmax_steps = 400\ncontrol = 'robosuite'\ndev = '10000-10099'\ntest = '40000-40199'\n\
+                        [versions]\nmujoco = '3.3.7'";
+
+    #[test]
+    fn every_protocol_that_is_built_in_reads_and_no_two_are_of_one_evaluation() {
+        let all = Protocols::built_in();
+        assert_eq!(all.iter().count(), BUILT_IN.len());
+        assert!(all.get("lift-v1").is_ok());
+        for (k, one) in all.0.iter().enumerate() {
+            for two in &all.0[k + 1..] {
+                let tells = one.task != two.task || one.max_steps != two.max_steps || one.test != two.test;
+                assert!(
+                    tells || one.versions != two.versions || one.control != two.control,
+                    "{}, {}",
+                    one.name,
+                    two.name
+                );
+            }
+        }
+        let message = all.get("lfit-v1").unwrap_err().to_string();
+        assert!(message.contains("did you mean `lift-v1`"), "{message}");
+    }
+
+    #[test]
+    fn an_evaluation_is_of_a_protocol_if_it_kept_to_it() {
+        let protocol = NamedProtocol::read("lift-v1", LIFT).unwrap();
+        let mut record = sample("a", 1, 100);
+        assert_eq!(protocol.block_of(&record), Some(Block::Dev));
+        record.seeds = Seeds { start: 40_000, count: 200 };
+        assert_eq!(protocol.block_of(&record), Some(Block::Test));
+        #[allow(clippy::type_complexity)]
+        let changes: [fn(&mut EvaluationRecord); 7] = [
+            |r| r.seeds.count = 199,
+            |r| r.protocol.max_steps = 500,
+            |r| r.protocol.control = Control::Compiled,
+            |r| r.protocol.env_args_sha256 = Some("0".repeat(64)),
+            |r| r.shard = Some(crate::results::Shard { index: 1, count: 2 }),
+            |r| drop(r.versions.insert("mujoco".into(), "3.9.0".into())),
+            |r| r.protocol.task = "Stack".into(),
+        ];
+        for change in changes {
+            let mut other = record.clone();
+            change(&mut other);
+            assert_eq!(protocol.block_of(&other), None, "{other:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_protocol_is_refused_by_name() {
+        for (name, text, word) in [
+            ("lift", LIFT.to_owned(), "ends in its version"),
+            ("lift-v0", LIFT.to_owned(), "ends in its version"),
+            ("lift-v1", LIFT.replace("40000-40199", "10050-10200"), "none of dev"),
+            ("lift-v1", LIFT.replace("10000-10099", "ten"), "dev: "),
+            ("lift-v1", LIFT.replace("max_steps", "max_stepz"), "max_stepz"),
+            ("lift-v1", LIFT.replace("'robosuite'", "'other'"), "control: expected"),
+            ("lift-v1", "task = ".to_owned(), "lift-v1"),
+        ] {
+            let error = NamedProtocol::read(name, &text).unwrap_err().to_string();
+            assert!(error.contains(word), "{word}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_folder_adds_protocols_and_changes_none() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("mine-v2.toml"), LIFT).unwrap();
+        let all = Protocols::with_folder(folder.path()).unwrap();
+        assert_eq!(all.get("mine-v2").unwrap().dev, Seeds { start: 10_000, count: 100 });
+        std::fs::write(folder.path().join("lift-v1.toml"), LIFT).unwrap();
+        let error = Protocols::with_folder(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("another version"), "{error}");
+    }
+}

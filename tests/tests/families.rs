@@ -1,0 +1,197 @@
+//! Families of trainings and what compares entries, as users run them: one row with n trainings, flips seed by seed,
+//! aliases, what is removed and what is not.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use e2e::{copied_zoo, listing, refused, root, succeeds, text, trained, zoo};
+use serde_json::Value;
+
+fn said(command: &mut Command) -> String {
+    String::from_utf8(succeeds(command).stdout).expect("text")
+}
+
+fn json(command: &mut Command) -> Value {
+    serde_json::from_str(&said(command)).expect("JSON")
+}
+
+/// Trains two steps with each of the seeds.
+fn train(folder: &Path, seeds: &str, more: &[&str]) -> Command {
+    let mut command =
+        zoo(["train", "act_lift", "train.steps=2", "train.batch_size=4", "policy.dim_model=32", "--seeds", seeds]);
+    command.args(["--data", text(&trained().join("lift")), "--zoo", text(&folder.join("zoo"))]);
+    command.args(["--runs", text(&folder.join("runs"))]).args(more);
+    command
+}
+
+#[test]
+fn several_seeds_make_a_family_that_is_one_row() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (folder, entries) = (folder.path(), folder.path().join("zoo"));
+    let first = said(&mut train(folder, "1..2", &[]));
+    assert!(first.contains("lift-act-s1@1 is in") && first.contains("lift-act-s2@1 is in"), "{first}");
+    // the same again with one more: the others are there
+    let more = said(&mut train(folder, "1..3", &[]));
+    assert_eq!(more.matches(" already (run ").count(), 2, "{more}");
+    assert!(more.contains("lift-act-s3@1 is in"), "{more}");
+    // other settings are another family, with runs of its own
+    let other = said(&mut train(folder, "1", &["train.lr=0.002"]));
+    assert!(other.contains("lift-act-s1@2 is in"), "{other}");
+    refused(&mut train(folder, "1..2", &["train.seed=4"]), &["--seeds", "train.seed=4"]);
+    refused(&mut train(folder, "2..1", &[]), &["2..1"]);
+    assert_eq!(json(&mut zoo(["list", "--json", "--zoo", text(&entries)])).as_array().map(Vec::len), Some(4));
+
+    let mut eval = zoo(["eval", "lift-act-s*@1", "--episodes", "20", "--max-steps", "4", "--json"]);
+    let evaluated = json(eval.args(["--zoo", text(&entries)]));
+    assert_eq!(evaluated.as_array().map(Vec::len), Some(3), "{evaluated}");
+    assert_eq!((&evaluated[0]["episodes"], &evaluated[0]["evaluated_before"]), (&20.into(), &false.into()));
+
+    let board = json(&mut zoo(["leaderboard", "--json", "--zoo", text(&entries)]));
+    let rows = board["rows"].as_array().expect("rows");
+    assert_eq!(rows.len(), 1, "{board}");
+    let row = &rows[0];
+    assert_eq!((&row["entry"], &row["trainings"], &row["episodes"]), (&"lift-act-s".into(), &3.into(), &60.into()));
+    assert_eq!(row["training_seed"], "1 2 3");
+    assert_eq!(board["trainings"].as_array().map(Vec::len), Some(3));
+    let each = fs::read_to_string(entries.join("leaderboard_trainings.csv")).expect("each training");
+    assert_eq!(each.lines().count(), 4, "{each}");
+    let table = said(&mut zoo(["leaderboard", "--trainings", "--zoo", text(&entries)]));
+    assert!(
+        table.contains("lift-act-s*@1") && table.contains("lift-act-s2@1") && table.contains("3 trainings"),
+        "{table}"
+    );
+}
+
+/// The shipped zoo, copied.
+fn shipped() -> (tempfile::TempDir, std::path::PathBuf) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let to = folder.path().join("zoo");
+    e2e::copy(&root().join("zoo"), &to);
+    (folder, to)
+}
+
+#[test]
+fn entries_are_compared_seed_by_seed() {
+    let (_folder, entries) = copied_zoo();
+    e2e::train_lift(&trained().join("lift"), &entries, &entries.join("runs"));
+    let eval = |more: &[&str]| {
+        let mut command =
+            zoo(["eval", "--all-versions", "--episodes", "20", "--max-steps", "4", "--zoo", text(&entries)]);
+        succeeds(command.args(more));
+    };
+    eval(&[]);
+    let compare = |more: &[&str]| {
+        let mut command = zoo(["compare", "lift-act@1", "lift-act@2", "--zoo", text(&entries)]);
+        command.args(more);
+        command
+    };
+    let told = said(&mut compare(&[]));
+    assert!(told.contains("20 seeds that both were run on") && told.contains("McNemar p 1.0000"), "{told}");
+    assert!(told.contains("sequential: not decided"), "{told}");
+    let value = json(&mut compare(&["--json"]));
+    assert_eq!((&value[0]["shared_seeds"], &value[0]["flips"]["neither"]), (&20.into(), &20.into()), "{value}");
+    // two trainings alike are not told apart, however many episodes are run; those that are there are not run again
+    let value = json(&mut compare(&["--until-decided", "--most", "24", "--max-steps", "4", "--json"]));
+    assert_eq!((&value["seeds"], &value["flips"]["decided_after"]), (&24.into(), &Value::Null), "{value}");
+    refused(&mut zoo(["compare", "lift-act@1", "lift-act@1", "--until-decided", "--zoo", text(&entries)]), &["twice"]);
+    refused(&mut zoo(["compare", "lift-act", "door", "--zoo", text(&entries)]), &["unknown entry `door`"]);
+}
+
+#[test]
+fn what_was_not_run_under_the_same_rules_is_not_compared() {
+    let (_folder, entries) = shipped();
+    let arguments = ["compare", "lift-act", "stack-act", "--zoo", text(&entries)];
+    refused(&mut zoo(arguments), &["lift-act@1", "stack-act@1", "same protocol"]);
+}
+
+#[test]
+fn rows_of_a_protocol_stand_under_its_name() {
+    let (_folder, entries) = shipped();
+    let board = json(&mut zoo(["leaderboard", "--json", "--zoo", text(&entries)]));
+    let rows = board["rows"].as_array().expect("rows");
+    assert_eq!(rows.len(), 12);
+    // the two blocks of each task are ranked apart
+    assert!(
+        rows.iter().all(|row| row["rank"] == 1 && row["named_protocol"].as_str().is_some_and(|n| n.ends_with("-v1")))
+    );
+    let blocks = rows.iter().filter(|row| row["block"] == "test").count();
+    assert_eq!(blocks, 6);
+    let eval = |name: &str, protocol: &str| zoo(["eval", name, "--protocol", protocol, "--zoo", text(&entries)]);
+    refused(&mut eval("lift-act", "stack-v1"), &["protocol stack-v1: task: expected Stack, found Lift"]);
+    refused(&mut eval("lift-act", "lfit-v1"), &["protocol `lfit-v1`", "lift-v1"]);
+    refused(eval("lift-act", "lift-v1").args(["--episodes", "3"]), &["--episodes"]);
+}
+
+#[test]
+fn aliases_point_and_what_something_stands_on_stays() {
+    let (_folder, entries) = shipped();
+    let command = |name: &str, arguments: &[&str]| {
+        let mut command = zoo([name]);
+        command.args(arguments).args(["--zoo", text(&entries)]);
+        command
+    };
+    refused(&mut command("show", &["lift-act@best"]), &["no alias `best`", "actrm-zoo alias"]);
+    assert_eq!(said(&mut command("alias", &["lift-act", "best", "--by-results"])), "lift-act@best is lift-act@1\n");
+    assert!(said(&mut command("show", &["lift-act@best"])).starts_with("# lift-act@1"));
+    assert_eq!(
+        said(&mut command("alias", &["lift-act"])),
+        "lift-act@latest is lift-act@1\nlift-act@best is lift-act@1\n"
+    );
+    refused(&mut command("remove", &["lift-act@1"]), &["not removed", "lift-act@1_Lift_10000-10099", "alias best"]);
+    refused(&mut command("remove", &["lift-act"]), &["expected a version"]);
+    for name in listing(&entries.join("results")).into_iter().filter(|name| name.starts_with("lift-act@1_")) {
+        fs::remove_dir_all(entries.join("results").join(name)).expect("removable");
+    }
+    succeeds(&mut command("alias", &["lift-act", "best", "--remove"]));
+    succeeds(&mut command("remove", &["lift-act@1"]));
+    refused(&mut command("show", &["lift-act"]), &["unknown entry `lift-act`"]);
+}
+
+#[test]
+fn entries_differ_in_what_they_say() {
+    let (_folder, entries) = shipped();
+    let command = |arguments: &[&str]| {
+        let mut command = zoo([]);
+        command.args(arguments).args(["--zoo", text(&entries)]);
+        command
+    };
+    let told = said(&mut command(&["diff", "lift-act", "stack-act"]));
+    for word in ["config.task.name", "config.train.steps", "data fingerprint", "result Lift lift-v1 test", "12000"] {
+        assert!(told.contains(word), "no {word}: {told}");
+    }
+    assert!(said(&mut command(&["diff", "lift-act", "lift-act@1"])).contains("differ in nothing"));
+    let curves = said(&mut command(&["curves", "lift-act", "stack-act"]));
+    assert!(curves.contains("lift-act@1") && curves.contains('█'), "{curves}");
+    let picture = entries.join("curves.svg");
+    succeeds(&mut command(&["curves", "*-act", "--svg", text(&picture)]));
+    let svg = fs::read_to_string(&picture).expect("a picture");
+    assert!(svg.starts_with("<svg xmlns=") && svg.matches("<polyline").count() == 6, "{}", &svg[..200]);
+}
+
+#[test]
+fn puzzles_refuse_what_is_the_robots_and_answer_again() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let entries = folder.path().join("zoo");
+    let (runs, at) = (folder.path().join("runs"), text(&entries));
+    let mut train = zoo(["train", "trm_maze8-original", "train.steps=2", "train.validate_every=1000000", "--zoo", at]);
+    succeeds(train.args(["--runs", text(&runs)]));
+    let name = listing(&entries).into_iter().find(|name| !name.starts_with('.')).expect("an entry");
+    let eval = |more: &[&str]| {
+        let mut command = zoo(["eval", &name, "--puzzles", "20", "--depth", "2", "--zoo", at]);
+        command.args(more);
+        command
+    };
+    refused(&mut eval(&["--again"]), &["nothing to run again"]);
+    let first = said(&mut eval(&[]));
+    let again = said(&mut eval(&[]));
+    assert_eq!(again, first.replace('\n', " (evaluated before; --again runs it again)\n"));
+    assert!(said(&mut eval(&["--again"])).contains("20 puzzles answered again, every answer the same"));
+    assert!(!said(&mut eval(&["--seed-start", "7"])).contains("evaluated before"));
+    for option in [["--episodes", "3"], ["--max-steps", "3"], ["--video", "1"]] {
+        refused(&mut eval(&option), &[option[0], "a solver of puzzles"]);
+    }
+    let Output { stdout, .. } = succeeds(&mut zoo(["leaderboard", "--zoo", at]));
+    let table = String::from_utf8(stdout).expect("text");
+    assert!(table.contains(", seed 7"), "{table}");
+}

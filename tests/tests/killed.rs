@@ -1,0 +1,138 @@
+//! SIGKILL at any time during a training, an evaluation or a leaderboard: nothing is left that cannot be read, and the same
+//! command goes on to the same bytes. `ACTRM_KILLS=100` for more than a few of each.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use e2e::{copied_zoo, copy, listing, root, succeeds, text, trained, zoo};
+
+fn kills() -> u64 {
+    std::env::var("ACTRM_KILLS").ok().map_or(3, |text| text.parse().expect("a number"))
+}
+
+/// A number from 0 to 1, another for every `k`, spread evenly.
+fn spread(k: u64) -> f64 {
+    (k as f64 * 0.618_033_988_749_894_9 + 0.37).fract()
+}
+
+/// Runs a command and kills it after `share` of the time that it takes; whether it was there to be killed.
+fn killed(command: &mut Command, takes: Duration, share: f64) -> bool {
+    let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("it starts");
+    let until = Instant::now() + takes.mul_f64(share);
+    while Instant::now() < until {
+        if child.try_wait().expect("a child").is_some() {
+            return false;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().expect("killed");
+    child.wait().expect("gone");
+    true
+}
+
+fn timed(command: &mut Command) -> Duration {
+    let begin = Instant::now();
+    succeeds(command);
+    begin.elapsed()
+}
+
+fn train(folder: &Path) -> Command {
+    let mut command = zoo([
+        "train",
+        "act_lift",
+        "train.steps=60",
+        "train.checkpoint_every=7",
+        "train.batch_size=8",
+        "policy.dim_model=32",
+    ]);
+    command.args(["--seeds", "1..2", "--data", text(&trained().join("lift"))]);
+    command.args(["--zoo", text(&folder.join("zoo")), "--runs", text(&folder.join("runs"))]);
+    command
+}
+
+/// Weights of both entries.
+fn weights(folder: &Path) -> Vec<Vec<u8>> {
+    let read = |name: &str| fs::read(folder.join("zoo").join(name).join("1/model.safetensors")).expect("an entry");
+    ["lift-act-s1", "lift-act-s2"].map(read).into()
+}
+
+#[test]
+fn a_killed_training_goes_on_to_the_same_bytes() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let at = |name: &str| -> PathBuf {
+        let path = folder.path().join(name);
+        fs::create_dir_all(&path).expect("creatable");
+        path
+    };
+    let straight = at("straight");
+    let takes = timed(&mut train(&straight));
+    for k in 0..kills() {
+        let folder = at(&format!("killed-{k}"));
+        let mut died = 0;
+        for again in 0..3 {
+            died += u32::from(killed(&mut train(&folder), takes, spread(3 * k + again)));
+            // whatever is there can be listed and read
+            succeeds(&mut zoo(["runs", "--runs", text(&folder.join("runs")), "--all"]));
+            succeeds(&mut zoo(["verify", "--zoo", text(&folder.join("zoo"))]));
+        }
+        succeeds(&mut train(&folder));
+        assert_eq!(weights(&folder), weights(&straight), "after {died} kills");
+        assert_eq!(listing(&folder.join("zoo")), ["lift-act-s1", "lift-act-s2"]);
+        fs::remove_dir_all(folder).expect("removable");
+    }
+}
+
+#[test]
+fn a_killed_evaluation_goes_on_to_the_same_bytes() {
+    let (_folder, entries) = copied_zoo();
+    let eval = |results: &Path| {
+        let mut command = zoo(["eval", "lift-act@1", "--max-steps", "6", "--episodes", "16", "--workers", "2"]);
+        command.args(["--zoo", text(&entries), "--results", text(results)]);
+        command
+    };
+    let outcomes = |results: &Path| {
+        let names = listing(results);
+        assert_eq!(names.len(), 1, "{names:?}");
+        fs::read(results.join(&names[0]).join("outcomes.parquet")).expect("a finished evaluation")
+    };
+    let straight = entries.join("straight");
+    let takes = timed(&mut eval(&straight));
+    for k in 0..kills() {
+        let results = entries.join(format!("killed-{k}"));
+        for again in 0..2 {
+            killed(&mut eval(&results), takes, spread(2 * k + again));
+        }
+        succeeds(&mut eval(&results));
+        assert_eq!(outcomes(&results), outcomes(&straight));
+        succeeds(&mut zoo(["verify", "--zoo", text(&entries), "--results", text(&results)]));
+    }
+}
+
+#[test]
+fn a_killed_leaderboard_leaves_whole_files() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (entries, out) = (folder.path().join("zoo"), folder.path().join("out"));
+    copy(&root().join("zoo"), &entries);
+    let board = || {
+        let mut command = zoo(["leaderboard", "--zoo", text(&entries), "--out", text(&out)]);
+        command.stdout(Stdio::null());
+        command
+    };
+    let files = || ["leaderboard.csv", "report.html"].map(|name| fs::read(out.join(name)).unwrap_or_default());
+    let takes = timed(&mut board());
+    let whole = files();
+    for k in 0..2 * kills() {
+        // over old files, and where there are none
+        if k % 2 == 0 {
+            fs::remove_dir_all(&out).expect("removable");
+        }
+        killed(&mut board(), takes, spread(k));
+        for (found, expected) in files().iter().zip(&whole) {
+            assert!(found == expected || (k % 2 == 0 && found.is_empty()), "half a file");
+        }
+        succeeds(&mut board());
+        assert_eq!(files(), whole);
+    }
+}

@@ -1,0 +1,386 @@
+use std::collections::BTreeMap;
+use std::process::ExitCode;
+
+use anyhow::{Context, bail};
+use cli::{INTERRUPTED, Stop, limits, shown};
+use report::comparison::{ALPHA, Comparison, Flips, compare};
+use report::{Counts, LeaderboardRow, Reading, percent, rank};
+use rollout::Pool;
+use serde_json::{Value, json};
+use zoo::audit::{KnownEntries, audit};
+use zoo::entry::{EntryId, LoadedEntry};
+use zoo::evaluation::{EvaluationOptions, FIRST_SEED, Subject};
+use zoo::results::{EvaluationRecord, Seeds, StoredEvaluation};
+
+use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
+use crate::simulation::{EnvironmentKey, RunArgs, run_missing};
+
+const GOES_ON: &str = "stopped; the same command goes on where it was";
+
+/// Compare two entries, or two families, on the seeds that both were run on
+///
+/// Seed by seed: who succeeded where the other failed, the difference of success with its interval, McNemar's exact test,
+/// and a sequential test that holds however often one looks. `--until-decided` runs more and more episodes of both until
+/// that test tells them apart at 5%, or the most are run. Results have to stand as in `actrm-zoo leaderboard`. An entry
+/// beside itself is compared where it was evaluated in several ways, such as under other versions of the simulator.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-zoo compare lift-act lift-actrm
+  actrm-zoo compare 'lift-act-s*' 'lift-actrm-s*'
+  actrm-zoo compare stack-act@1 stack-act@2 --until-decided --most 500
+  actrm-zoo compare lift-act lift-act --json")]
+pub struct Args {
+    /// Entry: `name` (its newest version), `name@version`, or with a `*` the trainings of a family
+    #[arg(add = entry_names())]
+    first: String,
+    /// The same
+    #[arg(add = entry_names())]
+    second: String,
+    /// Run episodes of both, on equal seeds, until it is decided
+    #[arg(long)]
+    until_decided: bool,
+    /// Most episodes of each then
+    #[arg(long, value_name = "N", default_value_t = 1000, requires = "until_decided",
+        value_parser = clap::value_parser!(u64).range(20..=limits::MOST_EPISODES))]
+    most: u64,
+    /// Seed of the first episode then
+    #[arg(long, value_name = "SEED", default_value_t = FIRST_SEED, requires = "until_decided")]
+    seed_start: u64,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    run: RunArgs,
+    #[command(flatten)]
+    results: ResultsArgs,
+    #[command(flatten)]
+    protocols: ProtocolArgs,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let registry = args.zoo.registry();
+    let sides = [registry.matching(&args.first)?, registry.matching(&args.second)?];
+    if args.until_decided {
+        return until_decided(args, &sides);
+    }
+    let entries = KnownEntries::open(&registry)?;
+    let results = args.results.folder(&args.zoo);
+    let audit = audit(&results, &entries)?;
+    for left in &audit.left_out {
+        cli::note(&format!("note: left out: {}: {}", shown(&left.folder), left.reason));
+    }
+    let reading = Reading { families: entries.families(), protocols: args.protocols.protocols()? };
+    let rows = |ids: &[EntryId]| {
+        let of = |one: &&StoredEvaluation| {
+            ids.iter().any(|id| id.name == one.record.entry.name && id.version == one.record.entry.version)
+        };
+        let own: Vec<StoredEvaluation> = audit.standing.iter().filter(of).cloned().collect();
+        rank(&own, &reading)
+    };
+    let [first, second] = [rows(&sides[0]), rows(&sides[1])];
+    let found = pairs(&first, &second, sides[0] == sides[1]);
+    if found.is_empty() {
+        let ids = |ids: &[EntryId]| ids.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+        bail!(
+            "{} and {}: no evaluations in {} under the same protocol; make some with: actrm-zoo eval",
+            ids(&sides[0]),
+            ids(&sides[1]),
+            shown(&results)
+        );
+    }
+    let told: Vec<Told> = found.iter().map(|(one, two)| Told::of(one, two)).collect();
+    match args.json {
+        true => cli::print_json(&told.iter().map(Told::json).collect::<Vec<_>>())?,
+        false => cli::print(&told.iter().map(Told::text).collect::<Vec<_>>().join("\n"))?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Rows of both sides under the same rules; those that share seeds, if there are any.
+fn pairs<'a>(
+    first: &'a [LeaderboardRow],
+    second: &'a [LeaderboardRow],
+    same: bool,
+) -> Vec<(&'a LeaderboardRow, &'a LeaderboardRow)> {
+    let mut all = Vec::new();
+    for (i, one) in first.iter().enumerate() {
+        // beside itself: each pair once, and no row beside itself
+        for two in second.iter().skip(if same { i + 1 } else { 0 }) {
+            if one.record().protocol == two.record().protocol {
+                all.push((one, two));
+            }
+        }
+    }
+    let shares = |(one, two): &(&LeaderboardRow, &LeaderboardRow)| one.record().seeds.overlap(&two.record().seeds);
+    if same || all.iter().any(shares) {
+        all.retain(shares);
+    }
+    all
+}
+
+/// What is said of two rows.
+struct Told<'a> {
+    rows: [&'a LeaderboardRow; 2],
+    comparison: Comparison,
+    /// Of two single trainings that share seeds.
+    flips: Option<Flips>,
+}
+
+impl<'a> Told<'a> {
+    fn of(first: &'a LeaderboardRow, second: &'a LeaderboardRow) -> Self {
+        let single = first.n_trainings() == 1 && second.n_trainings() == 1;
+        let comparison = compare(first, second);
+        let flips = (single && comparison.shared > 0).then(|| Flips::of(&outcomes(first), &outcomes(second)));
+        Self { rows: [first, second], comparison, flips }
+    }
+
+    /// What tells the two apart: their names, or else how they were run.
+    fn names(&self) -> [String; 2] {
+        let [one, two] = self.rows;
+        if one.name() != two.name() {
+            return [one.name(), two.name()];
+        }
+        let differing = |row: &LeaderboardRow, other: &LeaderboardRow| {
+            let (mine, theirs) = (row.record(), other.record());
+            let mut parts: Vec<String> = mine
+                .versions
+                .iter()
+                .filter(|(name, version)| theirs.versions.get(*name) != Some(*version))
+                .map(|(name, version)| format!("{name} {version}"))
+                .collect();
+            if mine.execution != theirs.execution {
+                parts.push(row.execution_text());
+            }
+            if mine.seeds != theirs.seeds {
+                parts.push(format!("seeds {}", mine.seeds));
+            }
+            format!("{} ({})", row.name(), parts.join(", "))
+        };
+        [differing(one, two), differing(two, one)]
+    }
+
+    fn text(&self) -> String {
+        let Self { rows: [one, two], comparison, flips } = self;
+        let [first, second] = self.names();
+        let mut text = format!("{}, {}: {} seeds that both were run on\n", one.task(), one.protocol_text(), comparison.shared);
+        let width = first.chars().count().max(second.chars().count());
+        for (name, row) in [(&first, one), (&second, two)] {
+            let trainings = match row.n_trainings() {
+                1 => String::new(),
+                n => format!(", {n} trainings"),
+            };
+            text.push_str(&format!("  {name:width$}  {}{trainings}\n", counts(row.counts)));
+        }
+        let points = |x: f64| format!("{:+.1}", x * 1e2);
+        let interval =
+            comparison.interval.map_or(String::new(), |(low, high)| format!(" [{}, {}]", points(low), points(high)));
+        text.push_str(&format!(
+            "  difference {} points{interval}, {} p {}\n",
+            points(comparison.difference),
+            comparison.test.name(),
+            p_text(comparison.p_value)
+        ));
+        let Some(flips) = flips else { return text };
+        text.push_str(&format!(
+            "  both {}, only {first} {}, only {second} {}, neither {}\n",
+            flips.counts.both, flips.counts.first_only, flips.counts.second_only, flips.counts.neither
+        ));
+        text.push_str(&format!("  {}\n", sequential_text(flips, &first, &second)));
+        for (name, seeds) in [(&first, &flips.first_only), (&second, &flips.second_only)] {
+            if !seeds.is_empty() {
+                text.push_str(&format!("  only {name}: {}\n", list(seeds)));
+            }
+        }
+        text
+    }
+
+    fn json(&self) -> Value {
+        let Self { rows: [one, two], comparison, flips } = self;
+        let side = |row: &LeaderboardRow, name: &str| {
+            json!({
+                "name": name, "trainings": row.n_trainings(), "successes": row.counts.successes,
+                "episodes": row.counts.episodes, "execution": row.execution_text(), "versions": row.record().versions,
+                "seeds": row.seeds_text(),
+            })
+        };
+        let [first, second] = self.names();
+        let mut value = json!({
+            "task": one.task(), "protocol": one.record().protocol.id(), "first": side(one, &first),
+            "second": side(two, &second), "shared_seeds": comparison.shared, "difference": comparison.difference,
+            "ci95": comparison.interval.map(|(low, high)| [low, high]), "test": comparison.test.name(),
+            "p_value": comparison.p_value,
+        });
+        if let Some(flips) = flips {
+            value["flips"] = flips_json(flips);
+        }
+        value
+    }
+}
+
+fn flips_json(flips: &Flips) -> Value {
+    json!({
+        "both": flips.counts.both, "neither": flips.counts.neither, "first_only": flips.first_only,
+        "second_only": flips.second_only, "e_value": flips.sequential.e_value(),
+        "sequential_p_value": flips.sequential.p_value(), "decided_after": flips.decided_after,
+    })
+}
+
+/// Successes of the only training by seed.
+fn outcomes(row: &LeaderboardRow) -> BTreeMap<u64, bool> {
+    row.evaluations().flat_map(|one| &one.episodes).map(|episode| (episode.seed, episode.success)).collect()
+}
+
+/// `95 of 100 (95.0%)`
+fn counts(Counts { successes, episodes }: Counts) -> String {
+    format!("{successes} of {episodes} ({}%)", percent(successes, episodes, 1))
+}
+
+fn p_text(p: f64) -> String {
+    if p < 1e-4 { format!("{p:.1e}") } else { format!("{p:.4}") }
+}
+
+fn sequential_text(flips: &Flips, first: &str, second: &str) -> String {
+    let p = format!("p {} at any time", p_text(flips.sequential.p_value()));
+    match flips.decided_after {
+        Some(seeds) => {
+            let better = if flips.sequential.lead() > 0 { first } else { second };
+            format!("sequential: decided after {seeds} seeds, {better} is better ({p})")
+        }
+        None => format!("sequential: not decided ({p})"),
+    }
+}
+
+/// The first seeds, and how many more.
+fn list(seeds: &[u64]) -> String {
+    const SHOWN: usize = 20;
+    let shown: Vec<String> = seeds.iter().take(SHOWN).map(u64::to_string).collect();
+    let more = seeds.len().saturating_sub(SHOWN);
+    shown.join(" ") + &if more > 0 { format!(" and {more} more") } else { String::new() }
+}
+
+/// One of the two entries that are run.
+struct Side {
+    subject: Subject<'static>,
+    /// Outcomes of the first seeds without a gap, ascending.
+    outcomes: BTreeMap<u64, bool>,
+}
+
+impl Side {
+    fn new(subject: Subject<'static>) -> Self {
+        Self { subject, outcomes: BTreeMap::new() }
+    }
+
+    /// Takes in what stands under `results` of evaluations that differ in nothing but their seeds, from `start` on.
+    fn take_stored(&mut self, ready: &rollout::Ready, standing: &[StoredEvaluation], options: &EvaluationOptions) -> anyhow::Result<()> {
+        let own = self.subject.record(ready, options)?;
+        let alike = |record: &EvaluationRecord| {
+            EvaluationRecord { seeds: own.seeds, shard: own.shard, demonstrated: own.demonstrated, ..record.clone() } == own
+        };
+        let all: BTreeMap<u64, bool> = standing
+            .iter()
+            .filter(|one| alike(&one.record))
+            .flat_map(|one| &one.episodes)
+            .map(|episode| (episode.seed, episode.success))
+            .collect();
+        let without_gap = (options.seeds.start..).zip(all.range(options.seeds.start..)).take_while(|(k, (seed, _))| k == *seed);
+        self.outcomes = without_gap.map(|(_, (seed, success))| (*seed, *success)).collect();
+        Ok(())
+    }
+}
+
+/// Runs both until the sequential test decides, or the most episodes are run.
+fn until_decided(args: &Args, sides: &[Vec<EntryId>; 2]) -> anyhow::Result<ExitCode> {
+    let [[first], [second]] = [sides[0].as_slice(), sides[1].as_slice()] else {
+        bail!("--until-decided: expected one entry on either side, found {} and {}", sides[0].len(), sides[1].len());
+    };
+    if first == second {
+        bail!("--until-decided: expected two entries, found {first} twice");
+    }
+    limits::check_seeds(args.seed_start, args.most)?;
+    let registry = args.zoo.registry();
+    let results = args.results.folder(&args.zoo);
+    let standing = audit(&results, &KnownEntries::open(&registry)?)?.standing;
+    let stop = Stop::install(GOES_ON)?;
+    let loaded = [first, second].map(|id| -> anyhow::Result<LoadedEntry> {
+        registry.entry(&id.to_string()).and_then(|entry| entry.load()).with_context(|| format!("entry {id}"))
+    });
+    let [one, two] = loaded;
+    let loaded = [one?, two?];
+    let mut pools: Vec<Pool> = Vec::new();
+    let mut keys: Vec<EnvironmentKey> = Vec::new();
+    let mut of_pool = Vec::new();
+    for entry in &loaded {
+        let key = EnvironmentKey::of(&args.run, entry.entry().meta())?;
+        if !keys.contains(&key) {
+            let spec = key.spec(&args.run, args.run.control)?;
+            let Some(pool) = args.run.simulator.start(spec, args.run.worker_logs.clone(), &stop)? else {
+                return Ok(interrupted(pools));
+            };
+            pools.push(pool);
+            keys.push(key.clone());
+        }
+        of_pool.push(keys.iter().position(|known| *known == key).unwrap_or_default());
+    }
+    let options = |count: u64, side: usize| EvaluationOptions {
+        seeds: Seeds { start: args.seed_start, count },
+        shard: None,
+        env_module: keys[of_pool[side]].env_module.clone(),
+        force: args.run.force,
+    };
+    let mut both = Vec::new();
+    for (k, entry) in loaded.iter().enumerate() {
+        let mut subject = entry.subject();
+        if let Some(max_steps) = args.run.max_steps {
+            subject.max_steps = Some(usize::try_from(max_steps)?);
+        }
+        if subject.time_decides {
+            bail!("entry {}: it thinks by the clock, so that its episodes may end otherwise: nothing to compare", subject.entry);
+        }
+        let mut side = Side::new(subject);
+        side.take_stored(pools[of_pool[k]].ready(), &standing, &options(args.most, k))?;
+        both.push(side);
+    }
+    let records = [0, 1].map(|k| both[k].subject.record(pools[of_pool[k]].ready(), &options(args.most, k)));
+    let [a, b] = records;
+    let (a, b) = (a?, b?);
+    if a.protocol != b.protocol {
+        bail!("{first} and {second}: protocol: expected the same, found {} and {} (--max-steps makes caps equal)", a.protocol.id(), b.protocol.id());
+    }
+    let mut run = both.iter().map(|side| side.outcomes.len() as u64).min().unwrap_or_default().min(args.most);
+    loop {
+        let upto = |side: &Side| side.outcomes.range(..args.seed_start + run).map(|(s, o)| (*s, *o)).collect();
+        let flips = Flips::of(&upto(&both[0]), &upto(&both[1]));
+        let names = [first.to_string(), second.to_string()];
+        let told = format!("{run} seeds: only {first} {}, only {second} {}", flips.counts.first_only, flips.counts.second_only);
+        if flips.decided_after.is_some() || run >= args.most {
+            let text = format!("{told}; {}\n", sequential_text(&flips, &names[0], &names[1]));
+            match args.json {
+                true => cli::print_json(&json!({
+                    "first": names[0], "second": names[1], "protocol": a.protocol.id(), "seeds": run, "level": ALPHA,
+                    "flips": flips_json(&flips),
+                }))?,
+                false => cli::print(&text)?,
+            }
+            pools.into_iter().for_each(cli::close);
+            return Ok(ExitCode::SUCCESS);
+        }
+        if run > 0 {
+            cli::note(&format!("{told}; not decided (p {} at any time)", p_text(flips.sequential.p_value())));
+        }
+        // half as many again: few results are left on the way, and the last one holds the others
+        run = (run + run / 2).max(20).min(args.most);
+        for (k, side) in both.iter_mut().enumerate() {
+            let done = run_missing(&side.subject, &mut pools[of_pool[k]], &results, &options(run, k))?;
+            let Some(done) = done.filter(|_| !stop.asked()) else { return Ok(interrupted(pools)) };
+            side.outcomes = done.evaluation.episodes.iter().map(|episode| (episode.seed, episode.success)).collect();
+        }
+    }
+}
+
+fn interrupted(pools: Vec<Pool>) -> ExitCode {
+    pools.into_iter().for_each(cli::close);
+    cli::note(GOES_ON);
+    ExitCode::from(INTERRUPTED)
+}

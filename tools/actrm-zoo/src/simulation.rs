@@ -1,0 +1,122 @@
+//! What the commands that run entries in simulators share.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::Context;
+use clap::Args;
+use cli::{Screen, SimulatorArgs, limits};
+use rollout::{Control, Pool, WorkerSpec};
+use zoo::ZooError;
+use zoo::entry::{CamerasMeta, EntryMeta};
+use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate};
+use zoo::results::StoredEvaluation;
+
+/// How entries are run.
+#[derive(Args)]
+pub struct RunArgs {
+    /// Control steps after which an episode has failed (the entry's or the task's own cap)
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_STEPS))]
+    pub max_steps: Option<u64>,
+    #[command(flatten)]
+    pub simulator: SimulatorArgs,
+    /// Another task than the entry's
+    #[arg(long)]
+    pub task: Option<String>,
+    /// Control loop inside the simulator: `compiled` or `robosuite`
+    #[arg(long, default_value_t = Control::Compiled)]
+    pub control: Control,
+    /// Evaluate although the demonstrations were recorded in another simulator generation, or with these seeds
+    #[arg(long)]
+    pub force: bool,
+    /// Seconds without an answer after which a worker counts as hung
+    #[arg(long, value_name = "S", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    step_timeout: u64,
+    /// Keep what workers say on standard error in this folder
+    #[arg(long, value_name = "DIR")]
+    pub worker_logs: Option<PathBuf>,
+}
+
+/// What simulators are started for.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct EnvironmentKey {
+    pub task: String,
+    pub env_module: Option<String>,
+    /// As JSON text.
+    env_args: Option<String>,
+    cameras: Option<CamerasMeta>,
+}
+
+impl EnvironmentKey {
+    /// The environment of an entry's demonstrations, unless the command line says otherwise.
+    pub fn of(args: &RunArgs, meta: &EntryMeta) -> Result<Self, ZooError> {
+        let recorded = || meta.env_module.as_ref().map(|module| module.name.clone());
+        let env_module = args.simulator.env_module.clone().or_else(recorded);
+        let cameras = meta.cameras()?;
+        Ok(match args.task.clone().filter(|task| *task != meta.task) {
+            // another task's environment has arguments of its own
+            Some(task) => Self { task, env_module, env_args: None, cameras },
+            None => {
+                let env_args = meta.env_args.as_ref().map(serde_json::Value::to_string);
+                Self { task: meta.task.clone(), env_module, env_args, cameras }
+            }
+        })
+    }
+
+    /// The worker that such a simulator is.
+    pub fn spec(&self, args: &RunArgs, control: Control) -> anyhow::Result<WorkerSpec> {
+        let env_args = self.env_args.as_deref().map(serde_json::from_str).transpose()?;
+        let mut spec = args.simulator.recorded_spec(&self.task, env_args.as_ref())?;
+        spec.env_module.clone_from(&self.env_module);
+        if let Some(cameras) = &self.cameras {
+            spec.cameras.clone_from(&cameras.names);
+            (spec.image_size, spec.fast_render) = (cameras.size, cameras.fast_render);
+        }
+        spec.control = control;
+        spec.limits.step = Duration::from_secs(args.step_timeout);
+        Ok(spec)
+    }
+}
+
+/// An evaluation that was run to its end, and whether nothing had to be run.
+pub struct Evaluated {
+    pub evaluation: Box<StoredEvaluation>,
+    pub was_there: bool,
+}
+
+/// Runs what has no outcome yet; nothing if it was stopped.
+pub fn run_missing(
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+    results: &Path,
+    options: &EvaluationOptions,
+) -> anyhow::Result<Option<Evaluated>> {
+    let id = subject.entry.to_string();
+    let mut screen = Screen::new();
+    let mut successes = 0_u64;
+    let mut was_there = false;
+    let end = evaluate(subject, pool, results, options, &mut |progress| match progress {
+        Progress::Begin { done, total, .. } => {
+            was_there = done == total;
+            screen.begin_at("eval", done, total);
+            screen.message(&id);
+        }
+        Progress::Episode(episode) => {
+            successes += u64::from(episode.success);
+            screen.step();
+            screen.message(&format!("{id}: {successes} successes"));
+        }
+    });
+    drop(screen);
+    match end.with_context(|| format!("entry {id}"))? {
+        EvaluationEnd::Complete(evaluation) => Ok(Some(Evaluated { evaluation, was_there })),
+        EvaluationEnd::Stopped { done, total } => {
+            cli::note(&format!("{id}: {done} of {total} episodes done"));
+            Ok(None)
+        }
+        EvaluationEnd::Failed { done, errors } => {
+            let first = errors.into_iter().next().context("an evaluation failed without saying why")?;
+            Err(anyhow::Error::new(first).context(format!("entry {id}: {done} episodes done, others could not be run")))
+        }
+    }
+}
