@@ -12,6 +12,8 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     text(|row: &LeaderboardRow| row.task().to_owned()).csv("task").table("task").page("task").left().kept(),
     text(|row: &LeaderboardRow| row.record().protocol.id()).csv("protocol"),
     text(LeaderboardRow::protocol_text).table("protocol").page("protocol"),
+    text(|row: &LeaderboardRow| row.counts.percent(1)).page("rate"),
+    text(|row: &LeaderboardRow| format!("{}%", super::row::interval_text(row.interval, 1, '–'))).page("95% interval"),
     text(|row: &LeaderboardRow| row.named.as_ref().map_or(String::new(), |(name, _)| name.clone()))
         .csv("named_protocol"),
     text(|row: &LeaderboardRow| row.named.as_ref().map_or(String::new(), |(_, block)| block.to_string())).csv("block"),
@@ -34,8 +36,6 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     count(|row: &LeaderboardRow| Some(row.standing.as_ref()?.ranks.1 as u64)).csv("rank_last"),
     text(ranks_text).table("ranks").page("ranks"),
     text(letters).csv("letters").table("group").page("group"),
-    text(|row: &LeaderboardRow| row.counts.percent(1)).page("rate"),
-    text(|row: &LeaderboardRow| format!("{}%", super::row::interval_text(row.interval, 1, '–'))).page("95% interval"),
     number(LeaderboardRow::mean_return, 4, 2).csv("mean_return").table("return").page("return"),
     number(LeaderboardRow::mean_steps_to_success, 2, 1)
         .csv("mean_steps_to_success")
