@@ -81,3 +81,44 @@ fn a_thought_is_shown_and_a_thought_by_the_clock_is_not_repeatable() {
     assert!(said(&mut eval("lift-actrm@2")).contains("it thinks by the clock"));
     refused(eval("lift-actrm@2").arg("--again"), &["lift-actrm@2", "by the clock"]);
 }
+
+#[test]
+fn attention_is_drawn_and_other_depths_are_counted() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    succeeds(&mut data(["convert", text(&lift()), text(&folder.path().join("lift"))]));
+    thinker(folder.path(), &[]);
+    let entries = folder.path().join("zoo");
+    let (svg, table) = (folder.path().join("attention.svg"), folder.path().join("trace.parquet"));
+    let mut command = zoo(["trace", "lift-actrm", "--seed", "10000", "--json", "--zoo", text(&entries)]);
+    let trace: Value = serde_json::from_str(&said(command.args(["--parquet", text(&table)]))).expect("JSON");
+    let names: Vec<&str> = trace["attended"].as_array().expect("names").iter().filter_map(Value::as_str).collect();
+    assert!(names.contains(&"observation.environment_state"), "{names:?}");
+    for step in queries(&trace)[0]["thought"].as_array().expect("steps") {
+        let attention = step["attention"].as_array().expect("a row an action");
+        assert_eq!(attention.len(), 16);
+        let row = attention[3].as_array().expect("numbers");
+        let sum: f64 = row.iter().filter_map(Value::as_f64).sum();
+        assert!(row.len() == names.len() && (sum - 1.0).abs() < 1e-4, "{row:?}");
+    }
+    said(zoo(["trace", "lift-actrm", "--zoo", text(&entries)]).args(["--svg", text(&svg)]));
+    assert!(std::fs::read_to_string(&svg).expect("a drawing").contains("environment_state</text>"));
+
+    let depth = |more: &[&str]| {
+        let mut command = zoo(["depth", "lift-actrm", "--episodes", "2", "--workers", "1", "--zoo", text(&entries)]);
+        command.args(["--work", text(&folder.path().join("depth"))]).args(more);
+        command
+    };
+    let rows: Value = serde_json::from_str(&said(&mut depth(&["--steps", "1,5", "--json"]))).expect("JSON");
+    let of = |row: usize, key: &str| rows[row][key].as_f64().expect("a number");
+    assert_eq!((of(0, "steps"), of(1, "steps"), of(0, "episodes")), (1.0, 5.0, 2.0));
+    assert!(of(1, "query_flops") > of(0, "query_flops"));
+    let shuffled = said(&mut depth(&["--steps", "3", "--intervene", "shuffle"]));
+    assert!(shuffled.contains("success"), "{shuffled}");
+    assert!(!entries.join("results").exists(), "what it does otherwise is no result of the entry");
+    refused(&mut depth(&["--intervene", "melt"]), &["freeze or shuffle"]);
+    let mut act = zoo(["depth", "lift-act@1", "--steps", "2", "--zoo", text(&root().join("zoo"))]);
+    refused(&mut act, &["lift-act@1", "does not think step by step"]);
+    let mut probe = zoo(["probe", "lift-actrm", "--episodes", "2", "--workers", "1", "--zoo", text(&entries)]);
+    probe.args(["--data", text(&folder.path().join("lift")), "--work", text(&folder.path().join("probe"))]);
+    refused(&mut probe, &["NAME_points", "lift-actrm"]);
+}

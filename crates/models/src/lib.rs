@@ -13,6 +13,7 @@ pub mod classification;
 pub mod encoders;
 mod error;
 mod features;
+mod flops;
 mod fused;
 mod gradients;
 mod history;

@@ -99,6 +99,12 @@ pub trait PolicyModel: Send + Sync {
         false
     }
 
+    /// Floating-point operations of the matrix products of one query, thinking for as long as it may; `None` where nobody
+    /// counts them.
+    fn query_flops(&self) -> Option<f64> {
+        None
+    }
+
     /// Number of actions in a predicted chunk.
     fn action_horizon(&self) -> usize;
 

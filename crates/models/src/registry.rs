@@ -1,6 +1,6 @@
 //! The policy models by name. This is the only place where their names stand: another model is a row of the table.
 
-use crate::error::Result;
+use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
 use crate::model::PolicyModel;
 use crate::models::{act, actrm, bc};
@@ -91,6 +91,33 @@ policies! {
     "actrm" => Actrm: actrm::Actrm,
     /// Behaviour cloning with a multi-layer perceptron
     "bc" => Bc: bc::Bc,
+}
+
+impl PolicyConfig {
+    /// The configuration of a policy that thinks step by step; `None` of the others.
+    pub fn reasoner(&self) -> Option<&actrm::Config> {
+        match self {
+            Self::Actrm(config) => Some(config),
+            _ => None,
+        }
+    }
+
+    /// The same policy thinking as `thinking` says.
+    ///
+    /// # Errors
+    /// A thought that cannot be; a policy that does not think, unless nothing is asked of it.
+    pub fn thinking(&self, thinking: &actrm::Thinking) -> Result<Self> {
+        match self {
+            Self::Actrm(config) => Ok(Self::Actrm(config.thinking(thinking)?)),
+            other if *thinking == actrm::Thinking::default() => Ok(other.clone()),
+            other => Err(ModelError::Config {
+                model: other.policy_type(),
+                field: "thinking",
+                found: "steps, halting or an intervention".to_string(),
+                expected: "none: it does not think step by step".to_string(),
+            }),
+        }
+    }
 }
 
 /// The type of a policy whose own keys are still to be read: with them, as a `DeserializeSeed`, it gives the

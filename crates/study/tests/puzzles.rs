@@ -11,7 +11,7 @@ use puzzles::Task;
 use report::csv;
 use study::puzzle::{
     AnyExperiment, Baseline, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest,
-    RECORD_FILE, SolverEntry, TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again,
+    RECORD_FILE, SolverEntry, Starts, TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again,
     list_puzzle_evaluations, trace, train_puzzles,
 };
 use zoo::audit::KnownEntries;
@@ -43,7 +43,8 @@ fn finish(request: &PuzzleTrainRequest) -> Entry {
 }
 
 fn evaluated(entry: &Entry, root: &Path, puzzles: u64) -> PuzzleEvaluation {
-    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles, depth: 4, seed: TEST_SEED };
+    let options =
+        PuzzleEvaluationOptions { task: None, givens: None, puzzles, depth: 4, seed: TEST_SEED, starts: Starts::ONE };
     evaluate_puzzles(&SolverEntry::load(entry, None).unwrap(), &root.join("zoo/results"), &options).unwrap().record
 }
 
@@ -52,7 +53,14 @@ fn answers_are_the_same_again_and_a_fresh_stream_is_another_evaluation() {
     let root = tempfile::tempdir().unwrap();
     let entry = finish(&request(root.path(), "trm_maze8-original", &["train.steps=2", "train.validate_every=1000000"]));
     let (solver, results) = (SolverEntry::load(&entry, None).unwrap(), root.path().join("zoo/results"));
-    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles: 20, depth: 2, seed: TEST_SEED };
+    let options = PuzzleEvaluationOptions {
+        task: None,
+        givens: None,
+        puzzles: 20,
+        depth: 2,
+        seed: TEST_SEED,
+        starts: Starts::ONE,
+    };
     let error = evaluate_puzzles_again(&solver, &results, &options).unwrap_err().to_string();
     assert!(error.contains("nothing to run again"), "{error}");
     let first = evaluate_puzzles(&solver, &results, &options).unwrap();
@@ -100,22 +108,38 @@ fn walkers_learn_the_studys_maze_by_every_algorithm() {
 
 /// As `short`, with up to 16 supervision steps.
 fn learned(name: &str, overrides: &[&str]) -> PuzzleEvaluation {
+    let plain = (TEST_SEED, Starts::ONE);
+    learned_and_asked(name, overrides, &[plain]).remove(0)
+}
+
+/// The same with an evaluation for each seed of test puzzles and number of starts.
+fn learned_and_asked(name: &str, overrides: &[&str], asked: &[(u64, Starts)]) -> Vec<PuzzleEvaluation> {
     let root = tempfile::tempdir().unwrap();
     let mut all = vec!["train.validate_every=1000000", "task.valid_puzzles=5"];
     all.extend(overrides);
-    let entry = finish(&request(root.path(), name, &all));
-    let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles: 200, depth: 16, seed: TEST_SEED };
-    evaluate_puzzles(&SolverEntry::load(&entry, None).unwrap(), &root.path().join("zoo/results"), &options)
-        .unwrap()
-        .record
+    let entry = SolverEntry::load(&finish(&request(root.path(), name, &all)), None).unwrap();
+    let evaluate = |&(seed, starts): &(u64, Starts)| {
+        let options = PuzzleEvaluationOptions { task: None, givens: None, puzzles: 200, depth: 16, seed, starts };
+        evaluate_puzzles(&entry, &root.path().join("zoo/results"), &options).unwrap().record
+    };
+    asked.iter().map(evaluate).collect()
 }
 
 #[test]
 fn a_short_training_finds_ways_through_perfect_mazes_it_has_not_seen() {
-    let result = learned(
-        "trm_dfs10",
-        &["train.steps=1700", "train.batch_size=16", "model.hidden_size=24", "model.inner_size=48"],
-    );
+    let short = ["train.steps=1700", "train.batch_size=16", "model.hidden_size=24", "model.inner_size=48"];
+    let starts = |most: u64| Starts { most, noise: 1.0 };
+    let asked = [(TEST_SEED, Starts::ONE), (TEST_SEED, starts(3)), (TEST_SEED, starts(3)), (7, Starts::ONE)];
+    let results = learned_and_asked("trm_dfs10", &short, &asked);
+    let result = &results[0];
+    // more starts take more steps where a thought does not settle, the same ones every time, and answer no worse
+    assert_eq!(results[1], results[2]);
+    assert!(results[1].steps > result.steps, "{} {}", results[1].steps, result.steps);
+    assert!(results[1].answers.exact >= result.answers.exact, "{:?} {:?}", results[1].answers, result.answers);
+    assert_eq!(results[1].by_depth, result.by_depth, "of the usual start");
+    // of another seed are other puzzles, as hard
+    assert_ne!((results[3].seed, &results[3].answers), (result.seed, &result.answers));
+    assert!(results[3].answers.exact.abs_diff(result.answers.exact) < 40, "{:?}", results[3].answers);
     // along the row and then along the column is the way in a quarter of them
     assert!(result.baselines.values().all(|counts| counts.exact < 70), "{:?}", result.baselines);
     assert!(result.answers.exact > 90, "{:?}", result.answers);

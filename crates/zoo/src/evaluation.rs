@@ -7,6 +7,7 @@ mod again;
 mod agent;
 mod clock;
 mod subject;
+mod thinking;
 mod trace;
 
 use std::ops::ControlFlow;
@@ -20,7 +21,8 @@ pub use self::again::{Again, evaluate_again};
 pub use self::agent::{PolicyAgent, QueryTimes};
 pub use self::clock::WallClock;
 pub use self::subject::Subject;
-pub use self::trace::{PolicyTrace, TracedQuery, TracedThought, trace};
+pub use self::thinking::{Start, starts, thinking_subject};
+pub use self::trace::{Examiner, PolicyTrace, TracedQuery, TracedThought, trace};
 use crate::ZooError;
 use crate::results::{EpisodeRecord, EpisodeTiming, ResultsFolder, Seeds, Shard, StoredEvaluation};
 

@@ -15,6 +15,7 @@ pub mod experiment;
 mod feature_keys;
 mod files;
 pub mod lerobot;
+pub mod probe;
 pub mod registry;
 pub mod run;
 pub mod tensors;

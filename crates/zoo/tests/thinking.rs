@@ -80,7 +80,7 @@ fn depths(trace: &PolicyTrace) -> Vec<usize> {
 #[test]
 fn warm_start_and_budget_change_what_is_executed() {
     let mut pool = Pool::start(options("Lift", 1)).unwrap();
-    let mut run = |reasoning: ReasoningConfig| trace(&subject(reasoning), &mut pool, 10_000).unwrap().unwrap();
+    let mut run = |reasoning: ReasoningConfig| trace(&subject(reasoning), &mut pool, 10_000, None).unwrap().unwrap();
     let plain = run(five());
     assert_eq!((plain.steps, plain.queries.len(), depths(&plain)), (18, 5, vec![5; 5]));
     assert_eq!(plain.queries.iter().map(|query| query.step).collect::<Vec<_>>(), [0, 4, 8, 12, 16]);

@@ -8,7 +8,7 @@ use puzzles::Task;
 use report::wilson_interval;
 use serde_json::{Value, json};
 use study::puzzle::{
-    EvaluatedPuzzles, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, TEST_SEED, evaluate_puzzles,
+    EvaluatedPuzzles, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, Starts, TEST_SEED, evaluate_puzzles,
     evaluate_puzzles_again,
 };
 use zoo::entry::Entry;
@@ -25,6 +25,12 @@ pub struct PuzzleArgs {
     /// Givens of a Sudoku (the fewest that the solver was trained on)
     #[arg(long, value_name = "N")]
     givens: Option<usize>,
+    /// Most starts of a thought about a puzzle: where it does not settle it begins anew from noise
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    starts: u64,
+    /// Standard deviation of that noise
+    #[arg(long, value_name = "STD", default_value_t = 1.0, requires = "starts")]
+    noise: f64,
 }
 
 /// The family of that name, or an error that lists them.
@@ -48,6 +54,9 @@ pub fn evaluate_solver(
     again: bool,
     results: &Path,
 ) -> anyhow::Result<(String, Value)> {
+    if !(args.noise.is_finite() && args.noise >= 0.0) {
+        bail!("--noise: expected a number from 0, found {}", args.noise);
+    }
     let task = task.map(family).transpose()?;
     let solver = SolverEntry::load(entry, task)?;
     let options = PuzzleEvaluationOptions {
@@ -56,6 +65,7 @@ pub fn evaluate_solver(
         puzzles: args.puzzles,
         depth: usize::try_from(args.depth)?,
         seed: seed.unwrap_or(TEST_SEED),
+        starts: if args.starts == 1 { Starts::ONE } else { Starts { most: args.starts, noise: args.noise } },
     };
     if again {
         let puzzles = evaluate_puzzles_again(&solver, results, &options)?.record.answers.puzzles;

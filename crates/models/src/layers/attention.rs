@@ -65,21 +65,28 @@ impl MultiHeadAttention {
         mode: &mut Mode<'_>,
     ) -> Result<Tensor> {
         let (b, t, dim) = q.dims3()?;
-        let s = k.dim(1)?;
-        let head = dim / self.n_heads;
-        let project = |x: &Tensor, part: usize, len: usize| -> Result<Tensor> {
-            let layer = Linear {
-                weight: self.in_proj_weight.narrow(0, part * dim, dim)?,
-                bias: Some(self.in_proj_bias.narrow(0, part * dim, dim)?),
-            };
-            let y = layer.forward(x)?.reshape((b, len, self.n_heads, head))?;
-            Ok(y.transpose(1, 2)?.contiguous()?)
-        };
-        let (q, k, v) = (project(q, 0, t)?, project(k, 1, s)?, project(v, 2, s)?);
-        let scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (head as f64).sqrt()))?;
-        let weights = self.dropout.forward(&masked_softmax(&scores, key_pad)?, mode)?;
-        let mixed = weights.matmul(&v)?.transpose(1, 2)?.reshape((b, t, dim))?;
+        let weights = self.dropout.forward(&self.weights(q, k, key_pad)?, mode)?;
+        let mixed = weights.matmul(&self.project(v, 2)?)?.transpose(1, 2)?.reshape((b, t, dim))?;
         self.out_proj.forward(&mixed)
+    }
+
+    /// How much each query attends to each key, without dropout: q: (b, t, D), k: (b, s, D) -> (b, n_heads, t, s)
+    pub fn weights(&self, q: &Tensor, k: &Tensor, key_pad: Option<&Tensor>) -> Result<Tensor> {
+        let (q, k) = (self.project(q, 0)?, self.project(k, 1)?);
+        let head = q.dim(D::Minus1)? as f64;
+        let scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / head.sqrt()))?;
+        masked_softmax(&scores, key_pad)
+    }
+
+    /// x: (b, n, D) -> queries, keys or values (parts 0, 1, 2) by head, (b, n_heads, n, D / n_heads)
+    fn project(&self, x: &Tensor, part: usize) -> Result<Tensor> {
+        let (b, n, dim) = x.dims3()?;
+        let layer = Linear {
+            weight: self.in_proj_weight.narrow(0, part * dim, dim)?,
+            bias: Some(self.in_proj_bias.narrow(0, part * dim, dim)?),
+        };
+        let y = layer.forward(x)?.reshape((b, n, self.n_heads, dim / self.n_heads))?;
+        Ok(y.transpose(1, 2)?.contiguous()?)
     }
 }
 

@@ -8,7 +8,7 @@ use report::column::{Column, count, number, text};
 use report::html::{self, escape};
 use report::{count_text, wilson_interval};
 
-use super::evaluation::{PuzzleEvaluation, TEST_SEED};
+use super::evaluation::{PuzzleEvaluation, Starts, TEST_SEED};
 use super::grade::Counts;
 
 /// Best first inside each task; ties by what does not change.
@@ -19,7 +19,7 @@ pub fn rank_puzzles(evaluations: &[PuzzleEvaluation]) -> Vec<PuzzleEvaluation> {
 }
 
 fn order(one: &PuzzleEvaluation, two: &PuzzleEvaluation) -> Ordering {
-    let group = |row: &PuzzleEvaluation| (row.task.clone(), row.givens, row.seed);
+    let group = |row: &PuzzleEvaluation| (row.task.clone(), row.givens, row.seed, row.starts.most);
     let share = |row: &PuzzleEvaluation, other: &PuzzleEvaluation| {
         u128::from(row.answers.valid) * u128::from(other.answers.puzzles.max(1))
     };
@@ -32,7 +32,8 @@ fn order(one: &PuzzleEvaluation, two: &PuzzleEvaluation) -> Ordering {
         .then_with(|| (one.depth, one.answers.puzzles).cmp(&(two.depth, two.answers.puzzles)))
 }
 
-/// `open8`, `sudoku9, 36 givens`; of other puzzles than those that every solver answers, `open8, seed 7`.
+/// `open8`, `sudoku9, 36 givens`; of other puzzles than those that every solver answers, `open8, seed 7`;
+/// where thoughts may begin again, `dfs20, 8 starts`.
 fn task_text(row: &PuzzleEvaluation) -> String {
     let mut text = match row.givens {
         0 => row.task.clone(),
@@ -40,6 +41,9 @@ fn task_text(row: &PuzzleEvaluation) -> String {
     };
     if row.seed != TEST_SEED {
         text.push_str(&format!(", seed {}", row.seed));
+    }
+    if row.starts != Starts::ONE {
+        text.push_str(&format!(", {} starts", row.starts.most));
     }
     text
 }
@@ -117,6 +121,7 @@ pub const PUZZLE_COLUMNS: &[Column<PuzzleEvaluation>] = &[
     text(|row: &PuzzleEvaluation| row.entry.hash.clone()).csv("entry_hash"),
     count(|row: &PuzzleEvaluation| Some(row.seed)).csv("seed"),
     text(depths_text).page("right after steps"),
+    count(|row: &PuzzleEvaluation| Some(row.starts.most)).csv("starts"),
 ];
 
 fn interval(row: &PuzzleEvaluation) -> (f64, f64) {
@@ -221,6 +226,7 @@ mod tests {
             givens: 0,
             seed: 20_000,
             depth: 16,
+            starts: Starts::ONE,
             answers: counts(valid),
             steps: 500,
             sampled: None,
@@ -258,5 +264,11 @@ mod tests {
         let html = puzzle_section(&rows);
         assert!(html.contains("<td>190/200</td>") && html.contains("1: 47.5%, 2: 95.0%"), "{html}");
         assert_eq!(puzzle_section(&[]), "");
+        // other puzzles and other rules are ranked by themselves
+        let fresh = PuzzleEvaluation { seed: 21_000, ..row("a", 200, "open8") };
+        let often = PuzzleEvaluation { starts: Starts { most: 8, noise: 1.0 }, ..row("a", 200, "open8") };
+        assert_eq!([task_text(&fresh), task_text(&often)], ["open8, seed 21000", "open8, 8 starts"]);
+        let names: Vec<String> = rank_puzzles(&[fresh, often, row("b", 150, "open8")]).iter().map(task_text).collect();
+        assert_eq!(names, ["open8", "open8, 8 starts", "open8, seed 21000"]);
     }
 }

@@ -18,7 +18,7 @@ use zoo::{ZooError, sha256_file, sha256_hex, write_atomic};
 
 use super::entry::{ProgressPoint, SolverEntry};
 use super::grade::{Baseline, Counts};
-use super::solver::{Solver, Thought, settled};
+use super::solver::{NoisyStart, Solver, Thought, settled};
 use super::walk;
 
 /// Seed of the test puzzles: every solver answers the same ones.
@@ -27,7 +27,7 @@ pub const TEST_SEED: u64 = 20_000;
 pub(super) const VALID_SEED: u64 = 10_000;
 
 /// Numbers of supervision steps after which answers are graded, as far as an evaluation goes.
-pub const DEPTHS: [usize; 6] = [1, 2, 4, 8, 16, 32];
+pub const DEPTHS: [usize; 8] = [1, 2, 4, 8, 16, 32, 64, 128];
 
 /// A finished evaluation of a solver.
 pub const RECORD_FILE: &str = "puzzles.json";
@@ -38,7 +38,7 @@ const OUTCOMES_FILE: &str = "outcomes.parquet";
 const BATCH: usize = 50;
 
 /// What to evaluate on.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct PuzzleEvaluationOptions {
     /// Another family than the entry's.
     pub task: Option<Task>,
@@ -50,6 +50,32 @@ pub struct PuzzleEvaluationOptions {
     pub depth: usize,
     /// Seed of the puzzles: [`TEST_SEED`] for those that every solver answers, another for a fresh stream of the same split.
     pub seed: u64,
+    /// How often a thought about a puzzle may begin.
+    pub starts: Starts,
+}
+
+/// How often a thought about a puzzle may begin: once as the solver was trained, and where it does not settle, again from
+/// noise. The first answer that settles counts; where none does, the one that the halting head is most sure of.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Starts {
+    /// Most starts.
+    pub most: u64,
+    /// Standard deviation of the noise on both states.
+    pub noise: f64,
+}
+
+impl Starts {
+    /// The usual start alone.
+    pub const ONE: Self = Self { most: 1, noise: 0.0 };
+
+    fn is_one(&self) -> bool {
+        self.most == 1
+    }
+
+    fn one() -> Self {
+        Self::ONE
+    }
 }
 
 /// Everything that an evaluation found, in counts: `puzzles.json`.
@@ -76,6 +102,9 @@ pub struct PuzzleEvaluation {
     pub seed: u64,
     /// Most supervision steps that it was given.
     pub depth: usize,
+    /// How often a thought might begin.
+    #[serde(default = "Starts::one", skip_serializing_if = "Starts::is_one")]
+    pub starts: Starts,
     /// Its answers: once its halting head is sure of one that stays the same, or after the last step.
     pub answers: Counts,
     /// Supervision steps that these took, or moves of a walker, together.
@@ -104,7 +133,11 @@ impl PuzzleEvaluation {
     /// The name of its folder: readable, and different for anything that could change an answer.
     pub fn folder_name(&self) -> String {
         let whole = (&self.entry, &self.task, self.givens, self.seed, self.depth, self.answers.puzzles);
-        let hash = sha256_hex(&serde_json::to_vec(&whole).expect("plain fields are always JSON"));
+        let text = match self.starts.is_one() {
+            true => serde_json::to_vec(&whole),
+            false => serde_json::to_vec(&(whole, self.starts)),
+        };
+        let hash = sha256_hex(&text.expect("plain fields are always JSON"));
         format!("{}_{}_test-{}_{}", self.entry, self.task, self.answers.puzzles, &hash[..8])
     }
 
@@ -157,8 +190,45 @@ impl Graded {
     }
 }
 
+/// The answer that a solver is left with.
+struct Kept {
+    thought: Thought,
+    /// Supervision steps so far, of all starts.
+    steps: usize,
+    settled: bool,
+}
+
+impl Kept {
+    /// Where thoughts about the puzzle at `place` settle, or their end.
+    fn of(thoughts: &[Vec<Thought>], place: usize) -> Self {
+        let answer = |at: usize| thoughts[at][place].answer.as_slice();
+        let stops = |at: &usize| {
+            let before = at.checked_sub(1).map(answer);
+            settled(thoughts[*at][place].halt, answer(*at), before)
+        };
+        let found = (0..thoughts.len()).find(stops);
+        let at = found.unwrap_or(thoughts.len() - 1);
+        Self { thought: thoughts[at][place].clone(), steps: at + 1, settled: found.is_some() }
+    }
+
+    /// Takes another start's answer where that is better, by the solver's own lights.
+    fn weigh(&mut self, other: Self) {
+        let steps = self.steps + other.steps;
+        if other.settled || other.thought.halt > self.thought.halt {
+            *self = other;
+        }
+        self.steps = steps;
+    }
+}
+
 /// Grades `solver` on `puzzles` after each number of steps in `depths` and where it halts, at the latest after `most`.
-pub(super) fn graded(solver: &Solver, puzzles: &[Puzzle], depths: &[usize], most: usize) -> Result<Graded, ModelError> {
+pub(super) fn graded(
+    solver: &Solver,
+    puzzles: &[Puzzle],
+    depths: &[usize],
+    most: usize,
+    starts: Starts,
+) -> Result<Graded, ModelError> {
     let mut graded = Graded {
         by_depth: BTreeMap::new(),
         halting: Counts::default(),
@@ -177,6 +247,7 @@ pub(super) fn graded(solver: &Solver, puzzles: &[Puzzle], depths: &[usize], most
         }));
         return Ok(graded);
     }
+    let mut kept: Vec<Kept> = Vec::with_capacity(puzzles.len());
     for batch in puzzles.chunks(BATCH) {
         let thoughts = solver.think(batch, most)?;
         for (index, thoughts) in thoughts.iter().enumerate() {
@@ -187,20 +258,25 @@ pub(super) fn graded(solver: &Solver, puzzles: &[Puzzle], depths: &[usize], most
                 }
             }
         }
-        for (place, puzzle) in batch.iter().enumerate() {
-            let answer = |at: usize| thoughts[at][place].answer.as_slice();
-            let stops = |at: &usize| {
-                let before = at.checked_sub(1).map(answer);
-                settled(thoughts[*at][place].halt, answer(*at), before)
-            };
-            let at = (0..thoughts.len()).find(stops).unwrap_or(thoughts.len() - 1);
-            let thought = &thoughts[at][place];
-            add(&mut graded.halting, puzzle, thought);
-            graded.steps += at as u64 + 1;
-            let grade = puzzle.grade(&thought.answer);
-            let (exact, valid, cells_right) = (grade.exact, grade.valid, grade.cells_right);
-            graded.rows.push(Row { exact, valid, steps: at + 1, cells_right });
+        kept.extend((0..batch.len()).map(|place| Kept::of(&thoughts, place)));
+    }
+    for number in 1..starts.most {
+        let open: Vec<usize> = (0..kept.len()).filter(|&i| !kept[i].settled).collect();
+        for chunk in open.chunks(BATCH) {
+            let batch: Vec<Puzzle> = chunk.iter().map(|&i| puzzles[i].clone()).collect();
+            let start = NoisyStart { noise: starts.noise, number, puzzles: chunk };
+            let thoughts = solver.think_from(&batch, most, Some(&start))?;
+            for (place, &i) in chunk.iter().enumerate() {
+                kept[i].weigh(Kept::of(&thoughts, place));
+            }
         }
+    }
+    for (puzzle, Kept { thought, steps, .. }) in puzzles.iter().zip(kept) {
+        add(&mut graded.halting, puzzle, &thought);
+        graded.steps += steps as u64;
+        let grade = puzzle.grade(&thought.answer);
+        let (exact, valid, cells_right) = (grade.exact, grade.valid, grade.cells_right);
+        graded.rows.push(Row { exact, valid, steps, cells_right });
     }
     Ok(graded)
 }
@@ -229,6 +305,7 @@ fn plan(entry: &SolverEntry, options: &PuzzleEvaluationOptions) -> Result<(Task,
         task: task.name().to_owned(),
         givens,
         seed: options.seed,
+        starts: if entry.solver().is_recursive() { options.starts } else { Starts::ONE },
         depth: if entry.solver().is_recursive() { options.depth } else { 0 },
         answers: Counts { puzzles: options.puzzles, ..Counts::default() },
         steps: 0,
@@ -252,7 +329,7 @@ fn run(
         (0..options.puzzles).map(|index| task.numbered(Split::Test, givens, seed, index)).collect();
     let name = record.entry.to_string();
     let failed = |source| ZooError::Model { operation: "evaluate", name: name.clone(), source };
-    let graded = graded(entry.solver(), &puzzles, &DEPTHS, options.depth).map_err(failed)?;
+    let graded = graded(entry.solver(), &puzzles, &DEPTHS, options.depth, record.starts).map_err(failed)?;
     record.baselines = match entry.solver() {
         Solver::Walker { .. } => Baseline::of_walkers(&puzzles),
         _ => Baseline::grade_all(task, givens, &puzzles),

@@ -24,7 +24,7 @@ pub use board::{PUZZLE_COLUMNS, puzzle_section, rank_puzzles};
 pub use cpu::cpu_seconds;
 pub use entry::{ProgressPoint, PuzzleMeta, SOLVER, SolverEntry};
 pub use evaluation::{
-    DEPTHS, EvaluatedPuzzles, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, TEST_SEED, audit_puzzles,
+    DEPTHS, EvaluatedPuzzles, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, Starts, TEST_SEED, audit_puzzles,
     evaluate_puzzles, evaluate_puzzles_again, list_puzzle_evaluations,
 };
 pub use experiment::{AnyExperiment, LearningSection, PuzzleExperiment, PuzzleTask};

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use candle_core::{Device, Tensor};
-use models::ModelError;
 use models::baselines::{GridDims, GridModel, WalkerNet};
 use models::classification::ClassProbability;
-use models::trm::{Gradient, Trm};
+use models::trm::{Carry, Gradient, Trm};
+use models::{ModelError, Rng};
 use puzzles::{MazeTask, Puzzle, Task};
 
 /// A model for one family of puzzles.
@@ -95,11 +95,24 @@ impl Solver {
     /// # Errors
     /// Puzzles of another size than the model's.
     pub fn think(&self, puzzles: &[Puzzle], steps: usize) -> Result<Vec<Vec<Thought>>, ModelError> {
+        self.think_from(puzzles, steps, None)
+    }
+
+    /// The same from another start, if it is a recursion.
+    pub(super) fn think_from(
+        &self,
+        puzzles: &[Puzzle],
+        steps: usize,
+        start: Option<&NoisyStart<'_>>,
+    ) -> Result<Vec<Vec<Thought>>, ModelError> {
         let mut thoughts = Vec::new();
         match self {
             Self::Trm { model, task, probability } => {
                 let inputs = tokens(puzzles)?;
                 let mut carry = model.initial_carry(puzzles.len())?;
+                if let Some(start) = start {
+                    carry = start.of(&carry)?;
+                }
                 for _ in 0..steps {
                     let out = model.supervision_step(&carry, &inputs, None, Gradient::Off)?;
                     carry = out.carry;
@@ -122,6 +135,29 @@ impl Solver {
             }
         }
         Ok(thoughts)
+    }
+}
+
+/// Noise on the states that thoughts begin with.
+pub(super) struct NoisyStart<'a> {
+    /// Its standard deviation.
+    pub(super) noise: f64,
+    /// Which of a puzzle's starts it is.
+    pub(super) number: u64,
+    /// The puzzles' numbers: each has noise of its own, whatever it is thought about together with.
+    pub(super) puzzles: &'a [usize],
+}
+
+impl NoisyStart<'_> {
+    fn of(&self, carry: &Carry) -> Result<Carry, ModelError> {
+        let (_, positions, width) = carry.z_h.dims3()?;
+        let mut noises = [Vec::new(), Vec::new()];
+        for &puzzle in self.puzzles {
+            let mut rng = Rng::new(puzzle as u64, &format!("noisy start {}", self.number));
+            noises.iter_mut().for_each(|noise| noise.extend(rng.normals(positions * width)));
+        }
+        let [h, l] = noises.map(|noise| Tensor::from_vec(noise, carry.z_h.shape(), &Device::Cpu));
+        Ok(Carry { z_h: (&carry.z_h + (h? * self.noise)?)?, z_l: (&carry.z_l + (l? * self.noise)?)? })
     }
 }
 

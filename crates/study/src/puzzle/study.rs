@@ -15,7 +15,7 @@ use zoo::run::{TrainEvent, TrainOutcome};
 use zoo::{ZooError, sha256_hex};
 
 use super::entry::SolverEntry;
-use super::evaluation::{PuzzleEvaluation, PuzzleEvaluationOptions, TEST_SEED, evaluate_puzzles};
+use super::evaluation::{PuzzleEvaluation, PuzzleEvaluationOptions, Starts, TEST_SEED, evaluate_puzzles};
 use super::experiment::{AnyExperiment, PuzzleExperiment};
 use super::training::{PuzzleTrainRequest, train_puzzles};
 
@@ -31,6 +31,10 @@ pub struct StudyTest {
     pub givens: Option<usize>,
     /// Most supervision steps.
     pub depth: usize,
+    /// Seed of the test puzzles.
+    pub seed: u64,
+    /// How often a thought may begin.
+    pub starts: Starts,
     /// What it should reach.
     pub bar: Option<Bar>,
 }
@@ -59,11 +63,20 @@ pub struct StudyRow {
     pub tests: &'static [StudyTest],
 }
 
-const PLAIN: StudyTest = StudyTest { task: None, givens: None, depth: 16, bar: None };
+const PLAIN: StudyTest =
+    StudyTest { task: None, givens: None, depth: 16, seed: TEST_SEED, starts: Starts::ONE, bar: None };
+/// Puzzles that were not looked at when settings were chosen and changed.
+const FRESH: u64 = 21_000;
+/// As often as a thought that does not settle may begin anew, and from how much noise.
+const STARTS: Starts = Starts { most: 8, noise: 1.0 };
 const BAR: Bar = Bar { right: 1.0, exact: 0.0, parameters: None, cpu_seconds: None };
 
 const fn with_bar(bar: Bar) -> StudyTest {
     StudyTest { bar: Some(bar), ..PLAIN }
+}
+
+const fn fresh(bar: Bar) -> StudyTest {
+    StudyTest { seed: FRESH, ..with_bar(bar) }
 }
 
 const fn row(experiment: &'static str, seeds: u64, tests: &'static [StudyTest]) -> StudyRow {
@@ -76,9 +89,17 @@ const DFS10: &[StudyTest] = &[
     with_bar(Bar { right: 0.995, exact: 0.995, parameters: Some(16_000), cpu_seconds: Some(100.0) }),
     StudyTest { task: Some("dfs16"), depth: 32, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
     StudyTest { task: Some("dfs20"), depth: 32, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
+    fresh(Bar { right: 0.995, exact: 0.995, ..BAR }),
+    StudyTest { task: Some("dfs16"), depth: 128, ..PLAIN },
+    StudyTest { task: Some("dfs20"), depth: 128, ..PLAIN },
+    StudyTest { task: Some("dfs16"), depth: 32, starts: STARTS, ..PLAIN },
+    StudyTest { task: Some("dfs20"), depth: 32, starts: STARTS, ..PLAIN },
 ];
-const OPEN8: &[StudyTest] = &[with_bar(Bar { right: 0.98, exact: 0.96, parameters: Some(9_922), cpu_seconds: None })];
-const SUDOKU4: &[StudyTest] = &[with_bar(BAR)];
+const OPEN8: &[StudyTest] = &[
+    with_bar(Bar { right: 0.98, exact: 0.96, parameters: Some(9_922), cpu_seconds: None }),
+    fresh(Bar { right: 0.98, exact: 0.96, ..BAR }),
+];
+const SUDOKU4: &[StudyTest] = &[with_bar(BAR), fresh(BAR)];
 const SUDOKU6: &[StudyTest] = &[with_bar(Bar { right: 0.99, ..BAR })];
 const SUDOKU9: &[StudyTest] = &[with_bar(Bar { right: 0.9, ..BAR }), StudyTest { givens: Some(30), ..PLAIN }];
 const NONE: &[StudyTest] = &[PLAIN];
@@ -128,7 +149,15 @@ impl StudyTest {
     pub fn file_name(&self, experiment: &str, seed: u64) -> String {
         let other = self.task.map_or(String::new(), |task| format!("_on-{task}"));
         let givens = self.givens.map_or(String::new(), |givens| format!("_{givens}-givens"));
-        format!("{experiment}_seed-{seed}{other}{givens}.json")
+        let fresh = if self.seed == TEST_SEED { String::new() } else { format!("_puzzles-{}", self.seed) };
+        let depth = if self.depth > 32 { format!("_depth-{}", self.depth) } else { String::new() };
+        let starts = if self.starts == Starts::ONE { String::new() } else { format!("_{}-starts", self.starts.most) };
+        format!("{experiment}_seed-{seed}{other}{givens}{fresh}{depth}{starts}.json")
+    }
+
+    /// Whether it asks what the first tests of an experiment did not: other puzzles, longer thoughts, more starts.
+    pub fn is_further(&self) -> bool {
+        self.seed != TEST_SEED || self.depth > 32 || self.starts != Starts::ONE
     }
 }
 
@@ -260,8 +289,8 @@ fn run_row(
 }
 
 fn evaluate(entry: &Entry, task: Option<Task>, test: &StudyTest, results: &Path) -> Result<PuzzleEvaluation, ZooError> {
-    let (givens, depth) = (test.givens, test.depth);
-    let options = PuzzleEvaluationOptions { task, givens, puzzles: STUDY_PUZZLES, depth, seed: TEST_SEED };
+    let StudyTest { givens, depth, seed, starts, .. } = *test;
+    let options = PuzzleEvaluationOptions { task, givens, puzzles: STUDY_PUZZLES, depth, seed, starts };
     Ok(evaluate_puzzles(&SolverEntry::load(entry, task)?, results, &options)?.record)
 }
 

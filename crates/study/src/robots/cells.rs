@@ -1,6 +1,6 @@
 //! What a study runs, in order.
 
-use super::file::Study;
+use super::file::{CellRow, Study};
 
 /// One training, and what it is tested on.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -13,6 +13,8 @@ pub struct Cell {
     pub seed: u64,
     /// The tests.
     pub tests: Vec<String>,
+    /// The stage of its row.
+    pub stage: u8,
 }
 
 impl Cell {
@@ -27,21 +29,27 @@ impl Cell {
     }
 }
 
-/// The cells of a study: row by row, in a row seed by seed, so that a study that is stopped has as many trainings of every
-/// arm. A training that stands in several rows is one cell with the tests of all.
+/// The cells of a study: stage by stage, row by row, in a row seed by seed, so that a study that is stopped has as many
+/// trainings of every arm. A training that stands in several rows of a stage is one cell with the tests of all; one that
+/// stands in a later stage again is another cell of the same name, with further tests.
 pub fn cells(study: &Study) -> Vec<Cell> {
     let mut cells: Vec<Cell> = Vec::new();
-    for row in &study.cells {
+    let mut rows: Vec<&CellRow> = study.cells.iter().collect();
+    rows.sort_by_key(|row| row.stage);
+    for row in rows {
         for seed in 1..=row.seeds {
             for arm in &row.arms {
-                let same = |cell: &&mut Cell| cell.arm == *arm && cell.data == row.data && cell.seed == seed;
+                let same = |cell: &&mut Cell| {
+                    cell.arm == *arm && cell.data == row.data && cell.seed == seed && cell.stage == row.stage
+                };
                 match cells.iter_mut().find(same) {
                     Some(cell) => {
                         let new: Vec<String> = row.tests.iter().filter(|t| !cell.tests.contains(t)).cloned().collect();
                         cell.tests.extend(new);
                     }
                     None => {
-                        cells.push(Cell { arm: arm.clone(), data: row.data.clone(), seed, tests: row.tests.clone() })
+                        let (arm, data, tests) = (arm.clone(), row.data.clone(), row.tests.clone());
+                        cells.push(Cell { arm, data, seed, tests, stage: row.stage });
                     }
                 }
             }
@@ -52,7 +60,6 @@ pub fn cells(study: &Study) -> Vec<Cell> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::file::CellRow;
     use super::*;
     use std::collections::BTreeMap;
 
@@ -63,7 +70,9 @@ mod tests {
             data: "d".to_owned(),
             seeds,
             tests: tests.iter().map(|t| (*t).to_owned()).collect(),
+            stage: 1,
         };
+        let later = CellRow { stage: 2, ..row(&["a"], 1, &["z"]) };
         let study = Study {
             title: String::new(),
             introduction: String::new(),
@@ -72,11 +81,18 @@ mod tests {
             data: BTreeMap::new(),
             arms: BTreeMap::new(),
             tests: BTreeMap::new(),
-            cells: vec![row(&["a", "b"], 2, &["x"]), row(&["b"], 3, &["x", "y"])],
+            cells: vec![later, row(&["a", "b"], 2, &["x"]), row(&["b"], 3, &["x", "y"])],
             comparisons: Vec::new(),
         };
         let found: Vec<String> = cells(&study).iter().map(|c| format!("{} {}", c.name(), c.tests.join("+"))).collect();
-        let expected = ["a-on-d-seed1 x", "b-on-d-seed1 x+y", "a-on-d-seed2 x", "b-on-d-seed2 x+y", "b-on-d-seed3 x+y"];
+        let expected = [
+            "a-on-d-seed1 x",
+            "b-on-d-seed1 x+y",
+            "a-on-d-seed2 x",
+            "b-on-d-seed2 x+y",
+            "b-on-d-seed3 x+y",
+            "a-on-d-seed1 z",
+        ];
         assert_eq!(found, expected);
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use models::actrm::{Intervention, Thinking};
 use serde::{Deserialize, Serialize};
 use zoo::ZooError;
 
@@ -68,6 +69,29 @@ pub struct Test {
     pub episodes: u64,
     /// Seed of the first; the others count up.
     pub seed_start: u64,
+    /// How policies think in it, where that is not as they were trained.
+    #[serde(default, skip_serializing_if = "as_trained")]
+    pub thinking: Thinking,
+}
+
+impl Test {
+    /// How policies think in it, in words; `None` where it is as they were trained.
+    pub fn thinking_words(&self) -> Option<String> {
+        let Thinking { steps, halting, intervene } = self.thinking;
+        let steps = steps.map(|n| format!("{n} step{}", if n == 1 { "" } else { "s" }));
+        let halting = match (&steps, halting) {
+            (_, None) => None,
+            (Some(_), Some(true)) => Some("at most, halting".to_owned()),
+            (None, Some(true)) => Some("halting".to_owned()),
+            (_, Some(false)) => Some("no halting".to_owned()),
+        };
+        let intervene = intervene.map(|intervention| match intervention {
+            Intervention::Freeze => "reasoning frozen after the first step".to_owned(),
+            Intervention::Shuffle => "reasoning of another episode".to_owned(),
+        });
+        let words: Vec<String> = [steps, halting, intervene].into_iter().flatten().collect();
+        (!words.is_empty()).then(|| words.join(", "))
+    }
 }
 
 /// Trainings of some arms on the same demonstrations.
@@ -82,6 +106,9 @@ pub struct CellRow {
     pub seeds: u64,
     /// What each training is tested on.
     pub tests: Vec<String>,
+    /// 1 for what was planned first; what was added later is run and reported after it.
+    #[serde(default = "first", skip_serializing_if = "is_first")]
+    pub stage: u8,
 }
 
 /// Two arms whose difference is a question of the study.
@@ -101,10 +128,25 @@ pub struct Comparison {
     /// Only episodes of these groups; of all where empty.
     #[serde(default)]
     pub groups: Vec<String>,
+    /// 1 for what was planned first; Holm's correction is made stage by stage.
+    #[serde(default = "first", skip_serializing_if = "is_first")]
+    pub stage: u8,
 }
 
 fn one() -> u64 {
     1
+}
+
+fn first() -> u8 {
+    1
+}
+
+fn is_first(stage: &u8) -> bool {
+    *stage == 1
+}
+
+fn as_trained(thinking: &Thinking) -> bool {
+    *thinking == Thinking::default()
 }
 
 impl Study {
@@ -216,6 +258,21 @@ mod tests {
         let error = open(&TEXT.replace("[arms.act]", "[arms.Act_1]")).unwrap_err();
         assert!(error.contains("cells[0].arms") || error.contains("arms.Act_1"), "{error}");
         assert!(open(&TEXT.replace("seeds = 2", "seed = 2")).unwrap_err().contains("seed"));
+    }
+
+    #[test]
+    fn a_test_may_ask_for_another_thought() {
+        let with =
+            |thinking: &str| TEXT.replace("seed_start = 40000", &format!("seed_start = 40000\nthinking = {thinking}"));
+        let words = |thinking: &str| open(&with(thinking)).unwrap().tests["lift"].thinking_words();
+        assert_eq!(open(TEXT).unwrap().tests["lift"].thinking_words(), None);
+        assert_eq!(words("{ steps = 1 }").unwrap(), "1 step");
+        assert_eq!(words("{ steps = 8, halting = true }").unwrap(), "8 steps, at most, halting");
+        assert_eq!(words("{ halting = false }").unwrap(), "no halting");
+        assert_eq!(words("{ steps = 6, intervene = \"shuffle\" }").unwrap(), "6 steps, reasoning of another episode");
+        assert!(open(&with("{ step = 1 }")).unwrap_err().contains("step"));
+        // a test as trained keeps its text
+        assert!(!serde_json::to_string(&open(TEXT).unwrap().tests["lift"]).unwrap().contains("thinking"));
     }
 
     #[test]

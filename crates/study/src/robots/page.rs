@@ -6,6 +6,7 @@ use std::path::Path;
 
 use report::statistics::{Estimate, difference, hierarchical, holm};
 use zoo::ZooError;
+use zoo::probe::{ProbeCell, ProbeResult};
 
 use super::cells::cells;
 use super::file::{Comparison, Study};
@@ -23,7 +24,7 @@ type Trainings = BTreeMap<u64, CellResult>;
 /// A result that cannot be read.
 pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
     let mut results: BTreeMap<(String, String, String), Trainings> = BTreeMap::new();
-    let mut missing = Vec::new();
+    let mut missing: BTreeMap<u8, Vec<String>> = BTreeMap::new();
     for cell in cells(study) {
         for test in &cell.tests {
             match CellResult::read(&study.results.join(cell.file_name(test)))? {
@@ -31,7 +32,7 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
                     let key = (test.clone(), cell.data.clone(), cell.arm.clone());
                     results.entry(key).or_default().insert(cell.seed, result);
                 }
-                None => missing.push(format!("{} on {test}", cell.name())),
+                None => missing.entry(cell.stage).or_default().push(format!("{} on {test}", cell.name())),
             }
         }
     }
@@ -46,7 +47,7 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
     if !study.introduction.is_empty() {
         let _ = writeln!(text, "{}\n", study.introduction.trim());
     }
-    for (name, test) in &study.tests {
+    for (name, test) in study.tests.iter().filter(|(_, test)| test.thinking_words().is_none()) {
         for data in study.data.keys() {
             let of_test: Vec<(&String, &Trainings)> = study
                 .arms
@@ -71,13 +72,24 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
             table(&mut text, study, &of_test);
         }
     }
-    comparisons(&mut text, study, &results);
+    for (stage, title) in [(1, "Comparisons"), (2, "Further comparisons, planned later")] {
+        comparisons(&mut text, study, &results, (stage, title));
+    }
+    thinking_otherwise(&mut text, study, &results);
+    probes(&mut text, study)?;
     costs(&mut text, study, &results);
     if !missing.is_empty() {
         let _ = writeln!(text, "## Not run\n");
-        missing.iter().for_each(|cell| {
+    }
+    for (stage, cells) in missing {
+        let _ = writeln!(text, "Stage {stage}:\n");
+        cells.iter().for_each(|cell| {
             let _ = writeln!(text, "- {cell}");
         });
+        text.push('\n');
+    }
+    while text.ends_with("\n\n") {
+        text.pop();
     }
     Ok(text)
 }
@@ -104,13 +116,158 @@ fn table(text: &mut String, study: &Study, rows: &[(&String, &Trainings)]) {
     let mut columns: Vec<Option<String>> = vec![None];
     columns.extend(groups.into_iter().map(Some));
     let heads: Vec<String> = columns.iter().map(|c| c.clone().unwrap_or_else(|| "all".to_owned())).collect();
-    let _ = writeln!(text, "| arm | {} |", heads.join(" | "));
-    let _ = writeln!(text, "|---|{}", "---|".repeat(heads.len()));
+    // by which words episodes were lost before their end, where results say so
+    let words: BTreeSet<&str> = rows
+        .iter()
+        .flat_map(|(_, trainings)| trainings.values())
+        .flat_map(|result| result.episodes.iter().filter_map(|episode| episode.failure.as_deref()))
+        .collect();
+    let lost: String = words.iter().map(|word| format!(" {word} |")).collect();
+    let _ = writeln!(text, "| arm | {} |{lost}", heads.join(" | "));
+    let _ = writeln!(text, "|---|{}", "---|".repeat(heads.len() + words.len()));
     for (arm, trainings) in rows {
         let cells: Vec<String> = columns.iter().map(|group| cell_text(trainings, group.as_slice())).collect();
-        let _ = writeln!(text, "| {} | {} |", study.arms[*arm].label, cells.join(" | "));
+        let share = |word: &str| -> String {
+            let all = trainings.values().flat_map(|result| &result.episodes);
+            let (lost, n) = all.fold((0.0, 0.0), |(lost, n), episode| {
+                (lost + f64::from(u8::from(episode.failure.as_deref() == Some(word))), n + 1.0)
+            });
+            format!(" {:.1}% |", 100.0 * lost / n)
+        };
+        let lost: String = words.iter().map(|word| share(word)).collect();
+        let _ = writeln!(text, "| {} | {} |{lost}", study.arms[*arm].label, cells.join(" | "));
     }
     text.push('\n');
+}
+
+/// An arm, how it thinks in words, and what came of it.
+type Otherwise<'a> = (&'a str, String, &'a Trainings);
+
+/// What the same weights do where they think otherwise than they were trained to.
+fn thinking_otherwise(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
+    let mut rows: BTreeMap<(&str, &str), Vec<Otherwise<'_>>> = BTreeMap::new();
+    for ((test, data, arm), trainings) in results {
+        let definition = &study.tests[test];
+        let Some(words) = definition.thinking_words() else { continue };
+        rows.entry((definition.task.as_str(), data.as_str())).or_default().push((arm.as_str(), words, trainings));
+    }
+    if rows.is_empty() {
+        return;
+    }
+    let _ = writeln!(
+        text,
+        "## The same weights, thinking otherwise\n\nNothing is trained again: the policies above with another number of steps, \
+         without a way to stop early, with their reasoning frozen or taken from the thought about another episode's beginning.\n"
+    );
+    for ((task, data), mut rows) in rows {
+        rows.sort_by_key(|(arm, _, trainings)| {
+            let thinking = trainings.values().next().map(|result| result.test_definition.thinking).unwrap_or_default();
+            (*arm, thinking.intervene.map(|i| i.name()), thinking.steps)
+        });
+        let groups: BTreeSet<String> = rows
+            .iter()
+            .flat_map(|(_, _, trainings)| trainings.values())
+            .flat_map(|result| result.episodes.iter().filter_map(|episode| episode.group.clone()))
+            .collect();
+        let mut columns: Vec<Option<String>> = vec![None];
+        columns.extend(groups.into_iter().map(Some));
+        let heads: Vec<String> = columns.iter().map(|c| c.clone().unwrap_or_else(|| "all".to_owned())).collect();
+        let _ = writeln!(
+            text,
+            "{task} after {} demonstrations:\n\n| arm | thinks | {} | a query, ms | MFLOP |\n|---|---|{}",
+            study.data[data].episodes,
+            heads.join(" | "),
+            "---|".repeat(heads.len() + 2)
+        );
+        for (arm, words, trainings) in rows {
+            let cells: Vec<String> = columns.iter().map(|group| cell_text(trainings, group.as_slice())).collect();
+            let of_arm: Vec<&CellResult> = trainings.values().collect();
+            let (label, cells) = (&study.arms[arm].label, cells.join(" | "));
+            let _ = writeln!(
+                text,
+                "| {label} | {words} | {cells} | {:.2} | {} |",
+                median(&of_arm, |result| result.query_ms),
+                megaflops(&of_arm)
+            );
+        }
+        text.push('\n');
+    }
+}
+
+/// What a linear probe reads from thoughts, from the files `probe_*.json` of the study's results.
+fn probes(text: &mut String, study: &Study) -> Result<(), ZooError> {
+    let failed = |source| ZooError::Io { operation: "read folder", path: study.results.clone(), source };
+    let mut files = Vec::new();
+    if study.results.is_dir() {
+        for entry in std::fs::read_dir(&study.results).map_err(failed)? {
+            let path = entry.map_err(failed)?.path();
+            if path.file_name().and_then(|name| name.to_str()).is_some_and(|name| name.starts_with("probe_")) {
+                files.push(path);
+            }
+        }
+    }
+    files.sort();
+    let _ = writeln!(
+        text,
+        "## What can be read from a thought\n\nA linear probe (`actrm-zoo probe`): which cube, by its colour, is it after i hops? \
+         Fitted to how demonstrations begin, with their colours renamed at random; read on the beginnings of fresh episodes whose \
+         chains have at least i hops, those as long as demonstrations have them, and (in brackets) longer ones. A guess is right \
+         one time in twelve; what an untrained network shows is what the observation gives away.\n"
+    );
+    if files.is_empty() {
+        let _ = writeln!(text, "Not run.\n");
+    }
+    for path in files {
+        let result = ProbeResult::read(&path)?;
+        let _ = writeln!(
+            text,
+            "`{}`, {} demonstrations shown {} times each, fresh episodes of seeds {}:\n",
+            result.entry, result.demonstrations, result.renamings, result.seeds
+        );
+        for reading in &result.readings {
+            let steps: BTreeSet<usize> = reading.cells.iter().map(|cell| cell.step).collect();
+            let head = |cell: &ProbeCell| cell.hops.map_or("the end".to_owned(), |hops| format!("{hops} hops"));
+            let of_step = |step: usize| reading.cells.iter().filter(move |cell| cell.step == step);
+            let heads: Vec<String> = steps.first().map(|&step| of_step(step).map(head).collect()).unwrap_or_default();
+            let _ = writeln!(text, "| {}, after step | {} |", reading.state, heads.join(" | "));
+            let _ = writeln!(text, "|---|{}", "---|".repeat(heads.len()));
+            for step in steps {
+                let cells: Vec<String> = of_step(step)
+                    .map(|cell| {
+                        let share = |right: u64, of: u64| match of {
+                            0 => "-".to_owned(),
+                            _ => format!("{:.0}%", 100.0 * right as f64 / of as f64),
+                        };
+                        format!("{} ({})", share(cell.right, cell.of), share(cell.right_beyond, cell.of_beyond))
+                    })
+                    .collect();
+                let _ = writeln!(text, "| {step} | {} |", cells.join(" | "));
+            }
+            text.push('\n');
+        }
+        let counts: Vec<String> = result
+            .readings
+            .first()
+            .map(|reading| reading.cells.iter().filter(|cell| cell.step == 1))
+            .into_iter()
+            .flatten()
+            .map(|cell| format!("{} ({})", cell.of, cell.of_beyond))
+            .collect();
+        let _ = writeln!(text, "Episodes behind the columns: {}.\n", counts.join(", "));
+    }
+    Ok(())
+}
+
+/// The middle value, the upper one of two.
+fn median(results: &[&CellResult], value: fn(&CellResult) -> f64) -> f64 {
+    let mut values: Vec<f64> = results.iter().map(|result| value(result)).collect();
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or_default()
+}
+
+fn megaflops(results: &[&CellResult]) -> String {
+    let counted = results.iter().find_map(|result| result.query_flops);
+    counted.map_or("-".to_owned(), |flops| format!("{:.1}", flops / 1e6))
 }
 
 /// `97% [95-99]` and, below, every training's count.
@@ -127,20 +284,25 @@ fn percent(estimate: &Estimate) -> String {
     format!("{:.1}% [{:.0}-{:.0}]", 100.0 * value, 100.0 * low, 100.0 * high)
 }
 
-fn comparisons(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
-    if study.comparisons.is_empty() {
+fn comparisons(
+    text: &mut String,
+    study: &Study,
+    results: &BTreeMap<(String, String, String), Trainings>,
+    (stage, title): (u8, &str),
+) {
+    let of_stage: Vec<&Comparison> = study.comparisons.iter().filter(|c| c.stage == stage).collect();
+    if of_stage.is_empty() {
         return;
     }
     let _ = writeln!(
         text,
-        "## Comparisons\n\nDifference of success, first less second, with its 95% interval (trainings drawn on both \
+        "## {title}\n\nDifference of success, first less second, with its 95% interval (trainings drawn on both \
          sides, episodes for both alike; Student's t for the number of trainings); p after Holm's correction over the \
          rows of this table.\n\n| question | first | second | episodes | trainings | difference | p | answer |\n\
          |---|---|---|---|---|---|---|---|"
     );
-    let found: Vec<(&Comparison, Option<_>)> = study
-        .comparisons
-        .iter()
+    let found: Vec<(&Comparison, Option<_>)> = of_stage
+        .into_iter()
         .map(|c| {
             let side = |arm: &String| {
                 let key = (c.test.clone(), c.data.clone(), arm.clone());
@@ -188,30 +350,161 @@ fn p_text(p: f64) -> String {
 fn costs(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
     let _ = writeln!(
         text,
-        "## What each costs\n\nMedians over all trainings of an arm; minutes are of a machine that did other work beside.\n\n\
-         | arm | experiment | settings | parameters | steps | minutes | a query, ms |\n|---|---|---|---|---|---|---|"
+        "## What each costs\n\nMedians over all trainings of an arm; minutes are of a machine that did other work beside. MFLOP: \
+         millions of floating-point operations in the matrix products of a query that thinks as long as it may.\n\n\
+         | arm | experiment | settings | parameters | steps | minutes | a query, ms | MFLOP |\n|---|---|---|---|---|---|---|---|"
     );
     for (name, arm) in &study.arms {
-        let of_arm: Vec<&CellResult> =
-            results.iter().filter(|((_, _, a), _)| a == name).flat_map(|(_, t)| t.values()).collect();
-        let Some(first) = of_arm.first() else { continue };
-        let median = |value: fn(&CellResult) -> f64| {
-            let mut values: Vec<f64> = of_arm.iter().map(|r| value(r)).collect();
-            values.sort_by(f64::total_cmp);
-            values[values.len() / 2]
+        let as_trained = |test: &str| study.tests[test].thinking_words().is_none();
+        let of_arm: Vec<&CellResult> = results
+            .iter()
+            .filter(|((test, _, a), _)| a == name && as_trained(test))
+            .flat_map(|(_, trainings)| trainings.values())
+            .collect();
+        let Some(first) = of_arm.first() else {
+            let settings: Vec<String> = arm.set.iter().map(|s| format!("`{s}`")).collect();
+            let settings = settings.join(", ");
+            let _ = writeln!(text, "| {} | `{}` | {settings} | not run | | | | |", arm.label, arm.experiment);
+            continue;
         };
         let settings: Vec<String> = arm.set.iter().map(|s| format!("`{s}`")).collect();
         let _ = writeln!(
             text,
-            "| {} | `{}` | {} | {} | {} | {:.1} | {:.2} |",
+            "| {} | `{}` | {} | {} | {} | {:.1} | {:.2} | {} |",
             arm.label,
             arm.experiment,
             settings.join(", "),
             first.training.parameters,
             first.training.steps,
-            median(|r| r.training.minutes),
-            median(|r| r.query_ms)
+            median(&of_arm, |r| r.training.minutes),
+            median(&of_arm, |r| r.query_ms),
+            megaflops(&of_arm)
         );
     }
     text.push('\n');
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::super::cells::Cell;
+    use super::*;
+    use zoo::probe::Reading;
+
+    const STUDY: &str = r#"
+        title = "T"
+        results = "RESULTS"
+        page = "RESULTS/page.md"
+        [data.chain]
+        task = "PickChain"
+        episodes = 200
+        [arms.one]
+        experiment = "actrm_pickchain"
+        label = "one step"
+        [arms.six]
+        experiment = "actrm_pickchain"
+        label = "six steps"
+        set = ["policy.reasoning.supervision_steps=6"]
+        [tests.t]
+        task = "PickChain"
+        episodes = 4
+        seed_start = 40000
+        [tests.t-32]
+        task = "PickChain"
+        episodes = 4
+        seed_start = 40000
+        thinking = { steps = 32 }
+        [[cells]]
+        arms = ["one", "six"]
+        data = "chain"
+        seeds = 2
+        tests = ["t"]
+        [[cells]]
+        arms = ["six"]
+        data = "chain"
+        seeds = 2
+        tests = ["t-32"]
+        stage = 2
+        [[comparisons]]
+        question = "Do they help?"
+        first = "six"
+        second = "one"
+        data = "chain"
+        test = "t"
+        [[comparisons]]
+        question = "Do they help at length?"
+        first = "six"
+        second = "one"
+        data = "chain"
+        test = "t"
+        groups = ["4 hops"]
+        stage = 2
+    "#;
+
+    /// A result of `cell` in which these episodes are solved.
+    fn result(study: &Study, cell: &Cell, test: &str, solved: [bool; 4]) -> CellResult {
+        let episode = |(i, success): (usize, &bool)| {
+            let failure = (!success).then_some("wrong");
+            serde_json::json!({"seed": 40_000 + i, "success": success, "steps": 60, "group": format!("{} hops", 3 + i % 2), "failure": failure})
+        };
+        serde_json::from_value(serde_json::json!({
+            "format": 1, "arm": cell.arm, "arm_definition": study.arms[&cell.arm], "data": cell.data,
+            "data_definition": study.data[&cell.data], "test": test, "test_definition": study.tests[test],
+            "seed": cell.seed, "settings": "0123456789", "entry": {"name": "e", "version": 1, "hash": "h"},
+            "training": {
+                "policy": "actrm", "parameters": 340_000, "steps": 6000, "minutes": 3.0, "seed": cell.seed,
+                "data_set": "d", "data_fingerprint": "f", "data_simulator": "1.5.1", "demos": 180,
+            },
+            "protocol": {
+                "rules": 1, "task": "PickChain", "env_name": "PickChain", "env_module": null,
+                "env_module_sha256": null, "env_args_sha256": null, "control": "compiled", "max_steps": 200,
+            },
+            "seeds": {"start": 40_000, "count": 4}, "versions": {}, "query_ms": 1.25, "query_flops": 42.4e6,
+            "episodes": solved.iter().enumerate().map(episode).collect::<Vec<_>>(),
+        }))
+        .unwrap()
+    }
+
+    #[test]
+    fn stages_thoughts_and_probes_have_places_of_their_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
+        let study = Study::open(&file).unwrap();
+        for cell in cells(&study).iter().filter(|cell| cell.seed == 1 || cell.stage == 1) {
+            for test in &cell.tests {
+                let result = result(&study, cell, test, [cell.arm == "six", true, test == "t-32", true]);
+                result.write(&folder.path().join(cell.file_name(test))).unwrap();
+            }
+        }
+        let page = || robot_page(&study, &file).unwrap();
+        assert!(page().contains("## What can be read from a thought") && page().contains("\nNot run.\n"));
+        let cell = |step, hops, right| ProbeCell { step, hops, right, of: 10, right_beyond: 1, of_beyond: 4 };
+        let six = result(&study, &cells(&study)[1], "t", [true; 4]);
+        let cells = vec![cell(1, Some(0), 9), cell(1, None, 3), cell(2, Some(0), 10), cell(2, None, 8)];
+        let readings = vec![Reading { state: "reasoning".into(), cells }];
+        let (entry, training, seeds) = (six.entry, six.training, six.seeds);
+        let probe = ProbeResult { format: 1, entry, training, demonstrations: 180, renamings: 16, seeds, readings };
+        probe.write(&folder.path().join("probe_six.json")).unwrap();
+        let page = page();
+        for there in [
+            "| arm | all | 3 hops | 4 hops | wrong |",
+            "| one step | 50.0%",
+            "## Comparisons\n",
+            "| Do they help? | six steps | one step | all | 2, 2 |",
+            "## Further comparisons, planned later\n",
+            "| Do they help at length? |",
+            "## The same weights, thinking otherwise\n",
+            "| six steps | 32 steps | 100.0%",
+            "| 1.25 | 42.4 |",
+            "| reasoning, after step | 0 hops | the end |\n|---|---|---|\n| 1 | 90% (25%) | 30% (25%) |",
+            "Stage 2:\n\n- six-on-chain-seed2 on t-32\n",
+        ] {
+            assert!(page.contains(there), "{there}\n---\n{page}");
+        }
+        // what is done to trained weights is no cost of an arm, and no result of stage 1 is missing
+        assert_eq!(page.matches("| six steps | `actrm_pickchain`").count(), 1);
+        assert!(!page.contains("Stage 1:"), "{page}");
+        assert!(page.ends_with("t-32\n"), "{page}");
+    }
 }

@@ -44,6 +44,9 @@ pub struct CellResult {
     pub versions: BTreeMap<String, String>,
     /// Median duration of a query in milliseconds.
     pub query_ms: f64,
+    /// Floating-point operations of a query that thinks as long as it may, where they are counted.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub query_flops: Option<f64>,
     /// Every episode, by seed.
     pub episodes: Vec<EpisodeOutcome>,
 }
@@ -58,6 +61,9 @@ pub struct EpisodeOutcome {
     pub success: bool,
     /// Control steps.
     pub steps: u32,
+    /// In a word why it was lost before the cap, where the environment says so.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
     /// The part of the report that it belongs to.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub group: Option<String>,
@@ -70,6 +76,7 @@ impl CellResult {
         (arm, data): (&Arm, &Data),
         (test, definition): (&str, &Test),
         settings: String,
+        query_flops: Option<f64>,
         evaluation: &StoredEvaluation,
     ) -> Self {
         let mut times: Vec<f64> = evaluation.timings.iter().flat_map(|t| t.inference_ms.iter().copied()).collect();
@@ -91,10 +98,17 @@ impl CellResult {
             seeds: record.seeds,
             versions: record.versions.clone(),
             query_ms: times.get(times.len() / 2).copied().unwrap_or_default(),
+            query_flops,
             episodes: evaluation
                 .episodes
                 .iter()
-                .map(|e| EpisodeOutcome { seed: e.seed, success: e.success, steps: e.steps, group: e.group.clone() })
+                .map(|e| EpisodeOutcome {
+                    seed: e.seed,
+                    success: e.success,
+                    steps: e.steps,
+                    failure: e.failure.clone(),
+                    group: e.group.clone(),
+                })
                 .collect(),
         }
     }

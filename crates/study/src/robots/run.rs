@@ -7,7 +7,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use recording::{CollectEnd, CollectOptions, collect};
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, harness_folder};
 use zoo::config::Library;
-use zoo::evaluation::{EvaluationEnd, EvaluationOptions, evaluate};
+use zoo::entry::LoadedEntry;
+use zoo::evaluation::{EvaluationEnd, EvaluationOptions, evaluate, thinking_subject};
 use zoo::experiment::Experiment;
 use zoo::registry::Registry;
 use zoo::results::Seeds;
@@ -29,6 +30,8 @@ pub struct RobotStudyRequest {
     pub work: PathBuf,
     /// Only cells whose name holds one of these; all where empty.
     pub only: Vec<String>,
+    /// Only cells of the stages up to this; of all where none is given.
+    pub stage: Option<u8>,
     /// Cells at once.
     pub jobs: usize,
     /// Python with robosuite.
@@ -68,12 +71,17 @@ pub fn run_robot_study(
 ) -> Result<bool, StudyError> {
     let study = &request.study;
     let all = cells(study);
-    let chosen = |cell: &Cell| request.only.is_empty() || request.only.iter().any(|o| cell.name().contains(o.as_str()));
+    let chosen = |cell: &Cell| {
+        let named = request.only.is_empty() || request.only.iter().any(|o| cell.name().contains(o.as_str()));
+        named && request.stage.is_none_or(|last| cell.stage <= last)
+    };
     let total: usize = all.iter().map(|cell| cell.tests.len()).sum();
+    let training = all.iter().map(|cell| (cell.name(), Mutex::new(()))).collect();
     let mut due = VecDeque::new();
     let mut there = 0;
     for cell in all {
         let missing = missing_tests(request, &cell)?;
+        count_operations(request, &cell, &missing)?;
         there += cell.tests.len() - missing.len();
         if !missing.is_empty() && chosen(&cell) {
             due.push_back(cell);
@@ -87,6 +95,7 @@ pub fn run_robot_study(
         total,
         on_event: Mutex::new(on_event),
         collecting: study.data.keys().map(|name| (name.clone(), Mutex::new(()))).collect(),
+        training,
         failure: Mutex::new(None),
     };
     std::thread::scope(|scope| {
@@ -119,6 +128,24 @@ fn missing_tests(request: &RobotStudyRequest, cell: &Cell) -> Result<Vec<String>
     Ok(missing)
 }
 
+/// Writes into results that were made before operations were counted how many a query has, where the entry is still there.
+fn count_operations(request: &RobotStudyRequest, cell: &Cell, missing: &[String]) -> Result<(), StudyError> {
+    for test in cell.tests.iter().filter(|test| !missing.contains(test)) {
+        let path = request.study.results.join(cell.file_name(test));
+        let Some(result) = CellResult::read(&path)?.filter(|result| result.query_flops.is_none()) else { continue };
+        let zoo = request.work.join("zoo");
+        let name = format!("{}-{}", cell.name(), &result.settings[..8]);
+        if !zoo.join(&name).exists() {
+            continue;
+        }
+        let query_flops = Registry::open(&zoo).entry(&name)?.load()?.model().query_flops();
+        if query_flops.is_some() {
+            CellResult { query_flops, ..result }.write(&path)?;
+        }
+    }
+    Ok(())
+}
+
 /// The experiment of a cell, and the hash of what it depends on: not its name, seed and path.
 fn experiment(request: &RobotStudyRequest, cell: &Cell) -> Result<(Experiment, String), StudyError> {
     let arm = &request.study.arms[&cell.arm];
@@ -142,6 +169,8 @@ struct Shared<'a> {
     on_event: Mutex<&'a mut (dyn FnMut(RobotEvent<'_>) + Send)>,
     /// held while demonstrations of that name are collected
     collecting: BTreeMap<String, Mutex<()>>,
+    /// held while the training of that cell is under way
+    training: BTreeMap<String, Mutex<()>>,
     failure: Mutex<Option<StudyError>>,
 }
 
@@ -182,6 +211,7 @@ impl Shared<'_> {
         // another definition is another entry, so that a changed arm is trained anew
         let runs = self.request.work.join("runs").join(format!("{}-{}", cell.name(), &settings[..8]));
         let name = format!("{}-{}", cell.name(), &settings[..8]);
+        let training = lock(&self.training[&cell.name()]);
         if !zoo.join(&name).exists() {
             let request = TrainRequest {
                 name: arm.experiment.clone(),
@@ -202,15 +232,22 @@ impl Shared<'_> {
                 return Ok(CellEnd::Stopped);
             }
         }
+        drop(training);
         let entry = Registry::open(&zoo).entry(&name)?.load()?;
         for test in missing_tests(self.request, cell)? {
             let definition = &study.tests[&test];
             self.tell(RobotEvent::Testing(&cell.name(), &test));
-            let Some(evaluation) = self.evaluate(&entry.subject(), definition, &zoo.join("results"))? else {
+            // what an entry does where it thinks otherwise is no result of the entry
+            let results = match definition.thinking_words() {
+                None => zoo.join("results"),
+                Some(_) => self.request.work.join("otherwise").join(&test),
+            };
+            let Some(evaluation) = self.evaluate(&entry, definition, &results)? else {
                 return Ok(CellEnd::Stopped);
             };
             let of_test = (test.as_str(), definition);
-            let result = CellResult::new(cell, (arm, data), of_test, settings.clone(), &evaluation);
+            let flops = entry.thinking(&definition.thinking)?.model().query_flops();
+            let result = CellResult::new(cell, (arm, data), of_test, settings.clone(), flops, &evaluation);
             result.write(&study.results.join(cell.file_name(&test)))?;
             self.tell(RobotEvent::Result(&result));
             let mut done = lock(&self.done);
@@ -264,7 +301,7 @@ impl Shared<'_> {
     /// A finished evaluation; nothing if it was stopped.
     fn evaluate(
         &self,
-        subject: &zoo::evaluation::Subject<'_>,
+        entry: &LoadedEntry,
         test: &Test,
         results: &Path,
     ) -> Result<Option<Box<zoo::results::StoredEvaluation>>, StudyError> {
@@ -275,7 +312,11 @@ impl Shared<'_> {
             env_module: None,
             force: false,
         };
-        let end = evaluate(subject, &mut pool, results, &options, &mut |_| {});
+        let end = match thinking_subject(entry, &test.thinking, &mut pool) {
+            Ok(Some(subject)) => evaluate(&subject, &mut pool, results, &options, &mut |_| {}),
+            Ok(None) => return Ok(None),
+            Err(error) => Err(error),
+        };
         pool.close();
         match end? {
             EvaluationEnd::Complete(evaluation) => Ok(Some(evaluation)),

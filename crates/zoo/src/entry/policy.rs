@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use models::{Normaliser, Policy, PolicyModel, Preprocess};
+use models::actrm::{Actrm, Thinking};
+use models::{ModelError, Normaliser, Policy, PolicyModel, Preprocess};
 
 use crate::evaluation::WallClock;
 use crate::experiment::Experiment;
@@ -71,6 +72,35 @@ impl LoadedEntry {
     /// Raw values to what the network reads, and back.
     pub fn preprocess(&self) -> &Arc<Preprocess> {
         &self.preprocess
+    }
+
+    /// The same weights in a policy that thinks as `thinking` says.
+    ///
+    /// # Errors
+    /// A policy that cannot think so.
+    pub fn thinking(&self, thinking: &Thinking) -> Result<Self, ZooError> {
+        let failed = |source| self.failed("change the thinking of", source);
+        let policy = self.experiment.policy.thinking(thinking).map_err(failed)?;
+        let model = policy.build(&self.entry.meta().signature, 0).map_err(failed)?;
+        model.params().load(&self.model.params().tensors()).map_err(failed)?;
+        let experiment = Experiment { policy, ..self.experiment.clone() };
+        Ok(Self { experiment, model: model.into(), ..self.clone() })
+    }
+
+    /// The network of a policy that thinks step by step, to look into its thoughts; `None` of the others.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    pub fn reasoner(&self) -> Result<Option<Arc<Actrm>>, ZooError> {
+        let Some(config) = self.experiment.policy.reasoner() else { return Ok(None) };
+        let failed = |source| self.failed("build the policy of", source);
+        let model = Actrm::new(config, &self.entry.meta().signature, 0).map_err(failed)?;
+        model.params().load(&self.model.params().tensors()).map_err(failed)?;
+        Ok(Some(Arc::new(model)))
+    }
+
+    pub(crate) fn failed(&self, operation: &'static str, source: ModelError) -> ZooError {
+        ZooError::Model { operation, name: self.entry.id().to_string(), source }
     }
 
     /// A policy for one environment, with a state of its own; it shares the weights with all others.

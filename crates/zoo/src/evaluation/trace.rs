@@ -7,13 +7,15 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use arrow::array::{ArrayRef, BooleanArray, Float64Array, Float64Builder, ListBuilder, UInt32Array, UInt64Array};
-use models::{ActionChunk, ModelError, Observation, Policy, ThoughtStep};
+use models::actrm::{Actrm, Config, Over};
+use models::{ActionChunk, ModelError, Observation, Policy, Preprocess, ThoughtStep};
 use rollout::{EpisodePlan, Outcome, Pool, RolloutError, Worker};
 use serde::Serialize;
 
 use super::Subject;
 use super::agent::PolicyAgent;
 use crate::ZooError;
+use crate::entry::LoadedEntry;
 use crate::results::write_table;
 
 /// One episode of a policy.
@@ -31,6 +33,9 @@ pub struct PolicyTrace {
     pub steps: usize,
     /// Sum of the rewards.
     pub total_reward: f64,
+    /// What the numbers of an attention stand for; empty where nobody looked.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub attended: Vec<String>,
     /// Every time that the policy was asked.
     pub queries: Vec<TracedQuery>,
 }
@@ -48,6 +53,39 @@ pub struct TracedQuery {
     pub thought: Vec<TracedThought>,
 }
 
+/// Looks into a policy's thoughts while its episode is traced.
+#[derive(Clone)]
+pub struct Examiner {
+    model: Arc<Actrm>,
+    preprocess: Arc<Preprocess>,
+}
+
+impl Examiner {
+    /// Of an entry that thinks step by step about its actions, each thought from the same start; `None` of others.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    pub fn of(entry: &LoadedEntry) -> Result<Option<Self>, ZooError> {
+        let fits = |config: &Config| config.reasoning.over == Over::Actions && config.reasoning.warm_start.is_none();
+        if !entry.experiment().policy.reasoner().is_some_and(fits) {
+            return Ok(None);
+        }
+        let of = |model| Self { model, preprocess: Arc::clone(entry.preprocess()) };
+        Ok(entry.reasoner()?.map(of))
+    }
+
+    /// What the attention's numbers stand for.
+    pub fn names(&self) -> Vec<String> {
+        self.model.context_names()
+    }
+
+    /// By step, by action: the attention to each of [`Examiner::names`].
+    fn attention(&self, seen: &[Observation], steps: usize) -> Result<Vec<Vec<Vec<f32>>>, ModelError> {
+        let steps = self.model.examine(&self.preprocess.observation(seen)?, steps, None)?;
+        steps.iter().map(|step| Ok(step.attention.squeeze(0)?.to_vec2::<f32>()?)).collect()
+    }
+}
+
 /// The answer after one step of a thought.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TracedThought {
@@ -59,6 +97,9 @@ pub struct TracedThought {
     pub halt: Option<f32>,
     /// How long the step took.
     pub milliseconds: f64,
+    /// Of each action: its share of attention to each of the trace's `attended`; absent where nobody looked.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub attention: Vec<Vec<f32>>,
 }
 
 /// The queries of an episode under way, shared with the policy that fills them.
@@ -69,6 +110,17 @@ struct Traced {
     policy: Box<dyn Policy>,
     queries: Queries,
     step: usize,
+    examiner: Option<Examiner>,
+    /// the observations that the policy sees at once, oldest first
+    seen: Vec<Observation>,
+}
+
+impl Traced {
+    fn see(&mut self, observation: &Observation) {
+        self.seen.push(observation.clone());
+        let surplus = self.seen.len().saturating_sub(self.policy.n_obs_steps());
+        self.seen.drain(..surplus);
+    }
 }
 
 fn rows(chunk: &ActionChunk) -> Vec<Vec<f32>> {
@@ -82,11 +134,17 @@ impl Policy for Traced {
         let milliseconds = asked.elapsed().as_secs_f64() * 1e3;
         let of = |step: ThoughtStep| {
             let ThoughtStep { chunk, change, halt, milliseconds } = step;
-            TracedThought { actions: rows(&chunk), change, halt: Some(halt), milliseconds }
+            TracedThought { actions: rows(&chunk), change, halt: Some(halt), milliseconds, attention: Vec::new() }
         };
         let mut thought: Vec<TracedThought> = self.policy.thought()?.into_iter().map(of).collect();
         if thought.is_empty() {
-            thought.push(TracedThought { actions: rows(&chunk), change: None, halt: None, milliseconds });
+            let (actions, attention) = (rows(&chunk), Vec::new());
+            thought.push(TracedThought { actions, change: None, halt: None, milliseconds, attention });
+        }
+        self.see(observation);
+        if let Some(examiner) = &self.examiner {
+            let attention = examiner.attention(&self.seen, thought.len())?;
+            thought.iter_mut().zip(attention).for_each(|(thought, attention)| thought.attention = attention);
         }
         let query = TracedQuery { step: self.step, executed: 0, milliseconds, thought };
         self.queries.lock().unwrap_or_else(PoisonError::into_inner).push(query);
@@ -98,6 +156,7 @@ impl Policy for Traced {
     }
 
     fn observe(&mut self, observation: &Observation) {
+        self.see(observation);
         self.policy.observe(observation);
     }
 
@@ -111,6 +170,7 @@ impl Policy for Traced {
 
     fn reset(&mut self, seed: u64) {
         self.step = 0;
+        self.seen.clear();
         self.queries.lock().unwrap_or_else(PoisonError::into_inner).clear();
         self.policy.reset(seed);
     }
@@ -120,16 +180,23 @@ impl Policy for Traced {
     }
 }
 
-/// Runs the episode of `seed` as an evaluation would and keeps what the policy thought; nothing if it was stopped.
+/// Runs the episode of `seed` as an evaluation would and keeps what the policy thought, with what its action tokens
+/// attended to where `examiner` looks; nothing if it was stopped.
 ///
 /// # Errors
 /// As for an evaluation.
-pub fn trace(subject: &Subject<'_>, pool: &mut Pool, seed: u64) -> Result<Option<PolicyTrace>, RolloutError> {
+pub fn trace(
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+    seed: u64,
+    examiner: Option<&Examiner>,
+) -> Result<Option<PolicyTrace>, RolloutError> {
     let (task, max_steps) = (pool.ready().task.clone(), subject.max_steps.unwrap_or(pool.ready().max_steps));
     let plan = EpisodePlan::new(pool.ready(), subject.keys.keys(), max_steps)?;
     let state = || {
         let queries = Queries::default();
-        let traced = |policy| Traced { policy, queries: Arc::clone(&queries), step: 0 };
+        let (queries_of, examiner) = (Arc::clone(&queries), examiner.cloned());
+        let traced = |policy| Traced { policy, queries: queries_of, step: 0, examiner, seen: Vec::new() };
         let made = (subject.policy)().and_then(|policy| subject.acting(traced(policy)));
         let operation = "building the policy";
         let made =
@@ -159,6 +226,7 @@ pub fn trace(subject: &Subject<'_>, pool: &mut Pool, seed: u64) -> Result<Option
         success: outcome.success,
         steps: outcome.steps,
         total_reward: outcome.total_reward,
+        attended: examiner.map(Examiner::names).unwrap_or_default(),
         queries,
     }))
 }
@@ -199,7 +267,8 @@ impl PolicyTrace {
     }
 
     /// As a table with a row for each action of each answer: `step` of the query, `thought` from 1, `ahead` from 0,
-    /// `executed`, `change`, `halt`, `milliseconds` of the thought's step, `action`.
+    /// `executed`, `change`, `halt`, `milliseconds` of the thought's step, `action`, and a column `attention to NAME` for each
+    /// token that actions attended to, if somebody looked.
     ///
     /// # Errors
     /// A file that cannot be written.
@@ -239,7 +308,66 @@ impl PolicyTrace {
             ("milliseconds", numbers(&|thought| Some(thought.milliseconds))),
             ("action", Arc::new(actions.finish())),
         ];
-        write_table(path, columns)
+        let names: Vec<String> = self.attended.iter().map(|name| format!("attention to {name}")).collect();
+        let attended = names.iter().enumerate().map(|(token, name)| {
+            let of = |row: &(usize, usize, usize, bool, &TracedThought, &Vec<f32>)| {
+                Some(f64::from(*row.4.attention.get(row.2)?.get(token)?))
+            };
+            (name.as_str(), Arc::new(rows.iter().map(of).collect::<Float64Array>()) as ArrayRef)
+        });
+        write_table(path, columns.into_iter().chain(attended).collect())
+    }
+
+    /// What the actions attended to as a drawing: a row a step of thought, a column a token, mean over the actions; darker is
+    /// more. `None` where nobody looked.
+    pub fn attention_svg(&self) -> Option<String> {
+        const CELL: usize = 14;
+        const TOP: usize = 190;
+        const LEFT: usize = 120;
+        let columns = self.attended.len();
+        let rows: Vec<(String, Vec<f32>)> = self
+            .queries
+            .iter()
+            .flat_map(|query| {
+                query.thought.iter().enumerate().map(move |(at, thought)| {
+                    let label = if at == 0 { format!("step {}, thought 1", query.step) } else { (at + 1).to_string() };
+                    let actions = thought.attention.len().max(1) as f32;
+                    let mean = |token: usize| thought.attention.iter().map(|row| row[token]).sum::<f32>() / actions;
+                    (label, (0..columns).map(mean).collect())
+                })
+            })
+            .collect();
+        if columns == 0 || rows.is_empty() {
+            return None;
+        }
+        let (width, height) = (LEFT + columns * CELL + 10, TOP + rows.len() * CELL + 10);
+        let mut svg = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" font-family=\"sans-serif\" \
+             font-size=\"10\">\n<rect width=\"{width}\" height=\"{height}\" fill=\"white\"/>\n\
+             <text x=\"6\" y=\"16\" font-size=\"12\">{} on {}, seed {}: what actions attend to</text>\n",
+            self.entry, self.task, self.seed
+        );
+        for (column, name) in self.attended.iter().enumerate() {
+            let (x, y) = (LEFT + column * CELL + CELL - 4, TOP - 4);
+            let short = name.rsplit('.').next().unwrap_or(name);
+            let _ = writeln!(svg, "<text transform=\"translate({x} {y}) rotate(-90)\">{short}</text>");
+        }
+        for (row, (label, shares)) in rows.iter().enumerate() {
+            let y = TOP + row * CELL;
+            let _ = writeln!(svg, "<text x=\"{}\" y=\"{}\" text-anchor=\"end\">{label}</text>", LEFT - 4, y + CELL - 4);
+            for (column, share) in shares.iter().enumerate() {
+                let (x, size) = (LEFT + column * CELL, CELL - 1);
+                // the root, so that small shares can be told apart
+                let dark = share.max(0.0).sqrt();
+                let _ = writeln!(
+                    svg,
+                    "<rect x=\"{x}\" y=\"{y}\" width=\"{size}\" height=\"{size}\" fill=\"#1b3a6b\" \
+                     fill-opacity=\"{dark:.3}\"><title>{share:.3}</title></rect>"
+                );
+            }
+        }
+        svg.push_str("</svg>\n");
+        Some(svg)
     }
 }
 
@@ -257,6 +385,7 @@ mod tests {
             change,
             halt,
             milliseconds: 0.25,
+            attention: vec![vec![0.25, 0.75], vec![1.0, 0.0]],
         };
         PolicyTrace {
             entry: "lift-actrm@1".into(),
@@ -265,6 +394,7 @@ mod tests {
             success: true,
             steps: 3,
             total_reward: 1.0,
+            attended: vec!["z0".into(), "observation.entity.cube0".into()],
             queries: vec![
                 TracedQuery {
                     step: 0,
@@ -302,7 +432,18 @@ mod tests {
         let halt = batch.column_by_name("halt").unwrap();
         assert_eq!(halt.null_count(), 2);
         let actions = batch.column_by_name("action").unwrap().as_list::<i32>();
+        let cube = batch.column_by_name("attention to observation.entity.cube0").unwrap();
+        assert_eq!(cube.as_primitive::<arrow::datatypes::Float64Type>().values()[..3], [0.75, 0.0, 0.75]);
         let last = actions.value(4);
         assert_eq!(last.as_primitive::<arrow::datatypes::Float64Type>().values()[..], [1.0, -1.0]);
+    }
+
+    #[test]
+    fn the_drawing_has_a_row_for_each_step_of_a_thought() {
+        let svg = sample().attention_svg().unwrap();
+        assert_eq!(svg.matches("<title>").count(), 3 * 2);
+        assert!(svg.contains(">cube0</text>") && svg.contains(">step 2, thought 1</text>"), "{svg}");
+        assert!(svg.contains("<title>0.625</title>"), "the mean over both actions: {svg}");
+        assert_eq!(PolicyTrace { attended: Vec::new(), ..sample() }.attention_svg(), None);
     }
 }

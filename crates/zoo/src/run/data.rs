@@ -223,6 +223,26 @@ pub(super) fn prepare(
     Ok(Demonstrations { train, valid, preprocess, symmetries, picture_statistics, meta, notes })
 }
 
+/// The windows of the episodes that a training of `experiment` learns from, its symmetries, and the number of each episode's
+/// first window. An HDF5 file is converted into `work`.
+///
+/// # Errors
+/// What a training would refuse.
+pub(crate) fn first_windows(
+    path: &Path,
+    work: &Path,
+    experiment: &Experiment,
+) -> Result<(Windows, Symmetries, Vec<u32>), ZooError> {
+    std::fs::create_dir_all(work).map_err(ZooError::io("create folder", work))?;
+    let dataset = open(path, work, experiment, &mut |_, _| {})?;
+    let all = || (0..dataset.episodes().len()).collect();
+    let episodes: Vec<usize> = dataset.split(&experiment.data.train_mask).unwrap_or_else(all);
+    let lengths = episodes.iter().map(|&episode| dataset.episodes()[episode].length as u32);
+    let firsts = lengths.scan(0, |next, length| Some(std::mem::replace(next, *next + length))).collect();
+    let demonstrations = prepare(&dataset, path, &path.display().to_string(), experiment)?;
+    Ok((demonstrations.train, demonstrations.symmetries, firsts))
+}
+
 /// Mean and standard deviation of three colours.
 fn colours(stats: &FeatureStats) -> Option<([f32; 3], [f32; 3])> {
     let three = |values: &[f64]| -> Option<[f32; 3]> {

@@ -17,6 +17,7 @@ mod training;
 mod validation;
 
 pub use checkpoint::Checkpoint;
+pub(crate) use data::first_windows;
 pub use data::locate;
 pub use folder::{COMMAND_FILE, RunFolder};
 pub use list::{FoundRun, RunState, list_runs};

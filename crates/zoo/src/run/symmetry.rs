@@ -21,7 +21,7 @@ use crate::experiment::Experiment;
 const PURPOSE: u64 = 0x5359_4d4d_4554_5259;
 
 /// The symmetries of a run.
-pub(super) struct Symmetries {
+pub(crate) struct Symmetries {
     seed: u64,
     all: Vec<Symmetry>,
 }

@@ -42,6 +42,7 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval --all --episodes 20
   actrm-zoo eval trm-dfs10 --puzzles 600
   actrm-zoo eval trm-dfs10 --task dfs16 --depth 32
+  actrm-zoo eval trm-dfs10 --task dfs20 --depth 32 --starts 8
   actrm-zoo eval lift-act --episodes 3 --video 3
   actrm-zoo eval lift-act --episodes 50 --again
   actrm-zoo eval lift-act --episodes 200 --shard 2/8")]

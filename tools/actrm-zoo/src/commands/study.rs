@@ -20,6 +20,7 @@ const GOES_ON: &str = "stopped; the same command goes on where it was";
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo study studies/thinking.toml --jobs 2
+  actrm-zoo study studies/thinking.toml --stage 1
   actrm-zoo study studies/thinking.toml --page-only
   actrm-zoo study --page docs/puzzles.md
   actrm-zoo study --only trm_dfs10 --only trm_open8 --seeds 1
@@ -44,6 +45,9 @@ pub struct Args {
     /// Only this experiment (of robot policies: cells whose name holds this); may be repeated
     #[arg(long, value_name = "EXPERIMENT")]
     only: Vec<String>,
+    /// Only what was planned up to this stage, of a study of robot policies
+    #[arg(long, value_name = "N", requires = "study")]
+    stage: Option<u8>,
     /// Only the seeds up to this
     #[arg(long, value_name = "N")]
     seeds: Option<u64>,
@@ -125,6 +129,7 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
             library: args.configs.library()?,
             work: args.work.join(file.file_stem().unwrap_or_default()),
             only: args.only.clone(),
+            stage: args.stage,
             jobs: usize::from(args.jobs),
             python: rollout::find_python(args.python.as_deref())?,
             stop: stop.flag(),

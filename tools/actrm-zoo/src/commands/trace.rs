@@ -15,7 +15,8 @@ use crate::puzzles::family;
 /// Show what an entry thought, step by step: a puzzle solver about a puzzle, a robot policy in an episode
 ///
 /// Of a puzzle: the grid, how sure the solver was of each cell, whether it would stop. Of an episode: every query and every
-/// step of the thought behind it, with the answer's change, the halting head's probability and the time.
+/// step of the thought behind it, with the answer's change, the halting head's probability and the time; in JSON, Parquet and
+/// the drawing also what the actions attended to.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo trace trm-dfs10
@@ -23,7 +24,8 @@ use crate::puzzles::family;
   actrm-zoo trace trm-dfs10 --task dfs16 --depth 24
   actrm-zoo trace trm-sudoku4 --json
   actrm-zoo trace lift-actrm --seed 10003
-  actrm-zoo trace lift-actrm --seed 10003 --parquet trace.parquet")]
+  actrm-zoo trace lift-actrm --seed 10003 --parquet trace.parquet
+  actrm-zoo trace pickchain-actrm --seed 30000 --svg attention.svg")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
@@ -54,7 +56,7 @@ pub struct Args {
     /// Print JSON instead of text
     #[arg(long)]
     json: bool,
-    /// Write a strip of pictures of a puzzle to this file instead
+    /// Draw to this file: of a puzzle, instead of text, a strip of pictures; of an episode what its actions attended to
     #[arg(long, value_name = "FILE", conflicts_with = "json")]
     svg: Option<PathBuf>,
     #[command(flatten)]
@@ -82,24 +84,31 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
         ("--index", args.index.is_some()),
         ("--depth", args.depth.is_some()),
         ("--givens", args.givens.is_some()),
-        ("--svg", args.svg.is_some()),
         ("--workers", args.simulator.workers.is_some()),
     ];
     refuse(entry, "a robot policy of which one episode is shown", &of_puzzles)?;
-    let subject = entry.load()?.subject();
+    let loaded = entry.load()?;
+    let (subject, examiner) = (loaded.subject(), evaluation::Examiner::of(&loaded)?);
+    if args.svg.is_some() && examiner.is_none() {
+        bail!("--svg means nothing for {}: it does not think step by step about its actions from one start", entry.id());
+    }
     let stop = Stop::install("stopped")?;
     let SimulatorArgs { env_module, python, .. } = &args.simulator;
     let one = SimulatorArgs { workers: Some(1), env_module: env_module.clone(), python: python.clone() };
     let mut spec = one.spec(args.task.as_deref().unwrap_or(&subject.task))?;
     spec.control = args.control;
     let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
-    let traced = evaluation::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED));
+    let traced = evaluation::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED), examiner.as_ref());
     cli::close(pool);
     let Some(traced) = traced.with_context(|| format!("entry {}", entry.id()))? else {
         return Ok(ExitCode::from(INTERRUPTED));
     };
     if let Some(path) = &args.parquet {
         traced.write_parquet(path)?;
+    }
+    if let (Some(path), Some(svg)) = (&args.svg, traced.attention_svg()) {
+        write_atomic(path, svg.as_bytes())?;
+        cli::note(&shown(path));
     }
     match args.json {
         true => cli::print_json(&traced)?,

@@ -32,6 +32,7 @@ use crate::chunk_policy::ChunkPolicy;
 use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
+use crate::flops;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
@@ -240,6 +241,18 @@ impl PolicyModel for Act {
 
     fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
         Box::new(ChunkPolicy::new(self, preprocess))
+    }
+
+    fn query_flops(&self) -> Option<f64> {
+        let (shape, layout) = (self.config.shape(), self.tokens.layout());
+        if layout.cameras.is_some() {
+            return None;
+        }
+        let (memory, horizon) = (layout.len(), self.config.action_horizon);
+        let encoder = flops::encoder_layer(shape, memory) * self.config.n_encoder_layers as f64;
+        let decoder = flops::decoder_layer(shape, horizon, memory) * self.config.n_decoder_layers as f64;
+        let head = flops::linear(horizon, shape.dim, self.signature.action_dim);
+        Some(flops::tokens(layout, self.config.latent_dim, shape.dim) + encoder + decoder + head)
     }
 
     fn action_horizon(&self) -> usize {

@@ -6,6 +6,7 @@ use crate::layers::{Activation, Shape};
 use crate::models::act;
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 
 /// What the recursion refines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -64,6 +65,27 @@ pub struct ReasoningConfig {
     pub halt_margin: f64,
     /// start from the previous query's answer (`over = "actions"`)
     pub warm_start: Option<WarmStart>,
+    /// a block of its own for every supervision step of the training instead of a shared one (`over = "actions"`): the same
+    /// depth and work, as many times the weights; steps beyond apply the last block
+    #[serde(skip_serializing_if = "is_default")]
+    pub untied: bool,
+    /// in training a thought begins with normal noise of this standard deviation instead of zero, at inference with its
+    /// mean, zero (`over = "actions"`)
+    #[serde(skip_serializing_if = "is_default")]
+    pub start_noise: f64,
+    /// whether the answer of every supervision step has a loss; else only the last one's has
+    #[serde(skip_serializing_if = "is_true")]
+    pub deep_supervision: bool,
+}
+
+// settings that came later are left out where they change nothing, so that a configuration keeps its text
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
+}
+
+fn is_true(value: &bool) -> bool {
+    *value
 }
 
 impl Default for ReasoningConfig {
@@ -83,6 +105,9 @@ impl Default for ReasoningConfig {
             halt_weight: 0.1,
             halt_margin: 0.02,
             warm_start: None,
+            untied: false,
+            start_noise: 0.0,
+            deep_supervision: true,
         }
     }
 }
@@ -105,6 +130,17 @@ impl ReasoningConfig {
     /// Most steps at inference.
     pub fn max_steps(&self) -> usize {
         self.max_steps.unwrap_or(self.supervision_steps)
+    }
+
+    /// Blocks with weights of their own.
+    pub fn blocks(&self) -> usize {
+        if self.untied { self.supervision_steps } else { 1 }
+    }
+
+    /// The layers of the block that supervision step `step`, from 0, applies.
+    pub(super) fn layers_of(&self, step: usize) -> Range<usize> {
+        let first = step.min(self.blocks() - 1) * self.n_layers;
+        first..first + self.n_layers
     }
 }
 
@@ -203,8 +239,9 @@ impl Config {
         let block = Shape { hidden: self.block_feedforward(), ..self.shape() };
         let tokens = if self.reasoning.over == Over::Actions { self.action_horizon } else { self.reasoning.tokens };
         let block = block.size(1, tokens) * self.reasoning.n_layers;
-        // the weights are shared by all steps, the last round of each keeps its activations
-        let steps = Size { weights: block.weights, ..block * self.reasoning.supervision_steps };
+        // weights are shared by all steps unless untied, the last round of each keeps its activations
+        let weights = block.weights * self.reasoning.blocks() as f64;
+        let steps = Size { weights, ..block * self.reasoning.supervision_steps };
         // over actions there is no decoder, over the memory no encoder beside the block
         let (encoder, decoder) = match self.reasoning.over {
             Over::Actions => (self.n_memory_layers, 0),
@@ -253,6 +290,7 @@ impl Config {
             ("reasoning.halt_weight", r.halt_weight),
             ("reasoning.halt_margin", r.halt_margin),
             ("reasoning.budget_ms", r.budget_ms.unwrap_or(0.0)),
+            ("reasoning.start_noise", r.start_noise),
             ("reasoning.warm_start.noise", r.warm_start.map_or(0.0, |w| w.noise)),
         ] {
             if !(value.is_finite() && value >= 0.0) {
@@ -261,6 +299,13 @@ impl Config {
         }
         if r.warm_start.is_some() && r.over == Over::Memory {
             return refuse("reasoning.warm_start", "present".into(), "absent with over = \"memory\"");
+        }
+        if r.untied && r.over == Over::Memory {
+            return refuse("reasoning.untied", "true".into(), "false with over = \"memory\"");
+        }
+        if r.start_noise > 0.0 && (r.over == Over::Memory || r.warm_start.is_some()) {
+            let expected = "0 with over = \"memory\" or a warm start";
+            return refuse("reasoning.start_noise", r.start_noise.to_string(), expected);
         }
         Ok(())
     }

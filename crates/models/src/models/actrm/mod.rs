@@ -21,6 +21,9 @@
 //! Validation and inference run at latent zero, as ACT's do (the original validates with the
 //! posterior of the true actions, which flatters it).
 //!
+//! Variants for comparison (`over = "actions"`): `reasoning.untied` gives every supervision step a block of its own,
+//! `start_noise` begins thoughts with noise in training, `deep_supervision = false` leaves only the last step its loss.
+//!
 //! Halting: a head reads the reasoning after each step and is trained on whether one more step
 //! would still lower this sample's chunk error. For the last step's target one more step runs
 //! without gradient.
@@ -29,12 +32,14 @@
 //! hand-written backward passes (`fused/`); tests hold the two together.
 
 mod config;
+mod examine;
 mod fused;
 mod reasoning;
 #[cfg(test)]
 mod tests;
 
 pub use config::{Config, Over, ReasoningConfig, WarmStart};
+pub use examine::{DisturbedPolicy, ExaminedStep, Intervention, Thinking};
 pub use reasoning::{Reasoning, ReasoningPolicy, ReasoningStep};
 
 use crate::batch::Batch;
@@ -43,6 +48,7 @@ use crate::classification::binary_cross_entropy;
 use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
+use crate::flops;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
@@ -103,6 +109,7 @@ struct OverActions {
     latent_pos: Embedding,
     /// (H, D), added to y before every update
     action_pos: Embedding,
+    /// of the shared block, or of every supervision step's block one after the other
     layers: Vec<BlockLayer>,
 }
 
@@ -189,7 +196,7 @@ impl Actrm {
                 },
                 latent_pos: Embedding::new(&mut p, "reasoning.latent_pos_embed", r.tokens, dim, rng)?,
                 action_pos: Embedding::new(&mut p, "reasoning.action_pos_embed", config.action_horizon, dim, rng)?,
-                layers: (0..r.n_layers)
+                layers: (0..r.blocks() * r.n_layers)
                     .map(|i| BlockLayer::new(&mut p, &format!("reasoning.layers.{i}"), config, rng))
                     .collect::<Result<_>>()?,
             }),
@@ -259,16 +266,21 @@ impl Actrm {
         })
     }
 
-    /// One supervision step. Earlier rounds than the last are detached call by call, so that their
-    /// graphs are freed as they go.
-    fn step(&self, memory: &Tensor, carry: &Carry, mode: &mut Mode<'_>) -> Result<Step> {
+    /// Supervision step number `at`, from 0. Earlier rounds than the last are detached call by call, so that their graphs
+    /// are freed as they go.
+    fn step(&self, memory: &Tensor, carry: &Carry, at: usize, mode: &mut Mode<'_>) -> Result<Step> {
         let mut carry = carry.clone();
         for round in 1..=self.config.reasoning.h_cycles {
             carry = match round == self.config.reasoning.h_cycles {
-                true => self.round(memory, &carry, false)?,
-                false => self.round(&memory.detach(), &carry.detach(), true)?,
+                true => self.round(memory, &carry, at, false)?,
+                false => self.round(&memory.detach(), &carry.detach(), at, true)?,
             };
         }
+        self.answer(carry, mode)
+    }
+
+    /// What a carry says.
+    fn answer(&self, carry: Carry, mode: &mut Mode<'_>) -> Result<Step> {
         let chunk = self.action_head.forward(&match &self.design {
             Design::Actions(_) => carry.answer.clone(),
             Design::Memory(design) => {
@@ -286,20 +298,19 @@ impl Actrm {
     }
 
     /// `l_cycles` updates of the reasoning, one of the answer.
-    fn round(&self, memory: &Tensor, carry: &Carry, quiet: bool) -> Result<Carry> {
+    fn round(&self, memory: &Tensor, carry: &Carry, at: usize, quiet: bool) -> Result<Carry> {
         let Carry { mut answer, mut reasoning } = carry.clone();
         let settle = |x: Tensor| if quiet { x.detach() } else { x };
         match &self.design {
             Design::Actions(design) => {
-                let action_pos = design.action_pos.weight.unsqueeze(0)?;
-                let latent_pos = design.latent_pos.weight.unsqueeze(0)?;
-                let y = answer.broadcast_add(&action_pos)?;
+                let layers = &design.layers[self.config.reasoning.layers_of(at)];
+                let y = positioned(&answer, &design.action_pos)?;
                 for _ in 0..self.config.reasoning.l_cycles {
-                    let z = reasoning.broadcast_add(&latent_pos)?;
-                    reasoning = settle(design.update(&z, &[&z, &y, memory])?);
+                    let z = positioned(&reasoning, &design.latent_pos)?;
+                    reasoning = settle(update(layers, &z, &[&z, &y, memory])?);
                 }
-                let z = reasoning.broadcast_add(&latent_pos)?;
-                answer = settle(design.update(&y, &[&z, &y, memory])?);
+                let z = positioned(&reasoning, &design.latent_pos)?;
+                answer = settle(update(layers, &y, &[&z, &y, memory])?);
             }
             Design::Memory(design) => {
                 let pos = self.tokens.positions()?;
@@ -325,9 +336,10 @@ impl Actrm {
     }
 
     /// Weights of the supervision steps, which sum to 1: growing with depth over actions (late
-    /// steps are what is executed), equal over the memory (the original's).
+    /// steps are what is executed), equal over the memory (the original's); all the last one's without deep supervision.
     fn step_weights(&self, steps: usize) -> Vec<f64> {
         let weight = |i: usize| match self.config.reasoning.over {
+            _ if !self.config.reasoning.deep_supervision => f64::from(u8::from(i + 1 == steps)),
             Over::Actions => (i + 1) as f64,
             Over::Memory => 1.0,
         };
@@ -366,8 +378,8 @@ impl Actrm {
         let latent = Tensor::zeros((batch.rows(), self.config.latent_dim), DType::F32, batch.device())?;
         let memory = self.memory(&latent, &observation, &mut Mode::Eval)?.detach();
         let mut thought = carry.clone();
-        for _ in 0..self.config.reasoning.supervision_steps {
-            thought = self.step(&memory, &thought, &mut Mode::Eval)?.carry.detach();
+        for at in 0..self.config.reasoning.supervision_steps {
+            thought = self.step(&memory, &thought, at, &mut Mode::Eval)?.carry.detach();
         }
         let warm: Vec<f32> = (0..batch.rows()).map(|_| if rng.uniform() < 0.5 { 1.0 } else { 0.0 }).collect();
         let warm = Tensor::from_vec(warm, (batch.rows(), 1, 1), batch.device())?;
@@ -375,16 +387,19 @@ impl Actrm {
     }
 }
 
-impl OverActions {
-    /// x: (b, t, D), context: tokens to attend to -> (b, t, D)
-    fn update(&self, x: &Tensor, context: &[&Tensor]) -> Result<Tensor> {
-        let context = Tensor::cat(context, 1)?;
-        let mut x = x.clone();
-        for layer in &self.layers {
-            x = layer.forward(&x, &context)?;
-        }
-        Ok(x)
+/// x: (b, t, D), positions of the t tokens -> their sum
+fn positioned(x: &Tensor, positions: &Embedding) -> Result<Tensor> {
+    Ok(x.broadcast_add(&positions.weight.unsqueeze(0)?)?)
+}
+
+/// A block's layers on x: (b, t, D), context: tokens to attend to -> (b, t, D)
+fn update(layers: &[BlockLayer], x: &Tensor, context: &[&Tensor]) -> Result<Tensor> {
+    let context = Tensor::cat(context, 1)?;
+    let mut x = x.clone();
+    for layer in layers {
+        x = layer.forward(&x, &context)?;
     }
+    Ok(x)
 }
 
 /// The fixed values that `z_h` and `z_l` begin with, (D) each: a pure function of the width, so that nothing untrained
@@ -427,11 +442,18 @@ impl PolicyModel for Actrm {
         if let Some(warm) = self.config.reasoning.warm_start {
             carry.answer = self.warm_answers(batch, warm, &carry, rng)?;
         }
+        let noise = self.config.reasoning.start_noise;
+        if noise > 0.0 {
+            for state in [&mut carry.answer, &mut carry.reasoning] {
+                let drawn = Tensor::from_vec(rng.normals(state.elem_count()), state.shape(), batch.device())?;
+                *state = (drawn * noise)?;
+            }
+        }
 
         let steps = self.steps_of(batch);
         let (mut chunks, mut halts) = (Vec::new(), Vec::new());
-        for _ in 0..steps {
-            let step = self.step(&memory, &carry, &mut Mode::Train(rng))?;
+        for at in 0..steps {
+            let step = self.step(&memory, &carry, at, &mut Mode::Train(rng))?;
             carry = match self.config.reasoning.over {
                 Over::Actions => step.carry,
                 Over::Memory => step.carry.detach(),
@@ -440,7 +462,7 @@ impl PolicyModel for Actrm {
             halts.push(step.halt_logit);
         }
         // one step more, so that the last depth has a halting target as well
-        let beyond = self.step(&memory.detach(), &carry.detach(), &mut Mode::Eval)?.chunk.detach();
+        let beyond = self.step(&memory.detach(), &carry.detach(), steps, &mut Mode::Eval)?.chunk.detach();
 
         let (b, c, a) = batch.actions.dims3()?;
         let valid = (1.0 - batch.is_pad.reshape((b, c, 1))?)?;
@@ -495,6 +517,27 @@ impl PolicyModel for Actrm {
 
     fn depends_on_time(&self) -> bool {
         self.config.reasoning.budget_ms.is_some()
+    }
+
+    fn query_flops(&self) -> Option<f64> {
+        let (config, r, layout) = (&self.config, &self.config.reasoning, self.tokens.layout());
+        if r.over == Over::Memory || layout.cameras.is_some() {
+            return None;
+        }
+        let (dim, memory, horizon) = (config.dim_model, layout.len(), config.action_horizon);
+        let block = Shape { hidden: config.block_feedforward(), ..config.shape() };
+        let context = r.tokens + horizon + memory;
+        let keys_and_values = |tokens: usize| flops::linear(tokens, dim, 2 * dim);
+        // queries and what they take home, the context's keys and values beside those that serve several updates
+        let update = |tokens: usize| {
+            let attention = flops::linear(tokens, dim, 2 * dim) + flops::mixing(tokens, context, dim);
+            keys_and_values(r.tokens) + attention + flops::dense(block, tokens)
+        };
+        let round = keys_and_values(horizon) + update(r.tokens) * r.l_cycles as f64 + update(horizon);
+        let step = round * (r.h_cycles * r.n_layers) as f64 + flops::linear(horizon, dim, self.signature.action_dim);
+        let once = flops::encoder_layer(config.shape(), memory) * config.n_memory_layers as f64
+            + keys_and_values(memory) * (r.blocks() * r.n_layers) as f64;
+        Some(flops::tokens(layout, config.latent_dim, dim) + once + step * r.max_steps() as f64)
     }
 
     fn action_horizon(&self) -> usize {

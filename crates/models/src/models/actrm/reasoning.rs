@@ -81,7 +81,7 @@ impl Actrm {
         }
         let mut thought = Thought::new(&self.config.reasoning, rows, should_stop);
         loop {
-            let step = self.step(&memory, &carry, &mut Mode::Eval)?;
+            let step = self.step(&memory, &carry, thought.steps.len(), &mut Mode::Eval)?;
             carry = Carry::detach(&step.carry);
             if thought.step(step.chunk.detach(), &step.halt_logit.to_vec1()?)? {
                 return thought.end(carry.answer);

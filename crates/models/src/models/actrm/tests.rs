@@ -270,6 +270,173 @@ fn the_policy_keeps_to_its_budget_and_starts_warm() {
 }
 
 #[test]
+fn settings_that_change_nothing_are_not_written() {
+    let text = serde_json::to_string(&small(ReasoningConfig::default())).unwrap();
+    for field in ["untied", "start_noise", "deep_supervision"] {
+        assert!(!text.contains(field), "{field} is in {text}: configurations would not keep their text");
+    }
+    let changed = ReasoningConfig { untied: true, start_noise: 0.5, deep_supervision: false, ..Default::default() };
+    let text = serde_json::to_string(&changed).unwrap();
+    assert_eq!(serde_json::from_str::<ReasoningConfig>(&text).unwrap(), changed);
+}
+
+#[test]
+fn untied_steps_have_blocks_of_their_own_and_the_shared_one_is_the_first() {
+    let tied = small(ReasoningConfig::default());
+    let untied = small(ReasoningConfig { untied: true, ..ReasoningConfig::default() });
+    let model = |config: &Config| Actrm::new(config, &signature(), 1).unwrap();
+    let (tied, free) = (model(&tied), model(&untied));
+    let of_block = |model: &Actrm| -> usize {
+        model
+            .params()
+            .iter()
+            .filter(|(name, _)| name.starts_with("reasoning.layers."))
+            .map(|(_, v)| v.elem_count())
+            .sum()
+    };
+    assert_eq!(of_block(&free), 3 * of_block(&tied));
+    assert_eq!(free.params().count() - of_block(&free), tied.params().count() - of_block(&tied));
+    // with the same weights in every block it is the shared one
+    for (name, var) in free.params().iter() {
+        let source = match name.strip_prefix("reasoning.layers.").and_then(|rest| rest.split_once('.')) {
+            Some((_, rest)) => format!("reasoning.layers.0.{rest}"),
+            None => name.to_string(),
+        };
+        var.set(&tied.params().get(&source).unwrap().as_tensor().copy().unwrap()).unwrap();
+    }
+    free.params().changed();
+    let batch = batch(tied.config(), 3, 1);
+    let chunk =
+        |model: &Actrm| model.predict(&batch.observation).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let (a, b) = (chunk(&tied), chunk(&free));
+    assert!(a.iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-6));
+    // another last block, another answer
+    let var = free.params().get("reasoning.layers.2.linear1.weight").unwrap();
+    var.set(&(var.as_tensor().copy().unwrap() * 2.0).unwrap()).unwrap();
+    free.params().changed();
+    assert_ne!(chunk(&free), b);
+}
+
+#[test]
+fn without_deep_supervision_only_the_last_answer_counts() {
+    let config = small(ReasoningConfig { deep_supervision: false, halt_weight: 0.0, ..ReasoningConfig::default() });
+    let config = Config { use_vae: false, ..config };
+    let model = Actrm::new(&config, &signature(), 1).unwrap();
+    let loss = model.loss(&batch(&config, 4, 0), &mut Rng::new(0, "loss")).unwrap();
+    assert!((value(&loss.total) - value(&loss.parts["l1_loss"])).abs() < 1e-6);
+    assert!((value(&loss.total) - value(&loss.parts["l1_loss_first"])).abs() > 1e-4);
+}
+
+#[test]
+fn thoughts_begin_with_noise_in_training_only() {
+    let with = |start_noise: f64| small(ReasoningConfig { start_noise, ..ReasoningConfig::default() });
+    let (plain, noisy) = (with(0.0), with(1.0));
+    let loss = |config: &Config, seed: u64| {
+        let model = Actrm::new(&Config { use_vae: false, ..config.clone() }, &signature(), 1).unwrap();
+        value(&model.loss(&batch(config, 4, 0), &mut Rng::new(seed, "loss")).unwrap().total)
+    };
+    assert_eq!(loss(&plain, 0), loss(&plain, 1));
+    assert_ne!(loss(&noisy, 0), loss(&noisy, 1));
+    let predict = |config: &Config| {
+        let model = Actrm::new(config, &signature(), 1).unwrap();
+        model.predict(&batch(config, 4, 0).observation).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap()
+    };
+    assert_eq!(predict(&plain), predict(&noisy));
+}
+
+#[test]
+fn a_thought_looked_into_is_the_thought() {
+    let still = ReasoningConfig { halt_threshold: 1.0, change_threshold: 0.0, ..ReasoningConfig::default() };
+    let deep = ReasoningConfig { h_cycles: 2, l_cycles: 2, n_layers: 2, untied: true, ..still.clone() };
+    for config in [small(still), small(deep)] {
+        let config = Config { reasoning: ReasoningConfig { max_steps: Some(5), ..config.reasoning.clone() }, ..config };
+        let model = Actrm::new(&config, &signature(), 5).unwrap();
+        let batch = batch(&config, 3, 1);
+        let thought = model.reason(&batch.observation, None, &mut |_| false).unwrap();
+        let steps = model.examine(&batch.observation, 5, None).unwrap();
+        let off = |a: &Tensor, b: &Tensor| value(&(a - b).unwrap().abs().unwrap().max_all().unwrap());
+        for (seen, step) in steps.iter().zip(&thought.steps) {
+            assert!(off(&seen.chunk, &step.chunk) < 1e-5);
+            // every action token's attention is a share
+            let names = model.context_names();
+            assert_eq!(seen.attention.dims(), [3, 5, names.len()]);
+            let sums = seen.attention.sum(2).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-5));
+        }
+        let frozen = model.examine(&batch.observation, 5, Some(Intervention::Freeze)).unwrap();
+        assert_eq!(off(&frozen[0].chunk, &steps[0].chunk), 0.0);
+        assert_eq!(off(&frozen[4].reasoning, &steps[0].reasoning), 0.0);
+        assert!(off(&frozen[4].chunk, &steps[4].chunk) > 0.0);
+        let shuffled = model.examine(&batch.observation, 5, Some(Intervention::Shuffle)).unwrap();
+        for row in 0..3 {
+            let of = |step: &ExaminedStep, row: usize| step.reasoning.narrow(0, row, 1).unwrap();
+            assert_eq!(off(&of(&shuffled[3], row), &of(&steps[3], (row + 1) % 3)), 0.0);
+        }
+        let one = batch.observation.map(|_, values| values.narrow(0, 0, 1).unwrap());
+        assert!(model.examine(&one, 2, Some(Intervention::Shuffle)).unwrap_err().to_string().contains("2 to shuffle"));
+    }
+    let memory = Actrm::new(&designs()[2], &signature(), 5).unwrap();
+    let error = memory.examine(&batch(&designs()[2], 2, 1).observation, 2, None).unwrap_err().to_string();
+    assert!(error.contains("reasoning.over"), "{error}");
+}
+
+#[test]
+fn a_trained_policy_can_be_asked_to_think_otherwise() {
+    let config = small(ReasoningConfig { budget_ms: Some(1.0), ..ReasoningConfig::default() });
+    let of = |thinking: &Thinking| config.thinking(thinking).unwrap().reasoning;
+    assert_eq!(of(&Thinking::default()), config.reasoning);
+    let exactly = of(&Thinking { steps: Some(7), ..Thinking::default() });
+    assert_eq!((exactly.max_steps(), exactly.halt_threshold, exactly.change_threshold), (7, 1.0, 0.0));
+    assert_eq!((exactly.supervision_steps, exactly.budget_ms), (3, None));
+    let at_most = of(&Thinking { steps: Some(7), halting: Some(true), ..Thinking::default() });
+    assert_eq!((at_most.max_steps(), at_most.halt_threshold), (7, config.reasoning.halt_threshold));
+    assert_eq!(of(&Thinking { halting: Some(false), ..Thinking::default() }).max_steps(), 3);
+    let both = Thinking { halting: Some(true), intervene: Some(Intervention::Freeze), ..Thinking::default() };
+    assert!(config.thinking(&both).unwrap_err().to_string().contains("thinking.halting"));
+    assert!(config.thinking(&Thinking { steps: Some(0), ..Thinking::default() }).is_err());
+    let act = PolicyConfig::Act(act::Config::default());
+    assert_eq!(act.thinking(&Thinking::default()).unwrap(), act);
+    assert!(act.thinking(&Thinking { steps: Some(2), ..Thinking::default() }).is_err());
+}
+
+#[test]
+fn a_disturbed_policy_depends_on_the_episode_only() {
+    let config =
+        small(ReasoningConfig::default()).thinking(&Thinking { steps: Some(4), ..Thinking::default() }).unwrap();
+    let model = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
+    let others = Arc::new((10..13).map(observation).collect::<Vec<_>>());
+    let make =
+        |intervene| DisturbedPolicy::new(Arc::clone(&model), identity(), intervene, Arc::clone(&others)).unwrap();
+    let mut policy = make(Intervention::Shuffle);
+    let mut of = |seed: u64| {
+        policy.reset(seed);
+        policy.predict(&observation(1)).unwrap()
+    };
+    let first = of(0);
+    assert_ne!(of(1), first, "another thought's reasoning");
+    assert_eq!((of(0), of(3)), (first.clone(), first.clone()));
+    let undisturbed = Arc::clone(&model).policy(identity(), ticking()).predict(&observation(1)).unwrap();
+    assert_ne!(first, undisturbed);
+    assert_ne!(make(Intervention::Freeze).predict(&observation(1)).unwrap(), undisturbed);
+    let nobody = DisturbedPolicy::new(model, identity(), Intervention::Shuffle, Arc::default());
+    assert!(nobody.is_err());
+}
+
+#[test]
+fn untied_steps_and_more_steps_cost_what_they_are() {
+    let flops =
+        |reasoning: ReasoningConfig| Actrm::new(&small(reasoning), &signature(), 1).unwrap().query_flops().unwrap();
+    let of = |supervision_steps: usize, untied: bool| {
+        flops(ReasoningConfig { supervision_steps, untied, ..ReasoningConfig::default() })
+    };
+    let step = of(2, false) - of(1, false);
+    assert!((of(6, false) - of(1, false) - 5.0 * step).abs() < 1e-3);
+    // 3 tokens of memory: keys and values for each block
+    assert_eq!(of(6, true) - of(6, false), 5.0 * 2.0 * (3 * 16 * 32) as f64);
+    assert!(step > 0.0);
+}
+
+#[test]
 fn impossible_configurations_name_the_field() {
     let with = |change: &dyn Fn(&mut Config)| {
         let mut config = small(ReasoningConfig::default());
@@ -281,6 +448,9 @@ fn impossible_configurations_name_the_field() {
         (with(&|c| c.reasoning.tokens = 0), "reasoning.tokens"),
         (with(&|c| c.reasoning.max_steps = Some(0)), "reasoning.max_steps"),
         (with(&|c| c.reasoning.halt_threshold = 1.5), "reasoning.halt_threshold"),
+        (with(&|c| (c.reasoning.over, c.reasoning.untied) = (Over::Memory, true)), "reasoning.untied"),
+        (with(&|c| (c.reasoning.over, c.reasoning.start_noise) = (Over::Memory, 1.0)), "reasoning.start_noise"),
+        (with(&|c| c.reasoning.start_noise = f64::NAN), "reasoning.start_noise"),
     ] {
         assert!(error.contains(field), "{error}");
     }

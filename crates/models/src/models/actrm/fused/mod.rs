@@ -59,8 +59,8 @@ trait Recursion<'m>: Sized {
     /// Reads the observations.
     fn observe(model: &'m Actrm, pass: &mut Pass<'_>, tokens: &Tokens<'_>, rows: usize) -> Self;
 
-    /// One supervision step.
-    fn step(&self, pass: &mut Pass<'_>, carry: &Carry) -> Step<Self::Trace>;
+    /// Supervision step number `at`, from 0.
+    fn step(&self, pass: &mut Pass<'_>, carry: &Carry, at: usize) -> Step<Self::Trace>;
 
     /// Takes the gradient of the step's chunk, (b, H, A), and of the carry that it left, if that flows; returns that of
     /// the carry it began with, if it does.
@@ -159,15 +159,18 @@ impl Actrm {
         let tokens = Tokens::new(self.tokens.layout(), (&latent, config.latent_dim), &data.inputs);
         let mut recursion = R::observe(self, pass, &tokens, rows);
         let answer = config.reasoning.warm_start.map(|warm| self.warm_answers_fused::<R>(pass, data, warm));
-        let start = Carry { answer, reasoning: None };
+        let start = match config.reasoning.start_noise > 0.0 {
+            true => self.noisy_start(pass, rows),
+            false => Carry { answer, reasoning: None },
+        };
         let mut done: Vec<Step<R::Trace>> = Vec::with_capacity(steps);
-        for _ in 0..steps {
+        for at in 0..steps {
             let carry = done.last().map_or(&start, |step| &step.carry);
-            done.push(recursion.step(pass, carry));
+            done.push(recursion.step(pass, carry, at));
         }
         // one step more, so that the last depth has a halting target as well
         let carry = done.last().map_or(&start, |step| &step.carry);
-        let beyond = quietly(pass, |pass| recursion.step(pass, carry));
+        let beyond = quietly(pass, |pass| recursion.step(pass, carry, steps));
 
         let entries = data.total_entries as f64;
         let mut loss = LossValues::default();
@@ -222,6 +225,20 @@ impl Actrm {
         loss
     }
 
+    /// Both states of a thought, drawn as the composed model draws them (`over = "actions"`).
+    fn noisy_start(&self, pass: &mut Pass<'_>, rows: usize) -> Carry {
+        let mut draw = |tokens: usize| {
+            let mut state = pass.take(rows * tokens * self.config.dim_model);
+            let rng = pass.rng.as_mut().expect("a training step has a generator");
+            let noise = rng.normals(state.len());
+            let scale = self.config.reasoning.start_noise as f32;
+            state.iter_mut().zip(noise).for_each(|(x, noise)| *x = noise * scale);
+            state
+        };
+        let answer = Some(draw(self.config.action_horizon));
+        Carry { answer, reasoning: Some(draw(self.config.reasoning.tokens)) }
+    }
+
     /// `warm_answers` of the composed model.
     fn warm_answers_fused<'m, R: Recursion<'m>>(
         &'m self,
@@ -240,8 +257,8 @@ impl Actrm {
         let mut answer = quietly(pass, |pass| {
             let recursion = R::observe(self, pass, &tokens, data.rows);
             let mut carry = Carry::default();
-            for _ in 0..self.config.reasoning.supervision_steps {
-                let step = recursion.step(pass, &carry);
+            for at in 0..self.config.reasoning.supervision_steps {
+                let step = recursion.step(pass, &carry, at);
                 let next = R::forget(pass, step);
                 std::mem::replace(&mut carry, next).free(pass);
             }
@@ -294,8 +311,8 @@ impl Actrm {
         let recursion = R::observe(self, pass, &tokens, rows);
         let mut carry = Carry { answer: start, reasoning: None };
         let shape = (rows, self.config.action_horizon, self.signature.action_dim);
-        loop {
-            let step = recursion.step(pass, &carry);
+        for at in 0.. {
+            let step = recursion.step(pass, &carry, at);
             let logits = step.halt_logits(pass);
             let chunk = Tensor::from_slice(&step.chunk, shape, &Device::Cpu)?;
             let halted = on_step(chunk, logits.clone())?;

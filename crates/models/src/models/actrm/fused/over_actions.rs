@@ -19,7 +19,7 @@ pub(super) struct OverActions<'m> {
     encoder: Option<Encoder>,
     /// (b, M, D), positions added
     memory: Vec<f32>,
-    /// its keys and values for each layer, (b, M, 2D)
+    /// its keys and values for each layer of every block, (b, M, 2D)
     memory_kv: Vec<Vec<f32>>,
     /// and their gradients, once one is there
     memory_kv_grad: Vec<Vec<f32>>,
@@ -34,6 +34,8 @@ struct Update {
 
 /// What the backward pass of a round needs.
 pub(super) struct Round {
+    /// number of its block's first layer
+    first_layer: usize,
     /// the answer before it with positions, (b, H, D), or (H, D) if it was zero
     y: Vec<f32>,
     /// the reasoning with positions that each update saw, likewise
@@ -90,8 +92,9 @@ impl OverActions<'_> {
         self.memory.len() / (self.rows * self.config.dim_model)
     }
 
-    /// `l_cycles` updates of the reasoning, one of the answer.
-    fn round(&self, pass: &mut Pass<'_>, carry: &Carry) -> (Carry, Round) {
+    /// `l_cycles` updates of the reasoning, one of the answer, by the block that begins with layer `first_layer`.
+    fn round(&self, pass: &mut Pass<'_>, carry: &Carry, first_layer: usize) -> (Carry, Round) {
+        let prefix = |i: usize| attention_prefix(first_layer + i);
         let (dim, horizon) = (pass.shape.dim, self.config.action_horizon);
         let (tokens, l_cycles) = (self.config.reasoning.tokens, self.config.reasoning.l_cycles);
         let action_pos = pass.weight("reasoning.action_pos_embed", ".weight");
@@ -100,7 +103,7 @@ impl OverActions<'_> {
         // a thought that begins at zero reads its positions alone
         let y_parameter = carry.answer.is_none().then_some("the action positions");
         let y_input = Input { x: &y, parameter: y_parameter };
-        let y_kv: Vec<_> = (0..self.n_layers()).map(|i| keys_and_values(pass, &attention_prefix(i), y_input)).collect();
+        let y_kv: Vec<_> = (0..self.n_layers()).map(|i| keys_and_values(pass, &prefix(i), y_input)).collect();
         let mut z = vec![positioned(pass, carry.reasoning.as_deref(), latent_pos)];
         let mut updates = Vec::with_capacity(l_cycles + 1);
         let mut settled: Option<Vec<f32>> = None;
@@ -112,16 +115,17 @@ impl OverActions<'_> {
             let (first, queries) = if of_answer { (y_input, horizon) } else { (seen, tokens) };
             let (mut inputs, mut layers) = (Vec::<Vec<f32>>::new(), Vec::with_capacity(self.n_layers()));
             for (i, y_kv) in y_kv.iter().enumerate() {
-                let z_kv = keys_and_values(pass, &attention_prefix(i), seen);
+                let z_kv = keys_and_values(pass, &prefix(i), seen);
                 let parts = [
                     Part { values: &z_kv, tokens },
                     Part { values: y_kv, tokens: horizon },
-                    Part { values: &self.memory_kv[i], tokens: self.memory_tokens() },
+                    Part { values: &self.memory_kv[first_layer + i], tokens: self.memory_tokens() },
                 ];
                 let kv = gather(pass, self.rows, 2 * dim, &parts);
                 pass.give(z_kv);
                 let input = inputs.last().map_or(first, |x| Input { x, parameter: None });
-                let (out, layer) = BlockLayer::forward(pass, layer_prefix(i), (self.rows, queries), input, kv);
+                let name = layer_prefix(first_layer + i);
+                let (out, layer) = BlockLayer::forward(pass, name, (self.rows, queries), input, kv);
                 inputs.push(out);
                 layers.push(layer);
             }
@@ -129,7 +133,7 @@ impl OverActions<'_> {
             updates.push(Update { inputs, layers });
             if of_answer {
                 y_kv.into_iter().for_each(|buffer| pass.give(buffer));
-                return (Carry { answer: out, reasoning: settled }, Round { y, z, updates });
+                return (Carry { answer: out, reasoning: settled }, Round { first_layer, y, z, updates });
             }
             z.push(positioned(pass, out.as_deref(), latent_pos));
             if let Some(before) = std::mem::replace(&mut settled, out) {
@@ -142,7 +146,7 @@ impl OverActions<'_> {
     fn round_backward(&mut self, pass: &mut Pass<'_>, round: Round, after: Carry, grads: &mut Grads<'_>) -> Carry {
         let (dim, tokens, horizon) = (pass.shape.dim, self.config.reasoning.tokens, self.config.action_horizon);
         let memory_tokens = self.memory_tokens();
-        let Round { y, z, updates } = round;
+        let Round { first_layer, y, z, updates } = round;
         let mut y_kv_grad: Vec<_> = (0..self.n_layers()).map(|_| pass.space.pool.zeros(2 * y.len())).collect();
         // what will be the gradient of y once the answer's update, the last, is passed
         let (mut out_grad, mut reasoning_grad) = (after.answer, after.reasoning);
@@ -163,10 +167,11 @@ impl OverActions<'_> {
                 let mut parts = [
                     (&mut z_kv_grad[..], tokens),
                     (&mut y_kv_grad[i][..], horizon),
-                    (&mut self.memory_kv_grad[i][..], memory_tokens),
+                    (&mut self.memory_kv_grad[first_layer + i][..], memory_tokens),
                 ];
                 scatter(&kv_grad, 2 * dim, &mut parts);
-                keys_and_values_backward(pass, &attention_prefix(i), &seen, &z_kv_grad, &mut z_grad, grads);
+                let prefix = attention_prefix(first_layer + i);
+                keys_and_values_backward(pass, &prefix, &seen, &z_kv_grad, &mut z_grad, grads);
                 pass.give(kv_grad);
                 pass.give(z_kv_grad);
             }
@@ -187,7 +192,8 @@ impl OverActions<'_> {
         }
         let mut y_grad = y_grad.expect("the answer is updated in every round");
         for (i, kv_grad) in y_kv_grad.into_iter().enumerate() {
-            keys_and_values_backward(pass, &attention_prefix(i), &y, &kv_grad, &mut y_grad, grads);
+            let prefix = attention_prefix(first_layer + i);
+            keys_and_values_backward(pass, &prefix, &y, &kv_grad, &mut y_grad, grads);
             pass.give(kv_grad);
         }
         add_sequences(slot(grads, "reasoning.action_pos_embed", ".weight"), &y_grad);
@@ -208,21 +214,22 @@ impl<'m> Recursion<'m> for OverActions<'m> {
             (memory, encoder) = (out, Some(done));
         }
         memory.chunks_exact_mut(pos.len()).for_each(|sequence| add(sequence, pos));
-        let layers = 0..config.reasoning.n_layers;
+        let layers = 0..config.reasoning.blocks() * config.reasoning.n_layers;
         let memory_kv = layers
             .map(|i| keys_and_values(pass, &attention_prefix(i), Input { x: &memory, parameter: None }))
             .collect();
         Self { config, rows, encoder, memory, memory_kv, memory_kv_grad: Vec::new() }
     }
 
-    fn step(&self, pass: &mut Pass<'_>, carry: &Carry) -> Step<Round> {
+    fn step(&self, pass: &mut Pass<'_>, carry: &Carry, at: usize) -> Step<Round> {
+        let first_layer = self.config.reasoning.layers_of(at).start;
         shaped(pass, self.inner(), |pass| {
-            let (mut after, mut round) = self.round(pass, carry);
+            let (mut after, mut round) = self.round(pass, carry, first_layer);
             // earlier rounds than the last leave no trace
             for _ in 1..self.config.reasoning.h_cycles {
                 round.free(pass);
                 let before = after;
-                (after, round) = self.round(pass, &before);
+                (after, round) = self.round(pass, &before, first_layer);
                 before.free(pass);
             }
             let (answer, reasoning) = (after.answer.as_ref(), after.reasoning.as_ref());

@@ -86,7 +86,7 @@ impl<'m> Recursion<'m> for OverMemory<'m> {
         Self { config, rows, tokens, tokens_grad, layout: model.tokens.layout(), positions, start }
     }
 
-    fn step(&self, pass: &mut Pass<'_>, carry: &Carry) -> Step<Trace> {
+    fn step(&self, pass: &mut Pass<'_>, carry: &Carry, _at: usize) -> Step<Trace> {
         let (after, updates) = shaped(pass, self.inner(), |pass| {
             let (mut after, mut updates) = self.round(pass, carry);
             // earlier rounds than the last leave no trace

@@ -43,6 +43,8 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         (reasoning(&|_| ()), plain.clone(), 3),
         (reasoning(&|r| r.warm_start = warm), entities.clone(), 3),
         (reasoning(&|_| ()), history.clone(), 2),
+        (reasoning(&|r| (r.untied, r.n_layers, r.h_cycles, r.l_cycles) = (true, 2, 2, 2)), entities.clone(), 3),
+        (reasoning(&|r| (r.start_noise, r.deep_supervision) = (0.7, false)), plain.clone(), 3),
         (memory(&|r| r.supervision_steps = 2), entities, 2),
         (memory(&|_| ()), history, 2),
         (

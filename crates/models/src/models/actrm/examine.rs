@@ -1,0 +1,228 @@
+//! Looking into a thought: its states after every step, what its action tokens attend to, and what becomes of it where
+//! its reasoning is tampered with. On candle's autograd: for measurements, not for speed.
+
+use super::{Actrm, Config, Design, positioned, update};
+use crate::error::{ModelError, Result};
+use crate::features::{Features, Observation};
+use crate::history::History;
+use crate::layers::Mode;
+use crate::policy::{ActionChunk, Policy};
+use crate::preprocess::Preprocess;
+use candle_core::{DType, Tensor};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// What is done to the reasoning `z` of a thought, while its answer `y` goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Intervention {
+    /// It stays as the first step left it.
+    Freeze,
+    /// After every update it is that of another observation's thought.
+    Shuffle,
+}
+
+impl Intervention {
+    /// Every one.
+    pub const ALL: [Self; 2] = [Self::Freeze, Self::Shuffle];
+
+    /// Its name in commands and files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Freeze => "freeze",
+            Self::Shuffle => "shuffle",
+        }
+    }
+}
+
+/// How a trained policy thinks where that is not as its configuration says; it is not trained again for it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Thinking {
+    /// Supervision steps: exactly so many, or with halting at most
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub steps: Option<usize>,
+    /// Whether a thought may stop before its last step; by default as configured, and no where `steps` are given
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub halting: Option<bool>,
+    /// What is done to its reasoning; such thoughts do not halt
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub intervene: Option<Intervention>,
+}
+
+impl Config {
+    /// The configuration of a model with the same weights that thinks otherwise.
+    ///
+    /// # Errors
+    /// No steps; halting together with an intervention.
+    pub fn thinking(&self, thinking: &Thinking) -> Result<Self> {
+        let mut config = self.clone();
+        let reasoning = &mut config.reasoning;
+        if thinking.halting == Some(true) && thinking.intervene.is_some() {
+            let (found, expected) = ("true".to_string(), "false with an intervention".to_string());
+            return Err(ModelError::Config { model: "actrm", field: "thinking.halting", found, expected });
+        }
+        if thinking.steps.is_some() {
+            (reasoning.max_steps, reasoning.budget_ms) = (thinking.steps, None);
+        }
+        let halting = thinking.halting.unwrap_or(thinking.steps.is_none() && thinking.intervene.is_none());
+        if !halting {
+            (reasoning.halt_threshold, reasoning.change_threshold, reasoning.budget_ms) = (1.0, 0.0, None);
+        }
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+/// What there is to see after a supervision step.
+#[derive(Debug, Clone)]
+pub struct ExaminedStep {
+    /// (b, H, A), network units
+    pub chunk: Tensor,
+    /// (b, H, D): the answer's state
+    pub answer: Tensor,
+    /// (b, R, D): the reasoning's state
+    pub reasoning: Tensor,
+    /// (b, H, R + H + M): what each action token attended to as it was updated last, mean of the heads of the block's first
+    /// layer; the columns are [`Actrm::context_names`]
+    pub attention: Tensor,
+}
+
+impl Actrm {
+    /// A thought of so many steps about observations in network units, (b, …) each, from the usual start; no rule stops it.
+    /// Shuffled, a row goes on with the reasoning of the next row's own thought, the last with the first's.
+    ///
+    /// # Errors
+    /// Inputs of the wrong shape, `over = "memory"`, a shuffle of a single row.
+    pub fn examine(
+        &self,
+        observation: &Features<Tensor>,
+        steps: usize,
+        intervene: Option<Intervention>,
+    ) -> Result<Vec<ExaminedStep>> {
+        let rows = self.check_inputs(observation)?;
+        let Design::Actions(design) = &self.design else {
+            let (found, expected) = ("memory".to_string(), "actions, to look into a thought".to_string());
+            return Err(ModelError::Config { model: "actrm", field: "reasoning.over", found, expected });
+        };
+        let others = match intervene {
+            Some(Intervention::Shuffle) if rows < 2 => {
+                let (found, expected) = ("1 row".to_string(), "at least 2 to shuffle".to_string());
+                return Err(ModelError::Input { operation: "examine", object: "observation", found, expected });
+            }
+            Some(Intervention::Shuffle) => Some(self.examine(observation, steps, None)?),
+            _ => None,
+        };
+        let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
+        let memory = self.memory(&latent, &self.tokens.look(observation, None)?, &mut Mode::Eval)?.detach();
+        let mut carry = self.start(rows, &memory)?;
+        let mut done: Vec<ExaminedStep> = Vec::with_capacity(steps);
+        for at in 0..steps {
+            let layers = &design.layers[self.config.reasoning.layers_of(at)];
+            let mut attention = None;
+            for _ in 0..self.config.reasoning.h_cycles {
+                let y = positioned(&carry.answer, &design.action_pos)?;
+                for _ in 0..self.config.reasoning.l_cycles {
+                    let z = positioned(&carry.reasoning, &design.latent_pos)?;
+                    carry.reasoning = update(layers, &z, &[&z, &y, &memory])?.detach();
+                }
+                match (intervene, &others) {
+                    (Some(Intervention::Freeze), _) if at > 0 => carry.reasoning = done[0].reasoning.clone(),
+                    (Some(Intervention::Shuffle), Some(others)) => carry.reasoning = rolled(&others[at].reasoning)?,
+                    _ => {}
+                }
+                let z = positioned(&carry.reasoning, &design.latent_pos)?;
+                let context = Tensor::cat(&[&z, &y, &memory], 1)?;
+                attention = Some(layers[0].attn.weights(&y, &context, None)?.mean(1)?.detach());
+                carry.answer = update(layers, &y, &[&z, &y, &memory])?.detach();
+            }
+            done.push(ExaminedStep {
+                chunk: self.action_head.forward(&carry.answer)?.detach(),
+                answer: carry.answer.clone(),
+                reasoning: carry.reasoning.clone(),
+                attention: attention.expect("at least one round"),
+            });
+        }
+        Ok(done)
+    }
+
+    /// What the columns of [`ExaminedStep::attention`] stand for: the reasoning's tokens, the actions', the latent, features
+    /// by name, places of pictures.
+    pub fn context_names(&self) -> Vec<String> {
+        let layout = self.tokens.layout();
+        let states = (0..self.config.reasoning.tokens).map(|i| format!("z{i}"));
+        let actions = (0..self.config.action_horizon).map(|i| format!("y{i}"));
+        let features = layout.tokens.iter().map(|token| token.feature.clone());
+        let places = layout.len() - layout.vectors();
+        let memory = std::iter::once("latent".to_string()).chain(features);
+        states.chain(actions).chain(memory).chain((0..places).map(|i| format!("picture{i}"))).collect()
+    }
+}
+
+/// Each row in the place of the one before, the first in the last one's.
+fn rolled(x: &Tensor) -> Result<Tensor> {
+    let rows = x.dim(0)?;
+    Ok(Tensor::cat(&[x.narrow(0, 1, rows - 1)?, x.narrow(0, 0, 1)?], 0)?)
+}
+
+/// ACTRM as a policy whose reasoning is tampered with, and that thinks as many steps as it may.
+pub struct DisturbedPolicy {
+    model: Arc<Actrm>,
+    preprocess: Arc<Preprocess>,
+    intervene: Intervention,
+    /// what the other thoughts are about, one an episode
+    others: Arc<Vec<Observation>>,
+    other: usize,
+    history: History,
+}
+
+impl DisturbedPolicy {
+    /// Shares `model`. `others` are observations whose reasoning takes the place of its own where it is shuffled: an
+    /// episode's is the one that its seed names, counted around.
+    ///
+    /// # Errors
+    /// A shuffle without others.
+    pub fn new(
+        model: Arc<Actrm>,
+        preprocess: Arc<Preprocess>,
+        intervene: Intervention,
+        others: Arc<Vec<Observation>>,
+    ) -> Result<Self> {
+        if intervene == Intervention::Shuffle && others.is_empty() {
+            let (found, expected) = ("none".to_string(), "at least one to shuffle".to_string());
+            return Err(ModelError::Input { operation: "disturb", object: "other observations", found, expected });
+        }
+        let history = History::new(preprocess.signature().n_obs_steps);
+        Ok(Self { model, preprocess, intervene, others, other: 0, history })
+    }
+}
+
+impl Policy for DisturbedPolicy {
+    fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
+        let mut seen = self.history.see(&self.preprocess, observation)?;
+        if self.intervene == Intervention::Shuffle {
+            let other = self.preprocess.observation(std::slice::from_ref(&self.others[self.other]))?;
+            let mut both = Features::new();
+            for (name, values) in seen.iter() {
+                both.insert(name, Tensor::cat(&[values, other.require("disturb", name)?], 0)?);
+            }
+            seen = both;
+        }
+        let steps = self.model.examine(&seen, self.model.config.reasoning.max_steps(), Some(self.intervene))?;
+        let last = steps.last().expect("at least one step");
+        self.preprocess.chunk(&last.chunk.narrow(0, 0, 1)?)
+    }
+
+    fn n_obs_steps(&self) -> usize {
+        self.history.steps()
+    }
+
+    fn observe(&mut self, observation: &Observation) {
+        self.history.observe(observation);
+    }
+
+    fn reset(&mut self, seed: u64) {
+        self.history.clear();
+        self.other = (seed % self.others.len().max(1) as u64) as usize;
+    }
+}

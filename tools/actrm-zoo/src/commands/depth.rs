@@ -1,0 +1,182 @@
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits};
+use models::actrm::{Intervention, Thinking};
+use report::statistics::wilson_interval;
+use serde::Serialize;
+use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, evaluate, thinking_subject};
+use zoo::results::{Seeds, StoredEvaluation};
+
+use crate::places::{ZooArgs, entry_names};
+
+const GOES_ON: &str = "stopped; the same command goes on where it was";
+
+/// Let a trained policy think more or fewer steps, or tamper with its reasoning, and count what it still solves
+///
+/// Nothing is trained: the entry's weights are applied so many times, to the last step, or until they halt. `freeze` leaves
+/// the reasoning as the first step made it, `shuffle` puts that of a thought about another episode's beginning in its place
+/// after every update. The outcomes are no results of the entry and are kept apart from the zoo's.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-zoo depth pickchain-actrm --steps 1,2,4,8,16,32
+  actrm-zoo depth pickchain-actrm --steps 6 --intervene shuffle --episodes 200
+  actrm-zoo depth pickchain-actrm --steps 8,32 --halting --json")]
+pub struct Args {
+    /// Entry: `name` (its newest version) or `name@version`
+    #[arg(add = entry_names())]
+    entry: String,
+    /// Supervision steps, each number for itself
+    #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "1,2,4,8,16,32",
+        value_parser = clap::value_parser!(u64).range(1..=1000))]
+    steps: Vec<u64>,
+    /// Let it stop earlier, as it was trained to
+    #[arg(long, conflicts_with = "intervene")]
+    halting: bool,
+    /// What is done to its reasoning: `freeze` or `shuffle`
+    #[arg(long, value_name = "HOW", value_parser = intervention)]
+    intervene: Option<Intervention>,
+    /// Episodes for each number of steps
+    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    episodes: u64,
+    /// Seed of the first episode; the others count up from it
+    #[arg(long = "seed-start", value_name = "SEED", default_value_t = 30_000)]
+    seed: u64,
+    #[command(flatten)]
+    simulator: SimulatorArgs,
+    /// Folder for the episodes' outcomes
+    #[arg(long, value_name = "DIR", default_value = "out/depth")]
+    work: PathBuf,
+    /// Print JSON instead of a table
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+fn intervention(text: &str) -> Result<Intervention, String> {
+    let found = Intervention::ALL.into_iter().find(|intervention| intervention.name() == text);
+    found.ok_or_else(|| format!("expected {}", Intervention::ALL.map(Intervention::name).join(" or ")))
+}
+
+/// What came of one number of steps.
+#[derive(Serialize)]
+struct Row {
+    #[serde(flatten)]
+    thinking: Thinking,
+    episodes: u64,
+    successes: u64,
+    /// Successes and episodes by group.
+    groups: BTreeMap<String, (u64, u64)>,
+    /// Median of a query.
+    query_ms: f64,
+    query_flops: Option<f64>,
+}
+
+impl Row {
+    fn new(thinking: Thinking, query_flops: Option<f64>, evaluation: &StoredEvaluation) -> Self {
+        let mut groups: BTreeMap<String, (u64, u64)> = BTreeMap::new();
+        for episode in &evaluation.episodes {
+            if let Some(group) = &episode.group {
+                let (successes, all) = groups.entry(group.clone()).or_default();
+                (*successes, *all) = (*successes + u64::from(episode.success), *all + 1);
+            }
+        }
+        let mut times: Vec<f64> = evaluation.timings.iter().flat_map(|t| t.inference_ms.iter().copied()).collect();
+        times.sort_by(f64::total_cmp);
+        Self {
+            thinking,
+            episodes: evaluation.episodes.len() as u64,
+            successes: evaluation.episodes.iter().filter(|episode| episode.success).count() as u64,
+            groups,
+            query_ms: times.get(times.len() / 2).copied().unwrap_or_default(),
+            query_flops,
+        }
+    }
+}
+
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    limits::check_seeds(args.seed, args.episodes)?;
+    let entry = args.zoo.registry().entry(&args.entry)?;
+    let loaded = entry.load()?;
+    let thoughts: Vec<Thinking> = args
+        .steps
+        .iter()
+        .map(|&steps| {
+            let steps = Some(usize::try_from(steps)?);
+            Ok(Thinking { steps, halting: args.halting.then_some(true), intervene: args.intervene })
+        })
+        .collect::<anyhow::Result<_>>()?;
+    // before anything is started: whether it can think so at all
+    thoughts.iter().try_for_each(|thinking| loaded.thinking(thinking).map(drop))?;
+    let stop = Stop::install(GOES_ON)?;
+    let meta = entry.meta();
+    let mut spec = args.simulator.recorded_spec(&meta.task, meta.env_args.as_ref())?;
+    spec.env_module = spec.env_module.or_else(|| meta.env_module.as_ref().map(|module| module.name.clone()));
+    let options = EvaluationOptions {
+        seeds: Seeds { start: args.seed, count: args.episodes },
+        shard: None,
+        env_module: spec.env_module.clone(),
+        force: false,
+    };
+    let Some(mut pool) = args.simulator.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
+    let mut rows = Vec::new();
+    for thinking in thoughts {
+        let how = thinking.intervene.map_or(if args.halting { "halting" } else { "whole" }, Intervention::name);
+        let results = args.work.join(format!("{}-{how}", thinking.steps.unwrap_or_default()));
+        let Some(subject) = thinking_subject(&loaded, &thinking, &mut pool)? else { break };
+        let mut screen = Screen::new();
+        let end = evaluate(&subject, &mut pool, &results, &options, &mut |progress| match progress {
+            Progress::Begin { done, total, .. } => {
+                screen.begin_at(format!("{} steps", thinking.steps.unwrap_or_default()), done, total);
+            }
+            Progress::Episode(_) => screen.step(),
+        });
+        drop(screen);
+        match end.with_context(|| format!("entry {}", entry.id()))? {
+            EvaluationEnd::Complete(evaluation) => {
+                let flops = loaded.thinking(&thinking)?.model().query_flops();
+                rows.push(Row::new(thinking, flops, &evaluation));
+            }
+            EvaluationEnd::Stopped { .. } => break,
+            EvaluationEnd::Failed { errors, .. } => {
+                let first = errors.into_iter().next().context("an evaluation failed without saying why")?;
+                return Err(first.into());
+            }
+        }
+    }
+    cli::close(pool);
+    match args.json {
+        true => cli::print_json(&rows)?,
+        false => cli::print(&table(&rows))?,
+    }
+    if stop.asked() {
+        cli::note(GOES_ON);
+        return Ok(ExitCode::from(INTERRUPTED));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn table(rows: &[Row]) -> String {
+    let groups: Vec<&String> = rows.first().map(|row| row.groups.keys().collect()).unwrap_or_default();
+    let mut header = vec!["steps", "success", "interval"];
+    header.extend(groups.iter().map(|group| group.as_str()));
+    header.extend(["a query, ms", "MFLOP"]);
+    let cells = |row: &Row| {
+        let (low, high) = wilson_interval(row.successes, row.episodes);
+        let mut cells = vec![
+            row.thinking.steps.unwrap_or_default().to_string(),
+            format!("{} of {}", row.successes, row.episodes),
+            format!("{:.0}-{:.0}%", 100.0 * low, 100.0 * high),
+        ];
+        let of = |group: &&String| row.groups.get(*group).map_or("-".to_owned(), |(won, all)| format!("{won}/{all}"));
+        cells.extend(groups.iter().map(of));
+        cells.push(format!("{:.2}", row.query_ms));
+        cells.push(row.query_flops.map_or("-".to_owned(), |flops| format!("{:.1}", flops / 1e6)));
+        cells
+    };
+    let rows: Vec<Vec<String>> = rows.iter().map(cells).collect();
+    cli::table(&header, &rows, &(0..header.len()).collect::<Vec<_>>())
+}
