@@ -118,7 +118,7 @@ fn the_report_works_in_a_browser() {
     assert!(told["target"].as_str().is_some_and(|hash| hash.starts_with("#door-act")), "{told}");
     assert_eq!((&told["open"], &told["unreachable"]), (&1.into(), &0.into()), "{told}");
     // at 390 pixels nothing but what scrolls by itself is wider, and charts keep a size that can be read
-    assert_eq!(told["overflow"], 390, "{told}");
+    assert!(told["overflow"].as_f64().is_some_and(|width| width <= 390.0), "{told}");
     let charts = numbers("charts");
     assert!(charts.len() > 20 && charts.iter().all(|width| *width >= 300.0), "{charts:?}");
 }

@@ -119,7 +119,7 @@ mod tests {
         assert_eq!(row.groups_text(), "seen 12/15, unseen 4/5");
         assert_eq!(cells(COLUMNS, [&row]).rows[0][3], "16/20\nseen 12/15\nunseen 4/5");
         assert!(markdown::table(COLUMNS, [&row]).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
-        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\""));
+        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\","));
         assert!(!row.summary().contains(" in "), "{}", row.summary());
         for (k, episode) in evaluation.episodes.iter_mut().enumerate().filter(|(_, episode)| !episode.success) {
             episode.failure = Some(if k < 5 { "late" } else { "wrong" }.to_owned());
