@@ -6,7 +6,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 export ACTRM_PEER_PYTHON="$PWD/.venv-peers/bin/python"
 examples=target/release/examples
-names=(puzzles data act trm control evaluation)
+names=(puzzles data act trm control evaluation vision)
 
 for name in "${@:-}"; do
     if [[ -n $name && " ${names[*]} " != *" $name "* ]]; then
@@ -20,9 +20,18 @@ for name in ${*:-${names[*]}}; do
     printf '\n== %s\n' "$name"
     rm -f "target/bench/$name.json"
     code=0
+    if [[ $name == vision ]]; then
+        # three parts: networks, data, drawing
+        rm -f target/bench/pictures.json target/bench/rendering.json
+        "$examples/bench_data" --pictures || ended+=("pictures=$?")
+        .venv/bin/python benches/rendering.py || ended+=("rendering=$?")
+        for part in pictures rendering; do
+            [[ " ${ended[*]} " == *" $part="* ]] || ended+=("$part=0")
+        done
+    fi
     case $name in
     puzzles | data) "$examples/bench_$name" || code=$? ;;
-    act | trm) "$examples/bench_$name" --peer "$ACTRM_PEER_PYTHON" || code=$? ;;
+    act | trm | vision) "$examples/bench_$name" --peer "$ACTRM_PEER_PYTHON" || code=$? ;;
     control | evaluation) .venv/bin/python "benches/$name.py" || code=$? ;;
     esac
     ended+=("$name=$code")

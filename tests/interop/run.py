@@ -6,6 +6,7 @@ difference ends the run with exit code 1.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import logging
 import os
@@ -21,6 +22,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 import h5py
 import numpy as np
 import torch
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "release"
@@ -170,7 +172,7 @@ def compare_images(source: Path, root: Path, form: str) -> str:
     return f"{pictures} pictures, pixel by pixel, and back"
 
 
-def train_lerobot(root: Path, out: Path) -> str:
+def train_lerobot(root: Path, out: Path, pictures: bool = False, **options: Any) -> str:
     """LeRobot trains its ACT on one of our sets for two steps, as its own example does, and stores what it has."""
     from lerobot.configs.types import FeatureType
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -181,8 +183,10 @@ def train_lerobot(root: Path, out: Path) -> str:
     torch.manual_seed(0)
     meta = open_lerobot(root).meta
     features = dataset_to_policy_features(meta.features)
+    seen = {FeatureType.STATE, FeatureType.VISUAL if pictures else FeatureType.ENV}
     config = ACTConfig(
-        input_features={k: f for k, f in features.items() if f.type in (FeatureType.STATE, FeatureType.ENV)},
+        input_features={k: f for k, f in features.items() if f.type in seen},
+        pretrained_backbone_weights=None,
         output_features={k: f for k, f in features.items() if f.type is FeatureType.ACTION},
         chunk_size=8,
         n_action_steps=8,
@@ -193,7 +197,8 @@ def train_lerobot(root: Path, out: Path) -> str:
     )
     policy = ACTPolicy(config).train()
     before, after = make_pre_post_processors(config, dataset_stats=meta.stats)
-    data = open_lerobot(root, delta_timestamps={"action": [k / meta.fps for k in config.action_delta_indices]})
+    deltas = {"action": [k / meta.fps for k in config.action_delta_indices]}
+    data = open_lerobot(root, delta_timestamps=deltas, **options)
     batches = iter(torch.utils.data.DataLoader(data, batch_size=16, shuffle=True))
     optimiser = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3)
     losses: list[float] = []
@@ -209,15 +214,57 @@ def train_lerobot(root: Path, out: Path) -> str:
     return f"2 steps, loss {losses[0]:.1f} then {losses[1]:.1f}"
 
 
-def compare_actions(root: Path, zoo: Path, entry: str, checkpoint: Path) -> str:
+def video_backends() -> list[str]:
+    """Those of LeRobot's video readers that are installed."""
+    found = [
+        name for name, module in (("torchcodec", "torchcodec"), ("pyav", "av")) if importlib.util.find_spec(module)
+    ]
+    assert found, "LeRobot has no video reader here"
+    return found
+
+
+def compare_videos(source: Path, root: Path) -> str:
+    """A video set of ours: LeRobot's readers see the pictures that we see, bit by bit, and LeRobot trains on it."""
+    ours("actrm-data", "convert", source, root, "--video")
+    said: list[str] = []
+    for backend in video_backends():
+        data = open_lerobot(root, video_backend=backend)
+        pictures = 0
+        for index, episode in enumerate(data.meta.episodes):
+            start, length = episode["dataset_from_index"], episode["length"]
+            for camera in data.meta.camera_keys:
+                sheet = root.with_suffix(f".{backend}.{index}.{camera}.png")
+                chosen = ["--episode", str(index), "--column", camera, "--frames", str(length)]
+                ours("actrm-data", "plot", root, *chosen, "--out", sheet)
+                drawn = np.asarray(Image.open(sheet))
+                side = drawn.shape[0]
+                for frame in range(length):
+                    shown = data[start + frame][camera]
+                    levels = np.rint(shown.numpy() * 255).astype(np.uint8).transpose(1, 2, 0)
+                    mine = drawn[:, frame * (side + 4) : frame * (side + 4) + side]
+                    assert np.array_equal(levels, mine), (backend, camera, index, frame)
+                    pictures += 1
+        trained = train_lerobot(root, root.with_suffix(f".{backend}.trained"), pictures=True, video_backend=backend)
+        said.append(f"{backend}: {pictures} pictures, {trained}")
+    return "; ".join(said)
+
+
+def compare_actions(root: Path, zoo: Path, entry: str, checkpoint: Path, pictures: bool = False) -> str:
     """An entry and a checkpoint of LeRobot give the same action chunks to 1e-5, raw observation to raw action."""
     from lerobot.policies.act.modeling_act import ACTPolicy
     from lerobot.policies.factory import make_pre_post_processors
 
     data = open_lerobot(root)
-    rows = [data[i] for i in (0, 17, 400, data.num_frames - 1)]
-    keys = ("observation.state", "observation.environment_state")
-    asked = [{key.removeprefix("observation."): row[key].tolist() for key in keys} for row in rows]
+    rows = [data[i] for i in (0, 17, data.num_frames // 2, data.num_frames - 1)]
+    cameras = tuple(data.meta.camera_keys) if pictures else ()
+    keys = ("observation.state", *(cameras or ("observation.environment_state",)))
+
+    def given(row: dict[str, Any], key: str) -> list[Any]:
+        if key not in cameras:
+            return row[key].tolist()
+        return np.rint(row[key].numpy() * 255).astype(int).transpose(1, 2, 0).ravel().tolist()
+
+    asked = [{key.removeprefix("observation."): given(row, key) for key in keys} for row in rows]
     answers = np.array(json.loads(run([BIN / "examples" / "predict", zoo, entry], json.dumps(asked))))
     policy = ACTPolicy.from_pretrained(checkpoint).eval()
     before, after = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
@@ -251,6 +298,34 @@ def import_entry(root: Path, folder: Path) -> str:
     zoo, checkpoint = folder / "zoo", folder / "trained"
     ours("actrm-zoo", "import", "lerobot", checkpoint, "--name", "theirs", "--task", "Lift", "--zoo", zoo)
     return compare_actions(root, zoo, "theirs@1", checkpoint)
+
+
+def export_seeing_entry(root: Path, folder: Path) -> str:
+    """An entry of ours that sees answers the same in LeRobot; one that crops its pictures is refused by name."""
+    zoo = folder / "zoo"
+    cameras = json.dumps([key.removeprefix("observation.images.") for key in open_lerobot(root).meta.camera_keys])
+    where = ["--data", root, "--zoo", zoo, "--runs", folder / "runs", "train.steps=2", "train.batch_size=4"]
+    sees = [f"data.cameras={cameras}", "data.env_keys=[]", "policy.vision.width=64", "policy.vision.norm=frozen"]
+    small = ["policy.dim_model=64", "policy.n_heads=4", "policy.dim_feedforward=128", "policy.n_encoder_layers=1"]
+    ours("actrm-zoo", "train", "act_lift", "entry=seeing", *sees, *small, *where)
+    ours("actrm-zoo", "export", "lerobot", "seeing@1", folder / "seeing", "--zoo", zoo)
+    ours("actrm-zoo", "train", "act_lift", "entry=cropping", *sees, *small, *where, "policy.vision.crop=48")
+    refused = subprocess.run(
+        [BIN / "actrm-zoo", "export", "lerobot", "cropping@1", folder / "cropping", "--zoo", zoo],
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert refused.returncode == 1 and "crop" in refused.stderr, refused
+    return compare_actions(root, zoo, "seeing@1", folder / "seeing", pictures=True)
+
+
+def import_seeing_entry(root: Path, folder: Path) -> str:
+    """LeRobot's ACT with pictures answers the same as an entry of ours."""
+    zoo, checkpoint = folder / "zoo", folder / "trained"
+    train_lerobot(root, checkpoint, pictures=True)
+    ours("actrm-zoo", "import", "lerobot", checkpoint, "--name", "theirs", "--task", "Lift", "--zoo", zoo)
+    return compare_actions(root, zoo, "theirs@1", checkpoint, pictures=True)
 
 
 def compare_robomimic(path: Path) -> str:
@@ -368,17 +443,21 @@ def main() -> None:
         ours("actrm-data", "convert", source, root)
         exported = folder / "exported.hdf5"
         ours("actrm-data", "export", root, exported)
-        images = folder / "images.hdf5"
+        images, plain = folder / "images.hdf5", folder / "plain"
         write_images(source, images)
+        ours("actrm-data", "convert", images, plain, "--env-keys", "")
         checks: dict[str, Callable[[], str]] = {
             "LeRobot opens the converted data set": lambda: compare_lerobot(source, root),
             "LeRobot pads action chunks as we do": lambda: compare_windows(source, root),
             "LeRobot opens a set of several files": lambda: compare_shards(source, folder / "shards"),
             "LeRobot shows PNG pictures pixel by pixel": lambda: compare_images(images, folder / "png", "png"),
             "LeRobot shows PPM pictures pixel by pixel": lambda: compare_images(images, folder / "ppm", "ppm"),
+            "LeRobot reads and trains on our videos": lambda: compare_videos(images, folder / "video"),
             "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
             "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),
+            "our entry that sees answers the same in LeRobot": lambda: export_seeing_entry(plain, folder / "seeing"),
+            "LeRobot's policy that sees answers the same": lambda: import_seeing_entry(plain, folder / "seen"),
             "robomimic reads the collected file": lambda: compare_robomimic(source),
             "export rebuilds the source": lambda: compare_trees(source, exported),
             "robomimic reads the exported file": lambda: compare_robomimic(exported),

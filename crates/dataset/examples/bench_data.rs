@@ -4,23 +4,31 @@
 //! piece of work three times and takes the fastest, runs the peers' scripts of `benches/peers` on the same files in
 //! `.venv-peers` (or `$ACTRM_PEER_PYTHON`), prints a table and writes `target/bench/data.json`. CPU time includes the
 //! isolated reader's. Without the peers' Python only our own numbers are shown.
+//!
+//! `bench_data --pictures` measures pictures instead: into memory from PNG columns and from AV1 videos, random windows with
+//! two of them, and writing videos; it writes `target/bench/pictures.json`.
 
 #![allow(clippy::print_stdout)]
 
 use dataset::shuffle::SplitMix64;
 use dataset::{
-    Array, ConvertOptions, Dataset, DatasetError, Demo, ImageForm, RobomimicWriter, WindowBatch, WindowSpec,
-    WriteOptions, convert, isolation,
+    Array, ConvertOptions, Dataset, DatasetError, Demo, ImageForm, RobomimicWriter, VideoOptions, WindowBatch,
+    WindowSpec, WriteOptions, convert, isolation,
 };
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Pieces of work are done this often; the fastest counts.
 const REPEATS: usize = 3;
 /// Bar for windows: samples a second on one core.
 const WINDOWS_BAR: f64 = 1e6;
+/// Bar for windows with two pictures: samples a second on one core.
+const PICTURE_WINDOWS_BAR: f64 = 20e3;
+/// Bar for reading videos: pictures a second on one core.
+const READING_BAR: f64 = 1e3;
 /// Bar for opening, in milliseconds.
 const OPEN_BAR: f64 = 150.0;
 
@@ -33,10 +41,19 @@ fn main() -> Result<(), AnyError> {
     std::fs::create_dir_all(&work)?;
     let bench = Bench { peers: Peers::find(&repository), work };
     let mut rows = Vec::new();
-    bench.low_dim(&mut rows)?;
-    bench.images(&mut rows)?;
+    let name = match std::env::args().any(|word| word == "--pictures") {
+        true => {
+            bench.pictures(&mut rows)?;
+            "pictures.json"
+        }
+        false => {
+            bench.low_dim(&mut rows)?;
+            bench.images(&mut rows)?;
+            "data.json"
+        }
+    };
     let text = serde_json::to_string_pretty(&rows)?;
-    std::fs::write(repository.join("target/bench/data.json"), text + "\n")?;
+    std::fs::write(repository.join("target/bench").join(name), text + "\n")?;
     print_table(&rows);
     Ok(())
 }
@@ -201,6 +218,42 @@ impl Bench {
         Ok(())
     }
 
+    /// Two cameras of 84 x 84, as PNG columns and as AV1 videos.
+    fn pictures(&self, rows: &mut Vec<Value>) -> Result<(), AnyError> {
+        let frames = 900;
+        let file = self.work.join("pictures.hdf5");
+        if !file.exists() {
+            make(&file, 6, frames, true)?;
+        }
+        let (png, video) = (self.fresh("png")?, self.fresh("video")?);
+        convert(&file, &png, &options(ImageForm::Png), &mut |_, _| {})?;
+        let as_video = ConvertOptions { video: Some(VideoOptions::default()), ..options(ImageForm::Png) };
+        let begun = cpu_seconds()?;
+        convert(&file, &video, &as_video, &mut |_, _| {})?;
+        let both = 2.0 * frames as f64;
+        let written = both / (cpu_seconds()? - begun);
+        rows.push(row("write AV1 84 x 84 (convert --video), CPU", "pictures/s", written, None, None, None));
+        for (form, folder, bar) in [("PNG", &png, None), ("AV1", &video, Some(READING_BAR))] {
+            let set = Dataset::open(folder)?;
+            let cameras: Vec<String> = set.cameras().map(str::to_owned).collect();
+            let cost = measure(|| cameras.iter().try_for_each(|camera| set.pictures(camera).map(drop)))?;
+            let work = format!("{form} 84 x 84 into memory, CPU");
+            rows.push(row(&work, "pictures/s", both / cost.cpu, None, None, bar));
+            let work = format!("windows with 2 pictures ({form}), batch 64, CPU");
+            let ours = windows(&set)?;
+            let peer = match &self.peers {
+                None => None,
+                Some(peers) => {
+                    let args = [text(folder)?, "--batches", "4"];
+                    let lerobot = best_rate("samples", "cpu_seconds", || peers.run("windows_lerobot.py", &args))?;
+                    Some(("LeRobot", lerobot))
+                }
+            };
+            rows.push(row(&work, "samples/s", ours, peer, Some(20.0), Some(PICTURE_WINDOWS_BAR)));
+        }
+        Ok(())
+    }
+
     /// A path in the work folder with nothing at it.
     fn fresh(&self, name: &str) -> Result<PathBuf, AnyError> {
         let path = self.work.join(name);
@@ -227,7 +280,10 @@ fn windows(set: &Dataset) -> Result<f64, AnyError> {
     let episodes = (0..set.episodes().len()).collect();
     let observation = [dataset::STATE, dataset::ENVIRONMENT_STATE].map(str::to_owned);
     let observation = observation.into_iter().filter(|name| set.column(name).is_some()).collect();
-    let windows = set.windows(&WindowSpec { observation, n_obs_steps: 1, action_horizon: 32, episodes })?;
+    let mut windows = set.windows(&WindowSpec { observation, n_obs_steps: 1, action_horizon: 32, episodes })?;
+    for camera in set.cameras() {
+        windows = windows.with_pictures(camera, Arc::new(set.pictures(camera)?));
+    }
     let mut batch = WindowBatch::default();
     let mut samples = 0_usize;
     let mut checksum = 0.0_f32;

@@ -17,6 +17,7 @@ mod lerobot;
 mod plan;
 mod puzzle_table;
 pub mod rotation;
+mod sheet;
 pub mod shuffle;
 mod source;
 mod stats;
@@ -27,11 +28,13 @@ pub use error::{DatasetError, InputError, Result};
 pub use keys::KeyItem;
 pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset,
-    ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info, Pictures,
-    Provenance, RotationForm, STATE, VideoOptions, VideoProvenance, convert, export, verify, verify_source,
+    ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info,
+    PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, VideoOptions, VideoProvenance, convert,
+    export, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};
+pub use sheet::Picture;
 pub use source::{RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};

@@ -6,10 +6,10 @@
 //! `delta_timestamps` and robomimic's padded sequences have it. Gathering a batch copies rows out of
 //! columns that stay in memory; it allocates nothing once the batch has been used.
 
-use crate::lerobot::Pictures;
+use crate::error::Result;
+use crate::lerobot::PictureStore;
 use crate::shuffle::SplitMix64;
 use arrow::buffer::ScalarBuffer;
-use std::sync::Arc;
 
 /// Which windows to make.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -52,7 +52,7 @@ struct Span {
 #[derive(Debug, Clone)]
 pub struct Windows {
     observation: Vec<(String, Resident)>,
-    pictures: Vec<(String, Arc<Pictures>)>,
+    pictures: Vec<(String, PictureStore)>,
     action: Resident,
     n_obs_steps: usize,
     action_horizon: usize,
@@ -100,16 +100,16 @@ impl Windows {
         Self { observation, pictures: Vec::new(), action, n_obs_steps, action_horizon, spans }
     }
 
-    /// The same windows with the pictures of a camera of the same data set, which stay in memory and are shared.
+    /// The same windows with the pictures of a camera of the same data set, which are shared.
     #[must_use]
-    pub fn with_pictures(mut self, camera: &str, pictures: Arc<Pictures>) -> Self {
-        self.pictures.push((camera.to_owned(), pictures));
+    pub fn with_pictures(mut self, camera: &str, pictures: impl Into<PictureStore>) -> Self {
+        self.pictures.push((camera.to_owned(), pictures.into()));
         self
     }
 
     /// Cameras with height and width of their pictures, in order.
     pub fn pictures(&self) -> impl Iterator<Item = (&str, (usize, usize))> {
-        self.pictures.iter().map(|(name, pictures)| (name.as_str(), (pictures.height, pictures.width)))
+        self.pictures.iter().map(|(name, pictures)| (name.as_str(), pictures.size()))
     }
 
     /// Number of windows: one a frame.
@@ -149,11 +149,27 @@ impl Windows {
         order
     }
 
+    /// Whether pictures are read from files.
+    pub fn reads_files(&self) -> bool {
+        self.pictures.iter().any(|(_, pictures)| matches!(pictures, PictureStore::File(_)))
+    }
+
+    /// [`Windows::try_gather`] of windows whose pictures are all in memory, if they have any.
+    ///
+    /// # Panics
+    /// When an index is not below [`Windows::len`], or a file of pictures cannot be read.
+    pub fn gather(&self, indices: &[u32], batch: &mut WindowBatch) {
+        self.try_gather(indices, batch).expect("what is in memory can be read");
+    }
+
     /// Copies the windows `indices` into `batch`, in that order.
+    ///
+    /// # Errors
+    /// A file of pictures that cannot be read.
     ///
     /// # Panics
     /// When an index is not below [`Windows::len`].
-    pub fn gather(&self, indices: &[u32], batch: &mut WindowBatch) {
+    pub fn try_gather(&self, indices: &[u32], batch: &mut WindowBatch) -> Result<()> {
         let (n, horizon, width) = (indices.len(), self.action_horizon, self.action.dim);
         (batch.n, batch.n_obs_steps) = (n, self.n_obs_steps);
         let named = batch.observation.iter().map(|(name, _)| name).eq(self.observation.iter().map(|(name, _)| name));
@@ -181,7 +197,7 @@ impl Windows {
             values.resize(n * self.n_obs_steps * pictures.picture_bytes(), 0);
             let rows = values.chunks_exact_mut(pictures.picture_bytes().max(1));
             for (row, frame) in rows.zip(indices.iter().flat_map(|&index| frames(index))) {
-                row.copy_from_slice(pictures.frame(frame));
+                pictures.read(frame, row)?;
             }
         }
         batch.actions.resize(n * horizon * width, 0.0);
@@ -201,6 +217,7 @@ impl Windows {
             flags[..real].fill(false);
             flags[real..].fill(true);
         }
+        Ok(())
     }
 }
 
@@ -208,7 +225,9 @@ impl Windows {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::lerobot::Pictures;
     use proptest::prelude::*;
+    use std::sync::Arc;
 
     fn column(rows: usize, dim: usize, salt: f32) -> Resident {
         let data: Vec<f32> = (0..rows * dim).map(|i| i as f32 + salt).collect();

@@ -3,11 +3,13 @@
 #![allow(clippy::unwrap_used)]
 
 use dataset::{
-    Array, ConvertOptions, Dataset, Demo, RobomimicWriter, Source, VideoOptions, WriteOptions, convert, export, verify,
+    Array, ConvertOptions, Dataset, Demo, RobomimicWriter, STATE, Source, VideoOptions, WindowBatch, WindowSpec,
+    WriteOptions, convert, export, verify,
 };
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 const CAMERA: &str = "observation.images.agentview";
 
@@ -179,6 +181,28 @@ fn videos_are_written_read_and_checked_and_the_source_comes_back() {
         (Some("av1"), Some(20), Some(false))
     );
     assert_eq!(set.column("action"), exact.column("action"));
+    for set in [&set, &exact] {
+        let (all, file) = (set.pictures(CAMERA).unwrap(), set.picture_file(CAMERA, dir.path()).unwrap());
+        assert_eq!(set.decoded_bytes(CAMERA).unwrap(), all.data.len() as u64);
+        let mut one = vec![0; all.picture_bytes()];
+        for frame in [0, 6, 7, 19] {
+            file.read(frame, &mut one).unwrap();
+            assert_eq!(one, all.frame(frame), "frame {frame}");
+        }
+        let beyond = file.read(20, &mut one).unwrap_err().to_string();
+        assert!(beyond.contains(&dir.path().display().to_string()) && beyond.contains("decoded pictures"), "{beyond}");
+        let second = set.episode_pictures(CAMERA, 1).unwrap();
+        assert_eq!(second.data, all.data[7 * one.len()..19 * one.len()]);
+        let spec =
+            WindowSpec { observation: vec![STATE.to_owned()], n_obs_steps: 2, action_horizon: 3, episodes: vec![0, 2] };
+        let windows = || set.windows(&spec).unwrap();
+        let (memory, disk) = (windows().with_pictures(CAMERA, Arc::new(all)), windows().with_pictures(CAMERA, file));
+        assert_eq!((memory.reads_files(), disk.reads_files()), (false, true));
+        let (mut a, mut b) = (WindowBatch::default(), WindowBatch::default());
+        memory.gather(&[7, 0, 3], &mut a);
+        disk.try_gather(&[7, 0, 3], &mut b).unwrap();
+        assert!(a == b);
+    }
     for camera in [CAMERA, "observation.images.robot0_eye_in_hand"] {
         let (near, right) = (set.pictures(camera).unwrap(), exact.pictures(camera).unwrap());
         assert_eq!((near.height, near.width, near.data.len()), (right.height, right.width, right.data.len()));

@@ -5,7 +5,7 @@ use crate::error::Result;
 use crate::features::Observation;
 use crate::history::History;
 use crate::model::PolicyModel;
-use crate::policy::{ActionChunk, Policy};
+use crate::policy::{ActionChunk, Clock, Policy};
 use crate::preprocess::Preprocess;
 use crate::rng::Rng;
 use std::sync::Arc;
@@ -16,13 +16,22 @@ pub struct ChunkPolicy {
     preprocess: Arc<Preprocess>,
     history: History,
     rng: Rng,
+    clock: Option<Box<dyn Clock>>,
+    encoding: Option<f64>,
 }
 
 impl ChunkPolicy {
     /// Shares `model` with others; begins with the episode of seed 0.
     pub fn new(model: Arc<dyn PolicyModel>, preprocess: Arc<Preprocess>) -> Self {
         let history = History::new(preprocess.signature().n_obs_steps);
-        Self { model, preprocess, history, rng: generator(0) }
+        Self { model, preprocess, history, rng: generator(0), clock: None, encoding: None }
+    }
+
+    /// The same with a clock, by which it tells what its pictures took.
+    #[must_use]
+    pub fn with_clock(mut self, clock: Box<dyn Clock>) -> Self {
+        self.clock = Some(clock);
+        self
     }
 }
 
@@ -33,8 +42,17 @@ fn generator(seed: u64) -> Rng {
 
 impl Policy for ChunkPolicy {
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
+        let begun = self.clock.as_mut().map(|clock| clock.milliseconds());
         let seen = self.history.see(&self.preprocess, observation)?;
-        self.preprocess.chunk(&self.model.sample(&seen, &mut self.rng)?)
+        let (mut clock, mut encoding) = (self.clock.as_mut(), None);
+        let mut on_seen = || encoding = clock.as_mut().zip(begun).map(|(clock, begun)| clock.milliseconds() - begun);
+        let actions = self.model.sample_seen(&seen, &mut self.rng, &mut on_seen)?;
+        self.encoding = encoding;
+        self.preprocess.chunk(&actions)
+    }
+
+    fn encoding(&self) -> Option<f64> {
+        self.encoding
     }
 
     fn n_obs_steps(&self) -> usize {
@@ -61,7 +79,7 @@ mod tests {
     use crate::models::act::{self, Act};
     use crate::normaliser::{ACTION, NormMode, Normaliser, STATE};
     use crate::params::Params;
-    use crate::policy::{Actor, Clock, RecedingHorizon};
+    use crate::policy::{Actor, RecedingHorizon};
     use candle_core::{Device, Tensor};
     use std::collections::BTreeMap;
 

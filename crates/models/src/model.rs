@@ -91,6 +91,14 @@ pub trait PolicyModel: Send + Sync {
         self.predict(observation)
     }
 
+    /// [`Self::sample`], and `on_seen` is called when pictures have become tokens, by a model that can tell.
+    ///
+    /// # Errors
+    /// As [`Self::predict`].
+    fn sample_seen(&self, observation: &Features<Tensor>, rng: &mut Rng, _on_seen: &mut dyn FnMut()) -> Result<Tensor> {
+        self.sample(observation, rng)
+    }
+
     /// A policy for one environment: it shares the weights, its episode's state is its own.
     fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy>;
 

@@ -37,6 +37,7 @@ pub(crate) fn sample(name: &str, version: u32, count: u64) -> EvaluationRecord {
             env_args_sha256: None,
             control: Control::Robosuite,
             max_steps: 400,
+            perturbation: None,
         },
         execution: Execution::RecedingHorizon { n_action_steps: 8 },
         time_decides: false,
@@ -65,6 +66,8 @@ pub(crate) fn finished(results: &Path, record: &EvaluationRecord) -> StoredEvalu
             seed,
             wall_ms: 900.0,
             simulator_ms: 700.0,
+            rendering_ms: Vec::new(),
+            encoding_ms: Vec::new(),
             inference_ms: (0..6).map(|i| 2.0 + (seed % 3) as f64 / 8.0 + f64::from(i)).collect(),
         };
         folder.add(episode, timing).unwrap();

@@ -59,6 +59,8 @@ pub struct Outcome {
     pub failure: Option<String>,
     /// Time spent waiting for the simulator.
     pub simulator: Duration,
+    /// Of that, what drawing took, once an observation that the agent was asked about; empty without pictures.
+    pub drawing: Vec<Duration>,
     /// Time of the whole episode.
     pub wall: Duration,
 }
@@ -125,13 +127,17 @@ impl EpisodePlan {
     ) -> Result<Outcome, JobError> {
         let begun = Instant::now();
         agent.reset(seed);
-        let Initial { fingerprint, group, mut observations } = worker.reset(seed)?;
+        let Initial { fingerprint, group, mut observations, mut drawing } = worker.reset(seed)?;
         let mut simulator = begun.elapsed();
         if let Some(watch) = &mut watch {
-            watch(worker)?;
+            watch(worker, &observations)?;
         }
         let (mut success, mut failure, mut steps, mut total_reward) = (false, None, 0, 0.0);
+        let mut drawn = Vec::new();
         while !success && failure.is_none() && steps < self.max_steps {
+            if !drawing.is_zero() {
+                drawn.push(std::mem::take(&mut drawing));
+            }
             let planned = match watch.is_some() {
                 true => agent.act(&observations).map(|one| vec![one]),
                 false => agent.act_ahead(&observations),
@@ -149,23 +155,24 @@ impl EpisodePlan {
                 steps += stepped.rewards.len();
                 total_reward = stepped.rewards.iter().fold(total_reward, |sum, reward| sum + reward);
                 (success, failure) = (stepped.success, stepped.failure);
-                observations = stepped.observations;
+                (observations, drawing) = (stepped.observations, stepped.drawing);
             }
             if let Some(found) = unusable.filter(|_| !success && failure.is_none()) {
                 let expected = format!("{} finite values", self.action_low.len());
                 return Err(RolloutError::Action { seed, step: steps, expected, found }.into());
             }
             if let Some(watch) = &mut watch {
-                watch(worker)?;
+                watch(worker, &observations)?;
             }
         }
         worker.check_quiet()?;
-        Ok(Outcome { success, steps, total_reward, fingerprint, group, failure, simulator, wall: begun.elapsed() })
+        let (drawing, wall) = (drawn, begun.elapsed());
+        Ok(Outcome { success, steps, total_reward, fingerprint, group, failure, simulator, drawing, wall })
     }
 }
 
-/// Called with the worker after an episode's reset and after every step of it.
-pub type Watch<'a> = &'a mut dyn FnMut(&mut Worker) -> Result<(), JobError>;
+/// Called with the worker and what it shows after an episode's reset and after every step of it.
+pub type Watch<'a> = &'a mut dyn FnMut(&mut Worker, &Observations) -> Result<(), JobError>;
 
 #[cfg(test)]
 mod tests {

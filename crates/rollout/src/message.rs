@@ -157,6 +157,9 @@ pub(crate) enum Reply {
         /// The group of episodes that this one belongs to, where the task has groups.
         #[serde(default)]
         group: Option<String>,
+        /// How long the observation's pictures took, in milliseconds.
+        #[serde(default)]
+        drawing_ms: f64,
     },
     Step {
         id: u64,
@@ -164,6 +167,8 @@ pub(crate) enum Reply {
         /// In a word why the task can no longer be solved, where the environment says so.
         #[serde(default)]
         failure: Option<String>,
+        #[serde(default)]
+        drawing_ms: f64,
     },
     Expert(EpisodeReply),
     Extract(EpisodeReply),

@@ -58,6 +58,8 @@ pub struct Initial {
     pub group: Option<String>,
     /// What the environment shows.
     pub observations: Observations,
+    /// How long its pictures took to draw, as the worker says; zero without any.
+    pub drawing: Duration,
 }
 
 /// What control steps did.
@@ -71,6 +73,8 @@ pub struct Stepped {
     pub failure: Option<String>,
     /// What the environment shows after the last of them.
     pub observations: Observations,
+    /// How long its pictures took to draw, as the worker says; zero without any.
+    pub drawing: Duration,
 }
 
 /// An RGB image, row-major from the top.
@@ -175,9 +179,9 @@ impl Worker {
         let request = Request::Reset { id: self.next_id, seed };
         let (reply, mut frame) = self.ask(&request, Vec::new(), self.limits.reset, 1)?;
         match reply {
-            Reply::Reset { fingerprint, group, .. } => {
+            Reply::Reset { fingerprint, group, drawing_ms, .. } => {
                 let observations = self.observations("reset", &mut frame)?;
-                Ok(Initial { fingerprint, group, observations })
+                Ok(Initial { fingerprint, group, observations, drawing: milliseconds(drawing_ms) })
             }
             other => Err(self.fault("reset", unexpected("reset", &other))),
         }
@@ -194,11 +198,11 @@ impl Worker {
         let tensors = vec![("action", FrameTensor::from_f64(&shape, &actions.concat()))];
         let (reply, mut frame) = self.ask(&request, tensors, self.limits.step, 2)?;
         match reply {
-            Reply::Step { success, failure, .. } => {
+            Reply::Step { success, failure, drawing_ms, .. } => {
                 let over = success || failure.is_some();
                 let rewards = self.rewards(&frame, actions.len(), over).map_err(|kind| self.fault("step", kind))?;
                 let observations = self.observations("step", &mut frame)?;
-                Ok(Stepped { rewards, success, failure, observations })
+                Ok(Stepped { rewards, success, failure, observations, drawing: milliseconds(drawing_ms) })
             }
             other => Err(self.fault("step", unexpected("step", &other))),
         }
@@ -412,6 +416,11 @@ impl Worker {
             log: self.process.log().to_owned(),
         }
     }
+}
+
+/// A duration that a worker reports; nonsense is no time.
+fn milliseconds(reported: f64) -> Duration {
+    Duration::try_from_secs_f64(reported / 1e3).unwrap_or_default()
 }
 
 fn unexpected(expected: &str, found: &Reply) -> FaultKind {

@@ -252,6 +252,16 @@ pub enum ZooError {
     },
 
     // ---- rollouts and results ----------------------------------------------------------------
+    /// Pictures that are to be changed are not what the policy sees.
+    #[error("entry {entry}: perturbation {perturbation} needs {expected}")]
+    Perturbation {
+        /// The entry.
+        entry: String,
+        /// What was to be done.
+        perturbation: String,
+        /// What it needs, and what was found.
+        expected: String,
+    },
     /// A rollout in a worker process.
     #[error(transparent)]
     Rollout(#[from] rollout::RolloutError),

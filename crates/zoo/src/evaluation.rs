@@ -6,6 +6,8 @@
 mod again;
 mod agent;
 mod clock;
+mod perturbation;
+mod saliency;
 mod subject;
 mod thinking;
 mod trace;
@@ -15,11 +17,13 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use rollout::{EpisodePlan, FaultKind, Image, JobError, Pool, Ready, RolloutError, Worker, WorkerFault};
+use rollout::{EpisodePlan, FaultKind, Image, JobError, Observations, Pool, Ready, RolloutError, Worker, WorkerFault};
 
 pub use self::again::{Again, evaluate_again};
-pub use self::agent::{PolicyAgent, QueryTimes};
+pub use self::agent::{PolicyAgent, QueryTime, QueryTimes};
 pub use self::clock::WallClock;
+pub use self::perturbation::Perturbation;
+pub use self::saliency::{Saliency, SalientCamera, SalientQuery, saliency};
 pub use self::subject::Subject;
 pub use self::thinking::{Start, starts, thinking_subject};
 pub use self::trace::{Examiner, PolicyTrace, TracedQuery, TracedThought, trace};
@@ -183,11 +187,14 @@ pub fn run_episodes(
             failure: outcome.failure,
         };
         let milliseconds = |duration: Duration| (duration.as_secs_f64() * 1e6).round() / 1e3;
+        let queries = times.take();
         let timing = EpisodeTiming {
             seed,
             wall_ms: milliseconds(outcome.wall),
             simulator_ms: milliseconds(outcome.simulator),
-            inference_ms: times.take().into_iter().map(milliseconds).collect(),
+            rendering_ms: outcome.drawing.into_iter().map(milliseconds).collect(),
+            encoding_ms: queries.iter().filter_map(|query| query.encoding).map(|ms| (ms * 1e3).round() / 1e3).collect(),
+            inference_ms: queries.iter().map(|query| milliseconds(query.whole)).collect(),
         };
         store(episode.clone(), timing)
             .map_err(|()| JobError::Final(failed(seed, "storing the outcome", "see the file error".into())))?;
@@ -201,7 +208,8 @@ pub fn run_episodes(
 }
 
 /// Episodes with an image of the start and of every step each; the images of one episode are kept at a time by each
-/// worker, and handed to `deliver` with the episode's seed and success.
+/// worker, and handed to `deliver` with the episode's seed and success. [`View::Seen`] of a policy without pictures gives
+/// no images.
 ///
 /// # Errors
 /// As for an evaluation; a machine that cannot render.
@@ -224,8 +232,13 @@ pub fn film(
     };
     let work = |(agent, _): &mut (PolicyAgent, QueryTimes), worker: &mut Worker, job| {
         let mut images = Vec::new();
-        let mut shoot = |worker: &mut Worker| -> Result<(), JobError> {
-            images.push(worker.render(&view.camera, view.height, view.width).map_err(|fault| unhelpable(task, fault))?);
+        let mut shoot = |worker: &mut Worker, observations: &Observations| -> Result<(), JobError> {
+            match view {
+                View::Camera { name, height, width } => {
+                    images.push(worker.render(name, *height, *width).map_err(|fault| unhelpable(task, fault))?);
+                }
+                View::Seen { scale } => images.extend(subject.seen(observations, *scale)),
+            }
             Ok(())
         };
         let outcome = plan.run(worker, agent, seed_of(job), Some(&mut shoot))?;
@@ -252,13 +265,21 @@ fn unhelpable(task: &str, fault: WorkerFault) -> JobError {
     }
 }
 
-/// A camera and the size of its images.
+/// What is filmed.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct View {
-    /// robosuite's name of the camera.
-    pub camera: String,
-    /// Rows.
-    pub height: usize,
-    /// Columns.
-    pub width: usize,
+pub enum View {
+    /// What a camera sees.
+    Camera {
+        /// robosuite's name of the camera.
+        name: String,
+        /// Rows.
+        height: usize,
+        /// Columns.
+        width: usize,
+    },
+    /// What the policy sees: its cameras side by side.
+    Seen {
+        /// Pixels of the image for one of the policy's, in each direction.
+        scale: usize,
+    },
 }

@@ -116,7 +116,7 @@ impl NamedProtocol {
     /// The block that an evaluation ran, whole and by these rules; nothing for any other.
     pub fn block_of(&self, record: &EvaluationRecord) -> Option<Block> {
         let rules = &record.protocol;
-        let same = (rules.task == self.task && rules.max_steps == self.max_steps && rules.control == self.control)
+        let same = (rules.task == self.task && rules.max_steps == self.max_steps && rules.control == self.control && rules.perturbation.is_none())
             // the task's own environment
             && rules.env_module.is_none()
             && rules.env_args_sha256.is_none()

@@ -83,6 +83,7 @@ fn subject() -> Subject<'static> {
         max_steps: Some(45),
         signature: Signature::low_dimensional(5, 10, 7),
         fast_render: None,
+        perturbation: None,
         policy: Box::new(|| Ok(Box::new(Grasper::default()))),
     }
 }
@@ -107,6 +108,25 @@ fn assert_same(a: &StoredEvaluation, b: &StoredEvaluation) {
     assert_eq!(a.episodes, b.episodes);
     for name in ["evaluation.json", "outcomes.parquet"] {
         assert_eq!(bytes(a, name), bytes(b, name), "{name}");
+    }
+}
+
+#[test]
+fn pictures_that_are_drawn_otherwise_than_the_demonstrations_are_refused() {
+    let _workers = beside_others();
+    let dir = tempfile::tempdir().unwrap();
+    let seeing = |fast_render| Subject { fast_render: Some(fast_render), ..subject() };
+    for drawn in [false, true] {
+        let mut options = options("Lift", 1);
+        (options.spec.cameras, options.spec.image_size) = (vec!["agentview".to_owned()], 16);
+        options.spec.fast_render = drawn;
+        let mut pool = Pool::start(options).unwrap();
+        let evaluated = |learned, pool: &mut Pool| {
+            evaluate(&seeing(learned), pool, dir.path(), &wanted(1), &mut |_| {}).map(|_| ()).map_err(|e| e.to_string())
+        };
+        evaluated(drawn, &mut pool).unwrap();
+        let error = evaluated(!drawn, &mut pool).unwrap_err();
+        assert!(error.contains("grasper@1") && error.contains("pictures drawn"), "{error}");
     }
 }
 

@@ -20,6 +20,7 @@ fn options() -> ImportOptions {
         task: "Lift".to_owned(),
         state_keys: ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"].map(str::to_owned).to_vec(),
         env_keys: vec!["object".to_owned()],
+        fast_render: false,
     }
 }
 

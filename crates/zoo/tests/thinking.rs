@@ -56,6 +56,7 @@ fn subject(reasoning: ReasoningConfig) -> Subject<'static> {
         execution: Execution::RecedingHorizon { n_action_steps: 4 },
         time_decides: model.depends_on_time(),
         fast_render: None,
+        perturbation: None,
         max_steps: Some(18),
         signature,
         policy: Box::new(move || Ok(Arc::clone(&model).policy(Arc::clone(&preprocess), Box::new(WallClock::new())))),

@@ -63,6 +63,7 @@ fn request(root: &Path, data: &Path, extra: &[&str]) -> TrainRequest {
         run: None,
         resume: false,
         zoo: root.join("zoo"),
+        image_memory: None,
     }
 }
 

@@ -50,12 +50,17 @@ pub struct EnvironmentKey {
 impl EnvironmentKey {
     /// The environment of an entry's demonstrations, unless the command line says otherwise.
     pub fn of(args: &RunArgs, meta: &EntryMeta) -> Result<Self, ZooError> {
+        Self::drawn(&args.simulator, args.task.as_deref(), meta)
+    }
+
+    /// The same for commands that show one episode: as its demonstrations, drawn as they were.
+    pub fn drawn(simulator: &SimulatorArgs, task: Option<&str>, meta: &EntryMeta) -> Result<Self, ZooError> {
         let recorded = || meta.env_module.as_ref().map(|module| module.name.clone());
-        let env_module = args.simulator.env_module.clone().or_else(recorded);
+        let env_module = simulator.env_module.clone().or_else(recorded);
         let cameras = meta.cameras()?;
-        Ok(match args.task.clone().filter(|task| *task != meta.task) {
+        Ok(match task.filter(|task| *task != meta.task) {
             // another task's environment has arguments of its own
-            Some(task) => Self { task, env_module, env_args: None, cameras },
+            Some(task) => Self { task: task.to_owned(), env_module, env_args: None, cameras },
             None => {
                 let env_args = meta.env_args.as_ref().map(serde_json::Value::to_string);
                 Self { task: meta.task.clone(), env_module, env_args, cameras }
@@ -65,15 +70,21 @@ impl EnvironmentKey {
 
     /// The worker that such a simulator is.
     pub fn spec(&self, args: &RunArgs, control: Control) -> anyhow::Result<WorkerSpec> {
+        let mut spec = self.worker(&args.simulator, control)?;
+        spec.limits.step = Duration::from_secs(args.step_timeout);
+        Ok(spec)
+    }
+
+    /// The same with the usual limits.
+    pub fn worker(&self, simulator: &SimulatorArgs, control: Control) -> anyhow::Result<WorkerSpec> {
         let env_args = self.env_args.as_deref().map(serde_json::from_str).transpose()?;
-        let mut spec = args.simulator.recorded_spec(&self.task, env_args.as_ref())?;
+        let mut spec = simulator.recorded_spec(&self.task, env_args.as_ref())?;
         spec.env_module.clone_from(&self.env_module);
         if let Some(cameras) = &self.cameras {
             spec.cameras.clone_from(&cameras.names);
             (spec.image_size, spec.fast_render) = (cameras.size, cameras.fast_render);
         }
         spec.control = control;
-        spec.limits.step = Duration::from_secs(args.step_timeout);
         Ok(spec)
     }
 }

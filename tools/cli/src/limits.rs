@@ -33,6 +33,30 @@ pub fn check_coefficient(coefficient: f64, horizon: usize) -> Result<()> {
     Ok(())
 }
 
+/// A size on the command line: `500M`, `2G`, `1.5G`, or a number of bytes.
+///
+/// # Errors
+/// Anything else, in words.
+pub fn bytes(text: &str) -> Result<u64, String> {
+    let (number, unit) = match text.char_indices().next_back() {
+        Some((at, letter)) if letter.is_ascii_alphabetic() => (&text[..at], letter.to_ascii_uppercase()),
+        _ => (text, 'B'),
+    };
+    let factor = match unit {
+        'B' => Some(1.0),
+        'K' => Some(1e3),
+        'M' => Some(1e6),
+        'G' => Some(1e9),
+        'T' => Some(1e12),
+        _ => None,
+    };
+    let size = number.parse::<f64>().ok().zip(factor).map(|(number, factor)| number * factor);
+    match size.filter(|size| (0.0..=1e18).contains(size)) {
+        Some(size) => Ok(size as u64),
+        None => Err("expected a size such as 500M or 2G".to_owned()),
+    }
+}
+
 /// How many simulators to start: one a core unless another number was asked for.
 ///
 /// # Errors
@@ -68,6 +92,14 @@ pub fn available_memory() -> Option<u64> {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+
+    #[test]
+    fn sizes_have_units() {
+        assert_eq!(["500M", "2G", "1.5g", "7", "7k"].map(bytes), [500e6, 2e9, 1.5e9, 7.0, 7e3].map(|x| Ok(x as u64)));
+        for wrong in ["", "G", "-1G", "2Q", "nan", "1e30T", "2 G 1"] {
+            assert!(bytes(wrong).unwrap_err().contains("500M or 2G"), "{wrong}");
+        }
+    }
 
     #[test]
     fn what_is_usual_passes_and_what_is_absurd_does_not() {

@@ -188,7 +188,7 @@ def answer(simulation: Simulation, request: protocol.Request, tensors: wire.Tens
             "success": stepped.success,
             "failure": stepped.failure,
         }
-        return reply, {"rewards": stepped.rewards, **observed(stepped.observation)}
+        return drawn(reply, stepped.drawing_ms), {"rewards": stepped.rewards, **observed(stepped.observation)}
     if isinstance(request, protocol.Reset):
         first = simulation.reset(request.seed, request.split == "demonstration")
         reply = {
@@ -199,7 +199,7 @@ def answer(simulation: Simulation, request: protocol.Request, tensors: wire.Tens
             "group": first.ep_meta.get("group"),
             "ep_meta": first.ep_meta,
         }
-        return reply, observed(first.observation)
+        return drawn(reply, first.drawing_ms), observed(first.observation)
     if isinstance(request, protocol.Expert):
         episode = simulation.expert(request.seed, request.split == "demonstration")
         return episode_reply("expert", request.id, episode), episode.tensors
@@ -211,6 +211,11 @@ def answer(simulation: Simulation, request: protocol.Request, tensors: wire.Tens
         image = simulation.image(request.camera, *request.size)
         return {"type": "render", "id": request.id}, {"image": image}
     raise RequestError("unknown_request", f"request {request!r} cannot be answered")
+
+
+def drawn(reply: wire.Message, milliseconds: float) -> wire.Message:
+    """The reply, and how long its pictures took where it has any."""
+    return {**reply, "drawing_ms": milliseconds} if milliseconds > 0 else reply
 
 
 def observed(observation: wire.Tensors) -> wire.Tensors:

@@ -25,16 +25,24 @@ pub(crate) fn encode(
             out.extend_from_slice(pixels);
             Ok(())
         }
-        ImageForm::Png => {
-            let mut encoder = png::Encoder::new(out, width as u32, height as u32);
-            encoder.set_color(png::ColorType::Rgb);
-            encoder.set_depth(png::BitDepth::Eight);
-            encoder.set_compression(png::Compression::Fast);
-            let mut writer = encoder.write_header()?;
-            writer.write_image_data(pixels)?;
-            writer.finish()
-        }
+        ImageForm::Png => encode_png(height, width, pixels, out),
     }
+}
+
+/// Appends one RGB picture as a PNG file.
+pub(crate) fn encode_png(
+    height: usize,
+    width: usize,
+    pixels: &[u8],
+    out: &mut Vec<u8>,
+) -> Result<(), png::EncodingError> {
+    let mut encoder = png::Encoder::new(out, width as u32, height as u32);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_compression(png::Compression::Fast);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(pixels)?;
+    writer.finish()
 }
 
 /// Pixels of an encoded picture that must be `height` x `width` RGB; in words what is wrong otherwise.

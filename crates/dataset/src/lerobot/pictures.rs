@@ -10,7 +10,12 @@ use crate::source::{VideoFile, VideoInfo};
 use arrow::array::{Array, ArrayRef, BinaryArray, StructArray};
 use arrow::datatypes::DataType;
 use rayon::prelude::*;
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::ops::Range;
+use std::os::unix::fs::FileExt;
 use std::path::{Component, Path, PathBuf};
+use std::sync::Arc;
 
 /// Pictures that are unpacked from a column at once.
 const ROWS: usize = 256;
@@ -41,6 +46,89 @@ impl Pictures {
     }
 }
 
+/// Bytes of decoded pictures that are on their way to a file at once.
+const BLOCK: usize = 64 << 20;
+
+/// All pictures of one camera in a file of their own: decoded once, read one by one, for those that memory cannot hold.
+/// The file has no name any more and goes when nobody uses it.
+#[derive(Debug, Clone)]
+pub struct PictureFile {
+    /// Rows of a picture.
+    pub height: usize,
+    /// Pixels in a row.
+    pub width: usize,
+    file: Arc<File>,
+    /// The folder that it lies in, for messages.
+    folder: PathBuf,
+}
+
+impl PictureFile {
+    /// Fills `out` with the picture of a frame of the data set.
+    ///
+    /// # Errors
+    /// A file that cannot be read, a frame beyond its end.
+    pub fn read(&self, frame: usize, out: &mut [u8]) -> Result<()> {
+        let at = (frame * self.height * self.width * 3) as u64;
+        self.file
+            .read_exact_at(out, at)
+            .map_err(failed(&self.folder, "read decoded pictures from a temporary file in it"))
+    }
+}
+
+/// A camera's pictures, wherever they are kept.
+#[derive(Debug, Clone)]
+pub enum PictureStore {
+    /// In memory.
+    Memory(Arc<Pictures>),
+    /// In a file.
+    File(PictureFile),
+}
+
+impl From<Arc<Pictures>> for PictureStore {
+    fn from(pictures: Arc<Pictures>) -> Self {
+        Self::Memory(pictures)
+    }
+}
+
+impl From<PictureFile> for PictureStore {
+    fn from(pictures: PictureFile) -> Self {
+        Self::File(pictures)
+    }
+}
+
+impl PictureStore {
+    /// Height and width of a picture.
+    pub fn size(&self) -> (usize, usize) {
+        match self {
+            Self::Memory(pictures) => (pictures.height, pictures.width),
+            Self::File(pictures) => (pictures.height, pictures.width),
+        }
+    }
+
+    /// Bytes of a picture.
+    pub fn picture_bytes(&self) -> usize {
+        let (height, width) = self.size();
+        height * width * 3
+    }
+
+    /// Fills `out` with the picture of a frame of the data set.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn read(&self, frame: usize, out: &mut [u8]) -> Result<()> {
+        match self {
+            Self::Memory(pictures) => out.copy_from_slice(pictures.frame(frame)),
+            Self::File(pictures) => pictures.read(frame, out)?,
+        }
+        Ok(())
+    }
+}
+
+fn failed(path: &Path, operation: &'static str) -> impl FnOnce(std::io::Error) -> DatasetError {
+    let path = path.to_path_buf();
+    move |source| DatasetError::Io { path, operation, source }
+}
+
 /// A file of one camera's videos.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraFile {
@@ -59,14 +147,77 @@ impl Dataset {
     /// Decodes all pictures of a camera into memory, with as many threads as there are cores. The bytes are those that
     /// LeRobot reads.
     pub fn pictures(&self, name: &str) -> Result<Pictures> {
-        let (feature, height, width) = self.camera(name)?;
-        let size = height * width * 3;
-        let mut data = vec![0; self.frames() * size];
-        match feature.dtype.as_str() {
-            "video" => self.film(name, (height, width), &mut data)?,
-            _ => self.unpack(name, (height, width), &mut data)?,
-        }
+        let (_, height, width) = self.camera(name)?;
+        let mut data = Vec::with_capacity(self.frames() * height * width * 3);
+        self.decode(name, 0..self.episodes().len(), BLOCK, &mut |block| {
+            data.extend_from_slice(block);
+            Ok(())
+        })?;
         Ok(Pictures { height, width, data })
+    }
+
+    /// The pictures of one episode, as [`Dataset::pictures`] has them.
+    ///
+    /// # Panics
+    /// When there is no such episode.
+    pub fn episode_pictures(&self, name: &str, episode: usize) -> Result<Pictures> {
+        let (_, height, width) = self.camera(name)?;
+        let mut data = Vec::new();
+        self.decode(name, episode..episode + 1, usize::MAX, &mut |block| {
+            data.extend_from_slice(block);
+            Ok(())
+        })?;
+        Ok(Pictures { height, width, data })
+    }
+
+    /// Bytes that all pictures of a camera take once they are decoded.
+    pub fn decoded_bytes(&self, name: &str) -> Result<u64> {
+        let (_, height, width) = self.camera(name)?;
+        Ok((self.frames() * height * width * 3) as u64)
+    }
+
+    /// Decodes all pictures of a camera into a file in `folder`, some megabytes at a time.
+    ///
+    /// # Errors
+    /// As [`Dataset::pictures`]; a file that cannot be written.
+    pub fn picture_file(&self, name: &str, folder: &Path) -> Result<PictureFile> {
+        let (_, height, width) = self.camera(name)?;
+        let write = "write decoded pictures to a temporary file in it";
+        let file = tempfile::tempfile_in(folder).map_err(failed(folder, "create a temporary file in it"))?;
+        let mut out = BufWriter::new(file);
+        self.decode(name, 0..self.episodes().len(), BLOCK, &mut |block| {
+            out.write_all(block).map_err(failed(folder, write))
+        })?;
+        let file = out.into_inner().map_err(|error| failed(folder, write)(error.into_error()))?;
+        Ok(PictureFile { height, width, file: Arc::new(file), folder: folder.to_path_buf() })
+    }
+
+    /// Decodes the pictures of some episodes, in order, in blocks of whole pictures: of one episode at least, of no more
+    /// than `limit` bytes otherwise.
+    fn decode(
+        &self,
+        name: &str,
+        episodes: Range<usize>,
+        limit: usize,
+        sink: &mut dyn FnMut(&[u8]) -> Result<()>,
+    ) -> Result<()> {
+        let (feature, height, width) = self.camera(name)?;
+        if feature.dtype != "video" {
+            return self.unpack(name, (height, width), episodes, sink);
+        }
+        let (mut from, size) = (episodes.start, height * width * 3);
+        while from < episodes.end {
+            let (mut to, mut bytes) = (from, 0);
+            while to < episodes.end && (to == from || bytes + self.episodes()[to].length * size <= limit) {
+                bytes += self.episodes()[to].length * size;
+                to += 1;
+            }
+            let mut block = vec![0; bytes];
+            self.film(name, (height, width), from..to, &mut block)?;
+            sink(&block)?;
+            from = to;
+        }
+        Ok(())
     }
 
     /// The files that a camera's videos lie in, each opened; none for an image column.
@@ -105,12 +256,12 @@ impl Dataset {
     }
 
     /// Videos: episodes lie one after the other in files, so each thread takes a run of episodes.
-    fn film(&self, name: &str, (height, width): (usize, usize), data: &mut [u8]) -> Result<()> {
+    fn film(&self, name: &str, (height, width): (usize, usize), episodes: Range<usize>, data: &mut [u8]) -> Result<()> {
         let size = height * width * 3;
         let places = places(self, name)?;
-        let mut tasks = Vec::with_capacity(places.len());
+        let mut tasks = Vec::with_capacity(episodes.len());
         let mut rest = data;
-        for (episode, place) in self.episodes().iter().zip(&places) {
+        for (episode, place) in self.episodes().iter().zip(&places).take(episodes.end).skip(episodes.start) {
             let (mine, after) = rest.split_at_mut(episode.length * size);
             tasks.push((episode, place, mine));
             rest = after;
@@ -123,10 +274,23 @@ impl Dataset {
     }
 
     /// Image columns: row groups one after the other, their pictures on all threads.
-    fn unpack(&self, name: &str, (height, width): (usize, usize), data: &mut [u8]) -> Result<()> {
+    fn unpack(
+        &self,
+        name: &str,
+        (height, width): (usize, usize),
+        episodes: Range<usize>,
+        sink: &mut dyn FnMut(&[u8]) -> Result<()>,
+    ) -> Result<()> {
         let size = height * width * 3;
         let mut rows = Rows::open(self.root(), "data", Some(name), ROWS)?;
-        for block in data.chunks_mut(ROWS * size) {
+        let before: usize = self.episodes()[..episodes.start].iter().map(|e| e.length).sum();
+        for from in (0..before).step_by(ROWS) {
+            rows.take(ROWS.min(before - from))?;
+        }
+        let frames: usize = self.episodes()[episodes].iter().map(|e| e.length).sum();
+        let mut buffer = vec![0; ROWS.min(frames) * size];
+        for from in (0..frames).step_by(ROWS) {
+            let block = &mut buffer[..ROWS.min(frames - from) * size];
             let mut files = Vec::new();
             for batch in rows.take(block.len() / size)? {
                 files.push(self.files(name, batch.column(0))?);
@@ -139,6 +303,7 @@ impl Dataset {
                 out.copy_from_slice(&pixels);
                 Ok::<(), DatasetError>(())
             })?;
+            sink(block)?;
         }
         Ok(())
     }

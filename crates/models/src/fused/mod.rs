@@ -150,6 +150,8 @@ pub(crate) struct Pass<'a> {
     pub(crate) rng: Option<&'a mut Rng>,
     /// for predictions
     pub(crate) packed: Option<&'a PackedWeights>,
+    /// called once, when pictures have become tokens
+    pub(crate) on_seen: Option<&'a mut dyn FnMut()>,
 }
 
 /// Row `r` of a computed tensor is row `r / computed * all + r % computed` of the whole one.

@@ -110,6 +110,9 @@ impl<'a> Tokens<'a> {
         }
         if let Some(eyes) = self.eyes() {
             let looked = eyes.forward(pass, self.pictures, &mut x, (self.layout.vectors(), tokens));
+            if let Some(on_seen) = pass.on_seen.take() {
+                on_seen();
+            }
             match pass.packed {
                 // a prediction has no backward pass
                 Some(_) => looked.free(pass),

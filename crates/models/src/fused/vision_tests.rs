@@ -90,7 +90,8 @@ fn tokens_and_gradients_are_the_composed_ones() {
                     let eyes = Eyes { shape: case.encoder.backbone().shape(), sizes: &case.sizes };
                     spaces.with(|space| {
                         with_weights(&case.params, |weights_of| {
-                            let pass = &mut Pass { weights: weights_of, shape, space, rng: None, packed: None };
+                            let pass =
+                                &mut Pass { weights: weights_of, shape, space, rng: None, packed: None, on_seen: None };
                             let mut x = spread(&vec![0.0; want.len()]);
                             let looked = eyes.forward(pass, &case.pictures, &mut x, (first, all));
                             close(&x, &spread(&want), 1e-5, "tokens");
@@ -115,7 +116,7 @@ fn tokens_and_gradients_are_the_composed_ones() {
             let eyes = Eyes { shape: case.encoder.backbone().shape(), sizes: &case.sizes };
             spaces.with(|space| {
                 with_weights(&case.params, |weights| {
-                    let pass = &mut Pass { weights, shape, space, rng: None, packed: Some(&packed) };
+                    let pass = &mut Pass { weights, shape, space, rng: None, packed: Some(&packed), on_seen: None };
                     eyes.forward(pass, &case.pictures, &mut x, (first, all)).free(pass);
                 })
                 .unwrap();

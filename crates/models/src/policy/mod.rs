@@ -81,6 +81,11 @@ pub trait Policy: Send {
     /// Tells it that so many actions of its last chunk are on their way.
     fn executed(&mut self, _actions: usize) {}
 
+    /// Milliseconds from the last query's beginning until its pictures were tokens; `None` if it sees none, or cannot tell.
+    fn encoding(&self) -> Option<f64> {
+        None
+    }
+
     /// Forgets the episode and begins another; what it draws from now on depends on `seed` only.
     fn reset(&mut self, seed: u64);
 
@@ -105,6 +110,9 @@ impl<P: Policy + ?Sized> Policy for Box<P> {
     }
     fn executed(&mut self, actions: usize) {
         (**self).executed(actions);
+    }
+    fn encoding(&self) -> Option<f64> {
+        (**self).encoding()
     }
     fn reset(&mut self, seed: u64) {
         (**self).reset(seed);

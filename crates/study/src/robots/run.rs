@@ -221,6 +221,7 @@ impl Shared<'_> {
                 resume: runs.join("config.toml").exists(),
                 run: Some(runs),
                 zoo: zoo.clone(),
+                image_memory: None,
             };
             let mut steps = 0;
             let outcome = train(&request, &|| self.stopped(), &mut |event| match event {

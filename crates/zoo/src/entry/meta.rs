@@ -91,6 +91,11 @@ pub struct CamerasMeta {
 const FAST_RENDER: &str = "fast_render";
 
 impl CamerasMeta {
+    /// What `env_args` say of an environment that draws without reflections and multisampling, if they say nothing else.
+    pub fn fast() -> serde_json::Value {
+        serde_json::json!({ FAST_RENDER: true })
+    }
+
     /// Whether the environment with these arguments draws without reflections and multisampling.
     pub fn draws_fast(env_args: &serde_json::Value) -> bool {
         env_args.get(FAST_RENDER).and_then(serde_json::Value::as_bool).unwrap_or(false)

@@ -47,6 +47,7 @@ impl LoadedEntry {
                 .of_kind(FeatureKind::Image)
                 .next()
                 .map(|_| meta.env_args.as_ref().is_some_and(CamerasMeta::draws_fast)),
+            perturbation: None,
             policy: Box::new(move || Ok(this.policy())),
         }
     }

@@ -1,10 +1,14 @@
 //! What is evaluated: an entry's policy with all that an evaluation has to know of it.
 
-use models::{Actor, ModelError, Policy, RecedingHorizon, Signature, TemporalEnsemble};
-use rollout::{EpisodePlan, Ready};
+use dataset::Picture;
+use models::{
+    Actor, FeatureKind, FeatureSpec, ModelError, Observation, Policy, RecedingHorizon, Signature, TemporalEnsemble,
+    Values,
+};
+use rollout::{EpisodePlan, Image, Observations, Ready};
 
-use super::EvaluationOptions;
 use super::agent::{PolicyAgent, QueryTimes, Timed};
+use super::{EvaluationOptions, Perturbation};
 use crate::entry::CamerasMeta;
 use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, Seeds, TrainingFacts};
 use crate::{FeatureKeys, ZooError};
@@ -33,6 +37,8 @@ pub struct Subject<'a> {
     pub time_decides: bool,
     /// Of a policy that sees pictures: whether those it learned from were drawn without reflections and multisampling.
     pub fast_render: Option<bool>,
+    /// What becomes of its pictures on their way to it.
+    pub perturbation: Option<Perturbation>,
     /// Makes a policy of its own for one environment.
     pub policy: Box<dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a>,
 }
@@ -68,6 +74,7 @@ impl Subject<'_> {
                 env_args_sha256: ready.env_args_sha256.clone(),
                 control: ready.control,
                 max_steps: self.max_steps.unwrap_or(ready.max_steps),
+                perturbation: self.perturbation.as_ref().map(Perturbation::to_string),
             },
             execution: self.execution,
             time_decides: self.time_decides,
@@ -80,6 +87,13 @@ impl Subject<'_> {
 
     fn check_signature(&self, ready: &Ready) -> Result<(), ZooError> {
         EpisodePlan::new(ready, self.keys.keys(), 1)?;
+        if let Some(perturbation) = &self.perturbation {
+            perturbation.check(&self.signature).map_err(|expected| ZooError::Perturbation {
+                entry: self.entry.to_string(),
+                perturbation: perturbation.to_string(),
+                expected,
+            })?;
+        }
         let features = self.signature.observation.iter().map(|spec| {
             let found = self.keys.width(&spec.name, ready).map_or_else(|reason| reason, |width| width.to_string());
             (format!("length of {}", spec.name), spec.width().to_string(), found)
@@ -104,6 +118,21 @@ impl Subject<'_> {
         Ok(())
     }
 
+    /// The pictures that a policy sees of an observation, side by side, each pixel as a square of `scale`; `None` without any.
+    pub(super) fn seen(&self, observations: &Observations, scale: usize) -> Option<Image> {
+        let mut seen = self.keys.observe(observations);
+        if let Some(perturbation) = &self.perturbation {
+            perturbation.apply(&self.signature, &mut seen);
+        }
+        let cameras = self.signature.of_kind(FeatureKind::Image);
+        let pictures: Vec<Picture> = cameras.filter_map(|camera| picture(camera, &seen)).collect();
+        if pictures.is_empty() {
+            return None;
+        }
+        let Picture { height, width, rgb } = Picture::sheet(&[pictures], 2).enlarged(scale);
+        Some(Image { height, width, rgb })
+    }
+
     /// An agent of its own for one environment, and where its queries' durations go.
     ///
     /// # Errors
@@ -120,7 +149,15 @@ impl Subject<'_> {
             Execution::RecedingHorizon { n_action_steps } => Box::new(RecedingHorizon::new(policy, n_action_steps)?),
             Execution::TemporalEnsemble { coefficient } => Box::new(TemporalEnsemble::new(policy, coefficient)?),
         };
-        Ok(PolicyAgent::new(actor, self.keys.clone()))
+        Ok(PolicyAgent::new(actor, self.keys.clone()).perturbed(self.perturbation.clone(), &self.signature))
+    }
+}
+
+/// What a camera shows in an observation.
+pub(super) fn picture(camera: &FeatureSpec, seen: &Observation) -> Option<Picture> {
+    match (seen.get(&camera.name)?, camera.shape.as_slice()) {
+        (Values::U8(rgb), &[height, width, _]) => Some(Picture { height, width, rgb: rgb.clone() }),
+        _ => None,
     }
 }
 

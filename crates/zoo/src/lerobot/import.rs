@@ -10,7 +10,7 @@ use models::{
     Signature,
 };
 
-use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta};
+use crate::entry::{CamerasMeta, CardWords, EntryDraft, EntryId, EntryMeta};
 use crate::experiment::{DataSection, Experiment, NormalisationSection, PICTURE_PREFIX, RolloutSection, TaskSection};
 use crate::run::TrainSection;
 use crate::{ZooError, tensors};
@@ -30,6 +30,8 @@ pub struct ImportOptions {
     pub state_keys: Vec<String>,
     /// Observation keys that make its environment state, in order.
     pub env_keys: Vec<String>,
+    /// Whether the pictures that it learned from were drawn without reflections and multisampling.
+    pub fast_render: bool,
 }
 
 /// Makes an entry in `zoo` of the checkpoint in `folder`.
@@ -41,6 +43,13 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     let LerobotAct { config: act, signature, n_action_steps, temporal_ensemble_coeff, .. } =
         lerobot::read_config(&config::read(&config_path)?).map_err(config::misfit(&config_path))?;
 
+    if options.fast_render && signature.of_kind(FeatureKind::Image).next().is_none() {
+        return Err(ZooError::InvalidValue {
+            key: "fast rendering".to_owned(),
+            expected: "a policy that sees pictures".to_owned(),
+            found: "one that sees none".to_owned(),
+        });
+    }
     let before = step(folder, PREPROCESSOR, "normalizer_processor")?;
     let after = step(folder, POSTPROCESSOR, "unnormalizer_processor")?;
     let normalisation = NormalisationSection {
@@ -112,7 +121,9 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             env_name: of_origin.and_then(|origin| origin.env_name.clone()),
             env_version: of_origin.and_then(|origin| origin.env_version.clone()),
             env_module: of_origin.and_then(|origin| origin.env_module.clone()),
-            env_args: of_origin.and_then(|origin| origin.env_args.clone()),
+            env_args: of_origin
+                .and_then(|origin| origin.env_args.clone())
+                .or_else(|| options.fast_render.then(CamerasMeta::fast)),
             parameters: model.params().count() as u64,
             signature: preprocess.signature().clone(),
             keys: experiment.data.feature_keys()?,

@@ -378,6 +378,8 @@ pub(crate) mod tests {
             seed,
             wall_ms: 900.0,
             simulator_ms: 700.0,
+            rendering_ms: Vec::new(),
+            encoding_ms: Vec::new(),
             inference_ms: (0..6).map(|i| 2.0 + (seed % 3) as f64 / 8.0 + f64::from(i)).collect(),
         };
         (episode, timing)

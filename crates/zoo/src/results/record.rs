@@ -29,6 +29,9 @@ pub struct Protocol {
     pub control: Control,
     /// Control steps after which an episode counts as failed.
     pub max_steps: usize,
+    /// What became of the pictures on their way to the policy, if anything: `swap-cameras`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub perturbation: Option<String>,
 }
 
 impl Protocol {
@@ -36,10 +39,12 @@ impl Protocol {
     /// before the reset, success ends an episode.
     pub const RULES: u32 = 1;
 
-    /// A short name, the same for the same rules: `Lift-400-robosuite-v1-1a2b3c`.
+    /// A short name, the same for the same rules: `Lift-400-robosuite-v1-1a2b3c`, with `-swap-cameras` where pictures were
+    /// perturbed.
     pub fn id(&self) -> String {
         let Self { rules, task, max_steps, control, .. } = self;
-        format!("{task}-{max_steps}-{control}-v{rules}-{}", &self.hash()[..6])
+        let perturbed = self.perturbation.as_ref().map_or(String::new(), |word| format!("-{word}"));
+        format!("{task}-{max_steps}-{control}-v{rules}-{}{perturbed}", &self.hash()[..6])
     }
 
     /// sha256 of the rules as JSON.
@@ -263,7 +268,13 @@ pub struct EpisodeTiming {
     pub wall_ms: f64,
     /// Time spent waiting for the simulator, in milliseconds.
     pub simulator_ms: f64,
-    /// Duration of each query of the policy, in milliseconds.
+    /// Of that, what drawing the pictures of each query took; none where a policy sees no pictures.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub rendering_ms: Vec<f64>,
+    /// Of each query, how long it took until pictures were tokens; none where a policy sees no pictures.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub encoding_ms: Vec<f64>,
+    /// Duration of each query of the policy, in milliseconds, its encoding included.
     pub inference_ms: Vec<f64>,
 }
 
@@ -314,6 +325,7 @@ pub(crate) mod tests {
                 env_args_sha256: None,
                 control: Control::Robosuite,
                 max_steps: 400,
+                perturbation: None,
             },
             execution: Execution::RecedingHorizon { n_action_steps: 8 },
             time_decides: false,
@@ -362,7 +374,7 @@ pub(crate) mod tests {
     #[test]
     fn whatever_can_change_an_outcome_changes_the_folder() {
         let first = sample("a", 1, 20);
-        let changes: [fn(&mut EvaluationRecord); 10] = [
+        let changes: [fn(&mut EvaluationRecord); 11] = [
             |r| r.entry.hash = "0".repeat(64),
             |r| r.entry.version = 2,
             |r| r.protocol.max_steps = 401,
@@ -370,6 +382,7 @@ pub(crate) mod tests {
             |r| r.protocol.env_module_sha256 = Some("0".repeat(64)),
             |r| r.protocol.env_args_sha256 = Some("0".repeat(64)),
             |r| r.execution = Execution::RecedingHorizon { n_action_steps: 4 },
+            |r| r.protocol.perturbation = Some("hue=0.1".into()),
             |r| r.seeds.count = 21,
             |r| drop(r.versions.insert("mujoco".into(), "3.3.8".into())),
             |r| r.shard = Some(Shard { index: 1, count: 2 }),

@@ -160,25 +160,33 @@ pub(super) fn read_episodes(path: &Path) -> Result<Vec<EpisodeRecord>, ZooError>
         .collect())
 }
 
-/// Writes the timings.
+/// Writes the timings. The columns `rendering_ms` and `encoding_ms` are there only where pictures were seen.
 pub(super) fn write_timings(path: &Path, timings: &[EpisodeTiming]) -> Result<(), ZooError> {
     let floats =
         |f: fn(&EpisodeTiming) -> f64| -> ArrayRef { Arc::new(Float64Array::from_iter_values(timings.iter().map(f))) };
-    let item = Arc::new(Field::new("item", DataType::Float64, false));
-    let mut queries = ListBuilder::new(Float64Builder::new()).with_field(item);
-    for timing in timings {
-        queries.values().append_slice(&timing.inference_ms);
-        queries.append(true);
+    let lists = |f: fn(&EpisodeTiming) -> &[f64]| -> ArrayRef {
+        let item = Arc::new(Field::new("item", DataType::Float64, false));
+        let mut queries = ListBuilder::new(Float64Builder::new()).with_field(item);
+        for timing in timings {
+            queries.values().append_slice(f(timing));
+            queries.append(true);
+        }
+        Arc::new(queries.finish())
+    };
+    let mut columns: Vec<(&str, ArrayRef)> = vec![
+        ("seed", Arc::new(UInt64Array::from_iter_values(timings.iter().map(|t| t.seed)))),
+        ("wall_ms", floats(|t| t.wall_ms)),
+        ("simulator_ms", floats(|t| t.simulator_ms)),
+        ("inference_ms", lists(|t| &t.inference_ms)),
+    ];
+    type Times = fn(&EpisodeTiming) -> &[f64];
+    let seen: [(&str, Times); 2] = [("rendering_ms", |t| &t.rendering_ms), ("encoding_ms", |t| &t.encoding_ms)];
+    for (name, of) in seen {
+        if timings.iter().any(|t| !of(t).is_empty()) {
+            columns.push((name, lists(of)));
+        }
     }
-    write_table(
-        path,
-        vec![
-            ("seed", Arc::new(UInt64Array::from_iter_values(timings.iter().map(|t| t.seed)))),
-            ("wall_ms", floats(|t| t.wall_ms)),
-            ("simulator_ms", floats(|t| t.simulator_ms)),
-            ("inference_ms", Arc::new(queries.finish())),
-        ],
-    )
+    write_table(path, columns)
 }
 
 /// Reads the timings.
@@ -187,16 +195,23 @@ pub(super) fn read_timings(path: &Path) -> Result<Vec<EpisodeTiming>, ZooError> 
     let (seeds, wall) = (columns.u64("seed")?, columns.f64("wall_ms")?);
     let simulator = columns.f64("simulator_ms")?;
     let list = DataType::List(Arc::new(Field::new("item", DataType::Float64, false)));
-    let queries = columns.get("inference_ms", &list, |a, out| {
-        let rows = a.as_list::<i32>().iter().flatten();
-        out.extend(rows.map(|row| row.as_primitive::<Float64Type>().values().to_vec()));
-    })?;
-    let rows = seeds.into_iter().zip(wall).zip(simulator).zip(queries);
+    let lists = |name: &str| {
+        columns.get(name, &list, |a, out| {
+            let rows = a.as_list::<i32>().iter().flatten();
+            out.extend(rows.map(|row| row.as_primitive::<Float64Type>().values().to_vec()));
+        })
+    };
+    let queries = lists("inference_ms")?;
+    let optional = |name: &str| if columns.has(name) { lists(name) } else { Ok(vec![Vec::new(); seeds.len()]) };
+    let seen = optional("rendering_ms")?.into_iter().zip(optional("encoding_ms")?);
+    let rows = seeds.into_iter().zip(wall).zip(simulator).zip(queries).zip(seen);
     Ok(rows
-        .map(|(((seed, wall_ms), simulator_ms), inference_ms)| EpisodeTiming {
+        .map(|((((seed, wall_ms), simulator_ms), inference_ms), (rendering_ms, encoding_ms))| EpisodeTiming {
             seed,
             wall_ms,
             simulator_ms,
+            rendering_ms,
+            encoding_ms,
             inference_ms,
         })
         .collect())
@@ -238,14 +253,18 @@ mod tests {
             assert_eq!(read_episodes(&a).unwrap(), all);
             assert_eq!(std::fs::read(&a).unwrap(), std::fs::read(&b).unwrap());
         }
-        let timings = [Vec::new(), vec![0.5, 0.75]].map(|inference_ms| EpisodeTiming {
-            seed: 3,
-            wall_ms: 1.5,
-            simulator_ms: 1.0,
-            inference_ms,
-        });
-        write_timings(&t, &timings).unwrap();
-        assert_eq!(read_timings(&t).unwrap(), timings);
+        for rendering_ms in [Vec::new(), vec![8.5, 9.0]] {
+            let timings = [Vec::new(), vec![0.5, 0.75]].map(|inference_ms| EpisodeTiming {
+                seed: 3,
+                wall_ms: 1.5,
+                simulator_ms: 1.0,
+                encoding_ms: rendering_ms.clone(),
+                rendering_ms: rendering_ms.clone(),
+                inference_ms,
+            });
+            write_timings(&t, &timings).unwrap();
+            assert_eq!(read_timings(&t).unwrap(), timings);
+        }
         let error = read_episodes(&t).unwrap_err().to_string();
         assert!(error.contains("column `success` is missing"), "{error}");
     }

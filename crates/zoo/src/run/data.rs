@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
-use dataset::{ConvertOptions, Dataset, FeatureStats, WindowBatch, WindowSpec, Windows};
+use dataset::{ConvertOptions, Dataset, DatasetError, FeatureStats, PictureStore, WindowBatch, WindowSpec, Windows};
 use models::{
     Batch, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureSpec, Normaliser, Preprocess, STATE, Signature, ValuesRef,
 };
@@ -14,6 +14,7 @@ use crate::ZooError;
 use crate::entry::DataMeta;
 use crate::experiment::{DataSection, EntitySection, Experiment, PICTURE_PREFIX};
 
+use super::preflight::picture_budget;
 use super::symmetry::Symmetries;
 
 /// Folder of the run that a converted HDF5 file goes to.
@@ -91,6 +92,16 @@ pub(super) fn open(
     opened(folder)
 }
 
+/// What pictures may take, and where those go that would take more.
+pub(super) struct PictureMemory<'a> {
+    pub budget: u64,
+    pub folder: &'a Path,
+}
+
+fn gigabytes(bytes: u64) -> String {
+    format!("{:.2} GB", bytes as f64 / 1e9)
+}
+
 /// Windows to train and to validate on, with the statistics of the episodes trained on.
 pub(super) struct Demonstrations {
     pub train: Windows,
@@ -110,6 +121,7 @@ pub(super) fn prepare(
     path: &Path,
     name: &str,
     experiment: &Experiment,
+    memory: &PictureMemory<'_>,
 ) -> Result<Demonstrations, ZooError> {
     let unfit = |reason: String| ZooError::UnfitData { path: path.to_owned(), reason };
     let failed = |source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) };
@@ -199,10 +211,22 @@ pub(super) fn prepare(
         false => Some(windows(valid)?),
     };
     let mut picture_statistics = Vec::new();
-    for camera in &experiment.data.cameras {
-        let name = format!("{PICTURE_PREFIX}{camera}");
-        let pictures = Arc::new(dataset.pictures(&name).map_err(failed)?);
-        train = train.with_pictures(&name, Arc::clone(&pictures));
+    let cameras: Vec<String> =
+        experiment.data.cameras.iter().map(|camera| format!("{PICTURE_PREFIX}{camera}")).collect();
+    let bytes = cameras.iter().map(|name| dataset.decoded_bytes(name)).sum::<Result<u64, _>>().map_err(failed)?;
+    let fits = bytes <= memory.budget;
+    if !fits {
+        let (bytes, budget) = (gigabytes(bytes), gigabytes(memory.budget));
+        notes.push(format!(
+            "pictures take {bytes}, {budget} are for them: kept in a file in the run's folder, read ahead"
+        ));
+    }
+    for name in cameras {
+        let pictures: PictureStore = match fits {
+            true => Arc::new(dataset.pictures(&name).map_err(failed)?).into(),
+            false => dataset.picture_file(&name, memory.folder).map_err(failed)?.into(),
+        };
+        train = train.with_pictures(&name, pictures.clone());
         valid = valid.map(|valid| valid.with_pictures(&name, pictures));
         picture_statistics.push(dataset.stats().get(&name).and_then(colours));
     }
@@ -239,7 +263,8 @@ pub(crate) fn first_windows(
     let episodes: Vec<usize> = dataset.split(&experiment.data.train_mask).unwrap_or_else(all);
     let lengths = episodes.iter().map(|&episode| dataset.episodes()[episode].length as u32);
     let firsts = lengths.scan(0, |next, length| Some(std::mem::replace(next, *next + length))).collect();
-    let demonstrations = prepare(&dataset, path, &path.display().to_string(), experiment)?;
+    let memory = PictureMemory { budget: picture_budget(), folder: work };
+    let demonstrations = prepare(&dataset, path, &path.display().to_string(), experiment, &memory)?;
     Ok((demonstrations.train, demonstrations.symmetries, firsts))
 }
 
@@ -301,6 +326,12 @@ pub(super) fn batch(
         .preprocess
         .batch(experiment.policy.action_horizon(), &observation, &windows.actions, &windows.is_pad)
         .map_err(experiment.model_error("make a batch for"))
+}
+
+/// Pictures of a data set that could be decoded and cannot be read any more.
+pub(super) fn unreadable(name: &str) -> impl FnOnce(DatasetError) -> ZooError + use<> {
+    let path = PathBuf::from(name);
+    move |source| ZooError::Dataset { path, source: Box::new(source) }
 }
 
 /// A mask that was asked for and is not there.

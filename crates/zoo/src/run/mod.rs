@@ -3,6 +3,7 @@
 mod checkpoint;
 mod data;
 mod eyes;
+mod feed;
 mod folder;
 mod list;
 mod loop_parts;

@@ -48,6 +48,11 @@ fn bytes(count: f64) -> String {
     if count >= 1e6 { format!("{count:.1e} {}", units[unit]) } else { format!("{count:.1} {}", units[unit]) }
 }
 
+/// Bytes that pictures may take unless it is said: half of what is free.
+pub(super) fn picture_budget() -> u64 {
+    available_memory().map_or(u64::MAX, |bytes| (bytes / 2.0) as u64)
+}
+
 /// Bytes that this process may still take: the machine's, or its control group's where that has less.
 fn available_memory() -> Option<f64> {
     let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<f64>().ok();

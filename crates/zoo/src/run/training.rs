@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use candle_core::Tensor;
-use dataset::{EnvMeta, WindowBatch};
+use dataset::EnvMeta;
 use models::{PolicyModel, Trainer, TrainerState};
 use serde::{Deserialize, Serialize};
 
@@ -14,9 +14,11 @@ use crate::experiment::Experiment;
 use crate::{ZooError, tensors, write_atomic};
 
 use super::checkpoint::Checkpoint;
-use super::data::{self, Demonstrations};
+use super::data::{self, Demonstrations, PictureMemory};
+use super::feed::Feed;
 use super::folder::RunFolder;
 use super::metrics::MetricsRow;
+use super::preflight::picture_budget;
 use super::sampler::Sampler;
 use super::section::TrainSection;
 use super::session::{self, Place, Settings, TrainEvent, TrainOutcome, Training};
@@ -39,6 +41,8 @@ pub struct TrainRequest {
     pub resume: bool,
     /// The zoo that gets the entry.
     pub zoo: PathBuf,
+    /// Bytes that pictures may take in memory; more are kept in a file and read ahead. `None`: half of what is free.
+    pub image_memory: Option<u64>,
 }
 
 impl TrainRequest {
@@ -128,8 +132,7 @@ struct PolicyTraining<'a> {
     trainer: Trainer,
     /// Carries the weights that are validated and sealed: the moving average where there is one.
     evaluated: Box<dyn PolicyModel>,
-    sampler: Sampler,
-    windows: WindowBatch,
+    feed: Feed,
     /// When the last row of metrics was written, and the samples since.
     rate: (Instant, u64),
 }
@@ -156,7 +159,9 @@ impl<'a> PolicyTraining<'a> {
             Some(provenance) => provenance.source.clone(),
             None => path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
         };
-        let demonstrations = data::prepare(&dataset, &path, &name, experiment)?;
+        let budget = request.image_memory.unwrap_or_else(picture_budget);
+        let memory = PictureMemory { budget, folder: folder.path() };
+        let demonstrations = data::prepare(&dataset, &path, &name, experiment, &memory)?;
         for note in &demonstrations.notes {
             on_event(TrainEvent::Note(note));
         }
@@ -195,8 +200,7 @@ impl<'a> PolicyTraining<'a> {
             env: dataset.env().cloned(),
             trainer,
             evaluated,
-            sampler: Sampler::new(section.seed, section.batch_size),
-            windows: WindowBatch::default(),
+            feed: Feed::new(Sampler::new(section.seed, section.batch_size), section.steps),
             rate: (Instant::now(), 0),
         })
     }
@@ -221,13 +225,12 @@ impl Training for PolicyTraining<'_> {
     }
 
     fn step(&mut self, step: u64) -> Result<BTreeMap<String, f64>, ZooError> {
-        let train = &self.demonstrations.train;
-        let indices = self.sampler.batch(train, step);
-        train.gather(indices.as_slice(), &mut self.windows);
-        self.demonstrations.symmetries.apply(step, &mut self.windows);
-        let batch = data::batch(&self.windows, &self.demonstrations, self.experiment)?;
+        let unreadable = data::unreadable(&self.demonstrations.meta.name);
+        let windows = self.feed.take(&self.demonstrations.train, step).map_err(unreadable)?;
+        self.demonstrations.symmetries.apply(step, windows);
+        let (batch, rows) = (data::batch(windows, &self.demonstrations, self.experiment)?, windows.n);
         let done = self.trainer.step(&batch).map_err(self.experiment.model_error("train"))?;
-        self.rate.1 += indices.len() as u64;
+        self.rate.1 += rows as u64;
         let mut values = BTreeMap::from([
             ("loss".to_owned(), f64::from(done.loss)),
             ("grad_norm".to_owned(), done.grad_norm),

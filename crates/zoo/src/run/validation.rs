@@ -26,7 +26,7 @@ pub(super) fn validation_loss(
     let (mut sum, mut count) = (0.0, 0.0);
     let mut gathered = WindowBatch::default();
     for chunk in indices.chunks(BATCH) {
-        windows.gather(chunk, &mut gathered);
+        windows.try_gather(chunk, &mut gathered).map_err(data::unreadable(&demonstrations.meta.name))?;
         let batch = data::batch(&gathered, demonstrations, experiment)?;
         let (error, entries) = absolute_error(model, &batch).map_err(experiment.model_error("validate"))?;
         sum += error;

@@ -1,44 +1,53 @@
 use crate::svg::{self, Content};
 use anyhow::{Context, Result, bail};
-use dataset::{Dataset, EpisodeMeta};
+use dataset::{Dataset, EpisodeMeta, Picture};
 use std::ffi::OsString;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// Draw an episode and the whole set, dimension by dimension.
+/// Draw an episode and the whole set, dimension by dimension, or an episode's pictures.
 ///
 /// One row a dimension: on the left its course over the episode, on the right its histogram over all frames of the
 /// set. The file's ending decides: .svg is one picture, .html a page with one picture a column. Neither needs anything
-/// from the network.
+/// from the network. A .png file shows what the cameras saw: a row a camera, pictures of some frames from the first to the
+/// last.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data plot lift --out lift.html
-  actrm-data plot lift --episode 3 --column action --out actions.svg")]
+  actrm-data plot lift --episode 3 --column action --out actions.svg
+  actrm-data plot lift_image --episode 3 --frames 12 --out episode.png")]
 pub struct Args {
     /// Data set directory
     dir: PathBuf,
     /// Episode to draw
     #[arg(long, default_value_t = 0)]
     episode: usize,
-    /// Columns to draw, by name; may be repeated [default: actions, observations and rewards]
+    /// Columns to draw, or cameras, by name; may be repeated [default: actions, observations and rewards; all cameras]
     #[arg(long, value_name = "NAME")]
     column: Vec<String>,
-    /// File to create, .svg or .html
+    /// Frames of a .png file, evenly spread
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    frames: u16,
+    /// File to create: .svg, .html or .png
     #[arg(long)]
     out: PathBuf,
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
     let extension = args.out.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    if !matches!(extension, "svg" | "html") {
-        bail!("{}: expected a name ending in .svg or .html", args.out.display());
+    if !matches!(extension, "svg" | "html" | "png") {
+        bail!("{}: expected a name ending in .svg, .html or .png", args.out.display());
     }
     let set = Dataset::open(&args.dir)?;
     let Some(episode) = set.episodes().get(args.episode) else {
         bail!("{}: no episode {}; there are {}", args.dir.display(), args.episode, set.episodes().len());
     };
-    let all: Vec<&str> = set.column_names().collect();
+    let pictures = extension == "png";
+    let all: Vec<&str> = if pictures { set.cameras().collect() } else { set.column_names().collect() };
+    if pictures && all.is_empty() {
+        bail!("{}: no pictures to draw in it", args.dir.display());
+    }
     for name in &args.column {
         if !all.contains(&name.as_str()) {
             bail!("{}: no column {name}; there is {}", args.dir.display(), all.join(", "));
@@ -53,16 +62,30 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         episode.demo.as_ref().map_or_else(String::new, |d| format!(" ({d})")),
         episode.length
     );
-    let text = match extension {
+    let file = match extension {
+        "png" => contact_sheet(&set, episode, &chosen, usize::from(args.frames))?,
         "svg" => {
             let data: Vec<Dimension> = chosen.iter().flat_map(|name| dimensions(&set, episode, name)).collect();
-            svg::page(&heading, &charts(&data), 2)
+            svg::page(&heading, &charts(&data), 2).into_bytes()
         }
-        _ => page(&set, episode, &chosen, &heading),
+        _ => page(&set, episode, &chosen, &heading).into_bytes(),
     };
-    create(&args.out, &text)?;
+    create(&args.out, &file)?;
     cli::print(&format!("{}: {}\n", args.out.display(), heading))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// A row a camera, `most` frames from the first to the last, as a PNG file.
+fn contact_sheet(set: &Dataset, episode: &EpisodeMeta, cameras: &[&str], most: usize) -> Result<Vec<u8>> {
+    let count = most.min(episode.length);
+    let frames: Vec<usize> = (0..count).map(|i| i * (episode.length - 1) / (count - 1).max(1)).collect();
+    let row = |camera: &&str| -> Result<Vec<Picture>> {
+        let all = set.episode_pictures(camera, episode.index)?;
+        let one = |&frame: &usize| Picture { height: all.height, width: all.width, rgb: all.frame(frame).to_vec() };
+        Ok(frames.iter().map(one).collect())
+    };
+    let rows = cameras.iter().map(row).collect::<Result<Vec<_>>>()?;
+    Ok(Picture::sheet(&rows, 4).to_png()?)
 }
 
 /// One dimension of a column.
@@ -113,7 +136,7 @@ fn page(set: &Dataset, episode: &EpisodeMeta, columns: &[&str], heading: &str) -
 }
 
 /// Writes a new file under a temporary name first.
-fn create(path: &Path, text: &str) -> Result<()> {
+fn create(path: &Path, bytes: &[u8]) -> Result<()> {
     if path.exists() {
         bail!("{}: exists already; choose another path or remove it first", path.display());
     }
@@ -124,7 +147,7 @@ fn create(path: &Path, text: &str) -> Result<()> {
     let temporary = parent.join(name);
     let write = || -> std::io::Result<()> {
         let mut file = std::fs::File::create(&temporary)?;
-        file.write_all(text.as_bytes())?;
+        file.write_all(bytes)?;
         file.sync_all()?;
         std::fs::rename(&temporary, path)
     };

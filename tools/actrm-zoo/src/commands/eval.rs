@@ -7,11 +7,12 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use clap::ValueEnum;
 use cli::{INTERRUPTED, Screen, Stop, limits, shown};
+use models::FeatureKind;
 use report::{COLUMNS, LeaderboardRow, json};
 use rollout::{Pool, remembered_greeting};
 use serde_json::{Value, json};
 use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
-use zoo::evaluation::{EvaluationOptions, FIRST_SEED, Subject, View, evaluate_again, film, finished};
+use zoo::evaluation::{EvaluationOptions, FIRST_SEED, Perturbation, Subject, View, evaluate_again, film, finished};
 use zoo::protocols::{Block, NamedProtocol};
 use zoo::registry::Registry;
 use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
@@ -44,6 +45,8 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval trm-dfs10 --task dfs16 --depth 32
   actrm-zoo eval trm-dfs10 --task dfs20 --depth 32 --starts 8
   actrm-zoo eval lift-act --episodes 3 --video 3
+  actrm-zoo eval lift-act-image --episodes 100 --video-failed 3
+  actrm-zoo eval lift-act-image --episodes 100 --perturb black-agentview
   actrm-zoo eval lift-act --episodes 50 --again
   actrm-zoo eval lift-act --episodes 200 --shard 2/8")]
 pub struct Args {
@@ -87,6 +90,12 @@ pub struct Args {
     /// Then write videos of the first N episodes into `videos` in the zoo
     #[arg(long, value_name = "N", default_value_t = 0)]
     video: u64,
+    /// Then write videos of the first N failed episodes: what the policy saw, its cameras side by side
+    #[arg(long, value_name = "N", default_value_t = 0, conflicts_with_all = ["shard", "again"])]
+    video_failed: u64,
+    /// Change the pictures on their way to the policy: swap-cameras, black-CAMERA, hue[=TURN], light[=FACTOR]
+    #[arg(long, value_name = "HOW", conflicts_with = "protocol")]
+    perturb: Option<Perturbation>,
     /// Camera of the videos
     #[arg(long, value_name = "NAME", default_value = "agentview")]
     camera: String,
@@ -247,9 +256,13 @@ fn open(
         ("--temporal-ensemble", args.temporal_ensemble.is_some()),
         ("--shard", args.shard.is_some()),
         ("--video", args.video > 0),
+        ("--video-failed", args.video_failed > 0),
+        ("--perturb", args.perturb.is_some()),
     ];
     if let Some((option, _)) = of_robots.iter().find(|(_, given)| *given && named) {
-        bail!("{option}: expected a robot policy, found a solver of puzzles, which takes --puzzles, --depth, --givens, --seed-start and --again");
+        bail!(
+            "{option}: expected a robot policy, found a solver of puzzles, which takes --puzzles, --depth, --givens, --seed-start and --again"
+        );
     }
     let (task, results) = (args.run.task.as_deref(), args.results.folder(&args.zoo));
     // seeds of episodes are no seeds of puzzles where both kinds are evaluated
@@ -271,7 +284,8 @@ fn evaluate_on(
     let spec = environment.spec(&args.run, asked.protocol.map_or(args.run.control, |protocol| protocol.control))?;
     let (results, options) = (args.results.folder(&args.zoo), options(args, asked, environment));
     // a finished evaluation is shown without starting a simulator
-    let remembered = (!args.again && args.video == 0).then(|| remembered_greeting(&spec)).flatten();
+    let remembered =
+        (!args.again && args.video == 0 && args.video_failed == 0).then(|| remembered_greeting(&spec)).flatten();
     let mut subjects = Vec::new();
     for loaded in entries {
         let id = loaded.entry().id();
@@ -311,6 +325,7 @@ fn evaluate_on(
 /// The entry as the command line wants it to act.
 fn subject(args: &Args, asked: &Asked<'_>, loaded: &LoadedEntry) -> anyhow::Result<Subject<'static>> {
     let mut subject = loaded.subject();
+    subject.perturbation.clone_from(&args.perturb);
     if let Some(protocol) = asked.protocol {
         subject.max_steps = Some(protocol.max_steps);
         subject.execution = protocol.execution.unwrap_or(subject.execution);
@@ -356,24 +371,45 @@ fn evaluate_entry(
     says: &mut Says,
 ) -> anyhow::Result<()> {
     let results = args.results.folder(&args.zoo);
+    let mut failed = Vec::new();
     let stopped = match args.again {
         false => match run_missing(subject, pool, &results, options)? {
             None => true,
             Some(Evaluated { evaluation, was_there }) => {
-                if let Some(protocol) = asked.protocol.filter(|protocol| protocol.block_of(&evaluation.record).is_none()) {
+                if let Some(protocol) =
+                    asked.protocol.filter(|protocol| protocol.block_of(&evaluation.record).is_none())
+                {
                     let (id, name, versions) = (&evaluation.record.entry, &protocol.name, &evaluation.record.versions);
-                    cli::note(&format!("note: {id}: not of {name}, which fixes {:?}: found {versions:?}", protocol.versions));
+                    cli::note(&format!(
+                        "note: {id}: not of {name}, which fixes {:?}: found {versions:?}",
+                        protocol.versions
+                    ));
                 }
                 says.evaluation(&evaluation, was_there)?;
+                let lost = evaluation.episodes.iter().filter(|episode| !episode.success).map(|episode| episode.seed);
+                failed.extend(lost.take(usize::try_from(args.video_failed)?));
                 false
             }
         },
         true => again(subject, pool, &results, options, says)?,
     };
     if !stopped && args.video > 0 && !stop.asked() {
-        videos(args, options.seeds, subject, pool)?;
+        let seeds: Vec<u64> = options.seeds.iter().take(usize::try_from(args.video)?).collect();
+        videos(args, &seeds, &camera_view(args), subject, pool)?;
+    }
+    if !stopped && !failed.is_empty() && !stop.asked() {
+        // about as large as the other videos
+        let side = subject.signature.of_kind(FeatureKind::Image).next().and_then(|spec| spec.shape.first().copied());
+        let seen = |side: usize| View::Seen { scale: (usize::from(args.video_size) / side).max(1).next_multiple_of(2) };
+        videos(args, &failed, &side.map_or_else(|| camera_view(args), seen), subject, pool)?;
     }
     Ok(())
+}
+
+/// What `--camera` sees.
+fn camera_view(args: &Args) -> View {
+    let side = usize::from(args.video_size);
+    View::Camera { name: args.camera.clone(), height: side, width: side }
 }
 
 /// Runs episodes of a finished evaluation once more and compares; whether it was stopped.
@@ -424,21 +460,19 @@ fn again(
     Ok(false)
 }
 
-/// Films the first episodes; the path of each video is printed.
-fn videos(args: &Args, seeds: Seeds, subject: &Subject<'_>, pool: &mut Pool) -> anyhow::Result<()> {
+/// Films episodes; the path of each video is printed.
+fn videos(args: &Args, seeds: &[u64], view: &View, subject: &Subject<'_>, pool: &mut Pool) -> anyhow::Result<()> {
     let folder = args.zoo.zoo.join("videos").join(subject.entry.to_string());
     fs::create_dir_all(&folder).with_context(|| format!("creating {}", shown(&folder)))?;
-    let count = args.video.min(seeds.count);
-    let seeds: Vec<u64> = seeds.iter().take(usize::try_from(count)?).collect();
-    let (side, rate) = (usize::from(args.video_size), pool.ready().control_freq);
-    let view = View { camera: args.camera.clone(), height: side, width: side };
+    let rate = pool.ready().control_freq;
     let task = pool.ready().task.clone();
     let mut screen = Screen::new();
-    screen.begin("film", count);
+    screen.begin("film", seeds.len() as u64);
     let mut failure: Option<anyhow::Error> = None;
-    film(subject, pool, &seeds, &view, &mut |seed, images, success| {
+    film(subject, pool, seeds, view, &mut |seed, images, success| {
         let word = if success { "success" } else { "failure" };
-        let path = folder.join(format!("{task}-{seed}-{word}.mp4"));
+        let seen = if matches!(view, View::Seen { .. }) { "-seen" } else { "" };
+        let path = folder.join(format!("{task}-{seed}-{word}{seen}.mp4"));
         screen.step();
         let line = shown(&path);
         let written = cli::film(&path, &images, rate).and_then(|()| match args.json {

@@ -42,6 +42,9 @@ struct LerobotArgs {
     /// Observation keys that make its environment state, in order
     #[arg(long, value_delimiter = ',', value_name = "KEYS", default_value = "object")]
     env_keys: Vec<String>,
+    /// Its pictures were drawn without reflections and multisampling, as `collect --fast-render` draws
+    #[arg(long)]
+    fast_render: bool,
     #[command(flatten)]
     zoo: ZooArgs,
 }
@@ -53,6 +56,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         task: args.task.clone(),
         state_keys: args.state_keys.clone(),
         env_keys: args.env_keys.clone(),
+        fast_render: args.fast_render,
     };
     let id = import(&args.folder, &options, &args.zoo.zoo)?;
     cli::print(&format!("{id} is in {}\n", shown(&args.zoo.zoo)))?;

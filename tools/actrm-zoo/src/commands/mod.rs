@@ -2,5 +2,5 @@
 
 cli::commands! {
     train, runs, eval, merge, compare, leaderboard, list, show, diff, curves, alias, remove,
-    verify, trace, depth, probe, study, import, export, completions,
+    verify, trace, saliency, depth, probe, study, import, export, completions,
 }

@@ -11,6 +11,7 @@ use zoo::write_atomic;
 
 use crate::places::{ZooArgs, entry_names};
 use crate::puzzles::family;
+use crate::simulation::EnvironmentKey;
 
 /// Show what an entry thought, step by step: a puzzle solver about a puzzle, a robot policy in an episode
 ///
@@ -92,11 +93,11 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     if args.svg.is_some() && examiner.is_none() {
         bail!("--svg means nothing for {}: it does not think step by step about its actions from one start", entry.id());
     }
+    let environment = EnvironmentKey::drawn(&args.simulator, args.task.as_deref(), entry.meta())?;
     let stop = Stop::install("stopped")?;
     let SimulatorArgs { env_module, python, .. } = &args.simulator;
     let one = SimulatorArgs { workers: Some(1), env_module: env_module.clone(), python: python.clone() };
-    let mut spec = one.spec(args.task.as_deref().unwrap_or(&subject.task))?;
-    spec.control = args.control;
+    let spec = environment.worker(&one, args.control)?;
     let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
     let traced = evaluation::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED), examiner.as_ref());
     cli::close(pool);

@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
-use cli::{INTERRUPTED, Screen, Stop, command_line, shown};
+use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use study::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
 use zoo::entry::member_name;
 use zoo::run::{COMMAND_FILE, MetricsRow, TrainEvent, TrainOutcome, TrainRequest, train};
@@ -50,6 +50,9 @@ pub struct Args {
     /// One training with each of these seeds: `1..8` (both ends included), `3` or `1,4,7`
     #[arg(long, value_name = "SEEDS", conflicts_with_all = ["run", "resume"])]
     seeds: Option<TrainingSeeds>,
+    /// Memory for pictures, such as 2G or 500M: more of them are kept in a file and read ahead [default: half of what is free]
+    #[arg(long, value_name = "SIZE", value_parser = limits::bytes)]
+    image_memory: Option<u64>,
     /// Print the resolved experiment and end
     #[arg(long)]
     print_config: bool,
@@ -115,7 +118,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         if let Some(entry) = finished_entry(&run)? {
             // of another zoo, or removed: it has to be trained again, which only the user can decide
             let id = args.zoo.registry().resolve(&entry).with_context(|| {
-                format!("seed {seed}: {} is finished and made {entry}; remove that folder to train it again", shown(&run))
+                format!(
+                    "seed {seed}: {} is finished and made {entry}; remove that folder to train it again",
+                    shown(&run)
+                )
             })?;
             cli::print(&format!("{id} is in {} already (run {})\n", shown(&args.zoo.zoo), shown(&run)))?;
             continue;
@@ -136,8 +142,8 @@ fn finished_entry(folder: &Path) -> anyhow::Result<Option<String>> {
         return Ok(None);
     }
     let text = std::fs::read(&path).with_context(|| format!("reading {}", shown(&path)))?;
-    let note: serde_json::Value =
-        serde_json::from_slice(&text).with_context(|| format!("{}: expected the note of a finished run", shown(&path)))?;
+    let note: serde_json::Value = serde_json::from_slice(&text)
+        .with_context(|| format!("{}: expected the note of a finished run", shown(&path)))?;
     match note["entry"].as_str() {
         Some(entry) => Ok(Some(entry.to_owned())),
         None => bail!("{}: entry: expected its name, found {}", shown(&path), note["entry"]),
@@ -168,7 +174,8 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
     let outcome = match experiment {
         AnyExperiment::Robot(experiment) => {
             let data = args.data.clone();
-            let request = TrainRequest { name, experiment: *experiment, data, runs, run, resume, zoo };
+            let image_memory = args.image_memory;
+            let request = TrainRequest { name, experiment: *experiment, data, runs, run, resume, zoo, image_memory };
             train(&request, &stop, &mut on_event)
         }
         AnyExperiment::Puzzle(experiment) => {
@@ -206,6 +213,9 @@ fn going_on(args: &Args, folder: &Path, seeded: bool) -> String {
     }
     if let Some(configs) = &args.configs.configs {
         option("--configs", configs);
+    }
+    if let Some(bytes) = args.image_memory {
+        option("--image-memory", Path::new(&bytes.to_string()));
     }
     option("--zoo", &args.zoo.zoo);
     match &args.seeds {

@@ -53,6 +53,8 @@ class Initial:
     fingerprint: str
     """SHA-256 of the initial state."""
     ep_meta: dict[str, Any]
+    drawing_ms: float = 0.0
+    """How long the observation's pictures took; for results only, nothing depends on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,8 @@ class Stepped:
     success: bool
     failure: str | None = None
     """In a word why the task can no longer be solved, where that is known: the episode ends."""
+    drawing_ms: float = 0.0
+    """How long the observation's pictures took."""
 
 
 @dataclass(frozen=True, slots=True)

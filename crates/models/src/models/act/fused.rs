@@ -50,20 +50,21 @@ impl Act {
         let eps = with_values(eps, <[f32]>::to_vec)?;
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.config().shape(), space, rng, packed: None };
+                let pass = &mut Pass { weights, shape: self.config().shape(), space, rng, packed: None, on_seen: None };
                 self.step(pass, &data, eps, &mut into.views())
             })
         })
     }
 
-    /// The features of the observation -> (b, C, A)
-    pub(crate) fn fused_predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+    /// The features of the observation -> (b, C, A); `on_seen` is called when pictures have become tokens.
+    pub(crate) fn fused_predict(&self, observation: &Features<Tensor>, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
         let rows = self.check_inputs(observation)?;
         let inputs = inputs(self.tokens.layout(), &self.tokens.look(observation, None)?)?;
         let packed = self.workspaces.packed(self.params());
         let actions = self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.config().shape(), space, rng: None, packed: Some(&packed) };
+                let (shape, packed) = (self.config().shape(), Some(&*packed));
+                let pass = &mut Pass { weights, shape, space, rng: None, packed, on_seen: Some(&mut *on_seen) };
                 let latent = pass.space.pool.zeros(rows * self.config().latent_dim);
                 let tokens = Tokens::new(self.tokens.layout(), (&latent, self.config().latent_dim), &inputs);
                 let Decoded { encoder, memory, decoder, x, actions } = self.decode_fused(pass, rows, &tokens);

@@ -70,7 +70,7 @@ fn the_fused_prediction_is_the_composed_one() {
     for (act, batch, what) in cases().chain(seeing()) {
         let want = act.predict_composed(&batch.observation).unwrap();
         for level in Level::ALL {
-            let got = at_most(level, || act.fused_predict(&batch.observation).unwrap());
+            let got = at_most(level, || act.fused_predict(&batch.observation, &mut || {}).unwrap());
             let off = (got - &want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
             assert!(off < 1e-5, "{off} {level:?} {what}");
         }

@@ -235,12 +235,19 @@ impl PolicyModel for Act {
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
         match self.composed_because() {
             Some(_) => self.predict_composed(observation),
-            None => self.fused_predict(observation),
+            None => self.fused_predict(observation, &mut || {}),
         }
     }
 
-    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
-        Box::new(ChunkPolicy::new(self, preprocess))
+    fn sample_seen(&self, observation: &Features<Tensor>, _: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
+        match self.composed_because() {
+            Some(_) => self.predict_composed(observation),
+            None => self.fused_predict(observation, on_seen),
+        }
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        Box::new(ChunkPolicy::new(self, preprocess).with_clock(clock))
     }
 
     fn query_flops(&self) -> Option<f64> {

@@ -10,6 +10,7 @@ use crate::model::PolicyModel;
 use crate::policy::{ActionChunk, Clock, Policy, ThoughtStep};
 use crate::preprocess::Preprocess;
 use candle_core::{DType, Tensor};
+use std::cell::RefCell;
 use std::sync::Arc;
 
 /// One supervision step as it happened.
@@ -52,12 +53,24 @@ impl Actrm {
         start: Option<&Tensor>,
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
+        self.reason_seen(observation, start, &mut || {}, should_stop)
+    }
+
+    /// The same, and `on_seen` is called when pictures have become tokens.
+    fn reason_seen(
+        &self,
+        observation: &Features<Tensor>,
+        start: Option<&Tensor>,
+        on_seen: &mut dyn FnMut(),
+        should_stop: &mut dyn FnMut(usize) -> bool,
+    ) -> Result<Reasoning> {
         if self.composed_because().is_some() {
             return self.reason_composed(observation, start, should_stop);
         }
         let rows = self.check_thought(observation, start)?;
         let mut thought = Thought::new(&self.config.reasoning, rows, should_stop);
-        let answer = self.think(observation, rows, start, &mut |chunk, logits| thought.step(chunk, &logits))?;
+        let answer =
+            self.think(observation, rows, start, on_seen, &mut |chunk, logits| thought.step(chunk, &logits))?;
         thought.end(answer)
     }
 
@@ -164,13 +177,15 @@ pub struct ReasoningPolicy {
     executed: usize,
     /// of the last thought's steps, in milliseconds
     times: Vec<f64>,
+    /// until the last query's pictures were tokens, in milliseconds
+    encoding: Option<f64>,
 }
 
 impl ReasoningPolicy {
     /// Shares `model` with others. `clock` tells when `budget_ms` are spent, and how long steps took.
     pub fn new(model: Arc<Actrm>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Self {
         let history = History::new(preprocess.signature().n_obs_steps);
-        Self { model, preprocess, clock, history, last: None, executed: 0, times: Vec::new() }
+        Self { model, preprocess, clock, history, last: None, executed: 0, times: Vec::new(), encoding: None }
     }
 
     /// The thought behind the last prediction.
@@ -192,19 +207,22 @@ fn warm_start(config: &Config, last: Option<&Reasoning>, executed: usize) -> Res
 
 impl Policy for ReasoningPolicy {
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
-        let (clock, budget) = (&mut self.clock, self.model.config.reasoning.budget_ms);
-        let begun = clock.milliseconds();
+        let (clock, budget) = (RefCell::new(&mut self.clock), self.model.config.reasoning.budget_ms);
+        let now = || clock.borrow_mut().milliseconds();
+        let begun = now();
         let seen = self.history.see(&self.preprocess, observation)?;
         let start = warm_start(&self.model.config, self.last.as_ref(), self.executed)?;
         let (mut before, mut times) = (begun, Vec::new());
         let mut should_stop = |_: usize| {
-            let now = clock.milliseconds();
+            let now = now();
             times.push(now - std::mem::replace(&mut before, now));
             budget.is_some_and(|budget| now - begun >= budget)
         };
-        let reasoning = self.model.reason(&seen, start.as_ref(), &mut should_stop)?;
+        let mut encoding = None;
+        let mut on_seen = || encoding = Some(now() - begun);
+        let reasoning = self.model.reason_seen(&seen, start.as_ref(), &mut on_seen, &mut should_stop)?;
         let chunk = self.preprocess.chunk(&reasoning.chunk)?;
-        (self.last, self.executed, self.times) = (Some(reasoning), 0, times);
+        (self.last, self.executed, self.times, self.encoding) = (Some(reasoning), 0, times, encoding);
         Ok(chunk)
     }
 
@@ -218,6 +236,10 @@ impl Policy for ReasoningPolicy {
 
     fn executed(&mut self, actions: usize) {
         self.executed += actions;
+    }
+
+    fn encoding(&self) -> Option<f64> {
+        self.encoding
     }
 
     fn reset(&mut self, _seed: u64) {

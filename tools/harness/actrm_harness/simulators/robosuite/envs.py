@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -62,6 +63,8 @@ class Session:
     xml_forgotten: bool = False
     unusual: str | None = None
     """SHA-256 of the arguments, where they are not the task's usual ones."""
+    drawing_ms: float = 0.0
+    """How long the last observation's pictures took; nothing depends on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,8 +248,9 @@ def images(session: Session) -> Tensors:
     """What the session's cameras see now, under robomimic's names."""
     if not session.cameras:
         return {}
-    size = session.image_size
+    size, begun = session.image_size, time.perf_counter()
     seen = renderer(session).images(session.env.sim, session.cameras, size, size)
+    session.drawing_ms = 1e3 * (time.perf_counter() - begun)
     return {f"{camera}_image": pixels for camera, pixels in zip(session.cameras, seen, strict=True)}
 
 

@@ -50,14 +50,15 @@ class Robosuite:
     def reset(self, seed: int, demonstration: bool) -> Initial:
         """Begin the episode of `seed`."""
         first = envs.reset(self.session, seed, demonstration)
-        return Initial(first, envs.fingerprint(self.session.env), self.session.env.get_ep_meta())
+        drawing_ms = self.session.drawing_ms
+        return Initial(first, envs.fingerprint(self.session.env), self.session.env.get_ep_meta(), drawing_ms)
 
     def step(self, actions: Array) -> Stepped:
         """Do one action, or one a row until the task is solved or lost."""
         checked = envs.check_actions(self.session.env, actions)
         envs.slim(self.session)
         result, rewards = envs.steps_session(self.session, checked)
-        return Stepped(result.observation, rewards, result.success, result.failure)
+        return Stepped(result.observation, rewards, result.success, result.failure, self.session.drawing_ms)
 
     def expert(self, seed: int, demonstration: bool) -> Episode:
         """One whole episode of the task's scripted expert."""

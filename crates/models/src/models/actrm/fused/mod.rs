@@ -121,7 +121,14 @@ impl Actrm {
         let steps = self.steps_of(batch);
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: Some(rng), packed: None };
+                let pass = &mut Pass {
+                    weights,
+                    shape: self.config.shape(),
+                    space,
+                    rng: Some(rng),
+                    packed: None,
+                    on_seen: None,
+                };
                 let grads = &mut into.views();
                 match self.config.reasoning.over {
                     Over::Actions => self.supervise::<OverActions<'_>>(pass, &data, steps, grads),
@@ -277,12 +284,14 @@ impl Actrm {
     }
 
     /// Thinks about observations from the answer state `start`, (b, t, D), until `on_step`, which gets each step's
-    /// chunk, (b, H, A), and halting logits, returns true; returns the last answer state.
+    /// chunk, (b, H, A), and halting logits, returns true; returns the last answer state. `on_seen` is called when pictures
+    /// have become tokens.
     pub(super) fn think(
         &self,
         observation: &Features<Tensor>,
         rows: usize,
         start: Option<&Tensor>,
+        on_seen: &mut dyn FnMut(),
         on_step: &mut dyn FnMut(Tensor, Vec<f32>) -> Result<bool>,
     ) -> Result<Tensor> {
         let inputs = inputs(self.tokens.layout(), &self.tokens.look(observation, None)?)?;
@@ -290,7 +299,8 @@ impl Actrm {
         let packed = self.workspaces.packed(self.params());
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape: self.config.shape(), space, rng: None, packed: Some(&packed) };
+                let (shape, packed) = (self.config.shape(), Some(&*packed));
+                let pass = &mut Pass { weights, shape, space, rng: None, packed, on_seen: Some(&mut *on_seen) };
                 match self.config.reasoning.over {
                     Over::Actions => self.think_with::<OverActions<'_>>(pass, (&inputs, rows), start, on_step),
                     Over::Memory => self.think_with::<OverMemory<'_>>(pass, (&inputs, rows), start, on_step),

@@ -1,0 +1,174 @@
+//! Policies that see, end to end: demonstrations with two cameras, videos, training, evaluation, what they look at, and
+//! what does not fit.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+
+use e2e::{data, listing, refused, succeeds, text, zoo};
+use serde_json::Value;
+use tempfile::TempDir;
+
+const AGENT: &str = "observation.images.agentview";
+
+fn said(command: &mut Command) -> String {
+    String::from_utf8(succeeds(command).stdout).expect("text")
+}
+
+/// Three demonstrations of Lift seen by two cameras, `seen.hdf5`, and `set`, the data set of it, in a folder.
+fn seen() -> &'static Path {
+    static SEEN: OnceLock<TempDir> = OnceLock::new();
+    SEEN.get_or_init(|| {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let (file, set) = (folder.path().join("seen.hdf5"), folder.path().join("set"));
+        let mut collect = data(["collect", "--task", "Lift", "--episodes", "3", "--no-next-obs", "--out", text(&file)]);
+        collect.args(["--cameras", "agentview,robot0_eye_in_hand", "--image-size", "24", "--fast-render"]);
+        succeeds(&mut collect);
+        succeeds(&mut data(["convert", text(&file), text(&set), "--env-keys", ""]));
+        folder
+    })
+    .path()
+}
+
+/// Trains `lift-act-image` on a data set for two steps, small.
+fn train(set: &Path, folder: &Path, more: &[&str]) -> Command {
+    let mut command = zoo(["train", "act_lift_image", "--data", text(set)]);
+    command.args(["--zoo", text(&folder.join("zoo")), "--runs", text(&folder.join("runs"))]);
+    command.args(["train.steps=2", "train.batch_size=4", "policy.dim_model=16", "policy.n_heads=2"]);
+    command.args(["policy.dim_feedforward=16", "policy.n_encoder_layers=1", "policy.vision.crop=20"]).args(more);
+    command
+}
+
+/// A zoo with `lift-act-image@1`, trained for two steps.
+fn trained() -> &'static Path {
+    static TRAINED: OnceLock<TempDir> = OnceLock::new();
+    TRAINED
+        .get_or_init(|| {
+            let folder = tempfile::tempdir().expect("a temporary folder");
+            succeeds(&mut train(&seen().join("set"), folder.path(), &[]));
+            folder
+        })
+        .path()
+}
+
+fn eval(entry: &str, zoo_folder: &Path, more: &[&str]) -> Command {
+    let mut command = zoo(["eval", entry, "--zoo", text(zoo_folder), "--workers", "1", "--max-steps", "12"]);
+    command.args(more);
+    command
+}
+
+/// Runs a training that must be refused, in words that hold every one of these; it has told of its folder before.
+fn stopped(command: &mut Command, words: &[&str]) {
+    let output = command.output().expect("the program starts");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{command:?}: {said}");
+    for word in words {
+        assert!(said.contains(word), "{command:?}: no {word:?} in: {said}");
+    }
+}
+
+fn weights(zoo_folder: &Path) -> Vec<u8> {
+    fs::read(zoo_folder.join("lift-act-image/1/model.safetensors")).expect("weights")
+}
+
+#[test]
+fn from_cameras_to_the_leaderboard() {
+    let entries = trained().join("zoo");
+    let info: Value =
+        serde_json::from_slice(&fs::read(seen().join("set/meta/info.json")).expect("info")).expect("JSON");
+    assert_eq!(info["actrm"]["env_args"]["fast_render"], true, "{}", info["actrm"]["env_args"]);
+    let entry = fs::read(entries.join("lift-act-image/1/entry.json")).expect("an entry");
+    let entry: Value = serde_json::from_slice(&entry).expect("JSON");
+    assert_eq!(entry["env_args"]["fast_render"], true);
+    assert!(entry["signature"]["observation"].as_array().is_some_and(|specs| specs.len() == 3), "{entry}");
+
+    let plain = eval("lift-act-image@1", &entries, &["--episodes", "2", "--video-failed", "1"]);
+    let text_of = |mut command: Command| said(&mut command);
+    let shown = text_of(plain);
+    assert!(shown.contains("lift-act-image@1 on Lift: 0 of 2"), "{shown}");
+    let videos = listing(&entries.join("videos/lift-act-image@1"));
+    assert_eq!(videos, ["Lift-10000-failure-seen.mp4"]);
+    // every outcome again, whatever drew the pictures
+    let again = text_of(eval("lift-act-image@1", &entries, &["--episodes", "2", "--again"]));
+    assert!(again.contains("2 episodes run again, every outcome the same"), "{again}");
+    let changed = text_of(eval("lift-act-image@1", &entries, &["--episodes", "2", "--perturb", "black-agentview"]));
+    assert!(changed.contains("lift-act-image@1 on Lift: 0 of 2"), "{changed}");
+    refused(
+        &mut eval("lift-act-image@1", &entries, &["--episodes", "2", "--perturb", "black-frontview"]),
+        &["lift-act-image@1", "black-frontview", "camera frontview, found agentview, robot0_eye_in_hand"],
+    );
+    refused(&mut eval("lift-act-image@1", &entries, &["--perturb", "upside-down"]), &["upside-down", "swap-cameras"]);
+
+    let board = said(&mut zoo(["leaderboard", "--zoo", text(&entries), "--wide"]));
+    assert!(board.contains("-black-agentview"), "changed pictures are a protocol of their own: {board}");
+}
+
+#[test]
+fn what_a_policy_looks_at_is_drawn() {
+    let (entries, folder) = (trained().join("zoo"), tempfile::tempdir().expect("a temporary folder"));
+    let out = folder.path().join("looked.png");
+    let saliency = |entry: &'static str, zoo_folder: &Path| {
+        let mut command = zoo(["saliency", entry, "--seed", "10003", "--queries", "2", "--zoo", text(zoo_folder)]);
+        command.args(["--out", text(&out), "--json"]);
+        command
+    };
+    let looked: Value = serde_json::from_str(&said(&mut saliency("lift-act-image@1", &entries))).expect("JSON");
+    let queries = looked["queries"].as_array().expect("queries");
+    assert_eq!(queries.len(), 2);
+    for query in queries {
+        let cameras = query["cameras"].as_array().expect("cameras");
+        let names: Vec<_> = cameras.iter().map(|camera| camera["camera"].as_str().expect("a name")).collect();
+        assert_eq!(names, ["agentview", "robot0_eye_in_hand"]);
+        assert!(cameras.iter().all(|camera| camera["most"].as_f64().is_some_and(|x| x > 0.0)), "{query}");
+    }
+    assert!(fs::read(&out).expect("a picture").starts_with(b"\x89PNG"));
+    refused(&mut saliency("lift-act@1", &e2e::root().join("zoo")), &["lift-act@1", "it sees no pictures"]);
+    // a thought about pictures is traced in the environment of its demonstrations
+    let traced = said(&mut zoo(["trace", "lift-act-image@1", "--zoo", text(&entries)]));
+    assert!(traced.starts_with("lift-act-image@1 on Lift, seed 10000: "), "{traced}");
+}
+
+#[test]
+fn videos_become_windows_and_pictures_may_stay_in_a_file() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let at = |name: &str| folder.path().join(name);
+    succeeds(&mut data(["convert", text(&seen().join("seen.hdf5")), text(&at("video")), "--env-keys", "", "--video"]));
+    let inspected: Value =
+        serde_json::from_str(&said(&mut data(["inspect", text(&at("video")), "--json"]))).expect("JSON");
+    let keys = inspected["keys"].as_array().expect("keys");
+    let camera = keys.iter().find(|key| key["key"] == AGENT).expect("the camera is there");
+    assert_eq!((&camera["dtype"], &camera["video"]["codecs"][0]), (&Value::from("video"), &Value::from("av1")));
+    // the same windows, from memory and from a file that is read ahead: the same weights to the bit
+    for (name, more) in [("memory", &[][..]), ("file", &["--image-memory", "1k"][..])] {
+        let output = succeeds(&mut train(&at("video"), &at(name), &[more, &["train.steps=3"]].concat()));
+        let kept = String::from_utf8_lossy(&output.stderr).contains("kept in a file");
+        assert_eq!(kept, name == "file");
+    }
+    assert!(weights(&at("memory/zoo")) == weights(&at("file/zoo")), "where pictures are kept changes what is learned");
+    let sheet = at("sheet.png");
+    succeeds(&mut data(["plot", text(&at("video")), "--episode", "2", "--frames", "4", "--out", text(&sheet)]));
+    assert!(fs::read(&sheet).expect("a picture").starts_with(b"\x89PNG"));
+    refused(
+        &mut data(["plot", text(&at("video")), "--column", "observation.images.side", "--out", text(&at("x.png"))]),
+        &["observation.images.side", AGENT],
+    );
+    // a video that ends before its episodes do
+    let file = |camera: &str| -> PathBuf { at("video").join(format!("videos/{camera}/chunk-000/file-000.mp4")) };
+    let short = folder.path().join("short.hdf5");
+    let mut one = data(["collect", "--task", "Lift", "--episodes", "1", "--no-next-obs", "--out", text(&short)]);
+    succeeds(one.args(["--cameras", "agentview", "--image-size", "24", "--fast-render"]));
+    succeeds(&mut data(["convert", text(&short), text(&at("short")), "--env-keys", "", "--video"]));
+    fs::copy(at("short").join(format!("videos/{AGENT}/chunk-000/file-000.mp4")), file(AGENT)).expect("copied");
+    stopped(&mut train(&at("video"), &at("cut"), &[]), &[AGENT, "frame 0 of episode 1", "within 0.0001 s of"]);
+}
+
+#[test]
+fn cameras_that_do_not_fit_are_named() {
+    let (set, folder) = (seen().join("set"), tempfile::tempdir().expect("a temporary folder"));
+    stopped(
+        &mut train(&set, folder.path(), &["data.cameras=[\"frontview\"]"]),
+        &["no camera observation.images.frontview", AGENT, "observation.images.robot0_eye_in_hand"],
+    );
+    stopped(&mut train(&set, folder.path(), &["policy.vision.crop=30"]), &["crop", "30", "24"]);
+}

@@ -1,0 +1,102 @@
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::{Context, bail};
+use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, shown};
+use models::FeatureKind;
+use rollout::Control;
+use zoo::evaluation::{self, FIRST_SEED, Saliency};
+use zoo::write_atomic;
+
+use crate::places::{ZooArgs, entry_names};
+use crate::simulation::EnvironmentKey;
+
+/// Show what a policy looks at: one episode's pictures with what matters in red, as a PNG file
+///
+/// Parts of a picture are covered one after the other, and the predicted actions compared with those of the whole picture.
+/// The file has a column a query; for each camera its picture, and below it the same in grey with the places in red that
+/// move the actions most. The table says how far the actions move without a camera's picture (mean over the chunk, in
+/// standard deviations of the demonstrations' actions), and where the most important square lies.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-zoo saliency lift-act-image --out saliency.png
+  actrm-zoo saliency lift-act-image@1 --seed 40007 --queries 4 --out saliency.png")]
+pub struct Args {
+    /// Entry: `name` (its newest version) or `name@version`
+    #[arg(add = entry_names())]
+    entry: String,
+    /// Seed of the episode
+    #[arg(long, value_name = "SEED", default_value_t = FIRST_SEED)]
+    seed: u64,
+    /// Queries to look at, evenly spread over the episode
+    #[arg(long, value_name = "N", default_value_t = 6, value_parser = clap::value_parser!(u16).range(1..=100))]
+    queries: u16,
+    /// File to write
+    #[arg(long, value_name = "FILE.png")]
+    out: PathBuf,
+    /// Another task than the entry's
+    #[arg(long)]
+    task: Option<String>,
+    /// Control loop inside the simulator: `compiled` or `robosuite`
+    #[arg(long, default_value_t = Control::Compiled)]
+    control: Control,
+    #[command(flatten)]
+    simulator: SimulatorArgs,
+    /// Print JSON instead of text
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let entry = args.zoo.registry().entry(&args.entry)?;
+    let id = entry.id();
+    if entry.meta().signature.of_kind(FeatureKind::Image).next().is_none() {
+        let names: Vec<&str> = entry.meta().signature.observation.iter().map(|spec| spec.name.as_str()).collect();
+        let seen = if names.is_empty() { "no observation".to_owned() } else { names.join(", ") };
+        bail!("entry {id}: it sees no pictures; it sees {seen}");
+    }
+    let loaded = entry.load()?;
+    let subject = loaded.subject();
+    let environment = EnvironmentKey::drawn(&args.simulator, args.task.as_deref(), entry.meta())?;
+    let stop = Stop::install("stopped")?;
+    let SimulatorArgs { env_module, python, .. } = &args.simulator;
+    let one = SimulatorArgs { workers: Some(1), env_module: env_module.clone(), python: python.clone() };
+    let spec = environment.worker(&one, args.control)?;
+    let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
+    let mut screen = Screen::new();
+    let queries = usize::from(args.queries);
+    let looked = evaluation::saliency(&loaded, &subject, &mut pool, args.seed, queries, &mut screen.advance("looking"));
+    drop(screen);
+    cli::close(pool);
+    let Some(looked) = looked.with_context(|| format!("entry {id}"))? else {
+        return Ok(ExitCode::from(INTERRUPTED));
+    };
+    let file = looked.strip().to_png().with_context(|| format!("{}: cannot draw it", shown(&args.out)))?;
+    write_atomic(&args.out, &file)?;
+    match args.json {
+        true => cli::print_json(&looked)?,
+        false => cli::print(&text(&looked, &shown(&args.out)))?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn text(looked: &Saliency, out: &str) -> String {
+    let how = if looked.success { "success" } else { "failure" };
+    let Saliency { entry, task, seed, steps, .. } = looked;
+    let mut text = format!("{entry} on {task}, seed {seed}: {how} after {steps} steps; {out}\n");
+    let rows: Vec<Vec<String>> = looked
+        .queries
+        .iter()
+        .flat_map(|query| query.cameras.iter().map(|camera| (query.step, camera)))
+        .map(|(step, camera)| {
+            let (row, column) = camera.place;
+            let (whole, most) = (format!("{:.3}", camera.whole), format!("{:.3}", camera.most));
+            vec![step.to_string(), camera.camera.clone(), whole, most, format!("{row}, {column}")]
+        })
+        .collect();
+    let head = ["step", "camera", "without it", "without its best square", "which is at (row, column)"];
+    text.push_str(&cli::table(&head, &rows, &[0, 2, 3]));
+    text
+}
