@@ -91,7 +91,10 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     let loaded = entry.load()?;
     let (subject, examiner) = (loaded.subject(), evaluation::Examiner::of(&loaded)?);
     if args.svg.is_some() && examiner.is_none() {
-        bail!("--svg means nothing for {}: it does not think step by step about its actions from one start", entry.id());
+        bail!(
+            "--svg means nothing for {}: it does not think step by step about its actions from one start",
+            entry.id()
+        );
     }
     let environment = EnvironmentKey::drawn(&args.simulator, args.task.as_deref(), entry.meta())?;
     let stop = Stop::install("stopped")?;
