@@ -3,13 +3,15 @@
 //! Window `i` starts at frame `t` of an episode and holds the actions of frames `t .. t + action_horizon`, and of each
 //! column of the observation the frames `t - n_obs_steps + 1 ..= t`. Before the episode its first frame is repeated.
 //! Past the end of the episode the last action is repeated and flagged in `is_pad`, as LeRobot's
-//! `delta_timestamps` and robomimic's padded sequences have it. Gathering a batch copies rows out of
+//! `delta_timestamps` and robomimic's padded sequences have it. A window may begin with the actions of so many frames
+//! before `t`; before the episode its first action is repeated and flagged. Gathering a batch copies rows out of
 //! columns that stay in memory; it allocates nothing once the batch has been used.
 
 use crate::error::Result;
 use crate::lerobot::PictureStore;
 use crate::shuffle::SplitMix64;
 use arrow::buffer::ScalarBuffer;
+use std::ops::Range;
 
 /// Which windows to make.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -56,6 +58,7 @@ pub struct Windows {
     action: Resident,
     n_obs_steps: usize,
     action_horizon: usize,
+    past_actions: usize,
     spans: Vec<Span>,
 }
 
@@ -72,7 +75,7 @@ pub struct WindowBatch {
     pub pictures: Vec<(String, Vec<u8>)>,
     /// `(n, action_horizon, action_dim)`
     pub actions: Vec<f32>,
-    /// `(n, action_horizon)`; true where the last action of the episode is repeated.
+    /// `(n, action_horizon)`; true where the first or last action of the episode is repeated.
     pub is_pad: Vec<bool>,
 }
 
@@ -97,7 +100,22 @@ impl Windows {
             let (begin, end) = (from as u32, to as u32);
             spans.extend((begin..end).map(|frame| Span { begin, frame, end }));
         }
-        Self { observation, pictures: Vec::new(), action, n_obs_steps, action_horizon, spans }
+        Self { observation, pictures: Vec::new(), action, n_obs_steps, action_horizon, past_actions: 0, spans }
+    }
+
+    /// The same windows whose `action_horizon` actions begin `past_actions` frames before their own.
+    #[must_use]
+    pub fn with_past_actions(self, past_actions: usize) -> Self {
+        Self { past_actions, ..self }
+    }
+
+    /// The windows of each episode, in order of time.
+    pub fn episodes(&self) -> Vec<Range<u32>> {
+        let first = |i: &u32| self.spans[*i as usize].frame == self.spans[*i as usize].begin;
+        let count = self.spans.len() as u32;
+        let mut begins: Vec<u32> = (0..count).filter(first).collect();
+        begins.push(count);
+        begins.windows(2).map(|pair| pair[0]..pair[1]).collect()
     }
 
     /// The same windows with the pictures of a camera of the same data set, which are shared.
@@ -203,19 +221,22 @@ impl Windows {
         batch.actions.resize(n * horizon * width, 0.0);
         batch.is_pad.resize(n * horizon, false);
         for (i, &index) in indices.iter().enumerate() {
-            let Span { frame, end, .. } = self.spans[index as usize];
-            let (frame, end) = (frame as usize, end as usize);
-            let real = horizon.min(end - frame);
+            let Span { begin, frame, end } = self.spans[index as usize];
+            let (begin, frame, end) = (begin as usize, frame as usize, end as usize);
+            // steps before the episode, and the one after its last
+            let before = (begin + self.past_actions).saturating_sub(frame).min(horizon);
+            let after = (end + self.past_actions).saturating_sub(frame).min(horizon);
             let actions = &mut batch.actions[i * horizon * width..(i + 1) * horizon * width];
-            let (head, tail) = actions.split_at_mut(real * width);
-            head.copy_from_slice(&self.action.data[frame * width..(frame + real) * width]);
-            let last = self.action.row(end - 1);
-            for repeated in tail.chunks_exact_mut(width) {
-                repeated.copy_from_slice(last);
+            let (head, tail) = actions.split_at_mut(after * width);
+            let (head, own) = head.split_at_mut(before * width);
+            let from = frame + before - self.past_actions.min(frame + before);
+            own.copy_from_slice(&self.action.data[from * width..from * width + own.len()]);
+            for (repeated, row) in [(head, begin), (tail, end - 1)] {
+                repeated.chunks_exact_mut(width).for_each(|action| action.copy_from_slice(self.action.row(row)));
             }
             let flags = &mut batch.is_pad[i * horizon..(i + 1) * horizon];
-            flags[..real].fill(false);
-            flags[real..].fill(true);
+            flags.fill(true);
+            flags[before..after].fill(false);
         }
         Ok(())
     }
@@ -234,13 +255,19 @@ mod tests {
         Resident { data: data.into(), dim }
     }
 
-    /// One window by the definition: index `t + k`, clamped to the last frame, flagged where clamped.
-    fn naive(action: &Resident, frame: usize, end: usize, horizon: usize) -> (Vec<f32>, Vec<bool>) {
+    /// One window by the definition: index `t - past + k`, clamped to the episode, flagged where clamped.
+    fn naive(
+        action: &Resident,
+        (begin, frame, end): (usize, usize, usize),
+        (past, horizon): (usize, usize),
+    ) -> (Vec<f32>, Vec<bool>) {
         let mut actions = Vec::new();
         let mut pad = Vec::new();
-        for k in 0..horizon {
-            actions.extend_from_slice(action.row((frame + k).min(end - 1)));
-            pad.push(frame + k >= end);
+        for k in 0..horizon as i64 {
+            let at = frame as i64 - past as i64 + k;
+            let inside = at.clamp(begin as i64, end as i64 - 1);
+            actions.extend_from_slice(action.row(inside as usize));
+            pad.push(at != inside);
         }
         (actions, pad)
     }
@@ -249,7 +276,7 @@ mod tests {
         #[test]
         fn windows_agree_with_clamped_indexing(
             lengths in prop::collection::vec(1_usize..12, 1..8),
-            (horizon, n_obs_steps) in (1_usize..20, 1_usize..6),
+            (horizon, n_obs_steps, past) in (1_usize..20, 1_usize..6, 0_usize..5),
             dims in prop::collection::vec(1_usize..4, 0..4),
             action_dim in 1_usize..4,
             picks in prop::collection::vec(any::<prop::sample::Index>(), 1..40),
@@ -269,7 +296,13 @@ mod tests {
             let frames: Vec<(usize, usize, usize)> =
                 ranges.iter().flat_map(|&(a, b)| (a..b).map(move |f| (a, f, b))).collect();
             let windows = Windows::new(observed.clone(), action.clone(), (n_obs_steps, horizon), &ranges);
+            let windows = windows.with_past_actions(past);
             prop_assert_eq!(windows.len(), frames.len());
+            let episodes = windows.episodes();
+            prop_assert_eq!(episodes.iter().map(ExactSizeIterator::len).sum::<usize>(), frames.len());
+            for (episode, (from, to)) in episodes.iter().zip(&ranges) {
+                prop_assert_eq!((frames[episode.start as usize].1, episode.len()), (*from, to - from));
+            }
             let indices: Vec<u32> = picks.iter().map(|p| p.index(frames.len()) as u32).collect();
             // a batch that held something else before must not leak it
             let mut batch = WindowBatch {
@@ -284,8 +317,7 @@ mod tests {
             prop_assert_eq!(batch.n, indices.len());
             let (mut a, mut p) = (vec![], vec![]);
             for &i in &indices {
-                let (_, frame, end) = frames[i as usize];
-                let (actions, pad) = naive(&action, frame, end, horizon);
+                let (actions, pad) = naive(&action, frames[i as usize], (past, horizon));
                 a.extend(actions);
                 p.extend(pad);
             }

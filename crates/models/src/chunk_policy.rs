@@ -18,13 +18,21 @@ pub struct ChunkPolicy {
     rng: Rng,
     clock: Option<Box<dyn Clock>>,
     encoding: Option<f64>,
+    /// actions that a chunk begins with and that were due before its observation
+    past: usize,
 }
 
 impl ChunkPolicy {
     /// Shares `model` with others; begins with the episode of seed 0.
     pub fn new(model: Arc<dyn PolicyModel>, preprocess: Arc<Preprocess>) -> Self {
         let history = History::new(preprocess.signature().n_obs_steps);
-        Self { model, preprocess, history, rng: generator(0), clock: None, encoding: None }
+        Self { model, preprocess, history, rng: generator(0), clock: None, encoding: None, past: 0 }
+    }
+
+    /// Leaves out the first `past` actions of every chunk: those of steps that were.
+    #[must_use]
+    pub fn without_past(self, past: usize) -> Self {
+        Self { past, ..self }
     }
 
     /// The same with a clock, by which it tells what its pictures took.
@@ -48,7 +56,8 @@ impl Policy for ChunkPolicy {
         let mut on_seen = || encoding = clock.as_mut().zip(begun).map(|(clock, begun)| clock.milliseconds() - begun);
         let actions = self.model.sample_seen(&seen, &mut self.rng, &mut on_seen)?;
         self.encoding = encoding;
-        self.preprocess.chunk(&actions)
+        let left = actions.dim(1)?.saturating_sub(self.past);
+        self.preprocess.chunk(&actions.narrow(1, self.past, left)?)
     }
 
     fn encoding(&self) -> Option<f64> {

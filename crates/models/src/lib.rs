@@ -42,7 +42,7 @@ pub use error::{ModelError, Result};
 pub use features::{ENTITY_PREFIX, FeatureKind, FeatureSpec, Features, Observation, Signature, Values, ValuesRef};
 pub use gradients::{Gradients, ParamLayout};
 pub use history::History;
-pub use model::{LossParts, LossValues, PolicyModel};
+pub use model::{LossParts, LossValues, Memory, PolicyModel};
 pub use models::*;
 pub use normaliser::{ACTION, ENVIRONMENT_STATE, Guarded, NormMode, Normaliser, STATE};
 pub use optim::{Optimiser, OptimiserConfig};

@@ -116,10 +116,24 @@ pub trait PolicyModel: Send + Sync {
     /// Number of actions in a predicted chunk.
     fn action_horizon(&self) -> usize;
 
+    /// What it keeps of the demonstrations themselves, if it keeps any.
+    fn memory(&self) -> Option<&dyn Memory> {
+        None
+    }
+
     /// How it sees pictures, if it does.
     fn vision(&self) -> Option<&VisionConfig> {
         None
     }
+}
+
+/// A model that keeps demonstrations, not only what it learned from them.
+pub trait Memory {
+    /// Takes them in before the training begins: of each episode a batch with all its windows in order of time.
+    ///
+    /// # Errors
+    /// Demonstrations that it cannot do without.
+    fn remember(&self, train: &[Batch], held_out: &[Batch]) -> Result<()>;
 }
 
 /// Loss, and its gradient from candle's backward pass added to `into`.

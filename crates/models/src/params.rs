@@ -4,8 +4,8 @@ use crate::error::{ModelError, Result, some_names};
 use crate::rng::Rng;
 use candle_core::{DType, Device, Tensor, Var};
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// How a new parameter is filled. Fans are those of a `(out, in)` matrix.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -72,12 +72,21 @@ impl Init {
     }
 }
 
-/// A model's parameters by name, and its buffers: numbers that belong to the weights and are never trained. Cloning shares
-/// the storage.
+/// Rows of one width, as many as the demonstrations bring.
+#[derive(Debug)]
+struct Table {
+    columns: usize,
+    /// (rows, columns), once there are some
+    rows: Option<Tensor>,
+}
+
+/// A model's parameters by name, its buffers, numbers that belong to the weights and are never trained, and its tables,
+/// rows kept of the demonstrations themselves. Cloning shares the storage.
 #[derive(Debug, Clone, Default)]
 pub struct Params {
     vars: BTreeMap<String, Var>,
     buffers: BTreeMap<String, Var>,
+    tables: Arc<Mutex<BTreeMap<String, Table>>>,
     /// learning rates relative to the others'
     rates: BTreeMap<String, f64>,
     version: Arc<AtomicU64>,
@@ -120,10 +129,59 @@ impl Params {
     }
 
     fn new_var(&self, name: &str, values: &Tensor) -> Result<Var> {
-        if self.vars.contains_key(name) || self.buffers.contains_key(name) {
+        self.check_new(name)?;
+        Ok(Var::from_tensor(&values.contiguous()?)?)
+    }
+
+    fn check_new(&self, name: &str) -> Result<()> {
+        if self.vars.contains_key(name) || self.buffers.contains_key(name) || self.lock().contains_key(name) {
             return Err(ModelError::State { object: "parameters", detail: format!("{name} exists already") });
         }
-        Ok(Var::from_tensor(&values.contiguous()?)?)
+        Ok(())
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Table>> {
+        self.tables.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Adds a table `name` of rows of `columns` numbers, which are saved and loaded like parameters; there are none yet.
+    ///
+    /// # Errors
+    /// If the name is taken.
+    pub fn insert_table(&mut self, name: &str, columns: usize) -> Result<()> {
+        self.check_new(name)?;
+        self.lock().insert(name.to_string(), Table { columns, rows: None });
+        Ok(())
+    }
+
+    /// Fills a table. rows: (rows, columns)
+    ///
+    /// # Errors
+    /// If there is no such table, or its rows have another width.
+    pub fn set_table(&self, name: &str, rows: &Tensor) -> Result<()> {
+        let mut tables = self.lock();
+        let given = some_names(tables.keys());
+        let table = tables.get_mut(name).ok_or_else(|| ModelError::MissingTensor { name: name.to_string(), given })?;
+        table.check(name, rows)?;
+        table.rows = Some(rows.to_dtype(DType::F32)?.contiguous()?);
+        drop(tables);
+        self.changed();
+        Ok(())
+    }
+
+    /// The rows of a table: (rows, columns)
+    ///
+    /// # Errors
+    /// If there is no such table, or nothing was put into it.
+    pub fn table(&self, name: &str) -> Result<Tensor> {
+        let tables = self.lock();
+        let rows = tables.get(name).and_then(|table| table.rows.clone());
+        rows.ok_or_else(|| ModelError::MissingTensor { name: name.to_string(), given: some_names(tables.keys()) })
+    }
+
+    /// The tables that have rows, in the order of their names.
+    pub fn tables(&self) -> Vec<(String, Tensor)> {
+        self.lock().iter().filter_map(|(name, table)| Some((name.clone(), table.rows.clone()?))).collect()
     }
 
     /// Names of parameters and buffers, each in order.
@@ -194,7 +252,7 @@ impl Params {
     pub fn without(&self, names: &[&str]) -> Self {
         let kept = self.vars.iter().filter(|(name, _)| !names.contains(&name.as_str()));
         let vars = kept.map(|(name, var)| (name.clone(), var.clone())).collect();
-        Self { vars, buffers: self.buffers.clone(), rates: self.rates.clone(), version: self.version.clone() }
+        Self { vars, ..self.clone() }
     }
 
     /// Number of scalar parameters, without buffers.
@@ -204,7 +262,7 @@ impl Params {
 
     /// The current values of everything, sharing the storage: copy them before the next update if they must stay.
     pub fn tensors(&self) -> BTreeMap<String, Tensor> {
-        self.all().map(|(k, v)| (k.to_string(), v.as_detached_tensor())).collect()
+        self.all().map(|(k, v)| (k.to_string(), v.as_detached_tensor())).chain(self.tables()).collect()
     }
 
     /// Takes all values from `tensors`, whose names and shapes must be exactly those of the model.
@@ -226,16 +284,41 @@ impl Params {
                 });
             }
         }
-        if let Some(name) = tensors.keys().find(|k| !self.vars.contains_key(*k) && !self.buffers.contains_key(*k)) {
-            let known = some_names(self.vars.keys().chain(self.buffers.keys()));
+        let mut tables = self.lock();
+        let known = |k: &String| self.vars.contains_key(k) || self.buffers.contains_key(k) || tables.contains_key(k);
+        if let Some(name) = tensors.keys().find(|k| !known(k)) {
+            let known = some_names(self.vars.keys().chain(self.buffers.keys()).chain(tables.keys()));
             return Err(ModelError::ExtraTensor { name: name.clone(), known });
+        }
+        for (name, table) in &*tables {
+            let given = tensors
+                .get(name)
+                .ok_or_else(|| ModelError::MissingTensor { name: name.clone(), given: some_names(tensors.keys()) })?;
+            table.check(name, given)?;
         }
         for (name, var) in self.all() {
             // copied, because a variable cannot be set to itself
             var.set(&tensors[name].to_dtype(DType::F32)?.copy()?)?;
         }
+        for (name, table) in &mut *tables {
+            table.rows = Some(tensors[name].to_dtype(DType::F32)?.contiguous()?);
+        }
+        drop(tables);
         self.changed();
         Ok(())
+    }
+}
+
+impl Table {
+    fn check(&self, name: &str, rows: &Tensor) -> Result<()> {
+        match *rows.dims() {
+            [count, columns] if count > 0 && columns == self.columns => Ok(()),
+            _ => Err(ModelError::MisshapenTensor {
+                name: name.to_string(),
+                expected: vec![rows.dims().first().copied().unwrap_or(1).max(1), self.columns],
+                found: rows.dims().to_vec(),
+            }),
+        }
     }
 }
 
@@ -293,6 +376,29 @@ mod tests {
         assert_eq!(mean.to_vec1::<f32>().unwrap(), [3.0, 4.0]);
         tensors.remove("norm.mean");
         assert!(matches!(params.load(&tensors), Err(ModelError::MissingTensor { name, .. }) if name == "norm.mean"));
+    }
+
+    #[test]
+    fn tables_take_as_many_rows_as_come() {
+        let rows = |n: usize, columns: usize| Tensor::zeros((n, columns), DType::F32, &Device::Cpu).unwrap();
+        let mut params = two();
+        params.insert_table("seen", 3).unwrap();
+        assert!(
+            params.insert_table("a", 3).is_err()
+                && params.create("seen", &[1], Init::Ones, &mut Rng::new(0, "init")).is_err()
+        );
+        assert!(matches!(params.table("seen"), Err(ModelError::MissingTensor { name, .. }) if name == "seen"));
+        assert!(params.set_table("seen", &rows(4, 2)).unwrap_err().to_string().contains("[4, 2], expected [4, 3]"));
+        assert!(params.set_table("sene", &rows(4, 3)).is_err());
+        params.set_table("seen", &rows(4, 3)).unwrap();
+        assert_eq!((params.count(), params.table("seen").unwrap().dims()), (9, &[4, 3][..]));
+        // a model that was just built takes them from a file, in any number
+        let mut other = two();
+        other.insert_table("seen", 3).unwrap();
+        assert!(matches!(other.load(&two().tensors()), Err(ModelError::MissingTensor { name, .. }) if name == "seen"));
+        other.load(&params.tensors()).unwrap();
+        assert_eq!(other.table("seen").unwrap().dims(), [4, 3]);
+        assert!(matches!(two().load(&params.tensors()), Err(ModelError::ExtraTensor { name, .. }) if name == "seen"));
     }
 
     #[test]

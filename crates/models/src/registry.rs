@@ -3,7 +3,8 @@
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
 use crate::model::PolicyModel;
-use crate::models::{act, actrm, bc};
+use crate::models::floors::{nearest, random, replay, zero};
+use crate::models::{act, actrm, bc, bc_rnn, bc_transformer, diffusion, flow, mip};
 use crate::size::Size;
 use serde::de::{DeserializeSeed, Deserializer};
 use serde::{Deserialize, Serialize};
@@ -91,6 +92,34 @@ policies! {
     "actrm" => Actrm: actrm::Actrm,
     /// Behaviour cloning with a multi-layer perceptron
     "bc" => Bc: bc::Bc,
+    /// Behaviour cloning with an LSTM and a mixture of Gaussians
+    "bc_rnn" => BcRnn: bc_rnn::BcRnn,
+    /// Behaviour cloning with a causal transformer and a mixture of Gaussians
+    "bc_transformer" => BcTransformer: bc_transformer::BcTransformer,
+    /// Diffusion policy
+    "diffusion" => Diffusion: diffusion::Diffusion,
+    /// Flow matching
+    "flow" => Flow: flow::Flow,
+    /// Minimal iterative policy: two steps of regression
+    "mip" => Mip: mip::Mip,
+    /// The nearest demonstrations' actions
+    "nearest" => Nearest: nearest::Nearest,
+    /// Actions by chance
+    "random" => Random: random::Random,
+    /// A held-out demonstration, played back
+    "replay" => Replay: replay::Replay,
+    /// No action
+    "zero" => Zero: zero::Zero,
+}
+
+impl PolicyConfig {
+    /// Actions in a chunk that lie before its observation's frame, for models that give one to every observation they see.
+    pub fn past_actions(&self, n_obs_steps: usize) -> usize {
+        match self {
+            Self::BcRnn(_) | Self::Diffusion(_) | Self::Flow(_) | Self::Mip(_) => n_obs_steps.saturating_sub(1),
+            _ => 0,
+        }
+    }
 }
 
 impl PolicyConfig {

@@ -308,8 +308,14 @@ impl Experiment {
         crate::entry::check_name(&self.entry)?;
         let steps = self.rollout.n_action_steps;
         let action_horizon = self.policy.action_horizon();
-        if steps == 0 || steps > action_horizon {
-            let expected = format!("1 to policy.action_horizon, {action_horizon}");
+        let past = self.policy.past_actions(self.data.n_obs_steps);
+        if steps == 0 || steps + past > action_horizon {
+            let expected = match past {
+                0 => format!("1 to policy.action_horizon, {action_horizon}"),
+                _ => format!(
+                    "1 to policy.action_horizon, {action_horizon}, less the {past} actions before the present one"
+                ),
+            };
             return invalid("rollout.n_action_steps", expected, steps.to_string());
         }
         if self.rollout.temporal_ensemble.is_some() && steps != 1 {

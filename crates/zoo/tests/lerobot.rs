@@ -168,8 +168,11 @@ fn a_missing_statistic_is_an_error_that_names_it() {
 
 #[test]
 fn what_we_cannot_run_is_refused() {
+    let text = refusal(|f| edit(&f.join("config.json"), "\"type\": \"act\"", "\"type\": \"smolvla\""));
+    assert!(text.contains("type is smolvla, expected act or diffusion"), "{text}");
+    // a diffusion policy has other keys
     let text = refusal(|f| edit(&f.join("config.json"), "\"type\": \"act\"", "\"type\": \"diffusion\""));
-    assert!(text.contains("type is diffusion, expected act"), "{text}");
+    assert!(text.contains("LeRobot diffusion") && text.contains("chunk_size"), "{text}");
     let text = refusal(|f| edit(&f.join("config.json"), "\"n_heads\"", "\"n_haeds\""));
     assert!(text.contains("n_haeds"), "{text}");
     let text =

@@ -5,7 +5,7 @@
 
 mod attention;
 mod conv;
-mod elementwise;
+pub(crate) mod elementwise;
 mod gemm;
 mod image;
 mod norm;

@@ -3,22 +3,32 @@
 //! Everything here has a gradient: candle-nn's `LayerNorm` and `softmax_last_dim` drop it in silence and are not used.
 
 mod attention;
+mod conv1d;
 mod dropout;
 mod embedding;
 mod feed_forward;
+mod group_norm;
 mod layer_norm;
 mod linear;
+mod lstm;
+mod mish;
+mod mixture;
 mod position;
 mod tokens;
 mod transformer;
 mod vae;
 
 pub use attention::{MultiHeadAttention, masked_softmax};
+pub use conv1d::{Conv1d, Upsample1d};
 pub use dropout::{Dropout, DropoutMask, Mode};
 pub use embedding::Embedding;
 pub use feed_forward::{Activation, FeedForward};
+pub use group_norm::GroupNorm;
 pub use layer_norm::LayerNorm;
 pub use linear::Linear;
+pub use lstm::{Lstm, LstmState};
+pub use mish::mish;
+pub use mixture::{Mixture, MixtureHead};
 pub use position::sinusoid_table;
 pub(crate) use tokens::{
     ENTITY_POSITIONS, FEATURE_POSITIONS, InputTokens, LATENT, Position, TokenLayout, environment_state,

@@ -4,4 +4,10 @@
 pub mod act;
 pub mod actrm;
 pub mod bc;
+pub mod bc_rnn;
+pub mod bc_transformer;
+pub mod diffusion;
+pub mod floors;
+pub mod flow;
+pub mod mip;
 pub mod trm;

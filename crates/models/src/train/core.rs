@@ -142,6 +142,7 @@ impl<P: Precision> Core<P> {
         for (name, var) in self.params.buffers() {
             tensors.insert(name.to_string(), var.as_detached_tensor().copy()?);
         }
+        tensors.extend(self.params.tables());
         Ok(tensors)
     }
 
@@ -161,6 +162,7 @@ impl<P: Precision> Core<P> {
         for (name, var) in self.params.all() {
             tensors.insert(format!("param.{name}"), var.as_detached_tensor().copy()?);
         }
+        tensors.extend(self.params.tables().into_iter().map(|(name, rows)| (format!("param.{name}"), rows)));
         if self.ema.is_some() {
             for (name, tensor) in self.eval_params()? {
                 tensors.insert(format!("ema.{name}"), tensor);

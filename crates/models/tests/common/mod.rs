@@ -13,6 +13,11 @@ pub const ACT: [&str; 3] = ["config.json", "model.safetensors", "io.npz"];
 /// A folder is a fixture of the official TRM if it holds these files.
 pub const TRM: [&str; 3] = ["config.json", "model.safetensors", "io.safetensors"];
 
+/// A folder is a fixture of LeRobot's diffusion if it holds these files.
+pub const DIFFUSION: [&str; 3] = ["config.json", "model.safetensors", "draws.npz"];
+/// A folder is a fixture of robomimic's if it holds these files.
+pub const ROBOMIMIC: [&str; 3] = ["config.json", "model.safetensors", "robomimic.npz"];
+
 /// A folder is a fixture of LeRobot's ACT with cameras if it holds these files and its configuration has pictures.
 pub const SEEING_ACT: [&str; 2] = ["config.json", "io.npz"];
 /// A folder is a fixture of an image encoder alone if it holds these files.
@@ -46,7 +51,7 @@ fn walk(folder: &Path, kind: &[&str], found: &mut Vec<PathBuf>) {
     if holds(kind) && sees == (kind == SEEING_ACT) {
         found.push(folder.to_path_buf());
     } else if holds(&["model.safetensors"]) {
-        let known = holds(&ACT) || holds(&TRM) || holds(&ENCODER);
+        let known = [&ACT, &TRM, &ENCODER, &DIFFUSION, &ROBOMIMIC].into_iter().any(|kind| holds(kind));
         assert!(known, "{}: expected {ACT:?}, {TRM:?} or {ENCODER:?}, found {entries:?}", folder.display());
     }
     entries.iter().filter(|path| path.is_dir()).for_each(|path| walk(path, kind, found));

@@ -1,16 +1,15 @@
-//! An ACT entry becomes a folder that LeRobot loads.
+//! An entry whose policy LeRobot has too becomes a folder that it loads.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use models::PolicyConfig;
-use models::lerobot::{self, LerobotAct};
 use serde_json::{Value, json};
 
 use crate::entry::Entry;
 use crate::files::sync_folder;
 use crate::{ZooError, sha256_file, tensors, write_atomic};
 
+use super::checkpoint::Checkpoint;
 use super::config::{NormaliserStep, Pipeline, Step};
 use super::provenance::{self, PROVENANCE};
 use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR};
@@ -18,30 +17,29 @@ use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR};
 /// Writes `entry` into the new folder `out`.
 ///
 /// # Errors
-/// When `out` exists, the entry is not ACT, or a file cannot be written.
+/// When `out` exists, the entry is neither ACT nor diffusion, or a file cannot be written.
 pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
     let loaded = entry.load()?;
     let experiment = loaded.experiment();
-    let PolicyConfig::Act(act) = &experiment.policy else {
+    let (meta, rollout) = (entry.meta(), &experiment.rollout);
+    let checkpoint = Checkpoint {
+        policy: experiment.policy.clone(),
+        signature: meta.signature.clone(),
+        n_action_steps: rollout.n_action_steps,
+        temporal_ensemble: rollout.temporal_ensemble,
+        modes: experiment.normalisation.modes(&meta.signature),
+    };
+    let Some(config) = checkpoint.write() else {
         return Err(ZooError::InvalidValue {
             key: format!("policy.type of {}", entry.id()),
-            expected: "act: LeRobot has no other policy of ours".to_owned(),
+            expected: "act or diffusion: LeRobot has no other policy of ours".to_owned(),
             found: experiment.policy_type(),
         });
     };
-    let (meta, rollout) = (entry.meta(), &experiment.rollout);
     let model_error = || experiment.model_error("export");
-    let config = lerobot::write_config(&LerobotAct {
-        config: act.clone(),
-        signature: meta.signature.clone(),
-        n_action_steps: rollout.n_action_steps,
-        temporal_ensemble_coeff: rollout.temporal_ensemble,
-        modes: experiment.normalisation.modes(&meta.signature),
-    })
-    .map_err(model_error())?;
-    let weights = lerobot::tensors_out(loaded.model().params(), act).map_err(model_error())?;
+    let config = config.map_err(model_error())?;
+    let (weights, of_pictures) = checkpoint.tensors(loaded.model().params()).map_err(model_error())?;
     let mut statistics = loaded.preprocess().normaliser().tensors().map_err(model_error())?;
-    let of_pictures = lerobot::statistics_out(loaded.model().params(), &meta.signature).map_err(model_error())?;
     statistics.extend(of_pictures);
 
     let (inputs, outputs) = (&config["input_features"], &config["output_features"]);

@@ -1,13 +1,12 @@
-//! A LeRobot ACT checkpoint becomes an entry.
+//! A LeRobot checkpoint of ACT or of diffusion becomes an entry.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use candle_core::Tensor;
-use models::lerobot::{self, LerobotAct};
 use models::{
     ACTION, ENVIRONMENT_STATE, FeatureKind, FeatureSpec, ModelError, NormMode, Normaliser, PolicyConfig, Preprocess,
-    Signature,
+    Signature, lerobot,
 };
 
 use crate::entry::{CamerasMeta, CardWords, EntryDraft, EntryId, EntryMeta};
@@ -15,6 +14,7 @@ use crate::experiment::{DataSection, Experiment, NormalisationSection, PICTURE_P
 use crate::run::TrainSection;
 use crate::{ZooError, tensors};
 
+use super::checkpoint::Checkpoint;
 use super::config::{self, NormaliserStep, Pipeline};
 use super::provenance;
 use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR};
@@ -40,8 +40,8 @@ pub struct ImportOptions {
 /// Files, keys, tensors or statistics that are missing, extra or misshapen, each by name.
 pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<EntryId, ZooError> {
     let config_path = folder.join(CONFIG_FILE);
-    let LerobotAct { config: act, signature, n_action_steps, temporal_ensemble_coeff, .. } =
-        lerobot::read_config(&config::read(&config_path)?).map_err(config::misfit(&config_path))?;
+    let checkpoint = Checkpoint::read(&config::read(&config_path)?).map_err(config::misfit(&config_path))?;
+    let Checkpoint { policy, signature, n_action_steps, temporal_ensemble, .. } = &checkpoint;
 
     if options.fast_render && signature.of_kind(FeatureKind::Image).next().is_none() {
         return Err(ZooError::InvalidValue {
@@ -65,7 +65,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
 
     let experiment = Experiment {
         entry: options.name.clone(),
-        description: format!("ACT imported from a LeRobot checkpoint, for {}.", options.task),
+        description: format!("{} imported from a LeRobot checkpoint, for {}.", name_of(policy), options.task),
         task: TaskSection { name: options.task.clone() },
         data: DataSection {
             state_keys: options.state_keys.clone(),
@@ -73,25 +73,30 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
                 None => Vec::new(),
                 Some(_) => options.env_keys.clone(),
             },
-            cameras: cameras(&signature).map_err(config::misfit(&config_path))?,
+            n_obs_steps: signature.n_obs_steps,
+            cameras: cameras(signature).map_err(config::misfit(&config_path))?,
             ..DataSection::default()
         },
         normalisation,
-        policy: PolicyConfig::Act(act.clone()),
+        policy: policy.clone(),
         train: TrainSection::default(),
-        rollout: RolloutSection { n_action_steps, temporal_ensemble: temporal_ensemble_coeff, max_steps: None },
+        rollout: RolloutSection {
+            n_action_steps: *n_action_steps,
+            temporal_ensemble: *temporal_ensemble,
+            max_steps: None,
+        },
     };
     experiment.check()?;
 
-    let model = experiment.policy.build(&signature, 0).map_err(experiment.model_error("build the policy of"))?;
+    let model = experiment.policy.build(signature, 0).map_err(experiment.model_error("build the policy of"))?;
     let model_path = folder.join(MODEL_FILE);
     let (weights, _) = tensors::read(&model_path)?;
-    lerobot::load_tensors(model.params(), &act, &weights).map_err(config::misfit(&model_path))?;
-    lerobot::load_statistics(model.params(), &signature, &before.config.norm_map, &before.statistics)
+    checkpoint
+        .load(model.params(), &weights, &before.config.norm_map, &before.statistics)
         .map_err(config::misfit(&model_path))?;
-    let modes = experiment.normalisation.modes(&signature);
+    let modes = experiment.normalisation.modes(signature);
     let preprocess = Normaliser::new(&modes, &statistics)
-        .and_then(|normaliser| Preprocess::new(signature, normaliser))
+        .and_then(|normaliser| Preprocess::new(signature.clone(), normaliser))
         .map_err(experiment.model_error("take the statistics of"))?;
 
     let statistics = preprocess.normaliser().tensors().map_err(experiment.model_error("store the normaliser of"))?;
@@ -139,6 +144,14 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
         normaliser: tensors::to_bytes(&model_path, &statistics, &serde_json::json!({"format": 1}))?,
     };
     draft.seal(zoo)
+}
+
+/// The policy in the words of a description.
+fn name_of(policy: &PolicyConfig) -> &'static str {
+    match policy {
+        PolicyConfig::Diffusion(_) => "A diffusion policy",
+        _ => "ACT",
+    }
 }
 
 /// The simulator's names of the cameras: what their features are called after LeRobot's prefix.

@@ -195,7 +195,8 @@ pub(super) fn prepare(
             action_horizon,
             episodes,
         };
-        dataset.windows(&spec).map_err(failed)
+        let past = experiment.policy.past_actions(experiment.data.n_obs_steps);
+        dataset.windows(&spec).map(|windows| windows.with_past_actions(past)).map_err(failed)
     };
     let meta = DataMeta {
         name: name.to_owned(),

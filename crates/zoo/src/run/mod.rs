@@ -7,6 +7,7 @@ mod feed;
 mod folder;
 mod list;
 mod loop_parts;
+mod memory;
 mod metrics;
 mod preflight;
 mod sampler;

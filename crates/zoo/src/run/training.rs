@@ -180,6 +180,7 @@ impl<'a> PolicyTraining<'a> {
             let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed);
             let model = model.map_err(experiment.model_error("build the policy of"))?;
             super::eyes::open(model.as_ref(), &demonstrations, experiment)?;
+            super::memory::fill(model.as_ref(), &demonstrations, experiment)?;
             Ok::<_, ZooError>(model)
         };
         let trainer = Trainer::new(build()?, section.trainer_config(), section.seed)

@@ -20,7 +20,7 @@ enum From {
     Lerobot(LerobotArgs),
 }
 
-/// A checkpoint folder of LeRobot's ACT
+/// A checkpoint folder of LeRobot's ACT or diffusion
 #[derive(clap::Args)]
 struct LerobotArgs {
     /// Folder with config.json, model.safetensors and the two processors

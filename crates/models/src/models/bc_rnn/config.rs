@@ -1,0 +1,65 @@
+//! BC-RNN's options.
+
+use crate::error::{ModelError, Result};
+use crate::size::Size;
+use serde::{Deserialize, Serialize};
+
+/// Options with robomimic's names' meaning and its defaults.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// steps of a sequence in training, and those after which the state begins anew (robomimic: `rnn.horizon` and
+    /// `train.seq_length`); as many as `data.n_obs_steps`
+    pub action_horizon: usize,
+    /// numbers in a layer's state (robomimic: `rnn.hidden_dim`)
+    pub hidden_dim: usize,
+    /// layers of the LSTM
+    pub n_layers: usize,
+    /// Gaussians of the mixture
+    pub n_modes: usize,
+    /// least deviation of a Gaussian in training
+    pub min_std: f64,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { action_horizon: 10, hidden_dim: 400, n_layers: 2, n_modes: 5, min_std: 1e-4 }
+    }
+}
+
+impl Config {
+    /// How large the model will be, without what depends on observation and action.
+    pub fn size(&self) -> Size {
+        let hidden = self.hidden_dim as f64;
+        let recurrent = 4.0 * hidden * hidden * (2.0 * self.n_layers as f64 - 1.0);
+        let biases = 8.0 * hidden * self.n_layers as f64;
+        Size {
+            weights: recurrent + biases,
+            activations: self.action_horizon as f64 * self.n_layers as f64 * 10.0 * hidden,
+        }
+    }
+
+    /// Checks that a model with this configuration can exist.
+    ///
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub fn validate(&self) -> Result<()> {
+        let refuse = |field: &'static str, found: String, expected: &str| {
+            Err(ModelError::Config { model: "bc_rnn", field, found, expected: expected.to_string() })
+        };
+        for (field, value) in [
+            ("action_horizon", self.action_horizon),
+            ("hidden_dim", self.hidden_dim),
+            ("n_layers", self.n_layers),
+            ("n_modes", self.n_modes),
+        ] {
+            if value == 0 {
+                return refuse(field, "0".to_string(), "at least 1");
+            }
+        }
+        if !(self.min_std.is_finite() && self.min_std > 0.0) {
+            return refuse("min_std", self.min_std.to_string(), "a positive number");
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,206 @@
+//! BC-RNN: an LSTM over the observations and a mixture of Gaussians over the action, of each step its own.
+//!
+//! Paper: Mandlekar et al., "What Matters in Learning from Offline Human Demonstrations for Robot Manipulation" (arXiv
+//! 2108.03298). Reference implementation: robomimic 0.3's `BC_RNN_GMM` with the options of that study (two layers of 400, no
+//! layers between LSTM and head, 5 Gaussians, tanh on their means, hardly any noise at test time); on fixtures made with it
+//! this has its outputs, its loss and its gradients.
+//!
+//! At test time the state goes from step to step and begins anew every `action_horizon` steps, as robomimic's does every
+//! `rnn.horizon`.
+//!
+//! Deviations: a sequence of training ends with a window's frame and is shorter at the beginning of an episode, where
+//! robomimic's begins with a frame and repeats the last of the episode, both in the loss; a step has the same share in the
+//! loss either way. No goals, no open loop, no GRU. The means lie in -1 to 1, so that actions have to be normalised by their
+//! range (`normalisation.action = "min_max"`).
+//!
+//! What it costs: one product a step and layer for the recurrence, one a layer for all that comes from below; the cell is by
+//! hand (`layers/lstm.rs`), the rest on candle's autograd.
+
+mod config;
+
+pub use config::Config;
+
+use crate::batch::Batch;
+use crate::checks::{check_batch, check_observation};
+use crate::error::{ModelError, Result};
+use crate::features::{FeatureKind, Features, Observation, Signature};
+use crate::layers::{Lstm, LstmState, Mixture, MixtureHead};
+use crate::losses::absolute;
+use crate::model::{LossParts, PolicyModel};
+use crate::params::Params;
+use crate::policy::{ActionChunk, Clock, Policy};
+use crate::preprocess::Preprocess;
+use crate::rng::Rng;
+use candle_core::{Device, Tensor};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// The kinds of features that it reads.
+pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+
+/// The model.
+#[derive(Debug)]
+pub struct BcRnn {
+    config: Config,
+    signature: Signature,
+    params: Params,
+    rnn: Lstm,
+    head: MixtureHead,
+}
+
+impl BcRnn {
+    /// Initial weights are torch's defaults.
+    ///
+    /// # Errors
+    /// A configuration or a signature that describes no possible model.
+    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+        config.validate()?;
+        signature.check("bc_rnn", READS)?;
+        if config.action_horizon != signature.n_obs_steps {
+            let (found, expected) =
+                (config.action_horizon.to_string(), format!("n_obs_steps, {}", signature.n_obs_steps));
+            return Err(ModelError::Config { model: "bc_rnn", field: "action_horizon", found, expected });
+        }
+        let rng = &mut Rng::new(seed, "init");
+        let mut p = Params::new();
+        let width = signature.observation.iter().map(|spec| spec.width()).sum();
+        let rnn = Lstm::new(&mut p, "rnn", (width, config.hidden_dim, config.n_layers), rng)?;
+        let sizes = (config.hidden_dim, config.n_modes, signature.action_dim);
+        let head = MixtureHead::new(&mut p, "decoder", sizes, config.min_std, rng)?;
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, rnn, head })
+    }
+
+    /// The signature's features, (b, T, …) each -> (b, T, everything of a step)
+    fn sequence(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
+        let mut joined = Vec::with_capacity(self.signature.observation.len());
+        for spec in &self.signature.observation {
+            let shape = (rows, self.signature.n_obs_steps, ());
+            joined.push(observation.require("bc_rnn", &spec.name)?.reshape(shape)?);
+        }
+        Ok(Tensor::cat(&joined, 2)?)
+    }
+
+    /// x: (b, T, D), from the state before it -> b*T mixtures
+    fn forward(&self, x: &Tensor, state: &mut LstmState) -> Result<Mixture> {
+        let (b, steps, _) = x.dims3()?;
+        let y = self.rnn.forward(x, state)?;
+        self.head.forward(&y.reshape((b * steps, self.config.hidden_dim))?)
+    }
+
+    /// The mixtures of the signature's features, (b, T, …) each -> b*T mixtures
+    ///
+    /// # Errors
+    /// An observation that does not fit.
+    pub fn mixtures(&self, observation: &Features<Tensor>) -> Result<Mixture> {
+        let rows = check_observation("bc_rnn", &self.signature, observation)?;
+        self.forward(&self.sequence(rows, observation)?, &mut self.rnn.zero_state(rows)?)
+    }
+}
+
+/// For every step of every row the one that takes its place once the padding that a row begins with is moved to its end,
+/// and 1 if it is real, else 0. is_pad: (b, T) -> b*T indices, b*T weights
+fn real_first(is_pad: &Tensor) -> Result<(Tensor, Tensor)> {
+    let (rows, steps) = is_pad.dims2()?;
+    let (mut from, mut real) = (Vec::with_capacity(rows * steps), Vec::with_capacity(rows * steps));
+    for (row, pad) in is_pad.to_vec2::<f32>()?.iter().enumerate() {
+        let before = pad.iter().take_while(|&&p| p != 0.0).count();
+        for step in 0..steps {
+            let at = (step + before).min(steps - 1);
+            from.push((row * steps + at) as u32);
+            real.push(if step + before < steps { 1.0 - pad[at] } else { 0.0 });
+        }
+    }
+    let count = rows * steps;
+    Ok((Tensor::from_vec(from, count, &Device::Cpu)?, Tensor::from_vec(real, count, &Device::Cpu)?))
+}
+
+impl PolicyModel for BcRnn {
+    fn params(&self) -> &Params {
+        &self.params
+    }
+
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn composed_because(&self) -> Option<String> {
+        Some("bc_rnn has no step by hand".to_string())
+    }
+
+    fn loss(&self, batch: &Batch, _rng: &mut Rng) -> Result<LossParts> {
+        check_batch("bc_rnn", &self.signature, self.config.action_horizon, batch)?;
+        let (rows, steps) = (batch.rows(), self.config.action_horizon);
+        let (from, real) = real_first(&batch.is_pad)?;
+        let moved = |x: &Tensor| -> Result<Tensor> {
+            let width = x.dim(2)?;
+            Ok(x.reshape((rows * steps, width))?.index_select(&from, 0)?)
+        };
+        let x = moved(&self.sequence(rows, &batch.observation)?)?;
+        let actions = moved(&batch.actions)?;
+        let mixtures = self.forward(&x.reshape((rows, steps, ()))?, &mut self.rnn.zero_state(rows)?)?;
+        let valid = batch.total_valid_steps.max(1) as f64;
+        let total = ((mixtures.log_prob(&actions)?.mul(&real)?.sum_all()? / valid)? * -1.0)?;
+        // of the likeliest Gaussian's mean, beside what other policies report
+        let away = absolute(&(mixtures.likeliest()?.detach() - &actions)?)?.broadcast_mul(&real.unsqueeze(1)?)?;
+        let l1 = (away.sum_all()? / (valid * self.signature.action_dim as f64))?;
+        let parts = BTreeMap::from([("nll".to_string(), total.detach()), ("l1_loss".to_string(), l1)]);
+        Ok(LossParts { total, parts })
+    }
+
+    /// The mean of the likeliest Gaussian at every step.
+    fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        let actions = self.mixtures(observation)?.likeliest()?.detach();
+        Ok(actions.reshape(((), self.config.action_horizon, self.signature.action_dim))?)
+    }
+
+    fn sample(&self, observation: &Features<Tensor>, rng: &mut Rng) -> Result<Tensor> {
+        let actions = self.mixtures(observation)?.sample(rng)?.detach();
+        Ok(actions.reshape(((), self.config.action_horizon, self.signature.action_dim))?)
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        Box::new(Recurrent { model: self, preprocess, state: None, steps: 0, rng: generator(0) })
+    }
+
+    fn action_horizon(&self) -> usize {
+        self.config.action_horizon
+    }
+}
+
+/// One episode of the policy: the LSTM's state and how many steps it has seen.
+struct Recurrent {
+    model: Arc<BcRnn>,
+    preprocess: Arc<Preprocess>,
+    state: Option<LstmState>,
+    steps: usize,
+    rng: Rng,
+}
+
+fn generator(seed: u64) -> Rng {
+    Rng::new(seed, "policy")
+}
+
+impl Policy for Recurrent {
+    /// One action.
+    fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
+        let model = &self.model;
+        let seen = self.preprocess.observation(std::slice::from_ref(observation))?;
+        // the same observation as often as a history is long: its last
+        let now = model.sequence(1, &seen)?.narrow(1, model.config.action_horizon - 1, 1)?;
+        let mut state = match self.state.take() {
+            Some(state) if !self.steps.is_multiple_of(model.config.action_horizon) => state,
+            _ => model.rnn.zero_state(1)?,
+        };
+        let mixture = model.forward(&now, &mut state)?;
+        let state: LstmState = state.into_iter().map(|(h, c)| (h.detach(), c.detach())).collect();
+        (self.state, self.steps) = (Some(state), self.steps + 1);
+        self.preprocess.chunk(&mixture.sample(&mut self.rng)?.detach().unsqueeze(1)?)
+    }
+
+    fn reset(&mut self, seed: u64) {
+        (self.state, self.steps, self.rng) = (None, 0, generator(seed));
+    }
+}
+
+#[cfg(test)]
+mod tests;

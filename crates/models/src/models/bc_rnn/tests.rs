@@ -1,0 +1,113 @@
+#![allow(clippy::unwrap_used)]
+use super::*;
+use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
+use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
+use crate::train::{TrainConfig, Trainer};
+
+fn small() -> Config {
+    Config { action_horizon: 3, hidden_dim: 9, n_modes: 2, min_std: 0.05, ..Config::default() }
+}
+
+/// A batch whose padding lies at the beginning of its rows, where windows with past actions have it.
+fn padded_before(signature: &Signature, rows: usize) -> Batch {
+    let mut batch = batch(signature, 3, rows, 3);
+    let pad: Vec<f32> = (0..rows * 3).map(|i| if i % 3 < (i / 3) % 3 { 1.0 } else { 0.0 }).collect();
+    batch.total_valid_steps = pad.iter().filter(|&&p| p == 0.0).count();
+    batch.is_pad = Tensor::from_vec(pad, (rows, 3), &Device::Cpu).unwrap();
+    batch
+}
+
+#[test]
+fn the_gradient_is_the_slope_of_the_loss() {
+    let signature = signatures().history;
+    for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }] {
+        let model = BcRnn::new(&config, &signature, 1).unwrap();
+        assert_the_gradient_is_the_slope(&model, &padded_before(&signature, 4), &format!("{config:?}"));
+    }
+}
+
+#[test]
+fn a_row_that_begins_with_padding_is_a_shorter_sequence() {
+    let signature = signatures().history;
+    let model = BcRnn::new(&small(), &signature, 1).unwrap();
+    let batch = padded_before(&signature, 3);
+    let (mut sum, mut count) = (0.0, 0);
+    let x = model.sequence(3, &batch.observation).unwrap();
+    for row in 0..3 {
+        // rows with 0, 1 and 2 steps of padding
+        let own = x.narrow(0, row, 1).unwrap().narrow(1, row, 3 - row).unwrap();
+        let mixtures = model.forward(&own, &mut model.rnn.zero_state(1).unwrap()).unwrap();
+        let actions = batch.actions.get(row).unwrap().narrow(0, row, 3 - row).unwrap();
+        let log_prob = mixtures.log_prob(&actions).unwrap().to_vec1::<f32>().unwrap();
+        sum += log_prob.iter().sum::<f32>();
+        count += log_prob.len();
+    }
+    let loss = model.loss(&batch, &mut Rng::new(0, "loss")).unwrap().total.to_scalar::<f32>().unwrap();
+    let want = -sum / count as f32;
+    assert!((loss - want).abs() < 1e-5 * want.abs().max(1.0), "{loss} {want}");
+}
+
+#[test]
+fn the_policy_carries_its_state_and_begins_anew_after_its_horizon() {
+    let signature = Signature { n_obs_steps: 3, ..signatures().plain };
+    let modes = [STATE, ENVIRONMENT_STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
+    let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
+    let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser).unwrap());
+    let model = Arc::new(BcRnn::new(&Config { n_modes: 1, ..small() }, &signature, 1).unwrap());
+    let mut policy = Recurrent {
+        model: Arc::clone(&model),
+        preprocess: Arc::clone(&preprocess),
+        state: None,
+        steps: 0,
+        rng: generator(0),
+    };
+    let seen = |k: usize| Observation::of_state(vec![k as f32 * 0.3, 1.0, -0.5], vec![0.1 * k as f32, 2.0]);
+    for seed in [7, 8] {
+        policy.reset(seed);
+        for step in 0..8_usize {
+            let action = policy.predict(&seen(step)).unwrap();
+            assert_eq!(action.action_horizon, 1);
+            // what the network gives for the whole sequence since the state was new
+            let from = step / 3 * 3;
+            let history: Vec<Observation> = (from..from + 3).map(seen).collect();
+            let whole = model.predict(&preprocess.observation(&history).unwrap()).unwrap().to_vec3::<f32>().unwrap();
+            for (got, want) in action.actions.iter().zip(&whole[0][step - from]) {
+                assert!((got - want).abs() < 1e-3, "step {step}: {got} {want}");
+            }
+        }
+    }
+    // the noise is the seed's
+    let mut first = |seed| {
+        policy.reset(seed);
+        policy.predict(&seen(0)).unwrap()
+    };
+    let again = first(7);
+    assert_ne!(first(8), again);
+    assert_eq!(first(7), again);
+}
+
+#[test]
+fn training_lowers_the_loss_with_the_same_bits_every_time() {
+    let signature = signatures().history;
+    let run = || {
+        let config = Config { hidden_dim: 24, ..small() };
+        let model = Box::new(BcRnn::new(&config, &signature, 1).unwrap());
+        let settings = TrainConfig { steps: 60, lr: 1e-2, warmup_steps: 3, ..Default::default() };
+        let mut trainer = Trainer::new(model, settings, 5).unwrap();
+        let batch = padded_before(&signature, 8);
+        let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
+        (losses[0], losses[59])
+    };
+    let (first, last) = run();
+    assert!(last < first - 0.5, "{first} {last}");
+    assert_eq!(run(), (first, last));
+}
+
+#[test]
+fn impossible_configurations_name_the_field() {
+    let signature = signatures().history;
+    let error = |config: Config| BcRnn::new(&config, &signature, 0).unwrap_err().to_string();
+    assert!(error(Config { action_horizon: 4, ..small() }).contains("action_horizon is 4, expected n_obs_steps, 3"));
+    assert!(error(Config { hidden_dim: 0, ..small() }).contains("hidden_dim"));
+    assert!(error(Config { min_std: 0.0, ..small() }).contains("min_std"));
+}

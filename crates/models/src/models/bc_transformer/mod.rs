@@ -1,0 +1,262 @@
+//! BC-Transformer: a causal transformer over the last observations and a mixture of Gaussians over the present action.
+//!
+//! Reference: robomimic 0.3's `BC_Transformer_GMM` (`algo/bc.py`, `models/transformers.py`, after Karpathy's minGPT) with its
+//! defaults: a token a step, learned positions, GELU, pre-norm blocks, the last step alone supervised, 5 Gaussians with tanh
+//! on their means, hardly any noise at test time. On fixtures made with it this has its outputs, its loss and its gradients.
+//! Before an episode has as many steps as the context, the first observation is repeated, there and here.
+//!
+//! Deviations: one dropout for tokens, attention and outputs; a window ends with its frame in the loss, where robomimic's may
+//! end with repeats of an episode's last one. No goals, no supervision of all steps, no sinusoidal positions. The means lie
+//! in -1 to 1, so that actions have to be normalised by their range (`normalisation.action = "min_max"`).
+
+mod config;
+
+pub use config::Config;
+
+use crate::batch::Batch;
+use crate::checks::{check_batch, check_observation};
+use crate::chunk_policy::ChunkPolicy;
+use crate::error::Result;
+use crate::features::{FeatureKind, Features, Signature};
+use crate::layers::{Dropout, LayerNorm, Linear, Mixture, MixtureHead, Mode, masked_softmax};
+use crate::losses::absolute;
+use crate::model::{LossParts, PolicyModel};
+use crate::params::{Init, Params};
+use crate::policy::{Clock, Policy};
+use crate::preprocess::Preprocess;
+use crate::rng::Rng;
+use candle_core::{Device, Tensor};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// The kinds of features that it reads.
+pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+
+/// The model.
+#[derive(Debug)]
+pub struct BcTransformer {
+    config: Config,
+    signature: Signature,
+    params: Params,
+    embed_encoder: Linear,
+    /// (1, T, D)
+    embed_timestep: Tensor,
+    embed_ln: LayerNorm,
+    blocks: Vec<Block>,
+    output_ln: LayerNorm,
+    head: MixtureHead,
+    dropout: Dropout,
+}
+
+/// Attention to what was before, then two dense layers; each after a norm and added to what it came from.
+#[derive(Debug)]
+struct Block {
+    ln1: LayerNorm,
+    qkv: Linear,
+    output: Linear,
+    ln2: LayerNorm,
+    mlp: [Linear; 2],
+    n_heads: usize,
+    dropout: Dropout,
+}
+
+impl Block {
+    fn new(p: &mut Params, prefix: &str, config: &Config, rng: &mut Rng) -> Result<Self> {
+        let dim = config.dim_model;
+        let mut linear = |p: &mut Params, name: &str, shape: (usize, usize), bias: Option<Init>| {
+            Linear::with_init(p, &format!("{prefix}.{name}"), shape, Init::Normal { std: 0.02 }, bias, rng)
+        };
+        let qkv = linear(p, "attention.nets.qkv", (dim, 3 * dim), None)?;
+        let output = linear(p, "attention.nets.output", (dim, dim), Some(Init::Zeros))?;
+        let mlp = [
+            linear(p, "mlp.0", (dim, 4 * dim), Some(Init::Zeros))?,
+            linear(p, "mlp.2", (4 * dim, dim), Some(Init::Zeros))?,
+        ];
+        Ok(Self {
+            ln1: LayerNorm::new(p, &format!("{prefix}.ln1"), dim, rng)?,
+            qkv,
+            output,
+            ln2: LayerNorm::new(p, &format!("{prefix}.ln2"), dim, rng)?,
+            mlp,
+            n_heads: config.n_heads,
+            dropout: Dropout { p: config.dropout },
+        })
+    }
+
+    /// x: (b, T, D), mask: (T, T), 0 where a step may look and very negative elsewhere -> (b, T, D)
+    fn forward(&self, x: &Tensor, mask: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
+        let (b, steps, dim) = x.dims3()?;
+        let head = dim / self.n_heads;
+        let qkv = self.qkv.forward(&self.ln1.forward(x)?)?;
+        let part = |i: usize| -> Result<Tensor> {
+            let part = qkv.narrow(2, i * dim, dim)?.reshape((b, steps, self.n_heads, head))?;
+            Ok(part.transpose(1, 2)?.contiguous()?)
+        };
+        let (q, k, v) = (part(0)?, part(1)?, part(2)?);
+        let scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (head as f64).sqrt()))?.broadcast_add(mask)?;
+        let weights = self.dropout.forward(&masked_softmax(&scores, None)?, mode)?;
+        let mixed = weights.matmul(&v)?.transpose(1, 2)?.reshape((b, steps, dim))?;
+        let x = (x + self.dropout.forward(&self.output.forward(&mixed)?, mode)?)?;
+        let inner = self.mlp[0].forward(&self.ln2.forward(&x)?)?.gelu_erf()?;
+        let outer = self.dropout.forward(&self.mlp[1].forward(&inner)?, mode)?;
+        Ok((x + outer)?)
+    }
+}
+
+impl BcTransformer {
+    /// Initial weights as robomimic draws them.
+    ///
+    /// # Errors
+    /// A configuration or a signature that describes no possible model.
+    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+        config.validate()?;
+        signature.check("bc_transformer", READS)?;
+        let rng = &mut Rng::new(seed, "init");
+        let mut p = Params::new();
+        let dim = config.dim_model;
+        let width = signature.observation.iter().map(|spec| spec.width()).sum();
+        let embed_encoder = Linear::new(&mut p, "embed_encoder", width, dim, rng)?;
+        let embed_timestep = p.create("embed_timestep", &[1, signature.n_obs_steps, dim], Init::Zeros, rng)?;
+        let embed_ln = LayerNorm::new(&mut p, "embed_ln", dim, rng)?;
+        let mut blocks = Vec::with_capacity(config.n_layers);
+        for i in 0..config.n_layers {
+            blocks.push(Block::new(&mut p, &format!("transformer.{i}"), config, rng)?);
+        }
+        let output_ln = LayerNorm::new(&mut p, "output_ln", dim, rng)?;
+        let sizes = (dim, config.n_modes, signature.action_dim);
+        let head = MixtureHead::new(&mut p, "decoder", sizes, config.min_std, rng)?;
+        let dropout = Dropout { p: config.dropout };
+        let (config, signature) = (config.clone(), signature.clone());
+        Ok(Self {
+            config,
+            signature,
+            params: p,
+            embed_encoder,
+            embed_timestep,
+            embed_ln,
+            blocks,
+            output_ln,
+            head,
+            dropout,
+        })
+    }
+
+    /// The signature's features, (b, T, …) each -> b mixtures, of the last step
+    ///
+    /// # Errors
+    /// An observation that does not fit.
+    pub fn mixtures(&self, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<Mixture> {
+        let rows = check_observation("bc_transformer", &self.signature, observation)?;
+        let steps = self.signature.n_obs_steps;
+        let mut joined = Vec::with_capacity(self.signature.observation.len());
+        for spec in &self.signature.observation {
+            joined.push(observation.require("bc_transformer", &spec.name)?.reshape((rows, steps, ()))?);
+        }
+        let x = self.embed_encoder.forward(&Tensor::cat(&joined, 2)?)?.broadcast_add(&self.embed_timestep)?;
+        let mut x = self.dropout.forward(&self.embed_ln.forward(&x)?, mode)?;
+        let mask: Vec<f32> = (0..steps * steps).map(|i| if i % steps > i / steps { -1e30 } else { 0.0 }).collect();
+        let mask = Tensor::from_vec(mask, (steps, steps), &Device::Cpu)?;
+        for block in &self.blocks {
+            x = block.forward(&x, &mask, mode)?;
+        }
+        let last = x.narrow(1, steps - 1, 1)?.squeeze(1)?;
+        self.head.forward(&self.output_ln.forward(&last)?)
+    }
+
+    /// The loss of these mixtures, one a row of the batch.
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn loss_of(&self, mixtures: &Mixture, batch: &Batch) -> Result<LossParts> {
+        let actions = batch.actions.squeeze(1)?;
+        let rows = batch.total_rows.max(1) as f64;
+        let total = ((mixtures.log_prob(&actions)?.sum_all()? / rows)? * -1.0)?;
+        // of the likeliest Gaussian's mean, beside what other policies report
+        let away = absolute(&(mixtures.likeliest()?.detach() - &actions)?)?;
+        let l1 = (away.sum_all()? / (rows * self.signature.action_dim as f64))?;
+        let parts = BTreeMap::from([("nll".to_string(), total.detach()), ("l1_loss".to_string(), l1)]);
+        Ok(LossParts { total, parts })
+    }
+}
+
+impl PolicyModel for BcTransformer {
+    fn params(&self) -> &Params {
+        &self.params
+    }
+
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn composed_because(&self) -> Option<String> {
+        Some("bc_transformer has no step by hand".to_string())
+    }
+
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
+        check_batch("bc_transformer", &self.signature, self.config.action_horizon, batch)?;
+        self.loss_of(&self.mixtures(&batch.observation, &mut Mode::Train(rng))?, batch)
+    }
+
+    /// The mean of the likeliest Gaussian.
+    fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        Ok(self.mixtures(observation, &mut Mode::Eval)?.likeliest()?.detach().unsqueeze(1)?)
+    }
+
+    fn sample(&self, observation: &Features<Tensor>, rng: &mut Rng) -> Result<Tensor> {
+        Ok(self.mixtures(observation, &mut Mode::Eval)?.sample(rng)?.detach().unsqueeze(1)?)
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        Box::new(ChunkPolicy::new(self, preprocess))
+    }
+
+    fn action_horizon(&self) -> usize {
+        self.config.action_horizon
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
+    use crate::train::{TrainConfig, Trainer};
+
+    fn small() -> Config {
+        Config { dim_model: 12, n_heads: 2, n_layers: 2, n_modes: 2, min_std: 0.05, ..Config::default() }
+    }
+
+    #[test]
+    fn the_gradient_is_the_slope_of_the_loss() {
+        let of = signatures();
+        for (signature, dropout) in [(&of.history, 0.0), (&of.plain, 0.0), (&of.history, 0.2)] {
+            let model = BcTransformer::new(&Config { dropout, ..small() }, signature, 1).unwrap();
+            crate::fused::testing::move_parameters(&model);
+            assert_the_gradient_is_the_slope(&model, &batch(signature, 1, 4, 3), &format!("dropout {dropout}"));
+        }
+    }
+
+    #[test]
+    fn training_lowers_the_loss_with_the_same_bits_every_time() {
+        let signature = signatures().history;
+        let run = || {
+            let model = Box::new(BcTransformer::new(&small(), &signature, 1).unwrap());
+            let settings = TrainConfig { steps: 60, lr: 5e-3, warmup_steps: 3, ..Default::default() };
+            let mut trainer = Trainer::new(model, settings, 5).unwrap();
+            let batch = batch(&signature, 1, 8, 0);
+            let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
+            (losses[0], losses[59])
+        };
+        let (first, last) = run();
+        assert!(last < first - 0.5, "{first} {last}");
+        assert_eq!(run(), (first, last));
+    }
+
+    #[test]
+    fn impossible_configurations_name_the_field() {
+        let error = |config: Config| BcTransformer::new(&config, &signatures().history, 0).unwrap_err().to_string();
+        assert!(error(Config { action_horizon: 2, ..small() }).contains("action_horizon is 2, expected 1"));
+        assert!(error(Config { n_heads: 5, ..small() }).contains("n_heads is 5, expected a divisor of dim_model, 12"));
+        assert!(error(Config { dropout: 1.0, ..small() }).contains("dropout"));
+    }
+}

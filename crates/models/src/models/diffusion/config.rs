@@ -1,0 +1,94 @@
+//! Diffusion's options.
+
+use super::unet::NetworkConfig;
+use crate::error::{ModelError, Result};
+use crate::size::Size;
+use serde::{Deserialize, Serialize};
+
+/// What the network is trained to give.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Prediction {
+    /// the noise that was added
+    #[default]
+    Epsilon,
+    /// the actions without it
+    Sample,
+}
+
+/// How actions are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Sampler {
+    /// noise only at the beginning (Song et al.)
+    #[default]
+    Ddim,
+    /// noise at every step (Ho et al.)
+    Ddpm,
+}
+
+/// Options, with LeRobot's defaults but for the sampler (there DDPM with all steps) and the horizon (there 64).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// actions in a sequence, beginning with that of the first observation seen (LeRobot: `horizon`)
+    pub action_horizon: usize,
+    /// the network
+    pub network: NetworkConfig,
+    /// steps of noise in training
+    pub num_train_timesteps: usize,
+    /// what the network gives
+    pub prediction: Prediction,
+    /// how actions are drawn
+    pub sampler: Sampler,
+    /// steps from noise to actions
+    pub inference_steps: usize,
+    /// largest magnitude of a normalised action, between steps too; 0 for any
+    pub clip_sample: f64,
+    /// whether steps beyond an episode's ends are left out of the loss (LeRobot: `do_mask_loss_for_padding`)
+    pub mask_padding: bool,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            action_horizon: 16,
+            network: NetworkConfig::default(),
+            num_train_timesteps: 100,
+            prediction: Prediction::Epsilon,
+            sampler: Sampler::Ddim,
+            inference_steps: 10,
+            clip_sample: 1.0,
+            mask_padding: false,
+        }
+    }
+}
+
+impl Config {
+    /// How large the model will be.
+    pub fn size(&self) -> Size {
+        self.network.size(self.action_horizon)
+    }
+
+    /// Checks that a model with this configuration can exist.
+    ///
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub fn validate(&self) -> Result<()> {
+        let refuse = |field, found: String, expected: String| {
+            Err(ModelError::Config { model: "diffusion", field, found, expected })
+        };
+        self.network.validate("diffusion", self.action_horizon)?;
+        if self.num_train_timesteps == 0 {
+            return refuse("num_train_timesteps", "0".to_string(), "at least 1".to_string());
+        }
+        if !(1..=self.num_train_timesteps).contains(&self.inference_steps) {
+            let expected = format!("1 to num_train_timesteps, {}", self.num_train_timesteps);
+            return refuse("inference_steps", self.inference_steps.to_string(), expected);
+        }
+        if !(self.clip_sample.is_finite() && self.clip_sample >= 0.0) {
+            return refuse("clip_sample", self.clip_sample.to_string(), "0 or more".to_string());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,339 @@
+//! LeRobot's diffusion files as values: `config.json` and the names of the tensors. Files are read and written in `zoo`.
+
+use super::{Config, Prediction, Sampler, unet::NetworkConfig};
+use crate::error::{ModelError, Result, some_names};
+use crate::features::{FeatureKind, Signature};
+use crate::lerobot::{mode_name, mode_of};
+use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
+use crate::params::Params;
+use candle_core::Tensor;
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+use std::collections::BTreeMap;
+
+/// The prefix of every tensor in LeRobot's files.
+const PREFIX: &str = "diffusion.";
+
+/// Keys that LeRobot knows and that do not matter to a policy at rest that sees no pictures.
+const OF_NO_MATTER: [&str; 35] = [
+    "type",
+    "device",
+    "use_amp",
+    "use_peft",
+    "push_to_hub",
+    "repo_id",
+    "private",
+    "tags",
+    "license",
+    "pretrained_path",
+    "pretrained_revision",
+    "drop_n_last_frames",
+    "vision_backbone",
+    "resize_shape",
+    "crop_ratio",
+    "crop_shape",
+    "crop_is_random",
+    "pretrained_backbone_weights",
+    "use_group_norm",
+    "spatial_softmax_num_keypoints",
+    "use_separate_rgb_encoder_per_camera",
+    "gradient_checkpointing",
+    // of a linear schedule, which is refused
+    "beta_start",
+    "beta_end",
+    "compile_model",
+    "compile_mode",
+    "optimizer_lr",
+    "optimizer_betas",
+    "optimizer_eps",
+    "optimizer_weight_decay",
+    "scheduler_name",
+    "scheduler_warmup_steps",
+    "use_policy_training_preset",
+    "feature_mapping",
+    "rtc_config",
+];
+
+/// What a LeRobot `config.json` of type `diffusion` says.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LerobotDiffusion {
+    /// the model
+    pub config: Config,
+    /// its inputs and outputs
+    pub signature: Signature,
+    /// actions executed before the next prediction
+    pub n_action_steps: usize,
+    /// normalisation of state, environment state and action; LeRobot leaves the environment state raw by default
+    pub modes: BTreeMap<String, NormMode>,
+}
+
+/// The keys of `config.json` under LeRobot's names and with its defaults; another key is an error, as it is there.
+#[derive(Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Keys {
+    n_obs_steps: usize,
+    horizon: usize,
+    n_action_steps: usize,
+    down_dims: Vec<usize>,
+    kernel_size: usize,
+    n_groups: usize,
+    diffusion_step_embed_dim: usize,
+    use_film_scale_modulation: bool,
+    noise_scheduler_type: String,
+    num_train_timesteps: usize,
+    beta_schedule: String,
+    prediction_type: Prediction,
+    clip_sample: bool,
+    clip_sample_range: f64,
+    num_inference_steps: Option<usize>,
+    do_mask_loss_for_padding: bool,
+    normalization_mapping: BTreeMap<String, String>,
+    input_features: BTreeMap<String, FeatureKeys>,
+    output_features: BTreeMap<String, FeatureKeys>,
+}
+
+#[derive(Debug, Deserialize)]
+struct FeatureKeys {
+    #[serde(rename = "type")]
+    kind: String,
+    shape: Vec<usize>,
+}
+
+impl Default for Keys {
+    fn default() -> Self {
+        let network = NetworkConfig::default();
+        let mapping = ["STATE", "ACTION"].map(|kind| (kind.to_string(), "MIN_MAX".to_string()));
+        Self {
+            n_obs_steps: 2,
+            horizon: 64,
+            n_action_steps: 32,
+            down_dims: network.down_dims,
+            kernel_size: network.kernel_size,
+            n_groups: network.n_groups,
+            diffusion_step_embed_dim: network.step_embed_dim,
+            use_film_scale_modulation: network.film_scale,
+            noise_scheduler_type: "DDPM".to_string(),
+            num_train_timesteps: 100,
+            beta_schedule: "squaredcos_cap_v2".to_string(),
+            prediction_type: Prediction::Epsilon,
+            clip_sample: true,
+            clip_sample_range: 1.0,
+            num_inference_steps: None,
+            do_mask_loss_for_padding: false,
+            normalization_mapping: BTreeMap::from(mapping),
+            input_features: BTreeMap::new(),
+            output_features: BTreeMap::new(),
+        }
+    }
+}
+
+fn refuse(field: &'static str, found: impl Into<String>, expected: &str) -> ModelError {
+    ModelError::Config { model: "LeRobot diffusion", field, found: found.into(), expected: expected.to_string() }
+}
+
+/// Reads a `config.json`.
+///
+/// # Errors
+/// Another type of policy, pictures, another schedule of noise, a missing feature, or a configuration that is impossible.
+pub fn read_config(config: &Value) -> Result<LerobotDiffusion> {
+    let kind = config.get("type").and_then(Value::as_str).unwrap_or("absent");
+    if kind != "diffusion" {
+        return Err(refuse("type", kind, "diffusion"));
+    }
+    let mut given: Map<String, Value> = config.as_object().cloned().unwrap_or_default();
+    // LeRobot writes `null` for absent options
+    given.retain(|key, value| !value.is_null() && !OF_NO_MATTER.contains(&key.as_str()));
+    let keys: Keys = serde_json::from_value(Value::Object(given))
+        .map_err(|e| refuse("config.json", e.to_string(), "LeRobot's keys and types"))?;
+    if keys.beta_schedule != "squaredcos_cap_v2" {
+        return Err(refuse("beta_schedule", keys.beta_schedule, "squaredcos_cap_v2"));
+    }
+    let sampler = match keys.noise_scheduler_type.as_str() {
+        "DDPM" => Sampler::Ddpm,
+        "DDIM" => Sampler::Ddim,
+        other => return Err(refuse("noise_scheduler_type", other, "DDPM or DDIM")),
+    };
+    let (mut state, mut env) = (0, 0);
+    for (name, feature) in &keys.input_features {
+        match (feature.kind.as_str(), name.as_str(), &feature.shape[..]) {
+            ("STATE", STATE, &[n]) => state = n,
+            ("ENV", ENVIRONMENT_STATE, &[n]) => env = n,
+            (kind, _, shape) => {
+                let found = format!("{name} of type {kind} and shape {shape:?}");
+                let expected = "observation.state of type STATE, observation.environment_state of type ENV";
+                return Err(refuse("input_features", found, expected));
+            }
+        }
+    }
+    let action = match keys.output_features.get(ACTION).map(|f| &f.shape[..]) {
+        Some([n]) => *n,
+        other => return Err(refuse("output_features", format!("action of shape {other:?}"), "one dimension")),
+    };
+    if state == 0 {
+        return Err(refuse("input_features", "no observation.state", "observation.state"));
+    }
+    let mut modes = BTreeMap::new();
+    for (feature, kind, present) in
+        [(STATE, "STATE", true), (ENVIRONMENT_STATE, "ENV", env > 0), (ACTION, "ACTION", true)]
+    {
+        let mode = mode_of(&keys.normalization_mapping, kind)?;
+        if present {
+            modes.insert(feature.to_string(), mode);
+        }
+    }
+    let most = (keys.horizon + 1).saturating_sub(keys.n_obs_steps);
+    if keys.n_action_steps == 0 || keys.n_action_steps > most {
+        let expected = format!("1 to horizon - n_obs_steps + 1, {most}");
+        return Err(refuse("n_action_steps", keys.n_action_steps.to_string(), &expected));
+    }
+    let config = Config {
+        action_horizon: keys.horizon,
+        network: NetworkConfig {
+            down_dims: keys.down_dims,
+            kernel_size: keys.kernel_size,
+            n_groups: keys.n_groups,
+            step_embed_dim: keys.diffusion_step_embed_dim,
+            film_scale: keys.use_film_scale_modulation,
+        },
+        num_train_timesteps: keys.num_train_timesteps,
+        prediction: keys.prediction_type,
+        sampler,
+        inference_steps: keys.num_inference_steps.unwrap_or(keys.num_train_timesteps),
+        clip_sample: if keys.clip_sample { keys.clip_sample_range } else { 0.0 },
+        mask_padding: keys.do_mask_loss_for_padding,
+    };
+    config.validate()?;
+    let signature = Signature { n_obs_steps: keys.n_obs_steps, ..Signature::low_dimensional(state, env, action) };
+    Ok(LerobotDiffusion { config, signature, n_action_steps: keys.n_action_steps, modes })
+}
+
+/// Writes a `config.json` that LeRobot 0.6.1 loads.
+///
+/// # Errors
+/// What LeRobot's diffusion cannot read: entities, or nothing but a state.
+pub fn write_config(diffusion: &LerobotDiffusion) -> Result<Value> {
+    let (c, signature) = (&diffusion.config, &diffusion.signature);
+    let mut inputs = json!({});
+    for spec in &signature.observation {
+        let kind = match spec.kind {
+            FeatureKind::State => "STATE",
+            FeatureKind::EnvironmentState => "ENV",
+            FeatureKind::Entity | FeatureKind::Image => {
+                let expected = "features that are written for LeRobot: state and environment_state";
+                return Err(refuse("input_features", format!("{} of kind {}", spec.name, spec.kind), expected));
+            }
+        };
+        inputs[&spec.name] = json!({ "type": kind, "shape": spec.shape });
+    }
+    if signature.get(ENVIRONMENT_STATE).is_none() {
+        let expected = "observation.environment_state, without which LeRobot has no diffusion on states";
+        return Err(refuse("input_features", "observation.state alone", expected));
+    }
+    let mut mapping = Map::from_iter([("VISUAL".to_string(), json!("MEAN_STD"))]);
+    for (feature, kind) in [(STATE, "STATE"), (ENVIRONMENT_STATE, "ENV"), (ACTION, "ACTION")] {
+        if let Some(mode) = diffusion.modes.get(feature) {
+            mapping.insert(kind.to_string(), json!(mode_name(*mode)));
+        }
+    }
+    Ok(json!({
+        "type": "diffusion",
+        "n_obs_steps": signature.n_obs_steps,
+        "input_features": inputs,
+        "output_features": { ACTION: { "type": "ACTION", "shape": [signature.action_dim] } },
+        "device": "cpu",
+        "normalization_mapping": mapping,
+        "horizon": c.action_horizon,
+        "n_action_steps": diffusion.n_action_steps,
+        "down_dims": c.network.down_dims,
+        "kernel_size": c.network.kernel_size,
+        "n_groups": c.network.n_groups,
+        "diffusion_step_embed_dim": c.network.step_embed_dim,
+        "use_film_scale_modulation": c.network.film_scale,
+        "noise_scheduler_type": match c.sampler { Sampler::Ddpm => "DDPM", Sampler::Ddim => "DDIM" },
+        "num_train_timesteps": c.num_train_timesteps,
+        "beta_schedule": "squaredcos_cap_v2",
+        "prediction_type": c.prediction,
+        "clip_sample": c.clip_sample > 0.0,
+        "clip_sample_range": if c.clip_sample > 0.0 { c.clip_sample } else { 1.0 },
+        "num_inference_steps": c.inference_steps,
+        "do_mask_loss_for_padding": c.mask_padding,
+    }))
+}
+
+/// Loads the tensors of a LeRobot `model.safetensors` into the parameters of a diffusion model: the name set must be exactly
+/// the model's, each with LeRobot's prefix.
+///
+/// # Errors
+/// The first tensor that is missing, extra or misshapen.
+pub fn load_tensors(params: &Params, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
+    let mut own = BTreeMap::new();
+    for (name, tensor) in tensors {
+        let known = || params.names().map(|n| format!("{PREFIX}{n}")).collect::<Vec<_>>();
+        let short = name
+            .strip_prefix(PREFIX)
+            .ok_or_else(|| ModelError::ExtraTensor { name: name.clone(), known: some_names(&known()) })?;
+        own.insert(short.to_string(), tensor.clone());
+    }
+    params.load(&own)
+}
+
+/// The tensors of a LeRobot `model.safetensors` for the parameters of a diffusion model.
+pub fn tensors_out(params: &Params) -> BTreeMap<String, Tensor> {
+    params.tensors().into_iter().map(|(name, tensor)| (format!("{PREFIX}{name}"), tensor)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::features::FeatureSpec;
+
+    fn example() -> LerobotDiffusion {
+        let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, ..NetworkConfig::default() };
+        let modes = [(STATE, NormMode::MinMax), (ENVIRONMENT_STATE, NormMode::Identity), (ACTION, NormMode::MinMax)];
+        LerobotDiffusion {
+            config: Config { network, clip_sample: 0.0, ..Config::default() },
+            signature: Signature { n_obs_steps: 2, ..Signature::low_dimensional(3, 2, 2) },
+            n_action_steps: 8,
+            modes: modes.map(|(name, mode)| (name.to_string(), mode)).into(),
+        }
+    }
+
+    #[test]
+    fn what_is_written_reads_back() {
+        let one = example();
+        assert_eq!(read_config(&write_config(&one).unwrap()).unwrap(), one);
+    }
+
+    #[test]
+    fn what_cannot_be_run_is_refused_by_name() {
+        let good = write_config(&example()).unwrap();
+        for (field, value, named) in [
+            ("type", json!("act"), "act"),
+            ("beta_schedule", json!("linear"), "linear"),
+            ("noise_scheduler_type", json!("Euler"), "Euler"),
+            ("n_action_steps", json!(16), "n_action_steps is 16, expected 1 to horizon - n_obs_steps + 1, 15"),
+            ("horizon", json!(14), "a multiple of 2^2"),
+            ("prediction_type", json!("v"), "config.json"),
+            ("n_gruops", json!(2), "n_gruops"),
+            ("normalization_mapping", json!({"STATE": "QUANTILES"}), "QUANTILES"),
+            ("input_features", json!({}), "observation.state"),
+            ("input_features", json!({"observation.image": {"type": "VISUAL", "shape": [3, 8, 8]}}), "VISUAL"),
+        ] {
+            let mut bad = good.clone();
+            bad[field] = value;
+            let error = read_config(&bad).unwrap_err().to_string();
+            assert!(error.contains(named), "{field}: {error}");
+        }
+    }
+
+    #[test]
+    fn what_lerobot_cannot_read_is_not_written() {
+        let mut entities = example();
+        entities.signature.observation.push(FeatureSpec::entity("cube", 3, "cube", false));
+        assert!(write_config(&entities).unwrap_err().to_string().contains("observation.entity.cube of kind entity"));
+        let mut alone = example();
+        alone.signature.observation.truncate(1);
+        assert!(write_config(&alone).unwrap_err().to_string().contains("observation.state alone"));
+    }
+}

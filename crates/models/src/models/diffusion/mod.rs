@@ -1,0 +1,213 @@
+//! Diffusion policy: actions are drawn by taking the noise out of noise, step by step, looking at the observation.
+//!
+//! Paper: Chi et al., "Diffusion Policy: Visuomotor Policy Learning via Action Diffusion" (arXiv 2303.04137). Reference
+//! implementation: LeRobot 0.6.1's `DiffusionPolicy`, of which this has the tensors' names and, on fixtures made with it, the
+//! outputs, the loss and the gradients. As there a sequence of actions begins with that of the first observation seen; what
+//! lies before the present one is not executed.
+//!
+//! Deviations: observations are low-dimensional, entities among them, joined in the signature's order; betas are those of
+//! the squared cosine only; actions are drawn with DDIM in 10 steps unless the configuration says otherwise (LeRobot: DDPM
+//! in as many as were trained); every frame starts a window (LeRobot leaves out the last 7 of an episode). The moving average
+//! of the weights is the trainer's (`train.ema_decay`), with one decay; Chi et al.'s grows, LeRobot has none.
+//!
+//! What it costs: the step is composed of candle's operations, convolutions as products over unfolded windows
+//! (`layers/conv1d.rs`); `bench_policies` puts it beside LeRobot's, whose training step is faster. One step of DDIM starts at the
+//! least noisy timestep, as diffusers' spacing `leading` has it: it is there for parity, not to act by.
+
+mod config;
+pub mod lerobot;
+mod schedule;
+pub mod unet;
+
+pub use config::{Config, Prediction, Sampler};
+pub use schedule::NoiseSchedule;
+
+use crate::batch::Batch;
+use crate::checks::{check_batch, check_observation};
+use crate::chunk_policy::ChunkPolicy;
+use crate::error::{ModelError, Result};
+use crate::features::{FeatureKind, Features, Signature};
+use crate::model::{LossParts, PolicyModel};
+use crate::params::Params;
+use crate::policy::{Clock, Policy};
+use crate::preprocess::Preprocess;
+use crate::rng::Rng;
+use candle_core::{Device, Tensor};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use unet::Unet;
+
+/// The kinds of features that it reads.
+pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+
+/// The model.
+#[derive(Debug)]
+pub struct Diffusion {
+    config: Config,
+    signature: Signature,
+    params: Params,
+    schedule: NoiseSchedule,
+    unet: Unet,
+}
+
+/// Numbers of everything seen at once.
+pub(crate) fn condition_width(signature: &Signature) -> usize {
+    signature.observation.iter().map(|spec| spec.width() * signature.n_obs_steps).sum()
+}
+
+/// The signature's features, (b, …) each -> (b, steps*width), the features of a step side by side, steps one after another
+pub(crate) fn condition(
+    model: &'static str,
+    signature: &Signature,
+    rows: usize,
+    observation: &Features<Tensor>,
+) -> Result<Tensor> {
+    let mut joined = Vec::with_capacity(signature.observation.len());
+    for spec in &signature.observation {
+        joined.push(observation.require(model, &spec.name)?.reshape((rows, signature.n_obs_steps, ()))?);
+    }
+    Ok(Tensor::cat(&joined, 2)?.reshape((rows, ()))?)
+}
+
+/// Checks that a sequence of actions reaches the present.
+pub(crate) fn check_reaches(model: &'static str, signature: &Signature, action_horizon: usize) -> Result<()> {
+    if action_horizon >= signature.n_obs_steps {
+        return Ok(());
+    }
+    let (found, expected) = (action_horizon.to_string(), format!("at least n_obs_steps, {}", signature.n_obs_steps));
+    Err(ModelError::Config { model, field: "action_horizon", found, expected })
+}
+
+/// The mean over what counts of squared differences. predicted, wanted: (b, H, A); with `masked` steps beyond an episode's
+/// ends do not count.
+pub(crate) fn squared_error(predicted: &Tensor, wanted: &Tensor, batch: &Batch, masked: bool) -> Result<Tensor> {
+    let squares = (predicted - wanted)?.sqr()?;
+    let (_, horizon, width) = squares.dims3()?;
+    if masked {
+        let valid = (1.0 - batch.is_pad.unsqueeze(2)?)?;
+        let entries = (batch.total_valid_steps * width).max(1) as f64;
+        return Ok((squares.broadcast_mul(&valid)?.sum_all()? / entries)?);
+    }
+    Ok((squares.sum_all()? / (batch.total_rows * horizon * width).max(1) as f64)?)
+}
+
+impl Diffusion {
+    /// Initial weights are torch's defaults.
+    ///
+    /// # Errors
+    /// A configuration or a signature that describes no possible model.
+    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+        config.validate()?;
+        signature.check("diffusion", READS)?;
+        check_reaches("diffusion", signature, config.action_horizon)?;
+        let mut p = Params::new();
+        let dims = (signature.action_dim, condition_width(signature));
+        let unet = Unet::new(&mut p, "unet", dims, &config.network, &mut Rng::new(seed, "init"))?;
+        let schedule = NoiseSchedule::new(config.num_train_timesteps);
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, schedule, unet })
+    }
+
+    /// The same model drawing its actions otherwise.
+    ///
+    /// # Errors
+    /// More steps than there are.
+    pub fn sampling(mut self, sampler: Sampler, inference_steps: usize) -> Result<Self> {
+        (self.config.sampler, self.config.inference_steps) = (sampler, inference_steps);
+        self.config.validate()?;
+        Ok(self)
+    }
+
+    /// What the network gives. x: (b, H, A), the step of each row -> (b, H, A)
+    ///
+    /// # Errors
+    /// An observation that does not fit.
+    pub fn denoise(&self, observation: &Features<Tensor>, x: &Tensor, steps: &[u32]) -> Result<Tensor> {
+        let rows = check_observation("diffusion", &self.signature, observation)?;
+        let cond = condition("diffusion", &self.signature, rows, observation)?;
+        let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
+        self.unet.forward(x, &steps, &cond)
+    }
+
+    /// The loss with this noise, (b, H, A), and these steps, one a row.
+    ///
+    /// # Errors
+    /// A batch that does not fit.
+    pub fn loss_with(&self, batch: &Batch, noise: &Tensor, steps: &[u32]) -> Result<Tensor> {
+        check_batch("diffusion", &self.signature, self.config.action_horizon, batch)?;
+        let noisy = self.schedule.add_noise(&batch.actions, noise, steps)?;
+        let output = self.denoise(&batch.observation, &noisy, steps)?;
+        let wanted = match self.config.prediction {
+            Prediction::Epsilon => noise,
+            Prediction::Sample => &batch.actions,
+        };
+        squared_error(&output, wanted, batch, self.config.mask_padding)
+    }
+
+    /// Actions from this noise, (b, H, A) -> (b, H, A); `drawn` gives more of it, which only DDPM asks for.
+    ///
+    /// # Errors
+    /// An observation that does not fit.
+    pub fn sample_from(
+        &self,
+        observation: &Features<Tensor>,
+        noise: &Tensor,
+        drawn: &mut dyn FnMut() -> Result<Tensor>,
+    ) -> Result<Tensor> {
+        let mut x = noise.clone();
+        for step in self.schedule.visited(self.config.inference_steps) {
+            let output = self.denoise(observation, &x, &vec![step; x.dim(0)?])?.detach();
+            x = self.schedule.back(&self.config, &x, &output, step, drawn)?;
+        }
+        Ok(x)
+    }
+
+    fn noise(&self, rows: usize, rng: &mut Rng) -> Result<Tensor> {
+        let shape = (rows, self.config.action_horizon, self.signature.action_dim);
+        Ok(Tensor::from_vec(rng.normals(shape.0 * shape.1 * shape.2), shape, &Device::Cpu)?)
+    }
+}
+
+impl PolicyModel for Diffusion {
+    fn params(&self) -> &Params {
+        &self.params
+    }
+
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn composed_because(&self) -> Option<String> {
+        Some("diffusion has no step by hand".to_string())
+    }
+
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
+        let rows = batch.rows();
+        let noise = self.noise(rows, rng)?;
+        let steps: Vec<u32> = (0..rows).map(|_| rng.below(self.schedule.steps() as u64) as u32).collect();
+        let total = self.loss_with(batch, &noise, &steps)?;
+        Ok(LossParts { parts: BTreeMap::from([("l2_loss".to_string(), total.detach())]), total })
+    }
+
+    /// Drawn with a generator that is always the same.
+    fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        self.sample(observation, &mut Rng::new(0, "predict"))
+    }
+
+    fn sample(&self, observation: &Features<Tensor>, rng: &mut Rng) -> Result<Tensor> {
+        let rows = check_observation("diffusion", &self.signature, observation)?;
+        let noise = self.noise(rows, rng)?;
+        self.sample_from(observation, &noise, &mut || self.noise(rows, rng))
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        let past = self.signature.n_obs_steps - 1;
+        Box::new(ChunkPolicy::new(self, preprocess).without_past(past))
+    }
+
+    fn action_horizon(&self) -> usize {
+        self.config.action_horizon
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,119 @@
+#![allow(clippy::unwrap_used)]
+use super::unet::NetworkConfig;
+use super::*;
+use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
+use crate::train::{TrainConfig, Trainer};
+
+fn small() -> Config {
+    let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, step_embed_dim: 8, ..NetworkConfig::default() };
+    Config { action_horizon: 8, network, ..Config::default() }
+}
+
+#[test]
+fn the_gradient_is_the_slope_of_the_loss() {
+    let of = signatures();
+    let shifted = NetworkConfig { film_scale: false, kernel_size: 3, ..small().network };
+    for (signature, config) in [
+        (&of.plain, small()),
+        (&of.history, Config { prediction: Prediction::Sample, mask_padding: true, ..small() }),
+        (&of.entities, Config { network: shifted, ..small() }),
+    ] {
+        let model = Diffusion::new(&config, signature, 1).unwrap();
+        let batch = batch(signature, 8, 3, 3);
+        assert_the_gradient_is_the_slope(&model, &batch, &format!("{config:?}"));
+    }
+}
+
+#[test]
+fn shards_add_up_to_the_whole() {
+    let signature = signatures().history;
+    for mask_padding in [false, true] {
+        let model = Diffusion::new(&Config { mask_padding, ..small() }, &signature, 1).unwrap();
+        let batch = batch(&signature, 8, 5, 3);
+        let noise = model.noise(5, &mut Rng::new(1, "noise")).unwrap();
+        let steps = [3, 99, 0, 50, 20];
+        let number = |loss: Tensor| loss.to_scalar::<f32>().unwrap();
+        let whole = number(model.loss_with(&batch, &noise, &steps).unwrap());
+        let mut sum = 0.0;
+        for (from, shard) in [0, 2].into_iter().zip(batch.shards(2).unwrap()) {
+            let part = noise.narrow(0, from, shard.rows()).unwrap().contiguous().unwrap();
+            sum += number(model.loss_with(&shard, &part, &steps[from..from + shard.rows()]).unwrap());
+        }
+        assert!((whole - sum).abs() < 1e-5 * whole, "{whole} {sum}");
+    }
+}
+
+#[test]
+fn ddpm_with_a_network_that_knows_the_noise_comes_back_to_the_actions() {
+    // with the true noise as output every step back keeps the same clean actions
+    let config = Config { clip_sample: 0.0, inference_steps: 100, ..small() };
+    let schedule = NoiseSchedule::new(100);
+    let clean = Tensor::new(&[[[0.3_f32], [-0.7]]], &Device::Cpu).unwrap();
+    for sampler in [Sampler::Ddim, Sampler::Ddpm] {
+        let config = Config { sampler, ..config.clone() };
+        let rng = &mut Rng::new(4, "test");
+        let noise = Tensor::from_vec(rng.normals(2), (1, 2, 1), &Device::Cpu).unwrap();
+        let mut x = schedule.add_noise(&clean, &noise, &[99]).unwrap();
+        for step in schedule.visited(100) {
+            let share = f64::from(schedule.alphas_cumprod_at(step));
+            let knows = ((&x - (&clean * share.sqrt()).unwrap()).unwrap() / (1.0 - share).sqrt()).unwrap();
+            let mut drawn = || -> Result<Tensor> { Ok(Tensor::from_vec(rng.normals(2), (1, 2, 1), &Device::Cpu)?) };
+            x = schedule.back(&config, &x, &knows, step, &mut drawn).unwrap();
+        }
+        let off =
+            (&x - &clean).unwrap().abs().unwrap().flatten_all().unwrap().max(0).unwrap().to_scalar::<f32>().unwrap();
+        assert!(off < 1e-3, "{sampler:?} {off}");
+    }
+}
+
+#[test]
+fn training_lowers_the_loss_with_the_same_bits_every_time() {
+    let signature = signatures().history;
+    let run = || {
+        let model = Box::new(Diffusion::new(&small(), &signature, 1).unwrap());
+        let settings = TrainConfig { steps: 60, lr: 3e-3, warmup_steps: 3, ..Default::default() };
+        let mut trainer = Trainer::new(model, settings, 5).unwrap();
+        let batch = batch(&signature, 8, 16, 0);
+        let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
+        let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
+        (mean(&losses[..10]), mean(&losses[50..]))
+    };
+    let (first, last) = run();
+    assert!(last < 0.9 * first, "{first} {last}");
+    assert_eq!(run(), (first, last));
+}
+
+#[test]
+fn what_is_drawn_depends_on_the_generator_and_stays_in_range() {
+    let signature = signatures().history;
+    let model = Diffusion::new(&small(), &signature, 1).unwrap();
+    let batch = batch(&signature, 8, 4, 3);
+    let flat = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let draw = |seed| flat(model.sample(&batch.observation, &mut Rng::new(seed, "policy")).unwrap());
+    assert_eq!(draw(1), draw(1));
+    assert_ne!(draw(1), draw(2));
+    assert!(draw(1).iter().all(|x| x.abs() <= 1.0));
+    assert_eq!(draw(1).len(), 4 * 8 * 2);
+}
+
+#[test]
+fn impossible_configurations_name_the_field() {
+    let of = signatures();
+    let error = |config: Config| Diffusion::new(&config, &of.plain, 0).unwrap_err().to_string();
+    let network = |change: fn(&mut NetworkConfig)| {
+        let mut config = small();
+        change(&mut config.network);
+        config
+    };
+    assert!(error(Config { action_horizon: 6, ..small() }).contains("action_horizon is 6, expected a multiple of 2^2"));
+    assert!(error(Config { inference_steps: 101, ..small() }).contains("inference_steps"));
+    assert!(error(Config { clip_sample: -1.0, ..small() }).contains("clip_sample"));
+    assert!(error(network(|n| n.n_groups = 3)).contains("network.n_groups is 3"));
+    assert!(error(network(|n| n.kernel_size = 4)).contains("network.kernel_size"));
+    assert!(error(network(|n| n.down_dims = vec![])).contains("network.down_dims"));
+    assert!(error(network(|n| n.down_dims = vec![12, 24])).contains("a multiple of 8 first"));
+    assert!(error(network(|n| n.step_embed_dim = 5)).contains("step_embed_dim"));
+    let long = Signature { n_obs_steps: 9, ..of.plain.clone() };
+    let error = Diffusion::new(&small(), &long, 0).unwrap_err().to_string();
+    assert!(error.contains("action_horizon is 8, expected at least n_obs_steps, 9"), "{error}");
+}

@@ -1,0 +1,46 @@
+//! Flow matching's options.
+
+use crate::error::{ModelError, Result};
+use crate::models::diffusion::unet::NetworkConfig;
+use crate::size::Size;
+use serde::{Deserialize, Serialize};
+
+/// Options.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// actions in a sequence, beginning with that of the first observation seen
+    pub action_horizon: usize,
+    /// the network
+    pub network: NetworkConfig,
+    /// Euler steps from noise to actions
+    pub inference_steps: usize,
+    /// whether steps beyond an episode's ends are left out of the loss
+    pub mask_padding: bool,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { action_horizon: 16, network: NetworkConfig::default(), inference_steps: 5, mask_padding: false }
+    }
+}
+
+impl Config {
+    /// How large the model will be.
+    pub fn size(&self) -> Size {
+        self.network.size(self.action_horizon)
+    }
+
+    /// Checks that a model with this configuration can exist.
+    ///
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub fn validate(&self) -> Result<()> {
+        self.network.validate("flow", self.action_horizon)?;
+        if self.inference_steps == 0 {
+            let (found, expected) = ("0".to_string(), "at least 1".to_string());
+            return Err(ModelError::Config { model: "flow", field: "inference_steps", found, expected });
+        }
+        Ok(())
+    }
+}

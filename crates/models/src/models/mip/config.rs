@@ -1,0 +1,47 @@
+//! MIP's options.
+
+use crate::error::{ModelError, Result};
+use crate::models::diffusion::unet::NetworkConfig;
+use crate::size::Size;
+use serde::{Deserialize, Serialize};
+
+/// Options.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// actions in a sequence, beginning with that of the first observation seen
+    pub action_horizon: usize,
+    /// the network
+    pub network: NetworkConfig,
+    /// share of the actions in what the second step is shown; the rest is noise in training
+    pub second_time: f64,
+    /// whether steps beyond an episode's ends are left out of the loss
+    pub mask_padding: bool,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { action_horizon: 16, network: NetworkConfig::default(), second_time: 0.9, mask_padding: false }
+    }
+}
+
+impl Config {
+    /// How large the model will be.
+    pub fn size(&self) -> Size {
+        let once = self.network.size(self.action_horizon);
+        Size { activations: 2.0 * once.activations, ..once }
+    }
+
+    /// Checks that a model with this configuration can exist.
+    ///
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub fn validate(&self) -> Result<()> {
+        self.network.validate("mip", self.action_horizon)?;
+        if !(self.second_time > 0.0 && self.second_time < 1.0) {
+            let (found, expected) = (self.second_time.to_string(), "between 0 and 1".to_string());
+            return Err(ModelError::Config { model: "mip", field: "second_time", found, expected });
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,127 @@
+//! MIP, the minimal iterative policy: two steps of regression, the second of which looks at a first answer and learned to
+//! correct a noisy one. Nothing is drawn at test time.
+//!
+//! Paper: Pan et al., "Much Ado About Noising: Dispelling the Myths of Generative Robotic Control" (arXiv 2512.01809). With
+//! demonstrated actions a, noise z and t = `second_time` the network π is trained on
+//! |π(o, 0, 0) - a|² + |π(o, t a + (1-t) z, t) - a|²; its answer is π(o, t a0, t) with a0 = π(o, 0, 0).
+//!
+//! The network is diffusion's (`models/diffusion/unet.rs`), which is shown 100 t as its step, and so is what a sequence
+//! begins with. Deviations: written from the paper's equations, without its code to hold it to; the two steps are held to an
+//! oracle in NumPy, the network to LeRobot's with diffusion. The loss is half the sum, so that it compares with one step's.
+
+mod config;
+
+pub use crate::models::diffusion::READS;
+pub use config::Config;
+
+use crate::batch::Batch;
+use crate::checks::{check_batch, check_observation};
+use crate::chunk_policy::ChunkPolicy;
+use crate::error::Result;
+use crate::features::{Features, Signature};
+use crate::model::{LossParts, PolicyModel};
+use crate::models::diffusion::unet::Unet;
+use crate::models::diffusion::{check_reaches, condition, condition_width, squared_error};
+use crate::models::flow::between;
+use crate::params::Params;
+use crate::policy::{Clock, Policy};
+use crate::preprocess::Preprocess;
+use crate::rng::Rng;
+use candle_core::{DType, Device, Tensor};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// What the network is shown at time 1.
+const LAST_STEP: f32 = 100.0;
+
+/// The model.
+#[derive(Debug)]
+pub struct Mip {
+    config: Config,
+    signature: Signature,
+    params: Params,
+    unet: Unet,
+}
+
+/// A first answer from nothing and a second one that looks at it; `answer` is given what it looks at and the time.
+pub(crate) fn two_steps(
+    nothing: &Tensor,
+    second_time: f32,
+    answer: impl Fn(&Tensor, f32) -> Result<Tensor>,
+) -> Result<Tensor> {
+    let first = answer(nothing, 0.0)?;
+    answer(&(first * f64::from(second_time))?, second_time)
+}
+
+impl Mip {
+    /// Initial weights are torch's defaults.
+    ///
+    /// # Errors
+    /// A configuration or a signature that describes no possible model.
+    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+        config.validate()?;
+        signature.check("mip", READS)?;
+        check_reaches("mip", signature, config.action_horizon)?;
+        let mut p = Params::new();
+        let dims = (signature.action_dim, condition_width(signature));
+        let unet = Unet::new(&mut p, "unet", dims, &config.network, &mut Rng::new(seed, "init"))?;
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, unet })
+    }
+
+    /// x: (b, H, A) -> the answer at this time
+    fn answer(&self, cond: &Tensor, x: &Tensor, time: f32) -> Result<Tensor> {
+        self.unet.forward(x, &vec![time * LAST_STEP; x.dim(0)?], cond)
+    }
+
+    fn nothing(&self, rows: usize) -> Result<Tensor> {
+        let shape = (rows, self.config.action_horizon, self.signature.action_dim);
+        Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?)
+    }
+}
+
+impl PolicyModel for Mip {
+    fn params(&self) -> &Params {
+        &self.params
+    }
+
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn composed_because(&self) -> Option<String> {
+        Some("mip has no step by hand".to_string())
+    }
+
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
+        check_batch("mip", &self.signature, self.config.action_horizon, batch)?;
+        let rows = batch.rows();
+        let cond = condition("mip", &self.signature, rows, &batch.observation)?;
+        let noise = Tensor::from_vec(rng.normals(batch.actions.elem_count()), batch.actions.shape(), &Device::Cpu)?;
+        let time = self.config.second_time as f32;
+        let noisy = between(&noise, &batch.actions, &vec![time; rows])?;
+        let error = |answer: Tensor| squared_error(&answer, &batch.actions, batch, self.config.mask_padding);
+        let first = error(self.answer(&cond, &self.nothing(rows)?, 0.0)?)?;
+        let second = error(self.answer(&cond, &noisy, time)?)?;
+        let parts = [("first_l2_loss", &first), ("second_l2_loss", &second)];
+        let parts = parts.into_iter().map(|(name, part)| (name.to_string(), part.detach()));
+        Ok(LossParts { parts: BTreeMap::from_iter(parts), total: ((first + second)? * 0.5)? })
+    }
+
+    fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        let rows = check_observation("mip", &self.signature, observation)?;
+        let cond = condition("mip", &self.signature, rows, observation)?;
+        two_steps(&self.nothing(rows)?, self.config.second_time as f32, |x, t| Ok(self.answer(&cond, x, t)?.detach()))
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        let past = self.signature.n_obs_steps - 1;
+        Box::new(ChunkPolicy::new(self, preprocess).without_past(past))
+    }
+
+    fn action_horizon(&self) -> usize {
+        self.config.action_horizon
+    }
+}
+
+#[cfg(test)]
+mod tests;
