@@ -96,7 +96,7 @@ fn files_are_written_whoever_reads_the_table() {
         let out = folder.path().join(name).join("public");
         let mut command = zoo(["leaderboard", "--zoo", text(&shipped), "--out", text(&out)]);
         assert_eq!(ran(command.stdout(to)).status.code(), Some(code));
-        assert_eq!(listing(&out), ["leaderboard.csv", "report.html"], "{name}");
+        assert_eq!(listing(&out), ["leaderboard.csv", "leaderboard_across.csv", "report.html"], "{name}");
     }
     // what was trained, converted and exported is there as well
     let at = |name: &str| folder.path().join(name);

@@ -12,14 +12,15 @@ use zoo::{ZooError, write_together};
 
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs};
 
-/// Rank all evaluations: tables here, leaderboard.csv, leaderboard_puzzles.csv and report.html in the zoo
+/// Rank all evaluations: tables here, leaderboard.csv and its like for puzzles and across tasks, and report.html in the zoo
 ///
 /// A family (trainings that differ in their seed alone, as `train --seeds` makes them) is one row, with an interval that
 /// holds the chance of training. Ranks go by the lower end of the 95% interval; a row of fewer than 20 episodes has none.
 /// Rows of a task and protocol that share a letter cannot be told apart: exact McNemar tests on equal seeds (Barnard's where
 /// seeds differ, a bootstrap between families), Holm's correction over the whole table. Results that are not as they
 /// were sealed, without a seal, in a folder of another name, or of an entry that is not in the zoo or says otherwise, are
-/// named and left out; the others are ranked, and the exit code is 1.
+/// named and left out; the others are ranked, and the exit code is 1. Where policies were evaluated on several tasks under
+/// one protocol, leaderboard_across.csv has their interquartile means over those tasks.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo leaderboard
