@@ -40,6 +40,13 @@ help: ## list the targets
 	@.venv-peers/bin/python -m $(PIP) -r $<
 	@touch $@
 
+# What the wheel is built with.
+.venv-wheel/.complete: crates/python/requirements.lock
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.11, 3.12 or 3.13 with venv found; name one: make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
+	@rm -rf .venv-wheel && "$(PYTHON)" -m venv .venv-wheel
+	@.venv-wheel/bin/python -m $(PIP) -r $<
+	@touch $@
+
 .PHONY: venv
 venv: .venv/.complete ## Python with robosuite, in .venv
 
@@ -58,6 +65,10 @@ programs: .venv/.complete
 demo: programs ## the whole line: demonstrations, data set, training, evaluation, leaderboard (in out/demo)
 	@tools/demo.sh
 
+.PHONY: wheel
+wheel: build .venv-wheel/.complete ## the Python package, with the programs in it, in target/wheels
+	@.venv-wheel/bin/python tools/wheel.py
+
 .PHONY: study-robots
 study-robots: build ## ACT on every robot task: 200 demonstrations, training, 100 unseen seeds (hours; goes on where it was)
 	@tools/study_robots.sh
@@ -67,17 +78,19 @@ study-thinking: build ## ACT beside ACTRM beside ACTRM that may not think, from 
 	@tools/study_thinking.sh
 
 .PHONY: test
-test: build ## every test: Rust, Python and end to end
+test: wheel ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace
 	@.venv/bin/python -m pytest -q tools/harness/tests
+	@tools/test_wheel.sh
 
 .PHONY: lint
 lint: .venv/.complete ## formatting and lints, Rust and Python
 	@$(CARGO) fmt --all --check
 	@$(CARGO) clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings
-	@.venv/bin/python -m ruff check tools benches tests
-	@.venv/bin/python -m ruff format --check tools benches tests
+	@.venv/bin/python -m ruff check tools benches tests crates/python
+	@.venv/bin/python -m ruff format --check tools benches tests crates/python
 	@.venv/bin/python -m basedpyright --project tools/harness --pythonpath .venv/bin/python
+	@.venv/bin/python -m basedpyright --project crates/python --pythonpath .venv/bin/python
 
 # ---- beside the others ----------------------------------------------------------------------------------------
 
@@ -106,4 +119,4 @@ interop: build .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open w
 
 .PHONY: clean
 clean: ## remove what was built and installed (target, .venv, .venv-peers, out)
-	@rm -rf target .venv .venv-peers out
+	@rm -rf target .venv .venv-peers .venv-wheel out

@@ -45,6 +45,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("recording", &["dataset", "rollout"]),
     ("report", &["models", "zoo"]),
     ("study", &["models", "puzzles", "recording", "report", "rollout", "zoo"]),
+    ("python", &["dataset", "models", "report", "rollout", "zoo"]),
     ("cli", &["rollout", "video"]),
     ("actrm-data", &["cli", "dataset", "puzzles", "recording", "rollout"]),
     ("actrm-query", &["cli", "dataset", "query"]),
@@ -86,6 +87,7 @@ fn each_heavy_dependency_has_one_room() {
         ("indicatif", &["cli"]),
         ("comfy-table", &["cli"]),
         ("ctrlc", &["cli"]),
+        ("pyo3", &["python"]),
     ];
     for (package, names) in dependencies() {
         for (dependency, allowed) in rooms {

@@ -18,6 +18,13 @@ pub enum DatasetError {
         path: PathBuf,
     },
 
+    /// Whoever asked for a conversion wanted no more of it.
+    #[error("{path}: the conversion was stopped", path = path.display())]
+    Stopped {
+        /// What was to be converted.
+        path: PathBuf,
+    },
+
     /// Pictures could not be encoded.
     #[error(transparent)]
     Video(#[from] video::VideoError),

@@ -1,4 +1,4 @@
-//! A small seeded generator and the shuffle drawn from it.
+//! A small seeded generator, the shuffle drawn from it, and the order in which a training reads its windows.
 //!
 //! SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number generators", 2014). It orders
 //! batches and splits sets; nothing here needs cryptographic strength, everything here needs the same
@@ -52,9 +52,81 @@ impl SplitMix64 {
     }
 }
 
+/// The numbers below `len` in the order of an epoch, which depends on `seed` and `epoch` only.
+pub fn order(seed: u64, epoch: u64, len: usize) -> Vec<u32> {
+    let mut order: Vec<u32> = (0..len as u32).collect();
+    SplitMix64::new(seed, epoch).shuffle(&mut order);
+    order
+}
+
+/// Which windows make which step's batch: epochs of shuffles laid end to end, cut into batches of one size.
+///
+/// A step's batch depends on the seed and the step alone, so that a resumed run needs no state of it.
+#[derive(Debug, Clone)]
+pub struct Sampler {
+    seed: u64,
+    batch_size: u64,
+    epoch: Option<(u64, Vec<u32>)>,
+}
+
+impl Sampler {
+    /// Batches of `batch_size`.
+    pub fn new(seed: u64, batch_size: usize) -> Self {
+        Self { seed, batch_size: batch_size as u64, epoch: None }
+    }
+
+    /// Which of `len` windows make step `step`, counted from 0.
+    ///
+    /// # Panics
+    /// When there are none.
+    pub fn batch(&mut self, len: usize, step: u64) -> Vec<u32> {
+        assert!(len > 0, "no windows, no batches");
+        positions(step, self.batch_size, len as u64).map(|(epoch, position)| self.order(len, epoch)[position]).collect()
+    }
+
+    fn order(&mut self, len: usize, epoch: u64) -> &[u32] {
+        if self.epoch.as_ref().is_none_or(|(number, kept)| (*number, kept.len()) != (epoch, len)) {
+            self.epoch = Some((epoch, order(self.seed, epoch, len)));
+        }
+        &self.epoch.as_ref().expect("it was just set").1
+    }
+}
+
+/// Epoch and position in it of each sample of a step.
+fn positions(step: u64, batch_size: u64, size: u64) -> impl Iterator<Item = (u64, usize)> {
+    let first = step * batch_size;
+    (first..first + batch_size).map(move |sample| (sample / size, (sample % size) as usize))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// Whatever the sizes: each epoch gives every window once, in steps of one size.
+        #[test]
+        fn epochs_are_cut_without_loss(batch_size in 1_u64..20, size in 1_u64..50) {
+            let steps = size * 2;
+            let all: Vec<(u64, usize)> = (0..steps).flat_map(|s| positions(s, batch_size, size)).collect();
+            prop_assert_eq!(all.len() as u64, steps * batch_size);
+            for (i, (epoch, position)) in all.iter().enumerate() {
+                prop_assert_eq!(*epoch * size + *position as u64, i as u64);
+                prop_assert!((*position as u64) < size);
+            }
+        }
+    }
+
+    #[test]
+    fn a_batch_depends_on_seed_and_step_alone() {
+        let mut forward = Sampler::new(7, 3);
+        let all: Vec<Vec<u32>> = (0..9).map(|step| forward.batch(5, step)).collect();
+        let backward: Vec<Vec<u32>> = (0..9).rev().map(|step| forward.batch(5, step)).collect();
+        assert_eq!(all, backward.into_iter().rev().collect::<Vec<_>>());
+        let joined: Vec<u32> = all.concat();
+        assert_eq!(joined[..5], order(7, 0, 5)[..]);
+        assert_eq!(joined[5..10], order(7, 1, 5)[..]);
+    }
 
     #[test]
     fn the_first_draws_are_those_of_the_published_generator() {

@@ -9,7 +9,6 @@
 
 use crate::error::Result;
 use crate::lerobot::PictureStore;
-use crate::shuffle::SplitMix64;
 use arrow::buffer::ScalarBuffer;
 use std::ops::Range;
 
@@ -162,9 +161,7 @@ impl Windows {
 
     /// Every window once, in an order that depends on `seed` and `epoch` only.
     pub fn shuffled(&self, seed: u64, epoch: u64) -> Vec<u32> {
-        let mut order: Vec<u32> = (0..self.spans.len() as u32).collect();
-        SplitMix64::new(seed, epoch).shuffle(&mut order);
-        order
+        crate::shuffle::order(seed, epoch, self.spans.len())
     }
 
     /// Whether pictures are read from files.

@@ -31,5 +31,5 @@ pub use harness::{Python, cache_folder, find_python, harness_folder};
 pub use message::{Control, PROTOCOL, Ready};
 pub use pool::{Incident, JobError, Pool, PoolOptions, RunEnd};
 pub use recorded::RecordedEpisode;
-pub use spec::{TimeLimits, WorkerSpec};
+pub use spec::{TimeLimits, WorkerSpec, set_control_library};
 pub use worker::{Image, Initial, Observations, Stepped, Worker};

@@ -174,6 +174,11 @@ impl Pool {
         &self.incidents
     }
 
+    /// The first worker, to be spoken to directly, step by step; `None` once it is known to have failed.
+    pub fn first_worker(&mut self) -> Option<&mut Worker> {
+        self.slots.first_mut()?.worker.as_mut()
+    }
+
     /// The ids of the workers' processes that are running now.
     pub fn process_ids(&self) -> Vec<u32> {
         self.slots.iter().filter_map(|s| s.worker.as_ref()).map(Worker::process_id).collect()

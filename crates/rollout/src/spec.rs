@@ -1,8 +1,9 @@
 //! What a worker is to be, and the command that starts one.
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 use std::time::Duration;
 
 use crate::harness::{Python, cache_folder};
@@ -61,6 +62,16 @@ impl WorkerSpec {
         }
     }
 
+    /// The same for an environment that was recorded with robomimic's `env_args`: its robots, its controllers, and its
+    /// module unless another is named already.
+    #[must_use]
+    pub fn recorded(mut self, env_args: Option<&serde_json::Value>) -> Self {
+        let module = || Some(env_args?.get("env_module")?.get("name")?.as_str()?.to_owned());
+        self.env_module = self.env_module.take().or_else(module);
+        self.env_args = env_args.filter(|args| args.get("env_kwargs").is_some()).cloned();
+        self
+    }
+
     /// The command that starts such a worker.
     pub(super) fn command(&self) -> Command {
         let mut command = Command::new(&self.python.path);
@@ -100,11 +111,23 @@ impl WorkerSpec {
     }
 }
 
-/// The library of the compiled control loop: `$ACTRM_CONTROL_LIB`, else beside this program, where a build
-/// puts it, or in the `lib` folder of an installation.
+/// Where the library of the compiled control loop lies, of a program that is not ours.
+static CONTROL_LIBRARY: OnceLock<PathBuf> = OnceLock::new();
+
+/// Says where the library of the compiled control loop lies: for a library in a program that is not ours. The first
+/// place that is named stays.
+pub fn set_control_library(path: &Path) {
+    CONTROL_LIBRARY.get_or_init(|| path.to_owned());
+}
+
+/// The library of the compiled control loop: `$ACTRM_CONTROL_LIB`, else where it was said to be, else beside this
+/// program, where a build puts it, or in the `lib` folder of an installation.
 fn control_library() -> Option<PathBuf> {
     if let Some(path) = std::env::var_os("ACTRM_CONTROL_LIB").filter(|path| !path.is_empty()) {
         return Some(PathBuf::from(path));
+    }
+    if let Some(path) = CONTROL_LIBRARY.get() {
+        return Some(path.clone());
     }
     let name = format!("{}control{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
     let program = std::env::current_exe().ok()?.canonicalize().ok()?;

@@ -6,6 +6,7 @@
 mod again;
 mod agent;
 mod clock;
+mod environment;
 mod perturbation;
 mod saliency;
 mod subject;
@@ -22,9 +23,10 @@ use rollout::{EpisodePlan, FaultKind, Image, JobError, Observations, Pool, Ready
 pub use self::again::{Again, evaluate_again};
 pub use self::agent::{PolicyAgent, QueryTime, QueryTimes};
 pub use self::clock::WallClock;
+pub use self::environment::Environment;
 pub use self::perturbation::Perturbation;
 pub use self::saliency::{Saliency, SalientCamera, SalientQuery, saliency};
-pub use self::subject::Subject;
+pub use self::subject::{Subject, acting};
 pub use self::thinking::{Start, starts, thinking_subject};
 pub use self::trace::{Examiner, PolicyTrace, TracedQuery, TracedThought, trace};
 use crate::ZooError;

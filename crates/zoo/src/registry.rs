@@ -196,6 +196,30 @@ impl Registry {
         fs::remove_dir_all(&hidden).map_err(ZooError::io("remove", &hidden))
     }
 
+    /// Opens and verifies the entry that `text` means: one of this zoo, or the path of another: of its folder
+    /// (`zoo/stack-act/1`), or of its name in its zoo (`zoo/stack-act`, the newest version, `zoo/stack-act@1`).
+    ///
+    /// # Errors
+    /// As [`Registry::entry`].
+    pub fn locate(&self, text: &str) -> Result<Entry, ZooError> {
+        let path = Path::new(text);
+        if !text.contains(std::path::MAIN_SEPARATOR) && !path.is_dir() {
+            return self.entry(text);
+        }
+        // `..` and a slash at the end have no name
+        let whole = match path.canonicalize() {
+            Ok(path) if path.is_dir() => path,
+            _ => path.to_owned(),
+        };
+        let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        let above = |path: &Path| path.parent().map(Path::to_owned).unwrap_or_default();
+        if !whole.join(ENTRY_FILE).is_file() {
+            return Self::open(&above(&whole)).entry(&name(&whole));
+        }
+        let parent = above(&whole);
+        Self::open(&above(&parent)).entry(&format!("{}@{}", name(&parent), name(&whole)))
+    }
+
     /// The newest version of every name.
     ///
     /// # Errors
@@ -312,6 +336,26 @@ mod tests {
         assert_eq!(matching("stack-act").unwrap(), ["stack-act@1"]);
         assert!(matching("door*").unwrap_err().contains("unknown entry `door*`"));
         assert!(matching("lift*@x").unwrap_err().contains("number from 1"));
+    }
+
+    #[test]
+    fn an_entry_is_found_by_its_name_and_by_its_path() {
+        let zoo = tempfile::tempdir().unwrap();
+        let other = Registry::open(Path::new("/nonexistent-zoo"));
+        for name in ["a", "a", "b"] {
+            draft(name).seal(zoo.path()).unwrap();
+        }
+        let place = |text: &str| zoo.path().join(text).display().to_string();
+        for (text, id) in
+            [("a", "a@2"), ("a/", "a@2"), ("a@1", "a@1"), ("a/1", "a@1"), ("a/1/", "a@1"), ("b/1/../../a/2", "a@2")]
+        {
+            assert_eq!(other.locate(&place(text)).unwrap().id().to_string(), id, "{text}");
+        }
+        assert_eq!(Registry::open(zoo.path()).locate("a").unwrap().id().to_string(), "a@2");
+        let message = other.locate(&place("c")).unwrap_err().to_string();
+        assert!(message.starts_with("unknown entry `c` in zoo ") && message.contains("a@1, a@2, b@1"), "{message}");
+        let message = other.locate("/").unwrap_err().to_string();
+        assert!(message.starts_with("entry name ``"), "{message}");
     }
 
     #[test]

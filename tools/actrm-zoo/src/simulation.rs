@@ -6,10 +6,10 @@ use std::time::Duration;
 use anyhow::Context;
 use clap::Args;
 use cli::{Screen, SimulatorArgs, limits};
-use rollout::{Control, Pool, WorkerSpec};
+use rollout::{Control, Pool, WorkerSpec, harness_folder};
 use zoo::ZooError;
-use zoo::entry::{CamerasMeta, EntryMeta};
-use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate};
+use zoo::entry::EntryMeta;
+use zoo::evaluation::{Environment, EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate};
 use zoo::results::StoredEvaluation;
 
 /// How entries are run.
@@ -37,56 +37,40 @@ pub struct RunArgs {
     pub worker_logs: Option<PathBuf>,
 }
 
-/// What simulators are started for.
-#[derive(Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub struct EnvironmentKey {
-    pub task: String,
-    pub env_module: Option<String>,
-    /// As JSON text.
-    env_args: Option<String>,
-    cameras: Option<CamerasMeta>,
+/// The environment of an entry's demonstrations, unless the command line says otherwise: what simulators are started for.
+///
+/// # Errors
+/// As [`Environment::of`].
+pub fn environment(args: &RunArgs, meta: &EntryMeta) -> Result<Environment, ZooError> {
+    drawn(&args.simulator, args.task.as_deref(), meta)
 }
 
-impl EnvironmentKey {
-    /// The environment of an entry's demonstrations, unless the command line says otherwise.
-    pub fn of(args: &RunArgs, meta: &EntryMeta) -> Result<Self, ZooError> {
-        Self::drawn(&args.simulator, args.task.as_deref(), meta)
-    }
+/// The same for commands that show one episode: as its demonstrations, drawn as they were.
+///
+/// # Errors
+/// As [`Environment::of`].
+pub fn drawn(simulator: &SimulatorArgs, task: Option<&str>, meta: &EntryMeta) -> Result<Environment, ZooError> {
+    Environment::of(meta, task, simulator.env_module.as_deref())
+}
 
-    /// The same for commands that show one episode: as its demonstrations, drawn as they were.
-    pub fn drawn(simulator: &SimulatorArgs, task: Option<&str>, meta: &EntryMeta) -> Result<Self, ZooError> {
-        let recorded = || meta.env_module.as_ref().map(|module| module.name.clone());
-        let env_module = simulator.env_module.clone().or_else(recorded);
-        let cameras = meta.cameras()?;
-        Ok(match task.filter(|task| *task != meta.task) {
-            // another task's environment has arguments of its own
-            Some(task) => Self { task: task.to_owned(), env_module, env_args: None, cameras },
-            None => {
-                let env_args = meta.env_args.as_ref().map(serde_json::Value::to_string);
-                Self { task: meta.task.clone(), env_module, env_args, cameras }
-            }
-        })
-    }
+/// The worker that such a simulator is.
+///
+/// # Errors
+/// No Python, no harness.
+pub fn worker(environment: &Environment, simulator: &SimulatorArgs, control: Control) -> anyhow::Result<WorkerSpec> {
+    let mut spec = environment.worker(simulator.python()?, harness_folder()?);
+    spec.control = control;
+    Ok(spec)
+}
 
-    /// The worker that such a simulator is.
-    pub fn spec(&self, args: &RunArgs, control: Control) -> anyhow::Result<WorkerSpec> {
-        let mut spec = self.worker(&args.simulator, control)?;
-        spec.limits.step = Duration::from_secs(args.step_timeout);
-        Ok(spec)
-    }
-
-    /// The same with the usual limits.
-    pub fn worker(&self, simulator: &SimulatorArgs, control: Control) -> anyhow::Result<WorkerSpec> {
-        let env_args = self.env_args.as_deref().map(serde_json::from_str).transpose()?;
-        let mut spec = simulator.recorded_spec(&self.task, env_args.as_ref())?;
-        spec.env_module.clone_from(&self.env_module);
-        if let Some(cameras) = &self.cameras {
-            spec.cameras.clone_from(&cameras.names);
-            (spec.image_size, spec.fast_render) = (cameras.size, cameras.fast_render);
-        }
-        spec.control = control;
-        Ok(spec)
-    }
+/// The same with the limits that the command line sets.
+///
+/// # Errors
+/// As [`worker`].
+pub fn limited_worker(environment: &Environment, args: &RunArgs, control: Control) -> anyhow::Result<WorkerSpec> {
+    let mut spec = worker(environment, &args.simulator, control)?;
+    spec.limits.step = Duration::from_secs(args.step_timeout);
+    Ok(spec)
 }
 
 /// An evaluation that was run to its end, and whether nothing had to be run.

@@ -46,12 +46,7 @@ impl SimulatorArgs {
     /// # Errors
     /// No Python, no harness.
     pub fn recorded_spec(&self, task: &str, env_args: Option<&Value>) -> Result<WorkerSpec> {
-        let mut spec = self.spec(task)?;
-        if spec.env_module.is_none() {
-            spec.env_module = env_args.and_then(|args| Some(args.get("env_module")?.get("name")?.as_str()?.to_owned()));
-        }
-        spec.env_args = env_args.filter(|args| args.get("env_kwargs").is_some()).cloned();
-        Ok(spec)
+        Ok(self.spec(task)?.recorded(env_args))
     }
 
     /// Starts the workers and says where they fall back on robosuite's own loop; nothing if it was stopped meanwhile.

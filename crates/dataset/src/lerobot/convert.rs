@@ -22,6 +22,7 @@ use crate::plan::Plan;
 use crate::source::Source;
 use crate::stats::FeatureStats;
 use std::collections::BTreeMap;
+use std::ops::ControlFlow;
 use std::path::Path;
 
 /// What a conversion did.
@@ -55,6 +56,22 @@ pub fn convert(
     out: &Path,
     options: &ConvertOptions,
     progress: &mut dyn FnMut(u64, u64),
+) -> Result<ConvertReport> {
+    convert_unless(source, out, options, &mut |done, total| {
+        progress(done, total);
+        ControlFlow::Continue(())
+    })
+}
+
+/// [`convert`], unless `progress` says that it is enough.
+///
+/// # Errors
+/// [`DatasetError::Stopped`] in that case; nothing stays behind.
+pub fn convert_unless(
+    source: &Path,
+    out: &Path,
+    options: &ConvertOptions,
+    progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
 ) -> Result<ConvertReport> {
     let input = Source::open_guarded(source)?;
     let plan = input.plan();
@@ -93,7 +110,11 @@ struct Frames {
 }
 
 impl Conversion<'_> {
-    fn write_frames(&self, input: &Source, progress: &mut dyn FnMut(u64, u64)) -> Result<Frames> {
+    fn write_frames(&self, input: &Source, progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>) -> Result<Frames> {
+        let mut tell = |done, total| match progress(done, total) {
+            ControlFlow::Continue(()) => Ok(()),
+            ControlFlow::Break(()) => Err(DatasetError::Stopped { path: self.source.to_owned() }),
+        };
         let (tasks, task_of) = self.tasks();
         let features = self.mapping.features();
         let arrow_schema = schema::data_schema(&features);
@@ -135,7 +156,7 @@ impl Conversion<'_> {
         let mut collected = Collected::new(self.mapping, &tasks, films);
         let total = self.plan.frames() as u64;
         let mut done = 0;
-        progress(0, total);
+        tell(0, total)?;
         work::in_order(
             groups.len(),
             self.jobs(),
@@ -154,8 +175,7 @@ impl Conversion<'_> {
                 if let (Some(writer), Some(beside)) = (&mut side_writer, beside) {
                     writer.append(beside)?;
                 }
-                progress(done, total);
-                Ok::<(), DatasetError>(())
+                tell(done, total)
             },
         )?;
         let mut files = shards.finish()?;

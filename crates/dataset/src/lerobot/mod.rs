@@ -21,7 +21,7 @@ mod verify;
 mod videos;
 mod work;
 
-pub use convert::{ConvertReport, convert};
+pub use convert::{ConvertReport, convert, convert_unless};
 pub use export::{ExportReport, export};
 pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, VideoOptions};
 pub(crate) use images::encode_png;

@@ -252,6 +252,21 @@ impl Dataset {
         (from <= to && to <= self.episodes.len()).then(|| (from..to).collect())
     }
 
+    /// As [`Dataset::split`].
+    ///
+    /// # Errors
+    /// [`DatasetError::NotInDataset`] with the names that there are.
+    pub fn required_split(&self, name: &str) -> Result<Vec<usize>> {
+        self.split(name).ok_or_else(|| DatasetError::NotInDataset {
+            path: self.root.clone(),
+            wanted: format!("split {name}"),
+            found: match self.split_names().join(", ") {
+                none if none.is_empty() => "none".to_owned(),
+                names => names,
+            },
+        })
+    }
+
     /// Names that [`Dataset::split`] knows.
     pub fn split_names(&self) -> Vec<&str> {
         match &self.info.actrm {
@@ -295,7 +310,7 @@ impl Dataset {
         Ok(Windows::new(observation, self.required(ACTION)?, lengths, &ranges))
     }
 
-    fn required(&self, name: &str) -> Result<Resident> {
+    pub(crate) fn required(&self, name: &str) -> Result<Resident> {
         self.columns.get(name).cloned().ok_or_else(|| DatasetError::NotInDataset {
             path: self.root.clone(),
             wanted: format!("column {name}"),
@@ -303,7 +318,7 @@ impl Dataset {
         })
     }
 
-    fn ranges(&self, episodes: &[usize]) -> Result<Vec<(usize, usize)>> {
+    pub(crate) fn ranges(&self, episodes: &[usize]) -> Result<Vec<(usize, usize)>> {
         let range = |&index: &usize| {
             let episode = self.episodes.get(index).ok_or_else(|| DatasetError::NotInDataset {
                 path: self.root.clone(),

@@ -5,8 +5,7 @@
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec};
@@ -45,7 +44,8 @@ pub(super) const ARRAY: u8 = b'A';
 pub(super) const ERROR: u8 = b'E';
 const BEAT: u8 = b'.';
 
-static ARMED: AtomicBool = AtomicBool::new(false);
+/// The program that reads, once one is known.
+static READER: OnceLock<PathBuf> = OnceLock::new();
 
 /// First statement of `main`: in a reading process this serves its parent and never returns; in any other it
 /// arms [`super::Source::open_isolated`] and returns at once.
@@ -57,12 +57,19 @@ pub fn serve_if_child() {
             std::process::exit(code);
         }
     }
-    ARMED.store(true, Ordering::Relaxed);
+    // the link in /proc outlives a program that is replaced on disk while it runs
+    serve_by(Path::new("/proc/self/exe"));
 }
 
-/// Whether [`serve_if_child`] has been called.
+/// Arms [`super::Source::open_isolated`] with another program that calls [`serve_if_child`]: for a library in a program
+/// that is not ours. The first program that is named stays.
+pub fn serve_by(program: &Path) {
+    READER.get_or_init(|| program.to_owned());
+}
+
+/// Whether a reading process can be started.
 pub fn armed() -> bool {
-    ARMED.load(Ordering::Relaxed)
+    READER.get().is_some()
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -224,11 +231,10 @@ impl Remote {
     /// Starts a process that reads `path` as the variable says, and takes what it says unasked.
     pub(super) fn start<T: serde::de::DeserializeOwned>(path: &Path, variable: &str) -> Result<(Self, T), InputError> {
         let cannot = |reason: String| InputError::ReaderStart { path: path.to_owned(), reason };
-        if !armed() {
+        let Some(program) = READER.get() else {
             return Err(cannot("the program has not called isolation::serve_if_child".to_owned()));
-        }
-        // the link in /proc outlives a program that is replaced on disk while it runs
-        let mut child = Command::new("/proc/self/exe")
+        };
+        let mut child = Command::new(program)
             .env(variable, path)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())

@@ -145,10 +145,7 @@ impl Subject<'_> {
 
     /// `policy` acting as the execution says.
     pub(super) fn acting(&self, policy: impl Policy + 'static) -> Result<PolicyAgent, ModelError> {
-        let actor: Box<dyn Actor> = match self.execution {
-            Execution::RecedingHorizon { n_action_steps } => Box::new(RecedingHorizon::new(policy, n_action_steps)?),
-            Execution::TemporalEnsemble { coefficient } => Box::new(TemporalEnsemble::new(policy, coefficient)?),
-        };
+        let actor = acting(policy, self.execution)?;
         Ok(PolicyAgent::new(actor, self.keys.clone()).perturbed(self.perturbation.clone(), &self.signature))
     }
 }
@@ -159,6 +156,17 @@ pub(super) fn picture(camera: &FeatureSpec, seen: &Observation) -> Option<Pictur
         (Values::U8(rgb), &[height, width, _]) => Some(Picture { height, width, rgb: rgb.clone() }),
         _ => None,
     }
+}
+
+/// `policy` acting as `execution` says.
+///
+/// # Errors
+/// An execution that cannot be.
+pub fn acting(policy: impl Policy + 'static, execution: Execution) -> Result<Box<dyn Actor>, ModelError> {
+    Ok(match execution {
+        Execution::RecedingHorizon { n_action_steps } => Box::new(RecedingHorizon::new(policy, n_action_steps)?),
+        Execution::TemporalEnsemble { coefficient } => Box::new(TemporalEnsemble::new(policy, coefficient)?),
+    })
 }
 
 /// A simulator's generation: major and minor version.

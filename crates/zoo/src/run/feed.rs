@@ -4,9 +4,8 @@
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
+use dataset::shuffle::Sampler;
 use dataset::{DatasetError, WindowBatch, Windows};
-
-use super::sampler::Sampler;
 
 /// A batch under way.
 type Coming = JoinHandle<Result<WindowBatch, DatasetError>>;
@@ -34,18 +33,18 @@ impl Feed {
     /// A file of pictures that cannot be read.
     pub fn take(&mut self, windows: &Windows, step: u64) -> Result<&mut WindowBatch, DatasetError> {
         if !windows.reads_files() {
-            windows.try_gather(&self.sampler.batch(windows, step), &mut self.batch)?;
+            windows.try_gather(&self.sampler.batch(windows.len(), step), &mut self.batch)?;
             return Ok(&mut self.batch);
         }
         let ready = self.ahead.take().map(|(of, coming)| (of, coming.join().expect("gathering does not panic")));
         match ready {
             Some((of, gathered)) if of == step => self.batch = gathered?,
             // the first step of a session
-            _ => windows.try_gather(&self.sampler.batch(windows, step), &mut self.batch)?,
+            _ => windows.try_gather(&self.sampler.batch(windows.len(), step), &mut self.batch)?,
         }
         if step + 1 < self.steps {
             let windows = Arc::clone(self.shared.get_or_insert_with(|| Arc::new(windows.clone())));
-            let indices = self.sampler.batch(&windows, step + 1);
+            let indices = self.sampler.batch(windows.len(), step + 1);
             let gather = move || {
                 let mut batch = WindowBatch::default();
                 windows.try_gather(&indices, &mut batch).map(|()| batch)

@@ -10,7 +10,6 @@ mod loop_parts;
 mod memory;
 mod metrics;
 mod preflight;
-mod sampler;
 mod section;
 mod session;
 mod symmetry;

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use candle_core::Tensor;
 use dataset::EnvMeta;
+use dataset::shuffle::Sampler;
 use models::{PolicyModel, Trainer, TrainerState};
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +20,6 @@ use super::feed::Feed;
 use super::folder::RunFolder;
 use super::metrics::MetricsRow;
 use super::preflight::picture_budget;
-use super::sampler::Sampler;
 use super::section::TrainSection;
 use super::session::{self, Place, Settings, TrainEvent, TrainOutcome, Training};
 use super::validation::validation_loss;

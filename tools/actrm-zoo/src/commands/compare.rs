@@ -9,11 +9,11 @@ use rollout::Pool;
 use serde_json::{Value, json};
 use zoo::audit::{KnownEntries, audit};
 use zoo::entry::{EntryId, LoadedEntry};
-use zoo::evaluation::{EvaluationOptions, FIRST_SEED, Subject};
+use zoo::evaluation::{Environment, EvaluationOptions, FIRST_SEED, Subject};
 use zoo::results::{EvaluationRecord, Seeds, StoredEvaluation};
 
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
-use crate::simulation::{EnvironmentKey, RunArgs, run_missing};
+use crate::simulation::{RunArgs, environment, limited_worker, run_missing};
 
 const GOES_ON: &str = "stopped; the same command goes on where it was";
 
@@ -309,12 +309,12 @@ fn until_decided(args: &Args, sides: &[Vec<EntryId>; 2]) -> anyhow::Result<ExitC
     let [one, two] = loaded;
     let loaded = [one?, two?];
     let mut pools: Vec<Pool> = Vec::new();
-    let mut keys: Vec<EnvironmentKey> = Vec::new();
+    let mut keys: Vec<Environment> = Vec::new();
     let mut of_pool = Vec::new();
     for entry in &loaded {
-        let key = EnvironmentKey::of(&args.run, entry.entry().meta())?;
+        let key = environment(&args.run, entry.entry().meta())?;
         if !keys.contains(&key) {
-            let spec = key.spec(&args.run, args.run.control)?;
+            let spec = limited_worker(&key, &args.run, args.run.control)?;
             let Some(pool) = args.run.simulator.start(spec, args.run.worker_logs.clone(), &stop)? else {
                 return Ok(interrupted(pools));
             };

@@ -12,14 +12,16 @@ use report::{COLUMNS, LeaderboardRow, json};
 use rollout::{Pool, remembered_greeting};
 use serde_json::{Value, json};
 use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
-use zoo::evaluation::{EvaluationOptions, FIRST_SEED, Perturbation, Subject, View, evaluate_again, film, finished};
+use zoo::evaluation::{
+    Environment, EvaluationOptions, FIRST_SEED, Perturbation, Subject, View, evaluate_again, film, finished,
+};
 use zoo::protocols::{Block, NamedProtocol};
 use zoo::registry::Registry;
 use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 use crate::puzzles::{PuzzleArgs, evaluate_solver};
-use crate::simulation::{EnvironmentKey, Evaluated, RunArgs, run_missing};
+use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
 
 const GOES_ON: &str = "stopped; the same command goes on where it was";
 /// Behind the line of an evaluation for which nothing was run.
@@ -188,10 +190,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // one bad entry must not keep the others from being evaluated
     let mut failures: Vec<anyhow::Error> = Vec::new();
     // one set of simulators serves all entries of an environment
-    let mut by_environment: BTreeMap<EnvironmentKey, Vec<LoadedEntry>> = BTreeMap::new();
+    let mut by_environment: BTreeMap<Environment, Vec<LoadedEntry>> = BTreeMap::new();
     for id in ids {
         match open(args, &asked, &registry, &id, &mut says).with_context(|| format!("entry {id}")) {
-            Ok(Some(loaded)) => match EnvironmentKey::of(&args.run, loaded.entry().meta()) {
+            Ok(Some(loaded)) => match environment(&args.run, loaded.entry().meta()) {
                 Ok(environment) => by_environment.entry(environment).or_default().push(loaded),
                 Err(error) => failures.push(error.into()),
             },
@@ -276,12 +278,12 @@ fn open(
 fn evaluate_on(
     args: &Args,
     asked: &Asked<'_>,
-    environment: &EnvironmentKey,
+    environment: &Environment,
     entries: &[LoadedEntry],
     stop: &Stop,
     (says, failures): (&mut Says, &mut Vec<anyhow::Error>),
 ) -> anyhow::Result<()> {
-    let spec = environment.spec(&args.run, asked.protocol.map_or(args.run.control, |protocol| protocol.control))?;
+    let spec = limited_worker(environment, &args.run, asked.protocol.map_or(args.run.control, |protocol| protocol.control))?;
     let (results, options) = (args.results.folder(&args.zoo), options(args, asked, environment));
     // a finished evaluation is shown without starting a simulator
     let remembered =
@@ -352,7 +354,7 @@ fn subject(args: &Args, asked: &Asked<'_>, loaded: &LoadedEntry) -> anyhow::Resu
     Ok(subject)
 }
 
-fn options(args: &Args, asked: &Asked<'_>, environment: &EnvironmentKey) -> EvaluationOptions {
+fn options(args: &Args, asked: &Asked<'_>, environment: &Environment) -> EvaluationOptions {
     EvaluationOptions {
         seeds: asked.seeds,
         shard: args.shard,

@@ -9,7 +9,7 @@ use zoo::evaluation::{self, FIRST_SEED, Saliency};
 use zoo::write_atomic;
 
 use crate::places::{ZooArgs, entry_names};
-use crate::simulation::EnvironmentKey;
+use crate::simulation::{drawn, worker};
 
 /// Show what a policy looks at: one episode's pictures with what matters in red, as a PNG file
 ///
@@ -59,11 +59,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let loaded = entry.load()?;
     let subject = loaded.subject();
-    let environment = EnvironmentKey::drawn(&args.simulator, args.task.as_deref(), entry.meta())?;
+    let environment = drawn(&args.simulator, args.task.as_deref(), entry.meta())?;
     let stop = Stop::install("stopped")?;
     let SimulatorArgs { env_module, python, .. } = &args.simulator;
     let one = SimulatorArgs { workers: Some(1), env_module: env_module.clone(), python: python.clone() };
-    let spec = environment.worker(&one, args.control)?;
+    let spec = worker(&environment, &one, args.control)?;
     let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
     let mut screen = Screen::new();
     let queries = usize::from(args.queries);

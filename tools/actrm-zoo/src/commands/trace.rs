@@ -11,7 +11,7 @@ use zoo::write_atomic;
 
 use crate::places::{ZooArgs, entry_names};
 use crate::puzzles::family;
-use crate::simulation::EnvironmentKey;
+use crate::simulation::{drawn, worker};
 
 /// Show what an entry thought, step by step: a puzzle solver about a puzzle, a robot policy in an episode
 ///
@@ -96,11 +96,11 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
             entry.id()
         );
     }
-    let environment = EnvironmentKey::drawn(&args.simulator, args.task.as_deref(), entry.meta())?;
+    let environment = drawn(&args.simulator, args.task.as_deref(), entry.meta())?;
     let stop = Stop::install("stopped")?;
     let SimulatorArgs { env_module, python, .. } = &args.simulator;
     let one = SimulatorArgs { workers: Some(1), env_module: env_module.clone(), python: python.clone() };
-    let spec = environment.worker(&one, args.control)?;
+    let spec = worker(&environment, &one, args.control)?;
     let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
     let traced = evaluation::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED), examiner.as_ref());
     cli::close(pool);

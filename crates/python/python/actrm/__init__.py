@@ -1,0 +1,174 @@
+"""Offline robot learning: data sets, policies without torch, evaluations, leaderboards.
+
+    actrm.convert("demos.hdf5", "lift")
+    ds = actrm.Dataset("lift", delta_timestamps={"action": range(16)}, split="train")
+    for batch in ds.batches(64, seed=1): ...
+    policy = actrm.load_policy("zoo/stack-act")
+    policy.reset(seed=1); policy.select_action(observation)
+    episodes = actrm.evaluate("zoo/stack-act", episodes=50, workers=2)
+    rows = actrm.leaderboard("zoo")
+
+Keys, shapes and names are LeRobot's. What is refused is an `actrm.Error` with the words of the programs.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+from . import _actrm
+from ._actrm import Dataset, Error, Policy, Simulator, __version__, leaderboard, load_policy
+from ._programs import CONTROL, folder
+from ._progress import Progress, teller
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    Path = str | PathLike[str]
+
+__all__ = [
+    "Dataset",
+    "Error",
+    "Policy",
+    "Simulator",
+    "__version__",
+    "convert",
+    "evaluate",
+    "leaderboard",
+    "load_policy",
+]
+
+_actrm.set_places(str(folder() / "actrm-data"), str(folder() / CONTROL))
+
+
+def convert(
+    src: Path,
+    dst: Path,
+    progress: Progress = None,
+    *,
+    state_keys: Sequence[str] | None = None,
+    env_keys: Sequence[str] | None = None,
+    entities: Mapping[str, Sequence[str]] | None = None,
+    fps: float | None = None,
+    images: Literal["png", "ppm", "video"] = "png",
+    actions: Literal["delta", "absolute"] = "delta",
+    rotation: Literal["axis-angle", "6d"] = "axis-angle",
+    lossless: bool = True,
+    jobs: int = 0,
+) -> dict[str, Any]:
+    """Convert demonstrations (HDF5 of robomimic's family) into a LeRobotDataset v3.0 folder.
+
+    `dst` appears whole or not at all; Ctrl-C leaves nothing behind. Python runs on meanwhile.
+
+    Parameters
+    ----------
+    src: HDF5 file, or a folder with one file an episode.
+    dst: folder to create.
+    progress: True shows a bar, False does not, a function is called with frames done and frames in all; unless given
+        there is a bar where somebody can see it.
+    state_keys, env_keys: observation keys of `observation.state` and `observation.environment_state`; those of the
+        file's layout unless given.
+    entities: by name the observation keys of `observation.entity.<name>`; parts (`key[0:3]`) and differences (`a - b`)
+        of keys may stand in the lists.
+    fps: frames a second; the control frequency that the file states unless given.
+    images: how pictures are stored.
+    actions: as the controller got them, or absolute poses.
+    rotation: how rotations in actions are written.
+    lossless: keep what the format has no place for in the side folder, from which `actrm-data export` rebuilds the
+        source.
+    jobs: threads; one a core for 0.
+
+    Returns what was written: `episodes`, `frames`, `tasks`, `files`, `bytes`, `fingerprint`, `layout`, `notes`.
+    """
+    with teller("convert", progress) as tell:
+        return _actrm.convert(
+            src,
+            dst,
+            tell,
+            state_keys=None if state_keys is None else list(state_keys),
+            env_keys=None if env_keys is None else list(env_keys),
+            entities={name: list(keys) for name, keys in (entities or {}).items()},
+            fps=fps,
+            images=images,
+            actions=actions,
+            rotation=rotation,
+            lossless=lossless,
+            jobs=jobs,
+        )
+
+
+def evaluate(
+    entry: Path,
+    episodes: int = 20,
+    workers: int | None = None,
+    progress: Progress = None,
+    *,
+    seed: int = 10_000,
+    task: str | None = None,
+    max_steps: int | None = None,
+    n_action_steps: int | None = None,
+    temporal_ensemble: float | None = None,
+    control: Literal["compiled", "robosuite"] = "compiled",
+    python: Path | None = None,
+    env_module: str | None = None,
+    zoo: Path | None = None,
+    results: Path | None = None,
+    force: bool = False,
+) -> dict[str, Any]:
+    """Evaluate an entry's policy in simulation, one episode a seed, as `actrm-zoo eval` does.
+
+    The results are stored where the leaderboard finds them. Finished episodes are not run again: an evaluation that was
+    interrupted goes on where it was, a finished one is returned at once. The outcome of an episode does not depend on
+    the number of workers.
+
+    Parameters
+    ----------
+    entry: an entry's folder (`zoo/stack-act`), or its name in `zoo`.
+    episodes: how many; their seeds count up from `seed`.
+    workers: simulators at once; one a core unless given.
+    progress: as in `convert`, in episodes.
+    task: another task than the entry's.
+    max_steps: control steps after which an episode has failed; the entry's or the task's own cap unless given.
+    n_action_steps: actions that are executed before the policy is asked again; the entry's unless given.
+    temporal_ensemble: ask at every step and average all predictions, with this coefficient.
+    control: control loop inside the simulator.
+    python: an interpreter with robosuite; this one where it has robosuite, else `$ACTRM_PYTHON`, `.venv` here or above,
+        `python3`.
+    env_module: Python module that registers environments.
+    zoo: folder of the zoo that names are looked up in.
+    results: folder of results; `results` in the entry's zoo unless given.
+    force: evaluate although the demonstrations were recorded in another simulator generation, or with these seeds.
+
+    Returns columns, a row an episode, ascending by seed: `seed`, `success`, `steps`, `return`, `wall_ms` and
+    `inference_ms` (mean of its queries) as arrays, `fingerprint` (of the initial state), `group` and `failure` as
+    lists.
+    """
+    with teller("eval", progress) as tell:
+        return _actrm.evaluate(
+            entry,
+            tell,
+            episodes=episodes,
+            workers=workers or os.cpu_count() or 1,
+            seed=seed,
+            task=task,
+            max_steps=max_steps,
+            n_action_steps=n_action_steps,
+            temporal_ensemble=temporal_ensemble,
+            control=control,
+            python=python or simulator_python(),
+            env_module=env_module,
+            zoo=zoo,
+            results=results,
+            force=force,
+        )
+
+
+def simulator_python() -> str | None:
+    """This interpreter, if workers can run in it and no other is named by the environment."""
+    needed = ("robosuite", "mujoco", "numba")
+    if os.environ.get("ACTRM_PYTHON") or not all(importlib.util.find_spec(name) for name in needed):
+        return None
+    return sys.executable

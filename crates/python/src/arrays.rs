@@ -1,0 +1,100 @@
+//! Arrays of numpy's: made of memory that is filled here, and read into memory of ours.
+//!
+//! numpy's own interface in C is not used: an array is a view of a `bytearray`, which is written in place, so that values
+//! are copied once, from where they lie into the array.
+
+use bytemuck::Pod;
+use pyo3::buffer::PyBuffer;
+use pyo3::intern;
+use pyo3::prelude::*;
+use pyo3::sync::GILOnceCell;
+use pyo3::types::{PyByteArray, PyDict, PyTuple, PyType};
+
+/// numpy's `ndarray`.
+fn ndarray(py: Python<'_>) -> PyResult<&Bound<'_, PyType>> {
+    static NDARRAY: GILOnceCell<Py<PyType>> = GILOnceCell::new();
+    NDARRAY.import(py, "numpy", "ndarray")
+}
+
+/// A number that numpy has a type for.
+pub(crate) trait Number: Pod {
+    /// numpy's name of it.
+    const NAME: &'static str;
+}
+
+impl Number for f32 {
+    const NAME: &'static str = "float32";
+}
+impl Number for f64 {
+    const NAME: &'static str = "float64";
+}
+impl Number for i64 {
+    const NAME: &'static str = "int64";
+}
+impl Number for u64 {
+    const NAME: &'static str = "uint64";
+}
+impl Number for u8 {
+    const NAME: &'static str = "uint8";
+}
+
+/// A new array of this shape whose values `fill` writes, row-major.
+pub(crate) fn filled<'py, T: Number>(
+    py: Python<'py>,
+    shape: &[usize],
+    fill: impl FnOnce(&mut [T]),
+) -> PyResult<Bound<'py, PyAny>> {
+    made(py, shape, T::NAME, fill)
+}
+
+/// A new array of truth values: what is not 0 is true.
+pub(crate) fn flags<'py>(
+    py: Python<'py>,
+    shape: &[usize],
+    fill: impl FnOnce(&mut [u8]),
+) -> PyResult<Bound<'py, PyAny>> {
+    made(py, shape, "bool", fill)
+}
+
+/// A new array of these values.
+pub(crate) fn array<'py, T: Number>(py: Python<'py>, shape: &[usize], values: &[T]) -> PyResult<Bound<'py, PyAny>> {
+    filled(py, shape, |out| out.copy_from_slice(values))
+}
+
+fn made<'py, T: Pod>(
+    py: Python<'py>,
+    shape: &[usize],
+    name: &str,
+    fill: impl FnOnce(&mut [T]),
+) -> PyResult<Bound<'py, PyAny>> {
+    let count: usize = shape.iter().product();
+    let memory = PyByteArray::new_with(py, count * size_of::<T>(), |bytes| {
+        if let Ok(values) = bytemuck::try_cast_slice_mut(bytes) {
+            fill(values);
+        } else {
+            // no allocator of Python's gives memory that is aligned so badly
+            let mut values = vec![T::zeroed(); count];
+            fill(&mut values);
+            bytes.copy_from_slice(bytemuck::cast_slice(&values));
+        }
+        Ok(())
+    })?;
+    ndarray(py)?.call1((PyTuple::new(py, shape)?, name, memory))
+}
+
+/// The shape and the values, row-major, of whatever numpy can make an array of.
+pub(crate) fn read<T: Number + pyo3::buffer::Element>(value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>, Vec<T>)> {
+    let py = value.py();
+    let options = PyDict::new(py);
+    options.set_item(intern!(py, "dtype"), T::NAME)?;
+    options.set_item(intern!(py, "order"), "C")?;
+    let array = numpy(py)?.call_method(intern!(py, "asarray"), (value,), Some(&options))?;
+    let shape = array.getattr(intern!(py, "shape"))?.extract()?;
+    Ok((shape, PyBuffer::<T>::get(&array)?.to_vec(py)?))
+}
+
+/// The module.
+pub(crate) fn numpy(py: Python<'_>) -> PyResult<&Bound<'_, PyModule>> {
+    static NUMPY: GILOnceCell<Py<PyModule>> = GILOnceCell::new();
+    NUMPY.get_or_try_init(py, || Ok::<_, PyErr>(py.import("numpy")?.unbind())).map(|module| module.bind(py))
+}

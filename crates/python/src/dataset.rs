@@ -1,0 +1,462 @@
+//! A data set as PyTorch and LeRobot expect one: map-style, with LeRobot's keys and shapes; and batches of it.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Mutex, PoisonError};
+
+use ::dataset::shuffle::{Sampler, order};
+use ::dataset::{SampleColumn, SampleSpec, Samples};
+use pyo3::exceptions::{PyIndexError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList, PyTuple};
+
+use crate::arrays::{array, filled, flags};
+use crate::error::raised;
+use crate::work::run;
+
+/// The most samples in a batch.
+const MOST_SAMPLES: usize = 1 << 24;
+
+/// A LeRobotDataset v3.0 folder, written by actrm or by LeRobot, as a map of samples.
+///
+/// A sample is a dict with LeRobot's keys and shapes: a column of numbers as an array (a column of one number without
+/// an axis), a camera as (3, height, width). Sample `i` is the `i`-th frame of the chosen episodes. Numbers are float32,
+/// truth values bool, the index columns int64; numeric columns and pictures stay in memory.
+///
+/// Parameters
+/// ----------
+/// path: the folder.
+/// delta_timestamps: by column the frames around the sample's that belong to it, as whole numbers of frames or, where
+///     any of them is a float, in seconds as LeRobot has them. The column then has an axis of frames in front, and
+///     `<column>_is_pad` says which of them lie outside the episode and repeat its first or last frame.
+/// split: take the episodes of this mask only (`train`, `valid`, ...).
+/// episodes: or these.
+/// cameras: cameras whose pictures are read; all of them unless given.
+/// return_uint8: pictures as they are stored, 0 to 255, instead of float32 from 0 to 1.
+///
+/// Pickles (by path), and works in a `torch.utils.data.DataLoader` whose workers are forked or spawned.
+#[pyclass(frozen, module = "actrm", name = "Dataset", subclass)]
+pub(crate) struct PyDataset {
+    given: Given,
+    dataset: dataset::Dataset,
+    chosen: Vec<usize>,
+    samples: Samples,
+    /// The index of each episode's task, where each has one.
+    tasks: Option<Vec<usize>>,
+}
+
+/// What it was made with.
+struct Given {
+    path: PathBuf,
+    offsets: BTreeMap<String, Vec<i64>>,
+    cameras: Vec<String>,
+    return_uint8: bool,
+}
+
+#[pymethods]
+impl PyDataset {
+    #[new]
+    #[pyo3(signature = (path, delta_timestamps=None, split=None, *, episodes=None, cameras=None, return_uint8=false))]
+    fn new(
+        py: Python<'_>,
+        path: PathBuf,
+        delta_timestamps: Option<&Bound<'_, PyAny>>,
+        split: Option<&str>,
+        episodes: Option<Vec<usize>>,
+        cameras: Option<Vec<String>>,
+        return_uint8: bool,
+    ) -> PyResult<Self> {
+        let path = std::path::absolute(path)?;
+        let dataset = py.allow_threads(|| run(|| dataset::Dataset::open(&path))).map_err(raised)?;
+        let chosen = match (split, episodes) {
+            (Some(_), Some(_)) => return Err(PyValueError::new_err("split and episodes: expected one of them")),
+            (Some(split), None) => dataset.required_split(split).map_err(raised)?,
+            (None, Some(episodes)) => episodes,
+            (None, None) => (0..dataset.episodes().len()).collect(),
+        };
+        let offsets = delta_timestamps.map_or_else(|| Ok(BTreeMap::new()), |given| offsets(&dataset, given))?;
+        let cameras = cameras.unwrap_or_else(|| dataset.cameras().map(str::to_owned).collect());
+        let spec = SampleSpec { offsets, cameras, episodes: chosen.clone() };
+        let samples = py.allow_threads(|| run(|| dataset.samples(&spec))).map_err(raised)?;
+        let tasks = task_indices(&dataset);
+        let given = Given { path, offsets: spec.offsets, cameras: spec.cameras, return_uint8 };
+        Ok(Self { given, dataset, chosen, samples, tasks })
+    }
+
+    fn __len__(&self) -> usize {
+        self.samples.len()
+    }
+
+    fn __getitem__<'py>(&self, py: Python<'py>, index: isize) -> PyResult<Bound<'py, PyDict>> {
+        self.gather(py, &[self.sample(index)?], None)
+    }
+
+    /// Several samples at once, as PyTorch's loader asks for them.
+    fn __getitems__<'py>(&self, py: Python<'py>, indices: Vec<isize>) -> PyResult<Bound<'py, PyList>> {
+        let sample = |index| self.gather(py, &[self.sample(index)?], None);
+        PyList::new(py, indices.into_iter().map(sample).collect::<PyResult<Vec<_>>>()?)
+    }
+
+    /// Several samples in one dict, each column with an axis of samples in front.
+    fn batch<'py>(&self, py: Python<'py>, indices: Vec<isize>) -> PyResult<Bound<'py, PyDict>> {
+        let samples: Vec<u32> = indices.into_iter().map(|index| self.sample(index)).collect::<PyResult<_>>()?;
+        self.gather(py, &samples, Some(samples.len()))
+    }
+
+    /// The samples in batches, one dict of arrays each.
+    ///
+    /// Without a seed in their order. With one in the order in which `actrm-zoo train` reads them with this seed: one
+    /// epoch, the `epoch`-th, whose last batch is smaller unless `drop_last`; or, with `steps`, the batches of as many
+    /// training steps from the step `start` on, epochs end to end and all batches of one size.
+    #[pyo3(signature = (batch_size, seed=None, *, epoch=0, steps=None, start=0, drop_last=false))]
+    fn batches(
+        slf: Bound<'_, Self>,
+        batch_size: usize,
+        seed: Option<u64>,
+        epoch: u64,
+        steps: Option<u64>,
+        start: u64,
+        drop_last: bool,
+    ) -> PyResult<Batches> {
+        let len = slf.get().samples.len();
+        if !(1..=MOST_SAMPLES).contains(&batch_size) {
+            return Err(PyValueError::new_err(format!("batch_size: expected 1 to {MOST_SAMPLES}, found {batch_size}")));
+        }
+        let last = start.checked_add(steps.unwrap_or(0)).and_then(|end| end.checked_mul(batch_size as u64));
+        if last.is_none() {
+            return Err(PyValueError::new_err("start and steps: more samples than there are numbers"));
+        }
+        let batches = match (seed, steps) {
+            (Some(seed), Some(steps)) if len > 0 => {
+                let sampler = Sampler::new(seed, batch_size);
+                Order::Training { sampler, next: start, end: start + steps }
+            }
+            (None, Some(_)) => return Err(PyValueError::new_err("steps: expected a seed with them, found none")),
+            (Some(seed), _) => Order::Once { order: order(seed, epoch, len), next: 0, drop_last },
+            (None, None) => Order::Once { order: (0..len as u32).collect(), next: 0, drop_last },
+        };
+        Ok(Batches { dataset: slf.unbind(), batch_size, order: Mutex::new(batches) })
+    }
+
+    /// Statistics over all episodes, as they are stored: by column `min`, `max`, `mean`, `std`, quantiles and `count`.
+    #[getter]
+    fn stats<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        for (name, stats) in self.dataset.stats() {
+            let of = PyDict::new(py);
+            let lists = [
+                ("min", &stats.min),
+                ("max", &stats.max),
+                ("mean", &stats.mean),
+                ("std", &stats.std),
+                ("q01", &stats.q01),
+                ("q10", &stats.q10),
+                ("q50", &stats.q50),
+                ("q90", &stats.q90),
+                ("q99", &stats.q99),
+            ];
+            for (statistic, values) in lists {
+                of.set_item(statistic, array(py, &[values.len()], values)?)?;
+            }
+            of.set_item("count", array(py, &[1], &[stats.count as i64])?)?;
+            all.set_item(name, of)?;
+        }
+        Ok(all)
+    }
+
+    /// The chosen episodes: for each its `episode_index`, `length`, `dataset_from_index`, `dataset_to_index`, `tasks`, and
+    /// the `demo` that it was converted from, if it was.
+    #[getter]
+    fn episodes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+        let row = |&index: &usize| -> PyResult<Bound<'py, PyDict>> {
+            let episode = &self.dataset.episodes()[index];
+            let row = PyDict::new(py);
+            row.set_item("episode_index", episode.index)?;
+            row.set_item("length", episode.length)?;
+            row.set_item("dataset_from_index", episode.from)?;
+            row.set_item("dataset_to_index", episode.to)?;
+            row.set_item("tasks", &episode.tasks)?;
+            row.set_item("demo", &episode.demo)?;
+            Ok(row)
+        };
+        PyList::new(py, self.chosen.iter().map(row).collect::<PyResult<Vec<_>>>()?)
+    }
+
+    /// Type, shape and names of every column, as `meta/info.json` states them.
+    #[getter]
+    fn features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        for (name, feature) in &self.dataset.info().features.0 {
+            let of = PyDict::new(py);
+            of.set_item("dtype", &feature.dtype)?;
+            of.set_item("shape", PyTuple::new(py, &feature.shape)?)?;
+            of.set_item("names", self.dataset.names(name))?;
+            all.set_item(name, of)?;
+        }
+        Ok(all)
+    }
+
+    /// The folder.
+    #[getter]
+    fn root(&self) -> PathBuf {
+        self.given.path.clone()
+    }
+
+    /// Frames a second.
+    #[getter]
+    fn fps(&self) -> f64 {
+        self.dataset.info().fps
+    }
+
+    /// Task texts; `task_index` counts them.
+    #[getter]
+    fn tasks(&self) -> Vec<String> {
+        self.dataset.tasks().to_vec()
+    }
+
+    /// Names that `split` knows.
+    #[getter]
+    fn splits(&self) -> Vec<&str> {
+        self.dataset.split_names()
+    }
+
+    /// Frames of the chosen episodes.
+    #[getter]
+    fn num_frames(&self) -> usize {
+        self.samples.len()
+    }
+
+    /// The number of chosen episodes.
+    #[getter]
+    fn num_episodes(&self) -> usize {
+        self.chosen.len()
+    }
+
+    /// SHA-256 of the content, the same whatever the file layout.
+    #[getter]
+    fn fingerprint(&self) -> &str {
+        self.dataset.fingerprint()
+    }
+
+    fn __repr__(&self) -> String {
+        let columns: Vec<&str> =
+            self.samples.numbers().chain(self.samples.pictures()).map(|column| column.name.as_str()).collect();
+        format!(
+            "Dataset({:?}, {} episodes, {} frames: {})",
+            self.given.path.display().to_string(),
+            self.chosen.len(),
+            self.samples.len(),
+            columns.join(", ")
+        )
+    }
+
+    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyTuple>)> {
+        let (py, this) = (slf.py(), slf.get());
+        let Given { path, offsets, cameras, return_uint8 } = &this.given;
+        let options = PyDict::new(py);
+        options.set_item("delta_timestamps", offsets)?;
+        options.set_item("episodes", &this.chosen)?;
+        options.set_item("cameras", cameras)?;
+        options.set_item("return_uint8", return_uint8)?;
+        let partial = py.import("functools")?.getattr("partial")?;
+        let make = partial.call((slf.get_type(), path), Some(&options))?;
+        Ok((make, PyTuple::empty(py)))
+    }
+}
+
+impl PyDataset {
+    /// The sample that `index` means; a negative one counts from the end.
+    fn sample(&self, index: isize) -> PyResult<u32> {
+        let len = self.samples.len();
+        let at = if index < 0 { index.checked_add_unsigned(len) } else { Some(index) };
+        at.and_then(|at| usize::try_from(at).ok())
+            .filter(|at| *at < len)
+            .map(|at| at as u32)
+            .ok_or_else(|| PyIndexError::new_err(format!("no sample {index}; there are {len}")))
+    }
+
+    /// The dict of these samples: of one of them, or of `batch` with an axis of them in front.
+    fn gather<'py>(&self, py: Python<'py>, samples: &[u32], batch: Option<usize>) -> PyResult<Bound<'py, PyDict>> {
+        let sample = PyDict::new(py);
+        for (i, column) in self.samples.numbers().enumerate() {
+            let shape = self.shape(batch, column);
+            let values = match column.boolean {
+                false => filled(py, &shape, |out| self.samples.copy_numbers(i, samples, out))?,
+                true => flags(py, &shape, |out| {
+                    let mut values = vec![0.0; out.len()];
+                    self.samples.copy_numbers(i, samples, &mut values);
+                    out.iter_mut().zip(values).for_each(|(out, value)| *out = u8::from(value != 0.0));
+                })?,
+            };
+            sample.set_item(&column.name, values)?;
+            self.padding(py, &sample, samples, batch, column)?;
+        }
+        for (i, column) in self.samples.pictures().enumerate() {
+            let shape = self.shape(batch, column);
+            let pictures = match self.given.return_uint8 {
+                true => filled(py, &shape, |out| self.samples.copy_pictures(i, samples, out))?,
+                false => filled(py, &shape, |out| self.bright(i, column.width(), samples, out))?,
+            };
+            // LeRobot's order, colours first, over memory that has them last
+            let axes = shape.len();
+            let order = (0..axes - 3).chain([axes - 1, axes - 3, axes - 2]);
+            let pictures = pictures.call_method1("transpose", PyTuple::new(py, order.collect::<Vec<_>>())?)?;
+            sample.set_item(&column.name, pictures)?;
+            self.padding(py, &sample, samples, batch, column)?;
+        }
+        self.places(py, &sample, samples, batch)?;
+        Ok(sample)
+    }
+
+    /// Extent of a column in a batch, or in one sample.
+    fn shape(&self, batch: Option<usize>, column: &SampleColumn) -> Vec<usize> {
+        let rows = column.offsets.as_ref().map(Vec::len);
+        // LeRobot's columns of one number have no axis
+        let row = if column.shape == [1] { &[][..] } else { &column.shape };
+        batch.into_iter().chain(rows).chain(row.iter().copied()).collect()
+    }
+
+    /// Pictures from 0 to 1, as PyTorch scales them.
+    fn bright(&self, camera: usize, each: usize, samples: &[u32], out: &mut [f32]) {
+        let scale: Vec<f32> = (0..=255_u8).map(|byte| f32::from(byte) / 255.0).collect();
+        let mut bytes = vec![0; each];
+        for (sample, out) in samples.iter().zip(out.chunks_exact_mut(each.max(1))) {
+            self.samples.copy_pictures(camera, &[*sample], &mut bytes);
+            out.iter_mut().zip(&bytes).for_each(|(out, &byte)| *out = scale[usize::from(byte)]);
+        }
+    }
+
+    fn padding(
+        &self,
+        py: Python<'_>,
+        sample: &Bound<'_, PyDict>,
+        samples: &[u32],
+        batch: Option<usize>,
+        column: &SampleColumn,
+    ) -> PyResult<()> {
+        let Some(offsets) = &column.offsets else { return Ok(()) };
+        let shape: Vec<usize> = batch.into_iter().chain([offsets.len()]).collect();
+        let padding = flags(py, &shape, |out| self.samples.padding(column, samples, out))?;
+        sample.set_item(format!("{}_is_pad", column.name), padding)
+    }
+
+    /// The index columns, which follow from where samples lie.
+    fn places(
+        &self,
+        py: Python<'_>,
+        sample: &Bound<'_, PyDict>,
+        samples: &[u32],
+        batch: Option<usize>,
+    ) -> PyResult<()> {
+        let places: Vec<_> = samples.iter().map(|&sample| self.samples.place(sample)).collect();
+        let shape: Vec<usize> = batch.into_iter().collect();
+        let fps = self.dataset.info().fps;
+        let times: Vec<f32> = places.iter().map(|place| (place.frame as f64 / fps) as f32).collect();
+        sample.set_item("timestamp", array(py, &shape, &times)?)?;
+        let set = |name: &str, of: &dyn Fn(&dataset::SamplePlace) -> usize| {
+            let numbers: Vec<i64> = places.iter().map(|place| of(place) as i64).collect();
+            sample.set_item(name, array(py, &shape, &numbers)?)
+        };
+        set("frame_index", &|place| place.frame)?;
+        set("episode_index", &|place| place.episode)?;
+        set("index", &|place| place.index)?;
+        let Some(tasks) = &self.tasks else { return Ok(()) };
+        set("task_index", &|place| tasks[place.episode])?;
+        let texts: Vec<&String> = places.iter().map(|place| &self.dataset.tasks()[tasks[place.episode]]).collect();
+        match (batch, texts.as_slice()) {
+            (None, [text]) => sample.set_item("task", text),
+            _ => sample.set_item("task", texts),
+        }
+    }
+}
+
+/// `delta_timestamps` in frames: whole numbers count them, floats are seconds.
+fn offsets(dataset: &dataset::Dataset, given: &Bound<'_, PyAny>) -> PyResult<BTreeMap<String, Vec<i64>>> {
+    let mut all = BTreeMap::new();
+    for pair in given.call_method0("items")?.try_iter()? {
+        let (name, values): (String, Bound<'_, PyAny>) = pair?.extract()?;
+        let values: Vec<Bound<'_, PyAny>> = values.try_iter()?.collect::<PyResult<_>>()?;
+        let whole: PyResult<Vec<i64>> = values.iter().map(|value| value.extract()).collect();
+        let frames = match whole {
+            Ok(frames) => frames,
+            Err(_) => {
+                let seconds: Vec<f64> = values.iter().map(|value| value.extract()).collect::<PyResult<_>>()?;
+                dataset.offsets(&name, &seconds).map_err(raised)?
+            }
+        };
+        all.insert(name, frames);
+    }
+    Ok(all)
+}
+
+/// The index of each episode's task; nothing where an episode has several, whose frames then differ.
+fn task_indices(dataset: &dataset::Dataset) -> Option<Vec<usize>> {
+    let index = |episode: &dataset::EpisodeMeta| match episode.tasks.as_slice() {
+        [task] => dataset.tasks().iter().position(|text| text == task),
+        _ => None,
+    };
+    dataset.episodes().iter().map(index).collect()
+}
+
+/// Which samples make which batch.
+enum Order {
+    Once { order: Vec<u32>, next: usize, drop_last: bool },
+    Training { sampler: Sampler, next: u64, end: u64 },
+}
+
+impl Order {
+    fn next(&mut self, size: usize, len: usize) -> Option<Vec<u32>> {
+        match self {
+            Self::Once { order, next, drop_last } => {
+                let end = next.saturating_add(size).min(order.len());
+                let batch = order.get(*next..end).filter(|batch| !batch.is_empty())?;
+                if *drop_last && batch.len() < size {
+                    return None;
+                }
+                let batch = batch.to_vec();
+                *next = end;
+                Some(batch)
+            }
+            Self::Training { sampler, next, end } => {
+                let step = (*next < *end).then_some(*next)?;
+                *next += 1;
+                Some(sampler.batch(len, step))
+            }
+        }
+    }
+
+    fn left(&self, size: usize) -> usize {
+        match self {
+            Self::Once { order, next, drop_last: true } => (order.len() - next) / size,
+            Self::Once { order, next, drop_last: false } => (order.len() - next).div_ceil(size),
+            Self::Training { next, end, .. } => usize::try_from(end - next).unwrap_or(usize::MAX),
+        }
+    }
+}
+
+/// Batches of a data set, one after the other.
+#[pyclass(frozen, module = "actrm")]
+pub(crate) struct Batches {
+    dataset: Py<PyDataset>,
+    batch_size: usize,
+    order: Mutex<Order>,
+}
+
+#[pymethods]
+impl Batches {
+    fn __iter__(slf: Bound<'_, Self>) -> Bound<'_, Self> {
+        slf
+    }
+
+    /// Batches that are still to come.
+    fn __len__(&self) -> usize {
+        self.order.lock().unwrap_or_else(PoisonError::into_inner).left(self.batch_size)
+    }
+
+    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
+        let dataset = self.dataset.get();
+        let len = dataset.samples.len();
+        let next = self.order.lock().unwrap_or_else(PoisonError::into_inner).next(self.batch_size, len);
+        next.map(|samples| dataset.gather(py, &samples, Some(samples.len()))).transpose()
+    }
+}

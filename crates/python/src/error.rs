@@ -1,0 +1,28 @@
+//! Our errors as Python's.
+
+use pyo3::create_exception;
+use pyo3::exceptions::PyException;
+use pyo3::prelude::*;
+
+create_exception!(
+    actrm,
+    Error,
+    PyException,
+    "What actrm refuses, in the words of its programs: file, key, what was expected and what was found."
+);
+
+/// An error with everything behind it, in one line.
+pub(crate) fn words(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text.push_str(&format!(": {error}"));
+        cause = error.source();
+    }
+    text
+}
+
+/// An error of ours as an exception.
+pub(crate) fn raised(error: impl std::error::Error) -> PyErr {
+    Error::new_err(words(&error))
+}

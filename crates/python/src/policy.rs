@@ -1,0 +1,387 @@
+//! Policies: entries of a zoo and checkpoints of LeRobot's, asked from Python.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+use models::{ActionChunk, Actor, FeatureKind, FeatureSpec, ModelError, Observation, Policy, Values};
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyTuple};
+use zoo::ZooError;
+use zoo::entry::LoadedEntry;
+use zoo::evaluation::acting;
+use zoo::experiment::DataSection;
+use zoo::lerobot::{ImportOptions, import};
+use zoo::registry::Registry;
+use zoo::results::Execution;
+
+use crate::arrays::{array, numpy, read};
+use crate::error::{Error, raised};
+use crate::work::run;
+
+/// The most rows of a batch of observations, each with a policy's state of its own.
+const MOST_ROWS: usize = 1 << 16;
+
+/// A trained policy: an entry of a zoo, or a checkpoint of LeRobot's. Made by `load_policy`.
+///
+/// Observations are dicts with LeRobot's keys, in the units of the data: `observation.state` and the others as arrays
+/// (or what numpy makes arrays of, such as tensors), pictures as 0 to 255 (uint8) or 0 to 1 (float), colours first or
+/// last. Further keys are left alone. With an axis of rows in front they are a batch: each row has the state of an
+/// episode of its own. Actions come back in the units of the data: nothing has to be normalised before or after.
+///
+/// `select_action` and `predict_action_chunk` each keep an episode of their own: observations that a policy looks back
+/// to, what it thought last. `reset` begins both anew. Safe to be used from several threads, one after the other.
+#[pyclass(frozen, module = "actrm", name = "Policy")]
+pub(crate) struct PyPolicy {
+    /// What loads it again.
+    path: PathBuf,
+    loaded: LoadedEntry,
+    execution: Execution,
+    acting: Mutex<Rows<Box<dyn Actor>>>,
+    predicting: Mutex<Rows<Predicting>>,
+}
+
+/// A policy and whether it was asked before in its episode.
+struct Predicting {
+    policy: Box<dyn Policy>,
+    asked: bool,
+}
+
+/// What each row of a batch keeps.
+struct Rows<T> {
+    seeds: Seeds,
+    rows: Vec<T>,
+}
+
+/// The seeds of the rows' episodes.
+#[derive(Clone, FromPyObject)]
+enum Seeds {
+    /// Of the first; the others count up from it.
+    First(u64),
+    Each(Vec<u64>),
+}
+
+impl Seeds {
+    fn of(&self, row: usize) -> Result<u64, PyErr> {
+        match self {
+            Self::First(seed) => Ok(seed.wrapping_add(row as u64)),
+            Self::Each(seeds) => seeds.get(row).copied().ok_or_else(|| {
+                PyValueError::new_err(format!("seed: expected one for each row, found {} seeds", seeds.len()))
+            }),
+        }
+    }
+}
+
+impl<T> Rows<T> {
+    fn new() -> Self {
+        Self { seeds: Seeds::First(0), rows: Vec::new() }
+    }
+
+    /// Makes sure that there are so many; `make` begins the episode of a seed.
+    fn grow(&mut self, rows: usize, make: impl Fn(u64) -> PyResult<T>) -> PyResult<&mut [T]> {
+        while self.rows.len() < rows {
+            self.rows.push(make(self.seeds.of(self.rows.len())?)?);
+        }
+        Ok(&mut self.rows[..rows])
+    }
+}
+
+/// What a policy is asked with.
+struct Asked {
+    /// Rows; nothing for one observation without an axis of them.
+    batch: Option<usize>,
+    observations: Vec<Observation>,
+}
+
+#[pymethods]
+impl PyPolicy {
+    /// Begins an episode: forgets the last one. What a policy draws depends on the seed only; row `i` of a batch has
+    /// the seed `seed + i`, or the `i`-th of a list.
+    #[pyo3(signature = (seed=None))]
+    fn reset(&self, py: Python<'_>, seed: Option<Seeds>) {
+        let seeds = seed.unwrap_or(Seeds::First(0));
+        py.allow_threads(|| {
+            *lock(&self.acting) = Rows { seeds: seeds.clone(), rows: Vec::new() };
+            *lock(&self.predicting) = Rows { seeds, rows: Vec::new() };
+        });
+    }
+
+    /// The action to execute now: (action_dim,), or (rows, action_dim) for a batch. Asks the network when the actions
+    /// that were planned are used up, as the entry's evaluations do.
+    fn select_action<'py>(&self, py: Python<'py>, observation: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
+        let asked = self.asked(observation)?;
+        let actions = py.allow_threads(|| {
+            let mut rows = lock(&self.acting);
+            let rows = rows.grow(asked.observations.len(), |seed| {
+                let mut actor = acting(self.loaded.policy(), self.execution).map_err(raised)?;
+                actor.reset(seed);
+                Ok(actor)
+            })?;
+            let act = |(actor, seen): (&mut Box<dyn Actor>, _)| actor.act(seen).map_err(raised);
+            run(|| rows.iter_mut().zip(&asked.observations).map(act).collect::<PyResult<Vec<_>>>())
+        })?;
+        let width = self.loaded.preprocess().signature().action_dim;
+        array(py, &shape(asked.batch, &[width]), &actions.concat())
+    }
+
+    /// The actions from now on, as the network plans them: (action_horizon, action_dim), or (rows, action_horizon,
+    /// action_dim) for a batch. `executed`: how many actions of the last chunk were executed since, for a policy that
+    /// goes on from its last thought; as many as the entry's evaluations execute unless given.
+    #[pyo3(signature = (observation, executed=None))]
+    fn predict_action_chunk<'py>(
+        &self,
+        py: Python<'py>,
+        observation: &Bound<'py, PyDict>,
+        executed: Option<usize>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let asked = self.asked(observation)?;
+        let executed = executed.unwrap_or_else(|| self.n_action_steps());
+        let chunks = py.allow_threads(|| {
+            let mut rows = lock(&self.predicting);
+            let rows = rows.grow(asked.observations.len(), |seed| {
+                let mut policy = self.loaded.policy();
+                policy.reset(seed);
+                Ok(Predicting { policy, asked: false })
+            })?;
+            let predict = |(row, seen): (&mut Predicting, _)| {
+                if std::mem::replace(&mut row.asked, true) {
+                    row.policy.executed(executed);
+                }
+                row.policy.predict(seen).map_err(raised)
+            };
+            run(|| rows.iter_mut().zip(&asked.observations).map(predict).collect::<PyResult<Vec<ActionChunk>>>())
+        })?;
+        let signature = self.loaded.preprocess().signature();
+        let (horizon, width) = (self.loaded.model().action_horizon(), signature.action_dim);
+        let values: Vec<f32> = chunks.into_iter().flat_map(|chunk| chunk.actions).collect();
+        array(py, &shape(asked.batch, &[horizon, width]), &values)
+    }
+
+    /// `name@version`.
+    #[getter]
+    fn id(&self) -> String {
+        self.loaded.entry().id().to_string()
+    }
+
+    /// The folder that it was loaded from.
+    #[getter]
+    fn path(&self) -> PathBuf {
+        self.path.clone()
+    }
+
+    /// The task that it was trained for.
+    #[getter]
+    fn task(&self) -> &str {
+        &self.loaded.entry().meta().task
+    }
+
+    /// The kind of policy: `act`, `actrm`, ...
+    #[getter]
+    fn kind(&self) -> &str {
+        &self.loaded.entry().meta().policy
+    }
+
+    /// Number of weights.
+    #[getter]
+    fn parameters(&self) -> u64 {
+        self.loaded.entry().meta().parameters
+    }
+
+    /// The features of an observation and their shapes, with LeRobot's keys; pictures have their colours first.
+    #[getter]
+    fn input_features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        for spec in &self.loaded.preprocess().signature().observation {
+            let shape = match (spec.kind, spec.shape.as_slice()) {
+                (FeatureKind::Image, &[height, width, colours]) => vec![colours, height, width],
+                (_, shape) => shape.to_vec(),
+            };
+            all.set_item(&spec.name, PyTuple::new(py, shape)?)?;
+        }
+        Ok(all)
+    }
+
+    /// The shape of an action.
+    #[getter]
+    fn output_features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        all.set_item(models::ACTION, PyTuple::new(py, [self.loaded.preprocess().signature().action_dim])?)?;
+        Ok(all)
+    }
+
+    /// The simulator's observation keys that make each feature, in order.
+    #[getter]
+    fn observation_keys<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let keys = &self.loaded.entry().meta().keys;
+        let all = PyDict::new(py);
+        keys.features().try_for_each(|feature| all.set_item(feature, keys.of(feature)))?;
+        Ok(all)
+    }
+
+    /// Actions in a chunk (LeRobot: `chunk_size`).
+    #[getter]
+    fn action_horizon(&self) -> usize {
+        self.loaded.model().action_horizon()
+    }
+
+    /// Actions that are executed before the network is asked again; 1 where predictions are averaged.
+    #[getter]
+    fn n_action_steps(&self) -> usize {
+        match self.execution {
+            Execution::RecedingHorizon { n_action_steps } => n_action_steps,
+            Execution::TemporalEnsemble { .. } => 1,
+        }
+    }
+
+    /// Observations that are seen at once: the present one and those before it, which are remembered.
+    #[getter]
+    fn n_obs_steps(&self) -> usize {
+        self.loaded.preprocess().signature().n_obs_steps
+    }
+
+    /// The model card, as Markdown.
+    #[getter]
+    fn card(&self, py: Python<'_>) -> PyResult<String> {
+        py.allow_threads(|| self.loaded.entry().card()).map_err(raised)
+    }
+
+    fn __repr__(&self) -> String {
+        let (id, kind, task) = (self.id(), self.kind(), self.task());
+        format!("Policy({id}: {kind}, {} weights, for {task})", self.parameters())
+    }
+
+    fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, (PathBuf,))> {
+        Ok((py.import("actrm")?.getattr("load_policy")?, (self.path.clone(),)))
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn shape(batch: Option<usize>, rest: &[usize]) -> Vec<usize> {
+    batch.into_iter().chain(rest.iter().copied()).collect()
+}
+
+impl PyPolicy {
+    fn new(path: PathBuf, loaded: LoadedEntry) -> PyResult<Self> {
+        let rollout = &loaded.experiment().rollout;
+        let execution = match rollout.temporal_ensemble {
+            Some(coefficient) => Execution::TemporalEnsemble { coefficient },
+            None => Execution::RecedingHorizon { n_action_steps: rollout.n_action_steps },
+        };
+        Ok(Self { path, loaded, execution, acting: Mutex::new(Rows::new()), predicting: Mutex::new(Rows::new()) })
+    }
+
+    /// The features of an observation, row by row. What is missing the network says by name.
+    fn asked(&self, observation: &Bound<'_, PyDict>) -> PyResult<Asked> {
+        let mut batch: Option<(Option<usize>, &str)> = None;
+        let mut features = Vec::new();
+        for spec in &self.loaded.preprocess().signature().observation {
+            let Some(value) = observation.get_item(&spec.name)? else { continue };
+            let (found, values) = feature(spec, &value)?;
+            let rows = match found.strip_suffix(spec.shape.as_slice()) {
+                Some([]) => None,
+                Some(&[rows]) if (1..=MOST_ROWS).contains(&rows) => Some(rows),
+                _ => {
+                    let (operation, name, expected) = ("predict", spec.name.clone(), spec.shape.clone());
+                    return Err(raised(ModelError::FeatureShape { operation, name, expected, found }));
+                }
+            };
+            match batch {
+                Some((before, other)) if before != rows => {
+                    let words = |rows: Option<usize>| rows.map_or("no".to_owned(), |rows| rows.to_string());
+                    let (expected, found) = (words(before), words(rows));
+                    let text = format!("predict: {} has {found} rows, expected {expected}, as {other}", spec.name);
+                    return Err(Error::new_err(text));
+                }
+                _ => batch = Some((rows, &spec.name)),
+            }
+            features.push((spec, values));
+        }
+        let batch = batch.and_then(|(rows, _)| rows);
+        let row = |row: usize| {
+            let cut = |(spec, values): &(&FeatureSpec, Values)| {
+                let range = row * spec.width()..(row + 1) * spec.width();
+                let part = match values {
+                    Values::F32(all) => Values::F32(all[range].to_vec()),
+                    Values::U8(all) => Values::U8(all[range].to_vec()),
+                };
+                (spec.name.clone(), part)
+            };
+            features.iter().map(cut).collect()
+        };
+        Ok(Asked { batch, observations: (0..batch.unwrap_or(1)).map(row).collect() })
+    }
+}
+
+/// The shape and values of a feature; pictures with their colours last.
+fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>, Values)> {
+    if spec.kind != FeatureKind::Image {
+        let (shape, values) = read::<f32>(value)?;
+        return Ok((shape, Values::F32(values)));
+    }
+    let numpy = numpy(value.py())?;
+    let mut picture = numpy.call_method1("asarray", (value,))?;
+    let kind: String = picture.getattr("dtype")?.getattr("name")?.extract()?;
+    if kind.starts_with("float") {
+        // 0 to 1, as PyTorch has them: back to the bytes that they were made of
+        let scaled = numpy.call_method1("clip", (&picture, 0.0, 1.0))?.mul(255.0)?;
+        picture = numpy.call_method1("rint", (scaled,))?.call_method1("astype", ("uint8",))?;
+    } else if kind != "uint8" {
+        let text = format!("predict: {} holds {kind}, expected uint8 from 0 to 255 or float from 0 to 1", spec.name);
+        return Err(PyTypeError::new_err(text));
+    }
+    let found: Vec<usize> = picture.getattr("shape")?.extract()?;
+    let first: Vec<usize> = spec.shape.last().into_iter().chain(spec.shape.iter().take(2)).copied().collect();
+    if !found.ends_with(&spec.shape) && found.ends_with(&first) {
+        picture = numpy.call_method1("moveaxis", (picture, -3, -1))?;
+    }
+    let (shape, values) = read::<u8>(&picture)?;
+    Ok((shape, Values::U8(values)))
+}
+
+/// A policy that can be asked: an entry of a zoo, every file of it checked against its hash, or a checkpoint of LeRobot's.
+///
+/// Parameters
+/// ----------
+/// path: an entry by its folder (`zoo/stack-act/1`, or `zoo/stack-act` for its newest version, `zoo/stack-act@1`), by its
+///     name in `zoo` (`stack-act`, `stack-act@1`), or the folder of a LeRobot checkpoint.
+/// zoo: the folder that names are looked up in; `$ACTRM_ZOO_DIR` or `zoo` unless given.
+#[pyfunction]
+#[pyo3(signature = (path, zoo=None))]
+pub(crate) fn load_policy(py: Python<'_>, path: PathBuf, zoo: Option<PathBuf>) -> PyResult<PyPolicy> {
+    py.allow_threads(|| {
+        run(|| {
+            if let Some(folder) = lerobot_checkpoint(&path) {
+                let loaded = import_checkpoint(&folder).map_err(raised)?;
+                return PyPolicy::new(std::path::absolute(folder)?, loaded);
+            }
+            let entry = registry(zoo).locate(&path.to_string_lossy()).map_err(raised)?;
+            let folder = std::path::absolute(entry.folder())?;
+            PyPolicy::new(folder, entry.load().map_err(raised)?)
+        })
+    })
+}
+
+/// The zoo that is meant.
+pub(crate) fn registry(zoo: Option<PathBuf>) -> Registry {
+    let named = || std::env::var_os("ACTRM_ZOO_DIR").filter(|folder| !folder.is_empty()).map(PathBuf::from);
+    Registry::open(&zoo.or_else(named).unwrap_or_else(|| PathBuf::from("zoo")))
+}
+
+/// The folder of a LeRobot checkpoint at `path`, or in the folder that LeRobot's training puts it in.
+fn lerobot_checkpoint(path: &Path) -> Option<PathBuf> {
+    let is_one = |folder: &PathBuf| folder.join("config.json").is_file() && folder.join("model.safetensors").is_file();
+    [path.to_owned(), path.join("pretrained_model")].into_iter().find(is_one)
+}
+
+/// A checkpoint as an entry that nobody keeps.
+fn import_checkpoint(folder: &Path) -> Result<LoadedEntry, ZooError> {
+    let zoo = tempfile::tempdir().map_err(ZooError::io("create folder", std::env::temp_dir()))?;
+    let DataSection { state_keys, env_keys, .. } = DataSection::default();
+    let (name, task) = ("lerobot-checkpoint".to_owned(), "unknown".to_owned());
+    let options = ImportOptions { name, task, state_keys, env_keys, fast_render: false };
+    let id = import(folder, &options, zoo.path())?;
+    Registry::open(zoo.path()).entry(&id.to_string())?.load()
+}

@@ -1,0 +1,244 @@
+//! A simulator that is stepped from Python: one worker process with one environment.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use models::{ENVIRONMENT_STATE, Observation, STATE, Values};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyTuple};
+use rollout::{Control, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder};
+use zoo::FeatureKeys;
+use zoo::evaluation::Environment;
+use zoo::experiment::DataSection;
+
+use crate::arrays::{array, filled, read};
+use crate::error::{Error, raised};
+use crate::policy::registry;
+use crate::work::interruptible;
+
+/// One environment in a worker process, as evaluations use it. `actrm.envs` makes a gymnasium environment of it.
+#[pyclass(frozen, module = "actrm")]
+pub(crate) struct Simulator {
+    ready: Ready,
+    keys: FeatureKeys,
+    pool: Mutex<Option<Pool>>,
+}
+
+#[pymethods]
+impl Simulator {
+    #[new]
+    #[pyo3(signature = (task=None, *, entry=None, zoo=None, keys=None, control="compiled", python=None, env_module=None))]
+    #[expect(clippy::too_many_arguments, reason = "options by name")]
+    fn new(
+        py: Python<'_>,
+        task: Option<String>,
+        entry: Option<PathBuf>,
+        zoo: Option<PathBuf>,
+        keys: Option<BTreeMap<String, Vec<String>>>,
+        control: &str,
+        python: Option<PathBuf>,
+        env_module: Option<String>,
+    ) -> PyResult<Self> {
+        let control: Control = control.parse().map_err(PyValueError::new_err)?;
+        let registry = registry(zoo);
+        let start = || -> PyResult<(FeatureKeys, Pool)> {
+            let python = find_python(python.as_deref()).map_err(raised)?;
+            let harness = harness_folder().map_err(raised)?;
+            let (mut spec, of_entry) = match (&entry, task) {
+                (Some(entry), task) => {
+                    let entry = registry.locate(&entry.to_string_lossy()).map_err(raised)?;
+                    let (task, module) = (task.as_deref(), env_module.as_deref());
+                    let environment = Environment::of(entry.meta(), task, module).map_err(raised)?;
+                    (environment.worker(python, harness), Some(entry.meta().keys.clone()))
+                }
+                (None, Some(task)) => {
+                    let mut spec = WorkerSpec::new(python, harness, &task);
+                    spec.env_module.clone_from(&env_module);
+                    (spec, None)
+                }
+                (None, None) => return Err(PyValueError::new_err("task or entry: expected one of them")),
+            };
+            spec.control = control;
+            let pool = Pool::start(PoolOptions::new(spec, 1)).map_err(raised)?;
+            let keys = match (keys, of_entry) {
+                (Some(keys), _) => chosen(keys.into_iter())?,
+                (None, Some(keys)) => keys,
+                (None, None) => usual(pool.ready())?,
+            };
+            for feature in keys.features() {
+                let words = |reason| Error::new_err(format!("task {}: {feature}: {reason}", pool.ready().task));
+                keys.width(feature, pool.ready()).map_err(words)?;
+            }
+            Ok((keys, pool))
+        };
+        let (keys, pool) = interruptible(py, |_, _| start(), |()| Ok(()))??;
+        Ok(Self { ready: pool.ready().clone(), keys, pool: Mutex::new(Some(pool)) })
+    }
+
+    /// Begins the episode of `seed`: the observation, and what is known of the episode.
+    fn reset<'py>(&self, py: Python<'py>, seed: u64) -> PyResult<(Bound<'py, PyDict>, Bound<'py, PyDict>)> {
+        let Initial { fingerprint, group, observations, .. } =
+            py.allow_threads(|| self.worker(|worker| worker.reset(seed).map_err(raised)))?;
+        let info = PyDict::new(py);
+        info.set_item("seed", seed)?;
+        info.set_item("fingerprint", fingerprint)?;
+        info.set_item("group", group)?;
+        Ok((self.seen(py, &self.keys.observe(&observations))?, info))
+    }
+
+    /// Executes an action, clipped to its limits: the observation, the reward, whether the task is done, and in a word
+    /// why it no longer can be, where the environment says so.
+    fn step<'py>(
+        &self,
+        py: Python<'py>,
+        action: &Bound<'py, PyAny>,
+    ) -> PyResult<(Bound<'py, PyDict>, f64, bool, Option<String>)> {
+        let (shape, values) = read::<f32>(action)?;
+        let action = self.executable(&shape, &values)?;
+        let Stepped { rewards, success, failure, observations, .. } =
+            py.allow_threads(|| self.worker(|worker| worker.step(&[action]).map_err(raised)))?;
+        Ok((self.seen(py, &self.keys.observe(&observations))?, rewards.iter().sum(), success, failure))
+    }
+
+    /// A picture of the present state: (height, width, 3), uint8.
+    #[pyo3(signature = (camera="agentview", height=256, width=256))]
+    fn render<'py>(&self, py: Python<'py>, camera: &str, height: usize, width: usize) -> PyResult<Bound<'py, PyAny>> {
+        if !(1..=4096).contains(&height) || !(1..=4096).contains(&width) {
+            return Err(PyValueError::new_err(format!(
+                "picture: expected a side of 1 to 4096, found {height}x{width}"
+            )));
+        }
+        let image = py.allow_threads(|| self.worker(|worker| worker.render(camera, height, width).map_err(raised)))?;
+        filled(py, &[height, width, 3], |out| out.copy_from_slice(&image.rgb))
+    }
+
+    /// Ends the worker.
+    fn close(&self, py: Python<'_>) {
+        py.allow_threads(|| {
+            if let Some(pool) = self.lock().take() {
+                pool.close();
+            }
+        });
+    }
+
+    /// The task.
+    #[getter]
+    fn task(&self) -> &str {
+        &self.ready.task
+    }
+
+    /// The task's cap on an episode, in steps.
+    #[getter]
+    fn max_steps(&self) -> usize {
+        self.ready.max_steps
+    }
+
+    /// Control steps a second.
+    #[getter]
+    fn control_freq(&self) -> f64 {
+        self.ready.control_freq
+    }
+
+    /// Smallest and largest action.
+    #[getter]
+    fn action_limits<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+        let limit = |values: &[f64]| {
+            let values: Vec<f32> = values.iter().map(|&value| value as f32).collect();
+            array(py, &[values.len()], &values)
+        };
+        Ok((limit(&self.ready.action_low)?, limit(&self.ready.action_high)?))
+    }
+
+    /// The features of an observation with their shapes; those of pictures have three axes.
+    #[getter]
+    fn features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        for feature in self.keys.features() {
+            let one = match self.keys.items(feature) {
+                [item] => self.ready.observations.get(&item.to_string()).filter(|shape| shape.len() == 3),
+                _ => None,
+            };
+            let shape = match one {
+                Some(shape) => shape.clone(),
+                None => vec![self.keys.width(feature, &self.ready).map_err(Error::new_err)?],
+            };
+            all.set_item(feature, PyTuple::new(py, shape)?)?;
+        }
+        Ok(all)
+    }
+
+    /// Versions of the simulator and of what it stands on.
+    #[getter]
+    fn versions(&self) -> BTreeMap<String, String> {
+        self.ready.versions.clone()
+    }
+}
+
+impl Simulator {
+    fn lock(&self) -> MutexGuard<'_, Option<Pool>> {
+        self.pool.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Asks the worker; one that failed is gone.
+    fn worker<T>(&self, ask: impl FnOnce(&mut Worker) -> PyResult<T>) -> PyResult<T> {
+        let mut held = self.lock();
+        let Some(worker) = held.as_mut().and_then(Pool::first_worker) else {
+            return Err(Error::new_err(format!("the simulator of task {} was closed", self.ready.task)));
+        };
+        let answer = ask(worker);
+        if answer.is_err() {
+            // whatever it says from now on is not to be believed
+            *held = None;
+        }
+        answer
+    }
+
+    /// The action that is executed: of the right length, finite, inside the environment's limits.
+    fn executable(&self, shape: &[usize], values: &[f32]) -> PyResult<Vec<f64>> {
+        let expected = [self.ready.action_dim];
+        if shape != expected {
+            return Err(PyValueError::new_err(format!("action: expected shape {expected:?}, found {shape:?}")));
+        }
+        if let Some(at) = values.iter().position(|value| !value.is_finite()) {
+            return Err(PyValueError::new_err(format!("action: {} at index {at}", values[at])));
+        }
+        let limits = self.ready.action_low.iter().zip(&self.ready.action_high);
+        Ok(values.iter().zip(limits).map(|(&value, (&low, &high))| f64::from(value).clamp(low, high)).collect())
+    }
+
+    fn seen<'py>(&self, py: Python<'py>, observation: &Observation) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        for (name, values) in observation.iter() {
+            let values = match values {
+                Values::F32(values) => array(py, &[values.len()], values)?,
+                Values::U8(bytes) => {
+                    let item = self.keys.of(name).concat();
+                    let shape = self.ready.observations.get(&item).cloned().unwrap_or_else(|| vec![bytes.len()]);
+                    array(py, &shape, bytes)?
+                }
+            };
+            all.set_item(name, values)?;
+        }
+        Ok(all)
+    }
+}
+
+/// The features that were asked for.
+fn chosen(keys: impl Iterator<Item = (String, Vec<String>)>) -> PyResult<FeatureKeys> {
+    let mut all = FeatureKeys::default();
+    for (feature, of) in keys {
+        let words = |found| PyValueError::new_err(format!("keys: {feature}: {found}"));
+        all.insert(&feature, &of).map_err(words)?;
+    }
+    Ok(all)
+}
+
+/// The features that data sets have by default, as far as the environment has their keys.
+fn usual(ready: &Ready) -> PyResult<FeatureKeys> {
+    let DataSection { state_keys, env_keys, .. } = DataSection::default();
+    let there = |keys: &Vec<String>| keys.iter().all(|key| ready.observations.contains_key(key));
+    let features = [(STATE, state_keys), (ENVIRONMENT_STATE, env_keys)].into_iter();
+    chosen(features.filter(|(_, keys)| there(keys)).map(|(name, keys)| (name.to_owned(), keys)))
+}

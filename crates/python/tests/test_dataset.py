@@ -1,0 +1,201 @@
+"""Data sets: LeRobot's keys and shapes, and the bits that training reads."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import actrm
+import numpy as np
+import pytest
+from conftest import RELEASE, output
+
+
+def test_samples_have_lerobot_s_keys_and_shapes(lift: Path) -> None:
+    ds = actrm.Dataset(lift, delta_timestamps={"action": range(16), "observation.state": [-0.05, 0.0]})
+    sample = ds[0]
+    shapes = {key: value.shape for key, value in sample.items() if isinstance(value, np.ndarray)}
+    assert shapes == {
+        "action": (16, 7),
+        "action_is_pad": (16,),
+        "observation.state": (2, 9),
+        "observation.state_is_pad": (2,),
+        "observation.environment_state": (10,),
+        "next.reward": (),
+        "next.done": (),
+        "next.success": (),
+        "timestamp": (),
+        "frame_index": (),
+        "episode_index": (),
+        "index": (),
+        "task_index": (),
+    }
+    assert {key: str(sample[key].dtype) for key in ("action", "action_is_pad", "next.done", "index", "timestamp")} == {
+        "action": "float32",
+        "action_is_pad": "bool",
+        "next.done": "bool",
+        "index": "int64",
+        "timestamp": "float32",
+    }
+    assert sample["task"] == ds.tasks[0]
+    assert sample["observation.state_is_pad"].tolist() == [True, False]
+    assert (sample["observation.state"][0] == sample["observation.state"][1]).all()
+
+
+def test_rows_follow_each_other_and_end_with_the_episode(lift: Path) -> None:
+    ds = actrm.Dataset(lift, delta_timestamps={"action": range(4)})
+    plain = actrm.Dataset(lift)
+    first = ds.episodes[0]
+    assert first["dataset_from_index"] == 0
+    end = first["dataset_to_index"]
+    last = ds[end - 2]
+    assert last["action_is_pad"].tolist() == [False, False, True, True]
+    actions = np.stack([plain[i]["action"] for i in (end - 2, end - 1, end - 1, end - 1)])
+    np.testing.assert_array_equal(last["action"], actions)
+    assert [int(ds[i]["frame_index"]) for i in (0, end - 1, end)] == [0, end - 1, 0]
+    assert float(ds[3]["timestamp"]) == np.float32(3 / ds.fps)
+    assert int(ds[-1]["index"]) == len(ds) - 1
+
+
+def test_whole_numbers_are_frames_and_floats_are_seconds(lift: Path) -> None:
+    frames = actrm.Dataset(lift, {"action": range(-2, 3)})
+    seconds = actrm.Dataset(lift, {"action": [k / frames.fps for k in range(-2, 3)]})
+    for i in (0, 1, 77):
+        np.testing.assert_array_equal(frames[i]["action"], seconds[i]["action"])
+    with pytest.raises(actrm.Error, match=r"no frame of action at 0.03 s from another; there is one every 1/20 s"):
+        actrm.Dataset(lift, {"action": [0.03]})
+
+
+def test_a_split_is_its_episodes(lift: Path) -> None:
+    whole, train, valid = actrm.Dataset(lift), actrm.Dataset(lift, split="train"), actrm.Dataset(lift, split="valid")
+    assert len(train) + len(valid) == len(whole) == whole.num_frames
+    chosen = [episode["episode_index"] for episode in train.episodes]
+    assert sorted({int(train[i]["episode_index"]) for i in range(len(train))}) == chosen
+    assert len(actrm.Dataset(lift, episodes=[3])) == whole.episodes[3]["length"]
+    with pytest.raises(actrm.Error, match="no split tarin; there is .*train"):
+        actrm.Dataset(lift, split="tarin")
+
+
+def test_statistics_are_numpy_s(lift: Path) -> None:
+    ds = actrm.Dataset(lift)
+    actions = ds.batch(range(len(ds)))["action"].astype(np.float64)
+    stats = ds.stats["action"]
+    np.testing.assert_allclose(stats["mean"], actions.mean(0), atol=1e-12)
+    np.testing.assert_allclose(stats["std"], actions.std(0), atol=1e-12)
+    np.testing.assert_array_equal(stats["max"], actions.max(0))
+    assert stats["count"].tolist() == [len(ds)]
+
+
+def test_batches_are_what_training_reads(lift: Path) -> None:
+    """Bit for bit, over the end of an epoch, in training's order."""
+    horizon, size, seed, steps = 16, 64, 5, 40
+    ds = actrm.Dataset(lift, {"action": range(horizon)}, split="train")
+    assert steps * size > len(ds)
+    program = RELEASE / "examples/training_windows"
+    read = np.frombuffer(output(program, lift, "train", *map(str, (horizon, size, seed, steps))), np.float32)
+    ours = []
+    for batch in ds.batches(size, seed=seed, steps=steps):
+        keys = ("observation.state", "observation.environment_state", "action", "action_is_pad")
+        ours += [batch[key].astype(np.float32).ravel() for key in keys]
+    ours = np.concatenate(ours)
+    np.testing.assert_array_equal(ours.view(np.uint32), read.view(np.uint32))
+
+
+def test_batches_end_with_the_epoch(lift: Path) -> None:
+    ds = actrm.Dataset(lift, split="train")
+    batches = ds.batches(64, seed=1)
+    assert len(batches) == -(-len(ds) // 64)
+    seen = np.concatenate([batch["index"] for batch in batches])
+    assert len(batches) == 0
+    assert len(seen) == len(ds) == len(set(seen.tolist()))
+    again = np.concatenate([batch["index"] for batch in ds.batches(64, seed=1)])
+    np.testing.assert_array_equal(seen, again)
+    other = np.concatenate([batch["index"] for batch in ds.batches(64, seed=1, epoch=1)])
+    assert (seen != other).any()
+    stream = np.concatenate([batch["index"] for batch in ds.batches(len(ds), seed=1, start=1, steps=1)])
+    np.testing.assert_array_equal(stream, other)
+    full = list(ds.batches(64, seed=1, drop_last=True))
+    assert {len(batch["index"]) for batch in full} == {64} and len(full) == len(ds) // 64
+    in_order = np.concatenate([batch["frame_index"] for batch in ds.batches(50)])
+    assert in_order[:3].tolist() == [0, 1, 2]
+
+
+def test_arrays_are_the_caller_s_own(lift: Path) -> None:
+    ds = actrm.Dataset(lift)
+    before = ds[0]["action"].copy()
+    mine = ds[0]["action"]
+    mine[:] = 7
+    np.testing.assert_array_equal(ds[0]["action"], before)
+    assert mine.flags.writeable and mine.flags.c_contiguous and mine.flags.aligned
+
+
+def test_a_data_set_pickles(lift: Path) -> None:
+    ds = actrm.Dataset(lift, {"action": range(3)}, split="valid")
+    again = pickle.loads(pickle.dumps(ds))
+    assert repr(again) == repr(ds) and len(again) == len(ds)
+    for key, value in ds[5].items():
+        np.testing.assert_array_equal(value, again[5][key])
+
+
+def test_loaders_ask_for_several_at_once(lift: Path) -> None:
+    ds = actrm.Dataset(lift, {"action": range(3)})
+    several, batch = ds.__getitems__([4, 0, -1]), ds.batch([4, 0, -1])
+    for key in ("action", "action_is_pad", "index", "next.done"):
+        np.testing.assert_array_equal(np.stack([one[key] for one in several]), batch[key])
+    assert batch["task"] == [one["task"] for one in several]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"path": "nowhere"}, actrm.Error, "nowhere: data set: expected a LeRobotDataset v3.0 directory"),
+        ({"delta_timestamps": {"acton": [0]}}, actrm.Error, "no column acton; there is action, "),
+        ({"delta_timestamps": {"action": []}}, actrm.Error, "no sample with 0 rows of action"),
+        ({"delta_timestamps": {"action": ["x"]}}, TypeError, "real number"),
+        ({"delta_timestamps": {"action": [float("nan")]}}, actrm.Error, "no frame of action at NaN s"),
+        ({"delta_timestamps": {"action": [1 << 70]}}, (actrm.Error, OverflowError), "."),
+        ({"delta_timestamps": 3}, AttributeError, "items"),
+        ({"episodes": [1000]}, actrm.Error, "no episode 1000; there is 0 to 49"),
+        ({"episodes": [-1]}, OverflowError, "."),
+        ({"cameras": ["front"]}, actrm.Error, "no camera front; there is no camera"),
+        ({"split": "train", "episodes": [0]}, ValueError, "expected one of them"),
+        ({"path": "a\0b"}, (ValueError, actrm.Error, OSError), "."),
+    ],
+)
+def test_what_cannot_be_is_an_exception(lift: Path, arguments: dict, error: type, words: str) -> None:
+    with pytest.raises(error, match=words):
+        actrm.Dataset(**{"path": lift, **arguments})
+
+
+def test_what_cannot_be_asked_for_is_an_exception(lift: Path) -> None:
+    ds = actrm.Dataset(lift)
+    for index in (len(ds), -len(ds) - 1, 1 << 62):
+        with pytest.raises(IndexError, match="no sample"):
+            ds[index]
+    with pytest.raises(TypeError):
+        ds["action"]  # type: ignore[call-overload]
+    for size in (0, 1 << 40):
+        with pytest.raises(ValueError, match="batch_size"):
+            ds.batches(size)
+    with pytest.raises(ValueError, match="steps"):
+        ds.batches(4, steps=3)
+    with pytest.raises(ValueError, match="more samples"):
+        ds.batches(1 << 20, seed=1, steps=1, start=1 << 60)
+    far = actrm.Dataset(lift, {"action": [-(1 << 62), 0, 1 << 62]})[10]
+    assert far["action_is_pad"].tolist() == [True, False, True]
+
+
+def test_a_damaged_data_set_is_an_exception(lift: Path, tmp_path: Path) -> None:
+    import shutil
+
+    bad = tmp_path / "bad"
+    shutil.copytree(lift, bad)
+    for path in sorted(bad.rglob("*.parquet")) + [bad / "meta/info.json"]:
+        whole = path.read_bytes()
+        for cut in (0, len(whole) // 2, len(whole) - 4):
+            path.write_bytes(whole[:cut])
+            if "actrm" not in path.parts:
+                with pytest.raises(actrm.Error):
+                    actrm.Dataset(bad)
+        path.write_bytes(whole)
+    actrm.Dataset(bad)

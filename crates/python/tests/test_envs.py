@@ -1,0 +1,61 @@
+"""gymnasium environments."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+import actrm
+import actrm.envs
+
+
+@pytest.mark.filterwarnings("ignore:.*Box .* precision lowered.*", "ignore:.*infinity.*")
+def test_gymnasium_s_checker_has_nothing_to_say() -> None:
+    from gymnasium.utils.env_checker import check_env
+
+    env = gymnasium.make("actrm/Stack-v0", render_mode="rgb_array", size=64)
+    check_env(env.unwrapped, skip_render_check="MUJOCO_GL" not in os.environ)
+    env.close()
+
+
+def test_every_task_is_known() -> None:
+    known = {name for name in gymnasium.registry if name.startswith("actrm/")}
+    assert known == {f"actrm/{task}-v0" for task in actrm.envs.TASKS}
+
+
+def test_an_episode_is_the_evaluation_s(zoo: Path) -> None:
+    stored = actrm.evaluate(zoo / "lift-act", episodes=200, seed=40_000, progress=False)
+    policy = actrm.load_policy(zoo / "lift-act")
+    env = gymnasium.make("actrm/Lift-v0", entry=str(zoo / "lift-act"))
+    policy.reset(seed=40_000)
+    observation, info = env.reset(seed=40_000)
+    assert info["fingerprint"] == stored["fingerprint"][0] and not info["is_success"]
+    steps, over = 0, False
+    while not over:
+        observation, reward, terminated, truncated, info = env.step(policy.select_action(observation))
+        steps, over = steps + 1, terminated or truncated
+    assert (info["is_success"], steps) == (bool(stored["success"][0]), int(stored["steps"][0]))
+    env.close()
+    with pytest.raises(actrm.Error, match="closed"):
+        env.unwrapped.reset(seed=1)
+
+
+def test_a_cap_truncates_and_bad_actions_are_refused() -> None:
+    env = actrm.envs.RobotEnv("Lift", max_steps=3)
+    env.reset(seed=5)
+    still = np.zeros(7, np.float32)
+    assert [env.step(still)[2:4] for _ in range(3)] == [(False, False), (False, False), (False, True)]
+    for action in (np.zeros(6), np.full(7, np.nan), np.zeros((1, 7))):
+        with pytest.raises(ValueError, match="action"):
+            env.step(action)
+    env.step(np.full(7, 1e9))
+    env.close()
+    with pytest.raises(actrm.Error, match="NoSuchTask"):
+        actrm.envs.RobotEnv("NoSuchTask")
+    with pytest.raises(actrm.Error, match="observation.state"):
+        actrm.envs.RobotEnv("Lift", keys={"observation.state": ["no_such_key"]})

@@ -1,0 +1,177 @@
+"""Policies: the bits that `actrm-zoo eval` computes, rows, threads, what is refused."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import threading
+from pathlib import Path
+
+import actrm
+import numpy as np
+import pytest
+from conftest import RELEASE, output
+
+ENTRIES = ("door-act", "lift-act", "nutassemblysquare-act", "pickplacecan-act", "stack-act", "stackthreecubes-act")
+
+
+def observations(policy: actrm.Policy, count: int, seed: int = 0) -> list[dict[str, np.ndarray]]:
+    """Numbers of about the size that data have."""
+    rng = np.random.default_rng(seed)
+    shapes = policy.input_features
+    return [{key: rng.normal(0, 0.5, shape).astype(np.float32) for key, shape in shapes.items()} for _ in range(count)]
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_chunks_are_what_the_entry_computes(zoo: Path, name: str) -> None:
+    policy = actrm.load_policy(zoo / name)
+    asked = observations(policy, 5)
+    given = [{key.removeprefix("observation."): value.tolist() for key, value in one.items()} for one in asked]
+    text = output(RELEASE / "examples/predict", zoo, name, given=json.dumps(given).encode())
+    wanted = np.array(json.loads(text), np.float32)
+    ours = np.stack([policy.predict_action_chunk(one) for one in asked])
+    assert ours.shape == (5, policy.action_horizon, 7)
+    np.testing.assert_array_equal(ours.view(np.uint32), wanted.view(np.uint32))
+
+
+def test_a_policy_is_found_by_path_and_by_name(zoo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = [zoo / "lift-act", f"{zoo}/lift-act@1", str(zoo / "lift-act/1"), f"{zoo}/lift-act/"]
+    found = [actrm.load_policy(path) for path in paths] + [actrm.load_policy("lift-act", zoo=zoo)]
+    monkeypatch.setenv("ACTRM_ZOO_DIR", str(zoo))
+    found.append(actrm.load_policy("lift-act@1"))
+    assert {policy.id for policy in found} == {"lift-act@1"}
+    assert {policy.path for policy in found} == {zoo / "lift-act/1"}
+    policy = found[0]
+    assert policy.input_features == {"observation.state": (9,), "observation.environment_state": (10,)}
+    assert policy.output_features == {"action": (7,)}
+    assert policy.observation_keys["observation.environment_state"] == ["object"]
+    assert (policy.task, policy.kind, policy.n_obs_steps) == ("Lift", "act", 1)
+    assert "lift-act@1" in policy.card and "lift-act@1" in repr(policy)
+    assert policy.parameters > 100_000
+
+
+def test_actions_are_the_heads_of_chunks(zoo: Path) -> None:
+    policy = actrm.load_policy(zoo / "stack-act")
+    asked = observations(policy, 2 * policy.n_action_steps)
+    policy.reset(seed=3)
+    actions = [policy.select_action(one) for one in asked]
+    policy.reset(seed=3)
+    chunks = [policy.predict_action_chunk(one) for one in asked[:: policy.n_action_steps]]
+    for i, action in enumerate(actions):
+        np.testing.assert_array_equal(action, chunks[i // policy.n_action_steps][i % policy.n_action_steps])
+
+
+def test_rows_of_a_batch_are_episodes_of_their_own(zoo: Path) -> None:
+    policy, single = actrm.load_policy(zoo / "stack-act"), actrm.load_policy(zoo / "stack-act")
+    rows, steps = 3, policy.n_action_steps + 2
+    asked = [observations(policy, rows, seed) for seed in range(steps)]
+    policy.reset(seed=[7, 8, 9])
+    together = []
+    for step in asked:
+        together.append(policy.select_action({key: np.stack([one[key] for one in step]) for key in step[0]}))
+    assert together[0].shape == (rows, 7)
+    for row in range(rows):
+        single.reset(seed=7 + row)
+        for step in range(steps):
+            np.testing.assert_array_equal(single.select_action(asked[step][row]), together[step][row])
+
+
+def test_other_types_are_taken_as_numpy_takes_them(zoo: Path) -> None:
+    policy = actrm.load_policy(zoo / "lift-act")
+    one = observations(policy, 1)[0]
+    wanted = policy.predict_action_chunk(one)
+    as_lists = {key: [float(x) for x in value] for key, value in one.items()}
+    as_doubles = {key: value.astype(np.float64) for key, value in one.items()}
+    strided = {key: np.repeat(value, 2)[::2] for key, value in one.items()}
+    for other in (as_lists, as_doubles, strided, {**one, "task": "lift", "index": 3}):
+        np.testing.assert_array_equal(policy.predict_action_chunk(other), wanted)
+
+
+def test_a_policy_pickles(zoo: Path) -> None:
+    policy = actrm.load_policy(zoo / "lift-act")
+    one = observations(policy, 1)[0]
+    again = pickle.loads(pickle.dumps(policy))
+    np.testing.assert_array_equal(again.predict_action_chunk(one), policy.predict_action_chunk(one))
+
+
+def test_several_threads_may_ask(zoo: Path) -> None:
+    policy = actrm.load_policy(zoo / "lift-act")
+    asked = observations(policy, 8)
+    wanted = [policy.predict_action_chunk(one) for one in asked]
+    wrong: list[int] = []
+
+    def work(worker: int) -> None:
+        for turn in range(50):
+            i = (worker + turn) % len(asked)
+            if not np.array_equal(policy.predict_action_chunk(asked[i]), wanted[i]):
+                wrong.append(i)
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert wrong == []
+
+
+def test_what_does_not_fit_is_named(zoo: Path) -> None:
+    policy = actrm.load_policy(zoo / "lift-act")
+    good = observations(policy, 1)[0]
+    state, objects = good["observation.state"], good["observation.environment_state"]
+    for asked, words in [
+        ({}, "feature observation.state is missing"),
+        ({"observation.state": state}, "observation.environment_state is missing; given: observation.state"),
+        ({**good, "observation.state": state[:5]}, r"observation.state has shape \[5\], expected \[9\]"),
+        ({**good, "observation.state": np.zeros((0, 9))}, r"has shape \[0, 9\], expected \[9\]"),
+        ({**good, "observation.state": np.zeros((2, 3, 9))}, r"has shape \[2, 3, 9\]"),
+        ({**good, "observation.state": state[None]}, "observation.environment_state has no rows, expected 1"),
+        (
+            {"observation.state": state[None], "observation.environment_state": np.stack([objects] * 2)},
+            "environment_state has 2 rows, expected 1",
+        ),
+    ]:
+        for ask in (policy.predict_action_chunk, policy.select_action):
+            with pytest.raises(actrm.Error, match=words):
+                ask(asked)
+    with pytest.raises(ValueError):
+        policy.select_action({**good, "observation.state": ["a"] * 9})
+    with pytest.raises(TypeError):
+        policy.select_action(3)  # type: ignore[arg-type]
+    policy.reset(seed=[1])
+    with pytest.raises(ValueError, match="one for each row"):
+        policy.select_action({key: np.stack([value] * 2) for key, value in good.items()})
+    policy.reset()
+    assert np.isfinite(policy.select_action(good)).all()
+
+
+def test_numbers_that_are_none_do_no_harm(zoo: Path) -> None:
+    """Whatever comes out, nothing crashes."""
+    policy = actrm.load_policy(zoo / "lift-act")
+    for value in (np.nan, np.inf, -np.inf, 3e38):
+        one = {key: np.full(shape, value, np.float32) for key, shape in policy.input_features.items()}
+        assert policy.predict_action_chunk(one).shape == (policy.action_horizon, 7)
+
+
+def test_every_byte_of_an_entry_is_checked(zoo: Path, tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(zoo / "lift-act", tmp_path / "lift-act")
+    for name in ("model.safetensors", "config.toml", "normaliser.safetensors", "README.md", "entry.json"):
+        path = tmp_path / "lift-act/1" / name
+        whole = path.read_bytes()
+        changed = bytearray(whole)
+        changed[len(changed) // 2] ^= 1
+        path.write_bytes(changed)
+        with pytest.raises(actrm.Error, match=f"{name}: sha256 does not match"):
+            actrm.load_policy(tmp_path / "lift-act")
+        path.unlink()
+        with pytest.raises(actrm.Error):
+            actrm.load_policy(tmp_path / "lift-act")
+        path.write_bytes(whole)
+    actrm.load_policy(tmp_path / "lift-act")
+
+
+def test_an_unknown_entry_lists_what_there_is(zoo: Path) -> None:
+    with pytest.raises(actrm.Error, match=r"unknown entry `lfit-act` in zoo .*did you mean `lift-act`.*stack-act@1"):
+        actrm.load_policy(zoo / "lfit-act")
+    for path in ("", "/", "a\0b", "..", "no/such/place"):
+        with pytest.raises((actrm.Error, ValueError)):
+            actrm.load_policy(path, zoo=zoo)

@@ -1,0 +1,87 @@
+"""Other processes: forked and spawned workers, PyTorch's loader, programs, import time."""
+
+from __future__ import annotations
+
+import multiprocessing
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import actrm
+import numpy as np
+import pytest
+
+
+def asked(policy: actrm.Policy) -> dict[str, np.ndarray]:
+    return {key: np.linspace(-0.5, 0.5, shape[0], dtype=np.float32) for key, shape in policy.input_features.items()}
+
+
+def work(ds: actrm.Dataset, policy: actrm.Policy, queue: multiprocessing.Queue) -> None:
+    queue.put((ds[7]["action"], policy.predict_action_chunk(asked(policy))))
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_data_and_policies_cross_into_other_processes(lift: Path, zoo: Path, method: str) -> None:
+    context = multiprocessing.get_context(method)
+    ds, policy = actrm.Dataset(lift, {"action": range(4)}), actrm.load_policy(zoo / "stack-act")
+    wanted = policy.predict_action_chunk(asked(policy))
+    queue = context.Queue()
+    processes = [context.Process(target=work, args=(ds, policy, queue)) for _ in range(2)]
+    [process.start() for process in processes]
+    for _ in processes:
+        action, chunk = queue.get(timeout=60)
+        np.testing.assert_array_equal(action, ds[7]["action"])
+        np.testing.assert_array_equal(chunk, wanted)
+    [process.join(30) for process in processes]
+    assert [process.exitcode for process in processes] == [0, 0]
+
+
+@pytest.mark.skipif(not find_spec("torch"), reason="torch is not installed here")
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_pytorch_s_loader_gives_the_same_with_workers(lift: Path, method: str) -> None:
+    import torch
+
+    ds = actrm.Dataset(lift, {"action": range(8)}, split="valid")
+    plain = list(torch.utils.data.DataLoader(ds, batch_size=32))
+    loader = torch.utils.data.DataLoader(ds, batch_size=32, num_workers=2, multiprocessing_context=method)
+    for ours, theirs in zip(plain, loader, strict=True):
+        assert ours.keys() == theirs.keys()
+        assert torch.equal(ours["action"], theirs["action"]) and ours["task"] == theirs["task"]
+    batch = next(iter(ds.batches(32)))
+    shared = torch.from_numpy(batch["action"])
+    assert torch.equal(shared, plain[0]["action"])
+    shared[0] = 3
+    assert (batch["action"][0] == 3).all()
+
+
+def test_the_programs_are_there() -> None:
+    folder = Path(sys.executable).parent
+    for name in ("actrm-data", "actrm-zoo"):
+        program = folder / name
+        if not program.exists():
+            pytest.skip("the package is not installed here")
+        said = subprocess.run([program, "--version"], capture_output=True, text=True, check=True).stdout
+        assert said == f"{name} {actrm.__version__}\n"
+
+
+def test_importing_is_quick_and_brings_no_more_than_itself() -> None:
+    script = (
+        "import sys, time; t = time.perf_counter(); import actrm; print(time.perf_counter() - t); print(*sys.modules)"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    seconds, modules = said.splitlines()
+    assert not {"numpy", "torch", "gymnasium"} & set(modules.split())
+    # the bar is 0.1 s on a machine with nothing else to do
+    assert float(seconds) < 1.0
+
+
+def test_everything_public_says_what_it_is() -> None:
+    for name in actrm.__all__:
+        thing = getattr(actrm, name)
+        if name == "__version__":
+            continue
+        assert thing.__doc__, name
+        for part, member in vars(thing).items() if isinstance(thing, type) else ():
+            if not part.startswith("_"):
+                assert member.__doc__, f"{name}.{part}"

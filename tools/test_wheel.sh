@@ -1,0 +1,28 @@
+#!/usr/bin/env bash
+# The wheel in a clean environment of every Python that is there: README's example in each, the tests in the first.
+# Called by `make test`.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+built=$(realpath "${CARGO_TARGET_DIR:-target}")
+wheel=$(echo "$built"/wheels/actrm-*.whl)
+tested=
+for version in 3.11 3.12 3.13; do
+    python=$(tools/find-python "$version" "$version")
+    [[ -n $python ]] || continue
+    venv=$built/wheel-venvs/$version
+    if [[ ! -e $venv/.complete || crates/python/tests/requirements.lock -nt $venv/.complete ]]; then
+        rm -rf "$venv"
+        "$python" -m venv "$venv"
+        "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --quiet --require-hashes --no-deps \
+            -r crates/python/tests/requirements.lock
+        touch "$venv/.complete"
+    fi
+    "$venv/bin/python" -m pip install --disable-pip-version-check --quiet --no-index --no-deps --force-reinstall "$wheel"
+    tests=(test_readme.py::test_readme_s_example_runs)
+    [[ -n $tested ]] || tests=(.)
+    echo "Python $version: ${tests[*]}"
+    # from the tests' folder, so that nothing of the repository is imported by accident
+    (cd crates/python/tests && "$venv/bin/python" -m pytest -q -p no:cacheprovider "${tests[@]}" --rootdir .)
+    tested=1
+done
+[[ -n $tested ]] || { echo "error: no Python 3.11, 3.12 or 3.13 found" >&2; exit 1; }
