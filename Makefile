@@ -95,7 +95,7 @@ lint: .venv/.complete ## formatting and lints, Rust and Python
 # ---- beside the others ----------------------------------------------------------------------------------------
 
 .PHONY: bench
-bench: build .venv-peers/.complete ## our speed beside the peers', measured in one run (table, target/bench/*.json)
+bench: wheel .venv-peers/.complete ## our speed beside the peers', measured in one run (table, target/bench/*.json)
 	@tools/bench.sh
 
 .PHONY: study-puzzles
@@ -114,7 +114,7 @@ bench-memory: build ## memory that converting a 3 GB image file takes (needs 6 G
 	@target/release/examples/bench_memory
 
 .PHONY: interop
-interop: build .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round; Ray runs shards
+interop: wheel .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round; Ray runs shards
 	@.venv-peers/bin/python tests/interop/run.py
 
 .PHONY: clean

@@ -3,10 +3,15 @@
 target/wheel-venvs/3.11/bin/python tools/python_api.py > docs/python.md
 """
 
+import ast
 import inspect
 import sys
+from pathlib import Path
 
 import actrm
+import actrm.envs
+
+PLUGIN = Path(__file__).resolve().parents[1] / "crates/python/lerobot_policy_actrm/lerobot_policy_actrm/__init__.py"
 
 HEAD = """# actrm in Python
 
@@ -63,6 +68,9 @@ def main() -> None:
             if not part.startswith("_"):
                 shown = signature(member) if callable(member) else ""
                 parts.append(f"**`{part}{shown}`** {doc(member)}")
+    parts += ["## `actrm.envs`", doc(actrm.envs)]
+    parts.append(f"### `actrm.envs.RobotEnv{signature(actrm.envs.RobotEnv)}`\n\n{doc(actrm.envs.RobotEnv)}")
+    parts += ["## LeRobot's plugin", ast.get_docstring(ast.parse(PLUGIN.read_text())) or ""]
     sys.stdout.write("\n\n".join(part.strip() for part in parts) + "\n")
 
 

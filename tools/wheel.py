@@ -1,4 +1,4 @@
-"""The Python package actrm as a wheel in target/wheels, made of what cargo has built.
+"""The Python package actrm and LeRobot's plugin as wheels in target/wheels, made of what cargo has built.
 
     .venv-wheel/bin/python tools/wheel.py
 
@@ -13,6 +13,7 @@ import os
 import re
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import tomllib
 import zipfile
@@ -21,6 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 CRATE = ROOT / "crates/python"
 TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+PLUGIN = CRATE / "lerobot_policy_actrm"
 PROGRAMS = ("actrm-data", "actrm-zoo", "libcontrol.so")
 # so that the same files make the same wheel
 EPOCH = (2020, 1, 1, 0, 0, 0)
@@ -33,24 +35,33 @@ def stripped(path: Path) -> bytes:
         return Path(out.name).read_bytes()
 
 
-def metadata(project: dict, version: str) -> dict[str, str]:
-    """The files that say what the wheel is; its tag is still to be found."""
+def metadata(project: dict, version: str, page: str) -> dict[str, bytes]:
+    """The files that say what the wheel is, but for its tag."""
+    info = f"{project['name']}-{version}.dist-info"
     lines = ["Metadata-Version: 2.4", f"Name: {project['name']}", f"Version: {version}"]
     lines += [f"Summary: {project['description']}", f"Requires-Python: {project['requires-python']}"]
     lines += [f"License-Expression: {project['license']}"]
-    lines += [f"Classifier: {classifier}" for classifier in project["classifiers"]]
+    lines += [f"Classifier: {classifier}" for classifier in project.get("classifiers", [])]
     lines += [f"Requires-Dist: {needed}" for needed in project["dependencies"]]
-    for extra, needs in project["optional-dependencies"].items():
+    for extra, needs in project.get("optional-dependencies", {}).items():
         lines += [f"Provides-Extra: {extra}", *(f"Requires-Dist: {need}; extra == '{extra}'" for need in needs)]
-    lines += ["Description-Content-Type: text/markdown", "", (CRATE / "README.md").read_text()]
-    scripts = "".join(f"{name} = {place}\n" for name, place in project["scripts"].items())
-    return {"METADATA": "\n".join(lines), "entry_points.txt": f"[console_scripts]\n{scripts}"}
+    files = {"METADATA": "\n".join([*lines, "Description-Content-Type: text/markdown", "", page])}
+    if scripts := "".join(f"{name} = {place}\n" for name, place in project.get("scripts", {}).items()):
+        files["entry_points.txt"] = f"[console_scripts]\n{scripts}"
+    licences = {f"{info}/licenses/{name}": (ROOT / name).read_bytes() for name in ("LICENSE-MIT", "LICENSE-APACHE")}
+    return {f"{info}/{name}": text.encode() for name, text in files.items()} | licences
 
 
-def write(path: Path, files: dict[str, bytes], info: str) -> None:
+def tag_file(info: str, tag: str, pure: bool) -> dict[str, bytes]:
+    """The file that says where the wheel may be installed."""
+    text = f"Wheel-Version: 1.0\nGenerator: actrm\nRoot-Is-Purelib: {str(pure).lower()}\nTag: {tag}\n"
+    return {f"{info}/WHEEL": text.encode()}
+
+
+def write(path: Path, files: dict[str, bytes], info: str, level: int = 9) -> None:
     """The archive, with the list of its files and their hashes last."""
     rows = []
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=level) as archive:
         for name, content in files.items():
             digest = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
             rows.append(f"{name},sha256={digest},{len(content)}\n")
@@ -63,42 +74,59 @@ def write(path: Path, files: dict[str, bytes], info: str) -> None:
         archive.writestr(entry, "".join(rows) + f"{info}/RECORD,,\n")
 
 
-def main() -> None:
-    """Write the wheel under the tag that fits what it holds."""
-    project = tomllib.loads((CRATE / "pyproject.toml").read_text())["project"]
-    version = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
-    info = f"actrm-{version}.dist-info"
-    package = CRATE / "python"
-    sources = sorted(path for path in (package / "actrm").glob("*") if path.suffix in {".py", ".pyi", ".typed"})
-    files = {path.relative_to(package).as_posix(): path.read_bytes() for path in sources}
-    files["actrm/_actrm.abi3.so"] = stripped(TARGET / "release/lib_actrm.so")
-    files |= {f"actrm/bin/{name}": stripped(TARGET / "release" / name) for name in PROGRAMS}
-    files |= {f"{info}/{name}": text.encode() for name, text in metadata(project, version).items()}
-    files |= {f"{info}/licenses/{name}": (ROOT / name).read_bytes() for name in ("LICENSE-MIT", "LICENSE-APACHE")}
-    out = TARGET / "wheels"
-    out.mkdir(parents=True, exist_ok=True)
-    for old in out.glob("actrm-*.whl"):
-        old.unlink()
-    tag = "linux_x86_64"
-    # once to ask auditwheel, once with its answer
-    for _ in range(2):
-        name = f"cp311-abi3-{tag}"
-        text = f"Wheel-Version: 1.0\nGenerator: actrm\nRoot-Is-Purelib: false\nTag: {name}\n"
-        path = out / f"actrm-{version}-{name}.whl"
-        write(path, files | {f"{info}/WHEEL": text.encode()}, info)
+def plugin(version: str) -> Path:
+    """The wheel of LeRobot's plugin, which is Python alone."""
+    project = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]
+    name = project["name"]
+    sources = sorted((PLUGIN / name).glob("*.py"))
+    files = {path.relative_to(PLUGIN).as_posix(): path.read_bytes() for path in sources}
+    page = files[f"{name}/__init__.py"].decode().split('"""')[1]
+    info = f"{name}-{version}.dist-info"
+    files |= metadata(project, version, page) | tag_file(info, "py3-none-any", True)
+    path = TARGET / "wheels" / f"{name}-{version}-py3-none-any.whl"
+    write(path, files, info)
+    return path
+
+
+def platform(files: dict[str, bytes], info: str) -> str:
+    """The platforms that auditwheel finds these files fit for."""
+    tag = f"cp311-abi3-{sysconfig.get_platform().replace('-', '_')}"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{info.removesuffix('.dist-info')}-{tag}.whl"
+        write(path, files | tag_file(info, tag, False), info, level=1)
         command = [sys.executable, "-m", "auditwheel", "show", str(path)]
         said = " ".join(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split())
-        found = re.search(r'platform tag: "(\w+)"', said)
-        if found is None:
-            raise SystemExit(f"error: {path}: auditwheel finds no tag: {said}")
-        if found[1] != tag:
-            path.unlink()
-            tag = found[1]
-        else:
-            break
-    if not path.exists():
-        raise SystemExit(f"error: auditwheel finds another tag than {tag}: {said}")
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+    found = re.search(r'platform tag: "(\w+)"', said)
+    if found is None:
+        raise SystemExit(f"error: {path.name}: auditwheel finds no tag: {said}")
+    return found[1]
+
+
+def package(version: str) -> Path:
+    """The wheel of the package, under the tag that fits what it holds."""
+    project = tomllib.loads((CRATE / "pyproject.toml").read_text())["project"]
+    info = f"actrm-{version}.dist-info"
+    folder = CRATE / "python"
+    sources = sorted(path for path in (folder / "actrm").glob("*") if path.suffix in {".py", ".pyi", ".typed"})
+    files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in sources}
+    files["actrm/_actrm.abi3.so"] = stripped(TARGET / "release/lib_actrm.so")
+    files |= {f"actrm/bin/{name}": stripped(TARGET / "release" / name) for name in PROGRAMS}
+    files |= metadata(project, version, (CRATE / "README.md").read_text())
+    tag = f"cp311-abi3-{platform(files, info)}"
+    path = TARGET / "wheels" / f"actrm-{version}-{tag}.whl"
+    write(path, files | tag_file(info, tag, False), info)
+    return path
+
+
+def main() -> None:
+    """Write both wheels in the place of older ones."""
+    version = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
+    out = TARGET / "wheels"
+    out.mkdir(parents=True, exist_ok=True)
+    for old in out.glob("*.whl"):
+        old.unlink()
+    for path in (package(version), plugin(version)):
+        print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 
 import h5py
 import numpy as np
+import python_door
 import torch
 from PIL import Image
 
@@ -328,6 +329,18 @@ def import_seeing_entry(root: Path, folder: Path) -> str:
     return compare_actions(root, zoo, "theirs@1", checkpoint, pictures=True)
 
 
+def train_seeing(folder: Path) -> Path:
+    """An entry of ours that sees Lift through two cameras, hardly trained."""
+    seen = folder / "seen.hdf5"
+    folder.mkdir()
+    cameras = ["--cameras", "agentview,robot0_eye_in_hand", "--image-size", "24", "--fast-render", "--no-next-obs"]
+    ours("actrm-data", "collect", "--task", "Lift", "--episodes", "2", *cameras, "--out", seen)
+    where = ["--data", seen, "--zoo", folder / "zoo", "--runs", folder / "runs", "train.steps=2", "train.batch_size=4"]
+    small = ["policy.dim_model=16", "policy.n_heads=2", "policy.dim_feedforward=16", "policy.vision.crop=20"]
+    ours("actrm-zoo", "train", "act_lift_image", *where, *small)
+    return folder / "zoo" / "lift-act-image"
+
+
 def compare_robomimic(path: Path) -> str:
     """robomimic's SequenceDataset opens the file and gives its numbers."""
     from robomimic.utils.dataset import SequenceDataset
@@ -432,6 +445,7 @@ def evaluate_on_ray(root: Path, folder: Path) -> str:
 
 def main() -> None:
     """Run every check; the first difference ends it."""
+    python_door.install()
     # LeRobot warns of video decoders that are not needed here, and of our entry in info.json
     logging.disable(logging.WARNING)
     source = ROOT / "data" / "lift.hdf5"
@@ -443,6 +457,7 @@ def main() -> None:
         ours("actrm-data", "convert", source, root)
         exported = folder / "exported.hdf5"
         ours("actrm-data", "export", root, exported)
+        lift = ROOT / "zoo" / "lift-act"
         images, plain = folder / "images.hdf5", folder / "plain"
         write_images(source, images)
         ours("actrm-data", "convert", images, plain, "--env-keys", "")
@@ -458,6 +473,22 @@ def main() -> None:
             "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),
             "our entry that sees answers the same in LeRobot": lambda: export_seeing_entry(plain, folder / "seeing"),
             "LeRobot's policy that sees answers the same": lambda: import_seeing_entry(plain, folder / "seen"),
+            "from Python: LeRobot's samples": lambda: python_door.compare_samples(root),
+            "from Python: LeRobot's samples with pictures": lambda: python_door.compare_samples(plain),
+            "from Python: LeRobot's samples with videos": lambda: python_door.compare_samples(folder / "video"),
+            "from Python: PyTorch's loader": lambda: python_door.compare_loaders(root),
+            "from Python: LeRobot's policy": lambda: python_door.compare_chunks(root, folder / "trained"),
+            "from Python: LeRobot's policy that sees": lambda: python_door.compare_chunks(
+                plain, folder / "seen" / "trained"
+            ),
+            "LeRobot finds an entry by our plugin": lambda: python_door.found_by_lerobot(lift, "Lift", folder / "a"),
+            "lerobot-eval runs it": lambda: python_door.lerobot_eval(lift, "Lift", folder / "a", 2, 100.0),
+            "LeRobot finds an entry that sees": lambda: python_door.found_by_lerobot(
+                train_seeing(folder / "eyes"), "Lift", folder / "b"
+            ),
+            "lerobot-eval runs it before cameras": lambda: python_door.lerobot_eval(
+                folder / "eyes/zoo/lift-act-image", "Lift", folder / "b", 1, None
+            ),
             "robomimic reads the collected file": lambda: compare_robomimic(source),
             "export rebuilds the source": lambda: compare_trees(source, exported),
             "robomimic reads the exported file": lambda: compare_robomimic(exported),

@@ -5,6 +5,7 @@
 
 use bytemuck::Pod;
 use pyo3::buffer::PyBuffer;
+use pyo3::exceptions::PyRuntimeError;
 use pyo3::intern;
 use pyo3::prelude::*;
 use pyo3::sync::GILOnceCell;
@@ -56,8 +57,12 @@ pub(crate) fn flags<'py>(
     made(py, shape, "bool", fill)
 }
 
-/// A new array of these values.
+/// A new array of these values; an exception where the shape is not theirs.
 pub(crate) fn array<'py, T: Number>(py: Python<'py>, shape: &[usize], values: &[T]) -> PyResult<Bound<'py, PyAny>> {
+    if shape.iter().product::<usize>() != values.len() {
+        let text = format!("array: expected {} values, found shape {shape:?}", values.len());
+        return Err(PyRuntimeError::new_err(text));
+    }
     filled(py, shape, |out| out.copy_from_slice(values))
 }
 

@@ -125,7 +125,8 @@ impl PyPolicy {
     }
 
     /// The actions from now on, as the network plans them: (action_horizon, action_dim), or (rows, action_horizon,
-    /// action_dim) for a batch. `executed`: how many actions of the last chunk were executed since, for a policy that
+    /// action_dim) for a batch. A policy that looks back (`n_obs_steps`) is to be shown the steps between two calls by
+    /// `observe`. `executed`: how many actions of the last chunk were executed since, for a policy that
     /// goes on from its last thought; as many as the entry's evaluations execute unless given.
     #[pyo3(signature = (observation, executed=None))]
     fn predict_action_chunk<'py>(
@@ -138,11 +139,7 @@ impl PyPolicy {
         let executed = executed.unwrap_or_else(|| self.n_action_steps());
         let chunks = py.allow_threads(|| {
             let mut rows = lock(&self.predicting);
-            let rows = rows.grow(asked.observations.len(), |seed| {
-                let mut policy = self.loaded.policy();
-                policy.reset(seed);
-                Ok(Predicting { policy, asked: false })
-            })?;
+            let rows = rows.grow(asked.observations.len(), |seed| Ok(self.predicting_from(seed)))?;
             let predict = |(row, seen): (&mut Predicting, _)| {
                 if std::mem::replace(&mut row.asked, true) {
                     row.policy.executed(executed);
@@ -151,10 +148,20 @@ impl PyPolicy {
             };
             run(|| rows.iter_mut().zip(&asked.observations).map(predict).collect::<PyResult<Vec<ActionChunk>>>())
         })?;
-        let signature = self.loaded.preprocess().signature();
-        let (horizon, width) = (self.loaded.model().action_horizon(), signature.action_dim);
+        let rows = [self.action_horizon(), self.loaded.preprocess().signature().action_dim];
         let values: Vec<f32> = chunks.into_iter().flat_map(|chunk| chunk.actions).collect();
-        array(py, &shape(asked.batch, &[horizon, width]), &values)
+        array(py, &shape(asked.batch, &rows), &values)
+    }
+
+    /// Shows `predict_action_chunk` a step at which it is not called; `select_action` sees every step.
+    fn observe(&self, py: Python<'_>, observation: &Bound<'_, PyDict>) -> PyResult<()> {
+        let asked = self.asked(observation)?;
+        py.allow_threads(|| {
+            let mut rows = lock(&self.predicting);
+            let rows = rows.grow(asked.observations.len(), |seed| Ok(self.predicting_from(seed)))?;
+            rows.iter_mut().zip(&asked.observations).for_each(|(row, seen)| row.policy.observe(seen));
+            Ok(())
+        })
     }
 
     /// `name@version`.
@@ -218,10 +225,11 @@ impl PyPolicy {
         Ok(all)
     }
 
-    /// Actions in a chunk (LeRobot: `chunk_size`).
+    /// Actions in a chunk (LeRobot: `chunk_size`), without those that were due before it.
     #[getter]
     fn action_horizon(&self) -> usize {
-        self.loaded.model().action_horizon()
+        let past = self.loaded.experiment().policy.past_actions(self.n_obs_steps());
+        self.loaded.model().action_horizon() - past
     }
 
     /// Actions that are executed before the network is asked again; 1 where predictions are averaged.
@@ -271,6 +279,13 @@ impl PyPolicy {
             None => Execution::RecedingHorizon { n_action_steps: rollout.n_action_steps },
         };
         Ok(Self { path, loaded, execution, acting: Mutex::new(Rows::new()), predicting: Mutex::new(Rows::new()) })
+    }
+
+    /// A row that begins the episode of a seed.
+    fn predicting_from(&self, seed: u64) -> Predicting {
+        let mut policy = self.loaded.policy();
+        policy.reset(seed);
+        Predicting { policy, asked: false }
     }
 
     /// The features of an observation, row by row. What is missing the network says by name.

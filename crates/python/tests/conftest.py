@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 from pathlib import Path
 
 import actrm
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -37,3 +39,27 @@ def zoo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("zoo") / "zoo"
     shutil.copytree(ROOT / "zoo", folder)
     return folder
+
+
+def train(experiment: str, data: Path, folder: Path, *settings: str) -> Path:
+    """The entry of a training of two steps."""
+    name = experiment.replace("_", "-")
+    where = ("--data", data, "--zoo", folder / "zoo", "--runs", folder / "runs")
+    output(
+        RELEASE / "actrm-zoo",
+        "train",
+        experiment,
+        *where,
+        f"entry={name}",
+        "train.steps=2",
+        "train.batch_size=4",
+        *settings,
+    )
+    return folder / "zoo" / name
+
+
+def computed(entry: Path, asked: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """The chunks that an entry computes without Python."""
+    given = [{key.removeprefix("observation."): value.ravel().tolist() for key, value in one.items()} for one in asked]
+    text = output(RELEASE / "examples/predict", entry.parent, entry.name, given=json.dumps(given).encode())
+    return np.array(json.loads(text), np.float32)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 import threading
 from pathlib import Path
@@ -10,9 +9,21 @@ from pathlib import Path
 import actrm
 import numpy as np
 import pytest
-from conftest import RELEASE, output
+from conftest import computed, train
 
 ENTRIES = ("door-act", "lift-act", "nutassemblysquare-act", "pickplacecan-act", "stack-act", "stackthreecubes-act")
+# small ones, of every kind that remembers, draws or copies
+NETWORK = ("policy.network.down_dims=[8,8]", "policy.network.step_embed_dim=8")
+KINDS = {
+    "actrm": (),
+    "bc": (),
+    "bc_rnn": ("policy.hidden_dim=16",),
+    "bc_transformer": ("policy.dim_model=16", "policy.n_heads=2", "policy.n_layers=1"),
+    "diffusion": NETWORK,
+    "flow": NETWORK,
+    "mip": NETWORK,
+    "nearest": (),
+}
 
 
 def observations(policy: actrm.Policy, count: int, seed: int = 0) -> list[dict[str, np.ndarray]]:
@@ -26,12 +37,23 @@ def observations(policy: actrm.Policy, count: int, seed: int = 0) -> list[dict[s
 def test_chunks_are_what_the_entry_computes(zoo: Path, name: str) -> None:
     policy = actrm.load_policy(zoo / name)
     asked = observations(policy, 5)
-    given = [{key.removeprefix("observation."): value.tolist() for key, value in one.items()} for one in asked]
-    text = output(RELEASE / "examples/predict", zoo, name, given=json.dumps(given).encode())
-    wanted = np.array(json.loads(text), np.float32)
+    wanted = computed(zoo / name, asked)
     ours = np.stack([policy.predict_action_chunk(one) for one in asked])
     assert ours.shape == (5, policy.action_horizon, 7)
     np.testing.assert_array_equal(ours.view(np.uint32), wanted.view(np.uint32))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_remembers_and_what_draws_computes_the_same(lift: Path, tmp_path: Path, kind: str) -> None:
+    """Policies that look back, go on from a thought or draw: asked one after the other, and anew after a reset."""
+    entry = train(f"{kind}_lift", lift, tmp_path, *KINDS[kind])
+    policy = actrm.load_policy(entry)
+    asked = observations(policy, 4)
+    wanted = computed(entry, asked)
+    for _ in range(2):
+        policy.reset(seed=0)
+        ours = np.stack([policy.predict_action_chunk(one, executed=0) for one in asked])
+        np.testing.assert_array_equal(ours.view(np.uint32), wanted.view(np.uint32))
 
 
 def test_a_policy_is_found_by_path_and_by_name(zoo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,6 +81,23 @@ def test_actions_are_the_heads_of_chunks(zoo: Path) -> None:
     chunks = [policy.predict_action_chunk(one) for one in asked[:: policy.n_action_steps]]
     for i, action in enumerate(actions):
         np.testing.assert_array_equal(action, chunks[i // policy.n_action_steps][i % policy.n_action_steps])
+
+
+def test_a_policy_that_looks_back_is_shown_every_step(lift: Path, tmp_path: Path) -> None:
+    """Asked for chunks, with the steps between shown, it plans what it executes step by step."""
+    policy = actrm.load_policy(train("diffusion_lift", lift, tmp_path, *NETWORK))
+    assert (policy.n_obs_steps, policy.n_action_steps) == (2, 8)
+    asked = observations(policy, 2 * policy.n_action_steps)
+    policy.reset(seed=5)
+    actions = np.stack([policy.select_action(one) for one in asked])
+    policy.reset(seed=5)
+    planned = []
+    for i, one in enumerate(asked):
+        if i % policy.n_action_steps:
+            policy.observe(one)
+        else:
+            planned.append(policy.predict_action_chunk(one)[: policy.n_action_steps])
+    np.testing.assert_array_equal(np.concatenate(planned), actions)
 
 
 def test_rows_of_a_batch_are_episodes_of_their_own(zoo: Path) -> None:

@@ -4,7 +4,7 @@
 //!
 //! Reads `[{"state": [...], "environment_state": [...], "images.front": [...]}, ...]` (numbers as they are, bytes of
 //! pictures row by row from the top; what an entry does not see may be missing) and prints a list of chunks, each a list of actions, all
-//! raw: the entry normalises on its own. `make interop` compares them with LeRobot's answers.
+//! raw: the entry normalises on its own. The observations are those of one episode, that of seed 0. `make interop` compares them with LeRobot's answers.
 
 #![allow(clippy::print_stdout)]
 
@@ -20,6 +20,7 @@ fn main() -> Result<(), AnyError> {
     let [zoo, entry] = given.as_slice() else { return Err("usage: predict ZOO ENTRY < observations.json".into()) };
     let observations: Vec<Value> = serde_json::from_reader(std::io::stdin().lock())?;
     let mut policy = Registry::open(Path::new(zoo)).entry(entry)?.load()?.policy();
+    policy.reset(0);
     let mut chunks = Vec::new();
     for observation in &observations {
         let mut asked = Observation::new();
