@@ -68,6 +68,8 @@ pub struct WindowBatch {
     pub n: usize,
     /// Observations in each.
     pub n_obs_steps: usize,
+    /// Which of the windows these are: `(n,)`.
+    pub indices: Vec<u32>,
     /// By column, in the order asked for: `(n, n_obs_steps, dim)`, oldest first.
     pub observation: Vec<(String, Vec<f32>)>,
     /// By camera, in the order in which they were added: `(n, n_obs_steps, height, width, 3)`, oldest first.
@@ -187,6 +189,8 @@ impl Windows {
     pub fn try_gather(&self, indices: &[u32], batch: &mut WindowBatch) -> Result<()> {
         let (n, horizon, width) = (indices.len(), self.action_horizon, self.action.dim);
         (batch.n, batch.n_obs_steps) = (n, self.n_obs_steps);
+        batch.indices.clear();
+        batch.indices.extend_from_slice(indices);
         let named = batch.observation.iter().map(|(name, _)| name).eq(self.observation.iter().map(|(name, _)| name));
         if !named {
             batch.observation = self.observation.iter().map(|(name, _)| (name.clone(), Vec::new())).collect();

@@ -67,6 +67,29 @@ pub struct TaskSection {
     pub name: String,
 }
 
+/// `[data.exchange.NAME]`: things that may change places with each other in training, all but the one that was taken.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExchangeSection {
+    /// Where each thing is from the hand; the nearest one at the end of a demonstration is the one that was taken.
+    pub taken: Vec<String>,
+    /// What is known of each thing, item for item.
+    pub items: Vec<Vec<String>>,
+    /// Where each thing is, item for item, all moved by one vector.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub places: Vec<Vec<String>>,
+}
+
+/// `[data.beginning]`: how often the first windows of an episode are drawn in training.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BeginningSection {
+    /// How many windows of an episode these are.
+    pub steps: usize,
+    /// How often each of them is drawn where another one is drawn once.
+    pub times: usize,
+}
+
 /// `[data]`
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -83,6 +106,12 @@ pub struct DataSection {
     /// Items of the lists above that are permuted alike in training, by the name of the symmetry.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub symmetries: BTreeMap<String, Vec<String>>,
+    /// Things that may change places in training, by a name for them.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub exchange: BTreeMap<String, ExchangeSection>,
+    /// What is drawn more often in training: the beginnings of episodes, where it is decided what to do.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub beginning: Option<BeginningSection>,
     /// Observations that the policy sees at once: the present one and those before it.
     #[serde(skip_serializing_if = "is_one")]
     pub n_obs_steps: usize,
@@ -104,6 +133,8 @@ impl Default for DataSection {
             env_keys: owned(&["object"]),
             entities: BTreeMap::new(),
             symmetries: BTreeMap::new(),
+            exchange: BTreeMap::new(),
+            beginning: None,
             n_obs_steps: 1,
             cameras: Vec::new(),
             train_mask: "train".to_owned(),
@@ -189,15 +220,36 @@ impl DataSection {
             return invalid("data.cameras".to_owned(), &expected, self.cameras.join(", "));
         }
         let keys = self.feature_keys()?;
-        for (name, items) in &self.symmetries {
-            let key = format!("data.symmetries.{name}");
+        let known: Vec<String> = keys.features().flat_map(|feature| keys.of(feature)).collect();
+        let symmetries = self.symmetries.iter().map(|(name, items)| (format!("data.symmetries.{name}"), items));
+        let exchanged = self.exchange.iter().flat_map(|(name, exchange)| {
+            let items = exchange.items.iter().map(move |items| (format!("data.exchange.{name}.items"), items));
+            let places = exchange.places.iter().map(move |items| (format!("data.exchange.{name}.places"), items));
+            items.chain(places).chain([(format!("data.exchange.{name}.taken"), &exchange.taken)])
+        });
+        for (key, items) in symmetries.chain(exchanged) {
             if items.is_empty() {
                 return invalid(key, "at least one item", "none".to_owned());
             }
-            let known: Vec<String> = keys.features().flat_map(|feature| keys.of(feature)).collect();
             if let Some(item) = items.iter().find(|item| !known.contains(item)) {
                 return invalid(key, &format!("items of the lists of keys: {}", known.join(", ")), format!("`{item}`"));
             }
+        }
+        for (name, exchange) in &self.exchange {
+            let things = exchange.taken.len();
+            for (key, lists) in [("items", &exchange.items), ("places", &exchange.places)] {
+                let here = format!("data.exchange.{name}.{key}");
+                if lists.len() != things && !(key == "places" && lists.is_empty()) {
+                    return invalid(here, &format!("{things} lists, one for each of `taken`"), lists.len().to_string());
+                }
+                if let Some(other) = lists.iter().find(|items| items.len() != lists[0].len()) {
+                    return invalid(here, &format!("lists of {} items", lists[0].len()), other.join(", "));
+                }
+            }
+        }
+        if let Some(beginning) = self.beginning.filter(|beginning| beginning.steps == 0 || beginning.times == 0) {
+            let BeginningSection { steps, times } = beginning;
+            return invalid("data.beginning".to_owned(), "1 or more", format!("steps {steps}, times {times}"));
         }
         Ok(())
     }
@@ -473,6 +525,19 @@ mod tests {
             message.contains("key `data.symmetries.axes`") && message.ends_with("gripper_qpos, found `cube_rgb`"),
             "{message}"
         );
+        let exchange = |of: &str| format!("data.exchange.things={{ {of} }}");
+        let both = "taken = ['robot0_eef_pos', 'robot0_eef_quat']";
+        assert!(load(&[&exchange(&format!("{both}, items = [['object'], ['object']]"))]).is_ok());
+        let message = error(&exchange(&format!("{both}, items = [['object']]")));
+        assert!(message.contains("expected 2 lists, one for each of `taken`, found 1"), "{message}");
+        let message = error(&exchange(&format!("{both}, items = [['object'], ['object', 'object']]")));
+        assert!(message.contains("expected lists of 1 items, found object, object"), "{message}");
+        let message = error(&exchange(&format!("{both}, items = [['object'], ['object']], places = [['object']]")));
+        assert!(message.contains("key `data.exchange.things.places`: expected 2 lists"), "{message}");
+        assert!(error(&exchange("taken = [], items = []")).contains("`data.exchange.things.taken`: expected at least"));
+        assert!(error(&exchange("taken = ['cube_pos'], items = [['object']]")).contains("found `cube_pos`"));
+        assert!(load(&["data.beginning={ steps = 8, times = 4 }"]).is_ok());
+        assert!(error("data.beginning={ steps = 8, times = 0 }").contains("found steps 8, times 0"));
         assert!(error("data.entities.cube=3").contains("a list of observation keys, or a table"));
     }
 }

@@ -75,6 +75,7 @@ TASKS = {
             expert=".experts.picks:PickExpert",
             soft_reset=True,
             max_steps=200,
+            arguments={"initialization_noise": None},
         ),
         Task(
             "PickAny",
@@ -82,6 +83,7 @@ TASKS = {
             expert=".experts.picks:PickExpert",
             soft_reset=True,
             max_steps=200,
+            arguments={"initialization_noise": None},
         ),
         Task(
             "TableMaze",

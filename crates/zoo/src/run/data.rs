@@ -14,6 +14,7 @@ use crate::ZooError;
 use crate::entry::DataMeta;
 use crate::experiment::{DataSection, EntitySection, Experiment, PICTURE_PREFIX};
 
+use super::exchange::Exchanges;
 use super::preflight::picture_budget;
 use super::symmetry::Symmetries;
 
@@ -108,6 +109,7 @@ pub(super) struct Demonstrations {
     pub valid: Option<Windows>,
     pub preprocess: Preprocess,
     pub symmetries: Symmetries,
+    pub exchanges: Exchanges,
     /// Mean and standard deviation of each camera's colours, on the scale from 0 to 1, where the data set has them.
     pub picture_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
     pub meta: DataMeta,
@@ -244,8 +246,9 @@ pub(super) fn prepare(
     let preprocess =
         Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
     let symmetries = Symmetries::new(experiment, dataset, path)?;
+    let exchanges = Exchanges::new(experiment, dataset, &train, path)?;
     let picture_statistics = picture_statistics.into_iter().collect();
-    Ok(Demonstrations { train, valid, preprocess, symmetries, picture_statistics, meta, notes })
+    Ok(Demonstrations { train, valid, preprocess, symmetries, exchanges, picture_statistics, meta, notes })
 }
 
 /// The windows of the episodes that a training of `experiment` learns from, its symmetries, and the number of each episode's

@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod data;
+mod exchange;
 mod eyes;
 mod feed;
 mod folder;
@@ -9,6 +10,7 @@ mod list;
 mod loop_parts;
 mod memory;
 mod metrics;
+mod places;
 mod preflight;
 mod section;
 mod session;

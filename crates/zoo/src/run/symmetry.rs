@@ -12,10 +12,12 @@
 use std::path::Path;
 
 use dataset::shuffle::SplitMix64;
-use dataset::{Dataset, KeyItem, WindowBatch};
+use dataset::{Dataset, WindowBatch};
 
 use crate::ZooError;
 use crate::experiment::Experiment;
+
+use super::places::{Place, Places};
 
 /// Keeps the draws apart from those of the batches' order, which have the same seed.
 const PURPOSE: u64 = 0x5359_4d4d_4554_5259;
@@ -30,8 +32,7 @@ pub(crate) struct Symmetries {
 #[derive(Debug, PartialEq)]
 struct Symmetry {
     width: usize,
-    /// feature, and where in its row the vector begins
-    places: Vec<(String, usize)>,
+    places: Vec<Place>,
 }
 
 impl Symmetries {
@@ -40,42 +41,13 @@ impl Symmetries {
     /// # Errors
     /// An item that stands nowhere, items of unequal lengths, by name.
     pub fn new(experiment: &Experiment, dataset: &Dataset, path: &Path) -> Result<Self, ZooError> {
-        let unfit = |reason: String| ZooError::UnfitData { path: path.to_owned(), reason };
-        let keys = experiment.data.feature_keys()?;
-        let mut spans = Vec::new();
-        if !experiment.data.symmetries.is_empty() {
-            for feature in keys.features() {
-                let items = keys.items(feature);
-                let names = dataset.names(feature);
-                let widths = KeyItem::widths(items, &names).ok_or_else(|| {
-                    unfit(format!("data.symmetries: the names of column {feature} do not say which keys it holds"))
-                })?;
-                let mut from = 0;
-                for (item, width) in items.iter().zip(widths) {
-                    spans.push((item.to_string(), feature.to_owned(), from, width));
-                    from += width;
-                }
-            }
-        }
         let mut all = Vec::new();
-        for (name, items) in &experiment.data.symmetries {
-            let mut symmetry = Symmetry { width: 0, places: Vec::new() };
-            for item in items {
-                let here: Vec<_> = spans.iter().filter(|(text, ..)| text == item).collect();
-                if here.is_empty() {
-                    return Err(unfit(format!("data.symmetries.{name}: {item} is an item of no feature")));
-                }
-                for (_, feature, from, width) in here {
-                    if symmetry.width != 0 && symmetry.width != *width {
-                        let (first, expected) = (&items[0], symmetry.width);
-                        let reason = format!("{item} has {width} numbers, {first} has {expected}");
-                        return Err(unfit(format!("data.symmetries.{name}: {reason}")));
-                    }
-                    symmetry.width = *width;
-                    symmetry.places.push((feature.clone(), *from));
-                }
+        if !experiment.data.symmetries.is_empty() {
+            let spans = Places::new(experiment, dataset, path, "data.symmetries")?;
+            for (name, items) in &experiment.data.symmetries {
+                let places = spans.alike(&format!("data.symmetries.{name}"), items)?;
+                all.push(Symmetry { width: places[0].width, places });
             }
-            all.push(symmetry);
         }
         Ok(Self { seed: experiment.train.seed ^ PURPOSE, all })
     }
@@ -88,14 +60,9 @@ impl Symmetries {
             for row in 0..windows.n {
                 let mut order: Vec<usize> = (0..symmetry.width).collect();
                 rng.shuffle(&mut order);
-                for (feature, from) in &symmetry.places {
-                    let Some((_, values)) = windows.observation.iter_mut().find(|(name, _)| name == feature) else {
-                        continue;
-                    };
-                    let per_window = values.len() / windows.n;
-                    let dim = per_window / windows.n_obs_steps;
-                    for step in values[row * per_window..(row + 1) * per_window].chunks_exact_mut(dim) {
-                        let vector = &mut step[*from..from + symmetry.width];
+                for place in &symmetry.places {
+                    for observation in 0..windows.n_obs_steps {
+                        let vector = place.of_mut(windows, row, observation);
                         before.clear();
                         before.extend_from_slice(vector);
                         vector.iter_mut().zip(&order).for_each(|(value, &at)| *value = before[at]);
@@ -114,7 +81,8 @@ mod tests {
     use super::*;
 
     fn symmetries(seed: u64) -> Symmetries {
-        let places = vec![("a".to_owned(), 1), ("b".to_owned(), 0), ("b".to_owned(), 3)];
+        let place = |feature: &str, from| Place { feature: feature.to_owned(), from, width: 3 };
+        let places = vec![place("a", 1), place("b", 0), place("b", 3)];
         Symmetries { seed, all: vec![Symmetry { width: 3, places }] }
     }
 

@@ -201,7 +201,7 @@ impl<'a> PolicyTraining<'a> {
             env: dataset.env().cloned(),
             trainer,
             evaluated,
-            feed: Feed::new(Sampler::new(section.seed, section.batch_size), section.steps),
+            feed: Feed::new(Sampler::new(section.seed, section.batch_size), experiment.data.beginning, section.steps),
             rate: (Instant::now(), 0),
         })
     }
@@ -229,6 +229,7 @@ impl Training for PolicyTraining<'_> {
         let unreadable = data::unreadable(&self.demonstrations.meta.name);
         let windows = self.feed.take(&self.demonstrations.train, step).map_err(unreadable)?;
         self.demonstrations.symmetries.apply(step, windows);
+        self.demonstrations.exchanges.apply(step, windows);
         let (batch, rows) = (data::batch(windows, &self.demonstrations, self.experiment)?, windows.n);
         let done = self.trainer.step(&batch).map_err(self.experiment.model_error("train"))?;
         self.rate.1 += rows as u64;

@@ -12,6 +12,9 @@ evenly and is the episode's group. Demonstrations have at most 4.
 `PickAny`: the goal names the colour of the cube itself, among 1 to 7 others; how many is drawn evenly and is the
 group. Cubes that are not there are seen as zeros.
 
+The hand always begins in the same pose: from another one in each episode, a policy would know its demonstrations by
+heart, and with them which cube was meant, before it knew the rule.
+
 Colours are seen one-hot, so that renaming them is a permutation of columns: of `cubeN_color`, `cubeN_points` and
 `goal_color` alike.
 """

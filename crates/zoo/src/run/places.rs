@@ -1,0 +1,93 @@
+//! Where the items of an experiment's lists of keys stand in the columns of a data set.
+
+use std::path::{Path, PathBuf};
+
+use dataset::{Dataset, KeyItem, WindowBatch};
+
+use crate::ZooError;
+use crate::experiment::Experiment;
+
+/// Where an item stands: the feature that holds it, where its numbers begin there and how many they are.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Place {
+    pub feature: String,
+    pub from: usize,
+    pub width: usize,
+}
+
+impl Place {
+    /// The item's numbers in an observation of a window; none where the windows lack the feature.
+    pub fn of<'w>(&self, windows: &'w WindowBatch, row: usize, observation: usize) -> &'w [f32] {
+        let values = windows.column(&self.feature).unwrap_or_default();
+        values.get(self.span(values.len(), windows, row, observation)).unwrap_or_default()
+    }
+
+    /// [`Place::of`], to be changed.
+    pub fn of_mut<'w>(&self, windows: &'w mut WindowBatch, row: usize, observation: usize) -> &'w mut [f32] {
+        let Some(at) = windows.observation.iter().position(|(name, _)| *name == self.feature) else {
+            return &mut [];
+        };
+        let span = self.span(windows.observation[at].1.len(), windows, row, observation);
+        &mut windows.observation[at].1[span]
+    }
+
+    fn span(&self, len: usize, windows: &WindowBatch, row: usize, observation: usize) -> std::ops::Range<usize> {
+        let observations = windows.n * windows.n_obs_steps;
+        let begin = (row * windows.n_obs_steps + observation) * (len / observations) + self.from;
+        begin..begin + self.width
+    }
+}
+
+/// Every item with its place.
+pub(super) struct Places {
+    path: PathBuf,
+    spans: Vec<(String, Place)>,
+}
+
+impl Places {
+    /// Reads them off `dataset`; `section` is the experiment's that needs them, for messages.
+    ///
+    /// # Errors
+    /// A column whose names do not say which keys it holds.
+    pub fn new(experiment: &Experiment, dataset: &Dataset, path: &Path, section: &str) -> Result<Self, ZooError> {
+        let keys = experiment.data.feature_keys()?;
+        let mut spans = Vec::new();
+        for feature in keys.features() {
+            let items = keys.items(feature);
+            let widths = KeyItem::widths(items, &dataset.names(feature)).ok_or_else(|| ZooError::UnfitData {
+                path: path.to_owned(),
+                reason: format!("{section}: the names of column {feature} do not say which keys it holds"),
+            })?;
+            let mut from = 0;
+            for (item, width) in items.iter().zip(widths) {
+                spans.push((item.to_string(), Place { feature: feature.to_owned(), from, width }));
+                from += width;
+            }
+        }
+        Ok(Self { path: path.to_owned(), spans })
+    }
+
+    /// The places of `items`, all of them equally long, in their order; an item of several features stands in each.
+    ///
+    /// # Errors
+    /// An item that stands nowhere, items of unequal lengths, by name and under `key`.
+    pub fn alike(&self, key: &str, items: &[String]) -> Result<Vec<Place>, ZooError> {
+        let unfit =
+            |reason: String| ZooError::UnfitData { path: self.path.clone(), reason: format!("{key}: {reason}") };
+        let mut places: Vec<Place> = Vec::new();
+        for item in items {
+            let here: Vec<&Place> =
+                self.spans.iter().filter(|(text, _)| text == item).map(|(_, place)| place).collect();
+            if here.is_empty() {
+                return Err(unfit(format!("{item} is an item of no feature")));
+            }
+            for place in here {
+                if let Some(first) = places.first().filter(|first| first.width != place.width) {
+                    return Err(unfit(format!("{item} has {} numbers, {} has {}", place.width, items[0], first.width)));
+                }
+                places.push(place.clone());
+            }
+        }
+        Ok(places)
+    }
+}
