@@ -195,17 +195,20 @@ impl Windows {
         if !named {
             batch.observation = self.observation.iter().map(|(name, _)| (name.clone(), Vec::new())).collect();
         }
-        // before an episode there is its first frame
-        let frames = |index: u32| {
-            let span = self.spans[index as usize];
-            let before = move |step: usize| (self.n_obs_steps - 1 - step).min((span.frame - span.begin) as usize);
-            (0..self.n_obs_steps).map(move |step| span.frame as usize - before(step))
-        };
         for ((_, values), (_, column)) in batch.observation.iter_mut().zip(&self.observation) {
             values.resize(n * self.n_obs_steps * column.dim, 0.0);
-            let rows = values.chunks_exact_mut(column.dim.max(1));
-            for (row, frame) in rows.zip(indices.iter().flat_map(|&index| frames(index))) {
-                row.copy_from_slice(column.row(frame));
+            let windows = values.chunks_exact_mut((self.n_obs_steps * column.dim).max(1)).zip(indices);
+            // most have one observation, and its copy takes less time than a loop over one
+            if self.n_obs_steps == 1 {
+                windows.for_each(|(row, &index)| {
+                    row.copy_from_slice(column.row(self.spans[index as usize].frame as usize))
+                });
+                continue;
+            }
+            for (rows, &index) in windows {
+                for (row, frame) in rows.chunks_exact_mut(column.dim).zip(self.frames(index)) {
+                    row.copy_from_slice(column.row(frame));
+                }
             }
         }
         let named = batch.pictures.iter().map(|(name, _)| name).eq(self.pictures.iter().map(|(name, _)| name));
@@ -215,7 +218,7 @@ impl Windows {
         for ((_, values), (_, pictures)) in batch.pictures.iter_mut().zip(&self.pictures) {
             values.resize(n * self.n_obs_steps * pictures.picture_bytes(), 0);
             let rows = values.chunks_exact_mut(pictures.picture_bytes().max(1));
-            for (row, frame) in rows.zip(indices.iter().flat_map(|&index| frames(index))) {
+            for (row, frame) in rows.zip(indices.iter().flat_map(|&index| self.frames(index))) {
                 pictures.read(frame, row)?;
             }
         }
@@ -232,14 +235,26 @@ impl Windows {
             let (head, own) = head.split_at_mut(before * width);
             let from = frame + before - self.past_actions.min(frame + before);
             own.copy_from_slice(&self.action.data[from * width..from * width + own.len()]);
-            for (repeated, row) in [(head, begin), (tail, end - 1)] {
-                repeated.chunks_exact_mut(width).for_each(|action| action.copy_from_slice(self.action.row(row)));
+            // most windows lie within their episode
+            if before > 0 {
+                head.chunks_exact_mut(width).for_each(|action| action.copy_from_slice(self.action.row(begin)));
+            }
+            if after < horizon {
+                tail.chunks_exact_mut(width).for_each(|action| action.copy_from_slice(self.action.row(end - 1)));
             }
             let flags = &mut batch.is_pad[i * horizon..(i + 1) * horizon];
-            flags.fill(true);
+            flags[..before].fill(true);
             flags[before..after].fill(false);
+            flags[after..].fill(true);
         }
         Ok(())
+    }
+
+    /// The frames of a window's observations, oldest first; before an episode there is its first frame.
+    fn frames(&self, index: u32) -> impl Iterator<Item = usize> {
+        let Span { begin, frame, .. } = self.spans[index as usize];
+        let most = self.n_obs_steps - 1;
+        (0..=most).map(move |step| frame as usize - (most - step).min((frame - begin) as usize))
     }
 }
 
@@ -309,13 +324,14 @@ mod tests {
             let mut batch = WindowBatch {
                 n: 1,
                 n_obs_steps: 9,
+                indices: vec![9; 3],
                 observation: vec![("c0".to_owned(), vec![9.0; 99])],
                 pictures: vec![("old".to_owned(), vec![9; 3])],
                 actions: vec![9.0; 7],
                 is_pad: vec![true; 200],
             };
             windows.gather(&indices, &mut batch);
-            prop_assert_eq!(batch.n, indices.len());
+            prop_assert_eq!((batch.n, &batch.indices), (indices.len(), &indices));
             let (mut a, mut p) = (vec![], vec![]);
             for &i in &indices {
                 let (actions, pad) = naive(&action, frames[i as usize], (past, horizon));
