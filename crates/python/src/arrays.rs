@@ -18,7 +18,7 @@ fn ndarray(py: Python<'_>) -> PyResult<&Bound<'_, PyType>> {
 }
 
 /// A number that numpy has a type for.
-pub(crate) trait Number: Pod {
+pub(crate) trait Number: Pod + Send {
     /// numpy's name of it.
     const NAME: &'static str;
 }
@@ -48,11 +48,11 @@ pub(crate) fn filled<'py, T: Number>(
     made(py, shape, T::NAME, fill)
 }
 
-/// A new array of truth values: what is not 0 is true.
-pub(crate) fn flags<'py>(
+/// A new array of truth values, made of bytes: what is not 0 is true.
+pub(crate) fn flags<'py, T: Number>(
     py: Python<'py>,
     shape: &[usize],
-    fill: impl FnOnce(&mut [u8]),
+    fill: impl FnOnce(&mut [T]),
 ) -> PyResult<Bound<'py, PyAny>> {
     made(py, shape, "bool", fill)
 }

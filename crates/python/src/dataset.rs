@@ -2,17 +2,16 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::{Mutex, PoisonError};
 
-use ::dataset::shuffle::{Sampler, order};
 use ::dataset::{SampleColumn, SampleSpec, Samples};
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList, PyTuple};
 
-use crate::arrays::{array, filled, flags};
+use crate::arrays::array;
+use crate::batches::{Arrays, Batches, Columns, Kind, Order};
 use crate::error::raised;
-use crate::work::run;
+use crate::work::{run, unlocked};
 
 /// The most samples in a batch.
 const MOST_SAMPLES: usize = 1 << 24;
@@ -67,7 +66,7 @@ impl PyDataset {
         return_uint8: bool,
     ) -> PyResult<Self> {
         let path = std::path::absolute(path)?;
-        let dataset = py.allow_threads(|| run(|| dataset::Dataset::open(&path))).map_err(raised)?;
+        let dataset = unlocked(py, || run(|| dataset::Dataset::open(&path)).map_err(raised))?;
         let chosen = match (split, episodes) {
             (Some(_), Some(_)) => return Err(PyValueError::new_err("split and episodes: expected one of them")),
             (Some(split), None) => dataset.required_split(split).map_err(raised)?,
@@ -77,7 +76,7 @@ impl PyDataset {
         let offsets = delta_timestamps.map_or_else(|| Ok(BTreeMap::new()), |given| offsets(&dataset, given))?;
         let cameras = cameras.unwrap_or_else(|| dataset.cameras().map(str::to_owned).collect());
         let spec = SampleSpec { offsets, cameras, episodes: chosen.clone() };
-        let samples = py.allow_threads(|| run(|| dataset.samples(&spec))).map_err(raised)?;
+        let samples = unlocked(py, || run(|| dataset.samples(&spec)).map_err(raised))?;
         let tasks = task_indices(&dataset);
         let given = Given { path, offsets: spec.offsets, cameras: spec.cameras, return_uint8 };
         Ok(Self { given, dataset, chosen, samples, tasks })
@@ -107,8 +106,10 @@ impl PyDataset {
     ///
     /// Without a seed in their order. With one in the order in which `actrm-zoo train` reads them with this seed: one
     /// epoch, the `epoch`-th, whose last batch is smaller unless `drop_last`; or, with `steps`, the batches of as many
-    /// training steps from the step `start` on, epochs end to end and all batches of one size.
-    #[pyo3(signature = (batch_size, seed=None, *, epoch=0, steps=None, start=0, drop_last=false))]
+    /// training steps from the step `start` on, epochs end to end and all batches of one size. With `threads`, as many
+    /// threads make batches ahead while Python does something else: the same batches in the same order.
+    #[pyo3(signature = (batch_size, seed=None, *, epoch=0, steps=None, start=0, drop_last=false, threads=0))]
+    #[expect(clippy::too_many_arguments, reason = "options by name")]
     fn batches(
         slf: Bound<'_, Self>,
         batch_size: usize,
@@ -117,6 +118,7 @@ impl PyDataset {
         steps: Option<u64>,
         start: u64,
         drop_last: bool,
+        threads: usize,
     ) -> PyResult<Batches> {
         let len = slf.get().samples.len();
         if !(1..=MOST_SAMPLES).contains(&batch_size) {
@@ -126,16 +128,12 @@ impl PyDataset {
         if last.is_none() {
             return Err(PyValueError::new_err("start and steps: more samples than there are numbers"));
         }
-        let batches = match (seed, steps) {
-            (Some(seed), Some(steps)) if len > 0 => {
-                let sampler = Sampler::new(seed, batch_size);
-                Order::Training { sampler, next: start, end: start + steps }
-            }
+        let order = match (seed, steps) {
+            (Some(seed), Some(steps)) if len > 0 => Order::training(seed, batch_size, start..start + steps),
             (None, Some(_)) => return Err(PyValueError::new_err("steps: expected a seed with them, found none")),
-            (Some(seed), _) => Order::Once { order: order(seed, epoch, len), next: 0, drop_last },
-            (None, None) => Order::Once { order: (0..len as u32).collect(), next: 0, drop_last },
+            (seed, _) => Order::once(seed, epoch, len, drop_last),
         };
-        Ok(Batches { dataset: slf.unbind(), batch_size, order: Mutex::new(batches) })
+        Batches::new(slf.unbind(), batch_size, order, threads)
     }
 
     /// Statistics over all episodes, as they are stored: by column `min`, `max`, `mean`, `std`, quantiles and `count`.
@@ -275,37 +273,52 @@ impl PyDataset {
             .ok_or_else(|| PyIndexError::new_err(format!("no sample {index}; there are {len}")))
     }
 
+    /// Their number.
+    pub(crate) fn len(&self) -> usize {
+        self.samples.len()
+    }
+
     /// The dict of these samples: of one of them, or of `batch` with an axis of them in front.
-    fn gather<'py>(&self, py: Python<'py>, samples: &[u32], batch: Option<usize>) -> PyResult<Bound<'py, PyDict>> {
+    pub(crate) fn gather<'py>(
+        &self,
+        py: Python<'py>,
+        samples: &[u32],
+        batch: Option<usize>,
+    ) -> PyResult<Bound<'py, PyDict>> {
         let sample = PyDict::new(py);
+        self.columns(samples, batch, &mut Arrays(&sample))?;
+        Ok(sample)
+    }
+
+    /// All that belongs to these samples, into `out`.
+    pub(crate) fn columns(&self, samples: &[u32], batch: Option<usize>, out: &mut impl Columns) -> PyResult<()> {
         for (i, column) in self.samples.numbers().enumerate() {
             let shape = self.shape(batch, column);
-            let values = match column.boolean {
-                false => filled(py, &shape, |out| self.samples.copy_numbers(i, samples, out))?,
-                true => flags(py, &shape, |out| {
+            match column.boolean {
+                false => out.add(&column.name, &shape, Kind::Numbers, |out| {
+                    self.samples.copy_numbers(i, samples, out);
+                })?,
+                true => out.add(&column.name, &shape, Kind::Flags, |out: &mut [u8]| {
                     let mut values = vec![0.0; out.len()];
                     self.samples.copy_numbers(i, samples, &mut values);
                     out.iter_mut().zip(values).for_each(|(out, value)| *out = u8::from(value != 0.0));
                 })?,
-            };
-            sample.set_item(&column.name, values)?;
-            self.padding(py, &sample, samples, batch, column)?;
+            }
+            self.padding(samples, batch, column, out)?;
         }
         for (i, column) in self.samples.pictures().enumerate() {
             let shape = self.shape(batch, column);
-            let pictures = match self.given.return_uint8 {
-                true => filled(py, &shape, |out| self.samples.copy_pictures(i, samples, out))?,
-                false => filled(py, &shape, |out| self.bright(i, column.width(), samples, out))?,
-            };
-            // LeRobot's order, colours first, over memory that has them last
-            let axes = shape.len();
-            let order = (0..axes - 3).chain([axes - 1, axes - 3, axes - 2]);
-            let pictures = pictures.call_method1("transpose", PyTuple::new(py, order.collect::<Vec<_>>())?)?;
-            sample.set_item(&column.name, pictures)?;
-            self.padding(py, &sample, samples, batch, column)?;
+            match self.given.return_uint8 {
+                true => out.add(&column.name, &shape, Kind::Picture, |out| {
+                    self.samples.copy_pictures(i, samples, out);
+                })?,
+                false => {
+                    out.add(&column.name, &shape, Kind::Picture, |out| self.bright(i, column.width(), samples, out))?;
+                }
+            }
+            self.padding(samples, batch, column, out)?;
         }
-        self.places(py, &sample, samples, batch)?;
-        Ok(sample)
+        self.places(samples, batch, out)
     }
 
     /// Extent of a column in a batch, or in one sample.
@@ -328,45 +341,38 @@ impl PyDataset {
 
     fn padding(
         &self,
-        py: Python<'_>,
-        sample: &Bound<'_, PyDict>,
         samples: &[u32],
         batch: Option<usize>,
         column: &SampleColumn,
+        out: &mut impl Columns,
     ) -> PyResult<()> {
         let Some(offsets) = &column.offsets else { return Ok(()) };
         let shape: Vec<usize> = batch.into_iter().chain([offsets.len()]).collect();
-        let padding = flags(py, &shape, |out| self.samples.padding(column, samples, out))?;
-        sample.set_item(format!("{}_is_pad", column.name), padding)
+        out.add(&format!("{}_is_pad", column.name), &shape, Kind::Flags, |out| {
+            self.samples.padding(column, samples, out);
+        })
     }
 
     /// The index columns, which follow from where samples lie.
-    fn places(
-        &self,
-        py: Python<'_>,
-        sample: &Bound<'_, PyDict>,
-        samples: &[u32],
-        batch: Option<usize>,
-    ) -> PyResult<()> {
+    fn places(&self, samples: &[u32], batch: Option<usize>, out: &mut impl Columns) -> PyResult<()> {
         let places: Vec<_> = samples.iter().map(|&sample| self.samples.place(sample)).collect();
         let shape: Vec<usize> = batch.into_iter().collect();
         let fps = self.dataset.info().fps;
-        let times: Vec<f32> = places.iter().map(|place| (place.frame as f64 / fps) as f32).collect();
-        sample.set_item("timestamp", array(py, &shape, &times)?)?;
-        let set = |name: &str, of: &dyn Fn(&dataset::SamplePlace) -> usize| {
-            let numbers: Vec<i64> = places.iter().map(|place| of(place) as i64).collect();
-            sample.set_item(name, array(py, &shape, &numbers)?)
+        out.add("timestamp", &shape, Kind::Numbers, |out: &mut [f32]| {
+            out.iter_mut().zip(&places).for_each(|(out, place)| *out = (place.frame as f64 / fps) as f32);
+        })?;
+        let mut set = |name: &str, of: &dyn Fn(&dataset::SamplePlace) -> usize| {
+            out.add(name, &shape, Kind::Numbers, |out: &mut [i64]| {
+                out.iter_mut().zip(&places).for_each(|(out, place)| *out = of(place) as i64);
+            })
         };
         set("frame_index", &|place| place.frame)?;
         set("episode_index", &|place| place.episode)?;
         set("index", &|place| place.index)?;
         let Some(tasks) = &self.tasks else { return Ok(()) };
         set("task_index", &|place| tasks[place.episode])?;
-        let texts: Vec<&String> = places.iter().map(|place| &self.dataset.tasks()[tasks[place.episode]]).collect();
-        match (batch, texts.as_slice()) {
-            (None, [text]) => sample.set_item("task", text),
-            _ => sample.set_item("task", texts),
-        }
+        let texts = places.iter().map(|place| self.dataset.tasks()[tasks[place.episode]].as_str());
+        out.texts("task", texts.collect(), batch.is_none())
     }
 }
 
@@ -396,67 +402,4 @@ fn task_indices(dataset: &dataset::Dataset) -> Option<Vec<usize>> {
         _ => None,
     };
     dataset.episodes().iter().map(index).collect()
-}
-
-/// Which samples make which batch.
-enum Order {
-    Once { order: Vec<u32>, next: usize, drop_last: bool },
-    Training { sampler: Sampler, next: u64, end: u64 },
-}
-
-impl Order {
-    fn next(&mut self, size: usize, len: usize) -> Option<Vec<u32>> {
-        match self {
-            Self::Once { order, next, drop_last } => {
-                let end = next.saturating_add(size).min(order.len());
-                let batch = order.get(*next..end).filter(|batch| !batch.is_empty())?;
-                if *drop_last && batch.len() < size {
-                    return None;
-                }
-                let batch = batch.to_vec();
-                *next = end;
-                Some(batch)
-            }
-            Self::Training { sampler, next, end } => {
-                let step = (*next < *end).then_some(*next)?;
-                *next += 1;
-                Some(sampler.batch(len, step))
-            }
-        }
-    }
-
-    fn left(&self, size: usize) -> usize {
-        match self {
-            Self::Once { order, next, drop_last: true } => (order.len() - next) / size,
-            Self::Once { order, next, drop_last: false } => (order.len() - next).div_ceil(size),
-            Self::Training { next, end, .. } => usize::try_from(end - next).unwrap_or(usize::MAX),
-        }
-    }
-}
-
-/// Batches of a data set, one after the other.
-#[pyclass(frozen, module = "actrm")]
-pub(crate) struct Batches {
-    dataset: Py<PyDataset>,
-    batch_size: usize,
-    order: Mutex<Order>,
-}
-
-#[pymethods]
-impl Batches {
-    fn __iter__(slf: Bound<'_, Self>) -> Bound<'_, Self> {
-        slf
-    }
-
-    /// Batches that are still to come.
-    fn __len__(&self) -> usize {
-        self.order.lock().unwrap_or_else(PoisonError::into_inner).left(self.batch_size)
-    }
-
-    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
-        let dataset = self.dataset.get();
-        let len = dataset.samples.len();
-        let next = self.order.lock().unwrap_or_else(PoisonError::into_inner).next(self.batch_size, len);
-        next.map(|samples| dataset.gather(py, &samples, Some(samples.len()))).transpose()
-    }
 }

@@ -1,5 +1,7 @@
 //! Our errors as Python's.
 
+use std::any::Any;
+
 use pyo3::create_exception;
 use pyo3::exceptions::PyException;
 use pyo3::prelude::*;
@@ -20,6 +22,12 @@ pub(crate) fn words(error: &dyn std::error::Error) -> String {
         cause = error.source();
     }
     text
+}
+
+/// What a panic said: it would be a defect of ours, and becomes an exception like every other error.
+pub(crate) fn defect(panic: &(dyn Any + Send)) -> PyErr {
+    let said = panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    Error::new_err(format!("a defect of actrm, please report it: {}", said.unwrap_or("nothing more is known")))
 }
 
 /// An error of ours as an exception.

@@ -12,6 +12,7 @@ use zoo::protocols::Protocols;
 
 use crate::error::{raised, words};
 use crate::policy::registry;
+use crate::work::unlocked;
 
 /// What was evaluated in a zoo, ranked: a list of dicts with the columns of `leaderboard.csv`, as `pandas.DataFrame` and
 /// `polars.DataFrame` take them. A value that a row does not have is None.
@@ -32,13 +33,11 @@ pub(crate) fn leaderboard<'py>(
 ) -> PyResult<Bound<'py, PyList>> {
     let registry = registry(zoo);
     let results = results.unwrap_or_else(|| registry.folder().join("results"));
-    let (entries, found) = py
-        .allow_threads(|| {
-            let entries = KnownEntries::open(&registry)?;
-            let found = audit(&results, &entries)?;
-            Ok::<_, zoo::ZooError>((entries, found))
-        })
-        .map_err(raised)?;
+    let (entries, found) = unlocked(py, || {
+        let entries = KnownEntries::open(&registry).map_err(raised)?;
+        let found = audit(&results, &entries).map_err(raised)?;
+        Ok((entries, found))
+    })?;
     let bad = entries.bad().map(|(id, error)| format!("entry {id}: {}", words(error)));
     let left_out =
         found.left_out.iter().map(|left| format!("left out: {}: {}", left.folder.display(), words(&left.reason)));

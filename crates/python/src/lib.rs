@@ -5,6 +5,7 @@
 //! nothing (the package's Python side draws the bars), and has no logic of data, training or evaluation.
 
 mod arrays;
+mod batches;
 mod convert;
 mod dataset;
 mod error;
@@ -29,16 +30,23 @@ fn set_places(reader: PathBuf, control: PathBuf) {
     }
 }
 
+/// Panics, for a test of what becomes of that.
+#[pyfunction]
+fn panics(py: Python<'_>) -> PyResult<()> {
+    work::unlocked(py, || panic!("as the test asked"))
+}
+
 #[pymodule]
 fn _actrm(module: &Bound<'_, PyModule>) -> PyResult<()> {
     work::at_home();
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("Error", module.py().get_type::<error::Error>())?;
     module.add_class::<dataset::PyDataset>()?;
-    module.add_class::<dataset::Batches>()?;
+    module.add_class::<batches::Batches>()?;
     module.add_class::<policy::PyPolicy>()?;
     module.add_class::<simulator::Simulator>()?;
     module.add_function(wrap_pyfunction!(set_places, module)?)?;
+    module.add_function(wrap_pyfunction!(panics, module)?)?;
     module.add_function(wrap_pyfunction!(convert::convert, module)?)?;
     module.add_function(wrap_pyfunction!(policy::load_policy, module)?)?;
     module.add_function(wrap_pyfunction!(evaluate::evaluate, module)?)?;

@@ -17,7 +17,7 @@ use zoo::results::Execution;
 
 use crate::arrays::{array, numpy, read};
 use crate::error::{Error, raised};
-use crate::work::run;
+use crate::work::{run, unlocked};
 
 /// The most rows of a batch of observations, each with a policy's state of its own.
 const MOST_ROWS: usize = 1 << 16;
@@ -98,19 +98,20 @@ impl PyPolicy {
     /// Begins an episode: forgets the last one. What a policy draws depends on the seed only; row `i` of a batch has
     /// the seed `seed + i`, or the `i`-th of a list.
     #[pyo3(signature = (seed=None))]
-    fn reset(&self, py: Python<'_>, seed: Option<Seeds>) {
+    fn reset(&self, py: Python<'_>, seed: Option<Seeds>) -> PyResult<()> {
         let seeds = seed.unwrap_or(Seeds::First(0));
-        py.allow_threads(|| {
+        unlocked(py, || {
             *lock(&self.acting) = Rows { seeds: seeds.clone(), rows: Vec::new() };
             *lock(&self.predicting) = Rows { seeds, rows: Vec::new() };
-        });
+            Ok(())
+        })
     }
 
     /// The action to execute now: (action_dim,), or (rows, action_dim) for a batch. Asks the network when the actions
     /// that were planned are used up, as the entry's evaluations do.
     fn select_action<'py>(&self, py: Python<'py>, observation: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
         let asked = self.asked(observation)?;
-        let actions = py.allow_threads(|| {
+        let actions = unlocked(py, || {
             let mut rows = lock(&self.acting);
             let rows = rows.grow(asked.observations.len(), |seed| {
                 let mut actor = acting(self.loaded.policy(), self.execution).map_err(raised)?;
@@ -137,7 +138,7 @@ impl PyPolicy {
     ) -> PyResult<Bound<'py, PyAny>> {
         let asked = self.asked(observation)?;
         let executed = executed.unwrap_or_else(|| self.n_action_steps());
-        let chunks = py.allow_threads(|| {
+        let chunks = unlocked(py, || {
             let mut rows = lock(&self.predicting);
             let rows = rows.grow(asked.observations.len(), |seed| Ok(self.predicting_from(seed)))?;
             let predict = |(row, seen): (&mut Predicting, _)| {
@@ -156,7 +157,7 @@ impl PyPolicy {
     /// Shows `predict_action_chunk` a step at which it is not called; `select_action` sees every step.
     fn observe(&self, py: Python<'_>, observation: &Bound<'_, PyDict>) -> PyResult<()> {
         let asked = self.asked(observation)?;
-        py.allow_threads(|| {
+        unlocked(py, || {
             let mut rows = lock(&self.predicting);
             let rows = rows.grow(asked.observations.len(), |seed| Ok(self.predicting_from(seed)))?;
             rows.iter_mut().zip(&asked.observations).for_each(|(row, seen)| row.policy.observe(seen));
@@ -250,7 +251,7 @@ impl PyPolicy {
     /// The model card, as Markdown.
     #[getter]
     fn card(&self, py: Python<'_>) -> PyResult<String> {
-        py.allow_threads(|| self.loaded.entry().card()).map_err(raised)
+        unlocked(py, || self.loaded.entry().card().map_err(raised))
     }
 
     fn __repr__(&self) -> String {
@@ -366,7 +367,7 @@ fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>
 #[pyfunction]
 #[pyo3(signature = (path, zoo=None))]
 pub(crate) fn load_policy(py: Python<'_>, path: PathBuf, zoo: Option<PathBuf>) -> PyResult<PyPolicy> {
-    py.allow_threads(|| {
+    unlocked(py, || {
         run(|| {
             if let Some(folder) = lerobot_checkpoint(&path) {
                 let loaded = import_checkpoint(&folder).map_err(raised)?;

@@ -16,7 +16,7 @@ use zoo::experiment::DataSection;
 use crate::arrays::{array, filled, read};
 use crate::error::{Error, raised};
 use crate::policy::registry;
-use crate::work::interruptible;
+use crate::work::{interruptible, unlocked};
 
 /// One environment in a worker process, as evaluations use it. `actrm.envs` makes a gymnasium environment of it.
 #[pyclass(frozen, module = "actrm")]
@@ -80,7 +80,7 @@ impl Simulator {
     /// Begins the episode of `seed`: the observation, and what is known of the episode.
     fn reset<'py>(&self, py: Python<'py>, seed: u64) -> PyResult<(Bound<'py, PyDict>, Bound<'py, PyDict>)> {
         let Initial { fingerprint, group, observations, .. } =
-            py.allow_threads(|| self.worker(|worker| worker.reset(seed).map_err(raised)))?;
+            unlocked(py, || self.worker(|worker| worker.reset(seed).map_err(raised)))?;
         let info = PyDict::new(py);
         info.set_item("seed", seed)?;
         info.set_item("fingerprint", fingerprint)?;
@@ -98,7 +98,7 @@ impl Simulator {
         let (shape, values) = read::<f32>(action)?;
         let action = self.executable(&shape, &values)?;
         let Stepped { rewards, success, failure, observations, .. } =
-            py.allow_threads(|| self.worker(|worker| worker.step(&[action]).map_err(raised)))?;
+            unlocked(py, || self.worker(|worker| worker.step(&[action]).map_err(raised)))?;
         Ok((self.seen(py, &self.keys.observe(&observations))?, rewards.iter().sum(), success, failure))
     }
 
@@ -110,17 +110,18 @@ impl Simulator {
                 "picture: expected a side of 1 to 4096, found {height}x{width}"
             )));
         }
-        let image = py.allow_threads(|| self.worker(|worker| worker.render(camera, height, width).map_err(raised)))?;
+        let image = unlocked(py, || self.worker(|worker| worker.render(camera, height, width).map_err(raised)))?;
         filled(py, &[height, width, 3], |out| out.copy_from_slice(&image.rgb))
     }
 
     /// Ends the worker.
-    fn close(&self, py: Python<'_>) {
-        py.allow_threads(|| {
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        unlocked(py, || {
             if let Some(pool) = self.lock().take() {
                 pool.close();
             }
-        });
+            Ok(())
+        })
     }
 
     /// The task.

@@ -1,6 +1,7 @@
 //! Work that takes long: elsewhere than on the thread that Python waits in, so that Ctrl-C is heard; and work in a
 //! process that was forked.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -10,8 +11,10 @@ use pyo3::prelude::*;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use rustix::process::{Pid, getpid};
 
+use crate::error::defect;
+
 /// How often Ctrl-C is looked for.
-const LOOK: Duration = Duration::from_millis(50);
+pub(crate) const LOOK: Duration = Duration::from_millis(50);
 
 /// Does `work` on a thread of its own. What it sends is told to `tell` here; it is asked to end, through the flag, as
 /// soon as `tell` fails or Ctrl-C is pressed, and its result is then that exception.
@@ -44,9 +47,14 @@ pub(crate) fn interruptible<T: Send, M: Send>(
                 failure.get_or_insert(error);
             }
         }
-        let done = py.allow_threads(|| working.join()).unwrap_or_else(|panic| std::panic::resume_unwind(panic));
-        failure.map_or(Ok(done), Err)
+        let done = py.allow_threads(|| working.join());
+        failure.map_or_else(|| done.map_err(|panic| defect(&*panic)), Err)
     })
+}
+
+/// Does `work` without Python's lock.
+pub(crate) fn unlocked<T: Send>(py: Python<'_>, work: impl FnOnce() -> PyResult<T> + Send) -> PyResult<T> {
+    py.allow_threads(|| catch_unwind(AssertUnwindSafe(work))).unwrap_or_else(|panic| Err(defect(&*panic)))
 }
 
 /// The process that loaded this library.

@@ -101,6 +101,24 @@ def test_batches_are_what_training_reads(lift: Path) -> None:
     np.testing.assert_array_equal(ours.view(np.uint32), read.view(np.uint32))
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_make_the_same_batches_ahead(lift: Path, threads: int) -> None:
+    ds = actrm.Dataset(lift, {"action": range(4)})
+    for options in ({"seed": 1}, {"seed": 1, "drop_last": True}, {"seed": 1, "steps": 90}, {}):
+        alone, ahead = ds.batches(64, **options), ds.batches(64, **options, threads=threads)
+        assert len(alone) == len(ahead)
+        for left, (one, other) in zip(reversed(range(len(alone))), zip(alone, ahead, strict=True), strict=True):
+            assert one.keys() == other.keys() and len(ahead) == left
+            for key, value in one.items():
+                np.testing.assert_array_equal(value, other[key])
+                assert type(value) is type(other[key]) and getattr(value, "dtype", 0) == getattr(other[key], "dtype", 0)
+        assert next(ahead, None) is None
+    # given up early
+    assert len(next(ds.batches(64, seed=1, threads=threads))["action"]) == 64
+    with pytest.raises(ValueError, match="^threads: expected 0 to 256, found 257$"):
+        ds.batches(64, threads=257)
+
+
 def test_batches_end_with_the_epoch(lift: Path) -> None:
     ds = actrm.Dataset(lift, split="train")
     batches = ds.batches(64, seed=1)

@@ -55,7 +55,7 @@ def test_pictures_are_what_training_reads(seen: Path) -> None:
     program = RELEASE / "examples/training_windows"
     read = np.frombuffer(output(program, seen, "train", *map(str, (horizon, size, seed, steps))), np.float32)
     ours = []
-    for batch in ds.batches(size, seed=seed, steps=steps):
+    for batch in ds.batches(size, seed=seed, steps=steps, threads=2):
         numbers = (batch[key] for key in ("observation.state", "action", "action_is_pad"))
         pictures = (np.moveaxis(batch[camera], 1, -1) for camera in CAMERAS)
         ours += [values.astype(np.float32).ravel() for values in (*numbers, *pictures)]

@@ -13,6 +13,7 @@ from pathlib import Path
 import actrm
 import numpy as np
 import pytest
+from actrm import _actrm  # pyright: ignore[reportPrivateUsage]
 from conftest import LIFT, RELEASE, ROOT, output
 
 
@@ -212,3 +213,8 @@ def test_what_cannot_be_evaluated_is_an_exception(zoo: Path) -> None:
 
 def test_a_signal_handler_of_the_caller_s_stays() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_panic_is_an_exception_like_others() -> None:
+    with pytest.raises(actrm.Error, match="^a defect of actrm, please report it: as the test asked$"):
+        _actrm.panics()

@@ -75,7 +75,7 @@ pub struct ExchangeSection {
     pub taken: Vec<String>,
     /// What is known of each thing, item for item.
     pub items: Vec<Vec<String>>,
-    /// Where each thing is, item for item, all moved by one vector.
+    /// Where each thing is, item for item, all moved by one vector to where one was taken in another demonstration.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub places: Vec<Vec<String>>,
 }

@@ -10,11 +10,13 @@
 //! Each demonstration shows by its end which thing was meant: the one whose vector in `taken`, from the hand, is the
 //! shortest in the last observation. Whatever the others are, the same demonstration is right. So what is known of them
 //! (`items`, as many lists as things, alike) is dealt out among them at random in every sample. And where `places` are
-//! named, each of them is moved to where the thing nearest to it lay in another demonstration, drawn for the sample: by
-//! the vector between the two at the beginnings, as the first item of each list tells them, all items of the list alike.
-//! Without this, a few hundred demonstrations, each with an arrangement of its own, can be learned by heart instead of the
-//! rule that leads to the thing. Validation sees the observations as they are. A batch depends on the seed and the step
-//! alone, so that a resumed run needs no state of this.
+//! named, each of them is moved to where another demonstration's taken thing lay, drawn for the sample from the
+//! [`NEAREST`] that are nearest to it: by the vector between the two at the beginnings, as the first item of each list
+//! tells them, all items of the list alike. Then everything lies where something was taken once, and no place by itself
+//! tells the one that was taken this time. Without this, a few hundred demonstrations, each with an arrangement of its own,
+//! can be learned by heart instead of the rule that leads to the thing. Things may come to overlap a little. Validation
+//! sees the observations as they are. A batch depends on the seed and the step alone, so that a resumed run needs no state
+//! of this.
 
 use std::path::Path;
 
@@ -28,6 +30,9 @@ use super::places::{Place, Places};
 
 /// Keeps the draws apart from those of the batches' order, which have the same seed.
 const PURPOSE: u64 = 0x4558_4348_414e_4745;
+
+/// So many places are there to draw from for each thing that is moved: few enough to stay in its neighbourhood.
+const NEAREST: usize = 16;
 
 /// The exchanges of a run.
 #[derive(Default)]
@@ -88,8 +93,7 @@ impl Exchanges {
                 let others: Vec<usize> = (0..exchange.things.len()).filter(|thing| *thing != episode.taken).collect();
                 exchange.deal(&others, row, windows, &mut rng);
                 if !exchange.moved.is_empty() {
-                    let other = &exchange.episodes[rng.below(exchange.episodes.len() as u64) as usize];
-                    exchange.lay(&others, (episode, other), row, windows);
+                    exchange.lay(&others, episode, row, windows, &mut rng);
                 }
             }
         }
@@ -113,12 +117,28 @@ impl Exchange {
         }
     }
 
-    fn lay(&self, others: &[usize], (own, other): (&Episode, &Episode), row: usize, windows: &mut WindowBatch) {
+    fn lay(&self, others: &[usize], own: &Episode, row: usize, windows: &mut WindowBatch, rng: &mut SplitMix64) {
+        let mut near: Vec<(f32, usize)> = Vec::with_capacity(self.episodes.len());
         for &thing in others {
             let here = &own.beginning[thing];
             let squared = |there: &[f32]| here.iter().zip(there).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
-            let nearest = other.beginning.iter().min_by(|a, b| squared(a).total_cmp(&squared(b)));
-            for (place, there) in self.moved[thing].iter().flat_map(|place| nearest.map(|there| (place, there))) {
+            near.clear();
+            near.extend(
+                (self.episodes.iter().enumerate().filter(|(_, other)| other.end != own.end))
+                    .map(|(at, other)| (squared(&other.beginning[other.taken]), at)),
+            );
+            let order = |a: &(f32, usize), b: &(f32, usize)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
+            if near.len() > NEAREST {
+                near.select_nth_unstable_by(NEAREST, order);
+                near.truncate(NEAREST);
+            }
+            near.sort_unstable_by(order);
+            if near.is_empty() {
+                continue;
+            }
+            let other = &self.episodes[near[rng.below(near.len() as u64) as usize].1];
+            let there = &other.beginning[other.taken];
+            for place in &self.moved[thing] {
                 for observation in 0..windows.n_obs_steps {
                     let vector = place.of_mut(windows, row, observation);
                     vector.iter_mut().zip(here.iter().zip(there)).for_each(|(x, (a, b))| *x += b - a);
@@ -214,35 +234,44 @@ mod tests {
     }
 
     #[test]
-    fn the_others_lie_where_one_lay_nearest_in_another_demonstration() {
+    fn the_others_lie_where_something_was_taken_in_another_demonstration() {
         let mut exchanges = exchange(1);
         // the things' numbers of `a` are where they are, and the first ones of `b` stand by them
         let place = |feature: &str, from| Place { feature: feature.to_owned(), from, width: 1 };
         exchanges.all[0].things = vec![Vec::new(); 4];
         exchanges.all[0].moved = (0..4).map(|i| vec![place("a", i), place("b", 1 + 2 * i)]).collect();
-        let lay = [[10.0, 20.0, 30.0, 40.0], [21.25, 41.25, 31.25, 11.25], [19.5, 39.5, 29.5, 9.5]];
+        // at whole tens, each demonstration's a little further
+        let offset = |at: usize| at as f32 / 128.0;
         for (at, episode) in exchanges.all[0].episodes.iter_mut().enumerate() {
-            episode.beginning = lay[if at < 3 { 1 + at % 2 } else { 0 }].map(|x| vec![x]).to_vec();
+            episode.beginning = (1..5).map(|thing| vec![10.0 * thing as f32 + offset(at)]).collect();
         }
         let mut batch = windows();
         exchanges.apply(3, &mut batch);
         let (a, b) = (batch.column("a").unwrap(), batch.column("b").unwrap());
         let mut seen = BTreeSet::new();
-        // those of the episodes after the first three, whose things lay at whole tens
-        for row in 0..N - 9 {
-            let taken = taken(N - 1 - row);
+        for row in 0..N {
+            let (window, taken) = (N - 1 - row, taken(N - 1 - row));
+            let own = window / 3;
             let (a, b) = (&a[row * 8..][..8], &b[row * 18..][..18]);
-            let by = a[4 + (taken + 1) % 4] - (10 * ((taken + 1) % 4 + 1) + 1) as f32;
-            assert!([0.0, 1.25, -0.5].contains(&by), "{by}");
             for thing in 0..4 {
-                let (by, before) = (if thing == taken { 0.0 } else { by }, 10.0 * (thing + 1) as f32);
+                let before = 10.0 * (thing + 1) as f32;
+                let by = a[thing] - before;
                 assert_eq!((a[thing], a[4 + thing]), (before + by, before + 1.0 + by));
                 assert_eq!((b[1 + 2 * thing], b[10 + 2 * thing]), (before + by, before + 1.0 + by));
                 assert_eq!((b[2 + 2 * thing], b[11 + 2 * thing]), (before + 5.0, before + 5.0), "not named");
+                if thing == taken {
+                    assert_eq!(by, 0.0);
+                    continue;
+                }
+                let other = (own as f32 + by * 128.0) as usize;
+                assert_eq!(other as f32, own as f32 + by * 128.0);
+                assert_eq!(other % 4, thing, "the one that was taken there");
+                let nearer = (0..N / 3).filter(|at| at % 4 == thing && at.abs_diff(own) < other.abs_diff(own));
+                assert!(nearer.count() < NEAREST);
+                seen.insert((own, thing, other));
             }
-            seen.insert((by * 4.0) as i32);
         }
-        assert_eq!(seen, BTreeSet::from([-2, 0, 5]));
+        assert!(seen.len() > 2 * N, "drawn anew for every sample: {}", seen.len());
     }
 
     #[test]
