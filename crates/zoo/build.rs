@@ -1,4 +1,5 @@
-//! Lists the files of `configs/` and `protocols/`, so that an experiment or a protocol is built in by lying there.
+//! Lists the files of `configs/` and `protocols/`, so that an experiment or a protocol is built in by lying there, and
+//! says which compiler made the program for what.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -6,6 +7,16 @@ use std::path::{Path, PathBuf};
 fn main() {
     list("../../configs", "experiments.rs");
     list("../../protocols", "protocols.rs");
+    println!("cargo:rustc-env=ACTRM_RUSTC={}", compiler());
+    println!("cargo:rustc-env=ACTRM_TARGET={}", std::env::var("TARGET").expect("cargo sets TARGET"));
+}
+
+/// `1.95.0`, or `unknown` of a compiler that does not say.
+fn compiler() -> String {
+    let rustc = std::env::var_os("RUSTC").expect("cargo sets RUSTC");
+    let said = std::process::Command::new(rustc).arg("--version").output();
+    let said = said.map(|output| String::from_utf8_lossy(&output.stdout).into_owned()).unwrap_or_default();
+    said.split_whitespace().nth(1).unwrap_or("unknown").to_owned()
 }
 
 /// Writes name and text of every TOML file in `folder` as a Rust expression.

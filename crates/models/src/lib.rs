@@ -51,5 +51,6 @@ pub use policy::{ActionChunk, Actor, Clock, Policy, RecedingHorizon, TemporalEns
 pub use preprocess::Preprocess;
 pub use registry::{PolicyConfig, PolicyType};
 pub use rng::Rng;
+pub use simd::vectors;
 pub use size::Size;
 pub use train::{Learner, LearnerMetrics, Schedule, StepMetrics, TrainConfig, Trainer, TrainerState};

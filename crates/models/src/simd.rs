@@ -35,6 +35,23 @@ pub(crate) fn dispatch<Op: WithSimd>(op: Op) -> Op::Output {
     Simd::vectorize(Scalar, op)
 }
 
+/// The vectors that arithmetic runs on here, by name. Sums of floats may differ in their last bits between two of these.
+pub fn vectors() -> &'static str {
+    struct Bytes;
+    impl WithSimd for Bytes {
+        type Output = usize;
+        fn with_simd<S: Simd>(self, _: S) -> usize {
+            size_of::<S::f32s>()
+        }
+    }
+    match dispatch(Bytes) {
+        64 => "AVX-512",
+        32 => "AVX2",
+        16 => "NEON",
+        _ => "none",
+    }
+}
+
 /// Compiles the closure for the widest vectors; what it calls must be `#[inline(always)]`.
 #[inline]
 pub(crate) fn vectorised<R>(f: impl FnOnce() -> R) -> R {

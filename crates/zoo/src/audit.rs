@@ -57,13 +57,18 @@ impl KnownEntries {
     /// # Errors
     /// A zoo that cannot be listed. Bad entries are [`KnownEntries::bad`].
     pub fn open(registry: &Registry) -> Result<Self, ZooError> {
+        Ok(Self::only(registry, registry.ids()?))
+    }
+
+    /// Opens these entries of `registry` and no other.
+    pub fn only(registry: &Registry, ids: impl IntoIterator<Item = EntryId>) -> Self {
         let zoo = registry.folder().to_owned();
-        let opened = registry.ids()?.into_iter().map(|id| {
+        let opened = ids.into_iter().map(|id| {
             let entry = Entry::open(&zoo, &id);
             (id, entry)
         });
         let opened = opened.collect();
-        Ok(Self { zoo, opened })
+        Self { zoo, opened }
     }
 
     /// Those that are what was written, by name and version.
@@ -175,7 +180,11 @@ fn unexplained(folder: &Path) -> Option<&'static str> {
     tables.filter(|_| !names.iter().any(|name| other(name)))
 }
 
-fn standing(folder: &Path, entries: &KnownEntries) -> Result<Option<StoredEvaluation>, ZooError> {
+/// The finished evaluation in `folder`; nothing if it is still under way.
+///
+/// # Errors
+/// Why it does not stand.
+pub fn standing(folder: &Path, entries: &KnownEntries) -> Result<Option<StoredEvaluation>, ZooError> {
     let Some(stored) = StoredEvaluation::read(folder)? else { return Ok(None) };
     check_folder_name(folder, &stored.record.folder_name())?;
     if !stored.sealed {

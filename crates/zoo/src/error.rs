@@ -296,6 +296,19 @@ pub enum ZooError {
         /// Seeds of the evaluations of this entry under this protocol.
         stored: Vec<String>,
     },
+    /// Not exactly one result is meant.
+    #[error(
+        "row `{row}`: expected one result in {}, found {}; name its folder, or the entry with --protocol and --block, or with --task",
+        results.display(), list(found)
+    )]
+    WhichRow {
+        /// What was asked for.
+        row: String,
+        /// The folder of results.
+        results: PathBuf,
+        /// Folders of the results that it fits.
+        found: Vec<String>,
+    },
     /// What is stored and what was found now are not the same.
     #[error("results in {}: {what} differs: stored {expected}, now {found}", folder.display())]
     ResultsDiffer {

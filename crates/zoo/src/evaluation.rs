@@ -20,6 +20,7 @@ use std::time::Duration;
 
 use rollout::{EpisodePlan, FaultKind, Image, JobError, Observations, Pool, Ready, RolloutError, Worker, WorkerFault};
 
+pub(crate) use self::again::differences;
 pub use self::again::{Again, evaluate_again};
 pub use self::agent::{PolicyAgent, QueryTime, QueryTimes};
 pub use self::clock::WallClock;

@@ -24,15 +24,23 @@ pub mod tensors;
 pub mod audit;
 pub mod evaluation;
 pub mod protocols;
+pub mod rerun;
 pub mod results;
 
 pub use error::ZooError;
 pub use feature_keys::FeatureKeys;
 pub use files::{sha256_file, sha256_hex, write_atomic, write_together};
 
-/// Versions of the software that makes entries and results, by name.
+/// What makes entries, by name: the software's versions, the compiler, what it compiled for, and the vectors of this
+/// machine. The same weights come out where all of these are the same.
 pub fn versions() -> std::collections::BTreeMap<String, String> {
-    let versions = [("actrm", env!("CARGO_PKG_VERSION")), ("candle", CANDLE)];
+    let versions = [
+        ("actrm", env!("CARGO_PKG_VERSION")),
+        ("candle", CANDLE),
+        ("rustc", env!("ACTRM_RUSTC")),
+        ("target", env!("ACTRM_TARGET")),
+        ("vectors", models::vectors()),
+    ];
     versions.into_iter().map(|(name, version)| (name.to_owned(), version.to_owned())).collect()
 }
 

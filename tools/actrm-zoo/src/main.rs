@@ -8,6 +8,7 @@ mod commands;
 mod places;
 mod puzzles;
 mod simulation;
+mod training;
 
 use std::process::ExitCode;
 

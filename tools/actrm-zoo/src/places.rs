@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use clap_complete::engine::{ArgValueCandidates, CompletionCandidate};
 use cli::completions::{candidates, given};
 use zoo::config::Library;
-use zoo::protocols::Protocols;
+use zoo::protocols::{Block, Protocols};
 use zoo::registry::Registry;
 
 /// Where the zoo is.
@@ -69,6 +69,22 @@ impl ProtocolArgs {
             Some(folder) => Protocols::with_folder(folder)?,
             None => Protocols::built_in(),
         })
+    }
+}
+
+/// A block of a named protocol, on the command line.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum BlockArg {
+    Test,
+    Dev,
+}
+
+impl From<BlockArg> for Block {
+    fn from(block: BlockArg) -> Self {
+        match block {
+            BlockArg::Test => Self::Test,
+            BlockArg::Dev => Self::Dev,
+        }
     }
 }
 

@@ -113,7 +113,8 @@ fn find(results: &Path, record: &EvaluationRecord) -> Result<StoredEvaluation, Z
     })
 }
 
-fn differences(stored: &EvaluationRecord, now: &EvaluationRecord) -> Vec<(String, String, String)> {
+/// Versions that are not the same: name, stored and now.
+pub(crate) fn differences(stored: &EvaluationRecord, now: &EvaluationRecord) -> Vec<(String, String, String)> {
     let names = stored.versions.keys().chain(now.versions.keys().filter(|name| !stored.versions.contains_key(*name)));
     let of =
         |record: &EvaluationRecord, name: &str| record.versions.get(name).cloned().unwrap_or_else(|| "none".into());

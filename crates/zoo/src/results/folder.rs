@@ -129,7 +129,8 @@ pub fn result_folders(results: &Path) -> Result<Vec<PathBuf>, ZooError> {
     Ok(folders)
 }
 
-fn read_record(folder: &Path) -> Result<EvaluationRecord, ZooError> {
+/// What an evaluation in `folder` is of, finished or not.
+pub(crate) fn read_record(folder: &Path) -> Result<EvaluationRecord, ZooError> {
     let path = folder.join(RECORD);
     let text = fs::read(&path).map_err(ZooError::io("read", &path))?;
     let malformed = |reason: String| ZooError::Malformed { path: path.clone(), reason };

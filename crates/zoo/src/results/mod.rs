@@ -14,7 +14,7 @@ mod record;
 mod seal;
 mod tables;
 
-pub(crate) use folder::{OUTCOMES, RECORD, evaluation_folders};
+pub(crate) use folder::{OUTCOMES, RECORD, evaluation_folders, read_record};
 pub use folder::{ResultsFolder, StoredEvaluation, list_evaluations, result_folders};
 pub use merge::merge_shards;
 pub use record::{

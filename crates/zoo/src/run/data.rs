@@ -93,6 +93,29 @@ pub(super) fn open(
     opened(folder)
 }
 
+/// The data set that a training of `experiment` on `path` reads, and its folder: `path` itself, or what an HDF5 file is
+/// converted to, below `work`.
+///
+/// # Errors
+/// [`ZooError::DataNotFound`], and what `dataset` refuses.
+pub(crate) fn demonstrations(
+    path: &Path,
+    work: &Path,
+    experiment: &Experiment,
+    progress: &mut dyn FnMut(u64, u64),
+) -> Result<(PathBuf, Dataset), ZooError> {
+    let path = locate(path)?;
+    if path.is_dir() {
+        let dataset = open(&path, work, experiment, progress)?;
+        return Ok((path, dataset));
+    }
+    // a folder for each file: another one may be tried in the same place
+    let folder = work.join(format!("demonstrations-{}", &crate::sha256_file(&path)?[..8]));
+    std::fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
+    let dataset = open(&path, &folder, experiment, progress)?;
+    Ok((folder.join(CONVERTED), dataset))
+}
+
 /// What pictures may take, and where those go that would take more.
 pub(super) struct PictureMemory<'a> {
     pub budget: u64,

@@ -24,7 +24,7 @@ pub(super) fn open_folder(name: &str, runs: &Path, run: Option<&Path>, resume: b
 }
 
 /// Refuses to go on with other settings than the run began with, naming the first that differs.
-pub(super) fn same_settings(
+pub(crate) fn same_settings(
     folder: &Path,
     saved: &BTreeMap<String, String>,
     asked: &BTreeMap<String, String>,

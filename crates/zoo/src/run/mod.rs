@@ -20,12 +20,13 @@ mod training;
 mod validation;
 
 pub use checkpoint::Checkpoint;
-pub(crate) use data::first_windows;
 pub use data::locate;
+pub(crate) use data::{demonstrations, first_windows};
 pub use folder::{COMMAND_FILE, RunFolder};
 pub use list::{FoundRun, RunState, list_runs};
+pub(crate) use loop_parts::same_settings;
 pub use metrics::{Metrics, MetricsRow};
 pub use section::{OptimiserKind, TrainSection};
-pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, run};
+pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, finished_entry, run};
 pub use tensorboard::EventWriter;
 pub use training::{TrainRequest, train};

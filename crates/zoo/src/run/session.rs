@@ -211,6 +211,25 @@ fn finish(folder: &RunFolder, entry: EntryId, training: &TrainingMeta) -> Result
     Ok(TrainOutcome::Finished { entry, run: folder.path().to_owned(), minutes })
 }
 
+/// The entry that the run in `folder` made, as `name@version`; nothing while it is not finished.
+///
+/// # Errors
+/// A note that cannot be read or names none.
+pub fn finished_entry(folder: &Path) -> Result<Option<String>, ZooError> {
+    let path = folder.join("finished.json");
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let text = std::fs::read(&path).map_err(ZooError::io("read", &path))?;
+    let malformed = |reason: String| ZooError::Malformed { path: path.clone(), reason };
+    let note: serde_json::Value =
+        serde_json::from_slice(&text).map_err(|e| malformed(format!("not the note of a finished run: {e}")))?;
+    match note["entry"].as_str() {
+        Some(entry) => Ok(Some(entry.to_owned())),
+        None => Err(malformed(format!("entry: expected its name, found {}", note["entry"]))),
+    }
+}
+
 /// The entry that a run is about to get, written before the entry appears: a run that was killed between the two
 /// finds its own again.
 #[derive(Serialize, Deserialize)]

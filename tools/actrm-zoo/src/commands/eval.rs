@@ -5,7 +5,6 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
-use clap::ValueEnum;
 use cli::{INTERRUPTED, Screen, Stop, limits, shown};
 use models::FeatureKind;
 use report::{COLUMNS, LeaderboardRow, json};
@@ -15,11 +14,11 @@ use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
 use zoo::evaluation::{
     Environment, EvaluationOptions, FIRST_SEED, Perturbation, Subject, View, evaluate_again, film, finished,
 };
-use zoo::protocols::{Block, NamedProtocol};
+use zoo::protocols::NamedProtocol;
 use zoo::registry::Registry;
 use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
-use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
+use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 use crate::puzzles::{PuzzleArgs, evaluate_solver};
 use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
 
@@ -113,22 +112,6 @@ pub struct Args {
     puzzles: PuzzleArgs,
     #[command(flatten)]
     zoo: ZooArgs,
-}
-
-/// A block of a named protocol, on the command line.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum BlockArg {
-    Test,
-    Dev,
-}
-
-impl From<BlockArg> for Block {
-    fn from(block: BlockArg) -> Self {
-        match block {
-            BlockArg::Test => Self::Test,
-            BlockArg::Dev => Self::Dev,
-        }
-    }
 }
 
 /// What is said of each evaluation: a line at once, or all of it as JSON at the end.

@@ -6,10 +6,11 @@ use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use study::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
 use zoo::entry::member_name;
-use zoo::run::{COMMAND_FILE, MetricsRow, TrainEvent, TrainOutcome, TrainRequest, train};
+use zoo::run::{COMMAND_FILE, TrainEvent, TrainOutcome, TrainRequest, finished_entry, train};
 use zoo::write_atomic;
 
 use crate::places::{ConfigArgs, ZooArgs, experiment_names};
+use crate::training::show;
 
 /// Train an experiment and put the result into the zoo
 ///
@@ -135,21 +136,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// The entry that the run in `folder` made, if it is finished.
-fn finished_entry(folder: &Path) -> anyhow::Result<Option<String>> {
-    let path = folder.join("finished.json");
-    if !path.is_file() {
-        return Ok(None);
-    }
-    let text = std::fs::read(&path).with_context(|| format!("reading {}", shown(&path)))?;
-    let note: serde_json::Value = serde_json::from_slice(&text)
-        .with_context(|| format!("{}: expected the note of a finished run", shown(&path)))?;
-    match note["entry"].as_str() {
-        Some(entry) => Ok(Some(entry.to_owned())),
-        None => bail!("{}: entry: expected its name, found {}", shown(&path), note["entry"]),
-    }
-}
-
 /// One training: where it takes place, and whether it is one of several.
 struct One {
     run: Option<PathBuf>,
@@ -231,59 +217,6 @@ fn going_on(args: &Args, folder: &Path, seeded: bool) -> String {
         }
     }
     command_line(&words)
-}
-
-fn show(event: &TrainEvent<'_>, screen: &mut Screen, stop: &Stop) {
-    match event {
-        TrainEvent::Folder(path) => screen.note(&format!("run folder: {}", shown(path))),
-        TrainEvent::Converting(done, total) => screen.advance("convert")(*done, *total),
-        TrainEvent::Note(note) => screen.note(&format!("note: {note}")),
-        TrainEvent::Begin { from, steps, parameters, windows } => {
-            // from here on there is a checkpoint to save first
-            stop.wait_for_work(from < steps);
-            screen.clear();
-            let examples = match windows {
-                0 => "puzzles drawn as they are needed".to_owned(),
-                n => format!("{n} examples"),
-            };
-            screen.note(&format!("{parameters} parameters, {examples}, {steps} steps"));
-            if *from > 0 {
-                screen.note(&format!("resumed after step {from}"));
-            }
-            screen.begin_at("train", *from, *steps);
-        }
-        TrainEvent::Step(row) => {
-            screen.at(row.step);
-            screen.message(&summary(row));
-        }
-        TrainEvent::Saved(_) => stop.wait_for_work(!screen.is_full()),
-    }
-}
-
-/// `loss 0.1234 (kld 0.0012, l1 0.1100) grad 1.2 lr 9.8e-4 580/s valid 0.0921`
-fn summary(row: &MetricsRow) -> String {
-    let value = |name: &str| row.values.get(name).copied();
-    let named = ["loss", "grad_norm", "lr", "samples_per_s", "valid_loss"];
-    let parts: Vec<String> = row
-        .values
-        .iter()
-        .filter(|(name, _)| !named.contains(&name.as_str()))
-        .map(|(name, x)| format!("{} {x:.4}", name.trim_end_matches("_loss")))
-        .collect();
-    let mut text = format!(
-        "loss {:.4} ({}) grad {:.2} lr {:.1e}",
-        value("loss").unwrap_or(f64::NAN),
-        parts.join(", "),
-        value("grad_norm").unwrap_or(f64::NAN),
-        value("lr").unwrap_or(f64::NAN),
-    );
-    if let Some(rate) = value("samples_per_s") {
-        text.push_str(&format!(" {rate:.0}/s"));
-    }
-    if let Some(valid) = value("valid_loss") {
-        text.push_str(&format!(" valid {valid:.4}"));
-    }
-    text
 }
 
 #[cfg(test)]

@@ -1,0 +1,217 @@
+//! Entries that are whole and tell another story than their weights: only training again finds that.
+
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use dataset::{RobomimicWriter, Source, WriteOptions};
+use rollout::Control;
+use zoo::config::Library;
+use zoo::entry::{CardWords, Entry, EntryDraft, EntryId, EntryMeta, training_facts};
+use zoo::experiment::Experiment;
+use zoo::registry::Registry;
+use zoo::rerun::{Outcome, Report, Rerun, Retrained, Retraining, find_row};
+use zoo::results::{
+    EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Execution, Protocol, ResultsFolder, Seeds,
+    StoredEvaluation,
+};
+use zoo::run::{TrainOutcome, TrainRequest, train};
+
+const SMALL: [&str; 10] = [
+    "policy.dim_model=16",
+    "policy.n_heads=2",
+    "policy.dim_feedforward=32",
+    "policy.n_encoder_layers=1",
+    "policy.n_vae_encoder_layers=1",
+    "policy.latent_dim=4",
+    "train.steps=12",
+    "train.batch_size=8",
+    "train.log_every=2",
+    "train.validate_every=4",
+];
+
+/// Three demonstrations, two of them to train on.
+fn demonstrations(folder: &Path) -> PathBuf {
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../dataset/tests/fixtures/lift_low_dim_3_demos.hdf5");
+    let out = folder.join("demos.hdf5");
+    let source = Source::open(&fixture).unwrap();
+    let ids: Vec<String> = source.plan().demos.iter().map(|d| d.id.clone()).collect();
+    let mut writer = RobomimicWriter::create(&out, &WriteOptions::default()).unwrap();
+    let mut root = source.root().unwrap();
+    root.datasets.retain(|name, _| !name.starts_with("mask"));
+    writer.set_root(&root).unwrap();
+    for index in 0..ids.len() {
+        writer.add_demo(&source.read_demo(index).unwrap()).unwrap();
+    }
+    writer.set_mask("train", &ids[..2]).unwrap();
+    writer.set_mask("valid", &ids[2..]).unwrap();
+    writer.finish().unwrap();
+    out
+}
+
+fn trained(folder: &Path, data: &Path) -> Entry {
+    let overrides: Vec<String> = SMALL.iter().map(|set| (*set).to_owned()).collect();
+    let request = TrainRequest {
+        name: "act_lift".to_owned(),
+        experiment: Experiment::load(&Library::built_in(), "act_lift", &overrides).unwrap(),
+        data: Some(data.to_owned()),
+        runs: folder.join("runs"),
+        run: None,
+        resume: false,
+        zoo: folder.join("zoo"),
+        image_memory: None,
+    };
+    match train(&request, &|| false, &mut |_| {}).unwrap() {
+        TrainOutcome::Finished { entry, .. } => Entry::open(&request.zoo, &entry).unwrap(),
+        TrainOutcome::Stopped { step, .. } => panic!("stopped after step {step}"),
+    }
+}
+
+/// The same files sealed anew, with other settings or another story.
+fn forged(entry: &Entry, zoo: &Path, config: &[(&str, &str)], story: impl Fn(&mut EntryMeta)) -> Entry {
+    let mut text = entry.config_text().unwrap();
+    for (from, to) in config {
+        assert!(text.contains(from), "{from} in {text}");
+        text = text.replacen(from, to, 1);
+    }
+    let mut meta = entry.meta().clone();
+    story(&mut meta);
+    let draft = EntryDraft {
+        meta,
+        model: fs::read(entry.folder().join("model.safetensors")).unwrap(),
+        config: text,
+        normaliser: fs::read(entry.folder().join("normaliser.safetensors")).unwrap(),
+        card: CardWords::default(),
+    };
+    Entry::open(zoo, &draft.seal(zoo).unwrap()).unwrap()
+}
+
+/// A finished evaluation of an entry, sealed, whose single outcome nobody measured.
+fn result(zoo: &Path, entry: &Entry) -> StoredEvaluation {
+    let EntryId { name, version } = entry.id();
+    let record = EvaluationRecord {
+        format: EvaluationRecord::FORMAT,
+        entry: EntryIdentity { name, version, hash: entry.meta().content_sha256() },
+        training: training_facts(entry.meta()),
+        protocol: Protocol {
+            rules: Protocol::RULES,
+            task: "Lift".into(),
+            env_name: "Lift".into(),
+            env_module: None,
+            env_module_sha256: None,
+            env_args_sha256: None,
+            control: Control::Compiled,
+            max_steps: 40,
+            perturbation: None,
+        },
+        execution: Execution::RecedingHorizon { n_action_steps: 8 },
+        time_decides: false,
+        demonstrated: false,
+        seeds: Seeds { start: 10_000, count: 1 },
+        shard: None,
+        versions: [("mujoco".to_owned(), "3.3.7".to_owned())].into(),
+    };
+    let mut folder = ResultsFolder::open(&zoo.join("results"), &record).unwrap();
+    let episode = EpisodeRecord {
+        seed: 10_000,
+        success: true,
+        steps: 12,
+        total_reward: 1.0,
+        fingerprint: "0".repeat(64),
+        group: None,
+        failure: None,
+    };
+    let timing = EpisodeTiming {
+        seed: 10_000,
+        wall_ms: 1.0,
+        simulator_ms: 1.0,
+        rendering_ms: Vec::new(),
+        encoding_ms: Vec::new(),
+        inference_ms: vec![1.0],
+    };
+    folder.add(episode, timing).unwrap();
+    folder.finish().unwrap()
+}
+
+/// Trains the row of the only result in `zoo` again.
+fn rerun(zoo: &Path, work: &Path, data: &Path) -> (Rerun, Report) {
+    let (registry, results) = (Registry::open(zoo), zoo.join("results"));
+    let row = find_row("lift-act", &registry, &results, &|_| true).unwrap();
+    let mut report = Report::default();
+    let rerun =
+        Rerun::open(&row, &registry, Some(work.to_owned()), Path::new("nowhere"), &mut report).unwrap().unwrap();
+    let how = Retraining { data: Some(data.to_owned()), image_memory: None };
+    let outcome = rerun.retrain(&how, &|| false, &mut |_| {}, &mut report).unwrap();
+    assert!(matches!(outcome, Retrained::Entry(_)), "{outcome:?}");
+    (rerun, report)
+}
+
+fn step<'a>(report: &'a Report, name: &str) -> (Outcome, &'a str) {
+    let step = report.steps().iter().find(|step| step.step == name).unwrap();
+    (step.outcome, &step.told)
+}
+
+#[test]
+fn the_same_settings_and_demonstrations_give_the_same_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let data = demonstrations(folder.path());
+    let entry = trained(folder.path(), &data);
+    let stored = result(&at("zoo"), &entry);
+    let (rerun, mut report) = rerun(&at("zoo"), &at("work"), &data);
+    assert!(report.is_same(), "{report:#?}");
+    assert_eq!(report.steps().len(), 6);
+    assert_eq!(report.reasons().count(), 0);
+    // an outcome that was made up, and another version of the simulator
+    let mut now = stored.clone();
+    now.episodes[0].success = false;
+    now.record.versions.insert("mujoco".to_owned(), "3.3.8".to_owned());
+    now.record.protocol.max_steps = 41;
+    rerun.compare_episodes(&now, &mut report);
+    assert_eq!(step(&report, "rules"), (Outcome::Differs, "max_steps: stored 40, now 41"));
+    let (outcome, told) = step(&report, "episodes");
+    assert!(outcome == Outcome::Differs && told.contains("success of 1") && told.contains("seed 10000"), "{told}");
+    let reasons: Vec<String> = report.reasons().map(|reason| reason.what.clone()).collect();
+    assert_eq!(reasons, ["mujoco"]);
+}
+
+#[test]
+fn weights_of_other_settings_are_told_however_well_they_are_sealed() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let data = demonstrations(folder.path());
+    let entry = trained(folder.path(), &data);
+    let lie = forged(&entry, &at("lies"), &[("dropout = 0.1", "dropout = 0.2")], |_| {});
+    result(&at("lies"), &lie);
+    let (_, report) = rerun(&at("lies"), &at("work"), &data);
+    assert_eq!(report.first_difference().map(|step| step.step), Some("training"));
+    assert!(step(&report, "training").1.starts_with("loss at step 2: recorded "), "{report:#?}");
+    let (outcome, told) = step(&report, "weights");
+    assert!(outcome == Outcome::Differs && told.contains("tensors, the first `"), "{told}");
+    assert_eq!(step(&report, "statistics").0, Outcome::Same);
+}
+
+#[test]
+fn a_story_that_the_training_does_not_bear_out_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let data = demonstrations(folder.path());
+    let entry = trained(folder.path(), &data);
+    let lie = forged(&entry, &at("lies"), &[], |meta| meta.data.as_mut().unwrap().train_episodes = 1);
+    result(&at("lies"), &lie);
+    let (_, report) = rerun(&at("lies"), &at("work"), &data);
+    let told = "entry.json: data.train_episodes: recorded 1, now 2";
+    assert_eq!(step(&report, "training"), (Outcome::Differs, told));
+    assert_eq!(step(&report, "weights").0, Outcome::Same);
+    // the work of one entry is no other's
+    let other = forged(&entry, &at("others"), &[("steps = 12", "steps = 13")], |_| {});
+    result(&at("others"), &other);
+    let (registry, results) = (Registry::open(&at("others")), at("others").join("results"));
+    let row = find_row("lift-act", &registry, &results, &|_| true).unwrap();
+    let mut report = Report::default();
+    let rerun = Rerun::open(&row, &registry, Some(at("work")), Path::new("nowhere"), &mut report).unwrap().unwrap();
+    let how = Retraining { data: Some(data), image_memory: None };
+    let error = rerun.retrain(&how, &|| false, &mut |_| {}, &mut report).unwrap_err().to_string();
+    assert!(error.contains("train.steps differs: the run has 12, asked for 13"), "{error}");
+}

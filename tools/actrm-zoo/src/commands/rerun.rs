@@ -1,0 +1,176 @@
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::Context;
+use cli::{Column, INTERRUPTED, Screen, SimulatorArgs, Stop, Table, limits, shown};
+use serde_json::json;
+use zoo::entry::Entry;
+use zoo::rerun::{EPISODES, Report, Rerun, Retrained, Retraining, find_row};
+use zoo::results::EvaluationRecord;
+
+use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
+use crate::simulation::{run_missing, worker};
+use crate::training::show;
+
+const GOES_ON: &str = "stopped; the same command goes on where it was";
+/// Folder of the work, below it one for each entry.
+const RERUNS: &str = "runs/rerun";
+
+/// Make a row of the leaderboard again, from its demonstrations to its last episode, and say which step differs
+///
+/// Checks entry and result, finds the demonstrations by their fingerprint, trains on them as the entry's experiment says, runs
+/// the row's episodes with what came of it, and compares each step with what is stored: weights byte by byte, episodes
+/// outcome by outcome. Where something differs, versions that are not as they were recorded are named. Neither the zoo nor
+/// its results are changed; the work lies in a folder of its own, and a rerun that was interrupted goes on there. The exit code
+/// is 0 where all that was asked for is the same, 1 otherwise. Solvers of puzzles are run again by `eval --again`.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-zoo rerun lift-act@1 --protocol lift-v1 --data lift.hdf5
+  actrm-zoo rerun lift-act@1 --protocol lift-v1 --block dev --skip-training --episodes 10
+  actrm-zoo rerun stack-act@1_Stack_40000-40199_c839488e
+  actrm-zoo rerun my-act --work /tmp/again --json")]
+pub struct Args {
+    /// Result: its folder's name, or its entry (`name`, `name@version`) where that has one, or one is chosen below
+    #[arg(add = entry_names())]
+    row: String,
+    /// Of several results of an entry, the one of this named protocol
+    #[arg(long, value_name = "NAME")]
+    protocol: Option<String>,
+    /// And of this block of it
+    #[arg(long, value_name = "BLOCK", default_value = "test", requires = "protocol")]
+    block: BlockArg,
+    #[command(flatten)]
+    protocols: ProtocolArgs,
+    /// Of several results of an entry, the one on this task
+    #[arg(long)]
+    task: Option<String>,
+    /// Demonstrations: an HDF5 file or a LeRobotDataset folder, where they are not at the experiment's path
+    #[arg(long, value_name = "PATH")]
+    data: Option<PathBuf>,
+    /// Folder of the work [default: runs/rerun/ENTRY@VERSION-HASH]
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
+    /// Only the row's first episodes
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    episodes: Option<u64>,
+    /// Run the episodes with the weights that are stored, and do not train
+    #[arg(long, conflicts_with_all = ["data", "image_memory"])]
+    skip_training: bool,
+    /// Memory for pictures, such as 2G or 500M: more of them are kept in a file and read ahead [default: half of what is free]
+    #[arg(long, value_name = "SIZE", value_parser = limits::bytes)]
+    image_memory: Option<u64>,
+    #[command(flatten)]
+    simulator: SimulatorArgs,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    results: ResultsArgs,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let registry = args.zoo.registry();
+    let protocols = args.protocols.protocols()?;
+    let protocol = args.protocol.as_deref().map(|name| protocols.get(name)).transpose()?;
+    let wanted = |record: &EvaluationRecord| {
+        let block = protocol.is_none_or(|protocol| protocol.block_of(record) == Some(args.block.into()));
+        block && args.task.as_ref().is_none_or(|task| *task == record.protocol.task)
+    };
+    let row = find_row(&args.row, &registry, &args.results.folder(&args.zoo), &wanted)?;
+    let mut report = Report::default();
+    let rerun = Rerun::open(&row, &registry, args.work.clone(), Path::new(RERUNS), &mut report)?;
+    if let Some(rerun) = &rerun {
+        // before hours of work
+        rerun.options(args.episodes)?;
+        let stop = Stop::install(GOES_ON)?;
+        if !again(args, rerun, &stop, &mut report)? {
+            cli::note(GOES_ON);
+            return Ok(ExitCode::from(INTERRUPTED));
+        }
+    }
+    tell(args, &row.folder, rerun.as_ref(), &report)?;
+    Ok(if report.is_same() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Trains and runs; whether it came to its end.
+fn again(args: &Args, rerun: &Rerun, stop: &Stop, report: &mut Report) -> anyhow::Result<bool> {
+    let entry = match args.skip_training {
+        true => {
+            report.skip_training("--skip-training: the stored weights act");
+            rerun.entry().clone()
+        }
+        false => match retrained(args, rerun, stop, report)? {
+            Retrained::Entry(entry) => *entry,
+            Retrained::Not => {
+                report.stop("nothing was trained; --skip-training runs the episodes with the stored weights");
+                return Ok(true);
+            }
+            Retrained::Stopped { step } => {
+                cli::note(&format!("stopped after step {step}"));
+                return Ok(false);
+            }
+        },
+    };
+    if stop.asked() {
+        return Ok(false);
+    }
+    match rerun.time_decides(report) {
+        true => Ok(true),
+        false => episodes(args, rerun, &entry, stop, report),
+    }
+}
+
+fn retrained(args: &Args, rerun: &Rerun, stop: &Stop, report: &mut Report) -> anyhow::Result<Retrained> {
+    let how = Retraining { data: args.data.clone(), image_memory: args.image_memory };
+    let mut screen = Screen::new();
+    let outcome = rerun.retrain(&how, &|| stop.asked(), &mut |event| show(&event, &mut screen, stop), report);
+    drop(screen);
+    outcome.with_context(|| format!("training {} again", rerun.entry().id()))
+}
+
+fn episodes(args: &Args, rerun: &Rerun, entry: &Entry, stop: &Stop, report: &mut Report) -> anyhow::Result<bool> {
+    let (subject, options) = (rerun.subject(entry)?, rerun.options(args.episodes)?);
+    let spec = worker(&rerun.environment()?, &args.simulator, rerun.stored().record.protocol.control)?;
+    let Some(mut pool) = args.simulator.start(spec, None, stop)? else { return Ok(false) };
+    let done = run_missing(&subject, &mut pool, &rerun.results(entry), &options);
+    cli::close(pool);
+    let Some(done) = done? else { return Ok(false) };
+    if done.was_there {
+        cli::note(&format!("{EPISODES}: run by an earlier call: remove {} to run them again", shown(rerun.work())));
+    }
+    rerun.compare_episodes(&done.evaluation, report);
+    Ok(true)
+}
+
+fn tell(args: &Args, folder: &Path, rerun: Option<&Rerun>, report: &Report) -> anyhow::Result<()> {
+    let reasons: Vec<_> = report.reasons().collect();
+    if args.json {
+        return cli::print_json(&json!({
+            "row": cli::lossy(folder), "same": report.is_same(), "steps": report.steps(), "reasons": reasons,
+            "first_difference": report.first_difference().map(|step| step.step),
+            "work": rerun.map(|rerun| cli::lossy(rerun.work())),
+        }));
+    }
+    let mut table = Table::new(vec![Column::new("step"), Column::new("outcome"), Column::new("what")]);
+    for step in report.steps() {
+        table.push(vec![step.step.to_owned(), step.outcome.as_str().to_owned(), step.told.clone()]);
+    }
+    let mut text = table.text(false);
+    if !reasons.is_empty() {
+        let word = if report.is_same() { "the same in spite of" } else { "possible reasons" };
+        text.push_str(&format!("\n{word}:\n"));
+        for reason in reasons {
+            let recorded = reason.recorded.as_deref().unwrap_or("not recorded");
+            text.push_str(&format!("  {}: {recorded} then, {} now\n", reason.what, reason.now));
+        }
+    }
+    let name = cli::lossy(Path::new(folder.file_name().unwrap_or_default()));
+    let told = match (report.is_same(), report.first_difference()) {
+        (true, _) => "all that was asked for is the same".to_owned(),
+        (false, Some(step)) => format!("the first step that differs: {}", step.step),
+        (false, None) => "not all that was asked for could be compared".to_owned(),
+    };
+    cli::print(&format!("{text}\n{name}: {told}\n"))
+}
