@@ -173,6 +173,59 @@ def compare_images(source: Path, root: Path, form: str) -> str:
     return f"{pictures} pictures, pixel by pixel, and back"
 
 
+def frames_of(data: Any, episode: int) -> list[dict[str, Any]]:
+    """What LeRobot gives for every frame of an episode."""
+    bounds = data.meta.episodes[episode]
+    return [data[i] for i in range(bounds["dataset_from_index"], bounds["dataset_to_index"])]
+
+
+def same_episode(one: Any, episode: int, two: Any, other: int, names: dict[str, str]) -> int:
+    """Compare an episode of one set with one of another, frame by frame, under other names; returns its length."""
+    ours_now, before = frames_of(one, episode), frames_of(two, other)
+    assert len(ours_now) == len(before), (len(ours_now), len(before))
+    for now, then in zip(ours_now, before, strict=True):
+        assert now["task"] == then["task"], (now["task"], then["task"])
+        for key in two.meta.features:
+            if key not in ("episode_index", "index", "task_index"):
+                a, b = now[names.get(key, key)], then[key]
+                assert a == b if isinstance(b, str) else torch.equal(a, b), (key, episode, other)
+        assert int(now["episode_index"]) == episode
+    return len(before)
+
+
+def edit_and_open(root: Path, folder: Path) -> str:
+    """Edits of a set: LeRobot opens each result and shows in it what the source shows; statistics follow."""
+    folder.mkdir()
+    source = open_lerobot(root)
+    last = source.num_episodes - 1
+    frames = 0
+    ours("actrm-data", "edit", "drop", root, folder / "dropped", "--episodes", "0")
+    ours("actrm-data", "edit", "keep", root, folder / "kept", "--episodes", f"0,{last}")
+    ours("actrm-data", "edit", "split", root, folder / "parts", "--counts", f"a=1,b={last}")
+    ours("actrm-data", "edit", "merge", folder / "parts/b", folder / "parts/a", "--out", folder / "merged")
+    key = (source.meta.camera_keys or ["observation.environment_state"])[-1]
+    ours("actrm-data", "edit", "rename", folder / "kept", folder / "renamed", "--feature", f"{key}=observation.renamed")
+    everything = list(range(last + 1))
+    expected = {
+        "dropped": everything[1:],
+        "kept": [0, last],
+        "parts/a": [0],
+        "parts/b": everything[1:],
+        "merged": [*everything[1:], 0],
+        "renamed": [0, last],
+    }
+    for name, episodes in expected.items():
+        ours("actrm-data", "validate", folder / name)
+        data = open_lerobot(folder / name)
+        assert data.num_episodes == len(episodes), (name, data.num_episodes)
+        names = {key: "observation.renamed"} if name == "renamed" else {}
+        frames += sum(same_episode(data, i, source, episode, names) for i, episode in enumerate(episodes))
+        actions = np.stack([data.hf_dataset[i]["action"].numpy() for i in range(data.num_frames)]).astype(np.float64)
+        for statistic, want in {"mean": actions.mean(0), "std": actions.std(0), "max": actions.max(0)}.items():
+            np.testing.assert_allclose(data.meta.stats["action"][statistic], want, atol=1e-6, err_msg=name)
+    return f"{len(expected)} results, {frames} frames"
+
+
 def train_lerobot(root: Path, out: Path, pictures: bool = False, **options: Any) -> str:
     """LeRobot trains its ACT on one of our sets for two steps, as its own example does, and stores what it has."""
     from lerobot.configs.types import FeatureType
@@ -392,25 +445,44 @@ def compare_trees(one: Path, two: Path) -> str:
     return f"{len(left)} groups and data sets"
 
 
-def write_lerobot(root: Path) -> int:
-    """A small data set written by LeRobot itself; returns its number of frames."""
+def write_lerobot(root: Path, form: str | None = None) -> int:
+    """A small data set written by LeRobot itself, with a camera where a form is given; returns its number of frames."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    features = {
+    features: dict[str, Any] = {
         "observation.state": {"dtype": "float32", "shape": (3,), "names": None},
         "observation.environment_state": {"dtype": "float32", "shape": (2,), "names": None},
         "action": {"dtype": "float32", "shape": (2,), "names": None},
     }
-    data = LeRobotDataset.create("actrm/theirs", fps=20, features=features, root=root, use_videos=False)
+    if form:
+        features["note"] = {"dtype": "string", "shape": (1,), "names": None}
+        features["next.reward"] = {"dtype": "float64", "shape": (1,), "names": None}
+        pictures = {"dtype": form, "shape": (64, 64, 3), "names": ["height", "width", "channels"]}
+        features["observation.images.front"] = pictures
+    data = LeRobotDataset.create("actrm/theirs", fps=20, features=features, root=root, use_videos=form == "video")
     rng = np.random.default_rng(0)
     lengths = (7, 11, 5)
-    for length in lengths:
-        for _ in range(length):
-            frame = {key: rng.normal(size=f["shape"]).astype(np.float32) for key, f in features.items()}
-            data.add_frame({**frame, "task": "wander"})
+
+    def value(key: str, feature: dict[str, Any], step: int) -> Any:
+        if key == "note":
+            return f"step {step}"
+        if key.startswith("observation.images."):
+            return rng.integers(0, 256, feature["shape"], dtype=np.uint8)
+        return rng.normal(size=feature["shape"]).astype(feature["dtype"])
+
+    for episode, length in enumerate(lengths):
+        for step in range(length):
+            frame = {key: value(key, feature, step) for key, feature in features.items()}
+            data.add_frame({**frame, "task": ("wander", "rest")[episode % 2]})
         data.save_episode()
     data.finalize()
     return sum(lengths)
+
+
+def edit_theirs(folder: Path, form: str) -> str:
+    """Edits of a set that LeRobot wrote, with pictures of this form."""
+    write_lerobot(folder / f"theirs-{form}", form)
+    return edit_and_open(folder / f"theirs-{form}", folder / f"edits-of-theirs-{form}")
 
 
 def open_theirs(folder: Path) -> str:
@@ -493,6 +565,11 @@ def main() -> None:
             "export rebuilds the source": lambda: compare_trees(source, exported),
             "robomimic reads the exported file": lambda: compare_robomimic(exported),
             "a data set written by LeRobot opens in ours": lambda: open_theirs(folder),
+            "LeRobot opens edited sets of ours": lambda: edit_and_open(root, folder / "edits"),
+            "LeRobot opens them with PNG pictures": lambda: edit_and_open(folder / "png", folder / "png-edits"),
+            "LeRobot opens them with videos": lambda: edit_and_open(folder / "video", folder / "video-edits"),
+            "LeRobot opens edited sets of its own": lambda: edit_theirs(folder, "image"),
+            "LeRobot opens them with its own videos": lambda: edit_theirs(folder, "video"),
             "shards on a Ray cluster make one evaluation": lambda: evaluate_on_ray(root, folder / "ray"),
         }
         for title, check in checks.items():

@@ -1,4 +1,4 @@
-//! SIGKILL at any time during a training, an evaluation or a leaderboard: nothing is left that cannot be read, and the same
+//! SIGKILL at any time during a training, an evaluation, a leaderboard or an edit: nothing is left that cannot be read, and the same
 //! command goes on to the same bytes. `ACTRM_KILLS=100` for more than a few of each.
 
 use std::fs;
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use e2e::{copied_zoo, copy, listing, root, succeeds, text, trained, zoo};
+use e2e::{copied_zoo, copy, data, lift, listing, root, succeeds, text, trained, zoo};
 
 fn kills() -> u64 {
     std::env::var("ACTRM_KILLS").ok().map_or(3, |text| text.parse().expect("a number"))
@@ -135,4 +135,33 @@ fn a_killed_leaderboard_leaves_whole_files() {
         succeeds(&mut board());
         assert_eq!(files(), whole);
     }
+}
+
+#[test]
+fn a_killed_edit_in_place_leaves_the_old_set_or_the_new() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let set = folder.path().join("set");
+    succeeds(&mut data(["convert", text(&lift()), text(&set)]));
+    let rename = |from: &str, to: &str| {
+        let mut command = data(["edit", "rename", text(&set), "--in-place", "--feature"]);
+        command.arg(format!("{from}={to}"));
+        command
+    };
+    let mut names = ["next.reward", "reward"];
+    let takes = timed(&mut rename(names[0], names[1]));
+    names.reverse();
+    let mut died = 0;
+    for k in 0..6 * kills() {
+        died += u32::from(killed(&mut rename(names[0], names[1]), takes, spread(k)));
+        succeeds(&mut data(["validate", text(&set)]));
+        let columns = String::from_utf8(succeeds(&mut data(["inspect", text(&set), "--json"])).stdout).expect("text");
+        let has = |name: &str| columns.contains(&format!("\"key\": \"{name}\""));
+        assert!(has(names[0]) != has(names[1]), "{columns}");
+        if has(names[1]) {
+            names.reverse();
+        }
+    }
+    // the next one takes away what the killed ones left
+    succeeds(&mut rename(names[0], names[1]));
+    assert_eq!(listing(folder.path()), ["set"], "after {died} kills");
 }

@@ -3,7 +3,7 @@
 //! [`Source`] reads a file or folder of demonstrations of any known layout, [`convert`] makes a LeRobotDataset v3.0
 //! directory of it, [`export`] rebuilds the file from that, [`Dataset`] opens a directory (ours or LeRobot's) with its
 //! numeric columns in memory, [`Windows`] cuts training samples out of them, and [`Samples`] those that LeRobot's
-//! `delta_timestamps` ask for. [`RobomimicWriter`] writes
+//! `delta_timestamps` ask for. [`edit`] makes data sets of data sets. [`RobomimicWriter`] writes
 //! demonstrations that were just collected, [`write_puzzles`] a table of puzzles.
 //!
 //! It is the only crate that knows HDF5. It knows nothing of models, tensors or simulators, starts no process but its
@@ -32,7 +32,7 @@ pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset,
     ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info,
     PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, VideoOptions, VideoProvenance, convert,
-    convert_unless, export, verify, verify_source,
+    convert_unless, edit, export, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};

@@ -137,6 +137,48 @@ impl FeatureStats {
         Some(stats)
     }
 
+    /// Statistics of several disjoint parts taken together, each counting by its frames. Extremes, mean and standard
+    /// deviation are the whole's; quantiles are the parts' means, as LeRobot has them, and empty where a part has none.
+    /// `None` of no frames.
+    pub fn pooled(parts: &[&Self]) -> Option<Self> {
+        let dim = parts.first()?.mean.len();
+        let count: u64 = parts.iter().map(|part| part.count).sum();
+        if count == 0 || parts.iter().any(|part| part.mean.len() != dim) {
+            return None;
+        }
+        type Get = fn(&FeatureStats) -> &Vec<f64>;
+        let weighted = |value: &dyn Fn(&Self) -> f64| -> f64 {
+            parts.iter().map(|part| part.count as f64 * value(part)).sum::<f64>() / count as f64
+        };
+        let averages = |get: Get| -> Vec<f64> {
+            match parts.iter().all(|part| get(part).len() == dim) {
+                true => (0..dim).map(|d| weighted(&|part| get(part)[d])).collect(),
+                false => Vec::new(),
+            }
+        };
+        let extreme = |get: Get, pick: fn(f64, f64) -> f64| -> Option<Vec<f64>> {
+            (0..dim).map(|d| parts.iter().filter_map(|part| get(part).get(d).copied()).reduce(pick)).collect()
+        };
+        let mean = averages(|s| &s.mean);
+        let std = (0..dim).map(|d| {
+            let spread =
+                |part: &Self| part.std.get(d).copied().unwrap_or(0.0).powi(2) + (part.mean[d] - mean[d]).powi(2);
+            weighted(&spread).sqrt()
+        });
+        Some(Self {
+            min: extreme(|s| &s.min, f64::min)?,
+            max: extreme(|s| &s.max, f64::max)?,
+            std: std.collect(),
+            count,
+            q01: averages(|s| &s.q01),
+            q10: averages(|s| &s.q10),
+            q50: averages(|s| &s.q50),
+            q90: averages(|s| &s.q90),
+            q99: averages(|s| &s.q99),
+            mean,
+        })
+    }
+
     /// The quantile vectors in the order of [`QUANTILES`].
     pub fn quantiles(&self) -> [&[f64]; 5] {
         [&self.q01, &self.q10, &self.q50, &self.q90, &self.q99]
@@ -249,8 +291,23 @@ mod tests {
         }
     }
 
+    proptest! {
+        #[test]
+        fn parts_taken_together_are_the_whole(rows in prop::collection::vec(-1e3_f64..1e3, 2..100), at in any::<prop::sample::Index>()) {
+            let (a, b) = rows.split_at(1 + at.index(rows.len() - 1));
+            let parts = [FeatureStats::of(a, 1).unwrap(), FeatureStats::of(b, 1).unwrap()];
+            let (whole, pooled) = (FeatureStats::of(&rows, 1).unwrap(), FeatureStats::pooled(&[&parts[0], &parts[1]]).unwrap());
+            prop_assert_eq!((whole.count, &whole.min, &whole.max), (pooled.count, &pooled.min, &pooled.max));
+            prop_assert!((whole.mean[0] - pooled.mean[0]).abs() < 1e-9 && (whole.std[0] - pooled.std[0]).abs() < 1e-9);
+            prop_assert!(pooled.q50[0] >= parts[0].q50[0].min(parts[1].q50[0]));
+            let old = FeatureStats { q10: Vec::new(), ..parts[1].clone() };
+            prop_assert!(FeatureStats::pooled(&[&parts[0], &old]).unwrap().q10.is_empty());
+        }
+    }
+
     #[test]
     fn no_rows_have_no_statistics() {
+        assert_eq!(FeatureStats::pooled(&[]), None);
         assert_eq!(FeatureStats::of::<f32>(&[], 3), None);
         assert_eq!(FeatureStats::of::<f32>(&[], 0), None);
     }

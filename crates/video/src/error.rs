@@ -93,6 +93,19 @@ pub enum VideoError {
         found: String,
     },
 
+    /// A stretch that cannot be taken out without being encoded again.
+    #[error("{name}: frames {from} to {to} cannot be cut out as they are: {reason}")]
+    Cut {
+        /// The file.
+        name: String,
+        /// The first frame of the stretch, from 0.
+        from: usize,
+        /// Its last frame.
+        to: usize,
+        /// Why.
+        reason: String,
+    },
+
     /// Pictures that cannot be encoded.
     #[error("pictures of {width} x {height} at {fps} frames a second cannot be encoded: {reason}")]
     Encode {

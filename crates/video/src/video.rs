@@ -5,6 +5,7 @@ use std::fs::File;
 use std::ops::Range;
 use std::path::Path;
 
+use crate::Sample;
 use crate::decode::{Decoder, Setup};
 use crate::demux::{self, Bytes, Codec, Track};
 use crate::error::{Result, VideoError};
@@ -135,6 +136,39 @@ impl Video {
         let index = self.info.frame_at(seconds).ok_or_else(|| self.none(format!("frame at {seconds} s")))?;
         let mut frames = self.range(index..index + 1)?;
         frames.next().unwrap_or_else(|| Err(self.none(format!("frame {index}"))))
+    }
+
+    /// The samples of a range of frames as they lie in the file, for another file ([`crate::Muxer`]): nothing is decoded.
+    ///
+    /// # Errors
+    /// [`VideoError::Cut`] where they would not be the same pictures elsewhere: the first one needs pictures before it, or
+    /// the file is H.264, whose samples may lie in another order than they are shown.
+    pub fn samples(&self, range: Range<usize>) -> Result<Vec<Sample>> {
+        let cut = |reason: String| VideoError::Cut {
+            name: self.name.clone(),
+            from: range.start,
+            to: range.end.saturating_sub(1),
+            reason,
+        };
+        if range.is_empty() || range.end > self.order.len() {
+            return Err(self.none(format!("frames {} to {}", range.start, range.end)));
+        }
+        if self.info.codec != Codec::Av1 {
+            return Err(cut(format!("expected av1, found {}", self.info.codec.name())));
+        }
+        if self.order[range.clone()].iter().zip(range.clone()).any(|(&sample, frame)| sample as usize != frame) {
+            return Err(cut("its samples lie in another order than they are shown".to_owned()));
+        }
+        if !self.track.places[range.start].key {
+            return Err(cut("the first is no key frame".to_owned()));
+        }
+        let mut samples = Vec::with_capacity(range.len());
+        for frame in range {
+            let mut bytes = Vec::new();
+            read_sample(&self.name, &self.bytes, &self.track, frame, &mut bytes)?;
+            samples.push(Sample { bytes, key: self.track.places[frame].key });
+        }
+        Ok(samples)
     }
 
     fn none(&self, wanted: String) -> VideoError {

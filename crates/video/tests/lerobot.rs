@@ -4,7 +4,7 @@
 
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
-use video::{Codec, Video, VideoError};
+use video::{Codec, Muxer, Rate, Video, VideoError};
 
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
@@ -61,4 +61,25 @@ fn any_frame_is_found_by_its_time_and_by_its_number() {
         assert_eq!(video.range(36..36).unwrap().count(), 0);
         assert!(video.frames().next_into(&mut [0; 7]).unwrap().is_err());
     }
+}
+
+#[test]
+fn samples_of_whole_stretches_make_another_file_of_the_same_pictures() {
+    let video = Video::open(&fixture("av1_agentview.mp4")).unwrap();
+    let keys: Vec<usize> = (0..36).filter(|&i| video.samples(i..i + 1).is_ok()).collect();
+    assert!(keys.len() > 2 && keys.len() < 36, "{keys:?}");
+    let (from, to) = (keys[1], keys[keys.len() - 1]);
+    let samples = video.samples(from..to).unwrap();
+    let mut muxer = Muxer::new(84, 84, Rate::of(20.0).unwrap());
+    samples.iter().try_for_each(|sample| muxer.push(sample)).unwrap();
+    let bytes = samples.iter().fold(muxer.header(), |file, sample| [file, sample.bytes.clone()].concat());
+    let cut = Video::from_bytes("cut", bytes).unwrap();
+    let found: Vec<String> = cut.frames().map(|frame| hash(&frame.unwrap().rgb)).collect();
+    assert_eq!(found, hashes("av1_agentview")[from..to]);
+    let refused = |video: &Video, range| video.samples(range).unwrap_err().to_string();
+    let other = (0..36).find(|i| !keys.contains(i)).unwrap();
+    assert!(refused(&video, other..36).ends_with("the first is no key frame"), "{}", refused(&video, other..36));
+    assert!(refused(&video, 30..37).contains("no frames 30 to 37"));
+    let h264 = Video::open(&fixture("h264_agentview.mp4")).unwrap();
+    assert!(refused(&h264, 0..36).contains("frames 0 to 35 cannot be cut out as they are: expected av1, found h264"));
 }

@@ -4,23 +4,21 @@
 //! episodes say about themselves. The bytes written do not depend on the number of threads.
 
 use super::check;
-use super::encode::{ColumnSummary, GroupOutput, Job, PartSummary, PictureSummary};
+use super::encode::{GroupOutput, Job};
 use super::features::{ConvertOptions, Mapping};
-use super::fingerprint::Fingerprint;
 use super::info::{self, Info, Provenance, VideoProvenance};
-use super::meta::{self, EpisodeRow};
+use super::meta;
 use super::schema::{self, CREATED_BY};
-use super::shards::{GroupEncoder, Place, ShardWriter, WrittenFile};
+use super::shards::{GroupEncoder, ShardWriter, WrittenFile};
 use super::side::{self, SideEncoder, SideOutput, SideWriter};
 use super::staging::Staging;
-use super::values::{Values, stats_of};
+use super::tally::{Tally, Told};
 use super::verify::hash_source;
 use super::videos::{self, VideoWriter};
-use super::work::{self, Part};
+use super::work;
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::Plan;
 use crate::source::Source;
-use crate::stats::FeatureStats;
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -103,9 +101,7 @@ struct Conversion<'a> {
 /// What is known once all frames are written.
 struct Frames {
     tasks: Vec<String>,
-    rows: Vec<EpisodeRow>,
-    stats: BTreeMap<String, FeatureStats>,
-    fingerprint: String,
+    told: Told,
     files: Vec<WrittenFile>,
 }
 
@@ -147,13 +143,13 @@ impl Conversion<'_> {
         };
         let mut side_writer = match &side {
             Some((side, objects, rest)) => {
-                Some(SideWriter::new(self.root, side, objects, limit, info::FILES_PER_FOLDER, rest)?)
+                Some(SideWriter::new(self.root, &side.layout, side.frames(), objects, limit, rest)?)
             }
             None => None,
         };
         let video_limit = (self.options.video_file_mb * f64::from(1 << 20)) as u64;
-        let films = VideoWriter::new(self.root, video_limit, &self.mapping.columns, self.mapping.fps)?;
-        let mut collected = Collected::new(self.mapping, &tasks, films);
+        let mut films = VideoWriter::new(self.root, video_limit, &self.mapping.columns, self.mapping.fps)?;
+        let mut tally = Tally::new(&features, self.mapping.fps, &tasks);
         let total = self.plan.frames() as u64;
         let mut done = 0;
         tell(0, total)?;
@@ -170,7 +166,8 @@ impl Conversion<'_> {
                 done += output.group.rows as u64;
                 let place = shards.append(output.group, begins)?;
                 for part in output.parts {
-                    collected.add(part, place, &task_of)?;
+                    let task = task_of[part.part.episode];
+                    tally.add(part, place, &[task], &mut |camera, samples| films.append(camera, samples))?;
                 }
                 if let (Some(writer), Some(beside)) = (&mut side_writer, beside) {
                     writer.append(beside)?;
@@ -182,9 +179,9 @@ impl Conversion<'_> {
         if let Some(writer) = side_writer {
             files.extend(writer.finish()?);
         }
-        let (rows, stats, fingerprint, films) = collected.finish();
+        let told = tally.finish();
         files.extend(films.finish()?);
-        Ok(Frames { tasks, rows, stats, fingerprint, files })
+        Ok(Frames { tasks, told, files })
     }
 
     /// Task texts in order of first use, and each episode's.
@@ -221,9 +218,9 @@ impl Conversion<'_> {
             self.mapping.columns.iter().map(|c| (c.name.clone(), c.feature.is_visual())).collect();
         let mut files = frames.files;
         files.push(meta::write_tasks(self.root, &frames.tasks)?);
-        files.push(meta::write_episodes(self.root, &frames.tasks, &statistical, &frames.rows)?);
-        files.push(meta::write_stats(self.root, &statistical, &frames.stats)?);
-        let info = check::sealed(self.info(&frames.tasks, &frames.fingerprint, source_sha256), self.root)?;
+        files.push(meta::write_episodes(self.root, &frames.tasks, &statistical, &frames.told.rows)?);
+        files.push(meta::write_stats(self.root, &statistical, &frames.told.stats)?);
+        let info = check::sealed(self.info(&frames.tasks, &frames.told.fingerprint, source_sha256), self.root)?;
         files.push(meta::write_json(self.root, "meta/info.json", &info)?);
         if self.options.lossless {
             files.push(side::write_manifest(self.root, &files)?);
@@ -240,7 +237,7 @@ impl Conversion<'_> {
                 .collect(),
             files: files.len(),
             bytes: files.iter().map(|f| f.bytes).sum(),
-            fingerprint: frames.fingerprint,
+            fingerprint: frames.told.fingerprint,
             tasks: frames.tasks,
             notes: self
                 .plan
@@ -285,6 +282,7 @@ impl Conversion<'_> {
             data_path: info::DATA_PATH.to_owned(),
             video_path: self.films().then(|| videos::VIDEO_PATH.to_owned()),
             features: self.mapping.features(),
+            other: BTreeMap::new(),
             actrm: Some(Provenance {
                 format: 1,
                 writer: CREATED_BY.to_owned(),
@@ -313,97 +311,5 @@ impl Conversion<'_> {
                 }),
             }),
         }
-    }
-}
-
-/// What the episodes said, as it comes in.
-struct Collected<'a> {
-    mapping: &'a Mapping,
-    rows: Vec<EpisodeRow>,
-    /// Values of each column, an entry an episode.
-    values: Vec<Vec<Values>>,
-    /// Pictures of each image column over all episodes (histograms only).
-    totals: BTreeMap<usize, PictureSummary>,
-    /// The episode that is being put together.
-    open: Option<(Vec<ColumnSummary>, BTreeMap<usize, PictureSummary>)>,
-    fingerprint: Fingerprint,
-    tasks: &'a [String],
-    films: VideoWriter<'a>,
-}
-
-impl<'a> Collected<'a> {
-    fn new(mapping: &'a Mapping, tasks: &'a [String], films: VideoWriter<'a>) -> Self {
-        Self {
-            mapping,
-            rows: Vec::new(),
-            values: mapping.columns.iter().map(|_| Vec::new()).collect(),
-            totals: BTreeMap::new(),
-            open: None,
-            fingerprint: Fingerprint::new(&mapping.features(), mapping.fps),
-            tasks,
-            films,
-        }
-    }
-
-    fn add(&mut self, summary: PartSummary, place: Place, task_of: &[usize]) -> Result<()> {
-        let part = summary.part;
-        if part.begins() {
-            self.rows.push(EpisodeRow {
-                length: part.length,
-                from: part.first_frame,
-                task_index: task_of[part.episode],
-                place,
-                stats: BTreeMap::new(),
-                videos: BTreeMap::new(),
-            });
-            self.open = Some((summary.values, summary.pictures));
-        } else if let Some((_, pictures)) = &mut self.open {
-            for (column, next) in summary.pictures {
-                pictures.entry(column).or_default().extend(next);
-            }
-        }
-        if part.ends() { self.close(&part) } else { Ok(()) }
-    }
-
-    fn close(&mut self, part: &Part) -> Result<()> {
-        let Some((columns, mut pictures)) = self.open.take() else { return Ok(()) };
-        let row = self.rows.last_mut().expect("an open episode has its row");
-        self.fingerprint.episode(part.length, &self.tasks[row.task_index]);
-        for (index, (column, summary)) in self.mapping.columns.iter().zip(columns).enumerate() {
-            let (stats, digest) = match pictures.remove(&index) {
-                Some(found) => {
-                    if column.feature.dtype == "video" {
-                        row.videos.insert(column.name.clone(), self.films.append(index, &found.samples)?);
-                    }
-                    let digest = found.digest();
-                    let total = self.totals.entry(index).or_default();
-                    total.add_counts(&found.histograms, found.sampled);
-                    (FeatureStats::of_histograms(&found.histograms, found.sampled), digest)
-                }
-                None => (summary.stats, summary.digest),
-            };
-            if let Some(stats) = stats {
-                row.stats.insert(column.name.clone(), stats);
-            }
-            if column.has_content() {
-                self.fingerprint.column(&column.name, digest);
-            }
-            self.values[index].push(summary.values);
-        }
-        Ok(())
-    }
-
-    fn finish(self) -> (Vec<EpisodeRow>, BTreeMap<String, FeatureStats>, String, VideoWriter<'a>) {
-        let mut stats = BTreeMap::new();
-        for (index, column) in self.mapping.columns.iter().enumerate() {
-            let of_column = match self.totals.get(&index) {
-                Some(total) => FeatureStats::of_histograms(&total.histograms, total.sampled),
-                None => stats_of(&self.values[index].iter().collect::<Vec<_>>(), column.dim()),
-            };
-            if let Some(of_column) = of_column {
-                stats.insert(column.name.clone(), of_column);
-            }
-        }
-        (self.rows, stats, self.fingerprint.finish(), self.films)
     }
 }

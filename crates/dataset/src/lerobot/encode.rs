@@ -281,7 +281,7 @@ fn number_array(column: &Column, index: usize, loaded: &[Loaded]) -> ArrayRef {
 
 /// Frames of an episode whose pictures enter the statistics: LeRobot's choice, `round(linspace(0, n - 1, k))`
 /// with `k = min(max(n^0.75, 100), 10000, n)`.
-fn sample(length: usize) -> Vec<usize> {
+pub(crate) fn sample(length: usize) -> Vec<usize> {
     let wanted = (length as f64).powf(0.75) as usize;
     let count = wanted.clamp(100, 10_000).min(length);
     if count < 2 {
@@ -292,7 +292,7 @@ fn sample(length: usize) -> Vec<usize> {
 }
 
 /// LeRobot looks at every `k`-th pixel of pictures of 300 or more on a side, so that 150 are left.
-fn add_to_histograms(summary: &mut PictureSummary, height: usize, width: usize, pixels: &[u8]) {
+pub(crate) fn add_to_histograms(summary: &mut PictureSummary, height: usize, width: usize, pixels: &[u8]) {
     const LARGE: usize = 300;
     const TARGET: usize = 150;
     let stride = if height.max(width) < LARGE { 1 } else { (height.max(width) / TARGET).max(1) };

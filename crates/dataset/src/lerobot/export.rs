@@ -105,7 +105,7 @@ pub fn export(
 }
 
 /// The layout of the side folder, once its files are known to be those that were written.
-fn side_folder(root: &Path, info: &Info) -> Result<Layout> {
+pub(crate) fn side_folder(root: &Path, info: &Info) -> Result<Layout> {
     let manifest_path = root.join(MANIFEST_FILE);
     if !manifest_path.exists() {
         let found = match info.actrm {
@@ -151,7 +151,8 @@ fn bad_object(root: &Path, object: &Object, expected: &str) -> DatasetError {
     }
 }
 
-fn rest(root: &Path, objects: Vec<Object>) -> Result<Demo> {
+/// What belongs to no demo.
+pub(crate) fn rest(root: &Path, objects: Vec<Object>) -> Result<Demo> {
     let mut demo = Demo::default();
     for object in objects {
         insert(root, &mut demo, object)?;
@@ -202,7 +203,7 @@ fn unshift(root: &Path, demo: &Demo, object: &Object) -> Result<Array> {
 }
 
 /// One dataset of a demo from the side folder's frames; `None` where the demo has none.
-fn column_array(
+pub(crate) fn column_array(
     root: &Path,
     column: &SideColumn,
     batches: &[RecordBatch],
@@ -301,7 +302,7 @@ pub(crate) fn picture_pixels(
 }
 
 /// The objects in order, an episode at a time.
-struct Objects {
+pub(crate) struct Objects {
     root: PathBuf,
     rows: Rows,
     /// The first object of an episode that was not asked for yet.
@@ -309,12 +310,14 @@ struct Objects {
 }
 
 impl Objects {
-    fn open(root: &Path) -> Result<Self> {
+    /// Before the first one.
+    pub(crate) fn open(root: &Path) -> Result<Self> {
         let rows = Rows::open(root, OBJECTS, None, 256)?;
         Ok(Self { root: root.to_path_buf(), rows, peeked: std::collections::VecDeque::new() })
     }
 
-    fn of(&mut self, episode: i64) -> Result<Vec<Object>> {
+    /// Those of an episode, or of [`NO_EPISODE`]; to be asked for in order.
+    pub(crate) fn of(&mut self, episode: i64) -> Result<Vec<Object>> {
         let mut found = Vec::new();
         loop {
             if self.peeked.is_empty() {

@@ -148,11 +148,6 @@ impl Column {
     pub(crate) fn dim(&self) -> usize {
         self.feature.dim()
     }
-
-    /// Whether the values say something that the episode's number and length do not.
-    pub(crate) fn has_content(&self) -> bool {
-        !matches!(self.origin, Origin::Index(_))
-    }
 }
 
 /// The columns, and what was chosen on the way.

@@ -14,7 +14,7 @@ pub const DATA_PATH: &str = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.
 /// Files in one folder before the next begins.
 pub const FILES_PER_FOLDER: usize = 1000;
 
-/// The whole of `meta/info.json`. Keys that LeRobot may add later are ignored.
+/// The whole of `meta/info.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Info {
     /// `v3.0`; another major version is refused.
@@ -54,6 +54,9 @@ pub struct Info {
     /// What we add: where the data came from. Absent in data sets that LeRobot wrote.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actrm: Option<Provenance>,
+    /// Keys that nothing here reads: those that LeRobot has besides, or may add later.
+    #[serde(flatten)]
+    pub other: BTreeMap<String, Value>,
 }
 
 fn files_per_folder() -> usize {

@@ -28,7 +28,8 @@ const EPISODES_PER_GROUP: usize = 1000;
 pub(crate) struct EpisodeRow {
     pub length: usize,
     pub from: usize,
-    pub task_index: usize,
+    /// Tasks of its frames, in order of first use: one, unless LeRobot wrote it.
+    pub tasks: Vec<usize>,
     pub place: Place,
     /// Statistics of each feature that has them, by name.
     pub stats: BTreeMap<String, FeatureStats>,
@@ -109,7 +110,7 @@ fn episode_columns(
     };
     let mut texts = ListBuilder::new(StringBuilder::new()).with_field(element(DataType::Utf8));
     for row in rows {
-        texts.values().append_value(&tasks[row.task_index]);
+        row.tasks.iter().for_each(|&task| texts.values().append_value(&tasks[task]));
         texts.append(true);
     }
     let mut columns: Vec<(String, ArrayRef)> = vec![
@@ -133,7 +134,10 @@ fn episode_columns(
         ]);
     }
     for (feature, is_image) in features {
-        for (name, get) in STATISTICS {
+        // sets written before quantiles were stored have none
+        for (name, get) in
+            STATISTICS.into_iter().filter(|(_, get)| !rows.iter().any(|r| get(&r.stats[feature]).is_empty()))
+        {
             let mut values = Float64Builder::new();
             let mut lengths = Vec::with_capacity(rows.len());
             for row in rows {
@@ -196,6 +200,9 @@ pub(crate) fn write_stats(
         let mut one = Map::new();
         for (statistic, get) in STATISTICS {
             let values = get(&stats[name]);
+            if values.is_empty() {
+                continue;
+            }
             let value = match is_image {
                 true => Value::from(values.iter().map(|v| json!([[v]])).collect::<Vec<_>>()),
                 false => json!(values),

@@ -2,6 +2,7 @@
 
 mod check;
 mod convert;
+pub mod edit;
 mod encode;
 mod export;
 mod features;
@@ -16,6 +17,7 @@ mod schema;
 mod shards;
 mod side;
 mod staging;
+mod tally;
 mod values;
 mod verify;
 mod videos;

@@ -318,7 +318,7 @@ impl Dataset {
     }
 
     /// Pictures of a column as files.
-    fn files(&self, name: &str, column: &ArrayRef) -> Result<BinaryArray> {
+    pub(crate) fn files(&self, name: &str, column: &ArrayRef) -> Result<BinaryArray> {
         let inner = match column.as_any().downcast_ref::<StructArray>() {
             Some(fields) => fields.column_by_name("bytes").ok_or_else(|| self.bad(name, 0, "no bytes".to_owned()))?,
             None => column,
@@ -338,6 +338,8 @@ pub(crate) struct VideoPlace {
     pub path: PathBuf,
     /// Seconds from the file's beginning to the episode's.
     pub from: f64,
+    /// Seconds to the episode's end.
+    pub to: f64,
 }
 
 /// The places of all episodes of one camera.
@@ -345,12 +347,13 @@ pub(crate) fn places(dataset: &Dataset, name: &str) -> Result<Vec<VideoPlace>> {
     let (root, info) = (dataset.root(), dataset.info());
     let mut places = Vec::with_capacity(dataset.episodes().len());
     let column = |what: &str| format!("videos/{name}/{what}");
-    let names = [column("chunk_index"), column("file_index"), column("from_timestamp")];
+    let names = ["chunk_index", "file_index", "from_timestamp", "to_timestamp"].map(column);
     for path in read::files(root, "meta/episodes")? {
         let (rows, arrays) = read::columns(&path, &names.each_ref().map(String::as_str))?;
         let chunk = read::integers(&path, &names[0], &arrays[0])?;
         let file = read::integers(&path, &names[1], &arrays[1])?;
         let from = read::doubles(&path, &names[2], &arrays[2])?;
+        let to = read::doubles(&path, &names[3], &arrays[3])?;
         for row in 0..rows {
             let relative = relative(info, name, chunk[row], file[row]).ok_or_else(|| DatasetError::BadDataset {
                 path: root.join("meta/info.json"),
@@ -358,7 +361,7 @@ pub(crate) fn places(dataset: &Dataset, name: &str) -> Result<Vec<VideoPlace>> {
                 expected: "a path inside the data set with video_key, chunk_index and file_index".to_owned(),
                 found: format!("{:?} for chunk {} and file {}", info.video_path, chunk[row], file[row]),
             })?;
-            places.push(VideoPlace { path: root.join(relative), from: from[row] });
+            places.push(VideoPlace { path: root.join(relative), from: from[row], to: to[row] });
         }
     }
     Ok(places)

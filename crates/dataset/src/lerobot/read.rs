@@ -127,7 +127,7 @@ pub(crate) fn numbers(path: &Path, name: &str, array: &ArrayRef, dim: usize) -> 
 }
 
 /// Unwraps lists down to values: every row must hold exactly `dim` of them, none may be null.
-fn leaf(column: &BadColumn<'_>, array: &ArrayRef, rows: usize, dim: usize) -> Result<ArrayRef> {
+pub(crate) fn leaf(column: &BadColumn<'_>, array: &ArrayRef, rows: usize, dim: usize) -> Result<ArrayRef> {
     if array.null_count() > 0 {
         return Err(column.because("a value in every row", format!("{} nulls", array.null_count())));
     }
@@ -220,4 +220,33 @@ pub(crate) fn text_lists(path: &Path, name: &str, array: &ArrayRef) -> Result<Ve
         return Err(column.because("a list in every row", "nulls"));
     }
     lists.iter().map(|list| texts(path, name, list)).collect()
+}
+
+/// A column of numbers, or of lists of them of any depth: those of each row, one after the other.
+pub(crate) fn number_lists(path: &Path, name: &str, array: &ArrayRef) -> Result<Vec<Vec<f64>>> {
+    let column = BadColumn { path, name };
+    let row = |row: usize| {
+        let mut inner = array.slice(row, 1);
+        loop {
+            let any = inner.as_any();
+            let below = match inner.data_type() {
+                DataType::FixedSizeList(_, _) => {
+                    any.downcast_ref::<FixedSizeListArray>().map(|a| ArrayRef::clone(a.values()))
+                }
+                DataType::List(_) => any.downcast_ref::<ListArray>().map(|a| {
+                    let offsets = a.value_offsets();
+                    let (from, to) = (offsets[0] as usize, offsets[offsets.len() - 1] as usize);
+                    a.values().slice(from, to - from)
+                }),
+                DataType::LargeList(_) => any.downcast_ref::<LargeListArray>().map(|a| {
+                    let offsets = a.value_offsets();
+                    let (from, to) = (offsets[0] as usize, offsets[offsets.len() - 1] as usize);
+                    a.values().slice(from, to - from)
+                }),
+                _ => return Ok(doubles(path, name, &inner)?.to_vec()),
+            };
+            inner = below.ok_or_else(|| column.because("lists of numbers", inner.data_type().to_string()))?;
+        }
+    };
+    (0..array.len()).map(row).collect()
 }

@@ -60,7 +60,12 @@ pub(crate) fn huggingface_metadata(features: &Features) -> KeyValue {
         };
         map.insert(name.clone(), described);
     }
-    let features = Value::Object(map);
+    described_as(map)
+}
+
+/// The entry that says this of the columns.
+pub(crate) fn described_as(columns: Map<String, Value>) -> KeyValue {
+    let features = Value::Object(columns);
     let digest: [u8; 32] = Sha256::digest(features.to_string()).into();
     let fingerprint = &hex(&digest)[..16];
     let text = json!({"info": {"features": features}, "fingerprint": fingerprint}).to_string();

@@ -11,8 +11,9 @@
 
 use super::encode::{Job, Loaded};
 use super::features::{Origin, VideoOptions};
+use super::info::FILES_PER_FOLDER;
 use super::schema::{element, writer_properties};
-use super::shards::{EncodedGroup, GroupEncoder, ShardWriter, WrittenFile};
+use super::shards::{EncodedGroup, GroupEncoder, Place, ShardWriter, WrittenFile};
 use super::work::{BULK_ROW_BYTES, Part};
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::{DemoPlan, KeyPlan, Plan};
@@ -136,7 +137,7 @@ impl SideColumn {
         }
     }
 
-    fn field(&self) -> Field {
+    pub(crate) fn field(&self) -> Field {
         let data_type = match (self.number_type(), self.row_elements()) {
             (Some(number), 1) => number,
             (Some(number), n) => DataType::FixedSizeList(element(number), n as i32),
@@ -239,8 +240,7 @@ impl SideEncoder {
             }
         }
         let layout = layout(plan, &pictures, &left_out);
-        let fields: Vec<Field> = layout.columns.iter().map(SideColumn::field).collect();
-        let frames = encoder(root, Schema::new(fields))?;
+        let frames = frame_encoder(root, &layout)?;
         Ok(Self { layout, frames, pictures, left_out })
     }
 
@@ -395,7 +395,7 @@ impl SideEncoder {
 }
 
 impl Object {
-    fn dataset(path: &str, array: Array) -> Self {
+    pub(crate) fn dataset(path: &str, array: Array) -> Self {
         Self { kind: Kind::Dataset, path: path.to_owned(), name: String::new(), rows: Vec::new(), array: Some(array) }
     }
 
@@ -436,6 +436,11 @@ fn encoder(root: &Path, schema: Schema) -> Result<GroupEncoder> {
         .map_err(|source| DatasetError::Parquet { path: root.join("actrm"), operation: "prepare writing it", source })
 }
 
+/// The encoder of the frames.
+pub(crate) fn frame_encoder(root: &Path, layout: &Layout) -> Result<GroupEncoder> {
+    encoder(root, Schema::new(layout.columns.iter().map(SideColumn::field).collect::<Vec<_>>()))
+}
+
 /// The encoder of the objects.
 pub(crate) fn object_encoder(root: &Path) -> Result<GroupEncoder> {
     encoder(
@@ -467,20 +472,21 @@ pub(crate) struct SideWriter<'a> {
 }
 
 impl<'a> SideWriter<'a> {
-    /// Starts with what belongs to no demo.
+    /// Starts with what belongs to no demo. `frames` encodes the columns of `layout`, `encoder` the objects; files are
+    /// closed at `limit` bytes.
     pub(crate) fn new(
         root: &'a Path,
-        side: &'a SideEncoder,
+        layout: &'a Layout,
+        frames: &'a GroupEncoder,
         encoder: &'a GroupEncoder,
         limit: u64,
-        files_per_folder: usize,
         rest: &Demo,
     ) -> Result<Self> {
         let mut writer = Self {
             root,
-            layout: &side.layout,
-            frames: ShardWriter::new(root, FRAMES, side.frames(), limit, files_per_folder),
-            objects: ShardWriter::new(root, OBJECTS, encoder, limit, files_per_folder),
+            layout,
+            frames: ShardWriter::new(root, FRAMES, frames, limit, FILES_PER_FOLDER),
+            objects: ShardWriter::new(root, OBJECTS, encoder, limit, FILES_PER_FOLDER),
             encoder,
             waiting: Vec::new(),
             waiting_bytes: 0,
@@ -513,6 +519,11 @@ impl<'a> SideWriter<'a> {
         Ok(())
     }
 
+    /// Appends rows of the frames.
+    pub(crate) fn append_frames(&mut self, group: EncodedGroup, begins_episode: bool) -> Result<Place> {
+        self.frames.append(group, begins_episode)
+    }
+
     /// Adds an object to the open episode; the pieces of a shifted dataset become one.
     fn join(&mut self, object: Object) {
         if object.kind == Kind::Shifted
@@ -527,7 +538,8 @@ impl<'a> SideWriter<'a> {
         }
     }
 
-    fn push(&mut self, episode: i64, object: Object) -> Result<()> {
+    /// Appends an object of an episode.
+    pub(crate) fn push(&mut self, episode: i64, object: Object) -> Result<()> {
         self.waiting_bytes += object.size();
         self.waiting.push((episode, object));
         if self.waiting_bytes > OBJECT_GROUP_BYTES { self.flush() } else { Ok(()) }

@@ -1,8 +1,8 @@
 //! A folder that appears whole or not at all.
 //!
 //! Everything is written into a hidden folder beside the target; [`Staging::publish`] flushes it to disk and
-//! renames it. A writer that is killed leaves the hidden folder, locked by nobody, and the next writer of the
-//! same target removes it.
+//! renames it, or exchanges it with the folder that it replaces. A writer that is killed leaves a hidden folder, locked by
+//! nobody, and the next writer of the same target removes it.
 
 use crate::error::{DatasetError, Result};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
@@ -17,6 +17,8 @@ pub(crate) struct Staging {
     target: PathBuf,
     /// Held open and locked: a folder that somebody is still writing is not removed by others.
     _lock: File,
+    /// Whether the target is there and is to be replaced.
+    replaces: bool,
     published: bool,
 }
 
@@ -29,6 +31,17 @@ impl Staging {
     /// Starts a folder that is to appear as `target`, which must not exist; its parent must.
     pub(crate) fn create(target: &Path) -> Result<Self> {
         refuse_existing(target)?;
+        Self::beside(target, false)
+    }
+
+    /// Starts a folder that is to take the place of the folder `target`.
+    pub(crate) fn replacing(target: &Path) -> Result<Self> {
+        // what a link names is replaced, not the link
+        let target = std::fs::canonicalize(target).map_err(io_error(target, "look at it"))?;
+        Self::beside(&target, true)
+    }
+
+    fn beside(target: &Path, replaces: bool) -> Result<Self> {
         let parent = parent_of(target);
         let name = target.file_name().ok_or_else(|| DatasetError::Io {
             path: target.to_path_buf(),
@@ -48,7 +61,7 @@ impl Staging {
             if folder.path().exists() {
                 widen_permissions(folder.path())?;
                 let path = folder.keep();
-                return Ok(Self { path, target: target.to_path_buf(), _lock: lock, published: false });
+                return Ok(Self { path, target: target.to_path_buf(), _lock: lock, replaces, published: false });
             }
         }
     }
@@ -61,6 +74,13 @@ impl Staging {
     /// Flushes everything to disk and gives the folder its name.
     pub(crate) fn publish(mut self) -> Result<()> {
         sync_tree(&self.path)?;
+        if self.replaces {
+            // at once: at no time is there neither of the two
+            renameat_with(CWD, &self.path, CWD, &self.target, RenameFlags::EXCHANGE)
+                .map_err(|errno| io_error(&self.target, "exchange it with what was written beside it")(errno.into()))?;
+            // dropped now, the hidden folder is the old one
+            return sync_parent(&self.target);
+        }
         match renameat_with(CWD, &self.path, CWD, &self.target, RenameFlags::NOREPLACE) {
             Ok(()) => {}
             Err(rustix::io::Errno::EXIST) => {
@@ -77,9 +97,7 @@ impl Staging {
             }
         }
         self.published = true;
-        let parent = parent_of(&self.target);
-        let folder = File::open(parent).map_err(io_error(parent, "open it"))?;
-        folder.sync_all().map_err(io_error(parent, "flush it to disk"))
+        sync_parent(&self.target)
     }
 }
 
@@ -97,6 +115,12 @@ fn parent_of(target: &Path) -> &Path {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     }
+}
+
+fn sync_parent(target: &Path) -> Result<()> {
+    let parent = parent_of(target);
+    let folder = File::open(parent).map_err(io_error(parent, "open it"))?;
+    folder.sync_all().map_err(io_error(parent, "flush it to disk"))
 }
 
 fn refuse_existing(target: &Path) -> Result<()> {
@@ -180,6 +204,23 @@ mod tests {
         std::fs::write(&target, "precious").unwrap();
         assert!(matches!(Staging::create(&target), Err(DatasetError::OutputExists { .. })));
         assert_eq!(std::fs::read_to_string(&target).unwrap(), "precious");
+    }
+
+    #[test]
+    fn a_folder_is_replaced_at_once_and_stays_until_then() {
+        let dir = tempfile::tempdir().unwrap();
+        let (target, link) = (dir.path().join("set"), dir.path().join("link"));
+        std::fs::create_dir(&target).unwrap();
+        std::fs::write(target.join("x"), "old").unwrap();
+        std::os::unix::fs::symlink(&target, &link).unwrap();
+        drop(Staging::replacing(&target).unwrap());
+        let staging = Staging::replacing(&link).unwrap();
+        std::fs::write(staging.path().join("x"), "new").unwrap();
+        assert_eq!(std::fs::read_to_string(target.join("x")).unwrap(), "old");
+        staging.publish().unwrap();
+        assert_eq!(std::fs::read_to_string(target.join("x")).unwrap(), "new");
+        assert_eq!(names(dir.path()), ["link", "set"]);
+        assert!(Staging::replacing(&dir.path().join("none")).is_err());
     }
 
     #[test]

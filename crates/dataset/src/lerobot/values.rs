@@ -15,9 +15,11 @@ use std::path::Path;
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Values {
     F32(Vec<f32>),
+    /// Only where LeRobot wrote them.
+    F64(Vec<f64>),
     I64(Vec<i64>),
     Bool(Vec<bool>),
-    /// Images are not held whole; they are read and encoded by rows.
+    /// Images are not held whole; they are read and encoded by rows. Texts have no statistics either.
     Pictures,
 }
 
@@ -36,6 +38,7 @@ impl Values {
         let mut hash = Sha256::new();
         match self {
             Self::F32(v) => hash_numbers(&mut hash, v, |x| x.to_le_bytes()),
+            Self::F64(v) => hash_numbers(&mut hash, v, |x| x.to_le_bytes()),
             Self::I64(v) => hash_numbers(&mut hash, v, |x| x.to_le_bytes()),
             Self::Bool(v) => hash_numbers(&mut hash, v, |x| [u8::from(*x)]),
             Self::Pictures => {}
@@ -56,6 +59,13 @@ pub(crate) fn stats_of(episodes: &[&Values], dim: usize) -> Option<FeatureStats>
             let pieces: Vec<&[f32]> = episodes
                 .iter()
                 .filter_map(|v| if let Values::F32(v) = v { Some(v.as_slice()) } else { None })
+                .collect();
+            FeatureStats::of_rows(&pieces, dim)
+        }
+        Values::F64(_) => {
+            let pieces: Vec<&[f64]> = episodes
+                .iter()
+                .filter_map(|v| if let Values::F64(v) = v { Some(v.as_slice()) } else { None })
                 .collect();
             FeatureStats::of_rows(&pieces, dim)
         }

@@ -66,7 +66,7 @@ impl Camera {
 }
 
 /// The rate as a fraction that a file can count in.
-fn rate(fps: f64, width: usize, height: usize) -> Result<Rate> {
+pub(crate) fn rate(fps: f64, width: usize, height: usize) -> Result<Rate> {
     let reason = "the rate is no fraction with a denominator up to 100 or 1001".to_owned();
     Ok(Rate::of(fps).ok_or(VideoError::Encode { width, height, fps, reason })?)
 }

@@ -9,9 +9,9 @@ use std::sync::{Condvar, Mutex, mpsc};
 
 /// Frames after which a row group of whole episodes is closed: setting up a column costs as much as packing some
 /// hundred frames of it, and a reader of one episode unpacks no more than this many frames.
-const GROUP_FRAMES: usize = 4096;
+pub(crate) const GROUP_FRAMES: usize = 4096;
 /// Raw bytes after which a row group is closed, and into which a large episode is cut.
-const GROUP_BYTES: u64 = 8 << 20;
+pub(crate) const GROUP_BYTES: u64 = 8 << 20;
 /// A dataset with more bytes a row than this is read by rows, never whole.
 pub(crate) const BULK_ROW_BYTES: u64 = 4096;
 

@@ -1,0 +1,172 @@
+//! Videos carried over without being encoded again: a file of which every episode is taken is copied, of another one the
+//! samples of its episodes are put into a new file.
+
+use super::super::encode::PictureSummary;
+use super::super::info::FILES_PER_FOLDER;
+use super::super::open::{Dataset, EpisodeMeta};
+use super::super::pictures::{Film, VideoPlace, places};
+use super::super::shards::{HashingFile, WrittenFile, create_parent};
+use super::super::videos::{Stretch, rate};
+use super::Edit;
+use crate::error::{DatasetError, Result};
+use rayon::prelude::*;
+use sha2::{Digest, Sha256};
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::Path;
+use video::{Muxer, Sample, Video, VideoError};
+
+/// One camera of the result.
+pub(super) struct Copied {
+    /// Where each episode's video is.
+    pub stretches: Vec<Stretch>,
+    /// What each episode's pictures hash to.
+    pub pictures: Vec<PictureSummary>,
+    pub files: Vec<WrittenFile>,
+}
+
+/// Carries over the videos of the feature `name`; a file of the result holds what was in one file of an input.
+///
+/// # Errors
+/// [`VideoError::Cut`] where part of a file is taken whose samples cannot be: H.264, or an episode that does not begin
+/// with a key frame.
+pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) -> Result<Copied> {
+    let old = edit.before(name);
+    let mut copied = Copied { stretches: Vec::new(), pictures: Vec::new(), files: Vec::new() };
+    for (input, taken) in edit.inputs.iter().zip(&edit.taken) {
+        let (set, places) = (&input.set, places(&input.set, old)?);
+        let mut stretches: Vec<Option<Stretch>> = vec![None; places.len()];
+        for &episode in taken {
+            if stretches[episode].is_some() {
+                continue;
+            }
+            // every episode of the file that this one is in
+            let of_file: Vec<usize> = (0..places.len()).filter(|&e| places[e].path == places[episode].path).collect();
+            let wanted: Vec<usize> = of_file.iter().copied().filter(|e| taken.binary_search(e).is_ok()).collect();
+            let (folder, file) = (copied.files.len() / FILES_PER_FOLDER, copied.files.len() % FILES_PER_FOLDER);
+            let target = Target { edit, relative: format!("videos/{name}/chunk-{folder:03}/file-{file:03}.mp4") };
+            let (written, spans) = match wanted.len() == of_file.len() {
+                true => target.whole(&places, &wanted)?,
+                false => target.cut(set, old, &places, &wanted)?,
+            };
+            copied.files.push(written);
+            for (episode, (from, to)) in wanted.into_iter().zip(spans) {
+                stretches[episode] = Some(Stretch { folder, file, from, to });
+            }
+        }
+        copied.stretches.extend(taken.iter().map(|&e| stretches[e].expect("each episode taken lies in a file")));
+        copied.pictures.extend(digests(edit, set, old, &places, taken)?);
+        advance(taken.iter().map(|&e| set.episodes()[e].length as u64).sum());
+    }
+    Ok(copied)
+}
+
+/// Seconds of each episode in a file, from and to.
+type Spans = Vec<(f64, f64)>;
+
+/// A file of the result.
+struct Target<'a> {
+    edit: &'a Edit<'a>,
+    relative: String,
+}
+
+impl Target<'_> {
+    fn create(&self) -> Result<HashingFile> {
+        let path = self.edit.root.join(&self.relative);
+        create_parent(&path)?;
+        HashingFile::create(&path)
+    }
+
+    fn failed(&self) -> impl FnOnce(io::Error) -> DatasetError {
+        let path = self.edit.root.join(&self.relative);
+        |source| DatasetError::Io { path, operation: "write it", source }
+    }
+
+    /// The file of the episodes, byte by byte.
+    fn whole(&self, places: &[VideoPlace], episodes: &[usize]) -> Result<(WrittenFile, Spans)> {
+        let source = &places[episodes[0]].path;
+        let read = |source_error| DatasetError::Io { path: source.clone(), operation: "read it", source: source_error };
+        let mut from = File::open(source).map_err(read)?;
+        let mut to = self.create()?;
+        io::copy(&mut from, &mut to).map_err(self.failed())?;
+        let spans = episodes.iter().map(|&e| (places[e].from, places[e].to)).collect();
+        Ok((to.written(&self.relative), spans))
+    }
+
+    /// The samples of the episodes, one episode after the other.
+    fn cut(
+        &self,
+        set: &Dataset,
+        name: &str,
+        places: &[VideoPlace],
+        episodes: &[usize],
+    ) -> Result<(WrittenFile, Spans)> {
+        let (_, height, width) = set.camera(name)?;
+        let rate = rate(set.info().fps, width, height)?;
+        let source = Source::open(&places[episodes[0]].path)?;
+        let mut muxer = Muxer::new(width as u16, height as u16, rate);
+        let mut spans = Spans::new();
+        for &episode in episodes {
+            let from = muxer.frames();
+            source.samples(&set.episodes()[episode], &places[episode])?.iter().try_for_each(|s| muxer.push(s))?;
+            spans.push((rate.seconds(from), rate.seconds(muxer.frames())));
+        }
+        let mut to = self.create()?;
+        to.write_all(&muxer.header()).map_err(self.failed())?;
+        for &episode in episodes {
+            for sample in source.samples(&set.episodes()[episode], &places[episode])? {
+                to.write_all(&sample.bytes).map_err(self.failed())?;
+            }
+        }
+        Ok((to.written(&self.relative), spans))
+    }
+}
+
+/// A file that is cut. Its tables are read here; only decoding needs a process of its own.
+struct Source(Video);
+
+impl Source {
+    fn open(path: &Path) -> Result<Self> {
+        Ok(Self(Video::open(path)?))
+    }
+
+    fn samples(&self, episode: &EpisodeMeta, place: &VideoPlace) -> Result<Vec<Sample>> {
+        let first = self.0.info().frame_at(place.from).ok_or_else(|| VideoError::NoSuchFrame {
+            name: place.path.display().to_string(),
+            wanted: format!("frame at {} s, where episode {} begins", place.from, episode.index),
+            found: format!("{} frames", self.0.info().frames),
+        })?;
+        Ok(self.0.samples(first..first + episode.length)?)
+    }
+}
+
+/// What the pictures of each episode hash to, where that is part of the fingerprint.
+fn digests(
+    edit: &Edit<'_>,
+    set: &Dataset,
+    name: &str,
+    places: &[VideoPlace],
+    taken: &[usize],
+) -> Result<Vec<PictureSummary>> {
+    if !edit.digests() {
+        return Ok(taken.iter().map(|_| PictureSummary::default()).collect());
+    }
+    let (_, height, width) = set.camera(name)?;
+    let size = height * width * 3;
+    // each thread keeps the file open that it reads
+    let run = taken.len().div_ceil(rayon::current_num_threads()).max(1);
+    let runs: Vec<Result<Vec<PictureSummary>>> = taken
+        .par_chunks(run)
+        .map(|run| {
+            let mut film = Film::new(set.info().fps, (height, width));
+            let of_episode = |&episode: &usize| {
+                let mut pixels = vec![0; set.episodes()[episode].length * size];
+                film.read(&set.episodes()[episode], &places[episode], &mut pixels)?;
+                let digests = pixels.chunks_exact(size).map(|p| Sha256::digest(p).into()).collect();
+                Ok(PictureSummary { digests, ..PictureSummary::default() })
+            };
+            run.iter().map(of_episode).collect()
+        })
+        .collect();
+    Ok(runs.into_iter().collect::<Result<Vec<_>>>()?.into_iter().flatten().collect())
+}

@@ -1,0 +1,389 @@
+//! The rows of the data files: carried over in the types that they have, with new numbers, and looked at once on the way
+//! for statistics and digests. Pictures stay the files that they are.
+
+use super::super::encode::{ColumnSummary, PartSummary, PictureSummary, add_to_histograms, sample};
+use super::super::export::Rows;
+use super::super::images;
+use super::super::info::{FILES_PER_FOLDER, Feature};
+use super::super::open::{Dataset, EpisodeMeta};
+use super::super::read::{self, BadColumn};
+use super::super::schema;
+use super::super::shards::{GroupEncoder, Place, ShardWriter, WrittenFile};
+use super::super::values::Values;
+use super::super::work::{GROUP_BYTES, Part};
+use super::groups::Groups;
+use super::{Edit, Renames};
+use crate::error::{DatasetError, Result};
+use crate::stats::FeatureStats;
+use arrow::array::{Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, RecordBatch};
+use arrow::compute::cast;
+use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use parquet::file::metadata::KeyValue;
+use rayon::prelude::*;
+use serde_json::{Map, Value};
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::path::Path;
+use std::sync::Arc;
+
+/// The data files of the result.
+pub(super) struct Copied {
+    pub files: Vec<WrittenFile>,
+    /// Task texts in order of first use.
+    pub tasks: Vec<String>,
+    pub episodes: Vec<CopiedEpisode>,
+}
+
+/// What an episode says of itself.
+pub(super) struct CopiedEpisode {
+    pub summary: PartSummary,
+    pub place: Place,
+    /// Its tasks, as [`Copied::tasks`] counts them.
+    pub tasks: Vec<usize>,
+}
+
+/// Whether the pictures of a feature are decoded for their statistics; others keep what is stored of them.
+pub(super) fn is_looked_at(feature: &Feature) -> bool {
+    feature.dtype == "image" && matches!(feature.shape[..], [height, width, 3] if height > 0 && width > 0)
+}
+
+/// Copies the rows of all episodes taken.
+pub(super) fn copy(edit: &Edit<'_>, advance: &mut dyn FnMut(u64)) -> Result<Copied> {
+    let info = edit.inputs[0].set.info();
+    let (names, schema, metadata) = written_as(edit.inputs[0].set.root(), edit.renames)?;
+    let encoder = schema::writer_properties(&schema, metadata.into_iter().collect())
+        .and_then(|properties| GroupEncoder::new(Arc::clone(&schema), properties))
+        .map_err(|source| DatasetError::Parquet {
+            path: edit.root.join("data"),
+            operation: "prepare writing it",
+            source,
+        })?;
+    let limit = (info.data_files_size_in_mb * f64::from(1 << 20)) as u64;
+    let mut shards = ShardWriter::new(edit.root, "data", &encoder, limit, FILES_PER_FOLDER);
+    let mut append = |group, begins| shards.append(group, begins);
+    let mut groups = Groups::new(edit.root, &encoder, limit);
+    let mut copied = Copied { files: Vec::new(), tasks: Vec::new(), episodes: Vec::new() };
+    let picture_bytes: usize = edit.features.0.iter().filter(|(_, f)| f.dtype == "image").map(|(_, f)| f.dim()).sum();
+    let batch_rows = (GROUP_BYTES as usize / picture_bytes.max(1)).clamp(1, 1024);
+    let (mut frames, mut summaries) = (0, Vec::new());
+    for (input, taken) in edit.inputs.iter().zip(&edit.taken) {
+        let set = &input.set;
+        let stored = stored_statistics(edit, set)?;
+        let mut rows = Rows::open(set.root(), "data", None, batch_rows)?;
+        for episode in set.episodes() {
+            if taken.binary_search(&episode.index).is_err() {
+                // what it held is not kept in memory
+                for from in (0..episode.length).step_by(batch_rows) {
+                    rows.take(batch_rows.min(episode.length - from))?;
+                }
+                continue;
+            }
+            let tasks = episode.tasks.iter().map(|text| number_of(&mut copied.tasks, text)).collect();
+            let part =
+                Part { episode: summaries.len(), length: episode.length, first_frame: frames, rows: 0..episode.length };
+            let mut seen = Seen::new(edit, set, &schema, part, episode);
+            groups.begin(episode.length, &mut append)?;
+            for from in (0..episode.length).step_by(batch_rows) {
+                for batch in rows.take(batch_rows.min(episode.length - from))? {
+                    let arrays = seen.numbered(columns(set.root(), &batch, &names, &schema)?, &mut copied.tasks)?;
+                    seen.look(&arrays)?;
+                    groups.push(arrays, &mut append)?;
+                }
+            }
+            frames += episode.length;
+            advance(episode.length as u64);
+            summaries.push((seen.summary(&stored), tasks));
+        }
+    }
+    let places = groups.finish(&mut append)?;
+    copied.files = shards.finish()?;
+    let episodes = summaries.into_iter().zip(places);
+    copied.episodes = episodes.map(|((summary, tasks), place)| CopiedEpisode { summary, place, tasks }).collect();
+    Ok(copied)
+}
+
+fn number_of(tasks: &mut Vec<String>, text: &str) -> usize {
+    tasks.iter().position(|t| t == text).unwrap_or_else(|| {
+        tasks.push(text.to_owned());
+        tasks.len() - 1
+    })
+}
+
+/// The names of the columns of a set's data files, their schema under the new names, and what the files tell Hugging
+/// Face's `datasets`.
+fn written_as(root: &Path, renames: &Renames) -> Result<(Vec<String>, SchemaRef, Option<KeyValue>)> {
+    let path = read::files(root, "data")?.swap_remove(0);
+    let failed = |source| DatasetError::Parquet { path: path.clone(), operation: "read it", source };
+    let file =
+        File::open(&path).map_err(|source| DatasetError::Io { path: path.clone(), operation: "open it", source })?;
+    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(failed)?;
+    let names: Vec<String> = builder.schema().fields().iter().map(|f| f.name().clone()).collect();
+    let new = |name: &String| renames.get(name).unwrap_or(name).clone();
+    let field = |field: &Arc<Field>| {
+        Field::clone(field)
+            .with_name(new(field.name()))
+            .with_metadata(std::collections::HashMap::<String, String>::new())
+    };
+    let schema = Schema::new(builder.schema().fields().iter().map(field).collect::<Vec<_>>());
+    let pairs = builder.metadata().file_metadata().key_value_metadata();
+    let told = pairs.into_iter().flatten().find(|pair| pair.key == "huggingface").cloned();
+    let told = match told {
+        Some(pair) if !renames.is_empty() => renamed_entry(&pair, &new),
+        told => told,
+    };
+    Ok((names, Arc::new(schema), told))
+}
+
+/// The entry with its columns under other names; none where it is not what `datasets` writes.
+fn renamed_entry(pair: &KeyValue, new: &dyn Fn(&String) -> String) -> Option<KeyValue> {
+    let told: Value = serde_json::from_str(pair.value.as_ref()?).ok()?;
+    let columns = told.get("info")?.get("features")?.as_object()?;
+    let columns: Map<String, Value> = columns.iter().map(|(name, what)| (new(name), what.clone())).collect();
+    Some(schema::described_as(columns))
+}
+
+/// The columns of a batch, in the types of the result.
+fn columns(root: &Path, batch: &RecordBatch, names: &[String], schema: &Schema) -> Result<Vec<ArrayRef>> {
+    let path = root.join("data");
+    let column = |(name, field): (&String, &Arc<Field>)| {
+        let array = batch.column_by_name(name).ok_or_else(|| DatasetError::NotInDataset {
+            path: path.clone(),
+            wanted: format!("column {name}"),
+            found: batch.schema().fields().iter().map(|f| f.name().as_str()).collect::<Vec<_>>().join(", "),
+        })?;
+        match array.data_type() == field.data_type() {
+            true => Ok(ArrayRef::clone(array)),
+            false => cast(array, field.data_type()).map_err(|e| {
+                let found = format!("{}: {e}", array.data_type());
+                BadColumn { path: &path, name }.because(field.data_type().to_string(), found)
+            }),
+        }
+    };
+    names.iter().zip(schema.fields()).map(column).collect()
+}
+
+/// A picture's digest, and its pixels where they count; neither of one that is not looked at.
+type Looked = Option<([u8; 32], Option<Vec<u8>>)>;
+
+/// An episode while its rows pass.
+struct Seen<'a> {
+    edit: &'a Edit<'a>,
+    set: &'a Dataset,
+    part: Part,
+    /// Rows that have passed.
+    rows: usize,
+    /// Its number in its own set.
+    episode: usize,
+    /// Column of the data files of each feature; none for videos.
+    columns: Vec<Option<usize>>,
+    /// Columns of episode, frame and task numbers.
+    numbers: [Option<usize>; 3],
+    /// Frames whose pictures enter the statistics.
+    sampled: Vec<usize>,
+    values: Vec<Values>,
+    pictures: BTreeMap<usize, PictureSummary>,
+}
+
+impl<'a> Seen<'a> {
+    fn new(edit: &'a Edit<'a>, set: &'a Dataset, schema: &Schema, part: Part, episode: &EpisodeMeta) -> Self {
+        let place = |name: &str| schema.index_of(name).ok();
+        let values = edit.features.0.iter().map(|(_, feature)| match feature.dtype.as_str() {
+            "image" | "video" | "string" => Values::Pictures,
+            "bool" => Values::Bool(Vec::new()),
+            "float64" => Values::F64(Vec::new()),
+            whole if whole.contains("int") => Values::I64(Vec::new()),
+            _ => Values::F32(Vec::new()),
+        });
+        Self {
+            edit,
+            set,
+            rows: 0,
+            episode: episode.index,
+            columns: edit.features.0.iter().map(|(name, _)| place(name)).collect(),
+            numbers: ["episode_index", "index", "task_index"].map(place),
+            sampled: sample(part.length),
+            values: values.collect(),
+            pictures: BTreeMap::new(),
+            part,
+        }
+    }
+
+    /// The columns with the numbers that they have in the result.
+    fn numbered(&self, mut arrays: Vec<ArrayRef>, tasks: &mut Vec<String>) -> Result<Vec<ArrayRef>> {
+        let path = self.set.root().join("data");
+        let rows = arrays.first().map_or(0, |a| a.len());
+        let first = (self.part.first_frame + self.rows) as i64;
+        let [episode, index, task] = self.numbers;
+        let mut numbers =
+            vec![(episode, vec![self.part.episode as i64; rows]), (index, (first..first + rows as i64).collect())];
+        if let Some(at) = task {
+            let mut known: BTreeMap<i64, i64> = BTreeMap::new();
+            let mut new = Vec::with_capacity(rows);
+            for &old in read::integers(&path, "task_index", &arrays[at])?.iter() {
+                new.push(match known.get(&old) {
+                    Some(&new) => new,
+                    None => {
+                        let number = number_of(tasks, self.task(&path, old)?) as i64;
+                        *known.entry(old).or_insert(number)
+                    }
+                });
+            }
+            numbers.push((task, new));
+        }
+        for (column, numbers) in numbers {
+            let Some(at) = column else { continue };
+            let numbers: ArrayRef = Arc::new(Int64Array::from(numbers));
+            arrays[at] = cast(&numbers, arrays[at].data_type()).map_err(|source| DatasetError::Parquet {
+                path: path.clone(),
+                operation: "number its rows",
+                source: source.into(),
+            })?;
+        }
+        Ok(arrays)
+    }
+
+    fn task(&self, path: &Path, number: i64) -> Result<&str> {
+        let text = usize::try_from(number).ok().and_then(|number| self.set.tasks().get(number));
+        text.map(String::as_str).ok_or_else(|| DatasetError::BadDataset {
+            path: path.to_path_buf(),
+            object: format!("task_index in episode {}", self.episode),
+            expected: format!("one of {} tasks", self.set.tasks().len()),
+            found: number.to_string(),
+        })
+    }
+
+    /// Takes note of the values of the next rows.
+    fn look(&mut self, arrays: &[ArrayRef]) -> Result<()> {
+        let path = self.set.root().join("data");
+        let edit = self.edit;
+        for (index, (name, feature)) in edit.features.0.iter().enumerate() {
+            let Some(array) = self.columns[index].map(|at| &arrays[at]) else { continue };
+            if is_looked_at(feature) {
+                self.look_at(index, edit.before(name), feature, array)?;
+                continue;
+            }
+            let column = BadColumn { path: &path, name: edit.before(name) };
+            let wrong = |e: arrow::error::ArrowError| column.because(feature.dtype.clone(), e.to_string());
+            let leaf = |to: DataType| -> Result<ArrayRef> {
+                cast(&read::leaf(&column, array, array.len(), feature.dim())?, &to).map_err(wrong)
+            };
+            match &mut self.values[index] {
+                Values::Pictures => {}
+                Values::F32(values) => {
+                    values.extend_from_slice(down::<Float32Array>(&leaf(DataType::Float32)?).values())
+                }
+                Values::F64(values) => {
+                    values.extend_from_slice(down::<Float64Array>(&leaf(DataType::Float64)?).values())
+                }
+                Values::I64(values) => values.extend_from_slice(down::<Int64Array>(&leaf(DataType::Int64)?).values()),
+                Values::Bool(values) => values.extend(down::<BooleanArray>(&leaf(DataType::Boolean)?).values()),
+            }
+        }
+        self.rows += arrays.first().map_or(0, |a| a.len());
+        Ok(())
+    }
+
+    /// Decodes the pictures of the next rows of a column, as far as their pixels are asked for.
+    fn look_at(&mut self, index: usize, name: &str, feature: &Feature, array: &ArrayRef) -> Result<()> {
+        let (height, width) = (feature.shape[0], feature.shape[1]);
+        let files = self.set.files(name, array)?;
+        let (digests, first, sampled) = (self.edit.digests(), self.rows, &self.sampled);
+        let look = |row: usize| -> Result<Looked> {
+            let counts = sampled.binary_search(&(first + row)).is_ok();
+            if !counts && !digests {
+                return Ok(None);
+            }
+            let mut pixels = Vec::with_capacity(height * width * 3);
+            images::decode(files.value(row), height, width, &mut pixels).map_err(|found| DatasetError::BadDataset {
+                path: self.set.root().join("data"),
+                object: format!("column {name}, frame {} of episode {}", first + row, self.episode),
+                expected: format!("a PNG or PPM picture of {height} x {width}"),
+                found,
+            })?;
+            let digest = if digests { Sha256::digest(&pixels).into() } else { [0; 32] };
+            Ok(Some((digest, counts.then_some(pixels))))
+        };
+        let looked: Vec<_> = (0..files.len()).into_par_iter().map(look).collect();
+        let summary = self.pictures.entry(index).or_default();
+        summary.histograms.resize(3, [0; 256]);
+        for one in looked {
+            let Some((digest, pixels)) = one? else { continue };
+            if digests {
+                summary.digests.push(digest);
+            }
+            if let Some(pixels) = pixels {
+                add_to_histograms(summary, height, width, &pixels);
+            }
+        }
+        Ok(())
+    }
+
+    /// All that is known once every row has passed; `stored` are statistics of features that were not looked at.
+    fn summary(self, stored: &BTreeMap<String, Vec<FeatureStats>>) -> PartSummary {
+        let column = |(values, (name, feature)): (Values, &(String, Feature))| ColumnSummary {
+            stats: match stored.get(name) {
+                Some(each) => each.get(self.episode).cloned(),
+                None => values.stats(feature.dim()),
+            },
+            digest: values.digest(),
+            values,
+        };
+        let values = self.values.into_iter().zip(&self.edit.features.0).map(column).collect();
+        PartSummary { part: self.part, values, pictures: self.pictures }
+    }
+}
+
+fn down<T: 'static>(array: &ArrayRef) -> &T {
+    array.as_any().downcast_ref::<T>().expect("it was just made one")
+}
+
+/// What a set's episodes say of the features that are not looked at, by their new names.
+fn stored_statistics(edit: &Edit<'_>, set: &Dataset) -> Result<BTreeMap<String, Vec<FeatureStats>>> {
+    let mut stored = BTreeMap::new();
+    for (name, _) in edit.features.0.iter().filter(|(_, f)| f.is_visual() && !is_looked_at(f)) {
+        let mut each = Vec::with_capacity(set.episodes().len());
+        for path in read::files(set.root(), "meta/episodes")? {
+            each.extend(statistics_in(&path, edit.before(name))?);
+        }
+        if !each.is_empty() {
+            stored.insert(name.clone(), each);
+        }
+    }
+    Ok(stored)
+}
+
+/// A feature's statistics in one file of episodes; nothing where it has none, no quantiles where they were not stored yet.
+fn statistics_in(path: &Path, feature: &str) -> Result<Vec<FeatureStats>> {
+    let read = |statistics: [&str; 5]| -> Result<Option<Vec<Vec<Vec<f64>>>>> {
+        let names = statistics.map(|statistic| format!("stats/{feature}/{statistic}"));
+        match read::columns(path, &names.each_ref().map(String::as_str)) {
+            Err(DatasetError::NotInDataset { .. }) => Ok(None),
+            Err(e) => Err(e),
+            Ok((_, arrays)) => {
+                let each = arrays.iter().zip(&names).map(|(array, name)| read::number_lists(path, name, array));
+                each.collect::<Result<Vec<_>>>().map(Some)
+            }
+        }
+    };
+    let Some(known) = read(["min", "max", "mean", "std", "count"])? else { return Ok(Vec::new()) };
+    let quantiles = read(["q01", "q10", "q50", "q90", "q99"])?;
+    let of_row = |row: usize| {
+        let vector = |i: usize| known[i][row].clone();
+        let quantile = |i: usize| quantiles.as_ref().map_or_else(Vec::new, |q| q[i][row].clone());
+        FeatureStats {
+            min: vector(0),
+            max: vector(1),
+            mean: vector(2),
+            std: vector(3),
+            count: known[4][row].first().map_or(0, |&count| count as u64),
+            q01: quantile(0),
+            q10: quantile(1),
+            q50: quantile(2),
+            q90: quantile(3),
+            q99: quantile(4),
+        }
+    };
+    Ok((0..known[0].len()).map(of_row).collect())
+}

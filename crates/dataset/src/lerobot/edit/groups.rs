@@ -1,0 +1,95 @@
+//! Rows that come in pieces, put together into row groups.
+
+use super::super::shards::{EncodedGroup, GroupEncoder, Place};
+use super::super::work::{GROUP_BYTES, GROUP_FRAMES};
+use crate::error::{DatasetError, Result};
+use arrow::array::{Array, ArrayRef};
+use arrow::compute::concat;
+use std::path::Path;
+
+/// Rows that become row groups: small episodes together, a large one in pieces.
+pub(super) struct Groups<'a> {
+    root: &'a Path,
+    encoder: &'a GroupEncoder,
+    /// Bytes at which a group is closed.
+    full: u64,
+    pieces: Vec<Vec<ArrayRef>>,
+    rows: usize,
+    bytes: u64,
+    /// Whether the group begins with an episode.
+    begins: bool,
+    /// Episodes that begin in it.
+    started: usize,
+    /// Bytes of a row, as far as rows were seen.
+    row_bytes: u64,
+    places: Vec<Place>,
+}
+
+/// Where a row group is appended.
+pub(super) type Append<'f> = dyn FnMut(EncodedGroup, bool) -> Result<Place> + 'f;
+
+impl<'a> Groups<'a> {
+    pub(super) fn new(root: &'a Path, encoder: &'a GroupEncoder, file_bytes: u64) -> Self {
+        Self {
+            root,
+            encoder,
+            full: GROUP_BYTES.min(file_bytes),
+            pieces: Vec::new(),
+            rows: 0,
+            bytes: 0,
+            begins: false,
+            started: 0,
+            row_bytes: 0,
+            places: Vec::new(),
+        }
+    }
+
+    /// The next rows begin an episode of this length.
+    pub(super) fn begin(&mut self, length: usize, append: &mut Append<'_>) -> Result<()> {
+        let expected = self.row_bytes * length as u64;
+        if self.rows > 0 && (self.rows + length > GROUP_FRAMES || self.bytes + expected > self.full) {
+            self.flush(append)?;
+        }
+        self.begins |= self.rows == 0;
+        self.started += 1;
+        Ok(())
+    }
+
+    pub(super) fn push(&mut self, arrays: Vec<ArrayRef>, append: &mut Append<'_>) -> Result<()> {
+        let rows = arrays.first().map_or(0, |a| a.len());
+        let bytes: u64 = arrays.iter().map(|a| a.to_data().get_slice_memory_size().unwrap_or(0) as u64).sum();
+        self.row_bytes = bytes / rows.max(1) as u64;
+        self.rows += rows;
+        self.bytes += bytes;
+        self.pieces.push(arrays);
+        // an episode that is larger than a group is cut
+        if self.bytes >= GROUP_BYTES { self.flush(append) } else { Ok(()) }
+    }
+
+    fn flush(&mut self, append: &mut Append<'_>) -> Result<()> {
+        if self.rows == 0 {
+            return Ok(());
+        }
+        let failed = |source: parquet::errors::ParquetError| DatasetError::Parquet {
+            path: self.root.to_path_buf(),
+            operation: "encode a row group of it",
+            source,
+        };
+        let mut arrays = Vec::with_capacity(self.pieces[0].len());
+        for column in 0..self.pieces[0].len() {
+            let pieces: Vec<&dyn Array> = self.pieces.iter().map(|piece| piece[column].as_ref()).collect();
+            arrays.push(concat(&pieces).map_err(|e| failed(e.into()))?);
+        }
+        let place = append(self.encoder.encode(&arrays).map_err(failed)?, self.begins)?;
+        self.places.extend(std::iter::repeat_n(place, self.started));
+        self.pieces.clear();
+        (self.rows, self.bytes, self.begins, self.started) = (0, 0, false, 0);
+        Ok(())
+    }
+
+    /// Where each episode begins.
+    pub(super) fn finish(mut self, append: &mut Append<'_>) -> Result<Vec<Place>> {
+        self.flush(append)?;
+        Ok(self.places)
+    }
+}

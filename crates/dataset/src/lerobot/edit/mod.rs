@@ -1,0 +1,397 @@
+//! Other data sets made of data sets: some of the episodes, several sets together, columns under other names.
+//!
+//! Frames, pictures and videos are carried over as they are stored; what follows from which episodes there are (numbers,
+//! tasks, masks, statistics, fingerprint, the side folder) is made anew, by the code that conversion has. Results appear
+//! whole or not at all, and no source is touched.
+
+mod agree;
+mod films;
+mod frames;
+mod groups;
+mod origin;
+mod select;
+mod side;
+
+pub use select::{Parts, Selection};
+
+use super::check;
+use super::export::side_folder;
+use super::info::{self, Feature, Features, Info};
+use super::meta;
+use super::open::{ACTION, Dataset};
+use super::side::{Layout, write_manifest};
+use super::staging::Staging;
+use super::tally::Tally;
+use super::videos::{Stretch, VIDEO_PATH};
+use crate::error::{DatasetError, Result};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Where an edited data set goes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Destination {
+    /// A directory that does not exist.
+    New(PathBuf),
+    /// The place of the set that is edited: written beside it and exchanged with it at once, so that a kill at any time
+    /// leaves one of the two there, whole.
+    InPlace,
+}
+
+/// What an edit made.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EditReport {
+    /// Episodes written.
+    pub episodes: usize,
+    /// Frames written.
+    pub frames: usize,
+    /// Task texts.
+    pub tasks: Vec<String>,
+    /// Files written.
+    pub files: usize,
+    /// Bytes written.
+    pub bytes: u64,
+    /// sha256 of the content.
+    pub fingerprint: String,
+    /// What could not be kept, and what was numbered otherwise.
+    pub notes: Vec<String>,
+}
+
+/// New names of features by their old ones.
+pub type Renames = BTreeMap<String, String>;
+
+/// Told frames done and frames in all.
+type Progress<'p> = dyn FnMut(u64, u64) + 'p;
+
+/// A data set that episodes are taken from.
+struct Input {
+    set: Dataset,
+    /// Of its side folder, whose files have the hashes recorded.
+    layout: Option<Layout>,
+}
+
+impl Input {
+    fn open(root: &Path) -> Result<Self> {
+        let set = Dataset::open(root)?;
+        let layout = match set.provenance() {
+            Some(provenance) if provenance.lossless => Some(side_folder(root, set.info())?),
+            _ => None,
+        };
+        Ok(Self { set, layout })
+    }
+}
+
+/// One result that is being put together.
+struct Edit<'a> {
+    inputs: &'a [Input],
+    /// Episodes of each input, ascending.
+    taken: Vec<Vec<usize>>,
+    /// The columns of the result.
+    features: Features,
+    renames: &'a Renames,
+    /// Where it is written.
+    root: &'a Path,
+}
+
+/// The episodes of `set` that are `chosen`, as a data set of its own.
+///
+/// # Errors
+/// An episode that is not there, a destination that is, videos that cannot be cut ([`video::VideoError::Cut`]).
+pub fn keep(set: &Path, to: &Destination, chosen: &Selection, progress: &mut Progress<'_>) -> Result<EditReport> {
+    let input = Input::open(set)?;
+    let episodes = chosen.resolve(&input.set)?.into_iter().collect();
+    one(input, to, episodes, &Renames::new(), progress)
+}
+
+/// `set` without the episodes that are `chosen`.
+///
+/// # Errors
+/// As [`keep`], and when no episode would be left.
+pub fn without(set: &Path, to: &Destination, chosen: &Selection, progress: &mut Progress<'_>) -> Result<EditReport> {
+    let input = Input::open(set)?;
+    let gone = chosen.resolve(&input.set)?;
+    let left: Vec<usize> = (0..input.set.episodes().len()).filter(|episode| !gone.contains(episode)).collect();
+    if left.is_empty() {
+        return Err(DatasetError::NotInDataset {
+            path: set.to_path_buf(),
+            wanted: "episode that would be left".to_owned(),
+            found: format!("{}, each to be dropped", gone.len()),
+        });
+    }
+    one(input, to, left, &Renames::new(), progress)
+}
+
+/// `set` with features under other names. The five index columns keep theirs, and so does `action` where its origin is
+/// recorded.
+///
+/// # Errors
+/// A feature that is not there, a name that is taken or that LeRobot does not allow.
+pub fn rename(set: &Path, to: &Destination, renames: &Renames, progress: &mut Progress<'_>) -> Result<EditReport> {
+    let input = Input::open(set)?;
+    check_names(&input.set, renames)?;
+    let all = (0..input.set.episodes().len()).collect();
+    one(input, to, all, renames, progress)
+}
+
+/// Several data sets of some of the episodes of `set`, each in a folder of its name in the new directory `out`, which
+/// appears with all of them. With a `seed` episodes are drawn, otherwise taken in order.
+///
+/// # Errors
+/// Parts that overlap, are empty or more than the whole; as [`keep`].
+pub fn split(
+    set: &Path,
+    out: &Path,
+    parts: &Parts,
+    seed: Option<u64>,
+    progress: &mut Progress<'_>,
+) -> Result<Vec<(String, EditReport)>> {
+    let inputs = [Input::open(set)?];
+    let parts = parts.resolve(&inputs[0].set, seed)?;
+    let staging = Staging::create(out)?;
+    let total: u64 = parts.iter().map(|(_, taken)| work_of(&inputs[0].set, taken)).sum();
+    let mut done = 0;
+    let mut advance = |frames| {
+        done += frames;
+        progress(done, total);
+    };
+    let mut made = Vec::with_capacity(parts.len());
+    for (name, taken) in parts {
+        let root = staging.path().join(&name);
+        std::fs::create_dir(&root).map_err(|source| DatasetError::Io {
+            path: out.join(&name),
+            operation: "create the folder",
+            source,
+        })?;
+        made.push((name, compose(&inputs, vec![taken], &Renames::new(), &root, &mut advance)?));
+    }
+    staging.publish()?;
+    Ok(made)
+}
+
+/// All episodes of several data sets, one set after the other, in the new directory `out`. They must have the same
+/// features at the same rate, of the same robot and environment; tasks become one table.
+///
+/// # Errors
+/// Sets that differ, with the first difference; as [`keep`].
+pub fn merge(sets: &[PathBuf], out: &Path, progress: &mut Progress<'_>) -> Result<EditReport> {
+    let inputs = sets.iter().map(|set| Input::open(set)).collect::<Result<Vec<_>>>()?;
+    let taken: Vec<Vec<usize>> = inputs.iter().map(|input| (0..input.set.episodes().len()).collect()).collect();
+    let staging = Staging::create(out)?;
+    let report = told(&inputs, taken, &Renames::new(), staging.path(), progress)?;
+    staging.publish()?;
+    Ok(report)
+}
+
+/// An edit of one data set.
+fn one(
+    input: Input,
+    to: &Destination,
+    taken: Vec<usize>,
+    renames: &Renames,
+    progress: &mut Progress<'_>,
+) -> Result<EditReport> {
+    let staging = match to {
+        Destination::New(out) => Staging::create(out)?,
+        Destination::InPlace => Staging::replacing(input.set.root())?,
+    };
+    let report = told(&[input], vec![taken], renames, staging.path(), progress)?;
+    staging.publish()?;
+    Ok(report)
+}
+
+/// [`compose`], with a total.
+fn told(
+    inputs: &[Input],
+    taken: Vec<Vec<usize>>,
+    renames: &Renames,
+    root: &Path,
+    progress: &mut Progress<'_>,
+) -> Result<EditReport> {
+    let total = inputs.iter().zip(&taken).map(|(input, taken)| work_of(&input.set, taken)).sum();
+    let mut done = 0;
+    progress(0, total);
+    compose(inputs, taken, renames, root, &mut |frames| {
+        done += frames;
+        progress(done, total);
+    })
+}
+
+/// Frames to be gone through: those of the data files, and those of each camera's videos.
+fn work_of(set: &Dataset, taken: &[usize]) -> u64 {
+    let films = set.info().features.0.iter().filter(|(_, f)| f.dtype == "video").count();
+    let frames: usize = taken.iter().map(|&episode| set.episodes()[episode].length).sum();
+    (frames * (1 + films)) as u64
+}
+
+/// Writes the episodes `taken` of each of `inputs`, one input after the other, as a data set into the empty folder `root`.
+fn compose(
+    inputs: &[Input],
+    taken: Vec<Vec<usize>>,
+    renames: &Renames,
+    root: &Path,
+    advance: &mut dyn FnMut(u64),
+) -> Result<EditReport> {
+    let mut notes = Vec::new();
+    let features = renamed(agree::features(inputs)?, renames);
+    let edit = Edit { inputs, taken, features, renames, root };
+    let first = inputs[0].set.info();
+    let mut copied = frames::copy(&edit, advance)?;
+    let mut files = std::mem::take(&mut copied.files);
+    let mut stretches: BTreeMap<usize, Vec<Stretch>> = BTreeMap::new();
+    for (index, (name, _)) in edit.features.0.iter().enumerate().filter(|(_, (_, f))| f.dtype == "video") {
+        let film = films::copy(&edit, name, advance)?;
+        for (episode, pictures) in copied.episodes.iter_mut().zip(film.pictures) {
+            episode.summary.pictures.insert(index, pictures);
+        }
+        files.extend(film.files);
+        stretches.insert(index, film.stretches);
+    }
+    let mut tally = Tally::new(&edit.features, first.fps, &copied.tasks);
+    for (number, episode) in copied.episodes.into_iter().enumerate() {
+        let film = &mut |camera, _: &[video::Sample]| Ok(stretches[&camera][number]);
+        tally.add(episode.summary, episode.place, &episode.tasks, film)?;
+    }
+    let mut told = tally.finish();
+    edit.keep_stored_totals(&mut told.stats);
+    // texts and the like have none
+    let statistical: Vec<(String, bool)> = edit
+        .features
+        .0
+        .iter()
+        .filter(|(name, _)| told.stats.contains_key(name))
+        .map(|(name, feature)| (name.clone(), feature.is_visual()))
+        .collect();
+    let origin = origin::of(&edit, &told.fingerprint, &mut notes)?;
+    let lossless = origin.as_ref().is_some_and(|provenance| provenance.lossless);
+    if let Some(provenance) = origin.as_ref().filter(|_| lossless) {
+        files.extend(side::copy(&edit, provenance, &mut notes)?);
+    }
+    files.push(meta::write_tasks(root, &copied.tasks)?);
+    files.push(meta::write_episodes(root, &copied.tasks, &statistical, &told.rows)?);
+    files.push(meta::write_stats(root, &statistical, &told.stats)?);
+    let info = Info {
+        total_episodes: told.rows.len(),
+        total_frames: told.rows.iter().map(|row| row.length).sum(),
+        total_tasks: copied.tasks.len(),
+        chunks_size: info::FILES_PER_FOLDER,
+        splits: edit.splits(),
+        data_path: info::DATA_PATH.to_owned(),
+        video_path: (!stretches.is_empty()).then(|| VIDEO_PATH.to_owned()),
+        features: edit.features.clone(),
+        actrm: origin,
+        ..first.clone()
+    };
+    files.push(meta::write_json(root, "meta/info.json", &check::sealed(info, root)?)?);
+    if lossless {
+        files.push(write_manifest(root, &files)?);
+    }
+    // what was just written opens, or it is not published
+    let set = Dataset::open(root)?;
+    Ok(EditReport {
+        episodes: set.episodes().len(),
+        frames: set.frames(),
+        tasks: copied.tasks,
+        files: files.len(),
+        bytes: files.iter().map(|f| f.bytes).sum(),
+        fingerprint: set.fingerprint().to_owned(),
+        notes,
+    })
+}
+
+impl Edit<'_> {
+    /// The name that a feature of the result has in the inputs.
+    fn before<'n>(&'n self, name: &'n str) -> &'n str {
+        self.renames.iter().find(|(_, new)| *new == name).map_or(name, |(old, _)| old)
+    }
+
+    /// Whether content is hashed: of sets that LeRobot wrote, pictures are no part of the fingerprint.
+    fn digests(&self) -> bool {
+        self.inputs.iter().all(|input| input.set.provenance().is_some())
+    }
+
+    /// The number of each episode taken in the result, by input.
+    fn numbers(&self) -> Vec<BTreeMap<usize, usize>> {
+        let mut next = 0..;
+        self.taken.iter().map(|taken| taken.iter().copied().zip(&mut next).collect()).collect()
+    }
+
+    /// Where every episode of one set is taken, statistics that cannot be computed again are those that it has.
+    fn keep_stored_totals(&self, stats: &mut BTreeMap<String, crate::stats::FeatureStats>) {
+        let [input] = self.inputs else { return };
+        if self.taken[0].len() < input.set.episodes().len() {
+            return;
+        }
+        for (name, feature) in self.features.0.iter().filter(|(_, f)| f.is_visual()) {
+            let stored = input.set.stats().get(self.before(name));
+            if let (false, Some(stored)) = (frames::is_looked_at(feature), stored) {
+                stats.insert(name.clone(), stored.clone());
+            }
+        }
+    }
+
+    /// Named ranges of episodes: the source's, less what was dropped; of several sets one range.
+    fn splits(&self) -> BTreeMap<String, String> {
+        let total: usize = self.taken.iter().map(Vec::len).sum();
+        let mut all: Vec<&BTreeMap<String, String>> = self.inputs.iter().map(|i| &i.set.info().splits).collect();
+        all.dedup();
+        let whole = |name: &str| BTreeMap::from([(name.to_owned(), format!("0:{total}"))]);
+        match (all.as_slice(), self.inputs) {
+            ([], _) => whole("train"),
+            ([splits], [_]) => {
+                let kept = |end: usize| self.taken[0].partition_point(|&episode| episode < end);
+                let range = |(name, text): (&String, &String)| {
+                    let (from, to) = text.split_once(':')?;
+                    let (from, to) = (from.trim().parse().ok()?, to.trim().parse().ok()?);
+                    Some((name.clone(), format!("{}:{}", kept(from), kept(to))))
+                };
+                splits.iter().filter_map(range).collect()
+            }
+            (splits, _) => match splits.iter().map(|s| s.keys().collect::<Vec<_>>()).collect::<Vec<_>>().as_slice() {
+                [first, rest @ ..] if first.len() == 1 && rest.iter().all(|names| names == first) => whole(first[0]),
+                _ => whole("train"),
+            },
+        }
+    }
+}
+
+fn renamed(features: Features, renames: &Renames) -> Features {
+    let new = |(name, feature): (String, Feature)| (renames.get(&name).cloned().unwrap_or(name), feature);
+    Features(features.0.into_iter().map(new).collect())
+}
+
+fn check_names(set: &Dataset, renames: &Renames) -> Result<()> {
+    let features = &set.info().features;
+    let bad = |object: String, expected: &str, found: &str| DatasetError::BadDataset {
+        path: set.root().to_path_buf(),
+        object,
+        expected: expected.to_owned(),
+        found: found.to_owned(),
+    };
+    for (old, new) in renames {
+        if features.get(old).is_none() {
+            return Err(DatasetError::NotInDataset {
+                path: set.root().to_path_buf(),
+                wanted: format!("feature {old}"),
+                found: features.names().collect::<Vec<_>>().join(", "),
+            });
+        }
+        let object = format!("new name of {old}");
+        let fixed = |name: &str| super::fingerprint::INDEX_COLUMNS.contains(&name);
+        if fixed(old) || (old == ACTION && set.provenance().is_some()) {
+            return Err(bad(object, &format!("{old}, which keeps its name"), new));
+        }
+        // LeRobot makes paths of names, and columns that are separated by slashes
+        let plain = |c: char| !c.is_control() && !matches!(c, '/' | '\\' | '{' | '}');
+        if new.is_empty() || new.starts_with('.') || !new.chars().all(plain) || fixed(new) {
+            return Err(bad(
+                object,
+                "a name without slashes and braces that is not an index column's",
+                &format!("{new:?}"),
+            ));
+        }
+        let stays = features.get(new).is_some() && !renames.contains_key(new);
+        if stays || renames.iter().any(|(other, name)| other != old && name == new) {
+            return Err(bad(object, "a name that no feature has", &format!("{new}, which is taken")));
+        }
+    }
+    Ok(())
+}
