@@ -86,7 +86,7 @@ def samples_per_second(batches: Callable[[], Iterator[dict[str, Any]]], count: i
     return best
 
 
-def windows(folder: Path, cameras: bool, rounds: int) -> Row:
+def windows(folder: Path, cameras: bool, rounds: int) -> Iterator[Row]:
     """Random windows, batch by batch."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -108,8 +108,37 @@ def windows(folder: Path, cameras: bool, rounds: int) -> Row:
     work = f"Python: windows of {HORIZON} steps, batch {BATCH}"
     if cameras:
         # ours are decoded once, when the set is opened, and stay in memory; both give float32 from 0 to 1
-        return rate(f"{work}, 2 x 84 x 84 pixels (peer: LeRobot)", "samples/s", mine, best, 0, 5)
-    return rate(f"{work} (peer: LeRobotDataset + DataLoader)", "samples/s", mine, best, 300_000, 500)
+        yield rate(f"{work}, 2 x 84 x 84 pixels (peer: LeRobot)", "samples/s", mine, best, 0, 5)
+        return
+    yield rate(f"{work} (peer: LeRobotDataset + DataLoader)", "samples/s", mine, best, 300_000, 500)
+    if has("rerun.experimental.dataloader") and has("datafusion"):
+        theirs_too = of_rerun(folder, rounds)
+        # of its samples only the actions, while ours have every column
+        yield Row(f"{work} (peer: Rerun)", "samples/s", mine, theirs_too, mine / theirs_too, "", None)
+
+
+def of_rerun(folder: Path, rounds: int) -> float:
+    """Windows of actions a second through Rerun's loader, from its server on this machine."""
+    import rerun
+    from rerun.experimental import LeRobotReader
+    from rerun.experimental.dataloader import DataSource, Field, NumericDecoder, RerunMapDataset
+
+    reader = LeRobotReader(folder)
+    with tempfile.TemporaryDirectory(prefix="actrm-bench-") as name:
+        files = [Path(name) / f"{episode}.rrd" for episode in reader.episodes()]
+        for episode, file in zip(reader.episodes(), files, strict=True):
+            told = {"application_id": folder.name, "recording_id": f"episode_{episode}"}
+            reader.stream(episode, video_mode="skip").write_rrd(file, **told)
+        with rerun.server.Server(host="127.0.0.1", datasets={"set": files}) as server:
+            source = DataSource(server.client().get_dataset("set"))
+            action = Field("/action:Scalars:scalars", decode=NumericDecoder(), window=tuple(range(HORIZON)))
+            data = RerunMapDataset(source, "frame_index", {"action": action})
+
+            def batches() -> Iterator[dict[str, Any]]:
+                while True:
+                    yield from torch.utils.data.DataLoader(data, batch_size=BATCH, shuffle=True, drop_last=True)
+
+            return samples_per_second(batches, 8, rounds)
 
 
 def waits(folder: Path, rounds: int) -> Row:
@@ -305,9 +334,9 @@ def main() -> int:
         folder = Path(name)
         actrm.convert(ROOT / "data/lift.hdf5", folder / "lift", progress=False)
         if args.only in "windows":
-            rows.append(windows(folder / "lift", False, args.rounds))
+            rows += windows(folder / "lift", False, args.rounds)
             with_cameras(ROOT / "data/lift.hdf5", folder / "cameras")
-            rows.append(windows(folder / "cameras", True, args.rounds))
+            rows += windows(folder / "cameras", True, args.rounds)
         if args.only in "waits":
             rows.append(waits(folder / "lift", args.rounds))
     if args.only in "latency":

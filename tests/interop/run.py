@@ -6,7 +6,7 @@ difference ends the run with exit code 1.
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import logging
 import os
@@ -269,10 +269,15 @@ def train_lerobot(root: Path, out: Path, pictures: bool = False, **options: Any)
 
 
 def video_backends() -> list[str]:
-    """Those of LeRobot's video readers that are installed."""
-    found = [
-        name for name, module in (("torchcodec", "torchcodec"), ("pyav", "av")) if importlib.util.find_spec(module)
-    ]
+    """Those of LeRobot's video readers that work here; torchcodec loads libraries of FFmpeg's that may not be there."""
+    found: list[str] = []
+    for name, module in (("torchcodec", "torchcodec.decoders"), ("pyav", "av")):
+        try:
+            importlib.import_module(module)
+        except (ImportError, RuntimeError, OSError) as error:
+            print(f"[{name}: {str(error).splitlines()[0]}]", end=" ")
+        else:
+            found.append(name)
     assert found, "LeRobot has no video reader here"
     return found
 
