@@ -352,6 +352,41 @@ def export_entry(root: Path, folder: Path) -> str:
     return compare_actions(root, zoo, "lift-act@1", folder / "lift-act")
 
 
+def read_by_the_hub(root: Path, folder: Path) -> str:
+    """The cards of entries, read by the Hub's own library, with the results that the leaderboard has."""
+    from huggingface_hub import ModelCard
+
+    zoo = train_ours(root, folder, 2)
+    sealed = ModelCard((zoo / "lift-act" / "1" / "README.md").read_text(), ignore_metadata_errors=False)
+    assert sealed.data.eval_results is None, "no result was measured when it was sealed"
+    ours("actrm-zoo", "export", "hub", "lift-act@1", folder / "unmeasured", "--zoo", zoo)
+    bare = ModelCard((folder / "unmeasured" / "README.md").read_text(), ignore_metadata_errors=False)
+    assert bare.content == sealed.content
+
+    out = folder / "lift-act"
+    ours("actrm-zoo", "export", "hub", "lift-act@1", out, "--zoo", ROOT / "zoo")
+    card = ModelCard((out / "README.md").read_text(), ignore_metadata_errors=False)
+    data = card.data.to_dict()
+    for given in (data, sealed.data.to_dict()):
+        assert given["library_name"] == "actrm" and given["license"] == "apache-2.0", given
+        assert given["pipeline_tag"] == "robotics" and {"robotics", "act", "Lift"} <= set(given["tags"]), given
+        assert "datasets" not in given, given
+    found = {(r.dataset_config, r.dataset_split): r for r in card.data.eval_results or []}
+    assert set(found) == {("lift-v1", "dev"), ("lift-v1", "test")}, found.keys()
+    test = found["lift-v1", "test"]
+    assert (test.task_type, test.dataset_type, test.metric_type) == ("robotics", "Lift", "success_rate"), test
+    assert test.metric_value == 100.0 and test.metric_args["episodes"] == 200, test
+    assert "95% interval 98.1-100.0" in test.metric_name, test
+    assert card.text.lstrip().startswith("# lift-act@1"), card.text[:80]
+    # what is pushed and pulled again is the entry
+    pulled = folder / "pulled" / "lift-act"
+    pulled.mkdir(parents=True)
+    out.rename(pulled / "1")
+    said = ours("actrm-zoo", "verify", "--deep", "--zoo", folder / "pulled")
+    assert "lift-act@1: 5 files and 0 results are as they were made" in said, said
+    return f"{len(found)} results, {test.metric_name}"
+
+
 def import_entry(root: Path, folder: Path) -> str:
     """What LeRobot trained answers the same as an entry of ours."""
     zoo, checkpoint = folder / "zoo", folder / "trained"
@@ -548,6 +583,7 @@ def main() -> None:
             "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
             "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),
+            "the Hub's library reads our model cards": lambda: read_by_the_hub(root, folder / "hub"),
             "our entry that sees answers the same in LeRobot": lambda: export_seeing_entry(plain, folder / "seeing"),
             "LeRobot's policy that sees answers the same": lambda: import_seeing_entry(plain, folder / "seen"),
             "from Python: LeRobot's samples": lambda: python_door.compare_samples(root),

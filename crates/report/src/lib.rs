@@ -7,6 +7,7 @@
 //! runs nothing and knows no kind of entry but robot policies; other kinds bring their own section (`study`).
 
 mod across;
+mod card;
 mod charts;
 pub mod column;
 pub mod comparison;
@@ -21,6 +22,7 @@ pub mod statistics;
 mod testing;
 
 pub use across::{ACROSS_COLUMNS, AcrossTasks, across_tasks};
+pub use card::model_index;
 pub use charts::curves_svg;
 pub use leaderboard::{Bound, COLUMNS, Counts, FEWEST_TO_RANK, LeaderboardRow, Reading, count_text, rank};
 pub use page::{Curve, to_html};

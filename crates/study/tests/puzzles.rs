@@ -32,6 +32,7 @@ fn request(root: &Path, name: &str, overrides: &[&str]) -> PuzzleTrainRequest {
         run: None,
         resume: false,
         zoo: root.join("zoo"),
+        command: None,
     }
 }
 

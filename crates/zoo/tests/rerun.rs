@@ -61,6 +61,7 @@ fn trained(folder: &Path, data: &Path) -> Entry {
         resume: false,
         zoo: folder.join("zoo"),
         image_memory: None,
+        command: None,
     };
     match train(&request, &|| false, &mut |_| {}).unwrap() {
         TrainOutcome::Finished { entry, .. } => Entry::open(&request.zoo, &entry).unwrap(),
@@ -83,6 +84,8 @@ fn forged(entry: &Entry, zoo: &Path, config: &[(&str, &str)], story: impl Fn(&mu
         config: text,
         normaliser: fs::read(entry.folder().join("normaliser.safetensors")).unwrap(),
         card: CardWords::default(),
+        metrics: fs::read(entry.folder().join("train.parquet")).ok(),
+        command: None,
     };
     Entry::open(zoo, &draft.seal(zoo).unwrap()).unwrap()
 }

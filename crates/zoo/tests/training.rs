@@ -64,6 +64,7 @@ fn request(root: &Path, data: &Path, extra: &[&str]) -> TrainRequest {
         resume: false,
         zoo: root.join("zoo"),
         image_memory: None,
+        command: None,
     }
 }
 

@@ -4,6 +4,7 @@
 //! standard output, progress and errors to standard error.
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
+mod card;
 mod commands;
 mod places;
 mod puzzles;

@@ -272,6 +272,7 @@ fn run_row(
                 resume: run.join("config.toml").is_file(),
                 run: Some(run),
                 zoo: zoo.clone(),
+                command: None,
             };
             match train_puzzles(&request, stop, &mut |event| on_event(StudyEvent::Training(event)))? {
                 TrainOutcome::Finished { entry, .. } => Entry::open(&zoo, &entry)?,

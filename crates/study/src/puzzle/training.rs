@@ -38,6 +38,8 @@ pub struct PuzzleTrainRequest {
     pub resume: bool,
     /// The zoo that gets the entry.
     pub zoo: PathBuf,
+    /// The command that trains it, for the entry.
+    pub command: Option<String>,
 }
 
 impl Settings for PuzzleExperiment {
@@ -76,8 +78,8 @@ pub fn train_puzzles(
     stop: &dyn Fn() -> bool,
     on_event: &mut dyn FnMut(TrainEvent<'_>),
 ) -> Result<TrainOutcome, ZooError> {
-    let PuzzleTrainRequest { name, experiment, runs, run, resume, zoo } = request.clone();
-    let place = Place { name, runs, run, resume, zoo };
+    let PuzzleTrainRequest { name, experiment, runs, run, resume, zoo, command } = request.clone();
+    let place = Place { name, runs, run, resume, zoo, command };
     zoo::run::run(&place, &experiment, |_, _| PuzzleTraining::new(&experiment), stop, on_event)
 }
 
@@ -351,6 +353,8 @@ impl Training for PuzzleTraining<'_> {
         Ok(EntryDraft {
             card: card_words(&puzzle),
             meta,
+            metrics: None,
+            command: None,
             model: tensors::to_bytes(Path::new(zoo::entry::MODEL_FILE), &self.solver.tensors(), &about)?,
             config: experiment.to_toml(),
             // tokens are not normalised: the file holds no statistic

@@ -222,6 +222,7 @@ impl Shared<'_> {
                 run: Some(runs),
                 zoo: zoo.clone(),
                 image_memory: None,
+                command: None,
             };
             let mut steps = 0;
             let outcome = train(&request, &|| self.stopped(), &mut |event| match event {

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::EntryMeta;
+use super::{EntryMeta, hub};
 
 /// What the card of another kind of entry says differently from a robot policy's.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -23,7 +23,7 @@ pub(super) fn render(meta: &EntryMeta, words: &CardWords) -> String {
 }
 
 fn render_into(meta: &EntryMeta, words: &CardWords, card: &mut String) -> std::fmt::Result {
-    writeln!(card, "# {}\n", meta.id())?;
+    writeln!(card, "---\n{}---\n\n# {}\n", hub::metadata(meta), meta.id())?;
     if !meta.description.is_empty() {
         writeln!(card, "{}\n", meta.description)?;
     }
@@ -129,7 +129,8 @@ mod tests {
         meta.parameters = 1_503_751;
         let card = render(&meta, &CardWords::default());
         for expected in [
-            "# lift-act@3",
+            "---\nlibrary_name: actrm\n",
+            "---\n\n# lift-act@3",
             "| parameters | 1,503,751 |",
             "| demonstrations | lift.hdf5: 45 episodes, 2,000 frames trained on, 5 episodes held out |",
             "| training | 3 steps of 64 windows, seed 1, 1.2 minutes on 2 threads |",

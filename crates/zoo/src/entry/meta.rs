@@ -133,7 +133,8 @@ pub struct TrainingMeta {
     pub minutes: f64,
     /// Threads it ran on.
     pub threads: u64,
-    /// The loss on the way, thinned.
+    /// The loss on the way, thinned; in `entry.json` of entries without `train.parquet` alone.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub curve: Vec<CurvePoint>,
 }
 

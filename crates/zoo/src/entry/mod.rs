@@ -1,12 +1,18 @@
 //! Entries: `name@version`, a trained policy sealed with everything needed to run and to trust it.
 //!
-//! An entry is a folder `<zoo>/<name>/<version>/` of five files: `model.safetensors`, `config.toml` (the
-//! resolved experiment), `normaliser.safetensors`, `README.md` (the model card) and `entry.json`, which
-//! holds the SHA-256 of the other four and of itself. A version is never rewritten.
+//! An entry is a folder `<zoo>/<name>/<version>/`: `model.safetensors`, `config.toml` (the resolved experiment),
+//! `normaliser.safetensors`, `README.md` (the model card) and `entry.json`, which holds the SHA-256 of the others and of
+//! itself. Those that were trained here also have `train.parquet` (the metrics on the way) and `command.txt` (the command
+//! that trains it); older ones have their curve in `entry.json`. A version is never rewritten.
+//!
+//! Such a folder can be pushed to the Hugging Face Hub as it is: the card begins with the Hub's YAML. What an entry's
+//! evaluations say is not sealed with it, because they come later: a card may hold it besides, under `model-index`.
 
 mod card;
+mod curve;
 mod family;
 mod format;
+mod hub;
 mod id;
 mod meta;
 mod open;
@@ -15,7 +21,9 @@ mod seal;
 mod subject;
 
 pub use card::{CardWords, grouped};
+pub(crate) use curve::thinned;
 pub use family::{Families, key as family_of, member_name};
+pub use hub::export_hub;
 pub use id::{EntryId, EntryRequest, LATEST, check_alias, check_name};
 pub use meta::{CamerasMeta, CurvePoint, DataMeta, EntryMeta, FileMeta, ModuleMeta, TrainingMeta};
 pub use open::Entry;
@@ -34,5 +42,9 @@ pub const CONFIG_FILE: &str = "config.toml";
 pub const NORMALISER_FILE: &str = "normaliser.safetensors";
 /// The model card.
 pub const CARD_FILE: &str = "README.md";
+/// The metrics of the training, row by row.
+pub const TRAIN_FILE: &str = "train.parquet";
+/// The command that trains it.
+pub const COMMAND_FILE: &str = "command.txt";
 /// Provenance and the hashes of the other files.
 pub const ENTRY_FILE: &str = "entry.json";

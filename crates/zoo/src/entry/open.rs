@@ -3,11 +3,13 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::{ZooError, sha256_file};
+use crate::{ZooError, sha256_file, sha256_hex};
 
 use super::format::upgrade;
 use super::meta::self_hashes;
-use super::{CARD_FILE, CONFIG_FILE, ENTRY_FILE, EntryId, EntryMeta, MODEL_FILE, NORMALISER_FILE};
+use super::{
+    CARD_FILE, CONFIG_FILE, ENTRY_FILE, EntryId, EntryMeta, MODEL_FILE, NORMALISER_FILE, TRAIN_FILE, curve, hub,
+};
 
 /// An entry whose files are the ones that were written.
 #[derive(Debug, Clone)]
@@ -22,16 +24,21 @@ impl Entry {
     /// # Errors
     /// [`ZooError::Tampered`] for the first file that differs from what was written.
     pub fn open(zoo: &Path, id: &EntryId) -> Result<Self, ZooError> {
-        let entry = Self::open_meta(zoo, id)?;
+        let mut entry = Self::open_meta(zoo, id)?;
         for (name, file) in &entry.meta.files {
             let path = entry.folder.join(name);
             let found = match path.is_file() {
                 true => sha256_file(&path)?,
                 false => "no such file".to_owned(),
             };
-            if found != file.sha256 {
+            if found != file.sha256 && !(name == CARD_FILE && entry.card_with_results(&file.sha256)?) {
                 return Err(ZooError::Tampered { path, expected: file.sha256.clone(), found });
             }
+        }
+        if let Some(training) = entry.meta.training.as_mut().filter(|training| training.curve.is_empty())
+            && entry.meta.files.contains_key(TRAIN_FILE)
+        {
+            training.curve = curve::read(&entry.folder.join(TRAIN_FILE))?;
         }
         Ok(entry)
     }
@@ -87,12 +94,37 @@ impl Entry {
         self.text(CARD_FILE)
     }
 
+    /// The model card without its metadata, as people read it.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn card_body(&self) -> Result<String, ZooError> {
+        Ok(hub::body(&self.card()?).to_owned())
+    }
+
     /// The resolved experiment as TOML text.
     ///
     /// # Errors
     /// When it cannot be read.
     pub fn config_text(&self) -> Result<String, ZooError> {
         self.text(CONFIG_FILE)
+    }
+
+    /// The model card for the Hugging Face Hub: with the results of evaluations, a YAML text that is a `model-index` or
+    /// empty, among its metadata.
+    ///
+    /// # Errors
+    /// When the card cannot be read.
+    pub fn hub_card(&self, model_index: &str) -> Result<String, ZooError> {
+        Ok(hub::with_results(&self.card()?, &self.meta, model_index))
+    }
+
+    /// Whether the card is the sealed one but for results of evaluations, which were written to it later.
+    fn card_with_results(&self, sealed: &str) -> Result<bool, ZooError> {
+        let path = self.folder.join(CARD_FILE);
+        let Ok(card) = fs::read(&path) else { return Ok(false) };
+        let Ok(card) = String::from_utf8(card) else { return Ok(false) };
+        Ok(hub::without_results(&card).iter().any(|text| sha256_hex(text.as_bytes()) == sealed))
     }
 
     fn text(&self, name: &str) -> Result<String, ZooError> {

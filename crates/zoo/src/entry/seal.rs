@@ -12,7 +12,8 @@ use crate::{ZooError, sha256_hex};
 use super::format::FORMAT;
 use super::meta::seal_text;
 use super::{
-    CARD_FILE, CONFIG_FILE, CardWords, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE, NORMALISER_FILE, card, id,
+    CARD_FILE, COMMAND_FILE, CONFIG_FILE, CardWords, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE,
+    NORMALISER_FILE, TRAIN_FILE, card, id,
 };
 
 /// What a version leaves behind that was removed: it is never given again.
@@ -31,6 +32,10 @@ pub struct EntryDraft {
     pub normaliser: Vec<u8>,
     /// What its model card says in other words than a robot policy's.
     pub card: CardWords,
+    /// Content of `train.parquet`, of an entry that was trained here: `entry.json` then holds no curve.
+    pub metrics: Option<Vec<u8>>,
+    /// Content of `command.txt`, where the command is known.
+    pub command: Option<String>,
 }
 
 impl EntryDraft {
@@ -65,12 +70,17 @@ impl EntryDraft {
         self.meta.version = newest + 1;
         self.meta.files = BTreeMap::new();
         let card = card::render(&self.meta, &self.card);
-        let contents: [(&str, &[u8]); 4] = [
+        let mut contents: Vec<(&str, &[u8])> = vec![
             (MODEL_FILE, &self.model),
             (CONFIG_FILE, self.config.as_bytes()),
             (NORMALISER_FILE, &self.normaliser),
             (CARD_FILE, card.as_bytes()),
         ];
+        contents.extend(self.command.as_ref().map(|command| (COMMAND_FILE, command.as_bytes())));
+        if let Some(metrics) = &self.metrics {
+            contents.push((TRAIN_FILE, metrics));
+            self.meta.training.iter_mut().for_each(|training| training.curve.clear());
+        }
         let staging = tempfile::Builder::new()
             .prefix(".tmp-")
             .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o755))
@@ -184,6 +194,8 @@ pub(crate) mod tests {
             config: "[task]\nname = \"Lift\"\n".to_owned(),
             normaliser: b"statistics".to_vec(),
             card: CardWords::default(),
+            metrics: None,
+            command: None,
         }
     }
 

@@ -112,6 +112,8 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     let of_origin = origin.as_ref();
     let draft = EntryDraft {
         card: CardWords::default(),
+        metrics: None,
+        command: None,
         meta: EntryMeta {
             format: 0,
             name: options.name.clone(),

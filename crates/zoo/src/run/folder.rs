@@ -98,6 +98,7 @@ impl RunFolder {
     pub(super) fn discard(&self) {
         // whatever cannot be removed is not worth hiding the error that led here
         let _ = fs::remove_file(self.path.join("lock"));
+        let _ = fs::remove_file(self.begun_path());
         let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));
         for folder in self.path.ancestors().take(3) {
             if fs::remove_dir(folder).is_err() {
@@ -124,6 +125,20 @@ impl RunFolder {
     /// The entry that the run is about to get.
     pub(super) fn sealing_path(&self) -> PathBuf {
         self.path.join("sealing.json")
+    }
+
+    /// The command that trains what is trained here, if the run was begun by one.
+    pub(super) fn begun_path(&self) -> PathBuf {
+        self.path.join("begun.txt")
+    }
+
+    /// What is written there.
+    pub(super) fn begun(&self) -> Result<Option<String>, ZooError> {
+        let path = self.begun_path();
+        match path.is_file() {
+            true => fs::read_to_string(&path).map(Some).map_err(ZooError::io("read", path)),
+            false => Ok(None),
+        }
     }
 
     /// Where checkpoints go.

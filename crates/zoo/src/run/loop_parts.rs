@@ -5,13 +5,10 @@ use std::path::Path;
 use std::time::SystemTime;
 
 use crate::ZooError;
-use crate::entry::CurvePoint;
+use crate::entry::{CurvePoint, thinned};
 
 use super::folder::RunFolder;
 use super::metrics::MetricsRow;
-
-/// Points kept of a training curve.
-const CURVE_POINTS: usize = 50;
 
 /// The folder of a training: `run` exactly, or the next or latest one of experiment `name` under `runs`.
 pub(super) fn open_folder(name: &str, runs: &Path, run: Option<&Path>, resume: bool) -> Result<RunFolder, ZooError> {
@@ -44,33 +41,13 @@ pub(crate) fn same_settings(
     Ok(())
 }
 
-/// At most 50 rows, evenly thinned; the last always stays.
+/// The loss on the way, thinned.
 pub(super) fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
-    let stride = rows.len().div_ceil(CURVE_POINTS).max(1);
-    let point = |row: &MetricsRow| {
-        let loss = *row.values.get("loss")?;
-        Some(CurvePoint { step: row.step, loss, valid_loss: row.values.get("valid_loss").copied() })
-    };
-    rows.iter().rev().step_by(stride).filter_map(point).collect::<Vec<_>>().into_iter().rev().collect()
+    let value = |row: &MetricsRow, name: &str| row.values.get(name).copied();
+    thinned(rows.iter().map(|row| (row.step, value(row, "loss"), value(row, "valid_loss"))))
 }
 
 /// Seconds since 1970.
 pub(super) fn wall_time() -> f64 {
     SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn curves_are_thinned_to_their_end() {
-        let rows: Vec<MetricsRow> =
-            (1..=1003).map(|step| MetricsRow { step, values: [("loss".to_owned(), step as f64)].into() }).collect();
-        let points = curve(&rows);
-        assert!(points.len() <= CURVE_POINTS && points.len() > CURVE_POINTS / 2);
-        assert_eq!(points.last().map(|p| p.step), Some(1003));
-        assert!(points.windows(2).all(|p| p[0].step < p[1].step));
-        assert_eq!(curve(&rows[..3]).len(), 3);
-    }
 }

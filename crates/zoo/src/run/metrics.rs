@@ -101,6 +101,14 @@ impl Metrics {
     /// # Errors
     /// When the file cannot be written.
     pub fn write_parquet(&self, path: &Path) -> Result<(), ZooError> {
+        write_atomic(path, &self.to_parquet(path)?)
+    }
+
+    /// The same as bytes, for the file at `path`.
+    ///
+    /// # Errors
+    /// Rows that are no table.
+    pub fn to_parquet(&self, path: &Path) -> Result<Vec<u8>, ZooError> {
         let failed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
         let steps = UInt64Array::from_iter_values(self.rows.iter().map(|r| r.step));
         let mut columns: Vec<(&str, ArrayRef)> = vec![("step", Arc::new(steps))];
@@ -116,7 +124,7 @@ impl Metrics {
         let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), None).map_err(|e| failed(e.to_string()))?;
         writer.write(&batch).map_err(|e| failed(e.to_string()))?;
         writer.close().map_err(|e| failed(e.to_string()))?;
-        write_atomic(path, &bytes)
+        Ok(bytes)
     }
 }
 

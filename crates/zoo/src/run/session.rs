@@ -9,7 +9,7 @@ use candle_core::{DType, Tensor};
 use models::ModelError;
 use serde::{Deserialize, Serialize};
 
-use crate::entry::{ENTRY_FILE, Entry, EntryDraft, EntryId, TrainingMeta};
+use crate::entry::{ENTRY_FILE, Entry, EntryDraft, EntryId, TRAIN_FILE, TrainingMeta};
 use crate::{ZooError, sha256_file, write_atomic};
 
 use super::checkpoint::Checkpoint;
@@ -33,6 +33,8 @@ pub struct Place {
     pub resume: bool,
     /// The zoo that gets the entry.
     pub zoo: PathBuf,
+    /// The command that trains it, for the entry; a run that goes on keeps the one that it began with.
+    pub command: Option<String>,
 }
 
 /// What a training tells while it runs.
@@ -185,6 +187,9 @@ fn run_in<E: Settings, T: Training>(
     }
     let training = make(folder, on_event)?;
     if !place.resume {
+        if let Some(command) = &place.command {
+            write_atomic(&folder.begun_path(), format!("{command}\n").as_bytes())?;
+        }
         // last: its presence says that the run was begun
         write_atomic(&config, experiment.text().as_bytes())?;
     }
@@ -194,7 +199,9 @@ fn run_in<E: Settings, T: Training>(
         return Ok(TrainOutcome::Stopped { step: session.step, run: folder.path().to_owned() });
     }
     let training = session.meta();
-    let draft = session.training.draft(&place.name, training.clone(), session.metrics.rows())?;
+    let mut draft = session.training.draft(&place.name, training.clone(), session.metrics.rows())?;
+    draft.metrics = Some(session.metrics.to_parquet(Path::new(TRAIN_FILE))?);
+    draft.command = folder.begun()?;
     let entry = draft.seal_noting(&place.zoo, &mut |entry, sha256| {
         let note = Sealing { name: entry.name.clone(), version: entry.version, sha256: sha256.to_owned() };
         let text = serde_json::to_string_pretty(&note).expect("strings and numbers become JSON") + "\n";

@@ -43,12 +43,14 @@ pub struct TrainRequest {
     pub zoo: PathBuf,
     /// Bytes that pictures may take in memory; more are kept in a file and read ahead. `None`: half of what is free.
     pub image_memory: Option<u64>,
+    /// The command that trains it, for the entry.
+    pub command: Option<String>,
 }
 
 impl TrainRequest {
     fn place(&self) -> Place {
-        let Self { name, runs, run, resume, zoo, .. } = self.clone();
-        Place { name, runs, run, resume, zoo }
+        let Self { name, runs, run, resume, zoo, command, .. } = self.clone();
+        Place { name, runs, run, resume, zoo, command }
     }
 }
 
@@ -304,6 +306,8 @@ impl Training for PolicyTraining<'_> {
         Ok(EntryDraft {
             card: CardWords::default(),
             meta,
+            metrics: None,
+            command: None,
             model: tensors::to_bytes(Path::new(crate::entry::MODEL_FILE), &weights, &about)?,
             config: experiment.to_toml(),
             normaliser: tensors::to_bytes(

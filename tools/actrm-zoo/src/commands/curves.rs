@@ -35,7 +35,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut entries = Vec::new();
     for text in &args.entries {
         for id in registry.matching(text)? {
-            entries.push(Entry::open_meta(registry.folder(), &id)?);
+            entries.push(Entry::open(registry.folder(), &id)?);
         }
     }
     let trained = |entry: &&Entry| entry.meta().training.as_ref().is_some_and(|training| !training.curve.is_empty());

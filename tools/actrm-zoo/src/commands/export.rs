@@ -2,14 +2,17 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use cli::shown;
+use zoo::entry::export_hub;
 use zoo::lerobot::export;
 
-use crate::places::{ZooArgs, entry_names};
+use crate::card::model_index_of;
+use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
 /// Write an entry in the form of another library
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  actrm-zoo export lerobot lift-act@1 lift-act-lerobot")]
+  actrm-zoo export lerobot lift-act@1 lift-act-lerobot
+  actrm-zoo export hub lift-act@1 lift-act-hub")]
 pub struct Args {
     #[command(subcommand)]
     to: To,
@@ -18,6 +21,26 @@ pub struct Args {
 #[derive(clap::Subcommand)]
 enum To {
     Lerobot(LerobotArgs),
+    Hub(HubArgs),
+}
+
+/// A folder for the Hugging Face Hub: the entry's files, with the results that stand in its model card
+///
+/// An entry's own folder can be pushed as it is, too; its card then has no results, because it was sealed before there were
+/// any. Copied to ZOO/NAME/VERSION, such a folder is the entry again: results in its card are not part of its seal.
+#[derive(clap::Args)]
+struct HubArgs {
+    /// Entry: `name` (its newest version) or `name@version`
+    #[arg(add = entry_names())]
+    entry: String,
+    /// New folder
+    folder: PathBuf,
+    #[command(flatten)]
+    results: ResultsArgs,
+    #[command(flatten)]
+    protocols: ProtocolArgs,
+    #[command(flatten)]
+    zoo: ZooArgs,
 }
 
 /// A checkpoint folder that LeRobot 0.6.1 loads
@@ -33,9 +56,19 @@ struct LerobotArgs {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let To::Lerobot(args) = &args.to;
-    let entry = args.zoo.registry().entry(&args.entry)?;
-    export(&entry, &args.folder)?;
-    cli::print(&format!("{} is in {}\n", entry.id(), shown(&args.folder)))?;
+    let (entry, folder) = match &args.to {
+        To::Lerobot(args) => {
+            let entry = args.zoo.registry().entry(&args.entry)?;
+            export(&entry, &args.folder)?;
+            (entry, &args.folder)
+        }
+        To::Hub(args) => {
+            let entry = args.zoo.registry().entry(&args.entry)?;
+            let results = model_index_of(&entry, &args.zoo, &args.results, &args.protocols)?;
+            export_hub(&entry, &args.folder, &results)?;
+            (entry, &args.folder)
+        }
+    };
+    cli::print(&format!("{} is in {}\n", entry.id(), shown(folder)))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,23 +1,32 @@
 use std::process::ExitCode;
 
-use crate::places::{ZooArgs, entry_names};
+use crate::card::model_index_of;
+use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
 /// Verify an entry and print its model card, its experiment or its provenance
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo show lift-act
+  actrm-zoo show lift-act@1 --card
   actrm-zoo show lift-act@1 --config
   actrm-zoo show lift-act@1 --json")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
     entry: String,
+    /// Print the model card for the Hugging Face Hub: with its metadata, and the results that stand as `model-index`
+    #[arg(long, conflicts_with_all = ["config", "json"])]
+    card: bool,
     /// Print the resolved experiment
     #[arg(long, conflicts_with = "json")]
     config: bool,
     /// Print the provenance and the hashes of all files
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    results: ResultsArgs,
+    #[command(flatten)]
+    protocols: ProtocolArgs,
     #[command(flatten)]
     zoo: ZooArgs,
 }
@@ -28,8 +37,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         cli::print_json(entry.meta())?;
     } else if args.config {
         cli::print(&entry.config_text()?)?;
+    } else if args.card {
+        cli::print(&entry.hub_card(&model_index_of(&entry, &args.zoo, &args.results, &args.protocols)?)?)?;
     } else {
-        cli::print(&entry.card()?)?;
+        cli::print(&entry.card_body()?)?;
     }
     Ok(ExitCode::SUCCESS)
 }

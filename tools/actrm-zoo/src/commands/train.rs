@@ -103,7 +103,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let asked = Stop::install("stopped before the first step")?;
     let Some(TrainingSeeds(seeds)) = &args.seeds else {
-        let one = One { run: args.run.clone(), resume: args.resume, seeded: false };
+        let one = One { run: args.run.clone(), resume: args.resume, seeded: false, own: Vec::new() };
         return train_one(args, experiment, &one, &asked);
     };
     if let Some(set) = args.overrides.iter().find(|set| set.starts_with("train.seed=") || set.starts_with("entry=")) {
@@ -113,8 +113,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let settings = zoo::sha256_hex(format!("{}\n{:?}", experiment.to_toml(), args.data).as_bytes());
     for &seed in seeds {
         let name = member_name(experiment.entry(), seed);
-        let overrides: Vec<String> =
-            args.overrides.iter().cloned().chain([format!("train.seed={seed}"), format!("entry={name}")]).collect();
+        let own = vec![format!("train.seed={seed}"), format!("entry={name}")];
+        let overrides: Vec<String> = args.overrides.iter().chain(&own).cloned().collect();
         let run = args.runs.join(&args.experiment).join(format!("{}-s{seed}", &settings[..8]));
         if let Some(entry) = finished_entry(&run)? {
             // of another zoo, or removed: it has to be trained again, which only the user can decide
@@ -127,7 +127,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             cli::print(&format!("{id} is in {} already (run {})\n", shown(&args.zoo.zoo), shown(&run)))?;
             continue;
         }
-        let one = One { resume: run.join("config.toml").is_file(), run: Some(run), seeded: true };
+        let one = One { resume: run.join("config.toml").is_file(), run: Some(run), seeded: true, own };
         let code = train_one(args, load(&overrides)?, &one, &asked)?;
         if code != ExitCode::SUCCESS {
             return Ok(code);
@@ -141,6 +141,8 @@ struct One {
     run: Option<PathBuf>,
     resume: bool,
     seeded: bool,
+    /// Changes to the experiment that are its alone.
+    own: Vec<String>,
 }
 
 fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) -> anyhow::Result<ExitCode> {
@@ -148,6 +150,7 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
     let stop = || asked.asked();
     let (name, runs, run) = (args.experiment.clone(), args.runs.clone(), one.run.clone());
     let (resume, zoo) = (one.resume, args.zoo.zoo.clone());
+    let command = Some(command_line(&trains(args, &one.own)));
     // the error of a file that is for people only must not end a training
     let mut unwritten = None;
     let mut on_event = |event: TrainEvent<'_>| {
@@ -161,14 +164,15 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
         AnyExperiment::Robot(experiment) => {
             let data = args.data.clone();
             let image_memory = args.image_memory;
-            let request = TrainRequest { name, experiment: *experiment, data, runs, run, resume, zoo, image_memory };
+            let request =
+                TrainRequest { name, experiment: *experiment, data, runs, run, resume, zoo, image_memory, command };
             train(&request, &stop, &mut on_event)
         }
         AnyExperiment::Puzzle(experiment) => {
             if args.data.is_some() {
                 bail!("--data: experiment `{name}` draws its own puzzles");
             }
-            let request = PuzzleTrainRequest { name, experiment: *experiment, runs, run, resume, zoo };
+            let request = PuzzleTrainRequest { name, experiment: *experiment, runs, run, resume, zoo, command };
             train_puzzles(&request, &stop, &mut on_event)
         }
     };
@@ -189,10 +193,10 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
     }
 }
 
-/// The command that goes on with the run in `folder`: everything that was asked for, wherever it came from.
-fn going_on(args: &Args, folder: &Path, seeded: bool) -> String {
+/// What decides the weights, as a command: the same wherever runs and zoo are.
+fn trains(args: &Args, own: &[String]) -> Vec<OsString> {
     let mut words: Vec<OsString> = ["actrm-zoo", "train", &args.experiment].map(OsString::from).to_vec();
-    words.extend(args.overrides.iter().map(OsString::from));
+    words.extend(args.overrides.iter().chain(own).map(OsString::from));
     let mut option = |name: &str, path: &Path| words.extend([name.into(), path.as_os_str().to_owned()]);
     if let Some(data) = &args.data {
         option("--data", data);
@@ -200,6 +204,13 @@ fn going_on(args: &Args, folder: &Path, seeded: bool) -> String {
     if let Some(configs) = &args.configs.configs {
         option("--configs", configs);
     }
+    words
+}
+
+/// The command that goes on with the run in `folder`: everything that was asked for, wherever it came from.
+fn going_on(args: &Args, folder: &Path, seeded: bool) -> String {
+    let mut words = trains(args, &[]);
+    let mut option = |name: &str, path: &Path| words.extend([name.into(), path.as_os_str().to_owned()]);
     if let Some(bytes) = args.image_memory {
         option("--image-memory", Path::new(&bytes.to_string()));
     }
