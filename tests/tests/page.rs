@@ -1,10 +1,10 @@
-//! The report in a browser: headless Chromium, where it is installed (`chromium` on the PATH, or `ACTRM_CHROMIUM`).
+//! The pages in a browser: headless Chromium, where it is installed (`chromium` on the PATH, or `ACTRM_CHROMIUM`).
 
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use e2e::{root, succeeds, text, zoo};
+use e2e::{data, lift, listing, refused, root, succeeds, text, zoo};
 
 /// The browser, if there is one.
 fn browser() -> Option<String> {
@@ -121,4 +121,119 @@ fn the_report_works_in_a_browser() {
     assert!(told["overflow"].as_f64().is_some_and(|width| width <= 390.0), "{told}");
     let charts = numbers("charts");
     assert!(charts.len() > 20 && charts.iter().all(|width| *width >= 300.0), "{charts:?}");
+}
+
+/// Done by a reader of a data set's page: opens an episode, looks for one, orders them; then looks at 390 pixels.
+const VIEWER: &str = r##"<script>
+addEventListener("load", async () => {
+  const told = {};
+  const settled = () => new Promise((done) => setTimeout(done, 60));
+  const shown = () => [...document.querySelectorAll(".episode")].filter((episode) => !episode.hidden);
+  told.episodes = shown().length;
+  const episode = shown()[1];
+  episode.querySelector("summary").click();
+  await settled();
+  told.points = [...episode.querySelectorAll(".line")].map((line) => line.getAttribute("d").match(/[ML]/g).length);
+  told.pictures = await Promise.all([...episode.querySelectorAll("img")].map((image) => image.decode().then(() => image.naturalWidth)));
+  told.captions = [...episode.querySelectorAll("figcaption")].map((caption) => caption.textContent);
+  episode.querySelectorAll("details").forEach((details) => { details.open = true; });
+  await settled();
+  told.columns = [...episode.querySelectorAll(":scope > details > summary")].map((summary) => summary.textContent);
+  told.all = episode.querySelectorAll(".line").length;
+  const find = document.getElementById("find"), order = document.getElementById("order");
+  order.value = "length";
+  order.dispatchEvent(new Event("change", { bubbles: true }));
+  told.lengths = shown().map((one) => +one.dataset.length);
+  find.value = "nothing-like-this";
+  find.dispatchEvent(new Event("input", { bubbles: true }));
+  told.none = document.getElementById("shown").textContent;
+  find.value = "";
+  find.dispatchEvent(new Event("input", { bubbles: true }));
+  location.hash = "#episode-0";
+  await settled();
+  told.linked = document.getElementById("episode-0").open;
+  const focusable = [...document.querySelectorAll("a, button, input, select, summary, [tabindex]")];
+  told.unreachable = focusable.filter((element) => element.tabIndex < 0).length;
+  const frame = document.createElement("iframe");
+  frame.width = 390; frame.height = 844;
+  frame.onload = async () => {
+    const narrow = frame.contentDocument;
+    narrow.querySelectorAll(".episode").forEach((details, i) => { details.open = i < 2; });
+    await settled();
+    told.overflow = narrow.documentElement.scrollWidth;
+    told.charts = [...narrow.querySelectorAll(".charts svg, .curves svg")].map((svg) => svg.getBoundingClientRect().width);
+    frame.remove();
+    const out = document.createElement("pre");
+    out.id = "told";
+    out.textContent = JSON.stringify(told);
+    document.body.append(out);
+  };
+  frame.srcdoc = PAGE;
+  document.body.append(frame);
+});
+</script>"##;
+
+/// What a reader was told by a page of a data set.
+fn viewed(browser: &str, page: &Path) -> serde_json::Value {
+    let html = fs::read_to_string(page).expect("a page");
+    let (_, console) = rendered(browser, page);
+    assert!(console.is_empty(), "{console:#?}");
+    let quoted = serde_json::to_string(&html).expect("text").replace("</", "<\\/").replace("<!--", "<\\!--");
+    let visited = page.with_extension("visited.html");
+    // the last one: names of features may look like the end of a body
+    let (before, after) = html.rsplit_once("</body>").expect("a body");
+    fs::write(&visited, format!("{before}{}</body>{after}", VIEWER.replace("PAGE", &quoted))).expect("writable");
+    let (dom, console) = rendered(browser, &visited);
+    assert!(console.is_empty(), "{console:#?}");
+    let told = dom.split("<pre id=\"told\">").nth(1).and_then(|rest| rest.split("</pre>").next());
+    serde_json::from_str(told.expect("the reader came to an end")).expect("JSON")
+}
+
+#[test]
+fn a_data_set_is_viewed_in_a_browser() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let at = |name: &str| folder.path().join(name);
+    let films = root().join("crates/dataset/tests/fixtures/lerobot_video_av1");
+    for (source, out) in [(&films, "films.html"), (&lift(), "file.html")] {
+        let mut view = data(["view", text(source), "--frames", "3", "--points", "40", "--out"]);
+        succeeds(view.arg(at(out)));
+    }
+    let words = ["films.html: exists already"];
+    refused(&mut data(["view", text(&films), "--out", text(&at("films.html"))]), &words);
+    let mut asked = data(["view", text(&films), "--column", "reward", "--out"]);
+    refused(asked.arg(at("x.html")), &["no column reward; there is action, observation.state"]);
+    assert_eq!(listing(folder.path()), ["file.html", "films.html"]);
+    let file = fs::read_to_string(at("file.html")).expect("a page");
+    for said in ["50", "2,498", "robomimic HDF5", "Lift, version 1.5.2", "No problems found.", "return 11 · success"] {
+        assert!(file.contains(said), "{said}");
+    }
+    assert!(!file.contains("http://") && !file.contains("https://"));
+    let Some(browser) = browser() else {
+        eprintln!("skipped: no Chromium on the PATH; name one by ACTRM_CHROMIUM");
+        return;
+    };
+    let told = viewed(&browser, &at("films.html"));
+    assert_eq!((&told["episodes"], &told["all"]), (&3.into(), &5.into()), "{told}");
+    // two cameras, three frames each, of an episode of 12 steps
+    assert_eq!(told["pictures"], serde_json::json!([84, 84, 84, 84, 84, 84]), "{told}");
+    assert_eq!(told["captions"].as_array().map(Vec::len), Some(6), "{told}");
+    assert_eq!(told["columns"], serde_json::json!(["action (2)", "observation.state (3)"]), "{told}");
+    let check = |told: &serde_json::Value| {
+        let numbers = |key: &str| -> Vec<f64> {
+            told[key].as_array().expect("a list").iter().map(|x| x.as_f64().expect("a number")).collect()
+        };
+        assert!(numbers("lengths").is_sorted_by(|a, b| a >= b), "{told}");
+        assert!(told["none"].as_str().is_some_and(|text| text.starts_with("0 of ")), "{told}");
+        assert_eq!((&told["linked"], &told["unreachable"]), (&true.into(), &0.into()), "{told}");
+        assert!(told["overflow"].as_f64().is_some_and(|width| width <= 390.0), "{told}");
+        let charts = numbers("charts");
+        assert!(charts.len() > 3 && charts.iter().all(|width| *width >= 250.0), "{charts:?}");
+        numbers("points")
+    };
+    assert_eq!(check(&told).len(), 2);
+    let told = viewed(&browser, &at("file.html"));
+    assert_eq!(told["episodes"], 50);
+    // seven actions, every second of an episode's 41 to 80 steps, or every one of fewer
+    let points = check(&told);
+    assert!(points.len() == 7 && points.iter().all(|n| (20.0..=40.0).contains(n)), "{points:?}");
 }

@@ -4,6 +4,7 @@
 mod cameras;
 mod commands;
 mod svg;
+mod view;
 
 use clap::{CommandFactory, Parser};
 use std::process::ExitCode;

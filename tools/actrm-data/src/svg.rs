@@ -3,10 +3,10 @@
 use std::fmt::Write;
 
 /// Inner size of a chart in pixels.
-const WIDTH: f64 = 420.0;
-const HEIGHT: f64 = 120.0;
+pub const WIDTH: f64 = 420.0;
+pub const HEIGHT: f64 = 120.0;
 /// Room for labels: left, top, right, bottom.
-const MARGIN: (f64, f64, f64, f64) = (58.0, 22.0, 10.0, 26.0);
+pub const MARGIN: (f64, f64, f64, f64) = (58.0, 22.0, 10.0, 26.0);
 
 /// Room that one chart takes.
 pub const SIZE: (f64, f64) = (WIDTH + MARGIN.0 + MARGIN.2, HEIGHT + MARGIN.1 + MARGIN.3);

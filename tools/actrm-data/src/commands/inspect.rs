@@ -30,22 +30,22 @@ pub struct Args {
 
 /// What is shown, whatever it was read from.
 #[derive(Serialize)]
-struct Summary {
+pub(super) struct Summary {
     path: String,
-    layout: String,
-    bytes: u64,
-    env_name: Option<String>,
-    env_version: Option<String>,
-    demos: usize,
-    frames: usize,
-    length_min: usize,
-    length_mean: f64,
-    length_max: usize,
+    pub(super) layout: String,
+    pub(super) bytes: u64,
+    pub(super) env_name: Option<String>,
+    pub(super) env_version: Option<String>,
+    pub(super) demos: usize,
+    pub(super) frames: usize,
+    pub(super) length_min: usize,
+    pub(super) length_mean: f64,
+    pub(super) length_max: usize,
     keys: Vec<KeyRow>,
-    masks: BTreeMap<String, usize>,
-    tasks: Vec<String>,
-    notes: Vec<String>,
-    problems: Vec<String>,
+    pub(super) masks: BTreeMap<String, usize>,
+    pub(super) tasks: Vec<String>,
+    pub(super) notes: Vec<String>,
+    pub(super) problems: Vec<String>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     each: Vec<DemoRow>,
 }
@@ -81,11 +81,37 @@ struct DemoRow {
     task: Option<String>,
 }
 
+/// What is in a file or a data set, without its demos and without reading a file's data.
+pub(super) fn summary(path: &Path) -> Result<Summary> {
+    of(&Args { path: path.to_owned(), quick: true, demos: false, json: false })
+}
+
+fn of(args: &Args) -> Result<Summary> {
+    match args.path.join("meta/info.json").exists() {
+        true => of_dataset(args),
+        false => of_source(args),
+    }
+}
+
+impl Summary {
+    /// Name, type, shape of a step, and range or codec of each feature.
+    pub(super) fn features(&self) -> Vec<[String; 4]> {
+        let row = |key: &KeyRow| {
+            let shapes: Vec<String> = key.shapes.iter().map(|shape| cli::shape(shape)).collect();
+            let video = key.video.as_ref().map(|video| {
+                let sizes: Vec<String> = video.sizes.iter().map(|(width, height)| format!("{width} x {height}")).collect();
+                let (codecs, files) = (video.codecs.join(" or "), video.files);
+                format!("{codecs}, {}, {files} files, {}", sizes.join(" or "), cli::bytes(video.bytes))
+            });
+            let range = key.min.zip(key.max).map(|(low, high)| format!("{} to {}", cli::number(low), cli::number(high)));
+            [key.key.clone(), key.dtype.clone(), shapes.join(" or "), video.or(range).unwrap_or_default()]
+        };
+        self.keys.iter().map(row).collect()
+    }
+}
+
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let summary = match args.path.join("meta/info.json").exists() {
-        true => of_dataset(args)?,
-        false => of_source(args)?,
-    };
+    let summary = of(args)?;
     if args.json {
         cli::print_json(&summary)?;
     } else {

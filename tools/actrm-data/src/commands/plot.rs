@@ -136,7 +136,7 @@ fn page(set: &Dataset, episode: &EpisodeMeta, columns: &[&str], heading: &str) -
 }
 
 /// Writes a new file under a temporary name first.
-fn create(path: &Path, bytes: &[u8]) -> Result<()> {
+pub(super) fn create(path: &Path, bytes: &[u8]) -> Result<()> {
     if path.exists() {
         bail!("{}: exists already; choose another path or remove it first", path.display());
     }
