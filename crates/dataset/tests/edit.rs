@@ -490,6 +490,20 @@ fn what_cannot_be_done_is_told_and_leaves_nothing() {
         parts(Parts::Masks(vec!["train".to_owned(), "train".to_owned()])),
         &["part 2: expected a name for a folder, another"],
     );
+    // nor are pictures that were exchanged where no hash of a file tells
+    let bare = ConvertOptions { lossless: false, fps: Some(20.0), ..ConvertOptions::default() };
+    let folder = tempfile::tempdir().unwrap();
+    let seen = synthetic(0, 4, Some(24));
+    let mut painted = seen.clone();
+    painted.datasets.get_mut("obs/agentview_image").unwrap().bytes[100] ^= 1;
+    let (one, two) =
+        (converted(&[seen], folder.path(), "one", &bare), converted(&[painted], folder.path(), "two", &bare));
+    let data = "data/chunk-000/file-000.parquet";
+    std::fs::copy(two.join(data), one.join(data)).unwrap();
+    told(
+        keep(&one, &new(), &numbers(&[0]), &mut quiet),
+        &["one: pictures: expected the content that was recorded", "fingerprint"],
+    );
     // what was changed since it was written is not carried on
     let path = set.join("actrm/layout.json");
     let mut text = std::fs::read_to_string(&path).unwrap();

@@ -185,7 +185,7 @@ fn split_problem(dataset: &Dataset) -> Option<String> {
 }
 
 /// Decodes every picture and compares the whole content with the fingerprint.
-fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u64)) -> Result<Option<String>> {
+pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u64)) -> Result<Option<String>> {
     let info: &Info = dataset.info();
     let root = dataset.root();
     let mut cursors = BTreeMap::new();

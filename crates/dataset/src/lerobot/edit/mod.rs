@@ -22,6 +22,7 @@ use super::open::{ACTION, Dataset};
 use super::side::{Layout, write_manifest};
 use super::staging::Staging;
 use super::tally::Tally;
+use super::verify::picture_problem;
 use super::videos::{Stretch, VIDEO_PATH};
 use crate::error::{DatasetError, Result};
 use std::collections::BTreeMap;
@@ -70,10 +71,23 @@ struct Input {
 }
 
 impl Input {
-    fn open(root: &Path) -> Result<Self> {
+    /// Opens a set and makes sure that it is what was written: what is damaged must not get a new fingerprint. The files of
+    /// a set with a side folder have hashes; of one without, pictures are held against the fingerprint.
+    fn open(root: &Path, progress: &mut Progress<'_>) -> Result<Self> {
         let set = Dataset::open(root)?;
         let layout = match set.provenance() {
             Some(provenance) if provenance.lossless => Some(side_folder(root, set.info())?),
+            Some(_) if set.cameras().next().is_some() => match picture_problem(&set, progress)? {
+                None => None,
+                Some(found) => {
+                    return Err(DatasetError::BadDataset {
+                        path: root.to_path_buf(),
+                        object: "pictures".to_owned(),
+                        expected: "the content that was recorded when it was made".to_owned(),
+                        found,
+                    });
+                }
+            },
             _ => None,
         };
         Ok(Self { set, layout })
@@ -97,7 +111,7 @@ struct Edit<'a> {
 /// # Errors
 /// An episode that is not there, a destination that is, videos that cannot be cut ([`video::VideoError::Cut`]).
 pub fn keep(set: &Path, to: &Destination, chosen: &Selection, progress: &mut Progress<'_>) -> Result<EditReport> {
-    let input = Input::open(set)?;
+    let input = Input::open(set, progress)?;
     let episodes = chosen.resolve(&input.set)?.into_iter().collect();
     one(input, to, episodes, &Renames::new(), progress)
 }
@@ -107,7 +121,7 @@ pub fn keep(set: &Path, to: &Destination, chosen: &Selection, progress: &mut Pro
 /// # Errors
 /// As [`keep`], and when no episode would be left.
 pub fn without(set: &Path, to: &Destination, chosen: &Selection, progress: &mut Progress<'_>) -> Result<EditReport> {
-    let input = Input::open(set)?;
+    let input = Input::open(set, progress)?;
     let gone = chosen.resolve(&input.set)?;
     let left: Vec<usize> = (0..input.set.episodes().len()).filter(|episode| !gone.contains(episode)).collect();
     if left.is_empty() {
@@ -126,7 +140,7 @@ pub fn without(set: &Path, to: &Destination, chosen: &Selection, progress: &mut 
 /// # Errors
 /// A feature that is not there, a name that is taken or that LeRobot does not allow.
 pub fn rename(set: &Path, to: &Destination, renames: &Renames, progress: &mut Progress<'_>) -> Result<EditReport> {
-    let input = Input::open(set)?;
+    let input = Input::open(set, progress)?;
     check_names(&input.set, renames)?;
     let all = (0..input.set.episodes().len()).collect();
     one(input, to, all, renames, progress)
@@ -144,7 +158,7 @@ pub fn split(
     seed: Option<u64>,
     progress: &mut Progress<'_>,
 ) -> Result<Vec<(String, EditReport)>> {
-    let inputs = [Input::open(set)?];
+    let inputs = [Input::open(set, progress)?];
     let parts = parts.resolve(&inputs[0].set, seed)?;
     let staging = Staging::create(out)?;
     let total: u64 = parts.iter().map(|(_, taken)| work_of(&inputs[0].set, taken)).sum();
@@ -173,7 +187,7 @@ pub fn split(
 /// # Errors
 /// Sets that differ, with the first difference; as [`keep`].
 pub fn merge(sets: &[PathBuf], out: &Path, progress: &mut Progress<'_>) -> Result<EditReport> {
-    let inputs = sets.iter().map(|set| Input::open(set)).collect::<Result<Vec<_>>>()?;
+    let inputs = sets.iter().map(|set| Input::open(set, progress)).collect::<Result<Vec<_>>>()?;
     let taken: Vec<Vec<usize>> = inputs.iter().map(|input| (0..input.set.episodes().len()).collect()).collect();
     let staging = Staging::create(out)?;
     let report = told(&inputs, taken, &Renames::new(), staging.path(), progress)?;
