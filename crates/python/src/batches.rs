@@ -11,6 +11,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use rayon::{ThreadPool, ThreadPoolBuilder};
+use rustix::process::{Pid, getpid};
 
 use crate::arrays::{Number, filled, flags};
 use crate::dataset::PyDataset;
@@ -143,6 +144,8 @@ pub(crate) struct Batches {
     batch_size: usize,
     coming: Mutex<Coming>,
     pool: Option<ThreadPool>,
+    /// The process whose threads the pool has.
+    home: Pid,
 }
 
 /// What is still to come.
@@ -162,7 +165,7 @@ impl Batches {
             threads => Some(ThreadPoolBuilder::new().num_threads(threads).build().map_err(crate::error::raised)?),
         };
         let coming = Mutex::new(Coming { order, ahead: VecDeque::new() });
-        Ok(Self { dataset, batch_size, coming, pool })
+        Ok(Self { dataset, batch_size, coming, pool, home: getpid() })
     }
 
     /// The next batch of those that threads make, and one more asked for in its place.
@@ -211,6 +214,9 @@ impl Batches {
             drop(coming);
             return next.map(|samples| dataset.gather(py, &samples, Some(samples.len()))).transpose();
         };
+        if getpid() != self.home {
+            return Err(Error::new_err("batches: their threads are another process's, from which this one was forked"));
+        }
         let Some(mut made) = self.ahead(py, pool) else { return Ok(None) };
         let parts = loop {
             let waiting = &mut made;

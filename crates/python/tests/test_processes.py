@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -35,6 +36,24 @@ def test_data_and_policies_cross_into_other_processes(lift: Path, zoo: Path, met
         np.testing.assert_array_equal(chunk, wanted)
     [process.join(30) for process in processes]
     assert [process.exitcode for process in processes] == [0, 0]
+
+
+def ask_on(batches: Iterator[dict[str, object]], queue: multiprocessing.Queue) -> None:
+    try:
+        next(batches)
+    except actrm.Error as error:
+        queue.put(str(error))
+
+
+def test_threads_of_another_process_are_not_waited_for(lift: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    batches, queue = actrm.Dataset(lift).batches(64, threads=2), context.Queue()
+    next(batches)
+    process = context.Process(target=ask_on, args=(batches, queue))
+    process.start()
+    assert "another process" in queue.get(timeout=60)
+    process.join(30)
+    assert process.exitcode == 0 and len(next(batches)["action"]) == 64
 
 
 @pytest.mark.skipif(not find_spec("torch"), reason="torch is not installed here")
