@@ -86,6 +86,7 @@ test: wheel ## every test: Rust, Python and end to end
 .PHONY: lint
 lint: .venv/.complete ## formatting and lints, Rust and Python
 	@$(CARGO) fmt --all --check
+	@rustfmt --edition 2024 --check tools/*/src/commands/*.rs # a macro names these modules, and fmt does not see them
 	@$(CARGO) clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings
 	@.venv/bin/python -m ruff check tools benches tests crates/python
 	@.venv/bin/python -m ruff format --check tools benches tests crates/python

@@ -84,7 +84,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let Collected { demos, steps, attempts, first_seed } = match end? {
         CollectEnd::Written(collected) => collected,
         CollectEnd::Stopped(done) => {
-            cli::note(&format!("stopped after {done} of {} demos; the same command goes on where it was", args.episodes));
+            cli::note(&format!(
+                "stopped after {done} of {} demos; the same command goes on where it was",
+                args.episodes
+            ));
             return Ok(ExitCode::from(INTERRUPTED));
         }
     };

@@ -248,7 +248,12 @@ fn tell(made: &[(PathBuf, EditReport)], json: bool) -> Result<()> {
     }
     let line = |(path, r): &(PathBuf, EditReport)| {
         let (episodes, frames) = (cli::count(r.episodes), cli::count(r.frames));
-        format!("{}: {episodes} episodes, {frames} frames, {} files, {}\n", path.display(), r.files, cli::bytes(r.bytes))
+        format!(
+            "{}: {episodes} episodes, {frames} frames, {} files, {}\n",
+            path.display(),
+            r.files,
+            cli::bytes(r.bytes)
+        )
     };
     cli::print(&made.iter().map(line).collect::<String>())
 }

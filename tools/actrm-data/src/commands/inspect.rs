@@ -99,11 +99,13 @@ impl Summary {
         let row = |key: &KeyRow| {
             let shapes: Vec<String> = key.shapes.iter().map(|shape| cli::shape(shape)).collect();
             let video = key.video.as_ref().map(|video| {
-                let sizes: Vec<String> = video.sizes.iter().map(|(width, height)| format!("{width} x {height}")).collect();
+                let sizes: Vec<String> =
+                    video.sizes.iter().map(|(width, height)| format!("{width} x {height}")).collect();
                 let (codecs, files) = (video.codecs.join(" or "), video.files);
                 format!("{codecs}, {}, {files} files, {}", sizes.join(" or "), cli::bytes(video.bytes))
             });
-            let range = key.min.zip(key.max).map(|(low, high)| format!("{} to {}", cli::number(low), cli::number(high)));
+            let range =
+                key.min.zip(key.max).map(|(low, high)| format!("{} to {}", cli::number(low), cli::number(high)));
             [key.key.clone(), key.dtype.clone(), shapes.join(" or "), video.or(range).unwrap_or_default()]
         };
         self.keys.iter().map(row).collect()

@@ -36,7 +36,10 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let program = std::env::current_exe().context("cannot find this program")?.with_file_name(PROGRAM);
     if !program.is_file() {
-        bail!("{}: expected the program that answers queries, found nothing (`make build` builds it)", program.display());
+        bail!(
+            "{}: expected the program that answers queries, found nothing (`make build` builds it)",
+            program.display()
+        );
     }
     let mut command = Command::new(&program);
     command.args(["--limit", &args.limit.to_string()]).args(args.json.then_some("--json"));

@@ -2,12 +2,12 @@ use anyhow::{Context, Result, bail};
 use cli::{Film, INTERRUPTED, Screen, SimulatorArgs, Stop};
 use dataset::{Demo, Source, WriteOptions};
 use recording::Recording;
+use rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
 use safetensors::Dtype;
 use serde_json::json;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
 
 /// Steps that a worker is asked to draw at a time.
 const PART: usize = 32;

@@ -73,7 +73,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 }
             }
         }
-        head.problems.extend(episode.problems.iter().filter(|p| !head.problems.contains(p)).cloned().collect::<Vec<_>>());
+        head.problems
+            .extend(episode.problems.iter().filter(|p| !head.problems.contains(p)).cloned().collect::<Vec<_>>());
         page.push(&episode, &frames, &pictures);
         screen.step();
     }

@@ -58,7 +58,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     registry.set_alias(&id, alias, !args.remove)?;
     let name = &id.name;
-    let said = if args.remove { format!("{name}@{alias} is nothing any more\n") } else { format!("{name}@{alias} is {id}\n") };
+    let said =
+        if args.remove { format!("{name}@{alias} is nothing any more\n") } else { format!("{name}@{alias} is {id}\n") };
     cli::print(&said)?;
     Ok(ExitCode::SUCCESS)
 }

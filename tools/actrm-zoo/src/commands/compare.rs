@@ -164,7 +164,8 @@ impl<'a> Told<'a> {
     fn text(&self) -> String {
         let Self { rows: [one, two], comparison, flips } = self;
         let [first, second] = self.names();
-        let mut text = format!("{}, {}: {} seeds that both were run on\n", one.task(), one.protocol_text(), comparison.shared);
+        let mut text =
+            format!("{}, {}: {} seeds that both were run on\n", one.task(), one.protocol_text(), comparison.shared);
         let width = first.chars().count().max(second.chars().count());
         for (name, row) in [(&first, one), (&second, two)] {
             let trainings = match row.n_trainings() {
@@ -273,10 +274,16 @@ impl Side {
     }
 
     /// Takes in what stands under `results` of evaluations that differ in nothing but their seeds, from `start` on.
-    fn take_stored(&mut self, ready: &rollout::Ready, standing: &[StoredEvaluation], options: &EvaluationOptions) -> anyhow::Result<()> {
+    fn take_stored(
+        &mut self,
+        ready: &rollout::Ready,
+        standing: &[StoredEvaluation],
+        options: &EvaluationOptions,
+    ) -> anyhow::Result<()> {
         let own = self.subject.record(ready, options)?;
         let alike = |record: &EvaluationRecord| {
-            EvaluationRecord { seeds: own.seeds, shard: own.shard, demonstrated: own.demonstrated, ..record.clone() } == own
+            EvaluationRecord { seeds: own.seeds, shard: own.shard, demonstrated: own.demonstrated, ..record.clone() }
+                == own
         };
         let all: BTreeMap<u64, bool> = standing
             .iter()
@@ -284,7 +291,8 @@ impl Side {
             .flat_map(|one| &one.episodes)
             .map(|episode| (episode.seed, episode.success))
             .collect();
-        let without_gap = (options.seeds.start..).zip(all.range(options.seeds.start..)).take_while(|(k, (seed, _))| k == *seed);
+        let without_gap =
+            (options.seeds.start..).zip(all.range(options.seeds.start..)).take_while(|(k, (seed, _))| k == *seed);
         self.outcomes = without_gap.map(|(_, (seed, success))| (*seed, *success)).collect();
         Ok(())
     }
@@ -336,7 +344,10 @@ fn until_decided(args: &Args, sides: &[Vec<EntryId>; 2]) -> anyhow::Result<ExitC
             subject.max_steps = Some(usize::try_from(max_steps)?);
         }
         if subject.time_decides {
-            bail!("entry {}: it thinks by the clock, so that its episodes may end otherwise: nothing to compare", subject.entry);
+            bail!(
+                "entry {}: it thinks by the clock, so that its episodes may end otherwise: nothing to compare",
+                subject.entry
+            );
         }
         let mut side = Side::new(subject);
         side.take_stored(pools[of_pool[k]].ready(), &standing, &options(args.most, k))?;
@@ -346,14 +357,21 @@ fn until_decided(args: &Args, sides: &[Vec<EntryId>; 2]) -> anyhow::Result<ExitC
     let [a, b] = records;
     let (a, b) = (a?, b?);
     if a.protocol != b.protocol {
-        bail!("{first} and {second}: protocol: expected the same, found {} and {} (--max-steps makes caps equal)", a.protocol.id(), b.protocol.id());
+        bail!(
+            "{first} and {second}: protocol: expected the same, found {} and {} (--max-steps makes caps equal)",
+            a.protocol.id(),
+            b.protocol.id()
+        );
     }
     let mut run = both.iter().map(|side| side.outcomes.len() as u64).min().unwrap_or_default().min(args.most);
     loop {
         let upto = |side: &Side| side.outcomes.range(..args.seed_start + run).map(|(s, o)| (*s, *o)).collect();
         let flips = Flips::of(&upto(&both[0]), &upto(&both[1]));
         let names = [first.to_string(), second.to_string()];
-        let told = format!("{run} seeds: only {first} {}, only {second} {}", flips.counts.first_only, flips.counts.second_only);
+        let told = format!(
+            "{run} seeds: only {first} {}, only {second} {}",
+            flips.counts.first_only, flips.counts.second_only
+        );
         if flips.decided_after.is_some() || run >= args.most {
             let text = format!("{told}; {}\n", sequential_text(&flips, &names[0], &names[1]));
             match args.json {

@@ -51,25 +51,25 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let (one, two) = (facts(&first)?, facts(&second)?);
     let names: BTreeSet<&String> = one.keys().chain(two.keys()).collect();
-    let differing: Vec<(&String, Option<&String>, Option<&String>)> = names
-        .into_iter()
-        .map(|name| (name, one.get(name), two.get(name)))
-        .filter(|(_, one, two)| one != two)
-        .collect();
+    let differing: Vec<(&String, Option<&String>, Option<&String>)> =
+        names.into_iter().map(|name| (name, one.get(name), two.get(name))).filter(|(_, one, two)| one != two).collect();
     if args.json {
-        let all: Vec<_> = differing
-            .iter()
-            .map(|(name, one, two)| json!({"what": name, "first": one, "second": two}))
-            .collect();
-        cli::print_json(&json!({"first": first.id().to_string(), "second": second.id().to_string(), "differences": all}))?;
+        let all: Vec<_> =
+            differing.iter().map(|(name, one, two)| json!({"what": name, "first": one, "second": two})).collect();
+        cli::print_json(
+            &json!({"first": first.id().to_string(), "second": second.id().to_string(), "differences": all}),
+        )?;
         return Ok(ExitCode::SUCCESS);
     }
     if differing.is_empty() {
         cli::print(&format!("{} and {} differ in nothing\n", first.id(), second.id()))?;
         return Ok(ExitCode::SUCCESS);
     }
-    let mut table =
-        Table::new(vec![Column::new("what"), Column::new(first.id().to_string()), Column::new(second.id().to_string())]);
+    let mut table = Table::new(vec![
+        Column::new("what"),
+        Column::new(first.id().to_string()),
+        Column::new(second.id().to_string()),
+    ]);
     let text = |value: Option<&String>| value.map_or("-".to_owned(), Clone::clone);
     differing.iter().for_each(|(name, one, two)| table.push(vec![(*name).clone(), text(*one), text(*two)]));
     cli::print(&table.text(false))?;

@@ -266,7 +266,8 @@ fn evaluate_on(
     stop: &Stop,
     (says, failures): (&mut Says, &mut Vec<anyhow::Error>),
 ) -> anyhow::Result<()> {
-    let spec = limited_worker(environment, &args.run, asked.protocol.map_or(args.run.control, |protocol| protocol.control))?;
+    let spec =
+        limited_worker(environment, &args.run, asked.protocol.map_or(args.run.control, |protocol| protocol.control))?;
     let (results, options) = (args.results.folder(&args.zoo), options(args, asked, environment));
     // a finished evaluation is shown without starting a simulator
     let remembered =

@@ -4,7 +4,9 @@ use std::process::ExitCode;
 use anyhow::Context;
 use cli::{Table, shown};
 use report::column::{Align, Column};
-use report::{ACROSS_COLUMNS, COLUMNS, Curve, LeaderboardRow, Reading, across_tasks, csv, json, markdown, rank, to_html};
+use report::{
+    ACROSS_COLUMNS, COLUMNS, Curve, LeaderboardRow, Reading, across_tasks, csv, json, markdown, rank, to_html,
+};
 use study::puzzle::{PUZZLE_COLUMNS, audit_puzzles, puzzle_section, rank_puzzles};
 use zoo::audit::{KnownEntries, audit};
 use zoo::entry::Entry;

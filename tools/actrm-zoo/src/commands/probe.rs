@@ -95,7 +95,8 @@ fn tables(result: &ProbeResult) -> String {
     for reading in &result.readings {
         let width = reading.cells.iter().filter(|cell| cell.step == 1).count();
         let heads = reading.cells[..width].iter();
-        let heads: Vec<String> = heads.map(|c| c.hops.map_or("end".to_owned(), |hops| format!("{hops} hops"))).collect();
+        let heads: Vec<String> =
+            heads.map(|c| c.hops.map_or("end".to_owned(), |hops| format!("{hops} hops"))).collect();
         let header: Vec<&str> = std::iter::once("step").chain(heads.iter().map(String::as_str)).collect();
         let rows: Vec<Vec<String>> = reading
             .cells

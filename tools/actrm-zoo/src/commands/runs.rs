@@ -40,11 +40,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     if runs.is_empty() {
-        cli::note(&format!("no trainings under way in {}; begin one with: actrm-zoo train act_lift", shown(&args.runs)));
+        cli::note(&format!(
+            "no trainings under way in {}; begin one with: actrm-zoo train act_lift",
+            shown(&args.runs)
+        ));
         return Ok(ExitCode::SUCCESS);
     }
-    let mut table =
-        Table::new(vec![Column::new("run"), Column::new("state"), Column::new("step").right(), Column::new("of").right()]);
+    let mut table = Table::new(vec![
+        Column::new("run"),
+        Column::new("state"),
+        Column::new("step").right(),
+        Column::new("of").right(),
+    ]);
     for run in &runs {
         let steps = run.steps.map_or_else(|| "?".to_owned(), |steps| steps.to_string());
         table.push(vec![shown(&run.folder), run.state.as_str().to_owned(), run.step.to_string(), steps]);

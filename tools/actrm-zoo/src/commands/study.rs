@@ -2,8 +2,8 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use cli::{INTERRUPTED, Screen, Stop, shown};
-use study::robots::{CellResult, RobotEvent, RobotStudyRequest, Study, robot_page, run_robot_study};
 use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, StudyRow, run_study, study_page};
+use study::robots::{CellResult, RobotEvent, RobotStudyRequest, Study, robot_page, run_robot_study};
 use zoo::run::TrainEvent;
 use zoo::write_atomic;
 
@@ -139,7 +139,9 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
         let mut printed = Ok(());
         whole = run_robot_study(&request, &mut |event| match event {
             RobotEvent::Done(done, total) => screen.begin_at("results", done as u64, total as u64),
-            RobotEvent::Collecting(name, done, all) => screen.message(&format!("{name}: {done} of {all} demonstrations")),
+            RobotEvent::Collecting(name, done, all) => {
+                screen.message(&format!("{name}: {done} of {all} demonstrations"))
+            }
             RobotEvent::Training(cell, step, steps) => screen.message(&format!("{cell}: step {step} of {steps}")),
             RobotEvent::Testing(cell, test) => screen.message(&format!("{cell}: {test}")),
             RobotEvent::Result(result) => {

@@ -4,8 +4,8 @@ use std::process::ExitCode;
 use anyhow::Context;
 use cli::shown;
 use study::puzzle::{SolverEntry, audit_puzzles};
-use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE};
 use zoo::audit::{KnownEntries, LeftOut, audit};
+use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE};
 use zoo::tensors;
 
 use crate::places::{ResultsArgs, ZooArgs, entry_names};
