@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 
@@ -18,6 +19,9 @@ LIFT = ROOT / "data/lift.hdf5"
 
 # workers run in the repository's Python, unless another is named
 os.environ.setdefault("ACTRM_PYTHON", str(ROOT / ".venv/bin/python"))
+
+# what starts the tests may have Ctrl-C ignored, as shells do for what runs in the background; here it is tested
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def output(*command: str | Path, given: bytes = b"") -> bytes:
