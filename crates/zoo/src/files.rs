@@ -4,6 +4,7 @@ use std::fs::{self, File};
 use std::io::{Read, Write};
 use std::path::Path;
 
+use rustix::fs::{CWD, RenameFlags, renameat_with};
 use sha2::{Digest, Sha256};
 
 use crate::ZooError;
@@ -67,6 +68,29 @@ pub fn write_together(files: &[(std::path::PathBuf, Vec<u8>)]) -> Result<(), Zoo
         sync_folder(parent(path))?;
     }
     Ok(())
+}
+
+/// Makes the new folder `out`: `fill` writes into a temporary one beside it, which then takes the name. It appears whole or
+/// not at all, and takes nobody's place.
+///
+/// # Errors
+/// When `out` exists or cannot be made there; those of `fill`.
+pub(crate) fn new_folder(out: &Path, fill: impl FnOnce(&Path) -> Result<(), ZooError>) -> Result<(), ZooError> {
+    let parent = parent(out);
+    if out.exists() {
+        return Err(ZooError::io("create folder", out)(std::io::ErrorKind::AlreadyExists.into()));
+    }
+    let staging = tempfile::Builder::new()
+        .prefix(".tmp-")
+        .permissions(mode(0o755))
+        .tempdir_in(parent)
+        .map_err(ZooError::io("create a temporary folder in", parent))?;
+    fill(staging.path())?;
+    renameat_with(CWD, staging.path(), CWD, out, RenameFlags::NOREPLACE)
+        .map_err(|e| ZooError::io("create folder", out)(e.into()))?;
+    // renamed away: nothing is left to remove
+    let _gone = staging.keep();
+    sync_folder(parent)
 }
 
 fn parent(path: &Path) -> &Path {

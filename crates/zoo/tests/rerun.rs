@@ -2,10 +2,12 @@
 
 #![allow(clippy::unwrap_used)]
 
-use std::fs;
-use std::path::{Path, PathBuf};
+mod common;
 
-use dataset::{RobomimicWriter, Source, WriteOptions};
+use std::fs;
+use std::path::Path;
+
+use common::{SMALL, demonstrations};
 use rollout::Control;
 use zoo::config::Library;
 use zoo::entry::{CardWords, Entry, EntryDraft, EntryId, EntryMeta, training_facts};
@@ -17,38 +19,6 @@ use zoo::results::{
     StoredEvaluation,
 };
 use zoo::run::{TrainOutcome, TrainRequest, train};
-
-const SMALL: [&str; 10] = [
-    "policy.dim_model=16",
-    "policy.n_heads=2",
-    "policy.dim_feedforward=32",
-    "policy.n_encoder_layers=1",
-    "policy.n_vae_encoder_layers=1",
-    "policy.latent_dim=4",
-    "train.steps=12",
-    "train.batch_size=8",
-    "train.log_every=2",
-    "train.validate_every=4",
-];
-
-/// Three demonstrations, two of them to train on.
-fn demonstrations(folder: &Path) -> PathBuf {
-    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../dataset/tests/fixtures/lift_low_dim_3_demos.hdf5");
-    let out = folder.join("demos.hdf5");
-    let source = Source::open(&fixture).unwrap();
-    let ids: Vec<String> = source.plan().demos.iter().map(|d| d.id.clone()).collect();
-    let mut writer = RobomimicWriter::create(&out, &WriteOptions::default()).unwrap();
-    let mut root = source.root().unwrap();
-    root.datasets.retain(|name, _| !name.starts_with("mask"));
-    writer.set_root(&root).unwrap();
-    for index in 0..ids.len() {
-        writer.add_demo(&source.read_demo(index).unwrap()).unwrap();
-    }
-    writer.set_mask("train", &ids[..2]).unwrap();
-    writer.set_mask("valid", &ids[2..]).unwrap();
-    writer.finish().unwrap();
-    out
-}
 
 fn trained(folder: &Path, data: &Path) -> Entry {
     let overrides: Vec<String> = SMALL.iter().map(|set| (*set).to_owned()).collect();

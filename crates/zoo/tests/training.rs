@@ -2,10 +2,13 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use std::cell::Cell;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use common::{SMALL, demonstrations};
 use dataset::{RobomimicWriter, Source, WriteOptions};
 use models::{Observation, Policy};
 use zoo::ZooError;
@@ -15,46 +18,11 @@ use zoo::experiment::Experiment;
 use zoo::registry::Registry;
 use zoo::run::{Checkpoint, TrainEvent, TrainOutcome, TrainRequest, train};
 
-fn fixture() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../dataset/tests/fixtures/lift_low_dim_3_demos.hdf5")
-}
-
-/// The fixture with its first two demos for training and the third for validation.
-fn demonstrations(folder: &Path) -> PathBuf {
-    let out = folder.join("demos.hdf5");
-    let source = Source::open(&fixture()).unwrap();
-    let ids: Vec<String> = source.plan().demos.iter().map(|d| d.id.clone()).collect();
-    let mut writer = RobomimicWriter::create(&out, &WriteOptions::default()).unwrap();
-    let mut root = source.root().unwrap();
-    root.datasets.retain(|name, _| !name.starts_with("mask"));
-    writer.set_root(&root).unwrap();
-    for index in 0..ids.len() {
-        writer.add_demo(&source.read_demo(index).unwrap()).unwrap();
-    }
-    writer.set_mask("train", &ids[..2]).unwrap();
-    writer.set_mask("valid", &ids[2..]).unwrap();
-    writer.finish().unwrap();
-    out
-}
-
-const SMALL: [&str; 13] = [
-    "policy.dim_model=16",
-    "policy.n_heads=2",
-    "policy.dim_feedforward=32",
-    "policy.n_encoder_layers=1",
-    "policy.n_vae_encoder_layers=1",
-    "policy.latent_dim=4",
-    "train.steps=12",
-    "train.batch_size=8",
-    "train.warmup_steps=2",
-    "train.log_every=2",
-    "train.validate_every=4",
-    "train.checkpoint_every=3",
-    "train.ema_decay=0.9",
-];
+/// Besides, so that a training that was stopped has something to go on from.
+const LONGER: [&str; 3] = ["train.warmup_steps=2", "train.checkpoint_every=3", "train.ema_decay=0.9"];
 
 fn request(root: &Path, data: &Path, extra: &[&str]) -> TrainRequest {
-    let overrides: Vec<String> = SMALL.iter().chain(extra).map(|o| (*o).to_owned()).collect();
+    let overrides: Vec<String> = SMALL.iter().chain(&LONGER).chain(extra).map(|o| (*o).to_owned()).collect();
     TrainRequest {
         name: "act_lift".to_owned(),
         experiment: Experiment::load(&Library::built_in(), "act_lift", &overrides).unwrap(),

@@ -7,10 +7,8 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use rustix::fs::{CWD, RenameFlags, renameat_with};
-
 use super::{CARD_FILE, ENTRY_FILE, Entry, EntryMeta};
-use crate::files::sync_folder;
+use crate::files::new_folder;
 use crate::{ZooError, write_atomic};
 
 /// Before and after the metadata.
@@ -83,29 +81,17 @@ pub(super) fn without_results(card: &str) -> Vec<String> {
 /// # Errors
 /// When `out` exists or a file cannot be written.
 pub fn export_hub(entry: &Entry, out: &Path, model_index: &str) -> Result<(), ZooError> {
-    let parent = out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
-    if out.exists() {
-        let exists = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
-        return Err(ZooError::io("create folder", out)(exists));
-    }
-    let staging = tempfile::Builder::new()
-        .prefix(".tmp-")
-        .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o755))
-        .tempdir_in(parent)
-        .map_err(ZooError::io("create a temporary folder in", parent))?;
-    for name in entry.meta().files.keys().map(String::as_str).chain([ENTRY_FILE]) {
-        let path = entry.folder().join(name);
-        let bytes = match name {
-            CARD_FILE => entry.hub_card(model_index)?.into_bytes(),
-            _ => std::fs::read(&path).map_err(ZooError::io("read", &path))?,
-        };
-        write_atomic(&staging.path().join(name), &bytes)?;
-    }
-    renameat_with(CWD, staging.path(), CWD, out, RenameFlags::NOREPLACE)
-        .map_err(|e| ZooError::io("create folder", out)(e.into()))?;
-    // renamed away: nothing is left to remove
-    let _gone = staging.keep();
-    sync_folder(parent)
+    new_folder(out, |folder| {
+        for name in entry.meta().files.keys().map(String::as_str).chain([ENTRY_FILE]) {
+            let path = entry.folder().join(name);
+            let bytes = match name {
+                CARD_FILE => entry.hub_card(model_index)?.into_bytes(),
+                _ => std::fs::read(&path).map_err(ZooError::io("read", &path))?,
+            };
+            write_atomic(&folder.join(name), &bytes)?;
+        }
+        Ok(())
+    })
 }
 
 #[cfg(test)]

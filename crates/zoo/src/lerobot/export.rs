@@ -6,7 +6,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 
 use crate::entry::Entry;
-use crate::files::sync_folder;
+use crate::files::new_folder;
 use crate::{ZooError, sha256_file, tensors, write_atomic};
 
 use super::checkpoint::Checkpoint;
@@ -68,38 +68,20 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
         steps: vec![normalise("unnormalizer_processor", outputs.clone(), POSTPROCESSOR, 0), device()],
     };
 
-    let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
-    if out.exists() {
-        let exists = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
-        return Err(ZooError::io("create folder", out)(exists));
-    }
-    let staging = tempfile::Builder::new()
-        .prefix(".tmp-")
-        .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o755))
-        .tempdir_in(parent)
-        .map_err(ZooError::io("create a temporary folder in", parent))?;
     let about = json!({"entry": entry.id().to_string(), "sha256": meta.content_sha256()});
-    let put = |name: &str, bytes: &[u8]| write_atomic(&staging.path().join(name), bytes);
-    put(MODEL_FILE, &tensors::to_bytes(out, &weights, &about)?)?;
-    put(CONFIG_FILE, pretty(&config).as_bytes())?;
-    put(PROVENANCE, provenance::text(meta, &sha256_file(&staging.path().join(MODEL_FILE))?).as_bytes())?;
-    for pipeline in [&before, &after] {
-        put(&format!("{}.json", pipeline.name), pretty(&to_json(pipeline)).as_bytes())?;
-        for file in pipeline.steps.iter().filter_map(|s| s.state_file.as_ref()) {
-            put(file, &tensors::to_bytes(out, &statistics, &about)?)?;
+    new_folder(out, |folder| {
+        let put = |name: &str, bytes: &[u8]| write_atomic(&folder.join(name), bytes);
+        put(MODEL_FILE, &tensors::to_bytes(out, &weights, &about)?)?;
+        put(CONFIG_FILE, pretty(&config).as_bytes())?;
+        put(PROVENANCE, provenance::text(meta, &sha256_file(&folder.join(MODEL_FILE))?).as_bytes())?;
+        for pipeline in [&before, &after] {
+            put(&format!("{}.json", pipeline.name), pretty(&to_json(pipeline)).as_bytes())?;
+            for file in pipeline.steps.iter().filter_map(|s| s.state_file.as_ref()) {
+                put(file, &tensors::to_bytes(out, &statistics, &about)?)?;
+            }
         }
-    }
-    rustix::fs::renameat_with(
-        rustix::fs::CWD,
-        staging.path(),
-        rustix::fs::CWD,
-        out,
-        rustix::fs::RenameFlags::NOREPLACE,
-    )
-    .map_err(|e| ZooError::io("create folder", out)(e.into()))?;
-    // renamed away: nothing is left to remove
-    let _gone = staging.keep();
-    sync_folder(parent)
+        Ok(())
+    })
 }
 
 fn step(registry_name: &str, config: Value) -> Step {
