@@ -1,5 +1,6 @@
 //! A batch of training windows in network units.
 
+use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::features::{Features, Signature, Values, ValuesRef};
 use candle_core::{Device, Tensor};
@@ -44,7 +45,7 @@ impl Batch {
             let values = observation.take("batch", &spec.name)?;
             tensors.insert(&spec.name, tensor(&spec.name, values, &signature.batch_shape(spec, n))?);
         }
-        let dev = &Device::Cpu;
+        let dev = &HERE;
         let pad: Vec<f32> = is_pad.iter().map(|&p| if p { 1.0 } else { 0.0 }).collect();
         Ok(Self {
             observation: tensors,
@@ -112,8 +113,8 @@ fn check(name: &str, found: usize, expected: &[usize]) -> Result<()> {
 pub(crate) fn tensor(name: &str, values: Values, shape: &[usize]) -> Result<Tensor> {
     check(name, values.as_ref().len(), shape)?;
     Ok(match values {
-        Values::F32(values) => Tensor::from_vec(values, shape, &Device::Cpu)?,
-        Values::U8(values) => Tensor::from_vec(values, shape, &Device::Cpu)?,
+        Values::F32(values) => Tensor::from_vec(values, shape, &HERE)?,
+        Values::U8(values) => Tensor::from_vec(values, shape, &HERE)?,
     })
 }
 

@@ -10,6 +10,7 @@ mod batch;
 mod checks;
 mod chunk_policy;
 pub mod classification;
+mod device;
 pub mod encoders;
 mod error;
 mod features;

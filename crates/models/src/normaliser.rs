@@ -1,7 +1,8 @@
 //! Raw units to network units and back, per feature, with LeRobot's formulas and names.
 
+use crate::device::HERE;
 use crate::error::{ModelError, Result, some_names};
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Tensor};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -137,7 +138,7 @@ impl Normaliser {
         let mut tensors = BTreeMap::new();
         for (name, feature) in &self.features {
             for (statistic, values) in feature.mode.statistics().iter().zip([&feature.a, &feature.b]) {
-                let tensor = Tensor::from_slice(values, values.len(), &Device::Cpu)?;
+                let tensor = Tensor::from_slice(values, values.len(), &HERE)?;
                 tensors.insert(format!("{name}.{statistic}"), tensor);
             }
         }
@@ -207,6 +208,7 @@ impl Feature {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use candle_core::Device;
     use proptest::prelude::*;
 
     fn normaliser(mode: NormMode, a: &[f32], b: &[f32]) -> Normaliser {

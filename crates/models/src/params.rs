@@ -1,8 +1,9 @@
 //! Named parameters of a model: created from our own generator, iterated in the order of their names.
 
+use crate::device::HERE;
 use crate::error::{ModelError, Result, some_names};
 use crate::rng::Rng;
-use candle_core::{DType, Device, Tensor, Var};
+use candle_core::{DType, Tensor, Var};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -103,7 +104,7 @@ impl Params {
     /// # Errors
     /// If the name is taken, or the tensor library fails.
     pub fn create(&mut self, name: &str, shape: &[usize], init: Init, rng: &mut Rng) -> Result<Tensor> {
-        self.insert(name, Tensor::from_vec(init.values(shape, rng), shape, &Device::Cpu)?)
+        self.insert(name, Tensor::from_vec(init.values(shape, rng), shape, &HERE)?)
     }
 
     /// Adds `name` with the given values.
@@ -326,6 +327,7 @@ impl Table {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use candle_core::Device;
 
     fn two() -> Params {
         let mut rng = Rng::new(0, "init");

@@ -7,11 +7,12 @@
 //! first answer is the uniform one.
 
 use super::grids::{Conv3x3, GridDims, GridModel, channels_last};
+use crate::device::HERE;
 use crate::error::Result;
 use crate::layers::Linear;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use candle_core::{D, DType, Device, Tensor};
+use candle_core::{D, DType, Tensor};
 use serde::{Deserialize, Serialize};
 
 /// What turns the grid into features per cell.
@@ -142,7 +143,7 @@ impl GridModel for SmallTrm {
         let (cells, classes) = (self.dims.cells(), self.dims.classes);
         let x = self.features(grid)?.reshape((batch, cells, self.config.features))?;
         let mut z = self.z_init.broadcast_as((batch, cells, self.config.latent))?.contiguous()?;
-        let uniform = Tensor::full(1.0 / classes as f32, (batch * cells, classes), &Device::Cpu)?;
+        let uniform = Tensor::full(1.0 / classes as f32, (batch * cells, classes), &HERE)?;
         let mut belief = uniform.to_dtype(DType::F32)?;
         let mut outputs = Vec::new();
         for step in 0..self.config.supervision_steps {

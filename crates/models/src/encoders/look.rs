@@ -2,9 +2,10 @@
 
 use super::config::{Normalisation, VisionConfig};
 use super::{ImageEncoder, Size};
+use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::rng::Rng;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Tensor};
 
 /// ImageNet's mean and standard deviation of red, green and blue, of numbers from 0 to 1.
 const IMAGENET: ([f32; 3], [f32; 3]) = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]);
@@ -146,7 +147,7 @@ impl ImageEncoder {
             };
             look.take(picture, size, seen, of_camera, out);
         }
-        Ok(Tensor::from_vec(out, (rows, seen.0, seen.1, 3), &Device::Cpu)?)
+        Ok(Tensor::from_vec(out, (rows, seen.0, seen.1, 3), &HERE)?)
     }
 }
 

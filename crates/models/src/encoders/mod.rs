@@ -18,11 +18,12 @@ pub(crate) use resnet::EPS;
 pub use resnet::{ResNet, ResNetShape};
 pub use spatial_softmax::SpatialSoftmax;
 
+use crate::device::HERE;
 use crate::error::{ModelError, Result, some_names};
 use crate::layers::Linear;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
 
 /// Prefix of the backbone's tensors, LeRobot's.
@@ -86,7 +87,7 @@ impl ImageEncoder {
         let sizes = given.iter().map(|&size| config.seen(size)).collect::<Result<Vec<_>>>()?;
         let (mean, std) = look::statistics(config.normalise);
         let mut buffer = |name: &str, values: [f32; 3]| {
-            let values = Tensor::from_vec(values.repeat(given.len()), (given.len(), 3), &Device::Cpu)?;
+            let values = Tensor::from_vec(values.repeat(given.len()), (given.len(), 3), &HERE)?;
             params.insert_buffer(name, values)
         };
         let (mean, std) = (buffer(PICTURE_MEAN, mean)?, buffer(PICTURE_STD, std)?);
@@ -106,7 +107,7 @@ impl ImageEncoder {
                 let bias = params.create(&format!("{PROJECTION}.bias"), &[dim], uniform, rng)?;
                 let table = |&size: &Size| {
                     let (h, w) = shape.map_size(size);
-                    Ok(Tensor::from_vec(position_table(dim, (h, w)), (h * w, dim), &Device::Cpu)?)
+                    Ok(Tensor::from_vec(position_table(dim, (h, w)), (h * w, dim), &HERE)?)
                 };
                 Head::Map { weight, bias, tables: sizes.iter().map(table).collect::<Result<_>>()? }
             }
@@ -141,7 +142,7 @@ impl ImageEncoder {
     /// Another number of cameras, or parameters without cameras.
     pub fn set_statistics(params: &Params, mean: &[[f32; 3]], std: &[[f32; 3]]) -> Result<()> {
         for (name, rows) in [(PICTURE_MEAN, mean), (PICTURE_STD, std)] {
-            let values = Tensor::from_vec(rows.concat(), (rows.len(), 3), &Device::Cpu)?;
+            let values = Tensor::from_vec(rows.concat(), (rows.len(), 3), &HERE)?;
             params.set_buffer(name, &values)?;
         }
         params.changed();

@@ -6,10 +6,11 @@
 //! `max(1, channels / 16)` groups, as Diffusion Policy and R3PL have it, under the names of the batch norms.
 
 use super::config::ImageNorm;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Tensor};
 
 /// Added to variances, torch's.
 pub(crate) const EPS: f64 = 1e-5;
@@ -112,9 +113,8 @@ impl Norm {
                 groups: ResNetShape::groups(channels),
             },
             ImageNorm::Frozen => {
-                let mut buffer = |last: &str, value: f32| {
-                    params.insert_buffer(&named(last), Tensor::full(value, channels, &Device::Cpu)?)
-                };
+                let mut buffer =
+                    |last: &str, value: f32| params.insert_buffer(&named(last), Tensor::full(value, channels, &HERE)?);
                 Self::Frozen {
                     weight: buffer("weight", 1.0)?,
                     bias: buffer("bias", 0.0)?,

@@ -4,10 +4,11 @@
 //! convolution is one product.
 
 use super::Linear;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 
 /// A convolution as `torch.nn.Conv1d`: weight (out, in, kernel), bias (out).
 #[derive(Debug, Clone)]
@@ -44,7 +45,7 @@ fn unfold(x: &Tensor, (first, stride): (i64, usize), taps: usize, outputs: usize
     let padded = x.pad_with_zeros(1, before, after)?;
     let from = (first + before as i64) as usize;
     let index: Vec<u32> = (0..outputs).flat_map(|i| (0..taps).map(move |k| (from + stride * i + k) as u32)).collect();
-    let index = Tensor::from_vec(index, outputs * taps, &Device::Cpu)?;
+    let index = Tensor::from_vec(index, outputs * taps, &HERE)?;
     Ok(padded.contiguous()?.index_select(&index, 1)?.reshape((b, outputs, taps * channels))?)
 }
 
@@ -112,6 +113,7 @@ impl Upsample1d {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use candle_core::Device;
 
     fn random(shape: &[usize], seed: u64) -> Tensor {
         let n = shape.iter().product();

@@ -1,12 +1,13 @@
 //! A long short-term memory (Hochreiter and Schmidhuber 1997) with torch's weights and gates, its cell by hand.
 
 use super::Linear;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::kernels::elementwise::exp;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
 use crate::simd::vectorised;
-use candle_core::{CpuStorage, CustomOp2, DType, Device, Layout, Result as CandleResult, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result as CandleResult, Shape, Tensor};
 
 /// Layers of LSTM cells, as `torch.nn.LSTM` without dropout.
 #[derive(Debug, Clone)]
@@ -54,7 +55,7 @@ impl Lstm {
     /// # Errors
     /// If the tensor library fails.
     pub fn zero_state(&self, rows: usize) -> Result<LstmState> {
-        let zeros = || Tensor::zeros((rows, self.hidden), DType::F32, &Device::Cpu);
+        let zeros = || Tensor::zeros((rows, self.hidden), DType::F32, &HERE);
         self.layers.iter().map(|_| Ok((zeros()?, zeros()?))).collect()
     }
 
@@ -181,7 +182,7 @@ impl CustomOp2 for Cell {
                 },
             );
         }
-        let of_gates = Tensor::from_vec(of_gates, (rows, 4 * hidden), &Device::Cpu)?;
-        Ok((Some(of_gates), Some(Tensor::from_vec(of_cell, (rows, hidden), &Device::Cpu)?)))
+        let of_gates = Tensor::from_vec(of_gates, (rows, 4 * hidden), &HERE)?;
+        Ok((Some(of_gates), Some(Tensor::from_vec(of_cell, (rows, hidden), &HERE)?)))
     }
 }

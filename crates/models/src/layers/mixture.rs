@@ -1,10 +1,11 @@
 //! A mixture of Gaussians over actions, as robomimic's GMM heads have it.
 
 use super::Linear;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::params::Params;
 use crate::rng::Rng;
-use candle_core::{D, Device, Tensor};
+use candle_core::{D, Tensor};
 
 /// Deviation of a component at test time (robomimic: `low_noise_eval`).
 const LOW_NOISE: f32 = 1e-4;
@@ -115,7 +116,7 @@ impl Mixture {
         };
         let modes: Vec<usize> = rows.iter().map(draw).collect();
         let means = self.of_modes(&modes)?;
-        let noise = Tensor::from_vec(rng.normals(means.elem_count()), means.shape(), &Device::Cpu)?;
+        let noise = Tensor::from_vec(rng.normals(means.elem_count()), means.shape(), &HERE)?;
         Ok((means + (noise * f64::from(LOW_NOISE))?)?)
     }
 
@@ -123,7 +124,7 @@ impl Mixture {
     fn of_modes(&self, modes: &[usize]) -> Result<Tensor> {
         let (n, count, width) = self.means.dims3()?;
         let rows: Vec<u32> = modes.iter().enumerate().map(|(row, mode)| (row * count + mode) as u32).collect();
-        Ok(self.means.reshape((n * count, width))?.index_select(&Tensor::from_vec(rows, n, &Device::Cpu)?, 0)?)
+        Ok(self.means.reshape((n * count, width))?.index_select(&Tensor::from_vec(rows, n, &HERE)?, 0)?)
     }
 }
 
@@ -131,6 +132,7 @@ impl Mixture {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use candle_core::Device;
 
     #[test]
     fn modes_are_drawn_by_their_weight() {

@@ -42,11 +42,12 @@ mod losses;
 mod tests;
 
 use crate::baselines::WalkerNet;
+use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::rng::Rng;
 use crate::train::{Learner, LearnerMetrics, TrainConfig};
 use advantages::{advantages, standardise};
-use candle_core::{D, Device, Tensor};
+use candle_core::{D, Tensor};
 use losses::{Chosen, entropy, log_softmax};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -407,7 +408,7 @@ impl Agent {
 
     /// One optimiser step on the steps `batch`; adds to `metrics` and returns the divergence.
     fn improve(&mut self, steps: &Steps, batch: &[u32], metrics: &mut RlMetrics) -> Result<f64> {
-        let index = Tensor::from_slice(batch, batch.len(), &Device::Cpu)?;
+        let index = Tensor::from_slice(batch, batch.len(), &HERE)?;
         let observations = steps.observations.index_select(&index, 0)?;
         let previous = steps.previous.index_select(&index, 0)?;
         let chosen = steps.chosen.select(batch);
@@ -471,8 +472,8 @@ impl Agent {
         let std = standardise(&mut chosen.advantages, self.config.advantage_std_floor);
         let count = previous.len();
         let steps = Steps {
-            observations: Tensor::from_vec(observations, (count, self.sizes.observation), &Device::Cpu)?,
-            previous: Tensor::from_vec(previous, count, &Device::Cpu)?,
+            observations: Tensor::from_vec(observations, (count, self.sizes.observation), &HERE)?,
+            previous: Tensor::from_vec(previous, count, &HERE)?,
             chosen,
         };
         Ok((steps, std))
@@ -502,7 +503,7 @@ impl Agent {
                 });
             }
         }
-        let targets = Tensor::from_slice(targets, (rows, actions), &Device::Cpu)?;
+        let targets = Tensor::from_slice(targets, (rows, actions), &HERE)?;
         let log_policy = log_softmax(&self.net.forward(&observations, Some(&previous))?.logits)?;
         let loss = ((log_policy * targets)?.sum_all()? * (-1.0 / rows as f64))?;
         self.learner.step(&loss)
@@ -567,8 +568,8 @@ fn inputs(net: &dyn WalkerNet, observations: &[f32], previous: &[u32]) -> Result
             expected: format!("below {actions}"),
         });
     }
-    let observations = Tensor::from_slice(observations, (n, width), &Device::Cpu)?;
-    Ok((observations, Tensor::from_slice(previous, n, &Device::Cpu)?))
+    let observations = Tensor::from_slice(observations, (n, width), &HERE)?;
+    Ok((observations, Tensor::from_slice(previous, n, &HERE)?))
 }
 
 /// Decisions of any policy network: drawn with `rng`, or the most probable ones without.

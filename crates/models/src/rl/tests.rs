@@ -1,6 +1,7 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
 use crate::baselines::WalkerConfig;
+use candle_core::Device;
 
 fn train(steps: u64, lr: f64) -> TrainConfig {
     TrainConfig {

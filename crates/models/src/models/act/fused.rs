@@ -6,6 +6,7 @@
 
 use super::Act;
 use crate::batch::Batch;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::features::Features;
 use crate::fused::{
@@ -17,7 +18,7 @@ use crate::kernels::add;
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
 use crate::values::with_values;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use std::collections::BTreeMap;
 
 /// What the decoder's backward pass needs.
@@ -77,7 +78,7 @@ impl Act {
                 out
             })
         })?;
-        Ok(Tensor::from_vec(actions, (rows, self.config().action_horizon, self.signature.action_dim), &Device::Cpu)?)
+        Ok(Tensor::from_vec(actions, (rows, self.config().action_horizon, self.signature.action_dim), &HERE)?)
     }
 
     fn decode_fused(&self, pass: &mut Pass<'_>, rows: usize, tokens: &Tokens<'_>) -> Decoded {

@@ -22,6 +22,7 @@ pub use config::Config;
 
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
+use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Observation, Signature};
 use crate::layers::{Lstm, LstmState, Mixture, MixtureHead};
@@ -31,7 +32,7 @@ use crate::params::Params;
 use crate::policy::{ActionChunk, Clock, Policy};
 use crate::preprocess::Preprocess;
 use crate::rng::Rng;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -111,7 +112,7 @@ fn real_first(is_pad: &Tensor) -> Result<(Tensor, Tensor)> {
         }
     }
     let count = rows * steps;
-    Ok((Tensor::from_vec(from, count, &Device::Cpu)?, Tensor::from_vec(real, count, &Device::Cpu)?))
+    Ok((Tensor::from_vec(from, count, &HERE)?, Tensor::from_vec(real, count, &HERE)?))
 }
 
 impl PolicyModel for BcRnn {

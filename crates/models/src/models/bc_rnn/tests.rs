@@ -3,6 +3,7 @@ use super::*;
 use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::train::{TrainConfig, Trainer};
+use candle_core::Device;
 
 fn small() -> Config {
     Config { action_horizon: 3, hidden_dim: 9, n_modes: 2, min_std: 0.05, ..Config::default() }

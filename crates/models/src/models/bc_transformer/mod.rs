@@ -16,6 +16,7 @@ pub use config::Config;
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::layers::{Dropout, LayerNorm, Linear, Mixture, MixtureHead, Mode, masked_softmax};
@@ -25,7 +26,7 @@ use crate::params::{Init, Params};
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use crate::rng::Rng;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -155,7 +156,7 @@ impl BcTransformer {
         let x = self.embed_encoder.forward(&Tensor::cat(&joined, 2)?)?.broadcast_add(&self.embed_timestep)?;
         let mut x = self.dropout.forward(&self.embed_ln.forward(&x)?, mode)?;
         let mask: Vec<f32> = (0..steps * steps).map(|i| if i % steps > i / steps { -1e30 } else { 0.0 }).collect();
-        let mask = Tensor::from_vec(mask, (steps, steps), &Device::Cpu)?;
+        let mask = Tensor::from_vec(mask, (steps, steps), &HERE)?;
         for block in &self.blocks {
             x = block.forward(&x, &mask, mode)?;
         }

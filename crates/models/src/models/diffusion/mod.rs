@@ -25,6 +25,7 @@ pub use schedule::NoiseSchedule;
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
+use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
 use crate::model::{LossParts, PolicyModel};
@@ -32,7 +33,7 @@ use crate::params::Params;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use crate::rng::Rng;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use unet::Unet;
@@ -163,7 +164,7 @@ impl Diffusion {
 
     fn noise(&self, rows: usize, rng: &mut Rng) -> Result<Tensor> {
         let shape = (rows, self.config.action_horizon, self.signature.action_dim);
-        Ok(Tensor::from_vec(rng.normals(shape.0 * shape.1 * shape.2), shape, &Device::Cpu)?)
+        Ok(Tensor::from_vec(rng.normals(shape.0 * shape.1 * shape.2), shape, &HERE)?)
     }
 }
 

@@ -3,8 +3,9 @@
 //! `fixed_small` variance) and the DDIM of Song et al. (arXiv 2010.02502, eta 0), timesteps spaced `leading`.
 
 use super::config::{Config, Prediction, Sampler};
+use crate::device::HERE;
 use crate::error::Result;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 
 /// The share of the actions' variance that is left at each step.
 #[derive(Debug, Clone)]
@@ -58,7 +59,7 @@ impl NoiseSchedule {
     pub fn add_noise(&self, actions: &Tensor, noise: &Tensor, steps: &[u32]) -> Result<Tensor> {
         let column = |of: &dyn Fn(f32) -> f32| {
             let values: Vec<f32> = steps.iter().map(|&t| of(self.alphas_cumprod[t as usize])).collect();
-            Tensor::from_vec(values, (steps.len(), 1, 1), &Device::Cpu)
+            Tensor::from_vec(values, (steps.len(), 1, 1), &HERE)
         };
         let (keep, add) = (column(&|a: f32| a.sqrt())?, column(&|a: f32| (1.0 - a).sqrt())?);
         Ok((actions.broadcast_mul(&keep)? + noise.broadcast_mul(&add)?)?)

@@ -3,6 +3,7 @@ use super::unet::NetworkConfig;
 use super::*;
 use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
 use crate::train::{TrainConfig, Trainer};
+use candle_core::Device;
 
 fn small() -> Config {
     let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, step_embed_dim: 8, ..NetworkConfig::default() };

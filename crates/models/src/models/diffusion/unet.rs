@@ -1,12 +1,13 @@
 //! The 1-D UNet over the steps of an action sequence, conditioned by FiLM: LeRobot's `DiffusionConditionalUnet1d` with its
 //! tensor names, steps before channels. Diffusion, flow matching and MIP share it.
 
+use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::layers::{Conv1d, GroupNorm, Linear, Upsample1d, mish};
 use crate::params::Params;
 use crate::rng::Rng;
 use crate::size::Size;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// Groups of the last block's norm, whatever the others have.
@@ -294,5 +295,5 @@ fn embedding(steps: &[f32], dim: usize) -> Result<Tensor> {
         values.extend(angles.iter().map(|angle| angle.sin()));
         values.extend(angles.iter().map(|angle| angle.cos()));
     }
-    Ok(Tensor::from_vec(values, (steps.len(), dim), &Device::Cpu)?)
+    Ok(Tensor::from_vec(values, (steps.len(), dim), &HERE)?)
 }

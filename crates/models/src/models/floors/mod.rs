@@ -12,6 +12,7 @@ pub mod zero;
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
+use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
 use crate::gradients::Gradients;
@@ -22,7 +23,7 @@ use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use crate::rng::Rng;
 use crate::size::Size;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -129,7 +130,7 @@ impl<R: Rule> Floor<R> {
     /// Chunks of one action repeated. action: rows*A values -> (rows, H, A)
     fn repeated(&self, rows: usize, action: Vec<f32>) -> Result<Tensor> {
         let (horizon, width) = (self.rule.action_horizon(), self.signature.action_dim);
-        let action = Tensor::from_vec(action, (rows, 1, width), &Device::Cpu)?;
+        let action = Tensor::from_vec(action, (rows, 1, width), &HERE)?;
         Ok(action.broadcast_as((rows, horizon, width))?.contiguous()?)
     }
 }

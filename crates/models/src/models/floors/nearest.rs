@@ -9,13 +9,14 @@
 pub use super::READS;
 use super::{Floor, Rule, at_least_one, joined};
 use crate::batch::Batch;
+use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::features::{Features, Signature};
 use crate::params::Params;
 use crate::rng::Rng;
 use crate::size::Size;
 use crate::values::with_values;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// Table of the observations, (windows, everything seen).
@@ -102,7 +103,7 @@ impl Rule for Neighbours {
             })
         })???;
         let shape = (rows, self.config.action_horizon, model.signature.action_dim);
-        Ok(Tensor::from_vec(chunks, shape, &Device::Cpu)?)
+        Ok(Tensor::from_vec(chunks, shape, &HERE)?)
     }
 
     fn remember(&self, model: &Floor<Self>, train: &[Batch], _held_out: &[Batch]) -> Result<()> {

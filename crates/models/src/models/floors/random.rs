@@ -4,11 +4,12 @@
 
 pub use super::{Config, READS};
 use super::{Floor, Rule};
+use crate::device::HERE;
 use crate::error::Result;
 use crate::features::{Features, Signature};
 use crate::params::Params;
 use crate::rng::Rng;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 
 /// The model.
 pub type Random = Floor<Chance>;
@@ -37,6 +38,6 @@ impl Rule for Chance {
         let Some(rng) = rng else { return model.repeated(rows, vec![0.0; rows * width]) };
         let horizon = self.config.action_horizon;
         let drawn: Vec<f32> = (0..rows * horizon * width).map(|_| 2.0 * rng.uniform() - 1.0).collect();
-        Ok(Tensor::from_vec(drawn, (rows, horizon, width), &Device::Cpu)?)
+        Ok(Tensor::from_vec(drawn, (rows, horizon, width), &HERE)?)
     }
 }

@@ -18,6 +18,7 @@ pub use config::Config;
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::features::{Features, Signature};
 use crate::model::{LossParts, PolicyModel};
@@ -27,7 +28,7 @@ use crate::params::Params;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use crate::rng::Rng;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -45,7 +46,7 @@ pub struct Flow {
 
 /// From noise z at time 0 to actions a at time 1. z, a: (b, H, A), the time of each row -> (b, H, A)
 pub(crate) fn between(z: &Tensor, a: &Tensor, times: &[f32]) -> Result<Tensor> {
-    let t = Tensor::from_slice(times, (times.len(), 1, 1), &Device::Cpu)?;
+    let t = Tensor::from_slice(times, (times.len(), 1, 1), &HERE)?;
     Ok((z.broadcast_mul(&(1.0 - &t)?)? + a.broadcast_mul(&t)?)?)
 }
 
@@ -82,7 +83,7 @@ impl Flow {
 
     fn noise(&self, rows: usize, rng: &mut Rng) -> Result<Tensor> {
         let shape = (rows, self.config.action_horizon, self.signature.action_dim);
-        Ok(Tensor::from_vec(rng.normals(shape.0 * shape.1 * shape.2), shape, &Device::Cpu)?)
+        Ok(Tensor::from_vec(rng.normals(shape.0 * shape.1 * shape.2), shape, &HERE)?)
     }
 }
 

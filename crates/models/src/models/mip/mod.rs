@@ -17,6 +17,7 @@ pub use config::Config;
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::features::{Features, Signature};
 use crate::model::{LossParts, PolicyModel};
@@ -27,7 +28,7 @@ use crate::params::Params;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use crate::rng::Rng;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -75,7 +76,7 @@ impl Mip {
 
     fn nothing(&self, rows: usize) -> Result<Tensor> {
         let shape = (rows, self.config.action_horizon, self.signature.action_dim);
-        Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?)
+        Ok(Tensor::zeros(shape, DType::F32, &HERE)?)
     }
 }
 
@@ -96,7 +97,7 @@ impl PolicyModel for Mip {
         check_batch("mip", &self.signature, self.config.action_horizon, batch)?;
         let rows = batch.rows();
         let cond = condition("mip", &self.signature, rows, &batch.observation)?;
-        let noise = Tensor::from_vec(rng.normals(batch.actions.elem_count()), batch.actions.shape(), &Device::Cpu)?;
+        let noise = Tensor::from_vec(rng.normals(batch.actions.elem_count()), batch.actions.shape(), &HERE)?;
         let time = self.config.second_time as f32;
         let noisy = between(&noise, &batch.actions, &vec![time; rows])?;
         let error = |answer: Tensor| squared_error(&answer, &batch.actions, batch, self.config.mask_padding);

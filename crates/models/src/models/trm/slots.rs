@@ -4,9 +4,10 @@
 
 use super::{Carry, Trm, misfit};
 use crate::classification::IGNORE_LABEL;
+use crate::device::HERE;
 use crate::error::Result;
 use crate::rng::Rng;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// One puzzle with its answer.
@@ -111,7 +112,7 @@ impl Slots {
             }
             let initial = model.initial_carry(self.batch())?;
             let shape = initial.z_h.shape().clone();
-            let reset = Tensor::from_vec(reset, (self.batch(), 1, 1), &Device::Cpu)?.broadcast_as(shape)?;
+            let reset = Tensor::from_vec(reset, (self.batch(), 1, 1), &HERE)?.broadcast_as(shape)?;
             self.carry = Carry {
                 z_h: reset.where_cond(&initial.z_h, &self.carry.z_h)?,
                 z_l: reset.where_cond(&initial.z_l, &self.carry.z_l)?,
@@ -123,12 +124,12 @@ impl Slots {
     /// The puzzles' tokens, `(batch, seq_len)`.
     pub(super) fn input_tensor(&self) -> Result<Tensor> {
         let len = self.inputs.len() / self.batch();
-        Ok(Tensor::from_slice(&self.inputs, (self.batch(), len), &Device::Cpu)?)
+        Ok(Tensor::from_slice(&self.inputs, (self.batch(), len), &HERE)?)
     }
 
     /// The puzzles' rows in the embedding table, `(batch,)`.
     pub(super) fn identifier_tensor(&self) -> Result<Tensor> {
-        Ok(Tensor::from_slice(&self.identifiers, self.batch(), &Device::Cpu)?)
+        Ok(Tensor::from_slice(&self.identifiers, self.batch(), &HERE)?)
     }
 
     /// Takes the states of a finished step and decides which slots halt.

@@ -2,10 +2,11 @@
 
 use super::fused::Fused;
 use super::{Config, Mixing, Positions, Trm};
+use crate::device::HERE;
 use crate::error::{ModelError, Result, some_names};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
 
 const H_INIT: &str = "inner.H_init";
@@ -99,7 +100,7 @@ fn rotary_table(positions: usize, size: usize, theta: f64) -> Result<(Tensor, Te
             angles.push(position as f32 * (1.0 / (theta as f32).powf(exponent)));
         }
     }
-    let angles = Tensor::from_vec(angles, (positions, size), &Device::Cpu)?;
+    let angles = Tensor::from_vec(angles, (positions, size), &HERE)?;
     Ok((angles.cos()?, angles.sin()?))
 }
 
@@ -145,7 +146,7 @@ impl Trm {
         let q = config.q_outputs;
         params.create("inner.q_head.weight", &[q, d], Init::Zeros, &mut rng)?;
         // near-certain "do not halt" at first, as in the reference
-        params.insert("inner.q_head.bias", Tensor::full(-5f32, q, &Device::Cpu)?)?;
+        params.insert("inner.q_head.bias", Tensor::full(-5f32, q, &HERE)?)?;
         if config.puzzle_emb_ndim > 0 {
             let shape = [config.num_puzzle_identifiers, config.puzzle_emb_ndim];
             params.create(PUZZLES, &shape, Init::Zeros, &mut rng)?;
