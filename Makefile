@@ -69,13 +69,14 @@ demo: programs ## the whole line: demonstrations, data set, training, evaluation
 wheel: build .venv-wheel/.complete ## the Python package, with the programs in it, in target/wheels
 	@.venv-wheel/bin/python tools/wheel.py
 
-.PHONY: study-robots
-study-robots: build ## ACT on every robot task: 200 demonstrations, training, 100 unseen seeds (hours; goes on where it was)
-	@tools/study_robots.sh
+.PHONY: zoo
+zoo: build ## every policy on every robot task, three trainings each, and the leaderboard (hours; goes on where it was; in out/zoo)
+	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/zoo.toml --jobs $(or $(JOBS),2)
+	@target/release/actrm-zoo leaderboard --zoo out/zoo
 
 .PHONY: study-thinking
-study-thinking: build ## ACT beside ACTRM beside ACTRM that may not think, from 25 to 200 demonstrations (hours; goes on where it was)
-	@tools/study_thinking.sh
+study-thinking: build ## does thinking help: the studies of robot policies, as far as they have not been run (days)
+	@for study in thinking fewer; do RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/$$study.toml --jobs $(or $(JOBS),2); done
 
 .PHONY: test
 test: wheel ## every test: Rust, Python and end to end

@@ -49,7 +49,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("cli", &["rollout", "video"]),
     ("actrm-data", &["cli", "dataset", "puzzles", "recording", "rollout"]),
     ("actrm-query", &["cli", "dataset", "query"]),
-    ("actrm-zoo", &["cli", "dataset", "models", "puzzles", "report", "rollout", "study", "zoo"]),
+    ("actrm-zoo", &["cli", "dataset", "models", "puzzles", "recording", "report", "rollout", "study", "zoo"]),
     ("e2e", &[]),
 ];
 

@@ -1,10 +1,11 @@
-//! The driver for Slurm, with a stand-in for `sbatch` that runs at once what would be queued.
+//! The drivers for Slurm, with a stand-in for `sbatch` that runs at once what would be queued.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
 use std::process::Command;
 
-use e2e::{copied_zoo, listing, program, root, succeeds, text};
+use e2e::{copied_zoo, listing, program, refused, root, succeeds, text};
 
 /// Runs the wrapped command, once for each task of an array, with the variables that Slurm sets, and prints a job's id.
 const SBATCH: &str = r#"#!/usr/bin/env bash
@@ -24,15 +25,78 @@ done
 echo 4711
 "#;
 
-#[test]
-fn an_array_of_shards_and_the_job_that_merges_them() {
-    let (folder, entries) = copied_zoo();
-    let bin = folder.path().join("bin");
+/// A folder of programs with the stand-in, and the path that finds it first.
+fn with_sbatch(folder: &Path) -> String {
+    let bin = folder.join("bin");
     fs::create_dir(&bin).expect("creatable");
     fs::write(bin.join("sbatch"), SBATCH).expect("writable");
     fs::set_permissions(bin.join("sbatch"), fs::Permissions::from_mode(0o755)).expect("executable");
+    format!("{}:{}", text(&bin), std::env::var("PATH").expect("a PATH"))
+}
+
+/// A study of two trainings that is over in seconds.
+const STUDY: &str = r#"
+title = "Small"
+results = "results"
+page = "page.md"
+zoo = "zoo"
+[data.lift]
+task = "Lift"
+episodes = 3
+[arms.act]
+label = "ACT"
+experiment = "act_{data}"
+set = ["train.steps=3", "train.batch_size=4", "policy.dim_model=16", "rollout.max_steps=3"]
+[tests.lift]
+task = "Lift"
+episodes = 2
+seed_start = 40000
+[[cells]]
+arms = ["act"]
+data = "lift"
+seeds = 2
+tests = ["lift"]
+"#;
+
+#[test]
+fn a_study_as_an_array_of_cells() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let jobs = folder.path().join("jobs");
-    let path = format!("{}:{}", text(&bin), std::env::var("PATH").expect("a PATH"));
+    fs::write(folder.path().join("small.toml"), STUDY).expect("writable");
+    let script = root().join("tools/cluster/slurm_study.sh");
+    let zoo = program("actrm-zoo").get_program().to_owned();
+    let mut command = Command::new(&script);
+    command.args(["small.toml", "--work", "work"]).current_dir(folder.path());
+    command.env("PATH", with_sbatch(folder.path())).env("ACTRM_ZOO", zoo).env("JOBS", &jobs);
+    command.env("ACTRM_PYTHON", root().join(".venv/bin/python"));
+    succeeds(&mut command);
+    let said = fs::read_to_string(&jobs).expect("jobs were queued");
+    assert!(said.contains("--array=1-2") && said.contains("--dependency=afterok:4711"), "{said}");
+    let results = ["act-on-lift-seed1_lift.json", "act-on-lift-seed2_lift.json"];
+    assert_eq!(listing(&folder.path().join("results")), results);
+    // entries are a family, and their evaluations lie where the leaderboard looks
+    assert_eq!(listing(&folder.path().join("zoo")), ["lift-act-s1", "lift-act-s2", "results"]);
+    let page = fs::read_to_string(folder.path().join("page.md")).expect("the page");
+    assert!(page.contains("| ACT | 0.0% [0-66]<br>0, 0 of 2 |") && !page.contains("## Not run"), "{page}");
+    let trains = fs::read_to_string(folder.path().join("zoo/lift-act-s2/1/command.txt")).expect("the command");
+    let data = "--data work/small/data/lift-3-seed1.hdf5";
+    assert!(trains.starts_with("actrm-zoo train act_lift ") && trains.trim_end().ends_with(data), "{trains}");
+
+    let mut unknown = program("actrm-zoo");
+    unknown.args(["study", "small.toml", "--work", "work", "--cell", "act-on-lift"]).current_dir(folder.path());
+    refused(&mut unknown, &["cell `act-on-lift`", "--list"]);
+    // another definition is trained anew, as the next version
+    fs::write(folder.path().join("small.toml"), STUDY.replace("steps=3\"", "steps=4\"")).expect("writable");
+    let mut again = program("actrm-zoo");
+    again.args(["study", "small.toml", "--work", "work", "--cell", "act-on-lift-seed1"]).current_dir(folder.path());
+    succeeds(again.env("ACTRM_PYTHON", root().join(".venv/bin/python")));
+    assert!(folder.path().join("zoo/lift-act-s1/2/model.safetensors").is_file());
+}
+
+#[test]
+fn an_array_of_shards_and_the_job_that_merges_them() {
+    let (folder, entries) = copied_zoo();
+    let (jobs, path) = (folder.path().join("jobs"), with_sbatch(folder.path()));
     let script = root().join("tools/cluster/slurm_eval.sh");
     let mut command = Command::new(&script);
     command.args(["3", "lift-act@1", "--episodes", "4", "--max-steps", "3", "--zoo", text(&entries)]);

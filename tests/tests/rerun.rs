@@ -189,3 +189,29 @@ fn other_demonstrations_are_told_by_their_fingerprint() {
     succeeds(&mut data(["convert", text(&lift()), text(&set)]));
     assert_eq!(told(&mut rerun(folder.path(), &["--data", text(&set), "--episodes", "1"]), 0)["same"], true);
 }
+
+#[test]
+fn demonstrations_of_the_scripted_expert_are_collected_again() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (demos, entries) = (folder.path().join("demos.hdf5"), folder.path().join("zoo"));
+    let collect =
+        ["collect", "--task", "Lift", "--episodes", "4", "--seed", "3", "--workers", "1", "--out", text(&demos)];
+    succeeds(&mut data(collect));
+    let mut train = zoo(["train", "act_lift", "--data", text(&demos), "--zoo", text(&entries)]);
+    train.args(["--runs", text(&folder.path().join("runs"))]);
+    succeeds(train.args(["train.steps=4", "train.batch_size=8", "policy.dim_model=32", "data.path=gone.hdf5"]));
+    succeeds(&mut zoo(["eval", "lift-act", "--episodes", "1", "--max-steps", "4", "--zoo", text(&entries)]));
+    fs::remove_file(&demos).expect("removable");
+
+    // nothing is where the experiment says: the seeds in the entry say how to make it
+    let again = told(&mut rerun(folder.path(), &[]), 0);
+    assert_eq!(outcomes(&again), STEPS.map(|step| (step, "same")), "{again:#}");
+    assert!(said(&again, "demonstrations").contains("work/demonstrations.hdf5"), "{again:#}");
+
+    // demonstrations that lie there and are others are not asked about again
+    let path = folder.path().join("work/demonstrations.hdf5");
+    fs::copy(lift(), &path).expect("copied");
+    fs::remove_dir_all(folder.path().join("work/run")).expect("removable");
+    let other = told(&mut rerun(folder.path(), &["--collect"]), 1);
+    assert_eq!(other["first_difference"], "demonstrations", "{other:#}");
+}

@@ -78,6 +78,7 @@ mod tests {
             introduction: String::new(),
             results: "r".into(),
             page: "p".into(),
+            zoo: None,
             data: BTreeMap::new(),
             arms: BTreeMap::new(),
             tests: BTreeMap::new(),

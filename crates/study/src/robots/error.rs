@@ -10,7 +10,28 @@ pub enum StudyError {
     /// The demonstrations could not be collected.
     #[error(transparent)]
     Recording(#[from] recording::RecordingError),
+    /// One cell of it could not be run.
+    #[error("cell {cell}")]
+    Cell {
+        /// Its name.
+        cell: String,
+        /// Why.
+        source: Box<StudyError>,
+    },
+    /// A cell was asked for that the study has not.
+    #[error("cell `{cell}`: expected one that `actrm-zoo study STUDY --list` names")]
+    UnknownCell {
+        /// What was asked for.
+        cell: String,
+    },
     /// A simulator could not be started.
     #[error(transparent)]
     Rollout(#[from] rollout::RolloutError),
+}
+
+impl StudyError {
+    /// Says which cell it was.
+    pub(super) fn of(self, cell: &super::cells::Cell) -> Self {
+        Self::Cell { cell: cell.name(), source: Box::new(self) }
+    }
 }

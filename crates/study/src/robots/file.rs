@@ -20,6 +20,10 @@ pub struct Study {
     pub results: PathBuf,
     /// The page.
     pub page: PathBuf,
+    /// A zoo that gets the entries, named as families are (`stack-act-s1`), and their evaluations; where none is given they stay
+    /// in the study's own folder, under the names of its cells.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub zoo: Option<PathBuf>,
     /// Demonstrations, by name.
     pub data: BTreeMap<String, Data>,
     /// What is trained, by name.
@@ -50,7 +54,7 @@ pub struct Data {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Arm {
-    /// The experiment.
+    /// The experiment; `{data}` in it stands for the name of the demonstrations.
     pub experiment: String,
     /// Dotted settings laid over it.
     #[serde(default)]
@@ -72,6 +76,13 @@ pub struct Test {
     /// How policies think in it, where that is not as they were trained.
     #[serde(default, skip_serializing_if = "as_trained")]
     pub thinking: Thinking,
+}
+
+impl Arm {
+    /// The experiment on the demonstrations called `data`.
+    pub fn experiment_on(&self, data: &str) -> String {
+        self.experiment.replace("{data}", data)
+    }
 }
 
 impl Test {
@@ -273,6 +284,25 @@ mod tests {
         assert!(open(&with("{ step = 1 }")).unwrap_err().contains("step"));
         // a test as trained keeps its text
         assert!(!serde_json::to_string(&open(TEXT).unwrap().tests["lift"]).unwrap().contains("thinking"));
+    }
+
+    #[test]
+    fn the_zoo_is_tested_as_named_protocols_say() {
+        let study = Study::open(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../studies/zoo.toml")).unwrap();
+        let protocols = zoo::protocols::Protocols::built_in();
+        for (name, test) in &study.tests {
+            let protocol = protocols.get(&format!("{name}-v1")).unwrap();
+            assert_eq!(
+                (&test.task, test.seed_start, test.episodes),
+                (&protocol.task, protocol.test.start, protocol.test.count)
+            );
+        }
+        let library = zoo::config::Library::built_in();
+        for cell in super::super::cells::cells(&study) {
+            let name = study.arms[&cell.arm].experiment_on(&cell.data);
+            let experiment = zoo::experiment::Experiment::load(&library, &name, &study.arms[&cell.arm].set);
+            assert_eq!(experiment.unwrap().task.name, study.data[&cell.data].task, "{name}");
+        }
     }
 
     #[test]

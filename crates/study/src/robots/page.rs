@@ -47,6 +47,7 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
     if !study.introduction.is_empty() {
         let _ = writeln!(text, "{}\n", study.introduction.trim());
     }
+    overview(&mut text, study, &results);
     for (name, test) in study.tests.iter().filter(|(_, test)| test.thinking_words().is_none()) {
         for data in study.data.keys() {
             let of_test: Vec<(&String, &Trainings)> = study
@@ -92,6 +93,54 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
         text.pop();
     }
     Ok(text)
+}
+
+/// Arms against demonstrations, where an arm was meant for several: success on the first test of each.
+fn overview(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
+    let mut columns: Vec<(&str, &str)> = Vec::new();
+    let mut rows: Vec<&str> = Vec::new();
+    let mut planned: BTreeMap<(&str, &str), u64> = BTreeMap::new();
+    for row in &study.cells {
+        let Some(test) = row.tests.iter().find(|test| study.tests[*test].thinking_words().is_none()) else { continue };
+        if !columns.iter().any(|(data, _)| *data == row.data) {
+            columns.push((&row.data, test));
+        }
+        for arm in &row.arms {
+            if !rows.contains(&arm.as_str()) {
+                rows.push(arm);
+            }
+            let seeds = planned.entry((arm, &row.data)).or_default();
+            *seeds = row.seeds.max(*seeds);
+        }
+    }
+    let several = rows.iter().any(|arm| planned.keys().filter(|(planned, _)| planned == arm).count() > 1);
+    if !several {
+        return;
+    }
+    let heads: Vec<&str> = columns.iter().map(|(data, _)| study.data[*data].task.as_str()).collect();
+    let _ = writeln!(
+        text,
+        "## All of it\n\nSuccess with its 95% interval over trainings and episodes, and how many trainings; what is planned and has \
+         no result is \"not run\".\n\n| | {} |\n|---|{}",
+        heads.join(" | "),
+        "---|".repeat(heads.len())
+    );
+    for arm in rows {
+        let cell = |(data, test): &(&str, &str)| {
+            let Some(&seeds) = planned.get(&(arm, *data)) else { return "-".to_owned() };
+            let key = ((*test).to_owned(), (*data).to_owned(), arm.to_owned());
+            let Some(trainings) = results.get(&key) else { return "not run".to_owned() };
+            let estimate = hierarchical(&outcomes(trainings, &[]), BOOTSTRAP_SEED);
+            let estimate = estimate.as_ref().map_or_else(|| "-".to_owned(), percent);
+            match trainings.len() as u64 {
+                there if there == seeds => format!("{estimate}, {seeds}"),
+                there => format!("{estimate}, {there} of {seeds}"),
+            }
+        };
+        let cells: Vec<String> = columns.iter().map(cell).collect();
+        let _ = writeln!(text, "| {} | {} |", study.arms[arm].label, cells.join(" | "));
+    }
+    text.push('\n');
 }
 
 /// Whether the episode counts for `group`; `None` is all of them.
@@ -207,6 +256,10 @@ fn probes(text: &mut String, study: &Study) -> Result<(), ZooError> {
         }
     }
     files.sort();
+    // a study that asks nothing about thoughts misses none
+    if files.is_empty() && study.tests.values().all(|test| test.thinking_words().is_none()) {
+        return Ok(());
+    }
     let _ = writeln!(
         text,
         "## What can be read from a thought\n\nA linear probe (`actrm-zoo probe`): which cube, by its colour, is it after i hops? \
@@ -355,33 +408,52 @@ fn costs(text: &mut String, study: &Study, results: &BTreeMap<(String, String, S
          | arm | experiment | settings | parameters | steps | minutes | a query, ms | MFLOP |\n|---|---|---|---|---|---|---|---|"
     );
     for (name, arm) in &study.arms {
-        let as_trained = |test: &str| study.tests[test].thinking_words().is_none();
-        let of_arm: Vec<&CellResult> = results
-            .iter()
-            .filter(|((test, _, a), _)| a == name && as_trained(test))
-            .flat_map(|(_, trainings)| trainings.values())
-            .collect();
-        let Some(first) = of_arm.first() else {
-            let settings: Vec<String> = arm.set.iter().map(|s| format!("`{s}`")).collect();
-            let settings = settings.join(", ");
-            let _ = writeln!(text, "| {} | `{}` | {settings} | not run | | | | |", arm.label, arm.experiment);
-            continue;
-        };
-        let settings: Vec<String> = arm.set.iter().map(|s| format!("`{s}`")).collect();
-        let _ = writeln!(
-            text,
-            "| {} | `{}` | {} | {} | {} | {:.1} | {:.2} | {} |",
-            arm.label,
-            arm.experiment,
-            settings.join(", "),
-            first.training.parameters,
-            first.training.steps,
-            median(&of_arm, |r| r.training.minutes),
-            median(&of_arm, |r| r.query_ms),
-            megaflops(&of_arm)
-        );
+        let mut data: Vec<&str> = Vec::new();
+        for row in study.cells.iter().filter(|row| row.arms.contains(name)) {
+            // an experiment of its own for each, or the same on all
+            if arm.experiment_on(&row.data) != arm.experiment && !data.contains(&row.data.as_str()) {
+                data.push(&row.data);
+            }
+        }
+        match data.is_empty() {
+            true => cost(text, study, results, (name, None)),
+            false => data.into_iter().for_each(|data| cost(text, study, results, (name, Some(data)))),
+        }
     }
     text.push('\n');
+}
+
+/// The row of an arm, on some demonstrations or on all.
+fn cost(
+    text: &mut String,
+    study: &Study,
+    results: &BTreeMap<(String, String, String), Trainings>,
+    (name, data): (&String, Option<&str>),
+) {
+    let arm = &study.arms[name];
+    let experiment = data.map_or_else(|| arm.experiment.clone(), |data| arm.experiment_on(data));
+    let settings: Vec<String> = arm.set.iter().map(|s| format!("`{s}`")).collect();
+    let settings = settings.join(", ");
+    let as_trained = |test: &str| study.tests[test].thinking_words().is_none();
+    let of_arm: Vec<&CellResult> = results
+        .iter()
+        .filter(|((test, d, a), _)| a == name && data.is_none_or(|data| data == d) && as_trained(test))
+        .flat_map(|(_, trainings)| trainings.values())
+        .collect();
+    let Some(first) = of_arm.first() else {
+        let _ = writeln!(text, "| {} | `{experiment}` | {settings} | not run | | | | |", arm.label);
+        return;
+    };
+    let _ = writeln!(
+        text,
+        "| {} | `{experiment}` | {settings} | {} | {} | {:.1} | {:.2} | {} |",
+        arm.label,
+        first.training.parameters,
+        first.training.steps,
+        median(&of_arm, |r| r.training.minutes),
+        median(&of_arm, |r| r.query_ms),
+        megaflops(&of_arm)
+    );
 }
 
 #[cfg(test)]
@@ -463,6 +535,34 @@ mod tests {
             "episodes": solved.iter().enumerate().map(episode).collect::<Vec<_>>(),
         }))
         .unwrap()
+    }
+
+    #[test]
+    fn arms_of_several_tasks_stand_in_one_table() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        let text = STUDY.replace("RESULTS", &folder.path().display().to_string()).replace(
+            "experiment = \"actrm_pickchain\"\n        label = \"one",
+            "experiment = \"act_{data}\"\n        label = \"one",
+        ) + "[data.lift]\ntask = \"Lift\"\nepisodes = 200\n[tests.lift]\ntask = \"Lift\"\nepisodes = 4\nseed_start = 40000\n\
+               [[cells]]\narms = [\"one\"]\ndata = \"lift\"\nseeds = 3\ntests = [\"lift\"]\n";
+        std::fs::write(&file, text).unwrap();
+        let study = Study::open(&file).unwrap();
+        for cell in cells(&study).iter().filter(|cell| cell.arm == "one" && cell.seed < 3) {
+            for test in &cell.tests {
+                result(&study, cell, test, [true; 4]).write(&folder.path().join(cell.file_name(test))).unwrap();
+            }
+        }
+        let page = robot_page(&study, &file).unwrap();
+        for there in [
+            "| | PickChain | Lift |\n|---|---|---|\n| one step | 100.0% [",
+            "], 2 of 3 |\n| six steps | not run | - |\n",
+            "| one step | `act_chain` |  | 340000 |",
+            "| one step | `act_lift` |  | 340000 |",
+            "| six steps | `actrm_pickchain` | `policy.reasoning.supervision_steps=6` | not run |",
+        ] {
+            assert!(page.contains(there), "{there}\n---\n{page}");
+        }
     }
 
     #[test]

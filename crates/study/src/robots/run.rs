@@ -2,12 +2,13 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use recording::{CollectEnd, CollectOptions, collect};
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, harness_folder};
 use zoo::config::Library;
-use zoo::entry::LoadedEntry;
+use zoo::entry::{Entry, LoadedEntry, member_name};
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, evaluate, thinking_subject};
 use zoo::experiment::Experiment;
 use zoo::registry::Registry;
@@ -17,7 +18,7 @@ use zoo::{ZooError, sha256_hex};
 
 use super::cells::{Cell, cells};
 use super::error::StudyError;
-use super::file::{Data, Study, Test};
+use super::file::{Arm, Data, Study, Test};
 use super::result::CellResult;
 
 /// What to run and where.
@@ -30,8 +31,12 @@ pub struct RobotStudyRequest {
     pub work: PathBuf,
     /// Only cells whose name holds one of these; all where empty.
     pub only: Vec<String>,
+    /// Only these cells, by their whole names; all where empty.
+    pub cells: Vec<String>,
     /// Only cells of the stages up to this; of all where none is given.
     pub stage: Option<u8>,
+    /// Collect what the cells learn from and end.
+    pub data_only: bool,
     /// Cells at once.
     pub jobs: usize,
     /// Python with robosuite.
@@ -61,7 +66,7 @@ enum CellEnd {
     Stopped,
 }
 
-/// Runs every cell that has no result; whether all have one now.
+/// Runs every cell that was chosen and has no result; whether nothing was stopped.
 ///
 /// # Errors
 /// The first failure; what was done stays.
@@ -70,17 +75,26 @@ pub fn run_robot_study(
     on_event: &mut (dyn FnMut(RobotEvent<'_>) + Send),
 ) -> Result<bool, StudyError> {
     let study = &request.study;
+    std::fs::create_dir_all(&study.results).map_err(|source| ZooError::Io {
+        operation: "create folder",
+        path: study.results.clone(),
+        source,
+    })?;
     let all = cells(study);
     let chosen = |cell: &Cell| {
         let named = request.only.is_empty() || request.only.iter().any(|o| cell.name().contains(o.as_str()));
-        named && request.stage.is_none_or(|last| cell.stage <= last)
+        let whole = request.cells.is_empty() || request.cells.contains(&cell.name());
+        named && whole && request.stage.is_none_or(|last| cell.stage <= last)
     };
     let total: usize = all.iter().map(|cell| cell.tests.len()).sum();
     let training = all.iter().map(|cell| (cell.name(), Mutex::new(()))).collect();
+    if let Some(name) = request.cells.iter().find(|name| all.iter().all(|cell| cell.name() != **name)) {
+        return Err(StudyError::UnknownCell { cell: name.clone() });
+    }
     let mut due = VecDeque::new();
     let mut there = 0;
     for cell in all {
-        let missing = missing_tests(request, &cell)?;
+        let missing = missing_tests(request, &cell).map_err(|error| error.of(&cell))?;
         count_operations(request, &cell, &missing)?;
         there += cell.tests.len() - missing.len();
         if !missing.is_empty() && chosen(&cell) {
@@ -93,6 +107,7 @@ pub fn run_robot_study(
         due: Mutex::new(due),
         done: Mutex::new(there),
         total,
+        stopped: AtomicBool::new(false),
         on_event: Mutex::new(on_event),
         collecting: study.data.keys().map(|name| (name.clone(), Mutex::new(()))).collect(),
         training,
@@ -105,7 +120,7 @@ pub fn run_robot_study(
     });
     match shared.failure.into_inner().unwrap_or_else(PoisonError::into_inner) {
         Some(error) => Err(error),
-        None => Ok(shared.done.into_inner().unwrap_or_else(PoisonError::into_inner) == total),
+        None => Ok(!shared.stopped.into_inner()),
     }
 }
 
@@ -133,12 +148,9 @@ fn count_operations(request: &RobotStudyRequest, cell: &Cell, missing: &[String]
     for test in cell.tests.iter().filter(|test| !missing.contains(test)) {
         let path = request.study.results.join(cell.file_name(test));
         let Some(result) = CellResult::read(&path)?.filter(|result| result.query_flops.is_none()) else { continue };
-        let zoo = request.work.join("zoo");
-        let name = format!("{}-{}", cell.name(), &result.settings[..8]);
-        if !zoo.join(&name).exists() {
-            continue;
-        }
-        let query_flops = Registry::open(&zoo).entry(&name)?.load()?.model().query_flops();
+        let (experiment, _) = experiment(request, cell)?;
+        let Some(entry) = request.trained(&experiment.entry, &result.settings)? else { continue };
+        let query_flops = entry.load()?.model().query_flops();
         if query_flops.is_some() {
             CellResult { query_flops, ..result }.write(&path)?;
         }
@@ -146,18 +158,63 @@ fn count_operations(request: &RobotStudyRequest, cell: &Cell, missing: &[String]
     Ok(())
 }
 
-/// The experiment of a cell, and the hash of what it depends on: not its name, seed and path.
+/// The experiment of a cell, under the name of its entry, and the hash of what it depends on.
 fn experiment(request: &RobotStudyRequest, cell: &Cell) -> Result<(Experiment, String), StudyError> {
     let arm = &request.study.arms[&cell.arm];
     let mut set = arm.set.clone();
-    set.extend([format!("entry={}", cell.name()), format!("train.seed={}", cell.seed)]);
-    let experiment = Experiment::load(&request.library, &arm.experiment, &set)?;
+    set.push(format!("train.seed={}", cell.seed));
+    let experiment = Experiment::load(&request.library, &arm.experiment_on(&cell.data), &set)?;
+    let settings = settings_hash(&experiment);
+    let entry = match request.study.zoo {
+        Some(_) => member_name(&experiment.entry, cell.seed),
+        // another definition is another entry, so that a changed arm is trained anew
+        None => run_name(cell, &settings),
+    };
+    Ok((Experiment { entry, ..experiment }, settings))
+}
+
+/// The same training without the study, as a command.
+fn train_command(arm: &Arm, cell: &Cell, entry: &str, data: &Path) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "_-=./".contains(c);
+    let quoted = |word: &String| if word.chars().all(plain) { word.clone() } else { format!("'{word}'") };
+    let mut words = vec!["actrm-zoo".to_owned(), "train".to_owned(), arm.experiment_on(&cell.data)];
+    words.extend(arm.set.iter().map(quoted));
+    words.extend([format!("train.seed={}", cell.seed), format!("entry={entry}"), "--data".to_owned()]);
+    words.push(quoted(&data.display().to_string()));
+    words.join(" ")
+}
+
+/// Hash of what an experiment's outcome depends on: not its name, seed and path.
+fn settings_hash(experiment: &Experiment) -> String {
     let mut flat = experiment.flat();
     for key in ["entry", "description", "train.seed", "data.path"] {
         flat.remove(key);
     }
     let text: Vec<String> = flat.iter().map(|(key, value)| format!("{key}={value}\n")).collect();
-    Ok((experiment, sha256_hex(text.concat().as_bytes())))
+    sha256_hex(text.concat().as_bytes())
+}
+
+/// The folder of a cell's run, by its name and its settings.
+fn run_name(cell: &Cell, settings: &str) -> String {
+    format!("{}-{}", cell.name(), &settings[..8])
+}
+
+impl RobotStudyRequest {
+    /// The zoo that gets the entries.
+    fn zoo(&self) -> PathBuf {
+        self.study.zoo.clone().unwrap_or_else(|| self.work.join("zoo"))
+    }
+
+    /// The newest entry called `name`, if it was trained with these settings.
+    fn trained(&self, name: &str, settings: &str) -> Result<Option<Entry>, ZooError> {
+        let zoo = self.zoo();
+        if !zoo.join(name).exists() {
+            return Ok(None);
+        }
+        let entry = Registry::open(&zoo).entry(name)?;
+        let its = Experiment::from_toml(&entry.id().to_string(), &entry.config_text()?)?;
+        Ok((settings_hash(&its) == settings).then_some(entry))
+    }
 }
 
 /// What the threads of a study share.
@@ -172,6 +229,8 @@ struct Shared<'a> {
     /// held while the training of that cell is under way
     training: BTreeMap<String, Mutex<()>>,
     failure: Mutex<Option<StudyError>>,
+    /// whether a cell was left because an end was asked for
+    stopped: AtomicBool,
 }
 
 fn lock<T: ?Sized>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -189,13 +248,17 @@ impl Shared<'_> {
 
     /// One thread: cells until there is none, or an end is asked for.
     fn work(&self) {
-        while !self.stopped() {
+        loop {
             let Some(cell) = lock(&self.due).pop_front() else { return };
-            match self.cell(&cell) {
+            let end = if self.stopped() { Ok(CellEnd::Stopped) } else { self.cell(&cell) };
+            match end {
                 Ok(CellEnd::Done) => {}
-                Ok(CellEnd::Stopped) => return,
+                Ok(CellEnd::Stopped) => {
+                    self.stopped.store(true, Ordering::Relaxed);
+                    return;
+                }
                 Err(error) => {
-                    lock(&self.failure).get_or_insert(error);
+                    lock(&self.failure).get_or_insert(error.of(&cell));
                     return;
                 }
             }
@@ -206,23 +269,24 @@ impl Shared<'_> {
         let study = &self.request.study;
         let (arm, data) = (&study.arms[&cell.arm], &study.data[&cell.data]);
         let Some(file) = self.demonstrations(&cell.data, data)? else { return Ok(CellEnd::Stopped) };
+        if self.request.data_only {
+            return Ok(CellEnd::Done);
+        }
         let (experiment, settings) = experiment(self.request, cell)?;
-        let zoo = self.request.work.join("zoo");
-        // another definition is another entry, so that a changed arm is trained anew
-        let runs = self.request.work.join("runs").join(format!("{}-{}", cell.name(), &settings[..8]));
-        let name = format!("{}-{}", cell.name(), &settings[..8]);
+        let (zoo, name) = (self.request.zoo(), experiment.entry.clone());
+        let run = self.request.work.join("runs").join(run_name(cell, &settings));
         let training = lock(&self.training[&cell.name()]);
-        if !zoo.join(&name).exists() {
+        if self.request.trained(&name, &settings)?.is_none() {
             let request = TrainRequest {
-                name: arm.experiment.clone(),
-                experiment: Experiment { entry: name.clone(), ..experiment },
+                name: arm.experiment_on(&cell.data),
+                command: Some(train_command(arm, cell, &name, &file)),
+                experiment,
                 data: Some(file),
                 runs: self.request.work.join("runs"),
-                resume: runs.join("config.toml").exists(),
-                run: Some(runs),
+                resume: run.join("config.toml").exists(),
+                run: Some(run),
                 zoo: zoo.clone(),
                 image_memory: None,
-                command: None,
             };
             let mut steps = 0;
             let outcome = train(&request, &|| self.stopped(), &mut |event| match event {

@@ -43,6 +43,19 @@ impl Rerun {
         self.work.join("zoo")
     }
 
+    /// Where the entry's experiment says that its demonstrations are; nothing for one that was not trained on any here.
+    ///
+    /// # Errors
+    /// An experiment that cannot be read.
+    pub fn usual_demonstrations(&self) -> Result<Option<PathBuf>, ZooError> {
+        let meta = self.entry.meta();
+        if meta.data.is_none() || meta.training.is_none() {
+            return Ok(None);
+        }
+        let experiment = Experiment::from_toml(&meta.id().to_string(), &self.entry.config_text()?)?;
+        Ok(Some(PathBuf::from(experiment.data.path)))
+    }
+
     /// Finds the demonstrations, trains on them as the entry's experiment says, or goes on where an earlier call was
     /// stopped, and compares.
     ///

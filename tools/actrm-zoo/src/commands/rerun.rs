@@ -3,8 +3,11 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use cli::{Column, INTERRUPTED, Screen, SimulatorArgs, Stop, Table, limits, shown};
+use recording::{CollectEnd, CollectOptions, CollectProgress, collect};
+use rollout::Control;
 use serde_json::json;
 use zoo::entry::Entry;
+use zoo::evaluation::Environment;
 use zoo::rerun::{EPISODES, Report, Rerun, Retrained, Retraining, find_row};
 use zoo::results::EvaluationRecord;
 
@@ -15,12 +18,14 @@ use crate::training::show;
 const GOES_ON: &str = "stopped; the same command goes on where it was";
 /// Folder of the work, below it one for each entry.
 const RERUNS: &str = "runs/rerun";
+/// Demonstrations that were collected again, in the folder of the work.
+const DEMONSTRATIONS: &str = "demonstrations.hdf5";
 
 /// Make a row of the leaderboard again, from its demonstrations to its last episode, and say which step differs
 ///
-/// Checks entry and result, finds the demonstrations by their fingerprint, trains on them as the entry's experiment says, runs
-/// the row's episodes with what came of it, and compares each step with what is stored: weights byte by byte, episodes
-/// outcome by outcome. Where something differs, versions that are not as they were recorded are named. Neither the zoo nor
+/// Checks entry and result, finds the demonstrations, or collects them again where they are the scripted expert's, knows them by
+/// their fingerprint, trains on them as the entry's experiment says, runs the row's episodes with what came of it, and compares
+/// each step with what is stored: weights byte by byte, episodes outcome by outcome. Where something differs, versions that are not as they were recorded are named. Neither the zoo nor
 /// its results are changed; the work lies in a folder of its own, and a rerun that was interrupted goes on there. The exit code
 /// is 0 where all that was asked for is the same, 1 otherwise. Solvers of puzzles are run again by `eval --again`.
 #[derive(clap::Args)]
@@ -28,6 +33,7 @@ const RERUNS: &str = "runs/rerun";
   actrm-zoo rerun lift-act@1 --protocol lift-v1 --data lift.hdf5
   actrm-zoo rerun lift-act@1 --protocol lift-v1 --block dev --skip-training --episodes 10
   actrm-zoo rerun stack-act@1_Stack_40000-40199_c839488e
+  actrm-zoo rerun stack-act-s1 --protocol stack-v1 --collect
   actrm-zoo rerun my-act --work /tmp/again --json")]
 pub struct Args {
     /// Result: its folder's name, or its entry (`name`, `name@version`) where that has one, or one is chosen below
@@ -47,6 +53,9 @@ pub struct Args {
     /// Demonstrations: an HDF5 file or a LeRobotDataset folder, where they are not at the experiment's path
     #[arg(long, value_name = "PATH")]
     data: Option<PathBuf>,
+    /// Collect the demonstrations again, with the seeds that the entry names, also where the experiment's path has some
+    #[arg(long, conflicts_with_all = ["data", "skip_training"])]
+    collect: bool,
     /// Folder of the work [default: runs/rerun/ENTRY@VERSION-HASH]
     #[arg(long, value_name = "DIR")]
     work: Option<PathBuf>,
@@ -123,11 +132,77 @@ fn again(args: &Args, rerun: &Rerun, stop: &Stop, report: &mut Report) -> anyhow
 }
 
 fn retrained(args: &Args, rerun: &Rerun, stop: &Stop, report: &mut Report) -> anyhow::Result<Retrained> {
-    let how = Retraining { data: args.data.clone(), image_memory: args.image_memory };
+    let usual = rerun.usual_demonstrations()?.is_some_and(|path| path.exists());
+    let data = match &args.data {
+        Some(path) => Some(path.clone()),
+        None if usual && !args.collect => None,
+        None => match collected(args, rerun, stop)? {
+            Collection::There(path) => Some(path),
+            Collection::Unknown if args.collect => anyhow::bail!(
+                "--collect: {}: its demonstrations are not known to be a scripted expert's; --data names them",
+                rerun.entry().id()
+            ),
+            Collection::Unknown => None,
+            Collection::Stopped => return Ok(Retrained::Stopped { step: 0 }),
+        },
+    };
+    let how = Retraining { data, image_memory: args.image_memory };
     let mut screen = Screen::new();
     let outcome = rerun.retrain(&how, &|| stop.asked(), &mut |event| show(&event, &mut screen, stop), report);
     drop(screen);
     outcome.with_context(|| format!("training {} again", rerun.entry().id()))
+}
+
+/// The demonstrations of an entry, collected again.
+enum Collection {
+    There(PathBuf),
+    /// Nothing says that they came from a collection.
+    Unknown,
+    Stopped,
+}
+
+/// Collects what the entry was trained on once more: a collection is told by the seeds of its demonstrations, which begin at a
+/// multiple of [`CollectOptions::SEED_STRIDE`]. Whether they are the same ones, their fingerprint says later.
+fn collected(args: &Args, rerun: &Rerun, stop: &Stop) -> anyhow::Result<Collection> {
+    let meta = rerun.entry().meta();
+    let Some((data, seeds)) = meta.data.as_ref().and_then(|data| Some((data, data.seeds?))) else {
+        return Ok(Collection::Unknown);
+    };
+    let seed = seeds.start / CollectOptions::SEED_STRIDE;
+    if seed == 0 || seeds.start % CollectOptions::SEED_STRIDE + seeds.count > CollectOptions::SEED_STRIDE {
+        return Ok(Collection::Unknown);
+    }
+    let out = rerun.work().join(DEMONSTRATIONS);
+    if out.exists() {
+        return Ok(Collection::There(out));
+    }
+    let episodes = data.train_episodes + data.valid_episodes;
+    std::fs::create_dir_all(rerun.work()).with_context(|| format!("cannot create {}", shown(rerun.work())))?;
+    let environment = Environment::of(meta, None, None)?;
+    cli::note(&format!("demonstrations: {episodes} of {}'s expert again, seed {seed}", environment.task));
+    let options = CollectOptions {
+        out: out.clone(),
+        episodes,
+        seed,
+        env_module: environment.env_module.clone(),
+        next_obs: false,
+        gzip: None,
+    };
+    let spec = worker(&environment, &args.simulator, Control::Compiled)?;
+    let Some(mut pool) = args.simulator.start(spec, None, stop)? else { return Ok(Collection::Stopped) };
+    let mut screen = Screen::new();
+    screen.begin(format!("collecting {}", environment.task), episodes);
+    let end = collect(&mut pool, &options, &mut |progress| {
+        if let CollectProgress::Demos(demos) = progress {
+            screen.at(demos);
+        }
+    });
+    drop(screen);
+    cli::close(pool);
+    match end.with_context(|| format!("collecting the demonstrations of {}", rerun.entry().id()))? {
+        CollectEnd::Written(_) => Ok(Collection::There(out)),
+        CollectEnd::Stopped(_) => Ok(Collection::Stopped),
+    }
 }
 
 fn episodes(args: &Args, rerun: &Rerun, entry: &Entry, stop: &Stop, report: &mut Report) -> anyhow::Result<bool> {

@@ -1,6 +1,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use anyhow::Context;
 use cli::{INTERRUPTED, Screen, Stop, shown};
 use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, StudyRow, run_study, study_page};
 use study::robots::{CellResult, RobotEvent, RobotStudyRequest, Study, robot_page, run_robot_study};
@@ -22,6 +23,8 @@ const GOES_ON: &str = "stopped; the same command goes on where it was";
   actrm-zoo study studies/thinking.toml --jobs 2
   actrm-zoo study studies/thinking.toml --stage 1
   actrm-zoo study studies/thinking.toml --page-only
+  actrm-zoo study studies/zoo.toml --only act-on-lift
+  actrm-zoo study studies/zoo.toml --cell act-on-lift-seed1
   actrm-zoo study --page docs/puzzles.md
   actrm-zoo study --only trm_dfs10 --only trm_open8 --seeds 1
   actrm-zoo study --page-only --page docs/puzzles.md
@@ -45,6 +48,12 @@ pub struct Args {
     /// Only this experiment (of robot policies: cells whose name holds this); may be repeated
     #[arg(long, value_name = "EXPERIMENT")]
     only: Vec<String>,
+    /// Only this cell, by its whole name in --list; may be repeated: no page is written, so that many machines can share a study
+    #[arg(long = "cell", value_name = "CELL", requires = "study", conflicts_with_all = ["only", "page_only", "stage"])]
+    cells: Vec<String>,
+    /// Only collect the demonstrations, of a study of robot policies
+    #[arg(long, requires = "study", conflicts_with = "page_only")]
+    data_only: bool,
     /// Only what was planned up to this stage, of a study of robot policies
     #[arg(long, value_name = "N", requires = "study")]
     stage: Option<u8>,
@@ -129,7 +138,9 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
             library: args.configs.library()?,
             work: args.work.join(file.file_stem().unwrap_or_default()),
             only: args.only.clone(),
+            cells: args.cells.clone(),
             stage: args.stage,
+            data_only: args.data_only,
             jobs: usize::from(args.jobs),
             python: rollout::find_python(args.python.as_deref())?,
             stop: stop.flag(),
@@ -154,8 +165,13 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
         drop(screen);
         printed?;
     }
-    write_atomic(&study.page, robot_page(&study, file)?.as_bytes())?;
-    cli::print(&(shown(&study.page) + "\n"))?;
+    if args.cells.is_empty() && !args.data_only {
+        if let Some(folder) = study.page.parent() {
+            std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", shown(folder)))?;
+        }
+        write_atomic(&study.page, robot_page(&study, file)?.as_bytes())?;
+        cli::print(&(shown(&study.page) + "\n"))?;
+    }
     if !whole {
         cli::note(GOES_ON);
         return Ok(ExitCode::from(INTERRUPTED));
