@@ -555,6 +555,46 @@ def evaluate_on_ray(root: Path, folder: Path) -> str:
     return shown.splitlines()[-1].split(" (")[0]
 
 
+STUDY = """
+title = "Small"
+results = "results"
+page = "page.md"
+zoo = "zoo"
+[data.lift]
+task = "Lift"
+episodes = 3
+[arms.act]
+label = "ACT"
+experiment = "act_{data}"
+set = ["train.steps=3", "train.batch_size=4", "policy.dim_model=16", "rollout.max_steps=3"]
+[tests.lift]
+task = "Lift"
+episodes = 2
+seed_start = 40000
+[[cells]]
+arms = ["act"]
+data = "lift"
+seeds = 2
+tests = ["lift"]
+"""
+
+
+def study_on_ray(folder: Path) -> str:
+    """The driver for Ray: cells of a study on a cluster of two cores, and the page of them all."""
+    folder.mkdir()
+    (folder / "study.toml").write_text(STUDY)
+    driver = [sys.executable, ROOT / "tools" / "cluster" / "ray_study.py", "study.toml", "--program", BIN / "actrm-zoo"]
+    os.environ.setdefault("ACTRM_PYTHON", str(ROOT / ".venv" / "bin" / "python"))
+    command = [*map(str, driver), "--", "--work", "work"]
+    done = subprocess.run(command, cwd=folder, text=True, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert all(f"act-on-lift-seed{seed}: ok" in done.stdout for seed in (1, 2)), done.stdout
+    assert sorted(path.name for path in (folder / "zoo").iterdir()) == ["lift-act-s1", "lift-act-s2", "results"]
+    page = (folder / "page.md").read_text()
+    assert "0, 0 of 2" in page and "Not run" not in page, page
+    return "2 cells, one page"
+
+
 def main() -> None:
     """Run every check; the first difference ends it."""
     python_door.install()
@@ -612,6 +652,7 @@ def main() -> None:
             "LeRobot opens edited sets of its own": lambda: edit_theirs(folder, "image"),
             "LeRobot opens them with its own videos": lambda: edit_theirs(folder, "video"),
             "shards on a Ray cluster make one evaluation": lambda: evaluate_on_ray(root, folder / "ray"),
+            "cells of a study run on a Ray cluster": lambda: study_on_ray(folder / "ray-study"),
         }
         for title, check in checks.items():
             print(f"{title:<48} ", end="", flush=True)

@@ -2,9 +2,9 @@
 
     python tools/cluster/ray_study.py studies/zoo.toml -- --work /shared/study
 
-What follows `--` are arguments of `actrm-zoo study`. The folders that the study names, and that of --work, must lie on a
-file system that all nodes see. What has a result is not run again; a cell whose node dies is run again by Ray and goes on
-where it was. Needs the package `ray`, on this machine and the nodes (tried with 2.51.1).
+What follows `--` are arguments of `actrm-zoo study`. The folders that the study names, and that of --work, must lie on
+a file system that all nodes see. What has a result is not run again; a cell whose node dies is run again by Ray and
+goes on where it was. Needs the package `ray`, on this machine and the nodes (tried with 2.51.1).
 """
 
 import argparse
@@ -22,9 +22,11 @@ def main() -> int:
     parser.add_argument("--cpus", type=int, default=1, help="cores a cell (default: %(default)s)")
     parser.add_argument("--address", help="a running cluster; without it one is started on this machine")
     parser.add_argument("--program", default=os.environ.get("ACTRM_ZOO", "actrm-zoo"), help="actrm-zoo on the nodes")
-    parser.add_argument("arguments", nargs="*", metavar="ARGUMENT", help="arguments of `actrm-zoo study`, after `--`")
-    args = parser.parse_args()
-    base = [args.program, "study", args.study, *args.arguments]
+    parser.usage = "%(prog)s [OPTIONS] STUDY [-- ARGUMENTS OF actrm-zoo study]"
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    args = parser.parse_args(words[:cut])
+    base = [args.program, "study", args.study, *words[cut + 1 :]]
     listed = subprocess.run([args.program, "study", args.study, "--list"], capture_output=True, text=True)
     if listed.returncode:
         sys.stderr.write(listed.stderr)
