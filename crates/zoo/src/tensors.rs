@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use candle_core::{DType, Device, Tensor};
+use half::f16;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView, serialize};
 
@@ -47,12 +48,13 @@ fn raw(tensor: &Tensor) -> candle_core::Result<(Dtype, Vec<u8>)> {
         };
     }
     let bytes = match tensor.dtype() {
+        DType::F16 => bytes!(f16),
         DType::F32 => bytes!(f32),
         DType::F64 => bytes!(f64),
         DType::I64 => bytes!(i64),
         DType::U32 => bytes!(u32),
         DType::U8 => bytes!(u8),
-        other => candle_core::bail!("dtype {other:?} is not one of f32, f64, i64, u32, u8"),
+        other => candle_core::bail!("dtype {other:?} is not one of f16, f32, f64, i64, u32, u8"),
     };
     Ok((tensor.dtype().into(), bytes))
 }
@@ -88,13 +90,39 @@ fn tensor(view: &TensorView<'_>) -> candle_core::Result<Tensor> {
         }};
     }
     match view.dtype() {
+        // what is stored in half is computed with in full
+        Dtype::F16 => values!(f16)?.to_dtype(DType::F32),
         Dtype::F32 => values!(f32),
         Dtype::F64 => values!(f64),
         Dtype::I64 => values!(i64),
         Dtype::U32 => values!(u32),
         Dtype::U8 => values!(u8),
-        other => candle_core::bail!("dtype {other:?} is not one of f32, f64, i64, u32, u8"),
+        other => candle_core::bail!("dtype {other:?} is not one of f16, f32, f64, i64, u32, u8"),
     }
+}
+
+/// Tensors with their 32-bit numbers rounded to 16 bits; `path` is named.
+///
+/// # Errors
+/// A number too large for 16 bits.
+pub fn halved(path: &Path, tensors: BTreeMap<String, Tensor>) -> Result<BTreeMap<String, Tensor>, ZooError> {
+    let half = |(name, tensor): (String, Tensor)| {
+        let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
+        if tensor.dtype() != DType::F32 {
+            return Ok((name, tensor));
+        }
+        let values = tensor.flatten_all().and_then(|flat| flat.to_vec1::<f32>());
+        let values = values.map_err(|e| malformed(format!("tensor `{name}`: {e}")))?;
+        if let Some(large) = values.into_iter().find(|value| value.abs() > f16::MAX.to_f32()) {
+            return Err(malformed(format!(
+                "tensor `{name}`: expected numbers up to {} for f16, found {large}",
+                f16::MAX
+            )));
+        }
+        let half = tensor.to_dtype(DType::F16).map_err(|e| malformed(format!("tensor `{name}`: {e}")))?;
+        Ok((name, half))
+    };
+    tensors.into_iter().map(half).collect()
 }
 
 /// Reads a safetensors file.
@@ -127,6 +155,28 @@ pub fn check_finite(path: &Path, tensors: &BTreeMap<String, Tensor>) -> Result<(
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+
+    #[test]
+    fn halves_are_rounded_once_and_come_back_in_full() {
+        let values = vec![0.1_f32, -1.0, 1e-9, 6e4, 0.333_333];
+        let tensor = Tensor::from_vec(values.clone(), 5, &Device::Cpu).unwrap();
+        let path = Path::new("x.safetensors");
+        let halves = |tensor: &Tensor| halved(path, BTreeMap::from([("w".to_owned(), tensor.clone())]));
+        let store = |tensor: &Tensor| to_bytes(path, &halves(tensor).unwrap(), &serde_json::Value::Null).unwrap();
+        let bytes = store(&tensor);
+        let back = from_bytes(path, &bytes).unwrap().0["w"].clone();
+        assert_eq!(back.dtype(), DType::F32);
+        for (value, stored) in values.iter().zip(back.to_vec1::<f32>().unwrap()) {
+            assert!((value - stored).abs() <= value.abs() / 2048.0 + 3e-8, "{value} {stored}");
+        }
+        assert_eq!(store(&back), bytes);
+        let large = Tensor::new(&[1e5_f32], &Device::Cpu).unwrap();
+        let refused = halves(&large).unwrap_err().to_string();
+        assert!(
+            refused.contains("x.safetensors: tensor `w`: expected numbers up to 65504 for f16, found 100000"),
+            "{refused}"
+        );
+    }
 
     #[test]
     fn tensors_come_back_and_bytes_repeat() {

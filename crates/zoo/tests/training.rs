@@ -77,6 +77,28 @@ fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
     assert!(policy.predict(&Observation::of_state(vec![0.1; 8], vec![0.1; 10])).is_err());
 }
 
+#[test]
+fn weights_in_half_are_half_the_size_and_act_as_they_are_stored() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let full = finish(&request(root.path(), &data, &[]));
+    let half = finish(&request(root.path(), &data, &["train.weights=f16"]));
+    let (a, b) = (model(&full).len() as f64, model(&half).len() as f64);
+    assert!(b < 0.6 * a && b > 0.45 * a, "{a} {b}");
+    let weights = |entry: &Entry| entry.load().unwrap().model().params().tensors();
+    let (full_weights, half_weights) = (weights(&full), weights(&half));
+    assert_eq!(full_weights.keys().collect::<Vec<_>>(), half_weights.keys().collect::<Vec<_>>());
+    let mut rounded = 0;
+    for (name, exact) in &full_weights {
+        let flat = |tensor: &candle_core::Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        for (exact, stored) in flat(exact).into_iter().zip(flat(&half_weights[name])) {
+            assert!((exact - stored).abs() <= exact.abs() / 2048.0 + 3e-8, "{name}: {exact} {stored}");
+            rounded += usize::from(exact != stored);
+        }
+    }
+    assert!(rounded > 100, "{rounded}");
+}
+
 /// Both kinds of policy, with two things cut out of `object` in place of the environment's state.
 #[test]
 fn entities_are_trained_on_sealed_and_asked_for_again() {

@@ -355,7 +355,11 @@ impl Training for PuzzleTraining<'_> {
             meta,
             metrics: None,
             command: None,
-            model: tensors::to_bytes(Path::new(zoo::entry::MODEL_FILE), &self.solver.tensors(), &about)?,
+            model: tensors::to_bytes(
+                Path::new(zoo::entry::MODEL_FILE),
+                &experiment.train.stored(self.solver.tensors())?,
+                &about,
+            )?,
             config: experiment.to_toml(),
             // tokens are not normalised: the file holds no statistic
             normaliser: tensors::to_bytes(

@@ -26,7 +26,7 @@ pub use folder::{COMMAND_FILE, RunFolder};
 pub use list::{FoundRun, RunState, list_runs};
 pub(crate) use loop_parts::same_settings;
 pub use metrics::{Metrics, MetricsRow};
-pub use section::{OptimiserKind, TrainSection};
+pub use section::{OptimiserKind, TrainSection, WeightsFormat};
 pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, finished_entry, run};
 pub use tensorboard::EventWriter;
 pub use training::{TrainRequest, train};

@@ -1,9 +1,14 @@
 //! `[train]`: the numbers of a training.
 
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use candle_core::Tensor;
 use models::{OptimiserConfig, Schedule, TrainConfig};
 use serde::{Deserialize, Serialize};
 
-use crate::ZooError;
+use crate::entry::MODEL_FILE;
+use crate::{ZooError, tensors};
 
 /// Which optimiser.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -13,6 +18,14 @@ pub enum OptimiserKind {
     Adamw,
     /// Adam with `atan2` in place of the quotient, as the official TRM.
     AdamAtan2,
+}
+
+/// How an entry stores its weights.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WeightsFormat {
+    /// Rounded to 16 bits (11 of them significant): half the size. What is evaluated is what is stored.
+    F16,
 }
 
 /// `[train]`
@@ -46,6 +59,9 @@ pub struct TrainSection {
     /// Decay of the moving average of the weights; absent: no average.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ema_decay: Option<f64>,
+    /// How an entry stores its weights; absent: as they were trained, in 32 bits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub weights: Option<WeightsFormat>,
     /// Steps between rows of metrics.
     pub log_every: u64,
     /// Steps between validations.
@@ -70,6 +86,7 @@ impl Default for TrainSection {
             grad_clip_norm: 10.0,
             accumulation: 1,
             ema_decay: None,
+            weights: None,
             log_every: 10,
             validate_every: 100,
             checkpoint_every: 250,
@@ -121,6 +138,17 @@ impl TrainSection {
             return invalid("ema_decay", "at least 0 and below 1", decay.to_string());
         }
         Ok(())
+    }
+
+    /// Weights as an entry stores them.
+    ///
+    /// # Errors
+    /// [`ZooError::Malformed`]: a weight that is too large for the format.
+    pub fn stored(&self, weights: BTreeMap<String, Tensor>) -> Result<BTreeMap<String, Tensor>, ZooError> {
+        match self.weights {
+            None => Ok(weights),
+            Some(WeightsFormat::F16) => tensors::halved(Path::new(MODEL_FILE), weights),
+        }
     }
 
     /// The part of it that the trainer wants.

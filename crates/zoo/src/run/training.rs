@@ -296,7 +296,7 @@ impl Training for PolicyTraining<'_> {
             versions: crate::versions(),
             files: BTreeMap::new(),
         };
-        let weights = self.evaluated.params().tensors();
+        let weights = experiment.train.stored(self.evaluated.params().tensors())?;
         let statistics = demonstrations
             .preprocess
             .normaliser()
