@@ -3,67 +3,97 @@
   const table = document.getElementById("all");
   if (!table) return;
   const body = table.tBodies[0];
-  const rows = [...body.rows];
-  const text = (cell) => cell.innerText.trim();
+  // rows as the page is written, and those after them: data until they are shown
+  const after = typeof rowsAfter === "undefined" ? [] : rowsAfter;
+  const size = after.length ? body.rows.length : Infinity;
+  const texts = (cell) => [...cell.childNodes].filter((node) => node.nodeName !== "BR").map((node) => node.textContent);
+  const rows = [...body.rows].map((row) => ({ row, id: row.id, ...row.dataset, cells: [...row.cells].map(texts) }));
+  rows.push(...after.map((data) => ({ ...data, row: null, cells: data.cells.map((cell) => cell.split("\n")) })));
+  const element = (one) => {
+    if (one.row) return one.row;
+    one.row = document.createElement("tr");
+    one.row.id = one.id;
+    one.cells.forEach(([first, ...others]) => {
+      const cell = one.row.insertCell();
+      cell.textContent = first;
+      others.forEach((other) => {
+        const small = document.createElement("small");
+        small.textContent = other;
+        cell.append(document.createElement("br"), small);
+      });
+    });
+    return one.row;
+  };
+  const shown = document.getElementById("shown");
+  const place = document.getElementById("place");
+  const [previous, next] = ["previous", "next"].map((id) => document.getElementById(id));
+  let fitting = rows;
+  let first = 0;
+  const show = (from) => {
+    first = from;
+    const seen = fitting.slice(first, first + size);
+    body.replaceChildren(...seen.map(element));
+    if (!place) return;
+    previous.disabled = first === 0;
+    next.disabled = first + size >= fitting.length;
+    place.textContent = seen.length ? `rows ${first + 1} to ${first + seen.length} of ${fitting.length}` : "";
+  };
+  if (place) {
+    previous.addEventListener("click", () => show(Math.max(0, first - size)));
+    next.addEventListener("click", () => show(first + size));
+  }
   const number = (value) => {
     const found = value.replace(/,/g, "").match(/^[-+]?\d+(\.\d+)?([kM])?/);
     if (!found) return NaN;
     return parseFloat(found[0]) * ({ k: 1e3, M: 1e6 }[found[2]] || 1);
   };
+  // filters
+  const filters = [...document.querySelectorAll("[data-filter]")];
+  const apply = () => {
+    const wanted = filters.map((filter) => [filter.dataset.filter, filter.value.trim()]).filter(([, value]) => value);
+    fitting = rows.filter((one) => wanted.every(([name, value]) =>
+      name === "text" ? one.cells[0].join("").toLowerCase().includes(value.toLowerCase()) : one[name] === value));
+    shown.textContent = `${fitting.length} of ${rows.length} rows`;
+    show(0);
+  };
+  filters.forEach((filter) => filter.addEventListener("input", apply));
+  document.querySelector("form.tools").addEventListener("submit", (event) => event.preventDefault());
   // sorting: a button in every heading
-  [...table.tHead.rows[0].cells].forEach((heading, column) => {
+  const compare = new Intl.Collator().compare;
+  const headings = [...table.tHead.rows[0].cells];
+  headings.forEach((heading, column) => {
     const button = document.createElement("button");
     button.type = "button";
     button.innerHTML = heading.innerHTML;
     heading.replaceChildren(button);
     button.addEventListener("click", () => {
       const down = heading.getAttribute("aria-sort") !== "descending";
-      [...table.tHead.rows[0].cells].forEach((other) => other.removeAttribute("aria-sort"));
+      headings.forEach((other) => other.removeAttribute("aria-sort"));
       heading.setAttribute("aria-sort", down ? "descending" : "ascending");
-      const keyed = rows.map((row) => {
-        const value = row.cells[column].textContent;
-        return { row, value, number: number(value) };
+      const keyed = rows.map((one) => {
+        const value = one.cells[column].join("");
+        return { one, value, number: number(value) };
       });
       const numbers = keyed.filter((key) => !Number.isNaN(key.number)).length * 2 > keyed.length;
       keyed.sort((a, b) => {
-        if (!numbers) return a.value.localeCompare(b.value);
+        if (!numbers) return compare(a.value, b.value);
         // what has no number stands last, either way
         const [x, y] = [a.number, b.number];
         if (Number.isNaN(x) || Number.isNaN(y)) return (Number.isNaN(x) - Number.isNaN(y)) * (down ? -1 : 1);
         return x - y;
       });
       if (down) keyed.reverse();
-      const sorted = document.createDocumentFragment();
-      keyed.forEach((key) => sorted.append(key.row));
-      body.append(sorted);
+      rows.splice(0, rows.length, ...keyed.map((key) => key.one));
+      apply();
     });
   });
-  // filters
-  const filters = [...document.querySelectorAll("[data-filter]")];
-  const shown = document.getElementById("shown");
-  const apply = () => {
-    let count = 0;
-    rows.forEach((row) => {
-      const fits = filters.every((filter) => {
-        const wanted = filter.value.trim();
-        if (!wanted) return true;
-        if (filter.dataset.filter === "text") return row.cells[0].textContent.toLowerCase().includes(wanted.toLowerCase());
-        return row.dataset[filter.dataset.filter] === wanted;
-      });
-      row.hidden = !fits;
-      count += fits ? 1 : 0;
-    });
-    shown.textContent = `${count} of ${rows.length} rows`;
-  };
-  filters.forEach((filter) => filter.addEventListener("input", apply));
-  document.querySelector("form.tools").addEventListener("submit", (event) => event.preventDefault());
   apply();
-  // what is seen, as CSV
+  // what fits the filters, as CSV
   const quoted = (value) => (/[",\n]/.test(value) ? `"${value.replace(/"/g, '""')}"` : value);
-  const line = (row) => [...row.cells].map((cell) => quoted(text(cell).replace(/\s*\n\s*/g, "; "))).join(",");
+  const line = (cells) => cells.map((cell) => quoted(cell.map((text) => text.trim()).join("; "))).join(",");
   document.getElementById("copy").addEventListener("click", async () => {
-    const seen = [...body.rows].filter((row) => !row.hidden);
-    const csv = [table.tHead.rows[0], ...seen].map(line).join("\n") + "\n";
+    const named = headings.map((heading) => texts(heading.firstChild));
+    const csv = [named, ...fitting.map((one) => one.cells)].map(line).join("\n") + "\n";
     try {
       await navigator.clipboard.writeText(csv);
     } catch {
@@ -75,13 +105,22 @@
       document.execCommand("copy");
       area.remove();
     }
-    shown.textContent = `${seen.length} rows copied`;
+    shown.textContent = `${fitting.length} rows copied`;
   });
-  // a link to a row opens its details
+  // a link to a row opens its details, or turns to it
   const open = () => {
     const name = decodeURIComponent(location.hash.slice(1));
     const details = document.getElementById(`details-${name}`) || document.getElementById(name);
     if (details instanceof HTMLDetailsElement) details.open = true;
+    const linked = rows.find((one) => one.id === name);
+    if (!linked || linked.row?.isConnected) return;
+    if (!fitting.includes(linked)) {
+      filters.forEach((filter) => { filter.value = ""; });
+      apply();
+    }
+    show(Math.floor(fitting.indexOf(linked) / size) * size);
+    rows.forEach((one) => one.row?.classList.toggle("linked", one === linked));
+    linked.row.scrollIntoView({ block: "center" });
   };
   addEventListener("hashchange", open);
   open();

@@ -24,8 +24,14 @@ pub struct Curve {
 /// Rows whose episodes, curves and origin are drawn; a page with ten thousand of them would be of no use.
 const MOST_DETAILED: usize = 200;
 
-/// Rows of a task that stand in its chart of intervals.
+/// Rows of a task that stand in its charts.
 const MOST_DRAWN: usize = 60;
+
+/// Rows in the charts of all tasks together: where there are many tasks, each has fewer, and the last may have none.
+const MOST_DRAWN_IN_ALL: usize = 1500;
+
+/// Rows that the table shows at once. Those after them are data in the script, and become elements when they are shown.
+const ROWS_AT_ONCE: usize = 500;
 
 /// The report over ranked rows as HTML, and after them `section`: HTML of other evaluations, or nothing.
 pub fn to_html(rows: &[LeaderboardRow], curves: &[Curve], section: &str) -> String {
@@ -56,9 +62,9 @@ pub fn to_html(rows: &[LeaderboardRow], curves: &[Curve], section: &str) -> Stri
         html.push_str(&all_rows(rows));
         contents(&groups, section, &mut html);
     }
-    let mut left = MOST_DETAILED;
+    let mut room = Room::for_groups(groups.len());
     for rows in groups.values() {
-        task(rows, curves, &mut left, &mut html);
+        task(rows, curves, &mut room, &mut html);
     }
     html.push_str(section);
     let _ = writeln!(
@@ -66,8 +72,9 @@ pub fn to_html(rows: &[LeaderboardRow], curves: &[Curve], section: &str) -> Stri
         "<footer>Intervals are 95%: Wilson's for one training; for several a bootstrap over trainings and episodes. Ranks go \
          by the lower end. Letters and ranges of ranks: exact McNemar tests on equal seeds (Barnard's on others, a bootstrap \
          between families), Holm's correction over the whole table. Made by <code>actrm-zoo leaderboard</code> {} from the \
-         results in the zoo; nothing here is loaded from elsewhere.</footer>\n</main>\n<script>\n{}</script>\n</body>\n</html>",
+         results in the zoo; nothing here is loaded from elsewhere.</footer>\n</main>\n{}<script>\n{}</script>\n</body>\n</html>",
         env!("CARGO_PKG_VERSION"),
+        rows_after(rows),
         include_str!("page.js")
     );
     html
@@ -121,7 +128,29 @@ fn overview(rows: &[LeaderboardRow]) -> String {
     html
 }
 
-/// Every row, with what filters and sorts them.
+/// The rows after those that the table is written with, as data: their cells as text, and what links and filters ask for.
+fn rows_after(rows: &[LeaderboardRow]) -> String {
+    let Some(after) = rows.get(ROWS_AT_ONCE..).filter(|after| !after.is_empty()) else { return String::new() };
+    let shown: Vec<_> = COLUMNS.iter().filter(|column| column.page_heading().is_some()).collect();
+    let data: Vec<serde_json::Value> = after
+        .iter()
+        .map(|row| {
+            let cells: Vec<String> = shown.iter().map(|column| column.shown(row)).collect();
+            serde_json::json!({
+                "id": anchor(row),
+                "task": row.task(),
+                "policy": row.policy(),
+                "protocol": row.protocol_text(),
+                "cells": cells,
+            })
+        })
+        .collect();
+    // nothing in a script may look like its end
+    let data = serde_json::Value::from(data).to_string().replace('<', "\\u003c");
+    format!("<script>\nconst rowsAfter = {data};\n</script>\n")
+}
+
+/// The rows that the table is written with, with what filters, sorts and turns to the others.
 fn all_rows(rows: &[LeaderboardRow]) -> String {
     let choice = |name: &str, of: &dyn Fn(&LeaderboardRow) -> String| {
         let mut values: Vec<String> = rows.iter().map(of).collect();
@@ -144,12 +173,26 @@ fn all_rows(rows: &[LeaderboardRow]) -> String {
     format!(
         "<h2 id=\"rows\">All rows</h2>\n<form class=\"tools\" role=\"search\" aria-label=\"Filter rows\">\n{}{}{}<label>entry \
          <input type=\"search\" data-filter=\"text\" placeholder=\"any\"></label>\n<button type=\"button\" id=\"copy\">Copy \
-         as CSV</button>\n<output id=\"shown\" aria-live=\"polite\"></output>\n</form>\n<div class=\"card\" role=\"region\" \
+         as CSV</button>\n<output id=\"shown\" aria-live=\"polite\"></output>\n</form>\n{}<div class=\"card\" role=\"region\" \
          aria-label=\"All rows\" tabindex=\"0\">{}</div>\n",
         choice("task", &|row| row.task().to_owned()),
         choice("policy", &|row| row.policy().to_owned()),
         choice("protocol", &LeaderboardRow::protocol_text),
-        html::table_of(COLUMNS, rows, "all", &attributes)
+        turning(rows.len()),
+        html::table_of(COLUMNS, &rows[..rows.len().min(ROWS_AT_ONCE)], "all", &attributes)
+    )
+}
+
+/// What turns to the next rows of the table; nothing where it shows them all.
+fn turning(rows: usize) -> String {
+    if rows <= ROWS_AT_ONCE {
+        return String::new();
+    }
+    format!(
+        "<noscript><p class=\"lead\">The first {ROWS_AT_ONCE} of {rows} rows; leaderboard.csv has all.</p></noscript>\n\
+         <div class=\"tools\" role=\"group\" aria-label=\"Turn to other rows\"><button type=\"button\" \
+         id=\"previous\">Previous</button><button type=\"button\" id=\"next\">Next</button><output id=\"place\" \
+         aria-live=\"polite\"></output></div>\n"
     )
 }
 
@@ -165,8 +208,25 @@ fn contents(groups: &BTreeMap<(String, String, String), Vec<&LeaderboardRow>>, s
     html.push_str("</ul></nav>\n");
 }
 
+/// What may still be drawn: a page with everything of ten thousand results would be of no use.
+struct Room {
+    /// Rows that a task's charts may have.
+    each: usize,
+    /// Rows that all charts to come may have.
+    drawn: usize,
+    /// Rows to come that may have details.
+    detailed: usize,
+}
+
+impl Room {
+    fn for_groups(groups: usize) -> Self {
+        let each = (MOST_DRAWN_IN_ALL / groups.max(1)).clamp(10, MOST_DRAWN);
+        Self { each, drawn: MOST_DRAWN_IN_ALL, detailed: MOST_DETAILED }
+    }
+}
+
 /// A task under one protocol: its chart, what success costs, and each row's details while there is room.
-fn task(rows: &[&LeaderboardRow], curves: &[Curve], left: &mut usize, html: &mut String) {
+fn task(rows: &[&LeaderboardRow], curves: &[Curve], room: &mut Room, html: &mut String) {
     let _ = writeln!(
         html,
         "<section>\n<h2 id=\"{}\">{}</h2>\n<p class=\"lead\">Protocol <code>{}</code></p>",
@@ -174,23 +234,25 @@ fn task(rows: &[&LeaderboardRow], curves: &[Curve], left: &mut usize, html: &mut
         escape(rows[0].task()),
         escape(&rows[0].protocol_text())
     );
-    let drawn = &rows[..rows.len().min(MOST_DRAWN)];
+    let drawn = &rows[..rows.len().min(room.each).min(room.drawn)];
+    room.drawn -= drawn.len();
     let more = match rows.len() - drawn.len() {
         0 => String::new(),
+        all if drawn.is_empty() => format!("<p class=\"lead\">{all} rows in the table above</p>"),
         more => format!("<p class=\"lead\">and {more} more rows in the table above</p>"),
     };
-    let _ = writeln!(html, "{}{more}", card("Success rates with their intervals", &charts::intervals(drawn)));
-    if rows.len() > 1 {
+    if !drawn.is_empty() {
+        html.push_str(&card("Success rates with their intervals", &charts::intervals(drawn)));
+    }
+    let _ = writeln!(html, "{more}");
+    if drawn.len() > 1 {
         let costs = charts::costs(drawn);
         let _ = writeln!(html, "{}", card("Success against what it costs", &costs));
     }
-    for row in rows {
-        if *left == 0 {
-            break;
-        }
-        *left -= 1;
+    for row in rows.iter().take(room.detailed) {
         details(row, curves, html);
     }
+    room.detailed = room.detailed.saturating_sub(rows.len());
     html.push_str("</section>\n");
 }
 
@@ -405,7 +467,17 @@ mod tests {
         let html = to_html(&rows, &[], "");
         let took = begin.elapsed();
         assert_eq!(rows.len(), 10_000);
-        assert!(html.len() < 40_000_000, "{} bytes", html.len());
+        assert!(html.len() < 12_000_000, "{} bytes", html.len());
         assert!(took.as_secs_f64() < 15.0, "{took:?}");
+        // what a browser has to build, however many rows there are
+        let elements = |html: &str| html.split('<').skip(1).filter(|tag| tag.starts_with(char::is_alphabetic)).count();
+        let all = elements(&html);
+        assert!(all < 80_000, "{all} elements");
+        let table = html.split("<table id=\"all\">").nth(1).unwrap().split("</table>").next().unwrap();
+        assert_eq!(table.matches("<tr").count(), 1 + ROWS_AT_ONCE);
+        // and nothing is left out
+        let names: Vec<String> = rows.iter().map(anchor).collect();
+        assert!(names[..ROWS_AT_ONCE].iter().all(|name| html.contains(&format!("<tr id=\"{name}\""))));
+        assert!(names[ROWS_AT_ONCE..].iter().step_by(97).all(|name| html.contains(&format!("\"id\":\"{name}\""))));
     }
 }

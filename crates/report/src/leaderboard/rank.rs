@@ -24,8 +24,11 @@ pub struct Reading {
 /// Evaluations of one family under the same protocol on the same seeds are one row. A row whose seeds and trainings are all
 /// in another one is left out, unless they are the block of a named protocol.
 pub fn rank(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<LeaderboardRow> {
-    let mut rows = without_parts(joined(evaluations, reading));
-    rows.sort_by(order);
+    let rows = without_parts(joined(evaluations, reading));
+    // a group's name holds a hash: made once a row, not at every comparison
+    let mut grouped: Vec<_> = rows.into_iter().map(|row| (group(&row), row)).collect();
+    grouped.sort_by(|(one_group, one), (two_group, two)| one_group.cmp(two_group).then_with(|| order(one, two)));
+    let mut rows: Vec<LeaderboardRow> = grouped.into_iter().map(|(_, row)| row).collect();
     let mut place = 0;
     for at in 0..rows.len() {
         let before = at.checked_sub(1).map(|at| &rows[at]).filter(|before| group(before) == group(&rows[at]));
@@ -108,13 +111,12 @@ fn compare_all(rows: &mut [LeaderboardRow]) {
     }
 }
 
-/// Best first: by what the success rate is at least, so that 1 of 1 does not come before 199 of 200. Bounds stand around
-/// the others, too few episodes come last; ties by what does not change.
+/// Best first inside a group: by what the success rate is at least, so that 1 of 1 does not come before 199 of 200. Bounds
+/// stand around the others, too few episodes come last; ties by what does not change.
 fn order(one: &LeaderboardRow, two: &LeaderboardRow) -> Ordering {
     let seeds = |row: &LeaderboardRow| (row.record().seeds.start, row.record().seeds.count);
-    group(one)
-        .cmp(&group(two))
-        .then(one.too_few().cmp(&two.too_few()))
+    one.too_few()
+        .cmp(&two.too_few())
         .then(two.interval.0.total_cmp(&one.interval.0))
         .then(two.counts.episodes.cmp(&one.counts.episodes))
         .then_with(|| one.record().entry.cmp(&two.record().entry))
