@@ -1,6 +1,9 @@
 //! What the end-to-end tests share: where the programs and the shipped demonstrations are, how a program is run and how
 //! its refusal is checked. The tests themselves lie in `tests/tests/`; each drives the real binaries.
 
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+pub mod faults;
+
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;

@@ -1,4 +1,4 @@
-//! SIGKILL at any time during a training, an evaluation, a leaderboard or an edit: nothing is left that cannot be read, and the same
+//! SIGKILL at any time during a training, an evaluation, a study, a leaderboard or an edit: nothing is left that cannot be read, and the same
 //! command goes on to the same bytes. `ACTRM_KILLS=100` for more than a few of each.
 
 use std::fs;
@@ -68,9 +68,9 @@ fn a_killed_training_goes_on_to_the_same_bytes() {
     };
     let straight = at("straight");
     let takes = timed(&mut train(&straight));
+    let mut died = 0;
     for k in 0..kills() {
         let folder = at(&format!("killed-{k}"));
-        let mut died = 0;
         for again in 0..3 {
             died += u32::from(killed(&mut train(&folder), takes, spread(3 * k + again)));
             // whatever is there can be listed and read
@@ -82,6 +82,7 @@ fn a_killed_training_goes_on_to_the_same_bytes() {
         assert_eq!(listing(&folder.join("zoo")), ["lift-act-s1", "lift-act-s2"]);
         fs::remove_dir_all(folder).expect("removable");
     }
+    println!("train: {died} of {} killed", 3 * kills());
 }
 
 #[test]
@@ -99,15 +100,89 @@ fn a_killed_evaluation_goes_on_to_the_same_bytes() {
     };
     let straight = entries.join("straight");
     let takes = timed(&mut eval(&straight));
+    let mut died = 0;
     for k in 0..kills() {
         let results = entries.join(format!("killed-{k}"));
         for again in 0..2 {
-            killed(&mut eval(&results), takes, spread(2 * k + again));
+            died += u32::from(killed(&mut eval(&results), takes, spread(2 * k + again)));
         }
         succeeds(&mut eval(&results));
         assert_eq!(outcomes(&results), outcomes(&straight));
         succeeds(&mut zoo(["verify", "--zoo", text(&entries), "--results", text(&results)]));
+        fs::remove_dir_all(results).expect("removable");
     }
+    println!("eval: {died} of {} killed", 2 * kills());
+}
+
+/// A study of one small policy: five demonstrations from the expert, a training, three episodes; with `demonstrations`
+/// that are there already, it begins with the training.
+fn study(folder: &Path, demonstrations: Option<&Path>) -> Command {
+    let (results, page) = (folder.join("results"), folder.join("page.md"));
+    let file = folder.join("small.toml");
+    let settings = ["train.steps=40", "train.checkpoint_every=7", "train.batch_size=8", "policy.dim_model=32"];
+    let definition = format!(
+        "title = \"Small\"\nresults = {results:?}\npage = {page:?}\n[data.lift]\ntask = \"Lift\"\nepisodes = 5\n\
+         [arms.act]\nlabel = \"ACT\"\nexperiment = \"act_lift\"\nset = {settings:?}\n\
+         [tests.lift]\ntask = \"Lift\"\nepisodes = 3\nseed_start = 40000\n\
+         [[cells]]\narms = [\"act\"]\ndata = \"lift\"\nseeds = 1\ntests = [\"lift\"]\n"
+    );
+    fs::write(&file, definition).expect("writable");
+    if let Some(from) = demonstrations {
+        let to = folder.join("work/small/data");
+        fs::create_dir_all(&to).expect("creatable");
+        fs::copy(from, to.join("lift-5-seed1.hdf5")).expect("copied");
+    }
+    let mut command = zoo(["study", text(&file), "--work", text(&folder.join("work"))]);
+    command.env("RAYON_NUM_THREADS", "1");
+    command
+}
+
+/// All that a study has made and that no clock decides: demonstrations, weights and outcomes.
+fn studied(folder: &Path) -> (Vec<u8>, Vec<u8>, serde_json::Value) {
+    let read = |path: PathBuf| fs::read(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let work = folder.join("work/small");
+    let entries: Vec<String> = listing(&work.join("zoo")).into_iter().filter(|name| name.starts_with("act")).collect();
+    assert_eq!(entries.len(), 1, "{entries:?}");
+    assert_eq!(listing(&folder.join("results")), ["act-on-lift-seed1_lift.json"]);
+    let result = read(folder.join("results/act-on-lift-seed1_lift.json"));
+    let mut result: serde_json::Value = serde_json::from_slice(&result).expect("JSON");
+    result["query_ms"] = 0.into();
+    result["training"]["minutes"] = 0.into();
+    assert!(folder.join("page.md").is_file());
+    let weights = read(work.join("zoo").join(&entries[0]).join("1/model.safetensors"));
+    (read(work.join("data/lift-5-seed1.hdf5")), weights, result)
+}
+
+#[test]
+fn a_killed_study_goes_on_to_the_same_bytes() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let at = |name: &str| -> PathBuf {
+        let path = folder.path().join(name);
+        fs::create_dir_all(&path).expect("creatable");
+        path
+    };
+    let straight = at("straight");
+    let whole = timed(&mut study(&straight, None));
+    let demonstrations = straight.join("work/small/data/lift-5-seed1.hdf5");
+    let trained = at("trained");
+    let takes = [whole, timed(&mut study(&trained, Some(&demonstrations)))];
+    assert_eq!(studied(&trained), studied(&straight));
+    let (mut died, mut begun) = (0, 0);
+    for k in 0..kills().div_ceil(3) {
+        let folder = at(&format!("killed-{k}"));
+        // every other one begins with the training
+        let demonstrations = (k % 2 == 1).then_some(&*demonstrations);
+        for again in 0..3 {
+            begun += 1;
+            let takes = takes[(k % 2) as usize];
+            died += u32::from(killed(&mut study(&folder, demonstrations), takes, spread(3 * k + again)));
+            succeeds(&mut zoo(["verify", "--zoo", text(&folder.join("work/small/zoo"))]));
+        }
+        succeeds(&mut study(&folder, demonstrations));
+        assert_eq!(studied(&folder), studied(&straight), "after {died} kills");
+        fs::remove_dir_all(folder).expect("removable");
+    }
+    println!("study: {died} of {begun} killed");
 }
 
 #[test]
@@ -123,18 +198,20 @@ fn a_killed_leaderboard_leaves_whole_files() {
     let files = || ["leaderboard.csv", "report.html"].map(|name| fs::read(out.join(name)).unwrap_or_default());
     let takes = timed(&mut board());
     let whole = files();
+    let mut died = 0;
     for k in 0..2 * kills() {
         // over old files, and where there are none
         if k % 2 == 0 {
             fs::remove_dir_all(&out).expect("removable");
         }
-        killed(&mut board(), takes, spread(k));
+        died += u32::from(killed(&mut board(), takes, spread(k)));
         for (found, expected) in files().iter().zip(&whole) {
             assert!(found == expected || (k % 2 == 0 && found.is_empty()), "half a file");
         }
         succeeds(&mut board());
         assert_eq!(files(), whole);
     }
+    println!("leaderboard: {died} of {} killed", 2 * kills());
 }
 
 #[test]

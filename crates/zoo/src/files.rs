@@ -9,6 +9,9 @@ use sha2::{Digest, Sha256};
 
 use crate::ZooError;
 
+/// How names begin of what is not finished.
+const TEMPORARY: &str = ".tmp-";
+
 /// Lower-case hexadecimal SHA-256 of `bytes`.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
@@ -81,7 +84,7 @@ pub(crate) fn new_folder(out: &Path, fill: impl FnOnce(&Path) -> Result<(), ZooE
         return Err(ZooError::io("create folder", out)(std::io::ErrorKind::AlreadyExists.into()));
     }
     let staging = tempfile::Builder::new()
-        .prefix(".tmp-")
+        .prefix(TEMPORARY)
         .permissions(mode(0o755))
         .tempdir_in(parent)
         .map_err(ZooError::io("create a temporary folder in", parent))?;
@@ -93,6 +96,22 @@ pub(crate) fn new_folder(out: &Path, fill: impl FnOnce(&Path) -> Result<(), ZooE
     sync_folder(parent)
 }
 
+/// Removes what killed writers have left in `folder`, where there is one. Only for whoever holds the folder's lock.
+pub(crate) fn sweep(folder: &Path) -> Result<(), ZooError> {
+    let items = match fs::read_dir(folder) {
+        Ok(items) => items,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        Err(error) => return Err(ZooError::io("read folder", folder)(error)),
+    };
+    for item in items {
+        let item = item.map_err(ZooError::io("read folder", folder))?;
+        if item.file_name().to_string_lossy().starts_with(TEMPORARY) && item.path().is_file() {
+            fs::remove_file(item.path()).map_err(ZooError::io("remove", item.path()))?;
+        }
+    }
+    Ok(())
+}
+
 fn parent(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
 }
@@ -101,7 +120,7 @@ fn parent(path: &Path) -> &Path {
 fn stage(path: &Path, bytes: &[u8]) -> Result<tempfile::NamedTempFile, ZooError> {
     let folder = parent(path);
     let mut file = tempfile::Builder::new()
-        .prefix(".tmp-")
+        .prefix(TEMPORARY)
         .permissions(mode(0o644))
         .tempfile_in(folder)
         .map_err(ZooError::io("create a temporary file in", folder))?;
@@ -188,6 +207,19 @@ mod tests {
         }
         assert_eq!(fs::read(at("b")).unwrap(), b"two");
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 3, "nothing else is left");
+    }
+
+    #[test]
+    fn what_killed_writers_left_is_swept_away() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in [".tmp-abc", ".hidden", "kept"] {
+            fs::write(folder.path().join(name), "x").unwrap();
+        }
+        sweep(folder.path()).unwrap();
+        sweep(&folder.path().join("nowhere")).unwrap();
+        let mut left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|item| item.unwrap().file_name()).collect();
+        left.sort();
+        assert_eq!(left, [".hidden", "kept"]);
     }
 
     #[test]

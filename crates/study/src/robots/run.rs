@@ -207,11 +207,12 @@ impl RobotStudyRequest {
 
     /// The newest entry called `name`, if it was trained with these settings.
     fn trained(&self, name: &str, settings: &str) -> Result<Option<Entry>, ZooError> {
-        let zoo = self.zoo();
-        if !zoo.join(name).exists() {
+        let zoo = Registry::open(&self.zoo());
+        // a folder of that name says nothing: whoever was killed while he made the entry leaves it, too
+        if !zoo.ids()?.iter().any(|id| id.name == name) {
             return Ok(None);
         }
-        let entry = Registry::open(&zoo).entry(name)?;
+        let entry = zoo.entry(name)?;
         let its = Experiment::from_toml(&entry.id().to_string(), &entry.config_text()?)?;
         Ok((settings_hash(&its) == settings).then_some(entry))
     }

@@ -11,7 +11,7 @@ use super::record::{EpisodeRecord, EpisodeTiming, EvaluationRecord};
 use super::seal::{SEAL_FILE, seal_of};
 use super::tables;
 use crate::ZooError;
-use crate::files::{sync_folder, write_atomic};
+use crate::files::{sweep, sync_folder, write_atomic};
 
 pub(crate) const RECORD: &str = "evaluation.json";
 pub(crate) const OUTCOMES: &str = "outcomes.parquet";
@@ -173,6 +173,7 @@ impl ResultsFolder {
             Err(TryLockError::WouldBlock) => return Err(ZooError::ResultsBusy { folder }),
             Err(TryLockError::Error(error)) => return Err(ZooError::io("lock", &path)(error)),
         }
+        sweep(&folder)?;
         if folder.join(RECORD).exists() {
             let found = read_record(&folder)?;
             // the folder's name pins what decides outcomes; the rest is the entry's story, which may

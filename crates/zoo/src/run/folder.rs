@@ -4,6 +4,7 @@ use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use crate::ZooError;
+use crate::files::sweep;
 
 /// In a run's folder: the command that goes on with it, for people.
 pub const COMMAND_FILE: &str = "command.txt";
@@ -87,7 +88,12 @@ impl RunFolder {
         let file_path = path.join("lock");
         let file = File::create(&file_path).map_err(ZooError::io("create", &file_path))?;
         match file.try_lock() {
-            Ok(()) => Ok(Self { path, _lock: file }),
+            Ok(()) => {
+                let folder = Self { path, _lock: file };
+                sweep(&folder.path)?;
+                sweep(&folder.checkpoints())?;
+                Ok(folder)
+            }
             Err(TryLockError::WouldBlock) => Err(ZooError::RunLocked { folder: path }),
             Err(TryLockError::Error(e)) => Err(ZooError::io("lock", file_path)(e)),
         }
