@@ -27,6 +27,7 @@ fn metrics_and_command_are_sealed_with_an_entry() {
         "entry.json",
         "model.safetensors",
         "normaliser.safetensors",
+        "reference.safetensors",
         "train.parquet",
     ];
     assert_eq!(listing(&folder), files);
@@ -36,7 +37,7 @@ fn metrics_and_command_are_sealed_with_an_entry() {
     assert!(!fs::read_to_string(folder.join("entry.json")).expect("text").contains("\"curve\""));
     let curves = said(&mut zoo(["curves", "lift-act", "--json", "--zoo", text(&entries)]));
     assert!(curves.contains("\"step\": 2") && curves.contains("valid_loss"), "{curves}");
-    for name in ["train.parquet", "command.txt"] {
+    for name in ["train.parquet", "command.txt", "reference.safetensors"] {
         let original = fs::read(folder.join(name)).expect("readable");
         let mut bytes = original.clone();
         bytes[7] ^= 1;

@@ -16,12 +16,16 @@ fn the_leaderboard_fits_80_columns_and_wide_shows_all() {
     let lines = screen(&written);
     let table: Vec<&String> = lines.iter().filter(|line| !line.contains(text(out))).collect();
     assert!(table.iter().all(|line| line.chars().count() <= 80), "{table:#?}");
-    for word in ["entry", "task", "success", "rate [95%]", "lift-act@1", "left out:", "--wide"] {
+    for word in ["entry", "protocol", "success", "rate [95%]", "lift-act@1", "left out:", "--wide"] {
         assert!(lines.iter().any(|line| line.contains(word)), "no {word}: {lines:#?}");
+    }
+    // blocks of seeds are told apart
+    for block in ["lift-v1 dev", "lift-v1 test"] {
+        assert_eq!(lines.iter().filter(|line| line.contains(block)).count(), 1, "{block}: {lines:#?}");
     }
     assert!(!lines[0].contains("demos"), "{}", lines[0]);
     let (wide, _) = in_terminal(80, &format!("{line} --wide"));
-    for word in ["protocol", "demos", "seeds", "params"] {
+    for word in ["task", "demos", "seeds", "params"] {
         assert!(wide.contains(word), "no {word}: {wide}");
     }
     assert!(!wide.contains("left out"), "{wide}");

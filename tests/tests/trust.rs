@@ -48,6 +48,25 @@ fn what_comes_with_the_repository_is_whole_to_the_last_value() {
 }
 
 #[test]
+fn an_entry_says_where_it_comes_from_and_answers_as_when_it_was_sealed() {
+    let (_folder, entries) = e2e::copied_zoo();
+    let verify = |more: &str| {
+        let said = succeeds(&mut zoo(["verify", "lift-act", more, "--zoo", text(&entries)]));
+        String::from_utf8(said.stdout).expect("text")
+    };
+    assert!(verify("--deep").contains("it gives the stored actions again, bit for bit"), "{}", verify("--deep"));
+    let entry = fs::read_to_string(entries.join("lift-act/1/entry.json")).expect("text");
+    let entry: serde_json::Value = serde_json::from_str(&entry).expect("JSON");
+    assert_eq!(entry["license"], "apache-2.0");
+    assert!(entry["training"]["machine"].as_str().is_some_and(|machine| machine.contains("cores, Linux")), "{entry}");
+    let (all, used) = (&entry["data"]["fingerprint"], &entry["data"]["train_fingerprint"]);
+    assert!(all != used && used.as_str().is_some_and(|hash| hash.len() == 64), "{entry}");
+    for key in ["actrm", "candle", "rustc", "target", "vectors"] {
+        assert!(entry["versions"][key].is_string(), "{key}: {entry}");
+    }
+}
+
+#[test]
 fn bad_files_stop_nothing_and_are_named() {
     let (_folder, entries) = shipped();
     succeeds(&mut zoo(["leaderboard", "--zoo", text(&entries)]));

@@ -103,6 +103,9 @@ fn an_entry_that_went_out_and_in_still_says_what_it_was_trained_on() {
     assert_eq!((&after.data, &after.training), (&before.data, &before.training));
     assert_eq!((&after.env_name, &after.env_version), (&before.env_name, &before.env_version));
     assert!(after.experiment.contains("act_lift, exported to LeRobot as lift-act@1"), "{}", after.experiment);
+    let parent = after.parent.as_ref().unwrap();
+    assert_eq!((parent.entry.as_str(), parent.content_sha256.as_str()), ("lift-act@1", &*before.content_sha256()));
+    assert_eq!(after.license(), "apache-2.0");
     let other_task = ImportOptions { task: "Stack".to_owned(), ..options() };
     let error = import(&out, &other_task, &zoo).unwrap_err().to_string();
     assert!(error.contains("--task") && error.contains("Lift"), "{error}");
@@ -113,6 +116,7 @@ fn an_entry_that_went_out_and_in_still_says_what_it_was_trained_on() {
     bytes[last] ^= 1;
     fs::write(&model, bytes).unwrap();
     let trained_further = again("further").meta().clone();
+    assert_eq!((&trained_further.parent, trained_further.license()), (&None, "unknown"));
     assert_eq!((trained_further.data, trained_further.training), (None, None));
     assert_eq!(trained_further.experiment, "imported from LeRobot");
 }

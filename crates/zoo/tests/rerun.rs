@@ -4,13 +4,17 @@
 
 mod common;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
+use candle_core::Tensor;
 use common::{SMALL, demonstrations};
 use rollout::Control;
 use zoo::config::Library;
-use zoo::entry::{CardWords, Entry, EntryDraft, EntryId, EntryMeta, training_facts};
+use zoo::entry::{
+    CardWords, Entry, EntryDraft, EntryId, EntryMeta, MODEL_FILE, REFERENCE_FILE, Repeats, training_facts,
+};
 use zoo::experiment::Experiment;
 use zoo::registry::Registry;
 use zoo::rerun::{Outcome, Report, Rerun, Retrained, Retraining, find_row};
@@ -19,6 +23,7 @@ use zoo::results::{
     StoredEvaluation,
 };
 use zoo::run::{TrainOutcome, TrainRequest, train};
+use zoo::tensors;
 
 fn trained(folder: &Path, data: &Path) -> Entry {
     let overrides: Vec<String> = SMALL.iter().map(|set| (*set).to_owned()).collect();
@@ -56,6 +61,7 @@ fn forged(entry: &Entry, zoo: &Path, config: &[(&str, &str)], story: impl Fn(&mu
         card: CardWords::default(),
         metrics: fs::read(entry.folder().join("train.parquet")).ok(),
         command: None,
+        reference: fs::read(entry.folder().join("reference.safetensors")).ok(),
     };
     Entry::open(zoo, &draft.seal(zoo).unwrap()).unwrap()
 }
@@ -123,6 +129,39 @@ fn rerun(zoo: &Path, work: &Path, data: &Path) -> (Rerun, Report) {
 fn step<'a>(report: &'a Report, name: &str) -> (Outcome, &'a str) {
     let step = report.steps().iter().find(|step| step.step == name).unwrap();
     (step.outcome, &step.told)
+}
+
+/// Weights that answer otherwise than those that the reference output is of.
+#[test]
+fn an_entry_whose_policy_answers_otherwise_than_when_it_was_sealed_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let entry = trained(folder.path(), &demonstrations(folder.path()));
+    let loaded = entry.load().unwrap();
+    assert_eq!(loaded.repeats().unwrap(), Repeats::Exactly);
+    let (mut contents, about) = tensors::read(&entry.folder().join(MODEL_FILE)).unwrap();
+    let changed = |contents: &BTreeMap<String, Tensor>| {
+        let draft = EntryDraft {
+            meta: entry.meta().clone(),
+            model: tensors::to_bytes(Path::new(MODEL_FILE), contents, &about).unwrap(),
+            config: entry.config_text().unwrap(),
+            normaliser: fs::read(entry.folder().join("normaliser.safetensors")).unwrap(),
+            card: CardWords::default(),
+            metrics: None,
+            command: None,
+            reference: fs::read(entry.folder().join(REFERENCE_FILE)).ok(),
+        };
+        let zoo = folder.path().join("changed");
+        Entry::open(&zoo, &draft.seal(&zoo).unwrap()).unwrap().load().unwrap().repeats()
+    };
+    // the last layer's bias: every action moves as far
+    let (name, bias) = contents.iter().find(|(name, _)| name.contains("action_head.bias")).unwrap();
+    let (name, bias) = (name.clone(), bias.clone());
+    contents.insert(name.clone(), (&bias + 1e-6).unwrap());
+    let Repeats::Within(far) = changed(&contents).unwrap() else { panic!("not the same bits") };
+    assert!(far > 0.0 && far < 1e-4, "{far}");
+    contents.insert(name, (&bias + 0.1).unwrap());
+    let error = changed(&contents).unwrap_err().to_string();
+    assert!(error.contains("reference output") && error.contains("lift-act@2"), "{error}");
 }
 
 #[test]

@@ -64,12 +64,18 @@ def run(requests: BinaryIO, replies: BinaryIO) -> int:
         return 1
     except Exception as error:
         traceback.print_exc()
-        wire.write_frame(replies, error_message("start_failed", f"{type(error).__name__}: {error}"))
+        wire.write_frame(replies, error_message("start_failed", f"{type(error).__name__}: {error} {place(error)}"))
         return 1
     try:
         return serve(simulation, requests, replies)
     except BrokenPipeError:
         return 1
+
+
+def place(error: BaseException) -> str:
+    """Where an error came from: a failed assertion of another library's says nothing else."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"({os.path.basename(frames[-1].filename)}:{frames[-1].lineno}, {frames[-1].name})" if frames else ""
 
 
 def arguments() -> argparse.Namespace:

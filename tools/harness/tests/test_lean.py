@@ -54,3 +54,17 @@ def test_a_slimmed_session_writes_its_model_again(kept: envs.Session) -> None:
     for model_file in ("", again.attrs["model_file"]):
         found = episodes.extract(kept, states, actions, model_file)
         assert found.attrs["model_file"].startswith("<mujoco")
+
+
+def test_a_mujoco_without_mjspec_begins_the_same_episodes_and_writes_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo 3.1: Lift's cube is drawn anew by the older call."""
+    session = envs.make("Lift")
+
+    def begun() -> list[dict[str, bytes]]:
+        return [{name: x.tobytes() for name, x in envs.reset(session, seed).items()} for seed in (3, 4, 3)]
+
+    expected = begun()
+    monkeypatch.delattr("mujoco.MjSpec")
+    assert begun() == expected
+    with pytest.raises(envs.RequestError, match=r"before 3\.2"):
+        envs.model_xml(session.env)

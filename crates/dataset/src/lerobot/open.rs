@@ -5,12 +5,14 @@ use super::fingerprint::{Fingerprint, INDEX_COLUMNS};
 use super::info::{Feature, Info, Provenance};
 use super::meta::parse_stats;
 use super::read;
+use super::schema::hex;
 use super::values::Values;
 use crate::error::{DatasetError, Result};
 use crate::shuffle::SplitMix64;
 use crate::stats::FeatureStats;
 use crate::windows::{Resident, WindowSpec, Windows};
 use arrow::buffer::ScalarBuffer;
+use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -104,7 +106,7 @@ impl Dataset {
         if let (Some(recorded), true) = (recorded, pictures) {
             return Ok(recorded.clone());
         }
-        let computed = self.numeric_fingerprint();
+        let computed = self.numeric_fingerprint(&self.episodes);
         match recorded {
             Some(recorded) if *recorded != computed => Err(DatasetError::BadDataset {
                 path: self.root.clone(),
@@ -116,10 +118,23 @@ impl Dataset {
         }
     }
 
-    /// The fingerprint of the columns in memory.
-    fn numeric_fingerprint(&self) -> String {
+    /// The fingerprint of these episodes alone: of a set of the same features that holds them and no other. Of pictures,
+    /// which are not in memory, the whole set's fingerprint enters beside it.
+    ///
+    /// # Panics
+    /// When an episode is not below the number of [`Dataset::episodes`].
+    pub fn fingerprint_of(&self, episodes: &[usize]) -> String {
+        let numbers = self.numeric_fingerprint(episodes.iter().map(|&episode| &self.episodes[episode]));
+        match self.info.features.0.iter().any(|(_, feature)| feature.is_visual()) {
+            true => hex(&Sha256::digest(format!("{}\n{numbers}\n", self.fingerprint))),
+            false => numbers,
+        }
+    }
+
+    /// The fingerprint of the columns in memory, of these episodes.
+    fn numeric_fingerprint<'a>(&self, episodes: impl IntoIterator<Item = &'a EpisodeMeta>) -> String {
         let mut fingerprint = Fingerprint::new(&self.info.features, self.info.fps);
-        for episode in &self.episodes {
+        for episode in episodes {
             fingerprint.episode(episode.length, episode.tasks.first().map_or("", String::as_str));
             for (name, digest) in self.episode_digests(episode) {
                 fingerprint.column(&name, digest);

@@ -9,9 +9,10 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     text(LeaderboardRow::stem).csv("entry"),
     text(|row: &LeaderboardRow| row.joined(|one| one.record.entry.version.to_string())).csv("version"),
     text(|row: &LeaderboardRow| row.policy().to_owned()).csv("policy").page("policy"),
-    text(|row: &LeaderboardRow| row.task().to_owned()).csv("task").table("task").page("task").left().kept(),
+    text(|row: &LeaderboardRow| row.task().to_owned()).csv("task").table("task").page("task").left(),
     text(|row: &LeaderboardRow| row.record().protocol.id()).csv("protocol"),
-    text(LeaderboardRow::protocol_text).table("protocol").page("protocol"),
+    // its name begins with the task's: of the two the protocol stays, which tells blocks of seeds apart
+    text(LeaderboardRow::protocol_lines).table("protocol").page("protocol").kept(),
     text(|row: &LeaderboardRow| row.counts.percent(1)).page("rate"),
     text(|row: &LeaderboardRow| format!("{}%", super::row::interval_text(row.interval, 1, '–'))).page("95% interval"),
     text(|row: &LeaderboardRow| row.named.as_ref().map_or(String::new(), |(name, _)| name.clone()))

@@ -259,6 +259,49 @@ mod tests {
     }
 
     #[test]
+    fn seeds_and_executions_of_one_entry_are_told_apart_beside_its_protocol() {
+        let dir = tempfile::tempdir().unwrap();
+        let with = |name: &str, start: u64, n_action_steps: usize| {
+            let mut record = sample(name, 1, 40);
+            record.seeds.start = start;
+            record.execution = zoo::results::Execution::RecedingHorizon { n_action_steps };
+            finished(dir.path(), &record)
+        };
+        let rows = rank(&[with("a", 100, 8), with("a", 900, 8), with("a", 900, 1), with("b", 100, 8)]);
+        let mut told: Vec<(String, String)> = rows.iter().map(|row| (row.name(), row.apart.clone())).collect();
+        told.sort();
+        let expected = [
+            ("a@1", "seeds 100-139, 8 steps"),
+            ("a@1", "seeds 900-939, 1 steps"),
+            ("a@1", "seeds 900-939, 8 steps"),
+            ("b@1", ""),
+        ];
+        assert_eq!(told, expected.map(|(name, apart)| (name.to_owned(), apart.to_owned())));
+        let table = crate::markdown::table(COLUMNS, &rows);
+        assert!(table.contains("seeds 900-939, 1 steps"), "{table}");
+    }
+
+    #[test]
+    fn simulators_of_other_versions_are_ranked_apart_and_told_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let with = |name: &str, package: &str, version: &str| {
+            let mut record = sample(name, 1, 40);
+            record.versions.insert(package.to_owned(), version.to_owned());
+            finished(dir.path(), &record)
+        };
+        let all = [with("a", "mujoco", "3.2.7"), with("a", "python", "3.11.7"), with("b", "python", "3.11.9")];
+        let rows = rank(&all);
+        let told: Vec<(String, String, Option<u64>)> =
+            rows.iter().map(|row| (row.name(), row.protocol_text(), row.rank)).collect();
+        let id = all[0].record.protocol.id();
+        // Python's own version moves no simulated body: the same table
+        let expected = [("a@1", "mujoco 3.2.7"), ("a@1", "mujoco 3.3.7"), ("b@1", "mujoco 3.3.7")]
+            .map(|(name, simulator)| (name.to_owned(), format!("{id} {simulator}"), Some(1)));
+        assert_eq!(told, expected);
+        assert_eq!(rank(&all[1..])[0].protocol_text(), id, "where all are alike nothing is said");
+    }
+
+    #[test]
     fn a_row_that_another_one_holds_is_left_out() {
         let dir = tempfile::tempdir().unwrap();
         let all = [10, 12, 30].map(|count| finished(dir.path(), &sample("a", 1, count)));

@@ -1,7 +1,7 @@
 //! Evaluations to rows: families joined, ranked inside their task and protocol, compared with each other.
 
 use std::cmp::Ordering;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use zoo::entry::Families;
 use zoo::protocols::Protocols;
@@ -24,7 +24,9 @@ pub struct Reading {
 /// Evaluations of one family under the same protocol on the same seeds are one row. A row whose seeds and trainings are all
 /// in another one is left out, unless they are the block of a named protocol.
 pub fn rank(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<LeaderboardRow> {
-    let rows = without_parts(joined(evaluations, reading));
+    let mut rows = without_parts(joined(evaluations, reading));
+    name_simulators(&mut rows);
+    tell_apart(&mut rows);
     // a group's name holds a hash: made once a row, not at every comparison
     let mut grouped: Vec<_> = rows.into_iter().map(|row| (group(&row), row)).collect();
     grouped.sort_by(|(one_group, one), (two_group, two)| one_group.cmp(two_group).then_with(|| order(one, two)));
@@ -46,10 +48,53 @@ pub fn rank(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<Leaderbo
     rows
 }
 
-/// Rows that are ranked against each other agree in this: task, rules, and the named block of seeds.
+/// Rows that are ranked against each other agree in this: task, the named block of seeds, and rules with the simulator that
+/// plays by them.
 pub(crate) fn group(row: &LeaderboardRow) -> (String, String, String) {
     let block = row.named.as_ref().map_or(String::new(), |(name, block)| format!("{name} {block}"));
-    (row.task().to_owned(), block, row.record().protocol.id())
+    let simulator: Vec<String> = simulator(row).map(|(name, version)| format!("{name} {version}")).collect();
+    (row.task().to_owned(), block, format!("{} {}", row.record().protocol.id(), simulator.join(" ")))
+}
+
+/// Versions of what moves the world. Python and its arrays only carry it: `eval --again` says where they differ.
+fn simulator(row: &LeaderboardRow) -> impl Iterator<Item = (&String, &String)> {
+    row.record().versions.iter().filter(|(name, _)| !["python", "numpy"].contains(&name.as_str()))
+}
+
+/// Lets rows of the same rules say the versions of the simulator in which they differ from others.
+fn name_simulators(rows: &mut [LeaderboardRow]) {
+    type Found = BTreeMap<String, BTreeSet<String>>;
+    let mut found: BTreeMap<String, Found> = BTreeMap::new();
+    for row in rows.iter() {
+        let rules = found.entry(row.record().protocol.id()).or_default();
+        for (name, version) in simulator(row) {
+            rules.entry(name.clone()).or_default().insert(version.clone());
+        }
+    }
+    for row in rows {
+        let rules = &found[&row.record().protocol.id()];
+        let differing = simulator(row).filter(|(name, _)| rules[*name].len() > 1);
+        let texts: Vec<String> = differing.map(|(name, version)| format!("{name} {version}")).collect();
+        row.simulator = texts.join(", ");
+    }
+}
+
+/// Lets rows of one entry under the same protocol say in what they differ: their seeds, how chunks are executed.
+fn tell_apart(rows: &mut [LeaderboardRow]) {
+    type Differing = (BTreeSet<String>, BTreeSet<String>);
+    let key = |row: &LeaderboardRow| (row.name(), row.protocol_text());
+    let mut found: BTreeMap<(String, String), Differing> = BTreeMap::new();
+    for row in rows.iter() {
+        let (seeds, executions) = found.entry(key(row)).or_default();
+        seeds.insert(row.record().seeds.to_string());
+        executions.insert(row.execution_text());
+    }
+    for row in rows {
+        let (seeds, executions) = &found[&key(row)];
+        let seeds = (seeds.len() > 1).then(|| format!("seeds {}", row.record().seeds));
+        let execution = (executions.len() > 1).then(|| row.execution_text());
+        row.apart = seeds.into_iter().chain(execution).collect::<Vec<_>>().join(", ");
+    }
 }
 
 /// Trainings of one family that were run alike become one row.

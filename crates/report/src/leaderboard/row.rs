@@ -60,6 +60,11 @@ pub struct LeaderboardRow {
     pub family: Option<String>,
     /// The named protocol and the block of its seeds that were run, if they are one.
     pub named: Option<(String, Block)>,
+    /// What of the simulator is of another version than in other rows under the same rules: `mujoco 3.2.7`; empty where
+    /// nothing is.
+    pub simulator: String,
+    /// What tells it from other rows of the same entry under the same protocol: its seeds, how chunks are executed.
+    pub apart: String,
     /// Its place in its task and protocol, by the lower end of the interval; equal counts share one. `None` for a row of
     /// too few episodes, for a [`Bound`], and for one that was not ranked with others.
     pub rank: Option<u64>,
@@ -148,7 +153,9 @@ impl LeaderboardRow {
         let mut queries: Vec<f64> = timings.flat_map(|t| t.inference_ms.iter().copied()).collect();
         queries.sort_by(f64::total_cmp);
         let latency = (quantile(&queries, 0.5).unwrap_or(0.0), quantile(&queries, 0.95).unwrap_or(0.0));
-        Self { trainings, counts, groups, interval, family: None, named: None, rank: None, standing: None, latency }
+        let (simulator, apart) = (String::new(), String::new());
+        let (family, named, rank, standing) = (None, None, None, None);
+        Self { trainings, counts, groups, interval, family, named, simulator, apart, rank, standing, latency }
     }
 
     /// What each training was measured, by the training's seed.
@@ -158,7 +165,13 @@ impl LeaderboardRow {
 
     /// Each training as a row of its own.
     pub fn details(&self) -> Vec<Self> {
-        let one = |evaluation| Self { family: self.family.clone(), named: self.named.clone(), ..Self::new(evaluation) };
+        let one = |evaluation| Self {
+            family: self.family.clone(),
+            named: self.named.clone(),
+            simulator: self.simulator.clone(),
+            apart: self.apart.clone(),
+            ..Self::new(evaluation)
+        };
         self.trainings.iter().map(one).collect()
     }
 
@@ -265,7 +278,7 @@ impl LeaderboardRow {
     }
 
     /// Control steps of the successful episodes, ascending.
-    fn steps_to_success(&self) -> Vec<f64> {
+    pub(crate) fn steps_to_success(&self) -> Vec<f64> {
         let won = self.trainings.iter().flat_map(|one| &one.episodes).filter(|episode| episode.success);
         let mut steps: Vec<f64> = won.map(|episode| f64::from(episode.steps)).collect();
         steps.sort_by(f64::total_cmp);
@@ -286,12 +299,18 @@ impl LeaderboardRow {
         }
     }
 
-    /// `lift@1 test` for a block of a named protocol; else the rules' own name.
+    /// `lift-v1 test` for a block of a named protocol; else the rules' own name, and what tells their simulator from others'.
     pub fn protocol_text(&self) -> String {
         match &self.named {
             Some((name, block)) => format!("{name} {block}"),
-            None => self.record().protocol.id(),
+            None if self.simulator.is_empty() => self.record().protocol.id(),
+            None => format!("{} {}", self.record().protocol.id(), self.simulator),
         }
+    }
+
+    /// The same, and below it what tells the row from others of its entry there.
+    pub(super) fn protocol_lines(&self) -> String {
+        if self.apart.is_empty() { self.protocol_text() } else { format!("{}\n{}", self.protocol_text(), self.apart) }
     }
 
     /// `seen 52/66, unseen 20/34`; nothing where the task has no groups.

@@ -11,7 +11,7 @@ use models::{Learner, ModelError, Signature};
 use puzzles::{Puzzle, Split, Task};
 use serde::{Deserialize, Serialize};
 
-use zoo::entry::{CardWords, EntryDraft, EntryMeta, TrainingMeta, grouped};
+use zoo::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, TrainingMeta, grouped};
 use zoo::run::{Checkpoint, MetricsRow, Place, Settings, TrainEvent, TrainOutcome, TrainSection, Training};
 use zoo::{ZooError, tensors};
 
@@ -346,6 +346,8 @@ impl Training for PuzzleTraining<'_> {
             kind: Some(SOLVER.to_owned()),
             section: Some(serde_json::to_value(&puzzle).expect("plain fields are always JSON")),
             training: Some(training),
+            parent: None,
+            license: Some(LICENSE.to_owned()),
             versions: zoo::versions(),
             files: BTreeMap::new(),
         };
@@ -355,6 +357,7 @@ impl Training for PuzzleTraining<'_> {
             meta,
             metrics: None,
             command: None,
+            reference: None,
             model: tensors::to_bytes(
                 Path::new(zoo::entry::MODEL_FILE),
                 &experiment.train.stored(self.solver.tensors())?,

@@ -18,7 +18,7 @@ const RESULTS: &str = "model-index:\n";
 
 /// The metadata that a card begins with, between its fences.
 pub(super) fn metadata(meta: &EntryMeta) -> String {
-    let mut text = "library_name: actrm\nlicense: apache-2.0\n".to_owned();
+    let mut text = format!("library_name: actrm\nlicense: {}\n", meta.license());
     // the Hub's own tags and ours, each once
     let mut tags: BTreeSet<&str> = ["actrm", &meta.policy, &meta.task].into();
     if meta.is_robot_policy() {

@@ -54,6 +54,12 @@ pub struct EntryMeta {
     pub section: Option<serde_json::Value>,
     /// How it was trained; `None` for an imported entry.
     pub training: Option<TrainingMeta>,
+    /// The entry that it was made of, where it went out to another library and came back.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parent: Option<ParentMeta>,
+    /// Its licence, by the name that the Hugging Face Hub knows; of an imported entry none is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub license: Option<String>,
     /// Versions of the software that made it.
     pub versions: BTreeMap<String, String>,
     /// Every other file of the entry.
@@ -102,6 +108,18 @@ impl CamerasMeta {
     }
 }
 
+/// The licence of what is trained here.
+pub const LICENSE: &str = "apache-2.0";
+
+/// An entry that another one was made of.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ParentMeta {
+    /// `name@version`.
+    pub entry: String,
+    /// Its hash, as [`EntryMeta::content_sha256`] gives it.
+    pub content_sha256: String,
+}
+
 /// The demonstrations behind an entry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DataMeta {
@@ -109,6 +127,9 @@ pub struct DataMeta {
     pub name: String,
     /// SHA-256 of the data set's content.
     pub fingerprint: String,
+    /// SHA-256 of the episodes trained on alone, as [`dataset::Dataset::fingerprint_of`] gives it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub train_fingerprint: Option<String>,
     /// Episodes trained on.
     pub train_episodes: u64,
     /// Frames trained on.
@@ -133,6 +154,9 @@ pub struct TrainingMeta {
     pub minutes: f64,
     /// Threads it ran on.
     pub threads: u64,
+    /// The machine that it ended on: processor, cores and kernel.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub machine: Option<String>,
     /// The loss on the way, thinned; in `entry.json` of entries without `train.parquet` alone.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub curve: Vec<CurvePoint>,
@@ -189,6 +213,13 @@ impl EntryMeta {
     /// Whether it is a policy for a robot's task.
     pub fn is_robot_policy(&self) -> bool {
         self.kind.is_none() && self.section.is_none()
+    }
+
+    /// Its licence, by the name that the Hugging Face Hub knows.
+    pub fn license(&self) -> &str {
+        // older entries do not say it; all that were trained here have this one
+        let usual = if self.training.is_some() { LICENSE } else { "unknown" };
+        self.license.as_deref().unwrap_or(usual)
     }
 
     /// `name@version`.

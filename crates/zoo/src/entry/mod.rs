@@ -17,6 +17,7 @@ mod id;
 mod meta;
 mod open;
 mod policy;
+mod reference;
 mod seal;
 mod subject;
 
@@ -25,9 +26,11 @@ pub(crate) use curve::thinned;
 pub use family::{Families, key as family_of, member_name};
 pub use hub::export_hub;
 pub use id::{EntryId, EntryRequest, LATEST, check_alias, check_name};
-pub use meta::{CamerasMeta, CurvePoint, DataMeta, EntryMeta, FileMeta, ModuleMeta, TrainingMeta};
+pub use meta::{CamerasMeta, CurvePoint, DataMeta, EntryMeta, FileMeta, LICENSE, ModuleMeta, ParentMeta, TrainingMeta};
 pub use open::Entry;
 pub use policy::LoadedEntry;
+pub use reference::Repeats;
+pub(crate) use reference::reference;
 pub use seal::EntryDraft;
 #[cfg(test)]
 pub(crate) use seal::tests::draft as test_draft;
@@ -44,6 +47,8 @@ pub const NORMALISER_FILE: &str = "normaliser.safetensors";
 pub const CARD_FILE: &str = "README.md";
 /// The metrics of the training, row by row.
 pub const TRAIN_FILE: &str = "train.parquet";
+/// Observations, and the actions that the policy gave when it was sealed.
+pub const REFERENCE_FILE: &str = "reference.safetensors";
 /// The command that trains it.
 pub const COMMAND_FILE: &str = "command.txt";
 /// Provenance and the hashes of the other files.

@@ -1,15 +1,17 @@
 //! An entry's weights in memory, and policies that share them.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use candle_core::Tensor;
 use models::actrm::{Actrm, Thinking};
-use models::{ModelError, Normaliser, Policy, PolicyModel, Preprocess};
+use models::{ModelError, Normaliser, Policy, PolicyModel, Preprocess, Signature};
 
 use crate::evaluation::WallClock;
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors};
 
-use super::{Entry, MODEL_FILE, NORMALISER_FILE};
+use super::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE};
 
 /// An entry's weights and normaliser in memory, shared by every environment.
 #[derive(Clone)]
@@ -36,21 +38,33 @@ impl Entry {
             });
         }
         let experiment = Experiment::from_toml(&self.id().to_string(), &self.config_text()?)?;
-        let failed = |operation| {
-            let name = self.id().to_string();
-            move |source| ZooError::Model { operation, name, source }
-        };
-        let signature = self.meta().signature.clone();
-        let model = experiment.policy.build(&signature, 0).map_err(failed("build the policy of"))?;
         let (weights, _) = tensors::read(&self.folder().join(MODEL_FILE))?;
-        model.params().load(&weights).map_err(failed("load the weights of"))?;
         let (statistics, _) = tensors::read(&self.folder().join(NORMALISER_FILE))?;
-        let modes = experiment.normalisation.modes(&signature);
-        let preprocess = Normaliser::new(&modes, &statistics)
-            .and_then(|normaliser| Preprocess::new(signature, normaliser))
-            .map_err(failed("load the normaliser of"))?;
-        Ok(LoadedEntry { entry: self.clone(), experiment, model: model.into(), preprocess: Arc::new(preprocess) })
+        let signature = &self.meta().signature;
+        let (model, preprocess) = assemble(&self.id(), &experiment, signature, &weights, &statistics)?;
+        Ok(LoadedEntry { entry: self.clone(), experiment, model, preprocess })
     }
+}
+
+/// The network and what its inputs and outputs go through. Every tensor must be there, in its shape, and no other.
+///
+/// # Errors
+/// What does not fit, by name.
+pub(super) fn assemble(
+    id: &EntryId,
+    experiment: &Experiment,
+    signature: &Signature,
+    weights: &BTreeMap<String, Tensor>,
+    statistics: &BTreeMap<String, Tensor>,
+) -> Result<(Arc<dyn PolicyModel>, Arc<Preprocess>), ZooError> {
+    let failed = |operation| move |source| ZooError::Model { operation, name: id.to_string(), source };
+    let model = experiment.policy.build(signature, 0).map_err(failed("build the policy of"))?;
+    model.params().load(weights).map_err(failed("load the weights of"))?;
+    let modes = experiment.normalisation.modes(signature);
+    let preprocess = Normaliser::new(&modes, statistics)
+        .and_then(|normaliser| Preprocess::new(signature.clone(), normaliser))
+        .map_err(failed("load the normaliser of"))?;
+    Ok((model.into(), Arc::new(preprocess)))
 }
 
 impl LoadedEntry {

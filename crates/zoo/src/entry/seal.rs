@@ -13,7 +13,7 @@ use super::format::FORMAT;
 use super::meta::seal_text;
 use super::{
     CARD_FILE, COMMAND_FILE, CONFIG_FILE, CardWords, ENTRY_FILE, EntryId, EntryMeta, FileMeta, MODEL_FILE,
-    NORMALISER_FILE, TRAIN_FILE, card, id,
+    NORMALISER_FILE, REFERENCE_FILE, TRAIN_FILE, card, id,
 };
 
 /// What a version leaves behind that was removed: it is never given again.
@@ -36,6 +36,8 @@ pub struct EntryDraft {
     pub metrics: Option<Vec<u8>>,
     /// Content of `command.txt`, where the command is known.
     pub command: Option<String>,
+    /// Content of `reference.safetensors`, where the policy gives the same for the same observations.
+    pub reference: Option<Vec<u8>>,
 }
 
 impl EntryDraft {
@@ -77,6 +79,7 @@ impl EntryDraft {
             (CARD_FILE, card.as_bytes()),
         ];
         contents.extend(self.command.as_ref().map(|command| (COMMAND_FILE, command.as_bytes())));
+        contents.extend(self.reference.as_ref().map(|reference| (REFERENCE_FILE, reference.as_slice())));
         if let Some(metrics) = &self.metrics {
             contents.push((TRAIN_FILE, metrics));
             self.meta.training.iter_mut().for_each(|training| training.curve.clear());
@@ -172,6 +175,7 @@ pub(crate) mod tests {
                 data: Some(DataMeta {
                     name: "lift.hdf5".to_owned(),
                     fingerprint: "f".repeat(64),
+                    train_fingerprint: None,
                     train_episodes: 45,
                     train_frames: 2000,
                     valid_episodes: 5,
@@ -185,8 +189,11 @@ pub(crate) mod tests {
                     seed: 1,
                     minutes: 1.25,
                     threads: 2,
+                    machine: None,
                     curve: curve.collect(),
                 }),
+                parent: None,
+                license: None,
                 versions: BTreeMap::from([("actrm".to_owned(), "0.1.0".to_owned())]),
                 files: BTreeMap::new(),
             },
@@ -196,6 +203,7 @@ pub(crate) mod tests {
             card: CardWords::default(),
             metrics: None,
             command: None,
+            reference: None,
         }
     }
 

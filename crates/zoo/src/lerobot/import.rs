@@ -9,7 +9,7 @@ use models::{
     Signature, lerobot,
 };
 
-use crate::entry::{CamerasMeta, CardWords, EntryDraft, EntryId, EntryMeta};
+use crate::entry::{CamerasMeta, CardWords, EntryDraft, EntryId, EntryMeta, ParentMeta, reference};
 use crate::experiment::{DataSection, Experiment, NormalisationSection, PICTURE_PREFIX, RolloutSection, TaskSection};
 use crate::run::TrainSection;
 use crate::{ZooError, tensors};
@@ -110,7 +110,9 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
         });
     }
     let of_origin = origin.as_ref();
+    let (weights, name) = (model.params().tensors(), EntryId { name: options.name.clone(), version: 0 });
     let draft = EntryDraft {
+        reference: reference(&name, &experiment, preprocess.signature(), &weights, &statistics)?,
         card: CardWords::default(),
         metrics: None,
         command: None,
@@ -138,10 +140,13 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             kind: None,
             section: None,
             training: of_origin.and_then(|origin| origin.training.clone()),
+            parent: of_origin
+                .map(|origin| ParentMeta { entry: origin.id().to_string(), content_sha256: origin.content_sha256() }),
+            license: of_origin.map(|origin| origin.license().to_owned()),
             versions: crate::versions(),
             files: BTreeMap::new(),
         },
-        model: tensors::to_bytes(&model_path, &model.params().tensors(), &about)?,
+        model: tensors::to_bytes(&model_path, &weights, &about)?,
         config: experiment.to_toml(),
         normaliser: tensors::to_bytes(&model_path, &statistics, &serde_json::json!({"format": 1}))?,
     };

@@ -226,6 +226,7 @@ pub(super) fn prepare(
     let meta = DataMeta {
         name: name.to_owned(),
         fingerprint: dataset.fingerprint().to_owned(),
+        train_fingerprint: Some(dataset.fingerprint_of(&train)),
         train_episodes: train.len() as u64,
         train_frames: train.iter().map(|e| dataset.episodes()[*e].length as u64).sum(),
         valid_episodes: valid.len() as u64,

@@ -366,9 +366,21 @@ impl<'a, T: Training> Session<'a, T> {
             seed: self.section.seed,
             minutes: self.seconds() / 60.0,
             threads: self.training.threads() as u64,
+            machine: machine(),
             curve: curve(self.metrics.rows()),
         }
     }
+}
+
+/// Processor, cores and kernel of this machine; nothing where Linux does not say.
+fn machine() -> Option<String> {
+    let text = std::fs::read_to_string("/proc/cpuinfo").ok()?;
+    // Arm's processors have no name there
+    let name = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    let name = name.map_or("unnamed processor", |(_, name)| name.trim());
+    let cores = text.lines().filter(|line| line.starts_with("processor")).count();
+    let kernel = std::fs::read_to_string("/proc/sys/kernel/osrelease").ok()?;
+    Some(format!("{name}, {cores} cores, Linux {}", kernel.trim()))
 }
 
 /// The first tensor with a value that no training recovers from.

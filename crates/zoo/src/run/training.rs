@@ -10,7 +10,7 @@ use dataset::shuffle::Sampler;
 use models::{PolicyModel, Trainer, TrainerState};
 use serde::{Deserialize, Serialize};
 
-use crate::entry::{CardWords, EntryDraft, EntryMeta, ModuleMeta, TrainingMeta};
+use crate::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, ModuleMeta, TrainingMeta, reference};
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors, write_atomic};
 
@@ -293,6 +293,8 @@ impl Training for PolicyTraining<'_> {
             kind: None,
             section: None,
             training: Some(training),
+            parent: None,
+            license: Some(LICENSE.to_owned()),
             versions: crate::versions(),
             files: BTreeMap::new(),
         };
@@ -304,6 +306,7 @@ impl Training for PolicyTraining<'_> {
             .map_err(experiment.model_error("store the normaliser of"))?;
         let about = serde_json::json!({"format": 1, "policy": policy});
         Ok(EntryDraft {
+            reference: reference(&meta.id(), experiment, &meta.signature, &weights, &statistics)?,
             card: CardWords::default(),
             meta,
             metrics: None,

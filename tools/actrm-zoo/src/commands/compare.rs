@@ -164,8 +164,10 @@ impl<'a> Told<'a> {
     fn text(&self) -> String {
         let Self { rows: [one, two], comparison, flips } = self;
         let [first, second] = self.names();
-        let mut text =
-            format!("{}, {}: {} seeds that both were run on\n", one.task(), one.protocol_text(), comparison.shared);
+        // under other simulators the rules alone are what both have
+        let alike = one.protocol_text() == two.protocol_text();
+        let rules = if alike { one.protocol_text() } else { one.record().protocol.id() };
+        let mut text = format!("{}, {rules}: {} seeds that both were run on\n", one.task(), comparison.shared);
         let width = first.chars().count().max(second.chars().count());
         for (name, row) in [(&first, one), (&second, two)] {
             let trainings = match row.n_trainings() {

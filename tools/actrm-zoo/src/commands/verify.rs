@@ -5,12 +5,12 @@ use anyhow::Context;
 use cli::shown;
 use study::puzzle::{SolverEntry, audit_puzzles};
 use zoo::audit::{KnownEntries, LeftOut, audit};
-use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE};
+use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE, Repeats};
 use zoo::tensors;
 
 use crate::places::{ResultsArgs, ZooArgs, entry_names};
 
-/// Check entries and their results: every hash and seal, and with --deep every tensor
+/// Check entries and their results: every hash and seal, and with --deep every tensor and what the policy answers
 ///
 /// A result has to be as it was sealed, in the folder that its record belongs in, and of an entry in the zoo that says the
 /// same of its training. Hashes tell damage and edits; that a result was measured, `eval --again` shows.
@@ -23,7 +23,8 @@ pub struct Args {
     /// Entries: `name` (its newest version) or `name@version` (all, with whatever lies in the folder of results)
     #[arg(add = entry_names())]
     entries: Vec<String>,
-    /// Also build each network and compare the names and shapes of its tensors; all values have to be finite
+    /// Also build each network and compare the names and shapes of its tensors, all values of which have to be finite, and
+    /// ask it once more for the actions that are stored with it
     #[arg(long)]
     deep: bool,
     #[command(flatten)]
@@ -49,9 +50,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut text = String::new();
     for id in &ids {
         match check(id, &entries, args.deep).with_context(|| format!("entry {id}")) {
-            Ok(count) => {
+            Ok((count, repeats)) => {
                 let results = whole.get(&(id.name.clone(), id.version)).copied().unwrap_or_default();
-                text.push_str(&format!("{id}: {count} files and {results} results are as they were made\n"));
+                text.push_str(&format!("{id}: {count} files and {results} results are as they were made{repeats}\n"));
             }
             Err(error) => failures.push(error),
         }
@@ -73,8 +74,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// How many files an entry has, all of which are what was written.
-fn check(id: &EntryId, entries: &KnownEntries, deep: bool) -> anyhow::Result<usize> {
+/// How many files an entry has, all of which are what was written, and what a deep check says of its answers.
+fn check(id: &EntryId, entries: &KnownEntries, deep: bool) -> anyhow::Result<(usize, String)> {
     let entry = match entries.get(id) {
         Some(entry) => entry,
         None => {
@@ -82,23 +83,25 @@ fn check(id: &EntryId, entries: &KnownEntries, deep: bool) -> anyhow::Result<usi
             anyhow::bail!("{}", bad.map_or_else(|| "not in the zoo".to_owned(), |(_, error)| error.to_string()))
         }
     };
-    if deep {
-        deep_check(entry)?;
-    }
+    let repeats = if deep { deep_check(entry)? } else { String::new() };
     // entry.json is hashed in itself
-    Ok(entry.meta().files.len() + 1)
+    Ok((entry.meta().files.len() + 1, repeats))
 }
 
-fn deep_check(entry: &Entry) -> anyhow::Result<()> {
+fn deep_check(entry: &Entry) -> anyhow::Result<String> {
     for name in [MODEL_FILE, NORMALISER_FILE] {
         let path = entry.folder().join(name);
         let (values, _) = tensors::read(&path)?;
         tensors::check_finite(&path, &values)?;
     }
     // names and shapes are compared where the network is built
-    match entry.meta().is_robot_policy() {
-        true => drop(entry.load()?),
-        false => drop(SolverEntry::load(entry, None)?),
+    if !entry.meta().is_robot_policy() {
+        SolverEntry::load(entry, None)?;
+        return Ok(String::new());
     }
-    Ok(())
+    Ok(match entry.load()?.repeats()? {
+        Repeats::NotStored => "; no reference output is stored".to_owned(),
+        Repeats::Exactly => "; it gives the stored actions again, bit for bit".to_owned(),
+        Repeats::Within(far) => format!("; it gives the stored actions again, no value further off than {far:.1e}"),
+    })
 }

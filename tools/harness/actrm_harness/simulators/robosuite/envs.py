@@ -384,6 +384,8 @@ def model_xml(env: Env) -> str:
 
     robosuite finds the last "robosuite" in a path and puts its own folder there when it loads the text again.
     """
+    if lean.overwrites_the_scene():
+        raise RequestError("mujoco", "MuJoCo before 3.2 cannot write the model of a scene that is kept")
     text = cast(str, env.sim.model.get_xml())
     text = text.replace(os.path.dirname(suite.package_dir()) + "/", "")
     if env.model.root.find("statistic") is None:

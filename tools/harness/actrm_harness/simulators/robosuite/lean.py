@@ -45,6 +45,19 @@ def forget_xml(give_back: bool) -> None:
             trim(0)
 
 
+def compiled(xml: str) -> Any:
+    """The model of this MJCF, through `MjSpec`, which leaves the text that the scene is written from as it is."""
+    mujoco: Any = importlib.import_module("mujoco")
+    if overwrites_the_scene():
+        return mujoco.MjModel.from_xml_string(xml)
+    return mujoco.MjSpec.from_string(xml).compile()
+
+
+def overwrites_the_scene() -> bool:
+    """Whether compiling another model takes the place of the scene's text: MuJoCo has `MjSpec` from 3.2 on."""
+    return not hasattr(importlib.import_module("mujoco"), "MjSpec")
+
+
 def _forget_files() -> None:
     cache_of, clear = _function("mj_getCache"), _function("mj_clearCache")
     if cache_of is not None and clear is not None:
@@ -67,8 +80,6 @@ def _set_mujoco_model(robot_model: Any, model: Any = None) -> None:
 def _mujoco_model(robot_model: Any) -> Any:
     """Compile the robot alone, when somebody looks at it; the scene's text stays the last one."""
     if robot_model.__dict__.get(_MODEL) is None:
-        mujoco: Any = importlib.import_module("mujoco")
         tree: Any = importlib.import_module("xml.etree.ElementTree")
-        spec = mujoco.MjSpec.from_string(tree.tostring(robot_model.root, encoding="unicode"))
-        robot_model.__dict__[_MODEL] = spec.compile()
+        robot_model.__dict__[_MODEL] = compiled(tree.tostring(robot_model.root, encoding="unicode"))
     return robot_model.__dict__[_MODEL]

@@ -10,6 +10,7 @@ import copy
 import importlib
 from typing import Any
 
+from actrm_harness.simulators.robosuite import lean
 from actrm_harness.simulators.robosuite.suite import Env
 
 _NAME = "cube"
@@ -35,8 +36,7 @@ def _alone(lift: Any, size: Any) -> Any:
     for tag in ("compiler", "option"):
         root.append(copy.deepcopy(lift.model.root.find(tag)))
     tree.SubElement(root, "worldbody").append(box(name=_NAME, size=size, rgba=[1, 0, 0, 1]).get_obj())
-    # through MjSpec, because from_xml_string would take the place of the text that the scene is written from
-    return importlib.import_module("mujoco").MjSpec.from_string(tree.tostring(root, encoding="unicode")).compile()
+    return lean.compiled(tree.tostring(root, encoding="unicode"))
 
 
 def _resize(model: Any, data: Any, alone: Any) -> None:
