@@ -5,19 +5,23 @@
 //! prints a table and writes `target/bench/report.json`; the exit code is 1 where a bar is missed. The results are those that
 //! come with the repository, over and over: 200 entries on 50 tasks, 50 episodes each. Chromium opens the page without a
 //! window and says, by its own clock, when everything was laid out, counted from the navigation, and how long sorting,
-//! filtering and turning to other rows take, layout included. The least of all rounds.
+//! filtering and turning to other rows take, layout included. The least of all rounds. Once, `actrm-zoo leaderboard` reads
+//! as many results from files: 200 small entries in 50 blocks of 20 seeds, written as trainings and evaluations write them.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 #[path = "../tests/common/mod.rs"]
 mod common;
 
 use std::path::Path;
-use std::process::ExitCode;
+use std::process::{Command, ExitCode};
 use std::time::Instant;
 
-use common::{browser, results, visit};
+use common::{TASKS, browser, results, visit};
 use report::{COLUMNS, Reading, csv, rank, to_html};
 use serde_json::{Value, json};
+use zoo::entry::{CardWords, Entry, EntryDraft, training_facts};
+use zoo::registry::Registry;
+use zoo::results::{ResultsFolder, Seeds, list_evaluations};
 
 /// What a reader does, and what the clock says to it.
 const READER: &str = r##"
@@ -40,6 +44,62 @@ timed("filter_off", () => filter("text", ""));
 const next = document.getElementById("next");
 if (next) timed("next", () => next.click());
 "##;
+
+/// A zoo with `count` results, each of which the leaderboard takes.
+fn store(zoo: &Path, count: usize) {
+    const EPISODES: u64 = 20;
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
+    let model = Registry::open(&shipped).entry("lift-act@1").unwrap();
+    let stored = list_evaluations(&shipped.join("results")).unwrap();
+    let stored =
+        stored.into_iter().find(|one| one.record.entry.name == "lift-act" && one.episodes.len() == 200).unwrap();
+    for number in 0..count.div_ceil(TASKS) {
+        let mut meta = model.meta().clone();
+        meta.name = format!("entry-{number}");
+        let draft = EntryDraft {
+            meta,
+            model: format!("weights {number}").into_bytes(),
+            config: model.config_text().unwrap(),
+            normaliser: b"normaliser".to_vec(),
+            card: CardWords::default(),
+            metrics: None,
+            command: None,
+        };
+        let id = draft.seal(zoo).unwrap();
+        let entry = Entry::open(zoo, &id).unwrap();
+        for block in 0..TASKS.min(count - number * TASKS) {
+            let mut record = stored.record.clone();
+            record.entry.name = id.name.clone();
+            record.entry.hash = entry.meta().content_sha256();
+            record.training = training_facts(entry.meta());
+            record.seeds = Seeds { start: 40_000 + 1_000 * block as u64, count: EPISODES };
+            let mut folder = ResultsFolder::open(&zoo.join("results"), &record).unwrap();
+            for (k, seed) in folder.missing().into_iter().enumerate() {
+                let (mut episode, mut timing) = (stored.episodes[k].clone(), stored.timings[k].clone());
+                (episode.seed, timing.seed) = (seed, seed);
+                episode.success = (seed as usize * 7919 + block) % 3 > 0;
+                folder.add(episode, timing).unwrap();
+            }
+            folder.finish().unwrap();
+        }
+    }
+}
+
+/// Seconds that `actrm-zoo leaderboard`, which lies beside this program, takes for `count` results in files.
+fn leaderboard(count: usize) -> f64 {
+    // what is timed is reading: in memory, where there is such a folder
+    let memory = Path::new("/dev/shm");
+    let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap();
+    store(folder.path(), count);
+    let program = std::env::current_exe().unwrap().ancestors().nth(2).unwrap().join("actrm-zoo");
+    let begin = Instant::now();
+    let output = Command::new(program).arg("leaderboard").arg("--zoo").arg(folder.path()).output().unwrap();
+    let took = begin.elapsed().as_secs_f64();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let table = std::fs::read_to_string(folder.path().join("leaderboard.csv")).unwrap();
+    assert_eq!(table.lines().count(), count + 1);
+    took
+}
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -71,7 +131,9 @@ fn main() -> ExitCode {
             note(name, value.as_f64().unwrap());
         }
     }
+    note("leaderboard", leaderboard(count) * 1e3);
     let named = [
+        ("leaderboard", "actrm-zoo leaderboard, from files to files", "ms", None),
         ("rank", "ranks, groups and intervals", "ms", None),
         ("write", "report.html and leaderboard.csv", "ms", None),
         ("size", "size of report.html", "MB", None),
