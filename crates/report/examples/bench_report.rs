@@ -63,6 +63,7 @@ fn store(zoo: &Path, count: usize) {
             normaliser: b"normaliser".to_vec(),
             card: CardWords::default(),
             metrics: None,
+            reference: None,
             command: None,
         };
         let id = draft.seal(zoo).unwrap();
