@@ -21,7 +21,7 @@ fn the_leaderboard_fits_80_columns_and_wide_shows_all() {
     }
     // blocks of seeds are told apart
     for block in ["lift-v1 dev", "lift-v1 test"] {
-        assert_eq!(lines.iter().filter(|line| line.contains(block)).count(), 1, "{block}: {lines:#?}");
+        assert!(lines.iter().any(|line| line.contains(block)), "{block}: {lines:#?}");
     }
     assert!(!lines[0].contains("demos"), "{}", lines[0]);
     let (wide, _) = in_terminal(80, &format!("{line} --wide"));
