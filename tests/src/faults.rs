@@ -102,6 +102,33 @@ pub fn run(command: &mut Command, folder: &Path, fault: Option<Fault>) -> Ended 
     Ended { calls: tracer.calls, status, stdout: text(&mut stdout), stderr: text(&mut stderr) }
 }
 
+/// Whether programs may be traced here: some sandboxes forbid it. Says so where they may not.
+///
+/// # Panics
+/// Where `true` cannot be started for another reason.
+pub fn allowed() -> bool {
+    let mut command = Command::new("true");
+    // SAFETY: as in `run`
+    unsafe {
+        command.pre_exec(|| match ptrace(libc::PTRACE_TRACEME, 0, 0, 0) {
+            -1 => Err(std::io::Error::last_os_error()),
+            _ => Ok(()),
+        });
+    }
+    match command.spawn() {
+        Ok(mut child) => {
+            // it stands at its first instruction
+            child.kill().and_then(|()| child.wait()).expect("it ends");
+            true
+        }
+        Err(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {
+            eprintln!("skipped: programs may not be traced here (ptrace: {error})");
+            false
+        }
+        Err(error) => panic!("true: {error}"),
+    }
+}
+
 /// What is to be done when a thread's call returns.
 #[derive(Clone, Copy)]
 enum Pending {
