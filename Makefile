@@ -70,9 +70,9 @@ wheel: build .venv-wheel/.complete ## the Python package, with the programs in i
 	@.venv-wheel/bin/python tools/wheel.py
 
 .PHONY: zoo
-zoo: build ## every policy on every robot task, three trainings each, and the leaderboard (hours; goes on where it was; in out/zoo)
+zoo: build ## every policy on every robot task, three trainings each, and the leaderboard (hours; goes on where it was)
 	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/zoo.toml --jobs $(or $(JOBS),2)
-	@target/release/actrm-zoo leaderboard --zoo out/zoo
+	@target/release/actrm-zoo leaderboard
 
 .PHONY: study-thinking
 study-thinking: build ## does thinking help: the studies of robot policies, as far as they have not been run (days)
