@@ -189,7 +189,7 @@ fn a_history_is_trained_on_and_kept_at_inference() {
     assert_ne!(after(&[0.3, 0.2]), after(&[0.2, 0.3]));
 }
 
-/// Entries sealed in the first form of `entry.json`.
+/// Six of them were sealed in the first form of `entry.json`.
 #[test]
 fn shipped_entries_open_and_answer() {
     let registry = Registry::open(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo"));
@@ -202,7 +202,7 @@ fn shipped_entries_open_and_answer() {
         let observation = signature.observation.iter();
         let observation: Observation =
             observation.map(|spec| (spec.name.clone(), vec![0.1; spec.width()].into())).collect();
-        assert_eq!(observation.len(), 2, "{id}");
+        assert!(observation.len() >= 2, "{id}");
         assert!(signature.observation.iter().all(|spec| !loaded.entry().meta().keys.of(&spec.name).is_empty()));
         let chunk = loaded.policy().predict(&observation).unwrap();
         assert!(chunk.actions.iter().all(|a| a.is_finite()), "{id}");
