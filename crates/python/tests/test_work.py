@@ -141,7 +141,7 @@ def test_results_that_do_not_stand_are_left_out_and_named(zoo: Path, tmp_path: P
 
     other = tmp_path / "zoo"
     shutil.copytree(ROOT / "zoo", other)
-    outcomes = next((other / "results").glob("lift-act*/outcomes.parquet"))
+    outcomes = next((other / "results").glob("lift-act@1_*/outcomes.parquet"))
     outcomes.write_bytes(outcomes.read_bytes()[:-1] + b"?")
     with pytest.warns(UserWarning, match="left out: .*lift-act.*outcomes.parquet"):
         rows = actrm.leaderboard(other)
