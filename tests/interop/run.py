@@ -555,34 +555,10 @@ def evaluate_on_ray(root: Path, folder: Path) -> str:
     return shown.splitlines()[-1].split(" (")[0]
 
 
-STUDY = """
-title = "Small"
-results = "results"
-page = "page.md"
-zoo = "zoo"
-[data.lift]
-task = "Lift"
-episodes = 3
-[arms.act]
-label = "ACT"
-experiment = "act_{data}"
-set = ["train.steps=3", "train.batch_size=4", "policy.dim_model=16", "rollout.max_steps=3"]
-[tests.lift]
-task = "Lift"
-episodes = 2
-seed_start = 40000
-[[cells]]
-arms = ["act"]
-data = "lift"
-seeds = 2
-tests = ["lift"]
-"""
-
-
 def study_on_ray(folder: Path) -> str:
     """The driver for Ray: cells of a study on a cluster of two cores, and the page of them all."""
     folder.mkdir()
-    (folder / "study.toml").write_text(STUDY)
+    (folder / "study.toml").write_bytes((ROOT / "tests" / "fixtures" / "small_study.toml").read_bytes())
     driver = [sys.executable, ROOT / "tools" / "cluster" / "ray_study.py", "study.toml", "--program", BIN / "actrm-zoo"]
     os.environ.setdefault("ACTRM_PYTHON", str(ROOT / ".venv" / "bin" / "python"))
     command = [*map(str, driver), "--", "--work", "work"]

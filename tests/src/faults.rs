@@ -82,13 +82,7 @@ pub fn run(command: &mut Command, folder: &Path, fault: Option<Fault>) -> Ended 
     let (mut stdout, mut stderr) = (output(), output());
     command.env_remove("RUST_BACKTRACE").stdin(std::process::Stdio::null());
     command.stdout(stdout.try_clone().expect("another handle")).stderr(stderr.try_clone().expect("another handle"));
-    // SAFETY: between fork and exec one call of the kernel, which allocates nothing and takes no lock
-    unsafe {
-        command.pre_exec(|| match ptrace(libc::PTRACE_TRACEME, 0, 0, 0) {
-            -1 => Err(std::io::Error::last_os_error()),
-            _ => Ok(()),
-        });
-    }
+    be_traced(command);
     #[allow(clippy::zombie_processes, reason = "the tracer below waits for it")]
     let child = command.spawn().expect("the program starts");
     let pid = pid_t::try_from(child.id()).expect("a process id");
@@ -102,19 +96,24 @@ pub fn run(command: &mut Command, folder: &Path, fault: Option<Fault>) -> Ended 
     Ended { calls: tracer.calls, status, stdout: text(&mut stdout), stderr: text(&mut stderr) }
 }
 
-/// Whether programs may be traced here: some sandboxes forbid it. Says so where they may not.
-///
-/// # Panics
-/// Where `true` cannot be started for another reason.
-pub fn allowed() -> bool {
-    let mut command = Command::new("true");
-    // SAFETY: as in `run`
+/// Lets the program stop for whoever starts it.
+fn be_traced(command: &mut Command) {
+    // SAFETY: between fork and exec one call of the kernel, which allocates nothing and takes no lock
     unsafe {
         command.pre_exec(|| match ptrace(libc::PTRACE_TRACEME, 0, 0, 0) {
             -1 => Err(std::io::Error::last_os_error()),
             _ => Ok(()),
         });
     }
+}
+
+/// Whether programs may be traced here: some sandboxes forbid it. Says so where they may not.
+///
+/// # Panics
+/// Where `true` cannot be started for another reason.
+pub fn allowed() -> bool {
+    let mut command = Command::new("true");
+    be_traced(&mut command);
     match command.spawn() {
         Ok(mut child) => {
             // it stands at its first instruction

@@ -35,28 +35,7 @@ fn with_sbatch(folder: &Path) -> String {
 }
 
 /// A study of two trainings that is over in seconds.
-const STUDY: &str = r#"
-title = "Small"
-results = "results"
-page = "page.md"
-zoo = "zoo"
-[data.lift]
-task = "Lift"
-episodes = 3
-[arms.act]
-label = "ACT"
-experiment = "act_{data}"
-set = ["train.steps=3", "train.batch_size=4", "policy.dim_model=16", "rollout.max_steps=3"]
-[tests.lift]
-task = "Lift"
-episodes = 2
-seed_start = 40000
-[[cells]]
-arms = ["act"]
-data = "lift"
-seeds = 2
-tests = ["lift"]
-"#;
+const STUDY: &str = include_str!("../fixtures/small_study.toml");
 
 #[test]
 fn a_study_as_an_array_of_cells() {

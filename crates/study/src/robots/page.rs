@@ -9,7 +9,7 @@ use zoo::ZooError;
 use zoo::probe::{ProbeCell, ProbeResult};
 
 use super::cells::cells;
-use super::file::{Comparison, Study};
+use super::file::{Comparison, Data, Study};
 use super::result::CellResult;
 
 /// Seed of the bootstrap: the same results give the same page.
@@ -117,7 +117,12 @@ fn overview(text: &mut String, study: &Study, results: &BTreeMap<(String, String
     if !several {
         return;
     }
-    let heads: Vec<&str> = columns.iter().map(|(data, _)| study.data[*data].task.as_str()).collect();
+    let head = |(data, _): &(&str, &str)| {
+        let Data { task, episodes, .. } = &study.data[*data];
+        let alone = columns.iter().filter(|(other, _)| study.data[*other].task == *task).count() == 1;
+        if alone { task.clone() } else { format!("{task}, {episodes}") }
+    };
+    let heads: Vec<String> = columns.iter().map(head).collect();
     let _ = writeln!(
         text,
         "## All of it\n\nSuccess with its 95% interval over trainings and episodes, and how many trainings; what is planned and has \
@@ -563,6 +568,13 @@ mod tests {
         ] {
             assert!(page.contains(there), "{there}\n---\n{page}");
         }
+        // of one task, how many demonstrations tell columns apart
+        let fewer = std::fs::read_to_string(&file)
+            .unwrap()
+            .replace("task = \"Lift\"\nepisodes = 200", "task = \"PickChain\"\nepisodes = 25");
+        std::fs::write(&file, fewer).unwrap();
+        let page = robot_page(&Study::open(&file).unwrap(), &file).unwrap();
+        assert!(page.contains("| | PickChain, 200 | PickChain, 25 |\n"), "{page}");
     }
 
     #[test]

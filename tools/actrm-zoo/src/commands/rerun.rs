@@ -25,9 +25,9 @@ const DEMONSTRATIONS: &str = "demonstrations.hdf5";
 ///
 /// Checks entry and result, finds the demonstrations, or collects them again where they are the scripted expert's, knows them by
 /// their fingerprint, trains on them as the entry's experiment says, runs the row's episodes with what came of it, and compares
-/// each step with what is stored: weights byte by byte, episodes outcome by outcome. Where something differs, versions that are not as they were recorded are named. Neither the zoo nor
-/// its results are changed; the work lies in a folder of its own, and a rerun that was interrupted goes on there. The exit code
-/// is 0 where all that was asked for is the same, 1 otherwise. Solvers of puzzles are run again by `eval --again`.
+/// each step with what is stored: weights byte by byte, episodes outcome by outcome. Where something differs, versions that are
+/// not as they were recorded are named. Neither the zoo nor its results are changed; the work lies in a folder of its own, and
+/// a rerun that was interrupted goes on there. The exit code is 0 where all that was asked for is the same, 1 otherwise. Solvers of puzzles are run again by `eval --again`.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo rerun lift-act@1 --protocol lift-v1 --data lift.hdf5
