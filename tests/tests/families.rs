@@ -169,6 +169,17 @@ fn entries_differ_in_what_they_say() {
         assert!(told.contains(word), "no {word}: {told}");
     }
     assert!(said(&mut command(&["diff", "lift-act", "lift-act@1"])).contains("differ in nothing"));
+    // their curves: 500 and 12,000 steps of other tasks; two trainings that differ in their seed alone
+    assert!(told.contains("training loss: "), "{told}");
+    let told = said(&mut command(&["diff", "lift-act-s1", "lift-act-s2", "--json"]));
+    let told: serde_json::Value = serde_json::from_str(&told).expect("JSON");
+    let training = &told["curves"][0];
+    let apart = &training["first_difference"];
+    assert_eq!((&training["what"], &apart["step"]), (&"training loss".into(), &training["at"][0]["step"]), "{told}");
+    assert_eq!(training["at"].as_array().map(Vec::len), Some(6), "{told}");
+    let number = |key: &str| apart[key].as_f64().expect("a number");
+    assert!((number("second") - number("first") - number("difference")).abs() < 1e-12, "{told}");
+    assert!(number("difference") != 0.0, "{told}");
     let curves = said(&mut command(&["curves", "lift-act", "stack-act"]));
     assert!(curves.contains("lift-act@1") && curves.contains('█'), "{curves}");
     let picture = entries.join("curves.svg");

@@ -29,6 +29,19 @@ type Row = (u64, Option<f64>, Option<f64>);
 /// # Errors
 /// [`ZooError::Table`] for a file that cannot be read, [`ZooError::Malformed`] for one without steps.
 pub(super) fn read(path: &Path) -> Result<Vec<CurvePoint>, ZooError> {
+    Ok(thinned(rows(path)?.into_iter()))
+}
+
+/// Every point of it.
+///
+/// # Errors
+/// As [`read`].
+pub(super) fn whole(path: &Path) -> Result<Vec<CurvePoint>, ZooError> {
+    let point = |(step, loss, valid_loss): Row| Some(CurvePoint { step, loss: loss?, valid_loss });
+    Ok(rows(path)?.into_iter().filter_map(point).collect())
+}
+
+fn rows(path: &Path) -> Result<Vec<Row>, ZooError> {
     let table = |source: Box<dyn std::error::Error + Send + Sync>| ZooError::Table {
         operation: "read table",
         path: path.to_owned(),
@@ -45,7 +58,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<CurvePoint>, ZooError> {
         let (loss, valid) = (numbers(&batch, "loss"), numbers(&batch, "valid_loss"));
         rows.extend(steps.values().iter().zip(loss).zip(valid).map(|((step, loss), valid)| (*step, loss, valid)));
     }
-    Ok(thinned(rows.into_iter()))
+    Ok(rows)
 }
 
 /// A column of numbers, none where it is not there or has no value.
@@ -91,6 +104,8 @@ mod tests {
         assert_eq!(curve.len(), 40);
         let last = CurvePoint { step: 120, loss: 1.0 / 120.0, valid_loss: Some(2.0 / 120.0) };
         assert_eq!((curve[39], curve[38].valid_loss), (last, None));
+        let whole = whole(&path).unwrap();
+        assert_eq!((whole.len(), whole[0].step, whole[119]), (120, 1, last));
         std::fs::write(&path, b"none").unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("train.parquet"));
     }

@@ -8,7 +8,8 @@ use crate::{ZooError, sha256_file, sha256_hex};
 use super::format::upgrade;
 use super::meta::self_hashes;
 use super::{
-    CARD_FILE, CONFIG_FILE, ENTRY_FILE, EntryId, EntryMeta, MODEL_FILE, NORMALISER_FILE, TRAIN_FILE, curve, hub,
+    CARD_FILE, CONFIG_FILE, CurvePoint, ENTRY_FILE, EntryId, EntryMeta, MODEL_FILE, NORMALISER_FILE, TRAIN_FILE, curve,
+    hub,
 };
 
 /// An entry whose files are the ones that were written.
@@ -74,6 +75,17 @@ impl Entry {
     /// What `entry.json` says.
     pub fn meta(&self) -> &EntryMeta {
         &self.meta
+    }
+
+    /// Every point of its training curve; where the metrics of its training are not there, those that `entry.json` kept.
+    ///
+    /// # Errors
+    /// When they cannot be read.
+    pub fn whole_curve(&self) -> Result<Vec<CurvePoint>, ZooError> {
+        if self.meta.training.is_some() && self.meta.files.contains_key(TRAIN_FILE) {
+            return curve::whole(&self.folder.join(TRAIN_FILE));
+        }
+        Ok(self.meta.training.as_ref().map_or_else(Vec::new, |training| training.curve.clone()))
     }
 
     /// `name@version`.

@@ -4,14 +4,18 @@ use std::process::ExitCode;
 use anyhow::Context;
 use cli::{Column, Table};
 use report::{LeaderboardRow, Reading, rank};
+use serde::Serialize;
 use serde_json::json;
 use zoo::audit::{KnownEntries, audit};
-use zoo::entry::Entry;
+use zoo::entry::{CurvePoint, Entry};
 use zoo::results::StoredEvaluation;
 
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
 /// Show in what two entries differ: settings, demonstrations, training, files and results
+///
+/// Their training curves are compared at every step that both have: where they first differ, and by how much at some of
+/// these steps.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo diff lift-act@1 lift-act@2
@@ -53,15 +57,24 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let names: BTreeSet<&String> = one.keys().chain(two.keys()).collect();
     let differing: Vec<(&String, Option<&String>, Option<&String>)> =
         names.into_iter().map(|name| (name, one.get(name), two.get(name))).filter(|(_, one, two)| one != two).collect();
+    let mut curves = Vec::new();
+    for (what, of) in LOSSES {
+        let points = |entry: &Entry| -> anyhow::Result<Points> {
+            let curve = entry.whole_curve().with_context(|| format!("entry {}", entry.id()))?;
+            Ok(curve.iter().filter_map(|point| Some((point.step, of(point)?))).collect())
+        };
+        curves.extend(Curves::of(what, &points(&first)?, &points(&second)?));
+    }
     if args.json {
         let all: Vec<_> =
             differing.iter().map(|(name, one, two)| json!({"what": name, "first": one, "second": two})).collect();
         cli::print_json(
-            &json!({"first": first.id().to_string(), "second": second.id().to_string(), "differences": all}),
+            &json!({"first": first.id().to_string(), "second": second.id().to_string(), "differences": all, "curves": curves}),
         )?;
         return Ok(ExitCode::SUCCESS);
     }
-    if differing.is_empty() {
+    let same = |curves: &Curves| curves.common_steps > 0 && curves.first_difference.is_none();
+    if differing.is_empty() && curves.iter().all(same) {
         cli::print(&format!("{} and {} differ in nothing\n", first.id(), second.id()))?;
         return Ok(ExitCode::SUCCESS);
     }
@@ -72,8 +85,104 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     ]);
     let text = |value: Option<&String>| value.map_or("-".to_owned(), Clone::clone);
     differing.iter().for_each(|(name, one, two)| table.push(vec![(*name).clone(), text(*one), text(*two)]));
-    cli::print(&table.text(false))?;
+    let mut told = vec![table.text(false)];
+    told.extend(curves.iter().map(|curves| curves.text(&first.id().to_string(), &second.id().to_string())));
+    cli::print(&told.join("\n"))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// A loss at a point, where it was computed.
+type Loss = fn(&CurvePoint) -> Option<f64>;
+
+/// The losses that a training curve has.
+const LOSSES: [(&str, Loss); 2] =
+    [("training loss", |point| Some(point.loss)), ("validation loss", |point| point.valid_loss)];
+
+/// A loss by step.
+type Points = BTreeMap<u64, f64>;
+
+/// Common steps at which two curves are shown.
+const SHOWN: usize = 6;
+
+/// Two curves beside each other.
+#[derive(Debug, Serialize)]
+struct Curves {
+    what: &'static str,
+    /// Steps that both have.
+    common_steps: usize,
+    /// Where they are first not the same to the last bit.
+    first_difference: Option<Beside>,
+    /// Some of the common steps, the first and the last among them.
+    at: Vec<Beside>,
+}
+
+/// Two losses at one step.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+struct Beside {
+    step: u64,
+    first: f64,
+    second: f64,
+    /// The second less the first.
+    difference: f64,
+}
+
+impl Curves {
+    /// Nothing where one has no curve.
+    fn of(what: &'static str, first: &Points, second: &Points) -> Option<Self> {
+        if first.is_empty() || second.is_empty() {
+            return None;
+        }
+        let beside = |(&step, &first): (&u64, &f64)| {
+            let second = *second.get(&step)?;
+            Some(Beside { step, first, second, difference: second - first })
+        };
+        let common: Vec<Beside> = first.iter().filter_map(beside).collect();
+        let last = common.len().saturating_sub(1);
+        let mut places: Vec<usize> = (0..SHOWN).map(|k| k * last / (SHOWN - 1)).collect();
+        places.dedup();
+        Some(Self {
+            what,
+            common_steps: common.len(),
+            first_difference: common.iter().find(|at| at.first.to_bits() != at.second.to_bits()).copied(),
+            at: places.into_iter().filter_map(|place| common.get(place).copied()).collect(),
+        })
+    }
+
+    fn text(&self, first: &str, second: &str) -> String {
+        let Self { what, common_steps, .. } = self;
+        let steps = if *common_steps == 1 { "step" } else { "steps" };
+        let Some(apart) = &self.first_difference else {
+            return match common_steps {
+                0 => format!("{what}: no step in common\n"),
+                _ => format!("{what}: the same at all {common_steps} common {steps}\n"),
+            };
+        };
+        let mut table = Table::new(vec![
+            Column::new("step").right(),
+            Column::new(first).right(),
+            Column::new(second).right(),
+            Column::new("difference").right(),
+        ]);
+        for at in &self.at {
+            let loss = |loss: f64| format!("{loss:.5}");
+            table.push(vec![at.step.to_string(), loss(at.first), loss(at.second), signed(at.difference)]);
+        }
+        let by = signed(apart.difference);
+        format!(
+            "{what}: {common_steps} common {steps}, first apart at step {} by {by}\n{}",
+            apart.step,
+            table.text(false)
+        )
+    }
+}
+
+/// A difference: five decimals, or what is left of it where they would say nothing.
+fn signed(difference: f64) -> String {
+    match difference.abs() {
+        0.0 => "0".to_owned(),
+        ..5e-6 => format!("{difference:+.1e}"),
+        _ => format!("{difference:+.5}"),
+    }
 }
 
 /// What an entry says of itself, by dotted names.
@@ -131,4 +240,42 @@ fn flatten(path: &str, value: &toml::Value, facts: &mut Facts) {
 fn result(row: &LeaderboardRow) -> (String, String) {
     let name = format!("result {} {}, seeds {}", row.task(), row.protocol_text(), row.seeds_text());
     (name, format!("{} ({})", row.counts, row.counts.percent(1)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn curves_are_compared_at_their_common_steps() {
+        let every = |pitch: u64, from: u64| -> Points {
+            (1..=120).map(|k| k * pitch).map(|step| (step, 1.0 / step as f64 + if step >= from { 0.25 } else { 0.0 })).collect()
+        };
+        // common: 30, 60, … 240; the second is 0.25 higher from 100 on
+        let found = Curves::of("training loss", &every(2, u64::MAX), &every(15, 100)).expect("both have points");
+        assert_eq!(found.common_steps, 8);
+        let apart = found.first_difference.expect("they differ");
+        assert_eq!((apart.step, apart.difference), (120, 0.25 + 1.0 / 120.0 - 1.0 / 120.0));
+        let steps: Vec<u64> = found.at.iter().map(|at| at.step).collect();
+        assert_eq!(steps, [30, 60, 90, 150, 180, 240]);
+        let text = found.text("a@1", "b@1");
+        assert!(text.starts_with("training loss: 8 common steps, first apart at step 120 by +0.25000\n"), "{text}");
+        assert!(text.contains("0.03333") && text.lines().count() == 9, "{text}");
+    }
+
+    #[test]
+    fn equal_curves_are_the_same_and_others_may_share_no_step() {
+        let one: Points = [(10, 0.5), (20, 0.25)].into();
+        let found = Curves::of("training loss", &one, &one).expect("both have points");
+        assert_eq!((found.first_difference, found.at.len()), (None, 2));
+        assert_eq!(found.text("a@1", "b@1"), "training loss: the same at all 2 common steps\n");
+        let other: Points = [(15, 0.5)].into();
+        let found = Curves::of("validation loss", &one, &other).expect("both have points");
+        assert_eq!(found.text("a@1", "b@1"), "validation loss: no step in common\n");
+        assert!(Curves::of("training loss", &one, &Points::new()).is_none());
+        // a bit is a difference, and is shown
+        let near: Points = [(10, 0.5), (20, 0.25 + f64::EPSILON)].into();
+        let text = Curves::of("training loss", &one, &near).expect("both have points").text("a@1", "b@1");
+        assert!(text.contains("first apart at step 20 by +2.2e-16"), "{text}");
+    }
 }
