@@ -207,6 +207,64 @@ fn demonstrations_of_another_simulator_generation_are_refused_unless_forced() {
     succeeds(&mut eval(&entries, "1", &["--force"]));
 }
 
+/// What a page says between `before` and `after`, again and again.
+fn between<'a>(page: &'a str, before: &str, after: &str) -> Vec<&'a str> {
+    page.split(before).skip(1).filter_map(|rest| rest.split(after).next()).collect()
+}
+
+#[test]
+fn a_page_shows_the_film_of_a_failure_and_its_commands_are_taken() {
+    let (folder, entries) = copied_zoo();
+    // of two results that differ in how chunks are executed, one is filmed
+    let results = folder.path().join("kept apart");
+    let kept = ["--results", text(&results)];
+    succeeds(&mut eval(&entries, "3", &[&kept[..], &["--n-action-steps", "2"]].concat()));
+    succeeds(&mut eval(&entries, "3", &[&kept[..], &["--video", "2", "--video-size", "32"]].concat()));
+    let board = |out: &Path| {
+        succeeds(&mut zoo(["leaderboard", "--zoo", text(&entries), kept[0], kept[1], "--out", text(out)]));
+        fs::read_to_string(out.join("report.html")).expect("a page")
+    };
+    let page = board(&folder.path().join("out"));
+    let films = between(&page, "<video controls preload=\"none\" aria-label=\"", "\"");
+    let expected = [10_000, 10_001].map(|seed| format!("lift-act@1, seed {seed}: failed after 6 steps"));
+    assert_eq!(films, expected, "each once: in the row that was filmed");
+    let mp4 = between(&page, "src=\"data:video/mp4;base64,", "\"");
+    assert!(mp4.len() == 2 && mp4.iter().all(|film| film.starts_with("AAAA") && film.len() > 1000), "{}", mp4.len());
+
+    let mut commands: Vec<String> = between(&page, "<code class=\"command\">", "</code>")
+        .into_iter()
+        .map(|line| line.replace("&#39;", "'"))
+        .collect();
+    commands.sort();
+    commands.dedup();
+    // of each result: its episodes, all of it, its first failure; and the second film
+    assert_eq!(commands.len(), 7, "{commands:#?}");
+    let program = zoo([]).get_program().to_owned();
+    let run = |line: &str| {
+        let mut shell = Command::new("sh");
+        let words = line.strip_prefix("actrm-zoo ").expect("our program");
+        // two steps of training and short episodes: what is asked here is whether the line is taken
+        let quick = if words.starts_with("rerun") { " --skip-training" } else { "" };
+        said(shell.args(["-c", &format!("exec \"$0\" {words}{quick}")]).arg(&program))
+    };
+    for line in &commands {
+        let told = run(line);
+        let word = if line.contains(" rerun ") { "is the same" } else { "every outcome the same" };
+        assert!(told.contains(word), "{line}: {told}");
+        assert_eq!(told.contains(".mp4"), line.contains(" --video 1"), "{line}: {told}");
+    }
+    assert_eq!(listing(&results).len(), 2, "no command leaves another result");
+    // now the other result has a film of its first failure as well
+    let page = board(&folder.path().join("out"));
+    assert_eq!(between(&page, "<video controls", "</video>").len(), 3);
+    // one from before films said of what result they are belongs to no row where it may be of two
+    let videos = entries.join("videos/lift-act@1");
+    let film = listing(&videos).into_iter().find(|name| name.contains("-10001-")).expect("a film");
+    fs::rename(videos.join(film), videos.join("Lift-10001-failure.mp4")).expect("renamed");
+    let page = board(&folder.path().join("out"));
+    assert_eq!(between(&page, "<video controls", "</video>").len(), 2);
+}
+
 #[test]
 fn episodes_and_demonstrations_become_videos() {
     let (folder, entries) = copied_zoo();
@@ -216,8 +274,9 @@ fn episodes_and_demonstrations_become_videos() {
     };
     let printed = said(&mut eval(&entries, "2", &["--video", "1", "--video-size", "64"]));
     let videos = entries.join("videos/lift-act@1");
-    assert_eq!(listing(&videos), ["Lift-10000-failure.mp4"], "{printed}");
-    assert!(is_video(&videos.join("Lift-10000-failure.mp4")));
+    let films = listing(&videos);
+    assert!(films.len() == 1 && films[0].starts_with("Lift-10000-failure-"), "{printed}: {films:?}");
+    assert!(printed.contains(&films[0]) && is_video(&videos.join(&films[0])), "{printed}");
 
     // of a robomimic file, and of the data set that was converted from it: the same images
     let set = trained().join("lift");

@@ -76,6 +76,22 @@ addEventListener("load", () => {
     narrow.querySelectorAll("details").forEach((details) => { details.open = true; });
     told.overflow = narrow.documentElement.scrollWidth;
     told.charts = [...narrow.querySelectorAll(".card > svg, .strip > svg, .costs > svg")].map((svg) => svg.getBoundingClientRect().width);
+    told.lines = [...narrow.querySelectorAll(".lines > svg")].map((svg) => {
+      const { width } = svg.getBoundingClientRect();
+      const least = Math.min(...[...svg.querySelectorAll("text")].map((text) => parseFloat(narrow.defaultView.getComputedStyle(text).fontSize)));
+      return [width, least * width / svg.viewBox.baseVal.width];
+    });
+    told.pairs = [...document.querySelectorAll("table.pairs")].map((pairs) => [
+      pairs.rows.length, pairs.tHead.rows[0].cells.length, pairs.caption.textContent.length > 0,
+      [...pairs.querySelectorAll(".better, .worse")].every((cell) => /[▲▼]/.test(cell.textContent)),
+    ]);
+    const commands = [...document.querySelectorAll("details[open] code.command")];
+    const copies = [...document.querySelectorAll("button.copy")];
+    told.copies = [copies.length, commands.length];
+    let copied = "";
+    Object.defineProperty(navigator, "clipboard", { value: { writeText: async (text) => { copied = text; } } });
+    copies[0].click();
+    told.copied = copied === commands[0].textContent && copied;
     frame.remove();
     const out = document.createElement("pre");
     out.id = "told";
@@ -131,6 +147,19 @@ fn the_report_works_in_a_browser() {
     assert!(told["overflow"].as_f64().is_some_and(|width| width <= 390.0), "{told}");
     let charts = numbers("charts");
     assert!(charts.len() > 20 && charts.iter().all(|width| *width >= 300.0), "{charts:?}");
+    // lines shrink with the page, and what is written in them does not
+    let lines = told["lines"].as_array().expect("charts");
+    let at = |pair: &serde_json::Value, place: usize| pair[place].as_f64().expect("a number");
+    assert!(lines.len() > 5, "{told}");
+    assert!(lines.iter().all(|pair| (300.0..=390.0).contains(&at(pair, 0)) && at(pair, 1) >= 10.0), "{lines:?}");
+    // ACT beside ACTRM, and more, on every task: as many rows as columns, told apart by more than their colour
+    let pairs = told["pairs"].as_array().expect("tables");
+    assert!(pairs.len() > 5, "{told}");
+    let sound = |pair: &serde_json::Value| pair[0] == pair[1] && (&pair[2], &pair[3]) == (&true.into(), &true.into());
+    assert!(pairs.iter().all(sound), "{pairs:?}");
+    // the row that was opened has a button for each of its commands, which copies it
+    assert!(told["copies"][0] == told["copies"][1] && told["copies"][0].as_u64() > Some(1), "{told}");
+    assert!(told["copied"].as_str().is_some_and(|line| line.starts_with("actrm-zoo ")), "{told}");
 }
 
 /// Done by a reader of a data set's page: opens an episode, looks for one, orders them; then looks at 390 pixels.

@@ -115,6 +115,21 @@ fn attention_is_drawn_and_other_depths_are_counted() {
     let shuffled = said(&mut depth(&["--steps", "3", "--intervene", "shuffle"]));
     assert!(shuffled.contains("success"), "{shuffled}");
     assert!(!entries.join("results").exists(), "what it does otherwise is no result of the entry");
+    let mut board = zoo(["leaderboard", "--json", "--zoo", text(&entries)]);
+    let told: Value =
+        serde_json::from_str(&said(board.args(["--depths", text(&folder.path().join("depth"))]))).expect("JSON");
+    let told = told["depths"].as_array().expect("a list");
+    let of = |key: &str| told.iter().map(|depth| depth[key].clone()).collect::<Vec<_>>();
+    assert_eq!(
+        (of("steps"), of("episodes")),
+        (vec![1.into(), 3.into(), 5.into()], vec![Value::from(2); 3]),
+        "{told:?}"
+    );
+    assert_eq!(of("thinking"), ["whole", "shuffle", "whole"], "{told:?}");
+    let page = std::fs::read_to_string(entries.join("report.html")).expect("a page");
+    for words in ["lift-actrm@1 on Lift", "every step done", "reasoning of another episode"] {
+        assert!(page.contains(words), "no {words}");
+    }
     refused(&mut depth(&["--intervene", "melt"]), &["freeze or shuffle"]);
     let mut act = zoo(["depth", "lift-act@1", "--steps", "2", "--zoo", text(&root().join("zoo"))]);
     refused(&mut act, &["lift-act@1", "does not think step by step"]);

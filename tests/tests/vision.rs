@@ -88,7 +88,7 @@ fn from_cameras_to_the_leaderboard() {
     let shown = text_of(plain);
     assert!(shown.contains("lift-act-image@1 on Lift: 0 of 2"), "{shown}");
     let videos = listing(&entries.join("videos/lift-act-image@1"));
-    assert_eq!(videos, ["Lift-10000-failure-seen.mp4"]);
+    assert!(videos.len() == 1 && videos[0].starts_with("Lift-10000-failure-seen-"), "{videos:?}");
     // every outcome again, whatever drew the pictures
     let again = text_of(eval("lift-act-image@1", &entries, &["--episodes", "2", "--again"]));
     assert!(again.contains("2 episodes run again, every outcome the same"), "{again}");

@@ -17,7 +17,7 @@ use std::process::{Command, ExitCode};
 use std::time::Instant;
 
 use common::{TASKS, browser, results, visit};
-use report::{COLUMNS, Reading, csv, rank, to_html};
+use report::{Beside, COLUMNS, Reading, csv, rank, to_html};
 use serde_json::{Value, json};
 use zoo::entry::{CardWords, Entry, EntryDraft, training_facts};
 use zoo::registry::Registry;
@@ -123,7 +123,7 @@ fn main() -> ExitCode {
         let rows = rank(&all, &Reading::default());
         note("rank", begin.elapsed().as_secs_f64() * 1e3);
         let begin = Instant::now();
-        let html = to_html(&rows, &[], "");
+        let html = to_html(&rows, &Beside::default());
         let table = csv::table(COLUMNS, &rows);
         note("write", begin.elapsed().as_secs_f64() * 1e3);
         assert_eq!((rows.len(), table.lines().count()), (count, count + 1));

@@ -6,10 +6,7 @@ use zoo::results::StoredEvaluation;
 
 use crate::html::escape;
 use crate::leaderboard::LeaderboardRow;
-use crate::page::Curve;
-
-/// Colours of the training curves, in order, readable on light and dark ground.
-const COLOURS: [&str; 8] = ["#2f62c8", "#d9772b", "#1f8f5f", "#a14fb8", "#c8452f", "#128c9c", "#8a7a1f", "#6b7480"];
+use crate::page::{COLOURS, Curve};
 
 const WIDTH: f64 = 1040.0;
 

@@ -11,6 +11,9 @@ pub const FEWEST_SHARED: usize = 20;
 /// Most rows of a task and protocol that are compared with each other: those that stand first.
 pub const MOST_COMPARED: usize = 60;
 
+/// Rows of a task and protocol whose comparisons with each other are kept: those that stand first.
+pub const MOST_PAIRED: usize = 12;
+
 /// Level of every decision.
 pub const ALPHA: f64 = 0.05;
 
@@ -171,12 +174,34 @@ impl Flips {
 }
 
 /// Where a row stands among those that it is compared with.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Standing {
     /// Rows that share a letter cannot be told apart.
     pub letters: String,
     /// The first and the last rank that it may have.
     pub ranks: (usize, usize),
+    /// What it is beside each of the first [`MOST_PAIRED`] rows that it is compared with, in their order; none beside itself.
+    /// Empty for the rows after those.
+    pub beside: Vec<Option<Pair>>,
+}
+
+/// A row beside another one, after the correction over the whole table.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pair {
+    /// The comparison, the row first: its difference is the row's success rate less the other's, its p-value uncorrected.
+    pub comparison: Comparison,
+    /// The p-value after Holm's correction over all comparisons of the table.
+    pub adjusted: f64,
+    /// Whether that tells them apart, as letters and ranks do.
+    pub distinct: bool,
+}
+
+impl Comparison {
+    /// The same seen from the second row.
+    fn turned(self) -> Self {
+        let interval = self.interval.map(|(low, high)| (-high, -low));
+        Self { difference: -self.difference, interval, ..self }
+    }
 }
 
 /// The standing of each of some rows; inner lists are those that are compared with each other, best first. p-values are
@@ -196,9 +221,19 @@ pub fn standings(groups: &[Vec<&LeaderboardRow>]) -> Vec<Vec<Option<Standing>>> 
         let corrected: Vec<(f64, f64)> =
             found.iter().map(|comparison| (comparison.difference, adjusted.next().unwrap_or(1.0))).collect();
         let distinct = Distinct::new(n, &corrected, ALPHA);
-        let letters = distinct.letters();
-        let standing = |(i, letters): (usize, String)| Some(Standing { letters, ranks: distinct.ranks(i) });
-        let mut standings: Vec<Option<Standing>> = letters.into_iter().enumerate().map(standing).collect();
+        let kept = n.min(MOST_PAIRED);
+        let mut beside = vec![Vec::new(); n];
+        beside.iter_mut().take(kept).for_each(|others| others.resize(kept, None));
+        for ((i, j), (&comparison, &(_, adjusted))) in pairs(n).zip(found.iter().zip(&corrected)) {
+            if j < kept {
+                let distinct = distinct.differ(i, j);
+                beside[i][j] = Some(Pair { comparison, adjusted, distinct });
+                beside[j][i] = Some(Pair { comparison: comparison.turned(), adjusted, distinct });
+            }
+        }
+        let letters = distinct.letters().into_iter().zip(beside).enumerate();
+        let standing = |(i, (letters, beside))| Some(Standing { letters, ranks: distinct.ranks(i), beside });
+        let mut standings: Vec<Option<Standing>> = letters.map(standing).collect();
         standings.resize(rows.len(), None);
         all.push(standings);
     }

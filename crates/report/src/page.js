@@ -88,23 +88,43 @@
     });
   });
   apply();
+  const copy = async (text) => {
+    try {
+      await navigator.clipboard.writeText(text);
+    } catch {
+      // a page from a file may not have a clipboard of its own
+      const area = document.createElement("textarea");
+      area.value = text;
+      document.body.append(area);
+      area.select();
+      document.execCommand("copy");
+      area.remove();
+    }
+  };
+  // beside every command a button that copies it, once its details are open
+  document.addEventListener("toggle", ({ target }) => {
+    if (!(target instanceof HTMLDetailsElement) || !target.open || target.dataset.copied) return;
+    target.dataset.copied = "yes";
+    target.querySelectorAll("code.command").forEach((command) => {
+      const button = document.createElement("button");
+      [button.type, button.className, button.textContent] = ["button", "copy", "Copy"];
+      button.setAttribute("aria-label", `Copy ${command.textContent}`);
+      button.addEventListener("click", async () => {
+        await copy(command.textContent);
+        button.removeAttribute("aria-label");
+        button.textContent = "Copied";
+        button.focus();
+      });
+      command.after(button);
+    });
+  }, true);
   // what fits the filters, as CSV
   const quoted = (value) => (/[",\n]/.test(value) ? `"${value.replace(/"/g, '""')}"` : value);
   const line = (cells) => cells.map((cell) => quoted(cell.map((text) => text.trim()).join("; "))).join(",");
   document.getElementById("copy").addEventListener("click", async () => {
     const named = headings.map((heading) => texts(heading.firstChild));
     const csv = [named, ...fitting.map((one) => one.cells)].map(line).join("\n") + "\n";
-    try {
-      await navigator.clipboard.writeText(csv);
-    } catch {
-      // a page from a file may not have a clipboard of its own
-      const area = document.createElement("textarea");
-      area.value = csv;
-      document.body.append(area);
-      area.select();
-      document.execCommand("copy");
-      area.remove();
-    }
+    await copy(csv);
     shown.textContent = `${fitting.length} rows copied`;
   });
   // a link to a row opens its details, or turns to it

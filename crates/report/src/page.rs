@@ -4,9 +4,21 @@
 //! training curves: no clock, no network, the same bytes for the same input. Without scripts everything is there; the
 //! script sorts, filters and copies.
 
+mod commands;
+mod demonstrations;
+mod depth;
+mod films;
+mod pairs;
+mod plot;
+mod solving;
+
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
+pub use self::commands::Places;
+pub use self::depth::{DEPTH_COLUMNS, Depth};
+pub use self::films::{Film, MOST_FILM_BYTES};
+pub(crate) use self::plot::COLOURS;
 use crate::across::{ACROSS_COLUMNS, across_tasks, speaking};
 use crate::charts;
 use crate::html::{self, escape};
@@ -21,6 +33,43 @@ pub struct Curve {
     pub points: Vec<(u64, f64)>,
 }
 
+/// What is known of an entry besides its results.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EntryFacts {
+    /// The task that it was trained for.
+    pub task: String,
+    /// Control steps a second of its environment.
+    pub hertz: f64,
+}
+
+/// What a page shows beside its rows. Nothing of it has to be there.
+#[derive(Debug, Clone, Default)]
+pub struct Beside {
+    /// Training curves.
+    pub curves: Vec<Curve>,
+    /// HTML of other evaluations.
+    pub section: String,
+    /// Facts of entries, by `name@version`.
+    pub entries: BTreeMap<String, EntryFacts>,
+    /// Evaluations at other depths of reasoning.
+    pub depths: Vec<Depth>,
+    /// Films of episodes.
+    pub films: Vec<Film>,
+    /// Folders that its commands name.
+    pub places: Places,
+}
+
+impl Beside {
+    fn entry(&self, row: &LeaderboardRow) -> Option<&EntryFacts> {
+        self.entries.get(&row.record().entry.to_string())
+    }
+
+    /// The task of a row's entry, if it is known.
+    fn task(&self, row: &LeaderboardRow) -> Option<&str> {
+        self.entry(row).map(|entry| entry.task.as_str())
+    }
+}
+
 /// Rows whose episodes, curves and origin are drawn; a page with ten thousand of them would be of no use.
 const MOST_DETAILED: usize = 200;
 
@@ -33,8 +82,12 @@ const MOST_DRAWN_IN_ALL: usize = 1500;
 /// Rows that the table shows at once. Those after them are data in the script, and become elements when they are shown.
 const ROWS_AT_ONCE: usize = 500;
 
-/// The report over ranked rows as HTML, and after them `section`: HTML of other evaluations, or nothing.
-pub fn to_html(rows: &[LeaderboardRow], curves: &[Curve], section: &str) -> String {
+/// Cells of all tables of pairs together.
+const MOST_PAIR_CELLS: usize = 3000;
+
+/// The report over ranked rows as HTML, with what is known beside them.
+pub fn to_html(rows: &[LeaderboardRow], beside: &Beside) -> String {
+    let section = beside.section.as_str();
     let mut groups: BTreeMap<(String, String, String), Vec<&LeaderboardRow>> = BTreeMap::new();
     for row in rows {
         groups.entry(group(row)).or_default().push(row);
@@ -47,8 +100,13 @@ pub fn to_html(rows: &[LeaderboardRow], curves: &[Curve], section: &str) -> Stri
     let _ = writeln!(html, "<body>\n{}\n<main>\n<h1>Leaderboard</h1>", charts::patterns());
     let episodes: u64 = rows.iter().map(|row| row.counts.episodes).sum();
     let trainings: usize = rows.iter().map(LeaderboardRow::n_trainings).sum();
+    let thinking = depth::section(&beside.depths);
     if rows.is_empty() {
-        html.push_str(if section.is_empty() { "<p>No finished evaluation yet.</p>\n" } else { "" });
+        html.push_str(if section.is_empty() && thinking.is_empty() {
+            "<p>No finished evaluation yet.</p>\n"
+        } else {
+            ""
+        });
     } else {
         let _ = writeln!(
             html,
@@ -60,12 +118,13 @@ pub fn to_html(rows: &[LeaderboardRow], curves: &[Curve], section: &str) -> Stri
         );
         html.push_str(&overview(rows));
         html.push_str(&all_rows(rows));
-        contents(&groups, section, &mut html);
+        contents(&groups, &thinking, section, &mut html);
     }
     let mut room = Room::for_groups(groups.len());
     for rows in groups.values() {
-        task(rows, curves, &mut room, &mut html);
+        task(rows, beside, &mut room, &mut html);
     }
+    html.push_str(&thinking);
     html.push_str(section);
     let _ = writeln!(
         html,
@@ -196,11 +255,19 @@ fn turning(rows: usize) -> String {
     )
 }
 
-fn contents(groups: &BTreeMap<(String, String, String), Vec<&LeaderboardRow>>, section: &str, html: &mut String) {
+fn contents(
+    groups: &BTreeMap<(String, String, String), Vec<&LeaderboardRow>>,
+    thinking: &str,
+    section: &str,
+    html: &mut String,
+) {
     html.push_str("<nav aria-label=\"Contents\"><ul class=\"contents\">");
     for rows in groups.values() {
         let (task, protocol) = (escape(rows[0].task()), escape(&rows[0].protocol_text()));
         let _ = write!(html, "<li><a href=\"#{}\">{task}</a> <small>{protocol}</small></li>", heading(rows[0]));
+    }
+    if !thinking.is_empty() {
+        html.push_str("<li><a href=\"#depth\">Reasoning depth</a></li>");
     }
     if !section.is_empty() {
         html.push_str("<li><a href=\"#puzzles\">Puzzles</a></li>");
@@ -216,17 +283,22 @@ struct Room {
     drawn: usize,
     /// Rows to come that may have details.
     detailed: usize,
+    /// Cells that tables of pairs to come may have.
+    pairs: usize,
+    /// Characters that films to come may have.
+    films: usize,
 }
 
 impl Room {
     fn for_groups(groups: usize) -> Self {
         let each = (MOST_DRAWN_IN_ALL / groups.max(1)).clamp(10, MOST_DRAWN);
-        Self { each, drawn: MOST_DRAWN_IN_ALL, detailed: MOST_DETAILED }
+        let (pairs, films) = (MOST_PAIR_CELLS, MOST_FILM_BYTES);
+        Self { each, drawn: MOST_DRAWN_IN_ALL, detailed: MOST_DETAILED, pairs, films }
     }
 }
 
-/// A task under one protocol: its chart, what success costs, and each row's details while there is room.
-fn task(rows: &[&LeaderboardRow], curves: &[Curve], room: &mut Room, html: &mut String) {
+/// A task under one protocol: its charts, its rows beside each other, and each row's details while there is room.
+fn task(rows: &[&LeaderboardRow], beside: &Beside, room: &mut Room, html: &mut String) {
     let _ = writeln!(
         html,
         "<section>\n<h2 id=\"{}\">{}</h2>\n<p class=\"lead\">Protocol <code>{}</code></p>",
@@ -249,8 +321,18 @@ fn task(rows: &[&LeaderboardRow], curves: &[Curve], room: &mut Room, html: &mut 
         let costs = charts::costs(drawn);
         let _ = writeln!(html, "{}", card("Success against what it costs", &costs));
     }
+    let hertz = rows.iter().find_map(|row| beside.entry(row)).map(|entry| entry.hertz);
+    for (title, content) in [
+        ("Rows beside each other", pairs::table(rows, &mut room.pairs)),
+        ("Episodes solved by each control step", solving::chart(drawn, hertz)),
+        ("Success over demonstrations", demonstrations::chart(drawn)),
+    ] {
+        if !content.is_empty() {
+            let _ = writeln!(html, "{}", card(title, &content));
+        }
+    }
     for row in rows.iter().take(room.detailed) {
-        details(row, curves, html);
+        details(row, beside, &mut room.films, html);
     }
     room.detailed = room.detailed.saturating_sub(rows.len());
     html.push_str("</section>\n");
@@ -264,7 +346,7 @@ fn card(title: &str, content: &str) -> String {
 }
 
 /// What lies behind a row: each training's episodes, its curve, and where it comes from.
-fn details(row: &LeaderboardRow, curves: &[Curve], html: &mut String) {
+fn details(row: &LeaderboardRow, beside: &Beside, films: &mut usize, html: &mut String) {
     let _ = writeln!(
         html,
         "<details class=\"row\" id=\"details-{}\"><summary>{} <small>{}, {} [{}%]</small></summary>",
@@ -288,24 +370,28 @@ fn details(row: &LeaderboardRow, curves: &[Curve], html: &mut String) {
             escape(&training.name()),
             training.counts,
             training.record().seeds,
-            failed(training)
+            failed(training, beside)
         );
     }
     html.push_str("</div>\n");
+    let filmed: String = trainings.iter().map(|training| films::failures(training, beside, films)).collect();
+    if !filmed.is_empty() {
+        let _ = writeln!(html, "{}", card("Failed episodes", &filmed));
+    }
     let names: Vec<String> = trainings.iter().map(LeaderboardRow::name).collect();
-    let mut shown: Vec<&Curve> = curves.iter().filter(|curve| names.contains(&curve.entry)).collect();
+    let mut shown: Vec<&Curve> = beside.curves.iter().filter(|curve| names.contains(&curve.entry)).collect();
     shown.sort_by(|a, b| a.entry.cmp(&b.entry));
     let drawn = charts::curves(&shown);
     if !drawn.is_empty() {
         let _ = writeln!(html, "{}", card("Training loss over optimiser steps", &drawn));
     }
     html.push_str("<div class=\"card\">\n<h3>Where these numbers come from</h3>\n");
-    trainings.iter().for_each(|training| html.push_str(&provenance(training)));
+    trainings.iter().for_each(|training| html.push_str(&provenance(training, beside)));
     html.push_str("</div>\n</details>\n");
 }
 
 /// The first seeds that failed, with the command that shows one.
-fn failed(row: &LeaderboardRow) -> String {
+fn failed(row: &LeaderboardRow, beside: &Beside) -> String {
     const SHOWN: usize = 12;
     let seeds: Vec<u64> =
         row.evaluations().flat_map(|one| &one.episodes).filter(|e| !e.success).map(|e| e.seed).collect();
@@ -313,11 +399,16 @@ fn failed(row: &LeaderboardRow) -> String {
     let listed: Vec<String> = seeds.iter().take(SHOWN).map(u64::to_string).collect();
     let more = seeds.len().saturating_sub(SHOWN);
     format!(
-        "<p>Failed: {}{}. Watch one: <code>actrm-zoo eval {} --seed-start {first} --episodes 1 --video 1</code></p>",
+        "<p>Failed: {}{}. Watch one: {}</p>",
         listed.join(", "),
         if more > 0 { format!(" and {more} more") } else { String::new() },
-        escape(&row.name())
+        command(&commands::watch(row, *first, beside.task(row), &beside.places))
     )
+}
+
+/// A command, beside which the script puts a button that copies it.
+fn command(line: &str) -> String {
+    format!("<code class=\"command\">{}</code>", escape(line))
 }
 
 /// A name for links: letters, digits and hyphens of what tells a row from the others.
@@ -334,8 +425,12 @@ fn slug(text: &str) -> String {
     escape(&text.chars().map(word).collect::<String>())
 }
 
-fn provenance(row: &LeaderboardRow) -> String {
+fn provenance(row: &LeaderboardRow, beside: &Beside) -> String {
     let t = &row.record().training;
+    let again = commands::again(row, beside.task(row), &beside.places).map_or_else(
+        || "it thinks by the clock: its episodes may end otherwise next time".to_owned(),
+        |line| command(&line),
+    );
     let facts = [
         ("entry hash", format!("<code>{}</code>", escape(&row.record().entry.hash))),
         (
@@ -356,15 +451,8 @@ fn provenance(row: &LeaderboardRow) -> String {
         ("rules", format!("<code>{}</code>", escape(&row.record().protocol.id()))),
         ("seeds", escape(&row.seeds_text())),
         ("versions", escape(&row.versions_text())),
-        (
-            "run it again",
-            format!(
-                "<code>actrm-zoo eval {} --seed-start {} --episodes {} --again</code>",
-                escape(&row.name()),
-                row.record().seeds.start,
-                row.record().seeds.count
-            ),
-        ),
+        ("its episodes again", again),
+        ("all of it again, from its demonstrations", command(&commands::rerun(row, &beside.places))),
     ];
     let mut html = format!("<h4>{}</h4><dl>", escape(&row.name()));
     for (name, value) in facts {
@@ -392,8 +480,13 @@ mod tests {
         stack.protocol.task = "Stack".into();
         finished(dir.path(), &stack);
         let points = (0..=500).step_by(10).map(|step| (step, 2.0 * (-(step as f64) / 120.0).exp() + 0.03)).collect();
-        let curves = [Curve { entry: "lift-act@1".into(), points }];
-        to_html(&rank(&list_evaluations(dir.path()).unwrap(), &Reading::default()), &curves, "")
+        let facts = EntryFacts { task: "Lift".into(), hertz: 20.0 };
+        let beside = Beside {
+            curves: vec![Curve { entry: "lift-act@1".into(), points }],
+            entries: [("lift-act@1".to_owned(), facts)].into(),
+            ..Beside::default()
+        };
+        to_html(&rank(&list_evaluations(dir.path()).unwrap(), &Reading::default()), &beside)
     }
 
     #[test]
@@ -436,14 +529,15 @@ mod tests {
         for (k, episode) in evaluation.episodes.iter_mut().enumerate() {
             episode.group = Some(if k < 15 { "seen" } else { "unseen" }.to_owned());
         }
-        let html = to_html(&rank(&[evaluation], &Reading::default()), &[], "");
+        let html = to_html(&rank(&[evaluation], &Reading::default()), &Beside::default());
         assert!(html.contains("16/20<br><small>seen 12/15 (55–93%)</small><br><small>unseen 4/5 (38–96%)</small>"));
     }
 
     #[test]
     fn no_result_is_a_page_that_says_so() {
-        assert!(to_html(&[], &[], "").contains("No finished evaluation yet"));
-        assert!(!to_html(&[], &[], "<h2 id=\"puzzles\">x</h2>").contains("No finished"));
+        let with = |section: &str| to_html(&[], &Beside { section: section.to_owned(), ..Beside::default() });
+        assert!(with("").contains("No finished evaluation yet"));
+        assert!(!with("<h2 id=\"puzzles\">x</h2>").contains("No finished"));
     }
 
     /// Ten thousand results over fifty tasks. The bound is for a machine that does other work beside.
@@ -464,7 +558,7 @@ mod tests {
             .collect();
         let begin = Instant::now();
         let rows = rank(&all, &Reading::default());
-        let html = to_html(&rows, &[], "");
+        let html = to_html(&rows, &Beside::default());
         let took = begin.elapsed();
         assert_eq!(rows.len(), 10_000);
         assert!(html.len() < 12_000_000, "{} bytes", html.len());

@@ -5,7 +5,7 @@
 mod common;
 
 use common::{browser, results, visit};
-use report::{Reading, rank, to_html};
+use report::{Beside, Reading, rank, to_html};
 use serde_json::json;
 
 const READER: &str = r##"
@@ -53,7 +53,7 @@ fn rows_that_are_not_shown_yet_are_sorted_found_linked_and_copied() {
         return;
     };
     let rows = rank(&results(1_200), &Reading::default());
-    let told = visit(&browser, &to_html(&rows, &[], ""), READER);
+    let told = visit(&browser, &to_html(&rows, &Beside::default()), READER);
     assert_eq!(told["first"], json!([500, "rows 1 to 500 of 1200", true, false]), "{told}");
     assert_eq!(told["last"], json!([200, "rows 1001 to 1200 of 1200", false, true]), "{told}");
     assert_eq!(told["like_the_written"], true, "{told}");

@@ -9,15 +9,23 @@ use zoo::config::Library;
 use zoo::protocols::{Block, Protocols};
 use zoo::registry::Registry;
 
+/// The folder of the zoo unless another one is named.
+const USUAL_ZOO: &str = "zoo";
+
 /// Where the zoo is.
 #[derive(Args)]
 pub struct ZooArgs {
     /// Folder of the zoo
-    #[arg(long, value_name = "DIR", default_value = "zoo", env = "ACTRM_ZOO_DIR")]
+    #[arg(long, value_name = "DIR", default_value = USUAL_ZOO, env = "ACTRM_ZOO_DIR")]
     pub zoo: PathBuf,
 }
 
 impl ZooArgs {
+    /// Its folder, unless it is the usual one.
+    pub fn named(&self) -> Option<String> {
+        (self.zoo != Path::new(USUAL_ZOO)).then(|| cli::lossy(&self.zoo))
+    }
+
     /// Its entries.
     pub fn registry(&self) -> Registry {
         Registry::open(&self.zoo)
@@ -33,6 +41,11 @@ pub struct ResultsArgs {
 }
 
 impl ResultsArgs {
+    /// The folder, if one was named.
+    pub fn named(&self) -> Option<String> {
+        self.results.as_deref().map(cli::lossy)
+    }
+
     /// The folder that was named, or the zoo's.
     pub fn folder(&self, zoo: &ZooArgs) -> PathBuf {
         self.results.clone().unwrap_or_else(|| zoo.zoo.join("results"))
@@ -63,6 +76,11 @@ pub struct ProtocolArgs {
 }
 
 impl ProtocolArgs {
+    /// The folder, if one was named.
+    pub fn named(&self) -> Option<String> {
+        self.protocols.as_deref().map(cli::lossy)
+    }
+
     /// The protocols.
     pub fn protocols(&self) -> anyhow::Result<Protocols> {
         Ok(match &self.protocols {
@@ -98,7 +116,7 @@ fn library(folder: Option<&Path>) -> anyhow::Result<Library> {
 /// Completes names of entries, with and without version, of the zoo that the line names.
 pub fn entry_names() -> ArgValueCandidates {
     ArgValueCandidates::new(|| {
-        let folder = given("--zoo").or_else(|| std::env::var_os("ACTRM_ZOO_DIR")).unwrap_or_else(|| "zoo".into());
+        let folder = given("--zoo").or_else(|| std::env::var_os("ACTRM_ZOO_DIR")).unwrap_or_else(|| USUAL_ZOO.into());
         let ids = Registry::open(Path::new(&folder)).ids().unwrap_or_default();
         candidates(ids.iter().map(ToString::to_string))
     })

@@ -224,6 +224,14 @@ impl EvaluationRecord {
         self.seeds.iter().filter(|seed| mine(seed - self.seeds.start)).collect()
     }
 
+    /// Eight hexadecimal digits, the same for evaluations that differ in nothing but their seeds: an episode of one seed is
+    /// the same in all of them.
+    pub fn conditions(&self) -> String {
+        let Self { entry, protocol, execution, versions, .. } = self;
+        let whole = serde_json::to_vec(&(entry, protocol, execution, versions));
+        sha256_hex(&whole.expect("plain fields are always JSON"))[..8].to_owned()
+    }
+
     /// The name of its folder: readable, and different for anything that could change an outcome.
     pub fn folder_name(&self) -> String {
         let Self { entry, protocol, execution, seeds, versions, .. } = self;

@@ -1,12 +1,15 @@
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits};
 use models::actrm::{Intervention, Thinking};
+use report::Depth;
 use report::statistics::wilson_interval;
 use serde::Serialize;
+use zoo::ZooError;
+use zoo::audit::{KnownEntries, LeftOut, audit};
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, evaluate, thinking_subject};
 use zoo::results::{Seeds, StoredEvaluation};
 
@@ -14,11 +17,44 @@ use crate::places::{ZooArgs, entry_names};
 
 const GOES_ON: &str = "stopped; the same command goes on where it was";
 
+/// Where the outcomes go unless another folder is named.
+pub(super) const WORK: &str = "out/depth";
+
+/// The folder of the results at so many steps: `8-whole`.
+fn folder_name(steps: usize, how: &str) -> String {
+    format!("{steps}-{how}")
+}
+
+/// What such a folder's name says: the steps, and how they were thought.
+fn of_folder(name: &str) -> Option<(u64, &str)> {
+    let (steps, how) = name.split_once('-')?;
+    Some((steps.parse().ok().filter(|steps| *steps > 0)?, how))
+}
+
+/// The depths in `work` that are of `entries`, for the report's page, and what is wrong with the others. Those of entries
+/// that are not there are somebody else's.
+pub(super) fn depths(work: &Path, entries: &KnownEntries) -> anyhow::Result<(Vec<Depth>, Vec<LeftOut>)> {
+    let (mut depths, mut left_out) = (Vec::new(), Vec::new());
+    let Ok(folders) = std::fs::read_dir(work) else { return Ok((depths, left_out)) };
+    let mut folders: Vec<PathBuf> = folders.flatten().map(|folder| folder.path()).collect();
+    folders.sort();
+    for folder in folders {
+        let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let Some((steps, how)) = of_folder(&name) else { continue };
+        let found = audit(&folder, entries)?;
+        depths.extend(found.standing.iter().map(|evaluation| Depth::new(steps, how, evaluation)));
+        let ours = |left: &LeftOut| !matches!(left.reason, ZooError::UnfitResult { .. });
+        left_out.extend(found.left_out.into_iter().filter(ours));
+    }
+    Ok((depths, left_out))
+}
+
 /// Let a trained policy think more or fewer steps, or tamper with its reasoning, and count what it still solves
 ///
 /// Nothing is trained: the entry's weights are applied so many times, to the last step, or until they halt. `freeze` leaves
 /// the reasoning as the first step made it, `shuffle` puts that of a thought about another episode's beginning in its place
-/// after every update. The outcomes are no results of the entry and are kept apart from the zoo's.
+/// after every update. The outcomes are no results of the entry and are kept apart from the zoo's; the page of
+/// `leaderboard` shows them in a section of their own.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo depth pickchain-actrm --steps 1,2,4,8,16,32
@@ -47,7 +83,7 @@ pub struct Args {
     #[command(flatten)]
     simulator: SimulatorArgs,
     /// Folder for the episodes' outcomes
-    #[arg(long, value_name = "DIR", default_value = "out/depth")]
+    #[arg(long, value_name = "DIR", default_value = WORK)]
     work: PathBuf,
     /// Print JSON instead of a table
     #[arg(long)]
@@ -125,7 +161,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut rows = Vec::new();
     for thinking in thoughts {
         let how = thinking.intervene.map_or(if args.halting { "halting" } else { "whole" }, Intervention::name);
-        let results = args.work.join(format!("{}-{how}", thinking.steps.unwrap_or_default()));
+        let results = args.work.join(folder_name(thinking.steps.unwrap_or_default(), how));
         let Some(subject) = thinking_subject(&loaded, &thinking, &mut pool)? else { break };
         let mut screen = Screen::new();
         let end = evaluate(&subject, &mut pool, &results, &options, &mut |progress| match progress {
@@ -179,4 +215,19 @@ fn table(rows: &[Row]) -> String {
     };
     let rows: Vec<Vec<String>> = rows.iter().map(cells).collect();
     cli::table(&header, &rows, &(0..header.len()).collect::<Vec<_>>())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{folder_name, of_folder};
+
+    #[test]
+    fn a_folder_says_how_deep_and_how() {
+        for (steps, how) in [(1, "whole"), (32, "halting"), (6, "shuffle")] {
+            assert_eq!(of_folder(&folder_name(steps, how)), Some((steps as u64, how)));
+        }
+        for other in ["whole", "x-whole", "0-whole", "lift-act@1_Lift_1-2_abc", ""] {
+            assert_eq!(of_folder(other), None, "{other}");
+        }
+    }
 }

@@ -18,6 +18,7 @@ use zoo::protocols::NamedProtocol;
 use zoo::registry::Registry;
 use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
+use crate::films;
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 use crate::puzzles::{PuzzleArgs, evaluate_solver};
 use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
@@ -381,13 +382,13 @@ fn evaluate_entry(
     };
     if !stopped && args.video > 0 && !stop.asked() {
         let seeds: Vec<u64> = options.seeds.iter().take(usize::try_from(args.video)?).collect();
-        videos(args, &seeds, &camera_view(args), subject, pool)?;
+        videos((args, options), &seeds, &camera_view(args), subject, pool)?;
     }
     if !stopped && !failed.is_empty() && !stop.asked() {
         // about as large as the other videos
         let side = subject.signature.of_kind(FeatureKind::Image).next().and_then(|spec| spec.shape.first().copied());
         let seen = |side: usize| View::Seen { scale: (usize::from(args.video_size) / side).max(1).next_multiple_of(2) };
-        videos(args, &failed, &side.map_or_else(|| camera_view(args), seen), subject, pool)?;
+        videos((args, options), &failed, &side.map_or_else(|| camera_view(args), seen), subject, pool)?;
     }
     Ok(())
 }
@@ -447,18 +448,24 @@ fn again(
 }
 
 /// Films episodes; the path of each video is printed.
-fn videos(args: &Args, seeds: &[u64], view: &View, subject: &Subject<'_>, pool: &mut Pool) -> anyhow::Result<()> {
-    let folder = args.zoo.zoo.join("videos").join(subject.entry.to_string());
+fn videos(
+    (args, options): (&Args, &EvaluationOptions),
+    seeds: &[u64],
+    view: &View,
+    subject: &Subject<'_>,
+    pool: &mut Pool,
+) -> anyhow::Result<()> {
+    let folder = films::folder(&args.zoo.zoo, &subject.entry);
+    let conditions = subject.record(pool.ready(), options)?.conditions();
     fs::create_dir_all(&folder).with_context(|| format!("creating {}", shown(&folder)))?;
     let rate = pool.ready().control_freq;
     let task = pool.ready().task.clone();
+    let seen = matches!(view, View::Seen { .. });
     let mut screen = Screen::new();
     screen.begin("film", seeds.len() as u64);
     let mut failure: Option<anyhow::Error> = None;
     film(subject, pool, seeds, view, &mut |seed, images, success| {
-        let word = if success { "success" } else { "failure" };
-        let seen = if matches!(view, View::Seen { .. }) { "-seen" } else { "" };
-        let path = folder.join(format!("{task}-{seed}-{word}{seen}.mp4"));
+        let path = folder.join(films::name(&task, seed, success, seen, &conditions));
         screen.step();
         let line = shown(&path);
         let written = cli::film(&path, &images, rate).and_then(|()| match args.json {

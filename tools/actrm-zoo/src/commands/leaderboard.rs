@@ -5,13 +5,16 @@ use anyhow::Context;
 use cli::{Table, shown};
 use report::column::{Align, Column};
 use report::{
-    ACROSS_COLUMNS, COLUMNS, Curve, LeaderboardRow, Reading, across_tasks, csv, json, markdown, rank, to_html,
+    ACROSS_COLUMNS, Beside, COLUMNS, Curve, DEPTH_COLUMNS, EntryFacts, LeaderboardRow, Places, Reading, across_tasks, csv,
+    json, markdown, rank, to_html,
 };
 use study::puzzle::{PUZZLE_COLUMNS, audit_puzzles, puzzle_section, rank_puzzles};
 use zoo::audit::{KnownEntries, audit};
 use zoo::entry::Entry;
 use zoo::{ZooError, write_together};
 
+use super::depth::{WORK, depths};
+use crate::films;
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs};
 
 /// Rank all evaluations: tables here, leaderboard.csv and its like for puzzles and across tasks, and report.html in the zoo
@@ -23,6 +26,10 @@ use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs};
 /// were sealed, without a seal, in a folder of another name, or of an entry that is not in the zoo or says otherwise, are
 /// named and left out; the others are ranked, and the exit code is 1. Where policies were evaluated on several tasks under
 /// one protocol, leaderboard_across.csv has their interquartile means over those tasks.
+///
+/// The page is one file that loads nothing: beside the tables it shows rows pair by pair, success over control steps, over
+/// demonstrations and over reasoning depth, films of failed episodes (`eval --video`, `--video-failed`; 20 MB of them, the
+/// others by their paths), and the commands that run a row again.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo leaderboard
@@ -39,6 +46,9 @@ pub struct Args {
     /// Also write the table as Markdown
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
+    /// Folder of what `depth` counted; it stands in a section of its own
+    #[arg(long, value_name = "DIR", default_value = WORK)]
+    depths: PathBuf,
     /// Show each training of a family below it
     #[arg(long)]
     trainings: bool,
@@ -60,13 +70,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (robots, solvers) = (audit(&results, &entries)?, audit_puzzles(&results, &entries)?);
     let mut failures: Vec<String> = entries.bad().map(|(id, error)| failure(&format!("entry {id}"), error)).collect();
     let left_out = robots.left_out.iter().chain(&solvers.left_out);
+    let (depths, damaged) = depths(&args.depths, &entries)?;
+    let left_out = left_out.chain(&damaged);
     failures.extend(left_out.map(|left| failure(&format!("left out: {}", shown(&left.folder)), &left.reason)));
     let end = || {
         failures.iter().for_each(|failure| cli::note(failure));
         if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
     };
     let (evaluations, puzzles) = (robots.standing, rank_puzzles(&solvers.standing));
-    if evaluations.is_empty() && puzzles.is_empty() && failures.is_empty() && !args.json {
+    let nothing = evaluations.is_empty() && puzzles.is_empty() && depths.is_empty();
+    if nothing && failures.is_empty() && !args.json {
         cli::note(&format!("no evaluations in {}; make one with: actrm-zoo eval --all", shown(&results)));
         return Ok(ExitCode::SUCCESS);
     }
@@ -77,7 +90,19 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // first the files: whoever reads the tables may go away before their end
     let out = args.out.as_ref().unwrap_or(&args.zoo.zoo);
     std::fs::create_dir_all(out).with_context(|| format!("creating {}", shown(out)))?;
-    let page = to_html(&rows, &curves(&entries), &puzzle_section(&puzzles));
+    let beside = Beside {
+        curves: curves(&entries),
+        section: puzzle_section(&puzzles),
+        entries: entries.good().map(facts).collect(),
+        depths,
+        films: films::of_failures(&rows, &args.zoo.zoo),
+        places: Places {
+            zoo: args.zoo.named(),
+            results: args.results.named(),
+            protocols: args.protocols.named(),
+        },
+    };
+    let page = to_html(&rows, &beside);
     let mut files = vec![
         (out.join("leaderboard.csv"), csv::table(COLUMNS, &rows).into_bytes()),
         (out.join("report.html"), page.into_bytes()),
@@ -104,6 +129,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "trainings": json::rows(COLUMNS, &details),
             "across_tasks": json::rows(ACROSS_COLUMNS, &across),
             "puzzles": json::rows(PUZZLE_COLUMNS, &puzzles),
+            "depths": json::rows(DEPTH_COLUMNS, &beside.depths),
             "left_out": failures,
         }))?;
         return Ok(end());
@@ -148,6 +174,16 @@ fn curves(entries: &KnownEntries) -> Vec<Curve> {
         Some(Curve { entry: entry.id().to_string(), points })
     };
     entries.good().filter_map(curve).collect()
+}
+
+/// What the page has to know of an entry besides its results.
+fn facts(entry: &Entry) -> (String, EntryFacts) {
+    /// Of environments whose arguments say nothing of it.
+    const USUAL: f64 = 20.0;
+    let meta = entry.meta();
+    let stated = meta.env_args.as_ref().and_then(|args| args.get("env_kwargs")?.get("control_freq")?.as_f64());
+    let hertz = stated.filter(|hertz| hertz.is_finite() && *hertz > 0.0).unwrap_or(USUAL);
+    (entry.id().to_string(), EntryFacts { task: meta.task.clone(), hertz })
 }
 
 /// What says most stays longest where the terminal is narrow; nothing without rows.
