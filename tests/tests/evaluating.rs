@@ -245,6 +245,8 @@ fn a_page_shows_the_film_of_a_failure_and_its_commands_are_taken() {
         let words = line.strip_prefix("actrm-zoo ").expect("our program");
         // two steps of training and short episodes: what is asked here is whether the line is taken
         let quick = if words.starts_with("rerun") { " --skip-training" } else { "" };
+        // what rerun leaves behind lies below the folder that it is run in
+        shell.current_dir(folder.path());
         said(shell.args(["-c", &format!("exec \"$0\" {words}{quick}")]).arg(&program))
     };
     for line in &commands {
