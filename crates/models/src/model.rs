@@ -121,6 +121,11 @@ pub trait PolicyModel: Send + Sync {
         None
     }
 
+    /// Whether the simulator's own scripted expert acts in its place: then nothing that it predicts is executed.
+    fn is_scripted(&self) -> bool {
+        false
+    }
+
     /// How it sees pictures, if it does.
     fn vision(&self) -> Option<&VisionConfig> {
         None

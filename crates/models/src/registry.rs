@@ -3,7 +3,7 @@
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
 use crate::model::PolicyModel;
-use crate::models::floors::{nearest, random, replay, zero};
+use crate::models::floors::{expert, nearest, random, replay, zero};
 use crate::models::{act, actrm, bc, bc_rnn, bc_transformer, diffusion, flow, mip};
 use crate::size::Size;
 use serde::de::{DeserializeSeed, Deserializer};
@@ -98,6 +98,8 @@ policies! {
     "bc_transformer" => BcTransformer: bc_transformer::BcTransformer,
     /// Diffusion policy
     "diffusion" => Diffusion: diffusion::Diffusion,
+    /// The task's scripted expert
+    "expert" => Expert: expert::Expert,
     /// Flow matching
     "flow" => Flow: flow::Flow,
     /// Minimal iterative policy: two steps of regression

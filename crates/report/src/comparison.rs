@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::leaderboard::LeaderboardRow;
-use crate::statistics::{Distinct, EProcess, Paired, barnard, difference, holm, pairs};
+use crate::statistics::{Difference, Distinct, EProcess, Paired, barnard, difference, holm, mean_difference, pairs};
 
 /// With fewer seeds in common two rows are compared as if they had none.
 pub const FEWEST_SHARED: usize = 20;
@@ -127,6 +127,32 @@ fn compare_outcomes(first: &[Outcomes], second: &[Outcomes]) -> Comparison {
     let p_value = if signs == (true, true) { 1.0 } else { largest };
     let test = if paired { Test::McNemar } else { Test::Barnard };
     Comparison { difference: sum / (first.len() * second.len()) as f64, interval, p_value, test, shared }
+}
+
+/// How much further the first comes on its way than the second, on the seeds that both were run on: two single trainings by
+/// Student's t on paired differences, two families by the bootstrap that [`compare`] uses. `None` where not every episode
+/// says how far it came, where a family stands beside a single training, and below [`FEWEST_SHARED`] seeds.
+pub fn compare_progress(first: &LeaderboardRow, second: &LeaderboardRow) -> Option<Difference> {
+    type Shares = BTreeMap<u64, f64>;
+    let shares = |row: &LeaderboardRow| -> Option<Vec<Shares>> {
+        let of = |one: &zoo::results::StoredEvaluation| -> Option<Shares> {
+            one.episodes.iter().map(|episode| Some((episode.seed, episode.progress?))).collect()
+        };
+        row.evaluations().map(of).collect()
+    };
+    let (first, second) = (shares(first)?, shares(second)?);
+    let shared: Vec<u64> = first[0].keys().filter(|seed| second[0].contains_key(seed)).copied().collect();
+    if shared.len() < FEWEST_SHARED {
+        return None;
+    }
+    let kept = |side: &[Shares]| -> Option<Vec<Vec<f64>>> {
+        side.iter().map(|one| shared.iter().map(|seed| one.get(seed).copied()).collect()).collect()
+    };
+    let (first, second) = (kept(&first)?, kept(&second)?);
+    match (first.as_slice(), second.as_slice()) {
+        ([one], [two]) => mean_difference(&one.iter().zip(two).map(|(a, b)| a - b).collect::<Vec<_>>()),
+        _ => difference(&first, &second, BOOTSTRAP_SEED),
+    }
 }
 
 /// Two entries on the seeds that both were run on, one by one.

@@ -61,6 +61,7 @@ pub(crate) fn finished(results: &Path, record: &EvaluationRecord) -> StoredEvalu
             fingerprint: format!("{seed:064x}"),
             group: None,
             failure: None,
+            progress: None,
         };
         let timing = EpisodeTiming {
             seed,

@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use crate::error::RolloutError;
+use crate::error::{FaultKind, RolloutError};
 use crate::message::Ready;
 use crate::pool::JobError;
-use crate::worker::{Initial, Observations, Worker};
+use crate::worker::{Initial, Observations, Scripted, Worker};
 
 /// What an agent's failure is to whoever runs it.
 pub type AgentError = Box<dyn std::error::Error + Send + Sync>;
@@ -57,6 +57,9 @@ pub struct Outcome {
     pub group: Option<String>,
     /// In a word why the episode was lost before the cap, where the environment says so.
     pub failure: Option<String>,
+    /// Which share of its way it came: the task's stages that were passed of all and success, 1 where the task was done;
+    /// `None` where no stages are known.
+    pub progress: Option<f64>,
     /// Time spent waiting for the simulator.
     pub simulator: Duration,
     /// Of that, what drawing took, once an observation that the agent was asked about; empty without pictures.
@@ -132,7 +135,7 @@ impl EpisodePlan {
         if let Some(watch) = &mut watch {
             watch(worker, &observations)?;
         }
-        let (mut success, mut failure, mut steps, mut total_reward) = (false, None, 0, 0.0);
+        let (mut success, mut failure, mut progress, mut steps, mut total_reward) = (false, None, None, 0, 0.0);
         let mut drawn = Vec::new();
         while !success && failure.is_none() && steps < self.max_steps {
             if !drawing.is_zero() {
@@ -154,7 +157,7 @@ impl EpisodePlan {
                 simulator += asked.elapsed();
                 steps += stepped.rewards.len();
                 total_reward = stepped.rewards.iter().fold(total_reward, |sum, reward| sum + reward);
-                (success, failure) = (stepped.success, stepped.failure);
+                (success, failure, progress) = (stepped.success, stepped.failure, stepped.progress);
                 (observations, drawing) = (stepped.observations, stepped.drawing);
             }
             if let Some(found) = unusable.filter(|_| !success && failure.is_none()) {
@@ -167,7 +170,42 @@ impl EpisodePlan {
         }
         worker.check_quiet()?;
         let (drawing, wall) = (drawn, begun.elapsed());
-        Ok(Outcome { success, steps, total_reward, fingerprint, group, failure, simulator, drawing, wall })
+        Ok(Outcome { success, steps, total_reward, fingerprint, group, failure, progress, simulator, drawing, wall })
+    }
+
+    /// Runs the task's scripted expert in the episode of `seed`, until it has done the task or the cap is reached.
+    ///
+    /// # Errors
+    /// A failure of the worker; a task without an expert.
+    pub fn run_expert(&self, worker: &mut Worker, seed: u64) -> Result<Outcome, JobError> {
+        let begun = Instant::now();
+        let Initial { fingerprint, group, .. } = worker.reset(seed)?;
+        let Scripted { rewards, solved, progress } = worker.expert_evaluated(seed).map_err(|fault| match &fault.kind {
+            // the same for a fresh worker
+            FaultKind::Reported { kind, message } if kind == "no_expert" => {
+                let task = worker.ready().task.clone();
+                RolloutError::Refused { task, kind: kind.clone(), message: message.clone() }.into()
+            }
+            _ => JobError::from(fault),
+        })?;
+        worker.check_quiet()?;
+        let end = solved.iter().take(self.max_steps).position(|solved| *solved);
+        let steps = end.map_or(solved.len().min(self.max_steps), |at| at + 1);
+        // how far it had come by a cap that is not its own is not known
+        let progress = progress.filter(|share| end.is_some() || *share < 1.0);
+        let (wall, drawing) = (begun.elapsed(), Vec::new());
+        Ok(Outcome {
+            success: end.is_some(),
+            steps,
+            total_reward: rewards.iter().take(steps).sum(),
+            fingerprint,
+            group,
+            failure: None,
+            progress,
+            simulator: wall,
+            drawing,
+            wall,
+        })
     }
 }
 

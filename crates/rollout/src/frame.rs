@@ -108,6 +108,22 @@ impl FrameTensor {
         let (values, _) = self.bytes.as_chunks::<8>();
         Ok(values.iter().map(|v| f64::from_le_bytes(*v)).collect())
     }
+
+    /// The values, if the element type is `i64`.
+    ///
+    /// # Errors
+    /// [`FrameError::Misshapen`] for any other element type.
+    pub fn to_i64(&self, name: &str) -> Result<Vec<i64>, FrameError> {
+        if self.dtype != Dtype::I64 {
+            return Err(FrameError::Misshapen {
+                name: name.to_owned(),
+                expected: "I64".to_owned(),
+                found: format!("{:?}", self.dtype),
+            });
+        }
+        let (values, _) = self.bytes.as_chunks::<8>();
+        Ok(values.iter().map(|v| i64::from_le_bytes(*v)).collect())
+    }
 }
 
 struct Borrowed<'a>(&'a FrameTensor);

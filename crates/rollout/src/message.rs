@@ -84,6 +84,9 @@ pub struct Ready {
     pub action_high: Vec<f64>,
     /// Observation keys with their shapes.
     pub observations: BTreeMap<String, Vec<usize>>,
+    /// What an episode passes before the task is solved, in order, where that is known.
+    #[serde(default)]
+    pub stages: Vec<String>,
     /// robomimic's `env_args` of this environment.
     #[serde(default)]
     pub env_args: serde_json::Value,
@@ -110,6 +113,7 @@ pub(crate) enum Request<'a> {
     Expert {
         id: u64,
         seed: u64,
+        split: &'a str,
     },
     Extract {
         id: u64,
@@ -169,6 +173,9 @@ pub(crate) enum Reply {
         failure: Option<String>,
         #[serde(default)]
         drawing_ms: f64,
+        /// Which share of its way the episode has come, where stages are known.
+        #[serde(default)]
+        progress: Option<f64>,
     },
     Expert(EpisodeReply),
     Extract(EpisodeReply),
@@ -197,6 +204,9 @@ pub(crate) struct EpisodeReply {
     pub steps: Option<usize>,
     #[serde(default)]
     pub attrs: BTreeMap<String, serde_json::Value>,
+    /// Which share of its way it came, where stages are known.
+    #[serde(default)]
+    pub progress: Option<f64>,
 }
 
 impl Reply {
@@ -225,6 +235,10 @@ mod tests {
         let text = |request: &Request<'_>| serde_json::to_string(request).unwrap();
         assert_eq!(text(&Request::Reset { id: 1, seed: 10000 }), r#"{"type":"reset","id":1,"seed":10000}"#);
         assert_eq!(text(&Request::Step { id: 2 }), r#"{"type":"step","id":2}"#);
+        assert_eq!(
+            text(&Request::Expert { id: 6, seed: 7, split: "evaluation" }),
+            r#"{"type":"expert","id":6,"seed":7,"split":"evaluation"}"#
+        );
         assert_eq!(
             text(&Request::Render { id: 3, camera: "agentview", size: [84, 96] }),
             r#"{"type":"render","id":3,"camera":"agentview","size":[84,96]}"#

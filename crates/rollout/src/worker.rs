@@ -75,6 +75,19 @@ pub struct Stepped {
     pub observations: Observations,
     /// How long its pictures took to draw, as the worker says; zero without any.
     pub drawing: Duration,
+    /// Which share of its way the episode has come, of the task's stages and success; `None` where no stages are known.
+    pub progress: Option<f64>,
+}
+
+/// What a scripted expert did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scripted {
+    /// The reward of each step.
+    pub rewards: Vec<f64>,
+    /// Whether the task was done after each step.
+    pub solved: Vec<bool>,
+    /// Which share of its way the episode came, where stages are known.
+    pub progress: Option<f64>,
 }
 
 /// An RGB image, row-major from the top.
@@ -198,11 +211,12 @@ impl Worker {
         let tensors = vec![("action", FrameTensor::from_f64(&shape, &actions.concat()))];
         let (reply, mut frame) = self.ask(&request, tensors, self.limits.step, 2)?;
         match reply {
-            Reply::Step { success, failure, drawing_ms, .. } => {
+            Reply::Step { success, failure, drawing_ms, progress, .. } => {
+                let progress = share(progress).map_err(|kind| self.fault("step", kind))?;
                 let over = success || failure.is_some();
                 let rewards = self.rewards(&frame, actions.len(), over).map_err(|kind| self.fault("step", kind))?;
                 let observations = self.observations("step", &mut frame)?;
-                Ok(Stepped { rewards, success, failure, observations, drawing: milliseconds(drawing_ms) })
+                Ok(Stepped { rewards, success, failure, observations, drawing: milliseconds(drawing_ms), progress })
             }
             other => Err(self.fault("step", unexpected("step", &other))),
         }
@@ -222,16 +236,45 @@ impl Worker {
         Ok(rewards)
     }
 
-    /// Runs a whole scripted episode.
+    /// Runs a whole scripted episode, to be learned from.
     ///
     /// # Errors
     /// Any failure of the worker.
     pub fn expert(&mut self, seed: u64) -> Result<RecordedEpisode, WorkerFault> {
+        self.scripted(seed, "demonstration").map(|(episode, _)| episode)
+    }
+
+    /// Runs the scripted expert in the episode that an evaluation of `seed` begins with.
+    ///
+    /// # Errors
+    /// Any failure of the worker.
+    pub fn expert_evaluated(&mut self, seed: u64) -> Result<Scripted, WorkerFault> {
+        let (episode, progress) = self.scripted(seed, "evaluation")?;
+        let read = |name: &str| {
+            let tensor = episode.tensors.get(name).ok_or_else(|| format!("no array {name:?} in the episode"))?;
+            Ok((tensor, name.to_owned()))
+        };
+        let fault = |what: String| self.fault("expert", FaultKind::Values(what));
+        let (rewards, name) = read("rewards").map_err(fault)?;
+        let rewards = rewards.to_f64(&name).map_err(|error| self.fault("expert", FaultKind::Nonsense(error)))?;
+        let (dones, name) = read("dones").map_err(fault)?;
+        let mut solved = dones.to_i64(&name).map_err(|error| self.fault("expert", FaultKind::Nonsense(error)))?;
+        // in robomimic's arrays the last step is done in any case
+        if let Some(last) = solved.last_mut() {
+            *last = i64::from(episode.success);
+        }
+        Ok(Scripted { rewards, solved: solved.into_iter().map(|done| done != 0).collect(), progress })
+    }
+
+    fn scripted(&mut self, seed: u64, split: &str) -> Result<(RecordedEpisode, Option<f64>), WorkerFault> {
         self.next_id += 1;
-        let request = Request::Expert { id: self.next_id, seed };
+        let request = Request::Expert { id: self.next_id, seed, split };
         let (reply, frame) = self.ask(&request, Vec::new(), self.limits.episode, 4)?;
         match reply {
-            Reply::Expert(reply) => self.recorded("expert", reply, frame),
+            Reply::Expert(reply) => {
+                let progress = share(reply.progress).map_err(|kind| self.fault("expert", kind))?;
+                Ok((self.recorded("expert", reply, frame)?, progress))
+            }
             other => Err(self.fault("expert", unexpected("expert", &other))),
         }
     }
@@ -415,6 +458,14 @@ impl Worker {
             stderr: self.process.stderr_tail(),
             log: self.process.log().to_owned(),
         }
+    }
+}
+
+/// A share that a worker reports: from 0 to 1, if it is one.
+fn share(reported: Option<f64>) -> Result<Option<f64>, FaultKind> {
+    match reported {
+        Some(share) if !(0.0..=1.0).contains(&share) => Err(FaultKind::Values(format!("progress {share}"))),
+        share => Ok(share),
     }
 }
 

@@ -179,7 +179,10 @@ pub fn run_episodes(
     let work = |(agent, times): &mut (PolicyAgent, QueryTimes), worker: &mut Worker, job| {
         let seed = seed_of(job);
         times.take();
-        let outcome = plan.run(worker, agent, seed, None)?;
+        let outcome = match subject.is_scripted {
+            true => plan.run_expert(worker, seed)?,
+            false => plan.run(worker, agent, seed, None)?,
+        };
         let episode = EpisodeRecord {
             seed,
             success: outcome.success,
@@ -188,6 +191,7 @@ pub fn run_episodes(
             fingerprint: outcome.fingerprint,
             group: outcome.group,
             failure: outcome.failure,
+            progress: outcome.progress,
         };
         let milliseconds = |duration: Duration| (duration.as_secs_f64() * 1e6).round() / 1e3;
         let queries = times.take();
@@ -223,6 +227,7 @@ pub fn film(
     view: &View,
     deliver: &mut dyn FnMut(u64, Vec<Image>, bool) -> ControlFlow<()>,
 ) -> Result<(), RolloutError> {
+    subject.check_watched()?;
     let max_steps = subject.max_steps.unwrap_or(pool.ready().max_steps);
     let task = &pool.ready().task.clone();
     let plan = EpisodePlan::new(pool.ready(), subject.keys.keys(), max_steps)?;

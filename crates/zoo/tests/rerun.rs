@@ -100,6 +100,7 @@ fn result(zoo: &Path, entry: &Entry) -> StoredEvaluation {
         fingerprint: "0".repeat(64),
         group: None,
         failure: None,
+        progress: None,
     };
     let timing = EpisodeTiming {
         seed: 10_000,

@@ -30,6 +30,8 @@ class Ready:
     action_low: list[float]
     action_high: list[float]
     observations: dict[str, list[int]]
+    stages: list[str]
+    """What an episode passes before the task is solved, in order, where that is known."""
     env_args: dict[str, Any]
 
 

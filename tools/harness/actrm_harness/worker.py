@@ -148,6 +148,7 @@ def describe(args: argparse.Namespace, simulation: Simulation) -> protocol.Ready
         action_low=found.action_low.tolist(),
         action_high=found.action_high.tolist(),
         observations=found.observations,
+        stages=found.stages,
         env_args=arguments,
     )
 
@@ -193,6 +194,7 @@ def answer(simulation: Simulation, request: protocol.Request, tensors: wire.Tens
             "reward": float(stepped.rewards[-1]),
             "success": stepped.success,
             "failure": stepped.failure,
+            "progress": stepped.progress,
         }
         return drawn(reply, stepped.drawing_ms), {"rewards": stepped.rewards, **observed(stepped.observation)}
     if isinstance(request, protocol.Reset):
@@ -237,6 +239,7 @@ def episode_reply(kind: str, number: int, episode: Episode) -> wire.Message:
         "success": episode.success,
         "steps": episode.steps,
         "attrs": episode.attrs,
+        "progress": episode.progress,
     }
 
 

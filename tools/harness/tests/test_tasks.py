@@ -218,3 +218,42 @@ def test_a_task_without_an_expert_says_so() -> None:
     with pytest.raises(WorkerError, match="no scripted expert"):
         client.ask("expert", seed=0)
     client.close()
+
+
+@pytest.mark.usefixtures("library")
+@pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task.expert])
+def test_an_expert_passes_every_stage_before_success_and_who_does_nothing_none(task: str) -> None:
+    """Stages come in an order that who solves the task goes through; looking at them changes nothing."""
+    session = envs.make(task)
+    session.control = control.attach(session.env)
+    solved = 0
+    for seed in (1_000_003, 1_000_004, 1_000_005):
+        passed: list[int] = []
+        episode = episodes.expert_episode(session, seed)
+        passed.append(session.reached)
+        if not episode.success:
+            assert episode.progress is not None and episode.progress < 1.0
+            continue
+        solved += 1
+        assert episode.progress == 1.0
+        assert passed == [len(session.stages)], [name for name, _ in session.stages]
+    assert solved >= 2
+    names = [name for name, _ in session.stages]
+    assert len(set(names)) == len(names) > 0
+    envs.reset(session, 10_000)
+    assert session.reached == 0
+    idle = np.zeros(session.env.action_dim)
+    if "maze" not in task.lower():
+        _, rewards = envs.steps_session(session, np.array([idle] * 5))
+        assert session.progress(False) == 0.0 and not rewards.any()
+    unseen = envs.make(task)
+    unseen.control = control.attach(unseen.env)
+    for one in (session, unseen):
+        envs.reset(one, 10_001)
+    unseen.stages = ()
+    for action in walk(3, 12):
+        one, other = envs.step_session(session, action), envs.step_session(unseen, action)
+        assert one.reward == other.reward and session.progress(False) is not None and unseen.progress(False) is None
+        assert envs.state(session.env).tobytes() == envs.state(unseen.env).tobytes()
+    session.env.close()
+    unseen.env.close()

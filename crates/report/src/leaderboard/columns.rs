@@ -37,6 +37,11 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     count(|row: &LeaderboardRow| Some(row.standing.as_ref()?.ranks.1 as u64)).csv("rank_last"),
     text(ranks_text).table("ranks").page("ranks"),
     text(letters).csv("letters").table("group").page("group"),
+    number(|row: &LeaderboardRow| Some(row.progress?.value), 4, 4).csv("progress"),
+    number(|row: &LeaderboardRow| Some(row.progress?.low), 4, 4).csv("progress_ci95_low"),
+    number(|row: &LeaderboardRow| Some(row.progress?.high), 4, 4).csv("progress_ci95_high"),
+    text(|row: &LeaderboardRow| row.progress_text(0)).table("progress"),
+    text(|row: &LeaderboardRow| row.progress_text(1)).page("progress"),
     number(LeaderboardRow::mean_return, 4, 2).csv("mean_return").table("return").page("return"),
     number(LeaderboardRow::mean_steps_to_success, 2, 1)
         .csv("mean_steps_to_success")
@@ -47,10 +52,8 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     text(|row: &LeaderboardRow| count_text(row.record().training.parameters)).table("params").page("parameters"),
     number(|row: &LeaderboardRow| Some(row.inference_ms().0), 3, 3).csv("inference_ms_median"),
     number(|row: &LeaderboardRow| Some(row.inference_ms().1), 3, 3).csv("inference_ms_p95"),
-    text(|row: &LeaderboardRow| format!("{:.1} / {:.1}", row.inference_ms().0, row.inference_ms().1))
-        .table("ms med/p95"),
-    text(|row: &LeaderboardRow| format!("{:.2} / {:.2}", row.inference_ms().0, row.inference_ms().1))
-        .page("inference ms\nmedian / p95"),
+    text(|row: &LeaderboardRow| row.inference_text(1)).table("ms med/p95"),
+    text(|row: &LeaderboardRow| row.inference_text(2)).page("inference ms\nmedian / p95"),
     count(|row: &LeaderboardRow| Some(row.record().training.steps)).csv("training_steps"),
     number(|row: &LeaderboardRow| Some(row.minutes()), 2, 2).csv("training_minutes"),
     text(|row: &LeaderboardRow| row.trained_text(", ")).table("trained"),

@@ -6,7 +6,7 @@ use zoo::protocols::Block;
 use zoo::results::{EvaluationRecord, Execution, StoredEvaluation};
 
 use crate::comparison::Standing;
-use crate::statistics::{hierarchical, mean, percent, quantile, wilson_interval};
+use crate::statistics::{Estimate, hierarchical, mean, mean_interval, percent, quantile, wilson_interval};
 
 /// With fewer episodes a training a row stands last in its protocol and has no rank.
 pub const FEWEST_TO_RANK: u64 = 20;
@@ -70,6 +70,9 @@ pub struct LeaderboardRow {
     pub rank: Option<u64>,
     /// What it can be told apart from, if it was compared.
     pub standing: Option<Standing>,
+    /// How far an episode comes on its way, on average: 1 for those in which the task was done. None where not every
+    /// episode says it.
+    pub progress: Option<Estimate>,
     /// Median and 95% quantile of a query's duration in milliseconds.
     latency: (f64, f64),
 }
@@ -149,13 +152,19 @@ impl LeaderboardRow {
             .then(|| hierarchical(&trainings.iter().map(outcomes).collect::<Vec<_>>(), BOOTSTRAP_SEED))
             .flatten();
         let interval = several.map_or_else(|| counts.interval(), |estimate| (estimate.low, estimate.high));
+        let come: Option<Vec<Vec<f64>>> =
+            trainings.iter().map(|one| one.episodes.iter().map(|episode| episode.progress).collect()).collect();
+        let progress = come.and_then(|come| match come.as_slice() {
+            [one] => mean_interval(one),
+            _ => hierarchical(&come, BOOTSTRAP_SEED),
+        });
         let timings = trainings.iter().flat_map(|one| &one.timings);
         let mut queries: Vec<f64> = timings.flat_map(|t| t.inference_ms.iter().copied()).collect();
         queries.sort_by(f64::total_cmp);
         let latency = (quantile(&queries, 0.5).unwrap_or(0.0), quantile(&queries, 0.95).unwrap_or(0.0));
         let (simulator, apart) = (String::new(), String::new());
         let (family, named, rank, standing) = (None, None, None, None);
-        Self { trainings, counts, groups, interval, family, named, simulator, apart, rank, standing, latency }
+        Self { trainings, counts, groups, interval, family, named, simulator, apart, rank, standing, progress, latency }
     }
 
     /// What each training was measured, by the training's seed.
@@ -260,6 +269,24 @@ impl LeaderboardRow {
     /// Minutes of training: the median of several.
     pub fn minutes(&self) -> f64 {
         self.median_of(|one| one.record.training.minutes)
+    }
+
+    /// `0.6 / 1.2`: median and 95% quantile of a query in milliseconds; nothing where none was asked.
+    pub(super) fn inference_text(&self, digits: usize) -> String {
+        match self.trainings.iter().flat_map(|one| &one.timings).any(|timing| !timing.inference_ms.is_empty()) {
+            true => format!("{:.digits$} / {:.digits$}", self.latency.0, self.latency.1),
+            false => "-".to_owned(),
+        }
+    }
+
+    /// `93.4 [90-96]`: how far episodes come on their way, in percent; nothing where that is not known.
+    pub(super) fn progress_text(&self, digits: usize) -> String {
+        self.progress.map_or_else(
+            || "-".to_owned(),
+            |Estimate { value, low, high }| {
+                format!("{:.digits$}% [{}]", value * 1e2, interval_text((low, high), 0, '-'))
+            },
+        )
     }
 
     /// Mean return of an episode.
@@ -388,6 +415,9 @@ impl LeaderboardRow {
         let mut text = format!("{} on {}: {}", self.record().entry, self.task(), rate(&self.counts));
         if let Some(steps) = self.mean_steps_to_success() {
             text.push_str(&format!(", mean {steps:.1} steps to success"));
+        }
+        if let Some(progress) = self.progress.filter(|progress| progress.value < 1.0) {
+            text.push_str(&format!(", {:.1}% of the way on average", progress.value * 1e2));
         }
         if self.record().time_decides {
             text.push_str("\n  it thinks by the clock: these episodes may end otherwise next time");

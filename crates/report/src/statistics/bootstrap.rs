@@ -113,6 +113,39 @@ pub fn difference(first: &[Vec<f64>], second: &[Vec<f64>], seed: u64) -> Option<
     Some(Difference { estimate, p_value })
 }
 
+/// The mean of shares between 0 and 1 with its 95% interval by Student's t, cut off at 0 and 1; `None` of none. Shares that
+/// are all alike have an interval without width, as one value has: Wilson's, of so many trials, then takes its place.
+pub fn mean_interval(shares: &[f64]) -> Option<Estimate> {
+    let n = shares.len();
+    let value = super::mean(shares.iter().copied())?;
+    let variance = shares.iter().map(|x| (x - value).powi(2)).sum::<f64>() / (n.max(2) - 1) as f64;
+    if variance < 1e-24 {
+        let (low, high) = wilson(value * n as f64, n as f64);
+        return Some(Estimate { value, low: low.min(value), high: high.max(value) });
+    }
+    let half = student_quantile(n) * (variance / n as f64).sqrt();
+    Some(Estimate { value, low: (value - half).max(0.0), high: (value + half).min(1.0) })
+}
+
+/// The mean of paired differences, with its interval and p-value by Student's t; `None` of fewer than two.
+pub fn mean_difference(differences: &[f64]) -> Option<Difference> {
+    let n = differences.len();
+    if n < 2 {
+        return None;
+    }
+    let value = super::mean(differences.iter().copied())?;
+    let variance = differences.iter().map(|x| (x - value).powi(2)).sum::<f64>() / (n - 1) as f64;
+    let error = (variance / n as f64).sqrt();
+    let p_value = match error > 1e-12 {
+        true => 2.0 * student_tail(value.abs() / error, n - 1),
+        false if value.abs() < 1e-12 => 1.0,
+        false => 0.0,
+    };
+    let half = student_quantile(n) * error;
+    let estimate = Estimate { value, low: (value - half).max(-1.0), high: (value + half).min(1.0) };
+    Some(Difference { estimate, p_value })
+}
+
 /// The 97.5% quantile of Student's t of `m - 1` degrees of freedom.
 fn student_quantile(m: usize) -> f64 {
     STUDENT.get(m - 2).copied().unwrap_or(1.96 + 2.4 / (m - 1) as f64)

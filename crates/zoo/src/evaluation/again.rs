@@ -7,7 +7,7 @@ use rollout::{Pool, RolloutError};
 
 use super::{EvaluationOptions, Subject, run_episodes};
 use crate::ZooError;
-use crate::results::{EpisodeRecord, EvaluationRecord, StoredEvaluation, evaluation_folders};
+use crate::results::{EpisodeRecord, EvaluationRecord, ResultsFolder, StoredEvaluation, evaluation_folders};
 
 /// How running again ended.
 #[derive(Debug)]
@@ -26,10 +26,13 @@ pub struct Again {
     pub errors: Vec<RolloutError>,
     /// Whether the stored evaluation had no seal and has one now: all of its episodes were run, every outcome the same.
     pub sealed: bool,
+    /// Whether it had no progress, being from before there were stages, and has it now: likewise.
+    pub progress: bool,
 }
 
-/// Runs the first of a stored evaluation's episodes again, as many as are asked for, and compares; writes nothing
-/// but a seal, where there is none yet and every episode was found to be the same.
+/// Runs the first of a stored evaluation's episodes again, as many as are asked for, and compares. Where every episode was
+/// run and found to be the same, what the stored evaluation lacks, being older, is added: a seal, the episodes' progress.
+/// Nothing else is written.
 ///
 /// The same entry, protocol, execution and seeds decide which evaluation is meant; one under other versions of the
 /// simulator will do where there is none under these.
@@ -66,15 +69,18 @@ pub fn evaluate_again(
         versions: differences(&stored.record, &record),
         errors: Vec::new(),
         sealed: false,
+        progress: false,
     };
+    let mut ran = Vec::new();
     progress(0, wanted);
     run_episodes(subject, pool, record.protocol.max_steps, &seeds, &|_, _| Ok(()), &mut |result| match result {
         Ok(now) => {
             again.episodes += 1;
             progress(again.episodes, wanted);
-            if let Some(before) = before.get(&now.seed).filter(|before| **before != now) {
-                again.different.push((before.clone(), now));
+            if let Some(before) = before.get(&now.seed).filter(|before| !before.is_same(&now)) {
+                again.different.push((before.clone(), now.clone()));
             }
+            ran.push(now);
         }
         Err(error) => again.errors.push(error),
     })?;
@@ -82,6 +88,11 @@ pub fn evaluate_again(
     if every && !stored.sealed {
         stored.seal()?;
         again.sealed = true;
+    }
+    let lacks = |episodes: &[EpisodeRecord]| episodes.iter().any(|episode| episode.progress.is_none());
+    if every && stored.record == record && lacks(&stored.episodes) && !lacks(&ran) {
+        ResultsFolder::open(results, &record)?.rewrite(ran)?;
+        again.progress = true;
     }
     Ok(again)
 }

@@ -163,6 +163,7 @@ pub fn saliency(
 
 /// The episode's outcome and what its policy was asked about.
 fn episode(subject: &Subject<'_>, pool: &mut Pool, seed: u64) -> Result<Option<(Outcome, Queries)>, ZooError> {
+    subject.check_watched()?;
     let plan =
         EpisodePlan::new(pool.ready(), subject.keys.keys(), subject.max_steps.unwrap_or(pool.ready().max_steps))?;
     let state = || {

@@ -5,7 +5,7 @@ use models::{
     Actor, FeatureKind, FeatureSpec, ModelError, Observation, Policy, RecedingHorizon, Signature, TemporalEnsemble,
     Values,
 };
-use rollout::{EpisodePlan, Image, Observations, Ready};
+use rollout::{EpisodePlan, Image, Observations, Ready, RolloutError};
 
 use super::agent::{PolicyAgent, QueryTimes, Timed};
 use super::{EvaluationOptions, Perturbation};
@@ -35,6 +35,8 @@ pub struct Subject<'a> {
     pub signature: Signature,
     /// Whether its policies think by the clock, so that an episode may end otherwise next time.
     pub time_decides: bool,
+    /// Whether the task's scripted expert acts in its place, inside the simulator.
+    pub is_scripted: bool,
     /// Of a policy that sees pictures: whether those it learned from were drawn without reflections and multisampling.
     pub fast_render: Option<bool>,
     /// What becomes of its pictures on their way to it.
@@ -131,6 +133,21 @@ impl Subject<'_> {
         }
         let Picture { height, width, rgb } = Picture::sheet(&[pictures], 2).enlarged(scale);
         Some(Image { height, width, rgb })
+    }
+
+    /// # Errors
+    /// [`RolloutError::Refused`] of what acts inside the simulator, by itself from the first step to the last.
+    pub(super) fn check_watched(&self) -> Result<(), RolloutError> {
+        if !self.is_scripted {
+            return Ok(());
+        }
+        Err(RolloutError::Refused {
+            task: self.task.clone(),
+            kind: "scripted".to_owned(),
+            message: "its expert acts inside the simulator and cannot be watched step by step; `actrm-data collect` \
+                      records it, `actrm-data replay --video` shows what was recorded"
+                .to_owned(),
+        })
     }
 
     /// An agent of its own for one environment, and where its queries' durations go.

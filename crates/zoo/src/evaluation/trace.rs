@@ -191,6 +191,7 @@ pub fn trace(
     seed: u64,
     examiner: Option<&Examiner>,
 ) -> Result<Option<PolicyTrace>, RolloutError> {
+    subject.check_watched()?;
     let (task, max_steps) = (pool.ready().task.clone(), subject.max_steps.unwrap_or(pool.ready().max_steps));
     let plan = EpisodePlan::new(pool.ready(), subject.keys.keys(), max_steps)?;
     let state = || {

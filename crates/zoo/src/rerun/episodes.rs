@@ -124,16 +124,17 @@ fn other_rule(rerun: &Rerun, now: &StoredEvaluation) -> Option<String> {
 fn other_outcomes(stored: &[EpisodeRecord], now: &[EpisodeRecord]) -> Option<String> {
     let stored: BTreeMap<u64, &EpisodeRecord> = stored.iter().map(|episode| (episode.seed, episode)).collect();
     let pairs = now.iter().filter_map(|now| Some((*stored.get(&now.seed)?, now)));
-    let other: Vec<(&EpisodeRecord, &EpisodeRecord)> = pairs.filter(|(stored, now)| stored != now).collect();
+    let other: Vec<(&EpisodeRecord, &EpisodeRecord)> = pairs.filter(|(stored, now)| !stored.is_same(now)).collect();
     let (first, then) = other.first()?;
     type Same = fn(&EpisodeRecord, &EpisodeRecord) -> bool;
-    let parts: [(&str, Same); 6] = [
+    let parts: [(&str, Same); 7] = [
         ("initial state", |a, b| a.fingerprint == b.fingerprint),
         ("success", |a, b| a.success == b.success),
         ("steps", |a, b| a.steps == b.steps),
         ("return", |a, b| a.total_reward == b.total_reward),
         ("group", |a, b| a.group == b.group),
         ("failure", |a, b| a.failure == b.failure),
+        ("progress", |a, b| a.progress.zip(b.progress).is_none_or(|(a, b)| a == b)),
     ];
     let counts = parts.iter().filter_map(|(name, same)| {
         let count = other.iter().filter(|(stored, now)| !same(stored, now)).count();
@@ -161,7 +162,7 @@ mod tests {
 
     fn episode(seed: u64, success: bool, steps: u32) -> EpisodeRecord {
         let fingerprint = format!("{seed:064x}");
-        EpisodeRecord { seed, success, steps, total_reward: 0.5, fingerprint, group: None, failure: None }
+        EpisodeRecord { seed, success, steps, total_reward: 0.5, fingerprint, group: None, failure: None, progress: None }
     }
 
     #[test]

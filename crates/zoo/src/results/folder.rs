@@ -273,7 +273,7 @@ impl ResultsFolder {
     pub fn add(&mut self, episode: EpisodeRecord, timing: EpisodeTiming) -> Result<(), ZooError> {
         let seed = episode.seed;
         if let Some((stored, _)) = self.done.get(&seed) {
-            if *stored == episode {
+            if stored.is_same(&episode) {
                 return Ok(());
             }
             return Err(ZooError::ResultsDiffer {
@@ -293,6 +293,40 @@ impl ResultsFolder {
             .map_err(ZooError::io("write", self.folder.join(JOURNAL)))?;
         self.done.insert(seed, (line.episode, line.timing));
         Ok(())
+    }
+
+    /// Writes the tables of a finished evaluation anew, with outcomes that were found to be the same and say more. Killed at
+    /// any moment it is what it was, or goes on from the journal of all its episodes.
+    ///
+    /// # Errors
+    /// [`ZooError::ResultsDiffer`] for another outcome of a seed; files that cannot be written.
+    pub(crate) fn rewrite(mut self, episodes: Vec<EpisodeRecord>) -> Result<StoredEvaluation, ZooError> {
+        let mut text = Vec::new();
+        for episode in episodes {
+            let seed = episode.seed;
+            let Some((stored, timing)) = self.done.get(&seed) else { continue };
+            if !stored.is_same(&episode) {
+                return Err(ZooError::ResultsDiffer {
+                    folder: self.folder.clone(),
+                    what: format!("outcome of seed {seed}"),
+                    expected: json(stored),
+                    found: json(&episode),
+                });
+            }
+            let line = JournalLine { episode, timing: timing.clone() };
+            text.extend(serde_json::to_vec(&line).expect("plain fields are always JSON"));
+            text.push(b'\n');
+            self.done.insert(seed, (line.episode, line.timing));
+        }
+        let path = self.folder.join(JOURNAL);
+        write_atomic(&path, &text)?;
+        // without its seal it is an evaluation under way, whose journal holds every episode
+        let seal = self.folder.join(SEAL_FILE);
+        fs::remove_file(&seal).map_err(ZooError::io("remove", &seal))?;
+        sync_folder(&self.folder)?;
+        let journal = OpenOptions::new().append(true).open(&path).map_err(ZooError::io("open", &path))?;
+        self.journal = Some(journal);
+        self.finish()
     }
 
     /// Writes the tables, if every episode is done, and reads them back.
@@ -375,6 +409,7 @@ pub(crate) mod tests {
             fingerprint: format!("{seed:064x}"),
             group: None,
             failure: None,
+            progress: None,
         };
         let timing = EpisodeTiming {
             seed,

@@ -264,6 +264,20 @@ pub struct EpisodeRecord {
     /// In a word why it was lost before the cap, where the environment says so, such as `wrong`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<String>,
+    /// Which share of its way it came: of the task's stages and success, how many it passed in order; 1 where the task was
+    /// done. None where no stages are known, and of episodes that were run before any were.
+    #[serde(default, skip_serializing_if = "Option::is_none", with = "exact_if_any")]
+    pub progress: Option<f64>,
+}
+
+impl EpisodeRecord {
+    /// Whether both are the same outcome. What only one of them was asked for tells nothing: evaluations from before there
+    /// were stages have no progress.
+    pub fn is_same(&self, other: &Self) -> bool {
+        let bits = |of: &Self| of.progress.map(f64::to_bits);
+        let progress = bits(self).zip(bits(other)).is_none_or(|(one, two)| one == two);
+        progress && Self { progress: None, ..self.clone() } == Self { progress: None, ..other.clone() }
+    }
 }
 
 /// How one episode went on the clock, to the microsecond.
@@ -297,6 +311,25 @@ mod exact {
     pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
         let text = String::deserialize(deserializer)?;
         text.parse().map_err(|e| D::Error::custom(format!("number {text:?}: {e}")))
+    }
+}
+
+/// The same where there may be none.
+mod exact_if_any {
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    #[derive(Deserialize)]
+    struct Exact(#[serde(with = "super::exact")] f64);
+
+    pub(super) fn serialize<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+        match value {
+            Some(value) => super::exact::serialize(value, serializer),
+            None => serializer.serialize_none(),
+        }
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f64>, D::Error> {
+        Ok(Option::<Exact>::deserialize(deserializer)?.map(|Exact(value)| value))
     }
 }
 
@@ -412,10 +445,14 @@ pub(crate) mod tests {
         fn an_episode_survives_the_journal_to_the_last_bit(seed: u64, bits: u64, steps: u32) {
             let total_reward = f64::from_bits(bits);
             prop_assume!(total_reward.is_finite());
-            let record = EpisodeRecord { seed, success: true, steps, total_reward, fingerprint: "ab".into(), group: None, failure: None };
+            let progress = Some(total_reward);
+            let (group, failure) = (None, None);
+            let fingerprint = "ab".to_owned();
+            let record = EpisodeRecord { seed, success: true, steps, total_reward, fingerprint, group, failure, progress };
             let text = serde_json::to_string(&record).unwrap();
             let back: EpisodeRecord = serde_json::from_str(&text).unwrap();
             prop_assert_eq!(back.total_reward.to_bits(), bits);
+            prop_assert_eq!(back.progress.map(f64::to_bits), Some(bits));
             prop_assert_eq!(back.seed, seed);
         }
     }

@@ -102,6 +102,23 @@ impl<'a> Columns<'a> {
         })
     }
 
+    /// A column that may be missing, and may lack values.
+    fn f64_if_any(&self, name: &str, rows: usize) -> Result<Vec<Option<f64>>, ZooError> {
+        if !self.has(name) {
+            return Ok(vec![None; rows]);
+        }
+        let mut all = Vec::with_capacity(rows);
+        for batch in &self.batches {
+            let column = batch.column_by_name(name).and_then(|column| column.as_primitive_opt::<Float64Type>());
+            let malformed = || ZooError::Malformed {
+                path: self.path.to_owned(),
+                reason: format!("column `{name}`: expected {}", DataType::Float64),
+            };
+            all.extend(column.ok_or_else(malformed)?.iter());
+        }
+        Ok(all)
+    }
+
     fn f64(&self, name: &str) -> Result<Vec<f64>, ZooError> {
         self.get(name, &DataType::Float64, |a, out| {
             out.extend_from_slice(a.as_primitive::<Float64Type>().values());
@@ -109,7 +126,8 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// Writes the outcomes. The columns `group` and `failure` are there only where a task has them; empty text is none.
+/// Writes the outcomes. The columns `group` and `failure` are there only where a task has them; empty text is none. So is
+/// `progress`, whose missing values are none.
 pub(crate) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), ZooError> {
     let fingerprints = all.iter().map(|e| &e.fingerprint);
     let mut columns: Vec<(&str, ArrayRef)> = vec![
@@ -126,6 +144,9 @@ pub(crate) fn write_episodes(path: &Path, all: &[EpisodeRecord]) -> Result<(), Z
             let texts = all.iter().map(|e| word(e).unwrap_or_default());
             columns.push((name, Arc::new(StringArray::from_iter_values(texts))));
         }
+    }
+    if all.iter().any(|e| e.progress.is_some()) {
+        columns.push(("progress", Arc::new(all.iter().map(|e| e.progress).collect::<Float64Array>())));
     }
     write_table(path, columns)
 }
@@ -145,10 +166,11 @@ pub(super) fn read_episodes(path: &Path) -> Result<Vec<EpisodeRecord>, ZooError>
         }
         Ok(columns.text(name)?.into_iter().map(|word| Some(word).filter(|word| !word.is_empty())).collect())
     };
-    let words = words("group")?.into_iter().zip(words("failure")?);
+    let progress = columns.f64_if_any("progress", seeds.len())?;
+    let words = words("group")?.into_iter().zip(words("failure")?).zip(progress);
     let rows = seeds.into_iter().zip(success).zip(steps).zip(returns).zip(fingerprint).zip(words);
     Ok(rows
-        .map(|(((((seed, success), steps), total_reward), fingerprint), (group, failure))| EpisodeRecord {
+        .map(|(((((seed, success), steps), total_reward), fingerprint), ((group, failure), progress))| EpisodeRecord {
             seed,
             success,
             steps,
@@ -156,6 +178,7 @@ pub(super) fn read_episodes(path: &Path) -> Result<Vec<EpisodeRecord>, ZooError>
             fingerprint,
             group,
             failure,
+            progress,
         })
         .collect())
 }
@@ -232,6 +255,7 @@ mod tests {
                 fingerprint: format!("{k:064x}"),
                 group: None,
                 failure: None,
+                progress: None,
             })
             .collect()
     }
@@ -246,6 +270,7 @@ mod tests {
                 for (k, episode) in all.iter_mut().enumerate() {
                     episode.group = [None, Some("seen".to_owned()), Some("unseen".to_owned())][k % 3].clone();
                     episode.failure = [None, Some("wrong".to_owned())][k % 2].clone();
+                    episode.progress = [None, Some(0.2), Some(1.0 / 3.0)][k % 3];
                 }
             }
             write_episodes(&a, &all).unwrap();

@@ -3,7 +3,8 @@ use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Stop, limits, shown};
-use report::comparison::{ALPHA, Comparison, Flips, compare};
+use report::comparison::{ALPHA, Comparison, Flips, compare, compare_progress};
+use report::statistics::{Difference, Estimate};
 use report::{Counts, LeaderboardRow, Reading, percent, rank};
 use rollout::Pool;
 use serde_json::{Value, json};
@@ -124,6 +125,8 @@ fn pairs<'a>(
 struct Told<'a> {
     rows: [&'a LeaderboardRow; 2],
     comparison: Comparison,
+    /// How much further the first comes on its way, where episodes say it.
+    progress: Option<Difference>,
     /// Of two single trainings that share seeds.
     flips: Option<Flips>,
 }
@@ -133,7 +136,8 @@ impl<'a> Told<'a> {
         let single = first.n_trainings() == 1 && second.n_trainings() == 1;
         let comparison = compare(first, second);
         let flips = (single && comparison.shared > 0).then(|| Flips::of(&outcomes(first), &outcomes(second)));
-        Self { rows: [first, second], comparison, flips }
+        let progress = compare_progress(first, second);
+        Self { rows: [first, second], comparison, progress, flips }
     }
 
     /// What tells the two apart: their names, or else how they were run.
@@ -162,7 +166,7 @@ impl<'a> Told<'a> {
     }
 
     fn text(&self) -> String {
-        let Self { rows: [one, two], comparison, flips } = self;
+        let Self { rows: [one, two], comparison, progress, flips } = self;
         let [first, second] = self.names();
         // under other simulators the rules alone are what both have
         let alike = one.protocol_text() == two.protocol_text();
@@ -185,6 +189,19 @@ impl<'a> Told<'a> {
             comparison.test.name(),
             p_text(comparison.p_value)
         ));
+        if let (Some(found), [Some(one), Some(two)]) = (progress, [one, two].map(|row| row.progress)) {
+            let share = |x: f64| format!("{:.1}%", x * 1e2);
+            let Estimate { value, low, high } = found.estimate;
+            text.push_str(&format!(
+                "  of the way {} and {}, difference {} points [{}, {}], p {}\n",
+                share(one.value),
+                share(two.value),
+                points(value),
+                points(low),
+                points(high),
+                p_text(found.p_value)
+            ));
+        }
         let Some(flips) = flips else { return text };
         text.push_str(&format!(
             "  both {}, only {first} {}, only {second} {}, neither {}\n",
@@ -200,12 +217,12 @@ impl<'a> Told<'a> {
     }
 
     fn json(&self) -> Value {
-        let Self { rows: [one, two], comparison, flips } = self;
+        let Self { rows: [one, two], comparison, progress, flips } = self;
         let side = |row: &LeaderboardRow, name: &str| {
             json!({
                 "name": name, "trainings": row.n_trainings(), "successes": row.counts.successes,
                 "episodes": row.counts.episodes, "execution": row.execution_text(), "versions": row.record().versions,
-                "seeds": row.seeds_text(),
+                "seeds": row.seeds_text(), "progress": row.progress.map(|progress| progress.value),
             })
         };
         let [first, second] = self.names();
@@ -215,6 +232,10 @@ impl<'a> Told<'a> {
             "ci95": comparison.interval.map(|(low, high)| [low, high]), "test": comparison.test.name(),
             "p_value": comparison.p_value,
         });
+        if let Some(found) = progress {
+            let Estimate { value: difference, low, high } = found.estimate;
+            value["progress"] = json!({"difference": difference, "ci95": [low, high], "p_value": found.p_value});
+        }
         if let Some(flips) = flips {
             value["flips"] = flips_json(flips);
         }

@@ -430,6 +430,9 @@ fn again(
     if again.sealed {
         cli::note(&format!("{id}: its results had no seal, and have one now"));
     }
+    if again.progress {
+        cli::note(&format!("{id}: its results had no progress, and have it now"));
+    }
     if again.episodes < again.wanted {
         cli::note(&format!("{id}: {} of {} episodes run again, every outcome the same", again.episodes, again.wanted));
         return Ok(true);
@@ -441,7 +444,7 @@ fn again(
         &format!("{id}: {}{of} episodes run again, every outcome the same\n", again.episodes),
         json!({
             "entry": id, "run_again": again.episodes, "stored": again.stored, "different": 0, "other_versions": versions,
-            "sealed_now": again.sealed,
+            "sealed_now": again.sealed, "progress_now": again.progress,
         }),
     )?;
     Ok(false)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from actrm_harness.environments.table import OnTable, Stack, Values
+from actrm_harness.simulators.robosuite.stages import Stage
 from actrm_harness.wire import Array
 
 SIDE = 10
@@ -167,6 +168,17 @@ class TableMaze(OnTable, Stack):
     def _check_success(self) -> bool:
         away = np.abs((self.tip() - self.center(self.goal))[:2])
         return bool(np.all(away < CELL / 2 - 0.003)) and self.failure() is None
+
+    def stages(self) -> list[Stage]:
+        """A quarter, half and three quarters of the way."""
+        away = distances(self.walls, self.goal)
+        whole = float(away[self.start])
+
+        def come(share: float) -> Stage:
+            # the walls have no distance: nothing is come there
+            return f"{share:.0%} of the way", lambda: 0 <= away[self.cell_of(self.tip())] <= (1.0 - share) * whole
+
+        return [come(0.25), come(0.5), come(0.75)]
 
     def failure(self) -> str | None:
         """Why it is lost: "lifted" above the walls, or "crossed" into one."""

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from actrm_harness.environments.table import Objects, OnTable, Stack, Values
+from actrm_harness.simulators.robosuite.stages import Stage, fetching
 from actrm_harness.wire import Array
 
 HALF = 0.016
@@ -107,6 +108,11 @@ class Picking(OnTable):
 
     def _check_success(self) -> bool:
         return self.lifted() == [self.target]
+
+    def stages(self) -> list[Stage]:
+        """At the right cube, and holding it."""
+        name = f"cube{self.target}"
+        return fetching(self, self.things[name], lambda: self.position(name))[:2]
 
     def failure(self) -> str | None:
         """Why the episode is lost: "wrong" where another cube is up."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from actrm_harness.environments.table import OnTable, Stack, Values
+from actrm_harness.simulators.robosuite.stages import Stage
 from actrm_harness.wire import Array
 
 KEEP_OUT = 0.06
@@ -68,6 +69,10 @@ class RoundPillar(OnTable, Stack):
 
     def _check_success(self) -> bool:
         return float(np.linalg.norm(self.hand() - self.goal)) < NEAR and self.failure() is None
+
+    def stages(self) -> list[Stage]:
+        """Beside the pillar."""
+        return [("beside the pillar", lambda: bool(self.hand()[0] > self.pillar[0]))]
 
     def failure(self) -> str | None:
         """Why it is lost: "struck" too near to the pillar."""

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from actrm_harness.environments.table import Objects, OnTable, Stack, Values
+from actrm_harness.simulators.robosuite.stages import Stage, fetching
 from actrm_harness.wire import Array
 
 COLORS = {"red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0)}
@@ -86,6 +87,18 @@ class StackThreeCubes(OnTable, Stack):
 
     def _check_success(self) -> bool:
         return self.staged_rewards()[1] > 0.0
+
+    def stages(self) -> list[Stage]:
+        """The middle cube fetched and put on the lowest, then the top one fetched."""
+        _, middle, top = self.order
+        first, second = (
+            [(f"{word} {which}", judge) for word, judge in fetching(self, self.things[name], place)]
+            for which, name, place in (
+                ("the middle cube", middle, lambda: self.position(middle)),
+                ("the top cube", top, lambda: self.position(top)),
+            )
+        )
+        return [*first[1:], ("placed the middle cube", lambda: self.staged_rewards()[0] > 0.0), *second[1:]]
 
 
 class StackColor(StackThreeCubes):

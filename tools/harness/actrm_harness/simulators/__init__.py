@@ -43,6 +43,8 @@ class Description:
     env_args: dict[str, Any] = field(default_factory=dict[str, Any])
     unusual: str | None = None
     """SHA-256 of the environment's arguments, where they are not the task's usual ones."""
+    stages: list[str] = field(default_factory=list[str])
+    """What an episode passes before the task is solved, in order, where that is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,8 @@ class Stepped:
     """In a word why the task can no longer be solved, where that is known: the episode ends."""
     drawing_ms: float = 0.0
     """How long the observation's pictures took."""
+    progress: float | None = None
+    """Which share of its way the episode has come, 1 where the task is solved; where stages are known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +83,8 @@ class Episode:
     steps: int
     attrs: dict[str, str]
     tensors: Tensors
+    progress: float | None = None
+    """Which share of its way it came before the task was solved, 1 if it was; where stages are known."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,10 @@
 //! Floors and ceilings: policies that learn nothing, evaluated like any other, so that every table says what a number is
-//! worth. What happens without moving (`zero`), by chance (`random`), by looking up what was done (`nearest`), and by
-//! playing back a demonstration blindly (`replay`).
+//! worth. What happens without moving (`zero`), by chance (`random`), by looking up what was done (`nearest`), by
+//! playing back a demonstration blindly (`replay`), and what the scripted expert itself reaches (`expert`).
 //!
 //! Each is a [`Rule`]; a [`Floor`] makes a model of it, whose training is one step that changes nothing.
 
+pub mod expert;
 pub mod nearest;
 pub mod random;
 pub mod replay;
@@ -95,6 +96,9 @@ pub trait Rule: Send + Sync + Sized + 'static {
         rng: Option<&mut Rng>,
     ) -> Result<Tensor>;
 
+    /// Whether the simulator's own expert acts in its place.
+    const SCRIPTED: bool = false;
+
     /// Takes in the demonstrations; nothing unless it remembers any.
     ///
     /// # Errors
@@ -184,6 +188,10 @@ impl<R: Rule> PolicyModel for Floor<R> {
 
     fn memory(&self) -> Option<&dyn Memory> {
         Some(self)
+    }
+
+    fn is_scripted(&self) -> bool {
+        R::SCRIPTED
     }
 
     fn action_horizon(&self) -> usize {

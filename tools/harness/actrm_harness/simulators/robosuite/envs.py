@@ -21,6 +21,7 @@ import numpy as np
 
 from actrm_harness.protocol import RequestError
 from actrm_harness.simulators.robosuite import lean, suite
+from actrm_harness.simulators.robosuite.stages import Stage, stages
 from actrm_harness.simulators.robosuite.suite import Env
 from actrm_harness.tasks import TASKS, Task, find, row
 from actrm_harness.wire import Array, Tensors
@@ -65,6 +66,21 @@ class Session:
     """SHA-256 of the arguments, where they are not the task's usual ones."""
     drawing_ms: float = 0.0
     """How long the last observation's pictures took; nothing depends on it."""
+    stages: tuple[Stage, ...] = ()
+    """What an episode passes on its way to success, in order; none where nobody has named any."""
+    reached: int = 0
+    """How many of them the episode under way has passed."""
+
+    def progress(self, solved: bool) -> float | None:
+        """Which share of its way the episode has come: stages passed of all and success; None without stages."""
+        if not self.stages:
+            return None
+        return 1.0 if solved else self.reached / (len(self.stages) + 1)
+
+    def look_ahead(self) -> None:
+        """Pass the stages that the present state reaches."""
+        while self.reached < len(self.stages) and self.stages[self.reached][1]():
+            self.reached += 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +213,7 @@ def reset(session: Session, seed: int, demonstration: bool = False) -> Tensors:
         find(session.task.redraw)(env)
     raw = env.reset()
     env.hard_reset = not session.task.soft_reset
+    session.stages, session.reached = stages(env, session.task.name), 0
     return {**observation(env, raw), **images(session)}
 
 
@@ -210,6 +227,7 @@ def slim(session: Session) -> None:
 def step_session(session: Session, action: Array) -> StepResult:
     """One control step with the session's control loop, images included."""
     result = step(session.env, action, session.control)
+    session.look_ahead()
     if not session.cameras:
         return result
     return replace(result, observation={**result.observation, **images(session)})
@@ -233,6 +251,7 @@ def steps_session(session: Session, actions: Array) -> tuple[StepResult, Array]:
             rewards.append(float(reward))
             solved = success(env)
             lost = None if solved else failure(env)
+            session.look_ahead()
             if solved or lost is not None:
                 raw = raw if look or control is None else control.look()
                 break

@@ -89,7 +89,8 @@ def expert_episode(session: Session, seed: int, demonstration: bool = True) -> E
         held = held + 1 if result.success else 0
         if held > STEPS_AFTER_SUCCESS or result.failure is not None:
             break
-    return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors())
+    progress = session.progress(any(recorder.successes))
+    return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors(), progress)
 
 
 def extract(

@@ -45,6 +45,7 @@ class Robosuite:
             },
             env_args=self.session.env_args,
             unusual=self.session.unusual,
+            stages=[name for name, _ in self.session.stages],
         )
 
     def reset(self, seed: int, demonstration: bool) -> Initial:
@@ -58,7 +59,10 @@ class Robosuite:
         checked = envs.check_actions(self.session.env, actions)
         envs.slim(self.session)
         result, rewards = envs.steps_session(self.session, checked)
-        return Stepped(result.observation, rewards, result.success, result.failure, self.session.drawing_ms)
+        progress = self.session.progress(result.success)
+        return Stepped(
+            result.observation, rewards, result.success, result.failure, self.session.drawing_ms, progress
+        )
 
     def expert(self, seed: int, demonstration: bool) -> Episode:
         """One whole episode of the task's scripted expert."""

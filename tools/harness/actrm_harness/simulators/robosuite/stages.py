@@ -1,0 +1,105 @@
+"""How far an episode came: the stages of robosuite's own tasks, in the order in which a policy passes them.
+
+A stage is a name and a question to the present state; it is reached once, and only after those before it. What solves the
+task is no stage: it ends the episode. Environments of ours have a method `stages()` that gives theirs. Nothing here changes
+the simulation, and nothing that an episode depends on is drawn from it.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from actrm_harness.wire import Array
+
+Stage = tuple[str, Callable[[], bool]]
+
+NEAR = 0.05
+"""How near to a thing the grip site is at it, in metres."""
+LIFTED = 0.03
+"""By how much a thing is higher than it lay when it is up."""
+
+
+def stages(env: Any, task: str) -> tuple[Stage, ...]:
+    """The stages of a task, for the episode that has just begun; none where nobody has named any."""
+    own = getattr(env, "stages", None)
+    if own is not None:
+        return tuple(own())
+    found = _STAGES.get(task)
+    return () if found is None else found(env)
+
+
+def hand(env: Any) -> Array:
+    """Where the grip site is."""
+    return np.array(env.sim.data.site_xpos[env.robots[0].eef_site_id["right"]])
+
+
+def held(env: Any, thing: Any) -> bool:
+    """Whether both fingers touch it."""
+    return bool(env._check_grasp(gripper=env.robots[0].gripper, object_geoms=thing))
+
+
+def fetching(env: Any, thing: Any, place: Callable[[], Array], grip: Callable[[], Array] | None = None) -> list[Stage]:
+    """At a thing, holding it, and holding it above where it lay; `grip` is where it is to be held, if not at its centre."""
+    at = place if grip is None else grip
+    rest = float(place()[2])
+    return [
+        ("at it", lambda: float(np.linalg.norm(hand(env) - at())) < NEAR),
+        ("held", lambda: held(env, thing)),
+        ("lifted", lambda: float(place()[2]) > rest + LIFTED),
+    ]
+
+
+def _body(env: Any, body: int) -> Callable[[], Array]:
+    return lambda: np.array(env.sim.data.body_xpos[body])
+
+
+def _above(place: Callable[[], Array], target: Callable[[], Array], within: float) -> Callable[[], bool]:
+    return lambda: float(np.abs((place() - target())[:2]).max()) < within
+
+
+def _lift(env: Any) -> tuple[Stage, ...]:
+    return tuple(fetching(env, env.cube, _body(env, env.cube_body_id))[:2])
+
+
+def _stack(env: Any) -> tuple[Stage, ...]:
+    upper, lower = _body(env, env.cubeA_body_id), _body(env, env.cubeB_body_id)
+    return (*fetching(env, env.cubeA, upper), ("above", _above(upper, lower, 0.02)))
+
+
+def _pick_place(env: Any) -> tuple[Stage, ...]:
+    thing = env.objects[env.object_id]
+    place, bin_place = _body(env, env.obj_body_id[thing.name]), np.array(env.target_bin_placements[env.object_id])
+    half = np.array(env.bin_size[:2]) / 4.0
+
+    def above() -> bool:
+        return bool(np.all(np.abs(place()[:2] - bin_place[:2]) < half))
+
+    return (*fetching(env, thing, place), ("above", above))
+
+
+def _nut(env: Any) -> tuple[Stage, ...]:
+    nut = env.nuts[env.nut_id]
+    place, peg = _body(env, env.obj_body_id[nut.name]), _body(env, (env.peg1_body_id, env.peg2_body_id)[env.nut_id])
+    handle = env.sim.model.site_name2id(nut.important_sites["handle"])
+    grip = lambda: np.array(env.sim.data.site_xpos[handle])  # noqa: E731
+    return (*fetching(env, nut, place, grip), ("above", _above(place, peg, 0.03)))
+
+
+def _door(env: Any) -> tuple[Stage, ...]:
+    def open_by(angle: float) -> Callable[[], bool]:
+        return lambda: float(env.sim.data.qpos[env.hinge_qpos_addr]) > angle
+
+    def at_handle() -> bool:
+        return float(np.linalg.norm(hand(env) - env._handle_xpos)) < NEAR
+
+    return (("at it", at_handle), ("ajar", open_by(0.03)), ("half open", open_by(0.15)))
+
+
+_STAGES: dict[str, Callable[[Any], tuple[Stage, ...]]] = {
+    "Lift": _lift,
+    "Stack": _stack,
+    "PickPlaceCan": _pick_place,
+    "NutAssemblySquare": _nut,
+    "Door": _door,
+}
