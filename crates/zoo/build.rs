@@ -21,7 +21,9 @@ fn compiler() -> String {
 
 /// Writes name and text of every TOML file in `folder` as a Rust expression.
 fn list(folder: &str, out: &str) {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
+    // asked when it runs: a checkout may have moved, its built script with it
+    let here = std::env::var_os("CARGO_MANIFEST_DIR").expect("cargo says where the package is");
+    let folder = Path::new(&here).join(folder);
     println!("cargo:rerun-if-changed={}", folder.display());
     let items = std::fs::read_dir(&folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display()));
     let mut files: Vec<PathBuf> = items.map(|item| item.expect("a folder can be listed").path()).collect();

@@ -180,14 +180,15 @@ impl EpisodePlan {
     pub fn run_expert(&self, worker: &mut Worker, seed: u64) -> Result<Outcome, JobError> {
         let begun = Instant::now();
         let Initial { fingerprint, group, .. } = worker.reset(seed)?;
-        let Scripted { rewards, solved, progress } = worker.expert_evaluated(seed).map_err(|fault| match &fault.kind {
-            // the same for a fresh worker
-            FaultKind::Reported { kind, message } if kind == "no_expert" => {
-                let task = worker.ready().task.clone();
-                RolloutError::Refused { task, kind: kind.clone(), message: message.clone() }.into()
-            }
-            _ => JobError::from(fault),
-        })?;
+        let Scripted { rewards, solved, progress } =
+            worker.expert_evaluated(seed).map_err(|fault| match &fault.kind {
+                // the same for a fresh worker
+                FaultKind::Reported { kind, message } if kind == "no_expert" => {
+                    let task = worker.ready().task.clone();
+                    RolloutError::Refused { task, kind: kind.clone(), message: message.clone() }.into()
+                }
+                _ => JobError::from(fault),
+            })?;
         worker.check_quiet()?;
         let end = solved.iter().take(self.max_steps).position(|solved| *solved);
         let steps = end.map_or(solved.len().min(self.max_steps), |at| at + 1);

@@ -37,9 +37,6 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     count(|row: &LeaderboardRow| Some(row.standing.as_ref()?.ranks.1 as u64)).csv("rank_last"),
     text(ranks_text).table("ranks").page("ranks"),
     text(letters).csv("letters").table("group").page("group"),
-    number(|row: &LeaderboardRow| Some(row.progress?.value), 4, 4).csv("progress"),
-    number(|row: &LeaderboardRow| Some(row.progress?.low), 4, 4).csv("progress_ci95_low"),
-    number(|row: &LeaderboardRow| Some(row.progress?.high), 4, 4).csv("progress_ci95_high"),
     text(|row: &LeaderboardRow| row.progress_text(0)).table("progress"),
     text(|row: &LeaderboardRow| row.progress_text(1)).page("progress"),
     number(LeaderboardRow::mean_return, 4, 2).csv("mean_return").table("return").page("return"),
@@ -72,6 +69,10 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     text(LeaderboardRow::groups_text).csv("groups"),
     text(|row: &LeaderboardRow| row.family.as_ref().map_or(String::new(), |key| key.chars().take(12).collect()))
         .csv("family"),
+    // columns of the CSV that came later stand at its end
+    number(|row: &LeaderboardRow| Some(row.progress?.value), 4, 4).csv("progress"),
+    number(|row: &LeaderboardRow| Some(row.progress?.low), 4, 4).csv("progress_ci95_low"),
+    number(|row: &LeaderboardRow| Some(row.progress?.high), 4, 4).csv("progress_ci95_high"),
 ];
 
 /// `1-3`: the ranks that it may have.

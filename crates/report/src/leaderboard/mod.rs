@@ -108,6 +108,44 @@ mod tests {
     }
 
     #[test]
+    fn progress_is_shown_where_every_episode_says_it() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut evaluation = finished(dir.path(), &sample("staged", 1, 20));
+        assert_eq!(LeaderboardRow::new(&evaluation).progress, None);
+        // 16 of 20 succeed, the others came half of the way
+        for episode in &mut evaluation.episodes {
+            episode.progress = Some(if episode.success { 1.0 } else { 0.5 });
+        }
+        let row = LeaderboardRow::new(&evaluation);
+        let progress = row.progress.unwrap();
+        assert!((progress.value - 0.9).abs() < 1e-12 && progress.low < 0.9 && progress.high > 0.9, "{progress:?}");
+        assert!(cells(COLUMNS, [&row]).rows[0].iter().any(|cell| cell.starts_with("90% [")));
+        assert!(row.summary().contains(", 90.0% of the way on average"), "{}", row.summary());
+        let mut further = evaluation.clone();
+        for (k, episode) in further.episodes.iter_mut().enumerate() {
+            episode.progress = Some(if episode.success || k % 2 == 0 { 1.0 } else { 0.75 });
+        }
+        let found = crate::comparison::compare_progress(&LeaderboardRow::new(&further), &row).unwrap();
+        // two of the four failures came all of the way instead of half, two came a quarter further
+        let gained = further.episodes.iter().zip(&evaluation.episodes);
+        let gained: f64 = gained.map(|(a, b)| a.progress.unwrap() - b.progress.unwrap()).sum::<f64>() / 20.0;
+        assert!(gained > 0.0 && (found.estimate.value - gained).abs() < 1e-12, "{found:?}");
+        evaluation.episodes[3].progress = None;
+        let row = LeaderboardRow::new(&evaluation);
+        assert_eq!((row.progress, row.progress_text(0).as_str()), (None, "-"));
+        assert!(crate::comparison::compare_progress(&row, &LeaderboardRow::new(&further)).is_none());
+    }
+
+    /// docs/leaderboard.md says what each column of the CSV is, in their order.
+    #[test]
+    fn every_column_of_the_csv_is_documented() {
+        let page = include_str!("../../../../docs/leaderboard.md");
+        let told: Vec<&str> = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
+        let names: Vec<&str> = COLUMNS.iter().filter_map(crate::column::Column::csv_name).collect();
+        assert_eq!(told, names);
+    }
+
+    #[test]
     fn groups_are_counted_apart() {
         let dir = tempfile::tempdir().unwrap();
         let mut evaluation = finished(dir.path(), &sample("color", 1, 20));
@@ -119,7 +157,7 @@ mod tests {
         assert_eq!(row.groups_text(), "seen 12/15, unseen 4/5");
         assert_eq!(cells(COLUMNS, [&row]).rows[0][3], "16/20\nseen 12/15\nunseen 4/5");
         assert!(markdown::table(COLUMNS, [&row]).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
-        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\","));
+        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\",,,,"));
         assert!(!row.summary().contains(" in "), "{}", row.summary());
         for (k, episode) in evaluation.episodes.iter_mut().enumerate().filter(|(_, episode)| !episode.success) {
             episode.failure = Some(if k < 5 { "late" } else { "wrong" }.to_owned());

@@ -139,7 +139,8 @@ pub fn mean_difference(differences: &[f64]) -> Option<Difference> {
     let p_value = match error > 1e-12 {
         true => 2.0 * student_tail(value.abs() / error, n - 1),
         false if value.abs() < 1e-12 => 1.0,
-        false => 0.0,
+        // all alike: as if signs were tossed
+        false => 0.5_f64.powi(i32::try_from(n - 1).unwrap_or(i32::MAX)),
     };
     let half = student_quantile(n) * error;
     let estimate = Estimate { value, low: (value - half).max(-1.0), high: (value + half).min(1.0) };
@@ -249,6 +250,31 @@ mod tests {
         }
         assert!((normal_tail(1.959_963_985) - 0.025).abs() < 1e-6);
         assert!((expanded_tail(200) - 0.0243).abs() < 5e-4);
+    }
+
+    /// `scipy.stats.ttest_1samp` and `scipy.stats.t.interval`.
+    #[test]
+    fn means_and_their_differences_agree_with_scipy() {
+        let near = |found: f64, expected: f64| (found - expected).abs() < 1e-3;
+        let found = mean_difference(&[0.1, 0.2, 0.0, -0.1, 0.3]).unwrap();
+        let Estimate { value, low, high } = found.estimate;
+        assert!((found.p_value - 0.230_199_641).abs() < 1e-8, "{found:?}");
+        assert!(near(value, 0.1) && near(low, -0.096_324) && near(high, 0.296_324), "{found:?}");
+        let shares: Vec<f64> = (0..40).map(|k| 0.2 * f64::from((k * 7) % 6)).collect();
+        let found = mean_difference(&shares.iter().map(|share| share - 0.4).collect::<Vec<_>>()).unwrap();
+        assert!((found.p_value - 0.146_299_150).abs() < 1e-8, "{found:?}");
+        let interval = mean_interval(&shares).unwrap();
+        assert!(near(interval.low, 0.370_834) && near(interval.high, 0.589_166), "{interval:?}");
+        let skewed = mean_interval(&[0.0, 0.25, 0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0]).unwrap();
+        assert!(near(skewed.low, 0.394_755) && near(skewed.high, 0.955_245), "{skewed:?}");
+        // all alike: nothing says how far the next may be from them, but how many they are
+        let all = mean_interval(&[1.0; 20]).unwrap();
+        assert_eq!((all.value, all.high), (1.0, 1.0));
+        assert!((all.low - wilson_interval(20, 20).0).abs() < 1e-12);
+        assert_eq!(mean_interval(&[0.5]).map(|one| one.value), Some(0.5));
+        assert!(mean_interval(&[]).is_none() && mean_difference(&[0.5]).is_none());
+        let alike = [mean_difference(&[0.0; 30]).unwrap(), mean_difference(&[0.25; 30]).unwrap()];
+        assert_eq!(alike.map(|one| one.p_value), [1.0, 2.0_f64.powi(-29)]);
     }
 
     #[test]

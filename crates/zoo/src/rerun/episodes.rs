@@ -162,7 +162,16 @@ mod tests {
 
     fn episode(seed: u64, success: bool, steps: u32) -> EpisodeRecord {
         let fingerprint = format!("{seed:064x}");
-        EpisodeRecord { seed, success, steps, total_reward: 0.5, fingerprint, group: None, failure: None, progress: None }
+        EpisodeRecord {
+            seed,
+            success,
+            steps,
+            total_reward: 0.5,
+            fingerprint,
+            group: None,
+            failure: None,
+            progress: None,
+        }
     }
 
     #[test]

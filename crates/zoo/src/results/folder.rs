@@ -490,6 +490,45 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn a_finished_evaluation_takes_in_progress_and_goes_on_when_killed_in_between() {
+        let dir = tempfile::tempdir().unwrap();
+        let record = sample("a", 1, 6);
+        let before = finished(dir.path(), &record);
+        let further: Vec<EpisodeRecord> = before
+            .episodes
+            .iter()
+            .map(|episode| EpisodeRecord {
+                progress: Some(if episode.success { 1.0 } else { 1.0 / 3.0 }),
+                ..episode.clone()
+            })
+            .collect();
+        let open = || ResultsFolder::open(dir.path(), &record).unwrap();
+        let mut other = further.clone();
+        other[2].steps += 1;
+        let error = open().rewrite(other).unwrap_err().to_string();
+        assert!(error.contains("outcome of seed 10002 differs"), "{error}");
+        assert_eq!(StoredEvaluation::read(&before.folder).unwrap().as_ref(), Some(&before), "nothing was touched");
+        let after = open().rewrite(further.clone()).unwrap();
+        assert_eq!((after.episodes, after.timings, after.sealed), (further.clone(), before.timings, true));
+        assert!(!before.folder.join(JOURNAL).exists());
+        // killed after the journal was written: the seal stands, and what it seals
+        let text = |episodes: &[EpisodeRecord]| -> String {
+            let lines =
+                episodes.iter().cloned().map(|episode| JournalLine { timing: self::episode(episode.seed).1, episode });
+            lines.map(|line| serde_json::to_string(&line).unwrap() + "\n").collect()
+        };
+        fs::write(before.folder.join(JOURNAL), text(&before.episodes)).unwrap();
+        assert!(open().is_finished());
+        // killed after the seal was removed: every episode is in the journal
+        fs::write(before.folder.join(JOURNAL), text(&further)).unwrap();
+        fs::remove_file(before.folder.join(SEAL_FILE)).unwrap();
+        assert_eq!(StoredEvaluation::read(&before.folder).unwrap(), None, "under way");
+        let folder = open();
+        assert!(!folder.is_finished() && folder.missing().is_empty());
+        assert_eq!(folder.finish().unwrap().episodes, further);
+    }
+
+    #[test]
     fn two_processes_cannot_work_in_one_folder() {
         let dir = tempfile::tempdir().unwrap();
         let record = sample("a", 1, 2);
