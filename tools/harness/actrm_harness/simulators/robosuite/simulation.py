@@ -60,9 +60,7 @@ class Robosuite:
         envs.slim(self.session)
         result, rewards = envs.steps_session(self.session, checked)
         progress = self.session.progress(result.success)
-        return Stepped(
-            result.observation, rewards, result.success, result.failure, self.session.drawing_ms, progress
-        )
+        return Stepped(result.observation, rewards, result.success, result.failure, self.session.drawing_ms, progress)
 
     def expert(self, seed: int, demonstration: bool) -> Episode:
         """One whole episode of the task's scripted expert."""

@@ -1,8 +1,8 @@
 """How far an episode came: the stages of robosuite's own tasks, in the order in which a policy passes them.
 
-A stage is a name and a question to the present state; it is reached once, and only after those before it. What solves the
-task is no stage: it ends the episode. Environments of ours have a method `stages()` that gives theirs. Nothing here changes
-the simulation, and nothing that an episode depends on is drawn from it.
+A stage is a name and a question to the present state; it is reached once, and only after those before it. What solves
+the task is no stage: it ends the episode. Environments of ours have a method `stages()` that gives theirs. Nothing here
+changes the simulation, and nothing that an episode depends on is drawn from it.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ def held(env: Any, thing: Any) -> bool:
 
 
 def fetching(env: Any, thing: Any, place: Callable[[], Array], grip: Callable[[], Array] | None = None) -> list[Stage]:
-    """At a thing, holding it, and holding it above where it lay; `grip` is where it is to be held, if not at its centre."""
+    """At a thing, holding it, and holding it above where it lay; `grip` is where to hold it, if not at its centre."""
     at = place if grip is None else grip
     rest = float(place()[2])
     return [
