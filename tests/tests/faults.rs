@@ -276,3 +276,59 @@ fn the_page_of_a_study_survives_a_fault_at_any_call() {
     }
     tally("study --page-only", &whole.calls, &faults);
 }
+
+#[test]
+fn an_alias_and_a_removal_survive_a_fault_at_any_call() {
+    if !allowed() {
+        return;
+    }
+    let (_folder, entries) = copied_zoo();
+    let entries = entries.canonicalize().expect("it is there");
+    let original = entries.join("../original");
+    copy(&entries.join("lift-act"), &original);
+    let afresh = || {
+        if entries.join("lift-act").exists() {
+            fs::remove_dir_all(entries.join("lift-act")).expect("removable");
+        }
+        copy(&original, &entries.join("lift-act"));
+    };
+    let whole_zoo = || {
+        for command in ["verify", "list"] {
+            succeeds(&mut zoo([command, "--zoo", text(&entries)]));
+        }
+    };
+    let alias = || zoo(["alias", "lift-act@1", "best", "--zoo", text(&entries)]);
+    let named = || fs::read_to_string(entries.join("lift-act/aliases.json")).ok();
+    let straight = run(&mut alias(), &entries, None);
+    assert!(straight.status.success(), "{}", straight.stderr);
+    let expected = named();
+    assert!(expected.as_deref().is_some_and(|text| text.contains("best")), "{expected:?}");
+    let aliased = faults(&straight.calls, 8);
+    for fault in &aliased {
+        afresh();
+        struck(&mut alias(), &entries, *fault);
+        whole_zoo();
+        assert!(named().is_none() || named() == expected, "{fault:?}: half a file");
+        succeeds(&mut alias());
+        assert_eq!(named(), expected, "{fault:?}");
+    }
+    tally("alias", &straight.calls, &aliased);
+
+    afresh();
+    let remove = || zoo(["remove", "lift-act@1", "--zoo", text(&entries)]);
+    let straight = run(&mut remove(), &entries, None);
+    assert!(straight.status.success(), "{}", straight.stderr);
+    let removed = faults(&straight.calls, 8);
+    for fault in &removed {
+        afresh();
+        struck(&mut remove(), &entries, *fault);
+        // there and whole, or gone; and what is gone is not there in part
+        whole_zoo();
+        let left = run(&mut remove(), &entries, None);
+        let told = format!("{fault:?}: {}", left.stderr);
+        assert!(left.status.success() || left.stderr.contains("unknown entry"), "{told}");
+        assert!(!entries.join("lift-act/1").exists(), "{told}");
+        whole_zoo();
+    }
+    tally("remove", &straight.calls, &removed);
+}

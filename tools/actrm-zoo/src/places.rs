@@ -6,8 +6,15 @@ use clap::{Args, ValueEnum};
 use clap_complete::engine::{ArgValueCandidates, CompletionCandidate};
 use cli::completions::{candidates, given};
 use zoo::config::Library;
+use zoo::entry::EntryId;
 use zoo::protocols::{Block, Protocols};
 use zoo::registry::Registry;
+
+/// The error of an entry, which names the entry once.
+pub fn of_entry(id: &EntryId, error: anyhow::Error) -> anyhow::Error {
+    let name = format!("entry {id}");
+    if error.to_string().starts_with(&name) { error } else { error.context(name) }
+}
 
 /// The folder of the zoo unless another one is named.
 const USUAL_ZOO: &str = "zoo";

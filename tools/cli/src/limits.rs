@@ -28,7 +28,7 @@ pub fn check_coefficient(coefficient: f64, horizon: usize) -> Result<()> {
     // beyond 10 the oldest prediction alone counts; exp(700) is near the largest number
     let least = -(700.0 / horizon.max(1) as f64).min(10.0);
     if !(least..=10.0).contains(&coefficient) {
-        bail!("--temporal-ensemble: expected a finite number from {least:.1} to 10, found {coefficient}");
+        bail!("--temporal-ensemble: expected a finite number from {least:.1} to 10, found {coefficient:?}");
     }
     Ok(())
 }

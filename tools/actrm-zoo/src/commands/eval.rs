@@ -19,7 +19,7 @@ use zoo::registry::Registry;
 use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
 use crate::films;
-use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
+use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names, of_entry};
 use crate::puzzles::{PuzzleArgs, evaluate_solver};
 use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
 
@@ -176,7 +176,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // one set of simulators serves all entries of an environment
     let mut by_environment: BTreeMap<Environment, Vec<LoadedEntry>> = BTreeMap::new();
     for id in ids {
-        match open(args, &asked, &registry, &id, &mut says).with_context(|| format!("entry {id}")) {
+        match open(args, &asked, &registry, &id, &mut says).map_err(|error| of_entry(&id, error)) {
             Ok(Some(loaded)) => match environment(&args.run, loaded.entry().meta()) {
                 Ok(environment) => by_environment.entry(environment).or_default().push(loaded),
                 Err(error) => failures.push(error.into()),
@@ -280,7 +280,7 @@ fn evaluate_on(
             Some(ready) => Ok((finished(&subject, ready, &results, &options)?, subject)),
             None => Ok((None, subject)),
         });
-        match done.with_context(|| format!("entry {id}")) {
+        match done.map_err(|error| of_entry(&id, error)) {
             Ok((Some(evaluation), _)) => says.evaluation(&evaluation, true)?,
             Ok((None, subject)) => subjects.push(subject),
             Err(error) => failures.push(error),

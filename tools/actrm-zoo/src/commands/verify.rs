@@ -1,14 +1,13 @@
 use std::collections::BTreeMap;
 use std::process::ExitCode;
 
-use anyhow::Context;
 use cli::shown;
 use study::puzzle::{SolverEntry, audit_puzzles};
 use zoo::audit::{KnownEntries, LeftOut, audit};
 use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE, Repeats};
 use zoo::tensors;
 
-use crate::places::{ResultsArgs, ZooArgs, entry_names};
+use crate::places::{ResultsArgs, ZooArgs, entry_names, of_entry};
 
 /// Check entries and their results: every hash and seal, and with --deep every tensor and what the policy answers
 ///
@@ -49,7 +48,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut failures = Vec::new();
     let mut text = String::new();
     for id in &ids {
-        match check(id, &entries, args.deep).with_context(|| format!("entry {id}")) {
+        match check(id, &entries, args.deep).map_err(|error| of_entry(id, error)) {
             Ok((count, repeats)) => {
                 let results = whole.get(&(id.name.clone(), id.version)).copied().unwrap_or_default();
                 text.push_str(&format!("{id}: {count} files and {results} results are as they were made{repeats}\n"));
