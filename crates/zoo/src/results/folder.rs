@@ -155,6 +155,8 @@ pub struct ResultsFolder {
     record: EvaluationRecord,
     journal: Option<File>,
     done: BTreeMap<u64, (EpisodeRecord, EpisodeTiming)>,
+    /// Whether a line could not be written: what is left of it is the journal's last, and nothing may come after it.
+    torn: bool,
     _lock: File,
 }
 
@@ -207,7 +209,7 @@ impl ResultsFolder {
                 (done, Some(journal.map_err(ZooError::io("open", &path))?))
             }
         };
-        Ok(Self { folder, record: record.clone(), journal, done, _lock: lock })
+        Ok(Self { folder, record: record.clone(), journal, done, torn: false, _lock: lock })
     }
 
     /// Where it is.
@@ -283,14 +285,17 @@ impl ResultsFolder {
                 found: json(&episode),
             });
         }
+        let unwritten = ZooError::io("write", self.folder.join(JOURNAL));
+        if self.torn {
+            return Err(unwritten(std::io::Error::other("an episode before this one could not be written")));
+        }
         let line = JournalLine { episode, timing };
         let mut text = serde_json::to_vec(&line).expect("plain fields are always JSON");
         text.push(b'\n');
         let journal = self.journal.as_mut().expect("a finished evaluation holds every seed");
-        journal
-            .write_all(&text)
-            .and_then(|()| journal.sync_data())
-            .map_err(ZooError::io("write", self.folder.join(JOURNAL)))?;
+        let written = journal.write_all(&text).and_then(|()| journal.sync_data());
+        self.torn = written.is_err();
+        written.map_err(unwritten)?;
         self.done.insert(seed, (line.episode, line.timing));
         Ok(())
     }
