@@ -14,6 +14,8 @@ pub struct Batch {
     pub actions: Tensor,
     /// (b, H): 1 where the step lies beyond the end of its episode, else 0
     pub is_pad: Tensor,
+    /// Of each row the feature of its demonstration that was taken, by its place in the signature; `None` where nobody asked.
+    pub taken: Option<Vec<u32>>,
     /// Rows of the whole batch that this one is a shard of: losses are averaged over this number.
     pub total_rows: usize,
     /// Steps of the whole batch that are not padding.
@@ -51,6 +53,7 @@ impl Batch {
             observation: tensors,
             actions: Tensor::from_vec(actions, (n, action_horizon, signature.action_dim), dev)?,
             is_pad: Tensor::from_vec(pad, (n, action_horizon), dev)?,
+            taken: None,
             total_rows: n,
             total_valid_steps: is_pad.iter().filter(|&&p| !p).count(),
             seed: 0,
@@ -94,6 +97,7 @@ impl Batch {
                     observation: self.observation.try_map(|_, tensor| cut(tensor))?,
                     actions: cut(&self.actions)?,
                     is_pad: cut(&self.is_pad)?,
+                    taken: self.taken.as_ref().map(|taken| taken[from..to].to_vec()),
                     ..self.clone()
                 })
             })

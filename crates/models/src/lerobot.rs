@@ -221,6 +221,7 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
         dropout: keys.dropout,
         kl_weight: keys.kl_weight,
         vision: if pictures.is_empty() { None } else { Some(vision(&keys)?) },
+        pointer: None,
     };
     config.validate()?;
     let mut signature = Signature::low_dimensional(state, env, action);

@@ -2,6 +2,7 @@
 
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
+use crate::layers::PointerConfig;
 use crate::model::PolicyModel;
 use crate::models::floors::{expert, nearest, random, replay, zero};
 use crate::models::{act, actrm, bc, bc_rnn, bc_transformer, diffusion, flow, mip};
@@ -129,6 +130,15 @@ impl PolicyConfig {
     pub fn reasoner(&self) -> Option<&actrm::Config> {
         match self {
             Self::Actrm(config) => Some(config),
+            _ => None,
+        }
+    }
+
+    /// What it asks of the entities, if it asks which one is meant.
+    pub fn pointer(&self) -> Option<&PointerConfig> {
+        match self {
+            Self::Act(config) => config.pointer.as_ref(),
+            Self::Actrm(config) => config.pointer.as_ref(),
             _ => None,
         }
     }

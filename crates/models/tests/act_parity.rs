@@ -56,6 +56,7 @@ impl Fixture {
             is_pad: self.get("pad"),
             total_rows: self.get("state").dim(0).unwrap(),
             total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
+            taken: None,
             seed: 0,
         }
     }

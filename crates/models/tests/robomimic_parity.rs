@@ -81,6 +81,7 @@ impl Fixture {
             actions,
             total_rows: rows,
             total_valid_steps: rows * horizon,
+            taken: None,
             seed: 0,
         }
     }

@@ -379,7 +379,32 @@ impl Experiment {
         }
         self.policy.validate().map_err(self.model_error("build the policy of"))?;
         self.data.check(self.policy.reads())?;
+        self.check_pointer()?;
         self.train.check()
+    }
+
+    /// The exchange that says which of the entities was taken that the policy's pointer is about: the one whose items lie in
+    /// them.
+    pub(crate) fn pointed_exchange(&self) -> Option<&str> {
+        let group = &self.policy.pointer()?.among;
+        let held = |item: &String| {
+            let mut entities = self.data.entities.iter();
+            entities.any(|(name, e)| e.keys.contains(item) && e.group_of(name) == *group && !e.position)
+        };
+        let about = self.data.exchange.iter().find(|(_, exchange)| exchange.taken.iter().all(held));
+        about.map(|(name, _)| name.as_str())
+    }
+
+    /// A pointer is trained on what demonstrations took.
+    fn check_pointer(&self) -> Result<(), ZooError> {
+        match self.policy.pointer() {
+            Some(pointer) if self.pointed_exchange().is_none() => Err(ZooError::InvalidValue {
+                key: "policy.pointer.among".to_owned(),
+                expected: "a group of entities of which a data.exchange says which was `taken`".to_owned(),
+                found: format!("`{}`", pointer.among),
+            }),
+            _ => Ok(()),
+        }
     }
 
     /// Kind of policy, as the config names it.
@@ -536,6 +561,17 @@ mod tests {
         assert!(message.contains("key `data.exchange.things.places`: expected 2 lists"), "{message}");
         assert!(error(&exchange("taken = [], items = []")).contains("`data.exchange.things.taken`: expected at least"));
         assert!(error(&exchange("taken = ['cube_pos'], items = [['object']]")).contains("found `cube_pos`"));
+        let things = ["data.entities.thing0=['cube0']", "data.entities.thing1=['cube1']"];
+        let taken = "data.exchange.things={ taken = ['cube0', 'cube1'], items = [['cube0'], ['cube1']] }";
+        let pointing = "policy.pointer={ among = 'thing' }";
+        let experiment = load(&[things[0], things[1], taken, pointing]).unwrap();
+        assert_eq!(experiment.pointed_exchange(), Some("things"));
+        assert_eq!(Experiment::from_toml("x", &experiment.to_toml()).unwrap(), experiment);
+        let refused = load(&[things[0], things[1], pointing]).unwrap_err();
+        assert!(refused.starts_with("key `policy.pointer.among`: expected a group of entities of which"), "{refused}");
+        assert!(
+            load(&[things[0], things[1], taken, "policy.pointer={ among = 'cube' }"]).unwrap_err().ends_with("`cube`")
+        );
         assert!(load(&["data.beginning={ steps = 8, times = 4 }"]).is_ok());
         assert!(error("data.beginning={ steps = 8, times = 0 }").contains("found steps 8, times 0"));
         assert!(error("data.entities.cube=3").contains("a list of observation keys, or a table"));

@@ -13,6 +13,7 @@ mod linear;
 mod lstm;
 mod mish;
 mod mixture;
+mod pointer;
 mod position;
 mod tokens;
 mod transformer;
@@ -29,9 +30,11 @@ pub use linear::Linear;
 pub use lstm::{Lstm, LstmState};
 pub use mish::mish;
 pub use mixture::{Mixture, MixtureHead};
+pub use pointer::PointerConfig;
+pub(crate) use pointer::{Pointed, Pointer};
 pub use position::sinusoid_table;
 pub(crate) use tokens::{
     ENTITY_POSITIONS, FEATURE_POSITIONS, InputTokens, LATENT, Position, TokenLayout, environment_state,
 };
-pub(crate) use transformer::{Decoder, DecoderLayer, Encoder, LayerInit, Shape};
+pub(crate) use transformer::{Decoder, DecoderLayer, Encoder, EncoderLayer, LayerInit, Shape};
 pub(crate) use vae::{Vae, kl_divergence, sample};

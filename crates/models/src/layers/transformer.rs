@@ -50,7 +50,7 @@ impl EncoderLayer {
         let ff = shape.activation;
         Ok(Self {
             self_attn: MultiHeadAttention::new(params, &attn, dim, shape.heads, p, init.weight(), rng)?,
-            ff: FeedForward::new(params, &format!("{prefix}."), hidden, ff, p, init.weight(), rng)?,
+            ff: FeedForward::new(params, &format!("{prefix}."), hidden, ff, p, init.dense(), rng)?,
             norm1: LayerNorm::new(params, &format!("{prefix}.norm1"), dim, rng)?,
             norm2: LayerNorm::new(params, &format!("{prefix}.norm2"), dim, rng)?,
             dropout: Dropout { p },
@@ -213,13 +213,23 @@ pub(crate) enum LayerInit {
     Xavier,
     /// VAE encoder
     TorchDefault,
+    /// a layer that is applied again and again: as encoder and decoder, with a weaker dense part
+    Recursive,
 }
 
 impl LayerInit {
     pub(crate) fn weight(self) -> Init {
         match self {
-            Self::Xavier => Init::XavierUniform,
+            Self::Xavier | Self::Recursive => Init::XavierUniform,
             Self::TorchDefault => Init::KaimingUniform,
+        }
+    }
+
+    /// Of the dense part of an encoder layer.
+    fn dense(self) -> Init {
+        match self {
+            Self::Xavier => Init::XavierUniform,
+            Self::TorchDefault | Self::Recursive => Init::KaimingUniform,
         }
     }
 }

@@ -82,7 +82,8 @@ impl Examiner {
     /// By step, by action: the attention to each of [`Examiner::names`].
     fn attention(&self, seen: &[Observation], steps: usize) -> Result<Vec<Vec<Vec<f32>>>, ModelError> {
         let steps = self.model.examine(&self.preprocess.observation(seen)?, steps, None)?;
-        steps.iter().map(|step| Ok(step.attention.squeeze(0)?.to_vec2::<f32>()?)).collect()
+        let attention = steps.iter().filter_map(|step| step.attention.as_ref());
+        attention.map(|attention| Ok(attention.squeeze(0)?.to_vec2::<f32>()?)).collect()
     }
 }
 

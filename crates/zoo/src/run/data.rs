@@ -267,10 +267,10 @@ pub(super) fn prepare(
             guarded.feature, guarded.dim, guarded.spread
         ));
     }
+    let exchanges = Exchanges::new(experiment, dataset, &train, &signature, path)?;
     let preprocess =
         Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
     let symmetries = Symmetries::new(experiment, dataset, path)?;
-    let exchanges = Exchanges::new(experiment, dataset, &train, path)?;
     let picture_statistics = picture_statistics.into_iter().collect();
     Ok(Demonstrations { train, valid, preprocess, symmetries, exchanges, picture_statistics, meta, notes })
 }

@@ -8,12 +8,13 @@
 //! ```
 //!
 //! Each demonstration shows by its end which thing was meant: the one whose vector in `taken`, from the hand, is the
-//! shortest in the last observation. Whatever the others are, the same demonstration is right. So what is known of them
+//! shortest in the last observation, of those that are not zero, which are not there. Whatever the others are, the same demonstration is right. So what is known of them
 //! (`items`, as many lists as things, alike) is dealt out among them at random in every sample. And where `places` are
 //! named, each of them is moved to where another demonstration's taken thing lay, drawn for the sample from the
 //! [`NEAREST`] that are nearest to it: by the vector between the two at the beginnings, as the first item of each list
 //! tells them, all items of the list alike. Then everything lies where something was taken once, and no place by itself
-//! tells the one that was taken this time. Without this, a few hundred demonstrations, each with an arrangement of its own,
+//! tells the one that was taken this time. A policy that points (`[policy.pointer]`) learns from the same table which thing
+//! was taken. Without this, a few hundred demonstrations, each with an arrangement of its own,
 //! can be learned by heart instead of the rule that leads to the thing. Things may come to overlap a little. Validation
 //! sees the observations as they are. A batch depends on the seed and the step alone, so that a resumed run needs no state
 //! of this.
@@ -22,6 +23,7 @@ use std::path::Path;
 
 use dataset::shuffle::SplitMix64;
 use dataset::{Dataset, WindowBatch, Windows};
+use models::Signature;
 
 use crate::ZooError;
 use crate::experiment::Experiment;
@@ -39,6 +41,8 @@ const NEAREST: usize = 16;
 pub(crate) struct Exchanges {
     seed: u64,
     all: Vec<Exchange>,
+    /// of what a pointer is asked: which of `all` says what was taken, and of each thing its feature's place in the signature
+    pointed: Option<(usize, Vec<u32>)>,
 }
 
 /// Things that change places.
@@ -63,24 +67,44 @@ struct Episode {
 }
 
 impl Exchanges {
-    /// Finds where the items stand in the columns of `dataset`, and what was taken in each episode of `windows`.
+    /// Finds where the items stand in the columns of `dataset`, and what was taken in each episode of `windows`, which are
+    /// seen as `signature` says.
     ///
     /// # Errors
     /// An item that stands nowhere, items of unequal lengths, by name; a file of pictures that cannot be read.
-    pub fn new(experiment: &Experiment, dataset: &Dataset, windows: &Windows, path: &Path) -> Result<Self, ZooError> {
-        let mut all = Vec::new();
+    pub fn new(
+        experiment: &Experiment,
+        dataset: &Dataset,
+        windows: &Windows,
+        signature: &Signature,
+        path: &Path,
+    ) -> Result<Self, ZooError> {
+        let (mut all, mut pointed) = (Vec::new(), None);
         if !experiment.data.exchange.is_empty() {
             let places = Places::new(experiment, dataset, path, "data.exchange")?;
             for (name, section) in &experiment.data.exchange {
                 let from_hand = places.alike(&format!("data.exchange.{name}.taken"), &section.taken)?;
                 let things = of_things(&places, &format!("data.exchange.{name}.items"), &section.items)?;
                 let moved = of_things(&places, &format!("data.exchange.{name}.places"), &section.places)?;
+                if experiment.pointed_exchange() == Some(name.as_str()) {
+                    let place =
+                        |place: &Place| signature.observation.iter().position(|spec| spec.name == place.feature);
+                    let features = from_hand.iter().filter_map(place).map(|at| at as u32).collect();
+                    pointed = Some((all.len(), features));
+                }
                 let episodes = episodes(&from_hand, &moved, windows);
                 let episodes = episodes.map_err(super::data::unreadable(&path.display().to_string()))?;
                 all.push(Exchange { things, moved, episodes });
             }
         }
-        Ok(Self { seed: experiment.train.seed ^ PURPOSE, all })
+        Ok(Self { seed: experiment.train.seed ^ PURPOSE, all, pointed })
+    }
+
+    /// Of each window the feature that its demonstration took, by its place in the signature; `None` where no pointer asks.
+    pub fn taken(&self, windows: &WindowBatch) -> Option<Vec<u32>> {
+        let (at, features) = self.pointed.as_ref()?;
+        let exchange = &self.all[*at];
+        Some(windows.indices.iter().map(|&index| features[exchange.episode(index).taken]).collect())
     }
 
     /// Deals out and moves the things of the windows of step `step`, each window by itself, alike in all its observations.
@@ -88,8 +112,7 @@ impl Exchanges {
         let mut rng = SplitMix64::new(self.seed, step);
         for exchange in &self.all {
             for row in 0..windows.n {
-                let index = windows.indices[row];
-                let episode = &exchange.episodes[exchange.episodes.partition_point(|episode| episode.end <= index)];
+                let episode = exchange.episode(windows.indices[row]);
                 let others: Vec<usize> = (0..exchange.things.len()).filter(|thing| *thing != episode.taken).collect();
                 exchange.deal(&others, row, windows, &mut rng);
                 if !exchange.moved.is_empty() {
@@ -101,6 +124,11 @@ impl Exchanges {
 }
 
 impl Exchange {
+    /// Of a window, by its number.
+    fn episode(&self, window: u32) -> &Episode {
+        &self.episodes[self.episodes.partition_point(|episode| episode.end <= window)]
+    }
+
     fn deal(&self, others: &[usize], row: usize, windows: &mut WindowBatch, rng: &mut SplitMix64) {
         let (mut dealt, mut before) = (others.to_vec(), Vec::new());
         rng.shuffle(&mut dealt);
@@ -172,7 +200,9 @@ fn episodes(
         windows.try_gather(&[range.start, range.end - 1], &mut ends)?;
         let last = ends.n_obs_steps - 1;
         let squared = |place: &Place| place.of(&ends, 1, last).iter().map(|x| x * x).sum::<f32>();
-        let nearest = (0..from_hand.len()).min_by(|a, b| squared(&from_hand[*a]).total_cmp(&squared(&from_hand[*b])));
+        // a thing that is not there is seen as zeros
+        let there = (0..from_hand.len()).filter(|thing| squared(&from_hand[*thing]) > 0.0);
+        let nearest = there.min_by(|a, b| squared(&from_hand[*a]).total_cmp(&squared(&from_hand[*b])));
         let beginning = moved.iter().map(|thing| thing[0].of(&ends, 0, last).to_vec()).collect();
         Ok(Episode { end: range.end, taken: nearest.unwrap_or(0), beginning })
     };
@@ -203,7 +233,7 @@ mod tests {
         let things = (0..4).map(|i| vec![place("a", i, 1), place("b", 1 + 2 * i, 2)]).collect();
         let episode = |at: usize| Episode { end: 3 * (at as u32 + 1), taken: taken(3 * at), beginning: Vec::new() };
         let episodes = (0..N / 3).map(episode).collect();
-        Exchanges { seed, all: vec![Exchange { things, moved: Vec::new(), episodes }] }
+        Exchanges { seed, all: vec![Exchange { things, moved: Vec::new(), episodes }], pointed: None }
     }
 
     /// What was taken in the demonstration of a window; each has three.
@@ -287,5 +317,63 @@ mod tests {
         let mut batch = windows();
         Exchanges::default().apply(7, &mut batch);
         assert_eq!(batch, windows());
+    }
+
+    /// Twelve things of twelve names that each point to a name, in three chains, and the name that one begins at.
+    fn chains(rng: &mut SplitMix64) -> (Vec<usize>, Vec<usize>, usize, usize) {
+        let mut shuffled = || {
+            let mut order: Vec<usize> = (0..12).collect();
+            rng.shuffle(&mut order);
+            order
+        };
+        let (names, order) = (shuffled(), shuffled());
+        let mut points = vec![0; 12];
+        for chain in [&order[..5], &order[5..9], &order[9..]] {
+            for (i, &thing) in chain.iter().enumerate() {
+                points[thing] = names[chain[(i + 1).min(chain.len() - 1)]];
+            }
+        }
+        (names.clone(), points, names[order[rng.below(5) as usize]], order[4])
+    }
+
+    #[test]
+    fn whoever_follows_the_chain_in_what_is_dealt_finds_what_was_taken() {
+        let mut rng = SplitMix64::new(5, 0);
+        let (mut things, mut goals, mut episodes) = (Vec::new(), Vec::new(), Vec::new());
+        for row in 0..N {
+            let (names, points, start, end) = chains(&mut rng);
+            let one_hot = |name: usize| (0..12).map(move |i| f32::from(u8::from(i == name)));
+            things.extend((0..12).flat_map(|i| one_hot(names[i]).chain(one_hot(points[i]))));
+            goals.extend(one_hot(start));
+            episodes.push(Episode { end: row as u32 + 1, taken: end, beginning: Vec::new() });
+        }
+        let observation = vec![("goal".to_owned(), goals), ("things".to_owned(), things)];
+        let indices = (0..N as u32).collect();
+        let mut batch = WindowBatch { n: N, n_obs_steps: 1, observation, indices, ..WindowBatch::default() };
+        let before = batch.clone();
+        let place = |from| Place { feature: "things".to_owned(), from, width: 12 };
+        let items = (0..12).map(|i| vec![place(24 * i), place(24 * i + 12)]).collect();
+        let all = vec![Exchange { things: items, moved: Vec::new(), episodes }];
+        let exchanges = Exchanges { seed: 1, all, pointed: Some((0, (100..112).collect())) };
+        exchanges.apply(3, &mut batch);
+        let taken = exchanges.taken(&batch).unwrap();
+        let mut moved = 0;
+        for row in 0..N {
+            let name = |values: &[f32]| values.iter().position(|x| *x == 1.0).unwrap();
+            let thing = |batch: &WindowBatch, i: usize| {
+                let numbers = &batch.column("things").unwrap()[row * 288 + 24 * i..][..24];
+                (name(&numbers[..12]), name(&numbers[12..]))
+            };
+            let mut at = name(&batch.column("goal").unwrap()[row * 12..][..12]);
+            let end = (0..12).find_map(|_| {
+                let here = (0..12).find(|&i| thing(&batch, i).0 == at).unwrap();
+                at = thing(&batch, here).1;
+                (at == thing(&batch, here).0).then_some(here)
+            });
+            assert_eq!(taken[row], 100 + end.unwrap() as u32, "row {row}");
+            moved += (0..12).filter(|&i| thing(&batch, i) != thing(&before, i)).count();
+        }
+        assert!(moved > 9 * N, "most of the other eleven lie elsewhere: {moved}");
+        assert_eq!(exchange(1).taken(&batch), None, "where no pointer asks");
     }
 }

@@ -232,7 +232,8 @@ impl Training for PolicyTraining<'_> {
         let windows = self.feed.take(&self.demonstrations.train, step).map_err(unreadable)?;
         self.demonstrations.symmetries.apply(step, windows);
         self.demonstrations.exchanges.apply(step, windows);
-        let (batch, rows) = (data::batch(windows, &self.demonstrations, self.experiment)?, windows.n);
+        let (mut batch, rows) = (data::batch(windows, &self.demonstrations, self.experiment)?, windows.n);
+        batch.taken = self.demonstrations.exchanges.taken(windows);
         let done = self.trainer.step(&batch).map_err(self.experiment.model_error("train"))?;
         self.rate.1 += rows as u64;
         let mut values = BTreeMap::from([

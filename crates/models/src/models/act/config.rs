@@ -2,7 +2,7 @@
 
 use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
-use crate::layers::{Activation, Shape};
+use crate::layers::{Activation, PointerConfig, Shape};
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
 
@@ -39,6 +39,9 @@ pub struct Config {
     /// how pictures are seen, if there are any
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
+    /// whether the encoder's output is asked which entity is meant
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pointer: Option<PointerConfig>,
 }
 
 impl Default for Config {
@@ -58,6 +61,7 @@ impl Default for Config {
             dropout: 0.1,
             kl_weight: 10.0,
             vision: None,
+            pointer: None,
         }
     }
 }
@@ -123,6 +127,7 @@ impl Config {
                 "relu or gelu (glu halves the width that linear2 expects)",
             );
         }
+        self.pointer.as_ref().map_or(Ok(()), |pointer| pointer.validate("act"))?;
         self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)
     }
 }

@@ -6,7 +6,7 @@ use crate::fused::testing::{
     Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
-use crate::layers::Activation;
+use crate::layers::{Activation, PointerConfig};
 use crate::models::act::Config;
 use crate::simd::{Level, at_most};
 
@@ -142,4 +142,39 @@ fn features_that_act_cannot_read_are_refused_by_name() {
     let expected =
         "config of act: observation is observation.environment_state, expected a feature of kind state among others";
     assert_eq!(error(signature), expected);
+}
+
+/// That points at one of the cubes; each row took one.
+fn pointing(pre_norm: bool) -> (Act, Batch) {
+    let (base, signature, _) = configs().swap_remove(2);
+    let pointer = Some(PointerConfig { among: "cube".to_string(), weight: 0.7 });
+    let act = Act::new(&Config { pre_norm, pointer, ..base }, &signature, 1).unwrap();
+    move_parameters(&act);
+    let cubes = act.config().pointer.as_ref().unwrap().candidates(&signature);
+    let batch = batch(&signature, act.config().action_horizon, 4, 3);
+    let taken = Some((0..4).map(|row| cubes[row % cubes.len()] as u32).collect());
+    (act, Batch { taken, ..batch })
+}
+
+#[test]
+fn the_gradient_of_pointing_is_the_slope_of_the_loss() {
+    for pre_norm in [false, true] {
+        let (act, batch) = pointing(pre_norm);
+        assert!(act.composed_because().unwrap().contains("pointer"));
+        assert_the_gradient_is_the_slope(&act, &batch, &format!("pre-norm {pre_norm}"));
+        let right = act.loss(&batch, &mut Rng::new(0, "loss")).unwrap().parts["pointer_right"].clone();
+        assert!((0.0..=1.0).contains(&right.to_scalar::<f32>().unwrap()));
+    }
+}
+
+#[test]
+fn a_pointer_needs_candidates_and_a_weight() {
+    let (base, signature, _) = configs().swap_remove(2);
+    let error = |among: &str, weight: f64| {
+        let pointer = Some(PointerConfig { among: among.to_string(), weight });
+        Act::new(&Config { pointer, ..base.clone() }, &signature, 1).unwrap_err().to_string()
+    };
+    // the goals have positions
+    assert!(error("goal", 1.0).contains("pointer.among is 0 of group goal"), "{}", error("goal", 1.0));
+    assert!(error("cube", -1.0).contains("pointer.weight"));
 }

@@ -15,6 +15,9 @@
 //! Pictures are tokens after all others, one a cell of a feature map (`encoders`), in the order of the cameras; as in
 //! LeRobot nothing tells cameras apart.
 //!
+//! With `pointer` (ours) the encoder's output is asked which entity a demonstration took, and the decoder reads that entity's
+//! token as one more; the answer has a loss of its own.
+//!
 //! Deviations: none in the maths. `feedforward_activation = "glu"` is refused: LeRobot accepts it in its configuration,
 //! but its layer then cannot run (`glu` halves the width that `linear2` expects).
 //!
@@ -36,8 +39,8 @@ use crate::flops;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
-    Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Mode, TokenLayout, Vae,
-    environment_state, kl_divergence, sample, sinusoid_table,
+    Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Mode, Pointed, Pointer,
+    TokenLayout, Vae, environment_state, kl_divergence, sample, sinusoid_table,
 };
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
@@ -60,6 +63,8 @@ pub struct TrainOutput {
     pub actions: Tensor,
     /// mean and log-variance of the latent, (b, latent_dim) each; `None` without VAE
     pub latent: Option<(Tensor, Tensor)>,
+    /// which entity is meant, if that is asked
+    pub(crate) pointed: Option<Pointed>,
 }
 
 /// The model.
@@ -73,6 +78,7 @@ pub struct Act {
     pub(crate) decoder: Decoder,
     pub(crate) tokens: InputTokens,
     pub(crate) action_head: Linear,
+    pointer: Option<Pointer>,
     pub(crate) workspaces: Workspaces,
     /// (1, action_horizon + 2, D), fixed
     pub(crate) vae_encoder_pos_enc: Tensor,
@@ -110,12 +116,18 @@ impl Act {
         let tokens = InputTokens::new(&mut p, layout, config.latent_dim, dim, env_state, rng)?;
         let pos_embed = Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?;
         let table = sinusoid_table(config.action_horizon + 2, dim)?;
+        let action_head = Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?;
+        let layout = tokens.layout();
+        let pointer = config.pointer.as_ref();
+        let pointer =
+            pointer.map(|pointer| Pointer::new(&mut p, pointer, ("act", signature, layout), dim, rng)).transpose()?;
         Ok(Self {
             vae,
             encoder,
             decoder: Decoder { layers, norm, pos_embed },
             tokens,
-            action_head: Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?,
+            action_head,
+            pointer,
             workspaces: Workspaces::default(),
             position_table: table.flatten_all()?.to_vec1()?,
             vae_encoder_pos_enc: table,
@@ -135,12 +147,21 @@ impl Act {
         &self.position_table
     }
 
-    /// latent: (b, L), the features of the observation -> (b, C, A)
-    fn decode(&self, latent: &Tensor, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
+    /// latent: (b, L), the features of the observation -> (b, C, A), and which entity is meant
+    fn decode(
+        &self,
+        latent: &Tensor,
+        observation: &Features<Tensor>,
+        mode: &mut Mode<'_>,
+    ) -> Result<(Tensor, Option<Pointed>)> {
         let tokens = self.tokens.forward(latent, observation)?;
-        let pos = self.tokens.positions()?;
-        let memory = self.encoder.forward(&tokens, &pos, None, mode)?;
-        self.action_head.forward(&self.decoder.forward(&memory, &pos, mode)?)
+        let mut pos = self.tokens.positions()?;
+        let mut memory = self.encoder.forward(&tokens, &pos, None, mode)?;
+        let pointed = self.pointer.as_ref().map(|pointer| pointer.forward(&memory, &tokens)).transpose()?;
+        if let (Some(pointer), Some(pointed)) = (&self.pointer, &pointed) {
+            (memory, pos) = pointer.beside(&memory, &pos, pointed)?;
+        }
+        Ok((self.action_head.forward(&self.decoder.forward(&memory, &pos, mode)?)?, pointed))
     }
 
     /// The training forward pass with dropout from `mode` and the latent's noise `eps`: (b, L).
@@ -158,11 +179,11 @@ impl Act {
             Some(latent) => sample(latent, eps)?,
             None => eps.zeros_like()?,
         };
-        let actions = self.decode(&sample, &observation, mode)?;
-        Ok(TrainOutput { actions, latent })
+        let (actions, pointed) = self.decode(&sample, &observation, mode)?;
+        Ok(TrainOutput { actions, latent, pointed })
     }
 
-    /// L1 over valid steps plus weighted KL, from a training forward pass.
+    /// L1 over valid steps plus weighted KL and, with a pointer, cross-entropy, from a training forward pass.
     pub fn loss_of(&self, output: &TrainOutput, batch: &Batch) -> Result<LossParts> {
         let (b, c, a) = batch.actions.dims3()?;
         let valid = (1.0 - batch.is_pad.reshape((b, c, 1))?)?;
@@ -175,6 +196,13 @@ impl Act {
             let kld = kl_divergence(mu, log_variance, batch.total_rows)?;
             parts.insert("kld_loss".to_string(), kld.detach());
             total = (total + (kld * self.config.kl_weight)?)?;
+        }
+        if let (Some(pointer), Some(pointed)) = (&self.pointer, &output.pointed) {
+            let taken = pointer.taken("act", batch)?;
+            let loss = pointer.loss(pointed, &taken, batch)?;
+            parts.insert("pointer_loss".to_string(), loss.detach());
+            parts.insert("pointer_right".to_string(), pointer.right(pointed, &taken, batch)?);
+            total = (total + (loss * pointer.weight)?)?;
         }
         Ok(LossParts { total, parts })
     }
@@ -191,7 +219,7 @@ impl Act {
     pub fn predict_composed(&self, observation: &Features<Tensor>) -> Result<Tensor> {
         let rows = self.check_inputs(observation)?;
         let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
-        self.decode(&latent, &self.tokens.look(observation, None)?, &mut Mode::Eval)
+        Ok(self.decode(&latent, &self.tokens.look(observation, None)?, &mut Mode::Eval)?.0)
     }
 
     /// The batch with pictures as the network reads them in training.
@@ -211,7 +239,8 @@ impl PolicyModel for Act {
     }
 
     fn composed_because(&self) -> Option<String> {
-        not_by_hand(&self.signature).or_else(|| self.tokens.composed_because())
+        let pointer = self.pointer.as_ref().map(|_| "the step by hand does not cover a pointer".to_string());
+        pointer.or_else(|| not_by_hand(&self.signature)).or_else(|| self.tokens.composed_because())
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
@@ -257,7 +286,8 @@ impl PolicyModel for Act {
         }
         let (memory, horizon) = (layout.len(), self.config.action_horizon);
         let encoder = flops::encoder_layer(shape, memory) * self.config.n_encoder_layers as f64;
-        let decoder = flops::decoder_layer(shape, horizon, memory) * self.config.n_decoder_layers as f64;
+        let read = memory + usize::from(self.pointer.is_some());
+        let decoder = flops::decoder_layer(shape, horizon, read) * self.config.n_decoder_layers as f64;
         let head = flops::linear(horizon, shape.dim, self.signature.action_dim);
         Some(flops::tokens(layout, self.config.latent_dim, shape.dim) + encoder + decoder + head)
     }

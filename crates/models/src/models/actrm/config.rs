@@ -2,7 +2,7 @@
 
 use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
-use crate::layers::{Activation, Shape};
+use crate::layers::{Activation, PointerConfig, Shape};
 use crate::models::act;
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
@@ -17,6 +17,19 @@ pub enum Over {
     Actions,
     /// The encoded observation.
     Memory,
+    /// The observation's tokens.
+    Tokens,
+}
+
+impl Over {
+    /// Its name in configurations.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Actions => "actions",
+            Self::Memory => "memory",
+            Self::Tokens => "tokens",
+        }
+    }
 }
 
 /// Starting the answer from the previous query's, moved on by the actions executed since.
@@ -45,9 +58,9 @@ pub struct ReasoningConfig {
     pub n_layers: usize,
     /// hidden width of the shared block's dense part; half of `dim_feedforward` when absent
     pub dim_feedforward: Option<usize>,
-    /// rounds per supervision step; the last one has gradients
+    /// rounds per supervision step; the last one has gradients (`over = "tokens"`: 1)
     pub h_cycles: usize,
-    /// updates of the reasoning per round
+    /// updates of the reasoning, or of the tokens, per round
     pub l_cycles: usize,
     /// supervision steps in training (`over = "memory"`: the most that are drawn)
     pub supervision_steps: usize,
@@ -65,12 +78,12 @@ pub struct ReasoningConfig {
     pub halt_margin: f64,
     /// start from the previous query's answer (`over = "actions"`)
     pub warm_start: Option<WarmStart>,
-    /// a block of its own for every supervision step of the training instead of a shared one (`over = "actions"`): the same
+    /// a block of its own for every supervision step of the training instead of a shared one (not `over = "memory"`): the same
     /// depth and work, as many times the weights; steps beyond apply the last block
     #[serde(skip_serializing_if = "is_default")]
     pub untied: bool,
     /// in training a thought begins with normal noise of this standard deviation instead of zero, at inference with its
-    /// mean, zero (`over = "actions"`)
+    /// mean, zero (`over = "actions"`); added to what is observed with `over = "tokens"`
     #[serde(skip_serializing_if = "is_default")]
     pub start_noise: f64,
     /// whether the answer of every supervision step has a loss; else only the last one's has
@@ -160,7 +173,7 @@ pub struct Config {
     pub feedforward_activation: Activation,
     /// layers that encode the memory before the recursion (`over = "actions"`)
     pub n_memory_layers: usize,
-    /// layers of the decoder (`over = "memory"`)
+    /// layers of the decoder (not `over = "actions"`)
     pub n_decoder_layers: usize,
     /// train with a latent
     pub use_vae: bool,
@@ -177,6 +190,9 @@ pub struct Config {
     /// how pictures are seen, if there are any
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
+    /// whether every supervision step is asked which entity is meant (`over = "tokens"`)
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pointer: Option<PointerConfig>,
 }
 
 impl Default for Config {
@@ -197,6 +213,7 @@ impl Default for Config {
             kl_weight: act.kl_weight,
             reasoning: ReasoningConfig::default(),
             vision: None,
+            pointer: None,
         }
     }
 }
@@ -212,6 +229,11 @@ impl Config {
             dropout: self.dropout,
             pre_norm: false,
         }
+    }
+
+    /// Of the shared block over tokens: pre-norm, without dropout.
+    pub(super) fn block_shape(&self) -> Shape {
+        Shape { hidden: self.block_feedforward(), dropout: 0.0, pre_norm: true, ..self.shape() }
     }
 
     /// The layers outside the shared block, as ACT's: what is checked there is checked here.
@@ -231,13 +253,14 @@ impl Config {
             dropout: self.dropout,
             kl_weight: self.kl_weight,
             vision: self.vision.clone(),
+            pointer: self.pointer.clone(),
         }
     }
 
     /// How large the model will be.
     pub fn size(&self) -> Size {
         let block = Shape { hidden: self.block_feedforward(), ..self.shape() };
-        let tokens = if self.reasoning.over == Over::Actions { self.action_horizon } else { self.reasoning.tokens };
+        let tokens = if self.reasoning.over == Over::Memory { self.reasoning.tokens } else { self.action_horizon };
         let block = block.size(1, tokens) * self.reasoning.n_layers;
         // weights are shared by all steps unless untied, the last round of each keeps its activations
         let weights = block.weights * self.reasoning.blocks() as f64;
@@ -245,7 +268,7 @@ impl Config {
         // over actions there is no decoder, over the memory no encoder beside the block
         let (encoder, decoder) = match self.reasoning.over {
             Over::Actions => (self.n_memory_layers, 0),
-            Over::Memory => (0, self.n_decoder_layers),
+            Over::Memory | Over::Tokens => (0, self.n_decoder_layers),
         };
         let around = act::Config { n_encoder_layers: encoder, n_decoder_layers: decoder, ..self.layers() };
         around.size() + steps
@@ -267,7 +290,7 @@ impl Config {
             Err(ModelError::Config { model: "actrm", field, found, expected })
         };
         let r = &self.reasoning;
-        let decoder = if r.over == Over::Memory { self.n_decoder_layers } else { 1 };
+        let decoder = if r.over == Over::Actions { 1 } else { self.n_decoder_layers };
         for (field, value) in [
             ("n_decoder_layers", decoder),
             ("reasoning.tokens", r.tokens),
@@ -297,8 +320,15 @@ impl Config {
                 return refuse(field, value.to_string(), "a finite number, at least 0");
             }
         }
-        if r.warm_start.is_some() && r.over == Over::Memory {
-            return refuse("reasoning.warm_start", "present".into(), "absent with over = \"memory\"");
+        if r.warm_start.is_some() && r.over != Over::Actions {
+            let expected = format!("absent with over = \"{}\"", r.over.name());
+            return refuse("reasoning.warm_start", "present".into(), &expected);
+        }
+        if r.h_cycles > 1 && r.over == Over::Tokens {
+            return refuse("reasoning.h_cycles", r.h_cycles.to_string(), "1 with over = \"tokens\"");
+        }
+        if let Some(pointer) = self.pointer.as_ref().filter(|_| r.over != Over::Tokens) {
+            return refuse("pointer", format!("among {}", pointer.among), "absent but for reasoning.over = \"tokens\"");
         }
         if r.untied && r.over == Over::Memory {
             return refuse("reasoning.untied", "true".into(), "false with over = \"memory\"");

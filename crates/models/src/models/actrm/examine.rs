@@ -1,7 +1,7 @@
 //! Looking into a thought: its states after every step, what its action tokens attend to, and what becomes of it where
 //! its reasoning is tampered with. On candle's autograd: for measurements, not for speed.
 
-use super::{Actrm, Config, Design, positioned, update};
+use super::{Actrm, Carry, Config, Design, positioned, update};
 use crate::error::{ModelError, Result};
 use crate::features::{Features, Observation};
 use crate::history::History;
@@ -79,13 +79,13 @@ impl Config {
 pub struct ExaminedStep {
     /// (b, H, A), network units
     pub chunk: Tensor,
-    /// (b, H, D): the answer's state
+    /// (b, H, D): the answer's state; over tokens what the decoder makes of them
     pub answer: Tensor,
-    /// (b, R, D): the reasoning's state
+    /// (b, R, D): the reasoning's state; over tokens (b, M, D), all of them
     pub reasoning: Tensor,
     /// (b, H, R + H + M): what each action token attended to as it was updated last, mean of the heads of the block's first
-    /// layer; the columns are [`Actrm::context_names`]
-    pub attention: Tensor,
+    /// layer; the columns are [`Actrm::context_names`]; `None` over tokens
+    pub attention: Option<Tensor>,
 }
 
 impl Actrm {
@@ -101,10 +101,10 @@ impl Actrm {
         intervene: Option<Intervention>,
     ) -> Result<Vec<ExaminedStep>> {
         let rows = self.check_inputs(observation)?;
-        let Design::Actions(design) = &self.design else {
-            let (found, expected) = ("memory".to_string(), "actions, to look into a thought".to_string());
+        if let Design::Memory(_) = &self.design {
+            let (found, expected) = ("memory".to_string(), "actions or tokens, to look into a thought".to_string());
             return Err(ModelError::Config { model: "actrm", field: "reasoning.over", found, expected });
-        };
+        }
         let others = match intervene {
             Some(Intervention::Shuffle) if rows < 2 => {
                 let (found, expected) = ("1 row".to_string(), "at least 2 to shuffle".to_string());
@@ -118,6 +118,11 @@ impl Actrm {
         let mut carry = self.start(rows, &memory)?;
         let mut done: Vec<ExaminedStep> = Vec::with_capacity(steps);
         for at in 0..steps {
+            let Design::Actions(design) = &self.design else {
+                let others = others.as_ref().map(|others| &others[at].reasoning);
+                done.push(self.examine_tokens(&memory, &mut carry, (at, intervene), done.first(), others)?);
+                continue;
+            };
             let layers = &design.layers[self.config.reasoning.layers_of(at)];
             let mut attention = None;
             for _ in 0..self.config.reasoning.h_cycles {
@@ -140,10 +145,32 @@ impl Actrm {
                 chunk: self.action_head.forward(&carry.answer)?.detach(),
                 answer: carry.answer.clone(),
                 reasoning: carry.reasoning.clone(),
-                attention: attention.expect("at least one round"),
+                attention,
             });
         }
         Ok(done)
+    }
+
+    /// A step over tokens. Where they are tampered with, the answer is decoded from what they became, and what is pointed at is
+    /// read from its own observation.
+    fn examine_tokens(
+        &self,
+        memory: &Tensor,
+        carry: &mut Carry,
+        (at, intervene): (usize, Option<Intervention>),
+        first: Option<&ExaminedStep>,
+        others: Option<&Tensor>,
+    ) -> Result<ExaminedStep> {
+        let mode = &mut Mode::Eval;
+        *carry = self.round(memory, carry, at, false)?.detach();
+        match (intervene, first, others) {
+            (Some(Intervention::Freeze), Some(first), _) => carry.answer = first.reasoning.clone(),
+            (Some(Intervention::Shuffle), _, Some(others)) => carry.answer = rolled(others)?,
+            _ => {}
+        }
+        let step = self.answer(memory, carry.clone(), mode)?;
+        let (chunk, answer) = (step.chunk.detach(), step.decoded.detach());
+        Ok(ExaminedStep { chunk, answer, reasoning: carry.answer.clone(), attention: None })
     }
 
     /// What the columns of [`ExaminedStep::attention`] stand for: the reasoning's tokens, the actions', the latent, features

@@ -1,4 +1,4 @@
-//! ACTRM: an action-chunking policy that thinks, with two designs behind one configuration.
+//! ACTRM: an action-chunking policy that thinks, with three designs behind one configuration.
 //!
 //! Origins: ACT (arXiv 2304.13705) for observations, latent and loss; the Tiny Recursive Model
 //! (Jolicoeur-Martineau, 2025) for the recursion; the original ACTRM (jshyunbin/R3PL) for putting
@@ -16,12 +16,18 @@
 //! fixed values, `h_cycles x l_cycles` per supervision step; ACT's decoder reads `z_h`. The carry
 //! goes on detached, and the number of supervision steps is drawn per batch.
 //!
-//! In both only the last round of a supervision step keeps a graph, the recursion has no dropout,
+//! **`reasoning.over = "tokens"`**, ours: the observation's tokens are the states. A supervision step sends all of them
+//! through the same pre-norm encoder layers (`l_cycles` times); what it leaves goes on to the next step with its graph. After
+//! every step ACT's decoder reads them under a norm. With `pointer` they are asked which entity is meant, the decoder reads that
+//! entity's token as one more, and each step's answer has a loss of its own: that is how a step learns to follow
+//! a relation from thing to thing, which the loss on actions alone did not teach (docs/study_plan.md).
+//!
+//! In the other two only the last round of a supervision step keeps a graph. The recursion has no dropout,
 //! and the latent is drawn once per batch (the original draws it anew for every step).
 //! Validation and inference run at latent zero, as ACT's do (the original validates with the
 //! posterior of the true actions, which flatters it).
 //!
-//! Variants for comparison (`over = "actions"`): `reasoning.untied` gives every supervision step a block of its own,
+//! Variants for comparison (`over = "actions"` and `"tokens"`): `reasoning.untied` gives every supervision step a block of its own,
 //! `start_noise` begins thoughts with noise in training, `deep_supervision = false` leaves only the last step its loss.
 //!
 //! Halting: a head reads the reasoning after each step and is trained on whether one more step
@@ -52,8 +58,9 @@ use crate::flops;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
-    Decoder, DecoderLayer, Embedding, Encoder, FeedForward, InputTokens, LayerInit, LayerNorm, Linear, Mode,
-    MultiHeadAttention, Shape, TokenLayout, Vae, environment_state, kl_divergence, sample, sinusoid_table,
+    Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, InputTokens, LayerInit, LayerNorm, Linear,
+    Mode, MultiHeadAttention, Pointed, Pointer, Shape, TokenLayout, Vae, environment_state, kl_divergence, sample,
+    sinusoid_table,
 };
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
@@ -121,13 +128,27 @@ struct OverMemory {
     decoder: Decoder,
 }
 
+/// The recursion over the observation's tokens, and ACT's decoder.
+#[derive(Debug)]
+struct OverTokens {
+    /// of the tokens before the first step
+    first_norm: LayerNorm,
+    /// pre-norm; of the shared block, or of every supervision step's block one after the other
+    layers: Vec<EncoderLayer>,
+    /// before tokens are read
+    norm: LayerNorm,
+    decoder: Decoder,
+    pointer: Option<Pointer>,
+}
+
 #[derive(Debug)]
 enum Design {
     Actions(OverActions),
     Memory(OverMemory),
+    Tokens(OverTokens),
 }
 
-/// The recursion's states: `(y, z)` over actions, `(z_h, z_l)` over the memory.
+/// The recursion's states: `(y, z)` over actions, `(z_h, z_l)` over the memory, the tokens twice over tokens.
 #[derive(Debug, Clone)]
 struct Carry {
     answer: Tensor,
@@ -147,6 +168,10 @@ struct Step {
     chunk: Tensor,
     /// (b,)
     halt_logit: Tensor,
+    /// what the chunk is read from, (b, H, D)
+    decoded: Tensor,
+    /// which entity is meant, if that is asked
+    pointed: Option<Pointed>,
 }
 
 /// The model.
@@ -206,12 +231,23 @@ impl Actrm {
                 Design::Memory(OverMemory {
                     block: Encoder::new(&mut p, "reasoning", r.n_layers, quiet, LayerInit::Xavier, rng)?,
                     z_init: fixed_values(dim),
-                    decoder: Decoder {
-                        layers: (0..config.n_decoder_layers)
-                            .map(|i| DecoderLayer::new(&mut p, &format!("decoder.layers.{i}"), shape, rng))
-                            .collect::<Result<_>>()?,
-                        norm: LayerNorm::new(&mut p, "decoder.norm", dim, rng)?,
-                        pos_embed: Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?,
+                    decoder: decoder(&mut p, config, rng)?,
+                })
+            }
+            Over::Tokens => {
+                let block = config.block_shape();
+                let layer = |i: usize| format!("reasoning.layers.{i}");
+                Design::Tokens(OverTokens {
+                    first_norm: LayerNorm::new(&mut p, "reasoning.first_norm", dim, rng)?,
+                    // a step begins as a small change of what tokens say: after six large ones nothing of it was left
+                    layers: (0..r.blocks() * r.n_layers)
+                        .map(|i| EncoderLayer::new(&mut p, &layer(i), block, LayerInit::Recursive, rng))
+                        .collect::<Result<_>>()?,
+                    norm: LayerNorm::new(&mut p, "reasoning.norm", dim, rng)?,
+                    decoder: decoder(&mut p, config, rng)?,
+                    pointer: match &config.pointer {
+                        Some(pointer) => Some(Pointer::new(&mut p, pointer, ("actrm", signature, &layout), dim, rng)?),
+                        None => None,
                     },
                 })
             }
@@ -246,6 +282,7 @@ impl Actrm {
                 Ok(memory.broadcast_add(&pos)?)
             }
             Design::Actions(_) => Ok(tokens.broadcast_add(&pos)?),
+            Design::Tokens(design) => design.first_norm.forward(&tokens.broadcast_add(&pos)?),
             Design::Memory(_) => Ok(tokens),
         }
     }
@@ -263,6 +300,7 @@ impl Actrm {
                 let all = |z: &[f32]| Tensor::from_slice(z, z.len(), memory.device())?.broadcast_as(memory.shape());
                 Carry { answer: all(h)?.contiguous()?, reasoning: all(l)?.contiguous()? }
             }
+            Design::Tokens(_) => Carry { answer: memory.clone(), reasoning: memory.clone() },
         })
     }
 
@@ -276,25 +314,39 @@ impl Actrm {
                 false => self.round(&memory.detach(), &carry.detach(), at, true)?,
             };
         }
-        self.answer(carry, mode)
+        self.answer(memory, carry, mode)
     }
 
     /// What a carry says.
-    fn answer(&self, carry: Carry, mode: &mut Mode<'_>) -> Result<Step> {
-        let chunk = self.action_head.forward(&match &self.design {
-            Design::Actions(_) => carry.answer.clone(),
+    fn answer(&self, memory: &Tensor, carry: Carry, mode: &mut Mode<'_>) -> Result<Step> {
+        let (mut pointed, mut read) = (None, carry.answer.clone());
+        let decoded = match &self.design {
+            Design::Actions(_) => {
+                read = carry.reasoning.clone();
+                carry.answer.clone()
+            }
             Design::Memory(design) => {
                 let pos = self.tokens.positions()?;
                 design.decoder.forward(&carry.answer, &pos, mode)?
             }
-        })?;
-        let read = match &self.design {
-            Design::Actions(_) => &carry.reasoning,
-            Design::Memory(_) => &carry.answer,
+            Design::Tokens(design) => {
+                read = design.norm.forward(&carry.answer)?;
+                // tokens have brought their positions along
+                let nowhere = self.tokens.positions()?.zeros_like()?;
+                match &design.pointer {
+                    Some(pointer) => {
+                        let which = pointed.insert(pointer.forward(&read, memory)?);
+                        let (beside, pos) = pointer.beside(&read, &nowhere, which)?;
+                        design.decoder.forward(&beside, &pos, mode)?
+                    }
+                    None => design.decoder.forward(&read, &nowhere, mode)?,
+                }
+            }
         };
+        let chunk = self.action_head.forward(&decoded)?;
         // the head judges the reasoning and must not bend it
         let halt_logit = self.halt_head.forward(&read.detach().mean(1)?)?.squeeze(1)?;
-        Ok(Step { carry, chunk, halt_logit })
+        Ok(Step { carry, chunk, halt_logit, decoded, pointed })
     }
 
     /// `l_cycles` updates of the reasoning, one of the answer.
@@ -321,6 +373,16 @@ impl Actrm {
                 }
                 answer = settle(update(&(&answer + &reasoning)?)?);
             }
+            Design::Tokens(design) => {
+                let layers = &design.layers[self.config.reasoning.layers_of(at)];
+                let nowhere = self.tokens.positions()?.zeros_like()?;
+                for _ in 0..self.config.reasoning.l_cycles {
+                    for layer in layers {
+                        answer = layer.forward(&answer, &nowhere, None, &mut Mode::Eval)?;
+                    }
+                }
+                reasoning = answer.clone();
+            }
         }
         Ok(Carry { answer, reasoning })
     }
@@ -329,18 +391,18 @@ impl Actrm {
     fn steps_of(&self, batch: &Batch) -> usize {
         let most = self.config.reasoning.supervision_steps;
         match self.config.reasoning.over {
-            Over::Actions => most,
+            Over::Actions | Over::Tokens => most,
             // the same for all shards of a batch
             Over::Memory => 1 + Rng::new(batch.seed, "supervision steps").below(most as u64) as usize,
         }
     }
 
-    /// Weights of the supervision steps, which sum to 1: growing with depth over actions (late
-    /// steps are what is executed), equal over the memory (the original's); all the last one's without deep supervision.
+    /// Weights of the supervision steps, which sum to 1: growing with depth (late steps
+    /// are what is executed), equal over the memory (the original's); all the last one's without deep supervision.
     fn step_weights(&self, steps: usize) -> Vec<f64> {
         let weight = |i: usize| match self.config.reasoning.over {
             _ if !self.config.reasoning.deep_supervision => f64::from(u8::from(i + 1 == steps)),
-            Over::Actions => (i + 1) as f64,
+            Over::Actions | Over::Tokens => (i + 1) as f64,
             Over::Memory => 1.0,
         };
         let total: f64 = (0..steps).map(weight).sum();
@@ -387,6 +449,18 @@ impl Actrm {
     }
 }
 
+/// ACT's decoder, which reads the states.
+fn decoder(p: &mut Params, config: &Config, rng: &mut Rng) -> Result<Decoder> {
+    let (dim, shape) = (config.dim_model, config.shape());
+    Ok(Decoder {
+        layers: (0..config.n_decoder_layers)
+            .map(|i| DecoderLayer::new(p, &format!("decoder.layers.{i}"), shape, rng))
+            .collect::<Result<_>>()?,
+        norm: LayerNorm::new(p, "decoder.norm", dim, rng)?,
+        pos_embed: Embedding::new(p, "decoder_pos_embed", config.action_horizon, dim, rng)?,
+    })
+}
+
 /// x: (b, t, D), positions of the t tokens -> their sum
 fn positioned(x: &Tensor, positions: &Embedding) -> Result<Tensor> {
     Ok(x.broadcast_add(&positions.weight.unsqueeze(0)?)?)
@@ -419,7 +493,9 @@ impl PolicyModel for Actrm {
     }
 
     fn composed_because(&self) -> Option<String> {
-        not_by_hand(&self.signature).or_else(|| self.tokens.composed_because())
+        let tokens = matches!(self.design, Design::Tokens(_));
+        let design = tokens.then(|| "the step by hand does not cover reasoning.over = \"tokens\"".to_string());
+        design.or_else(|| not_by_hand(&self.signature)).or_else(|| self.tokens.composed_because())
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
@@ -446,20 +522,24 @@ impl PolicyModel for Actrm {
         if noise > 0.0 {
             for state in [&mut carry.answer, &mut carry.reasoning] {
                 let drawn = Tensor::from_vec(rng.normals(state.elem_count()), state.shape(), batch.device())?;
-                *state = (drawn * noise)?;
+                *state = match self.config.reasoning.over {
+                    Over::Tokens => (&*state + (drawn * noise)?)?,
+                    _ => (drawn * noise)?,
+                };
             }
         }
 
         let steps = self.steps_of(batch);
-        let (mut chunks, mut halts) = (Vec::new(), Vec::new());
+        let (mut chunks, mut halts, mut pointed) = (Vec::new(), Vec::new(), Vec::new());
         for at in 0..steps {
             let step = self.step(&memory, &carry, at, &mut Mode::Train(rng))?;
             carry = match self.config.reasoning.over {
-                Over::Actions => step.carry,
+                Over::Actions | Over::Tokens => step.carry,
                 Over::Memory => step.carry.detach(),
             };
             chunks.push(step.chunk);
             halts.push(step.halt_logit);
+            pointed.extend(step.pointed);
         }
         // one step more, so that the last depth has a halting target as well
         let beyond = self.step(&memory.detach(), &carry.detach(), steps, &mut Mode::Eval)?.chunk.detach();
@@ -482,6 +562,18 @@ impl PolicyModel for Actrm {
             total = (total + (l1 * weight)?)?;
         }
         row_errors.push(errors(&beyond)?.sum((1, 2))?);
+
+        if let Design::Tokens(OverTokens { pointer: Some(pointer), .. }) = &self.design {
+            let taken = pointer.taken("actrm", batch)?;
+            for (pointed, weight) in pointed.iter().zip(self.step_weights(steps)) {
+                let loss = pointer.loss(pointed, &taken, batch)?;
+                let right = pointer.right(pointed, &taken, batch)?;
+                parts.insert("pointer_loss".to_string(), loss.detach());
+                parts.entry("pointer_right_first".to_string()).or_insert_with(|| right.clone());
+                parts.insert("pointer_right".to_string(), right);
+                total = (total + (loss * (weight * pointer.weight))?)?;
+            }
+        }
 
         let mut halt = Tensor::zeros((), DType::F32, batch.device())?;
         let still = 1.0 - self.config.reasoning.halt_margin;
@@ -526,6 +618,13 @@ impl PolicyModel for Actrm {
         }
         let (dim, memory, horizon) = (config.dim_model, layout.len(), config.action_horizon);
         let block = Shape { hidden: config.block_feedforward(), ..config.shape() };
+        if r.over == Over::Tokens {
+            let read = memory + usize::from(config.pointer.is_some());
+            let layers = flops::encoder_layer(block, memory) * (r.l_cycles * r.n_layers) as f64;
+            let decoder = flops::decoder_layer(config.shape(), horizon, read) * config.n_decoder_layers as f64;
+            let step = layers + decoder + flops::linear(horizon, dim, self.signature.action_dim);
+            return Some(flops::tokens(layout, config.latent_dim, dim) + step * r.max_steps() as f64);
+        }
         let context = r.tokens + horizon + memory;
         let keys_and_values = |tokens: usize| flops::linear(tokens, dim, 2 * dim);
         // queries and what they take home, the context's keys and values beside those that serve several updates

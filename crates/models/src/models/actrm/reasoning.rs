@@ -107,7 +107,7 @@ impl Actrm {
         let rows = self.check_inputs(observation)?;
         let tokens = match self.config.reasoning.over {
             Over::Actions => self.config.action_horizon,
-            Over::Memory => self.tokens.layout().len(),
+            Over::Memory | Over::Tokens => self.tokens.layout().len(),
         };
         if let Some(start) = start {
             check_shape("actrm", "warm start", start, &[rows, tokens, self.config.dim_model])?;

@@ -1,7 +1,9 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::features::{Features, Observation};
+use crate::features::{FeatureSpec, Features, Observation, ValuesRef};
+use crate::fused::testing::{assert_the_gradient_is_the_slope, move_parameters, signatures};
 use crate::gradients::ParamLayout;
+use crate::layers::PointerConfig;
 use crate::models::act::{self, Act};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::policy::Policy;
@@ -28,10 +30,11 @@ fn small(reasoning: ReasoningConfig) -> Config {
     }
 }
 
-fn designs() -> [Config; 3] {
+fn designs() -> [Config; 4] {
     let deep = ReasoningConfig { h_cycles: 2, l_cycles: 2, ..ReasoningConfig::default() };
     let memory = ReasoningConfig { n_layers: 2, supervision_steps: 4, l_cycles: 2, ..ReasoningConfig::original() };
-    [small(ReasoningConfig::default()), small(deep), small(memory)]
+    let tokens = ReasoningConfig { over: Over::Tokens, supervision_steps: 2, ..ReasoningConfig::default() };
+    [small(ReasoningConfig::default()), small(deep), small(memory), small(tokens)]
 }
 
 fn batch(config: &Config, rows: usize, seed: u64) -> Batch {
@@ -47,6 +50,10 @@ fn batch(config: &Config, rows: usize, seed: u64) -> Batch {
         .collect();
     let is_pad: Vec<bool> = (0..rows * h).map(|i| i % h == h - 1 && (i / h).is_multiple_of(3)).collect();
     Batch::from_slices(&signature(), h, &Features::of_slices(&state, &env), &actions, &is_pad).unwrap()
+}
+
+fn among(group: &str) -> PointerConfig {
+    PointerConfig { among: group.to_string(), weight: 0.7 }
 }
 
 fn value(t: &Tensor) -> f32 {
@@ -348,7 +355,8 @@ fn thoughts_begin_with_noise_in_training_only() {
 fn a_thought_looked_into_is_the_thought() {
     let still = ReasoningConfig { halt_threshold: 1.0, change_threshold: 0.0, ..ReasoningConfig::default() };
     let deep = ReasoningConfig { h_cycles: 2, l_cycles: 2, n_layers: 2, untied: true, ..still.clone() };
-    for config in [small(still), small(deep)] {
+    let tokens = ReasoningConfig { over: Over::Tokens, ..still.clone() };
+    for config in [small(still), small(deep), small(tokens)] {
         let config = Config { reasoning: ReasoningConfig { max_steps: Some(5), ..config.reasoning.clone() }, ..config };
         let model = Actrm::new(&config, &signature(), 5).unwrap();
         let batch = batch(&config, 3, 1);
@@ -359,8 +367,12 @@ fn a_thought_looked_into_is_the_thought() {
             assert!(off(&seen.chunk, &step.chunk) < 1e-5);
             // every action token's attention is a share
             let names = model.context_names();
-            assert_eq!(seen.attention.dims(), [3, 5, names.len()]);
-            let sums = seen.attention.sum(2).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            let Some(attention) = &seen.attention else {
+                assert_eq!(config.reasoning.over, Over::Tokens);
+                continue;
+            };
+            assert_eq!(attention.dims(), [3, 5, names.len()]);
+            let sums = attention.sum(2).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
             assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-5));
         }
         let frozen = model.examine(&batch.observation, 5, Some(Intervention::Freeze)).unwrap();
@@ -451,6 +463,20 @@ fn impossible_configurations_name_the_field() {
         (with(&|c| (c.reasoning.over, c.reasoning.untied) = (Over::Memory, true)), "reasoning.untied"),
         (with(&|c| (c.reasoning.over, c.reasoning.start_noise) = (Over::Memory, 1.0)), "reasoning.start_noise"),
         (with(&|c| c.reasoning.start_noise = f64::NAN), "reasoning.start_noise"),
+        (with(&|c| (c.reasoning.over, c.reasoning.h_cycles) = (Over::Tokens, 2)), "reasoning.h_cycles"),
+        (
+            with(&|c| (c.reasoning.over, c.reasoning.warm_start) = (Over::Tokens, Some(WarmStart { noise: 0.1 }))),
+            "reasoning.warm_start",
+        ),
+        (with(&|c| c.pointer = Some(among("cube"))), "pointer is among cube"),
+        (with(&|c| (c.reasoning.over, c.pointer) = (Over::Tokens, Some(among("cube")))), "0 of group cube"),
+        (
+            with(&|c| {
+                c.reasoning.over = Over::Tokens;
+                c.pointer = Some(PointerConfig { weight: f64::NAN, ..among("cube") });
+            }),
+            "pointer.weight",
+        ),
     ] {
         assert!(error.contains(field), "{error}");
     }
@@ -464,4 +490,133 @@ fn it_is_configured_beside_act() {
     assert_eq!((config.dim_model, config.reasoning.over), (16, Over::Memory));
     let wrong = serde_json::json!({"type": "actrm", "reasoning": {"cycles": 3}});
     assert!(serde_json::from_value::<PolicyConfig>(wrong).is_err());
+}
+
+/// A policy over tokens that points at one of three cubes, and windows of which each took one.
+fn pointing(change: &dyn Fn(&mut Config)) -> (Actrm, Batch) {
+    let tokens = ReasoningConfig { over: Over::Tokens, supervision_steps: 3, ..ReasoningConfig::default() };
+    let mut config = Config { pointer: Some(among("cube")), use_vae: false, ..small(tokens) };
+    change(&mut config);
+    let signature = signatures().entities;
+    let model = Actrm::new(&config, &signature, 1).unwrap();
+    move_parameters(&model);
+    let mut batch = crate::fused::testing::batch(&signature, config.action_horizon, 6, 3);
+    let cubes: Vec<u32> = (0..signature.observation.len() as u32)
+        .filter(|&i| signature.observation[i as usize].group() == "cube")
+        .collect();
+    batch.taken = Some((0..6).map(|row| cubes[row % 3]).collect());
+    (model, batch)
+}
+
+#[test]
+fn the_gradient_of_pointing_is_the_slope_of_the_loss() {
+    let variants: [&dyn Fn(&mut Config); 4] = [
+        &|_| (),
+        &|c| (c.reasoning.untied, c.reasoning.n_layers, c.reasoning.l_cycles) = (true, 2, 2),
+        &|c| (c.reasoning.deep_supervision, c.reasoning.start_noise) = (false, 0.3),
+        &|c| (c.pointer, c.use_vae) = (None, true),
+    ];
+    for change in variants {
+        let (model, batch) = pointing(&|c| {
+            change(c);
+            // the halting head leaves what it reads without gradient on purpose
+            c.reasoning.halt_weight = 1e-6;
+        });
+        assert_the_gradient_is_the_slope(&model, &batch, &format!("{:?}", model.config()));
+    }
+}
+
+#[test]
+fn a_batch_says_what_was_taken_of_the_candidates() {
+    let (model, batch) = pointing(&|_| ());
+    let error = |taken: Option<Vec<u32>>| {
+        let batch = Batch { taken, ..batch.clone() };
+        model.loss(&batch, &mut Rng::new(0, "loss")).unwrap_err().to_string()
+    };
+    assert!(error(None).contains("what was taken"), "{}", error(None));
+    assert!(error(Some(vec![0; 6])).contains("feature 0"), "the state is no candidate");
+    assert!(error(Some(vec![1; 5])).contains("5 for 6 rows"));
+    let whole = value(&model.loss(&batch, &mut Rng::new(0, "loss")).unwrap().parts["pointer_loss"]);
+    let shards = batch.shards(4).unwrap();
+    let of = |shard: &Batch| value(&model.loss(shard, &mut Rng::new(0, "loss")).unwrap().parts["pointer_loss"]);
+    let sum: f32 = shards.iter().map(of).sum();
+    assert!((whole - sum).abs() < 1e-5, "{whole} {sum}");
+}
+
+#[test]
+fn an_answer_over_tokens_does_not_depend_on_the_order_of_a_group() {
+    let (model, batch) = pointing(&|_| ());
+    let (before, mut other) = (model.predict(&batch.observation).unwrap(), Features::new());
+    let turned = |name: &str| match name {
+        "observation.entity.cube0" => "observation.entity.cube1".to_string(),
+        "observation.entity.cube1" => "observation.entity.cube2".to_string(),
+        "observation.entity.cube2" => "observation.entity.cube0".to_string(),
+        name => name.to_string(),
+    };
+    for name in batch.observation.names() {
+        other.insert(name, batch.observation.get(&turned(name)).unwrap().clone());
+    }
+    let off = |a: &Tensor| value(&(a - &before).unwrap().abs().unwrap().max_all().unwrap());
+    assert!(off(&model.predict(&other).unwrap()) < 1e-5);
+    // and on what they are it does
+    let cube = batch.observation.get("observation.entity.cube0").unwrap();
+    other.insert("observation.entity.cube0", (cube + 1.0).unwrap());
+    assert!(off(&model.predict(&other).unwrap()) > 1e-3);
+}
+
+/// One hop: each of four things shows a name and one it points to, the goal a name; the thing to take is that which the named
+/// one points to. Its numbers are the actions.
+fn one_hop(config: &Config, signature: &Signature, rows: usize, seed: u64) -> Batch {
+    let mut rng = Rng::new(seed, "hop");
+    let one_hot = |name: usize| (0..4).map(move |i| if i == name { 1.5f32 } else { -0.5 });
+    let (mut things, mut goal, mut actions, mut taken) = (vec![Vec::new(); 4], Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..rows {
+        let mut names: Vec<usize> = (0..4).collect();
+        for i in (1..4).rev() {
+            names.swap(i, rng.below(i as u64 + 1) as usize);
+        }
+        // a ring of things, in an order that only what they show tells
+        let (first, places) = (rng.below(4) as usize, rng.normals(4));
+        for (i, thing) in things.iter_mut().enumerate() {
+            thing.extend(one_hot(names[i]).chain(one_hot(names[(i + 1) % 4])).chain([places[i]]));
+        }
+        goal.extend(std::iter::repeat_n(0.0, 4).chain(one_hot(names[first])).chain([0.0]));
+        let target = (first + 1) % 4;
+        actions.extend(std::iter::repeat_n(places[target], config.action_horizon));
+        taken.push(1 + target as u32);
+    }
+    let mut observation = Features::new();
+    observation.insert(STATE, ValuesRef::F32(&[0.0; 4096][..rows]));
+    for (i, thing) in things.iter().enumerate() {
+        observation.insert(&format!("observation.entity.thing{i}"), ValuesRef::F32(thing));
+    }
+    observation.insert("observation.entity.goal", ValuesRef::F32(&goal));
+    let is_pad = vec![false; rows * config.action_horizon];
+    let batch = Batch::from_slices(signature, config.action_horizon, &observation, &actions, &is_pad).unwrap();
+    Batch { taken: Some(taken), ..batch }
+}
+
+#[test]
+fn a_pointer_learns_to_follow_a_relation_and_the_actions_go_there() {
+    let thing = |i: usize| FeatureSpec::entity(&format!("thing{i}"), 9, "thing", false);
+    let goal = FeatureSpec::entity("goal", 9, "thing", true);
+    let observation = [FeatureSpec::state(1)].into_iter().chain((0..4).map(thing)).chain([goal]).collect();
+    let signature = Signature { observation, n_obs_steps: 1, action_dim: 1 };
+    let tokens = ReasoningConfig { over: Over::Tokens, supervision_steps: 3, ..ReasoningConfig::default() };
+    let base = Config { use_vae: false, dim_model: 32, dim_feedforward: 64, action_horizon: 2, ..small(tokens) };
+    let error = |pointer: Option<PointerConfig>| {
+        let config = Config { pointer, ..base.clone() };
+        let settings = TrainConfig { steps: 700, lr: 3e-3, ..TrainConfig::default() };
+        let model = Box::new(Actrm::new(&config, &signature, 1).unwrap());
+        let mut trainer = Trainer::new(model, settings, 1).unwrap();
+        for step in 0..700 {
+            trainer.step(&one_hop(&config, &signature, 48, step)).unwrap();
+        }
+        let fresh = one_hop(&config, &signature, 256, 10_000);
+        let off = (trainer.model().predict(&fresh.observation).unwrap() - &fresh.actions).unwrap();
+        value(&off.abs().unwrap().mean_all().unwrap())
+    };
+    // always answering zero is off by 0.8
+    let with = error(Some(among("thing")));
+    assert!(with < 0.25, "{with}");
 }

@@ -133,6 +133,7 @@ impl Actrm {
                 match self.config.reasoning.over {
                     Over::Actions => self.supervise::<OverActions<'_>>(pass, &data, steps, grads),
                     Over::Memory => self.supervise::<OverMemory<'_>>(pass, &data, steps, grads),
+                    Over::Tokens => unreachable!("its steps are composed"),
                 }
             })
         })
@@ -304,6 +305,7 @@ impl Actrm {
                 match self.config.reasoning.over {
                     Over::Actions => self.think_with::<OverActions<'_>>(pass, (&inputs, rows), start, on_step),
                     Over::Memory => self.think_with::<OverMemory<'_>>(pass, (&inputs, rows), start, on_step),
+                    Over::Tokens => unreachable!("its thoughts are composed"),
                 }
             })
         })?
