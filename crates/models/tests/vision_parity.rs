@@ -106,6 +106,7 @@ impl Fixture {
             total_rows: self.io["state"].dim(0).unwrap(),
             total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
             seed: 0,
+            taken: None,
         }
     }
 
