@@ -249,7 +249,10 @@ mod tests {
     #[test]
     fn curves_are_compared_at_their_common_steps() {
         let every = |pitch: u64, from: u64| -> Points {
-            (1..=120).map(|k| k * pitch).map(|step| (step, 1.0 / step as f64 + if step >= from { 0.25 } else { 0.0 })).collect()
+            (1..=120)
+                .map(|k| k * pitch)
+                .map(|step| (step, 1.0 / step as f64 + if step >= from { 0.25 } else { 0.0 }))
+                .collect()
         };
         // common: 30, 60, … 240; the second is 0.25 higher from 100 on
         let found = Curves::of("training loss", &every(2, u64::MAX), &every(15, 100)).expect("both have points");

@@ -5,8 +5,8 @@ use anyhow::Context;
 use cli::{Table, shown};
 use report::column::{Align, Column};
 use report::{
-    ACROSS_COLUMNS, Beside, COLUMNS, Curve, DEPTH_COLUMNS, EntryFacts, LeaderboardRow, Places, Reading, across_tasks, csv,
-    json, markdown, rank, to_html,
+    ACROSS_COLUMNS, Beside, COLUMNS, Curve, DEPTH_COLUMNS, EntryFacts, LeaderboardRow, Places, Reading, across_tasks,
+    csv, json, markdown, rank, to_html,
 };
 use study::puzzle::{PUZZLE_COLUMNS, audit_puzzles, puzzle_section, rank_puzzles};
 use zoo::audit::{KnownEntries, audit};
@@ -96,11 +96,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         entries: entries.good().map(facts).collect(),
         depths,
         films: films::of_failures(&rows, &args.zoo.zoo),
-        places: Places {
-            zoo: args.zoo.named(),
-            results: args.results.named(),
-            protocols: args.protocols.named(),
-        },
+        places: Places { zoo: args.zoo.named(), results: args.results.named(), protocols: args.protocols.named() },
     };
     let page = to_html(&rows, &beside);
     let mut files = vec![
