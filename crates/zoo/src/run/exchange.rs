@@ -358,7 +358,7 @@ mod tests {
         exchanges.apply(3, &mut batch);
         let taken = exchanges.taken(&batch).unwrap();
         let mut moved = 0;
-        for row in 0..N {
+        for (row, &taken) in taken.iter().enumerate() {
             let name = |values: &[f32]| values.iter().position(|x| *x == 1.0).unwrap();
             let thing = |batch: &WindowBatch, i: usize| {
                 let numbers = &batch.column("things").unwrap()[row * 288 + 24 * i..][..24];
@@ -370,7 +370,7 @@ mod tests {
                 at = thing(&batch, here).1;
                 (at == thing(&batch, here).0).then_some(here)
             });
-            assert_eq!(taken[row], 100 + end.unwrap() as u32, "row {row}");
+            assert_eq!(taken, 100 + end.unwrap() as u32, "row {row}");
             moved += (0..12).filter(|&i| thing(&batch, i) != thing(&before, i)).count();
         }
         assert!(moved > 9 * N, "most of the other eleven lie elsewhere: {moved}");
