@@ -18,7 +18,11 @@ const EPISODES: usize = 50;
 pub fn results(count: usize) -> Vec<StoredEvaluation> {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo/results");
     let mut stored = list_evaluations(&shipped).unwrap();
-    stored.retain(|one| one.episodes.len() == 200);
+    // rows of one form: ranked, and without groups of episodes
+    let alike = |one: &StoredEvaluation| {
+        one.record.training.policy.starts_with("act") && one.episodes.iter().all(|episode| episode.group.is_none())
+    };
+    stored.retain(|one| one.episodes.len() == 200 && alike(one));
     for one in &mut stored {
         one.record.seeds.count = EPISODES as u64;
         one.episodes.truncate(EPISODES);
