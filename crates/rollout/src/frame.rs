@@ -98,15 +98,7 @@ impl FrameTensor {
     /// # Errors
     /// [`FrameError::Misshapen`] for any other element type.
     pub fn to_f64(&self, name: &str) -> Result<Vec<f64>, FrameError> {
-        if self.dtype != Dtype::F64 {
-            return Err(FrameError::Misshapen {
-                name: name.to_owned(),
-                expected: "F64".to_owned(),
-                found: format!("{:?}", self.dtype),
-            });
-        }
-        let (values, _) = self.bytes.as_chunks::<8>();
-        Ok(values.iter().map(|v| f64::from_le_bytes(*v)).collect())
+        Ok(self.words(name, Dtype::F64)?.iter().map(|word| f64::from_le_bytes(*word)).collect())
     }
 
     /// The values, if the element type is `i64`.
@@ -114,15 +106,19 @@ impl FrameTensor {
     /// # Errors
     /// [`FrameError::Misshapen`] for any other element type.
     pub fn to_i64(&self, name: &str) -> Result<Vec<i64>, FrameError> {
-        if self.dtype != Dtype::I64 {
+        Ok(self.words(name, Dtype::I64)?.iter().map(|word| i64::from_le_bytes(*word)).collect())
+    }
+
+    /// The elements of eight bytes, if they are of this type.
+    fn words(&self, name: &str, expected: Dtype) -> Result<&[[u8; 8]], FrameError> {
+        if self.dtype != expected {
             return Err(FrameError::Misshapen {
                 name: name.to_owned(),
-                expected: "I64".to_owned(),
+                expected: format!("{expected:?}"),
                 found: format!("{:?}", self.dtype),
             });
         }
-        let (values, _) = self.bytes.as_chunks::<8>();
-        Ok(values.iter().map(|v| i64::from_le_bytes(*v)).collect())
+        Ok(self.bytes.as_chunks::<8>().0)
     }
 }
 

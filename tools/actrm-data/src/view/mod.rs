@@ -8,6 +8,8 @@ mod read;
 pub use read::{Drawn, Episode, Opened};
 
 use crate::svg::{self, Content, escape};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use std::fmt::Write as _;
 
 /// What the page says above its episodes.
@@ -88,11 +90,11 @@ impl Page {
         for (at, (column, values)) in self.columns.iter().zip(&episode.columns).enumerate() {
             let rows = values.chunks_exact(column.names.len().max(1)).step_by(stride);
             let bytes: Vec<u8> = rows.flatten().flat_map(|v| v.to_le_bytes()).collect();
-            let _ = write!(data, "{}\"{}\"", if at > 0 { "," } else { "" }, base64(&bytes));
+            let _ = write!(data, "{}\"{}\"", if at > 0 { "," } else { "" }, STANDARD.encode(&bytes));
         }
         let _ = write!(data, "],\"frames\":{frames:?},\"pictures\":[");
         for (at, camera) in pictures.iter().enumerate() {
-            let files: Vec<String> = camera.iter().map(|file| format!("\"{}\"", base64(file))).collect();
+            let files: Vec<String> = camera.iter().map(|file| format!("\"{}\"", STANDARD.encode(file))).collect();
             let _ = write!(data, "{}[{}]", if at > 0 { "," } else { "" }, files.join(","));
         }
         data.push_str("]}</script>\n");
@@ -225,42 +227,9 @@ fn histogram(title: &str, values: &[f32]) -> String {
     )
 }
 
-/// RFC 4648, with padding.
-fn base64(bytes: &[u8]) -> String {
-    const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
-    for part in bytes.chunks(3) {
-        let word = part.iter().enumerate().fold(0_u32, |word, (i, &byte)| word | u32::from(byte) << (16 - 8 * i));
-        for letter in 0..4 {
-            match letter <= part.len() {
-                true => text.push(char::from(LETTERS[(word >> (18 - 6 * letter) & 63) as usize])),
-                false => text.push('='),
-            }
-        }
-    }
-    text
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn base64_is_that_of_the_standard() {
-        let known = [
-            ("", ""),
-            ("f", "Zg=="),
-            ("fo", "Zm8="),
-            ("foo", "Zm9v"),
-            ("foob", "Zm9vYg=="),
-            ("fooba", "Zm9vYmE="),
-            ("foobar", "Zm9vYmFy"),
-        ];
-        for (plain, coded) in known {
-            assert_eq!(base64(plain.as_bytes()), coded);
-        }
-        assert_eq!(base64(&[0xff, 0xfe, 0xfd]), "//79");
-    }
 
     fn episode(name: &str, length: usize) -> Episode {
         let columns = vec![(0..2 * length).map(|i| i as f32).collect()];
@@ -290,12 +259,10 @@ mod tests {
         assert!(html.contains("<title>a &amp; b</title>") && html.contains("No problems found."));
         assert!(html.contains("0 · demo_0 <small>10 steps · return 1.5 · success · &lt;lift&gt;</small>"), "{html}");
         let floats: Vec<u8> = (0..6).flat_map(|i| (i as f32).to_le_bytes()).collect();
-        assert!(
-            html.contains(&format!(
-                "{{\"stride\":1,\"curves\":[\"{}\"],\"frames\":[],\"pictures\":[]}}",
-                base64(&floats)
-            ))
-        );
+        assert!(html.contains(&format!(
+            "{{\"stride\":1,\"curves\":[\"{}\"],\"frames\":[],\"pictures\":[]}}",
+            STANDARD.encode(&floats)
+        )));
         assert!(html.contains("\"frames\":[0, 9],\"pictures\":[[\"b25l\",\"dHdv\"]]"));
         assert_eq!(html.matches("</script>").count(), html.matches("<script").count());
         assert!(!html.contains("http://") && !html.contains("https://") && !html.contains("--points"));
