@@ -14,14 +14,31 @@ pub struct Batch {
     pub actions: Tensor,
     /// (b, H): 1 where the step lies beyond the end of its episode, else 0
     pub is_pad: Tensor,
-    /// Of each row the feature of its demonstration that was taken, by its place in the signature; `None` where nobody asked.
-    pub taken: Option<Vec<u32>>,
+    /// What the demonstrations took; `None` where nobody asked.
+    pub taken: Option<Taken>,
     /// Rows of the whole batch that this one is a shard of: losses are averaged over this number.
     pub total_rows: usize,
     /// Steps of the whole batch that are not padding.
     pub total_valid_steps: usize,
     /// The same for all shards of a batch: what a model draws once per batch it draws from here.
     pub seed: u64,
+}
+
+/// What demonstrations took.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Taken {
+    /// of each row the feature, by its place in the signature; `None` where it is not asked
+    pub features: Vec<Option<u32>>,
+    /// Rows of the whole batch where it is asked: the loss is averaged over this number.
+    pub total: usize,
+}
+
+impl Taken {
+    /// Of a whole batch.
+    pub fn new(features: Vec<Option<u32>>) -> Self {
+        let total = features.iter().flatten().count();
+        Self { features, total }
+    }
 }
 
 impl Batch {
@@ -97,7 +114,10 @@ impl Batch {
                     observation: self.observation.try_map(|_, tensor| cut(tensor))?,
                     actions: cut(&self.actions)?,
                     is_pad: cut(&self.is_pad)?,
-                    taken: self.taken.as_ref().map(|taken| taken[from..to].to_vec()),
+                    taken: self
+                        .taken
+                        .as_ref()
+                        .map(|taken| Taken { features: taken.features[from..to].to_vec(), ..*taken }),
                     ..self.clone()
                 })
             })

@@ -31,7 +31,7 @@ fn stable_slope(x: f64) -> f64 {
 
 impl ClassProbability {
     /// The negative log-probability of `label`.
-    fn loss(self, scores: &[f32], label: usize) -> f64 {
+    pub(crate) fn loss(self, scores: &[f32], label: usize) -> f64 {
         match self {
             Self::Stablemax => {
                 let sum: f64 = scores.iter().map(|&x| stable(f64::from(x))).sum();
@@ -44,8 +44,8 @@ impl ClassProbability {
         }
     }
 
-    /// Adds `weight` times the gradient of [`Self::loss`] to `out`.
-    fn gradient(self, scores: &[f32], label: usize, weight: f64, out: &mut [f32]) {
+    /// Writes `weight` times the gradient of [`Self::loss`] into `out`.
+    pub(crate) fn gradient(self, scores: &[f32], label: usize, weight: f64, out: &mut [f32]) {
         match self {
             Self::Stablemax => {
                 let sum: f64 = scores.iter().map(|&x| stable(f64::from(x))).sum();

@@ -37,7 +37,7 @@ mod size;
 mod train;
 mod values;
 
-pub use batch::Batch;
+pub use batch::{Batch, Taken};
 pub use chunk_policy::ChunkPolicy;
 pub use error::{ModelError, Result};
 pub use features::{ENTITY_PREFIX, FeatureKind, FeatureSpec, Features, Observation, Signature, Values, ValuesRef};

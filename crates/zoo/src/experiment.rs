@@ -78,6 +78,9 @@ pub struct ExchangeSection {
     /// Where each thing is, item for item, all moved by one vector to where one was taken in another demonstration.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub places: Vec<Vec<String>>,
+    /// At so many observations of a demonstration, the first ones, a pointer is asked which was taken; at all where absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub asked: Option<usize>,
 }
 
 /// `[data.beginning]`: how often the first windows of an episode are drawn in training.
@@ -237,6 +240,9 @@ impl DataSection {
         }
         for (name, exchange) in &self.exchange {
             let things = exchange.taken.len();
+            if exchange.asked == Some(0) {
+                return invalid(format!("data.exchange.{name}.asked"), "1 or more", "0".to_owned());
+            }
             for (key, lists) in [("items", &exchange.items), ("places", &exchange.places)] {
                 let here = format!("data.exchange.{name}.{key}");
                 if lists.len() != things && !(key == "places" && lists.is_empty()) {
@@ -561,6 +567,8 @@ mod tests {
         assert!(message.contains("key `data.exchange.things.places`: expected 2 lists"), "{message}");
         assert!(error(&exchange("taken = [], items = []")).contains("`data.exchange.things.taken`: expected at least"));
         assert!(error(&exchange("taken = ['cube_pos'], items = [['object']]")).contains("found `cube_pos`"));
+        let never = exchange(&format!("{both}, items = [['object'], ['object']], asked = 0"));
+        assert!(error(&never).contains("`data.exchange.things.asked`: expected 1 or more, found 0"));
         let things = ["data.entities.thing0=['cube0']", "data.entities.thing1=['cube1']"];
         let taken = "data.exchange.things={ taken = ['cube0', 'cube1'], items = [['cube0'], ['cube1']] }";
         let pointing = "policy.pointer={ among = 'thing' }";

@@ -8,7 +8,7 @@ use crate::layers::Shape;
 
 /// What an encoder layer's backward pass needs.
 #[derive(Debug)]
-struct EncoderLayer {
+pub(crate) struct EncoderLayer {
     prefix: String,
     /// input of the attention
     y1: Vec<f32>,
@@ -34,7 +34,7 @@ fn first_rows(pass: &mut Pass<'_>, x: &[f32], tokens: usize) -> Vec<f32> {
 impl EncoderLayer {
     /// x: (b, t, D), pos: (t, D), key_pad: (b, t) -> (b, t, D), or (b, 1, D) with `only_first`: then only the first
     /// token's output is computed, for a last layer of which nothing else is used.
-    fn forward(
+    pub(crate) fn forward(
         pass: &mut Pass<'_>,
         prefix: String,
         x: Vec<f32>,
@@ -83,7 +83,7 @@ impl EncoderLayer {
     }
 
     /// grad: that of the output -> that of x; adds to `pos_grad`.
-    fn backward(
+    pub(crate) fn backward(
         self,
         pass: &mut Pass<'_>,
         mut grad: Vec<f32>,
@@ -145,7 +145,7 @@ impl EncoderLayer {
     }
 
     /// Gives the buffers back without a backward pass.
-    fn free(self, pass: &mut Pass<'_>) {
+    pub(crate) fn free(self, pass: &mut Pass<'_>) {
         self.attention.free(pass);
         self.ff.free(pass);
         self.residual1.norm.free(pass);

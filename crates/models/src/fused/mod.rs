@@ -12,6 +12,7 @@ mod encoder;
 mod feed_forward;
 mod loss;
 mod observation;
+mod pointer;
 #[cfg(test)]
 pub(crate) mod testing;
 mod vae;
@@ -19,9 +20,10 @@ mod vision;
 
 pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_and_values_backward, scatter};
 pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
-pub(crate) use encoder::Encoder;
+pub(crate) use encoder::{Encoder, EncoderLayer};
 pub(crate) use loss::AbsoluteError;
 pub(crate) use observation::{Data, Inputs, Tokens, inputs, positions_backward, uncovered};
+pub(crate) use pointer::{Pointed, PointerGrads};
 pub(crate) use vae::Vae;
 
 use crate::error::{ModelError, Result};

@@ -1,7 +1,7 @@
 //! What the tests of fused models share: the composed model and finite differences as oracles.
 #![allow(clippy::unwrap_used)]
 
-use crate::batch::Batch;
+use crate::batch::{Batch, Taken};
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, FeatureSpec, Features, Signature, Values};
 use crate::gradients::{Gradients, ParamLayout};
@@ -36,6 +36,11 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
     let pad: Vec<bool> = (0..rows * horizon).map(|i| i / horizon % 2 == 1 && i % horizon > horizon / 2).collect();
     let mut batch = Batch::new(signature, horizon, observation, a, &pad).unwrap();
     batch.seed = seed;
+    // of a pointer: of every third row it is not asked
+    let cubes = signature.observation.iter().enumerate().filter(|(_, spec)| spec.group() == "cube");
+    let cubes: Vec<u32> = cubes.map(|(at, _)| at as u32).collect();
+    let taken = (0..rows).map(|row| cubes.get(row % cubes.len().max(1)).copied().filter(|_| row % 3 != 2));
+    batch.taken = Some(Taken::new(taken.collect()));
     batch
 }
 

@@ -31,7 +31,7 @@ pub use lstm::{Lstm, LstmState};
 pub use mish::mish;
 pub use mixture::{Mixture, MixtureHead};
 pub use pointer::PointerConfig;
-pub(crate) use pointer::{Pointed, Pointer};
+pub(crate) use pointer::{Asked, Pointed, Pointer};
 pub use position::sinusoid_table;
 pub(crate) use tokens::{
     ENTITY_POSITIONS, FEATURE_POSITIONS, InputTokens, LATENT, Position, TokenLayout, environment_state,

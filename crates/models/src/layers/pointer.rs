@@ -7,7 +7,7 @@
 use super::tokens::TokenLayout;
 use super::{Embedding, Linear};
 use crate::batch::Batch;
-use crate::classification::{ClassProbability, cross_entropy};
+use crate::classification::{ClassProbability, IGNORE_LABEL, cross_entropy};
 use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
@@ -57,7 +57,7 @@ pub(crate) struct Pointer {
     /// (1, D), of the token that is read
     position: Embedding,
     /// places of the candidates among the tokens
-    tokens: Tensor,
+    pub(crate) places: Vec<u32>,
     /// and of their features in the signature
     features: Vec<usize>,
     pub(crate) weight: f64,
@@ -98,7 +98,7 @@ impl Pointer {
         Ok(Self {
             score: Linear::new(p, "pointer.score", dim, 1, rng)?,
             position: Embedding::new(p, "pointer.pos_embed", 1, dim, rng)?,
-            tokens: Tensor::new(places, &HERE)?,
+            places,
             features,
             weight: config.weight,
         })
@@ -106,10 +106,11 @@ impl Pointer {
 
     /// encoded and tokens: (b, M, D), after and before everything was encoded
     pub(crate) fn forward(&self, encoded: &Tensor, tokens: &Tensor) -> Result<Pointed> {
-        let scores = self.score.forward(&encoded.index_select(&self.tokens, 1)?)?.squeeze(2)?;
+        let places = Tensor::new(self.places.as_slice(), &HERE)?;
+        let scores = self.score.forward(&encoded.index_select(&places, 1)?)?.squeeze(2)?;
         let shares = scores.broadcast_sub(&scores.max_keepdim(D::Minus1)?.detach())?.exp()?;
         let shares = shares.broadcast_div(&shares.sum_keepdim(D::Minus1)?)?;
-        let token = shares.unsqueeze(1)?.matmul(&tokens.index_select(&self.tokens, 1)?.contiguous()?)?;
+        let token = shares.unsqueeze(1)?.matmul(&tokens.index_select(&places, 1)?.contiguous()?)?;
         Ok(Pointed { scores, token })
     }
 
@@ -119,36 +120,77 @@ impl Pointer {
         Ok((Tensor::cat(&[memory, &pointed.token], 1)?, Tensor::cat(&[pos, &own], 1)?))
     }
 
-    /// The candidate that was taken in each row.
+    /// What is asked of a batch.
     ///
     /// # Errors
-    /// A batch that does not say, or names something else.
-    pub(crate) fn taken(&self, model: &'static str, batch: &Batch) -> Result<Vec<i64>> {
+    /// A batch that does not say what was taken, or names something else than the candidates.
+    pub(crate) fn asked(&self, model: &'static str, batch: &Batch) -> Result<Asked> {
         let refuse = |found: String| {
             let expected = "one of the candidates of `pointer.among` for each row".to_string();
             ModelError::Input { operation: model, object: "what was taken", found, expected }
         };
         let taken = batch.taken.as_ref().ok_or_else(|| refuse("nothing".to_string()))?;
-        if taken.len() != batch.rows() {
-            return Err(refuse(format!("{} for {} rows", taken.len(), batch.rows())));
+        if taken.features.len() != batch.rows() {
+            return Err(refuse(format!("{} for {} rows", taken.features.len(), batch.rows())));
         }
-        let label = |&feature: &u32| {
+        let candidate = |feature: u32| {
             let at = self.features.iter().position(|&candidate| candidate == feature as usize);
-            at.map(|at| at as i64).ok_or_else(|| refuse(format!("feature {feature}")))
+            at.ok_or_else(|| refuse(format!("feature {feature}")))
         };
-        taken.iter().map(label).collect()
+        let candidates = taken.features.iter().map(|feature| feature.map(candidate).transpose());
+        Ok(Asked { candidates: candidates.collect::<Result<_>>()?, total: taken.total.max(1) })
+    }
+}
+
+/// What a pointer is asked of a shard: of each row the candidate that was taken, where it is asked.
+#[derive(Debug)]
+pub(crate) struct Asked {
+    candidates: Vec<Option<usize>>,
+    /// rows of the whole batch that are asked
+    total: usize,
+}
+
+/// How a pointer answers.
+#[derive(Debug)]
+pub(crate) struct Answers {
+    /// cross-entropy, a share of the mean over all rows of the batch that are asked
+    pub(crate) loss: f64,
+    /// rows whose highest score is that of what was taken, a share likewise
+    pub(crate) right: f32,
+}
+
+impl Asked {
+    /// scores: (b, candidates) -> cross-entropy, a share of the mean over all rows of the batch that are asked.
+    pub(crate) fn loss(&self, scores: &Tensor) -> Result<Tensor> {
+        let label = |candidate: &Option<usize>| candidate.map_or(IGNORE_LABEL, |at| at as i64);
+        let labels: Vec<i64> = self.candidates.iter().map(label).collect();
+        let each = cross_entropy(scores, &labels, ClassProbability::Softmax)?.to_dtype(DType::F32)?;
+        Ok((each.sum_all()? / self.total as f64)?)
     }
 
-    /// Cross-entropy, a share of the mean over the whole batch.
-    pub(crate) fn loss(&self, pointed: &Pointed, taken: &[i64], batch: &Batch) -> Result<Tensor> {
-        let each = cross_entropy(&pointed.scores, taken, ClassProbability::Softmax)?.to_dtype(DType::F32)?;
-        Ok((each.sum_all()? / batch.total_rows.max(1) as f64)?)
+    /// The same on a slice; writes `weight` times the gradient of the loss into `grad`, (b, candidates).
+    pub(crate) fn answers(&self, scores: &[f32], grad: Option<(&mut [f32], f64)>) -> Answers {
+        let width = scores.len() / self.candidates.len();
+        let rows = || self.candidates.iter().zip(scores.chunks_exact(width));
+        let asked = || rows().filter_map(|(taken, scores)| taken.map(|taken| (taken, scores)));
+        let loss: f64 = asked().map(|(taken, scores)| ClassProbability::Softmax.loss(scores, taken)).sum();
+        let highest = |scores: &[f32]| (1..width).fold(0, |best, at| if scores[at] > scores[best] { at } else { best });
+        let right = asked().filter(|(taken, scores)| highest(scores) == *taken).count();
+        if let Some((grad, weight)) = grad {
+            let share = weight / self.total as f64;
+            for ((taken, scores), grad) in rows().zip(grad.chunks_exact_mut(width)) {
+                match taken {
+                    Some(taken) => ClassProbability::Softmax.gradient(scores, *taken, share, grad),
+                    None => grad.fill(0.0),
+                }
+            }
+        }
+        Answers { loss: loss / self.total as f64, right: right as f32 / self.total as f32 }
     }
 
-    /// Rows whose highest score is that of what was taken, a share of all rows of the batch.
-    pub(crate) fn right(&self, pointed: &Pointed, taken: &[i64], batch: &Batch) -> Result<Tensor> {
-        let highest = pointed.scores.detach().argmax(D::Minus1)?.to_vec1::<u32>()?;
-        let right = highest.iter().zip(taken).filter(|(a, b)| i64::from(**a) == **b).count();
-        Ok(Tensor::new(right as f32 / batch.total_rows.max(1) as f32, pointed.scores.device())?)
+    /// Rows whose highest score is that of what was taken, a share of all rows of the batch that are asked.
+    pub(crate) fn right(&self, scores: &Tensor) -> Result<Tensor> {
+        let values = scores.detach().flatten_all()?.to_vec1::<f32>()?;
+        Ok(Tensor::new(self.answers(&values, None).right, scores.device())?)
     }
 }

@@ -8,13 +8,14 @@
 //! ```
 //!
 //! Each demonstration shows by its end which thing was meant: the one whose vector in `taken`, from the hand, is the
-//! shortest in the last observation, of those that are not zero, which are not there. Whatever the others are, the same demonstration is right. So what is known of them
+//! shortest in the last observation, of those that are not zero, which are not there and stay as they are. Whatever the others are, the same demonstration is right. So what is known of them
 //! (`items`, as many lists as things, alike) is dealt out among them at random in every sample. And where `places` are
 //! named, each of them is moved to where another demonstration's taken thing lay, drawn for the sample from the
 //! [`NEAREST`] that are nearest to it: by the vector between the two at the beginnings, as the first item of each list
 //! tells them, all items of the list alike. Then everything lies where something was taken once, and no place by itself
 //! tells the one that was taken this time. A policy that points (`[policy.pointer]`) learns from the same table which thing
-//! was taken. Without this, a few hundred demonstrations, each with an arrangement of its own,
+//! was taken; with `asked = 1` it is asked at the first observation of a demonstration alone, before the way of the hand
+//! tells. Without this, a few hundred demonstrations, each with an arrangement of its own,
 //! can be learned by heart instead of the rule that leads to the thing. Things may come to overlap a little. Validation
 //! sees the observations as they are. A batch depends on the seed and the step alone, so that a resumed run needs no state
 //! of this.
@@ -23,7 +24,7 @@ use std::path::Path;
 
 use dataset::shuffle::SplitMix64;
 use dataset::{Dataset, WindowBatch, Windows};
-use models::Signature;
+use models::{Signature, Taken};
 
 use crate::ZooError;
 use crate::experiment::Experiment;
@@ -41,8 +42,17 @@ const NEAREST: usize = 16;
 pub(crate) struct Exchanges {
     seed: u64,
     all: Vec<Exchange>,
-    /// of what a pointer is asked: which of `all` says what was taken, and of each thing its feature's place in the signature
-    pointed: Option<(usize, Vec<u32>)>,
+    pointed: Option<Asked>,
+}
+
+/// What a pointer is asked.
+struct Asked {
+    /// which exchange says what was taken
+    exchange: usize,
+    /// of each thing its feature's place in the signature
+    features: Vec<u32>,
+    /// at so many observations of an episode, the first ones
+    first: u32,
 }
 
 /// Things that change places.
@@ -62,6 +72,8 @@ struct Episode {
     end: u32,
     /// The thing that the hand took.
     taken: usize,
+    /// The others that are there.
+    others: Vec<usize>,
     /// Where each thing lay at the beginning, if that is to be changed.
     beginning: Vec<Vec<f32>>,
 }
@@ -90,7 +102,8 @@ impl Exchanges {
                     let place =
                         |place: &Place| signature.observation.iter().position(|spec| spec.name == place.feature);
                     let features = from_hand.iter().filter_map(place).map(|at| at as u32).collect();
-                    pointed = Some((all.len(), features));
+                    let first = section.asked.map_or(u32::MAX, |first| u32::try_from(first).unwrap_or(u32::MAX));
+                    pointed = Some(Asked { exchange: all.len(), features, first });
                 }
                 let episodes = episodes(&from_hand, &moved, windows);
                 let episodes = episodes.map_err(super::data::unreadable(&path.display().to_string()))?;
@@ -100,11 +113,16 @@ impl Exchanges {
         Ok(Self { seed: experiment.train.seed ^ PURPOSE, all, pointed })
     }
 
-    /// Of each window the feature that its demonstration took, by its place in the signature; `None` where no pointer asks.
-    pub fn taken(&self, windows: &WindowBatch) -> Option<Vec<u32>> {
-        let (at, features) = self.pointed.as_ref()?;
-        let exchange = &self.all[*at];
-        Some(windows.indices.iter().map(|&index| features[exchange.episode(index).taken]).collect())
+    /// What the demonstrations of the windows took; `None` where no pointer asks.
+    pub fn taken(&self, windows: &WindowBatch) -> Option<Taken> {
+        let asked = self.pointed.as_ref()?;
+        let exchange = &self.all[asked.exchange];
+        let of = |&window: &u32| {
+            let at = exchange.number(window);
+            let begins = at.checked_sub(1).map_or(0, |before| exchange.episodes[before].end);
+            (window - begins < asked.first).then(|| asked.features[exchange.episodes[at].taken])
+        };
+        Some(Taken::new(windows.indices.iter().map(of).collect()))
     }
 
     /// Deals out and moves the things of the windows of step `step`, each window by itself, alike in all its observations.
@@ -113,10 +131,9 @@ impl Exchanges {
         for exchange in &self.all {
             for row in 0..windows.n {
                 let episode = exchange.episode(windows.indices[row]);
-                let others: Vec<usize> = (0..exchange.things.len()).filter(|thing| *thing != episode.taken).collect();
-                exchange.deal(&others, row, windows, &mut rng);
+                exchange.deal(&episode.others, row, windows, &mut rng);
                 if !exchange.moved.is_empty() {
-                    exchange.lay(&others, episode, row, windows, &mut rng);
+                    exchange.lay(episode, row, windows, &mut rng);
                 }
             }
         }
@@ -126,7 +143,11 @@ impl Exchanges {
 impl Exchange {
     /// Of a window, by its number.
     fn episode(&self, window: u32) -> &Episode {
-        &self.episodes[self.episodes.partition_point(|episode| episode.end <= window)]
+        &self.episodes[self.number(window)]
+    }
+
+    fn number(&self, window: u32) -> usize {
+        self.episodes.partition_point(|episode| episode.end <= window)
     }
 
     fn deal(&self, others: &[usize], row: usize, windows: &mut WindowBatch, rng: &mut SplitMix64) {
@@ -145,9 +166,9 @@ impl Exchange {
         }
     }
 
-    fn lay(&self, others: &[usize], own: &Episode, row: usize, windows: &mut WindowBatch, rng: &mut SplitMix64) {
+    fn lay(&self, own: &Episode, row: usize, windows: &mut WindowBatch, rng: &mut SplitMix64) {
         let mut near: Vec<(f32, usize)> = Vec::with_capacity(self.episodes.len());
-        for &thing in others {
+        for &thing in &own.others {
             let here = &own.beginning[thing];
             let squared = |there: &[f32]| here.iter().zip(there).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
             near.clear();
@@ -201,10 +222,11 @@ fn episodes(
         let last = ends.n_obs_steps - 1;
         let squared = |place: &Place| place.of(&ends, 1, last).iter().map(|x| x * x).sum::<f32>();
         // a thing that is not there is seen as zeros
-        let there = (0..from_hand.len()).filter(|thing| squared(&from_hand[*thing]) > 0.0);
-        let nearest = there.min_by(|a, b| squared(&from_hand[*a]).total_cmp(&squared(&from_hand[*b])));
+        let there = || (0..from_hand.len()).filter(|thing| squared(&from_hand[*thing]) > 0.0);
+        let nearest = there().min_by(|a, b| squared(&from_hand[*a]).total_cmp(&squared(&from_hand[*b])));
         let beginning = moved.iter().map(|thing| thing[0].of(&ends, 0, last).to_vec()).collect();
-        Ok(Episode { end: range.end, taken: nearest.unwrap_or(0), beginning })
+        let taken = nearest.unwrap_or(0);
+        Ok(Episode { end: range.end, taken, others: there().filter(|thing| *thing != taken).collect(), beginning })
     };
     windows.episodes().into_iter().map(episode).collect()
 }
@@ -231,13 +253,17 @@ mod tests {
     fn exchange(seed: u64) -> Exchanges {
         let place = |feature: &str, from, width| Place { feature: feature.to_owned(), from, width };
         let things = (0..4).map(|i| vec![place("a", i, 1), place("b", 1 + 2 * i, 2)]).collect();
-        let episode = |at: usize| Episode { end: 3 * (at as u32 + 1), taken: taken(3 * at), beginning: Vec::new() };
+        let episode = |at: usize| {
+            let taken = taken_in(3 * at);
+            let others = (0..4).filter(|thing| *thing != taken).collect();
+            Episode { end: 3 * (at as u32 + 1), taken, others, beginning: Vec::new() }
+        };
         let episodes = (0..N / 3).map(episode).collect();
         Exchanges { seed, all: vec![Exchange { things, moved: Vec::new(), episodes }], pointed: None }
     }
 
     /// What was taken in the demonstration of a window; each has three.
-    fn taken(window: usize) -> usize {
+    fn taken_in(window: usize) -> usize {
         window / 3 % 4
     }
 
@@ -247,7 +273,7 @@ mod tests {
         exchange(1).apply(3, &mut batch);
         let (a, b) = (batch.column("a").unwrap(), batch.column("b").unwrap());
         for row in 0..N {
-            let taken = taken(N - 1 - row);
+            let taken = taken_in(N - 1 - row);
             let (a, b) = (&a[row * 8..][..8], &b[row * 18..][..18]);
             assert_eq!(a[taken], 10.0 * (taken + 1) as f32);
             assert_eq!((b[0], b[9]), (7.0, 7.0), "what is not named stays");
@@ -280,7 +306,7 @@ mod tests {
         let (a, b) = (batch.column("a").unwrap(), batch.column("b").unwrap());
         let mut seen = BTreeSet::new();
         for row in 0..N {
-            let (window, taken) = (N - 1 - row, taken(N - 1 - row));
+            let (window, taken) = (N - 1 - row, taken_in(N - 1 - row));
             let own = window / 3;
             let (a, b) = (&a[row * 8..][..8], &b[row * 18..][..18]);
             for thing in 0..4 {
@@ -319,6 +345,34 @@ mod tests {
         assert_eq!(batch, windows());
     }
 
+    #[test]
+    fn what_is_not_there_stays_as_it_is() {
+        let mut exchanges = exchange(1);
+        for episode in &mut exchanges.all[0].episodes {
+            episode.others.retain(|thing| *thing != 0);
+        }
+        let (mut batch, mut moved) = (windows(), 0);
+        exchanges.apply(3, &mut batch);
+        for row in 0..N {
+            let (a, b) = (&batch.column("a").unwrap()[row * 8..][..8], &batch.column("b").unwrap()[row * 18..][..18]);
+            assert_eq!((a[0], a[4], b[1], b[2]), (10.0, 11.0, 10.0, 15.0));
+            moved += usize::from(a[1] != 20.0);
+        }
+        assert!(moved > N / 4, "the others change places: {moved}");
+    }
+
+    #[test]
+    fn a_pointer_is_asked_as_often_as_told() {
+        let (mut exchanges, batch) = (exchange(1), windows());
+        for first in [1, 2, 3, u32::MAX] {
+            exchanges.pointed = Some(Asked { exchange: 0, features: vec![5, 6, 7, 8], first });
+            let taken = exchanges.taken(&batch).unwrap();
+            let of = |window: usize| ((window % 3) < first as usize).then_some(5 + taken_in(window) as u32);
+            assert_eq!(taken.features, (0..N).rev().map(of).collect::<Vec<_>>());
+            assert_eq!(taken.total, N / 3 * first.min(3) as usize);
+        }
+    }
+
     /// Twelve things of twelve names that each point to a name, in three chains, and the name that one begins at.
     fn chains(rng: &mut SplitMix64) -> (Vec<usize>, Vec<usize>, usize, usize) {
         let mut shuffled = || {
@@ -345,7 +399,8 @@ mod tests {
             let one_hot = |name: usize| (0..12).map(move |i| f32::from(u8::from(i == name)));
             things.extend((0..12).flat_map(|i| one_hot(names[i]).chain(one_hot(points[i]))));
             goals.extend(one_hot(start));
-            episodes.push(Episode { end: row as u32 + 1, taken: end, beginning: Vec::new() });
+            let others = (0..12).filter(|thing| *thing != end).collect();
+            episodes.push(Episode { end: row as u32 + 1, taken: end, others, beginning: Vec::new() });
         }
         let observation = vec![("goal".to_owned(), goals), ("things".to_owned(), things)];
         let indices = (0..N as u32).collect();
@@ -354,11 +409,12 @@ mod tests {
         let place = |from| Place { feature: "things".to_owned(), from, width: 12 };
         let items = (0..12).map(|i| vec![place(24 * i), place(24 * i + 12)]).collect();
         let all = vec![Exchange { things: items, moved: Vec::new(), episodes }];
-        let exchanges = Exchanges { seed: 1, all, pointed: Some((0, (100..112).collect())) };
+        let asked = Asked { exchange: 0, features: (100..112).collect(), first: 1 };
+        let exchanges = Exchanges { seed: 1, all, pointed: Some(asked) };
         exchanges.apply(3, &mut batch);
         let taken = exchanges.taken(&batch).unwrap();
         let mut moved = 0;
-        for (row, &taken) in taken.iter().enumerate() {
+        for (row, taken) in taken.features.iter().enumerate() {
             let name = |values: &[f32]| values.iter().position(|x| *x == 1.0).unwrap();
             let thing = |batch: &WindowBatch, i: usize| {
                 let numbers = &batch.column("things").unwrap()[row * 288 + 24 * i..][..24];
@@ -370,7 +426,7 @@ mod tests {
                 at = thing(&batch, here).1;
                 (at == thing(&batch, here).0).then_some(here)
             });
-            assert_eq!(taken, 100 + end.unwrap() as u32, "row {row}");
+            assert_eq!(*taken, Some(100 + end.unwrap() as u32), "row {row}");
             moved += (0..12).filter(|&i| thing(&batch, i) != thing(&before, i)).count();
         }
         assert!(moved > 9 * N, "most of the other eleven lie elsewhere: {moved}");

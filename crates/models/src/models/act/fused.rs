@@ -10,11 +10,12 @@ use crate::device::HERE;
 use crate::error::Result;
 use crate::features::Features;
 use crate::fused::{
-    AbsoluteError, Data, Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, Vae, inputs, positions_backward,
-    slot, with_weights,
+    AbsoluteError, Data, Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Pointed, PointerGrads, Tokens, Vae,
+    inputs, positions_backward, slot, with_weights,
 };
 use crate::gradients::Gradients;
 use crate::kernels::add;
+use crate::layers::Asked;
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
 use crate::values::with_values;
@@ -24,7 +25,12 @@ use std::collections::BTreeMap;
 /// What the decoder's backward pass needs.
 struct Decoded {
     encoder: Encoder,
+    /// what the decoder reads, (b, M, D), or (b, M + 1, D) with the token that is pointed at
     memory: Vec<f32>,
+    /// its positions
+    pos: Vec<f32>,
+    /// what a pointer says, and the tokens before the encoder, (b, M, D)
+    pointed: Option<(Pointed, Vec<f32>)>,
     decoder: Decoder,
     /// after the norm, (b, C, D)
     x: Vec<f32>,
@@ -49,10 +55,11 @@ impl Act {
         let observation = self.tokens.look(&batch.observation, None)?;
         let data = Data::of(&Batch { observation, ..batch.clone() }, self.tokens.layout())?;
         let eps = with_values(eps, <[f32]>::to_vec)?;
+        let asked = self.pointer.as_ref().map(|pointer| pointer.asked("act", batch)).transpose()?;
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass { weights, shape: self.config().shape(), space, rng, packed: None, on_seen: None };
-                self.step(pass, &data, eps, &mut into.views())
+                self.step(pass, (&data, asked.as_ref()), eps, &mut into.views())
             })
         })
     }
@@ -68,11 +75,16 @@ impl Act {
                 let pass = &mut Pass { weights, shape, space, rng: None, packed, on_seen: Some(&mut *on_seen) };
                 let latent = pass.space.pool.zeros(rows * self.config().latent_dim);
                 let tokens = Tokens::new(self.tokens.layout(), (&latent, self.config().latent_dim), &inputs);
-                let Decoded { encoder, memory, decoder, x, actions } = self.decode_fused(pass, rows, &tokens);
+                let Decoded { encoder, memory, pos, pointed, decoder, x, actions } =
+                    self.decode_fused(pass, rows, &tokens);
                 let out = actions.clone();
                 encoder.free(pass);
                 decoder.free(pass);
-                for buffer in [latent, memory, x, actions] {
+                if let Some((pointed, before)) = pointed {
+                    pointed.free(pass);
+                    pass.give(before);
+                }
+                for buffer in [latent, memory, pos, x, actions] {
                     pass.give(buffer);
                 }
                 out
@@ -83,23 +95,33 @@ impl Act {
 
     fn decode_fused(&self, pass: &mut Pass<'_>, rows: usize, tokens: &Tokens<'_>) -> Decoded {
         let x = tokens.forward(pass);
-        let pos = &*tokens.positions(pass);
-        let (memory, encoder) = Encoder::forward(pass, "encoder", self.config().n_encoder_layers, x, pos, None, false);
+        let given = tokens.positions(pass);
+        let mut pos = pass.space.pool.copy(&given);
+        let before = self.pointer.as_ref().map(|pointer| (pointer, pass.space.pool.copy(&x)));
+        let layers = self.config().n_encoder_layers;
+        let (mut memory, encoder) = Encoder::forward(pass, "encoder", layers, x, &given, None, false);
+        let pointed = before.map(|(pointer, before)| {
+            let (beside, pointed) = Pointed::forward(pass, pointer, &memory, &before, rows);
+            pass.give(std::mem::replace(&mut memory, beside));
+            let beside = Pointed::positions(pass, &pos);
+            pass.give(std::mem::replace(&mut pos, beside));
+            (pointed, before)
+        });
         let query_pos = pass.weight("decoder_pos_embed", ".weight");
-        let from = Memory { x: &memory, pos, batch: rows };
+        let from = Memory { x: &memory, pos: &pos, batch: rows };
         let (x, decoder) = Decoder::forward(pass, self.config().n_decoder_layers, query_pos, from);
         let actions = pass.linear("action_head", &x);
-        Decoded { encoder, memory, decoder, x, actions }
+        Decoded { encoder, memory, pos, pointed, decoder, x, actions }
     }
 
-    /// Takes the gradient of the actions, (b, C, A); returns that of the latent, (b, L).
+    /// Takes the gradients of the actions, (b, C, A), and of a pointer's scores; returns that of the latent, (b, L).
     fn decode_backward(
         &self,
         pass: &mut Pass<'_>,
         rows: usize,
         tokens: &Tokens<'_>,
         done: Decoded,
-        grad: &[f32],
+        (grad, scores): (&[f32], Option<&[f32]>),
         grads: &mut Grads<'_>,
     ) -> Vec<f32> {
         let dim = pass.shape.dim;
@@ -107,23 +129,44 @@ impl Act {
         let x = pass.linear_input("action_head", grad, dim);
         let (pos, query_pos) = (&*tokens.positions(pass), pass.weight("decoder_pos_embed", ".weight"));
         let mut memory = pass.space.pool.zeros(done.memory.len());
-        let mut memory_pos = pass.space.pool.zeros(pos.len());
+        let mut memory_pos = pass.space.pool.zeros(done.pos.len());
         let mut query = pass.space.pool.zeros(query_pos.len());
-        let from = Memory { x: &done.memory, pos, batch: rows };
+        let from = Memory { x: &done.memory, pos: &done.pos, batch: rows };
         let mut into = DecoderGrads { memory: &mut memory, memory_pos: &mut memory_pos, query_pos: &mut query };
         done.decoder.backward(pass, x, query_pos, from, &mut into, grads);
-        let x = done.encoder.backward(pass, memory, pos, Some(&mut memory_pos), grads);
+        let mut before_grad = None;
+        if let (Some(pointer), Some((pointed, before))) = (&self.pointer, done.pointed) {
+            Pointed::positions_backward(&memory_pos, dim, grads);
+            memory_pos.truncate(pos.len());
+            let (mut encoded, mut tokens) = (pass.space.pool.zeros(before.len()), pass.space.pool.zeros(before.len()));
+            let into = PointerGrads { encoded: &mut encoded, tokens: &mut tokens };
+            pointed.backward(pass, pointer, &before, &memory, scores, into, grads);
+            pass.give(std::mem::replace(&mut memory, encoded));
+            pass.give(before);
+            before_grad = Some(tokens);
+        }
+        let mut x = done.encoder.backward(pass, memory, pos, Some(&mut memory_pos), grads);
+        if let Some(grad) = before_grad {
+            add(&mut x, &grad);
+            pass.give(grad);
+        }
         positions_backward(tokens.layout(), dim, &memory_pos, grads);
         add(slot(grads, "decoder_pos_embed", ".weight"), &query);
         let latent = tokens.backward(pass, &x, grads);
-        for buffer in [x, memory_pos, query, done.memory, done.x, done.actions] {
+        for buffer in [x, memory_pos, query, done.memory, done.pos, done.x, done.actions] {
             pass.give(buffer);
         }
         latent
     }
 
     /// One shard, forwards and backwards.
-    fn step(&self, pass: &mut Pass<'_>, data: &Data, eps: Vec<f32>, grads: &mut Grads<'_>) -> LossValues {
+    fn step(
+        &self,
+        pass: &mut Pass<'_>,
+        (data, asked): (&Data, Option<&Asked>),
+        eps: Vec<f32>,
+        grads: &mut Grads<'_>,
+    ) -> LossValues {
         let (config, rows) = (self.config(), data.rows);
         let vae = Vae {
             n_layers: config.n_vae_encoder_layers,
@@ -145,10 +188,19 @@ impl Act {
         let into = Some((&mut grad[..], 1.0 / entries));
         let l1 = AbsoluteError::of(&decoded.actions, &data.actions, &data.is_pad, rows, into).total();
         let l1 = (l1 / f64::from(entries)) as f32;
-        let latent_grad = self.decode_backward(pass, rows, &tokens, decoded, &grad, grads);
-        pass.give(grad);
-
         let mut loss = LossValues { total: l1, parts: BTreeMap::from([("l1_loss".to_string(), l1)]) };
+        let mut scores = None;
+        if let (Some(pointer), Some(asked), Some((pointed, _))) = (&self.pointer, asked, &decoded.pointed) {
+            let mut grad = pass.take(pointed.scores.len());
+            let answers = asked.answers(&pointed.scores, Some((&mut grad, pointer.weight)));
+            loss.parts.insert("pointer_loss".to_string(), answers.loss as f32);
+            loss.parts.insert("pointer_right".to_string(), answers.right);
+            loss.total += (answers.loss * pointer.weight) as f32;
+            scores = Some(grad);
+        }
+        let latent_grad = self.decode_backward(pass, rows, &tokens, decoded, (&grad, scores.as_deref()), grads);
+        [grad].into_iter().chain(scores).for_each(|buffer| pass.give(buffer));
+
         if let Some(encoded) = encoded {
             let kld = vae.backward(pass, data, encoded, &latent_grad, config.kl_weight, grads);
             loss.parts.insert("kld_loss".to_string(), kld);

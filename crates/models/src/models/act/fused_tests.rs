@@ -24,12 +24,15 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         ..Default::default()
     };
     let Signatures { plain, no_env, entities, history, .. } = signatures();
+    let pointer = Some(PointerConfig { among: "cube".to_string(), weight: 0.7 });
     let gelu = Config { feedforward_activation: Activation::Gelu, ..base.clone() };
     vec![
         (base.clone(), plain.clone(), 3),
         (Config { pre_norm: true, n_decoder_layers: 2, ..base.clone() }, plain.clone(), 4),
         (base.clone(), entities.clone(), 3),
-        (Config { pre_norm: true, n_decoder_layers: 2, ..base.clone() }, entities, 2),
+        (Config { pre_norm: true, n_decoder_layers: 2, ..base.clone() }, entities.clone(), 2),
+        (Config { pointer: pointer.clone(), ..base.clone() }, entities.clone(), 4),
+        (Config { pointer, pre_norm: true, use_vae: false, ..base.clone() }, entities, 1),
         (base.clone(), history, 4),
         (Config { n_decoder_layers: 3, action_horizon: 17, n_vae_encoder_layers: 1, ..gelu.clone() }, no_env, 2),
         (Config { pre_norm: true, use_vae: false, ..gelu }, plain.clone(), 1),
@@ -142,29 +145,6 @@ fn features_that_act_cannot_read_are_refused_by_name() {
     let expected =
         "config of act: observation is observation.environment_state, expected a feature of kind state among others";
     assert_eq!(error(signature), expected);
-}
-
-/// That points at one of the cubes; each row took one.
-fn pointing(pre_norm: bool) -> (Act, Batch) {
-    let (base, signature, _) = configs().swap_remove(2);
-    let pointer = Some(PointerConfig { among: "cube".to_string(), weight: 0.7 });
-    let act = Act::new(&Config { pre_norm, pointer, ..base }, &signature, 1).unwrap();
-    move_parameters(&act);
-    let cubes = act.config().pointer.as_ref().unwrap().candidates(&signature);
-    let batch = batch(&signature, act.config().action_horizon, 4, 3);
-    let taken = Some((0..4).map(|row| cubes[row % cubes.len()] as u32).collect());
-    (act, Batch { taken, ..batch })
-}
-
-#[test]
-fn the_gradient_of_pointing_is_the_slope_of_the_loss() {
-    for pre_norm in [false, true] {
-        let (act, batch) = pointing(pre_norm);
-        assert!(act.composed_because().unwrap().contains("pointer"));
-        assert_the_gradient_is_the_slope(&act, &batch, &format!("pre-norm {pre_norm}"));
-        let right = act.loss(&batch, &mut Rng::new(0, "loss")).unwrap().parts["pointer_right"].clone();
-        assert!((0.0..=1.0).contains(&right.to_scalar::<f32>().unwrap()));
-    }
 }
 
 #[test]

@@ -198,10 +198,10 @@ impl Act {
             total = (total + (kld * self.config.kl_weight)?)?;
         }
         if let (Some(pointer), Some(pointed)) = (&self.pointer, &output.pointed) {
-            let taken = pointer.taken("act", batch)?;
-            let loss = pointer.loss(pointed, &taken, batch)?;
+            let asked = pointer.asked("act", batch)?;
+            let loss = asked.loss(&pointed.scores)?;
             parts.insert("pointer_loss".to_string(), loss.detach());
-            parts.insert("pointer_right".to_string(), pointer.right(pointed, &taken, batch)?);
+            parts.insert("pointer_right".to_string(), asked.right(&pointed.scores)?);
             total = (total + (loss * pointer.weight)?)?;
         }
         Ok(LossParts { total, parts })
@@ -239,8 +239,7 @@ impl PolicyModel for Act {
     }
 
     fn composed_because(&self) -> Option<String> {
-        let pointer = self.pointer.as_ref().map(|_| "the step by hand does not cover a pointer".to_string());
-        pointer.or_else(|| not_by_hand(&self.signature)).or_else(|| self.tokens.composed_because())
+        not_by_hand(&self.signature).or_else(|| self.tokens.composed_because())
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {

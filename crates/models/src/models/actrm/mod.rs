@@ -493,9 +493,7 @@ impl PolicyModel for Actrm {
     }
 
     fn composed_because(&self) -> Option<String> {
-        let tokens = matches!(self.design, Design::Tokens(_));
-        let design = tokens.then(|| "the step by hand does not cover reasoning.over = \"tokens\"".to_string());
-        design.or_else(|| not_by_hand(&self.signature)).or_else(|| self.tokens.composed_because())
+        not_by_hand(&self.signature).or_else(|| self.tokens.composed_because())
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
@@ -564,10 +562,9 @@ impl PolicyModel for Actrm {
         row_errors.push(errors(&beyond)?.sum((1, 2))?);
 
         if let Design::Tokens(OverTokens { pointer: Some(pointer), .. }) = &self.design {
-            let taken = pointer.taken("actrm", batch)?;
+            let asked = pointer.asked("actrm", batch)?;
             for (pointed, weight) in pointed.iter().zip(self.step_weights(steps)) {
-                let loss = pointer.loss(pointed, &taken, batch)?;
-                let right = pointer.right(pointed, &taken, batch)?;
+                let (loss, right) = (asked.loss(&pointed.scores)?, asked.right(&pointed.scores)?);
                 parts.insert("pointer_loss".to_string(), loss.detach());
                 parts.entry("pointer_right_first".to_string()).or_insert_with(|| right.clone());
                 parts.insert("pointer_right".to_string(), right);

@@ -1,5 +1,6 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
+use crate::batch::Taken;
 use crate::features::{FeatureSpec, Features, Observation, ValuesRef};
 use crate::fused::testing::{assert_the_gradient_is_the_slope, move_parameters, signatures};
 use crate::gradients::ParamLayout;
@@ -504,7 +505,8 @@ fn pointing(change: &dyn Fn(&mut Config)) -> (Actrm, Batch) {
     let cubes: Vec<u32> = (0..signature.observation.len() as u32)
         .filter(|&i| signature.observation[i as usize].group() == "cube")
         .collect();
-    batch.taken = Some((0..6).map(|row| cubes[row % 3]).collect());
+    // of every fourth row it is not asked
+    batch.taken = Some(Taken::new((0..6).map(|row| (row % 4 != 3).then(|| cubes[row % 3])).collect()));
     (model, batch)
 }
 
@@ -530,6 +532,7 @@ fn the_gradient_of_pointing_is_the_slope_of_the_loss() {
 fn a_batch_says_what_was_taken_of_the_candidates() {
     let (model, batch) = pointing(&|_| ());
     let error = |taken: Option<Vec<u32>>| {
+        let taken = taken.map(|taken| Taken::new(taken.into_iter().map(Some).collect()));
         let batch = Batch { taken, ..batch.clone() };
         model.loss(&batch, &mut Rng::new(0, "loss")).unwrap_err().to_string()
     };
@@ -583,7 +586,7 @@ fn one_hop(config: &Config, signature: &Signature, rows: usize, seed: u64) -> Ba
         goal.extend(std::iter::repeat_n(0.0, 4).chain(one_hot(names[first])).chain([0.0]));
         let target = (first + 1) % 4;
         actions.extend(std::iter::repeat_n(places[target], config.action_horizon));
-        taken.push(1 + target as u32);
+        taken.push(Some(1 + target as u32));
     }
     let mut observation = Features::new();
     observation.insert(STATE, ValuesRef::F32(&[0.0; 4096][..rows]));
@@ -593,7 +596,7 @@ fn one_hop(config: &Config, signature: &Signature, rows: usize, seed: u64) -> Ba
     observation.insert("observation.entity.goal", ValuesRef::F32(&goal));
     let is_pad = vec![false; rows * config.action_horizon];
     let batch = Batch::from_slices(signature, config.action_horizon, &observation, &actions, &is_pad).unwrap();
-    Batch { taken: Some(taken), ..batch }
+    Batch { taken: Some(Taken::new(taken)), ..batch }
 }
 
 #[test]

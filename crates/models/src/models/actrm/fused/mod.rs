@@ -4,22 +4,24 @@
 
 mod over_actions;
 mod over_memory;
+mod over_tokens;
 #[cfg(test)]
 mod tests;
 
-use super::{Actrm, Over, WarmStart};
+use super::{Actrm, Design, Over, OverTokens as TokenLayers, WarmStart};
 use crate::batch::Batch;
 use crate::error::Result;
 use crate::features::Features;
-use crate::fused::{AbsoluteError, Data, Grads, Inputs, Pass, Tokens, Vae, inputs, with_weights};
+use crate::fused::{AbsoluteError, Data, Grads, Inputs, Pass, Pointed, Tokens, Vae, inputs, with_weights};
 use crate::gradients::Gradients;
-use crate::layers::Shape;
+use crate::layers::{Asked, Shape};
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
 use crate::values::with_values;
 use candle_core::{Device, Tensor};
 use over_actions::OverActions;
 use over_memory::OverMemory;
+use over_tokens::OverTokens;
 
 /// The recursion's states, or their gradients; `None` is the state that a thought begins with, the same in every row.
 #[derive(Debug, Default)]
@@ -52,7 +54,15 @@ impl<T> Step<T> {
     }
 }
 
-/// One of the two designs, about one shard of observations.
+/// The gradient of what a supervision step answers.
+struct AnswerGrad {
+    /// (b, H, A)
+    chunk: Vec<f32>,
+    /// of a pointer's scores, (b, candidates), if it is asked
+    scores: Option<Vec<f32>>,
+}
+
+/// One of the designs, about one shard of observations.
 trait Recursion<'m>: Sized {
     type Trace;
 
@@ -62,13 +72,18 @@ trait Recursion<'m>: Sized {
     /// Supervision step number `at`, from 0.
     fn step(&self, pass: &mut Pass<'_>, carry: &Carry, at: usize) -> Step<Self::Trace>;
 
-    /// Takes the gradient of the step's chunk, (b, H, A), and of the carry that it left, if that flows; returns that of
+    /// What a step points at.
+    fn pointed(_: &Step<Self::Trace>) -> Option<&Pointed> {
+        None
+    }
+
+    /// Takes the gradient of the step's answer and of the carry that it left, if that flows; returns that of
     /// the carry it began with, if it does.
     fn backward(
         &mut self,
         pass: &mut Pass<'_>,
         step: Step<Self::Trace>,
-        chunk_grad: &[f32],
+        answer_grad: &AnswerGrad,
         carry_grad: Carry,
         grads: &mut Grads<'_>,
     ) -> Carry;
@@ -119,6 +134,13 @@ impl Actrm {
         let batch = &self.looked_at(batch, rng)?;
         let data = Data::of(batch, self.tokens.layout())?;
         let steps = self.steps_of(batch);
+        let asked = match &self.design {
+            Design::Tokens(TokenLayers { pointer: Some(pointer), .. }) => {
+                Some((pointer.asked("actrm", batch)?, pointer.weight))
+            }
+            _ => None,
+        };
+        let asked = asked.as_ref();
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass {
@@ -131,19 +153,19 @@ impl Actrm {
                 };
                 let grads = &mut into.views();
                 match self.config.reasoning.over {
-                    Over::Actions => self.supervise::<OverActions<'_>>(pass, &data, steps, grads),
-                    Over::Memory => self.supervise::<OverMemory<'_>>(pass, &data, steps, grads),
-                    Over::Tokens => unreachable!("its steps are composed"),
+                    Over::Actions => self.supervise::<OverActions<'_>>(pass, (&data, asked), steps, grads),
+                    Over::Memory => self.supervise::<OverMemory<'_>>(pass, (&data, asked), steps, grads),
+                    Over::Tokens => self.supervise::<OverTokens<'_>>(pass, (&data, asked), steps, grads),
                 }
             })
         })
     }
 
-    /// One shard, forwards and backwards.
+    /// One shard, forwards and backwards; what a pointer is asked, and the weight of that.
     fn supervise<'m, R: Recursion<'m>>(
         &'m self,
         pass: &mut Pass<'_>,
-        data: &Data,
+        (data, asked): (&Data, Option<&(Asked, f64)>),
         steps: usize,
         grads: &mut Grads<'_>,
     ) -> LossValues {
@@ -167,7 +189,8 @@ impl Actrm {
         let tokens = Tokens::new(self.tokens.layout(), (&latent, config.latent_dim), &data.inputs);
         let mut recursion = R::observe(self, pass, &tokens, rows);
         let answer = config.reasoning.warm_start.map(|warm| self.warm_answers_fused::<R>(pass, data, warm));
-        let start = match config.reasoning.start_noise > 0.0 {
+        // over tokens the noise is the recursion's own: it is added to what is observed
+        let start = match config.reasoning.start_noise > 0.0 && config.reasoning.over == Over::Actions {
             true => self.noisy_start(pass, rows),
             false => Carry { answer, reasoning: None },
         };
@@ -182,7 +205,7 @@ impl Actrm {
 
         let entries = data.total_entries as f64;
         let mut loss = LossValues::default();
-        let (mut errors, mut chunk_grads) = (Vec::with_capacity(steps + 1), Vec::with_capacity(steps));
+        let (mut errors, mut answer_grads) = (Vec::with_capacity(steps + 1), Vec::with_capacity(steps));
         for (step, weight) in done.iter().zip(self.step_weights(steps)) {
             let mut grad = pass.take(step.chunk.len());
             let into = Some((&mut grad[..], (weight / entries) as f32));
@@ -193,7 +216,16 @@ impl Actrm {
             loss.parts.insert("l1_loss".to_string(), l1);
             loss.parts.entry("l1_loss_first".to_string()).or_insert(l1);
             errors.push(error);
-            chunk_grads.push(grad);
+            let pointed = asked.zip(R::pointed(step)).map(|((asked, share), pointed)| {
+                let (mut grad, share) = (pass.take(pointed.scores.len()), weight * share);
+                let answers = asked.answers(&pointed.scores, Some((&mut grad, share)));
+                loss.total += (answers.loss * share) as f32;
+                loss.parts.insert("pointer_loss".to_string(), answers.loss as f32);
+                loss.parts.entry("pointer_right_first".to_string()).or_insert(answers.right);
+                loss.parts.insert("pointer_right".to_string(), answers.right);
+                grad
+            });
+            answer_grads.push(AnswerGrad { chunk: grad, scores: pointed });
         }
         errors.push(AbsoluteError::of(&beyond.chunk, &data.actions, &data.is_pad, rows, None));
         R::forget(pass, beyond).free(pass);
@@ -216,9 +248,9 @@ impl Actrm {
         loss.total += (halt * config.reasoning.halt_weight) as f32;
 
         let mut carry_grad = Carry::default();
-        for (step, grad) in done.into_iter().zip(chunk_grads).rev() {
+        for (step, grad) in done.into_iter().zip(answer_grads).rev() {
             carry_grad = recursion.backward(pass, step, &grad, carry_grad, grads);
-            pass.give(grad);
+            [grad.chunk].into_iter().chain(grad.scores).for_each(|buffer| pass.give(buffer));
         }
         carry_grad.free(pass);
         start.free(pass);
@@ -305,7 +337,7 @@ impl Actrm {
                 match self.config.reasoning.over {
                     Over::Actions => self.think_with::<OverActions<'_>>(pass, (&inputs, rows), start, on_step),
                     Over::Memory => self.think_with::<OverMemory<'_>>(pass, (&inputs, rows), start, on_step),
-                    Over::Tokens => unreachable!("its thoughts are composed"),
+                    Over::Tokens => self.think_with::<OverTokens<'_>>(pass, (&inputs, rows), start, on_step),
                 }
             })
         })?

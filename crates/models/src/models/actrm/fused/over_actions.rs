@@ -4,7 +4,7 @@
 //! answer once per round; a thought that begins at zero begins with the same tokens in every row, so their projections
 //! in the first round are computed once for the whole batch.
 
-use super::{Carry, Recursion, Step, mean_over_tokens, shaped};
+use super::{AnswerGrad, Carry, Recursion, Step, mean_over_tokens, shaped};
 use crate::fused::{
     BlockLayer, Encoder, Grads, Input, Part, Pass, Tokens, gather, keys_and_values, keys_and_values_backward,
     positions_backward, scatter, slot,
@@ -243,7 +243,7 @@ impl<'m> Recursion<'m> for OverActions<'m> {
         &mut self,
         pass: &mut Pass<'_>,
         step: Step<Round>,
-        chunk_grad: &[f32],
+        answer_grad: &AnswerGrad,
         carry_grad: Carry,
         grads: &mut Grads<'_>,
     ) -> Carry {
@@ -254,16 +254,16 @@ impl<'m> Recursion<'m> for OverActions<'m> {
         shaped(pass, self.inner(), |pass| {
             let dim = pass.shape.dim;
             let answer = carry.answer.as_ref().expect("a step leaves an answer");
-            pass.linear_backward("action_head", answer, chunk_grad, dim, grads);
-            let mut answer_grad = pass.linear_input("action_head", chunk_grad, dim);
+            pass.linear_backward("action_head", answer, &answer_grad.chunk, dim, grads);
+            let mut state_grad = pass.linear_input("action_head", &answer_grad.chunk, dim);
             if let Some(later) = carry_grad.answer {
-                add(&mut answer_grad, &later);
+                add(&mut state_grad, &later);
                 pass.give(later);
             }
             carry.free(pass);
             pass.give(chunk);
             pass.give(read);
-            let after = Carry { answer: Some(answer_grad), reasoning: carry_grad.reasoning };
+            let after = Carry { answer: Some(state_grad), reasoning: carry_grad.reasoning };
             let before = self.round_backward(pass, trace, after, grads);
             if self.config.reasoning.h_cycles == 1 {
                 return before;

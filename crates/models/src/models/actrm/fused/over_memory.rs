@@ -1,6 +1,6 @@
 //! The recursion over the memory, the original's, and ACT's decoder.
 
-use super::{Carry, Recursion, Step, mean_over_tokens, shaped};
+use super::{AnswerGrad, Carry, Recursion, Step, mean_over_tokens, shaped};
 use crate::fused::{Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, positions_backward, slot};
 use crate::kernels::add;
 use crate::layers::{Shape, TokenLayout};
@@ -112,27 +112,27 @@ impl<'m> Recursion<'m> for OverMemory<'m> {
         &mut self,
         pass: &mut Pass<'_>,
         step: Step<Trace>,
-        chunk_grad: &[f32],
+        answer_grad: &AnswerGrad,
         carry_grad: Carry,
         grads: &mut Grads<'_>,
     ) -> Carry {
         let Step { carry, chunk, read, trace: Trace { mut updates, decoder, decoded } } = step;
         let dim = pass.shape.dim;
         let query_pos = pass.weight("decoder_pos_embed", ".weight");
-        pass.linear_backward("action_head", &decoded, chunk_grad, dim, grads);
-        let x = pass.linear_input("action_head", chunk_grad, dim);
+        pass.linear_backward("action_head", &decoded, &answer_grad.chunk, dim, grads);
+        let x = pass.linear_input("action_head", &answer_grad.chunk, dim);
         let answer = carry.answer.as_ref().expect("a step leaves an answer");
-        let mut answer_grad = pass.space.pool.zeros(answer.len());
+        let mut state_grad = pass.space.pool.zeros(answer.len());
         let pos = &self.positions;
         let (mut pos_grad, mut query_grad) = (pass.space.pool.zeros(pos.len()), pass.space.pool.zeros(query_pos.len()));
-        let mut into = DecoderGrads { memory: &mut answer_grad, memory_pos: &mut pos_grad, query_pos: &mut query_grad };
+        let mut into = DecoderGrads { memory: &mut state_grad, memory_pos: &mut pos_grad, query_pos: &mut query_grad };
         let memory = Memory { x: answer, pos, batch: self.rows };
         decoder.backward(pass, x, query_pos, memory, &mut into, grads);
         add(slot(grads, "decoder_pos_embed", ".weight"), &query_grad);
 
         shaped(pass, self.inner(), |pass| {
             let last = updates.pop().expect("a round updates its answer");
-            let mut grad = last.backward(pass, answer_grad, pos, Some(&mut pos_grad), grads);
+            let mut grad = last.backward(pass, state_grad, pos, Some(&mut pos_grad), grads);
             for update in updates.into_iter().rev() {
                 // of the state before and of what was injected alike
                 grad = update.backward(pass, grad, pos, Some(&mut pos_grad), grads);

@@ -5,11 +5,11 @@ use crate::fused::testing::{
     Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
-use crate::layers::Activation;
+use crate::layers::{Activation, PointerConfig};
 use crate::models::actrm::{Config, ReasoningConfig, WarmStart};
 use crate::simd::{Level, at_most};
 
-/// Odd sizes in both designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
+/// Odd sizes in all designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
 fn configs() -> Vec<(Config, Signature, usize)> {
     let Signatures { plain, no_env, entities, history, .. } = signatures();
     let base = Config {
@@ -37,6 +37,12 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         change(&mut reasoning);
         Config { reasoning, ..base.clone() }
     };
+    let tokens = |pointer: bool, change: &dyn Fn(&mut ReasoningConfig)| {
+        let mut reasoning = ReasoningConfig { over: Over::Tokens, supervision_steps: 3, ..Default::default() };
+        change(&mut reasoning);
+        let pointer = pointer.then(|| PointerConfig { among: "cube".to_string(), weight: 0.7 });
+        Config { reasoning, pointer, ..base.clone() }
+    };
     let warm = Some(WarmStart { noise: 0.1 });
     let gelu = Activation::Gelu;
     vec![
@@ -45,6 +51,11 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         (reasoning(&|_| ()), history.clone(), 2),
         (reasoning(&|r| (r.untied, r.n_layers, r.h_cycles, r.l_cycles) = (true, 2, 2, 2)), entities.clone(), 3),
         (reasoning(&|r| (r.start_noise, r.deep_supervision) = (0.7, false)), plain.clone(), 3),
+        (tokens(true, &|_| ()), entities.clone(), 4),
+        (tokens(true, &|r| (r.untied, r.n_layers, r.l_cycles) = (true, 2, 2)), entities.clone(), 3),
+        (tokens(true, &|r| (r.start_noise, r.deep_supervision) = (0.7, false)), entities.clone(), 3),
+        (Config { n_decoder_layers: 2, ..tokens(false, &|r| r.dim_feedforward = Some(7)) }, history.clone(), 2),
+        (Config { use_vae: false, ..tokens(true, &|r| r.n_layers = 2) }, entities.clone(), 2),
         (memory(&|r| r.supervision_steps = 2), entities, 2),
         (memory(&|_| ()), history, 2),
         (
@@ -76,17 +87,18 @@ fn model(config: &Config, signature: &Signature) -> Actrm {
     model
 }
 
-/// With pictures, in both designs; their network has too many kinks for slopes.
+/// With pictures, in all designs; their network has too many kinks for slopes.
 fn seeing() -> Vec<(Config, Signature, usize)> {
     let all = configs();
-    let of = |over: Over| all.iter().find(|(config, ..)| config.reasoning.over == over && config.use_vae);
-    let designs = [Over::Actions, Over::Memory].into_iter().filter_map(of);
+    let plain = |config: &Config| config.use_vae && config.pointer.is_none();
+    let of = |over: Over| all.iter().find(|(config, ..)| config.reasoning.over == over && plain(config));
+    let designs = [Over::Actions, Over::Memory, Over::Tokens].into_iter().filter_map(of);
     designs.map(|(config, ..)| (Config { vision: Some(eyes()), ..config.clone() }, signatures().pictures, 2)).collect()
 }
 
 #[test]
 fn the_fused_step_is_the_composed_one_with_dropout() {
-    assert_eq!(seeing().len(), 2);
+    assert_eq!(seeing().len(), 3);
     for (config, signature, rows) in configs().into_iter().chain(seeing()) {
         let model = model(&config, &signature);
         for seed in [3, 4] {
