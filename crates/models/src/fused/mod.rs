@@ -11,6 +11,8 @@ mod decoder;
 mod encoder;
 mod feed_forward;
 mod loss;
+mod lstm;
+mod mixture;
 mod observation;
 mod pointer;
 #[cfg(test)]
@@ -22,6 +24,8 @@ pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_an
 pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::{Encoder, EncoderLayer};
 pub(crate) use loss::AbsoluteError;
+pub(crate) use lstm::Lstm;
+pub(crate) use mixture::{Wanted, likelihood};
 pub(crate) use observation::{Data, Inputs, Tokens, inputs, positions_backward, uncovered};
 pub(crate) use pointer::{Pointed, PointerGrads};
 pub(crate) use vae::Vae;

@@ -89,13 +89,14 @@ struct Cell;
 
 /// From one exponential that cannot overflow.
 #[inline(always)]
-fn sigmoid(x: f32) -> f32 {
+pub(crate) fn sigmoid(x: f32) -> f32 {
     let w = exp(-x.abs());
     if x < 0.0 { w / (1.0 + w) } else { 1.0 / (1.0 + w) }
 }
 
+/// Likewise.
 #[inline(always)]
-fn tanh(x: f32) -> f32 {
+pub(crate) fn tanh(x: f32) -> f32 {
     let w = exp(-2.0 * x.abs());
     let t = (1.0 - w) / (1.0 + w);
     if x < 0.0 { -t } else { t }

@@ -28,6 +28,7 @@ pub use group_norm::GroupNorm;
 pub use layer_norm::LayerNorm;
 pub use linear::Linear;
 pub use lstm::{Lstm, LstmState};
+pub(crate) use lstm::{sigmoid, tanh};
 pub use mish::mish;
 pub use mixture::{Mixture, MixtureHead};
 pub use pointer::PointerConfig;

@@ -14,9 +14,13 @@
 //! range (`normalisation.action = "min_max"`).
 //!
 //! What it costs: one product a step and layer for the recurrence, one a layer for all that comes from below; the cell is by
-//! hand (`layers/lstm.rs`), the rest on candle's autograd.
+//! hand (`layers/lstm.rs`).
+//!
+//! This file is the model as one reads it, on candle's autograd. Training steps run the same maths with hand-written backward
+//! passes (`fused.rs`); tests hold the two together.
 
 mod config;
+mod fused;
 
 pub use config::Config;
 
@@ -25,9 +29,11 @@ use crate::checks::{check_batch, check_observation};
 use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Observation, Signature};
+use crate::fused::Workspaces;
+use crate::gradients::Gradients;
 use crate::layers::{Lstm, LstmState, Mixture, MixtureHead};
 use crate::losses::absolute;
-use crate::model::{LossParts, PolicyModel};
+use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
 use crate::params::Params;
 use crate::policy::{ActionChunk, Clock, Policy};
 use crate::preprocess::Preprocess;
@@ -47,6 +53,7 @@ pub struct BcRnn {
     params: Params,
     rnn: Lstm,
     head: MixtureHead,
+    workspaces: Workspaces,
 }
 
 impl BcRnn {
@@ -68,7 +75,14 @@ impl BcRnn {
         let rnn = Lstm::new(&mut p, "rnn", (width, config.hidden_dim, config.n_layers), rng)?;
         let sizes = (config.hidden_dim, config.n_modes, signature.action_dim);
         let head = MixtureHead::new(&mut p, "decoder", sizes, config.min_std, rng)?;
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, rnn, head })
+        Ok(Self {
+            config: config.clone(),
+            signature: signature.clone(),
+            params: p,
+            rnn,
+            head,
+            workspaces: Workspaces::default(),
+        })
     }
 
     /// The signature's features, (b, T, …) each -> (b, T, everything of a step)
@@ -98,17 +112,24 @@ impl BcRnn {
     }
 }
 
+/// Which step of a row stands at place `step` once the padding that the row begins with is moved to its end, and 1 if it is real,
+/// else 0. is_pad: (T)
+fn beginnings(is_pad: &[f32], step: usize) -> (usize, f32) {
+    let before = is_pad.iter().take_while(|&&p| p != 0.0).count();
+    let at = (step + before).min(is_pad.len() - 1);
+    (at, if step + before < is_pad.len() { 1.0 - is_pad[at] } else { 0.0 })
+}
+
 /// For every step of every row the one that takes its place once the padding that a row begins with is moved to its end,
 /// and 1 if it is real, else 0. is_pad: (b, T) -> b*T indices, b*T weights
 fn real_first(is_pad: &Tensor) -> Result<(Tensor, Tensor)> {
     let (rows, steps) = is_pad.dims2()?;
     let (mut from, mut real) = (Vec::with_capacity(rows * steps), Vec::with_capacity(rows * steps));
     for (row, pad) in is_pad.to_vec2::<f32>()?.iter().enumerate() {
-        let before = pad.iter().take_while(|&&p| p != 0.0).count();
         for step in 0..steps {
-            let at = (step + before).min(steps - 1);
+            let (at, is_real) = beginnings(pad, step);
             from.push((row * steps + at) as u32);
-            real.push(if step + before < steps { 1.0 - pad[at] } else { 0.0 });
+            real.push(is_real);
         }
     }
     let count = rows * steps;
@@ -125,7 +146,15 @@ impl PolicyModel for BcRnn {
     }
 
     fn composed_because(&self) -> Option<String> {
-        Some("bc_rnn has no step by hand".to_string())
+        not_by_hand(&self.signature)
+    }
+
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        check_batch("bc_rnn", &self.signature, self.config.action_horizon, batch)?;
+        match self.composed_because() {
+            Some(_) => autograd(self, batch, rng, into),
+            None => self.fused_gradients(batch, into),
+        }
     }
 
     fn loss(&self, batch: &Batch, _rng: &mut Rng) -> Result<LossParts> {

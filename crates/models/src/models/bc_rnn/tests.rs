@@ -1,6 +1,8 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
+use crate::fused::testing::{
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients, signatures,
+};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
@@ -24,6 +26,39 @@ fn the_gradient_is_the_slope_of_the_loss() {
     for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }] {
         let model = BcRnn::new(&config, &signature, 1).unwrap();
         assert_the_gradient_is_the_slope(&model, &padded_before(&signature, 4), &format!("{config:?}"));
+    }
+}
+
+#[test]
+fn the_step_by_hand_is_the_composed_one() {
+    let signature = signatures().history;
+    let other = Config { n_layers: 3, hidden_dim: 17, n_modes: 5, ..small() };
+    for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }, other] {
+        let model = BcRnn::new(&config, &signature, 1).unwrap();
+        assert!(model.composed_because().is_none());
+        for rows in [1, 5] {
+            assert_the_step_is_the_composed_one(&model, &padded_before(&signature, rows), &format!("{config:?}"));
+        }
+    }
+    // sequences of one step
+    let signature = Signature { n_obs_steps: 1, ..signature };
+    let config = Config { action_horizon: 1, ..small() };
+    let model = BcRnn::new(&config, &signature, 1).unwrap();
+    assert_the_step_is_the_composed_one(&model, &batch(&signature, 1, 4, 3), "one step");
+}
+
+#[test]
+fn steps_need_no_more_memory_than_the_first() {
+    let signature = signatures().history;
+    let model = BcRnn::new(&small(), &signature, 1).unwrap();
+    let batch = padded_before(&signature, 4);
+    let held = || {
+        gradients(&model, &batch);
+        model.workspaces.with(|space| space.pool.numbers())
+    };
+    let first = held();
+    for _ in 0..3 {
+        assert_eq!(held(), first);
     }
 }
 
