@@ -8,6 +8,9 @@
 //! Deviations: one dropout for tokens, attention and outputs; a window ends with its frame in the loss, where robomimic's may
 //! end with repeats of an episode's last one. No goals, no supervision of all steps, no sinusoidal positions. The means lie
 //! in -1 to 1, so that actions have to be normalised by their range (`normalisation.action = "min_max"`).
+//!
+//! What it costs: of the last block only the last step is computed beyond keys and values, because nothing else is read
+//! (robomimic computes all of it).
 
 mod config;
 
@@ -84,20 +87,26 @@ impl Block {
         })
     }
 
-    /// x: (b, T, D), mask: (T, T), 0 where a step may look and very negative elsewhere -> (b, T, D)
-    fn forward(&self, x: &Tensor, mask: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
+    /// x: (b, T, D), mask: (T, T), 0 where a step may look and very negative elsewhere -> (b, T, D), or (b, 1, D) without
+    /// a mask: the last step alone, which may look everywhere
+    fn forward(&self, x: &Tensor, mask: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
         let (b, steps, dim) = x.dims3()?;
         let head = dim / self.n_heads;
         let qkv = self.qkv.forward(&self.ln1.forward(x)?)?;
-        let part = |i: usize| -> Result<Tensor> {
-            let part = qkv.narrow(2, i * dim, dim)?.reshape((b, steps, self.n_heads, head))?;
+        let part = |i: usize, of: &Tensor| -> Result<Tensor> {
+            let part = of.narrow(2, i * dim, dim)?.reshape((b, (), self.n_heads, head))?;
             Ok(part.transpose(1, 2)?.contiguous()?)
         };
-        let (q, k, v) = (part(0)?, part(1)?, part(2)?);
-        let scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (head as f64).sqrt()))?.broadcast_add(mask)?;
+        let computed = if mask.is_some() { steps } else { 1 };
+        let last = |x: &Tensor| -> Result<Tensor> { Ok(x.narrow(1, steps - computed, computed)?) };
+        let (q, k, v) = (part(0, &last(&qkv)?)?, part(1, &qkv)?, part(2, &qkv)?);
+        let mut scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (head as f64).sqrt()))?;
+        if let Some(mask) = mask {
+            scores = scores.broadcast_add(mask)?;
+        }
         let weights = self.dropout.forward(&masked_softmax(&scores, None)?, mode)?;
-        let mixed = weights.matmul(&v)?.transpose(1, 2)?.reshape((b, steps, dim))?;
-        let x = (x + self.dropout.forward(&self.output.forward(&mixed)?, mode)?)?;
+        let mixed = weights.matmul(&v)?.transpose(1, 2)?.reshape((b, computed, dim))?;
+        let x = (last(x)? + self.dropout.forward(&self.output.forward(&mixed)?, mode)?)?;
         let inner = self.mlp[0].forward(&self.ln2.forward(&x)?)?.gelu_erf()?;
         let outer = self.dropout.forward(&self.mlp[1].forward(&inner)?, mode)?;
         Ok((x + outer)?)
@@ -157,11 +166,10 @@ impl BcTransformer {
         let mut x = self.dropout.forward(&self.embed_ln.forward(&x)?, mode)?;
         let mask: Vec<f32> = (0..steps * steps).map(|i| if i % steps > i / steps { -1e30 } else { 0.0 }).collect();
         let mask = Tensor::from_vec(mask, (steps, steps), &HERE)?;
-        for block in &self.blocks {
-            x = block.forward(&x, &mask, mode)?;
+        for (i, block) in self.blocks.iter().enumerate() {
+            x = block.forward(&x, Some(&mask).filter(|_| i + 1 < self.blocks.len()), mode)?;
         }
-        let last = x.narrow(1, steps - 1, 1)?.squeeze(1)?;
-        self.head.forward(&self.output_ln.forward(&last)?)
+        self.head.forward(&self.output_ln.forward(&x.squeeze(1)?)?)
     }
 
     /// The loss of these mixtures, one a row of the batch.
