@@ -107,8 +107,25 @@ impl WorkerSpec {
             command.env(name, "1");
         }
         command.env("PYTHONHASHSEED", "0");
+        if std::env::var_os(BLAS_KERNELS).is_none() && has_haswells_kernels() {
+            command.env(BLAS_KERNELS, "Haswell");
+        }
         command
     }
+}
+
+/// Which kernels OpenBLAS, numpy's linear algebra, runs. Left to itself it takes those of the processor, whose last bits differ: an
+/// orientation of robosuite's then comes with the other sign, and an episode ends otherwise on another machine. A user's own
+/// choice stays.
+const BLAS_KERNELS: &str = "OPENBLAS_CORETYPE";
+
+/// Whether the kernels for AVX2 run here, which all x86-64 processors of the last ten years have in common.
+fn has_haswells_kernels() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    let has = std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma");
+    #[cfg(not(target_arch = "x86_64"))]
+    let has = false;
+    has
 }
 
 /// Where the library of the compiled control loop lies, of a program that is not ours.
