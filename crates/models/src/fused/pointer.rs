@@ -82,8 +82,7 @@ impl Pointed {
         pass: &mut Pass<'_>,
         pointer: &Pointer,
         tokens: &[f32],
-        beside: &[f32],
-        scores: Option<&[f32]>,
+        (beside, scores): (&[f32], Option<&[f32]>),
         into: PointerGrads<'_>,
         grads: &mut Grads<'_>,
     ) {

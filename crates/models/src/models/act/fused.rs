@@ -140,7 +140,7 @@ impl Act {
             memory_pos.truncate(pos.len());
             let (mut encoded, mut tokens) = (pass.space.pool.zeros(before.len()), pass.space.pool.zeros(before.len()));
             let into = PointerGrads { encoded: &mut encoded, tokens: &mut tokens };
-            pointed.backward(pass, pointer, &before, &memory, scores, into, grads);
+            pointed.backward(pass, pointer, &before, (&memory, scores), into, grads);
             pass.give(std::mem::replace(&mut memory, encoded));
             pass.give(before);
             before_grad = Some(tokens);

@@ -134,7 +134,8 @@ impl<'m> Recursion<'m> for OverTokens<'m> {
             Pointed::positions_backward(&pos_grad, dim, grads);
             let mut encoded = pass.space.pool.zeros(self.memory.len());
             let into = PointerGrads { encoded: &mut encoded, tokens: &mut self.memory_grad };
-            pointed.backward(pass, pointer, &self.memory, &read_grad, answer_grad.scores.as_deref(), into, grads);
+            let of_answer = (&read_grad[..], answer_grad.scores.as_deref());
+            pointed.backward(pass, pointer, &self.memory, of_answer, into, grads);
             pass.give(std::mem::replace(&mut read_grad, encoded));
         }
         norm.backward(pass, "reasoning.norm", &mut read_grad, grads);
