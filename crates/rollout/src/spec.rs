@@ -114,9 +114,9 @@ impl WorkerSpec {
     }
 }
 
-/// Which kernels OpenBLAS, numpy's linear algebra, runs. Left to itself it takes those of the processor, whose last bits differ: an
-/// orientation of robosuite's then comes with the other sign, and an episode ends otherwise on another machine. A user's own
-/// choice stays.
+/// Which kernels OpenBLAS, numpy's linear algebra, runs. Left to itself it takes those of the processor, whose last bits differ (an
+/// orientation that robosuite takes from an eigenvector may then come with the other sign): episodes of NutAssemblySquare ended
+/// otherwise on another machine. A user's own choice stays.
 const BLAS_KERNELS: &str = "OPENBLAS_CORETYPE";
 
 /// Whether the kernels for AVX2 run here, which all x86-64 processors of the last ten years have in common.
