@@ -112,14 +112,21 @@ fn part_of_a_finished_evaluation_can_be_run_again() {
     // under another version of what was there: run, compared, and told
     let record = result(&entries.join("results"), "lift-act").join("evaluation.json");
     let text = fs::read_to_string(&record).expect("a record");
-    let numpy = text.split("\"numpy\": \"").nth(1).and_then(|rest| rest.split('"').next()).expect("numpy's version");
+    let value = |name: &str| {
+        let rest = text.split(&format!("\"{name}\": \"")).nth(1).and_then(|rest| rest.split('"').next());
+        rest.unwrap_or_else(|| panic!("no {name} in {text}"))
+    };
+    let (numpy, kernels) = (value("numpy"), value("kernels"));
     let changed = text.replace(&format!("\"numpy\": \"{numpy}\""), "\"numpy\": \"1.0.0\"");
+    let changed = changed.replace(kernels, "openblas Other");
     fs::write(&record, changed).expect("writable");
     fs::remove_file(record.with_file_name("seal.json")).expect("results made before seals have none");
     let output = succeeds(&mut eval(&entries, "2", &["--again"]));
     assert!(String::from_utf8_lossy(&output.stdout).contains("every outcome the same"));
     let note = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(note.contains("numpy 1.0.0") && note.contains(numpy), "{note}");
+    for told in ["numpy 1.0.0", numpy, "kernels openblas Other", kernels] {
+        assert!(note.contains(told), "{told}: {note}");
+    }
 }
 
 #[test]

@@ -45,6 +45,7 @@ pub(crate) fn sample(name: &str, version: u32, count: u64) -> EvaluationRecord {
         seeds: Seeds { start: 10_000, count },
         shard: None,
         versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),
+        kernels: None,
     }
 }
 

@@ -1,7 +1,7 @@
 //! What workers said of themselves the last time: enough to know what an evaluation would be called, without starting one.
 //!
 //! Remembered in the cache folder, under a name that holds everything a greeting depends on: the harness, the
-//! interpreter, its versions of the simulator and of what that stands on, the task and the control loop. An environment
+//! interpreter, its versions of the simulator and of what that stands on, the task, the control loop and what was said of the kernels. An environment
 //! module of the user's may say something else every time; workers that load one are not remembered.
 
 use std::ffi::OsString;
@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 use crate::files::write_atomic;
 use crate::harness::cache_folder;
 use crate::message::Ready;
-use crate::spec::WorkerSpec;
+use crate::spec::{BLAS_KERNELS, WorkerSpec};
 
 /// The greeting that workers of `spec` would give, if they gave it before and nothing that it depends on has changed.
 pub fn remembered_greeting(spec: &WorkerSpec) -> Option<Ready> {
@@ -37,9 +37,11 @@ fn path(spec: &WorkerSpec) -> Option<PathBuf> {
         return None;
     }
     let mut hasher = Sha256::new();
-    let control = std::env::var_os("ACTRM_CONTROL_LIB").unwrap_or_default();
+    let variable = |name: &str| std::env::var_os(name).unwrap_or_default();
+    let (control, kernels) = (variable("ACTRM_CONTROL_LIB"), variable(BLAS_KERNELS));
     let env_args: OsString = spec.env_args.as_ref().map(ToString::to_string).unwrap_or_default().into();
-    let parts = [spec.harness.as_os_str(), spec.python.path.as_os_str(), &control, spec.task.as_ref(), &env_args];
+    let parts =
+        [spec.harness.as_os_str(), spec.python.path.as_os_str(), &control, &kernels, spec.task.as_ref(), &env_args];
     for part in parts.iter().map(|part| part.as_encoded_bytes()).chain([spec.control.as_str().as_bytes()]) {
         hasher.update((part.len() as u64).to_le_bytes());
         hasher.update(part);

@@ -87,6 +87,10 @@ pub struct Ready {
     /// What an episode passes before the task is solved, in order, where that is known.
     #[serde(default)]
     pub stages: Vec<String>,
+    /// Which kernels the worker's linear algebra runs, such as `openblas Haswell`, where that can be told: the last bits of
+    /// what is computed depend on them.
+    #[serde(default)]
+    pub kernels: Option<String>,
     /// robomimic's `env_args` of this environment.
     #[serde(default)]
     pub env_args: serde_json::Value,

@@ -117,7 +117,7 @@ impl WorkerSpec {
 /// Which kernels OpenBLAS, numpy's linear algebra, runs. Left to itself it takes those of the processor, whose last bits differ (an
 /// orientation that robosuite takes from an eigenvector may then come with the other sign): episodes of NutAssemblySquare ended
 /// otherwise on another machine. A user's own choice stays.
-const BLAS_KERNELS: &str = "OPENBLAS_CORETYPE";
+pub(crate) const BLAS_KERNELS: &str = "OPENBLAS_CORETYPE";
 
 /// Whether the kernels for AVX2 run here, which all x86-64 processors of the last ten years have in common.
 fn has_haswells_kernels() -> bool {
@@ -175,5 +175,23 @@ impl Default for TimeLimits {
             step: Duration::from_secs(30),
             episode: Duration::from_secs(300),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn workers_run_one_set_of_kernels_unless_the_user_chose_another() {
+        let spec = WorkerSpec::new(
+            Python { path: "python".into(), origin: "--python".into() },
+            PathBuf::from("harness"),
+            "Lift",
+        );
+        let command = spec.command();
+        let set = command.get_envs().find(|(name, _)| *name == BLAS_KERNELS).and_then(|(_, value)| value);
+        let chosen = std::env::var_os(BLAS_KERNELS).is_some();
+        assert_eq!(set, (!chosen && has_haswells_kernels()).then(|| "Haswell".as_ref()));
     }
 }

@@ -98,7 +98,7 @@ pub fn finished(
 ) -> Result<Option<StoredEvaluation>, ZooError> {
     let record = subject.record(ready, options)?;
     let stored = StoredEvaluation::read_if_there(&results.join(record.folder_name()))?;
-    Ok(stored.filter(|stored| stored.record == record))
+    Ok(stored.filter(|stored| stored.record.is_same(&record)))
 }
 
 /// Runs the episodes that have no outcome yet on `pool` and puts each on disk when it is done.

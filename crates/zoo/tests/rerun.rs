@@ -90,6 +90,7 @@ fn result(zoo: &Path, entry: &Entry) -> StoredEvaluation {
         seeds: Seeds { start: 10_000, count: 1 },
         shard: None,
         versions: [("mujoco".to_owned(), "3.3.7".to_owned())].into(),
+        kernels: None,
     };
     let mut folder = ResultsFolder::open(&zoo.join("results"), &record).unwrap();
     let episode = EpisodeRecord {

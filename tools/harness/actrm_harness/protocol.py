@@ -33,6 +33,8 @@ class Ready:
     stages: list[str]
     """What an episode passes before the task is solved, in order, where that is known."""
     env_args: dict[str, Any]
+    kernels: str | None = None
+    """Which kernels numpy's linear algebra runs, where that can be told: the last bits depend on them."""
 
 
 @dataclass(frozen=True, slots=True)

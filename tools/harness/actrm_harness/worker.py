@@ -149,6 +149,7 @@ def describe(args: argparse.Namespace, simulation: Simulation) -> protocol.Ready
         action_high=found.action_high.tolist(),
         observations=found.observations,
         stages=found.stages,
+        kernels=found.kernels,
         env_args=arguments,
     )
 

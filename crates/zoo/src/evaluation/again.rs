@@ -90,8 +90,8 @@ pub fn evaluate_again(
         again.sealed = true;
     }
     let lacks = |episodes: &[EpisodeRecord]| episodes.iter().any(|episode| episode.progress.is_none());
-    if every && stored.record == record && lacks(&stored.episodes) && !lacks(&ran) {
-        ResultsFolder::open(results, &record)?.rewrite(ran)?;
+    if every && stored.record.is_same(&record) && lacks(&stored.episodes) && !lacks(&ran) {
+        ResultsFolder::open(results, &stored.record)?.rewrite(ran)?;
         again.progress = true;
     }
     Ok(again)
@@ -124,10 +124,13 @@ fn find(results: &Path, record: &EvaluationRecord) -> Result<StoredEvaluation, Z
     })
 }
 
-/// Versions that are not the same: name, stored and now.
+/// Versions that are not the same: name, stored and now; kernels, too, where they were told.
 pub(crate) fn differences(stored: &EvaluationRecord, now: &EvaluationRecord) -> Vec<(String, String, String)> {
     let names = stored.versions.keys().chain(now.versions.keys().filter(|name| !stored.versions.contains_key(*name)));
     let of =
         |record: &EvaluationRecord, name: &str| record.versions.get(name).cloned().unwrap_or_else(|| "none".into());
-    names.map(|name| (name.clone(), of(stored, name), of(now, name))).filter(|(_, stored, now)| stored != now).collect()
+    let kernels = stored.kernels.clone().zip(now.kernels.clone());
+    let kernels = kernels.map(|(stored, now)| ("kernels".to_owned(), stored, now));
+    let all = names.map(|name| (name.clone(), of(stored, name), of(now, name))).chain(kernels);
+    all.filter(|(_, stored, now)| stored != now).collect()
 }

@@ -84,6 +84,7 @@ impl Subject<'_> {
             seeds: options.seeds,
             shard: options.shard,
             versions: ready.versions.clone(),
+            kernels: ready.kernels.clone(),
         })
     }
 

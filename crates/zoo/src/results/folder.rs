@@ -176,11 +176,12 @@ impl ResultsFolder {
             Err(TryLockError::Error(error)) => return Err(ZooError::io("lock", &path)(error)),
         }
         sweep(&folder)?;
+        let mut own = record.clone();
         if folder.join(RECORD).exists() {
             let found = read_record(&folder)?;
             // the folder's name pins what decides outcomes; the rest is the entry's story, which may
             // not change for one entry hash either
-            if found != *record {
+            if !found.is_same(record) {
                 return Err(ZooError::ResultsDiffer {
                     folder,
                     what: RECORD.to_owned(),
@@ -188,6 +189,7 @@ impl ResultsFolder {
                     found: json(record),
                 });
             }
+            own = found;
         } else {
             let mut text = serde_json::to_vec_pretty(record).expect("plain fields are always JSON");
             text.push(b'\n');
@@ -209,7 +211,7 @@ impl ResultsFolder {
                 (done, Some(journal.map_err(ZooError::io("open", &path))?))
             }
         };
-        Ok(Self { folder, record: record.clone(), journal, done, torn: false, _lock: lock })
+        Ok(Self { folder, record: own, journal, done, torn: false, _lock: lock })
     }
 
     /// Where it is.
@@ -249,7 +251,7 @@ impl ResultsFolder {
                     shard: self.record.shard,
                     ..record.clone()
                 };
-                seeds(other) == self.record
+                seeds(other).is_same(&self.record)
             };
             if !read_record(&folder).is_ok_and(|other| same(&other)) {
                 continue;

@@ -70,6 +70,7 @@ fn difference(a: &EvaluationRecord, b: &EvaluationRecord) -> Option<(&'static st
         ("entry", text(&a.entry), text(&b.entry)),
         ("protocol", text(&a.protocol), text(&b.protocol)),
         ("versions", text(&a.versions), text(&b.versions)),
+        ("kernels", text(&a.kernels), text(&b.kernels)),
         ("execution", text(&a.execution), text(&b.execution)),
         ("seeds", text(&a.seeds), text(&b.seeds)),
         ("training", text(&a.training), text(&b.training)),

@@ -212,6 +212,10 @@ pub struct EvaluationRecord {
     pub shard: Option<Shard>,
     /// Versions of the simulator and what it stands on.
     pub versions: BTreeMap<String, String>,
+    /// Which kernels numpy's linear algebra ran, such as `openblas Haswell`, where that was told. Outcomes
+    /// can depend on them, so workers run one set everywhere unless the user chose another.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub kernels: Option<String>,
 }
 
 impl EvaluationRecord {
@@ -222,6 +226,12 @@ impl EvaluationRecord {
     pub fn own_seeds(&self) -> Vec<u64> {
         let mine = |k: u64| self.shard.is_none_or(|shard| k % shard.count == shard.index - 1);
         self.seeds.iter().filter(|seed| mine(seed - self.seeds.start)).collect()
+    }
+
+    /// Whether both are of one evaluation. Kernels that only one of them tells, being older, tell nothing.
+    pub fn is_same(&self, other: &Self) -> bool {
+        let kernels = self.kernels.as_ref().zip(other.kernels.as_ref()).is_none_or(|(one, two)| one == two);
+        kernels && Self { kernels: None, ..self.clone() } == Self { kernels: None, ..other.clone() }
     }
 
     /// Eight hexadecimal digits, the same for evaluations that differ in nothing but their seeds: an episode of one seed is
@@ -374,6 +384,7 @@ pub(crate) mod tests {
             seeds: Seeds { start: 10_000, count },
             shard: None,
             versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),
+            kernels: None,
         }
     }
 
@@ -410,6 +421,18 @@ pub(crate) mod tests {
         }
         assert!(seeds(10, 5).overlap(&seeds(14, 1)) && seeds(14, 1).overlap(&seeds(10, 5)));
         assert!(!seeds(10, 5).overlap(&seeds(15, 5)) && !seeds(10, 0).overlap(&seeds(5, 10)));
+    }
+
+    #[test]
+    fn kernels_that_only_one_tells_are_no_difference() {
+        let old = sample("a", 1, 20);
+        let with = |kernels: &str| EvaluationRecord { kernels: Some(kernels.into()), ..old.clone() };
+        assert!(old.is_same(&with("openblas Haswell")) && with("openblas Haswell").is_same(&old));
+        assert!(with("openblas Haswell").is_same(&with("openblas Haswell")));
+        assert!(!with("openblas Haswell").is_same(&with("openblas Zen")));
+        assert!(!old.is_same(&EvaluationRecord { demonstrated: true, ..with("openblas Zen") }));
+        // they are one evaluation's, whoever tells
+        assert_eq!(old.folder_name(), with("openblas Zen").folder_name());
     }
 
     #[test]

@@ -45,6 +45,8 @@ class Description:
     """SHA-256 of the environment's arguments, where they are not the task's usual ones."""
     stages: list[str] = field(default_factory=list[str])
     """What an episode passes before the task is solved, in order, where that is known."""
+    kernels: str | None = None
+    """Which kernels numpy's linear algebra runs, where that can be told."""
 
 
 @dataclass(frozen=True, slots=True)

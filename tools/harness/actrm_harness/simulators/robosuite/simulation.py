@@ -2,12 +2,19 @@
 
 import platform
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
 from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped, Stored
 from actrm_harness.simulators.robosuite import control, envs, episodes, suite
 from actrm_harness.wire import Array
+
+try:
+    from threadpoolctl import threadpool_info
+except ImportError:
+    # another Python than ours, with a robosuite of its own
+    threadpool_info = None
 
 
 @dataclass(slots=True)
@@ -46,6 +53,7 @@ class Robosuite:
             env_args=self.session.env_args,
             unusual=self.session.unusual,
             stages=[name for name, _ in self.session.stages],
+            kernels=kernels(),
         )
 
     def reset(self, seed: int, demonstration: bool) -> Initial:
@@ -73,3 +81,10 @@ class Robosuite:
     def image(self, camera: str, height: int, width: int) -> Array:
         """What a camera sees now."""
         return envs.image(self.session, camera, height, width)
+
+
+def kernels() -> str | None:
+    """The kernels that the loaded linear algebra runs, such as `openblas Haswell`; None where that cannot be told."""
+    loaded = [] if threadpool_info is None else cast("list[dict[str, Any]]", threadpool_info())
+    found = {f"{one['internal_api']} {one['architecture']}" for one in loaded if one.get("architecture")}
+    return ", ".join(sorted(found)) or None
