@@ -11,7 +11,7 @@ from actrm_harness.simulators.robosuite import control, envs, episodes, suite
 from actrm_harness.wire import Array
 
 try:
-    from threadpoolctl import threadpool_info
+    from threadpoolctl import threadpool_info  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 except ImportError:
     # another Python than ours, with a robosuite of its own
     threadpool_info = None
