@@ -55,6 +55,31 @@ fn killed_and_run_again_it_writes_the_same_bytes_and_leaves_nothing_else() {
 }
 
 #[test]
+fn which_expert_recorded_demonstrations_goes_with_them() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (file, set) = (folder.path().join("towers.hdf5"), folder.path().join("set"));
+    let one = |task: &str, expert: &str| {
+        let mut command = data(["collect", "--task", task, "--episodes", "1", "--expert", expert, "--workers", "1"]);
+        command.args(["--out", text(&file)]);
+        command
+    };
+    refused(&mut one("Lift", "recoveries"), &["Lift", "recoveries", "known: none"]);
+    succeeds(&mut one("StackColor", "recoveries"));
+    succeeds(&mut data(["convert", text(&file), text(&set)]));
+    let info = fs::read(set.join("meta/info.json")).expect("a data set");
+    let info: serde_json::Value = serde_json::from_slice(&info).expect("JSON");
+    assert_eq!(info["actrm"]["expert"], "recoveries");
+    // back in the file it says so, too
+    let again = folder.path().join("again.hdf5");
+    succeeds(&mut data(["export", text(&set), text(&again)]));
+    let expert = |path: &Path| {
+        let attribute = hdf5::File::open(path).expect("a file").group("data").expect("data").attr("expert");
+        attribute.expect("an attribute").read_scalar::<hdf5::types::VarLenUnicode>().expect("text").to_string()
+    };
+    assert_eq!((expert(&file), expert(&again)), ("recoveries".to_owned(), "recoveries".to_owned()));
+}
+
+#[test]
 fn cameras_add_images_and_change_nothing_else() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (plain, seen) = (folder.path().join("plain.hdf5"), folder.path().join("seen.hdf5"));

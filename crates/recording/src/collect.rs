@@ -32,6 +32,8 @@ pub struct CollectOptions {
     pub seed: u64,
     /// The module of the user's that registers the environment.
     pub env_module: Option<String>,
+    /// Another of the task's experts than the usual one, by its name.
+    pub expert: Option<String>,
     /// Store `next_obs`.
     pub next_obs: bool,
     /// Level of gzip; none stores datasets as they are.
@@ -98,6 +100,7 @@ pub fn collect(
     let task = pool.ready().task.clone();
     let first_seed = options.seed * CollectOptions::SEED_STRIDE;
     let record = CollectionRecord::new(pool.ready(), first_seed, options.env_module.clone());
+    let record = CollectionRecord { expert: options.expert.clone(), ..record };
     let collection = Collection::open(&attempts_folder(&options.out), &record)?;
     let earlier = collection.count()?;
     if earlier > 0 {
@@ -170,6 +173,9 @@ fn write(
     let first_seed = options.seed * CollectOptions::SEED_STRIDE;
     let last = good.last().map_or(0, |attempt| attempt.index);
     writer.set_data_attr("seeds", &Array::from_str(&format!("{first_seed}-{}", first_seed + last)))?;
+    if let Some(expert) = &options.expert {
+        writer.set_data_attr("expert", &Array::from_str(expert))?;
+    }
     let (train, valid) = masks(&ids, options.seed);
     writer.set_mask("train", &train)?;
     writer.set_mask("valid", &valid)?;

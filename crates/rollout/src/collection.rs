@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::episode::no_expert;
 use crate::error::RolloutError;
 use crate::files::write_atomic;
 use crate::message::{Control, Ready};
@@ -36,6 +37,9 @@ pub struct CollectionRecord {
     pub control: Control,
     /// The module of the user's that registers the environment, if any.
     pub env_module: Option<String>,
+    /// Another of the task's experts than the usual one, by its name.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expert: Option<String>,
     /// robomimic's arguments of the environment, cameras included.
     pub env_args: serde_json::Value,
     /// Versions of the simulator and what it stands on.
@@ -51,6 +55,7 @@ impl CollectionRecord {
             first_seed,
             control: ready.control,
             env_module,
+            expert: None,
             env_args: ready.env_args.clone(),
             versions: ready.versions.clone(),
         }
@@ -79,6 +84,7 @@ impl Attempt {
 pub struct Collection {
     folder: PathBuf,
     first_seed: u64,
+    expert: Option<String>,
     _lock: File,
 }
 
@@ -100,13 +106,17 @@ impl Collection {
         let path = folder.join(RECORD);
         let mut text = serde_json::to_vec_pretty(record).expect("plain fields are always JSON");
         text.push(b'\n');
+        let (first_seed, expert) = (record.first_seed, record.expert.clone());
+        let collection = Self { folder: folder.to_owned(), first_seed, expert, _lock: lock };
         match fs::read(&path) {
             Ok(found) if found == text => {}
-            Ok(found) => return Err(differs(folder, &found, record)),
+            // one that came to no attempt is in nobody's way
+            Ok(found) if collection.count()? > 0 => return Err(differs(folder, &found, record)),
+            Ok(_) => write_atomic(&path, &text)?,
             Err(error) if error.kind() == ErrorKind::NotFound => write_atomic(&path, &text)?,
             Err(error) => return Err(RolloutError::file("reading", &path)(error)),
         }
-        Ok(Self { folder: folder.to_owned(), first_seed: record.first_seed, _lock: lock })
+        Ok(collection)
     }
 
     fn path(&self, attempt: u64) -> PathBuf {
@@ -173,7 +183,8 @@ impl Collection {
             if let Some(episode) = self.get(attempt).map_err(failed(attempt, "reading the stored attempt"))? {
                 return Ok(Attempt::of(attempt, &episode));
             }
-            let episode = worker.expert(seed_of(attempt))?;
+            let played = worker.expert(seed_of(attempt), self.expert.as_deref());
+            let episode = played.map_err(|fault| no_expert(worker, fault))?;
             let done = Attempt::of(attempt, &episode);
             self.put(attempt, episode).map_err(failed(attempt, "storing the attempt"))?;
             Ok(done)
@@ -217,6 +228,7 @@ mod tests {
             first_seed: 1_000_000,
             control: Control::Compiled,
             env_module: None,
+            expert: None,
             env_args: serde_json::json!({"env_name": "Lift", "env_kwargs": {"camera_names": ["agentview"]}}),
             versions: [("mujoco".to_owned(), "3.3.7".to_owned())].into(),
         }
@@ -255,8 +267,13 @@ mod tests {
         let first = Collection::open(dir.path(), &record()).unwrap();
         let busy = Collection::open(dir.path(), &record()).unwrap_err();
         assert!(matches!(busy, RolloutError::CollectionBusy { .. }), "{busy}");
+        // one without an attempt gives way to another
         drop(first);
         let other = CollectionRecord { first_seed: 2_000_000, ..record() };
+        drop(Collection::open(dir.path(), &other).unwrap());
+        let first = Collection::open(dir.path(), &record()).unwrap();
+        first.put(0, episode(true)).unwrap();
+        drop(first);
         let error = Collection::open(dir.path(), &other).unwrap_err().to_string();
         assert!(error.contains("first_seed: expected 2000000, found 1000000"), "{error}");
     }

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::error::{FaultKind, RolloutError};
+use crate::error::{FaultKind, RolloutError, WorkerFault};
 use crate::message::Ready;
 use crate::pool::JobError;
 use crate::worker::{Initial, Observations, Scripted, Worker};
@@ -181,14 +181,7 @@ impl EpisodePlan {
         let begun = Instant::now();
         let Initial { fingerprint, group, .. } = worker.reset(seed)?;
         let Scripted { rewards, solved, progress } =
-            worker.expert_evaluated(seed).map_err(|fault| match &fault.kind {
-                // the same for a fresh worker
-                FaultKind::Reported { kind, message } if kind == "no_expert" => {
-                    let task = worker.ready().task.clone();
-                    RolloutError::Refused { task, kind: kind.clone(), message: message.clone() }.into()
-                }
-                _ => JobError::from(fault),
-            })?;
+            worker.expert_evaluated(seed).map_err(|fault| no_expert(worker, fault))?;
         worker.check_quiet()?;
         let end = solved.iter().take(self.max_steps).position(|solved| *solved);
         let steps = end.map_or(solved.len().min(self.max_steps), |at| at + 1);
@@ -212,6 +205,17 @@ impl EpisodePlan {
 
 /// Called with the worker and what it shows after an episode's reset and after every step of it.
 pub type Watch<'a> = &'a mut dyn FnMut(&mut Worker, &Observations) -> Result<(), JobError>;
+
+/// What a worker says that has no such expert is the same for a fresh worker.
+pub(crate) fn no_expert(worker: &Worker, fault: WorkerFault) -> JobError {
+    match &fault.kind {
+        FaultKind::Reported { kind, message } if kind == "no_expert" => {
+            let task = worker.ready().task.clone();
+            RolloutError::Refused { task, kind: kind.clone(), message: message.clone() }.into()
+        }
+        _ => fault.into(),
+    }
+}
 
 #[cfg(test)]
 mod tests {

@@ -118,6 +118,8 @@ pub(crate) enum Request<'a> {
         id: u64,
         seed: u64,
         split: &'a str,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        expert: Option<&'a str>,
     },
     Extract {
         id: u64,
@@ -240,7 +242,7 @@ mod tests {
         assert_eq!(text(&Request::Reset { id: 1, seed: 10000 }), r#"{"type":"reset","id":1,"seed":10000}"#);
         assert_eq!(text(&Request::Step { id: 2 }), r#"{"type":"step","id":2}"#);
         assert_eq!(
-            text(&Request::Expert { id: 6, seed: 7, split: "evaluation" }),
+            text(&Request::Expert { id: 6, seed: 7, split: "evaluation", expert: None }),
             r#"{"type":"expert","id":6,"seed":7,"split":"evaluation"}"#
         );
         assert_eq!(

@@ -236,12 +236,12 @@ impl Worker {
         Ok(rewards)
     }
 
-    /// Runs a whole scripted episode, to be learned from.
+    /// Runs a whole scripted episode, to be learned from; `expert` is another of the task's experts than the usual one.
     ///
     /// # Errors
     /// Any failure of the worker.
-    pub fn expert(&mut self, seed: u64) -> Result<RecordedEpisode, WorkerFault> {
-        self.scripted(seed, "demonstration").map(|(episode, _)| episode)
+    pub fn expert(&mut self, seed: u64, expert: Option<&str>) -> Result<RecordedEpisode, WorkerFault> {
+        self.scripted(seed, "demonstration", expert).map(|(episode, _)| episode)
     }
 
     /// Runs the scripted expert in the episode that an evaluation of `seed` begins with.
@@ -249,7 +249,7 @@ impl Worker {
     /// # Errors
     /// Any failure of the worker.
     pub fn expert_evaluated(&mut self, seed: u64) -> Result<Scripted, WorkerFault> {
-        let (episode, progress) = self.scripted(seed, "evaluation")?;
+        let (episode, progress) = self.scripted(seed, "evaluation", None)?;
         let read = |name: &str| {
             let tensor = episode.tensors.get(name).ok_or_else(|| format!("no array {name:?} in the episode"))?;
             Ok((tensor, name.to_owned()))
@@ -266,9 +266,14 @@ impl Worker {
         Ok(Scripted { rewards, solved: solved.into_iter().map(|done| done != 0).collect(), progress })
     }
 
-    fn scripted(&mut self, seed: u64, split: &str) -> Result<(RecordedEpisode, Option<f64>), WorkerFault> {
+    fn scripted(
+        &mut self,
+        seed: u64,
+        split: &str,
+        expert: Option<&str>,
+    ) -> Result<(RecordedEpisode, Option<f64>), WorkerFault> {
         self.next_id += 1;
-        let request = Request::Expert { id: self.next_id, seed, split };
+        let request = Request::Expert { id: self.next_id, seed, split, expert };
         let (reply, frame) = self.ask(&request, Vec::new(), self.limits.episode, 4)?;
         match reply {
             Reply::Expert(reply) => {

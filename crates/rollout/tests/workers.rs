@@ -75,7 +75,7 @@ fn an_episode_is_the_same_on_any_worker_in_any_order_after_anything() {
 
 /// Episodes of the expert.
 fn shown(pool: &mut Pool, attempts: std::ops::Range<u64>) -> Vec<RecordedEpisode> {
-    let work = |(): &mut (), worker: &mut Worker, attempt| Ok(worker.expert(1_000_000 + attempt)?);
+    let work = |(): &mut (), worker: &mut Worker, attempt| Ok(worker.expert(1_000_000 + attempt, None)?);
     let mut all = Vec::new();
     pool.run(attempts, &|attempt| attempt, &|| Ok(()), &work, &mut |_, episode| {
         all.push(episode.unwrap());

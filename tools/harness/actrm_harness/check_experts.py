@@ -43,12 +43,15 @@ class Outcome:
     steps: int
     pause: int
     """The longest run of steps in which the arm was hardly told to move."""
+    expert: str | None = None
+    """Which of the task's experts; None is the usual one."""
 
 
 # Of seeds, share that must end alike with both loops.
 SAME = 0.99
 
 _session: "Session | None" = None
+_expert: str | None = None
 
 
 def main() -> int:
@@ -62,6 +65,7 @@ def main() -> int:
     parser.add_argument(
         "--control", default="compiled", choices=["compiled", "robosuite", "both"], help="loop (default: %(default)s)"
     )
+    parser.add_argument("--expert", help="another of the task's experts than the usual one, by its name")
     parser.add_argument("--out", type=Path, help="a file of one line of JSON a seed; what it holds is not run again")
     args = parser.parse_args()
     tasks = list(BARS) if args.task == "all" else args.task.split(",")
@@ -74,8 +78,9 @@ def main() -> int:
     for task in tasks:
         found: list[list[Outcome]] = []
         for loop in loops:
-            known = {each.seed: each for each in read(args.out) if (each.task, each.control) == (task, loop)}
-            for outcome in play(task, loop, [seed for seed in wanted if seed not in known], args.workers):
+            wanted_of = (task, loop, args.expert)
+            known = {each.seed: each for each in read(args.out) if (each.task, each.control, each.expert) == wanted_of}
+            for outcome in play(wanted_of, [seed for seed in wanted if seed not in known], args.workers):
                 known[outcome.seed] = outcome
                 if args.out:
                     with args.out.open("a") as file:
@@ -95,22 +100,23 @@ def read(path: Path | None) -> list[Outcome]:
     return [Outcome(**json.loads(line)) for line in lines]
 
 
-def play(task: str, loop: str, seeds: list[int], workers: int) -> Iterator[Outcome]:
+def play(of: tuple[str, str, str | None], seeds: list[int], workers: int) -> Iterator[Outcome]:
     """The outcomes of these seeds, in any order."""
     if not seeds:
         return
-    processes = multiprocessing.get_context("spawn").Pool(min(workers, len(seeds)), _start, (task, loop))
+    processes = multiprocessing.get_context("spawn").Pool(min(workers, len(seeds)), _start, of)
     with processes as pool:
         yield from pool.imap_unordered(_play, seeds)
 
 
-def _start(task: str, loop: str) -> None:
-    global _session  # noqa: PLW0603
+def _start(task: str, loop: str, expert: str | None) -> None:
+    global _session, _expert  # noqa: PLW0603
     from actrm_harness.simulators.robosuite import suite
 
     suite.prepare()
     from actrm_harness.simulators.robosuite import control, envs
 
+    _expert = expert
     _session = envs.make(task)
     if loop == "compiled":
         _session.control = control.attach(_session.env)
@@ -122,14 +128,14 @@ def _play(seed: int) -> Outcome:
     from actrm_harness.simulators.robosuite import episodes
 
     assert _session is not None, "the pool's initializer made it"
-    episode = episodes.expert_episode(_session, seed)
+    episode = episodes.expert_episode(_session, seed, name=_expert)
     moving = np.abs(episode.tensors["actions"][:, :6]).max(axis=1) > STILL
     longest = current = 0
     for moves in moving.tolist():
         current = 0 if moves else current + 1
         longest = max(longest, current)
     loop = "robosuite" if _session.control is None else "compiled"
-    return Outcome(_session.task.name, loop, seed, episode.success, episode.steps, longest)
+    return Outcome(_session.task.name, loop, seed, episode.success, episode.steps, longest, _expert)
 
 
 def report(task: str, loop: str, outcomes: list[Outcome]) -> bool:

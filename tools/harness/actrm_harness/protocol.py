@@ -60,6 +60,8 @@ class Expert:
     id: int
     seed: int
     split: str = "demonstration"
+    expert: str | None = None
+    """Another of the task's experts than the usual one, by its name."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,8 @@ class Task:
     """The module that defines the environment; None where the simulator brings it."""
     expert: str | Callable[..., Any] | None = None
     """The scripted expert, or the place of it."""
+    experts: dict[str, str] = field(default_factory=dict[str, str])
+    """Further experts by their names, for demonstrations of another kind."""
     bar: float = 0.95
     """The share of episodes that the expert has to solve."""
     max_steps: int = DEFAULT_MAX_STEPS
@@ -52,6 +54,7 @@ TASKS = {
             "StackThreeCubes",
             defined_in=".environments.towers",
             expert=".experts.cubes:TowerExpert",
+            experts={"recoveries": ".experts.cubes:RecoveringTowerExpert"},
             soft_reset=True,
             max_steps=600,
         ),
@@ -59,6 +62,7 @@ TASKS = {
             "StackColor",
             defined_in=".environments.towers",
             expert=".experts.cubes:TowerExpert",
+            experts={"recoveries": ".experts.cubes:RecoveringTowerExpert"},
             soft_reset=True,
             max_steps=600,
         ),
@@ -66,6 +70,7 @@ TASKS = {
             "Recall",
             defined_in=".environments.towers",
             expert=".experts.cubes:TowerExpert",
+            experts={"recoveries": ".experts.cubes:RecoveringTowerExpert"},
             soft_reset=True,
             max_steps=600,
         ),

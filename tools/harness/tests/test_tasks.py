@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from conftest import Client, WorkerError, walk
 
+from actrm_harness.experts.cubes import RecoveringTowerExpert
+from actrm_harness.experts.parts import Scene
+from actrm_harness.protocol import RequestError
 from actrm_harness.simulators.robosuite import control, envs, episodes, suite
 from actrm_harness.tasks import TASKS
 
@@ -81,6 +84,54 @@ def test_the_expert_solves_the_task(task: str) -> None:
     solved = [episodes.expert_episode(session, 1_000_000 + seed).success for seed in range(2)]
     session.env.close()
     assert all(solved)
+
+
+FURTHER = [(task.name, name) for task in TASKS.values() for name in task.experts]
+
+
+@pytest.mark.usefixtures("library")
+@pytest.mark.parametrize(("task", "expert"), FURTHER)
+def test_further_experts_solve_the_task_otherwise(task: str, expert: str) -> None:
+    session = envs.make(task)
+    session.control = control.attach(session.env)
+    usual = [episodes.expert_episode(session, 1_000_000 + seed).steps for seed in range(3)]
+    further = [episodes.expert_episode(session, 1_000_000 + seed, True, expert) for seed in range(3)]
+    session.env.close()
+    assert all(episode.success for episode in further)
+    assert [episode.steps for episode in further] != usual
+
+
+@pytest.mark.usefixtures("library")
+def test_what_the_recovering_expert_does_wrong_it_makes_up_for() -> None:
+    """Over some episodes the middle cube stands, falls, and stands again."""
+    session = envs.make("StackColor")
+    session.control = control.attach(session.env)
+    fallen = 0
+    for seed in range(12):
+        envs.reset(session, 30_000 + seed, True)
+        scene = Scene(session.env)
+        bottom, middle, _ = (f"{name}_main" for name in scene.task.order)
+        expert = RecoveringTowerExpert(scene, np.random.default_rng([seed, 1]))
+        stood, fell, solved = False, False, False
+        for _ in range(600):
+            solved = envs.step_session(session, np.clip(expert.act(), -1.0, 1.0)).success
+            away = scene.body(middle) - scene.body(bottom)
+            stands = abs(float(away[2]) - 0.04) < 0.008 and float(np.linalg.norm(away[:2])) < 0.03
+            fell |= stood and float(away[2]) < 0.02
+            stood |= stands
+            if solved:
+                break
+        assert solved
+        fallen += fell
+    session.env.close()
+    assert fallen >= 2
+
+
+def test_an_expert_that_a_task_has_not_is_refused_by_name() -> None:
+    session = envs.make("StackColor")
+    with pytest.raises(RequestError, match=r"'careless'.*known: recoveries"):
+        episodes.expert_episode(session, 1, True, "careless")
+    session.env.close()
 
 
 @pytest.mark.usefixtures("library")

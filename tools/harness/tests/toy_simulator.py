@@ -38,7 +38,7 @@ class Slide:
                 break
         return Stepped({"place": self.place}, np.array(rewards), bool(rewards[-1]))
 
-    def expert(self, seed: int, demonstration: bool) -> Episode:
+    def expert(self, seed: int, demonstration: bool, expert: str | None = None) -> Episode:
         """There is none."""
         raise RequestError("no_expert", f"nobody knows how, seed {seed}, {demonstration}")
 

@@ -294,6 +294,7 @@ impl Conversion<'_> {
                 env_version: plan.env_version.clone(),
                 env_args: plan.env_args.clone(),
                 seeds: plan.texts.get("data/seeds").cloned(),
+                expert: plan.texts.get("data/expert").cloned(),
                 state_keys: self.mapping.state_keys.clone(),
                 env_keys: self.mapping.env_keys.clone(),
                 entities: self.mapping.entities.clone(),

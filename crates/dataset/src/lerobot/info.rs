@@ -180,6 +180,9 @@ pub struct Provenance {
     /// The simulator's seeds that the demos were recorded with, `FIRST-LAST`, where the source states them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seeds: Option<String>,
+    /// Which of the task's experts recorded them, where it is not the usual one and the source states it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expert: Option<String>,
     /// Observation keys that make up `observation.state`, in order.
     pub state_keys: Vec<String>,
     /// Observation keys that make up `observation.environment_state`, in order.

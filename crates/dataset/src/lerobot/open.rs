@@ -64,6 +64,8 @@ pub struct EnvMeta {
     pub env_args: serde_json::Value,
     /// The seeds that the demonstrations were recorded with, `FIRST-LAST`, where the source states them.
     pub seeds: Option<String>,
+    /// Which of the task's experts recorded them, where it is not the usual one and the source states it.
+    pub expert: Option<String>,
 }
 
 /// A numeric column in memory.
@@ -91,6 +93,7 @@ impl Dataset {
                 env_version: p.env_version.clone(),
                 env_args: p.env_args.clone().unwrap_or(serde_json::Value::Null),
                 seeds: p.seeds.clone(),
+                expert: p.expert.clone(),
             })
         });
         let mut dataset =

@@ -48,6 +48,9 @@ pub struct Data {
     /// The collection's seed.
     #[serde(default = "one")]
     pub seed: u64,
+    /// Another of the task's experts than the usual one, by its name.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expert: Option<String>,
 }
 
 /// One kind of policy under study.
@@ -132,8 +135,11 @@ pub struct Comparison {
     pub first: String,
     /// The other.
     pub second: String,
-    /// The demonstrations of both.
+    /// The demonstrations of both, or of the first.
     pub data: String,
+    /// Those of the second, where they are others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub second_data: Option<String>,
     /// The test of both.
     pub test: String,
     /// Only episodes of these groups; of all where empty.
@@ -192,6 +198,9 @@ impl Study {
             arms(format!("comparisons[{i}].first"), &comparison.first)?;
             arms(format!("comparisons[{i}].second"), &comparison.second)?;
             data(format!("comparisons[{i}].data"), &comparison.data)?;
+            if let Some(second) = &comparison.second_data {
+                data(format!("comparisons[{i}].second_data"), second)?;
+            }
             tests(format!("comparisons[{i}].test"), &comparison.test)?;
         }
         for (kind, names) in [

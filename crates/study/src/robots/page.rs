@@ -61,11 +61,12 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
             let source = &study.data[data];
             let _ = writeln!(
                 text,
-                "## {} after {} demonstrations of {}\n\nSeeds {} to {}, {} episodes a training. Success with its 95% \
+                "## {} after {} demonstrations of {}{}\n\nSeeds {} to {}, {} episodes a training. Success with its 95% \
                  interval over trainings and episodes; below it each training's.\n",
                 test.task,
                 source.episodes,
                 source.task,
+                source.expert.as_ref().map(|expert| format!(", expert `{expert}`")).unwrap_or_default(),
                 test.seed_start,
                 test.seed_start + test.episodes - 1,
                 test.episodes
@@ -118,9 +119,10 @@ fn overview(text: &mut String, study: &Study, results: &BTreeMap<(String, String
         return;
     }
     let head = |(data, _): &(&str, &str)| {
-        let Data { task, episodes, .. } = &study.data[*data];
+        let Data { task, episodes, expert, .. } = &study.data[*data];
         let alone = columns.iter().filter(|(other, _)| study.data[*other].task == *task).count() == 1;
-        if alone { task.clone() } else { format!("{task}, {episodes}") }
+        let expert = expert.as_ref().map(|expert| format!(", {expert}")).unwrap_or_default();
+        if alone { format!("{task}{expert}") } else { format!("{task}, {episodes}{expert}") }
     };
     let heads: Vec<String> = columns.iter().map(head).collect();
     let _ = writeln!(
@@ -177,10 +179,15 @@ fn table(text: &mut String, study: &Study, rows: &[(&String, &Trainings)]) {
         .flat_map(|result| result.episodes.iter().filter_map(|episode| episode.failure.as_deref()))
         .collect();
     let lost: String = words.iter().map(|word| format!(" {word} |")).collect();
-    let _ = writeln!(text, "| arm | {} |{lost}", heads.join(" | "));
-    let _ = writeln!(text, "|---|{}", "---|".repeat(heads.len() + words.len()));
-    for (arm, trainings) in rows {
+    let ways: Vec<Option<f64>> = rows.iter().map(|(_, trainings)| mean_progress(trainings)).collect();
+    // a column where any arm has it
+    let staged = ways.iter().any(Option::is_some);
+    let way = if staged { " progress |" } else { "" };
+    let _ = writeln!(text, "| arm | {} |{way}{lost}", heads.join(" | "));
+    let _ = writeln!(text, "|---|{}", "---|".repeat(heads.len() + words.len() + usize::from(staged)));
+    for ((arm, trainings), way) in rows.iter().zip(ways) {
         let cells: Vec<String> = columns.iter().map(|group| cell_text(trainings, group.as_slice())).collect();
+        let way = way.map_or(if staged { " - |" } else { "" }.to_owned(), |way| format!(" {way:.3} |"));
         let share = |word: &str| -> String {
             let all = trainings.values().flat_map(|result| &result.episodes);
             let (lost, n) = all.fold((0.0, 0.0), |(lost, n), episode| {
@@ -189,9 +196,22 @@ fn table(text: &mut String, study: &Study, rows: &[(&String, &Trainings)]) {
             format!(" {:.1}% |", 100.0 * lost / n)
         };
         let lost: String = words.iter().map(|word| share(word)).collect();
-        let _ = writeln!(text, "| {} | {} |{lost}", study.arms[*arm].label, cells.join(" | "));
+        let _ = writeln!(text, "| {} | {} |{way}{lost}", study.arms[*arm].label, cells.join(" | "));
     }
     text.push('\n');
+    if staged {
+        let _ = writeln!(
+            text,
+            "Progress: the mean share of the task's stages, success the last, that an episode passed in order.\n"
+        );
+    }
+}
+
+/// Mean share of their way that the episodes came; none unless every one has it.
+fn mean_progress(trainings: &Trainings) -> Option<f64> {
+    let all = trainings.values().flat_map(|result| &result.episodes);
+    let ways: Option<Vec<f64>> = all.map(|episode| episode.progress).collect();
+    ways.filter(|ways| !ways.is_empty()).map(|ways| ways.iter().sum::<f64>() / ways.len() as f64)
 }
 
 /// An arm, how it thinks in words, and what came of it.
@@ -362,11 +382,11 @@ fn comparisons(
     let found: Vec<(&Comparison, Option<_>)> = of_stage
         .into_iter()
         .map(|c| {
-            let side = |arm: &String| {
-                let key = (c.test.clone(), c.data.clone(), arm.clone());
+            let side = |arm: &String, data: &String| {
+                let key = (c.test.clone(), data.clone(), arm.clone());
                 results.get(&key).map(|trainings| outcomes(trainings, &c.groups))
             };
-            let sides = side(&c.first).zip(side(&c.second));
+            let sides = side(&c.first, &c.data).zip(side(&c.second, c.second_data.as_ref().unwrap_or(&c.data)));
             let counted = sides.and_then(|(a, b)| {
                 let trainings = (a.len(), b.len());
                 difference(&a, &b, BOOTSTRAP_SEED).map(|d| (d, trainings))
@@ -377,7 +397,12 @@ fn comparisons(
     let p_values: Vec<f64> = found.iter().filter_map(|(_, d)| d.as_ref().map(|(d, _)| d.p_value)).collect();
     let mut adjusted = holm(&p_values).into_iter();
     for (comparison, counted) in found {
-        let (first, second) = (&study.arms[&comparison.first].label, &study.arms[&comparison.second].label);
+        let side = |arm: &String, data: &String| match &comparison.second_data {
+            Some(_) => format!("{}, {data}", study.arms[arm].label),
+            None => study.arms[arm].label.clone(),
+        };
+        let second = comparison.second_data.as_ref().unwrap_or(&comparison.data);
+        let (first, second) = (side(&comparison.first, &comparison.data), side(&comparison.second, second));
         let episodes = match comparison.groups.is_empty() {
             true => "all".to_owned(),
             false => comparison.groups.join(", "),
@@ -575,6 +600,43 @@ mod tests {
         std::fs::write(&file, fewer).unwrap();
         let page = robot_page(&Study::open(&file).unwrap(), &file).unwrap();
         assert!(page.contains("| | PickChain, 200 | PickChain, 25 |\n"), "{page}");
+        // and who showed them
+        let others =
+            std::fs::read_to_string(&file).unwrap().replace("episodes = 25", "episodes = 25\nexpert = \"careful\"");
+        let compared = "[[comparisons]]\nquestion = \"Better?\"\nfirst = \"one\"\nsecond = \"one\"\ndata = \"lift\"\n\
+                        second_data = \"chain\"\ntest = \"t\"\n";
+        std::fs::write(&file, others + compared).unwrap();
+        let page = robot_page(&Study::open(&file).unwrap(), &file).unwrap();
+        assert!(page.contains("| | PickChain, 200 | PickChain, 25, careful |\n"), "{page}");
+        assert!(page.contains("| Better? | one step, lift | one step, chain | all | not run |"), "{page}");
+    }
+
+    #[test]
+    fn progress_stands_where_every_episode_has_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
+        let study = Study::open(&file).unwrap();
+        let write = |ways: [Option<f64>; 4]| {
+            for cell in cells(&study).iter().filter(|cell| cell.stage == 1) {
+                let mut result = result(&study, cell, "t", [true, true, false, false]);
+                for (episode, way) in result.episodes.iter_mut().zip(ways).filter(|_| cell.arm == "six") {
+                    episode.progress = way;
+                }
+                result.write(&folder.path().join(cell.file_name("t"))).unwrap();
+            }
+            robot_page(&study, &file).unwrap()
+        };
+        let page = write([Some(1.0), Some(1.0), Some(0.25), Some(0.75)]);
+        assert!(
+            page.contains("| arm | all | 3 hops | 4 hops | progress | wrong |\n|---|---|---|---|---|---|\n"),
+            "{page}"
+        );
+        assert!(page.contains(" | 0.750 | 50.0% |\n") && page.contains(" | - | 50.0% |\n"), "{page}");
+        assert!(page.contains("Progress: "), "{page}");
+        // of some episodes it would be another mean
+        let page = write([Some(1.0), None, Some(0.25), Some(0.75)]);
+        assert!(!page.to_lowercase().contains("progress"), "{page}");
     }
 
     #[test]

@@ -42,6 +42,9 @@ pub struct CellResult {
     pub seeds: Seeds,
     /// Versions of the simulator and what it stands on.
     pub versions: BTreeMap<String, String>,
+    /// Which kernels numpy's linear algebra ran, where that was told.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub kernels: Option<String>,
     /// Median duration of a query in milliseconds.
     pub query_ms: f64,
     /// Floating-point operations of a query that thinks as long as it may, where they are counted.
@@ -67,6 +70,9 @@ pub struct EpisodeOutcome {
     /// The part of the report that it belongs to.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub group: Option<String>,
+    /// Which share of its way it came, where the task has stages.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub progress: Option<f64>,
 }
 
 impl CellResult {
@@ -97,6 +103,7 @@ impl CellResult {
             protocol: record.protocol.clone(),
             seeds: record.seeds,
             versions: record.versions.clone(),
+            kernels: record.kernels.clone(),
             query_ms: times.get(times.len() / 2).copied().unwrap_or_default(),
             query_flops,
             episodes: evaluation
@@ -108,6 +115,7 @@ impl CellResult {
                     steps: e.steps,
                     failure: e.failure.clone(),
                     group: e.group.clone(),
+                    progress: e.progress,
                 })
                 .collect(),
         }

@@ -335,7 +335,9 @@ impl Shared<'_> {
     fn demonstrations(&self, name: &str, data: &Data) -> Result<Option<PathBuf>, StudyError> {
         let _one_at_a_time = lock(&self.collecting[name]);
         let folder = self.request.work.join("data");
-        let file = folder.join(format!("{}-{}-seed{}.hdf5", data.task.to_lowercase(), data.episodes, data.seed));
+        let expert = data.expert.as_ref().map(|expert| format!("{expert}-")).unwrap_or_default();
+        let name_of = format!("{}-{expert}{}-seed{}.hdf5", data.task.to_lowercase(), data.episodes, data.seed);
+        let file = folder.join(name_of);
         if file.exists() {
             return Ok(Some(file));
         }
@@ -350,6 +352,7 @@ impl Shared<'_> {
             episodes: data.episodes,
             seed: data.seed,
             env_module: None,
+            expert: data.expert.clone(),
             next_obs: false,
             gzip: None,
         };

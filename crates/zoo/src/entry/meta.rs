@@ -139,6 +139,9 @@ pub struct DataMeta {
     /// The simulator's seeds that the demonstrations were recorded with, where the data set says.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seeds: Option<Seeds>,
+    /// Which of the task's experts recorded them, where it is not the usual one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expert: Option<String>,
 }
 
 /// How an entry was trained.

@@ -180,6 +180,7 @@ pub(crate) mod tests {
                     train_frames: 2000,
                     valid_episodes: 5,
                     seeds: None,
+                    expert: None,
                 }),
                 kind: None,
                 section: None,

@@ -231,6 +231,7 @@ pub(super) fn prepare(
         train_frames: train.iter().map(|e| dataset.episodes()[*e].length as u64).sum(),
         valid_episodes: valid.len() as u64,
         seeds: dataset.env().and_then(|env| env.seeds.as_deref()?.parse().ok()),
+        expert: dataset.env().and_then(|env| env.expert.clone()),
     };
     let mut train = windows(train)?;
     let mut valid = match valid.is_empty() {

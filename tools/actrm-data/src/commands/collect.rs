@@ -21,6 +21,7 @@ const GOES_ON: &str = "stopped; the same command goes on where it was";
 #[command(after_help = "Examples:
   actrm-data collect --task Lift --episodes 50 --seed 1 --out lift.hdf5
   actrm-data collect --task Stack --episodes 200 --seed 7 --workers 4 --out stack.hdf5
+  actrm-data collect --task StackColor --episodes 200 --expert recoveries --out stackcolor.hdf5
   actrm-data collect --task Lift --episodes 20 --cameras agentview,robot0_eye_in_hand --out lift_image.hdf5")]
 pub struct Args {
     /// Task, as robosuite or the environment module names it
@@ -32,6 +33,10 @@ pub struct Args {
     /// Seed of the whole collection, 1 or more
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     seed: u64,
+    /// Another of the task's experts than the usual one: `recoveries` makes more mistakes with towers of cubes, and
+    /// shows how each is made up for
+    #[arg(long, value_name = "NAME")]
+    expert: Option<String>,
     /// File to create
     #[arg(long)]
     out: PathBuf,
@@ -65,6 +70,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         episodes: args.episodes,
         seed: args.seed,
         env_module: args.simulator.env_module.clone(),
+        expert: args.expert.clone(),
         next_obs: !args.no_next_obs,
         gzip: (args.gzip > 0).then_some(args.gzip),
     };

@@ -185,6 +185,7 @@ fn collected(args: &Args, rerun: &Rerun, stop: &Stop) -> anyhow::Result<Collecti
         episodes,
         seed,
         env_module: environment.env_module.clone(),
+        expert: data.expert.clone(),
         next_obs: false,
         gzip: None,
     };

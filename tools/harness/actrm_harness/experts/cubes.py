@@ -20,6 +20,11 @@ TOWER_MISHAPS = Mishaps(pushed=80.0, fumbled=250.0)
 CLUMSY = 0.12
 BESIDE = (0.02, 0.032)
 
+# The same where recoveries are to be shown: some stay where they are, askew; and how often the tower is knocked down.
+SLOPPY = 0.3
+BESIDE_OR_FALLEN = (0.008, 0.032)
+KNOCKING = 0.25
+
 
 def clear_yaw(here: Array, others: list[Array]) -> float:
     """The least turn of a hand at a cube that keeps its fingers clear of the other cubes, whichever way the cube lies.
@@ -147,3 +152,103 @@ class TowerExpert:
         here = self.scene.body(cube)
         others = [self.scene.body(name) for name in self.order if name != cube]
         return clear_yaw(here, [other for other in others if float(other[2]) > float(here[2]) - 0.03])
+
+
+class RecoveringTowerExpert(TowerExpert):
+    """Build the tower, make more mistakes on the way, and show how each is made up for.
+
+    Cubes are set down a little or far beside their places, the one that is held knocks down what stands already, and
+    whatever lies on a cube that is needed is put aside on the table first. What nothing was done to is set down with
+    more care than `TowerExpert` takes. Held cube or none, what is done next follows from where the cubes are.
+    """
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        super().__init__(scene, rng)
+        self.aside = Carry(scene, self.grasp, self.above - 0.06, OFF)
+        self.knocks = bool(rng.random() < KNOCKING)
+        self.cube = self.order[1]
+        self.spot: Array | None = None
+        self.leaving = False
+
+    def _draw_beside(self, rng: np.random.Generator) -> list[Array]:
+        beside: list[Array] = []
+        for _ in range(2):
+            bad, angle, far = rng.random() < SLOPPY, rng.uniform(0, 2 * np.pi), rng.uniform(*BESIDE_OR_FALLEN)
+            beside.append(np.array([far * np.cos(angle), far * np.sin(angle), 0.0]) * bad)
+        return beside
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        scene = self.scene
+        bottom, middle, _ = self.order
+        stands = self._stands(middle, bottom)
+        self._choose(stands)
+        thing = scene.body(self.cube)
+        carry, goal, level = self._job(stands)
+        hand = hand_yaw(scene.hand_rotation)
+        turn = hand
+        if carry.update(thing, goal, flat=0.006, height=0.006):
+            target, grip = carry.let_go()
+            self.leaving = True
+            if level is not None and scene.gap > OFF[1]:
+                self.beside[level] = np.zeros(3)
+        else:
+            turn = self._grip_yaw(self.cube)
+            target, grip = self.grasp.reach(thing, turn - hand)
+            if stands and not self.grasp.closing and np.linalg.norm((thing - scene.hand)[:2]) > 0.05:
+                target[2] = self.above
+            if self.grasp.held:
+                target = carry.bring(thing, goal, near=0.006, far=0.04)
+                turn = hand
+                if level == 1 and self.knocks:
+                    # sideways against what stands
+                    target = scene.hand + (scene.body(middle) - thing) * (1.0 if thing[2] > TABLE + 0.05 else 0.0)
+                    target[2] += 0.05 * float(thing[2] < TABLE + 0.055)
+        return self.servo.move(target, grip, about_z(turn) @ DOWN)
+
+    def _choose(self, stands: bool) -> None:
+        """Which cube is next, and where to put it aside if its place is not ready."""
+        bottom, middle, top = self.order
+        if not stands:
+            self.knocks &= self.cube != top or not self.grasp.held
+        if self.grasp.held or (self.leaving and not self._left(self.cube)):
+            # in the hand while its place was lost
+            if self.grasp.held and self.cube == top and not stands and self.spot is None:
+                self.spot = self._free_spot()
+            return
+        self.leaving = False
+        lying = [cube for cube in (top, bottom) if any(self._lies_on(cube, other) for other in self.order)]
+        if stands:
+            chosen, self.spot = top, None
+        elif lying:
+            chosen = lying[0]
+            self.spot = self._free_spot() if chosen != self.cube or self.spot is None else self.spot
+        else:
+            chosen, self.spot = middle, None
+        if chosen != self.cube:
+            self.cube = chosen
+            for carry in (*self.carries, self.aside):
+                carry.released = False
+
+    def _job(self, stands: bool) -> tuple[Carry, Array, int | None]:
+        """How the chosen cube is carried, where to, and on which level of the tower if on any."""
+        bottom, middle, top = self.order
+        if self.spot is not None:
+            return self.aside, self.spot, None
+        level = int(self.cube == top and stands)
+        below = self.scene.body(middle if level else bottom)
+        return self.carries[level], below + np.array([0.0, 0.0, 0.041]) + self.beside[level], level
+
+    def _lies_on(self, cube: str, other: str) -> bool:
+        """Whether a cube lies on another or leans on it."""
+        away = self.scene.body(cube) - self.scene.body(other)
+        return cube != other and bool(np.linalg.norm(away[:2]) < 0.045 and float(away[2]) > 0.012)
+
+    def _free_spot(self) -> Array:
+        """The place on the table that is nearest to the chosen cube and away from the others."""
+        here = self.scene.body(self.cube)
+        others = [self.scene.body(name) for name in self.order if name != self.cube]
+        steps = np.linspace(-0.1, 0.1, 9)
+        places = [np.array([x, y, TABLE + 0.021]) for x in steps for y in steps]
+        free = [p for p in places if min(float(np.linalg.norm((p - other)[:2])) for other in others) > 0.085]
+        return min(free, key=lambda p: float(np.linalg.norm((p - here)[:2])))

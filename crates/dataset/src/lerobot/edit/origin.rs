@@ -60,6 +60,8 @@ pub(super) fn of(edit: &Edit<'_>, fingerprint: &str, notes: &mut Vec<String>) ->
     let same = |get: &dyn Fn(&Provenance, &Provenance) -> bool| all.iter().all(|p| get(p, first));
     let env_version =
         first.env_version.clone().filter(|_| shared("env_version", same(&|a, b| a.env_version == b.env_version)));
+    let same_expert = same(&|a, b| a.expert == b.expert);
+    let expert = first.expert.clone().filter(|_| shared("the expert that recorded them", same_expert));
     let same_args = same(&|a, b| a.env_args == b.env_args);
     let env_args = first.env_args.clone().filter(|_| shared("env_args", same_args));
     let same_video = same(&|a, b| a.video == b.video);
@@ -94,6 +96,7 @@ pub(super) fn of(edit: &Edit<'_>, fingerprint: &str, notes: &mut Vec<String>) ->
         env_version,
         env_args,
         seeds: all_seeds,
+        expert,
         state_keys: keys(STATE).unwrap_or_default(),
         env_keys: keys(ENVIRONMENT_STATE).unwrap_or_default(),
         entities: entities.collect(),

@@ -68,18 +68,18 @@ class _Recorder:
         return tensors
 
 
-def expert_episode(session: Session, seed: int, demonstration: bool = True) -> Episode:
+def expert_episode(session: Session, seed: int, demonstration: bool = True, name: str | None = None) -> Episode:
     """One episode of the task's expert; its noise has a generator of its own, drawn from the same seed.
 
-    `demonstration` False asks for the episode that an evaluation of this seed begins with.
+    `demonstration` False asks for the episode that an evaluation of this seed begins with, `name` for another of the
+    task's experts than the usual one.
     """
+    place = _expert_place(session, name)
     env = session.env
     session.foreign_model |= session.xml_forgotten
     recorder = _Recorder(envs.reset(session, seed, demonstration), whole=False)
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
-    if session.task.expert is None:
-        raise RequestError("no_expert", f"task {session.task.name!r} has no scripted expert")
-    expert: Expert = find(session.task.expert)(Scene(env), np.random.default_rng([seed, 1]))
+    expert: Expert = find(place)(Scene(env), np.random.default_rng([seed, 1]))
     held = 0
     for _ in range(session.task.max_steps):
         before = envs.state(env)
@@ -91,6 +91,20 @@ def expert_episode(session: Session, seed: int, demonstration: bool = True) -> E
             break
     progress = session.progress(any(recorder.successes))
     return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors(), progress)
+
+
+def _expert_place(session: Session, name: str | None) -> Any:
+    task = session.task
+    if task.expert is None:
+        raise RequestError("no_expert", f"task {task.name!r} has no scripted expert")
+    if name is None:
+        return task.expert
+    if name not in task.experts:
+        known = ", ".join(sorted(task.experts)) or "none"
+        raise RequestError(
+            "no_expert", f"task {task.name!r} has no expert {name!r} beside its usual one; known: {known}"
+        )
+    return task.experts[name]
 
 
 def extract(
