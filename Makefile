@@ -76,7 +76,7 @@ zoo: build ## every policy on every robot task, three trainings each, and the le
 
 .PHONY: study-thinking
 study-thinking: build ## does thinking help: the studies of robot policies, as far as they have not been run (days)
-	@for study in thinking fewer; do RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/$$study.toml --jobs $(or $(JOBS),2); done
+	@for study in thinking towers fewer; do RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/$$study.toml --jobs $(or $(JOBS),2); done
 
 .PHONY: test
 test: wheel ## every test: Rust, Python and end to end
