@@ -1,8 +1,9 @@
 //! What workers said of themselves the last time: enough to know what an evaluation would be called, without starting one.
 //!
 //! Remembered in the cache folder, under a name that holds everything a greeting depends on: the harness, the
-//! interpreter, its versions of the simulator and of what that stands on, the task, the control loop and what was said of the kernels. An environment
-//! module of the user's may say something else every time; workers that load one are not remembered.
+//! interpreter, its versions of the simulator and of what that stands on, the task, the control loop and which kernels
+//! were asked for. An environment module of the user's may say something else every time; workers that load one are not
+//! remembered.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
