@@ -152,6 +152,11 @@ impl Rerun {
         report.add_versions(
             crate::versions().into_iter().map(|(name, now)| (name.clone(), versions.get(&name).cloned(), now)),
         );
+        // another machine is no difference, and may be why there is one
+        let machine = |entry: &Entry| entry.meta().training.as_ref().and_then(|training| training.machine.clone());
+        if let (Some(then), Some(here)) = (machine(&self.entry), machine(now)) {
+            report.add_versions([("machine".to_owned(), Some(then), here)]);
+        }
         let (outcome, told) = compare(NORMALISER_FILE, &self.entry, now)?;
         report.add(STATISTICS, outcome, told);
         let (expected, found) = (self.entry.meta(), now.meta());
@@ -185,8 +190,17 @@ fn facts(meta: &EntryMeta) -> Vec<(String, Value)> {
     let mut facts = Vec::new();
     flatten("", whole, &mut facts);
     let varies = |name: &str| {
-        ["training.minutes", "training.threads", "data.name", "format", "version", "experiment", "description"]
-            .contains(&name)
+        [
+            "training.minutes",
+            "training.threads",
+            "training.machine",
+            "data.name",
+            "format",
+            "version",
+            "experiment",
+            "description",
+        ]
+        .contains(&name)
             || ["versions.", "files.", "training.curve"].iter().any(|prefix| name.starts_with(prefix))
     };
     facts.retain(|(name, value)| !varies(name) && !value.is_null());
@@ -248,11 +262,13 @@ mod tests {
 
     #[test]
     fn facts_that_a_training_does_not_repeat_are_told() {
-        let recorded = test_draft("lift-act").meta;
+        let mut recorded = test_draft("lift-act").meta;
+        recorded.training.as_mut().unwrap().machine = Some("one".to_owned());
         assert_eq!(other_fact(&recorded, &recorded), None);
         let mut now = recorded.clone();
         let training = now.training.as_mut().unwrap();
         (training.minutes, training.threads, now.version) = (99.0, 64, 7);
+        training.machine = Some("another".to_owned());
         now.versions.insert("rustc".to_owned(), "1.95.0".to_owned());
         now.data.as_mut().unwrap().seeds = Some(crate::results::Seeds { start: 1, count: 2 });
         assert_eq!(
