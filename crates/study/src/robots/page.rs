@@ -379,7 +379,7 @@ fn comparisons(
          rows of this table.\n\n| question | first | second | episodes | trainings | difference | p | answer |\n\
          |---|---|---|---|---|---|---|---|"
     );
-    let found: Vec<(&Comparison, Option<_>)> = of_stage
+    let found: Vec<(&Comparison, Option<(usize, usize)>, Option<_>)> = of_stage
         .into_iter()
         .map(|c| {
             let side = |arm: &String, data: &String| {
@@ -387,16 +387,13 @@ fn comparisons(
                 results.get(&key).map(|trainings| outcomes(trainings, &c.groups))
             };
             let sides = side(&c.first, &c.data).zip(side(&c.second, c.second_data.as_ref().unwrap_or(&c.data)));
-            let counted = sides.and_then(|(a, b)| {
-                let trainings = (a.len(), b.len());
-                difference(&a, &b, BOOTSTRAP_SEED).map(|d| (d, trainings))
-            });
-            (c, counted)
+            let trainings = sides.as_ref().map(|(a, b)| (a.len(), b.len()));
+            (c, trainings, sides.and_then(|(a, b)| difference(&a, &b, BOOTSTRAP_SEED)))
         })
         .collect();
-    let p_values: Vec<f64> = found.iter().filter_map(|(_, d)| d.as_ref().map(|(d, _)| d.p_value)).collect();
+    let p_values: Vec<f64> = found.iter().filter_map(|(_, _, d)| d.as_ref().map(|d| d.p_value)).collect();
     let mut adjusted = holm(&p_values).into_iter();
-    for (comparison, counted) in found {
+    for (comparison, trainings, counted) in found {
         let side = |arm: &String, data: &String| match &comparison.second_data {
             Some(_) => format!("{}, {data}", study.arms[arm].label),
             None => study.arms[arm].label.clone(),
@@ -407,9 +404,11 @@ fn comparisons(
             true => "all".to_owned(),
             false => comparison.groups.join(", "),
         };
-        let rest = match counted {
-            None => "| not run | - | - | not run".to_owned(),
-            Some((d, (m, n))) => {
+        let rest = match (trainings, counted) {
+            (None, _) => "| not run | - | - | not run".to_owned(),
+            // one training says nothing of how trainings differ
+            (Some((m, n)), None) => format!("| {m}, {n} | - | - | too few trainings"),
+            (Some((m, n)), Some(d)) => {
                 let p = adjusted.next().unwrap_or(1.0);
                 let Estimate { value, low, high } = d.estimate;
                 let answer = match (p < 0.05, value > 0.0) {
@@ -609,6 +608,22 @@ mod tests {
         let page = robot_page(&Study::open(&file).unwrap(), &file).unwrap();
         assert!(page.contains("| | PickChain, 200 | PickChain, 25, careful |\n"), "{page}");
         assert!(page.contains("| Better? | one step, lift | one step, chain | all | not run |"), "{page}");
+    }
+
+    #[test]
+    fn one_training_on_a_side_is_too_few_and_not_called_unrun() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
+        let study = Study::open(&file).unwrap();
+        let row = "| Do they help? | six steps | one step | all |";
+        assert!(robot_page(&study, &file).unwrap().contains(&format!("{row} not run | - | - | not run |")));
+        for cell in cells(&study).iter().filter(|cell| cell.stage == 1 && cell.seed == 1) {
+            let result = result(&study, cell, "t", [true, cell.arm == "six", true, true]);
+            result.write(&folder.path().join(cell.file_name("t"))).unwrap();
+        }
+        let page = robot_page(&study, &file).unwrap();
+        assert!(page.contains(&format!("{row} 1, 1 | - | - | too few trainings |")), "{page}");
     }
 
     #[test]
