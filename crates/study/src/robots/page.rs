@@ -379,7 +379,7 @@ fn comparisons(
          rows of this table.\n\n| question | first | second | episodes | trainings | difference | p | answer |\n\
          |---|---|---|---|---|---|---|---|"
     );
-    let found: Vec<(&Comparison, Option<(usize, usize)>, Option<_>)> = of_stage
+    let found: Vec<_> = of_stage
         .into_iter()
         .map(|c| {
             let side = |arm: &String, data: &String| {
