@@ -7,6 +7,7 @@
 
 mod attention;
 mod block;
+mod convolution;
 mod decoder;
 mod encoder;
 mod feed_forward;
@@ -21,6 +22,7 @@ mod vae;
 mod vision;
 
 pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_and_values_backward, scatter};
+pub(crate) use convolution::{convolve, framed, input_gradient, weight_gradient as convolution_gradient};
 pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::{Encoder, EncoderLayer};
 pub(crate) use loss::AbsoluteError;

@@ -3,12 +3,19 @@
 //! All cameras of the same size go through the network as one batch. Feature maps are kept in frames of zeros for the
 //! convolutions (`kernels/conv.rs`); normed values are kept for the backward pass, everything else is computed in passing.
 
+use super::convolution::{framed, input_gradient, weight_gradient};
 use super::{Grads, Pass, slot};
 use crate::encoders::{BACKBONE, EPS, ImageNorm, PROJECTION, ResNetShape, Size};
 use crate::kernels::{
     Conv, Frame, Shortcut, add, group_norm, group_norm_backward, max_pool, max_pool_backward, relu_backward,
     scale_backward, scale_relu,
 };
+
+fn convolve(pass: &mut Pass<'_>, name: &str, conv: &Conv, x: &[f32]) -> Vec<f32> {
+    let mut y = pass.take(conv.made((0, 0)).inside());
+    super::convolution::convolve(pass, name, conv, x, false, &mut y);
+    y
+}
 
 /// Values of a convolution's output, normed if there are groups, and what the norm multiplies and adds.
 #[derive(Debug)]
@@ -54,20 +61,25 @@ struct Net<'a> {
 
 impl<'a> Net<'a> {
     fn new(shape: &'a ResNetShape, pictures: usize, (height, width): Size) -> Self {
-        let input = Frame { pictures, height, width, channels: 3, border: 3 };
-        let stem = Conv { input, output: shape.width, kernel: 7, stride: 2 };
-        let made = stem.made(1);
+        let input = Frame { pictures, height, width, channels: 3, border: (3, 3) };
+        let stem = Conv { input, output: shape.width, kernel: (7, 7), stride: (2, 2) };
+        let made = stem.made((1, 1));
         let pooled = Frame { height: made.height.div_ceil(2), width: made.width.div_ceil(2), ..made };
         let (mut frame, mut blocks) = (pooled, Vec::new());
         let all = shape.all_blocks();
         let count = all.len();
         for (i, (name, before, after, stride)) in all.into_iter().enumerate() {
-            let conv1 = Conv { input: frame, output: after, kernel: 3, stride };
-            let conv2 = Conv { input: conv1.made(1), output: after, kernel: 3, stride: 1 };
-            let downsample =
-                (stride != 1 || before != after).then_some(Conv { input: frame, output: after, kernel: 1, stride });
+            let conv1 = Conv { input: frame, output: after, kernel: (3, 3), stride: (stride, stride) };
+            let conv2 = Conv { input: conv1.made((1, 1)), output: after, kernel: (3, 3), stride: (1, 1) };
+            let downsample = (stride != 1 || before != after).then_some(Conv {
+                input: frame,
+                output: after,
+                kernel: (1, 1),
+                stride: (stride, stride),
+            });
             // nothing reads windows of the last map
-            let out = conv2.made(usize::from(i + 1 < count));
+            let border = usize::from(i + 1 < count);
+            let out = conv2.made((border, border));
             blocks.push(Block { name: format!("{BACKBONE}.{name}"), conv1, conv2, downsample, out });
             frame = out;
         }
@@ -127,7 +139,7 @@ impl<'a> Net<'a> {
 
     /// pictures: framed -> the last map, (n, pixels, C), and what the backward pass needs
     fn forward(&self, pass: &mut Pass<'_>, pictures: Vec<f32>) -> Seen {
-        let made = self.stem.made(1);
+        let made = self.stem.made((1, 1));
         let y = convolve(pass, &format!("{BACKBONE}.conv1"), &self.stem, &pictures);
         let stem = self.norm(pass, &format!("{BACKBONE}.bn1"), y, &made);
         let mut x = framed(pass, &made);
@@ -187,7 +199,7 @@ impl<'a> Net<'a> {
         }
         let pooled = maps.pop().expect("what the first block read");
         relu_backward(&mut grad, &self.pooled, &pooled);
-        let made = self.stem.made(1);
+        let made = self.stem.made(self.stem.grad_border());
         let mut before = pass.take(made.inside());
         max_pool_backward(&grad, &winner, &made, &self.pooled, &mut before);
         let framed = self.norm_backward(pass, &format!("{BACKBONE}.bn1"), stem, &made, &before, grads);
@@ -209,7 +221,7 @@ impl<'a> Net<'a> {
     ) -> Vec<f32> {
         let name = |last: &str| format!("{}.{last}", block.name);
         let middle = block.conv2.input;
-        let made = block.conv2.made(1);
+        let made = block.conv2.made((1, 1));
         let framed = self.norm_backward(pass, &name("bn2"), second, &made, &grad, grads);
         weight_gradient(pass, &name("conv2"), &block.conv2, &a, &framed, grads);
         let mut inner = pass.take(middle.inside());
@@ -225,7 +237,7 @@ impl<'a> Net<'a> {
         pass.give(framed);
         match (down, block.downsample) {
             (Some(down), Some(conv)) => {
-                let made = conv.made(0);
+                let made = conv.made((0, 0));
                 let framed = self.norm_backward(pass, &name("downsample.1"), down, &made, &grad, grads);
                 weight_gradient(pass, &name("downsample.0"), &conv, x, &framed, grads);
                 input_gradient(pass, &name("downsample.0"), &conv, &framed, true, &mut out);
@@ -259,50 +271,6 @@ impl Seen {
             }
         }
     }
-}
-
-/// A frame with its border of zeros.
-fn framed(pass: &mut Pass<'_>, frame: &Frame) -> Vec<f32> {
-    let mut x = pass.take(frame.len());
-    frame.clear_border(&mut x);
-    x
-}
-
-fn convolve(pass: &mut Pass<'_>, name: &str, conv: &Conv, x: &[f32]) -> Vec<f32> {
-    let weight = pass.weight(name, ".weight");
-    let mut y = pass.take(conv.made(0).inside());
-    let make = |panels: &mut [f32]| conv.pack(weight, panels);
-    match pass.packed {
-        Some(packed) => {
-            // panels are as wide as the vectors of the instruction set that reads them
-            let panels = packed.made_once(&format!("{name} in panels of {}", conv.panel_width()), || {
-                let mut panels = vec![0.0; conv.panel_len().0];
-                make(&mut panels);
-                panels
-            });
-            conv.forward(x, &panels, &mut y);
-        }
-        None => {
-            let mut panels = pass.take(conv.panel_len().0);
-            make(&mut panels);
-            conv.forward(x, &panels, &mut y);
-            pass.give(panels);
-        }
-    }
-    y
-}
-
-fn input_gradient(pass: &mut Pass<'_>, name: &str, conv: &Conv, grad: &[f32], add: bool, out: &mut [f32]) {
-    let mut panels = pass.take(conv.panel_len().1);
-    conv.pack_backward(pass.weight(name, ".weight"), &mut panels);
-    conv.backward(grad, &panels, add, out);
-    pass.give(panels);
-}
-
-fn weight_gradient(pass: &mut Pass<'_>, name: &str, conv: &Conv, x: &[f32], grad: &[f32], grads: &mut Grads<'_>) {
-    let mut turned = pass.take(conv.weights());
-    conv.weight_gradient(x, grad, &mut turned, slot(grads, name, ".weight"));
-    pass.give(turned);
 }
 
 /// Cameras, and the network that all of them go through.

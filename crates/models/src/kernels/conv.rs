@@ -1,10 +1,12 @@
 //! Convolutions as products over windows, without copies of the windows.
 //!
-//! Pictures lie pixel after pixel with all channels of a pixel side by side, in a frame of zeros as wide as the padding.
+//! Pictures lie pixel after pixel with all channels of a pixel side by side, in a frame of zeros as wide as the padding; a
+//! sequence is a picture of one row, convolved by kernels of one row, and upsampling is the way back of a convolution.
 //! A window is then a few stretches of memory that follow each other at equal distances, and a product can read the
 //! stretches of a dozen windows where they are. Forward pass, gradient of the input and gradient of the weights are all
 //! such products. Sums run in an order that depends on the sizes alone.
 
+use super::gemm::{Pack, Start, few_or_many};
 use crate::simd::dispatch;
 use pulp::{Simd, WithSimd};
 
@@ -20,19 +22,19 @@ pub(crate) struct Frame {
     pub(crate) height: usize,
     pub(crate) width: usize,
     pub(crate) channels: usize,
-    /// zeros on every side
-    pub(crate) border: usize,
+    /// rows of zeros above and below, columns of zeros to the left and right
+    pub(crate) border: (usize, usize),
 }
 
 impl Frame {
     /// Numbers of a row with its borders.
     pub(crate) fn row(&self) -> usize {
-        (self.width + 2 * self.border) * self.channels
+        (self.width + 2 * self.border.1) * self.channels
     }
 
     /// Numbers of a picture with its borders.
     pub(crate) fn picture(&self) -> usize {
-        (self.height + 2 * self.border) * self.row()
+        (self.height + 2 * self.border.0) * self.row()
     }
 
     /// Numbers of all pictures, and some that are never used.
@@ -53,18 +55,18 @@ impl Frame {
     /// Where row `y` of picture `n` begins inside the border.
     #[inline(always)]
     pub(crate) fn at(&self, n: usize, y: usize) -> usize {
-        n * self.picture() + (y + self.border) * self.row() + self.border * self.channels
+        n * self.picture() + (y + self.border.0) * self.row() + self.border.1 * self.channels
     }
 
     /// Writes the zeros of the border and of the tail.
     pub(crate) fn clear_border(&self, x: &mut [f32]) {
-        let (row, side) = (self.row(), self.border * self.channels);
+        let (row, side) = (self.row(), self.border.1 * self.channels);
         let end = self.pictures * self.picture();
         for picture in x[..end].chunks_exact_mut(self.picture().max(1)) {
-            picture[..self.border * row].fill(0.0);
-            let below = (self.border + self.height) * row;
+            picture[..self.border.0 * row].fill(0.0);
+            let below = (self.border.0 + self.height) * row;
             picture[below..].fill(0.0);
-            for line in picture[self.border * row..below].chunks_exact_mut(row) {
+            for line in picture[self.border.0 * row..below].chunks_exact_mut(row) {
                 line[..side].fill(0.0);
                 line[row - side..].fill(0.0);
             }
@@ -73,17 +75,17 @@ impl Frame {
     }
 }
 
-/// A convolution without bias, padded by half its kernel.
+/// A convolution without bias, padded by half of what its kernel is wider than one pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Conv {
     /// what it reads
     pub(crate) input: Frame,
     /// channels that it makes
     pub(crate) output: usize,
-    /// 1, 3 or 7
-    pub(crate) kernel: usize,
-    /// 1 or 2
-    pub(crate) stride: usize,
+    /// rows and columns of a window
+    pub(crate) kernel: (usize, usize),
+    /// rows and columns from window to window: 1 or 2
+    pub(crate) stride: (usize, usize),
 }
 
 /// Places of a grid of windows: `start + picture * n + row * y + column * x`.
@@ -143,41 +145,46 @@ impl Grid {
 }
 
 impl Conv {
-    fn padding(&self) -> usize {
-        self.kernel / 2
+    fn padding(&self) -> (usize, usize) {
+        ((self.kernel.0 - 1) / 2, (self.kernel.1 - 1) / 2)
+    }
+
+    /// Weights between two channels.
+    fn taps(&self) -> usize {
+        self.kernel.0 * self.kernel.1
     }
 
     /// What it makes, in a frame of `border`.
-    pub(crate) fn made(&self, border: usize) -> Frame {
+    pub(crate) fn made(&self, border: (usize, usize)) -> Frame {
         let Frame { pictures, height, width, .. } = self.input;
-        let (height, width) = (height.div_ceil(self.stride), width.div_ceil(self.stride));
+        let (height, width) = (height.div_ceil(self.stride.0), width.div_ceil(self.stride.1));
         Frame { pictures, height, width, channels: self.output, border }
     }
 
     /// Numbers of its weights.
     pub(crate) fn weights(&self) -> usize {
-        self.output * self.input.channels * self.kernel * self.kernel
+        self.output * self.input.channels * self.taps()
     }
 
     /// Windows of the input, results one after the other.
     fn forward_grid(&self) -> Grid {
-        let (x, made) = (self.input, self.made(0));
+        let (x, made) = (self.input, self.made((0, 0)));
         let c = x.channels;
-        let inset = x.border - self.padding();
+        let pad = self.padding();
         Grid {
             pictures: x.pictures,
             rows: made.height,
             columns: made.width,
             from: Places {
-                start: inset * (x.row() + c),
+                start: (x.border.0 - pad.0) * x.row() + (x.border.1 - pad.1) * c,
                 picture: x.picture(),
-                row: self.stride * x.row(),
-                column: self.stride * c,
+                row: self.stride.0 * x.row(),
+                column: self.stride.1 * c,
             },
             to: Places { start: 0, picture: made.picture(), row: made.row(), column: made.channels },
-            stretches: self.kernel,
+            stretches: self.kernel.0,
             apart: x.row(),
-            length: self.kernel * c,
+            length: self.kernel.1 * c,
         }
     }
 
@@ -187,25 +194,26 @@ impl Conv {
     fn backward_grids(&self, grad: Frame) -> Vec<(Grid, Vec<usize>, Vec<usize>)> {
         let (x, g) = (self.input, grad);
         let (pad, s) = (self.padding(), self.stride);
-        // an input row 2 i + parity meets the kernel's rows `ky` of the outputs `first + 0..`
-        let taps = |parity: usize| -> (Vec<usize>, usize) {
+        // an input row 2 i + parity meets the kernel's rows `ky` of the outputs `first + 0..`; columns likewise
+        let taps = |parity: usize, (kernel, pad, s, border): (usize, usize, usize, usize)| -> (Vec<usize>, usize) {
             let taps: Vec<usize> =
-                (0..self.kernel).rev().filter(|ky| (parity + pad + s - ky % s).is_multiple_of(s)).collect();
+                (0..kernel).rev().filter(|ky| (parity + pad + s - ky % s).is_multiple_of(s)).collect();
             // the output of the first tap, counted with the border: (parity + pad - ky) / s, which may be negative
-            let first = taps.first().map_or(0, |&ky| g.border * s + parity + pad - ky) / s;
+            let first = taps.first().map_or(0, |&ky| border * s + parity + pad - ky) / s;
             (taps, first)
         };
         let mut grids = Vec::new();
-        for py in 0..s.min(x.height) {
-            for px in 0..s.min(x.width) {
-                let ((ys, y0), (xs, x0)) = (taps(py), taps(px));
+        for py in 0..s.0.min(x.height) {
+            for px in 0..s.1.min(x.width) {
+                let (ys, y0) = taps(py, (self.kernel.0, pad.0, s.0, g.border.0));
+                let (xs, x0) = taps(px, (self.kernel.1, pad.1, s.1, g.border.1));
                 if ys.is_empty() || xs.is_empty() {
                     continue;
                 }
                 let grid = Grid {
                     pictures: x.pictures,
-                    rows: (x.height - py).div_ceil(s),
-                    columns: (x.width - px).div_ceil(s),
+                    rows: (x.height - py).div_ceil(s.0),
+                    columns: (x.width - px).div_ceil(s.1),
                     from: Places {
                         start: y0 * g.row() + x0 * g.channels,
                         picture: g.picture(),
@@ -215,8 +223,8 @@ impl Conv {
                     to: Places {
                         start: (py * x.width + px) * x.channels,
                         picture: x.height * x.width * x.channels,
-                        row: s * x.width * x.channels,
-                        column: s * x.channels,
+                        row: s.0 * x.width * x.channels,
+                        column: s.1 * x.channels,
                     },
                     stretches: ys.len(),
                     apart: g.row(),
@@ -229,25 +237,28 @@ impl Conv {
     }
 
     /// Border that the output's gradient needs around it.
-    pub(crate) fn grad_border(&self) -> usize {
-        self.padding().min(1)
+    pub(crate) fn grad_border(&self) -> (usize, usize) {
+        // outputs beyond the ends that an input would meet if they were there
+        let beyond = |kernel: usize, pad: usize, stride: usize| (kernel - 1 - pad).div_ceil(stride);
+        let pad = self.padding();
+        (beyond(self.kernel.0, pad.0, self.stride.0), beyond(self.kernel.1, pad.1, self.stride.1))
     }
 
-    /// Columns of a panel of the forward pass.
-    pub(crate) fn panel_width(&self) -> usize {
-        panel_width(self.output)
+    /// Columns of a panel, of the forward pass and of the input's gradient.
+    pub(crate) fn panel_widths(&self) -> (usize, usize) {
+        (panel_width(self.output), panel_width(self.input.channels))
     }
 
     /// Numbers of the panels of both directions.
     pub(crate) fn panel_len(&self) -> (usize, usize) {
-        let per = self.kernel * self.kernel;
+        let per = self.taps();
         let wide = |n: usize| n.next_multiple_of(panel_width(n));
         (per * self.input.channels * wide(self.output), per * self.output * wide(self.input.channels))
     }
 
     /// w: (O, I, k, k) -> panels of the forward pass
     pub(crate) fn pack(&self, w: &[f32], panels: &mut [f32]) {
-        let (c, per) = (self.input.channels, self.kernel * self.kernel);
+        let (c, per) = (self.input.channels, self.taps());
         let nr = panel_width(self.output);
         for (j0, panel) in (0..self.output).step_by(nr).zip(panels.chunks_exact_mut(per * c * nr)) {
             let columns = nr.min(self.output - j0);
@@ -266,7 +277,7 @@ impl Conv {
 
     /// w: (O, I, k, k) -> panels of the input's gradient, one after the other for each of its grids
     pub(crate) fn pack_backward(&self, w: &[f32], panels: &mut [f32]) {
-        let (c, o, k) = (self.input.channels, self.output, self.kernel);
+        let (c, o, per) = (self.input.channels, self.output, self.taps());
         let nr = panel_width(c);
         let mut rest = panels;
         for (grid, ys, xs) in self.backward_grids(self.made(self.grad_border())) {
@@ -275,11 +286,11 @@ impl Conv {
             rest = others;
             for (j0, panel) in (0..c).step_by(nr).zip(mine.chunks_exact_mut(depth * nr)) {
                 let columns = nr.min(c - j0);
-                let taps = ys.iter().flat_map(|y| xs.iter().map(move |x| y * k + x));
+                let taps = ys.iter().flat_map(|y| xs.iter().map(move |x| y * self.kernel.1 + x));
                 for (tap, lines) in taps.zip(panel.chunks_exact_mut(o * nr)) {
                     for (from, line) in lines.chunks_exact_mut(nr).enumerate() {
-                        let from = (from * c + j0) * k * k + tap;
-                        for (to, w) in line[..columns].iter_mut().zip(w[from..].iter().step_by(k * k)) {
+                        let from = (from * c + j0) * per + tap;
+                        for (to, w) in line[..columns].iter_mut().zip(w[from..].iter().step_by(per)) {
                             *to = *w;
                         }
                         line[columns..].fill(0.0);
@@ -289,16 +300,16 @@ impl Conv {
         }
     }
 
-    /// x: the input's frame -> out: (pixels, O)
-    pub(crate) fn forward(&self, x: &[f32], panels: &[f32], out: &mut [f32]) {
-        self.run(self.forward_grid(), x, panels, self.output, false, out);
+    /// x: the input's frame -> out: (pixels, O); with `add` added to what is there
+    pub(crate) fn forward(&self, x: &[f32], panels: &[f32], add: bool, out: &mut [f32]) {
+        self.run(self.forward_grid(), x, panels, self.output, add, out);
     }
 
     /// grad: the output's gradient in a frame of `grad_border`, `panels` of `pack_backward` -> that of the input, (pixels, I);
     /// with `add` added to what is there. Pixels that no output sees are written only without `add`.
     pub(crate) fn backward(&self, grad: &[f32], panels: &[f32], add: bool, out: &mut [f32]) {
         let grids = self.backward_grids(self.made(self.grad_border()));
-        if !add && grids.len() < self.stride.min(self.input.height) * self.stride.min(self.input.width) {
+        if !add && grids.len() < self.stride.0.min(self.input.height) * self.stride.1.min(self.input.width) {
             out.fill(0.0);
         }
         let c = self.input.channels;
@@ -316,13 +327,20 @@ impl Conv {
 
     /// x: the input's frame, grad: as in `backward`; adds the gradient of the weights to `into`: (O, I, k, k). `turned` is
     /// scratch of as many numbers.
-    pub(crate) fn weight_gradient(&self, x: &[f32], grad: &[f32], turned: &mut [f32], into: &mut [f32]) {
+    pub(crate) fn weight_gradient(
+        &self,
+        x: &[f32],
+        grad: &[f32],
+        turned: &mut [f32],
+        into: &mut [f32],
+        pack: &mut Pack,
+    ) {
         let mut grid = self.forward_grid();
         let g = self.made(self.grad_border());
         grid.to = Places { start: g.at(0, 0), picture: g.picture(), row: g.row(), column: g.channels };
         turned.fill(0.0);
-        dispatch(WeightGradient { grid, x, grad, output: self.output, into: turned });
-        let (c, per) = (self.input.channels, self.kernel * self.kernel);
+        dispatch(WeightGradient { grid, x, grad, output: self.output, into: turned, pack });
+        let (c, per) = (self.input.channels, self.taps());
         for (to, from) in into.chunks_exact_mut(c * per).zip(turned.chunks_exact(c * per)) {
             for (i, to) in to.chunks_exact_mut(per).enumerate() {
                 to.iter_mut().zip(from[i..].iter().step_by(c)).for_each(|(to, x)| *to += x);
@@ -381,7 +399,8 @@ fn windows<S: Simd, const R: usize, const V: usize>(simd: S, w: Windows<'_>) {
             for places in block[..count].chunks(R) {
                 // the last windows of a block may be few
                 match places.len() {
-                    0..=6 if R == 12 => tile::<S, 6, V>(simd, &grid, x, panel, places, (j0, columns), add, out),
+                    0..=4 if R == 12 => tile::<S, 4, V>(simd, &grid, x, panel, places, (j0, columns), add, out),
+                    5..=8 if R == 12 => tile::<S, 8, V>(simd, &grid, x, panel, places, (j0, columns), add, out),
                     _ => tile::<S, R, V>(simd, &grid, x, panel, places, (j0, columns), add, out),
                 }
             }
@@ -462,13 +481,15 @@ fn tile<S: Simd, const R: usize, const V: usize>(
     }
 }
 
-/// `into[o][depth] += sum over windows of grad[to][o] * x[window][depth]`
+/// `into[o][depth] += sum over windows of grad[to][o] * x[window][depth]`: the product of two matrices whose rows lie where
+/// the windows are, packed block by block for `gemm`'s tile.
 struct WeightGradient<'a> {
     grid: Grid,
     x: &'a [f32],
     grad: &'a [f32],
     output: usize,
     into: &'a mut [f32],
+    pack: &'a mut Pack,
 }
 
 impl WithSimd for WeightGradient<'_> {
@@ -476,78 +497,79 @@ impl WithSimd for WeightGradient<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        if S::F32_LANES >= 16 { weights::<S, 8, 3>(simd, self) } else { weights::<S, 4, 3>(simd, self) }
+        if S::F32_LANES >= 16 { weights::<S, 12>(simd, self) } else { weights::<S, 6>(simd, self) }
+    }
+}
+
+/// A vector's worth of a window: where it begins in the window and in a row of weights, how many of its numbers count.
+#[derive(Clone, Copy, Default)]
+struct Piece {
+    from: usize,
+    to: usize,
+    count: usize,
+}
+
+impl Grid {
+    /// A window in pieces of `lanes` numbers, each of one stretch.
+    fn pieces(&self, lanes: usize) -> Vec<Piece> {
+        let of_stretch = |s: usize| {
+            (0..self.length).step_by(lanes).map(move |at| Piece {
+                from: s * self.apart + at,
+                to: s * self.length + at,
+                count: lanes.min(self.length - at),
+            })
+        };
+        (0..self.stretches).flat_map(of_stretch).collect()
     }
 }
 
 #[inline(always)]
-fn weights<S: Simd, const R: usize, const V: usize>(simd: S, w: WeightGradient<'_>) {
-    let WeightGradient { grid, x, grad, output, into } = w;
+fn weights<S: Simd, const MR: usize>(simd: S, w: WeightGradient<'_>) {
+    let WeightGradient { grid, x, grad, output, into, pack } = w;
     let (lanes, depth) = (S::F32_LANES, grid.depth());
-    let wide = V * lanes;
+    let nr = 2 * lanes;
+    let pieces = grid.pieces(lanes);
+    let panels = pack.panels(BLOCK * output.next_multiple_of(MR), BLOCK * nr);
     let mut block: Block = [(0, 0); BLOCK];
     for first in (0..grid.windows()).step_by(BLOCK) {
         let count = grid.block(first, &mut block);
-        for o0 in (0..output).step_by(R) {
-            let channels = R.min(output - o0);
-            for s in 0..grid.stretches {
-                for p0 in (0..grid.length).step_by(wide) {
-                    let at = s * grid.apart + p0;
-                    let sums = match channels == R {
-                        true => weight_tile::<S, R, V>(simd, x, grad, &block[..count], at, o0),
-                        false => {
-                            let mut some = [[simd.splat_f32s(0.0); V]; R];
-                            for (r, sums) in some.iter_mut().enumerate().take(channels) {
-                                [*sums] = weight_tile::<S, 1, V>(simd, x, grad, &block[..count], at, o0 + r);
-                            }
-                            some
-                        }
-                    };
-                    let columns = wide.min(grid.length - p0);
-                    let mut buffer = [0f32; 64];
-                    for (r, sums) in sums.iter().enumerate().take(channels) {
-                        let (whole, _) = S::as_mut_simd_f32s(&mut buffer[..wide]);
-                        whole.copy_from_slice(sums);
-                        let line = &mut into[(o0 + r) * depth + s * grid.length + p0..][..columns];
-                        line.iter_mut().zip(&buffer).for_each(|(to, sum)| *to += sum);
+        for (panel, o0) in panels.0.chunks_exact_mut(MR * count).zip((0..output).step_by(MR)) {
+            let channels = MR.min(output - o0);
+            for (line, &(_, to)) in panel.chunks_exact_mut(MR).zip(&block[..count]) {
+                match grad[to + o0..].first_chunk::<MR>() {
+                    // beyond the last channel is something else, of which nothing is kept
+                    Some(values) => line.copy_from_slice(values),
+                    None => line[..channels].copy_from_slice(&grad[to + o0..][..channels]),
+                }
+            }
+        }
+        for pair in pieces.chunks(2) {
+            let [one, other] = [pair[0], pair[pair.len() - 1]];
+            let panel_b = &mut panels.1[..count * nr];
+            let (lines, _) = S::as_mut_simd_f32s(panel_b);
+            for (line, &(from, _)) in lines.chunks_exact_mut(2).zip(&block[..count]) {
+                line[0] = S::as_simd_f32s(&x[from + one.from..][..lanes]).0[0];
+                line[1] = S::as_simd_f32s(&x[from + other.from..][..lanes]).0[0];
+            }
+            let whole = pair.len() == 2 && one.count == lanes && other.count == lanes;
+            for (panel_a, o0) in panels.0.chunks_exact(MR * count).zip((0..output).step_by(MR)) {
+                let channels = MR.min(output - o0);
+                if whole {
+                    let at = &mut into[o0 * depth + one.to..];
+                    few_or_many::<S, MR>(simd, (panel_a, panel_b), Start::Add, at, depth, (channels, nr));
+                    continue;
+                }
+                let mut sums = [0f32; 12 * 64];
+                few_or_many::<S, MR>(simd, (panel_a, panel_b), Start::Zero, &mut sums, nr, (channels, nr));
+                for (o, sums) in sums.chunks_exact(nr).take(channels).enumerate() {
+                    for (piece, sums) in pair.iter().zip(sums.chunks_exact(lanes)) {
+                        let to = &mut into[(o0 + o) * depth + piece.to..][..piece.count];
+                        to.iter_mut().zip(sums).for_each(|(to, sum)| *to += sum);
                     }
                 }
             }
         }
     }
-}
-
-/// As in [`tile`] nothing may panic.
-#[allow(clippy::needless_range_loop)] // plain indices keep the tile in registers
-#[inline(always)]
-fn weight_tile<S: Simd, const R: usize, const V: usize>(
-    simd: S,
-    x: &[f32],
-    grad: &[f32],
-    places: &[(usize, usize)],
-    at: usize,
-    o0: usize,
-) -> [[S::f32s; V]; R] {
-    let wide = V * S::F32_LANES;
-    let mut sums = [[simd.splat_f32s(0.0); V]; R];
-    for some in places.chunks(STRIDE) {
-        // as in `tile`
-        let mut own = sums;
-        for &(from, to) in some {
-            let (b, a) = (x.get(from + at..).and_then(|x| x.get(..wide)), grad.get(to + o0..));
-            let (Some(b), Some(a)) = (b, a.and_then(|a| a.first_chunk::<R>())) else { continue };
-            let (b, _) = S::as_simd_f32s(b);
-            let Some(b) = b.first_chunk::<V>() else { continue };
-            for r in 0..R {
-                let a = simd.splat_f32s(a[r]);
-                for v in 0..V {
-                    own[r][v] = simd.mul_add_e_f32s(a, b[v], own[r][v]);
-                }
-            }
-        }
-        sums = own;
-    }
-    sums
 }
 
 #[cfg(test)]

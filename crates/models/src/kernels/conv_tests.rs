@@ -5,30 +5,30 @@ use crate::simd::{Level, at_most};
 
 /// What a convolution is by its definition, in f64: (n, h, w, c) and (O, I, k, k) -> (n, oh, ow, O).
 fn naive(conv: &Conv, x: &[f32], w: &[f32]) -> Vec<f64> {
-    let (f, made, k) = (conv.input, conv.made(0), conv.kernel);
+    let (f, made, k) = (conv.input, conv.made((0, 0)), conv.kernel);
     let mut out = vec![0.0; made.inside()];
     each(conv, |to, from, weight| out[to] += f64::from(x[from]) * f64::from(w[weight]));
-    assert_eq!((f.channels * made.channels * k * k, w.len()), (w.len(), conv.weights()));
+    assert_eq!((f.channels * made.channels * k.0 * k.1, w.len()), (w.len(), conv.weights()));
     out
 }
 
 /// Calls `f(output, input, weight)` for every product of the definition.
 fn each(conv: &Conv, mut f: impl FnMut(usize, usize, usize)) {
-    let (x, made, k) = (conv.input, conv.made(0), conv.kernel);
+    let (x, made, k) = (conv.input, conv.made((0, 0)), conv.kernel);
     for n in 0..x.pictures {
         for oy in 0..made.height {
             for ox in 0..made.width {
-                for (ky, kx) in (0..k * k).map(|t| (t / k, t % k)) {
-                    let (y, x0) = (oy * conv.stride + ky, ox * conv.stride + kx);
-                    let pad = k / 2;
-                    if y < pad || x0 < pad || y - pad >= x.height || x0 - pad >= x.width {
+                for (ky, kx) in (0..k.0 * k.1).map(|t| (t / k.1, t % k.1)) {
+                    let (y, x0) = (oy * conv.stride.0 + ky, ox * conv.stride.1 + kx);
+                    let pad = ((k.0 - 1) / 2, (k.1 - 1) / 2);
+                    if y < pad.0 || x0 < pad.1 || y - pad.0 >= x.height || x0 - pad.1 >= x.width {
                         continue;
                     }
-                    let pixel = (n * x.height + y - pad) * x.width + x0 - pad;
+                    let pixel = (n * x.height + y - pad.0) * x.width + x0 - pad.1;
                     for o in 0..conv.output {
                         for i in 0..x.channels {
                             let to = ((n * made.height + oy) * made.width + ox) * conv.output + o;
-                            f(to, pixel * x.channels + i, ((o * x.channels + i) * k + ky) * k + kx);
+                            f(to, pixel * x.channels + i, ((o * x.channels + i) * k.0 + ky) * k.1 + kx);
                         }
                     }
                 }
@@ -72,8 +72,22 @@ fn cases() -> Vec<Conv> {
         (1, 18, 17, 2, 40, 3, 2),
     ] {
         for border in [kernel / 2, 3] {
-            let input = Frame { pictures, height, width, channels, border };
-            all.push(Conv { input, output, kernel, stride });
+            let input = Frame { pictures, height, width, channels, border: (border, border) };
+            all.push(Conv { input, output, kernel: (kernel, kernel), stride: (stride, stride) });
+        }
+    }
+    // sequences: those of a UNet, one step alone, and the way back of an upsampling
+    for (pictures, width, channels, output, kernel, stride) in [
+        (3, 8, 7, 20, 5, 1),
+        (1, 1, 16, 33, 5, 1),
+        (2, 8, 17, 5, 3, 2),
+        (1, 2, 4, 16, 3, 2),
+        (2, 6, 9, 9, 4, 2),
+        (4, 5, 6, 3, 1, 1),
+    ] {
+        for border in [(0, kernel / 2), (1, 2)] {
+            let input = Frame { pictures, height: 1, width, channels, border };
+            all.push(Conv { input, output, kernel: (1, kernel), stride: (1, stride) });
         }
     }
     all
@@ -85,7 +99,7 @@ fn all_three_products_are_those_of_the_definition() {
         let what = format!("{conv:?}");
         let mut rng = Rng::new(1, "conv");
         let (x, w) = (rng.normals(conv.input.inside()), rng.normals(conv.weights()));
-        let grad = rng.normals(conv.made(0).inside());
+        let grad = rng.normals(conv.made((0, 0)).inside());
         let (mut dx, mut dw) = (vec![0f64; x.len()], vec![0f64; w.len()]);
         each(&conv, |to, from, weight| {
             dx[from] += f64::from(grad[to]) * f64::from(w[weight]);
@@ -96,17 +110,20 @@ fn all_three_products_are_those_of_the_definition() {
                 let frame = framed(&conv.input, &x);
                 let mut panels = vec![f32::NAN; conv.panel_len().0];
                 conv.pack(&w, &mut panels);
-                let mut out = vec![f32::NAN; conv.made(0).inside()];
-                conv.forward(&frame, &panels, &mut out);
+                let mut out = vec![f32::NAN; conv.made((0, 0)).inside()];
+                conv.forward(&frame, &panels, false, &mut out);
                 close(&out, &naive(&conv, &x, &w), &what);
+                out.fill(3.0);
+                conv.forward(&frame, &panels, true, &mut out);
+                close(&out, &naive(&conv, &x, &w).iter().map(|x| x + 3.0).collect::<Vec<_>>(), &what);
 
                 let g = framed(&conv.made(conv.grad_border()), &grad);
                 let mut turned = vec![f32::NAN; w.len()];
                 let mut into = vec![0.5; w.len()];
-                conv.weight_gradient(&frame, &g, &mut turned, &mut into);
+                conv.weight_gradient(&frame, &g, &mut turned, &mut into, &mut Pack::default());
                 close(&into, &dw.iter().map(|x| x + 0.5).collect::<Vec<_>>(), &what);
 
-                if conv.kernel < 7 {
+                if conv.kernel.0 < 7 {
                     let mut panels = vec![f32::NAN; conv.panel_len().1];
                     conv.pack_backward(&w, &mut panels);
                     let mut got = vec![f32::NAN; x.len()];

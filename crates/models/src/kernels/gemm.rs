@@ -63,6 +63,19 @@ pub(crate) struct Packed {
     nr: usize,
 }
 
+impl Pack {
+    /// Room for so many numbers of A and of B.
+    pub(super) fn panels(&mut self, a: usize, b: usize) -> (&mut [f32], &mut [f32]) {
+        if self.a.len() < a {
+            self.a.resize(a, 0.0);
+        }
+        if self.b.len() < b {
+            self.b.resize(b, 0.0);
+        }
+        (&mut self.a[..a], &mut self.b[..b])
+    }
+}
+
 struct PanelWidth;
 
 impl WithSimd for PanelWidth {
@@ -249,12 +262,7 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
     let (depth, wide) = (k.min(KC), n.min(NC).next_multiple_of(nr));
     let tall = m.min(MC).next_multiple_of(MR);
     let packed = packed.filter(|packed| packed.nr == nr);
-    if packed.is_none() && pack.b.len() < depth * wide {
-        pack.b.resize(depth * wide, 0.0);
-    }
-    if pack.a.len() < depth * tall {
-        pack.a.resize(depth * tall, 0.0);
-    }
+    pack.panels(depth * tall, if packed.is_none() { depth * wide } else { 0 });
     for jc in (0..n).step_by(NC) {
         let nc = NC.min(n - jc);
         let mut pc = 0;
@@ -307,6 +315,23 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
                 break;
             }
         }
+    }
+}
+
+/// A tile of two panels, of which the first may have few rows: rows and columns in `size`.
+#[inline(always)]
+pub(super) fn few_or_many<S: Simd, const MR: usize>(
+    simd: S,
+    (a, b): (&[f32], &[f32]),
+    start: Start<'_>,
+    c: &mut [f32],
+    ldc: usize,
+    size: (usize, usize),
+) {
+    match size.0 {
+        0..=4 => tile::<S, MR, 4>(simd, a, b, start, c, ldc, size, (&[], 0)),
+        5..=8 if MR > 8 => tile::<S, MR, 8>(simd, a, b, start, c, ldc, size, (&[], 0)),
+        _ => tile::<S, MR, MR>(simd, a, b, start, c, ldc, size, (&[], 0)),
     }
 }
 

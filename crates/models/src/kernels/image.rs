@@ -249,7 +249,7 @@ pub(crate) fn max_pool(x: &[f32], from: &Frame, to: &Frame, out: &mut [f32], win
                 let (n, y) = (r / to.height, r % to.height);
                 let at = to.at(n, y);
                 // the frame's border takes part: zeros lose against every positive number
-                let first = n * from.picture() + (2 * y + from.border - 1) * from.row() + (from.border - 1) * c;
+                let first = n * from.picture() + (2 * y + from.border.0 - 1) * from.row() + (from.border.1 - 1) * c;
                 let lines = out[at..at + to.width * c].chunks_exact_mut(c).zip(winners.chunks_exact_mut(c));
                 for (column, (out, winner)) in lines.enumerate() {
                     for tap in 0..9 {

@@ -1,7 +1,7 @@
 //! Mish, `x tanh(ln(1 + exp(x)))` (Misra, arXiv 1908.08681), with its derivative.
 
 use crate::error::Result;
-use crate::kernels::elementwise::exp;
+use crate::kernels::mish_parts;
 use crate::simd::vectorised;
 use crate::values::with_values;
 use candle_core::{CpuStorage, CustomOp1, Layout, Result as CandleResult, Shape, Tensor};
@@ -9,16 +9,6 @@ use candle_core::{CpuStorage, CustomOp1, Layout, Result as CandleResult, Shape, 
 /// x: any shape -> the same
 pub fn mish(x: &Tensor) -> Result<Tensor> {
     Ok(x.contiguous()?.apply_op1(Mish)?)
-}
-
-/// `tanh(ln(1 + exp(x)))` and the sigmoid, from one exponential that cannot overflow.
-#[inline(always)]
-fn parts(x: f32) -> (f32, f32) {
-    let w = exp(-x.abs());
-    let square = w * w;
-    let (over, under) = if x < 0.0 { (square + 2.0 * w, 2.0) } else { (1.0 + 2.0 * w, 2.0 * square) };
-    let sigmoid = if x < 0.0 { w } else { 1.0 } / (1.0 + w);
-    (over / (over + under), sigmoid)
 }
 
 struct Mish;
@@ -35,7 +25,7 @@ impl CustomOp1 for Mish {
         let mut out = storage.as_slice::<f32>()?[from..to].to_vec();
         vectorised(
             #[inline(always)]
-            || out.iter_mut().for_each(|x| *x *= parts(*x).0),
+            || out.iter_mut().for_each(|x| *x *= mish_parts(*x).0),
         );
         Ok((CpuStorage::F32(out), layout.shape().clone()))
     }
@@ -47,7 +37,7 @@ impl CustomOp1 for Mish {
                 #[inline(always)]
                 || {
                     for (g, &x) in out.iter_mut().zip(x) {
-                        let (t, sigmoid) = parts(x);
+                        let (t, sigmoid) = mish_parts(x);
                         *g *= t + x * (1.0 - t * t) * sigmoid;
                     }
                 },

@@ -10,11 +10,12 @@
 //! in as many as were trained); every frame starts a window (LeRobot leaves out the last 7 of an episode). The moving average
 //! of the weights is the trainer's (`train.ema_decay`), with one decay; Chi et al.'s grows, LeRobot has none.
 //!
-//! What it costs: the step is composed of candle's operations, convolutions as products over unfolded windows
-//! (`layers/conv1d.rs`); `bench_policies` puts it beside LeRobot's, whose training step is faster. One step of DDIM starts at the
-//! least noisy timestep, as diffusers' spacing `leading` has it: it is there for parity, not to act by.
+//! `unet.rs` is the readable form; training steps and predictions run on `fused.rs`, the same maths written out, which
+//! `bench_policies` puts beside LeRobot's. One step of DDIM starts at the least noisy timestep, as diffusers' spacing
+//! `leading` has it: it is there for parity, not to act by.
 
 mod config;
+pub(crate) mod fused;
 pub mod lerobot;
 mod schedule;
 pub mod unet;
@@ -28,12 +29,15 @@ use crate::chunk_policy::ChunkPolicy;
 use crate::device::HERE;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
-use crate::model::{LossParts, PolicyModel};
+use crate::gradients::Gradients;
+use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::Params;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use crate::rng::Rng;
+use crate::values::with_values;
 use candle_core::Tensor;
+use fused::{Asked, FusedUnet, Wanted};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use unet::Unet;
@@ -49,6 +53,7 @@ pub struct Diffusion {
     params: Params,
     schedule: NoiseSchedule,
     unet: Unet,
+    fused: FusedUnet,
 }
 
 /// Numbers of everything seen at once.
@@ -68,6 +73,27 @@ pub(crate) fn condition(
         joined.push(observation.require(model, &spec.name)?.reshape((rows, signature.n_obs_steps, ()))?);
     }
     Ok(Tensor::cat(&joined, 2)?.reshape((rows, ()))?)
+}
+
+/// A tensor's numbers in order.
+pub(crate) fn values(t: &Tensor) -> Result<Vec<f32>> {
+    with_values(t, <[f32]>::to_vec)
+}
+
+/// Calls `f` with what [`squared_error`] holds an answer to. wanted: (b, H, A)
+pub(crate) fn with_wanted<R>(
+    wanted: &Tensor,
+    batch: &Batch,
+    masked: bool,
+    share: f64,
+    f: impl FnOnce(Wanted<'_>) -> Result<R>,
+) -> Result<R> {
+    let (_, horizon, width) = wanted.dims3()?;
+    let counted = if masked { batch.total_valid_steps * width } else { batch.total_rows * horizon * width };
+    let valid: Option<Vec<f32>> =
+        masked.then(|| values(&batch.is_pad)).transpose()?.map(|pad| pad.iter().map(|pad| 1.0 - pad).collect());
+    let wanted = values(wanted)?;
+    f(Wanted { values: &wanted, valid: valid.as_deref(), entries: counted.max(1) as f64, share })
 }
 
 /// Checks that a sequence of actions reaches the present.
@@ -104,8 +130,9 @@ impl Diffusion {
         let mut p = Params::new();
         let dims = (signature.action_dim, condition_width(signature));
         let unet = Unet::new(&mut p, "unet", dims, &config.network, &mut Rng::new(seed, "init"))?;
+        let fused = FusedUnet::new(&config.network, "unet", (config.action_horizon, signature.action_dim));
         let schedule = NoiseSchedule::new(config.num_train_timesteps);
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, schedule, unet })
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, schedule, unet, fused })
     }
 
     /// The same model drawing its actions otherwise.
@@ -118,7 +145,7 @@ impl Diffusion {
         Ok(self)
     }
 
-    /// What the network gives. x: (b, H, A), the step of each row -> (b, H, A)
+    /// What the network gives, in operations of candle, with a gradient. x: (b, H, A), the step of each row -> (b, H, A)
     ///
     /// # Errors
     /// An observation that does not fit.
@@ -154,12 +181,21 @@ impl Diffusion {
         noise: &Tensor,
         drawn: &mut dyn FnMut() -> Result<Tensor>,
     ) -> Result<Tensor> {
+        let rows = check_observation("diffusion", &self.signature, observation)?;
+        let cond = values(&condition("diffusion", &self.signature, rows, observation)?)?;
         let mut x = noise.clone();
         for step in self.schedule.visited(self.config.inference_steps) {
-            let output = self.denoise(observation, &x, &vec![step; x.dim(0)?])?.detach();
+            let steps = vec![step as f32; rows];
+            let output = self.fused.answered(&self.params, &x, &steps, &cond)?;
             x = self.schedule.back(&self.config, &x, &output, step, drawn)?;
         }
         Ok(x)
+    }
+
+    /// What a training step draws: noise, (b, H, A), and the step of each row.
+    fn drawn(&self, rows: usize, rng: &mut Rng) -> Result<(Tensor, Vec<u32>)> {
+        let noise = self.noise(rows, rng)?;
+        Ok((noise, (0..rows).map(|_| rng.below(self.schedule.steps() as u64) as u32).collect()))
     }
 
     fn noise(&self, rows: usize, rng: &mut Rng) -> Result<Tensor> {
@@ -178,13 +214,29 @@ impl PolicyModel for Diffusion {
     }
 
     fn composed_because(&self) -> Option<String> {
-        Some("diffusion has no step by hand".to_string())
+        None
+    }
+
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        check_batch("diffusion", &self.signature, self.config.action_horizon, batch)?;
+        let rows = batch.rows();
+        let (noise, steps) = self.drawn(rows, rng)?;
+        let noisy = values(&self.schedule.add_noise(&batch.actions, &noise, &steps)?)?;
+        let cond = values(&condition("diffusion", &self.signature, rows, &batch.observation)?)?;
+        let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
+        let asked = Asked { x: &noisy, steps: &steps, cond: &cond };
+        let wanted = match self.config.prediction {
+            Prediction::Epsilon => &noise,
+            Prediction::Sample => &batch.actions,
+        };
+        let loss = with_wanted(wanted, batch, self.config.mask_padding, 1.0, |wanted| {
+            self.fused.squared_error(&self.params, asked, wanted, into)
+        })?;
+        Ok(LossValues { total: loss as f32, parts: BTreeMap::from([("l2_loss".to_string(), loss as f32)]) })
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
-        let rows = batch.rows();
-        let noise = self.noise(rows, rng)?;
-        let steps: Vec<u32> = (0..rows).map(|_| rng.below(self.schedule.steps() as u64) as u32).collect();
+        let (noise, steps) = self.drawn(batch.rows(), rng)?;
         let total = self.loss_with(batch, &noise, &steps)?;
         Ok(LossParts { parts: BTreeMap::from([("l2_loss".to_string(), total.detach())]), total })
     }

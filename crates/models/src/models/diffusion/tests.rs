@@ -1,7 +1,10 @@
 #![allow(clippy::unwrap_used)]
 use super::unet::NetworkConfig;
 use super::*;
-use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
+use crate::fused::testing::{
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+};
+use crate::simd::{Level, at_most};
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
 
@@ -10,18 +13,64 @@ fn small() -> Config {
     Config { action_horizon: 8, network, ..Config::default() }
 }
 
-#[test]
-fn the_gradient_is_the_slope_of_the_loss() {
+/// One level and three, with and without scales, masked and not.
+fn cases() -> Vec<(Signature, Config)> {
     let of = signatures();
     let shifted = NetworkConfig { film_scale: false, kernel_size: 3, ..small().network };
-    for (signature, config) in [
-        (&of.plain, small()),
-        (&of.history, Config { prediction: Prediction::Sample, mask_padding: true, ..small() }),
-        (&of.entities, Config { network: shifted, ..small() }),
-    ] {
-        let model = Diffusion::new(&config, signature, 1).unwrap();
-        let batch = batch(signature, 8, 3, 3);
+    let one_level = NetworkConfig { down_dims: vec![24], kernel_size: 1, ..small().network };
+    let three = NetworkConfig { down_dims: vec![16, 24, 40], ..small().network };
+    vec![
+        (of.plain, small()),
+        (of.history, Config { prediction: Prediction::Sample, mask_padding: true, ..small() }),
+        (of.entities, Config { network: shifted, ..small() }),
+        (of.no_env.clone(), Config { network: one_level, ..small() }),
+        (of.no_env, Config { network: three, mask_padding: true, ..small() }),
+    ]
+}
+
+#[test]
+fn the_gradient_is_the_slope_of_the_loss() {
+    for (signature, config) in cases().into_iter().take(3) {
+        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let batch = batch(&signature, 8, 3, 3);
         assert_the_gradient_is_the_slope(&model, &batch, &format!("{config:?}"));
+    }
+}
+
+#[test]
+fn the_step_by_hand_is_the_composed_one() {
+    for (signature, config) in cases() {
+        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        move_parameters(&model);
+        for rows in [1, 13] {
+            let batch = batch(&signature, 8, rows, 3);
+            assert_the_step_is_the_composed_one(&model, &batch, &format!("{rows} rows, {config:?}"));
+        }
+    }
+}
+
+#[test]
+fn answers_by_hand_are_the_composed_ones_also_when_weights_change() {
+    for (signature, config) in cases() {
+        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        for rows in [1, 2, 13] {
+            let other = Diffusion::new(&config, &signature, rows as u64).unwrap();
+            move_parameters(&other);
+            let weights = other.params.iter().map(|(name, var)| (name.to_string(), var.as_tensor().clone()));
+            model.params.load(&weights.collect()).unwrap();
+            let batch = batch(&signature, 8, rows, 3);
+            let steps: Vec<u32> = (0..rows as u32).map(|row| row * 7).collect();
+            let want = values(&model.denoise(&batch.observation, &batch.actions, &steps).unwrap()).unwrap();
+            let cond = values(&condition("diffusion", &signature, rows, &batch.observation).unwrap()).unwrap();
+            let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
+            for level in Level::ALL {
+                let got =
+                    at_most(level, || model.fused.answered(&model.params, &batch.actions, &steps, &cond).unwrap());
+                for (got, want) in values(&got).unwrap().iter().zip(&want) {
+                    assert!((got - want).abs() < 1e-5 * want.abs().max(1.0), "{got} {want} {level:?} {config:?}");
+                }
+            }
+        }
     }
 }
 

@@ -11,7 +11,7 @@ use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// Groups of the last block's norm, whatever the others have.
-const LAST_GROUPS: usize = 8;
+pub(super) const LAST_GROUPS: usize = 8;
 
 /// Options of the network, with LeRobot's names and defaults.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -262,7 +262,9 @@ impl Unet {
     /// If the tensor library fails.
     pub fn forward(&self, x: &Tensor, steps: &[f32], cond: &Tensor) -> Result<Tensor> {
         let [first, second] = &self.step_encoder;
-        let embedded = second.forward(&mish(&first.forward(&embedding(steps, self.step_embed_dim)?)?)?)?;
+        let width = self.step_embed_dim;
+        let embedded = Tensor::from_vec(embedding(steps, width), (steps.len(), width), &HERE)?;
+        let embedded = second.forward(&mish(&first.forward(&embedded)?)?)?;
         // every block begins with the same activation of the same condition
         let cond = mish(&Tensor::cat(&[&embedded, cond], 1)?)?;
         let through = |pair: &[ResidualBlock; 2], x: &Tensor| pair[1].forward(&pair[0].forward(x, &cond)?, &cond);
@@ -285,7 +287,7 @@ impl Unet {
 }
 
 /// steps: b numbers -> (b, dim), sines, then cosines, of frequencies from 1 down to 1/10000
-fn embedding(steps: &[f32], dim: usize) -> Result<Tensor> {
+pub(super) fn embedding(steps: &[f32], dim: usize) -> Vec<f32> {
     let half = dim / 2;
     // rounded where the reference rounds
     let rate = (10_000f64.ln() / (half - 1) as f64) as f32;
@@ -295,5 +297,5 @@ fn embedding(steps: &[f32], dim: usize) -> Result<Tensor> {
         values.extend(angles.iter().map(|angle| angle.sin()));
         values.extend(angles.iter().map(|angle| angle.cos()));
     }
-    Ok(Tensor::from_vec(values, (steps.len(), dim), &HERE)?)
+    values
 }

@@ -21,9 +21,11 @@ use crate::chunk_policy::ChunkPolicy;
 use crate::device::HERE;
 use crate::error::Result;
 use crate::features::{Features, Signature};
-use crate::model::{LossParts, PolicyModel};
+use crate::gradients::Gradients;
+use crate::model::{LossParts, LossValues, PolicyModel};
+use crate::models::diffusion::fused::{Asked, FusedUnet};
 use crate::models::diffusion::unet::Unet;
-use crate::models::diffusion::{check_reaches, condition, condition_width, squared_error};
+use crate::models::diffusion::{check_reaches, condition, condition_width, squared_error, values, with_wanted};
 use crate::params::Params;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
@@ -42,6 +44,12 @@ pub struct Flow {
     signature: Signature,
     params: Params,
     unet: Unet,
+    fused: FusedUnet,
+}
+
+/// What the network is shown of these times.
+fn shown(times: &[f32]) -> Vec<f32> {
+    times.iter().map(|t| t * LAST_STEP).collect()
 }
 
 /// From noise z at time 0 to actions a at time 1. z, a: (b, H, A), the time of each row -> (b, H, A)
@@ -72,13 +80,19 @@ impl Flow {
         let mut p = Params::new();
         let dims = (signature.action_dim, condition_width(signature));
         let unet = Unet::new(&mut p, "unet", dims, &config.network, &mut Rng::new(seed, "init"))?;
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, unet })
+        let fused = FusedUnet::new(&config.network, "unet", (config.action_horizon, signature.action_dim));
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, unet, fused })
     }
 
-    /// x: (b, H, A), the time of each row -> the velocity there
+    /// x: (b, H, A), the time of each row -> the velocity there, with a gradient
     fn velocity(&self, cond: &Tensor, x: &Tensor, times: &[f32]) -> Result<Tensor> {
-        let steps: Vec<f32> = times.iter().map(|t| t * LAST_STEP).collect();
-        self.unet.forward(x, &steps, cond)
+        self.unet.forward(x, &shown(times), cond)
+    }
+
+    /// What a training step draws: noise, (b, H, A), and the time of each row.
+    fn drawn(&self, rows: usize, rng: &mut Rng) -> Result<(Tensor, Vec<f32>)> {
+        let noise = self.noise(rows, rng)?;
+        Ok((noise, (0..rows).map(|_| rng.uniform()).collect()))
     }
 
     fn noise(&self, rows: usize, rng: &mut Rng) -> Result<Tensor> {
@@ -97,15 +111,28 @@ impl PolicyModel for Flow {
     }
 
     fn composed_because(&self) -> Option<String> {
-        Some("flow has no step by hand".to_string())
+        None
+    }
+
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        check_batch("flow", &self.signature, self.config.action_horizon, batch)?;
+        let rows = batch.rows();
+        let cond = values(&condition("flow", &self.signature, rows, &batch.observation)?)?;
+        let (noise, times) = self.drawn(rows, rng)?;
+        let x = values(&between(&noise, &batch.actions, &times)?)?;
+        let asked = Asked { x: &x, steps: &shown(&times), cond: &cond };
+        let wanted = (&batch.actions - &noise)?;
+        let loss = with_wanted(&wanted, batch, self.config.mask_padding, 1.0, |wanted| {
+            self.fused.squared_error(&self.params, asked, wanted, into)
+        })?;
+        Ok(LossValues { total: loss as f32, parts: BTreeMap::from([("l2_loss".to_string(), loss as f32)]) })
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         check_batch("flow", &self.signature, self.config.action_horizon, batch)?;
         let rows = batch.rows();
         let cond = condition("flow", &self.signature, rows, &batch.observation)?;
-        let noise = self.noise(rows, rng)?;
-        let times: Vec<f32> = (0..rows).map(|_| rng.uniform()).collect();
+        let (noise, times) = self.drawn(rows, rng)?;
         let velocity = self.velocity(&cond, &between(&noise, &batch.actions, &times)?, &times)?;
         let total = squared_error(&velocity, &(&batch.actions - &noise)?, batch, self.config.mask_padding)?;
         Ok(LossParts { parts: BTreeMap::from([("l2_loss".to_string(), total.detach())]), total })
@@ -118,9 +145,9 @@ impl PolicyModel for Flow {
 
     fn sample(&self, observation: &Features<Tensor>, rng: &mut Rng) -> Result<Tensor> {
         let rows = check_observation("flow", &self.signature, observation)?;
-        let cond = condition("flow", &self.signature, rows, observation)?;
+        let cond = values(&condition("flow", &self.signature, rows, observation)?)?;
         euler(&self.noise(rows, rng)?, self.config.inference_steps, |x, t| {
-            Ok(self.velocity(&cond, x, &vec![t; rows])?.detach())
+            self.fused.answered(&self.params, x, &shown(&vec![t; rows]), &cond)
         })
     }
 

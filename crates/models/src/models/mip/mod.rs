@@ -20,9 +20,11 @@ use crate::chunk_policy::ChunkPolicy;
 use crate::device::HERE;
 use crate::error::Result;
 use crate::features::{Features, Signature};
-use crate::model::{LossParts, PolicyModel};
+use crate::gradients::Gradients;
+use crate::model::{LossParts, LossValues, PolicyModel};
+use crate::models::diffusion::fused::{Asked, FusedUnet};
 use crate::models::diffusion::unet::Unet;
-use crate::models::diffusion::{check_reaches, condition, condition_width, squared_error};
+use crate::models::diffusion::{check_reaches, condition, condition_width, squared_error, values, with_wanted};
 use crate::models::flow::between;
 use crate::params::Params;
 use crate::policy::{Clock, Policy};
@@ -42,6 +44,7 @@ pub struct Mip {
     signature: Signature,
     params: Params,
     unet: Unet,
+    fused: FusedUnet,
 }
 
 /// A first answer from nothing and a second one that looks at it; `answer` is given what it looks at and the time.
@@ -66,12 +69,19 @@ impl Mip {
         let mut p = Params::new();
         let dims = (signature.action_dim, condition_width(signature));
         let unet = Unet::new(&mut p, "unet", dims, &config.network, &mut Rng::new(seed, "init"))?;
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, unet })
+        let fused = FusedUnet::new(&config.network, "unet", (config.action_horizon, signature.action_dim));
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, unet, fused })
     }
 
-    /// x: (b, H, A) -> the answer at this time
+    /// x: (b, H, A) -> the answer at this time, with a gradient
     fn answer(&self, cond: &Tensor, x: &Tensor, time: f32) -> Result<Tensor> {
         self.unet.forward(x, &vec![time * LAST_STEP; x.dim(0)?], cond)
+    }
+
+    /// The actions with the noise that the second step learns to take away.
+    fn noisy(&self, batch: &Batch, rng: &mut Rng) -> Result<Tensor> {
+        let noise = Tensor::from_vec(rng.normals(batch.actions.elem_count()), batch.actions.shape(), &HERE)?;
+        between(&noise, &batch.actions, &vec![self.config.second_time as f32; batch.rows()])
     }
 
     fn nothing(&self, rows: usize) -> Result<Tensor> {
@@ -90,16 +100,33 @@ impl PolicyModel for Mip {
     }
 
     fn composed_because(&self) -> Option<String> {
-        Some("mip has no step by hand".to_string())
+        None
+    }
+
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        check_batch("mip", &self.signature, self.config.action_horizon, batch)?;
+        let rows = batch.rows();
+        let cond = values(&condition("mip", &self.signature, rows, &batch.observation)?)?;
+        let time = self.config.second_time as f32;
+        let noisy = values(&self.noisy(batch, rng)?)?;
+        let nothing = vec![0.0; noisy.len()];
+        let mut error = |x: &[f32], time: f32| {
+            let asked = Asked { x, steps: &vec![time * LAST_STEP; rows], cond: &cond };
+            with_wanted(&batch.actions, batch, self.config.mask_padding, 0.5, |wanted| {
+                self.fused.squared_error(&self.params, asked, wanted, into)
+            })
+        };
+        let (first, second) = (error(&nothing, 0.0)?, error(&noisy, time)?);
+        let parts = [("first_l2_loss", first), ("second_l2_loss", second)];
+        let parts = parts.map(|(name, value)| (name.to_string(), value as f32));
+        Ok(LossValues { total: (0.5 * (first + second)) as f32, parts: BTreeMap::from(parts) })
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         check_batch("mip", &self.signature, self.config.action_horizon, batch)?;
         let rows = batch.rows();
         let cond = condition("mip", &self.signature, rows, &batch.observation)?;
-        let noise = Tensor::from_vec(rng.normals(batch.actions.elem_count()), batch.actions.shape(), &HERE)?;
-        let time = self.config.second_time as f32;
-        let noisy = between(&noise, &batch.actions, &vec![time; rows])?;
+        let (time, noisy) = (self.config.second_time as f32, self.noisy(batch, rng)?);
         let error = |answer: Tensor| squared_error(&answer, &batch.actions, batch, self.config.mask_padding);
         let first = error(self.answer(&cond, &self.nothing(rows)?, 0.0)?)?;
         let second = error(self.answer(&cond, &noisy, time)?)?;
@@ -110,8 +137,10 @@ impl PolicyModel for Mip {
 
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
         let rows = check_observation("mip", &self.signature, observation)?;
-        let cond = condition("mip", &self.signature, rows, observation)?;
-        two_steps(&self.nothing(rows)?, self.config.second_time as f32, |x, t| Ok(self.answer(&cond, x, t)?.detach()))
+        let cond = values(&condition("mip", &self.signature, rows, observation)?)?;
+        two_steps(&self.nothing(rows)?, self.config.second_time as f32, |x, t| {
+            self.fused.answered(&self.params, x, &vec![t * LAST_STEP; rows], &cond)
+        })
     }
 
     fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {

@@ -1,6 +1,8 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
+use crate::fused::testing::{
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+};
 use crate::models::diffusion::unet::NetworkConfig;
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
@@ -8,6 +10,16 @@ use candle_core::Device;
 fn small() -> Config {
     let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, step_embed_dim: 8, ..NetworkConfig::default() };
     Config { action_horizon: 8, network, ..Config::default() }
+}
+
+#[test]
+fn the_step_by_hand_is_the_composed_one() {
+    let of = signatures();
+    for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
+        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1).unwrap();
+        move_parameters(&model);
+        assert_the_step_is_the_composed_one(&model, &batch(signature, 8, 5, 3), &format!("{mask_padding}"));
+    }
 }
 
 #[test]
