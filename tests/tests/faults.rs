@@ -191,7 +191,8 @@ fn an_evaluation_survives_a_fault_at_any_call() {
         assert!(again.status.success(), "{fault:?}: {}", again.stderr);
         let sealed = recorded(&again) == 0 && kept == 0;
         assert!(kept >= finished || sealed, "{fault:?}: {finished} episodes were finished, {kept} kept");
-        assert!(sealed || recorded(&again) + kept == EPISODES, "{fault:?}: an episode was run again");
+        let ran = recorded(&again);
+        assert!(sealed || ran + kept == EPISODES, "{fault:?}: {kept} episodes kept, {ran} run; {}", again.stderr);
         assert!(outcomes(&results) == expected, "{fault:?}: other outcomes");
         succeeds(&mut zoo(["verify", "--zoo", text(&entries), "--results", text(&results)]));
         fs::remove_dir_all(&results).expect("removable");

@@ -131,8 +131,17 @@ impl BlockLayer {
         let (dim, heads) = (pass.shape.dim, pass.shape.heads);
         let keys = kv.len() / (batch * 2 * dim);
         let shared_queries = x.len() == queries * dim;
-        let heads =
-            Heads { batch, heads, queries, all_queries: queries, keys, dim, shared_queries, shared_keys: false };
+        let heads = Heads {
+            batch,
+            heads,
+            queries,
+            all_queries: queries,
+            keys,
+            dim,
+            shared_queries,
+            shared_keys: false,
+            causal: false,
+        };
         let rows = Rows { computed: queries, all: queries };
         let attn = format!("{prefix}.attn");
         let q = project(pass, &attn, input, "queries", 0..dim);

@@ -59,6 +59,7 @@ impl DecoderLayer {
             dim,
             shared_queries: shared,
             shared_keys: shared,
+            causal: false,
         };
         let name = |part: &str| format!("{prefix}.{part}");
 
@@ -180,8 +181,17 @@ impl Begun {
         let Shape { dim, heads, .. } = pass.shape;
         let queries = query_pos.len() / dim;
         let (all_queries, keys, shared) = (queries, queries, false);
-        let heads =
-            Heads { batch: 1, heads, queries, all_queries, keys, dim, shared_queries: shared, shared_keys: shared };
+        let heads = Heads {
+            batch: 1,
+            heads,
+            queries,
+            all_queries,
+            keys,
+            dim,
+            shared_queries: shared,
+            shared_keys: shared,
+            causal: false,
+        };
         let rows = Rows { computed: queries, all: queries };
         let name = |part: &str| format!("{prefix}.{part}");
         let zeros = pass.space.pool.zeros(query_pos.len());
@@ -217,6 +227,7 @@ impl Begun {
             dim,
             shared_queries,
             shared_keys: false,
+            causal: false,
         };
         let rows = Rows { computed: queries, all: queries };
         let name = |part: &str| format!("{prefix}.{part}");

@@ -57,6 +57,7 @@ impl EncoderLayer {
             dim,
             shared_queries: false,
             shared_keys: false,
+            causal: false,
         };
 
         let Entry { y: y1, x, norm } = enter(pass, &format!("{prefix}.norm1"), x);

@@ -3,6 +3,7 @@
 use super::{Grads, Pass, Rows};
 use crate::kernels::{Mat, Start, activate, activate_backward, gemm_with};
 use crate::layers::{Activation, DropoutMask, Shape};
+use crate::simd::vectorised;
 
 /// What the feed-forward branch's backward pass needs.
 #[derive(Debug)]
@@ -28,9 +29,14 @@ impl FeedForward {
         } else {
             let linear = pass.times(x, w, Start::Bias(bias), |_, _, _| ());
             let mut hidden = pass.space.pool.copy(&linear);
-            for (i, row) in hidden.chunks_exact_mut(width).enumerate() {
-                activate(row, activation, mask, rows.full(i) * width);
-            }
+            vectorised(
+                #[inline(always)]
+                || {
+                    for (i, row) in hidden.chunks_exact_mut(width).enumerate() {
+                        activate(row, activation, mask, rows.full(i) * width);
+                    }
+                },
+            );
             before = Some(linear);
             hidden
         };

@@ -182,7 +182,7 @@ impl<'a> Pass<'a> {
         self.weights.get(name.as_str()).copied().expect("the model was built with this parameter")
     }
 
-    fn mask(&mut self) -> Option<DropoutMask> {
+    pub(crate) fn mask(&mut self) -> Option<DropoutMask> {
         match &mut self.rng {
             Some(rng) if self.shape.dropout > 0.0 => Some(DropoutMask::draw(self.shape.dropout, rng)),
             _ => None,
@@ -217,7 +217,7 @@ impl<'a> Pass<'a> {
 
     /// x: (rows, in), w: (out, in), whole rows of a parameter -> `start + x wᵀ`, (rows, out), then `epilogue` as in
     /// `gemm_with`
-    fn times(
+    pub(crate) fn times(
         &mut self,
         x: &[f32],
         w: &[f32],
@@ -267,7 +267,7 @@ pub(crate) fn slot<'g>(grads: &'g mut Grads<'_>, prefix: &str, name: &str) -> &'
 }
 
 /// `into (out, in) += gradᵀ (out, rows) x (rows, in)`; rows of `grad` are `stride` apart.
-fn weight_gradient(
+pub(crate) fn weight_gradient(
     (out, input): (usize, usize),
     grad: &[f32],
     stride: usize,

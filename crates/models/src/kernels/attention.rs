@@ -22,6 +22,8 @@ pub(crate) struct Heads {
     pub(crate) shared_queries: bool,
     /// so are keys and values
     pub(crate) shared_keys: bool,
+    /// a query sees the keys of its own step and of those before
+    pub(crate) causal: bool,
 }
 
 impl Heads {
@@ -81,6 +83,9 @@ pub(crate) fn attend(
                             row.iter_mut()
                                 .zip(pad)
                                 .for_each(|(x, &pad)| *x = if pad > 0.0 { f32::NEG_INFINITY } else { *x });
+                        }
+                        if heads.causal {
+                            row[i + 1..].fill(f32::NEG_INFINITY);
                         }
                         let max = row.iter().fold(f32::NEG_INFINITY, |m, &x| if x > m { x } else { m });
                         row.iter_mut()

@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use models::actrm::{Intervention, Thinking};
 use serde::{Deserialize, Serialize};
 use zoo::ZooError;
+use zoo::entry::CamerasMeta;
+use zoo::evaluation::Perturbation;
 
 /// A study, as its TOML file has it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,6 +53,9 @@ pub struct Data {
     /// Another of the task's experts than the usual one, by its name.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expert: Option<String>,
+    /// Cameras whose pictures they have.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cameras: Option<CamerasMeta>,
 }
 
 /// One kind of policy under study.
@@ -79,6 +84,9 @@ pub struct Test {
     /// How policies think in it, where that is not as they were trained.
     #[serde(default, skip_serializing_if = "as_trained")]
     pub thinking: Thinking,
+    /// What becomes of the pictures on their way to policies, as `actrm-zoo eval --perturb` has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub perturb: Option<String>,
 }
 
 impl Arm {
@@ -88,7 +96,37 @@ impl Arm {
     }
 }
 
+impl Data {
+    /// Their file's name: of the task, what is not as usual, how many, and the seed.
+    pub fn file_name(&self) -> String {
+        let expert = self.expert.as_ref().map(|expert| format!("{expert}-")).unwrap_or_default();
+        let seen = self.cameras.as_ref().map(|cameras| format!("seen{}-", cameras.size)).unwrap_or_default();
+        format!("{}-{expert}{seen}{}-seed{}.hdf5", self.task.to_lowercase(), self.episodes, self.seed)
+    }
+
+    /// What is not as usual with them, in words, each after a comma.
+    pub fn words(&self) -> String {
+        let expert = self.expert.as_ref().map(|expert| format!(", expert `{expert}`")).unwrap_or_default();
+        let of_cameras = |cameras: &CamerasMeta| {
+            let CamerasMeta { names, size, fast_render } = cameras;
+            let drawn = if *fast_render { "" } else { " with reflections" };
+            format!(", pictures of {} ({size} x {size}{drawn})", names.join(" and "))
+        };
+        format!("{expert}{}", self.cameras.as_ref().map(of_cameras).unwrap_or_default())
+    }
+}
+
 impl Test {
+    /// Whether policies act in it as they were trained, their pictures as they are drawn.
+    pub fn is_plain(&self) -> bool {
+        as_trained(&self.thinking) && self.perturb.is_none()
+    }
+
+    /// What becomes of the pictures.
+    pub fn perturbation(&self) -> Option<Perturbation> {
+        self.perturb.as_ref().and_then(|text| text.parse().ok())
+    }
+
     /// How policies think in it, in words; `None` where it is as they were trained.
     pub fn thinking_words(&self) -> Option<String> {
         let Thinking { steps, halting, intervene } = self.thinking;
@@ -203,6 +241,11 @@ impl Study {
             }
             tests(format!("comparisons[{i}].test"), &comparison.test)?;
         }
+        for (name, test) in &self.tests {
+            let Some(Err(expected)) = test.perturb.as_ref().map(|text| text.parse::<Perturbation>()) else { continue };
+            let found = test.perturb.clone().unwrap_or_default();
+            return Err(ZooError::InvalidValue { key: format!("tests.{name}.perturb"), expected, found });
+        }
         for (kind, names) in [
             ("data", self.data.keys().collect::<Vec<_>>()),
             ("arms", self.arms.keys().collect()),
@@ -293,6 +336,27 @@ mod tests {
         assert!(open(&with("{ step = 1 }")).unwrap_err().contains("step"));
         // a test as trained keeps its text
         assert!(!serde_json::to_string(&open(TEXT).unwrap().tests["lift"]).unwrap().contains("thinking"));
+    }
+
+    #[test]
+    fn demonstrations_may_have_pictures_and_tests_may_change_them() {
+        let cameras = r#"episodes = 10
+        cameras = { names = ["agentview", "robot0_eye_in_hand"], size = 84, fast_render = true }"#;
+        let study = open(&TEXT.replace("episodes = 10", cameras)).unwrap();
+        let data = &study.data["lift"];
+        assert_eq!(data.file_name(), "lift-seen84-10-seed1.hdf5");
+        assert_eq!(data.words(), ", pictures of agentview and robot0_eye_in_hand (84 x 84)");
+        assert_eq!(open(TEXT).unwrap().data["lift"].file_name(), "lift-10-seed1.hdf5");
+        let with =
+            |perturb: &str| TEXT.replace("seed_start = 40000", &format!("seed_start = 40000\nperturb = \"{perturb}\""));
+        let test = open(&with("black-agentview")).unwrap().tests["lift"].clone();
+        assert_eq!((test.is_plain(), test.perturbation()), (false, Some(Perturbation::Black("agentview".to_owned()))));
+        assert!(open(TEXT).unwrap().tests["lift"].is_plain());
+        let error = open(&with("blck-agentview")).unwrap_err();
+        assert!(error.contains("tests.lift.perturb") && error.contains("black-CAMERA"), "{error}");
+        // what has neither keeps its text
+        let plain = serde_json::to_string(&open(TEXT).unwrap()).unwrap();
+        assert!(!plain.contains("cameras") && !plain.contains("perturb"), "{plain}");
     }
 
     #[test]

@@ -48,7 +48,7 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
         let _ = writeln!(text, "{}\n", study.introduction.trim());
     }
     overview(&mut text, study, &results);
-    for (name, test) in study.tests.iter().filter(|(_, test)| test.thinking_words().is_none()) {
+    for (name, test) in study.tests.iter().filter(|(_, test)| test.is_plain()) {
         for data in study.data.keys() {
             let of_test: Vec<(&String, &Trainings)> = study
                 .arms
@@ -66,7 +66,7 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
                 test.task,
                 source.episodes,
                 source.task,
-                source.expert.as_ref().map(|expert| format!(", expert `{expert}`")).unwrap_or_default(),
+                source.words(),
                 test.seed_start,
                 test.seed_start + test.episodes - 1,
                 test.episodes
@@ -77,6 +77,7 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
     for (stage, title) in [(1, "Comparisons"), (2, "Further comparisons, planned later")] {
         comparisons(&mut text, study, &results, (stage, title));
     }
+    pictures_changed(&mut text, study, &results);
     thinking_otherwise(&mut text, study, &results);
     probes(&mut text, study)?;
     costs(&mut text, study, &results);
@@ -102,7 +103,7 @@ fn overview(text: &mut String, study: &Study, results: &BTreeMap<(String, String
     let mut rows: Vec<&str> = Vec::new();
     let mut planned: BTreeMap<(&str, &str), u64> = BTreeMap::new();
     for row in &study.cells {
-        let Some(test) = row.tests.iter().find(|test| study.tests[*test].thinking_words().is_none()) else { continue };
+        let Some(test) = row.tests.iter().find(|test| study.tests[*test].is_plain()) else { continue };
         if !columns.iter().any(|(data, _)| *data == row.data) {
             columns.push((&row.data, test));
         }
@@ -263,6 +264,45 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &BTreeMap<(Stri
                 median(&of_arm, |result| result.query_ms),
                 megaflops(&of_arm)
             );
+        }
+        text.push('\n');
+    }
+}
+
+/// What policies lose where their pictures are changed on the way to them: success on the plain test, then on each of the
+/// others of the same task and demonstrations.
+fn pictures_changed(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
+    let mut tables: BTreeMap<&str, BTreeMap<&str, Vec<(&str, &Trainings)>>> = BTreeMap::new();
+    for ((test, data, arm), trainings) in results {
+        if let Some(perturb) = &study.tests[test].perturb {
+            tables.entry(data).or_default().entry(arm).or_default().push((perturb, trainings));
+        }
+    }
+    if tables.is_empty() {
+        return;
+    }
+    let _ = writeln!(
+        text,
+        "## Pictures changed on their way to the policy\n\nNothing is trained again: the policies above with their cameras taken for each \
+         other, one of them black, colours turned, less light (`actrm-zoo eval --perturb`). The episodes are the first of those above.\n"
+    );
+    for (data, arms) in tables {
+        let changes: BTreeSet<&str> = arms.values().flatten().map(|(perturb, _)| *perturb).collect();
+        let heads: Vec<&str> = changes.iter().copied().collect();
+        let task = &study.data[data].task;
+        let _ =
+            writeln!(text, "| {task} | as drawn | {} |\n|---|---|{}", heads.join(" | "), "---|".repeat(heads.len()));
+        for (arm, changed) in arms {
+            let plain = results.iter().find(|((test, of, its), _)| {
+                study.tests[test].is_plain() && study.tests[test].task == *task && of == data && its == arm
+            });
+            let plain = plain.map_or("not run".to_owned(), |(_, trainings)| cell_text(trainings, &[]));
+            let cells: Vec<String> = changes
+                .iter()
+                .map(|change| changed.iter().find(|(perturb, _)| perturb == change))
+                .map(|found| found.map_or("not run".to_owned(), |(_, trainings)| cell_text(trainings, &[])))
+                .collect();
+            let _ = writeln!(text, "| {} | {plain} | {} |", study.arms[arm].label, cells.join(" | "));
         }
         text.push('\n');
     }
@@ -463,7 +503,7 @@ fn cost(
     let experiment = data.map_or_else(|| arm.experiment.clone(), |data| arm.experiment_on(data));
     let settings: Vec<String> = arm.set.iter().map(|s| format!("`{s}`")).collect();
     let settings = settings.join(", ");
-    let as_trained = |test: &str| study.tests[test].thinking_words().is_none();
+    let as_trained = |test: &str| study.tests[test].is_plain();
     let of_arm: Vec<&CellResult> = results
         .iter()
         .filter(|((test, d, a), _)| a == name && data.is_none_or(|data| data == d) && as_trained(test))

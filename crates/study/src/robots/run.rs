@@ -9,7 +9,7 @@ use recording::{CollectEnd, CollectOptions, collect};
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, harness_folder};
 use zoo::config::Library;
 use zoo::entry::{Entry, LoadedEntry, member_name};
-use zoo::evaluation::{EvaluationEnd, EvaluationOptions, evaluate, thinking_subject};
+use zoo::evaluation::{Environment, EvaluationEnd, EvaluationOptions, evaluate, thinking_subject};
 use zoo::experiment::Experiment;
 use zoo::registry::Registry;
 use zoo::results::Seeds;
@@ -300,16 +300,17 @@ impl Shared<'_> {
             }
         }
         drop(training);
-        let entry = Registry::open(&zoo).entry(&name)?.load()?;
+        let stored = Registry::open(&zoo).entry(&name)?;
+        let entry = stored.load()?;
         for test in missing_tests(self.request, cell)? {
             let definition = &study.tests[&test];
             self.tell(RobotEvent::Testing(&cell.name(), &test));
-            // what an entry does where it thinks otherwise is no result of the entry
-            let results = match definition.thinking_words() {
-                None => zoo.join("results"),
-                Some(_) => self.request.work.join("otherwise").join(&test),
+            // what an entry does where it thinks or sees otherwise is no result of the entry
+            let results = match definition.is_plain() {
+                true => zoo.join("results"),
+                false => self.request.work.join("otherwise").join(&test),
             };
-            let Some(evaluation) = self.evaluate(&entry, definition, &results)? else {
+            let Some(evaluation) = self.evaluate((&stored, &entry), definition, &results)? else {
                 return Ok(CellEnd::Stopped);
             };
             let of_test = (test.as_str(), definition);
@@ -324,9 +325,13 @@ impl Shared<'_> {
         Ok(CellEnd::Done)
     }
 
-    /// One simulator for `task`, in this thread's cell alone.
-    fn simulator(&self, task: &str) -> Result<Pool, StudyError> {
-        let spec = WorkerSpec::new(self.request.python.clone(), harness_folder()?, task);
+    /// A worker for `task`, without cameras.
+    fn worker(&self, task: &str) -> Result<WorkerSpec, StudyError> {
+        Ok(WorkerSpec::new(self.request.python.clone(), harness_folder()?, task))
+    }
+
+    /// One simulator, in this thread's cell alone.
+    fn simulator(&self, spec: WorkerSpec) -> Result<Pool, StudyError> {
         let stop = Arc::clone(&self.request.stop);
         Ok(Pool::start(PoolOptions { stop, ..PoolOptions::new(spec, 1) })?)
     }
@@ -335,9 +340,7 @@ impl Shared<'_> {
     fn demonstrations(&self, name: &str, data: &Data) -> Result<Option<PathBuf>, StudyError> {
         let _one_at_a_time = lock(&self.collecting[name]);
         let folder = self.request.work.join("data");
-        let expert = data.expert.as_ref().map(|expert| format!("{expert}-")).unwrap_or_default();
-        let name_of = format!("{}-{expert}{}-seed{}.hdf5", data.task.to_lowercase(), data.episodes, data.seed);
-        let file = folder.join(name_of);
+        let file = folder.join(data.file_name());
         if file.exists() {
             return Ok(Some(file));
         }
@@ -346,7 +349,12 @@ impl Shared<'_> {
             path: folder.clone(),
             source,
         })?;
-        let mut pool = self.simulator(&data.task)?;
+        let mut worker = self.worker(&data.task)?;
+        if let Some(cameras) = &data.cameras {
+            worker.cameras.clone_from(&cameras.names);
+            (worker.image_size, worker.fast_render) = (cameras.size, cameras.fast_render);
+        }
+        let mut pool = self.simulator(worker)?;
         let options = CollectOptions {
             out: file.clone(),
             episodes: data.episodes,
@@ -371,11 +379,17 @@ impl Shared<'_> {
     /// A finished evaluation; nothing if it was stopped.
     fn evaluate(
         &self,
-        entry: &LoadedEntry,
+        (stored, entry): (&Entry, &LoadedEntry),
         test: &Test,
         results: &Path,
     ) -> Result<Option<Box<zoo::results::StoredEvaluation>>, StudyError> {
-        let mut pool = self.simulator(&test.task)?;
+        let environment = Environment::of(stored.meta(), Some(&test.task), None)?;
+        let worker = match &environment.cameras {
+            // drawn as the demonstrations were
+            Some(_) => environment.worker(self.request.python.clone(), harness_folder()?),
+            None => self.worker(&test.task)?,
+        };
+        let mut pool = self.simulator(worker)?;
         let options = EvaluationOptions {
             seeds: Seeds { start: test.seed_start, count: test.episodes },
             shard: None,
@@ -383,7 +397,10 @@ impl Shared<'_> {
             force: false,
         };
         let end = match thinking_subject(entry, &test.thinking, &mut pool) {
-            Ok(Some(subject)) => evaluate(&subject, &mut pool, results, &options, &mut |_| {}),
+            Ok(Some(mut subject)) => {
+                subject.perturbation = test.perturbation();
+                evaluate(&subject, &mut pool, results, &options, &mut |_| {})
+            }
             Ok(None) => return Ok(None),
             Err(error) => Err(error),
         };

@@ -83,7 +83,8 @@ impl ModuleMeta {
 }
 
 /// Cameras that a policy sees through.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct CamerasMeta {
     /// The simulator's names of them, in order.
     pub names: Vec<String>,

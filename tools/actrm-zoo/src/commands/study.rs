@@ -49,7 +49,7 @@ pub struct Args {
     #[arg(long, value_name = "EXPERIMENT")]
     only: Vec<String>,
     /// Only this cell, by its whole name in --list; may be repeated: no page is written, so that many machines can share a study
-    #[arg(long = "cell", value_name = "CELL", requires = "study", conflicts_with_all = ["only", "page_only", "stage"])]
+    #[arg(long = "cell", value_name = "CELL", requires = "study", conflicts_with_all = ["only", "page_only"])]
     cells: Vec<String>,
     /// Only collect the demonstrations, of a study of robot policies
     #[arg(long, requires = "study", conflicts_with = "page_only")]

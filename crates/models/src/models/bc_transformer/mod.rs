@@ -10,9 +10,11 @@
 //! in -1 to 1, so that actions have to be normalised by their range (`normalisation.action = "min_max"`).
 //!
 //! What it costs: of the last block only the last step is computed beyond keys and values, because nothing else is read
-//! (robomimic computes all of it).
+//! (robomimic computes all of it). This file is the readable form; training steps run on `fused.rs`, the same maths written
+//! out, which `bench_policies` puts beside robomimic's.
 
 mod config;
+mod fused;
 
 pub use config::Config;
 
@@ -22,9 +24,11 @@ use crate::chunk_policy::ChunkPolicy;
 use crate::device::HERE;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
+use crate::fused::Workspaces;
+use crate::gradients::Gradients;
 use crate::layers::{Dropout, LayerNorm, Linear, Mixture, MixtureHead, Mode, masked_softmax};
 use crate::losses::absolute;
-use crate::model::{LossParts, PolicyModel};
+use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::{Init, Params};
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
@@ -50,6 +54,7 @@ pub struct BcTransformer {
     output_ln: LayerNorm,
     head: MixtureHead,
     dropout: Dropout,
+    workspaces: Workspaces,
 }
 
 /// Attention to what was before, then two dense layers; each after a norm and added to what it came from.
@@ -148,7 +153,18 @@ impl BcTransformer {
             output_ln,
             head,
             dropout,
+            workspaces: Workspaces::default(),
         })
+    }
+
+    /// The signature's features, (b, T, …) each -> (b, T, everything of a step)
+    fn sequence(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
+        let mut joined = Vec::with_capacity(self.signature.observation.len());
+        for spec in &self.signature.observation {
+            let shape = (rows, self.signature.n_obs_steps, ());
+            joined.push(observation.require("bc_transformer", &spec.name)?.reshape(shape)?);
+        }
+        Ok(Tensor::cat(&joined, 2)?)
     }
 
     /// The signature's features, (b, T, …) each -> b mixtures, of the last step
@@ -158,11 +174,7 @@ impl BcTransformer {
     pub fn mixtures(&self, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<Mixture> {
         let rows = check_observation("bc_transformer", &self.signature, observation)?;
         let steps = self.signature.n_obs_steps;
-        let mut joined = Vec::with_capacity(self.signature.observation.len());
-        for spec in &self.signature.observation {
-            joined.push(observation.require("bc_transformer", &spec.name)?.reshape((rows, steps, ()))?);
-        }
-        let x = self.embed_encoder.forward(&Tensor::cat(&joined, 2)?)?.broadcast_add(&self.embed_timestep)?;
+        let x = self.embed_encoder.forward(&self.sequence(rows, observation)?)?.broadcast_add(&self.embed_timestep)?;
         let mut x = self.dropout.forward(&self.embed_ln.forward(&x)?, mode)?;
         let mask: Vec<f32> = (0..steps * steps).map(|i| if i % steps > i / steps { -1e30 } else { 0.0 }).collect();
         let mask = Tensor::from_vec(mask, (steps, steps), &HERE)?;
@@ -198,7 +210,12 @@ impl PolicyModel for BcTransformer {
     }
 
     fn composed_because(&self) -> Option<String> {
-        Some("bc_transformer has no step by hand".to_string())
+        None
+    }
+
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        check_batch("bc_transformer", &self.signature, self.config.action_horizon, batch)?;
+        self.fused_gradients(batch, rng, into)
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
@@ -228,7 +245,9 @@ impl PolicyModel for BcTransformer {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
+    use crate::fused::testing::{
+        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+    };
     use crate::train::{TrainConfig, Trainer};
 
     fn small() -> Config {
@@ -236,11 +255,25 @@ mod tests {
     }
 
     #[test]
+    fn the_step_by_hand_is_the_composed_one() {
+        let of = signatures();
+        for (signature, n_layers, dropout) in
+            [(&of.history, 1, 0.0), (&of.history, 3, 0.2), (&of.plain, 2, 0.2), (&of.entities, 2, 0.0)]
+        {
+            let config = Config { n_layers, dropout, dim_model: 24, ..small() };
+            let model = BcTransformer::new(&config, signature, 1).unwrap();
+            move_parameters(&model);
+            let what = format!("{n_layers} layers, dropout {dropout}");
+            assert_the_step_is_the_composed_one(&model, &batch(signature, 1, 7, 3), &what);
+        }
+    }
+
+    #[test]
     fn the_gradient_is_the_slope_of_the_loss() {
         let of = signatures();
         for (signature, dropout) in [(&of.history, 0.0), (&of.plain, 0.0), (&of.history, 0.2)] {
             let model = BcTransformer::new(&Config { dropout, ..small() }, signature, 1).unwrap();
-            crate::fused::testing::move_parameters(&model);
+            move_parameters(&model);
             assert_the_gradient_is_the_slope(&model, &batch(signature, 1, 4, 3), &format!("dropout {dropout}"));
         }
     }
