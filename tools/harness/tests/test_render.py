@@ -165,3 +165,26 @@ def test_fast_rendering_changes_pixels_and_nothing_else() -> None:
             assert 0 < off.mean() < 3, name
         else:
             assert np.array_equal(full, drawn[True][name]), name
+
+
+@pytest.mark.parametrize("task", ["Lift", "PickPlaceCan", "Door"])
+def test_what_is_left_out_cannot_be_seen(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fast pictures are those of all shapes, pixel by pixel, while something is left out."""
+    session = envs.make(task)
+    envs.reset(session, 3)
+    cameras = ("agentview", "robot0_eye_in_hand", "frontview")
+    fast, whole = render.Renderer(fast=True), render.Renderer(fast=True)
+    monkeypatch.setattr(whole, "_leave_out", do_nothing)
+    left_out = 0
+    for action in walk(2, 24):
+        session.env.step(action)
+        for height, width in ((84, 84), (48, 96)):
+            drawn = fast.images(session.env.sim, cameras, height, width)
+            none = suite.mujoco().mjtGeom.mjGEOM_NONE
+            scene = fast._scene
+            left_out += sum(scene.geoms[index].type == none for index in range(scene.ngeom))
+            expected = whole.images(session.env.sim, cameras, height, width)
+            for camera, ours, all_shapes in zip(cameras, drawn, expected, strict=True):
+                assert np.array_equal(ours, all_shapes), camera
+    assert left_out > 0
+    session.env.close()

@@ -27,7 +27,8 @@ _EGL_PLATFORM_DEVICE = 0x313F
 class Renderer:
     """Draws a simulation's cameras; the model's textures and meshes are loaded again when the model changes.
 
-    `fast` draws without reflections and multisampling, which takes a third of the time where a processor draws.
+    `fast` draws without reflections and multisampling, which takes a third of the time where a processor draws, and leaves
+    out what lies outside of the picture: half of a scene's triangles belong to an arm that the camera on its hand never sees.
     """
 
     def __init__(self, fast: bool = False) -> None:
@@ -62,6 +63,8 @@ class Renderer:
         self.make_current()
         self._load(sim.model._model, height, width)
         data, everything = sim.data._data, mujoco.mjtCatBit.mjCAT_ALL
+        # what cannot be seen itself may be mirrored or throw a shadow
+        alone = self._fast and not np.any(self._model.light_castshadow)
         viewport = mujoco.MjrRect(0, 0, width, height)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         drawn: list[Array] = []
@@ -70,10 +73,32 @@ class Renderer:
             mujoco.mjv_updateScene(
                 self._model, data, self._options, mujoco.MjvPerturb(), self._camera, everything, self._scene
             )
+            if alone:
+                self._leave_out(data, self._camera.fixedcamid, width / height)
             mujoco.mjr_render(viewport, self._scene, self._context)
             mujoco.mjr_readPixels(pixels, None, viewport, self._context)
             drawn.append(np.ascontiguousarray(pixels[::-1]))
         return drawn
+
+    def _leave_out(self, data: Any, camera: int, aspect: float) -> None:
+        """Take the shape of everything in the scene whose bounding sphere is outside of what `camera` sees."""
+        mujoco, model = suite.mujoco(), self._model
+        if model.cam_orthographic[camera] or model.cam_sensorsize[camera].any():
+            return
+        drawn = self._scene.geoms[: self._scene.ngeom]
+        of_model = [geom for geom in drawn if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM]
+        ids = np.fromiter((geom.objid for geom in of_model), dtype=np.intp, count=len(of_model))
+        radius = model.geom_rbound[ids]
+        right, up, backward = data.cam_xmat[camera].reshape(3, 3).T
+        from_camera = data.geom_xpos[ids] - data.cam_xpos[camera]
+        depth = -(from_camera @ backward)
+        tall = np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
+        beyond = depth < model.vis.map.znear * model.stat.extent - radius
+        for aside, tangent in ((from_camera @ right, tall * aspect), (from_camera @ up, tall)):
+            beyond |= np.abs(aside) - tangent * depth > radius * np.sqrt(1.0 + tangent * tangent)
+        # planes have no bounds
+        for index in np.flatnonzero(beyond & (radius > 0.0)):
+            of_model[index].type = mujoco.mjtGeom.mjGEOM_NONE
 
     def _load(self, model: Any, height: int, width: int) -> None:
         fits = self._context is not None and width <= self._context.offWidth and height <= self._context.offHeight
