@@ -8,6 +8,7 @@
 //! history lie side by side.
 
 mod config;
+mod fused;
 
 pub use config::{Config, Loss};
 
@@ -16,9 +17,11 @@ use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
+use crate::fused::Workspaces;
+use crate::gradients::Gradients;
 use crate::layers::Linear;
 use crate::losses::absolute;
-use crate::model::{LossParts, PolicyModel};
+use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::Params;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
@@ -38,6 +41,7 @@ pub struct Bc {
     params: Params,
     hidden: Vec<Linear>,
     action_head: Linear,
+    workspaces: Workspaces,
 }
 
 impl Bc {
@@ -57,16 +61,22 @@ impl Bc {
             width = next;
         }
         let action_head = Linear::new(&mut p, "action_head", width, config.action_horizon * signature.action_dim, rng)?;
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, hidden, action_head })
+        let (config, signature, workspaces) = (config.clone(), signature.clone(), Workspaces::default());
+        Ok(Self { config, signature, params: p, hidden, action_head, workspaces })
     }
 
-    /// The signature's features, (b, …) each -> (b, H, A)
-    fn forward(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
+    /// The signature's features, (b, …) each -> (b, everything)
+    fn joined(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
         let mut joined = Vec::with_capacity(self.signature.observation.len());
         for spec in &self.signature.observation {
             joined.push(observation.require("bc", &spec.name)?.reshape((rows, ()))?);
         }
-        let mut x = Tensor::cat(&joined, 1)?;
+        Ok(Tensor::cat(&joined, 1)?)
+    }
+
+    /// The signature's features, (b, …) each -> (b, H, A)
+    fn forward(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
+        let mut x = self.joined(rows, observation)?;
         for layer in &self.hidden {
             x = layer.forward(&x)?.relu()?;
         }
@@ -85,7 +95,12 @@ impl PolicyModel for Bc {
     }
 
     fn composed_because(&self) -> Option<String> {
-        Some("bc has no step by hand".to_string())
+        None
+    }
+
+    fn accumulate_gradients(&self, batch: &Batch, _rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        check_batch("bc", &self.signature, self.config.action_horizon, batch)?;
+        self.fused_gradients(batch, into)
     }
 
     fn loss(&self, batch: &Batch, _rng: &mut Rng) -> Result<LossParts> {
@@ -126,13 +141,28 @@ impl PolicyModel for Bc {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::fused::testing::{assert_the_gradient_is_the_slope, batch, signatures};
+    use crate::fused::testing::{
+        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+    };
     use crate::train::{TrainConfig, Trainer};
 
     fn configs() -> Vec<Config> {
         [(Loss::L2, vec![11, 7]), (Loss::L1, vec![9]), (Loss::L2, vec![])]
             .map(|(loss, hidden)| Config { action_horizon: 3, hidden, loss })
             .into()
+    }
+
+    #[test]
+    fn the_step_by_hand_is_the_composed_one() {
+        let of = signatures();
+        for signature in [&of.plain, &of.entities, &of.history] {
+            for config in configs() {
+                let model = Bc::new(&config, signature, 1).unwrap();
+                move_parameters(&model);
+                let batch = batch(signature, config.action_horizon, 7, 3);
+                assert_the_step_is_the_composed_one(&model, &batch, &format!("{config:?}"));
+            }
+        }
     }
 
     #[test]
