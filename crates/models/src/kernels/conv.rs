@@ -6,7 +6,7 @@
 //! stretches of a dozen windows where they are. Forward pass, gradient of the input and gradient of the weights are all
 //! such products. Sums run in an order that depends on the sizes alone.
 
-use super::gemm::{Pack, Start, few_or_many};
+use super::gemm::{Pack, Start, tile_of};
 use crate::simd::dispatch;
 use pulp::{Simd, WithSimd};
 
@@ -556,11 +556,11 @@ fn weights<S: Simd, const MR: usize>(simd: S, w: WeightGradient<'_>) {
                 let channels = MR.min(output - o0);
                 if whole {
                     let at = &mut into[o0 * depth + one.to..];
-                    few_or_many::<S, MR>(simd, (panel_a, panel_b), Start::Add, at, depth, (channels, nr));
+                    tile_of::<S, MR>(simd, (panel_a, panel_b), Start::Add, at, depth, (channels, nr), (&[], 0));
                     continue;
                 }
                 let mut sums = [0f32; 12 * 64];
-                few_or_many::<S, MR>(simd, (panel_a, panel_b), Start::Zero, &mut sums, nr, (channels, nr));
+                tile_of::<S, MR>(simd, (panel_a, panel_b), Start::Zero, &mut sums, nr, (channels, nr), (&[], 0));
                 for (o, sums) in sums.chunks_exact(nr).take(channels).enumerate() {
                     for (piece, sums) in pair.iter().zip(sums.chunks_exact(lanes)) {
                         let to = &mut into[(o0 + o) * depth + piece.to..][..piece.count];

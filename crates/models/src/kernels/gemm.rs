@@ -295,13 +295,7 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
                             other => other,
                         };
                         let ahead = (&next[next.len().min(ip * kc * nr / tiles)..], nr.div_ceil(tiles));
-                        let size = (rows, cols);
-                        // the last rows of a block may be few
-                        match rows {
-                            0..=4 => tile::<S, MR, 4>(simd, panel_a, panel_b, bias, at, ldc, size, ahead),
-                            5..=8 if MR > 8 => tile::<S, MR, 8>(simd, panel_a, panel_b, bias, at, ldc, size, ahead),
-                            _ => tile::<S, MR, MR>(simd, panel_a, panel_b, bias, at, ldc, size, ahead),
-                        }
+                        tile_of::<S, MR>(simd, (panel_a, panel_b), bias, at, ldc, (rows, cols), ahead);
                     }
                 }
                 if last {
@@ -318,20 +312,21 @@ fn blocks<S: Simd, const MR: usize, E: Fn(usize, usize, &mut [f32])>(simd: S, g:
     }
 }
 
-/// A tile of two panels, of which the first may have few rows: rows and columns in `size`.
+/// A tile of two panels for as many rows as there are: the last ones of a block may be few. `size` is rows and columns.
 #[inline(always)]
-pub(super) fn few_or_many<S: Simd, const MR: usize>(
+pub(super) fn tile_of<S: Simd, const MR: usize>(
     simd: S,
     (a, b): (&[f32], &[f32]),
     start: Start<'_>,
     c: &mut [f32],
     ldc: usize,
     size: (usize, usize),
+    ahead: (&[f32], usize),
 ) {
     match size.0 {
-        0..=4 => tile::<S, MR, 4>(simd, a, b, start, c, ldc, size, (&[], 0)),
-        5..=8 if MR > 8 => tile::<S, MR, 8>(simd, a, b, start, c, ldc, size, (&[], 0)),
-        _ => tile::<S, MR, MR>(simd, a, b, start, c, ldc, size, (&[], 0)),
+        0..=4 => tile::<S, MR, 4>(simd, a, b, start, c, ldc, size, ahead),
+        5..=8 if MR > 8 => tile::<S, MR, 8>(simd, a, b, start, c, ldc, size, ahead),
+        _ => tile::<S, MR, MR>(simd, a, b, start, c, ldc, size, ahead),
     }
 }
 
