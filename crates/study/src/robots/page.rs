@@ -269,10 +269,13 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &BTreeMap<(Stri
     }
 }
 
+/// What became of the pictures, and what came of it.
+type Changed<'a> = Vec<(&'a str, &'a Trainings)>;
+
 /// What policies lose where their pictures are changed on the way to them: success on the plain test, then on each of the
 /// others of the same task and demonstrations.
 fn pictures_changed(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
-    let mut tables: BTreeMap<&str, BTreeMap<&str, Vec<(&str, &Trainings)>>> = BTreeMap::new();
+    let mut tables: BTreeMap<&str, BTreeMap<&str, Changed<'_>>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results {
         if let Some(perturb) = &study.tests[test].perturb {
             tables.entry(data).or_default().entry(arm).or_default().push((perturb, trainings));
