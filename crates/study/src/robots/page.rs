@@ -698,6 +698,38 @@ mod tests {
     }
 
     #[test]
+    fn what_changed_pictures_cost_stands_beside_what_is_drawn_and_nowhere_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        let dark = "[tests.t-dark]\ntask = \"PickChain\"\nepisodes = 4\nseed_start = 40000\nperturb = \"black-agentview\"\n\
+                    [[cells]]\narms = [\"one\", \"six\"]\ndata = \"chain\"\nseeds = 1\ntests = [\"t-dark\"]\nstage = 2\n";
+        let text = STUDY.replace("RESULTS", &folder.path().display().to_string()) + dark;
+        std::fs::write(&file, text).unwrap();
+        let study = Study::open(&file).unwrap();
+        let page = || robot_page(&study, &file).unwrap();
+        assert!(!page().contains("## Pictures changed"), "{}", page());
+        for cell in cells(&study).iter().filter(|cell| cell.seed == 1) {
+            for test in cell.tests.iter().filter(|test| *test != "t-32") {
+                let solved = [true, test == "t", test == "t", cell.arm == "six" || test == "t"];
+                result(&study, cell, test, solved).write(&folder.path().join(cell.file_name(test))).unwrap();
+            }
+        }
+        let page = page();
+        let row = |arm: &str| {
+            let begins = format!("| {arm} | 100.0% [");
+            let rows: Vec<&str> = page.lines().filter(|line| line.starts_with(&begins)).collect();
+            rows.last().copied().unwrap_or_default().to_owned()
+        };
+        assert!(page.contains("| PickChain | as drawn | black-agentview |\n|---|---|---|\n"), "{page}");
+        assert!(
+            row("one step").contains("<br>4 of 4 | 25.0% [") && row("one step").ends_with("<br>1 of 4 |"),
+            "{page}"
+        );
+        assert!(row("six steps").ends_with("<br>2 of 4 |"), "{page}");
+        assert!(!page.contains("PickChain after 200 demonstrations:\n"), "{page}");
+    }
+
+    #[test]
     fn stages_thoughts_and_probes_have_places_of_their_own() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("study.toml");
