@@ -5,6 +5,7 @@
 
 use super::check;
 use super::encode::{GroupOutput, Job};
+use super::encoded;
 use super::features::{ConvertOptions, Mapping};
 use super::info::{self, Info, Provenance, VideoProvenance};
 use super::meta;
@@ -76,7 +77,7 @@ pub fn convert_unless(
     if plan.dialect.needs_extraction() {
         return Err(InputError::NeedsExtraction { path: source.to_path_buf() }.into());
     }
-    let mapping = Mapping::resolve(plan, options)?;
+    let mapping = Mapping::resolve(plan, options, &encoded::sizes(&input)?)?;
     let staging = Staging::create(out)?;
     let conversion = Conversion { source, plan, mapping: &mapping, options, root: staging.path() };
     let report = std::thread::scope(|scope| {

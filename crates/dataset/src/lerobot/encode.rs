@@ -10,7 +10,7 @@ use super::work::{Part, is_bulk};
 use crate::error::{DatasetError, InputError, Result};
 use crate::source::Source;
 use crate::stats::FeatureStats;
-use crate::tree::{Array, Demo};
+use crate::tree::Demo;
 use arrow::array::{
     ArrayRef, BinaryArray, BooleanArray, FixedSizeListArray, Float32Array, Int64Array, StringArray, StructArray,
 };
@@ -111,12 +111,12 @@ impl Job<'_> {
         let mut arrays: Vec<ArrayRef> = Vec::with_capacity(self.mapping.columns.len());
         for (index, column) in self.mapping.columns.iter().enumerate() {
             match (&column.origin, self.video) {
-                (Origin::Image { key, height, width }, None) => {
-                    arrays.push(self.pictures(index, key, *height, *width, loaded, &mut summaries)?);
+                (Origin::Image { .. }, None) => {
+                    arrays.push(self.pictures(index, Stored::of(column), loaded, &mut summaries)?);
                 }
-                (Origin::Image { key, height, width }, Some(options)) => {
+                (Origin::Image { .. }, Some(options)) => {
                     for (l, summary) in loaded.iter().zip(&mut summaries) {
-                        let film = self.film(column, options, key, (*height, *width), l)?;
+                        let film = self.film(column, options, Stored::of(column), l)?;
                         summary.pictures.insert(index, film);
                     }
                 }
@@ -147,37 +147,33 @@ impl Job<'_> {
     fn pictures(
         &self,
         index: usize,
-        key: &str,
-        height: usize,
-        width: usize,
+        stored: Stored<'_>,
         loaded: &[Loaded],
         summaries: &mut [PartSummary],
     ) -> Result<ArrayRef> {
+        let Stored { key, height, width, jpeg } = stored;
         let mut files = Vec::new();
         let mut offsets = vec![0_i32];
         let mut names = Vec::new();
+        let extension = if jpeg { "jpg" } else { images::extension(self.images) };
         for (l, summary) in loaded.iter().zip(summaries) {
-            let rows = l.part.rows.clone();
-            let array = self.pixels(l, key, height, width)?;
-            let size = height * width * 3;
             let sampled = sample(l.part.length);
             let mut pictures = PictureSummary { histograms: vec![[0; 256]; 3], ..PictureSummary::default() };
-            for (frame, pixels) in rows.zip(array.bytes.chunks_exact(size)) {
-                images::encode(self.images, height, width, pixels, &mut files).map_err(|e| {
-                    DatasetError::BadDataset {
-                        path: self.path.to_path_buf(),
-                        object: format!("{} {key} frame {frame}", l.demo.id),
-                        expected: "a picture that can be encoded".to_owned(),
-                        found: e.to_string(),
-                    }
-                })?;
+            self.each_picture(l, stored, &mut |frame, file, pixels| {
+                match file {
+                    // as it was recorded
+                    Some(file) => files.extend_from_slice(file),
+                    None => images::encode(self.images, height, width, pixels, &mut files)
+                        .map_err(|e| self.bad_picture(l, key, frame, "a picture that can be encoded", e.to_string()))?,
+                }
                 offsets.push(i32::try_from(files.len()).ok().ok_or_else(|| too_large(self.path, key))?);
-                names.push(format!("frame-{frame:06}.{}", images::extension(self.images)));
+                names.push(format!("frame-{frame:06}.{extension}"));
                 pictures.digests.push(Sha256::digest(pixels).into());
                 if sampled.binary_search(&frame).is_ok() {
                     add_to_histograms(&mut pictures, height, width, pixels);
                 }
-            }
+                Ok(())
+            })?;
             summary.pictures.insert(index, pictures);
         }
         let offsets = OffsetBuffer::new(ScalarBuffer::from(offsets));
@@ -186,45 +182,78 @@ impl Job<'_> {
         Ok(Arc::new(StructArray::new(image_fields(), columns, None)))
     }
 
-    /// The pictures of a part, as many bytes as they must have.
-    fn pixels(&self, l: &Loaded, key: &str, height: usize, width: usize) -> Result<Array> {
-        let rows = &l.part.rows;
+    fn bad_picture(&self, l: &Loaded, key: &str, frame: usize, expected: &str, found: String) -> DatasetError {
+        let (path, object) = (self.path.to_path_buf(), format!("{} {key} frame {frame}", l.demo.id));
+        DatasetError::BadDataset { path, object, expected: expected.to_owned(), found }
+    }
+
+    /// Calls `take` with every picture of a part: its frame, its file if the source has one, and its pixels.
+    fn each_picture(&self, l: &Loaded, stored: Stored<'_>, take: &mut TakePicture<'_>) -> Result<()> {
+        let Stored { key, height, width, jpeg } = stored;
+        let (rows, size) = (l.part.rows.clone(), height * width * 3);
         let array = self.source.read_rows(l.part.episode, key, rows.start, rows.len())?;
-        if array.bytes.len() == height * width * 3 * rows.len() {
-            return Ok(array);
+        if jpeg {
+            let expected = format!("a JPEG file of {height} x {width}");
+            let (row, mut pixels) = (array.bytes.len() / rows.len().max(1), Vec::with_capacity(size));
+            for (frame, bytes) in rows.zip(array.bytes.chunks_exact(row.max(1))) {
+                let bad = |found| self.bad_picture(l, key, frame, &expected, found);
+                let file = images::jpeg(bytes).ok_or_else(|| bad("other bytes".to_owned()))?;
+                pixels.clear();
+                images::decode(file, height, width, &mut pixels).map_err(bad)?;
+                take(frame, Some(file), &pixels)?;
+            }
+            return Ok(());
         }
-        Err(InputError::WrongShape {
-            path: self.path.to_path_buf(),
-            demo: l.demo.id.clone(),
-            key: key.to_owned(),
-            expected: format!("{} images of {height} x {width} x 3", rows.len()),
-            found: format!("{} {:?}", array.dtype, array.shape),
+        if array.bytes.len() != size * rows.len() {
+            return Err(InputError::WrongShape {
+                path: self.path.to_path_buf(),
+                demo: l.demo.id.clone(),
+                key: key.to_owned(),
+                expected: format!("{} images of {height} x {width} x 3", rows.len()),
+                found: format!("{} {:?}", array.dtype, array.shape),
+            }
+            .into());
         }
-        .into())
+        rows.zip(array.bytes.chunks_exact(size)).try_for_each(|(frame, pixels)| take(frame, None, pixels))
     }
 
     /// Encodes the pictures of a part as video; the statistics are those of the pictures as they were recorded, as
     /// LeRobot's are.
-    fn film(
-        &self,
-        column: &Column,
-        options: &VideoOptions,
-        key: &str,
-        (height, width): (usize, usize),
-        l: &Loaded,
-    ) -> Result<PictureSummary> {
-        let array = self.pixels(l, key, height, width)?;
+    fn film(&self, column: &Column, options: &VideoOptions, stored: Stored<'_>, l: &Loaded) -> Result<PictureSummary> {
         let sampled = sample(l.part.length);
         let mut summary = PictureSummary { histograms: vec![[0; 256]; 3], ..PictureSummary::default() };
         let mut camera = Camera::new(column, self.mapping.fps, options)?;
-        for (frame, pixels) in l.part.rows.clone().zip(array.bytes.chunks_exact(height * width * 3)) {
+        self.each_picture(l, stored, &mut |frame, _, pixels| {
             camera.push(pixels)?;
             if sampled.binary_search(&frame).is_ok() {
-                add_to_histograms(&mut summary, height, width, pixels);
+                add_to_histograms(&mut summary, stored.height, stored.width, pixels);
             }
-        }
+            Ok(())
+        })?;
         (summary.samples, summary.digests) = camera.finish()?;
         Ok(summary)
+    }
+}
+
+/// What is done with a picture: its frame, its file if the source has one, its pixels.
+type TakePicture<'f> = dyn FnMut(usize, Option<&[u8]>, &[u8]) -> Result<()> + 'f;
+
+/// Where the pictures of a column are, and how large they are.
+#[derive(Clone, Copy)]
+struct Stored<'a> {
+    key: &'a str,
+    height: usize,
+    width: usize,
+    /// as JPEG files
+    jpeg: bool,
+}
+
+impl<'a> Stored<'a> {
+    fn of(column: &'a Column) -> Self {
+        match &column.origin {
+            &Origin::Image { ref key, height, width, jpeg } => Self { key, height, width, jpeg },
+            _ => unreachable!("asked of columns of pictures alone"),
+        }
     }
 }
 

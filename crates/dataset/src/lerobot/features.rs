@@ -1,5 +1,6 @@
 //! Which dataset of a demo becomes which column: resolved once from the plan, before anything is read.
 
+use super::encoded::may_hold_files;
 use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm};
 use crate::error::{DatasetError, InputError, Result};
 use crate::keys::KeyItem;
@@ -119,8 +120,8 @@ pub(crate) enum Origin {
     Done,
     /// `rewards` at its maximum of 1: the task is solved at this step.
     Success,
-    /// A dataset of 8-bit images.
-    Image { key: String, height: usize, width: usize },
+    /// A dataset of 8-bit images, or of their JPEG files.
+    Image { key: String, height: usize, width: usize, jpeg: bool },
     /// One of the five columns that every data set has.
     Index(IndexColumn),
 }
@@ -164,13 +165,18 @@ pub(crate) struct Mapping {
 }
 
 impl Mapping {
-    /// Chooses columns for `plan`. Every demo must have every chosen dataset in the same shape.
-    pub(crate) fn resolve(plan: &Plan, options: &ConvertOptions) -> Result<Self> {
+    /// Chooses columns for `plan`. Every demo must have every chosen dataset in the same shape. `files` are the datasets of
+    /// JPEG files with height and width of their pictures.
+    pub(crate) fn resolve(
+        plan: &Plan,
+        options: &ConvertOptions,
+        files: &BTreeMap<String, (usize, usize)>,
+    ) -> Result<Self> {
         let first = plan
             .demos
             .first()
             .ok_or_else(|| InputError::NoDemos { path: plan.path.clone(), found: "none".to_owned() })?;
-        let chooser = Chooser { plan, first };
+        let chooser = Chooser { plan, first, files };
         let state_keys = chooser.state_keys(options)?;
         let env_keys = chooser.env_keys(options)?;
         let mut columns = Vec::new();
@@ -249,6 +255,7 @@ impl Mapping {
 struct Chooser<'a> {
     plan: &'a Plan,
     first: &'a DemoPlan,
+    files: &'a BTreeMap<String, (usize, usize)>,
 }
 
 impl Chooser<'_> {
@@ -342,9 +349,11 @@ impl Chooser<'_> {
         let mut taken = BTreeSet::new();
         for (path, key) in &self.first.keys {
             let Some(name) = path.strip_prefix("obs/") else { continue };
-            if !key.is_image() || key.shape[3] != 3 {
-                continue;
-            }
+            let (jpeg, (height, width)) = match (self.files.get(path), key.is_image()) {
+                (Some(&size), _) => (true, size),
+                (None, true) if key.shape[3] == 3 => (false, (key.shape[1], key.shape[2])),
+                _ => continue,
+            };
             let camera = name
                 .strip_suffix("_image")
                 .or_else(|| name.strip_suffix("_rgb"))
@@ -353,11 +362,17 @@ impl Chooser<'_> {
                 .replace('/', ".");
             // two datasets of one camera name keep their full names apart
             let camera = if taken.insert(camera.clone()) { camera } else { name.replace('/', ".") };
-            let (height, width) = (key.shape[1], key.shape[2]);
             for demo in &self.plan.demos {
                 let other = self.key(demo, path)?;
-                if !other.is_image() || other.shape[1..] != key.shape[1..] {
-                    let expected = format!("uint8 images {height} x {width} x 3");
+                let (fits, expected) = match jpeg {
+                    // their rows are as long as the longest file of the demo
+                    true => (may_hold_files(path, other), "a row of bytes a step, a JPEG file in each".to_owned()),
+                    false => (
+                        other.is_image() && other.shape[1..] == key.shape[1..],
+                        format!("uint8 images {height} x {width} x 3"),
+                    ),
+                };
+                if !fits {
                     return Err(self.wrong_shape(demo, path, &expected).into());
                 }
             }
@@ -369,7 +384,7 @@ impl Chooser<'_> {
                     names: json!(["height", "width", "channels"]),
                     info: None,
                 },
-                origin: Origin::Image { key: path.clone(), height, width },
+                origin: Origin::Image { key: path.clone(), height, width, jpeg },
             });
         }
         Ok(columns)
@@ -382,18 +397,19 @@ impl Chooser<'_> {
         for (path, key) in self.plan.demos.iter().flat_map(|d| &d.keys) {
             let shape = key.shape.get(1..).unwrap_or_default();
             let what = match shape {
-                _ if !path.starts_with("obs/") => continue,
+                _ if !path.starts_with("obs/") || self.files.contains_key(path) => continue,
                 [_, _, 3] if key.is_image() => continue,
                 [_, _, 1 | 3 | 4] => format!("{} {shape:?}", key.dtype),
-                // a row of bytes a step under the name of a camera: JPEG files, as newer ALOHA recordings have them
+                // a row of bytes a step under the name of a camera that is no JPEG file
                 [_] | [] if path.starts_with("obs/images/") => format!("encoded images, {} {shape:?}", key.dtype),
                 _ => continue,
             };
             found.entry(path).or_insert(what);
         }
         let fate = if lossless { "the side folder keeps it as stored" } else { "it is left out (--no-lossless)" };
-        let note =
-            |(path, what)| format!("{path} ({what}) becomes no column, only uint8 [height, width, 3] does; {fate}");
+        let note = |(path, what)| {
+            format!("{path} ({what}) becomes no column, only uint8 [height, width, 3] and JPEG files do; {fate}")
+        };
         found.into_iter().map(note).collect()
     }
 

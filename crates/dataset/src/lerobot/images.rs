@@ -1,7 +1,16 @@
-//! Images as files inside a column: PNG or uncompressed PPM, and back to pixels.
+//! Images as files inside a column: PNG or uncompressed PPM, JPEG as it was recorded, and back to pixels.
 
 use super::features::ImageForm;
 use std::io::Cursor;
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+/// What JPEG files begin with: start of image, then the next marker.
+const JPEG: [u8; 3] = [0xFF, 0xD8, 0xFF];
+/// The longest side of a JPEG picture that is opened.
+const MOST_PIXELS: usize = 1 << 14;
 
 /// What a picture's file name ends in.
 pub(crate) fn extension(form: ImageForm) -> &'static str {
@@ -50,7 +59,8 @@ pub(crate) fn decode(file: &[u8], height: usize, width: usize, out: &mut Vec<u8>
     let found = match file {
         [b'P', b'6', ..] => decode_ppm(file, height, width, out)?,
         [0x89, b'P', b'N', b'G', ..] => decode_png(file, height * width * 3, out)?,
-        _ => return Err("neither a PNG nor a PPM file".to_owned()),
+        _ if file.starts_with(&JPEG) => decode_jpeg(file, (height, width), out)?,
+        _ => return Err("neither a PNG nor a PPM nor a JPEG file".to_owned()),
     };
     if found != (height, width) {
         return Err(format!("a picture of {} x {} instead of {height} x {width}", found.0, found.1));
@@ -99,6 +109,44 @@ fn decode_png(file: &[u8], expected: usize, out: &mut Vec<u8>) -> Result<(usize,
     let start = out.len();
     out.resize(start + expected, 0);
     reader.next_frame(&mut out[start..]).map_err(|e| format!("a broken PNG file: {e}"))?;
+    Ok(size)
+}
+
+/// A JPEG file without the zeros that recordings fill its row of bytes up with; `None` where it is none.
+pub(crate) fn jpeg(row: &[u8]) -> Option<&[u8]> {
+    let end = row.iter().rposition(|&byte| byte != 0).map_or(0, |last| last + 1);
+    // whatever follows the end of image is not part of it
+    row.starts_with(&JPEG).then(|| &row[..end])
+}
+
+fn opened(file: &[u8]) -> Result<(JpegDecoder<ZCursor<&[u8]>>, (usize, usize)), String> {
+    let options = DecoderOptions::default()
+        .set_max_width(MOST_PIXELS)
+        .set_max_height(MOST_PIXELS)
+        .set_strict_mode(true)
+        .jpeg_set_out_colorspace(ColorSpace::RGB);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(file), options);
+    let broken = |e: &dyn std::fmt::Debug| format!("a broken JPEG file: {e:?}");
+    decoder.decode_headers().map_err(|e| broken(&e))?;
+    let (width, height) = decoder.dimensions().ok_or_else(|| "a JPEG file without a size".to_owned())?;
+    Ok((decoder, (height, width)))
+}
+
+/// Height and width of a JPEG file; in words what is wrong otherwise.
+pub(crate) fn jpeg_size(file: &[u8]) -> Result<(usize, usize), String> {
+    opened(file).map(|(_, size)| size)
+}
+
+fn decode_jpeg(file: &[u8], expected: (usize, usize), out: &mut Vec<u8>) -> Result<(usize, usize), String> {
+    let (mut decoder, size) = opened(file)?;
+    if size != expected {
+        return Ok(size);
+    }
+    let pixels = decoder.decode().map_err(|e| format!("a broken JPEG file: {e:?}"))?;
+    if pixels.len() != size.0 * size.1 * 3 {
+        return Err(format!("a JPEG file with {} bytes of pixels instead of {}", pixels.len(), size.0 * size.1 * 3));
+    }
+    out.extend_from_slice(&pixels);
     Ok(size)
 }
 

@@ -4,6 +4,7 @@ mod check;
 mod convert;
 pub mod edit;
 mod encode;
+mod encoded;
 mod export;
 mod features;
 mod fingerprint;

@@ -228,14 +228,14 @@ impl SideEncoder {
         let (mut pictures, mut left_out) = (BTreeMap::new(), BTreeSet::new());
         for column in job_columns {
             match (&column.origin, video) {
-                (Origin::Image { key, .. }, None) => {
+                (Origin::Image { key, jpeg: false, .. }, None) => {
                     pictures.insert(key.clone(), column.name.clone());
                 }
                 (Origin::Image { key, .. }, Some(options)) if !options.side_pictures => {
                     left_out.insert(key.replacen("obs/", "next_obs/", 1));
                     left_out.insert(key.clone());
                 }
-                // video is not exact: the recording is kept like any other dataset
+                // video is not exact, and a JPEG file's row has more than the file: kept like any other dataset
                 _ => {}
             }
         }

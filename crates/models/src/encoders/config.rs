@@ -80,7 +80,13 @@ pub struct VisionConfig {
     /// learning rate of the network relative to the rest; absent: 1, or 0.1 with weights
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lr_backbone: Option<f64>,
+    /// numbers that a cell of the map becomes for a model that reads one vector; absent: 32
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cell_features: Option<usize>,
 }
+
+/// What a cell of the map becomes where nothing else is said.
+const CELL_FEATURES: usize = 32;
 
 impl Default for VisionConfig {
     fn default() -> Self {
@@ -95,6 +101,7 @@ impl Default for VisionConfig {
             normalise: Normalisation::Imagenet,
             weights: None,
             lr_backbone: None,
+            cell_features: None,
         }
     }
 }
@@ -129,7 +136,17 @@ impl VisionConfig {
         {
             return refuse("lr_backbone", lr.to_string(), "a share of the learning rate, 0 or more");
         }
+        if let Some(count) = self.cell_features
+            && (count == 0 || !count.is_multiple_of(4))
+        {
+            return refuse("cell_features", count.to_string(), "a multiple of 4");
+        }
         Ok(())
+    }
+
+    /// Numbers that a cell of the map becomes for a model that reads one vector.
+    pub fn cell_features(&self) -> usize {
+        self.cell_features.unwrap_or(CELL_FEATURES)
     }
 
     /// The network it describes.

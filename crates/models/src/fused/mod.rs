@@ -31,6 +31,7 @@ pub(crate) use mixture::{Wanted, likelihood};
 pub(crate) use observation::{Data, Inputs, Tokens, inputs, positions_backward, uncovered};
 pub(crate) use pointer::{Pointed, PointerGrads};
 pub(crate) use vae::Vae;
+pub(crate) use vision::{Eyes, Looked};
 
 use crate::error::{ModelError, Result};
 
@@ -213,6 +214,17 @@ impl<'a> Pass<'a> {
     pub(crate) fn linear(&mut self, prefix: &str, x: &[f32]) -> Vec<f32> {
         let (w, b) = (self.weight(prefix, ".weight"), self.weight(prefix, ".bias"));
         self.times(x, w, Start::Bias(b), |_, _, _| ())
+    }
+
+    /// Rows side by side: (rows, …) and (rows, …) -> (rows, both)
+    pub(crate) fn beside(&mut self, rows: usize, first: &[f32], second: &[f32]) -> Vec<f32> {
+        let (a, b) = (first.len() / rows, second.len() / rows);
+        let mut out = self.take(rows * (a + b));
+        for (n, out) in out.chunks_exact_mut(a + b).enumerate() {
+            out[..a].copy_from_slice(&first[n * a..][..a]);
+            out[a..].copy_from_slice(&second[n * b..][..b]);
+        }
+        out
     }
 
     /// x: (rows, in), w: (out, in), whole rows of a parameter -> `start + x wᵀ`, (rows, out), then `epilogue` as in

@@ -45,13 +45,14 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
 }
 
 /// What models are tried on: with and without an environment state, with a history, with entities in two groups, of which
-/// one has positions, and with pictures of three cameras.
+/// one has positions, with pictures of three cameras, and with a history of two pictures.
 pub(crate) struct Signatures {
     pub(crate) plain: Signature,
     pub(crate) no_env: Signature,
     pub(crate) entities: Signature,
     pub(crate) history: Signature,
     pub(crate) pictures: Signature,
+    pub(crate) film: Signature,
 }
 
 /// Eyes for the pictures: parts at random, colours changed, tokens of all maps.
@@ -71,7 +72,9 @@ pub(crate) fn signatures() -> Signatures {
     pictures.observation.extend(["a", "b"].map(|name| FeatureSpec::image(name, 40, 36)));
     pictures.observation.push(FeatureSpec::image("c", 34, 34));
     pictures.observation.push(cube("cube0"));
-    Signatures { plain, no_env, entities, history, pictures }
+    let mut film = Signature { n_obs_steps: 2, ..no_env.clone() };
+    film.observation.push(FeatureSpec::image("a", 36, 40));
+    Signatures { plain, no_env, entities, history, pictures, film }
 }
 
 /// Loss and gradients as the trainer gets them.

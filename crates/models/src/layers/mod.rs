@@ -15,6 +15,7 @@ mod mish;
 mod mixture;
 mod pointer;
 mod position;
+mod sight;
 mod tokens;
 mod transformer;
 mod vae;
@@ -34,8 +35,9 @@ pub use mixture::{Mixture, MixtureHead};
 pub use pointer::PointerConfig;
 pub(crate) use pointer::{Asked, Pointed, Pointer};
 pub use position::sinusoid_table;
+pub(crate) use sight::Sight;
 pub(crate) use tokens::{
-    ENTITY_POSITIONS, FEATURE_POSITIONS, InputTokens, LATENT, Position, TokenLayout, environment_state,
+    Cameras, ENTITY_POSITIONS, FEATURE_POSITIONS, InputTokens, LATENT, Position, TokenLayout, environment_state,
 };
 pub(crate) use transformer::{Decoder, DecoderLayer, Encoder, EncoderLayer, LayerInit, Shape};
 pub(crate) use vae::{Vae, kl_divergence, sample};

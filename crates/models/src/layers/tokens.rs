@@ -73,9 +73,6 @@ impl Cameras {
         let refuse = |field: &'static str, found: String, expected: &str| {
             Err(ModelError::Config { model: "vision", field, found, expected: expected.to_string() })
         };
-        if signature.n_obs_steps != 1 {
-            return refuse("n_obs_steps", signature.n_obs_steps.to_string(), "1 with pictures");
-        }
         let (mut given, mut seen) = (Vec::new(), Vec::new());
         for spec in &specs {
             let &[h, w, 3] = spec.shape.as_slice() else {
@@ -98,6 +95,17 @@ impl Cameras {
         let features = specs.iter().map(|spec| spec.name.clone()).collect();
         Ok(Some(Self { config: config.clone(), shape, features, given, seen, tokens, positions }))
     }
+
+    /// The same with the default encoder where nothing is said; to say something where nothing is seen is an error.
+    pub(crate) fn asked(signature: &Signature, vision: Option<&VisionConfig>, dim: usize) -> Result<Option<Self>> {
+        let cameras = Self::new(signature, vision.unwrap_or(&VisionConfig::default()), dim)?;
+        if vision.is_some() && cameras.is_none() {
+            let names: Vec<&str> = signature.observation.iter().map(|spec| spec.name.as_str()).collect();
+            let (found, expected) = (names.join(", "), "a feature of kind image".to_string());
+            return Err(ModelError::Config { model: "vision", field: "observation", found, expected });
+        }
+        Ok(cameras)
+    }
 }
 
 /// The tokens after the latent's: state, environment state, entities, then pictures.
@@ -111,11 +119,10 @@ pub(crate) struct TokenLayout {
 impl TokenLayout {
     /// Of a signature that was checked, for tokens of width `dim`; pictures are seen as `vision` says.
     pub(crate) fn new(signature: &Signature, vision: Option<&VisionConfig>, dim: usize) -> Result<Self> {
-        let cameras = Cameras::new(signature, vision.unwrap_or(&VisionConfig::default()), dim)?;
-        if vision.is_some() && cameras.is_none() {
-            let names: Vec<&str> = signature.observation.iter().map(|spec| spec.name.as_str()).collect();
-            let (found, expected) = (names.join(", "), "a feature of kind image".to_string());
-            return Err(ModelError::Config { model: "vision", field: "observation", found, expected });
+        let cameras = Cameras::asked(signature, vision, dim)?;
+        if cameras.is_some() && signature.n_obs_steps != 1 {
+            let (found, expected) = (signature.n_obs_steps.to_string(), "1 with pictures".to_string());
+            return Err(ModelError::Config { model: "vision", field: "n_obs_steps", found, expected });
         }
         let mut specs: Vec<_> = signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image).collect();
         specs.sort_by_key(|spec| spec.kind);

@@ -46,9 +46,6 @@ impl Layout for Aloha {
             episode(index, file, &mut out)?;
             beat();
         }
-        if survey.files.iter().any(|f| f.datasets.contains_key("compress_len")) {
-            out.notes.push("images are JPEG streams; they are kept as stored bytes, not as images".to_owned());
-        }
         Ok(out)
     }
 }

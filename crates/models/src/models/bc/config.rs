@@ -1,5 +1,6 @@
 //! BC's options.
 
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
@@ -25,11 +26,14 @@ pub struct Config {
     pub hidden: Vec<usize>,
     /// what is minimised
     pub loss: Loss,
+    /// how pictures are seen, if there are any
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<VisionConfig>,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { action_horizon: 1, hidden: vec![1024, 1024], loss: Loss::L2 }
+        Self { action_horizon: 1, hidden: vec![1024, 1024], loss: Loss::L2, vision: None }
     }
 }
 

@@ -2,41 +2,105 @@
 
 use super::{Bc, Loss};
 use crate::batch::Batch;
+use crate::device::HERE;
 use crate::error::Result;
-use crate::fused::{Pass, with_weights};
+use crate::features::Features;
+use crate::fused::{Looked, Pass, with_weights};
 use crate::gradients::Gradients;
 use crate::kernels::{activate, activate_backward};
-use crate::layers::{Activation, Shape};
+use crate::layers::{Activation, Shape, Sight};
 use crate::model::{LossValues, PolicyModel};
 use crate::simd::vectorised;
 use crate::values::with_values;
+use candle_core::Tensor;
 use std::collections::BTreeMap;
 
+/// What every layer reads, the first one `first`, and last what they give.
+fn through(pass: &mut Pass<'_>, names: &[String], first: Vec<f32>) -> Vec<Vec<f32>> {
+    let mut read = vec![first];
+    for (name, x) in names.iter().zip(0..) {
+        let mut y = pass.linear(name, &read[x]);
+        vectorised(
+            #[inline(always)]
+            || activate(&mut y, Activation::Relu, None, 0),
+        );
+        read.push(y);
+    }
+    read
+}
+
 impl Bc {
+    /// Of transformers alone, but for the width of a cell of what cameras see.
+    fn shape(&self) -> Shape {
+        let dim = self.sight.as_ref().map_or(1, |sight| sight.config().cell_features());
+        Shape { dim, heads: 1, hidden: 1, activation: Activation::Relu, dropout: 0.0, pre_norm: false }
+    }
+
+    /// What the first layer reads, (b, …): numbers, then what the cameras see.
+    fn first(
+        &self,
+        pass: &mut Pass<'_>,
+        rows: usize,
+        numbers: &[f32],
+        pictures: Option<&[Vec<f32>]>,
+    ) -> (Vec<f32>, Option<Looked>) {
+        let (Some(sight), Some(pictures)) = (&self.sight, pictures) else {
+            return (pass.space.pool.copy(numbers), None);
+        };
+        let mut x = pass.take(rows * sight.width());
+        let looked = sight.eyes().forward(pass, pictures, &mut x, (0, sight.cameras().tokens));
+        let both = pass.beside(rows, numbers, &x);
+        pass.give(x);
+        (both, Some(looked))
+    }
+
+    /// The prediction from pictures; without them `forward` is as fast.
+    pub(super) fn fused_predict(
+        &self,
+        sight: &Sight,
+        rows: usize,
+        observation: &Features<Tensor>,
+        on_seen: &mut dyn FnMut(),
+    ) -> Result<Tensor> {
+        let numbers = with_values(&self.numbers(rows, observation)?, <[f32]>::to_vec)?;
+        let pictures = sight.pictures(&sight.look(observation, None)?)?;
+        let (packed, shape) = (self.workspaces.packed(self.params()), self.shape());
+        let actions = self.workspaces.with(|space| {
+            with_weights(self.params(), |weights| {
+                let pass = &mut Pass { weights, shape, space, rng: None, packed: Some(&packed), on_seen: None };
+                let names: Vec<String> = (0..self.hidden.len()).map(|i| format!("hidden.{i}")).collect();
+                let (first, looked) = self.first(pass, rows, &numbers, Some(&pictures));
+                looked.into_iter().for_each(|looked| looked.free(pass));
+                on_seen();
+                let read = through(pass, &names, first);
+                let out = pass.linear("action_head", &read[names.len()]);
+                read.into_iter().for_each(|buffer| pass.give(buffer));
+                // the workspace keeps its buffers
+                let actions = out.clone();
+                pass.give(out);
+                actions
+            })
+        })?;
+        Ok(Tensor::from_vec(actions, (rows, self.config.action_horizon, self.signature.action_dim), &HERE)?)
+    }
+
     /// Loss of a batch, and its gradients added to `into`.
     pub(super) fn fused_gradients(&self, batch: &Batch, into: &mut Gradients) -> Result<LossValues> {
         let width = self.signature.action_dim;
-        let seen = with_values(&self.joined(batch.rows(), &batch.observation)?, <[f32]>::to_vec)?;
+        let rows = batch.rows();
+        let numbers = with_values(&self.numbers(rows, &batch.observation)?, <[f32]>::to_vec)?;
+        let pictures = self.sight.as_ref().map(|sight| sight.pictures(&batch.observation)).transpose()?;
         let actions = with_values(&batch.actions, <[f32]>::to_vec)?;
         let is_pad = with_values(&batch.is_pad, <[f32]>::to_vec)?;
         let entries = (batch.total_valid_steps * width).max(1) as f64;
-        // of transformers alone
-        let shape = Shape { dim: 1, heads: 1, hidden: 1, activation: Activation::Relu, dropout: 0.0, pre_norm: false };
+        let shape = self.shape();
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass { weights, shape, space, rng: None, packed: None, on_seen: None };
                 let grads = &mut into.views();
                 let names: Vec<String> = (0..self.hidden.len()).map(|i| format!("hidden.{i}")).collect();
-                // what every layer reads
-                let mut read = vec![pass.space.pool.copy(&seen)];
-                for (name, x) in names.iter().zip(0..) {
-                    let mut y = pass.linear(name, &read[x]);
-                    vectorised(
-                        #[inline(always)]
-                        || activate(&mut y, Activation::Relu, None, 0),
-                    );
-                    read.push(y);
-                }
+                let (first, mut looked) = self.first(pass, rows, &numbers, pictures.as_deref());
+                let read = through(pass, &names, first);
                 let mut grad = pass.linear("action_head", &read[names.len()]);
                 let (mut l1, mut l2) = (0.0, 0.0);
                 for ((out, action), pad) in grad.chunks_exact_mut(width).zip(actions.chunks_exact(width)).zip(&is_pad) {
@@ -53,7 +117,7 @@ impl Bc {
                 }
                 let mut name = "action_head";
                 for (i, x) in read.iter().enumerate().rev() {
-                    let input = x.len() / batch.rows();
+                    let input = x.len() / rows;
                     pass.linear_backward(name, x, &grad, input, grads);
                     if let Some(below) = i.checked_sub(1) {
                         let mut of_x = pass.linear_input(name, &grad, input);
@@ -63,6 +127,16 @@ impl Bc {
                         );
                         pass.give(std::mem::replace(&mut grad, of_x));
                         name = &names[below];
+                    } else if let (Some(sight), Some(looked)) = (&self.sight, looked.take()) {
+                        let of_x = pass.linear_input(name, &grad, input);
+                        let mut of_seen = pass.take(rows * sight.width());
+                        let last = input - sight.width();
+                        for (to, from) in of_seen.chunks_exact_mut(sight.width()).zip(of_x.chunks_exact(input)) {
+                            to.copy_from_slice(&from[last..]);
+                        }
+                        sight.eyes().backward(pass, looked, &of_seen, (0, sight.cameras().tokens), grads);
+                        pass.give(of_x);
+                        pass.give(of_seen);
                     }
                 }
                 read.into_iter().chain([grad]).for_each(|buffer| pass.give(buffer));

@@ -5,7 +5,8 @@
 //!
 //! Deviations: actions may be predicted as a chunk; robomimic predicts one. Its outputs go through `tanh`, because its
 //! actions lie in -1 to 1; ours are normalised and do not. Its history goes through an LSTM (`BC-RNN`); here the steps of a
-//! history lie side by side.
+//! history lie side by side. Pictures become the cells of `[policy.vision]`'s feature map behind the numbers (robomimic:
+//! keypoints).
 
 mod config;
 mod fused;
@@ -15,11 +16,12 @@ pub use config::{Config, Loss};
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
+use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
-use crate::layers::Linear;
+use crate::layers::{Linear, Sight};
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::Params;
@@ -31,7 +33,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
-pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+pub const READS: &[FeatureKind] =
+    &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
 
 /// The model.
 #[derive(Debug)]
@@ -39,6 +42,7 @@ pub struct Bc {
     config: Config,
     signature: Signature,
     params: Params,
+    sight: Option<Sight>,
     hidden: Vec<Linear>,
     action_head: Linear,
     workspaces: Workspaces,
@@ -54,7 +58,10 @@ impl Bc {
         signature.check("bc", READS)?;
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
-        let mut width: usize = signature.observation.iter().map(|spec| spec.width() * signature.n_obs_steps).sum();
+        let sight = Sight::new(&mut p, signature, config.vision.as_ref(), rng)?;
+        let numbers = signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image);
+        let numbers: usize = numbers.map(|spec| spec.width() * signature.n_obs_steps).sum();
+        let mut width = numbers + sight.as_ref().map_or(0, Sight::width);
         let mut hidden = Vec::with_capacity(config.hidden.len());
         for (i, &next) in config.hidden.iter().enumerate() {
             hidden.push(Linear::new(&mut p, &format!("hidden.{i}"), width, next, rng)?);
@@ -62,13 +69,13 @@ impl Bc {
         }
         let action_head = Linear::new(&mut p, "action_head", width, config.action_horizon * signature.action_dim, rng)?;
         let (config, signature, workspaces) = (config.clone(), signature.clone(), Workspaces::default());
-        Ok(Self { config, signature, params: p, hidden, action_head, workspaces })
+        Ok(Self { config, signature, params: p, sight, hidden, action_head, workspaces })
     }
 
-    /// The signature's features, (b, …) each -> (b, everything)
-    fn joined(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
+    /// The signature's features that are numbers, (b, …) each -> (b, all of them)
+    fn numbers(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
         let mut joined = Vec::with_capacity(self.signature.observation.len());
-        for spec in &self.signature.observation {
+        for spec in self.signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image) {
             joined.push(observation.require("bc", &spec.name)?.reshape((rows, ()))?);
         }
         Ok(Tensor::cat(&joined, 1)?)
@@ -76,12 +83,25 @@ impl Bc {
 
     /// The signature's features, (b, …) each -> (b, H, A)
     fn forward(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
-        let mut x = self.joined(rows, observation)?;
+        let mut x = self.numbers(rows, observation)?;
+        if let Some(sight) = &self.sight {
+            x = Tensor::cat(&[x, sight.forward(&sight.look(observation, None)?)?], 1)?;
+        }
         for layer in &self.hidden {
             x = layer.forward(&x)?.relu()?;
         }
         let shape = (rows, self.config.action_horizon, self.signature.action_dim);
         Ok(self.action_head.forward(&x)?.reshape(shape)?)
+    }
+
+    /// The batch with pictures as the network reads them in training.
+    fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
+        check_batch("bc", &self.signature, self.config.action_horizon, batch)?;
+        let observation = match &self.sight {
+            Some(sight) => sight.look(&batch.observation, Some(rng))?,
+            None => batch.observation.clone(),
+        };
+        Ok(Batch { observation, ..batch.clone() })
     }
 }
 
@@ -98,13 +118,12 @@ impl PolicyModel for Bc {
         None
     }
 
-    fn accumulate_gradients(&self, batch: &Batch, _rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
-        check_batch("bc", &self.signature, self.config.action_horizon, batch)?;
-        self.fused_gradients(batch, into)
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+        self.fused_gradients(&self.looked_at(batch, rng)?, into)
     }
 
-    fn loss(&self, batch: &Batch, _rng: &mut Rng) -> Result<LossParts> {
-        check_batch("bc", &self.signature, self.config.action_horizon, batch)?;
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
+        let batch = &self.looked_at(batch, rng)?;
         let difference = (self.forward(batch.rows(), &batch.observation)? - &batch.actions)?;
         let valid = (1.0 - batch.is_pad.unsqueeze(2)?)?;
         let entries = (batch.total_valid_steps * self.signature.action_dim).max(1) as f64;
@@ -124,12 +143,24 @@ impl PolicyModel for Bc {
     }
 
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
-        let rows = check_observation("bc", &self.signature, observation)?;
-        Ok(self.forward(rows, observation)?.detach())
+        self.sample_seen(observation, &mut Rng::new(0, "predict"), &mut || {})
     }
 
-    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
-        Box::new(ChunkPolicy::new(self, preprocess))
+    /// Nothing is drawn.
+    fn sample_seen(&self, observation: &Features<Tensor>, _rng: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
+        let rows = check_observation("bc", &self.signature, observation)?;
+        match &self.sight {
+            Some(sight) => self.fused_predict(sight, rows, observation, on_seen),
+            None => Ok(self.forward(rows, observation)?.detach()),
+        }
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        Box::new(ChunkPolicy::new(self, preprocess).with_clock(clock))
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.sight.as_ref().map(Sight::config)
     }
 
     fn action_horizon(&self) -> usize {
@@ -142,13 +173,13 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::fused::testing::{
-        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
     };
     use crate::train::{TrainConfig, Trainer};
 
     fn configs() -> Vec<Config> {
         [(Loss::L2, vec![11, 7]), (Loss::L1, vec![9]), (Loss::L2, vec![])]
-            .map(|(loss, hidden)| Config { action_horizon: 3, hidden, loss })
+            .map(|(loss, hidden)| Config { action_horizon: 3, hidden, loss, vision: None })
             .into()
     }
 
@@ -161,6 +192,24 @@ mod tests {
                 move_parameters(&model);
                 let batch = batch(signature, config.action_horizon, 7, 3);
                 assert_the_step_is_the_composed_one(&model, &batch, &format!("{config:?}"));
+            }
+        }
+    }
+
+    #[test]
+    fn from_pictures_step_and_prediction_are_the_composed_ones() {
+        let of = signatures();
+        for signature in [&of.pictures, &of.film] {
+            for config in configs() {
+                let model = Bc::new(&Config { vision: Some(eyes()), ..config }, signature, 1).unwrap();
+                move_parameters(&model);
+                let batch = batch(signature, 3, 3, 3);
+                assert_the_step_is_the_composed_one(&model, &batch, &format!("{:?}", model.config));
+                let (want, mut seen) = (model.forward(3, &batch.observation).unwrap(), 0);
+                let rng = &mut Rng::new(0, "unused");
+                let got = model.sample_seen(&batch.observation, rng, &mut || seen += 1).unwrap();
+                let off = (got - want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+                assert!(off < 1e-4 && seen == 1, "{off} {seen}");
             }
         }
     }
@@ -202,7 +251,7 @@ mod tests {
     fn training_lowers_the_loss_with_the_same_bits_every_time() {
         let signature = signatures().entities;
         let run = || {
-            let config = Config { action_horizon: 2, hidden: vec![32, 32], loss: Loss::L2 };
+            let config = Config { action_horizon: 2, hidden: vec![32, 32], ..Default::default() };
             let model = Box::new(Bc::new(&config, &signature, 1).unwrap());
             let settings = TrainConfig { steps: 80, lr: 3e-3, warmup_steps: 3, ..Default::default() };
             let mut trainer = Trainer::new(model, settings, 5).unwrap();

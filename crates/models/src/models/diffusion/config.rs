@@ -1,6 +1,7 @@
 //! Diffusion's options.
 
 use super::unet::NetworkConfig;
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
@@ -47,6 +48,9 @@ pub struct Config {
     pub clip_sample: f64,
     /// whether steps beyond an episode's ends are left out of the loss (LeRobot: `do_mask_loss_for_padding`)
     pub mask_padding: bool,
+    /// how pictures are seen, if there are any
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<VisionConfig>,
 }
 
 impl Default for Config {
@@ -60,6 +64,7 @@ impl Default for Config {
             inference_steps: 10,
             clip_sample: 1.0,
             mask_padding: false,
+            vision: None,
         }
     }
 }

@@ -2,6 +2,7 @@
 //! are those of pictures of one row (`kernels/conv.rs`), and feature maps lie in frames of zeros for them; normed values are
 //! kept for the backward pass, everything else is computed in passing.
 
+use super::condition::Told;
 use super::unet::{LAST_GROUPS, NetworkConfig, embedding};
 use super::values;
 use crate::device::HERE;
@@ -30,18 +31,17 @@ pub(crate) struct FusedUnet {
 
 /// What the network looks at: x (n, T, A), the step of each row, the condition (n, C).
 #[derive(Clone, Copy)]
-pub(crate) struct Asked<'a> {
-    pub(crate) x: &'a [f32],
-    pub(crate) steps: &'a [f32],
-    pub(crate) cond: &'a [f32],
+struct Asked<'a> {
+    x: &'a [f32],
+    steps: &'a [f32],
+    cond: &'a [f32],
 }
 
 /// What its answer is held to: (n, T, A), how much each step counts, (n, T), or all alike, and over how many numbers and
 /// with what share of the loss the mean is taken.
-#[derive(Clone, Copy)]
-pub(crate) struct Wanted<'a> {
-    pub(crate) values: &'a [f32],
-    pub(crate) valid: Option<&'a [f32]>,
+pub(crate) struct Wanted {
+    pub(crate) values: Vec<f32>,
+    pub(crate) valid: Option<Vec<f32>>,
     pub(crate) entries: f64,
     pub(crate) share: f64,
 }
@@ -51,16 +51,18 @@ impl FusedUnet {
         Self { config: config.clone(), prefix, horizon, action_dim, workspaces: Workspaces::default() }
     }
 
-    /// Calls `run` with a pass over the weights and the network for `rows` sequences.
+    /// Calls `run` with a pass over the weights and the network for `rows` sequences; a cell of what cameras see becomes
+    /// `cell` numbers.
     fn pass<R>(
         &self,
         params: &Params,
-        (rows, packed): (usize, bool),
+        (rows, cell, packed): (usize, usize, bool),
         run: impl FnOnce(&Net, &mut Pass<'_>) -> R,
     ) -> Result<R> {
         let net = Net::new(self, rows);
-        // of transformers alone
-        let shape = Shape { dim: 1, heads: 1, hidden: 1, activation: Activation::Relu, dropout: 0.0, pre_norm: false };
+        // of transformers alone, but for the width of a cell
+        let (dim, activation) = (cell, Activation::Relu);
+        let shape = Shape { dim, heads: 1, hidden: 1, activation, dropout: 0.0, pre_norm: false };
         let panels = packed.then(|| self.workspaces.packed(params));
         self.workspaces.with(|space| {
             with_weights(params, |weights| {
@@ -75,7 +77,7 @@ impl FusedUnet {
     /// # Errors
     /// Weights that are not on the CPU.
     fn answer(&self, params: &Params, asked: Asked<'_>) -> Result<Vec<f32>> {
-        self.pass(params, (asked.steps.len(), true), |net, pass| {
+        self.pass(params, (asked.steps.len(), 1, true), |net, pass| {
             let (out, seen) = net.forward(pass, asked);
             seen.free(pass);
             // the workspace keeps its buffers
@@ -94,36 +96,82 @@ impl FusedUnet {
         Ok(Tensor::from_vec(answer, x.shape(), &HERE)?)
     }
 
-    /// The mean squared error of the answer; its gradients are added to `into`.
+    /// The condition, (n, C), with what the cameras see.
+    ///
+    /// # Errors
+    /// As [`Self::answer`].
+    pub(crate) fn seen(&self, params: &Params, rows: usize, told: Told<'_>) -> Result<Vec<f32>> {
+        let Some(sight) = told.sight else { return Ok(told.numbers) };
+        self.pass(params, (rows, sight.config().cell_features(), true), |_, pass| {
+            let mut x = pass.take(rows * sight.width());
+            sight.eyes().forward(pass, &told.pictures, &mut x, (0, sight.cameras().tokens)).free(pass);
+            let cond = pass.beside(rows, &told.numbers, &x);
+            pass.give(x);
+            // the workspace keeps its buffers
+            let out = cond.clone();
+            pass.give(cond);
+            out
+        })
+    }
+
+    /// The mean squared errors of answers about the same observations: to x (n, T, A) at the steps of its rows. Gradients
+    /// are added to `into`.
     ///
     /// # Errors
     /// Weights that are not on the CPU.
-    pub(crate) fn squared_error(
+    pub(crate) fn squared_errors<const N: usize>(
         &self,
         params: &Params,
-        asked: Asked<'_>,
-        wanted: Wanted<'_>,
+        told: Told<'_>,
+        parts: [(&[f32], &[f32], Wanted); N],
         into: &mut Gradients,
-    ) -> Result<f64> {
-        let width = self.action_dim;
-        self.pass(params, (asked.steps.len(), false), |net, pass| {
-            let (mut out, seen) = net.forward(pass, asked);
-            let mut sum = 0.0;
-            let slope = (2.0 * wanted.share / wanted.entries) as f32;
-            for (step, (out, wanted_here)) in
-                out.chunks_exact_mut(width).zip(wanted.values.chunks_exact(width)).enumerate()
-            {
-                let counts = wanted.valid.map_or(1.0, |valid| valid[step]);
-                for (out, wanted) in out.iter_mut().zip(wanted_here) {
-                    let away = *out - wanted;
-                    sum += f64::from(counts * away * away);
-                    *out = counts * away * slope;
-                }
+    ) -> Result<[f64; N]> {
+        let rows = parts.first().map_or(0, |(_, steps, _)| steps.len());
+        let cell = told.sight.map_or(1, |sight| sight.config().cell_features());
+        self.pass(params, (rows, cell, false), |net, pass| {
+            let mut looked = None;
+            let (mut cond, mut of_seen) = (pass.space.pool.copy(&told.numbers), Vec::new());
+            if let Some(sight) = told.sight {
+                let mut x = pass.take(rows * sight.width());
+                let of_cameras = (0, sight.cameras().tokens);
+                looked =
+                    Some((sight.eyes(), of_cameras, sight.eyes().forward(pass, &told.pictures, &mut x, of_cameras)));
+                let both = pass.beside(rows, &told.numbers, &x);
+                pass.give(std::mem::replace(&mut cond, both));
+                x.fill(0.0);
+                of_seen = x;
             }
-            net.backward(pass, seen, &out, &mut into.views());
-            pass.give(out);
-            sum / wanted.entries
+            let errors = parts.map(|(x, steps, wanted)| {
+                let (mut out, seen) = net.forward(pass, Asked { x, steps, cond: &cond });
+                let error = wanted.compare(&mut out, self.action_dim);
+                net.backward(pass, seen, &out, &mut of_seen, &mut into.views());
+                pass.give(out);
+                error
+            });
+            if let Some((eyes, of_cameras, looked)) = looked {
+                eyes.backward(pass, looked, &of_seen, of_cameras, &mut into.views());
+            }
+            pass.give(cond);
+            pass.give(of_seen);
+            errors
         })
+    }
+}
+
+impl Wanted {
+    /// The mean squared error of an answer, (n, T, A), which becomes its gradient.
+    fn compare(&self, out: &mut [f32], width: usize) -> f64 {
+        let mut sum = 0.0;
+        let slope = (2.0 * self.share / self.entries) as f32;
+        for (step, (out, wanted)) in out.chunks_exact_mut(width).zip(self.values.chunks_exact(width)).enumerate() {
+            let counts = self.valid.as_ref().map_or(1.0, |valid| valid[step]);
+            for (out, wanted) in out.iter_mut().zip(wanted) {
+                let away = *out - wanted;
+                sum += f64::from(counts * away * away);
+                *out = counts * away * slope;
+            }
+        }
+        sum / self.entries
     }
 }
 
@@ -462,8 +510,8 @@ impl<'a> Net<'a> {
         (answer, Seen { embedding, hidden, cond, blocks, halved, doubled, ends: [end, read], last })
     }
 
-    /// grad: that of the answer, (n, T, A).
-    fn backward(&self, pass: &mut Pass<'_>, seen: Seen, grad: &[f32], grads: &mut Grads<'_>) {
+    /// grad: that of the answer, (n, T, A); adds that of the condition's last numbers to `of_seen`, (n, as many as there are).
+    fn backward(&self, pass: &mut Pass<'_>, seen: Seen, grad: &[f32], of_seen: &mut [f32], grads: &mut Grads<'_>) {
         let Seen { embedding, hidden, cond: [joined, cond], mut blocks, mut halved, mut doubled, ends, last } = seen;
         let config = &self.unet.config;
         let mut of_cond = pass.space.pool.zeros(cond.len());
@@ -537,6 +585,12 @@ impl<'a> Net<'a> {
         mish_backward(&mut of_cond, &joined);
         let (width, [before, after], [first, second]) = (config.step_embed_dim, hidden, self.step_encoder());
         let per = joined.len() / self.answer.input.pictures;
+        let last = of_seen.len() / self.answer.input.pictures;
+        if last > 0 {
+            for (to, from) in of_seen.chunks_exact_mut(last).zip(of_cond.chunks_exact(per)) {
+                add(to, &from[per - last..]);
+            }
+        }
         let mut of_steps = pass.take(embedding.len());
         for (to, from) in of_steps.chunks_exact_mut(width).zip(of_cond.chunks_exact(per)) {
             to.copy_from_slice(&from[..width]);

@@ -201,6 +201,7 @@ pub fn read_config(config: &Value) -> Result<LerobotDiffusion> {
         inference_steps: keys.num_inference_steps.unwrap_or(keys.num_train_timesteps),
         clip_sample: if keys.clip_sample { keys.clip_sample_range } else { 0.0 },
         mask_padding: keys.do_mask_loss_for_padding,
+        vision: None,
     };
     config.validate()?;
     let signature = Signature { n_obs_steps: keys.n_obs_steps, ..Signature::low_dimensional(state, env, action) };

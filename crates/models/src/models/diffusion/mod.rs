@@ -5,8 +5,9 @@
 //! outputs, the loss and the gradients. As there a sequence of actions begins with that of the first observation seen; what
 //! lies before the present one is not executed.
 //!
-//! Deviations: observations are low-dimensional, entities among them, joined in the signature's order; betas are those of
-//! the squared cosine only; actions are drawn with DDIM in 10 steps unless the configuration says otherwise (LeRobot: DDPM
+//! Deviations: numbers are joined in the signature's order, entities among them, and before what the cameras see; pictures go
+//! through `[policy.vision]`'s network and become its map's cells (Chi et al. and LeRobot: keypoints), of every step seen;
+//! betas are those of the squared cosine only; actions are drawn with DDIM in 10 steps unless the configuration says otherwise (LeRobot: DDPM
 //! in as many as were trained); every frame starts a window (LeRobot leaves out the last 7 of an episode). The moving average
 //! of the weights is the trainer's (`train.ema_decay`), with one decay; Chi et al.'s grows, LeRobot has none.
 //!
@@ -14,6 +15,7 @@
 //! `bench_policies` puts beside LeRobot's. One step of DDIM starts at the least noisy timestep, as diffusers' spacing
 //! `leading` has it: it is there for parity, not to act by.
 
+pub(crate) mod condition;
 mod config;
 pub(crate) mod fused;
 pub mod lerobot;
@@ -27,6 +29,7 @@ use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::device::HERE;
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
 use crate::gradients::Gradients;
@@ -37,13 +40,15 @@ use crate::preprocess::Preprocess;
 use crate::rng::Rng;
 use crate::values::with_values;
 use candle_core::Tensor;
-use fused::{Asked, FusedUnet, Wanted};
+use condition::Condition;
+use fused::{FusedUnet, Wanted};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use unet::Unet;
 
 /// The kinds of features that it reads.
-pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+pub const READS: &[FeatureKind] =
+    &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
 
 /// The model.
 #[derive(Debug)]
@@ -51,28 +56,10 @@ pub struct Diffusion {
     config: Config,
     signature: Signature,
     params: Params,
+    condition: Condition,
     schedule: NoiseSchedule,
     unet: Unet,
     fused: FusedUnet,
-}
-
-/// Numbers of everything seen at once.
-pub(crate) fn condition_width(signature: &Signature) -> usize {
-    signature.observation.iter().map(|spec| spec.width() * signature.n_obs_steps).sum()
-}
-
-/// The signature's features, (b, …) each -> (b, steps*width), the features of a step side by side, steps one after another
-pub(crate) fn condition(
-    model: &'static str,
-    signature: &Signature,
-    rows: usize,
-    observation: &Features<Tensor>,
-) -> Result<Tensor> {
-    let mut joined = Vec::with_capacity(signature.observation.len());
-    for spec in &signature.observation {
-        joined.push(observation.require(model, &spec.name)?.reshape((rows, signature.n_obs_steps, ()))?);
-    }
-    Ok(Tensor::cat(&joined, 2)?.reshape((rows, ()))?)
 }
 
 /// A tensor's numbers in order.
@@ -80,20 +67,15 @@ pub(crate) fn values(t: &Tensor) -> Result<Vec<f32>> {
     with_values(t, <[f32]>::to_vec)
 }
 
-/// Calls `f` with what [`squared_error`] holds an answer to. wanted: (b, H, A)
-pub(crate) fn with_wanted<R>(
-    wanted: &Tensor,
-    batch: &Batch,
-    masked: bool,
-    share: f64,
-    f: impl FnOnce(Wanted<'_>) -> Result<R>,
-) -> Result<R> {
-    let (_, horizon, width) = wanted.dims3()?;
-    let counted = if masked { batch.total_valid_steps * width } else { batch.total_rows * horizon * width };
-    let valid: Option<Vec<f32>> =
-        masked.then(|| values(&batch.is_pad)).transpose()?.map(|pad| pad.iter().map(|pad| 1.0 - pad).collect());
-    let wanted = values(wanted)?;
-    f(Wanted { values: &wanted, valid: valid.as_deref(), entries: counted.max(1) as f64, share })
+impl Wanted {
+    /// What [`squared_error`] holds an answer to. wanted: (b, H, A)
+    pub(crate) fn of(wanted: &Tensor, batch: &Batch, masked: bool, share: f64) -> Result<Self> {
+        let (_, horizon, width) = wanted.dims3()?;
+        let counted = if masked { batch.total_valid_steps * width } else { batch.total_rows * horizon * width };
+        let valid: Option<Vec<f32>> =
+            masked.then(|| values(&batch.is_pad)).transpose()?.map(|pad| pad.iter().map(|pad| 1.0 - pad).collect());
+        Ok(Self { values: values(wanted)?, valid, entries: counted.max(1) as f64, share })
+    }
 }
 
 /// Checks that a sequence of actions reaches the present.
@@ -127,12 +109,13 @@ impl Diffusion {
         config.validate()?;
         signature.check("diffusion", READS)?;
         check_reaches("diffusion", signature, config.action_horizon)?;
-        let mut p = Params::new();
-        let dims = (signature.action_dim, condition_width(signature));
-        let unet = Unet::new(&mut p, "unet", dims, &config.network, &mut Rng::new(seed, "init"))?;
+        let (mut p, rng) = (Params::new(), &mut Rng::new(seed, "init"));
+        let condition = Condition::new(&mut p, "diffusion", signature, config.vision.as_ref(), rng)?;
+        let dims = (signature.action_dim, condition.width());
+        let unet = Unet::new(&mut p, "unet", dims, &config.network, rng)?;
         let fused = FusedUnet::new(&config.network, "unet", (config.action_horizon, signature.action_dim));
         let schedule = NoiseSchedule::new(config.num_train_timesteps);
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, schedule, unet, fused })
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, condition, schedule, unet, fused })
     }
 
     /// The same model drawing its actions otherwise.
@@ -151,7 +134,7 @@ impl Diffusion {
     /// An observation that does not fit.
     pub fn denoise(&self, observation: &Features<Tensor>, x: &Tensor, steps: &[u32]) -> Result<Tensor> {
         let rows = check_observation("diffusion", &self.signature, observation)?;
-        let cond = condition("diffusion", &self.signature, rows, observation)?;
+        let cond = self.condition.forward(rows, observation)?;
         let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
         self.unet.forward(x, &steps, &cond)
     }
@@ -181,8 +164,22 @@ impl Diffusion {
         noise: &Tensor,
         drawn: &mut dyn FnMut() -> Result<Tensor>,
     ) -> Result<Tensor> {
+        self.sample_and_tell(observation, noise, drawn, &mut || {})
+    }
+
+    /// [`Self::sample_from`], and `on_seen` is called when the observation was seen.
+    fn sample_and_tell(
+        &self,
+        observation: &Features<Tensor>,
+        noise: &Tensor,
+        drawn: &mut dyn FnMut() -> Result<Tensor>,
+        on_seen: &mut dyn FnMut(),
+    ) -> Result<Tensor> {
         let rows = check_observation("diffusion", &self.signature, observation)?;
-        let cond = values(&condition("diffusion", &self.signature, rows, observation)?)?;
+        let cond = self.fused.seen(&self.params, rows, self.condition.told(rows, observation)?)?;
+        if self.condition.vision().is_some() {
+            on_seen();
+        }
         let mut x = noise.clone();
         for step in self.schedule.visited(self.config.inference_steps) {
             let steps = vec![step as f32; rows];
@@ -219,23 +216,23 @@ impl PolicyModel for Diffusion {
 
     fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
         check_batch("diffusion", &self.signature, self.config.action_horizon, batch)?;
+        let batch = &self.condition.looked_at(batch, rng)?;
         let rows = batch.rows();
         let (noise, steps) = self.drawn(rows, rng)?;
         let noisy = values(&self.schedule.add_noise(&batch.actions, &noise, &steps)?)?;
-        let cond = values(&condition("diffusion", &self.signature, rows, &batch.observation)?)?;
+        let told = self.condition.told(rows, &batch.observation)?;
         let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
-        let asked = Asked { x: &noisy, steps: &steps, cond: &cond };
         let wanted = match self.config.prediction {
             Prediction::Epsilon => &noise,
             Prediction::Sample => &batch.actions,
         };
-        let loss = with_wanted(wanted, batch, self.config.mask_padding, 1.0, |wanted| {
-            self.fused.squared_error(&self.params, asked, wanted, into)
-        })?;
+        let wanted = Wanted::of(wanted, batch, self.config.mask_padding, 1.0)?;
+        let [loss] = self.fused.squared_errors(&self.params, told, [(&noisy, &steps, wanted)], into)?;
         Ok(LossValues { total: loss as f32, parts: BTreeMap::from([("l2_loss".to_string(), loss as f32)]) })
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
+        let batch = &self.condition.looked_at(batch, rng)?;
         let (noise, steps) = self.drawn(batch.rows(), rng)?;
         let total = self.loss_with(batch, &noise, &steps)?;
         Ok(LossParts { parts: BTreeMap::from([("l2_loss".to_string(), total.detach())]), total })
@@ -252,9 +249,19 @@ impl PolicyModel for Diffusion {
         self.sample_from(observation, &noise, &mut || self.noise(rows, rng))
     }
 
-    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
+    fn sample_seen(&self, observation: &Features<Tensor>, rng: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
+        let rows = check_observation("diffusion", &self.signature, observation)?;
+        let noise = self.noise(rows, rng)?;
+        self.sample_and_tell(observation, &noise, &mut || self.noise(rows, rng), on_seen)
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
         let past = self.signature.n_obs_steps - 1;
-        Box::new(ChunkPolicy::new(self, preprocess).without_past(past))
+        Box::new(ChunkPolicy::new(self, preprocess).without_past(past).with_clock(clock))
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.condition.vision()
     }
 
     fn action_horizon(&self) -> usize {

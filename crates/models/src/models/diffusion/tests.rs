@@ -1,8 +1,9 @@
 #![allow(clippy::unwrap_used)]
 use super::unet::NetworkConfig;
 use super::*;
+use crate::encoders::{ImageNorm, TokenKind};
 use crate::fused::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
 };
 use crate::simd::{Level, at_most};
 use crate::train::{TrainConfig, Trainer};
@@ -11,6 +12,14 @@ use candle_core::Device;
 fn small() -> Config {
     let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, step_embed_dim: 8, ..NetworkConfig::default() };
     Config { action_horizon: 8, network, ..Config::default() }
+}
+
+/// With pictures, whose network has too many kinks for slopes; of one step and of two.
+fn seeing() -> Vec<(Signature, Config)> {
+    let of = signatures();
+    let frozen = VisionConfig { norm: ImageNorm::Frozen, cell_features: Some(4), ..eyes() };
+    let masked = Config { mask_padding: true, vision: Some(frozen), ..small() };
+    vec![(of.pictures, Config { vision: Some(eyes()), ..small() }), (of.film, masked)]
 }
 
 /// One level and three, with and without scales, masked and not.
@@ -39,10 +48,10 @@ fn the_gradient_is_the_slope_of_the_loss() {
 
 #[test]
 fn the_step_by_hand_is_the_composed_one() {
-    for (signature, config) in cases() {
+    for (signature, config) in cases().into_iter().chain(seeing()) {
         let model = Diffusion::new(&config, &signature, 1).unwrap();
         move_parameters(&model);
-        for rows in [1, 13] {
+        for rows in if config.vision.is_some() { [1, 3] } else { [1, 13] } {
             let batch = batch(&signature, 8, rows, 3);
             assert_the_step_is_the_composed_one(&model, &batch, &format!("{rows} rows, {config:?}"));
         }
@@ -51,21 +60,22 @@ fn the_step_by_hand_is_the_composed_one() {
 
 #[test]
 fn answers_by_hand_are_the_composed_ones_also_when_weights_change() {
-    for (signature, config) in cases() {
+    for (signature, config) in cases().into_iter().chain(seeing()) {
         let model = Diffusion::new(&config, &signature, 1).unwrap();
         for rows in [1, 2, 13] {
             let other = Diffusion::new(&config, &signature, rows as u64).unwrap();
             move_parameters(&other);
-            let weights = other.params.iter().map(|(name, var)| (name.to_string(), var.as_tensor().clone()));
-            model.params.load(&weights.collect()).unwrap();
+            model.params.load(&other.params.tensors()).unwrap();
             let batch = batch(&signature, 8, rows, 3);
             let steps: Vec<u32> = (0..rows as u32).map(|row| row * 7).collect();
             let want = values(&model.denoise(&batch.observation, &batch.actions, &steps).unwrap()).unwrap();
-            let cond = values(&condition("diffusion", &signature, rows, &batch.observation).unwrap()).unwrap();
             let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
             for level in Level::ALL {
-                let got =
-                    at_most(level, || model.fused.answered(&model.params, &batch.actions, &steps, &cond).unwrap());
+                let got = at_most(level, || {
+                    let told = model.condition.told(rows, &batch.observation).unwrap();
+                    let cond = model.fused.seen(&model.params, rows, told).unwrap();
+                    model.fused.answered(&model.params, &batch.actions, &steps, &cond).unwrap()
+                });
                 for (got, want) in values(&got).unwrap().iter().zip(&want) {
                     assert!((got - want).abs() < 1e-5 * want.abs().max(1.0), "{got} {want} {level:?} {config:?}");
                 }
@@ -163,7 +173,45 @@ fn impossible_configurations_name_the_field() {
     assert!(error(network(|n| n.down_dims = vec![])).contains("network.down_dims"));
     assert!(error(network(|n| n.down_dims = vec![12, 24])).contains("a multiple of 8 first"));
     assert!(error(network(|n| n.step_embed_dim = 5)).contains("step_embed_dim"));
+    let sees = |vision| {
+        let config = Config { vision: Some(vision), ..small() };
+        Diffusion::new(&config, &of.pictures, 0).unwrap_err().to_string()
+    };
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 8 }, ..eyes() };
+    assert!(sees(keypoints).contains("tokens is Keypoints { count: 8 }, expected the map"));
+    assert!(
+        sees(VisionConfig { cell_features: Some(6), ..eyes() }).contains("cell_features is 6, expected a multiple")
+    );
+    let blind = error(Config { vision: Some(eyes()), ..small() });
+    assert!(blind.contains("expected a feature of kind image"), "{blind}");
     let long = Signature { n_obs_steps: 9, ..of.plain.clone() };
     let error = Diffusion::new(&small(), &long, 0).unwrap_err().to_string();
     assert!(error.contains("action_horizon is 8, expected at least n_obs_steps, 9"), "{error}");
+}
+
+#[test]
+fn what_a_camera_sees_decides_and_is_told_before_anything_is_drawn() {
+    for (signature, config) in seeing() {
+        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        move_parameters(&model);
+        assert_eq!(model.vision(), config.vision.as_ref());
+        let one = batch(&signature, 8, 1, 3).observation;
+        let mut seen = 0;
+        let flat = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let first = flat(model.sample_seen(&one, &mut Rng::new(1, "policy"), &mut || seen += 1).unwrap());
+        assert_eq!(seen, 1);
+        assert_eq!(first, flat(model.sample(&one, &mut Rng::new(1, "policy")).unwrap()));
+        // every camera, and of a history every step
+        for spec in signature.of_kind(FeatureKind::Image) {
+            for step in 0..signature.n_obs_steps {
+                let picture = one.get(&spec.name).unwrap();
+                let mut bytes = picture.flatten_all().unwrap().to_vec1::<u8>().unwrap();
+                bytes[step * spec.width()..][..spec.width()].iter_mut().for_each(|byte| *byte = 255 - *byte);
+                let mut other = one.clone();
+                other.insert(&spec.name, Tensor::from_vec(bytes, picture.shape(), &Device::Cpu).unwrap());
+                let then = flat(model.sample(&other, &mut Rng::new(1, "policy")).unwrap());
+                assert_ne!(then, first, "{} step {step}", spec.name);
+            }
+        }
+    }
 }

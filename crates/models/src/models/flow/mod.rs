@@ -19,13 +19,15 @@ use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::device::HERE;
+use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{Features, Signature};
 use crate::gradients::Gradients;
 use crate::model::{LossParts, LossValues, PolicyModel};
-use crate::models::diffusion::fused::{Asked, FusedUnet};
+use crate::models::diffusion::condition::Condition;
+use crate::models::diffusion::fused::{FusedUnet, Wanted};
 use crate::models::diffusion::unet::Unet;
-use crate::models::diffusion::{check_reaches, condition, condition_width, squared_error, values, with_wanted};
+use crate::models::diffusion::{check_reaches, squared_error, values};
 use crate::params::Params;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
@@ -43,6 +45,7 @@ pub struct Flow {
     config: Config,
     signature: Signature,
     params: Params,
+    condition: Condition,
     unet: Unet,
     fused: FusedUnet,
 }
@@ -77,11 +80,12 @@ impl Flow {
         config.validate()?;
         signature.check("flow", READS)?;
         check_reaches("flow", signature, config.action_horizon)?;
-        let mut p = Params::new();
-        let dims = (signature.action_dim, condition_width(signature));
-        let unet = Unet::new(&mut p, "unet", dims, &config.network, &mut Rng::new(seed, "init"))?;
+        let (mut p, rng) = (Params::new(), &mut Rng::new(seed, "init"));
+        let condition = Condition::new(&mut p, "flow", signature, config.vision.as_ref(), rng)?;
+        let dims = (signature.action_dim, condition.width());
+        let unet = Unet::new(&mut p, "unet", dims, &config.network, rng)?;
         let fused = FusedUnet::new(&config.network, "unet", (config.action_horizon, signature.action_dim));
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, unet, fused })
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, condition, unet, fused })
     }
 
     /// x: (b, H, A), the time of each row -> the velocity there, with a gradient
@@ -116,22 +120,21 @@ impl PolicyModel for Flow {
 
     fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
         check_batch("flow", &self.signature, self.config.action_horizon, batch)?;
+        let batch = &self.condition.looked_at(batch, rng)?;
         let rows = batch.rows();
-        let cond = values(&condition("flow", &self.signature, rows, &batch.observation)?)?;
         let (noise, times) = self.drawn(rows, rng)?;
         let x = values(&between(&noise, &batch.actions, &times)?)?;
-        let asked = Asked { x: &x, steps: &shown(&times), cond: &cond };
-        let wanted = (&batch.actions - &noise)?;
-        let loss = with_wanted(&wanted, batch, self.config.mask_padding, 1.0, |wanted| {
-            self.fused.squared_error(&self.params, asked, wanted, into)
-        })?;
+        let wanted = Wanted::of(&(&batch.actions - &noise)?, batch, self.config.mask_padding, 1.0)?;
+        let told = self.condition.told(rows, &batch.observation)?;
+        let [loss] = self.fused.squared_errors(&self.params, told, [(&x, &shown(&times), wanted)], into)?;
         Ok(LossValues { total: loss as f32, parts: BTreeMap::from([("l2_loss".to_string(), loss as f32)]) })
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         check_batch("flow", &self.signature, self.config.action_horizon, batch)?;
+        let batch = &self.condition.looked_at(batch, rng)?;
         let rows = batch.rows();
-        let cond = condition("flow", &self.signature, rows, &batch.observation)?;
+        let cond = self.condition.forward(rows, &batch.observation)?;
         let (noise, times) = self.drawn(rows, rng)?;
         let velocity = self.velocity(&cond, &between(&noise, &batch.actions, &times)?, &times)?;
         let total = squared_error(&velocity, &(&batch.actions - &noise)?, batch, self.config.mask_padding)?;
@@ -144,16 +147,27 @@ impl PolicyModel for Flow {
     }
 
     fn sample(&self, observation: &Features<Tensor>, rng: &mut Rng) -> Result<Tensor> {
+        self.sample_seen(observation, rng, &mut || {})
+    }
+
+    fn sample_seen(&self, observation: &Features<Tensor>, rng: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
         let rows = check_observation("flow", &self.signature, observation)?;
-        let cond = values(&condition("flow", &self.signature, rows, observation)?)?;
+        let cond = self.fused.seen(&self.params, rows, self.condition.told(rows, observation)?)?;
+        if self.condition.vision().is_some() {
+            on_seen();
+        }
         euler(&self.noise(rows, rng)?, self.config.inference_steps, |x, t| {
             self.fused.answered(&self.params, x, &shown(&vec![t; rows]), &cond)
         })
     }
 
-    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
         let past = self.signature.n_obs_steps - 1;
-        Box::new(ChunkPolicy::new(self, preprocess).without_past(past))
+        Box::new(ChunkPolicy::new(self, preprocess).without_past(past).with_clock(clock))
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.condition.vision()
     }
 
     fn action_horizon(&self) -> usize {

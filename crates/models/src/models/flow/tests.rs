@@ -1,7 +1,7 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
 use crate::fused::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
 };
 use crate::models::diffusion::unet::NetworkConfig;
 use crate::train::{TrainConfig, Trainer};
@@ -20,6 +20,25 @@ fn the_step_by_hand_is_the_composed_one() {
         move_parameters(&model);
         assert_the_step_is_the_composed_one(&model, &batch(signature, 8, 5, 3), &format!("{mask_padding}"));
     }
+}
+
+#[test]
+fn from_pictures_too() {
+    let signature = signatures().film;
+    let model = Flow::new(&Config { vision: Some(eyes()), ..small() }, &signature, 1).unwrap();
+    move_parameters(&model);
+    let batch = batch(&signature, 8, 3, 3);
+    assert_the_step_is_the_composed_one(&model, &batch, "pictures");
+    let rows = check_observation("flow", &signature, &batch.observation).unwrap();
+    let seen = model.condition.look(&batch.observation, None).unwrap();
+    let cond = model.condition.forward(rows, &seen).unwrap();
+    let want = euler(&model.noise(rows, &mut Rng::new(0, "predict")).unwrap(), model.config.inference_steps, |x, t| {
+        model.velocity(&cond, x, &vec![t; rows])
+    })
+    .unwrap();
+    let got = model.predict(&batch.observation).unwrap();
+    let off = (got - want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+    assert!(off < 1e-4, "{off}");
 }
 
 #[test]

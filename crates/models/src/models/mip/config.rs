@@ -1,5 +1,6 @@
 //! MIP's options.
 
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::models::diffusion::unet::NetworkConfig;
 use crate::size::Size;
@@ -17,11 +18,20 @@ pub struct Config {
     pub second_time: f64,
     /// whether steps beyond an episode's ends are left out of the loss
     pub mask_padding: bool,
+    /// how pictures are seen, if there are any
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<VisionConfig>,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { action_horizon: 16, network: NetworkConfig::default(), second_time: 0.9, mask_padding: false }
+        Self {
+            action_horizon: 16,
+            network: NetworkConfig::default(),
+            second_time: 0.9,
+            mask_padding: false,
+            vision: None,
+        }
     }
 }
 

@@ -18,13 +18,15 @@ use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::device::HERE;
+use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{Features, Signature};
 use crate::gradients::Gradients;
 use crate::model::{LossParts, LossValues, PolicyModel};
-use crate::models::diffusion::fused::{Asked, FusedUnet};
+use crate::models::diffusion::condition::Condition;
+use crate::models::diffusion::fused::{FusedUnet, Wanted};
 use crate::models::diffusion::unet::Unet;
-use crate::models::diffusion::{check_reaches, condition, condition_width, squared_error, values, with_wanted};
+use crate::models::diffusion::{check_reaches, squared_error, values};
 use crate::models::flow::between;
 use crate::params::Params;
 use crate::policy::{Clock, Policy};
@@ -43,6 +45,7 @@ pub struct Mip {
     config: Config,
     signature: Signature,
     params: Params,
+    condition: Condition,
     unet: Unet,
     fused: FusedUnet,
 }
@@ -66,11 +69,12 @@ impl Mip {
         config.validate()?;
         signature.check("mip", READS)?;
         check_reaches("mip", signature, config.action_horizon)?;
-        let mut p = Params::new();
-        let dims = (signature.action_dim, condition_width(signature));
-        let unet = Unet::new(&mut p, "unet", dims, &config.network, &mut Rng::new(seed, "init"))?;
+        let (mut p, rng) = (Params::new(), &mut Rng::new(seed, "init"));
+        let condition = Condition::new(&mut p, "mip", signature, config.vision.as_ref(), rng)?;
+        let dims = (signature.action_dim, condition.width());
+        let unet = Unet::new(&mut p, "unet", dims, &config.network, rng)?;
         let fused = FusedUnet::new(&config.network, "unet", (config.action_horizon, signature.action_dim));
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, unet, fused })
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, condition, unet, fused })
     }
 
     /// x: (b, H, A) -> the answer at this time, with a gradient
@@ -105,18 +109,15 @@ impl PolicyModel for Mip {
 
     fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
         check_batch("mip", &self.signature, self.config.action_horizon, batch)?;
+        let batch = &self.condition.looked_at(batch, rng)?;
         let rows = batch.rows();
-        let cond = values(&condition("mip", &self.signature, rows, &batch.observation)?)?;
-        let time = self.config.second_time as f32;
         let noisy = values(&self.noisy(batch, rng)?)?;
         let nothing = vec![0.0; noisy.len()];
-        let mut error = |x: &[f32], time: f32| {
-            let asked = Asked { x, steps: &vec![time * LAST_STEP; rows], cond: &cond };
-            with_wanted(&batch.actions, batch, self.config.mask_padding, 0.5, |wanted| {
-                self.fused.squared_error(&self.params, asked, wanted, into)
-            })
-        };
-        let (first, second) = (error(&nothing, 0.0)?, error(&noisy, time)?);
+        let [begun, later] = [0.0, self.config.second_time as f32].map(|time| vec![time * LAST_STEP; rows]);
+        let wanted = || Wanted::of(&batch.actions, batch, self.config.mask_padding, 0.5);
+        let parts = [(&nothing[..], &begun[..], wanted()?), (&noisy[..], &later[..], wanted()?)];
+        let told = self.condition.told(rows, &batch.observation)?;
+        let [first, second] = self.fused.squared_errors(&self.params, told, parts, into)?;
         let parts = [("first_l2_loss", first), ("second_l2_loss", second)];
         let parts = parts.map(|(name, value)| (name.to_string(), value as f32));
         Ok(LossValues { total: (0.5 * (first + second)) as f32, parts: BTreeMap::from(parts) })
@@ -124,8 +125,9 @@ impl PolicyModel for Mip {
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         check_batch("mip", &self.signature, self.config.action_horizon, batch)?;
+        let batch = &self.condition.looked_at(batch, rng)?;
         let rows = batch.rows();
-        let cond = condition("mip", &self.signature, rows, &batch.observation)?;
+        let cond = self.condition.forward(rows, &batch.observation)?;
         let (time, noisy) = (self.config.second_time as f32, self.noisy(batch, rng)?);
         let error = |answer: Tensor| squared_error(&answer, &batch.actions, batch, self.config.mask_padding);
         let first = error(self.answer(&cond, &self.nothing(rows)?, 0.0)?)?;
@@ -136,16 +138,28 @@ impl PolicyModel for Mip {
     }
 
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        self.sample_seen(observation, &mut Rng::new(0, "predict"), &mut || {})
+    }
+
+    /// Nothing is drawn.
+    fn sample_seen(&self, observation: &Features<Tensor>, _rng: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
         let rows = check_observation("mip", &self.signature, observation)?;
-        let cond = values(&condition("mip", &self.signature, rows, observation)?)?;
+        let cond = self.fused.seen(&self.params, rows, self.condition.told(rows, observation)?)?;
+        if self.condition.vision().is_some() {
+            on_seen();
+        }
         two_steps(&self.nothing(rows)?, self.config.second_time as f32, |x, t| {
             self.fused.answered(&self.params, x, &vec![t * LAST_STEP; rows], &cond)
         })
     }
 
-    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
         let past = self.signature.n_obs_steps - 1;
-        Box::new(ChunkPolicy::new(self, preprocess).without_past(past))
+        Box::new(ChunkPolicy::new(self, preprocess).without_past(past).with_clock(clock))
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.condition.vision()
     }
 
     fn action_horizon(&self) -> usize {

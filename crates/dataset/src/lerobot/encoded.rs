@@ -1,0 +1,33 @@
+//! Cameras whose pictures a source keeps as JPEG files, a row of bytes a step filled up with zeros, as newer ALOHA
+//! recordings do: their sizes stand in the files alone.
+
+use super::images;
+use crate::error::Result;
+use crate::plan::KeyPlan;
+use crate::source::Source;
+use crate::tree::Dtype;
+use std::collections::BTreeMap;
+
+/// Where such datasets are.
+const CAMERAS: &str = "obs/images/";
+
+/// Whether a dataset of a demo may hold files: a row of bytes a step.
+pub(crate) fn may_hold_files(path: &str, key: &KeyPlan) -> bool {
+    path.starts_with(CAMERAS)
+        && key.dtype == Dtype::U8
+        && matches!(key.shape[..], [rows, bytes] if rows > 0 && bytes > 0)
+}
+
+/// Height and width of the pictures of such datasets, by path: those of the first demo's first step. What begins with no
+/// JPEG file is left out.
+pub(crate) fn sizes(source: &Source) -> Result<BTreeMap<String, (usize, usize)>> {
+    let mut found = BTreeMap::new();
+    let Some(first) = source.plan().demos.first() else { return Ok(found) };
+    for (path, _) in first.keys.iter().filter(|(path, key)| may_hold_files(path, key)) {
+        let row = source.read_rows(0, path, 0, 1)?;
+        if let Some(size) = images::jpeg(&row.bytes).and_then(|file| images::jpeg_size(file).ok()) {
+            found.insert(path.clone(), size);
+        }
+    }
+    Ok(found)
+}

@@ -1,0 +1,95 @@
+//! What cameras see as numbers beside other numbers, for models that read one vector: the cells of every camera's feature
+//! map, each through the same dense layer, side by side. Of a history every step is seen.
+
+use crate::encoders::{ImageEncoder, TokenKind, VisionConfig};
+use crate::error::{ModelError, Result};
+use crate::features::{Features, Signature};
+use crate::fused::Eyes;
+use crate::layers::Cameras;
+use crate::params::Params;
+use crate::rng::Rng;
+use crate::values::with_values;
+use candle_core::{DType, Tensor};
+
+/// Cameras, and the network that their pictures go through.
+#[derive(Debug)]
+pub(crate) struct Sight {
+    cameras: Cameras,
+    encoder: ImageEncoder,
+    steps: usize,
+}
+
+impl Sight {
+    /// Of a signature that was checked; `None` where it has no pictures. Without `vision` the default encoder sees.
+    pub(crate) fn new(
+        p: &mut Params,
+        signature: &Signature,
+        vision: Option<&VisionConfig>,
+        rng: &mut Rng,
+    ) -> Result<Option<Self>> {
+        let cell = vision.unwrap_or(&VisionConfig::default()).cell_features();
+        let Some(cameras) = Cameras::asked(signature, vision, cell)? else { return Ok(None) };
+        if cameras.config.tokens != TokenKind::Map {
+            let found = format!("{:?}", cameras.config.tokens);
+            let expected = "the map of a model that reads one vector".to_string();
+            return Err(ModelError::Config { model: "vision", field: "tokens", found, expected });
+        }
+        let encoder = ImageEncoder::new(p, &cameras.config, &cameras.given, cell, rng)?;
+        Ok(Some(Self { cameras, encoder, steps: signature.n_obs_steps }))
+    }
+
+    /// How pictures are seen.
+    pub(crate) fn config(&self) -> &VisionConfig {
+        &self.cameras.config
+    }
+
+    /// The cameras.
+    pub(crate) fn cameras(&self) -> &Cameras {
+        &self.cameras
+    }
+
+    /// The same by hand: its tokens are those of all cameras, of every step.
+    pub(crate) fn eyes(&self) -> Eyes<'_> {
+        Eyes { shape: &self.cameras.shape, sizes: &self.cameras.seen }
+    }
+
+    /// Numbers of a row: those of all cells of all cameras, step after step.
+    pub(crate) fn width(&self) -> usize {
+        self.steps * self.cameras.tokens * self.config().cell_features()
+    }
+
+    /// A camera's pictures one after the other, (b, …) or (b, steps, …) -> (b*steps, …)
+    fn unfolded(&self, pictures: &Tensor) -> Result<Tensor> {
+        Ok(if self.steps > 1 { pictures.flatten(0, 1)? } else { pictures.clone() })
+    }
+
+    /// The observation with pictures as the network reads them: random parts in training, with `rng`. What was looked at
+    /// already stays.
+    pub(crate) fn look(&self, observation: &Features<Tensor>, mut rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
+        let mut seen = observation.clone();
+        for (i, name) in self.cameras.features.iter().enumerate() {
+            let pictures = observation.require("see", name)?;
+            if pictures.dtype() != DType::U8 {
+                continue;
+            }
+            let looked = self.encoder.look(i, &self.unfolded(pictures)?, rng.as_deref_mut())?;
+            let (_, h, w, colours) = looked.dims4()?;
+            seen.insert(name, if self.steps > 1 { looked.reshape(((), self.steps, h, w, colours))? } else { looked });
+        }
+        Ok(seen)
+    }
+
+    /// An observation that was looked at -> (b, width), with a gradient
+    pub(crate) fn forward(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        let pictures = self.cameras.features.iter();
+        let pictures = pictures.map(|name| self.unfolded(observation.require("see", name)?));
+        let tokens = self.encoder.forward(&pictures.collect::<Result<Vec<_>>>()?)?;
+        Ok(tokens.reshape(((), self.width()))?)
+    }
+
+    /// The pictures of an observation that was looked at as slices, (b*steps, H, W, 3) a camera.
+    pub(crate) fn pictures(&self, observation: &Features<Tensor>) -> Result<Vec<Vec<f32>>> {
+        let names = self.cameras.features.iter();
+        names.map(|name| with_values(observation.require("see", name)?, <[f32]>::to_vec)).collect()
+    }
+}
