@@ -7,6 +7,7 @@ difference ends the run with exit code 1.
 from __future__ import annotations
 
 import importlib
+import io
 import json
 import logging
 import os
@@ -171,6 +172,46 @@ def compare_images(source: Path, root: Path, form: str) -> str:
     ours("actrm-data", "export", root, back)
     compare_trees(source, back)
     return f"{pictures} pictures, pixel by pixel, and back"
+
+
+def write_jpeg_recording(folder: Path) -> None:
+    """Two episodes as ALOHA's newer recordings: JPEG files in rows as long as the longest, the rest zeros."""
+    rng = np.random.default_rng(4)
+    folder.mkdir()
+    for episode in range(2):
+        files: list[bytes] = []
+        for step in range(6):
+            ramp = np.add.outer(np.arange(48) * 3, np.arange(64) * 2)[..., None] + np.array([0, 40, 90]) + step * 9
+            picture = np.clip(ramp + rng.integers(-9, 10, (48, 64, 3)), 0, 255).astype(np.uint8)
+            out = io.BytesIO()
+            Image.fromarray(picture).save(out, "JPEG", quality=50 + 5 * step)
+            files.append(out.getvalue())
+        longest = max(map(len, files))
+        rows = np.stack([np.frombuffer(file.ljust(longest, b"\0"), np.uint8) for file in files])
+        with h5py.File(folder / f"episode_{episode}.hdf5", "w") as out_file:
+            out_file["action"] = rng.normal(size=(6, 14)).astype(np.float32)
+            out_file["observations/qpos"] = rng.normal(size=(6, 14)).astype(np.float32)
+            out_file["observations/images/top"] = rows
+            out_file["compress_len"] = np.array([[len(file) for file in files]], np.float32)
+
+
+def compare_jpeg(folder: Path, root: Path) -> str:
+    """LeRobot shows the recorded JPEG files, which it opens as we left them."""
+    write_jpeg_recording(folder)
+    ours("actrm-data", "convert", folder, root, "--fps", "50")
+    data = open_lerobot(root)
+    for episode in range(2):
+        with h5py.File(folder / f"episode_{episode}.hdf5") as file:
+            for step, row in enumerate(file["observations/images/top"][:]):
+                shown = data[episode * 6 + step]["observation.images.top"]
+                recorded = np.asarray(Image.open(io.BytesIO(row.tobytes())))
+                levels = np.rint(shown.numpy() * 255).astype(np.uint8).transpose(1, 2, 0)
+                assert np.array_equal(levels, recorded), (episode, step)
+    pixels = np.stack([data[i]["observation.images.top"].numpy() for i in range(12)])
+    # decoders differ by some levels where colours are stored at half the resolution
+    mean = np.ravel(data.meta.stats["observation.images.top"]["mean"])
+    np.testing.assert_allclose(mean, pixels.mean((0, 2, 3)), atol=2e-3)
+    return "12 pictures, pixel by pixel"
 
 
 def frames_of(data: Any, episode: int) -> list[dict[str, Any]]:
@@ -595,6 +636,7 @@ def main() -> None:
             "LeRobot opens a set of several files": lambda: compare_shards(source, folder / "shards"),
             "LeRobot shows PNG pictures pixel by pixel": lambda: compare_images(images, folder / "png", "png"),
             "LeRobot shows PPM pictures pixel by pixel": lambda: compare_images(images, folder / "ppm", "ppm"),
+            "LeRobot shows recorded JPEG pictures": lambda: compare_jpeg(folder / "aloha", folder / "jpeg"),
             "LeRobot reads and trains on our videos": lambda: compare_videos(images, folder / "video"),
             "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),

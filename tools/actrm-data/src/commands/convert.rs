@@ -9,8 +9,8 @@ use std::time::Instant;
 ///
 /// Columns: observation.state, observation.environment_state, observation.entity.<name>, observation.images.<camera>, action, next.reward,
 /// next.done, next.success, and the five index columns. What the format has no place for is kept in the side folder
-/// `actrm/`, from which `actrm-data export` rebuilds the source; so are pictures that are not 8-bit colour (depth, grey,
-/// RGBA, encoded JPEG), and a note says so. OUT appears whole or not at all.
+/// `actrm/`, from which `actrm-data export` rebuilds the source; so are depth, grey and RGBA
+/// pictures, and a note says so. Recorded JPEG files (newer ALOHA) stay the files they are. OUT appears whole or not at all.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data convert data/lift.hdf5 lift
