@@ -69,15 +69,17 @@ fn jpeg_files_become_a_camera_and_come_back_as_they_were() {
     let seen = set.pictures(CAMERA).unwrap();
     assert_eq!((seen.height, seen.width), (18, 26));
     let expected = ["0.png", "1.png", "0.png", "0.png", "0.png"].map(|name| pixels(&fixture(name)));
-    let mut most = 0;
+    let (mut most, mut sum) = (0, 0);
     for (frame, expected) in expected.iter().enumerate() {
         assert_eq!(seen.frame(frame).len(), expected.len());
         for (a, b) in seen.frame(frame).iter().zip(expected) {
             most = most.max(a.abs_diff(*b));
+            sum += u32::from(a.abs_diff(*b));
         }
     }
-    // two decoders round differently where colours are stored at half the resolution
-    assert!(most <= 4, "{most} levels from Pillow");
+    // two decoders differ most where colours are stored at half the resolution
+    let mean = f64::from(sum) / expected.concat().len() as f64;
+    assert!(most <= 8 && mean < 1.0, "{most} levels from Pillow, {mean} on average");
     assert_eq!(seen.frame(0), seen.frame(4));
     verify_source(&out, &source).unwrap();
     export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
