@@ -80,6 +80,11 @@ class Scene:
         return np.array(self.env.sim.data.site_xmat[self._site]).reshape(3, 3)
 
     @property
+    def base(self) -> Array:
+        """Position of the robot's base."""
+        return np.array(self._robot.base_pos)
+
+    @property
     def gap(self) -> float:
         """Distance between the finger tips in metres (0.08 when open)."""
         left, right = self.env.sim.data.qpos[self._fingers]
