@@ -129,7 +129,10 @@ def _play(seed: int) -> Outcome:
 
     assert _session is not None, "the pool's initializer made it"
     episode = episodes.expert_episode(_session, seed, name=_expert)
-    moving = np.abs(episode.tensors["actions"][:, :6]).max(axis=1) > STILL
+    actions = episode.tensors["actions"]
+    # six numbers an arm, then its fingers', where it has any
+    arms = np.arange(actions.shape[1]) % 7 < 6
+    moving = np.abs(actions[:, arms]).max(axis=1) > STILL
     longest = current = 0
     for moves in moving.tolist():
         current = 0 if moves else current + 1

@@ -120,7 +120,7 @@ TASKS = {
             max_steps=150,
             arguments={"initialization_noise": None},
         ),
-        Task("TwoArmLift", arguments=PANDAS),
+        Task("TwoArmLift", expert=".experts.arms:TwoArmLiftExpert", soft_reset=True, arguments=PANDAS),
         Task("TwoArmHandover", arguments=PANDAS),
         Task("TwoArmTransport", arguments=PANDAS, max_steps=700),
     )

@@ -24,7 +24,7 @@ def trace(session: envs.Session, seed: int, steps: int = 12) -> list[object]:
     """Everything that an episode shows."""
     first = envs.reset(session, seed)
     seen: list[object] = [envs.fingerprint(session.env), *(first[name].tobytes() for name in sorted(first))]
-    for action in walk(seed, steps):
+    for action in walk(seed, steps, session.env.action_dim):
         result = envs.step_session(session, action)
         seen += [envs.state(session.env).tobytes(), result.reward, result.success]
         seen += [result.observation[name].tobytes() for name in sorted(result.observation)]
@@ -265,7 +265,7 @@ def test_the_documentation_shows_that_module() -> None:
 
 
 def test_a_task_without_an_expert_says_so() -> None:
-    client = Client("--task", "PickPlaceMilk")
+    client = Client("--task", "TwoArmHandover")
     with pytest.raises(WorkerError, match="no scripted expert"):
         client.ask("expert", seed=0)
     client.close()
@@ -302,7 +302,7 @@ def test_an_expert_passes_every_stage_before_success_and_who_does_nothing_none(t
     for one in (session, unseen):
         envs.reset(one, 10_001)
     unseen.stages = ()
-    for action in walk(3, 12):
+    for action in walk(3, 12, session.env.action_dim):
         one, other = envs.step_session(session, action), envs.step_session(unseen, action)
         assert one.reward == other.reward and session.progress(False) is not None and unseen.progress(False) is None
         assert envs.state(session.env).tobytes() == envs.state(unseen.env).tobytes()
