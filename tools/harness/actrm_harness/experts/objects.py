@@ -35,6 +35,8 @@ class Thing:
     """How far above its origin it is held."""
     rise: float = 0.0
     """How much higher than the can it is carried over the walls."""
+    back: float = 0.0
+    """How far the hand is drawn back, for every metre that it rises when it leaves: a stretched elbow stays stretched."""
     flat: bool = False
     """Whether it is wider than the fingers open one way, so that the hand has to turn to it."""
     low: bool = False
@@ -48,8 +50,8 @@ HALF_HAND = 0.11
 # From the grip site to an open finger.
 FINGER = 0.055
 
-# How far above its grip on a thing the hand is when it has left it, and how near to its place a thing is there.
-LEFT = 0.06
+# How far above the place where it let go the hand has left a thing, and how near to its place a thing is there.
+LEFT = 0.08
 ARRIVED = np.array([0.09, 0.10, 0.12])
 
 MILK = Thing("Milk", (0.01, 0.15, 0.905), grip=0.045)
@@ -67,8 +69,6 @@ class BinsExpert:
     """
 
     THINGS: tuple[Thing, ...]
-    BACK = 0.0
-    """How far the hand is drawn back for every metre that it rises when it leaves a thing: a stretched elbow stays so."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
@@ -88,7 +88,7 @@ class BinsExpert:
         if carry.update(place, goal, flat=0.02, height=0.02, lost=0.15):
             target, grip = carry.let_go()
             back = (self.scene.base - target)[:2]
-            target[:2] += self.BACK * (target[2] - self.scene.hand[2]) * back / np.linalg.norm(back)
+            target[:2] += thing.back * (target[2] - self.scene.hand[2]) * back / np.linalg.norm(back)
         else:
             turn = self._turned(thing, place, rotation)
             askew = turn - hand_yaw(self.scene.hand_rotation)
@@ -105,8 +105,8 @@ class BinsExpert:
     def _next(self) -> int:
         """The first thing that is not in its compartment; the one at hand until the hand has left it."""
         thing, carry = self.THINGS[self.at], self.carries[self.at]
-        away = self.scene.hand - self._pose(thing)[0]
-        if self.grasp.closing or (carry.released and float(away[2]) < thing.grip + LEFT):
+        up = float(self.scene.hand[2]) - thing.place[2] - thing.grip
+        if self.grasp.closing or (carry.released and up < LEFT):
             return self.at
         out = [index for index, thing in enumerate(self.THINGS) if not self._arrived(thing)]
         return out[0] if out else self.at
@@ -140,8 +140,7 @@ def roomy_yaw(place: Array, others: list[Array], low: bool) -> float:
 class AllThingsExpert(BinsExpert):
     """All four, the tall ones first, so that the hand never reaches down between things that are taller."""
 
-    THINGS = (replace(CEREAL, rise=0.09), MILK, replace(CAN, place=(0.14, 0.335, 0.91)), BREAD)
-    BACK = 1.0
+    THINGS = (replace(CEREAL, rise=0.09), MILK, replace(CAN, place=(0.14, 0.33, 0.91), back=2.0), BREAD)
 
 
 class CanExpert(BinsExpert):
