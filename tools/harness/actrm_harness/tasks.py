@@ -55,7 +55,9 @@ TASKS = {
         Task("NutAssemblyRound", expert=".experts.objects:RoundExpert", soft_reset=True),
         Task("NutAssemblySquare", expert=".experts.objects:SquareExpert", soft_reset=True, bar=0.85),
         Task("Door", expert=".experts.objects:DoorExpert", soft_reset=True, bar=0.85),
-        Task("Wipe", expert=".experts.wipes:WipeExpert", soft_reset=True, redraw=".simulators.robosuite.wipe_dirt:redraw"),
+        Task(
+            "Wipe", expert=".experts.wipes:WipeExpert", soft_reset=True, redraw=".simulators.robosuite.wipe_dirt:redraw"
+        ),
         Task(
             "StackThreeCubes",
             defined_in=".environments.towers",

@@ -350,7 +350,9 @@ def test_other_controllers_keep_robosuites_loop_and_are_named_once(capfd: pytest
         env.step(np.zeros(env.action_dim))
 
 
-@pytest.mark.parametrize(("task", "reason"), [("Wipe", "parts of an action"), ("TwoArmLift", "not one on a fixed base")])
+@pytest.mark.parametrize(
+    ("task", "reason"), [("Wipe", "parts of an action"), ("TwoArmLift", "not one on a fixed base")]
+)
 def test_tasks_of_other_robots_keep_robosuites_loop(task: str, reason: str, capfd: pytest.CaptureFixture[str]) -> None:
     env = envs.make(task).env
     capfd.readouterr()

@@ -36,7 +36,7 @@ class Thing:
     rise: float = 0.0
     """How much higher than the can it is carried over the walls."""
     back: float = 0.0
-    """How far the hand is drawn back, for every metre that it rises when it leaves: a stretched elbow stays stretched."""
+    """How far the hand draws back, for every metre that it rises when it leaves: a stretched elbow stays so."""
     flat: bool = False
     """Whether it is wider than the fingers open one way, so that the hand has to turn to it."""
     low: bool = False
@@ -124,7 +124,7 @@ class BinsExpert:
 
 
 def roomy_yaw(place: Array, others: list[Array], low: bool) -> float:
-    """The least turn of a hand that keeps its fingers clear of other things and, at a low one, itself inside the bin."""
+    """The least turn of a hand that keeps its fingers clear of others and, at a low thing, itself inside the bin."""
 
     def wanting(angle: float) -> float:
         way = np.array([-np.sin(angle), np.cos(angle)])
@@ -134,7 +134,8 @@ def roomy_yaw(place: Array, others: list[Array], low: bool) -> float:
         gaps = [float(np.linalg.norm(finger - other[:2])) for finger in fingers for other in others]
         return outside + max(CLEAR - min(gaps, default=1.0), 0.0)
 
-    return min(TURNS, key=wanting)
+    # mostly there is room without a turn
+    return TURNS[0] if wanting(TURNS[0]) <= 0.0 else min(TURNS, key=wanting)
 
 
 class AllThingsExpert(BinsExpert):
