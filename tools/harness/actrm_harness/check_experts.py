@@ -86,7 +86,7 @@ def main() -> int:
                     with args.out.open("a") as file:
                         file.write(json.dumps(asdict(outcome)) + "\n")
             found.append([known[seed] for seed in wanted])
-            met &= report(task, loop, found[-1])
+            met &= report(task, found[-1])
         if args.control == "both":
             met &= compare(task, *found)
     return 0 if met else 1
@@ -141,8 +141,9 @@ def _play(seed: int) -> Outcome:
     return Outcome(_session.task.name, loop, seed, episode.success, episode.steps, longest, _expert)
 
 
-def report(task: str, loop: str, outcomes: list[Outcome]) -> bool:
-    """Print a task's line; whether its bar is met."""
+def report(task: str, outcomes: list[Outcome]) -> bool:
+    """Print a task's line, with the loop that ran; whether its bar is met."""
+    loop = " and ".join(sorted({outcome.control for outcome in outcomes}))
     solved = sorted(outcome.steps for outcome in outcomes if outcome.success)
     failed = [outcome.seed for outcome in outcomes if not outcome.success]
     met = len(solved) >= BARS[task] * len(outcomes)

@@ -10,6 +10,9 @@ from actrm_harness.wire import Array
 # How far below the table's top the hand aims, so that the tool presses.
 DEPTH = 0.02
 
+# How near to the dirt, sideways, the tool is pressed down.
+NEAR = 0.08
+
 
 class WipeExpert:
     """Put the tool on the nearer end of what is left of the dirt and follow it.
@@ -29,8 +32,10 @@ class WipeExpert:
         if left:
             target = min((left[0], left[-1]), key=lambda end: float(np.linalg.norm((end - hand)[:2])))
             away = float(np.linalg.norm((target - hand)[:2]))
-            target[2] += self.servo.style.hover * funnel(away, 0.08, 0.14)
-            target[2] = max(float(target[2]), float(hand[2])) - DEPTH if away < 0.08 else target[2]
+            target[2] += self.servo.style.hover * funnel(away, NEAR, 0.14)
+            if away < NEAR:
+                # down at a pace that does not hit the table, and then into it
+                target[2] = max(float(target[2]), float(hand[2])) - DEPTH
         else:
             target = hand + np.array([0.0, 0.0, 0.05])
         return self.servo.move(target, OPEN, DOWN)[:6]
