@@ -48,8 +48,16 @@ TASKS = {
         ),
         Task("Stack", expert=".experts.cubes:StackExpert", soft_reset=True),
         Task("PickPlaceCan", expert=".experts.objects:CanExpert", soft_reset=True),
+        Task("PickPlaceMilk", expert=".experts.objects:MilkExpert", soft_reset=True),
+        Task("PickPlaceBread", expert=".experts.objects:BreadExpert", soft_reset=True),
+        Task("PickPlaceCereal", expert=".experts.objects:CerealExpert", soft_reset=True),
+        Task("PickPlace", expert=".experts.objects:AllThingsExpert", soft_reset=True, max_steps=1200),
+        Task("NutAssemblyRound", expert=".experts.objects:RoundExpert", soft_reset=True),
         Task("NutAssemblySquare", expert=".experts.objects:SquareExpert", soft_reset=True, bar=0.85),
         Task("Door", expert=".experts.objects:DoorExpert", soft_reset=True, bar=0.85),
+        Task(
+            "Wipe", expert=".experts.wipes:WipeExpert", soft_reset=True, redraw=".simulators.robosuite.wipe_dirt:redraw"
+        ),
         Task(
             "StackThreeCubes",
             defined_in=".environments.towers",
@@ -114,7 +122,7 @@ TASKS = {
             max_steps=150,
             arguments={"initialization_noise": None},
         ),
-        Task("TwoArmLift", arguments=PANDAS),
+        Task("TwoArmLift", expert=".experts.arms:TwoArmLiftExpert", soft_reset=True, arguments=PANDAS),
         Task("TwoArmHandover", arguments=PANDAS),
         Task("TwoArmTransport", arguments=PANDAS, max_steps=700),
     )

@@ -19,7 +19,7 @@ from actrm_harness.simulators.robosuite.control import CompiledControl  # noqa: 
 from actrm_harness.simulators.robosuite.control_abi import Library  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
 
-TASKS = ["Lift", "Stack", "PickPlaceCan", "NutAssemblySquare", "Door"]
+TASKS = ["Lift", "Stack", "PickPlaceCan", "PickPlace", "NutAssemblySquare", "NutAssemblyRound", "Door"]
 
 
 pytestmark = pytest.mark.usefixtures("library")
@@ -348,6 +348,17 @@ def test_other_controllers_keep_robosuites_loop_and_are_named_once(capfd: pytest
         assert len(lines) == 1, lines
         assert reason in lines[0]
         env.step(np.zeros(env.action_dim))
+
+
+@pytest.mark.parametrize(
+    ("task", "reason"), [("Wipe", "parts of an action"), ("TwoArmLift", "not one on a fixed base")]
+)
+def test_tasks_of_other_robots_keep_robosuites_loop(task: str, reason: str, capfd: pytest.CaptureFixture[str]) -> None:
+    env = envs.make(task).env
+    capfd.readouterr()
+    assert control.attach(env) is None
+    assert reason in capfd.readouterr().err
+    env.close()
 
 
 def test_a_missing_or_foreign_library_is_one_line(

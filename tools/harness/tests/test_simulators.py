@@ -39,7 +39,7 @@ OLD_CONTROLLER: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("task", "arguments", "width", "robots"),
     [
-        ("TwoArmLift", None, 14, ["Panda", "Panda"]),
+        ("TwoArmHandover", None, 14, ["Panda", "Panda"]),
         ("TwoArmLift", env_args(robots=["Panda", "Sawyer"], env_configuration="parallel"), 14, ["Panda", "Sawyer"]),
         ("Lift", env_args(robots=["Sawyer"]), 7, "Sawyer"),
         ("Lift", env_args(robots="IIWA", gripper_types="PandaGripper"), 7, "IIWA"),

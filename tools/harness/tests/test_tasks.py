@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from conftest import Client, WorkerError, walk
 
-from actrm_harness.experts.cubes import RecoveringTowerExpert
+from actrm_harness.experts.cubes import CLEAR, RecoveringTowerExpert
+from actrm_harness.experts.objects import BIN, FINGER, HALF_HAND, MilkExpert, roomy_yaw
 from actrm_harness.experts.parts import Scene
 from actrm_harness.protocol import RequestError
 from actrm_harness.simulators.robosuite import control, envs, episodes, suite
@@ -24,7 +25,7 @@ def trace(session: envs.Session, seed: int, steps: int = 12) -> list[object]:
     """Everything that an episode shows."""
     first = envs.reset(session, seed)
     seen: list[object] = [envs.fingerprint(session.env), *(first[name].tobytes() for name in sorted(first))]
-    for action in walk(seed, steps):
+    for action in walk(seed, steps, session.env.action_dim):
         result = envs.step_session(session, action)
         seen += [envs.state(session.env).tobytes(), result.reward, result.success]
         seen += [result.observation[name].tobytes() for name in sorted(result.observation)]
@@ -84,6 +85,45 @@ def test_the_expert_solves_the_task(task: str) -> None:
     solved = [episodes.expert_episode(session, 1_000_000 + seed).success for seed in range(2)]
     session.env.close()
     assert all(solved)
+
+
+@pytest.mark.usefixtures("library")
+def test_a_thing_that_slips_out_of_the_hand_is_taken_again() -> None:
+    """The milk is put back where it was while the hand carries it."""
+    session = envs.make("PickPlaceMilk")
+    session.control = control.attach(session.env)
+    envs.reset(session, 1_000_002, True)
+    scene = Scene(session.env)
+    expert = MilkExpert(scene, np.random.default_rng([1_000_002, 1]))
+    data: Any = session.env.sim.data
+    start = np.array(data.get_joint_qpos("Milk_joint0"))
+    carried = solved = False
+    steps = 0
+    while not solved and steps < 400:
+        solved = envs.step_session(session, np.clip(expert.act(), -1.0, 1.0)).success
+        steps += 1
+        if not carried and float(scene.body("Milk_main")[1]) > float(start[1]) + 0.1:
+            carried = True
+            data.set_joint_qpos("Milk_joint0", start)
+            data.set_joint_qvel("Milk_joint0", np.zeros(6))
+            session.env.sim.forward()
+            assert float(np.linalg.norm(scene.body("Milk_main") - scene.hand)) > 0.1
+    session.env.close()
+    assert carried and solved
+
+
+def test_the_hand_turns_only_where_there_is_no_room() -> None:
+    """Beside a wall of the bin at a low thing, and where another thing stands in a finger's way."""
+    middle = np.array([0.1, -0.25, 0.84])
+    at_wall = np.array([0.1, -0.42, 0.84])
+    assert roomy_yaw(middle, [], low=True) == 0.0
+    assert roomy_yaw(at_wall, [], low=False) == 0.0
+    turn = roomy_yaw(at_wall, [], low=True)
+    assert at_wall[1] - HALF_HAND * np.cos(turn) >= BIN[0, 1] and 0.0 < abs(turn) < np.pi / 2
+    neighbour = middle + np.array([0.0, 0.07, 0.0])
+    turn = roomy_yaw(middle, [neighbour], low=False)
+    fingers = [middle + side * FINGER * np.array([-np.sin(turn), np.cos(turn), 0.0]) for side in (-1.0, 1.0)]
+    assert turn != 0.0 and min(float(np.linalg.norm(finger - neighbour)) for finger in fingers) >= CLEAR
 
 
 FURTHER = [(task.name, name) for task in TASKS.values() for name in task.experts]
@@ -265,7 +305,7 @@ def test_the_documentation_shows_that_module() -> None:
 
 
 def test_a_task_without_an_expert_says_so() -> None:
-    client = Client("--task", "PickPlaceMilk")
+    client = Client("--task", "TwoArmHandover")
     with pytest.raises(WorkerError, match="no scripted expert"):
         client.ask("expert", seed=0)
     client.close()
@@ -302,7 +342,7 @@ def test_an_expert_passes_every_stage_before_success_and_who_does_nothing_none(t
     for one in (session, unseen):
         envs.reset(one, 10_001)
     unseen.stages = ()
-    for action in walk(3, 12):
+    for action in walk(3, 12, session.env.action_dim):
         one, other = envs.step_session(session, action), envs.step_session(unseen, action)
         assert one.reward == other.reward and session.progress(False) is not None and unseen.progress(False) is None
         assert envs.state(session.env).tobytes() == envs.state(unseen.env).tobytes()

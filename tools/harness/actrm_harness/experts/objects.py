@@ -1,7 +1,10 @@
 """Experts for robosuite's tasks with other things than cubes."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
+from actrm_harness.experts.cubes import CLEAR, TURNS
 from actrm_harness.experts.parts import (
     CLOSE,
     DOWN,
@@ -21,43 +24,162 @@ from actrm_harness.experts.parts import (
 from actrm_harness.wire import Array
 
 
-class CanExpert:
-    """Take the can out of one bin and drop it into its compartment of the other.
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """A thing of the bins: how it is held, and where it is let go."""
 
-    The middle of the compartment is out of the arm's reach; the can is dropped over its near corner. A can that a
-    finger touches on the way down falls over, and few who learn from this expert pick it up again: so the fingers stay
-    above it until they are around it.
+    name: str
+    place: tuple[float, float, float]
+    """Over its compartment; where the middle of that is out of the arm's reach, over its near corner."""
+    grip: float = 0.0
+    """How far above its origin it is held."""
+    rise: float = 0.0
+    """How much higher than the can it is carried over the walls."""
+    back: float = 0.0
+    """How far the hand draws back, for every metre that it rises when it leaves: a stretched elbow stays so."""
+    flat: bool = False
+    """Whether it is wider than the fingers open one way, so that the hand has to turn to it."""
+    low: bool = False
+    """Whether it lies so low that the hand, wide as it is, has to turn where the bin's wall is near."""
+
+
+# The inside of the bin that things lie in, and how far the hand reaches to either side.
+BIN = np.array([[-0.09, -0.49], [0.29, -0.01]])
+HALF_HAND = 0.11
+
+# From the grip site to an open finger.
+FINGER = 0.055
+
+# How far above the place where it let go the hand has left a thing, and how near to its place a thing is there.
+LEFT = 0.08
+ARRIVED = np.array([0.09, 0.10, 0.12])
+
+MILK = Thing("Milk", (0.01, 0.15, 0.905), grip=0.045)
+BREAD = Thing("Bread", (0.155, 0.145, 0.89), grip=0.01, low=True)
+CEREAL = Thing("Cereal", (0.01, 0.37, 0.912), grip=0.04, rise=0.03, flat=True)
+CAN = Thing("Can", (0.145, 0.355, 0.91))
+
+
+class BinsExpert:
+    """Take things out of one bin, one after the other, and drop each into its compartment of the other.
+
+    A thing that a finger touches on the way down falls over, and few who learn from this expert pick it up again: so
+    the fingers stay above it until they are around it. The hand turns for what it cannot hold any way round, and back
+    while it carries: the wrist's range does not reach as far over the other bin.
     """
 
-    PLACE = np.array([0.145, 0.355, 0.91])
+    THINGS: tuple[Thing, ...]
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
         self.servo = Servo(scene, rng, pace=1.4, mishaps=Mishaps(pushed=15.0))
         self.grasp = Grasp(scene, self.servo.style, tall=0.04, mouth=(0.006, 0.018))
-        self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
+        clear = rng.uniform(0.99, 1.01)
+        self.carries = [Carry(scene, self.grasp, clear + thing.rise) for thing in self.THINGS]
+        self.at = 0
 
     def act(self) -> Array:
         """The action for the current state."""
-        can = self.scene.body("Can_main")
-        goal = self.PLACE
-        if self.carry.update(can, goal, flat=0.02, height=0.02, lost=0.15):
-            target, grip = self.carry.let_go()
+        self.at = self._next()
+        thing, carry = self.THINGS[self.at], self.carries[self.at]
+        place, rotation = self._pose(thing)
+        goal = np.array(thing.place)
+        turn = 0.0
+        if carry.update(place, goal, flat=0.02, height=0.02, lost=0.15):
+            target, grip = carry.let_go()
+            back = (self.scene.base - target)[:2]
+            target[:2] += thing.back * (target[2] - self.scene.hand[2]) * back / np.linalg.norm(back)
         else:
-            target, grip = self.grasp.reach(can)
+            turn = self._turned(thing, place, rotation)
+            askew = turn - hand_yaw(self.scene.hand_rotation)
+            target, grip = self.grasp.reach(place + rotation @ np.array([0.0, 0.0, thing.grip]), askew)
             if self.grasp.held:
-                target = self.carry.bring(can, goal, near=0.015, far=0.04)
-        return self.servo.move(target, grip, DOWN)
+                target = carry.bring(place, goal, near=0.015, far=0.04)
+                turn = 0.0
+        return self.servo.move(target, grip, about_z(turn) @ DOWN)
+
+    def _pose(self, thing: Thing) -> tuple[Array, Array]:
+        body = f"{thing.name}_main"
+        return self.scene.body(body), self.scene.body_rotation(body)
+
+    def _next(self) -> int:
+        """The first thing that is not in its compartment; the one at hand until the hand has left it."""
+        thing, carry = self.THINGS[self.at], self.carries[self.at]
+        up = float(self.scene.hand[2]) - thing.place[2] - thing.grip
+        if self.grasp.closing or (carry.released and up < LEFT):
+            return self.at
+        out = [index for index, thing in enumerate(self.THINGS) if not self._arrived(thing)]
+        return out[0] if out else self.at
+
+    def _arrived(self, thing: Thing) -> bool:
+        away = self._pose(thing)[0] - np.array(thing.place)
+        return bool(np.all(np.abs(away) < ARRIVED))
+
+    def _turned(self, thing: Thing, place: Array, rotation: Array) -> float:
+        """How the hand has to be turned to take the thing; mostly not at all, which is easiest to learn."""
+        if thing.flat:
+            return nearest(yaw(rotation), np.pi, hand_yaw(self.scene.hand_rotation))
+        others = [self._pose(other)[0] for other in self.THINGS if other != thing]
+        return roomy_yaw(place, [other for other in others if BIN[1, 1] > other[1]], thing.low)
 
 
-class SquareExpert:
-    """Take the square nut by its handle, turn it to the peg and lower it around it.
+def roomy_yaw(place: Array, others: list[Array], low: bool) -> float:
+    """The least turn of a hand that keeps its fingers clear of others and, at a low thing, itself inside the bin."""
+
+    def wanting(angle: float) -> float:
+        way = np.array([-np.sin(angle), np.cos(angle)])
+        ends = np.array([place[:2] - HALF_HAND * way, place[:2] + HALF_HAND * way])
+        outside = float(np.maximum(np.maximum(BIN[0] - ends, ends - BIN[1]), 0.0).max()) if low else 0.0
+        fingers = [place[:2] + side * FINGER * way for side in (-1.0, 1.0)]
+        gaps = [float(np.linalg.norm(finger - other[:2])) for finger in fingers for other in others]
+        return outside + max(CLEAR - min(gaps, default=1.0), 0.0)
+
+    # mostly there is room without a turn
+    return TURNS[0] if wanting(TURNS[0]) <= 0.0 else min(TURNS, key=wanting)
+
+
+class AllThingsExpert(BinsExpert):
+    """All four, the tall ones first, so that the hand never reaches down between things that are taller."""
+
+    THINGS = (replace(CEREAL, rise=0.09), MILK, replace(CAN, place=(0.14, 0.33, 0.91), back=2.0), BREAD)
+
+
+class CanExpert(BinsExpert):
+    """The can alone."""
+
+    THINGS = (CAN,)
+
+
+class MilkExpert(BinsExpert):
+    """The milk alone."""
+
+    THINGS = (MILK,)
+
+
+class BreadExpert(BinsExpert):
+    """The bread alone."""
+
+    THINGS = (BREAD,)
+
+
+class CerealExpert(BinsExpert):
+    """The cereal alone."""
+
+    THINGS = (CEREAL,)
+
+
+class NutExpert:
+    """Take the nut by its handle, turn it to the peg and lower it around it.
 
     The peg is at the end of the arm's reach, so the handle has to point at the robot in the end, and the hand never
     reaches further out than it is then: a stretched elbow does not come back. The hand holds the handle either way
     round, as it was at the start or turned by half a circle in the end, whichever is the shorter way for joint 7.
     """
 
+    NUT: str
+    PEG: str
+    HANDLE: float
+    """From the nut's middle to where it is held."""
     # What joint 7 lets the hand turn about the vertical.
     LOWEST, HIGHEST = np.radians(-95), np.radians(200)
     FINAL = (0.0, np.pi)
@@ -74,9 +196,9 @@ class SquareExpert:
     def act(self) -> Array:
         """The action for the current state."""
         scene = self.scene
-        nut, rotation = scene.body("SquareNut_main"), scene.body_rotation("SquareNut_main")
+        nut, rotation = scene.body(self.NUT), scene.body_rotation(self.NUT)
         hand = self._hand()
-        goal = np.array([*scene.body("peg1")[:2], 0.86])
+        goal = np.array([*scene.body(self.PEG)[:2], 0.86])
         if self.carry.update(nut, goal, flat=0.01, height=0.01):
             target, grip = self.carry.let_go()
             wanted = hand
@@ -85,7 +207,7 @@ class SquareExpert:
                 best = min(self.FINAL, key=self._way)
                 self.final = best if self._way(best) < self._way(self.final) - 0.5 else self.final
             wanted = self._at_handle(self.final)
-            target, grip = self.grasp.reach(nut + rotation @ np.array([0.054, 0.0, 0.0]), wanted - hand)
+            target, grip = self.grasp.reach(nut + rotation @ np.array([self.HANDLE, 0.0, 0.0]), wanted - hand)
             if self.grasp.held:
                 target = self.carry.bring(nut, goal, near=0.005, far=0.012)
                 target[0] = min(float(target[0]), self.REACH)
@@ -97,7 +219,7 @@ class SquareExpert:
 
     def _at_handle(self, final: float) -> float:
         """The hand's angle on the handle that is `final` once the handle points at the robot."""
-        return self._unwrapped(yaw(self.scene.body_rotation("SquareNut_main")) - np.pi + final)
+        return self._unwrapped(yaw(self.scene.body_rotation(self.NUT)) - np.pi + final)
 
     def _way(self, final: float) -> float:
         """How far the hand has to turn, to the handle and with it."""
@@ -107,6 +229,18 @@ class SquareExpert:
 
     def _unwrapped(self, angle: float) -> float:
         return self.LOWEST + float((angle - self.LOWEST) % (2 * np.pi))
+
+
+class SquareExpert(NutExpert):
+    """The square nut."""
+
+    NUT, PEG, HANDLE = "SquareNut_main", "peg1", 0.054
+
+
+class RoundExpert(NutExpert):
+    """The round nut."""
+
+    NUT, PEG, HANDLE = "RoundNut_main", "peg2", 0.06
 
 
 class DoorExpert:

@@ -55,11 +55,14 @@ class Style:
 
 
 class Scene:
-    """What an expert may look at: gripper, fingers and named bodies, in world coordinates."""
+    """What an expert may look at: gripper, fingers and named bodies, in world coordinates.
 
-    def __init__(self, env: Env) -> None:
+    `robot` says whose gripper and fingers, where there are several.
+    """
+
+    def __init__(self, env: Env, robot: int = 0) -> None:
         self.env = env
-        self._robot: Any = env.robots[0]
+        self._robot: Any = env.robots[robot]
         self._site = int(self._robot.eef_site_id["right"])
         self._fingers: list[int] = list(self._robot._ref_gripper_joint_pos_indexes["right"])
         self._finger_speeds: list[int] = list(self._robot._ref_gripper_joint_vel_indexes["right"])
@@ -78,6 +81,16 @@ class Scene:
     def hand_rotation(self) -> Array:
         """Rotation matrix of the grip site."""
         return np.array(self.env.sim.data.site_xmat[self._site]).reshape(3, 3)
+
+    @property
+    def base(self) -> Array:
+        """Position of the robot's base."""
+        return np.array(self._robot.base_pos)
+
+    @property
+    def base_rotation(self) -> Array:
+        """Rotation matrix of the robot's base: what an action asks for is as the robot sees it."""
+        return np.array(self._robot.base_ori)
 
     @property
     def gap(self) -> float:
@@ -170,7 +183,8 @@ class Servo:
         elif self._time == self._fumble[1]:
             self._fumble = self._draw_fumble()
         self._time += 1
-        return np.concatenate([np.concatenate([wanted, turn]) + self._noise, [grip]])
+        own = self.scene.base_rotation.T
+        return np.concatenate([np.concatenate([own @ wanted, own @ turn]) + self._noise, [grip]])
 
 
 def limit(vector: Array, length: float) -> Array:

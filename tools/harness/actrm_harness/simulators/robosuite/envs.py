@@ -3,7 +3,8 @@
 An episode depends on (task, seed, actions) only, whatever ran before in the process: `reset` writes the seed's bit
 generator state into the environment's own generator (a new generator would not reach robosuite's placement samplers)
 and then resets. Where `Task.soft_reset` is set, the model is kept between episodes, which is bit-identical to loading
-it again; for Lift, whose cube robosuite draws when it loads the model, because `Task.redraw` draws it (`lift_cube`).
+it again; where robosuite draws while it loads the model (Lift's cube, Wipe's dirt), because `Task.redraw` draws it
+(`lift_cube`, `wipe_dirt`).
 """
 
 import hashlib

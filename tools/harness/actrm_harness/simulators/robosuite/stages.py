@@ -67,15 +67,34 @@ def _stack(env: Any) -> tuple[Stage, ...]:
     return (*fetching(env, env.cubeA, upper), ("above", _above(upper, lower, 0.02)))
 
 
+# How far above their origins the tall things of the bins are taken.
+_GRIPPED = {"Milk": 0.045, "Cereal": 0.04}
+
+
 def _pick_place(env: Any) -> tuple[Stage, ...]:
     thing = env.objects[env.object_id]
     place, bin_place = _body(env, env.obj_body_id[thing.name]), np.array(env.target_bin_placements[env.object_id])
     half = np.array(env.bin_size[:2]) / 4.0
+    grip = np.array([0.0, 0.0, _GRIPPED.get(thing.name, 0.0)])
 
     def above() -> bool:
         return bool(np.all(np.abs(place()[:2] - bin_place[:2]) < half))
 
-    return (*fetching(env, thing, place), ("above", above))
+    return (*fetching(env, thing, place, lambda: place() + grip), ("above", above))
+
+
+def _pick_place_all(env: Any) -> tuple[Stage, ...]:
+    def arrived(count: int) -> Callable[[], bool]:
+        def judge() -> bool:
+            places = [env.sim.data.body_xpos[env.obj_body_id[thing.name]] for thing in env.objects]
+            return sum(not env.not_in_bin(place, index) for index, place in enumerate(places)) >= count
+
+        return judge
+
+    return (
+        ("held", lambda: any(held(env, thing) for thing in env.objects)),
+        *((f"{name} there", arrived(count)) for count, name in ((1, "one"), (2, "two"), (3, "three"))),
+    )
 
 
 def _nut(env: Any) -> tuple[Stage, ...]:
@@ -96,10 +115,41 @@ def _door(env: Any) -> tuple[Stage, ...]:
     return (("at it", at_handle), ("ajar", open_by(0.03)), ("half open", open_by(0.15)))
 
 
+def _wipe(env: Any) -> tuple[Stage, ...]:
+    def wiped(share: float) -> Callable[[], bool]:
+        return lambda: len(env.wiped_markers) >= share * env.num_markers
+
+    return (("begun", wiped(0.01)), ("half", wiped(0.5)), ("nearly", wiped(0.9)))
+
+
+def _two_arm_lift(env: Any) -> tuple[Stage, ...]:
+    handles = (env.pot.handle0_geoms, env.pot.handle1_geoms)
+    rest = float(env.sim.data.body_xpos[env.pot_body_id][2])
+
+    def hold(count: int) -> Callable[[], bool]:
+        def judge() -> bool:
+            pairs = zip(env.robots, handles, strict=True)
+            return sum(env._check_grasp(gripper=robot.gripper, object_geoms=geoms) for robot, geoms in pairs) >= count
+
+        return judge
+
+    def lifted() -> bool:
+        return float(env.sim.data.body_xpos[env.pot_body_id][2]) > rest + LIFTED
+
+    return (("one holds", hold(1)), ("both hold", hold(2)), ("lifted", lifted))
+
+
 _STAGES: dict[str, Callable[[Any], tuple[Stage, ...]]] = {
     "Lift": _lift,
     "Stack": _stack,
     "PickPlaceCan": _pick_place,
+    "PickPlaceMilk": _pick_place,
+    "PickPlaceBread": _pick_place,
+    "PickPlaceCereal": _pick_place,
+    "PickPlace": _pick_place_all,
     "NutAssemblySquare": _nut,
+    "NutAssemblyRound": _nut,
+    "Wipe": _wipe,
+    "TwoArmLift": _two_arm_lift,
     "Door": _door,
 }
