@@ -10,7 +10,7 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 /// What JPEG files begin with: start of image, then the next marker.
 const JPEG: [u8; 3] = [0xFF, 0xD8, 0xFF];
 /// The longest side of a JPEG picture that is opened.
-const MOST_PIXELS: usize = 1 << 14;
+const MOST_PIXELS: usize = 1 << 13;
 
 /// What a picture's file name ends in.
 pub(crate) fn extension(form: ImageForm) -> &'static str {
@@ -173,6 +173,31 @@ mod tests {
             file[at] ^= 1 << rng.below(8);
             let _ = decode(&file, height, width, &mut Vec::new());
             let _ = decode(&file[..at], height, width, &mut Vec::new());
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(2000))]
+        #[test]
+        fn damaged_jpeg_files_decode_to_something_or_are_refused(which in 0..2, seed in any::<u64>()) {
+            let files: [&[u8]; 2] =
+                [include_bytes!("../../tests/fixtures/jpeg/0.jpg"), include_bytes!("../../tests/fixtures/jpeg/1.jpg")];
+            let mut file = files[which as usize].to_vec();
+            let mut out = Vec::new();
+            decode(&file, 18, 26, &mut out).unwrap();
+            prop_assert_eq!(out.len(), 18 * 26 * 3);
+            let mut rng = crate::shuffle::SplitMix64::new(seed, 0);
+            for _ in 0..1 + rng.below(4) {
+                let at = rng.below(file.len() as u64) as usize;
+                file[at] ^= 1 << rng.below(8);
+            }
+            let cut = rng.below(file.len() as u64) as usize;
+            for damaged in [&file[..], &file[..cut]] {
+                out.clear();
+                if let Ok((18, 26)) = decode(damaged, 18, 26, &mut out) {
+                    prop_assert_eq!(out.len(), 18 * 26 * 3);
+                }
+            }
         }
     }
 }
