@@ -227,6 +227,41 @@ fn weights_of_another_size_are_refused_before_a_model_is_built() {
     }
 }
 
+#[test]
+fn weights_that_are_not_robomimics_are_refused_by_name() {
+    let of = |name: &str| {
+        let path = fixture(&format!("{name}.pth"));
+        let bytes = rollout::read_robomimic(&python(), &path).unwrap();
+        let (tensors, stored) = zoo::tensors::from_bytes(&path, &bytes).unwrap();
+        let keys = options();
+        (models::robomimic::read_checkpoint(&stored, &keys.state_keys, &keys.env_keys).unwrap(), tensors)
+    };
+    let (rnn, tensors) = of("bc_rnn");
+    rnn.weights(&tensors).unwrap();
+    let refused = |change: &dyn Fn(&mut std::collections::BTreeMap<String, candle_core::Tensor>)| {
+        let mut changed = tensors.clone();
+        change(&mut changed);
+        rnn.weights(&changed).unwrap_err().to_string()
+    };
+    let (head, copy) = ("policy.nets.decoder.nets.mean.bias", "policy.nets.rnn.per_step_net.nets.mean.bias");
+    let error = refused(&|t| drop(t.insert(copy.to_owned(), (&t[copy] + 1e-3).unwrap())));
+    assert!(error.contains(copy) && error.contains("differs from its copy"), "{error}");
+    let error = refused(&|t| drop((t.remove(copy), t.remove(head))));
+    assert!(error.contains("tensor decoder.mean.bias is missing"), "{error}");
+    let error = refused(&|t| drop(t.insert("optimizer.state".to_owned(), t[head].clone())));
+    assert!(error.contains("optimizer.state does not belong"), "{error}");
+    let first = "policy.nets.rnn.nets.weight_ih_l0";
+    let error = refused(&|t| drop(t.insert(first.to_owned(), t[first].narrow(1, 0, 18).unwrap())));
+    assert!(error.contains(first) && error.contains("expected [32, 19]"), "{error}");
+
+    let (transformer, mut tensors) = of("bc_transformer");
+    transformer.weights(&tensors).unwrap();
+    let mask = "policy.nets.transformer.nets.transformer.1.nets.attention.mask";
+    tensors.insert(mask.to_owned(), tensors[mask].ones_like().unwrap());
+    let error = transformer.weights(&tensors).unwrap_err().to_string();
+    assert!(error.contains(mask) && error.contains("after it"), "{error}");
+}
+
 /// The error of importing a file that Python code makes at `path`, beside which nothing may happen.
 fn refused(make: &str) -> String {
     let root = tempfile::tempdir().unwrap();
