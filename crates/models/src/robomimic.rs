@@ -176,12 +176,11 @@ pub fn read_checkpoint(stored: &Value, state_keys: &[String], env_keys: &[String
     let keys: Keys = serde_json::from_str(&stored.config)
         .map_err(|e| refuse("config", e, "robomimic 0.3's keys and types of `bc`"))?;
     let policy = policy(&keys)?;
-    let (n_obs_steps, frame_stack) = match &policy {
-        PolicyConfig::BcRnn(config) => (config.action_horizon, 1),
-        _ => (keys.algo.transformer.as_ref().map_or(1, |t| t.context_length), 0),
+    let (n_obs_steps, stacked) = match &keys.algo.transformer {
+        Some(transformer) if transformer.enabled => (transformer.context_length, transformer.context_length),
+        _ => (keys.algo.rnn.horizon, 1),
     };
-    want("train.frame_stack", &keys.train.frame_stack, &if frame_stack == 1 { 1 } else { n_obs_steps })?;
-
+    want("train.frame_stack", &keys.train.frame_stack, &stacked)?;
     if n_obs_steps > LONGEST {
         return Err(refuse("algo.rnn.horizon or context_length", n_obs_steps, &format!("at most {LONGEST} steps")));
     }

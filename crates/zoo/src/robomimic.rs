@@ -9,7 +9,7 @@ use models::{NormMode, Normaliser, PolicyConfig, Preprocess, robomimic};
 use rollout::Python;
 use serde_json::{Value, json};
 
-use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta, ModuleMeta, reference};
+use crate::entry::{CardWords, EntryDraft, EntryId, EntryMeta, reference};
 use crate::experiment::{DataSection, Experiment, NormalisationSection, RolloutSection, TaskSection};
 use crate::run::TrainSection;
 use crate::{ZooError, tensors};
@@ -97,8 +97,8 @@ pub fn import(path: &Path, options: &ImportOptions, python: &Python, zoo: &Path)
             task: options.task.clone(),
             env_name: Some(env.name),
             env_version: env.version,
-            env_module: ModuleMeta::of(&stored["env_metadata"]),
-            env_args: Some(stored["env_metadata"].clone()),
+            env_module: None,
+            env_args: Some(env.args),
             parameters: model.params().count() as u64,
             signature: preprocess.signature().clone(),
             keys: experiment.data.feature_keys()?,
@@ -122,6 +122,8 @@ pub fn import(path: &Path, options: &ImportOptions, python: &Python, zoo: &Path)
 struct RecordedIn {
     name: String,
     version: Option<String>,
+    /// Its robots and controllers.
+    args: Value,
 }
 
 fn environment(metadata: &Value) -> Result<RecordedIn, String> {
@@ -131,5 +133,8 @@ fn environment(metadata: &Value) -> Result<RecordedIn, String> {
     }
     let text = |key: &str| metadata[key].as_str().map(str::to_owned);
     let name = text("env_name").ok_or("env_metadata.env_name: expected text, found none")?;
-    Ok(RecordedIn { name, version: text("env_version") })
+    let mut args = metadata.clone();
+    // a module to import is named by who evaluates (`--env-module`), not by a file of somebody else's
+    args.as_object_mut().map(|args| args.remove("env_module"));
+    Ok(RecordedIn { name, version: text("env_version"), args })
 }

@@ -127,6 +127,9 @@ fn an_entry_says_where_it_comes_from() {
     assert_eq!((meta.policy.as_str(), meta.experiment.as_str()), ("bc_rnn", "imported from robomimic"));
     assert_eq!((meta.env_name.as_deref(), meta.env_version.as_deref()), (Some("Lift"), Some("1.5.2")));
     assert_eq!(meta.license(), "unknown");
+    // robots and controllers come with it; which module is imported is not the file's to say
+    assert_eq!(meta.env_args.as_ref().unwrap()["env_kwargs"]["robots"], "Panda");
+    assert!(meta.env_module.is_none() && meta.env_args.as_ref().unwrap().get("env_module").is_none());
     let loaded = entry.load().unwrap();
     assert_eq!(loaded.experiment().rollout.n_action_steps, 1);
     let text = loaded.experiment().to_toml();
