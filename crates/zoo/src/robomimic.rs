@@ -135,6 +135,8 @@ fn environment(metadata: &Value) -> Result<RecordedIn, String> {
     let name = text("env_name").ok_or("env_metadata.env_name: expected text, found none")?;
     let mut args = metadata.clone();
     // a module to import is named by who evaluates (`--env-module`), not by a file of somebody else's
-    args.as_object_mut().map(|args| args.remove("env_module"));
+    if let Some(args) = args.as_object_mut() {
+        args.remove("env_module");
+    }
     Ok(RecordedIn { name, version: text("env_version"), args })
 }
