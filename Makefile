@@ -119,6 +119,10 @@ bench-memory: build ## memory that converting a 3 GB image file takes (needs 6 G
 interop: wheel .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round; Ray runs shards
 	@.venv-peers/bin/python tests/interop/run.py
 
+.PHONY: references
+references: build .venv-peers/.complete ## LeRobot and robomimic train on our demonstrations, our harness judges (an hour alone)
+	@tools/references.sh
+
 .PHONY: clean
 clean: ## remove what was built and installed (target, .venv, .venv-peers, out)
 	@rm -rf target .venv .venv-peers .venv-wheel out

@@ -2,6 +2,7 @@
 
 use std::ffi::{OsStr, OsString};
 use std::os::unix::ffi::OsStrExt;
+use std::path::Path;
 use std::process::{Command, Output};
 
 use e2e::{data, lift, text, zoo};
@@ -49,6 +50,8 @@ fn every_command_works_in_a_folder_whose_name_is_not_utf8() {
     ] {
         works(folder, data, arguments);
     }
+    let theirs = e2e::root().join("crates/zoo/tests/fixtures/robomimic/bc_rnn.pth");
+    std::fs::copy(theirs, Path::new(folder).join("model.pth")).expect("copied");
     let places = ["--zoo", "@/zoo", "--runs", "@/runs"];
     let small = ["train", "act_lift", "train.steps=1", "--data"];
     works(folder, zoo, &[&small[..], &["@/set"], &places].concat());
@@ -60,6 +63,7 @@ fn every_command_works_in_a_folder_whose_name_is_not_utf8() {
         &["runs", "--runs", "@/runs", "--all", "--json"],
         &["export", "lerobot", "lift-act@1", "@/theirs", "--zoo", "@/zoo"],
         &["import", "lerobot", "@/theirs", "--name", "again", "--task", "Lift", "--zoo", "@/zoo"],
+        &["import", "robomimic", "@/model.pth", "--name", "robomimics", "--task", "Lift", "--zoo", "@/zoo"],
         &["leaderboard", "--zoo", "@/zoo", "--out", "@/public"],
     ] {
         works(folder, zoo, arguments);

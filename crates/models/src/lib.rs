@@ -32,6 +32,7 @@ mod preprocess;
 mod registry;
 pub mod rl;
 mod rng;
+pub mod robomimic;
 mod simd;
 mod size;
 mod train;

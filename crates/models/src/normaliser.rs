@@ -64,7 +64,7 @@ pub struct Guarded {
 }
 
 impl Normaliser {
-    const EPS: f32 = 1e-8;
+    pub(crate) const EPS: f32 = 1e-8;
 
     /// Takes the statistics that `modes` need from `tensors`, named `<feature>.mean`, `.std`, `.min`, `.max`.
     ///

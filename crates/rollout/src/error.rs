@@ -59,6 +59,14 @@ pub enum RolloutError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// A checkpoint of other people's could not be read.
+    #[error("checkpoint {}: {problem}", path.display())]
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What the harness says of it.
+        problem: String,
+    },
     /// A worker said at once that it cannot do what was asked.
     #[error("worker for task {task:?}: {message} ({kind})")]
     Refused {

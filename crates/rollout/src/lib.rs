@@ -7,6 +7,7 @@
 //! episodes on them. Workers may die, hang or answer nonsense: their episode is then run again on a
 //! fresh worker and its outcome is the same, because an episode depends only on task, seed and policy.
 
+mod checkpoint;
 pub mod collection;
 mod episode;
 mod error;
@@ -23,6 +24,7 @@ mod spec;
 mod stop;
 mod worker;
 
+pub use checkpoint::read_robomimic;
 pub use episode::{Agent, AgentError, EpisodePlan, Outcome, Watch};
 pub use error::{FaultKind, RolloutError, WorkerFault};
 pub use frame::{FrameError, FrameTensor, MAX_FRAME_BYTES};

@@ -9,13 +9,17 @@ use std::time::Duration;
 use crate::harness::{Python, cache_folder};
 use crate::message::Control;
 
-/// Runs the worker module, having asked Linux (`prctl(PR_SET_PDEATHSIG, SIGKILL)`) to kill it with us: a
+/// Runs a module of the harness, having asked Linux (`prctl(PR_SET_PDEATHSIG, SIGKILL)`) to kill it with us: a
 /// worker that hangs or is stopped would not see its pipe close.
-const BOOT: &str = "import runpy, sys
+pub(super) fn boot(module: &str) -> String {
+    format!(
+        "import runpy, sys
 if sys.platform == 'linux':
     import ctypes
     ctypes.CDLL(None).prctl(1, 9)
-runpy.run_module('actrm_harness.worker', run_name='__main__', alter_sys=True)";
+runpy.run_module('{module}', run_name='__main__', alter_sys=True)"
+    )
+}
 
 /// What a worker is to run.
 #[derive(Debug, Clone)]
@@ -75,7 +79,7 @@ impl WorkerSpec {
     /// The command that starts such a worker.
     pub(super) fn command(&self) -> Command {
         let mut command = Command::new(&self.python.path);
-        command.args(["-c", BOOT, "--task", &self.task]);
+        command.args(["-c", &boot("actrm_harness.worker"), "--task", &self.task]);
         command.args(["--control", self.control.as_str()]);
         if let Some(module) = &self.env_module {
             command.args(["--env-module", module]);

@@ -17,6 +17,7 @@ mod files;
 pub mod lerobot;
 pub mod probe;
 pub mod registry;
+pub mod robomimic;
 pub mod run;
 pub mod tensors;
 

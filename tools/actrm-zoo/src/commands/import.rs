@@ -2,14 +2,15 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use cli::shown;
-use zoo::lerobot::{ImportOptions, import};
+use zoo::{lerobot, robomimic};
 
 use crate::places::ZooArgs;
 
 /// Make an entry of a policy that was trained elsewhere
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  actrm-zoo import lerobot outputs/train/checkpoints/last/pretrained_model --name lift-theirs --task Lift")]
+  actrm-zoo import lerobot outputs/train/checkpoints/last/pretrained_model --name lift-theirs --task Lift
+  actrm-zoo import robomimic bc_trained_models/lift/20260101120000/models/model_epoch_600.pth --name lift-theirs --task Lift")]
 pub struct Args {
     #[command(subcommand)]
     from: From,
@@ -18,13 +19,12 @@ pub struct Args {
 #[derive(clap::Subcommand)]
 enum From {
     Lerobot(LerobotArgs),
+    Robomimic(RobomimicArgs),
 }
 
-/// A checkpoint folder of LeRobot's ACT or diffusion
+/// What both do not say about themselves.
 #[derive(clap::Args)]
-struct LerobotArgs {
-    /// Folder with config.json, model.safetensors and the two processors
-    folder: PathBuf,
+struct NamedArgs {
     /// Name of the entry
     #[arg(long)]
     name: String,
@@ -42,6 +42,15 @@ struct LerobotArgs {
     /// Observation keys that make its environment state, in order
     #[arg(long, value_delimiter = ',', value_name = "KEYS", default_value = "object")]
     env_keys: Vec<String>,
+}
+
+/// A checkpoint folder of LeRobot's ACT or diffusion
+#[derive(clap::Args)]
+struct LerobotArgs {
+    /// Folder with config.json, model.safetensors and the two processors
+    folder: PathBuf,
+    #[command(flatten)]
+    named: NamedArgs,
     /// Its pictures were drawn without reflections and multisampling, as `collect --fast-render` draws
     #[arg(long)]
     fast_render: bool,
@@ -49,16 +58,49 @@ struct LerobotArgs {
     zoo: ZooArgs,
 }
 
+/// A checkpoint of robomimic's BC-RNN or BC-Transformer with a mixture of Gaussians
+///
+/// The file is a pickle. It is read by the harness in a process of its own, which takes tensors and plain values from it and
+/// runs nothing of what it says; anything else in it is an error with its name.
+#[derive(clap::Args)]
+struct RobomimicArgs {
+    /// File that robomimic 0.3's training saved: models/model_epoch_N.pth
+    file: PathBuf,
+    #[command(flatten)]
+    named: NamedArgs,
+    /// Python with numpy [default: $ACTRM_PYTHON, else .venv/bin/python here or above, else python3]
+    #[arg(long, value_name = "PATH")]
+    python: Option<PathBuf>,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let From::Lerobot(args) = &args.from;
-    let options = ImportOptions {
-        name: args.name.clone(),
-        task: args.task.clone(),
-        state_keys: args.state_keys.clone(),
-        env_keys: args.env_keys.clone(),
-        fast_render: args.fast_render,
+    let (id, zoo) = match &args.from {
+        From::Lerobot(args) => {
+            let NamedArgs { name, task, state_keys, env_keys } = &args.named;
+            let options = lerobot::ImportOptions {
+                name: name.clone(),
+                task: task.clone(),
+                state_keys: state_keys.clone(),
+                env_keys: env_keys.clone(),
+                fast_render: args.fast_render,
+            };
+            (lerobot::import(&args.folder, &options, &args.zoo.zoo)?, &args.zoo.zoo)
+        }
+        From::Robomimic(args) => {
+            let NamedArgs { name, task, state_keys, env_keys } = &args.named;
+            let options = robomimic::ImportOptions {
+                name: name.clone(),
+                task: task.clone(),
+                state_keys: state_keys.clone(),
+                // "" makes none
+                env_keys: env_keys.iter().filter(|key| !key.is_empty()).cloned().collect(),
+            };
+            let python = rollout::find_python(args.python.as_deref())?;
+            (robomimic::import(&args.file, &options, &python, &args.zoo.zoo)?, &args.zoo.zoo)
+        }
     };
-    let id = import(&args.folder, &options, &args.zoo.zoo)?;
-    cli::print(&format!("{id} is in {}\n", shown(&args.zoo.zoo)))?;
+    cli::print(&format!("{id} is in {}\n", shown(zoo)))?;
     Ok(ExitCode::SUCCESS)
 }
