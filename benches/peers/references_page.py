@@ -128,7 +128,8 @@ and are no comparison of speed: that is [notes/performance_policies.md](notes/pe
 ## What is not the same
 
 - LeRobot (`lerobot-train`, its own data loader, AdamW, clipping and cosine with warm-up, with our numbers): no moving
-  average of the weights, which ours has on PickPlaceCan. Its statistics are those of the same 180 demonstrations.
+  average of the weights, which ours has on PickPlaceCan. Its statistics are those of the same 180 demonstrations. What
+  its data set gives for a frame is kept and given again (`benches/peers/train_lerobot.py`): time, and nothing else.
 - robomimic (its `train`, data loader and Adam): the learning rate falls in a line to 0 every hundred steps, the nearest
   that it has to our warm-up and cosine; no clipping of gradients, no moving average; actions raw in -1 to 1, where ours
   are scaled to their range; sequences as in the head of `crates/models/src/models/bc_rnn/mod.rs`.
@@ -141,13 +142,25 @@ and are no comparison of speed: that is [notes/performance_policies.md](notes/pe
 
 FOUND = """## What came of it
 
-- LeRobot's ACT and ours solve the same of Lift.
-- robomimic's BC-RNN as it is released solves none of Lift and two thirds of PickPlaceCan, where ours solves all. With
-  its normalisation of observations mended, and nothing else changed, it solves all of Lift, too: the difference is
-  normalisation. In its own log the loss of the last hundred steps on Lift is -18.3 without it and -20.3 with it. 1,500
-  steps are few for robomimic, whose default is 200,000; what it reaches then was not tried.
+- LeRobot's ACT and ours solve the same of Lift. On PickPlaceCan its training was not run to its end; our row there is
+  of another collection of demonstrations by the same seeds.
+- robomimic's BC-RNN with its normalisation mended solves what ours does, within each other's interval, on both tasks.
+- robomimic's BC-RNN as it is released solves none of Lift and two thirds of PickPlaceCan, where ours solves all.
+  Nothing but the normalisation of observations is different from the row below it: that is what is missing. In its own
+  log the loss of the last hundred steps on Lift is -18.3 without it and -20.3 with it, on PickPlaceCan -18.6 and -20.2.
+  1,500 and 6,000 steps are few for robomimic, whose default is 200,000; what it reaches then was not tried.
 - What else is not the same (schedule, clipping, moving average, scale of actions, ends of sequences) shows nothing on
-  Lift, where nothing is left to be gained.
+  these two tasks, where hardly anything is left to be gained.
+
+## The commands
+
+    tools/references.sh                                 # collects the demonstrations, too, where they are not there
+    tools/references.sh --data FOLDER --only act-on-lift
+    actrm-zoo import robomimic MODEL.pth --name lift-theirs --task Lift
+    actrm-zoo eval lift-theirs --protocol lift-v1 --block test
+
+Every training's own command stands in `benches/peers/references.py`; its log, checkpoint and times lie in
+`out/references/train`.
 """
 
 
