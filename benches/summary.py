@@ -107,7 +107,9 @@ def processor() -> str:
     """Which processor this is: ratios differ between those that compute 512 bits at a time and those that do not."""
     facts = [line.partition(":") for line in Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()]
     known = {name.strip(): value.strip() for name, _, value in facts}
-    return f"{known.get('model name', 'unknown')}, family {known.get('cpu family', '?')}, model {known.get('model', '?')}"
+    return (
+        f"{known.get('model name', 'unknown')}, family {known.get('cpu family', '?')}, model {known.get('model', '?')}"
+    )
 
 
 def main() -> int:
