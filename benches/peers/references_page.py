@@ -142,8 +142,8 @@ and are no comparison of speed: that is [notes/performance_policies.md](notes/pe
 
 FOUND = """## What came of it
 
-- LeRobot's ACT and ours solve the same of Lift. On PickPlaceCan its training was not run to its end; our row there is
-  of another collection of demonstrations by the same seeds.
+- LeRobot's ACT and ours solve as many episodes of both tasks. On PickPlaceCan our row is of another collection of
+  demonstrations by the same seeds.
 - robomimic's BC-RNN with its normalisation mended solves what ours does, within each other's interval, on both tasks.
 - robomimic's BC-RNN as it is released solves none of Lift and two thirds of PickPlaceCan, where ours solves all.
   Nothing but the normalisation of observations is different from the row below it: that is what is missing. In its own

@@ -9,7 +9,8 @@ use crate::models::act::Config;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
 use crate::params::Params;
 use candle_core::{DType, Tensor};
-use serde::Deserialize;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
@@ -78,10 +79,21 @@ struct Keys {
     dropout: f64,
     kl_weight: f64,
     vision_backbone: String,
+    #[serde(deserialize_with = "truth")]
     replace_final_stride_with_dilation: bool,
     normalization_mapping: BTreeMap<String, String>,
     input_features: BTreeMap<String, FeatureKeys>,
     output_features: BTreeMap<String, FeatureKeys>,
+}
+
+/// True or false, or 1 or 0: LeRobot calls the value a number, writes `false` in a first training and `0` in one that goes on.
+fn truth<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<bool, D::Error> {
+    match Value::deserialize(from)? {
+        Value::Bool(value) => Ok(value),
+        number if number == 0 => Ok(false),
+        number if number == 1 => Ok(true),
+        other => Err(D::Error::custom(format!("{other} where true, false, 0 or 1 is expected"))),
+    }
 }
 
 #[derive(Debug, Deserialize)]
@@ -502,6 +514,13 @@ mod tests {
     }
 
     #[test]
+    fn a_training_that_went_on_writes_numbers_for_truth_values() {
+        let mut config = write_config(&example()).unwrap();
+        config["replace_final_stride_with_dilation"] = json!(0);
+        assert_eq!(read_config(&config).unwrap(), example());
+    }
+
+    #[test]
     fn what_cannot_be_run_is_refused_by_name() {
         let good = write_config(&example()).unwrap();
         for (field, value, named) in [
@@ -512,6 +531,8 @@ mod tests {
             ("feedforward_activation", json!("glu"), "glu"),
             ("chunk_size", json!("many"), "config.json"),
             ("n_haeds", json!(2), "n_haeds"),
+            ("replace_final_stride_with_dilation", json!(1), "basic blocks are not dilated"),
+            ("replace_final_stride_with_dilation", json!(2), "0 or 1 is expected"),
             ("normalization_mapping", json!({"STATE": "QUANTILES"}), "QUANTILES"),
             ("input_features", json!({}), "observation.state"),
         ] {
