@@ -119,7 +119,11 @@ pub(crate) fn jpeg(row: &[u8]) -> Option<&[u8]> {
     row.starts_with(&JPEG).then(|| &row[..end])
 }
 
-fn opened(file: &[u8]) -> Result<(JpegDecoder<ZCursor<&[u8]>>, (usize, usize)), String> {
+/// A JPEG file whose header was read.
+type Jpeg<'a> = JpegDecoder<ZCursor<&'a [u8]>>;
+
+/// The file with height and width.
+fn opened(file: &[u8]) -> Result<(Jpeg<'_>, (usize, usize)), String> {
     let options = DecoderOptions::default()
         .set_max_width(MOST_PIXELS)
         .set_max_height(MOST_PIXELS)
