@@ -531,7 +531,6 @@ mod tests {
             ("feedforward_activation", json!("glu"), "glu"),
             ("chunk_size", json!("many"), "config.json"),
             ("n_haeds", json!(2), "n_haeds"),
-            ("replace_final_stride_with_dilation", json!(1), "basic blocks are not dilated"),
             ("replace_final_stride_with_dilation", json!(2), "0 or 1 is expected"),
             ("normalization_mapping", json!({"STATE": "QUANTILES"}), "QUANTILES"),
             ("input_features", json!({}), "observation.state"),
