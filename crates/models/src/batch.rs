@@ -16,6 +16,8 @@ pub struct Batch {
     pub is_pad: Tensor,
     /// What the demonstrations took; `None` where nobody asked.
     pub taken: Option<Taken>,
+    /// (b, cells): 1 where a demonstration comes by a cell of a grid now or later, else 0; `None` where nobody asked.
+    pub visited: Option<Tensor>,
     /// Rows of the whole batch that this one is a shard of: losses are averaged over this number.
     pub total_rows: usize,
     /// Steps of the whole batch that are not padding.
@@ -71,6 +73,7 @@ impl Batch {
             actions: Tensor::from_vec(actions, (n, action_horizon, signature.action_dim), dev)?,
             is_pad: Tensor::from_vec(pad, (n, action_horizon), dev)?,
             taken: None,
+            visited: None,
             total_rows: n,
             total_valid_steps: is_pad.iter().filter(|&&p| !p).count(),
             seed: 0,
@@ -118,6 +121,7 @@ impl Batch {
                         .taken
                         .as_ref()
                         .map(|taken| Taken { features: taken.features[from..to].to_vec(), ..*taken }),
+                    visited: self.visited.as_ref().map(cut).transpose()?,
                     ..self.clone()
                 })
             })

@@ -2,7 +2,7 @@
 
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
-use crate::layers::PointerConfig;
+use crate::layers::{GridConfig, PointerConfig};
 use crate::model::PolicyModel;
 use crate::models::floors::{expert, nearest, random, replay, zero};
 use crate::models::{act, actrm, bc, bc_rnn, bc_transformer, diffusion, flow, mip};
@@ -139,6 +139,14 @@ impl PolicyConfig {
         match self {
             Self::Act(config) => config.pointer.as_ref(),
             Self::Actrm(config) => config.pointer.as_ref(),
+            _ => None,
+        }
+    }
+
+    /// The grid that it thinks over, if it does.
+    pub fn grid(&self) -> Option<&GridConfig> {
+        match self {
+            Self::Actrm(config) => config.reasoning.grid.as_ref(),
             _ => None,
         }
     }

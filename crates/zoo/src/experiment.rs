@@ -1,6 +1,7 @@
 //! An experiment: what is trained, on which demonstrations, how, and how the result acts.
 
 mod entities;
+mod grids;
 
 use std::collections::BTreeMap;
 
@@ -12,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 pub use self::entities::EntitySection;
+pub use self::grids::GridSection;
 use crate::config::{Library, apply_overrides, from_value, from_value_as};
 use crate::run::TrainSection;
 use crate::{FeatureKeys, ZooError};
@@ -106,6 +108,9 @@ pub struct DataSection {
     /// Things that are a token each, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub entities: BTreeMap<String, EntitySection>,
+    /// Grids, each cell of which is such a thing, by name.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub grids: BTreeMap<String, GridSection>,
     /// Items of the lists above that are permuted alike in training, by the name of the symmetry.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub symmetries: BTreeMap<String, Vec<String>>,
@@ -135,6 +140,7 @@ impl Default for DataSection {
             state_keys: owned(&["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]),
             env_keys: owned(&["object"]),
             entities: BTreeMap::new(),
+            grids: BTreeMap::new(),
             symmetries: BTreeMap::new(),
             exchange: BTreeMap::new(),
             beginning: None,
@@ -348,7 +354,7 @@ impl Experiment {
             entry: sections.entry,
             description: sections.description,
             task: sections.task,
-            data: sections.data,
+            data: sections.data.with_cells()?,
             normalisation: sections.normalisation,
             policy: policy(sections.policy)?,
             train: sections.train,
@@ -386,6 +392,7 @@ impl Experiment {
         self.policy.validate().map_err(self.model_error("build the policy of"))?;
         self.data.check(self.policy.reads())?;
         self.check_pointer()?;
+        self.check_grid()?;
         self.train.check()
     }
 
@@ -411,6 +418,30 @@ impl Experiment {
             }),
             _ => Ok(()),
         }
+    }
+
+    /// The grid whose cells the policy is asked about, by name, and the key that says where the hand is.
+    pub(crate) fn asked_grid(&self) -> Option<(&str, &GridSection, &str)> {
+        let asked = self.policy.grid().filter(|grid| grid.way > 0.0)?;
+        let (name, grid) = self.data.grids.get_key_value(&asked.among)?;
+        Some((name, grid, grid.visited.as_deref()?))
+    }
+
+    /// A grid's rows are those of the data, and what is asked of it is there.
+    fn check_grid(&self) -> Result<(), ZooError> {
+        let Some(asked) = self.policy.grid() else { return Ok(()) };
+        let invalid = |key: &str, expected: String, found: String| {
+            Err(ZooError::InvalidValue { key: format!("policy.reasoning.grid.{key}"), expected, found })
+        };
+        if let Some(grid) = self.data.grids.get(&asked.among).filter(|grid| grid.columns != asked.columns) {
+            let expected = format!("{}, as data.grids.{}", grid.columns, asked.among);
+            return invalid("columns", expected, asked.columns.to_string());
+        }
+        if asked.way > 0.0 && self.asked_grid().is_none() {
+            let expected = "a grid of data.grids with the key `visited`".to_owned();
+            return invalid("among", expected, format!("`{}`", asked.among));
+        }
+        Ok(())
     }
 
     /// Kind of policy, as the config names it.

@@ -11,6 +11,7 @@ mod convolution;
 mod decoder;
 mod encoder;
 mod feed_forward;
+mod grid;
 mod loss;
 mod lstm;
 mod mixture;
@@ -25,6 +26,7 @@ pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_an
 pub(crate) use convolution::{convolve, framed, input_gradient, weight_gradient as convolution_gradient};
 pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::{Encoder, EncoderLayer};
+pub(crate) use grid::{GridLayer, cells_of, put_cells};
 pub(crate) use loss::AbsoluteError;
 pub(crate) use lstm::Lstm;
 pub(crate) use mixture::{Wanted, likelihood};

@@ -41,15 +41,19 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
     let cubes: Vec<u32> = cubes.map(|(at, _)| at as u32).collect();
     let taken = (0..rows).map(|row| cubes.get(row % cubes.len().max(1)).copied().filter(|_| row % 3 != 2));
     batch.taken = Some(Taken::new(taken.collect()));
+    let cells = signature.observation.iter().filter(|spec| spec.group() == "cell").count();
+    let visited = (0..rows * cells).map(|_| rng.below(2) as f32).collect();
+    batch.visited = (cells > 0).then(|| Tensor::from_vec(visited, (rows, cells), &Device::Cpu).unwrap());
     batch
 }
 
 /// What models are tried on: with and without an environment state, with a history, with entities in two groups, of which
-/// one has positions, with pictures of three cameras, and with a history of two pictures.
+/// one has positions, with a grid of cells and a thing beside it, with pictures of three cameras, and with a history of two pictures.
 pub(crate) struct Signatures {
     pub(crate) plain: Signature,
     pub(crate) no_env: Signature,
     pub(crate) entities: Signature,
+    pub(crate) grid: Signature,
     pub(crate) history: Signature,
     pub(crate) pictures: Signature,
     pub(crate) film: Signature,
@@ -66,6 +70,9 @@ pub(crate) fn signatures() -> Signatures {
     let goal = |name: &str| FeatureSpec::entity(name, 2, "goal", true);
     let mut entities = no_env.clone();
     entities.observation.extend([cube("cube0"), cube("cube1"), cube("cube2"), goal("goal0"), goal("goal1")]);
+    let mut grid = no_env.clone();
+    grid.observation.extend((0..6).map(|i| FeatureSpec::entity(&format!("cell{i}"), 2, "cell", i == 4)));
+    grid.observation.push(FeatureSpec::entity("peg", 3, "peg", false));
     let mut history = Signature { n_obs_steps: 3, ..plain.clone() };
     history.observation.extend([cube("cube0"), cube("cube1")]);
     let mut pictures = plain.clone();
@@ -74,7 +81,7 @@ pub(crate) fn signatures() -> Signatures {
     pictures.observation.push(cube("cube0"));
     let mut film = Signature { n_obs_steps: 2, ..no_env.clone() };
     film.observation.push(FeatureSpec::image("a", 36, 40));
-    Signatures { plain, no_env, entities, history, pictures, film }
+    Signatures { plain, no_env, entities, grid, history, pictures, film }
 }
 
 /// Loss and gradients as the trainer gets them.

@@ -226,7 +226,7 @@ impl LayerInit {
     }
 
     /// Of the dense part of an encoder layer.
-    fn dense(self) -> Init {
+    pub(crate) fn dense(self) -> Init {
         match self {
             Self::Xavier => Init::XavierUniform,
             Self::TorchDefault | Self::Recursive => Init::KaimingUniform,

@@ -17,6 +17,7 @@ use crate::experiment::{DataSection, EntitySection, Experiment, PICTURE_PREFIX};
 use super::exchange::Exchanges;
 use super::preflight::picture_budget;
 use super::symmetry::Symmetries;
+use super::way::Ways;
 
 /// Folder of the run that a converted HDF5 file goes to.
 pub(super) const CONVERTED: &str = "data";
@@ -133,6 +134,7 @@ pub(super) struct Demonstrations {
     pub preprocess: Preprocess,
     pub symmetries: Symmetries,
     pub exchanges: Exchanges,
+    pub ways: Ways,
     /// Mean and standard deviation of each camera's colours, on the scale from 0 to 1, where the data set has them.
     pub picture_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
     pub meta: DataMeta,
@@ -269,11 +271,12 @@ pub(super) fn prepare(
         ));
     }
     let exchanges = Exchanges::new(experiment, dataset, &train, &signature, path)?;
+    let ways = Ways::new(experiment, dataset, &train, path)?;
     let preprocess =
         Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
     let symmetries = Symmetries::new(experiment, dataset, path)?;
     let picture_statistics = picture_statistics.into_iter().collect();
-    Ok(Demonstrations { train, valid, preprocess, symmetries, exchanges, picture_statistics, meta, notes })
+    Ok(Demonstrations { train, valid, preprocess, symmetries, exchanges, ways, picture_statistics, meta, notes })
 }
 
 /// The windows of the episodes that a training of `experiment` learns from, its symmetries, and the number of each episode's

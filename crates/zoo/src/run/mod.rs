@@ -18,6 +18,7 @@ mod symmetry;
 mod tensorboard;
 mod training;
 mod validation;
+mod way;
 
 pub use checkpoint::Checkpoint;
 pub use data::locate;

@@ -234,6 +234,8 @@ impl Training for PolicyTraining<'_> {
         self.demonstrations.exchanges.apply(step, windows);
         let (mut batch, rows) = (data::batch(windows, &self.demonstrations, self.experiment)?, windows.n);
         batch.taken = self.demonstrations.exchanges.taken(windows);
+        let unfit = |source: candle_core::Error| self.experiment.model_error("train")(source.into());
+        batch.visited = self.demonstrations.ways.of(windows).map_err(unfit)?;
         let done = self.trainer.step(&batch).map_err(self.experiment.model_error("train"))?;
         self.rate.1 += rows as u64;
         let mut values = BTreeMap::from([

@@ -188,7 +188,9 @@ class TableMaze(OnTable, Stack):
         return "crossed" if self.walls[self.cell_of(tip)] else None
 
     def values(self) -> Values:
-        """Walls and goal cell by cell, 10 x 10 from the robot outwards; the tip, and where the goal is from it."""
+        """Walls and goal cell by cell, 10 x 10 from the robot outwards; the tip, where the goal is from it, and where it is
+        from the middle of its own cell.
+        """
         return {
             "maze_walls": lambda: self.walls.astype(np.float64),
             "maze_goal": lambda: np.eye(SIDE * SIDE)[self.goal],
@@ -196,6 +198,7 @@ class TableMaze(OnTable, Stack):
             "peg_pos": self.tip,
             "goal_pos": lambda: self.center(self.goal),
             "peg_to_goal": lambda: self.center(self.goal) - self.tip(),
+            "peg_in_cell": lambda: (self.tip() - self.center(self.cell_of(self.tip())))[:2],
         }
 
 

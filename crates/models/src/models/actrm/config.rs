@@ -2,7 +2,7 @@
 
 use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
-use crate::layers::{Activation, PointerConfig, Shape};
+use crate::layers::{Activation, GridConfig, PointerConfig, Shape};
 use crate::models::act;
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
@@ -89,6 +89,10 @@ pub struct ReasoningConfig {
     /// whether the answer of every supervision step has a loss; else only the last one's has
     #[serde(skip_serializing_if = "is_true")]
     pub deep_supervision: bool,
+    /// the recursion goes over a grid of cells, from neighbour to neighbour, instead of attention among all tokens
+    /// (`over = "tokens"`)
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub grid: Option<GridConfig>,
 }
 
 // settings that came later are left out where they change nothing, so that a configuration keeps its text
@@ -121,6 +125,7 @@ impl Default for ReasoningConfig {
             untied: false,
             start_noise: 0.0,
             deep_supervision: true,
+            grid: None,
         }
     }
 }
@@ -329,6 +334,13 @@ impl Config {
         }
         if let Some(pointer) = self.pointer.as_ref().filter(|_| r.over != Over::Tokens) {
             return refuse("pointer", format!("among {}", pointer.among), "absent but for reasoning.over = \"tokens\"");
+        }
+        if let Some(grid) = &r.grid {
+            grid.validate("actrm")?;
+            if r.over != Over::Tokens || self.pointer.is_some() {
+                let expected = "absent but for over = \"tokens\" without a pointer";
+                return refuse("reasoning.grid", format!("among {}", grid.among), expected);
+            }
         }
         if r.untied && r.over == Over::Memory {
             return refuse("reasoning.untied", "true".into(), "false with over = \"memory\"");

@@ -170,7 +170,9 @@ impl Actrm {
         }
         let step = self.answer(memory, carry.clone(), mode)?;
         let (chunk, answer) = (step.chunk.detach(), step.decoded.detach());
-        Ok(ExaminedStep { chunk, answer, reasoning: carry.answer.clone(), attention: None })
+        // over a grid what goes on is under a norm; what is seen is as it was left
+        let left = std::mem::replace(carry, step.carry.detach());
+        Ok(ExaminedStep { chunk, answer, reasoning: left.answer, attention: None })
     }
 
     /// What the columns of [`ExaminedStep::attention`] stand for: the reasoning's tokens, the actions', the latent, features

@@ -22,6 +22,10 @@
 //! entity's token as one more, and each step's answer has a loss of its own: that is how a step learns to follow
 //! a relation from thing to thing, which the loss on actions alone did not teach (docs/study_plan.md).
 //!
+//! With `grid` the states are the cells of a grid alone: a convolution takes the place of attention, so that what a cell knows
+//! goes on to its neighbours, and as in TRM every step begins from the states under a norm, with what is observed added
+//! again. `way` asks each cell after every step whether the demonstration still comes by it.
+//!
 //! In the other two only the last round of a supervision step keeps a graph. The recursion has no dropout,
 //! and the latent is drawn once per batch (the original draws it anew for every step).
 //! Validation and inference run at latent zero, as ACT's do (the original validates with the
@@ -58,9 +62,9 @@ use crate::flops;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
-    Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, InputTokens, LayerInit, LayerNorm, Linear,
-    Mode, MultiHeadAttention, Pointed, Pointer, Shape, TokenLayout, Vae, environment_state, kl_divergence, sample,
-    sinusoid_table,
+    Answers, Asked, Cells, Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, GridLayer, InputTokens,
+    LayerInit, LayerNorm, Linear, Mode, MultiHeadAttention, NEIGHBOURS, Pointer, Shape, TokenLayout, Vae, Visited, environment_state,
+    kl_divergence, sample, sinusoid_table,
 };
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
@@ -133,12 +137,20 @@ struct OverMemory {
 struct OverTokens {
     /// of the tokens before the first step
     first_norm: LayerNorm,
-    /// pre-norm; of the shared block, or of every supervision step's block one after the other
-    layers: Vec<EncoderLayer>,
+    layers: TokenLayers,
     /// before tokens are read
     norm: LayerNorm,
     decoder: Decoder,
     pointer: Option<Pointer>,
+}
+
+/// Pre-norm; of the shared block, or of every supervision step's block one after the other.
+#[derive(Debug)]
+enum TokenLayers {
+    /// among all tokens
+    Attention(Vec<EncoderLayer>),
+    /// from cell to cell of a grid
+    Grid(Cells, Vec<GridLayer>),
 }
 
 #[derive(Debug)]
@@ -161,6 +173,46 @@ impl Carry {
     }
 }
 
+/// What a supervision step is asked beside the actions.
+#[derive(Debug)]
+enum Question {
+    /// which entity a demonstration took
+    Taken(Asked),
+    /// which cells it still comes by
+    Visited(Visited),
+}
+
+impl Question {
+    /// What its parts of the loss begin with.
+    fn name(&self) -> &'static str {
+        match self {
+            Self::Taken(_) => "pointer",
+            Self::Visited(_) => "way",
+        }
+    }
+
+    fn loss(&self, scores: &Tensor) -> Result<Tensor> {
+        match self {
+            Self::Taken(asked) => asked.loss(scores),
+            Self::Visited(visited) => visited.loss(scores),
+        }
+    }
+
+    /// The loss on a slice, and `weight` times its gradient.
+    fn answers(&self, scores: &[f32], grad: Option<(&mut [f32], f64)>) -> Answers {
+        match self {
+            Self::Taken(asked) => asked.answers(scores, grad),
+            Self::Visited(visited) => visited.answers(scores, grad),
+        }
+    }
+
+    /// Rows that are answered rightly, a share of all rows of the batch that are asked.
+    fn right(&self, scores: &Tensor) -> Result<Tensor> {
+        let values = scores.detach().flatten_all()?.to_vec1::<f32>()?;
+        Ok(Tensor::new(self.answers(&values, None).right, scores.device())?)
+    }
+}
+
 /// What a supervision step gives.
 struct Step {
     carry: Carry,
@@ -170,8 +222,8 @@ struct Step {
     halt_logit: Tensor,
     /// what the chunk is read from, (b, H, D)
     decoded: Tensor,
-    /// which entity is meant, if that is asked
-    pointed: Option<Pointed>,
+    /// of every candidate whether it is the entity that is meant, or of every cell whether the way goes there, if that is asked
+    scores: Option<Tensor>,
 }
 
 /// The model.
@@ -237,12 +289,21 @@ impl Actrm {
             Over::Tokens => {
                 let block = config.block_shape();
                 let layer = |i: usize| format!("reasoning.layers.{i}");
+                let blocks = 0..r.blocks() * r.n_layers;
                 Design::Tokens(OverTokens {
                     first_norm: LayerNorm::new(&mut p, "reasoning.first_norm", dim, rng)?,
                     // a step begins as a small change of what tokens say: after six large ones nothing of it was left
-                    layers: (0..r.blocks() * r.n_layers)
-                        .map(|i| EncoderLayer::new(&mut p, &layer(i), block, LayerInit::Recursive, rng))
-                        .collect::<Result<_>>()?,
+                    layers: match &r.grid {
+                        None => TokenLayers::Attention(
+                            blocks
+                                .map(|i| EncoderLayer::new(&mut p, &layer(i), block, LayerInit::Recursive, rng))
+                                .collect::<Result<_>>()?,
+                        ),
+                        Some(grid) => TokenLayers::Grid(
+                            Cells::new(&mut p, grid, ("actrm", &layout), dim, rng)?,
+                            blocks.map(|i| GridLayer::new(&mut p, &layer(i), block, rng)).collect::<Result<_>>()?,
+                        ),
+                    },
                     norm: LayerNorm::new(&mut p, "reasoning.norm", dim, rng)?,
                     decoder: decoder(&mut p, config, rng)?,
                     pointer: match &config.pointer {
@@ -319,7 +380,7 @@ impl Actrm {
 
     /// What a carry says.
     fn answer(&self, memory: &Tensor, carry: Carry, mode: &mut Mode<'_>) -> Result<Step> {
-        let (mut pointed, mut read) = (None, carry.answer.clone());
+        let (mut scores, mut read, mut carry) = (None, carry.answer.clone(), carry);
         let decoded = match &self.design {
             Design::Actions(_) => {
                 read = carry.reasoning.clone();
@@ -331,12 +392,17 @@ impl Actrm {
             }
             Design::Tokens(design) => {
                 read = design.norm.forward(&carry.answer)?;
+                if let TokenLayers::Grid(cells, _) = &design.layers {
+                    scores = cells.way(&read)?;
+                    carry = Carry { answer: read.clone(), reasoning: read.clone() };
+                }
                 // tokens have brought their positions along
                 let nowhere = self.tokens.positions()?.zeros_like()?;
                 match &design.pointer {
                     Some(pointer) => {
-                        let which = pointed.insert(pointer.forward(&read, memory)?);
-                        let (beside, pos) = pointer.beside(&read, &nowhere, which)?;
+                        let which = pointer.forward(&read, memory)?;
+                        let (beside, pos) = pointer.beside(&read, &nowhere, &which)?;
+                        scores = Some(which.scores);
                         design.decoder.forward(&beside, &pos, mode)?
                     }
                     None => design.decoder.forward(&read, &nowhere, mode)?,
@@ -346,7 +412,7 @@ impl Actrm {
         let chunk = self.action_head.forward(&decoded)?;
         // the head judges the reasoning and must not bend it
         let halt_logit = self.halt_head.forward(&read.detach().mean(1)?)?.squeeze(1)?;
-        Ok(Step { carry, chunk, halt_logit, decoded, pointed })
+        Ok(Step { carry, chunk, halt_logit, decoded, scores })
     }
 
     /// `l_cycles` updates of the reasoning, one of the answer.
@@ -374,11 +440,23 @@ impl Actrm {
                 answer = settle(update(&(&answer + &reasoning)?)?);
             }
             Design::Tokens(design) => {
-                let layers = &design.layers[self.config.reasoning.layers_of(at)];
-                let nowhere = self.tokens.positions()?.zeros_like()?;
-                for _ in 0..self.config.reasoning.l_cycles {
-                    for layer in layers {
-                        answer = layer.forward(&answer, &nowhere, None, &mut Mode::Eval)?;
+                let of_step = self.config.reasoning.layers_of(at);
+                match &design.layers {
+                    TokenLayers::Attention(layers) => {
+                        let nowhere = self.tokens.positions()?.zeros_like()?;
+                        for layer in (0..self.config.reasoning.l_cycles).flat_map(|_| &layers[of_step.clone()]) {
+                            answer = layer.forward(&answer, &nowhere, None, &mut Mode::Eval)?;
+                        }
+                    }
+                    TokenLayers::Grid(cells, layers) => {
+                        if at > 0 {
+                            answer = (answer + memory)?;
+                        }
+                        let mut x = cells.of(&answer)?;
+                        for layer in (0..self.config.reasoning.l_cycles).flat_map(|_| &layers[of_step.clone()]) {
+                            x = layer.forward(cells.grid, &x)?;
+                        }
+                        answer = cells.put(&answer, &x)?;
                     }
                 }
                 reasoning = answer.clone();
@@ -407,6 +485,18 @@ impl Actrm {
         };
         let total: f64 = (0..steps).map(weight).sum();
         (0..steps).map(|i| weight(i) / total).collect()
+    }
+
+    /// What is asked of a batch beside the actions, and the weight of the loss on it.
+    fn question(&self, batch: &Batch) -> Result<Option<(Question, f64)>> {
+        let Design::Tokens(design) = &self.design else { return Ok(None) };
+        Ok(match (&design.pointer, &design.layers) {
+            (Some(pointer), _) => Some((Question::Taken(pointer.asked("actrm", batch)?), pointer.weight)),
+            (None, TokenLayers::Grid(cells, _)) => {
+                cells.asked("actrm", batch)?.map(|visited| (Question::Visited(visited), cells.weight))
+            }
+            _ => None,
+        })
     }
 
     fn check_inputs(&self, observation: &Features<Tensor>) -> Result<usize> {
@@ -528,7 +618,7 @@ impl PolicyModel for Actrm {
         }
 
         let steps = self.steps_of(batch);
-        let (mut chunks, mut halts, mut pointed) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut chunks, mut halts, mut scores) = (Vec::new(), Vec::new(), Vec::new());
         for at in 0..steps {
             let step = self.step(&memory, &carry, at, &mut Mode::Train(rng))?;
             carry = match self.config.reasoning.over {
@@ -537,7 +627,7 @@ impl PolicyModel for Actrm {
             };
             chunks.push(step.chunk);
             halts.push(step.halt_logit);
-            pointed.extend(step.pointed);
+            scores.extend(step.scores);
         }
         // one step more, so that the last depth has a halting target as well
         let beyond = self.step(&memory.detach(), &carry.detach(), steps, &mut Mode::Eval)?.chunk.detach();
@@ -561,14 +651,14 @@ impl PolicyModel for Actrm {
         }
         row_errors.push(errors(&beyond)?.sum((1, 2))?);
 
-        if let Design::Tokens(OverTokens { pointer: Some(pointer), .. }) = &self.design {
-            let asked = pointer.asked("actrm", batch)?;
-            for (pointed, weight) in pointed.iter().zip(self.step_weights(steps)) {
-                let (loss, right) = (asked.loss(&pointed.scores)?, asked.right(&pointed.scores)?);
-                parts.insert("pointer_loss".to_string(), loss.detach());
-                parts.entry("pointer_right_first".to_string()).or_insert_with(|| right.clone());
-                parts.insert("pointer_right".to_string(), right);
-                total = (total + (loss * (weight * pointer.weight))?)?;
+        if let Some((question, share)) = self.question(batch)? {
+            let name = question.name();
+            for (scores, weight) in scores.iter().zip(self.step_weights(steps)) {
+                let (loss, right) = (question.loss(scores)?, question.right(scores)?);
+                parts.insert(format!("{name}_loss"), loss.detach());
+                parts.entry(format!("{name}_right_first")).or_insert_with(|| right.clone());
+                parts.insert(format!("{name}_right"), right);
+                total = (total + (loss * (weight * share))?)?;
             }
         }
 
@@ -615,9 +705,16 @@ impl PolicyModel for Actrm {
         }
         let (dim, memory, horizon) = (config.dim_model, layout.len(), config.action_horizon);
         let block = Shape { hidden: config.block_feedforward(), ..config.shape() };
-        if r.over == Over::Tokens {
+        if let Design::Tokens(design) = &self.design {
             let read = memory + usize::from(config.pointer.is_some());
-            let layers = flops::encoder_layer(block, memory) * (r.l_cycles * r.n_layers) as f64;
+            let layer = match &design.layers {
+                TokenLayers::Attention(_) => flops::encoder_layer(block, memory),
+                TokenLayers::Grid(cells, _) => {
+                    let cells = cells.grid.cells();
+                    flops::linear(cells, NEIGHBOURS * dim, dim) + flops::dense(block, cells)
+                }
+            };
+            let layers = layer * (r.l_cycles * r.n_layers) as f64;
             let decoder = flops::decoder_layer(config.shape(), horizon, read) * config.n_decoder_layers as f64;
             let step = layers + decoder + flops::linear(horizon, dim, self.signature.action_dim);
             return Some(flops::tokens(layout, config.latent_dim, dim) + step * r.max_steps() as f64);

@@ -8,13 +8,13 @@ mod over_tokens;
 #[cfg(test)]
 mod tests;
 
-use super::{Actrm, Design, Over, OverTokens as TokenLayers, WarmStart};
+use super::{Actrm, Over, Question, WarmStart};
 use crate::batch::Batch;
 use crate::error::Result;
 use crate::features::Features;
-use crate::fused::{AbsoluteError, Data, Grads, Inputs, Pass, Pointed, Tokens, Vae, inputs, with_weights};
+use crate::fused::{AbsoluteError, Data, Grads, Inputs, Pass, Tokens, Vae, inputs, with_weights};
 use crate::gradients::Gradients;
-use crate::layers::{Asked, Shape};
+use crate::layers::Shape;
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
 use crate::values::with_values;
@@ -58,7 +58,7 @@ impl<T> Step<T> {
 struct AnswerGrad {
     /// (b, H, A)
     chunk: Vec<f32>,
-    /// of a pointer's scores, (b, candidates), if it is asked
+    /// of the scores of what is asked beside the actions, (b, candidates or cells)
     scores: Option<Vec<f32>>,
 }
 
@@ -72,8 +72,8 @@ trait Recursion<'m>: Sized {
     /// Supervision step number `at`, from 0.
     fn step(&self, pass: &mut Pass<'_>, carry: &Carry, at: usize) -> Step<Self::Trace>;
 
-    /// What a step points at.
-    fn pointed(_: &Step<Self::Trace>) -> Option<&Pointed> {
+    /// What a step says to what is asked beside the actions, (b, candidates or cells).
+    fn scores(_: &Step<Self::Trace>) -> Option<&[f32]> {
         None
     }
 
@@ -134,12 +134,7 @@ impl Actrm {
         let batch = &self.looked_at(batch, rng)?;
         let data = Data::of(batch, self.tokens.layout())?;
         let steps = self.steps_of(batch);
-        let asked = match &self.design {
-            Design::Tokens(TokenLayers { pointer: Some(pointer), .. }) => {
-                Some((pointer.asked("actrm", batch)?, pointer.weight))
-            }
-            _ => None,
-        };
+        let asked = self.question(batch)?;
         let asked = asked.as_ref();
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
@@ -161,11 +156,11 @@ impl Actrm {
         })
     }
 
-    /// One shard, forwards and backwards; what a pointer is asked, and the weight of that.
+    /// One shard, forwards and backwards; what is asked beside the actions, and the weight of that.
     fn supervise<'m, R: Recursion<'m>>(
         &'m self,
         pass: &mut Pass<'_>,
-        (data, asked): (&Data, Option<&(Asked, f64)>),
+        (data, asked): (&Data, Option<&(Question, f64)>),
         steps: usize,
         grads: &mut Grads<'_>,
     ) -> LossValues {
@@ -216,16 +211,17 @@ impl Actrm {
             loss.parts.insert("l1_loss".to_string(), l1);
             loss.parts.entry("l1_loss_first".to_string()).or_insert(l1);
             errors.push(error);
-            let pointed = asked.zip(R::pointed(step)).map(|((asked, share), pointed)| {
-                let (mut grad, share) = (pass.take(pointed.scores.len()), weight * share);
-                let answers = asked.answers(&pointed.scores, Some((&mut grad, share)));
+            let scores = asked.zip(R::scores(step)).map(|((question, share), scores)| {
+                let (mut grad, share) = (pass.take(scores.len()), weight * share);
+                let answers = question.answers(scores, Some((&mut grad, share)));
+                let name = question.name();
                 loss.total += (answers.loss * share) as f32;
-                loss.parts.insert("pointer_loss".to_string(), answers.loss as f32);
-                loss.parts.entry("pointer_right_first".to_string()).or_insert(answers.right);
-                loss.parts.insert("pointer_right".to_string(), answers.right);
+                loss.parts.insert(format!("{name}_loss"), answers.loss as f32);
+                loss.parts.entry(format!("{name}_right_first")).or_insert(answers.right);
+                loss.parts.insert(format!("{name}_right"), answers.right);
                 grad
             });
-            answer_grads.push(AnswerGrad { chunk: grad, scores: pointed });
+            answer_grads.push(AnswerGrad { chunk: grad, scores });
         }
         errors.push(AbsoluteError::of(&beyond.chunk, &data.actions, &data.is_pad, rows, None));
         R::forget(pass, beyond).free(pass);

@@ -2,16 +2,18 @@
 
 use super::{AnswerGrad, Carry, Recursion, Step, mean_over_tokens, shaped};
 use crate::fused::{
-    Decoder, DecoderGrads, EncoderLayer, Grads, Memory, Norm, Pass, Pointed, PointerGrads, Tokens, positions_backward,
-    slot,
+    Decoder, DecoderGrads, EncoderLayer, Grads, GridLayer, Memory, Norm, Pass, Pointed, PointerGrads, Tokens, cells_of,
+    positions_backward, put_cells, slot,
 };
 use crate::kernels::add;
-use crate::layers::Pointer;
-use crate::models::actrm::{Actrm, Config, Design, OverTokens as Layers};
+use crate::layers::{Cells, Pointer, WAY};
+use crate::models::actrm::{Actrm, Config, Design, TokenLayers};
 
 pub(super) struct OverTokens<'m> {
     config: &'m Config,
     pointer: Option<&'m Pointer>,
+    /// of a grid, if the recursion goes over one
+    cells: Option<&'m Cells>,
     rows: usize,
     /// of the tokens before the first step
     first_norm: Norm,
@@ -26,13 +28,25 @@ pub(super) struct OverTokens<'m> {
     read_pos: Vec<f32>,
 }
 
+/// What the way of a grid is read off, (b, cells, D), and what it says, (b, cells).
+struct Way {
+    read: Vec<f32>,
+    scores: Vec<f32>,
+}
+
+/// `l_cycles` times those of the block.
+enum Layers {
+    Attention(Vec<EncoderLayer>),
+    Grid(Vec<GridLayer>),
+}
+
 pub(super) struct Trace {
     /// whether the step began with what was observed
     first: bool,
-    /// `l_cycles` times those of the block
-    layers: Vec<EncoderLayer>,
+    layers: Layers,
     norm: Norm,
     pointed: Option<Pointed>,
+    way: Option<Way>,
     /// what the decoder reads, (b, M, D) or (b, M + 1, D)
     read: Vec<f32>,
     decoder: Decoder,
@@ -40,12 +54,51 @@ pub(super) struct Trace {
     decoded: Vec<f32>,
 }
 
+impl OverTokens<'_> {
+    /// The layers of step `at` on all tokens, (b, M, D), by attention.
+    fn attend(&self, pass: &mut Pass<'_>, at: usize, x: &mut Vec<f32>) -> Layers {
+        let r = &self.config.reasoning;
+        let mut layers = Vec::with_capacity(r.l_cycles * r.n_layers);
+        shaped(pass, self.config.block_shape(), |pass| {
+            for i in (0..r.l_cycles).flat_map(|_| r.layers_of(at)) {
+                let (name, before) = (format!("reasoning.layers.{i}"), std::mem::take(x));
+                let (after, layer) = EncoderLayer::forward(pass, name, before, &self.nowhere, None, false);
+                *x = after;
+                layers.push(layer);
+            }
+        });
+        Layers::Attention(layers)
+    }
+
+    /// The same on the cells of a grid, from neighbour to neighbour; the other tokens stay.
+    fn spread(&self, pass: &mut Pass<'_>, at: usize, cells: &Cells, x: &mut [f32]) -> Layers {
+        let r = &self.config.reasoning;
+        let mut layers = Vec::with_capacity(r.l_cycles * r.n_layers);
+        let mut own = cells_of(pass, cells.grid, x, self.rows);
+        shaped(pass, self.config.block_shape(), |pass| {
+            for i in (0..r.l_cycles).flat_map(|_| r.layers_of(at)) {
+                let name = format!("reasoning.layers.{i}");
+                let (after, layer) = GridLayer::forward(pass, name, cells.grid, std::mem::take(&mut own));
+                own = after;
+                layers.push(layer);
+            }
+        });
+        put_cells(pass.shape.dim, cells.grid, x, &own);
+        pass.give(own);
+        Layers::Grid(layers)
+    }
+}
+
 impl<'m> Recursion<'m> for OverTokens<'m> {
     type Trace = Trace;
 
     fn observe(model: &'m Actrm, pass: &mut Pass<'_>, tokens: &Tokens<'_>, rows: usize) -> Self {
-        let Design::Tokens(Layers { pointer, .. }) = &model.design else { unreachable!("asked for by the design") };
-        let (config, pointer, pos) = (&model.config, pointer.as_ref(), tokens.positions(pass).into_owned());
+        let Design::Tokens(design) = &model.design else { unreachable!("asked for by the design") };
+        let (config, pointer, pos) = (&model.config, design.pointer.as_ref(), tokens.positions(pass).into_owned());
+        let cells = match &design.layers {
+            TokenLayers::Grid(cells, _) => Some(cells),
+            TokenLayers::Attention(_) => None,
+        };
         let mut x = tokens.forward(pass);
         x.chunks_exact_mut(pos.len()).for_each(|sequence| add(sequence, &pos));
         let (memory, first_norm) = Norm::forward(pass, "reasoning.first_norm", &x);
@@ -68,25 +121,21 @@ impl<'m> Recursion<'m> for OverTokens<'m> {
             Some(_) => Pointed::positions(pass, &nowhere),
             None => pass.space.pool.copy(&nowhere),
         };
-        Self { config, pointer, rows, first_norm, memory, memory_grad, noisy, nowhere, read_pos }
+        Self { config, pointer, cells, rows, first_norm, memory, memory_grad, noisy, nowhere, read_pos }
     }
 
     fn step(&self, pass: &mut Pass<'_>, carry: &Carry, at: usize) -> Step<Trace> {
-        let r = &self.config.reasoning;
         let begun = self.noisy.as_ref().unwrap_or(&self.memory);
         let mut x = pass.space.pool.copy(carry.answer.as_ref().unwrap_or(begun));
-        let mut layers = Vec::with_capacity(r.l_cycles * r.n_layers);
-        shaped(pass, self.config.block_shape(), |pass| {
-            for _ in 0..r.l_cycles {
-                for i in r.layers_of(at) {
-                    let before = std::mem::take(&mut x);
-                    let name = format!("reasoning.layers.{i}");
-                    let (after, layer) = EncoderLayer::forward(pass, name, before, &self.nowhere, None, false);
-                    x = after;
-                    layers.push(layer);
+        let layers = match self.cells {
+            None => self.attend(pass, at, &mut x),
+            Some(cells) => {
+                if at > 0 {
+                    add(&mut x, &self.memory);
                 }
+                self.spread(pass, at, cells, &mut x)
             }
-        });
+        };
         let (mut read, norm) = Norm::forward(pass, "reasoning.norm", &x);
         let mean = mean_over_tokens(pass, &read, self.rows);
         let pointed = self.pointer.map(|pointer| {
@@ -94,17 +143,26 @@ impl<'m> Recursion<'m> for OverTokens<'m> {
             pass.give(std::mem::replace(&mut read, beside));
             pointed
         });
+        let way = self.cells.filter(|cells| cells.weight > 0.0).map(|cells| {
+            let read = cells_of(pass, cells.grid, &read, self.rows);
+            Way { scores: pass.linear(WAY, &read), read }
+        });
+        if self.cells.is_some() {
+            let under_norm = pass.space.pool.copy(&read);
+            pass.give(std::mem::replace(&mut x, under_norm));
+        }
         let query_pos = pass.weight("decoder_pos_embed", ".weight");
         let memory = Memory { x: &read, pos: &self.read_pos, batch: self.rows };
         let (decoded, decoder) = Decoder::forward(pass, self.config.n_decoder_layers, query_pos, memory);
         let chunk = pass.linear("action_head", &decoded);
         let carry_on = Carry { answer: Some(x), reasoning: None };
-        let trace = Trace { first: carry.answer.is_none(), layers, norm, pointed, read, decoder, decoded };
+        let trace = Trace { first: carry.answer.is_none(), layers, norm, pointed, way, read, decoder, decoded };
         Step { carry: carry_on, chunk, read: mean, trace }
     }
 
-    fn pointed(step: &Step<Trace>) -> Option<&Pointed> {
-        step.trace.pointed.as_ref()
+    fn scores(step: &Step<Trace>) -> Option<&[f32]> {
+        let pointed = step.trace.pointed.as_ref().map(|pointed| &pointed.scores);
+        pointed.or(step.trace.way.as_ref().map(|way| &way.scores)).map(Vec::as_slice)
     }
 
     fn backward(
@@ -116,7 +174,7 @@ impl<'m> Recursion<'m> for OverTokens<'m> {
         grads: &mut Grads<'_>,
     ) -> Carry {
         let Step { carry, chunk, read: mean, trace } = step;
-        let Trace { first, layers, norm, pointed, read, decoder, decoded } = trace;
+        let Trace { first, layers, norm, pointed, way, read, decoder, decoded } = trace;
         let dim = pass.shape.dim;
         let query_pos = pass.weight("decoder_pos_embed", ".weight");
         pass.linear_backward("action_head", &decoded, &answer_grad.chunk, dim, grads);
@@ -138,18 +196,56 @@ impl<'m> Recursion<'m> for OverTokens<'m> {
             pointed.backward(pass, pointer, &self.memory, of_answer, into, grads);
             pass.give(std::mem::replace(&mut read_grad, encoded));
         }
+        if let (Some(cells), Some(way)) = (self.cells, way) {
+            if let Some(scores) = &answer_grad.scores {
+                pass.linear_backward(WAY, &way.read, scores, dim, grads);
+                let of_cells = pass.linear_input(WAY, scores, dim);
+                let mut of_all = pass.space.pool.zeros(read_grad.len());
+                put_cells(dim, cells.grid, &mut of_all, &of_cells);
+                add(&mut read_grad, &of_all);
+                pass.give(of_cells);
+                pass.give(of_all);
+            }
+            pass.give(way.read);
+            pass.give(way.scores);
+        }
+        // over a grid the states go on under the norm, else before it
+        let (before, after) = match self.cells {
+            Some(_) => (carry_grad.answer, None),
+            None => (None, carry_grad.answer),
+        };
+        if let Some(later) = before {
+            add(&mut read_grad, &later);
+            pass.give(later);
+        }
         norm.backward(pass, "reasoning.norm", &mut read_grad, grads);
         let mut grad = read_grad;
-        if let Some(later) = carry_grad.answer {
+        if let Some(later) = after {
             add(&mut grad, &later);
             pass.give(later);
         }
-        shaped(pass, self.config.block_shape(), |pass| {
-            for layer in layers.into_iter().rev() {
-                let after = std::mem::take(&mut grad);
-                grad = layer.backward(pass, after, &self.nowhere, None, grads);
+        match (layers, self.cells) {
+            (Layers::Grid(layers), Some(cells)) => {
+                let mut of_cells = cells_of(pass, cells.grid, &grad, self.rows);
+                shaped(pass, self.config.block_shape(), |pass| {
+                    for layer in layers.into_iter().rev() {
+                        of_cells = layer.backward(pass, cells.grid, std::mem::take(&mut of_cells), grads);
+                    }
+                });
+                put_cells(dim, cells.grid, &mut grad, &of_cells);
+                pass.give(of_cells);
+                if !first {
+                    add(&mut self.memory_grad, &grad);
+                }
             }
-        });
+            (Layers::Attention(layers), _) => shaped(pass, self.config.block_shape(), |pass| {
+                for layer in layers.into_iter().rev() {
+                    let after = std::mem::take(&mut grad);
+                    grad = layer.backward(pass, after, &self.nowhere, None, grads);
+                }
+            }),
+            (Layers::Grid(_), None) => unreachable!("layers over a grid have one"),
+        }
         carry.free(pass);
         for buffer in [chunk, mean, read, decoded, pos_grad, query_grad] {
             pass.give(buffer);
@@ -164,12 +260,19 @@ impl<'m> Recursion<'m> for OverTokens<'m> {
 
     fn forget(pass: &mut Pass<'_>, step: Step<Trace>) -> Carry {
         let Step { carry, chunk, read: mean, trace } = step;
-        let Trace { first: _, layers, norm, pointed, read, decoder, decoded } = trace;
-        layers.into_iter().for_each(|layer| layer.free(pass));
+        let Trace { first: _, layers, norm, pointed, way, read, decoder, decoded } = trace;
+        match layers {
+            Layers::Attention(layers) => layers.into_iter().for_each(|layer| layer.free(pass)),
+            Layers::Grid(layers) => layers.into_iter().for_each(|layer| layer.free(pass)),
+        }
         norm.free(pass);
         decoder.free(pass);
         if let Some(pointed) = pointed {
             pointed.free(pass);
+        }
+        if let Some(way) = way {
+            pass.give(way.read);
+            pass.give(way.scores);
         }
         for buffer in [chunk, mean, read, decoded] {
             pass.give(buffer);

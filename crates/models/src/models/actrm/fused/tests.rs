@@ -5,13 +5,14 @@ use crate::fused::testing::{
     Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
-use crate::layers::{Activation, PointerConfig};
+use crate::layers::{Activation, GridConfig, PointerConfig};
 use crate::models::actrm::{Config, ReasoningConfig, WarmStart};
 use crate::simd::{Level, at_most};
 
 /// Odd sizes in all designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
 fn configs() -> Vec<(Config, Signature, usize)> {
-    let Signatures { plain, no_env, entities, history, .. } = signatures();
+    let Signatures { plain, no_env, entities, history, grid, .. } = signatures();
+    let cells = |way| Some(GridConfig { among: "cell".to_string(), columns: 3, way });
     let base = Config {
         action_horizon: 5,
         dim_model: 12,
@@ -56,6 +57,9 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         (tokens(true, &|r| (r.start_noise, r.deep_supervision) = (0.7, false)), entities.clone(), 3),
         (Config { n_decoder_layers: 2, ..tokens(false, &|r| r.dim_feedforward = Some(7)) }, history.clone(), 2),
         (Config { use_vae: false, ..tokens(true, &|r| r.n_layers = 2) }, entities.clone(), 2),
+        (tokens(false, &|r| (r.grid, r.l_cycles) = (cells(0.9), 2)), grid.clone(), 3),
+        (tokens(false, &|r| (r.grid, r.untied, r.n_layers) = (cells(0.3), true, 2)), grid.clone(), 2),
+        (Config { use_vae: false, ..tokens(false, &|r| (r.grid, r.start_noise) = (cells(0.0), 0.4)) }, grid, 4),
         (memory(&|r| r.supervision_steps = 2), entities, 2),
         (memory(&|_| ()), history, 2),
         (
@@ -90,7 +94,7 @@ fn model(config: &Config, signature: &Signature) -> Actrm {
 /// With pictures, in all designs; their network has too many kinks for slopes.
 fn seeing() -> Vec<(Config, Signature, usize)> {
     let all = configs();
-    let plain = |config: &Config| config.use_vae && config.pointer.is_none();
+    let plain = |config: &Config| config.use_vae && config.pointer.is_none() && config.reasoning.grid.is_none();
     let of = |over: Over| all.iter().find(|(config, ..)| config.reasoning.over == over && plain(config));
     let designs = [Over::Actions, Over::Memory, Over::Tokens].into_iter().filter_map(of);
     designs.map(|(config, ..)| (Config { vision: Some(eyes()), ..config.clone() }, signatures().pictures, 2)).collect()

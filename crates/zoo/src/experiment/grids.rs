@@ -1,0 +1,107 @@
+//! `[data.grids]`: observation keys that tell something of every cell of a grid; each cell is an entity.
+//!
+//! ```toml
+//! [data.grids.cell]
+//! keys = ["maze_walls", "maze_goal", "peg_cell"]
+//! rows = 10
+//! columns = 10
+//! visited = "peg_cell"
+//! ```
+//!
+//! Every key has a number for each cell, row by row. The entities are `cell00` to `cell99`, of group `cell`.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::{DataSection, EntitySection};
+use crate::ZooError;
+
+/// The most cells: more tokens than any policy here should have.
+const MOST_CELLS: usize = 4096;
+
+/// One grid of `[data.grids]`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GridSection {
+    /// Observation keys with a number for each cell.
+    pub keys: Vec<String>,
+    /// Rows of cells.
+    pub rows: usize,
+    /// Cells of a row.
+    pub columns: usize,
+    /// Whether every cell gets a learned position of its own.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub position: bool,
+    /// The key of them that is 1 where the hand is, so that a demonstration shows which cells it comes by.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub visited: Option<String>,
+}
+
+impl GridSection {
+    /// How many cells it has.
+    pub fn cells(&self) -> usize {
+        self.rows.saturating_mul(self.columns)
+    }
+
+    /// What a key says of cell number `cell`, as an item of a list of keys.
+    pub fn item(key: &str, cell: usize) -> String {
+        format!("{key}[{cell}:{}]", cell + 1)
+    }
+
+    /// The cells of the grid `name` as entities, in order.
+    fn entities(&self, name: &str) -> impl Iterator<Item = (String, EntitySection)> {
+        let digits = self.cells().saturating_sub(1).to_string().len();
+        (0..self.cells()).map(move |cell| {
+            let keys = self.keys.iter().map(|key| Self::item(key, cell)).collect();
+            let entity = EntitySection { keys, group: Some(name.to_owned()), position: self.position };
+            (format!("{name}{cell:0digits$}"), entity)
+        })
+    }
+
+    fn check(&self, name: &str) -> Result<(), ZooError> {
+        let invalid = |key: &str, expected: &str, found: String| {
+            let key = format!("data.grids.{name}.{key}");
+            Err(ZooError::InvalidValue { key, expected: expected.to_owned(), found })
+        };
+        if !(1..=MOST_CELLS).contains(&self.cells()) {
+            let found = format!("{} x {}", self.rows, self.columns);
+            return invalid("rows", &format!("1 to {MOST_CELLS} cells"), found);
+        }
+        if self.keys.is_empty() {
+            return invalid("keys", "at least one key", "none".to_owned());
+        }
+        if let Some(key) = self.keys.iter().find(|key| key.contains('[') || key.contains(" - ")) {
+            return invalid("keys", "whole keys", format!("`{key}`"));
+        }
+        match self.visited.as_ref().filter(|key| !self.keys.contains(key)) {
+            Some(key) => invalid("visited", &format!("one of {}", self.keys.join(", ")), format!("`{key}`")),
+            None => Ok(()),
+        }
+    }
+}
+
+impl DataSection {
+    /// Adds the entities that the grids make. A resolved experiment has them already.
+    ///
+    /// # Errors
+    /// A grid that cannot be one, an entity of another kind under a cell's name.
+    pub(super) fn with_cells(mut self) -> Result<Self, ZooError> {
+        let mut made: BTreeMap<String, EntitySection> = BTreeMap::new();
+        for (name, grid) in &self.grids {
+            grid.check(name)?;
+            made.extend(grid.entities(name));
+        }
+        for (name, entity) in made {
+            if let Some(other) = self.entities.get(&name).filter(|other| **other != entity) {
+                return Err(ZooError::InvalidValue {
+                    key: format!("data.entities.{name}"),
+                    expected: format!("the cell that data.grids makes: {}", entity.keys.join(", ")),
+                    found: other.keys.join(", "),
+                });
+            }
+            self.entities.insert(name, entity);
+        }
+        Ok(self)
+    }
+}
