@@ -1,17 +1,29 @@
 //! Lists of observation keys, as experiments and conversions name them.
 //!
-//! An item of a list is a key (`cube_pos`), a part of one (`goal_rgb[0:3]`), or the difference of two of those
+//! An item of a list is a key (`cube_pos`), a part of one (`goal_rgb[0:3]`), either as it was at the first step of the
+//! episode (`first(goal_rgb)`, `first(goal_rgb)[0:3]`: what is remembered), or the difference of two of those
 //! (`cube_pos - robot0_eef_pos`). The same item gives the same numbers whether it is read out of a file or out of a
 //! simulator: values become f32 first.
 
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::fmt;
 use std::str::FromStr;
+
+/// When a key is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Moment {
+    /// at the step that is asked about
+    Now,
+    /// at the first step of its episode
+    First,
+}
 
 /// A key, or some of its numbers.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Term {
     key: String,
+    moment: Moment,
     /// the numbers from the first to before the second
     range: Option<(usize, usize)>,
 }
@@ -19,17 +31,32 @@ struct Term {
 impl Term {
     fn parse(text: &str) -> Result<Self, String> {
         let text = text.trim();
+        if let Some((key, rest)) = text.strip_prefix("first(").and_then(|inside| inside.split_once(')')) {
+            // what stands behind is read as behind any other key
+            let plain = !key.is_empty() && !key.contains(['(', '[', ']']) && (rest.is_empty() || rest.starts_with('['));
+            let term = plain.then(|| Self::parse(&format!("{key}{rest}")));
+            return Ok(Self { moment: Moment::First, ..term.ok_or("first(key) or first(key)[from:to]")?? });
+        }
+        let moment = Moment::Now;
         let Some(open) = text.find('[') else {
-            let good = !text.is_empty() && !text.contains(']');
-            return good.then(|| Self { key: text.to_owned(), range: None }).ok_or_else(|| "a key".to_owned());
+            let good = !text.is_empty() && !text.contains([']', '(', ')']);
+            return good.then(|| Self { key: text.to_owned(), moment, range: None }).ok_or_else(|| "a key".to_owned());
         };
         let range = text[open + 1..].strip_suffix(']').and_then(|inside| inside.split_once(':'));
         let numbers = range.and_then(|(a, b)| Some((a.trim().parse().ok()?, b.trim().parse().ok()?)));
         match numbers {
             Some((from, to)) if from < to && open > 0 => {
-                Ok(Self { key: text[..open].to_owned(), range: Some((from, to)) })
+                Ok(Self { key: text[..open].to_owned(), moment, range: Some((from, to)) })
             }
             _ => Err("key[from:to] with from below to".to_owned()),
+        }
+    }
+
+    /// The key with when it is read, without the part.
+    fn whole(&self) -> Cow<'_, str> {
+        match self.moment {
+            Moment::Now => Cow::Borrowed(&self.key),
+            Moment::First => Cow::Owned(format!("first({})", self.key)),
         }
     }
 
@@ -52,8 +79,8 @@ impl Term {
 impl fmt::Display for Term {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.range {
-            None => f.write_str(&self.key),
-            Some((from, to)) => write!(f, "{}[{from}:{to}]", self.key),
+            None => f.write_str(&self.whole()),
+            Some((from, to)) => write!(f, "{}[{from}:{to}]", self.whole()),
         }
     }
 }
@@ -85,17 +112,22 @@ impl KeyItem {
         }
     }
 
-    /// Appends its numbers to `out`, where `values_of` gives the numbers of a key; `None`, with nothing appended, if a key
+    /// Whether it remembers how an episode began.
+    pub fn remembers(&self) -> bool {
+        std::iter::once(&self.plus).chain(&self.minus).any(|term| term.moment == Moment::First)
+    }
+
+    /// Appends its numbers to `out`, where `values_of` gives the numbers of a key at a moment; `None`, with nothing appended, if a key
     /// is not there.
     ///
     /// # Panics
     /// If a key has fewer numbers than when the width was asked for.
-    pub fn append<'v>(&self, values_of: impl Fn(&str) -> Option<&'v [f32]>, out: &mut Vec<f32>) -> Option<()> {
-        let plus = self.plus.of(values_of(&self.plus.key)?);
+    pub fn append<'v>(&self, values_of: impl Fn(&str, Moment) -> Option<&'v [f32]>, out: &mut Vec<f32>) -> Option<()> {
+        let plus = self.plus.of(values_of(&self.plus.key, self.plus.moment)?);
         match &self.minus {
             None => out.extend_from_slice(plus),
             Some(minus) => {
-                let minus = minus.of(values_of(&minus.key)?);
+                let minus = minus.of(values_of(&minus.key, minus.moment)?);
                 out.extend(plus.iter().zip(minus).map(|(a, b)| a - b));
             }
         }
@@ -122,7 +154,7 @@ impl KeyItem {
             _ => 0,
         };
         let (whole, base) = match &self.minus {
-            None => (self.plus.range.is_none(), self.plus.key.clone()),
+            None => (self.plus.range.is_none(), self.plus.whole().into_owned()),
             Some(_) => (true, self.to_string()),
         };
         (0..width).map(move |i| match width {
@@ -178,8 +210,9 @@ mod tests {
         text.parse().unwrap()
     }
 
-    fn values(key: &str) -> Option<&'static [f32]> {
+    fn values(key: &str, moment: Moment) -> Option<&'static [f32]> {
         match key {
+            "a" if moment == Moment::First => Some(&[0.5, 0.6, 0.7]),
             "a" => Some(&[1.0, 2.0, 3.0]),
             "b" => Some(&[10.0, 20.0, 30.0, 40.0]),
             "one" => Some(&[7.0]),
@@ -189,7 +222,7 @@ mod tests {
 
     fn read(text: &str) -> Result<Vec<f32>, String> {
         let item = item(text);
-        let width = item.width(|key| values(key).map(<[f32]>::len))?;
+        let width = item.width(|key| values(key, Moment::Now).map(<[f32]>::len))?;
         let mut out = Vec::new();
         item.append(values, &mut out).unwrap();
         assert_eq!((out.len(), item.names(width).count()), (width, width));
@@ -202,6 +235,10 @@ mod tests {
         assert_eq!(read("b[1:3]").unwrap(), [20.0, 30.0]);
         assert_eq!(read("b[0:3] - a").unwrap(), [9.0, 18.0, 27.0]);
         assert_eq!(read("a[2:3] - one").unwrap(), [-4.0]);
+        assert_eq!(read("first(a)").unwrap(), [0.5, 0.6, 0.7]);
+        assert_eq!(read("a[0:2] - first(a)[0:2]").unwrap(), [0.5, 1.4]);
+        assert!(item("a - first(a)").remembers() && !item("a").remembers());
+        assert_eq!(item("first(b)[1:3]").keys().collect::<Vec<_>>(), ["b"]);
         assert_eq!(item("b[1:3] - a[0:2]").keys().collect::<Vec<_>>(), ["b", "a"]);
     }
 
@@ -210,7 +247,7 @@ mod tests {
         assert_eq!(read("b[2:5]").unwrap_err(), "b[2:5]: b has 4 numbers");
         assert_eq!(read("b - a").unwrap_err(), "b - a: 4 numbers minus 3");
         assert_eq!(read("a - c").unwrap_err(), "a - c: no c");
-        for bad in ["", "a[", "a[1]", "a[3:3]", "[0:2]", "a - ", "a]"] {
+        for bad in ["", "a[", "a[1]", "a[3:3]", "[0:2]", "a - ", "a]", "first()", "first(a", "first(a[0:1])", "first(a)b", "last(a)"] {
             let message = bad.parse::<KeyItem>().unwrap_err();
             assert!(message.starts_with(&format!("`{bad}`: expected ")), "{message}");
         }
@@ -218,7 +255,7 @@ mod tests {
 
     #[test]
     fn items_are_written_as_they_are_read() {
-        for text in ["a", "b[1:3]", "b[0:3] - a"] {
+        for text in ["a", "b[1:3]", "b[0:3] - a", "first(a)", "b[0:1] - first(a)[1:2]"] {
             assert_eq!(item(text).to_string(), text);
             assert_eq!(serde_json::from_str::<KeyItem>(&format!("\"{text}\"")).unwrap(), item(text));
         }
@@ -230,6 +267,8 @@ mod tests {
         listed[4] = "c_1".to_owned();
         assert_eq!(KeyItem::widths(&items, &listed), None);
         assert_eq!(names("a", 3), ["a_0", "a_1", "a_2"]);
+        assert_eq!(names("first(one)", 1), ["first(one)"]);
+        assert_eq!(names("first(b)[1:3]", 2), ["first(b)_1", "first(b)_2"]);
         assert_eq!(names("one", 1), ["one"]);
         assert_eq!(names("b[1:3]", 2), ["b_1", "b_2"]);
         assert_eq!(names("b[1:2]", 1), ["b_1"]);

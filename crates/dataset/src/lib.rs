@@ -27,7 +27,7 @@ mod tree;
 mod windows;
 
 pub use error::{DatasetError, InputError, Result};
-pub use keys::KeyItem;
+pub use keys::{KeyItem, Moment};
 pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset,
     ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info,

@@ -8,7 +8,7 @@ use models::{ENVIRONMENT_STATE, Observation, STATE, Values};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use rollout::{Control, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder};
+use rollout::{Control, Initial, Observations, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder};
 use zoo::FeatureKeys;
 use zoo::evaluation::Environment;
 use zoo::experiment::DataSection;
@@ -24,6 +24,8 @@ pub(crate) struct Simulator {
     ready: Ready,
     keys: FeatureKeys,
     pool: Mutex<Option<Pool>>,
+    /// what the episode began with
+    first: Mutex<Option<Observations>>,
 }
 
 #[pymethods]
@@ -74,7 +76,7 @@ impl Simulator {
             Ok((keys, pool))
         };
         let (keys, pool) = interruptible(py, |_, _| start(), |()| Ok(()))??;
-        Ok(Self { ready: pool.ready().clone(), keys, pool: Mutex::new(Some(pool)) })
+        Ok(Self { ready: pool.ready().clone(), keys, pool: Mutex::new(Some(pool)), first: Mutex::new(None) })
     }
 
     /// Begins the episode of `seed`: the observation, and what is known of the episode.
@@ -85,7 +87,9 @@ impl Simulator {
         info.set_item("seed", seed)?;
         info.set_item("fingerprint", fingerprint)?;
         info.set_item("group", group)?;
-        Ok((self.seen(py, &self.keys.observe(&observations))?, info))
+        let seen = self.seen(py, &self.keys.observe(&observations, &observations))?;
+        *self.first() = Some(observations);
+        Ok((seen, info))
     }
 
     /// Executes an action, clipped to its limits: the observation, the reward, whether the task is done, and in a word
@@ -99,7 +103,8 @@ impl Simulator {
         let action = self.executable(&shape, &values)?;
         let Stepped { rewards, success, failure, observations, .. } =
             unlocked(py, || self.worker(|worker| worker.step(&[action]).map_err(raised)))?;
-        Ok((self.seen(py, &self.keys.observe(&observations))?, rewards.iter().sum(), success, failure))
+        let seen = self.keys.observe(&observations, self.first().as_ref().unwrap_or(&observations));
+        Ok((self.seen(py, &seen)?, rewards.iter().sum(), success, failure))
     }
 
     /// A picture of the present state: (height, width, 3), uint8.
@@ -178,6 +183,10 @@ impl Simulator {
 }
 
 impl Simulator {
+    fn first(&self) -> MutexGuard<'_, Option<Observations>> {
+        self.first.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn lock(&self) -> MutexGuard<'_, Option<Pool>> {
         self.pool.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use dataset::KeyItem;
+use dataset::{KeyItem, Moment};
 use models::{Observation, Values};
 use rollout::{Observations, Ready};
 use serde::{Deserialize, Serialize};
@@ -57,13 +57,22 @@ impl FeatureKeys {
         self.0.get(feature).into_iter().flatten().map(|item| item.width(width_of)).sum()
     }
 
-    /// The observation of a step. A feature of which a key is missing is left out.
-    pub fn observe(&self, observations: &Observations) -> Observation {
-        let read: BTreeMap<&str, Vec<f32>> = self
-            .keys()
-            .filter_map(|key| Some((key, observations.get(key)?.iter().map(|&value| value as f32).collect())))
-            .collect();
-        let values_of = |key: &str| read.get(key).map(Vec::as_slice);
+    /// Whether it is remembered how an episode began.
+    pub fn remember(&self) -> bool {
+        self.0.values().flatten().any(KeyItem::remembers)
+    }
+
+    /// The observation of a step, of an episode that began with `first`. A feature of which a key is missing is left out.
+    pub fn observe(&self, observations: &Observations, first: &Observations) -> Observation {
+        let read = |observations: &Observations| -> BTreeMap<&str, Vec<f32>> {
+            let of = |key| Some((key, observations.get(key)?.iter().map(|&value| value as f32).collect()));
+            self.keys().filter_map(of).collect()
+        };
+        let (now, begun) = (read(observations), if self.remember() { read(first) } else { BTreeMap::new() });
+        let values_of = |key: &str, moment: Moment| {
+            let read = if moment == Moment::First { &begun } else { &now };
+            read.get(key).map(Vec::as_slice)
+        };
         let feature = |items: &Vec<KeyItem>| {
             let mut values = Vec::new();
             items.iter().try_for_each(|item| item.append(values_of, &mut values))?;
@@ -93,11 +102,14 @@ mod tests {
         keys.insert("observation.entity.thing", &["b[1:2]".into(), "a - c".into()]).unwrap();
         keys.insert("observation.entity.gone", &["a".into(), "d".into()]).unwrap();
         let observations = [("a", vec![1.0]), ("b", vec![2.0, 3.0]), ("c", vec![4.0])];
-        let seen = keys.observe(&observations.map(|(key, values)| (key.to_owned(), values)).into());
+        keys.insert("observation.entity.kept", &["a".into(), "first(b)[0:1]".into()]).unwrap();
+        let first = [("b", vec![9.0, 8.0])].map(|(key, values)| (key.to_owned(), values)).into();
+        let seen = keys.observe(&observations.map(|(key, values)| (key.to_owned(), values)).into(), &first);
         let numbers = |name: &str| seen.get(name).cloned();
         assert_eq!(numbers(STATE), Some(vec![2.0, 3.0, 1.0].into()));
         assert_eq!(numbers(ENVIRONMENT_STATE), Some(vec![4.0].into()));
         assert_eq!(numbers("observation.entity.thing"), Some(vec![3.0, -3.0].into()));
+        assert_eq!(numbers("observation.entity.kept"), Some(vec![1.0, 9.0].into()));
         assert_eq!(numbers("observation.entity.gone"), None);
     }
 

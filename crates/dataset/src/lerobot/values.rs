@@ -3,7 +3,7 @@
 use super::features::{Column, IndexColumn, Mapping, Origin};
 use super::info::RotationForm;
 use crate::error::{DatasetError, InputError, Result};
-use crate::keys::KeyItem;
+use crate::keys::{KeyItem, Moment};
 use crate::rotation;
 use crate::stats::FeatureStats;
 use crate::tree::{Array, Demo};
@@ -153,8 +153,9 @@ fn concat(
             datasets.push((key, width, numbers(path, demo, &format!("obs/{key}"), width, length)?));
         }
         for (step, out) in out.chunks_exact_mut(width).enumerate() {
-            let values_of = |key: &str| {
+            let values_of = |key: &str, moment: Moment| {
                 let (_, width, values) = datasets.iter().find(|(name, ..)| *name == key)?;
+                let step = if moment == Moment::First { 0 } else { step };
                 Some(&values[step * width..(step + 1) * width])
             };
             row.clear();

@@ -13,13 +13,15 @@ use crate::FeatureKeys;
 pub struct PolicyAgent {
     actor: Box<dyn Actor>,
     keys: FeatureKeys,
+    /// what the episode began with, if that is remembered
+    first: Option<Observations>,
     perturbed: Option<(Perturbation, Signature)>,
 }
 
 impl PolicyAgent {
     /// `actor`, shown the features that `keys` make of the observations.
     pub fn new(actor: Box<dyn Actor>, keys: FeatureKeys) -> Self {
-        Self { actor, keys, perturbed: None }
+        Self { actor, keys, first: None, perturbed: None }
     }
 
     /// The same with pictures of the policy's `signature` changed.
@@ -29,8 +31,11 @@ impl PolicyAgent {
         self
     }
 
-    fn observe(&self, observations: &Observations) -> Observation {
-        let mut seen = self.keys.observe(observations);
+    fn observe(&mut self, observations: &Observations) -> Observation {
+        if self.first.is_none() && self.keys.remember() {
+            self.first = Some(observations.clone());
+        }
+        let mut seen = self.keys.observe(observations, self.first.as_ref().unwrap_or(observations));
         if let Some((perturbation, signature)) = &self.perturbed {
             perturbation.apply(signature, &mut seen);
         }
@@ -50,6 +55,7 @@ impl Agent for PolicyAgent {
     }
 
     fn reset(&mut self, seed: u64) {
+        self.first = None;
         self.actor.reset(seed);
     }
 }

@@ -123,7 +123,8 @@ impl Subject<'_> {
 
     /// The pictures that a policy sees of an observation, side by side, each pixel as a square of `scale`; `None` without any.
     pub(super) fn seen(&self, observations: &Observations, scale: usize) -> Option<Image> {
-        let mut seen = self.keys.observe(observations);
+        // pictures are not remembered
+        let mut seen = self.keys.observe(observations, observations);
         if let Some(perturbation) = &self.perturbation {
             perturbation.apply(&self.signature, &mut seen);
         }

@@ -32,7 +32,8 @@ pub fn starts(keys: &FeatureKeys, pool: &mut Pool, seeds: &[u64]) -> Result<Opti
     let seed_of = |job: u64| seeds[usize::try_from(job).expect("a job is an index of seeds")];
     let work = |(): &mut (), worker: &mut Worker, job: u64| {
         let seed = seed_of(job);
-        Ok(Start { seed, observation: keys.observe(&worker.reset(seed)?.observations) })
+        let begun = worker.reset(seed)?.observations;
+        Ok(Start { seed, observation: keys.observe(&begun, &begun) })
     };
     let (mut found, mut failure) = (Vec::new(), None);
     pool.run(0..seeds.len() as u64, &seed_of, &|| Ok(()), &work, &mut |_, result| match result {
