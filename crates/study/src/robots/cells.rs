@@ -78,6 +78,7 @@ mod tests {
             introduction: String::new(),
             results: "r".into(),
             page: "p".into(),
+            appendix: None,
             zoo: None,
             data: BTreeMap::new(),
             arms: BTreeMap::new(),

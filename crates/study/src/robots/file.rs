@@ -22,6 +22,9 @@ pub struct Study {
     pub results: PathBuf,
     /// The page.
     pub page: PathBuf,
+    /// A page whose text stands at the end of this one, in Markdown.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub appendix: Option<PathBuf>,
     /// A zoo that gets the entries, named as families are (`stack-act-s1`), and their evaluations; where none is given they stay
     /// in the study's own folder, under the names of its cells.
     #[serde(default, skip_serializing_if = "Option::is_none")]

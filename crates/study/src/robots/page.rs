@@ -91,10 +91,25 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
         });
         text.push('\n');
     }
+    if let Some(appendix) = &study.appendix {
+        let page = std::fs::read_to_string(appendix).map_err(ZooError::io("read", appendix))?;
+        text.push_str(&one_level_down(&page));
+    }
     while text.ends_with("\n\n") {
         text.pop();
     }
     Ok(text)
+}
+
+/// A page as a part of another one: its headings a level lower.
+fn one_level_down(page: &str) -> String {
+    let mut code = false;
+    let line = |line: &str| {
+        code ^= line.starts_with("```");
+        let mark = if line.starts_with('#') && !code { "#" } else { "" };
+        format!("{mark}{line}\n")
+    };
+    page.lines().map(line).collect()
 }
 
 /// Arms against demonstrations, where an arm was meant for several: success on the first test of each.
