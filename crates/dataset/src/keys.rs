@@ -247,7 +247,20 @@ mod tests {
         assert_eq!(read("b[2:5]").unwrap_err(), "b[2:5]: b has 4 numbers");
         assert_eq!(read("b - a").unwrap_err(), "b - a: 4 numbers minus 3");
         assert_eq!(read("a - c").unwrap_err(), "a - c: no c");
-        for bad in ["", "a[", "a[1]", "a[3:3]", "[0:2]", "a - ", "a]", "first()", "first(a", "first(a[0:1])", "first(a)b", "last(a)"] {
+        for bad in [
+            "",
+            "a[",
+            "a[1]",
+            "a[3:3]",
+            "[0:2]",
+            "a - ",
+            "a]",
+            "first()",
+            "first(a",
+            "first(a[0:1])",
+            "first(a)b",
+            "last(a)",
+        ] {
             let message = bad.parse::<KeyItem>().unwrap_err();
             assert!(message.starts_with(&format!("`{bad}`: expected ")), "{message}");
         }

@@ -240,6 +240,7 @@ fn policy(keys: &Keys) -> Result<PolicyConfig> {
                 n_layers: rnn.num_layers,
                 n_modes: gmm.num_modes,
                 min_std: gmm.min_std,
+                vision: None,
             })
         }
         Some(t) => {
@@ -256,6 +257,7 @@ fn policy(keys: &Keys) -> Result<PolicyConfig> {
                 dropout: t.emb_dropout,
                 n_modes: gmm.num_modes,
                 min_std: gmm.min_std,
+                vision: None,
             })
         }
     };

@@ -8,7 +8,9 @@ use models::{ENVIRONMENT_STATE, Observation, STATE, Values};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use rollout::{Control, Initial, Observations, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder};
+use rollout::{
+    Control, Initial, Observations, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder,
+};
 use zoo::FeatureKeys;
 use zoo::evaluation::Environment;
 use zoo::experiment::DataSection;

@@ -72,7 +72,13 @@ impl GridLayer {
     }
 
     /// grad: that of the output -> that of x
-    pub(crate) fn backward(self, pass: &mut Pass<'_>, grid: Grid, mut grad: Vec<f32>, grads: &mut Grads<'_>) -> Vec<f32> {
+    pub(crate) fn backward(
+        self,
+        pass: &mut Pass<'_>,
+        grid: Grid,
+        mut grad: Vec<f32>,
+        grads: &mut Grads<'_>,
+    ) -> Vec<f32> {
         let Self { prefix, y1, residual1, y2, ff, residual2 } = self;
         let (norm1, norm2, conv) = (format!("{prefix}.norm1"), format!("{prefix}.norm2"), format!("{prefix}.conv"));
 

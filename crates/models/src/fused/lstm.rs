@@ -82,8 +82,14 @@ impl Lstm {
         Self { prefix, rows, hidden, layers, output }
     }
 
-    /// grad: that of the output, (T, b, H).
-    pub(crate) fn backward(self, pass: &mut Pass<'_>, mut grad: Vec<f32>, grads: &mut Grads<'_>) {
+    /// grad: that of the output, (T, b, H) -> that of x, (T, b, in), if it is `wanted`.
+    pub(crate) fn backward(
+        self,
+        pass: &mut Pass<'_>,
+        mut grad: Vec<f32>,
+        wanted: bool,
+        grads: &mut Grads<'_>,
+    ) -> Option<Vec<f32>> {
         let Self { prefix, rows, hidden, layers, mut output } = self;
         let size = rows * hidden;
         for (l, Layer { input, gates: mut of_gates, cells }) in layers.into_iter().enumerate().rev() {
@@ -117,7 +123,7 @@ impl Lstm {
             }
             column_sums(slot(grads, &name("bias_ih"), ""), &of_gates);
             column_sums(slot(grads, &name("bias_hh"), ""), &of_gates);
-            if l > 0 {
+            if l > 0 || wanted {
                 let mut below = pass.take(input.len());
                 let (a, w) = (Mat::rows(&of_gates, wide), Mat::rows(of_input, width));
                 product((cells.len() / hidden, width, wide), a, w, Start::Zero, &mut below, &mut pass.space.pack);
@@ -130,7 +136,11 @@ impl Lstm {
             pass.give(std::mem::replace(&mut output, input));
         }
         pass.give(output);
+        if wanted {
+            return Some(grad);
+        }
         pass.give(grad);
+        None
     }
 }
 

@@ -282,7 +282,8 @@ mod tests {
             for (tap, at) in grid.neighbours(cell).enumerate() {
                 if let Some(at) = at {
                     let w = layer.conv.weight.narrow(1, tap * 4, 4).unwrap();
-                    sum = (sum + w.matmul(&y.narrow(0, at, 1).unwrap().t().unwrap()).unwrap().squeeze(1).unwrap()).unwrap();
+                    sum = (sum + w.matmul(&y.narrow(0, at, 1).unwrap().t().unwrap()).unwrap().squeeze(1).unwrap())
+                        .unwrap();
                 }
             }
             let after = (x.squeeze(0).unwrap().narrow(0, cell, 1).unwrap() + sum.unsqueeze(0).unwrap()).unwrap();

@@ -17,6 +17,7 @@ mod mixture;
 mod pointer;
 mod position;
 mod sight;
+mod steps;
 mod tokens;
 mod transformer;
 mod vae;
@@ -39,6 +40,7 @@ pub use pointer::PointerConfig;
 pub(crate) use pointer::{Answers, Asked, Pointed, Pointer};
 pub use position::sinusoid_table;
 pub(crate) use sight::Sight;
+pub(crate) use steps::Steps;
 pub(crate) use tokens::{
     Cameras, ENTITY_POSITIONS, FEATURE_POSITIONS, InputTokens, LATENT, Position, TokenLayout, environment_state,
 };

@@ -58,6 +58,11 @@ impl Sight {
         self.steps * self.cameras.tokens * self.config().cell_features()
     }
 
+    /// The same cameras and network, of one step.
+    pub(crate) fn one_step(&self) -> OneStep<'_> {
+        OneStep(self)
+    }
+
     /// A camera's pictures one after the other, (b, …) or (b, steps, …) -> (b*steps, …)
     fn unfolded(&self, pictures: &Tensor) -> Result<Tensor> {
         Ok(if self.steps > 1 { pictures.flatten(0, 1)? } else { pictures.clone() })
@@ -87,9 +92,30 @@ impl Sight {
         Ok(tokens.reshape(((), self.width()))?)
     }
 
+    /// Pictures of one step, in order -> (b, numbers of a step)
+    fn tokens(&self, pictures: &[Tensor]) -> Result<Tensor> {
+        Ok(self.encoder.forward(pictures)?.reshape(((), self.width() / self.steps))?)
+    }
+
     /// The pictures of an observation that was looked at as slices, (b*steps, H, W, 3) a camera.
     pub(crate) fn pictures(&self, observation: &Features<Tensor>) -> Result<Vec<Vec<f32>>> {
         let names = self.cameras.features.iter();
         names.map(|name| with_values(observation.require("see", name)?, <[f32]>::to_vec)).collect()
+    }
+}
+
+/// Cameras that see a single step, whatever the history is.
+pub(crate) struct OneStep<'a>(&'a Sight);
+
+impl OneStep<'_> {
+    /// Pictures as the data has them, (b, H, W, 3) or (b, 1, H, W, 3) a camera -> (b, numbers of a step)
+    pub(crate) fn forward(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        let mut looked = Vec::with_capacity(self.0.cameras.features.len());
+        for (i, name) in self.0.cameras.features.iter().enumerate() {
+            let pictures = observation.require("see", name)?;
+            let pictures = if pictures.rank() == 5 { pictures.squeeze(1)? } else { pictures.clone() };
+            looked.push(self.0.encoder.look(i, &pictures, None)?);
+        }
+        self.0.tokens(&looked)
     }
 }

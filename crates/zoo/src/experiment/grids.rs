@@ -105,3 +105,68 @@ impl DataSection {
         Ok(self)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::config::Library;
+    use crate::experiment::Experiment;
+
+    fn data(grid: GridSection) -> DataSection {
+        DataSection { grids: BTreeMap::from([("cell".to_owned(), grid)]), ..DataSection::default() }
+    }
+
+    fn grid() -> GridSection {
+        let keys = vec!["walls".to_owned(), "peg".to_owned()];
+        GridSection { keys, rows: 3, columns: 4, position: true, visited: Some("peg".to_owned()) }
+    }
+
+    #[test]
+    fn every_cell_is_an_entity_and_its_names_sort_as_the_cells_lie() {
+        let with = data(grid()).with_cells().unwrap();
+        let names: Vec<&str> = with.entities.keys().map(String::as_str).collect();
+        assert_eq!((names.len(), names[0], names[10], names[11]), (12, "cell00", "cell10", "cell11"));
+        let last = &with.entities["cell11"];
+        assert_eq!(last.keys, ["walls[11:12]", "peg[11:12]"]);
+        assert!(last.position && last.group_of("cell11") == "cell");
+        // what was resolved is read again as it is
+        assert_eq!(with.clone().with_cells().unwrap(), with);
+        let mut other = with;
+        other.grids.get_mut("cell").unwrap().position = false;
+        let error = other.with_cells().unwrap_err().to_string();
+        assert!(error.contains("data.entities.cell00"), "{error}");
+    }
+
+    #[test]
+    fn what_cannot_be_a_grid_is_named() {
+        let error = |change: &dyn Fn(&mut GridSection)| {
+            let mut grid = grid();
+            change(&mut grid);
+            data(grid).with_cells().unwrap_err().to_string()
+        };
+        assert!(error(&|g| g.rows = 0).contains("data.grids.cell.rows"));
+        assert!(error(&|g| g.rows = usize::MAX).contains("1 to 4096 cells"));
+        assert!(error(&|g| g.keys.clear()).contains("data.grids.cell.keys"));
+        assert!(error(&|g| g.keys[0] = "walls[0:12]".to_owned()).contains("`walls[0:12]`"));
+        assert!(error(&|g| g.visited = Some("hand".to_owned())).contains("one of walls, peg"));
+    }
+
+    #[test]
+    fn a_policy_over_a_grid_needs_its_columns_and_what_was_visited() {
+        let library = Library::embedded();
+        let load = |set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|s| (*s).to_owned()).collect();
+            Experiment::load(&library, "actrm_tablemaze", &set)
+        };
+        let experiment = load(&[]).unwrap();
+        assert_eq!(experiment.asked_grid().map(|(name, grid, key)| (name, grid.cells(), key)), Some(("cell", 100, "peg_cell")));
+        // a saved experiment is read again as it is
+        assert_eq!(Experiment::from_toml("saved", &experiment.to_toml()).unwrap(), experiment);
+        let error = |set: &[&str]| load(set).unwrap_err().to_string();
+        assert!(error(&["policy.reasoning.grid.columns=5"]).contains("policy.reasoning.grid.columns"));
+        assert!(error(&["policy.reasoning.grid.among='hole'"]).contains("policy.reasoning.grid.among"));
+        let mute = load(&["policy.reasoning.grid.way=0.0"]).unwrap();
+        assert!(mute.asked_grid().is_none());
+    }
+}

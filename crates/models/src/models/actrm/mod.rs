@@ -62,9 +62,9 @@ use crate::flops;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
-    Answers, Asked, Cells, Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, GridLayer, InputTokens,
-    LayerInit, LayerNorm, Linear, Mode, MultiHeadAttention, NEIGHBOURS, Pointer, Shape, TokenLayout, Vae, Visited, environment_state,
-    kl_divergence, sample, sinusoid_table,
+    Answers, Asked, Cells, Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, GridLayer,
+    InputTokens, LayerInit, LayerNorm, Linear, Mode, MultiHeadAttention, NEIGHBOURS, Pointer, Shape, TokenLayout, Vae,
+    Visited, environment_state, kl_divergence, sample, sinusoid_table,
 };
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};

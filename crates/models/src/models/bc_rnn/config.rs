@@ -1,5 +1,6 @@
 //! BC-RNN's options.
 
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
@@ -19,11 +20,14 @@ pub struct Config {
     pub n_modes: usize,
     /// least deviation of a Gaussian in training
     pub min_std: f64,
+    /// how pictures are seen, if there are any
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<VisionConfig>,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { action_horizon: 10, hidden_dim: 400, n_layers: 2, n_modes: 5, min_std: 1e-4 }
+        Self { action_horizon: 10, hidden_dim: 400, n_layers: 2, n_modes: 5, min_std: 1e-4, vision: None }
     }
 }
 

@@ -5,6 +5,7 @@ use crate::batch::Batch;
 use crate::error::Result;
 use crate::fused::{Lstm, Pass, Wanted, likelihood, with_weights};
 use crate::gradients::Gradients;
+use crate::kernels::add;
 use crate::layers::{Activation, Shape};
 use crate::model::{LossValues, PolicyModel};
 use crate::values::with_values;
@@ -12,8 +13,8 @@ use std::collections::BTreeMap;
 
 /// A shard of sequences, step by step, without the padding that they begin with.
 struct Sequences {
-    /// (T, b, everything of a step)
-    x: Vec<f32>,
+    /// of each step and row the place in the batch that it comes from, row by row: (T, b)
+    from: Vec<usize>,
     /// (T, b, A)
     actions: Vec<f32>,
     /// (T, b)
@@ -22,22 +23,15 @@ struct Sequences {
 
 impl Sequences {
     fn of(model: &BcRnn, batch: &Batch) -> Result<Self> {
-        let (rows, steps) = (batch.rows(), model.config.action_horizon);
-        let values = |t: &candle_core::Tensor| with_values(t, <[f32]>::to_vec);
-        let specs = &model.signature.observation;
-        let features: Vec<(Vec<f32>, usize)> = specs
-            .iter()
-            .map(|spec| Ok((values(batch.observation.require("bc_rnn", &spec.name)?)?, spec.width())))
-            .collect::<Result<_>>()?;
-        let (actions, is_pad, wide) = (values(&batch.actions)?, values(&batch.is_pad)?, model.signature.action_dim);
-        let mut all = Self { x: Vec::new(), actions: Vec::new(), real: Vec::new() };
+        let (rows, steps, wide) = (batch.rows(), model.config.action_horizon, model.signature.action_dim);
+        let (actions, is_pad) =
+            (with_values(&batch.actions, <[f32]>::to_vec)?, with_values(&batch.is_pad, <[f32]>::to_vec)?);
+        let mut all = Self { from: Vec::new(), actions: Vec::new(), real: Vec::new() };
         for step in 0..steps {
             for (row, (from, real)) in (0..rows).map(|row| (row, beginnings(&is_pad[row * steps..][..steps], step))) {
                 let at = row * steps + from;
-                for (values, width) in &features {
-                    all.x.extend_from_slice(&values[at * width..][..*width]);
-                }
                 all.actions.extend_from_slice(&actions[at * wide..][..wide]);
+                all.from.push(at);
                 all.real.push(real);
             }
         }
@@ -46,9 +40,11 @@ impl Sequences {
 }
 
 impl BcRnn {
-    /// Loss of a batch, and its gradients added to `into`.
+    /// Loss of a batch whose pictures were looked at, and its gradients added to `into`.
     pub(super) fn fused_gradients(&self, batch: &Batch, into: &mut Gradients) -> Result<LossValues> {
-        let Sequences { x, actions, real } = Sequences::of(self, batch)?;
+        let Sequences { from, actions, real } = Sequences::of(self, batch)?;
+        let numbers = with_values(&self.steps.numbers(batch.rows(), &batch.observation)?, <[f32]>::to_vec)?;
+        let pictures = self.steps.pictures(&batch.observation)?;
         let (config, rows) = (&self.config, batch.rows());
         let hidden = config.hidden_dim;
         let shape =
@@ -57,13 +53,26 @@ impl BcRnn {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass { weights, shape, space, rng: None, packed: None, on_seen: None };
                 let grads = &mut into.views();
-                // of the pool, to which the layers give it back
-                let x = pass.space.pool.copy(&x);
+                let (seen, looked) = self.steps.see(pass, rows, &numbers, pictures.as_deref());
+                let width = self.steps.width();
+                let mut x = pass.take(seen.len());
+                for (x, &from) in x.chunks_exact_mut(width).zip(&from) {
+                    x.copy_from_slice(&seen[from * width..][..width]);
+                }
+                pass.give(seen);
                 let rnn = Lstm::forward(pass, "rnn", (config.n_layers, hidden), x, rows);
                 let wanted = Wanted { actions: &actions, real: &real, total: batch.total_valid_steps };
                 let modes = (config.n_modes, config.min_std);
                 let (loss, grad) = likelihood(pass, "decoder", modes, &rnn.output, &wanted, grads);
-                rnn.backward(pass, grad, grads);
+                if let Some(of_x) = rnn.backward(pass, grad, self.steps.learns(), grads) {
+                    let mut of_seen = pass.space.pool.zeros(of_x.len());
+                    for (of_x, &from) in of_x.chunks_exact(width).zip(&from) {
+                        add(&mut of_seen[from * width..][..width], of_x);
+                    }
+                    self.steps.learn(pass, looked, &of_seen, grads);
+                    pass.give(of_seen);
+                    pass.give(of_x);
+                }
                 let parts = [("nll", loss.nll), ("l1_loss", loss.l1)];
                 let parts = parts.map(|(name, value)| (name.to_string(), value as f32));
                 LossValues { total: loss.nll as f32, parts: BTreeMap::from(parts) }

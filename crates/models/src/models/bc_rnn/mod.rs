@@ -10,7 +10,7 @@
 //!
 //! Deviations: a sequence of training ends with a window's frame and is shorter at the beginning of an episode, where
 //! robomimic's begins with a frame and repeats the last of the episode, both in the loss; a step has the same share in the
-//! loss either way. No goals, no open loop, no GRU. The means lie in -1 to 1, so that actions have to be normalised by their
+//! loss either way. Pictures become the cells of `[policy.vision]`'s feature map behind a step's numbers (robomimic: keypoints). No goals, no open loop, no GRU. The means lie in -1 to 1, so that actions have to be normalised by their
 //! range (`normalisation.action = "min_max"`).
 //!
 //! What it costs: one product a step and layer for the recurrence, one a layer for all that comes from below; the cell is by
@@ -27,11 +27,12 @@ pub use config::Config;
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::device::HERE;
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Observation, Signature};
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
-use crate::layers::{Lstm, LstmState, Mixture, MixtureHead};
+use crate::layers::{Lstm, LstmState, Mixture, MixtureHead, Steps};
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
 use crate::params::Params;
@@ -43,7 +44,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
-pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+pub const READS: &[FeatureKind] =
+    &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
 
 /// The model.
 #[derive(Debug)]
@@ -51,6 +53,7 @@ pub struct BcRnn {
     config: Config,
     signature: Signature,
     params: Params,
+    steps: Steps,
     rnn: Lstm,
     head: MixtureHead,
     workspaces: Workspaces,
@@ -71,28 +74,19 @@ impl BcRnn {
         }
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
-        let width = signature.observation.iter().map(|spec| spec.width()).sum();
-        let rnn = Lstm::new(&mut p, "rnn", (width, config.hidden_dim, config.n_layers), rng)?;
+        let steps = Steps::new(&mut p, "bc_rnn", signature, config.vision.as_ref(), rng)?;
+        let rnn = Lstm::new(&mut p, "rnn", (steps.width(), config.hidden_dim, config.n_layers), rng)?;
         let sizes = (config.hidden_dim, config.n_modes, signature.action_dim);
         let head = MixtureHead::new(&mut p, "decoder", sizes, config.min_std, rng)?;
         Ok(Self {
             config: config.clone(),
             signature: signature.clone(),
             params: p,
+            steps,
             rnn,
             head,
             workspaces: Workspaces::default(),
         })
-    }
-
-    /// The signature's features, (b, T, …) each -> (b, T, everything of a step)
-    fn sequence(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
-        let mut joined = Vec::with_capacity(self.signature.observation.len());
-        for spec in &self.signature.observation {
-            let shape = (rows, self.signature.n_obs_steps, ());
-            joined.push(observation.require("bc_rnn", &spec.name)?.reshape(shape)?);
-        }
-        Ok(Tensor::cat(&joined, 2)?)
     }
 
     /// x: (b, T, D), from the state before it -> b*T mixtures
@@ -108,7 +102,7 @@ impl BcRnn {
     /// An observation that does not fit.
     pub fn mixtures(&self, observation: &Features<Tensor>) -> Result<Mixture> {
         let rows = check_observation("bc_rnn", &self.signature, observation)?;
-        self.forward(&self.sequence(rows, observation)?, &mut self.rnn.zero_state(rows)?)
+        self.forward(&self.steps.forward(rows, observation)?, &mut self.rnn.zero_state(rows)?)
     }
 }
 
@@ -153,19 +147,20 @@ impl PolicyModel for BcRnn {
         check_batch("bc_rnn", &self.signature, self.config.action_horizon, batch)?;
         match self.composed_because() {
             Some(_) => autograd(self, batch, rng, into),
-            None => self.fused_gradients(batch, into),
+            None => self.fused_gradients(&self.steps.looked_at(batch, rng)?, into),
         }
     }
 
-    fn loss(&self, batch: &Batch, _rng: &mut Rng) -> Result<LossParts> {
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         check_batch("bc_rnn", &self.signature, self.config.action_horizon, batch)?;
+        let batch = &self.steps.looked_at(batch, rng)?;
         let (rows, steps) = (batch.rows(), self.config.action_horizon);
         let (from, real) = real_first(&batch.is_pad)?;
         let moved = |x: &Tensor| -> Result<Tensor> {
             let width = x.dim(2)?;
             Ok(x.reshape((rows * steps, width))?.index_select(&from, 0)?)
         };
-        let x = moved(&self.sequence(rows, &batch.observation)?)?;
+        let x = moved(&self.steps.forward(rows, &batch.observation)?)?;
         let actions = moved(&batch.actions)?;
         let mixtures = self.forward(&x.reshape((rows, steps, ()))?, &mut self.rnn.zero_state(rows)?)?;
         let valid = batch.total_valid_steps.max(1) as f64;
@@ -188,8 +183,12 @@ impl PolicyModel for BcRnn {
         Ok(actions.reshape(((), self.config.action_horizon, self.signature.action_dim))?)
     }
 
-    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
-        Box::new(Recurrent { model: self, preprocess, state: None, steps: 0, rng: generator(0) })
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        Box::new(Recurrent { model: self, preprocess, state: None, steps: 0, rng: generator(0), clock, encoding: None })
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.steps.vision()
     }
 
     fn action_horizon(&self) -> usize {
@@ -204,6 +203,9 @@ struct Recurrent {
     state: Option<LstmState>,
     steps: usize,
     rng: Rng,
+    clock: Box<dyn Clock>,
+    /// until the last query's pictures were numbers, in milliseconds
+    encoding: Option<f64>,
 }
 
 fn generator(seed: u64) -> Rng {
@@ -213,10 +215,11 @@ fn generator(seed: u64) -> Rng {
 impl Policy for Recurrent {
     /// One action.
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
-        let model = &self.model;
+        let (model, begun) = (&self.model, self.clock.milliseconds());
         let seen = self.preprocess.observation(std::slice::from_ref(observation))?;
         // the same observation as often as a history is long: its last
-        let now = model.sequence(1, &seen)?.narrow(1, model.config.action_horizon - 1, 1)?;
+        let now = model.steps.last(&seen)?;
+        self.encoding = model.vision().map(|_| self.clock.milliseconds() - begun);
         let mut state = match self.state.take() {
             Some(state) if !self.steps.is_multiple_of(model.config.action_horizon) => state,
             _ => model.rnn.zero_state(1)?,
@@ -225,6 +228,10 @@ impl Policy for Recurrent {
         let state: LstmState = state.into_iter().map(|(h, c)| (h.detach(), c.detach())).collect();
         (self.state, self.steps) = (Some(state), self.steps + 1);
         self.preprocess.chunk(&mixture.sample(&mut self.rng)?.detach().unsqueeze(1)?)
+    }
+
+    fn encoding(&self) -> Option<f64> {
+        self.encoding
     }
 
     fn reset(&mut self, seed: u64) {

@@ -1,7 +1,9 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
+use crate::features::Values;
 use crate::fused::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients, move_parameters,
+    signatures,
 };
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::train::{TrainConfig, Trainer};
@@ -9,6 +11,16 @@ use candle_core::Device;
 
 fn small() -> Config {
     Config { action_horizon: 3, hidden_dim: 9, n_modes: 2, min_std: 0.05, ..Config::default() }
+}
+
+/// A clock that goes on by one whenever somebody looks.
+struct Ticks(f64);
+
+impl Clock for Ticks {
+    fn milliseconds(&mut self) -> f64 {
+        self.0 += 1.0;
+        self.0
+    }
 }
 
 /// A batch whose padding lies at the beginning of its rows, where windows with past actions have it.
@@ -47,6 +59,52 @@ fn the_step_by_hand_is_the_composed_one() {
     assert_the_step_is_the_composed_one(&model, &batch(&signature, 1, 4, 3), "one step");
 }
 
+/// What it sees of two cameras' pictures, a step after another.
+fn film() -> Signature {
+    Signature { n_obs_steps: 3, ..signatures().film }
+}
+
+#[test]
+fn from_pictures_the_step_by_hand_is_the_composed_one() {
+    for rows in [1, 4] {
+        let model = BcRnn::new(&Config { vision: Some(eyes()), ..small() }, &film(), 1).unwrap();
+        move_parameters(&model);
+        assert_the_step_is_the_composed_one(&model, &padded_before(&film(), rows), &format!("{rows} rows"));
+    }
+    let (signature, config) = (signatures().pictures, Config { action_horizon: 1, vision: Some(eyes()), ..small() });
+    let model = BcRnn::new(&config, &signature, 1).unwrap();
+    move_parameters(&model);
+    assert_the_step_is_the_composed_one(&model, &batch(&signature, 1, 2, 3), "one step");
+}
+
+#[test]
+fn from_pictures_the_policy_sees_one_step_at_a_time() {
+    let signature = film();
+    let modes = [STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
+    let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
+    let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser).unwrap());
+    let config = Config { n_modes: 1, vision: Some(eyes()), ..small() };
+    let model = Arc::new(BcRnn::new(&config, &signature, 1).unwrap());
+    let mut policy = Arc::clone(&model).policy(Arc::clone(&preprocess), Box::new(Ticks(0.0)));
+    let seen = |k: usize| {
+        let picture: Vec<u8> = (0..36 * 40 * 3).map(|i| ((i * 7 + k * 31) % 251) as u8).collect();
+        let mut observation = Observation::of_state(vec![k as f32 * 0.3, 1.0, -0.5], Vec::new());
+        observation.insert("a", Values::U8(picture));
+        observation
+    };
+    policy.reset(7);
+    for step in 0..5_usize {
+        let action = policy.predict(&seen(step)).unwrap();
+        assert_eq!(policy.encoding(), Some(1.0));
+        let from = step / 3 * 3;
+        let history: Vec<Observation> = (from..from + 3).map(seen).collect();
+        let whole = model.predict(&preprocess.observation(&history).unwrap()).unwrap().to_vec3::<f32>().unwrap();
+        for (got, want) in action.actions.iter().zip(&whole[0][step - from]) {
+            assert!((got - want).abs() < 1e-3, "step {step}: {got} {want}");
+        }
+    }
+}
+
 #[test]
 fn steps_need_no_more_memory_than_the_first() {
     let signature = signatures().history;
@@ -68,7 +126,7 @@ fn a_row_that_begins_with_padding_is_a_shorter_sequence() {
     let model = BcRnn::new(&small(), &signature, 1).unwrap();
     let batch = padded_before(&signature, 3);
     let (mut sum, mut count) = (0.0, 0);
-    let x = model.sequence(3, &batch.observation).unwrap();
+    let x = model.steps.forward(3, &batch.observation).unwrap();
     for row in 0..3 {
         // rows with 0, 1 and 2 steps of padding
         let own = x.narrow(0, row, 1).unwrap().narrow(1, row, 3 - row).unwrap();
@@ -96,6 +154,8 @@ fn the_policy_carries_its_state_and_begins_anew_after_its_horizon() {
         state: None,
         steps: 0,
         rng: generator(0),
+        clock: Box::new(Ticks(0.0)),
+        encoding: None,
     };
     let seen = |k: usize| Observation::of_state(vec![k as f32 * 0.3, 1.0, -0.5], vec![0.1 * k as f32, 2.0]);
     for seed in [7, 8] {

@@ -1,5 +1,6 @@
 //! BC-Transformer's options.
 
+use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
@@ -22,11 +23,23 @@ pub struct Config {
     pub n_modes: usize,
     /// least deviation of a Gaussian in training
     pub min_std: f64,
+    /// how pictures are seen, if there are any
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<VisionConfig>,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { action_horizon: 1, dim_model: 512, n_heads: 8, n_layers: 6, dropout: 0.1, n_modes: 5, min_std: 1e-4 }
+        Self {
+            action_horizon: 1,
+            dim_model: 512,
+            n_heads: 8,
+            n_layers: 6,
+            dropout: 0.1,
+            n_modes: 5,
+            min_std: 1e-4,
+            vision: None,
+        }
     }
 }
 

@@ -149,11 +149,12 @@ impl Block {
 }
 
 impl BcTransformer {
-    /// Loss of a batch, and its gradients added to `into`.
+    /// Loss of a batch whose pictures were looked at, and its gradients added to `into`.
     pub(super) fn fused_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
         let (config, rows) = (&self.config, batch.rows());
         let (dim, steps) = (config.dim_model, self.signature.n_obs_steps);
-        let seen = with_values(&self.sequence(rows, &batch.observation)?, <[f32]>::to_vec)?;
+        let numbers = with_values(&self.steps.numbers(rows, &batch.observation)?, <[f32]>::to_vec)?;
+        let pictures = self.steps.pictures(&batch.observation)?;
         let actions = with_values(&batch.actions, <[f32]>::to_vec)?;
         let shape = Shape {
             dim,
@@ -167,6 +168,7 @@ impl BcTransformer {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass { weights, shape, space, rng: Some(rng), packed: None, on_seen: None };
                 let grads = &mut into.views();
+                let (seen, looked) = self.steps.see(pass, rows, &numbers, pictures.as_deref());
                 let mut embedded = pass.linear("embed_encoder", &seen);
                 let positions = pass.weight("embed_timestep", "");
                 embedded.chunks_exact_mut(steps * dim).for_each(|x| add(x, positions));
@@ -207,7 +209,14 @@ impl BcTransformer {
                 drop_all(&mut grad, of_tokens);
                 embed_ln.backward(pass, "embed_ln", &mut grad, grads);
                 column_sums(slot(grads, "embed_timestep", ""), &grad);
-                pass.linear_backward("embed_encoder", &seen, &grad, seen.len() / (rows * steps), grads);
+                let width = self.steps.width();
+                pass.linear_backward("embed_encoder", &seen, &grad, width, grads);
+                if self.steps.learns() {
+                    let of_seen = pass.linear_input("embed_encoder", &grad, width);
+                    self.steps.learn(pass, looked, &of_seen, grads);
+                    pass.give(of_seen);
+                }
+                pass.give(seen);
                 pass.give(grad);
                 let parts = [("nll", loss.nll), ("l1_loss", loss.l1)];
                 let parts = parts.map(|(name, value)| (name.to_string(), value as f32));

@@ -6,7 +6,8 @@
 //! Before an episode has as many steps as the context, the first observation is repeated, there and here.
 //!
 //! Deviations: one dropout for tokens, attention and outputs; a window ends with its frame in the loss, where robomimic's may
-//! end with repeats of an episode's last one. No goals, no supervision of all steps, no sinusoidal positions. The means lie
+//! end with repeats of an episode's last one. Pictures become the cells of `[policy.vision]`'s feature map behind a step's
+//! numbers (robomimic: keypoints). No goals, no supervision of all steps, no sinusoidal positions. The means lie
 //! in -1 to 1, so that actions have to be normalised by their range (`normalisation.action = "min_max"`).
 //!
 //! What it costs: of the last block only the last step is computed beyond keys and values, because nothing else is read
@@ -22,11 +23,12 @@ use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::device::HERE;
+use crate::encoders::VisionConfig;
 use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
-use crate::layers::{Dropout, LayerNorm, Linear, Mixture, MixtureHead, Mode, masked_softmax};
+use crate::layers::{Dropout, LayerNorm, Linear, Mixture, MixtureHead, Mode, Steps, masked_softmax};
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::{Init, Params};
@@ -38,7 +40,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
-pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity];
+pub const READS: &[FeatureKind] =
+    &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
 
 /// The model.
 #[derive(Debug)]
@@ -46,6 +49,7 @@ pub struct BcTransformer {
     config: Config,
     signature: Signature,
     params: Params,
+    steps: Steps,
     embed_encoder: Linear,
     /// (1, T, D)
     embed_timestep: Tensor,
@@ -129,8 +133,8 @@ impl BcTransformer {
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
         let dim = config.dim_model;
-        let width = signature.observation.iter().map(|spec| spec.width()).sum();
-        let embed_encoder = Linear::new(&mut p, "embed_encoder", width, dim, rng)?;
+        let steps = Steps::new(&mut p, "bc_transformer", signature, config.vision.as_ref(), rng)?;
+        let embed_encoder = Linear::new(&mut p, "embed_encoder", steps.width(), dim, rng)?;
         let embed_timestep = p.create("embed_timestep", &[1, signature.n_obs_steps, dim], Init::Zeros, rng)?;
         let embed_ln = LayerNorm::new(&mut p, "embed_ln", dim, rng)?;
         let mut blocks = Vec::with_capacity(config.n_layers);
@@ -146,6 +150,7 @@ impl BcTransformer {
             config,
             signature,
             params: p,
+            steps,
             embed_encoder,
             embed_timestep,
             embed_ln,
@@ -157,24 +162,19 @@ impl BcTransformer {
         })
     }
 
-    /// The signature's features, (b, T, …) each -> (b, T, everything of a step)
-    fn sequence(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
-        let mut joined = Vec::with_capacity(self.signature.observation.len());
-        for spec in &self.signature.observation {
-            let shape = (rows, self.signature.n_obs_steps, ());
-            joined.push(observation.require("bc_transformer", &spec.name)?.reshape(shape)?);
-        }
-        Ok(Tensor::cat(&joined, 2)?)
-    }
-
     /// The signature's features, (b, T, …) each -> b mixtures, of the last step
     ///
     /// # Errors
     /// An observation that does not fit.
     pub fn mixtures(&self, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<Mixture> {
         let rows = check_observation("bc_transformer", &self.signature, observation)?;
+        self.mixtures_of(&self.steps.forward(rows, observation)?, mode)
+    }
+
+    /// The same of sequences, (b, T, everything of a step)
+    fn mixtures_of(&self, seen: &Tensor, mode: &mut Mode<'_>) -> Result<Mixture> {
         let steps = self.signature.n_obs_steps;
-        let x = self.embed_encoder.forward(&self.sequence(rows, observation)?)?.broadcast_add(&self.embed_timestep)?;
+        let x = self.embed_encoder.forward(seen)?.broadcast_add(&self.embed_timestep)?;
         let mut x = self.dropout.forward(&self.embed_ln.forward(&x)?, mode)?;
         let mask: Vec<f32> = (0..steps * steps).map(|i| if i % steps > i / steps { -1e30 } else { 0.0 }).collect();
         let mask = Tensor::from_vec(mask, (steps, steps), &HERE)?;
@@ -215,11 +215,12 @@ impl PolicyModel for BcTransformer {
 
     fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
         check_batch("bc_transformer", &self.signature, self.config.action_horizon, batch)?;
-        self.fused_gradients(batch, rng, into)
+        self.fused_gradients(&self.steps.looked_at(batch, rng)?, rng, into)
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         check_batch("bc_transformer", &self.signature, self.config.action_horizon, batch)?;
+        let batch = &self.steps.looked_at(batch, rng)?;
         self.loss_of(&self.mixtures(&batch.observation, &mut Mode::Train(rng))?, batch)
     }
 
@@ -229,11 +230,24 @@ impl PolicyModel for BcTransformer {
     }
 
     fn sample(&self, observation: &Features<Tensor>, rng: &mut Rng) -> Result<Tensor> {
-        Ok(self.mixtures(observation, &mut Mode::Eval)?.sample(rng)?.detach().unsqueeze(1)?)
+        self.sample_seen(observation, rng, &mut || {})
     }
 
-    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, _clock: Box<dyn Clock>) -> Box<dyn Policy> {
-        Box::new(ChunkPolicy::new(self, preprocess))
+    fn sample_seen(&self, observation: &Features<Tensor>, rng: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
+        let rows = check_observation("bc_transformer", &self.signature, observation)?;
+        let seen = self.steps.forward(rows, observation)?;
+        if self.steps.learns() {
+            on_seen();
+        }
+        Ok(self.mixtures_of(&seen, &mut Mode::Eval)?.sample(rng)?.detach().unsqueeze(1)?)
+    }
+
+    fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
+        Box::new(ChunkPolicy::new(self, preprocess).with_clock(clock))
+    }
+
+    fn vision(&self) -> Option<&VisionConfig> {
+        self.steps.vision()
     }
 
     fn action_horizon(&self) -> usize {
@@ -246,7 +260,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::fused::testing::{
-        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
     };
     use crate::train::{TrainConfig, Trainer};
 
@@ -265,6 +279,23 @@ mod tests {
             move_parameters(&model);
             let what = format!("{n_layers} layers, dropout {dropout}");
             assert_the_step_is_the_composed_one(&model, &batch(signature, 1, 7, 3), &what);
+        }
+    }
+
+    #[test]
+    fn from_pictures_the_step_by_hand_is_the_composed_one() {
+        let of = signatures();
+        for signature in [&of.pictures, &of.film] {
+            let config = Config { vision: Some(eyes()), dropout: 0.2, ..small() };
+            let model = BcTransformer::new(&config, signature, 1).unwrap();
+            move_parameters(&model);
+            let batch = batch(signature, 1, 3, 3);
+            assert_the_step_is_the_composed_one(&model, &batch, &format!("{} steps", signature.n_obs_steps));
+            let (mut seen, rng) = (0, &mut Rng::new(0, "drawn"));
+            let first = model.sample_seen(&batch.observation, rng, &mut || seen += 1).unwrap();
+            let again = model.sample(&batch.observation, &mut Rng::new(0, "drawn")).unwrap();
+            let off = (first - again).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+            assert_eq!((off, seen), (0.0, 1));
         }
     }
 
