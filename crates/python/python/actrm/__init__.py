@@ -71,8 +71,8 @@ def convert(
         there is a bar where somebody can see it.
     state_keys, env_keys: observation keys of `observation.state` and `observation.environment_state`; those of the
         file's layout unless given.
-    entities: by name the observation keys of `observation.entity.<name>`; parts (`key[0:3]`) and differences (`a - b`)
-        of keys may stand in the lists.
+    entities: by name the observation keys of `observation.entity.<name>`; parts (`key[0:3]`), differences (`a - b`) and
+        what an episode began with (`first(key)`) may stand in the lists.
     fps: frames a second; the control frequency that the file states unless given.
     images: how pictures are stored.
     actions: as the controller got them, or absolute poses.

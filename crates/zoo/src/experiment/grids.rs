@@ -154,7 +154,7 @@ mod tests {
 
     #[test]
     fn a_policy_over_a_grid_needs_its_columns_and_what_was_visited() {
-        let library = Library::embedded();
+        let library = Library::built_in();
         let load = |set: &[&str]| {
             let set: Vec<String> = set.iter().map(|s| (*s).to_owned()).collect();
             Experiment::load(&library, "actrm_tablemaze", &set)
