@@ -12,6 +12,7 @@ mod saliency;
 mod subject;
 mod thinking;
 mod trace;
+mod way;
 
 use std::ops::ControlFlow;
 use std::path::Path;

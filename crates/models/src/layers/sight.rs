@@ -4,7 +4,7 @@
 use crate::encoders::{ImageEncoder, TokenKind, VisionConfig};
 use crate::error::{ModelError, Result};
 use crate::features::{Features, Signature};
-use crate::fused::Eyes;
+use crate::fused::{Eyes, Grads, Looked, Pass};
 use crate::layers::Cameras;
 use crate::params::Params;
 use crate::rng::Rng;
@@ -51,6 +51,51 @@ impl Sight {
     /// The same by hand: its tokens are those of all cameras, of every step.
     pub(crate) fn eyes(&self) -> Eyes<'_> {
         Eyes { shape: &self.cameras.shape, sizes: &self.cameras.seen }
+    }
+
+    /// By hand: numbers, and behind them what the cameras see, in so many `lines` (one a row, or one a step of a row), and what
+    /// the backward pass needs.
+    pub(crate) fn beside(
+        &self,
+        pass: &mut Pass<'_>,
+        lines: usize,
+        numbers: &[f32],
+        pictures: &[Vec<f32>],
+    ) -> (Vec<f32>, Looked) {
+        let first = pictures.first().map_or(0, Vec::len);
+        let (height, width) = self.cameras.seen[0];
+        let rows = first / (height * width * 3 * self.steps);
+        let mut x = pass.take(rows * self.width());
+        let looked = self.of_cells(pass, |pass| self.eyes().forward(pass, pictures, &mut x, (0, self.cameras.tokens)));
+        let both = pass.beside(lines, numbers, &x);
+        pass.give(x);
+        (both, looked)
+    }
+
+    /// Adds the gradients of the cameras' network, given that of such lines of `width` numbers.
+    pub(crate) fn learn(
+        &self,
+        pass: &mut Pass<'_>,
+        looked: Looked,
+        (grad, width): (&[f32], usize),
+        own: usize,
+        grads: &mut Grads<'_>,
+    ) {
+        let mut of_seen = pass.take(grad.len() / width * own);
+        for (to, from) in of_seen.chunks_exact_mut(own).zip(grad.chunks_exact(width)) {
+            to.copy_from_slice(&from[width - own..]);
+        }
+        self.of_cells(pass, |pass| self.eyes().backward(pass, looked, &of_seen, (0, self.cameras.tokens), grads));
+        pass.give(of_seen);
+    }
+
+    /// Calls `f` with the width of a cell for that of the layers.
+    fn of_cells<R>(&self, pass: &mut Pass<'_>, f: impl FnOnce(&mut Pass<'_>) -> R) -> R {
+        let layers = pass.shape;
+        pass.shape.dim = self.config().cell_features();
+        let result = f(pass);
+        pass.shape = layers;
+        result
     }
 
     /// Numbers of a row: those of all cells of all cameras, step after step.

@@ -31,6 +31,11 @@ impl Steps {
         Ok(Self { model, signature: signature.clone(), sight })
     }
 
+    /// The cameras, if there are any.
+    pub(crate) fn sight(&self) -> Option<&Sight> {
+        self.sight.as_ref()
+    }
+
     /// How pictures are seen, if there are any.
     pub(crate) fn vision(&self) -> Option<&VisionConfig> {
         self.sight.as_ref().map(Sight::config)
@@ -39,6 +44,11 @@ impl Steps {
     /// Numbers of a step that cameras make.
     fn of_cameras(&self) -> usize {
         self.sight.as_ref().map_or(0, |sight| sight.width() / self.signature.n_obs_steps)
+    }
+
+    /// Steps of an observation.
+    pub(crate) fn count(&self) -> usize {
+        self.signature.n_obs_steps
     }
 
     /// Numbers of a step.
@@ -109,11 +119,7 @@ impl Steps {
         let (Some(sight), Some(pictures)) = (&self.sight, pictures) else {
             return (pass.space.pool.copy(numbers), None);
         };
-        let mut x = pass.take(rows * sight.width());
-        let looked =
-            of_cells(pass, sight, |pass| sight.eyes().forward(pass, pictures, &mut x, (0, sight.cameras().tokens)));
-        let both = pass.beside(rows * self.signature.n_obs_steps, numbers, &x);
-        pass.give(x);
+        let (both, looked) = sight.beside(pass, rows * self.signature.n_obs_steps, numbers, pictures);
         (both, Some(looked))
     }
 
@@ -125,23 +131,6 @@ impl Steps {
     /// Adds the gradients of the cameras' network, given that of what `see` gave, (b*T, width).
     pub(crate) fn learn(&self, pass: &mut Pass<'_>, looked: Option<Looked>, grad: &[f32], grads: &mut Grads<'_>) {
         let (Some(sight), Some(looked)) = (&self.sight, looked) else { return };
-        let (all, own) = (self.width(), self.of_cameras());
-        let mut of_seen = pass.take(grad.len() / all * own);
-        for (to, from) in of_seen.chunks_exact_mut(own).zip(grad.chunks_exact(all)) {
-            to.copy_from_slice(&from[all - own..]);
-        }
-        of_cells(pass, sight, |pass| {
-            sight.eyes().backward(pass, looked, &of_seen, (0, sight.cameras().tokens), grads);
-        });
-        pass.give(of_seen);
+        sight.learn(pass, looked, (grad, self.width()), self.of_cameras(), grads);
     }
-}
-
-/// Calls `f` with the width of a cell for that of the layers.
-fn of_cells<R>(pass: &mut Pass<'_>, sight: &Sight, f: impl FnOnce(&mut Pass<'_>) -> R) -> R {
-    let layers = pass.shape;
-    pass.shape.dim = sight.config().cell_features();
-    let result = f(pass);
-    pass.shape = layers;
-    result
 }

@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use arrow::array::{ArrayRef, BooleanArray, Float64Array, Float64Builder, ListBuilder, UInt32Array, UInt64Array};
 use models::actrm::{Actrm, Config, Over};
-use models::{ActionChunk, ModelError, Observation, Policy, Preprocess, ThoughtStep};
+use models::{ActionChunk, ModelError, Observation, Policy, Preprocess, ThoughtStep, Values};
 use rollout::{EpisodePlan, Outcome, Pool, RolloutError, Worker};
 use serde::Serialize;
 
@@ -36,6 +36,9 @@ pub struct PolicyTrace {
     /// What the numbers of an attention stand for; empty where nobody looked.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub attended: Vec<String>,
+    /// Cells of a row, of a policy that thinks over a grid; absent where nobody looked.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub columns: Option<usize>,
     /// Every time that the policy was asked.
     pub queries: Vec<TracedQuery>,
 }
@@ -49,6 +52,9 @@ pub struct TracedQuery {
     pub executed: usize,
     /// How long it took.
     pub milliseconds: f64,
+    /// What each cell of the grid showed; empty where nobody looked.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub cells: Vec<Vec<f32>>,
     /// What it thought, step by step; the last answer is the one that counts. A policy that does not think has one.
     pub thought: Vec<TracedThought>,
 }
@@ -61,12 +67,16 @@ pub struct Examiner {
 }
 
 impl Examiner {
-    /// Of an entry that thinks step by step about its actions, each thought from the same start; `None` of others.
+    /// Of an entry that thinks step by step about its actions, each thought from the same start, or over a grid of which it is
+    /// asked for the way; `None` of others.
     ///
     /// # Errors
     /// When a tensor operation fails.
     pub fn of(entry: &LoadedEntry) -> Result<Option<Self>, ZooError> {
-        let fits = |config: &Config| config.reasoning.over == Over::Actions && config.reasoning.warm_start.is_none();
+        let fits = |config: &Config| {
+            let over_actions = config.reasoning.over == Over::Actions && config.reasoning.warm_start.is_none();
+            over_actions || config.reasoning.grid.as_ref().is_some_and(|grid| grid.way > 0.0)
+        };
         if !entry.experiment().policy.reasoner().is_some_and(fits) {
             return Ok(None);
         }
@@ -74,16 +84,41 @@ impl Examiner {
         Ok(entry.reasoner()?.map(of))
     }
 
-    /// What the attention's numbers stand for.
+    /// What the attention's numbers stand for; nothing of a policy that thinks over a grid.
     pub fn names(&self) -> Vec<String> {
-        self.model.context_names()
+        if self.columns().is_some() { Vec::new() } else { self.model.context_names() }
     }
 
-    /// By step, by action: the attention to each of [`Examiner::names`].
-    fn attention(&self, seen: &[Observation], steps: usize) -> Result<Vec<Vec<Vec<f32>>>, ModelError> {
-        let steps = self.model.examine(&self.preprocess.observation(seen)?, steps, None)?;
-        let attention = steps.iter().filter_map(|step| step.attention.as_ref());
-        attention.map(|attention| Ok(attention.squeeze(0)?.to_vec2::<f32>()?)).collect()
+    /// Cells of a row of the grid that it thinks over.
+    pub fn columns(&self) -> Option<usize> {
+        self.model.config().reasoning.grid.as_ref().map(|grid| grid.columns)
+    }
+
+    /// What each cell of the grid shows.
+    fn cells(&self, seen: &Observation) -> Vec<Vec<f32>> {
+        let Some(grid) = &self.model.config().reasoning.grid else { return Vec::new() };
+        let cells = self.preprocess.signature().observation.iter().filter(|spec| spec.group() == grid.among);
+        let numbers = |values: &Values| match values {
+            Values::F32(numbers) => numbers.clone(),
+            Values::U8(_) => Vec::new(),
+        };
+        cells.filter_map(|spec| seen.get(&spec.name).map(numbers)).collect()
+    }
+
+    /// Looks at the steps of a thought: by action the attention to each of [`Examiner::names`], by cell the probability that
+    /// the way goes there.
+    fn look(&self, seen: &[Observation], thought: &mut [TracedThought]) -> Result<(), ModelError> {
+        let steps = self.model.examine(&self.preprocess.observation(seen)?, thought.len(), None)?;
+        for (step, thought) in steps.iter().zip(thought) {
+            if let Some(attention) = &step.attention {
+                thought.attention = attention.squeeze(0)?.to_vec2()?;
+            }
+            if let (Some(scores), Some(_)) = (&step.scores, self.columns()) {
+                let scores: Vec<f32> = scores.squeeze(0)?.to_vec1()?;
+                thought.way = scores.into_iter().map(|score| 1.0 / (1.0 + (-score).exp())).collect();
+            }
+        }
+        Ok(())
     }
 }
 
@@ -101,6 +136,9 @@ pub struct TracedThought {
     /// Of each action: its share of attention to each of the trace's `attended`; absent where nobody looked.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub attention: Vec<Vec<f32>>,
+    /// Of each cell of a grid the probability that the way goes there; absent where nobody looked.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub way: Vec<f32>,
 }
 
 /// The queries of an episode under way, shared with the policy that fills them.
@@ -135,19 +173,20 @@ impl Policy for Traced {
         let milliseconds = asked.elapsed().as_secs_f64() * 1e3;
         let of = |step: ThoughtStep| {
             let ThoughtStep { chunk, change, halt, milliseconds } = step;
-            TracedThought { actions: rows(&chunk), change, halt: Some(halt), milliseconds, attention: Vec::new() }
+            let (attention, way) = (Vec::new(), Vec::new());
+            TracedThought { actions: rows(&chunk), change, halt: Some(halt), milliseconds, attention, way }
         };
         let mut thought: Vec<TracedThought> = self.policy.thought()?.into_iter().map(of).collect();
         if thought.is_empty() {
-            let (actions, attention) = (rows(&chunk), Vec::new());
-            thought.push(TracedThought { actions, change: None, halt: None, milliseconds, attention });
+            let (actions, attention, way) = (rows(&chunk), Vec::new(), Vec::new());
+            thought.push(TracedThought { actions, change: None, halt: None, milliseconds, attention, way });
         }
         self.see(observation);
         if let Some(examiner) = &self.examiner {
-            let attention = examiner.attention(&self.seen, thought.len())?;
-            thought.iter_mut().zip(attention).for_each(|(thought, attention)| thought.attention = attention);
+            examiner.look(&self.seen, &mut thought)?;
         }
-        let query = TracedQuery { step: self.step, executed: 0, milliseconds, thought };
+        let cells = self.examiner.as_ref().map(|examiner| examiner.cells(observation)).unwrap_or_default();
+        let query = TracedQuery { step: self.step, executed: 0, milliseconds, cells, thought };
         self.queries.lock().unwrap_or_else(PoisonError::into_inner).push(query);
         Ok(chunk)
     }
@@ -229,6 +268,7 @@ pub fn trace(
         steps: outcome.steps,
         total_reward: outcome.total_reward,
         attended: examiner.map(Examiner::names).unwrap_or_default(),
+        columns: examiner.and_then(Examiner::columns),
         queries,
     }))
 }
@@ -388,6 +428,7 @@ mod tests {
             halt,
             milliseconds: 0.25,
             attention: vec![vec![0.25, 0.75], vec![1.0, 0.0]],
+            way: Vec::new(),
         };
         PolicyTrace {
             entry: "lift-actrm@1".into(),
@@ -397,14 +438,22 @@ mod tests {
             steps: 3,
             total_reward: 1.0,
             attended: vec!["z0".into(), "observation.entity.cube0".into()],
+            columns: None,
             queries: vec![
                 TracedQuery {
                     step: 0,
                     executed: 2,
                     milliseconds: 0.5,
+                    cells: Vec::new(),
                     thought: vec![thought(0.125, None, Some(0.1)), thought(0.25, Some(0.0625), Some(0.95))],
                 },
-                TracedQuery { step: 2, executed: 1, milliseconds: 0.25, thought: vec![thought(1.0, None, None)] },
+                TracedQuery {
+                    step: 2,
+                    executed: 1,
+                    milliseconds: 0.25,
+                    cells: Vec::new(),
+                    thought: vec![thought(1.0, None, None)],
+                },
             ],
         }
     }

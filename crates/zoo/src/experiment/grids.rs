@@ -160,7 +160,10 @@ mod tests {
             Experiment::load(&library, "actrm_tablemaze", &set)
         };
         let experiment = load(&[]).unwrap();
-        assert_eq!(experiment.asked_grid().map(|(name, grid, key)| (name, grid.cells(), key)), Some(("cell", 100, "peg_cell")));
+        assert_eq!(
+            experiment.asked_grid().map(|(name, grid, key)| (name, grid.cells(), key)),
+            Some(("cell", 100, "peg_cell"))
+        );
         // a saved experiment is read again as it is
         assert_eq!(Experiment::from_toml("saved", &experiment.to_toml()).unwrap(), experiment);
         let error = |set: &[&str]| load(set).unwrap_err().to_string();

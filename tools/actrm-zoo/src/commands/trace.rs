@@ -17,7 +17,7 @@ use crate::simulation::{drawn, worker};
 ///
 /// Of a puzzle: the grid, how sure the solver was of each cell, whether it would stop. Of an episode: every query and every
 /// step of the thought behind it, with the answer's change, the halting head's probability and the time; in JSON, Parquet and
-/// the drawing also what the actions attended to.
+/// the drawing also what the actions attended to, or where a policy that thinks over a grid took the way to go on.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo trace trm-dfs10
@@ -26,7 +26,8 @@ use crate::simulation::{drawn, worker};
   actrm-zoo trace trm-sudoku4 --json
   actrm-zoo trace lift-actrm --seed 10003
   actrm-zoo trace lift-actrm --seed 10003 --parquet trace.parquet
-  actrm-zoo trace pickchain-actrm --seed 30000 --svg attention.svg")]
+  actrm-zoo trace pickchain-actrm --seed 30000 --svg attention.svg
+  actrm-zoo trace tablemaze-actrm --seed 30000 --svg way.svg")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
@@ -57,7 +58,7 @@ pub struct Args {
     /// Print JSON instead of text
     #[arg(long)]
     json: bool,
-    /// Draw to this file: of a puzzle, instead of text, a strip of pictures; of an episode what its actions attended to
+    /// Draw to this file: of a puzzle, instead of text, a strip of pictures; of an episode what its actions attended to, or the way
     #[arg(long, value_name = "FILE", conflicts_with = "json")]
     svg: Option<PathBuf>,
     #[command(flatten)]
@@ -92,7 +93,7 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     let (subject, examiner) = (loaded.subject(), evaluation::Examiner::of(&loaded)?);
     if args.svg.is_some() && examiner.is_none() {
         bail!(
-            "--svg means nothing for {}: it does not think step by step about its actions from one start",
+            "--svg means nothing for {}: it does not think step by step about its actions from one start, nor over a grid",
             entry.id()
         );
     }
@@ -110,7 +111,7 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     if let Some(path) = &args.parquet {
         traced.write_parquet(path)?;
     }
-    if let (Some(path), Some(svg)) = (&args.svg, traced.attention_svg()) {
+    if let (Some(path), Some(svg)) = (&args.svg, traced.way_svg().or_else(|| traced.attention_svg())) {
         write_atomic(path, svg.as_bytes())?;
         cli::note(&shown(path));
     }

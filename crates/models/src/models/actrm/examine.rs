@@ -86,6 +86,8 @@ pub struct ExaminedStep {
     /// (b, H, R + H + M): what each action token attended to as it was updated last, mean of the heads of the block's first
     /// layer; the columns are [`Actrm::context_names`]; `None` over tokens
     pub attention: Option<Tensor>,
+    /// (b, candidates or cells): scores of what is asked beside the actions; `None` if nothing is
+    pub scores: Option<Tensor>,
 }
 
 impl Actrm {
@@ -146,6 +148,7 @@ impl Actrm {
                 answer: carry.answer.clone(),
                 reasoning: carry.reasoning.clone(),
                 attention,
+                scores: None,
             });
         }
         Ok(done)
@@ -172,7 +175,8 @@ impl Actrm {
         let (chunk, answer) = (step.chunk.detach(), step.decoded.detach());
         // over a grid what goes on is under a norm; what is seen is as it was left
         let left = std::mem::replace(carry, step.carry.detach());
-        Ok(ExaminedStep { chunk, answer, reasoning: left.answer, attention: None })
+        let scores = step.scores.map(|scores| scores.detach());
+        Ok(ExaminedStep { chunk, answer, reasoning: left.answer, attention: None, scores })
     }
 
     /// What the columns of [`ExaminedStep::attention`] stand for: the reasoning's tokens, the actions', the latent, features

@@ -29,13 +29,10 @@ fn through(pass: &mut Pass<'_>, names: &[String], first: Vec<f32>) -> Vec<Vec<f3
     read
 }
 
-impl Bc {
-    /// Of transformers alone, but for the width of a cell of what cameras see.
-    fn shape(&self) -> Shape {
-        let dim = self.sight.as_ref().map_or(1, |sight| sight.config().cell_features());
-        Shape { dim, heads: 1, hidden: 1, activation: Activation::Relu, dropout: 0.0, pre_norm: false }
-    }
+/// Of transformers alone.
+const SHAPE: Shape = Shape { dim: 1, heads: 1, hidden: 1, activation: Activation::Relu, dropout: 0.0, pre_norm: false };
 
+impl Bc {
     /// What the first layer reads, (b, …): numbers, then what the cameras see.
     fn first(
         &self,
@@ -47,10 +44,7 @@ impl Bc {
         let (Some(sight), Some(pictures)) = (&self.sight, pictures) else {
             return (pass.space.pool.copy(numbers), None);
         };
-        let mut x = pass.take(rows * sight.width());
-        let looked = sight.eyes().forward(pass, pictures, &mut x, (0, sight.cameras().tokens));
-        let both = pass.beside(rows, numbers, &x);
-        pass.give(x);
+        let (both, looked) = sight.beside(pass, rows, numbers, pictures);
         (both, Some(looked))
     }
 
@@ -64,10 +58,10 @@ impl Bc {
     ) -> Result<Tensor> {
         let numbers = with_values(&self.numbers(rows, observation)?, <[f32]>::to_vec)?;
         let pictures = sight.pictures(&sight.look(observation, None)?)?;
-        let (packed, shape) = (self.workspaces.packed(self.params()), self.shape());
+        let packed = self.workspaces.packed(self.params());
         let actions = self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape, space, rng: None, packed: Some(&packed), on_seen: None };
+                let pass = &mut Pass { weights, shape: SHAPE, space, rng: None, packed: Some(&packed), on_seen: None };
                 let names: Vec<String> = (0..self.hidden.len()).map(|i| format!("hidden.{i}")).collect();
                 let (first, looked) = self.first(pass, rows, &numbers, Some(&pictures));
                 looked.into_iter().for_each(|looked| looked.free(pass));
@@ -93,10 +87,9 @@ impl Bc {
         let actions = with_values(&batch.actions, <[f32]>::to_vec)?;
         let is_pad = with_values(&batch.is_pad, <[f32]>::to_vec)?;
         let entries = (batch.total_valid_steps * width).max(1) as f64;
-        let shape = self.shape();
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
-                let pass = &mut Pass { weights, shape, space, rng: None, packed: None, on_seen: None };
+                let pass = &mut Pass { weights, shape: SHAPE, space, rng: None, packed: None, on_seen: None };
                 let grads = &mut into.views();
                 let names: Vec<String> = (0..self.hidden.len()).map(|i| format!("hidden.{i}")).collect();
                 let (first, mut looked) = self.first(pass, rows, &numbers, pictures.as_deref());
@@ -129,14 +122,8 @@ impl Bc {
                         name = &names[below];
                     } else if let (Some(sight), Some(looked)) = (&self.sight, looked.take()) {
                         let of_x = pass.linear_input(name, &grad, input);
-                        let mut of_seen = pass.take(rows * sight.width());
-                        let last = input - sight.width();
-                        for (to, from) in of_seen.chunks_exact_mut(sight.width()).zip(of_x.chunks_exact(input)) {
-                            to.copy_from_slice(&from[last..]);
-                        }
-                        sight.eyes().backward(pass, looked, &of_seen, (0, sight.cameras().tokens), grads);
+                        sight.learn(pass, looked, (&of_x, input), sight.width(), grads);
                         pass.give(of_x);
-                        pass.give(of_seen);
                     }
                 }
                 read.into_iter().chain([grad]).for_each(|buffer| pass.give(buffer));

@@ -4,19 +4,15 @@ use super::values;
 use crate::batch::Batch;
 use crate::encoders::VisionConfig;
 use crate::error::Result;
-use crate::features::{FeatureKind, Features, Signature};
-use crate::layers::Sight;
+use crate::features::{Features, Signature};
+use crate::layers::{Sight, Steps};
 use crate::params::Params;
 use crate::rng::Rng;
 use candle_core::Tensor;
 
 /// The condition of diffusion, flow matching and MIP.
 #[derive(Debug)]
-pub(crate) struct Condition {
-    model: &'static str,
-    signature: Signature,
-    sight: Option<Sight>,
-}
+pub(crate) struct Condition(Steps);
 
 /// An observation on slices.
 pub(crate) struct Told<'a> {
@@ -36,50 +32,40 @@ impl Condition {
         vision: Option<&VisionConfig>,
         rng: &mut Rng,
     ) -> Result<Self> {
-        let sight = Sight::new(p, signature, vision, rng)?;
-        Ok(Self { model, signature: signature.clone(), sight })
+        Ok(Self(Steps::new(p, model, signature, vision, rng)?))
     }
 
     /// Numbers of a row.
     pub(crate) fn width(&self) -> usize {
-        let numbers = self.signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image);
-        let numbers: usize = numbers.map(|spec| spec.width() * self.signature.n_obs_steps).sum();
-        numbers + self.sight.as_ref().map_or(0, Sight::width)
+        self.0.width() * self.0.count()
     }
 
     /// How pictures are seen, if there are any.
     pub(crate) fn vision(&self) -> Option<&VisionConfig> {
-        self.sight.as_ref().map(Sight::config)
+        self.0.vision()
     }
 
-    /// The observation with pictures as the network reads them, random parts with `rng`.
-    pub(crate) fn look(&self, observation: &Features<Tensor>, rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
-        match &self.sight {
-            Some(sight) => sight.look(observation, rng),
-            None => Ok(observation.clone()),
-        }
+    /// The observation with pictures as the network reads them outside of training.
+    #[cfg(test)]
+    pub(crate) fn look(&self, observation: &Features<Tensor>) -> Result<Features<Tensor>> {
+        self.0.look(observation, None)
     }
 
     /// The batch with pictures as the network reads them in training.
     pub(crate) fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
-        Ok(Batch { observation: self.look(&batch.observation, Some(rng))?, ..batch.clone() })
+        self.0.looked_at(batch, rng)
     }
 
     /// The features that are numbers, (b, …) each -> (b, steps*width), the features of a step side by side, steps one after
     /// another
     fn numbers(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
-        let mut joined = Vec::with_capacity(self.signature.observation.len());
-        for spec in self.signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image) {
-            let shape = (rows, self.signature.n_obs_steps, ());
-            joined.push(observation.require(self.model, &spec.name)?.reshape(shape)?);
-        }
-        Ok(Tensor::cat(&joined, 2)?.reshape((rows, ()))?)
+        Ok(self.0.numbers(rows, observation)?.reshape((rows, ()))?)
     }
 
     /// The signature's features, (b, …) each -> (b, width), with a gradient
     pub(crate) fn forward(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
         let numbers = self.numbers(rows, observation)?;
-        match &self.sight {
+        match self.0.sight() {
             Some(sight) => Ok(Tensor::cat(&[numbers, sight.forward(&sight.look(observation, None)?)?], 1)?),
             None => Ok(numbers),
         }
@@ -88,10 +74,10 @@ impl Condition {
     /// The same as slices, its pictures still to be seen.
     pub(crate) fn told(&self, rows: usize, observation: &Features<Tensor>) -> Result<Told<'_>> {
         let numbers = values(&self.numbers(rows, observation)?)?;
-        let pictures = match &self.sight {
+        let pictures = match self.0.sight() {
             Some(sight) => sight.pictures(&sight.look(observation, None)?)?,
             None => Vec::new(),
         };
-        Ok(Told { numbers, pictures, sight: self.sight.as_ref() })
+        Ok(Told { numbers, pictures, sight: self.0.sight() })
     }
 }

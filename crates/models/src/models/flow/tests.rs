@@ -30,7 +30,7 @@ fn from_pictures_too() {
     let batch = batch(&signature, 8, 3, 3);
     assert_the_step_is_the_composed_one(&model, &batch, "pictures");
     let rows = check_observation("flow", &signature, &batch.observation).unwrap();
-    let seen = model.condition.look(&batch.observation, None).unwrap();
+    let seen = model.condition.look(&batch.observation).unwrap();
     let cond = model.condition.forward(rows, &seen).unwrap();
     let want = euler(&model.noise(rows, &mut Rng::new(0, "predict")).unwrap(), model.config.inference_steps, |x, t| {
         model.velocity(&cond, x, &vec![t; rows])

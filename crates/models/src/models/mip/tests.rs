@@ -30,7 +30,7 @@ fn from_pictures_too() {
     let batch = batch(&signature, 8, 3, 3);
     assert_the_step_is_the_composed_one(&model, &batch, "pictures");
     let rows = check_observation("mip", &signature, &batch.observation).unwrap();
-    let seen = model.condition.look(&batch.observation, None).unwrap();
+    let seen = model.condition.look(&batch.observation).unwrap();
     let cond = model.condition.forward(rows, &seen).unwrap();
     let want =
         two_steps(&model.nothing(rows).unwrap(), model.config.second_time as f32, |x, t| model.answer(&cond, x, t))
