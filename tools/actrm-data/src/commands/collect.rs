@@ -109,8 +109,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let seconds = start.elapsed().as_secs_f64();
     if args.json {
         cli::print_json(&json!({
-            "out": cli::lossy(&args.out), "task": args.task, "demos": demos, "steps": steps, "attempts": attempts,
-            "expert_success_rate": rate, "skill": args.skill, "first_seed": first_seed, "bytes": size, "seconds": seconds,
+            "out": cli::lossy(&args.out), "task": args.task, "skill": args.skill, "demos": demos, "steps": steps,
+            "attempts": attempts, "expert_success_rate": rate, "first_seed": first_seed, "bytes": size,
+            "seconds": seconds,
         }))?;
     } else {
         cli::print(&format!(
