@@ -36,6 +36,8 @@ fn killed_and_run_again_it_writes_the_same_bytes_and_leaves_nothing_else() {
     killed(&again);
     // what lies there belongs to seed 1
     refused(&mut collect(&again, &["--seed", "2"]), &[".again.hdf5.attempts", "first_seed", "2000000", "1000000"]);
+    // and to the good demonstrator
+    refused(&mut collect(&again, &["--skill", "poor"]), &[".again.hdf5.attempts", "skill", "poor", "good"]);
     let output = succeeds(&mut collect(&again, &["--workers", "1"]));
     let error = String::from_utf8_lossy(&output.stderr);
     assert!(error.contains("going on after"), "{error}");
@@ -77,6 +79,46 @@ fn which_expert_recorded_demonstrations_goes_with_them() {
         attribute.expect("an attribute").read_scalar::<hdf5::types::VarLenUnicode>().expect("text").to_string()
     };
     assert_eq!((expert(&file), expert(&again)), ("recoveries".to_owned(), "recoveries".to_owned()));
+}
+
+#[test]
+fn who_showed_demonstrations_goes_with_them() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let place = |name: &str| folder.path().join(name);
+    let few = |out: &Path, more: &[&str]| {
+        let mut command = data(["collect", "--task", "Lift", "--episodes", "6", "--workers", "1", "--out", text(out)]);
+        command.args(more);
+        command
+    };
+    let (mixed, usual, good) = (place("mixed.hdf5"), place("usual.hdf5"), place("good.hdf5"));
+    refused(&mut few(&mixed, &["--skill", "careless"]), &["careless", "good", "mixed", "poor"]);
+    succeeds(&mut few(&mixed, &["--skill", "mixed"]));
+    succeeds(&mut few(&usual, &[]));
+    succeeds(&mut few(&good, &["--skill", "good"]));
+    assert!(fs::read(&usual).expect("a file") == fs::read(&good).expect("a file"), "good is not the usual");
+
+    let word = |place: &hdf5::Group| {
+        let attribute = place.attr("skill").expect("an attribute");
+        attribute.read_scalar::<hdf5::types::VarLenUnicode>().expect("text").to_string()
+    };
+    let shown_by = |path: &Path| {
+        let all = hdf5::File::open(path).expect("a file").group("data").expect("data");
+        assert_eq!(word(&all), "mixed");
+        (0..6).map(|demo| word(&all.group(&format!("demo_{demo}")).expect("a demo"))).collect::<Vec<_>>()
+    };
+    let who = shown_by(&mixed);
+    assert!(who.iter().all(|name| ["good", "middling", "poor"].contains(&name.as_str())), "{who:?}");
+    assert!(who.iter().any(|name| *name != who[0]), "{who:?}");
+    let usual = hdf5::File::open(&usual).expect("a file").group("data").expect("data");
+    assert!(usual.attr("skill").is_err() && usual.group("demo_0").expect("a demo").attr("skill").is_err());
+
+    let (set, again) = (place("set"), place("again.hdf5"));
+    succeeds(&mut data(["convert", text(&mixed), text(&set)]));
+    let info = fs::read(set.join("meta/info.json")).expect("a data set");
+    let info: serde_json::Value = serde_json::from_slice(&info).expect("JSON");
+    assert_eq!(info["actrm"]["skill"], "mixed");
+    succeeds(&mut data(["export", text(&set), text(&again)]));
+    assert_eq!(shown_by(&again), who);
 }
 
 #[test]

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use dataset::shuffle::SplitMix64;
 use dataset::{Array, DatasetError, RobomimicWriter, WriteOptions};
 use rollout::collection::{Attempt, Collection, CollectionRecord};
-use rollout::{Pool, RunEnd};
+use rollout::{Pool, RunEnd, Skill};
 
 use crate::demo::demo;
 use crate::error::{RecordingError, Result};
@@ -34,6 +34,8 @@ pub struct CollectOptions {
     pub env_module: Option<String>,
     /// Another of the task's experts than the usual one, by its name.
     pub expert: Option<String>,
+    /// How able whoever shows the demonstrations is.
+    pub skill: Skill,
     /// Store `next_obs`.
     pub next_obs: bool,
     /// Level of gzip; none stores datasets as they are.
@@ -100,7 +102,7 @@ pub fn collect(
     let task = pool.ready().task.clone();
     let first_seed = options.seed * CollectOptions::SEED_STRIDE;
     let record = CollectionRecord::new(pool.ready(), first_seed, options.env_module.clone());
-    let record = CollectionRecord { expert: options.expert.clone(), ..record };
+    let record = CollectionRecord { expert: options.expert.clone(), skill: options.skill, ..record };
     let collection = Collection::open(&attempts_folder(&options.out), &record)?;
     let earlier = collection.count()?;
     if earlier > 0 {
@@ -175,6 +177,10 @@ fn write(
     writer.set_data_attr("seeds", &Array::from_str(&format!("{first_seed}-{}", first_seed + last)))?;
     if let Some(expert) = &options.expert {
         writer.set_data_attr("expert", &Array::from_str(expert))?;
+    }
+    // who showed a demonstration, its own attribute says
+    if !options.skill.is_good() {
+        writer.set_data_attr("skill", &Array::from_str(options.skill.as_str()))?;
     }
     let (train, valid) = masks(&ids, options.seed);
     writer.set_mask("train", &train)?;

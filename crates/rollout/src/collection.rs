@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::episode::no_expert;
 use crate::error::RolloutError;
 use crate::files::write_atomic;
-use crate::message::{Control, Ready};
+use crate::message::{Control, Ready, Skill};
 use crate::pool::{Pool, RunEnd};
 use crate::recorded::RecordedEpisode;
 use crate::worker::Worker;
@@ -40,6 +40,9 @@ pub struct CollectionRecord {
     /// Another of the task's experts than the usual one, by its name.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expert: Option<String>,
+    /// How able whoever shows the demonstrations is.
+    #[serde(default, skip_serializing_if = "Skill::is_good")]
+    pub skill: Skill,
     /// robomimic's arguments of the environment, cameras included.
     pub env_args: serde_json::Value,
     /// Versions of the simulator and what it stands on.
@@ -56,6 +59,7 @@ impl CollectionRecord {
             control: ready.control,
             env_module,
             expert: None,
+            skill: Skill::Good,
             env_args: ready.env_args.clone(),
             versions: ready.versions.clone(),
         }
@@ -85,6 +89,7 @@ pub struct Collection {
     folder: PathBuf,
     first_seed: u64,
     expert: Option<String>,
+    skill: Skill,
     _lock: File,
 }
 
@@ -106,8 +111,8 @@ impl Collection {
         let path = folder.join(RECORD);
         let mut text = serde_json::to_vec_pretty(record).expect("plain fields are always JSON");
         text.push(b'\n');
-        let (first_seed, expert) = (record.first_seed, record.expert.clone());
-        let collection = Self { folder: folder.to_owned(), first_seed, expert, _lock: lock };
+        let (first_seed, expert, skill) = (record.first_seed, record.expert.clone(), record.skill);
+        let collection = Self { folder: folder.to_owned(), first_seed, expert, skill, _lock: lock };
         match fs::read(&path) {
             Ok(found) if found == text => {}
             // one that came to no attempt is in nobody's way
@@ -183,7 +188,7 @@ impl Collection {
             if let Some(episode) = self.get(attempt).map_err(failed(attempt, "reading the stored attempt"))? {
                 return Ok(Attempt::of(attempt, &episode));
             }
-            let played = worker.expert(seed_of(attempt), self.expert.as_deref());
+            let played = worker.expert(seed_of(attempt), self.expert.as_deref(), self.skill);
             let episode = played.map_err(|fault| no_expert(worker, fault))?;
             let done = Attempt::of(attempt, &episode);
             self.put(attempt, episode).map_err(failed(attempt, "storing the attempt"))?;
@@ -203,8 +208,12 @@ impl Collection {
 
 /// The first field in which the stored record differs.
 fn differs(folder: &Path, stored: &[u8], record: &CollectionRecord) -> RolloutError {
-    let stored: serde_json::Value = serde_json::from_slice(stored).unwrap_or_default();
-    let now = serde_json::to_value(record).expect("plain fields are always JSON");
+    let mut stored: serde_json::Value = serde_json::from_slice(stored).unwrap_or_default();
+    let mut now = serde_json::to_value(record).expect("plain fields are always JSON");
+    for fields in [&mut stored, &mut now].into_iter().filter_map(serde_json::Value::as_object_mut) {
+        // the usual one is left out of records, but not of what is said about them
+        fields.entry("skill").or_insert_with(|| Skill::Good.as_str().into());
+    }
     let fields = now.as_object().into_iter().flatten();
     let text = |value: Option<&serde_json::Value>| value.map_or_else(|| "nothing".to_owned(), ToString::to_string);
     let found = fields.map(|(name, value)| (name, value, stored.get(name))).find(|(_, now, was)| *was != Some(*now));
@@ -229,6 +238,7 @@ mod tests {
             control: Control::Compiled,
             env_module: None,
             expert: None,
+            skill: Skill::Good,
             env_args: serde_json::json!({"env_name": "Lift", "env_kwargs": {"camera_names": ["agentview"]}}),
             versions: [("mujoco".to_owned(), "3.3.7".to_owned())].into(),
         }
@@ -276,6 +286,21 @@ mod tests {
         drop(first);
         let error = Collection::open(dir.path(), &other).unwrap_err().to_string();
         assert!(error.contains("first_seed: expected 2000000, found 1000000"), "{error}");
+        let mixed = CollectionRecord { skill: Skill::Mixed, ..record() };
+        let error = Collection::open(dir.path(), &mixed).unwrap_err().to_string();
+        assert!(error.contains("skill: expected \"mixed\", found \"good\""), "{error}");
+    }
+
+    #[test]
+    fn a_skill_is_kept_and_the_usual_one_is_written_as_it_always_was() {
+        let text = serde_json::to_string(&record()).unwrap();
+        assert!(!text.contains("skill"), "{text}");
+        let dir = tempfile::tempdir().unwrap();
+        let mixed = CollectionRecord { skill: Skill::Mixed, ..record() };
+        Collection::open(dir.path(), &mixed).unwrap().put(0, episode(true)).unwrap();
+        assert_eq!(Collection::open(dir.path(), &mixed).unwrap().count().unwrap(), 1);
+        let error = Collection::open(dir.path(), &record()).unwrap_err().to_string();
+        assert!(error.contains("skill: expected \"good\", found \"mixed\""), "{error}");
     }
 
     #[test]

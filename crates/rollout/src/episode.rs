@@ -206,10 +206,10 @@ impl EpisodePlan {
 /// Called with the worker and what it shows after an episode's reset and after every step of it.
 pub type Watch<'a> = &'a mut dyn FnMut(&mut Worker, &Observations) -> Result<(), JobError>;
 
-/// What a worker says that has no such expert is the same for a fresh worker.
+/// What a worker says that has no such expert, or none of such a skill, is the same for a fresh worker.
 pub(crate) fn no_expert(worker: &Worker, fault: WorkerFault) -> JobError {
     match &fault.kind {
-        FaultKind::Reported { kind, message } if kind == "no_expert" => {
+        FaultKind::Reported { kind, message } if kind == "no_expert" || kind == "no_skill" => {
             let task = worker.ready().task.clone();
             RolloutError::Refused { task, kind: kind.clone(), message: message.clone() }.into()
         }

@@ -30,7 +30,7 @@ pub use error::{FaultKind, RolloutError, WorkerFault};
 pub use frame::{FrameError, FrameTensor, MAX_FRAME_BYTES};
 pub use greeting::remembered_greeting;
 pub use harness::{Python, cache_folder, find_python, harness_folder};
-pub use message::{Control, PROTOCOL, Ready};
+pub use message::{Control, PROTOCOL, Ready, Skill};
 pub use pool::{Incident, JobError, Pool, PoolOptions, RunEnd};
 pub use recorded::RecordedEpisode;
 pub use spec::{TimeLimits, WorkerSpec, set_control_library};

@@ -51,6 +51,53 @@ impl std::str::FromStr for Control {
     }
 }
 
+/// How able whoever shows demonstrations is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Skill {
+    /// The scripted expert as it is.
+    #[default]
+    Good,
+    /// Every episode draws whether somebody good, middling or poor shows it.
+    Mixed,
+    /// Slow, hesitating, with detours and grasps that miss.
+    Poor,
+}
+
+impl Skill {
+    /// The word that names it on command lines, in files and to workers.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Skill::Good => "good",
+            Skill::Mixed => "mixed",
+            Skill::Poor => "poor",
+        }
+    }
+
+    /// Whether it is the usual one, which is left out of what is written.
+    pub fn is_good(&self) -> bool {
+        *self == Skill::Good
+    }
+}
+
+impl std::fmt::Display for Skill {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+impl std::str::FromStr for Skill {
+    type Err = String;
+    fn from_str(word: &str) -> Result<Self, String> {
+        match word {
+            "good" => Ok(Skill::Good),
+            "mixed" => Ok(Skill::Mixed),
+            "poor" => Ok(Skill::Poor),
+            other => Err(format!("skill {other:?}: expected \"good\", \"mixed\" or \"poor\"")),
+        }
+    }
+}
+
 /// The greeting of a worker: what it runs and what its environment looks like.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Ready {
@@ -120,6 +167,8 @@ pub(crate) enum Request<'a> {
         split: &'a str,
         #[serde(skip_serializing_if = "Option::is_none")]
         expert: Option<&'a str>,
+        #[serde(skip_serializing_if = "Skill::is_good")]
+        skill: Skill,
     },
     Extract {
         id: u64,
@@ -242,8 +291,12 @@ mod tests {
         assert_eq!(text(&Request::Reset { id: 1, seed: 10000 }), r#"{"type":"reset","id":1,"seed":10000}"#);
         assert_eq!(text(&Request::Step { id: 2 }), r#"{"type":"step","id":2}"#);
         assert_eq!(
-            text(&Request::Expert { id: 6, seed: 7, split: "evaluation", expert: None }),
+            text(&Request::Expert { id: 6, seed: 7, split: "evaluation", expert: None, skill: Skill::Good }),
             r#"{"type":"expert","id":6,"seed":7,"split":"evaluation"}"#
+        );
+        assert_eq!(
+            text(&Request::Expert { id: 7, seed: 8, split: "demonstration", expert: None, skill: Skill::Mixed }),
+            r#"{"type":"expert","id":7,"seed":8,"split":"demonstration","skill":"mixed"}"#
         );
         assert_eq!(
             text(&Request::Render { id: 3, camera: "agentview", size: [84, 96] }),

@@ -11,7 +11,7 @@ use safetensors::Dtype;
 
 use crate::error::{FaultKind, RolloutError, WorkerFault};
 use crate::frame::{Frame, FrameTensor};
-use crate::message::{Control, EpisodeReply, PROTOCOL, Ready, Reply, Request};
+use crate::message::{Control, EpisodeReply, PROTOCOL, Ready, Reply, Request, Skill};
 use crate::process::{Limit, Process};
 use crate::recorded::RecordedEpisode;
 use crate::spec::{TimeLimits, WorkerSpec};
@@ -236,12 +236,13 @@ impl Worker {
         Ok(rewards)
     }
 
-    /// Runs a whole scripted episode, to be learned from; `expert` is another of the task's experts than the usual one.
+    /// Runs a whole scripted episode, to be learned from; `expert` is another of the task's experts than the usual one,
+    /// `skill` says how able whoever shows it is.
     ///
     /// # Errors
     /// Any failure of the worker.
-    pub fn expert(&mut self, seed: u64, expert: Option<&str>) -> Result<RecordedEpisode, WorkerFault> {
-        self.scripted(seed, "demonstration", expert).map(|(episode, _)| episode)
+    pub fn expert(&mut self, seed: u64, expert: Option<&str>, skill: Skill) -> Result<RecordedEpisode, WorkerFault> {
+        self.scripted(seed, "demonstration", expert, skill).map(|(episode, _)| episode)
     }
 
     /// Runs the scripted expert in the episode that an evaluation of `seed` begins with.
@@ -249,7 +250,7 @@ impl Worker {
     /// # Errors
     /// Any failure of the worker.
     pub fn expert_evaluated(&mut self, seed: u64) -> Result<Scripted, WorkerFault> {
-        let (episode, progress) = self.scripted(seed, "evaluation", None)?;
+        let (episode, progress) = self.scripted(seed, "evaluation", None, Skill::Good)?;
         let read = |name: &str| {
             let tensor = episode.tensors.get(name).ok_or_else(|| format!("no array {name:?} in the episode"))?;
             Ok((tensor, name.to_owned()))
@@ -271,9 +272,10 @@ impl Worker {
         seed: u64,
         split: &str,
         expert: Option<&str>,
+        skill: Skill,
     ) -> Result<(RecordedEpisode, Option<f64>), WorkerFault> {
         self.next_id += 1;
-        let request = Request::Expert { id: self.next_id, seed, split, expert };
+        let request = Request::Expert { id: self.next_id, seed, split, expert, skill };
         let (reply, frame) = self.ask(&request, Vec::new(), self.limits.episode, 4)?;
         match reply {
             Reply::Expert(reply) => {

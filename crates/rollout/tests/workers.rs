@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use common::{alive, impatient, options, spec, wait_until, wrapped};
-use rollout::{JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, TimeLimits, Worker};
+use rollout::{JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, Skill, TimeLimits, Worker};
 use rustix::process::{Pid, Signal, kill_process};
 
 /// Everything that an episode shows, to the last bit: fingerprint, observations, rewards.
@@ -75,7 +75,7 @@ fn an_episode_is_the_same_on_any_worker_in_any_order_after_anything() {
 
 /// Episodes of the expert.
 fn shown(pool: &mut Pool, attempts: std::ops::Range<u64>) -> Vec<RecordedEpisode> {
-    let work = |(): &mut (), worker: &mut Worker, attempt| Ok(worker.expert(1_000_000 + attempt, None)?);
+    let work = |(): &mut (), worker: &mut Worker, attempt| Ok(worker.expert(1_000_000 + attempt, None, Skill::Good)?);
     let mut all = Vec::new();
     pool.run(attempts, &|attempt| attempt, &|| Ok(()), &work, &mut |_, episode| {
         all.push(episode.unwrap());

@@ -62,6 +62,8 @@ class Expert:
     split: str = "demonstration"
     expert: str | None = None
     """Another of the task's experts than the usual one, by its name."""
+    skill: str | None = None
+    """How able whoever shows it is: good, which is also meant where nothing is said, mixed or poor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +142,8 @@ def parse_request(message: Message) -> Request:
     for name in ("camera", "model_file"):
         if name in fields and not isinstance(fields[name], str):
             raise RequestError("bad_request", f"{kind}: {name} must be text, got {fields[name]!r}")
+    if not isinstance(fields.get("skill"), str | None):
+        raise RequestError("bad_request", f"{kind}: skill must be text, got {fields['skill']!r}")
     if fields.get("split", SPLITS[0]) not in SPLITS:
         raise RequestError("bad_request", f"{kind}: split must be one of {list(SPLITS)}, got {fields['split']!r}")
     if not isinstance(fields.get("ep_meta", {}), dict):

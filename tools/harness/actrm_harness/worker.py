@@ -210,7 +210,9 @@ def answer(simulation: Simulation, request: protocol.Request, tensors: wire.Tens
         }
         return drawn(reply, first.drawing_ms), observed(first.observation)
     if isinstance(request, protocol.Expert):
-        episode = simulation.expert(request.seed, request.split == "demonstration", request.expert)
+        # a simulator of somebody else's may know of no skills
+        skill = {} if request.skill is None else {"skill": request.skill}
+        episode = simulation.expert(request.seed, request.split == "demonstration", request.expert, **skill)
         return episode_reply("expert", request.id, episode), episode.tensors
     if isinstance(request, protocol.Extract):
         stored = Stored(tensor(tensors, "states"), tensor(tensors, "actions"), request.model_file, request.ep_meta)

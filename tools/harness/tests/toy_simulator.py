@@ -38,9 +38,9 @@ class Slide:
                 break
         return Stepped({"place": self.place}, np.array(rewards), bool(rewards[-1]))
 
-    def expert(self, seed: int, demonstration: bool, expert: str | None = None) -> Episode:
+    def expert(self, seed: int, demonstration: bool, expert: str | None = None, skill: str | None = None) -> Episode:
         """There is none."""
-        raise RequestError("no_expert", f"nobody knows how, seed {seed}, {demonstration}")
+        raise RequestError("no_expert", f"nobody knows how, seed {seed}, {demonstration}, {expert}, {skill}")
 
     def extract(self, stored: Stored) -> Episode:
         """Nothing is stored."""

@@ -296,6 +296,7 @@ impl Conversion<'_> {
                 env_args: plan.env_args.clone(),
                 seeds: plan.texts.get("data/seeds").cloned(),
                 expert: plan.texts.get("data/expert").cloned(),
+                skill: plan.texts.get("data/skill").cloned(),
                 state_keys: self.mapping.state_keys.clone(),
                 env_keys: self.mapping.env_keys.clone(),
                 entities: self.mapping.entities.clone(),

@@ -183,6 +183,10 @@ pub struct Provenance {
     /// Which of the task's experts recorded them, where it is not the usual one and the source states it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expert: Option<String>,
+    /// How able whoever showed them is (`mixed`, `poor`), where that is not as usual and the source states it. Who showed
+    /// which, the demos' own attribute says.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub skill: Option<String>,
     /// Observation keys that make up `observation.state`, in order.
     pub state_keys: Vec<String>,
     /// Observation keys that make up `observation.environment_state`, in order.

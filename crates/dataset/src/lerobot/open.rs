@@ -66,6 +66,8 @@ pub struct EnvMeta {
     pub seeds: Option<String>,
     /// Which of the task's experts recorded them, where it is not the usual one and the source states it.
     pub expert: Option<String>,
+    /// How able whoever showed them is (`mixed`, `poor`), where that is not as usual and the source states it.
+    pub skill: Option<String>,
 }
 
 /// A numeric column in memory.
@@ -94,6 +96,7 @@ impl Dataset {
                 env_args: p.env_args.clone().unwrap_or(serde_json::Value::Null),
                 seeds: p.seeds.clone(),
                 expert: p.expert.clone(),
+                skill: p.skill.clone(),
             })
         });
         let mut dataset =

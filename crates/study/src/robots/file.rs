@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use models::actrm::{Intervention, Thinking};
+use rollout::Skill;
 use serde::{Deserialize, Serialize};
 use zoo::ZooError;
 use zoo::entry::CamerasMeta;
@@ -56,6 +57,9 @@ pub struct Data {
     /// Another of the task's experts than the usual one, by its name.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expert: Option<String>,
+    /// How able whoever shows them is.
+    #[serde(default, skip_serializing_if = "Skill::is_good")]
+    pub skill: Skill,
     /// Cameras whose pictures they have.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cameras: Option<CamerasMeta>,
@@ -103,19 +107,21 @@ impl Data {
     /// Their file's name: of the task, what is not as usual, how many, and the seed.
     pub fn file_name(&self) -> String {
         let expert = self.expert.as_ref().map(|expert| format!("{expert}-")).unwrap_or_default();
+        let skill = if self.skill.is_good() { String::new() } else { format!("{}-", self.skill) };
         let seen = self.cameras.as_ref().map(|cameras| format!("seen{}-", cameras.size)).unwrap_or_default();
-        format!("{}-{expert}{seen}{}-seed{}.hdf5", self.task.to_lowercase(), self.episodes, self.seed)
+        format!("{}-{expert}{skill}{seen}{}-seed{}.hdf5", self.task.to_lowercase(), self.episodes, self.seed)
     }
 
     /// What is not as usual with them, in words, each after a comma.
     pub fn words(&self) -> String {
         let expert = self.expert.as_ref().map(|expert| format!(", expert `{expert}`")).unwrap_or_default();
+        let skill = if self.skill.is_good() { String::new() } else { format!(", skill `{}`", self.skill) };
         let of_cameras = |cameras: &CamerasMeta| {
             let CamerasMeta { names, size, fast_render } = cameras;
             let drawn = if *fast_render { "" } else { " with reflections" };
             format!(", pictures of {} ({size} x {size}{drawn})", names.join(" and "))
         };
-        format!("{expert}{}", self.cameras.as_ref().map(of_cameras).unwrap_or_default())
+        format!("{expert}{skill}{}", self.cameras.as_ref().map(of_cameras).unwrap_or_default())
     }
 }
 

@@ -135,10 +135,11 @@ fn overview(text: &mut String, study: &Study, results: &BTreeMap<(String, String
         return;
     }
     let head = |(data, _): &(&str, &str)| {
-        let Data { task, episodes, expert, .. } = &study.data[*data];
+        let Data { task, episodes, expert, skill, .. } = &study.data[*data];
         let alone = columns.iter().filter(|(other, _)| study.data[*other].task == *task).count() == 1;
         let expert = expert.as_ref().map(|expert| format!(", {expert}")).unwrap_or_default();
-        if alone { format!("{task}{expert}") } else { format!("{task}, {episodes}{expert}") }
+        let skill = if skill.is_good() { String::new() } else { format!(", {skill}") };
+        if alone { format!("{task}{expert}{skill}") } else { format!("{task}, {episodes}{expert}{skill}") }
     };
     let heads: Vec<String> = columns.iter().map(head).collect();
     let _ = writeln!(
@@ -665,6 +666,16 @@ mod tests {
         std::fs::write(&file, others + compared).unwrap();
         let page = robot_page(&Study::open(&file).unwrap(), &file).unwrap();
         assert!(page.contains("| | PickChain, 200 | PickChain, 25, careful |\n"), "{page}");
+        let shown = std::fs::read_to_string(&file).unwrap().replace("expert = \"careful\"", "skill = \"mixed\"");
+        std::fs::write(&file, &shown).unwrap();
+        let study = Study::open(&file).unwrap();
+        let page = robot_page(&study, &file).unwrap();
+        assert!(page.contains("| | PickChain, 200 | PickChain, 25, mixed |\n"), "{page}");
+        assert_eq!(study.data["lift"].file_name(), "pickchain-mixed-25-seed1.hdf5");
+        std::fs::write(&file, shown.replace("\"mixed\"", "\"careless\"")).unwrap();
+        let error = format!("{:?}", Study::open(&file).unwrap_err());
+        assert!(error.contains("careless"), "{error}");
+        std::fs::write(&file, shown).unwrap();
         assert!(page.contains("| Better? | one step, lift | one step, chain | all | not run |"), "{page}");
     }
 

@@ -361,6 +361,7 @@ impl Shared<'_> {
             seed: data.seed,
             env_module: None,
             expert: data.expert.clone(),
+            skill: data.skill,
             next_obs: false,
             gzip: None,
         };

@@ -143,6 +143,9 @@ pub struct DataMeta {
     /// Which of the task's experts recorded them, where it is not the usual one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expert: Option<String>,
+    /// How able whoever showed them is, where that is not as usual.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub skill: Option<String>,
 }
 
 /// How an entry was trained.

@@ -181,6 +181,7 @@ pub(crate) mod tests {
                     valid_episodes: 5,
                     seeds: None,
                     expert: None,
+                    skill: None,
                 }),
                 kind: None,
                 section: None,

@@ -234,6 +234,7 @@ pub(super) fn prepare(
         valid_episodes: valid.len() as u64,
         seeds: dataset.env().and_then(|env| env.seeds.as_deref()?.parse().ok()),
         expert: dataset.env().and_then(|env| env.expert.clone()),
+        skill: dataset.env().and_then(|env| env.skill.clone()),
     };
     let mut train = windows(train)?;
     let mut valid = match valid.is_empty() {

@@ -2,6 +2,7 @@ use crate::cameras::CameraArgs;
 use anyhow::Result;
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop};
 use recording::{CollectEnd, CollectOptions, CollectProgress, Collected, collect};
+use rollout::Skill;
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -22,6 +23,7 @@ const GOES_ON: &str = "stopped; the same command goes on where it was";
   actrm-data collect --task Lift --episodes 50 --seed 1 --out lift.hdf5
   actrm-data collect --task Stack --episodes 200 --seed 7 --workers 4 --out stack.hdf5
   actrm-data collect --task StackColor --episodes 200 --expert recoveries --out stackcolor.hdf5
+  actrm-data collect --task PickPlaceCan --episodes 200 --skill mixed --out can_mixed.hdf5
   actrm-data collect --task Lift --episodes 20 --cameras agentview,robot0_eye_in_hand --out lift_image.hdf5")]
 pub struct Args {
     /// Task, as robosuite or the environment module names it
@@ -37,6 +39,10 @@ pub struct Args {
     /// shows how each is made up for
     #[arg(long, value_name = "NAME")]
     expert: Option<String>,
+    /// How able whoever shows the task is: `good`, the expert as it is; `poor`, slow and hesitating, with detours and
+    /// grasps that miss; `mixed`, every episode draws good, middling or poor, and its demo's attribute `skill` says which
+    #[arg(long, default_value_t = Skill::Good)]
+    skill: Skill,
     /// File to create
     #[arg(long)]
     out: PathBuf,
@@ -71,6 +77,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         seed: args.seed,
         env_module: args.simulator.env_module.clone(),
         expert: args.expert.clone(),
+        skill: args.skill,
         next_obs: !args.no_next_obs,
         gzip: (args.gzip > 0).then_some(args.gzip),
     };
@@ -102,8 +109,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let seconds = start.elapsed().as_secs_f64();
     if args.json {
         cli::print_json(&json!({
-            "out": cli::lossy(&args.out), "task": args.task, "demos": demos, "steps": steps, "attempts": attempts,
-            "expert_success_rate": rate, "first_seed": first_seed, "bytes": size, "seconds": seconds,
+            "out": cli::lossy(&args.out), "task": args.task, "skill": args.skill, "demos": demos, "steps": steps,
+            "attempts": attempts, "expert_success_rate": rate, "first_seed": first_seed, "bytes": size,
+            "seconds": seconds,
         }))?;
     } else {
         cli::print(&format!(

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use cli::{Column, INTERRUPTED, Screen, SimulatorArgs, Stop, Table, limits, shown};
 use recording::{CollectEnd, CollectOptions, CollectProgress, collect};
-use rollout::Control;
+use rollout::{Control, Skill};
 use serde_json::json;
 use zoo::entry::Entry;
 use zoo::evaluation::Environment;
@@ -180,12 +180,14 @@ fn collected(args: &Args, rerun: &Rerun, stop: &Stop) -> anyhow::Result<Collecti
     std::fs::create_dir_all(rerun.work()).with_context(|| format!("cannot create {}", shown(rerun.work())))?;
     let environment = Environment::of(meta, None, None)?;
     cli::note(&format!("demonstrations: {episodes} of {}'s expert again, seed {seed}", environment.task));
+    let skill = data.skill.as_deref().map_or(Ok(Skill::Good), str::parse::<Skill>).map_err(anyhow::Error::msg)?;
     let options = CollectOptions {
         out: out.clone(),
         episodes,
         seed,
         env_module: environment.env_module.clone(),
         expert: data.expert.clone(),
+        skill,
         next_obs: false,
         gzip: None,
     };

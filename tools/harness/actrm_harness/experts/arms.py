@@ -21,7 +21,7 @@ class TwoArmLiftExpert:
     """
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
-        self.scenes = [scene, Scene(scene.env, 1)]
+        self.scenes = [scene, Scene(scene.env, 1, scene.shown_by)]
         self.servos = [Servo(each, rng) for each in self.scenes]
         # both at the pace of the first
         self.servos[1].style = self.servos[0].style

@@ -21,6 +21,7 @@ from actrm_harness.experts.parts import (
     rotation_vector,
     yaw,
 )
+from actrm_harness.experts.skills import Slips
 from actrm_harness.wire import Array
 
 
@@ -262,6 +263,7 @@ class DoorExpert:
         self.scene = scene
         self.servo = Servo(scene, rng, pace=2.0, turn=1.0)
         self.along = rng.uniform(0.115, 0.13)
+        self.slips = Slips(scene.shown_by, above=0.01, beside=False)
         self.closing = self.held = False
 
     def act(self) -> Array:
@@ -271,6 +273,10 @@ class DoorExpert:
         pressed = float(data.get_joint_qpos("Door_latch_joint"))
         opened = float(data.get_joint_qpos("Door_hinge"))
         place, rotation = self._pose(pressed, 0.0)
+        back = self.slips.back(scene.hand, rotation, scene.gap)
+        if back is not None:
+            return self.servo.move(back, OPEN, rotation)
+        place = place + self.slips.off(rotation)
         away = place - scene.hand
         distance = float(np.linalg.norm(away))
         askew = float(np.linalg.norm(rotation_vector(rotation @ scene.hand_rotation.T)))
@@ -278,12 +284,17 @@ class DoorExpert:
             self.closing = True
         elif self.closing and (distance > 0.06 or scene.gap < 0.03):
             self.closing = self.held = False
+            self.slips.missed()
         if not self.closing:
             pointing = rotation[:, 2]
             aside = float(np.linalg.norm(away - pointing * (away @ pointing)))
             back = max(funnel(aside, 0.01, 0.04), funnel(askew, 0.15, 0.4))
             return self.servo.move(place - pointing * self.servo.style.hover * back, OPEN, rotation)
-        self.held |= scene.gap < 0.062 and abs(scene.gap_speed) < 0.02
+        taken = not self.held and scene.gap < 0.062 and abs(scene.gap_speed) < 0.02
+        self.held |= taken
+        if taken and self.slips.lets_go():
+            self.closing = self.held = False
+            return self.servo.move(place, OPEN, rotation)
         if not self.held:
             return self.servo.move(place, CLOSE, rotation)
         free = funnel(pressed, self.FREE - 0.15, self.FREE) if opened < 0.03 else 1.0

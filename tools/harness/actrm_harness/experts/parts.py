@@ -2,15 +2,17 @@
 
 An expert is closed-loop: every action follows from what can be observed now, so that it recovers from a push, and so
 that a policy which sees the same observations can learn it. Episodes differ by a `Style` drawn once (speed, height and
-side of the approach), by correlated noise on the command, and by pushes of a few steps that it has to make up for.
+side of the approach), by correlated noise on the command, by pushes of a few steps that it has to make up for, and by
+who shows them (`skills`).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
+from actrm_harness.experts.skills import SKILLS, USUAL, Demonstrator, Manner, Slips
 from actrm_harness.simulators.robosuite.suite import Env
 from actrm_harness.wire import Array
 
@@ -53,15 +55,21 @@ class Style:
             noise=rng.uniform(0.01, 0.05),
         )
 
+    def of(self, demonstrator: Demonstrator) -> "Style":
+        """What this style becomes in the hands of a demonstrator."""
+        return replace(self, speed=self.speed * demonstrator.speed, hover=self.hover * demonstrator.height)
+
 
 class Scene:
     """What an expert may look at: gripper, fingers and named bodies, in world coordinates.
 
-    `robot` says whose gripper and fingers, where there are several.
+    `robot` says whose gripper and fingers, where there are several; `shown_by` who moves them, a good demonstrator
+    unless somebody else is named.
     """
 
-    def __init__(self, env: Env, robot: int = 0) -> None:
+    def __init__(self, env: Env, robot: int = 0, shown_by: Demonstrator | None = None) -> None:
         self.env = env
+        self.shown_by = shown_by or Demonstrator(SKILLS[USUAL], np.random.default_rng(0))
         self._robot: Any = env.robots[robot]
         self._site = int(self._robot.eef_site_id["right"])
         self._fingers: list[int] = list(self._robot._ref_gripper_joint_pos_indexes["right"])
@@ -115,7 +123,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Mishaps:
-    """What befalls an expert, each every so many steps on average.
+    """What befalls an expert, each every so many steps on average; more, the slower who shows it.
 
     A push moves the hand for three steps. A fumble makes the fingers do the opposite of what they should for 4 to 13:
     a thing is lost, or they close on nothing. What the expert does to make up for them is what a policy learns from to
@@ -131,7 +139,7 @@ ONE_PUSH = Mishaps()
 
 
 class Servo:
-    """Turns a target pose of the hand into an action, with this episode's style, noise and mishaps."""
+    """Turns a target pose of the hand into an action, with this episode's style, noise, mishaps and demonstrator."""
 
     def __init__(
         self,
@@ -142,17 +150,18 @@ class Servo:
         mishaps: Mishaps = ONE_PUSH,
     ) -> None:
         self.scene = scene
-        self.style = Style.draw(rng)
+        self.style = Style.draw(rng).of(scene.shown_by)
+        self.manner = Manner(scene.shown_by)
         self.pace = pace
-        self.turn = turn
-        self.upright = scene.hand_rotation
+        self.turn = turn * scene.shown_by.speed
+        self.upright = about_z(scene.shown_by.askew) @ scene.hand_rotation
         self._rng = rng
         self._noise = np.zeros(6)
         self._time = 0
-        self._pushed = mishaps.pushed
+        self._pushed = mishaps.pushed * scene.shown_by.slowness
         self._push_at: int = 3 + int(37 * rng.random())
         self._push = self._draw_push()
-        self._fumbled = mishaps.fumbled
+        self._fumbled = mishaps.fumbled * scene.shown_by.slowness
         self._fumble: tuple[int, int] = self._draw_fumble()
 
     def _draw_fumble(self) -> tuple[int, int]:
@@ -169,10 +178,14 @@ class Servo:
     def move(self, target: Array, grip: float, rotation: Array | None = None) -> Array:
         """A step towards `target` (and `rotation`, else as the hand was at the start)."""
         style = self.style
-        wanted = limit((target - self.scene.hand) / METRES_PER_UNIT * style.gain, style.speed * self.pace)
+        target = self.manner.onward(self.scene.hand, target, grip, self.scene.base)
+        haste = self.manner.haste()
+        fastest = style.speed * self.pace
+        wanted = limit((target - self.scene.hand) / METRES_PER_UNIT * style.gain, fastest) * haste
+        noise = style.noise * self.manner.tremble(float(np.linalg.norm(wanted)) / fastest)
         goal = self.upright if rotation is None else rotation
-        turn = limit(rotation_vector(goal @ self.scene.hand_rotation.T) / RADIANS_PER_UNIT, self.turn)
-        self._noise = 0.7 * self._noise + self._rng.normal(size=6) * style.noise * np.repeat([1.0, 0.3], 3)
+        turn = limit(rotation_vector(goal @ self.scene.hand_rotation.T) / RADIANS_PER_UNIT, self.turn) * haste
+        self._noise = 0.7 * self._noise + self._rng.normal(size=6) * noise * np.repeat([1.0, 0.3], 3)
         if self._push_at <= self._time < self._push_at + 3:
             wanted = wanted + self._push
         elif self._time == self._push_at + 3 and math.isfinite(self._pushed):
@@ -239,6 +252,8 @@ class Grasp:
     """
 
     THINNEST, WIDEST = 0.01, 0.07
+    # Where a hand that cannot get to a point beside the thing gives up.
+    NEAR = 0.05
 
     def __init__(
         self,
@@ -250,6 +265,8 @@ class Grasp:
     ) -> None:
         self.scene = scene
         self.style = style
+        # what is tall falls over where fingers touch it: a hand that misses it closes above
+        self.slips = Slips(scene.shown_by, tall, beside=tall == 0.0)
         self.close = close
         self.hover = style.hover + tall
         self.mouth = mouth
@@ -261,16 +278,26 @@ class Grasp:
 
         `askew` is the angle by which the hand still has to turn; it stays above until that is small.
         """
-        hand = self.scene.hand
+        hand, rotation = self.scene.hand, self.scene.hand_rotation
+        back = self.slips.back(hand, rotation, self.scene.gap)
+        if back is not None:
+            return back, OPEN
+        point = point + self.slips.off(rotation)
         offset = point - hand
         flat, height = float(np.linalg.norm(offset[:2])), abs(float(offset[2]))
         if not self.closing and flat < self.close[0] and height < self.close[1]:
             self.closing = True
         elif self.closing and (flat > 0.035 or height > 0.035 or self.scene.gap < self.THINNEST):
             self.closing = self.held = False
+            if self.scene.gap < self.THINNEST:
+                self.slips.missed()
+        elif not self.closing and max(flat, height) < self.NEAR:
+            self.slips.near()
         gap = self.scene.gap
         if self.closing and self.THINNEST < gap < self.WIDEST and abs(self.scene.gap_speed) < 0.01:
-            self.held = True
+            self.held, taken = True, not self.held
+            if taken and self.slips.lets_go():
+                self.closing = self.held = False
         target = np.array(point)
         if not self.closing:
             lift = max(funnel(flat, *self.mouth), funnel(abs(askew), 0.15, 0.4))

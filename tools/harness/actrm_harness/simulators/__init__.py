@@ -114,8 +114,8 @@ class Simulation(Protocol):
         """Do one action, or one a row until the task is solved or lost."""
         ...
 
-    def expert(self, seed: int, demonstration: bool, expert: str | None = None) -> Episode:
-        """One whole episode of the task's scripted expert, or of another of them by its name."""
+    def expert(self, seed: int, demonstration: bool, expert: str | None = None, skill: str | None = None) -> Episode:
+        """One whole episode of the task's scripted expert, or of another of them by its name, of a skill if named."""
         ...
 
     def extract(self, stored: Stored) -> Episode:

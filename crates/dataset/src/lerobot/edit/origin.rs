@@ -62,6 +62,8 @@ pub(super) fn of(edit: &Edit<'_>, fingerprint: &str, notes: &mut Vec<String>) ->
         first.env_version.clone().filter(|_| shared("env_version", same(&|a, b| a.env_version == b.env_version)));
     let same_expert = same(&|a, b| a.expert == b.expert);
     let expert = first.expert.clone().filter(|_| shared("the expert that recorded them", same_expert));
+    let same_skill = same(&|a, b| a.skill == b.skill);
+    let skill = first.skill.clone().filter(|_| shared("the skill of who showed them", same_skill));
     let same_args = same(&|a, b| a.env_args == b.env_args);
     let env_args = first.env_args.clone().filter(|_| shared("env_args", same_args));
     let same_video = same(&|a, b| a.video == b.video);
@@ -97,6 +99,7 @@ pub(super) fn of(edit: &Edit<'_>, fingerprint: &str, notes: &mut Vec<String>) ->
         env_args,
         seeds: all_seeds,
         expert,
+        skill,
         state_keys: keys(STATE).unwrap_or_default(),
         env_keys: keys(ENVIRONMENT_STATE).unwrap_or_default(),
         entities: entities.collect(),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from actrm_harness.experts.parts import Expert, Scene
+from actrm_harness.experts.skills import USUAL, Demonstrator
 from actrm_harness.protocol import RequestError
 from actrm_harness.simulators import Episode
 from actrm_harness.simulators.robosuite import envs
@@ -68,18 +69,21 @@ class _Recorder:
         return tensors
 
 
-def expert_episode(session: Session, seed: int, demonstration: bool = True, name: str | None = None) -> Episode:
+def expert_episode(
+    session: Session, seed: int, demonstration: bool = True, name: str | None = None, skill: str | None = None
+) -> Episode:
     """One episode of the task's expert; its noise has a generator of its own, drawn from the same seed.
 
     `demonstration` False asks for the episode that an evaluation of this seed begins with, `name` for another of the
-    task's experts than the usual one.
+    task's experts than the usual one, `skill` for less able demonstrators: the attribute `skill` then says who it was.
     """
     place = _expert_place(session, name)
+    shown_by = Demonstrator.draw(skill, seed)
     env = session.env
     session.foreign_model |= session.xml_forgotten
     recorder = _Recorder(envs.reset(session, seed, demonstration), whole=False)
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
-    expert: Expert = find(place)(Scene(env), np.random.default_rng([seed, 1]))
+    expert: Expert = find(place)(Scene(env, shown_by=shown_by), np.random.default_rng([seed, 1]))
     held = 0
     for _ in range(session.task.max_steps):
         before = envs.state(env)
@@ -89,6 +93,11 @@ def expert_episode(session: Session, seed: int, demonstration: bool = True, name
         held = held + 1 if result.success else 0
         if held > STEPS_AFTER_SUCCESS or result.failure is not None:
             break
+    if skill not in (None, USUAL):
+        if shown_by.arms == 0:
+            text = f"the expert of task {session.task.name!r} moves without a Servo and has one skill only: {USUAL}"
+            raise RequestError("no_skill", text)
+        attrs["skill"] = shown_by.skill.name
     progress = session.progress(any(recorder.successes))
     return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors(), progress)
 

@@ -70,9 +70,9 @@ class Robosuite:
         progress = self.session.progress(result.success)
         return Stepped(result.observation, rewards, result.success, result.failure, self.session.drawing_ms, progress)
 
-    def expert(self, seed: int, demonstration: bool, expert: str | None = None) -> Episode:
+    def expert(self, seed: int, demonstration: bool, expert: str | None = None, skill: str | None = None) -> Episode:
         """One whole episode of the task's scripted expert."""
-        return episodes.expert_episode(self.session, seed, demonstration, expert)
+        return episodes.expert_episode(self.session, seed, demonstration, expert, skill)
 
     def extract(self, stored: Stored) -> Episode:
         """What stored states look like."""
