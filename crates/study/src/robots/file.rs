@@ -69,7 +69,7 @@ pub struct Data {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Arm {
-    /// The experiment; `{data}` in it stands for the name of the demonstrations.
+    /// The experiment; `{data}` in it stands for the name of the demonstrations, `{task}` for their task's in small letters.
     pub experiment: String,
     /// Dotted settings laid over it.
     #[serde(default)]
@@ -94,13 +94,6 @@ pub struct Test {
     /// What becomes of the pictures on their way to policies, as `actrm-zoo eval --perturb` has it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub perturb: Option<String>,
-}
-
-impl Arm {
-    /// The experiment on the demonstrations called `data`.
-    pub fn experiment_on(&self, data: &str) -> String {
-        self.experiment.replace("{data}", data)
-    }
 }
 
 impl Data {
@@ -214,6 +207,12 @@ fn as_trained(thinking: &Thinking) -> bool {
 }
 
 impl Study {
+    /// The experiment of an arm on the demonstrations called `data`.
+    pub fn experiment_on(&self, arm: &str, data: &str) -> String {
+        let task = self.data[data].task.to_lowercase();
+        self.arms[arm].experiment.replace("{data}", data).replace("{task}", &task)
+    }
+
     /// Reads and checks a study file.
     ///
     /// # Errors
@@ -381,7 +380,7 @@ mod tests {
         }
         let library = zoo::config::Library::built_in();
         for cell in super::super::cells::cells(&study) {
-            let name = study.arms[&cell.arm].experiment_on(&cell.data);
+            let name = study.experiment_on(&cell.arm, &cell.data);
             let experiment = zoo::experiment::Experiment::load(&library, &name, &study.arms[&cell.arm].set);
             assert_eq!(experiment.unwrap().task.name, study.data[&cell.data].task, "{name}");
         }

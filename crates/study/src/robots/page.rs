@@ -499,7 +499,7 @@ fn costs(text: &mut String, study: &Study, results: &BTreeMap<(String, String, S
         let mut data: Vec<&str> = Vec::new();
         for row in study.cells.iter().filter(|row| row.arms.contains(name)) {
             // an experiment of its own for each, or the same on all
-            if arm.experiment_on(&row.data) != arm.experiment && !data.contains(&row.data.as_str()) {
+            if study.experiment_on(name, &row.data) != arm.experiment && !data.contains(&row.data.as_str()) {
                 data.push(&row.data);
             }
         }
@@ -519,7 +519,7 @@ fn cost(
     (name, data): (&String, Option<&str>),
 ) {
     let arm = &study.arms[name];
-    let experiment = data.map_or_else(|| arm.experiment.clone(), |data| arm.experiment_on(data));
+    let experiment = data.map_or_else(|| arm.experiment.clone(), |data| study.experiment_on(name, data));
     let settings: Vec<String> = arm.set.iter().map(|s| format!("`{s}`")).collect();
     let settings = settings.join(", ");
     let as_trained = |test: &str| study.tests[test].is_plain();

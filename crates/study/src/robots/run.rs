@@ -18,7 +18,7 @@ use zoo::{ZooError, sha256_hex};
 
 use super::cells::{Cell, cells};
 use super::error::StudyError;
-use super::file::{Arm, Data, Study, Test};
+use super::file::{Data, Study, Test};
 use super::result::CellResult;
 
 /// What to run and where.
@@ -163,7 +163,7 @@ fn experiment(request: &RobotStudyRequest, cell: &Cell) -> Result<(Experiment, S
     let arm = &request.study.arms[&cell.arm];
     let mut set = arm.set.clone();
     set.push(format!("train.seed={}", cell.seed));
-    let experiment = Experiment::load(&request.library, &arm.experiment_on(&cell.data), &set)?;
+    let experiment = Experiment::load(&request.library, &request.study.experiment_on(&cell.arm, &cell.data), &set)?;
     let settings = settings_hash(&experiment);
     let entry = match request.study.zoo {
         Some(_) => member_name(&experiment.entry, cell.seed),
@@ -174,10 +174,11 @@ fn experiment(request: &RobotStudyRequest, cell: &Cell) -> Result<(Experiment, S
 }
 
 /// The same training without the study, as a command.
-fn train_command(arm: &Arm, cell: &Cell, entry: &str, data: &Path) -> String {
+fn train_command(study: &Study, cell: &Cell, entry: &str, data: &Path) -> String {
+    let arm = &study.arms[&cell.arm];
     let plain = |c: char| c.is_ascii_alphanumeric() || "_-=./".contains(c);
     let quoted = |word: &String| if word.chars().all(plain) { word.clone() } else { format!("'{word}'") };
-    let mut words = vec!["actrm-zoo".to_owned(), "train".to_owned(), arm.experiment_on(&cell.data)];
+    let mut words = vec!["actrm-zoo".to_owned(), "train".to_owned(), study.experiment_on(&cell.arm, &cell.data)];
     words.extend(arm.set.iter().map(quoted));
     words.extend([format!("train.seed={}", cell.seed), format!("entry={entry}"), "--data".to_owned()]);
     words.push(quoted(&data.display().to_string()));
@@ -279,8 +280,8 @@ impl Shared<'_> {
         let training = lock(&self.training[&cell.name()]);
         if self.request.trained(&name, &settings)?.is_none() {
             let request = TrainRequest {
-                name: arm.experiment_on(&cell.data),
-                command: Some(train_command(arm, cell, &name, &file)),
+                name: self.request.study.experiment_on(&cell.arm, &cell.data),
+                command: Some(train_command(&self.request.study, cell, &name, &file)),
                 experiment,
                 data: Some(file),
                 runs: self.request.work.join("runs"),
