@@ -57,6 +57,7 @@ impl Fixture {
             total_rows: self.get("state").dim(0).unwrap(),
             total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
             taken: None,
+            visited: None,
             seed: 0,
         }
     }

@@ -82,6 +82,7 @@ impl Fixture {
             total_rows: rows,
             total_valid_steps: rows * horizon,
             taken: None,
+            visited: None,
             seed: 0,
         }
     }

@@ -107,6 +107,7 @@ impl Fixture {
             total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
             seed: 0,
             taken: None,
+            visited: None,
         }
     }
 
