@@ -33,9 +33,9 @@ UPRIGHT_AT = np.array([-0.08, -0.16])
 
 # How far the wrench is tilted around the hook before it is let go, and where its ring is then, from the middle of the
 # upturned end.
-TILT = 1.1
+TILT = 1.15
 TILTED = 0.75
-AROUND = np.array([-0.004, 0.0, -0.012])
+AROUND = np.array([-0.008, 0.0, -0.012])
 
 # The hand over the wrench, in the wrench's axes (z up, -x to the ring): it leans towards the ring, so that it does not
 # have to lean as far the other way when the wrench is tilted.
@@ -86,9 +86,9 @@ class ToolHangExpert:
         frame, rotation = self.scene.body("frame_root"), self.scene.body_rotation("frame_root")
         tip = self._site("frame_tip_site")
         mouth = self.scene.body("stand_root") + np.array([0.0, 0.045, 0.0])
-        goal = np.array([*mouth[:2], TABLE + 0.045])
+        goal = np.array([*mouth[:2], TABLE + 0.026])
         grip = frame + rotation @ GRIP
-        if not self.insertion.update(tip, goal, flat=0.006, height=0.04, lost=0.06):
+        if not self.insertion.update(tip, goal, flat=0.006, height=0.018, lost=0.06):
             self.left = False
             return self._insert(grip, rotation, tip, goal)
         self.left |= float(np.linalg.norm(self.scene.hand - grip)) > 0.1
@@ -144,8 +144,9 @@ class ToolHangExpert:
         tool, rotation = scene.body("tool_root"), scene.body_rotation("tool_root")
         ring, hook = self._site("tool_hole1_center"), self._geom("frame_hook_frame")
         tilted = self.hanging.released or lean_of(rotation) > TILTED
-        if tilted and self.hanging.update(ring, hook + AROUND, flat=0.008, height=0.006, lost=0.06):
+        if tilted and self.hanging.update(ring, hook + AROUND, flat=0.005, height=0.006, lost=0.06):
             target, fingers = self.hanging.let_go()
+            target[2] = min(float(target[2]), self.high)
             return self.servo.move(target, fingers, scene.hand_rotation)
         wanted = rotation @ OVER
         askew = float(np.linalg.norm(rotation_vector(wanted @ scene.hand_rotation.T)))
@@ -163,7 +164,7 @@ class ToolHangExpert:
         tilt = np.array([0.0, TILT, 0.0]) if around else np.zeros(3)
         left = rotation_vector(about(tilt) @ rotation.T)
         lean = lean_of(rotation)
-        goal = hook + np.array([0.004 * lean - 0.012 * funnel(lean, 0.55, 0.8), 0.0, -0.001 - 0.0135 * lean])
+        goal = hook + np.array([0.004 * lean - 0.013 * funnel(lean, 0.55, 0.8), 0.0, -0.001 - 0.0135 * lean])
         self.servo.turn = GENTLE if around else FREE
         if around:
             target = self.scene.hand + FIRM * (goal - ring)
