@@ -125,7 +125,7 @@ TASKS = {
         Task("ToolHang", expert=".experts.tools:ToolHangExpert", soft_reset=True, max_steps=700),
         Task("TwoArmLift", expert=".experts.arms:TwoArmLiftExpert", soft_reset=True, arguments=PANDAS),
         Task("TwoArmHandover", arguments=PANDAS),
-        Task("TwoArmTransport", arguments=PANDAS, max_steps=700),
+        Task("TwoArmTransport", expert=".experts.arms:TwoArmTransportExpert", arguments=PANDAS, max_steps=700),
     )
 }
 

@@ -19,7 +19,7 @@ from actrm_harness.simulators.robosuite.control import CompiledControl  # noqa: 
 from actrm_harness.simulators.robosuite.control_abi import Library  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
 
-TASKS = ["Lift", "Stack", "PickPlaceCan", "PickPlace", "NutAssemblySquare", "NutAssemblyRound", "Door"]
+TASKS = ["Lift", "Stack", "PickPlaceCan", "PickPlace", "NutAssemblySquare", "NutAssemblyRound", "ToolHang", "Door"]
 
 
 pytestmark = pytest.mark.usefixtures("library")
@@ -351,7 +351,12 @@ def test_other_controllers_keep_robosuites_loop_and_are_named_once(capfd: pytest
 
 
 @pytest.mark.parametrize(
-    ("task", "reason"), [("Wipe", "parts of an action"), ("TwoArmLift", "not one on a fixed base")]
+    ("task", "reason"),
+    [
+        ("Wipe", "parts of an action"),
+        ("TwoArmLift", "not one on a fixed base"),
+        ("TwoArmTransport", "not one on a fixed base"),
+    ],
 )
 def test_tasks_of_other_robots_keep_robosuites_loop(task: str, reason: str, capfd: pytest.CaptureFixture[str]) -> None:
     env = envs.make(task).env

@@ -60,7 +60,7 @@ CROOKED = (0.04, 0.1)
 BENT = (0.06, 0.15)
 INSIDE = 0.035
 MISSED = 0.01
-# How much firmer the hand holds its place there, against the friction of the walls.
+# How much firmer the hand holds the ring's place, against the hook's friction.
 FIRM = 2.5
 
 
@@ -112,8 +112,9 @@ class ToolHangExpert:
         self.servo.turn = GENTLE
         target = self._lower(tip, goal, self.insertion.clear, crooked)
         if inside:
-            # the walls hold the tip, so the hand brings the rod's upper end over it
-            target[:2] = (self.scene.hand + FIRM * (goal - grip))[:2]
+            # the walls hold the tip, so the hand brings the rod's upper end over it; gently, as the walls are a
+            # millimetre thick and a rod that is pressed into them comes out on the other side
+            target[:2] = (self.scene.hand + goal - grip)[:2]
         aside = funnel(crooked, 0.15, 0.4)
         target[:2] += (UPRIGHT_AT - target[:2]) * aside
         return self.servo.move(target, fingers, wanted)
