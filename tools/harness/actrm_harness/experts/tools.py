@@ -39,7 +39,7 @@ AROUND = np.array([-0.008, 0.0, -0.012])
 
 # The hand over the wrench, in the wrench's axes (z up, -x to the ring): it leans towards the ring, so that it does not
 # have to lean as far the other way when the wrench is tilted.
-OVER_LEAN = 0.5
+OVER_LEAN = 0.2
 OVER = np.array(
     [
         [0.0, -np.cos(OVER_LEAN), np.sin(OVER_LEAN)],
@@ -52,14 +52,18 @@ OVER = np.array(
 FREE, GENTLE = 0.6, 0.2
 
 # Lowering: how far the hand is asked to go down at once, how far beside its place and how crooked a thing may be where
-# it begins, how crooked once it is inside; and what inside is: so far below the height that clears everything, and at
-# most so far to the side.
+# it begins, and how crooked once it is inside, at most so far to the side.
 STEP = 0.014
 BESIDE = (0.003, 0.007)
 CROOKED = (0.04, 0.1)
 BENT = (0.06, 0.15)
-INSIDE = 0.035
 MISSED = 0.01
+
+# From the stand's middle to just below the top of its mount; from the middle of the hook's upturned end to where a ring
+# that lies flat is around it.
+MOUNT = 0.073
+UPTURNED = 0.007
+
 # How much firmer the hand holds the ring's place, against the hook's friction.
 FIRM = 2.5
 
@@ -106,11 +110,12 @@ class ToolHangExpert:
         # the tip stays above the table while the rod is stood up
         room = float(tip[2]) - TABLE - 0.015
         # a rod between walls turns in the fingers rather than with the hand: then it is the hand that is kept straight
-        inside = float(tip[2]) < self.insertion.clear - INSIDE and float(np.linalg.norm((goal - tip)[:2])) < MISSED
+        top = float(self.scene.body("stand_root")[2]) + MOUNT
+        inside = float(tip[2]) < top and float(np.linalg.norm((goal - tip)[:2])) < MISSED
         wanted = STANDING @ ALONG if inside else about(left) @ hand if room > 0.0 else hand
         crooked = float(np.linalg.norm(left))
         self.servo.turn = GENTLE
-        target = self._lower(tip, goal, self.insertion.clear, crooked)
+        target = self._lower(tip, goal, self.insertion.clear, top, crooked)
         if inside:
             # the walls hold the tip, so the hand brings the rod's upper end over it; gently, as the walls are a
             # millimetre thick and a rod that is pressed into them comes out on the other side
@@ -119,11 +124,14 @@ class ToolHangExpert:
         target[:2] += (UPRIGHT_AT - target[:2]) * aside
         return self.servo.move(target, fingers, wanted)
 
-    def _lower(self, thing: Array, goal: Array, clear: float, crooked: float) -> Array:
-        """Where the hand should go to take `thing` over `goal` and, once it is straight, slowly down to it."""
+    def _lower(self, thing: Array, goal: Array, clear: float, top: float, crooked: float) -> Array:
+        """Where the hand should go to take `thing` over `goal` and, once it is straight, slowly down to it.
+
+        It is taken there at the height `clear`, and below `top` it is inside.
+        """
         away = goal - thing
         flat, rise = float(np.linalg.norm(away[:2])), clear - float(thing[2])
-        inside = rise > INSIDE and flat < MISSED
+        inside = float(thing[2]) < top and flat < MISSED
         off = funnel(crooked, *(BENT if inside else CROOKED))
         if inside:
             down = -STEP * (1.0 - off)
@@ -170,7 +178,8 @@ class ToolHangExpert:
         if around:
             target = self.scene.hand + FIRM * (goal - ring)
         else:
-            target = self._lower(ring, goal, self.hanging.clear, float(np.linalg.norm(left)))
+            crooked = float(np.linalg.norm(left))
+            target = self._lower(ring, goal, self.hanging.clear, float(hook[2]) + UPTURNED, crooked)
         return self.servo.move(target, CLOSE, about(left) @ self.scene.hand_rotation)
 
     def _over(self, target: Array) -> Array:
