@@ -122,9 +122,10 @@ TASKS = {
             max_steps=150,
             arguments={"initialization_noise": None},
         ),
+        Task("ToolHang", expert=".experts.tools:ToolHangExpert", soft_reset=True, max_steps=700),
         Task("TwoArmLift", expert=".experts.arms:TwoArmLiftExpert", soft_reset=True, arguments=PANDAS),
         Task("TwoArmHandover", arguments=PANDAS),
-        Task("TwoArmTransport", arguments=PANDAS, max_steps=700),
+        Task("TwoArmTransport", expert=".experts.arms:TwoArmTransportExpert", arguments=PANDAS, max_steps=700),
     )
 }
 

@@ -34,6 +34,7 @@ TASKS = (
     "StackThreeCubes",
     "TableMaze",
     "TableMaze10",
+    "ToolHang",
 )
 
 Observation = dict[str, NDArray[Any]]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from actrm_harness.experts.parts import DOWN, Grasp, Scene, Servo, about_z, hand_yaw, nearest, yaw
+from actrm_harness.experts.parts import DOWN, OPEN, Carry, Grasp, Scene, Servo, about_z, funnel, hand_yaw, nearest, yaw
 from actrm_harness.wire import Array
 
 # In the pot's frame, where the first arm holds its handle: one of the two bars that lead away from the pot. The second
@@ -44,3 +44,173 @@ class TwoArmLiftExpert:
                 turn = hand
             actions.append(servo.move(target, grip, about_z(turn) @ DOWN))
         return np.concatenate(actions)
+
+
+# Along the hammer's handle, from its middle to where the first and the second hand hold it; a hand is 6.4 cm thick.
+APART = {1.0: 0.035, -1.0: 0.055}
+
+# How far up or down a hand is asked to go at once.
+STEADY = 0.03
+
+# The fingers' height over the walls of the bins.
+OVER_WALLS = 1.04
+
+
+class Hammer:
+    """A hammer that lies flat, seen from two arms that face each other along y, each holding an end of its handle."""
+
+    def __init__(self, scene: Scene, name: str) -> None:
+        self.scene = scene
+        self.name = name
+
+    @property
+    def middle(self) -> Array:
+        """The middle of the handle."""
+        return self.scene.body(self.name)
+
+    def along(self, side: float) -> Array:
+        """The handle's direction, away from the arm on the side of -y (`side` 1) or of +y (-1)."""
+        way = self.scene.body_rotation(self.name)[:, 2]
+        return way if way[1] * side > 0.0 else -way
+
+    def grip(self, side: float) -> Array:
+        """Where that arm holds it."""
+        return self.middle - APART[side] * self.along(side)
+
+    def turn(self, side: float, hand: float) -> float:
+        """The turn of that arm's hand, from which the handle leads away."""
+        way = self.along(side)
+        return nearest(float(np.arctan2(way[1], way[0])), 2 * np.pi, hand)
+
+
+class TwoArmTransportExpert:
+    """The first arm uncovers and fetches the hammer while the second throws out the trash; then they hand it over.
+
+    Both hold the hammer by its handle from above, side by side, in the middle between the tables. The first opens once
+    the second holds, and the second lays the hammer into its bin once the first is away. Over the tables the hands are
+    near the end of their range, towards their own bases: there they are led back to the bins' line and not only up.
+    """
+
+    BODY = "payload_root"
+    LID = np.array([-0.2, -0.45, 0.826])
+    MEET = np.array([0.0, 0.0, 1.1])
+    # where each arm waits, the second beside the place where they meet
+    BACK = np.array([0.0, -0.3, 1.2])
+    WAITING = np.array([0.0, 0.14, 1.2])
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.scenes = [scene, Scene(scene.env, 1)]
+        self.servos = [Servo(each, rng, pace=1.4) for each in self.scenes]
+        self.servos[1].style = self.servos[0].style
+        style = self.servos[0].style
+        self.hammer = Hammer(scene, self.BODY)
+        self.lid = Grasp(scene, style, tall=0.02, mouth=(0.012, 0.03))
+        self.trash = Grasp(self.scenes[1], style, tall=0.19, mouth=(0.012, 0.04))
+        # the first reaches into a bin for the hammer, the second up to where it is held
+        self.holds = [
+            Grasp(scene, style, tall=0.19, mouth=(0.012, 0.04), close=(0.012, 0.012)),
+            Grasp(self.scenes[1], style, mouth=(0.012, 0.03), close=(0.012, 0.012)),
+        ]
+        self.meet = self.MEET + np.array([0.0, 0.0, rng.uniform(-0.02, 0.02)])
+        clear = rng.uniform(1.03, 1.05)
+        self.uncover = Carry(scene, self.lid, clear)
+        self.throw = Carry(self.scenes[1], self.trash, clear)
+        self.fetch = Carry(scene, self.holds[0], clear=float(self.meet[2]))
+        self.lay = Carry(self.scenes[1], self.holds[1], clear=float(self.meet[2]))
+        self.given = self.uncovered = self.thrown = False
+
+    def act(self) -> Array:
+        """The action for the current state, the first arm's before the second's."""
+        self.given |= self.holds[0].held and self.holds[1].held
+        return np.concatenate([self._first(), self._second()])
+
+    def _move(self, servo: Servo, target: Array, fingers: float, rotation: Array) -> Array:
+        """A step that leaves some of the speed for keeping to the line: who only goes down drifts towards the base."""
+        step = target - servo.scene.hand
+        step[2] = np.clip(step[2], -STEADY, STEADY)
+        return servo.move(servo.scene.hand + step, fingers, rotation)
+
+    def _first(self) -> Array:
+        scene, servo = self.scenes[0], self.servos[0]
+        hand = hand_yaw(scene.hand_rotation)
+        straight = about_z(nearest(np.pi / 2, 2 * np.pi, hand)) @ DOWN
+        if not self.uncovered:
+            lid, handle = scene.body("transport_start_bin_lid_root"), _geom(scene, "transport_start_bin_lid_handle")
+            if self.uncover.update(lid, self.LID, flat=0.04, height=0.012, lost=0.1):
+                target, fingers = self.uncover.let_go()
+                target[1] = self.LID[1]
+                self.uncovered = float(scene.hand[2] - handle[2]) > 0.08
+                return self._move(servo, target, fingers, straight)
+            target, fingers = self.lid.reach(handle)
+            if self.lid.held:
+                target = self.uncover.bring(lid, self.LID, near=0.03, far=0.08)
+                target[1] = self.LID[1]
+            return self._move(servo, target, fingers, straight)
+        if self.given:
+            # up off the handle, and back from it
+            target, fingers = self.fetch.let_go()
+            if float(scene.hand[2]) > float(self.hammer.middle[2]) + 0.05 or float(scene.hand[1]) < -0.15:
+                target = self.BACK
+            return self._move(servo, target, fingers, straight)
+        turn = self.hammer.turn(1.0, hand)
+        target, fingers = self.holds[0].reach(self.hammer.grip(1.0), turn - hand)
+        if not self.holds[0].held:
+            if float(np.linalg.norm((target - scene.hand)[:2])) > 0.05:
+                # out of the lid's place and over the bin's wall
+                target[:2] += (scene.hand - target)[:2] * funnel(OVER_WALLS - float(scene.hand[2]), 0.01, 0.05)
+            return self._move(servo, target, fingers, about_z(turn) @ DOWN)
+        middle = self.hammer.middle
+        target = self.fetch.bring(middle, self.meet, near=0.01, far=0.05)
+        low = funnel(float(self.meet[2] - middle[2]), 0.01, 0.05)
+        target[:2] += low * (_geom(scene, "transport_start_bin_base") - middle)[:2]
+        return self._move(servo, target, fingers, about_z(hand + nearest(np.pi / 2, 2 * np.pi, turn) - turn) @ DOWN)
+
+    def _second(self) -> Array:
+        scene, servo = self.scenes[1], self.servos[1]
+        hand = hand_yaw(scene.hand_rotation)
+        straight = about_z(nearest(-np.pi / 2, 2 * np.pi, hand)) @ DOWN
+        if not self.thrown:
+            return self._throw_out(straight)
+        hold = self.holds[1]
+        if self.given:
+            goal = _geom(scene, "transport_target_bin_base") + np.array([0.0, 0.0, 0.03])
+            if self.lay.update(self.hammer.middle, goal, flat=0.03, height=0.01):
+                target, fingers = self.lay.let_go()
+                target[:2] = goal[:2] - APART[-1.0] * self.hammer.along(-1.0)[:2]
+                return self._move(servo, target, fingers, straight)
+            target, fingers = hold.reach(self.hammer.grip(-1.0))
+            away = float(np.linalg.norm(self.scenes[0].hand - self.hammer.grip(1.0))) > 0.06
+            if hold.held and away:
+                target = self.lay.bring(self.hammer.middle, goal, near=0.02, far=0.06)
+            return self._move(servo, target, fingers, straight)
+        offered = self.hammer.middle - self.meet
+        if self.holds[0].held and float(np.linalg.norm(offered)) < 0.03:
+            turn = self.hammer.turn(-1.0, hand)
+            target, fingers = hold.reach(self.hammer.grip(-1.0), turn - hand)
+            return self._move(servo, target, fingers, about_z(turn) @ DOWN)
+        return self._move(servo, self.WAITING, OPEN, straight)
+
+    def _throw_out(self, straight: Array) -> Array:
+        scene, servo = self.scenes[1], self.servos[1]
+        trash, rotation = scene.body("trash_main"), scene.body_rotation("trash_main")
+        goal = _geom(scene, "transport_trash_bin_base") + np.array([0.0, 0.0, 0.07])
+        away = np.abs(trash - goal)
+        inside = float(trash[2]) < float(goal[2]) - 0.03 and float(away[:2].max()) < 0.12
+        if self.throw.update(trash, goal, flat=0.04, height=0.02, lost=0.2) or inside:
+            target, fingers = self.throw.let_go()
+            target[:2] = goal[:2]
+            self.thrown = float(scene.hand[2]) > 1.02
+            return self._move(servo, target, fingers, straight)
+        hand = hand_yaw(scene.hand_rotation)
+        turn = nearest(yaw(rotation), np.pi / 2, hand)
+        target, fingers = self.trash.reach(trash, turn - hand)
+        if self.trash.held:
+            target = self.throw.bring(trash, goal, near=0.03, far=0.08)
+            target[1] = goal[1]
+            return self._move(servo, target, fingers, straight)
+        return self._move(servo, target, fingers, about_z(turn) @ DOWN)
+
+
+def _geom(scene: Scene, name: str) -> Array:
+    """Position of a shape."""
+    return np.array(scene.env.sim.data.geom_xpos[scene.env.sim.model.geom_name2id(name)])

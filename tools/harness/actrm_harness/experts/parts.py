@@ -216,6 +216,16 @@ def rotation_vector(matrix: Array) -> Array:
     return axis / (2 * sine) * float(np.arctan2(sine, cosine))
 
 
+def about(vector: Array) -> Array:
+    """Rotation matrix of an axis times an angle: what `rotation_vector` reads."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-9:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
 def about_z(angle: float) -> Array:
     """Rotation matrix about the vertical."""
     c, s = np.cos(angle), np.sin(angle)

@@ -139,6 +139,50 @@ def _two_arm_lift(env: Any) -> tuple[Stage, ...]:
     return (("one holds", hold(1)), ("both hold", hold(2)), ("lifted", lifted))
 
 
+def _tool_hang(env: Any) -> tuple[Stage, ...]:
+    frame, tool = _body(env, env.obj_body_id["frame"]), _body(env, env.obj_body_id["tool"])
+    handle = env.sim.model.geom_name2id("frame_grip_frame")
+    hook = env.sim.model.geom_name2id("frame_hook_frame")
+
+    def at(geom: int) -> Callable[[], Array]:
+        return lambda: np.array(env.sim.data.geom_xpos[geom])
+
+    def ring() -> Array:
+        return np.array(env.sim.data.site_xpos[env.obj_site_id["tool_hole1_center"]])
+
+    return (
+        *((f"frame {name}", reached) for name, reached in fetching(env, env.frame, frame, at(handle))),
+        ("assembled", lambda: bool(env._check_frame_assembled())),
+        *((f"tool {name}", reached) for name, reached in fetching(env, env.tool, tool)),
+        ("above", _above(ring, at(hook), 0.02)),
+    )
+
+
+def _two_arm_transport(env: Any) -> tuple[Stage, ...]:
+    group = env.transport
+    payload = _body(env, group.payload_body_id)
+    rest = float(payload()[2])
+    covered = float(group.lid_handle_pos[0])
+
+    def holds(*arms: int) -> Callable[[], bool]:
+        """Whether these arms hold the hammer, and no other."""
+
+        def judge() -> bool:
+            grasps = [env._check_grasp(gripper=robot.gripper, object_geoms=group.payload) for robot in env.robots]
+            return all(bool(grasp) == (arm in arms) for arm, grasp in enumerate(grasps))
+
+        return judge
+
+    return (
+        ("uncovered", lambda: abs(float(group.lid_handle_pos[0]) - covered) > env.bin_size[0] / 2.0),
+        ("trash out", lambda: bool(group.trash_in_trash_bin)),
+        ("first holds", holds(0)),
+        ("lifted", lambda: float(payload()[2]) > rest + LIFTED),
+        ("both hold", holds(0, 1)),
+        ("second holds", holds(1)),
+    )
+
+
 _STAGES: dict[str, Callable[[Any], tuple[Stage, ...]]] = {
     "Lift": _lift,
     "Stack": _stack,
@@ -151,5 +195,7 @@ _STAGES: dict[str, Callable[[Any], tuple[Stage, ...]]] = {
     "NutAssemblyRound": _nut,
     "Wipe": _wipe,
     "TwoArmLift": _two_arm_lift,
+    "TwoArmTransport": _two_arm_transport,
+    "ToolHang": _tool_hang,
     "Door": _door,
 }
