@@ -112,8 +112,8 @@ imports and evaluates what is missing, and writes this page.
 
 Other people's training code on the same demonstrations, judged by the same harness: LeRobot's ACT and robomimic's
 BC-RNN, each trained by the package that it comes from, become entries by `actrm-zoo import` and play the test block of
-the task's protocol, as our own did ([results.md](results.md)). Demonstrations (200, of which 180 are trained on), sizes of
-networks, batches, steps and learning rates are those of our experiments (`configs/`), read from the same files. Each
+the task's protocol, as our own did ([results.md](results.md)). Demonstrations (200, of which 180 are trained on), sizes
+of networks, batches, steps and learning rates are those of our experiments (`configs/`), read from the same files. Each
 row is one training beside one of ours with the same seed: how much two trainings of one kind differ is in
 [results.md](results.md), not here.
 

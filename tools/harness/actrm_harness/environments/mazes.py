@@ -188,9 +188,7 @@ class TableMaze(OnTable, Stack):
         return "crossed" if self.walls[self.cell_of(tip)] else None
 
     def values(self) -> Values:
-        """Walls and goal cell by cell, 10 x 10 from the robot outwards; the tip, where the goal is from it, and where it is
-        from the middle of its own cell.
-        """
+        """Walls and goal cell by cell, 10 x 10 from the robot outwards; where the tip is, also in its own cell."""
         return {
             "maze_walls": lambda: self.walls.astype(np.float64),
             "maze_goal": lambda: np.eye(SIDE * SIDE)[self.goal],
