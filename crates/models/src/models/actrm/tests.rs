@@ -4,7 +4,7 @@ use crate::batch::Taken;
 use crate::features::{FeatureSpec, Features, Observation, ValuesRef};
 use crate::fused::testing::{assert_the_gradient_is_the_slope, move_parameters, signatures};
 use crate::gradients::ParamLayout;
-use crate::layers::PointerConfig;
+use crate::layers::{GridConfig, PointerConfig};
 use crate::models::act::{self, Act};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::policy::Policy;
@@ -350,6 +350,42 @@ fn thoughts_begin_with_noise_in_training_only() {
         model.predict(&batch(config, 4, 0).observation).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap()
     };
     assert_eq!(predict(&plain), predict(&noisy));
+}
+
+#[test]
+fn a_thought_over_a_grid_looked_into_is_the_thought() {
+    let grid = Some(GridConfig { among: "cell".to_string(), columns: 3, way: 1.0 });
+    let base = ReasoningConfig { over: Over::Tokens, grid, max_steps: Some(5), ..ReasoningConfig::default() };
+    let reasoning = ReasoningConfig { l_cycles: 2, halt_threshold: 1.0, change_threshold: 0.0, ..base };
+    let config = small(reasoning);
+    let signature = crate::fused::testing::signatures().grid;
+    let model = Actrm::new(&config, &signature, 5).unwrap();
+    let batch = crate::fused::testing::batch(&signature, config.action_horizon, 3, 1);
+    let off = |a: &Tensor, b: &Tensor| value(&(a - b).unwrap().abs().unwrap().max_all().unwrap());
+    let thought = model.reason(&batch.observation, None, &mut |_| false).unwrap();
+    let steps = model.examine(&batch.observation, 5, None).unwrap();
+    for (seen, step) in steps.iter().zip(&thought.steps) {
+        assert!(off(&seen.chunk, &step.chunk) < 1e-5);
+        assert_eq!(seen.scores.as_ref().unwrap().dims(), [3, 6]);
+    }
+    let frozen = model.examine(&batch.observation, 5, Some(Intervention::Freeze)).unwrap();
+    assert_eq!(off(frozen[4].scores.as_ref().unwrap(), steps[0].scores.as_ref().unwrap()), 0.0);
+    assert!(off(steps[4].scores.as_ref().unwrap(), steps[0].scores.as_ref().unwrap()) > 0.0);
+    // a thought goes farther with every application
+    let mut moved = batch.observation.clone();
+    let far = "observation.entity.cell0";
+    let changed = (batch.observation.get(far).unwrap() + 1.0).unwrap();
+    moved.insert(far, changed);
+    let other = model.examine(&moved, 5, None).unwrap();
+    let of = |step: &ExaminedStep, cell: usize| step.scores.as_ref().unwrap().narrow(1, cell, 1).unwrap();
+    // two rows of three cells: the far corner is two columns away, which two applications reach
+    assert!(off(&of(&other[0], 5), &of(&steps[0], 5)) > 0.0);
+    let one = ReasoningConfig { l_cycles: 1, ..config.reasoning.clone() };
+    let near = Actrm::new(&small(one), &signature, 5).unwrap();
+    let (before, after) = (near.examine(&batch.observation, 2, None).unwrap(), near.examine(&moved, 2, None).unwrap());
+    assert_eq!(off(&of(&after[0], 5), &of(&before[0], 5)), 0.0);
+    assert!(off(&of(&after[0], 4), &of(&before[0], 4)) > 0.0);
+    assert!(off(&of(&after[1], 5), &of(&before[1], 5)) > 0.0);
 }
 
 #[test]
