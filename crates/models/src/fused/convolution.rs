@@ -1,7 +1,7 @@
 //! Convolutions of a pass: weights in panels, gradients into their buffers.
 
 use super::{Grads, Pass, slot};
-use crate::kernels::{Conv, Frame};
+use crate::kernels::{Conv, Frame, Winograd};
 
 /// A frame with its border of zeros.
 pub(crate) fn framed(pass: &mut Pass<'_>, frame: &Frame) -> Vec<f32> {
@@ -35,9 +35,22 @@ fn with_panels(
     }
 }
 
+/// The convolution in tiles, where that is fewer products. Predictions stay with the plain sum: what an entry does may not
+/// depend on how many pictures it is asked about at once.
+fn in_tiles(pass: &Pass<'_>, conv: &Conv) -> Option<Winograd> {
+    if pass.packed.is_some() { None } else { Winograd::of(conv) }
+}
+
 /// x: the convolution's input in its frame -> y: (pixels, O); with `add` added to what is there.
 pub(crate) fn convolve(pass: &mut Pass<'_>, name: &str, conv: &Conv, x: &[f32], add: bool, y: &mut [f32]) {
     let weight = pass.weight(name, ".weight");
+    if let Some(tiles) = in_tiles(pass, conv) {
+        let (mut panels, mut scratch) = (pass.take(tiles.panel_len().0), pass.take(tiles.scratch()));
+        tiles.pack(weight, &mut panels);
+        tiles.forward(x, &panels, add, y, &mut scratch);
+        pass.give(panels);
+        return pass.give(scratch);
+    }
     // panels are as wide as the vectors of the instruction set that reads them
     let kind = || format!("{name} in panels of {}", conv.panel_widths().0);
     let run = |panels: &[f32]| conv.forward(x, panels, add, y);
@@ -48,6 +61,13 @@ pub(crate) fn convolve(pass: &mut Pass<'_>, name: &str, conv: &Conv, x: &[f32], 
 /// forward of a transposed convolution.
 pub(crate) fn input_gradient(pass: &mut Pass<'_>, name: &str, conv: &Conv, grad: &[f32], add: bool, out: &mut [f32]) {
     let weight = pass.weight(name, ".weight");
+    if let Some(tiles) = in_tiles(pass, conv) {
+        let (mut panels, mut scratch) = (pass.take(tiles.panel_len().1), pass.take(tiles.scratch()));
+        tiles.pack_backward(weight, &mut panels);
+        tiles.backward(grad, &panels, add, out, &mut scratch);
+        pass.give(panels);
+        return pass.give(scratch);
+    }
     let kind = || format!("{name} backwards in panels of {}", conv.panel_widths().1);
     let run = |panels: &[f32]| conv.backward(grad, panels, add, out);
     with_panels(pass, (conv.panel_len().1, &kind), |panels| conv.pack_backward(weight, panels), run);
@@ -62,6 +82,13 @@ pub(crate) fn weight_gradient(
     grad: &[f32],
     grads: &mut Grads<'_>,
 ) {
+    if let Some(tiles) = in_tiles(pass, conv) {
+        let (mut points, mut scratch) = (pass.take(tiles.weights()), pass.take(tiles.scratch()));
+        let into = slot(grads, name, ".weight");
+        tiles.weight_gradient((x, grad), into, &mut points, &mut scratch, &mut pass.space.pack);
+        pass.give(points);
+        return pass.give(scratch);
+    }
     let mut turned = pass.take(conv.weights());
     conv.weight_gradient(x, grad, &mut turned, slot(grads, name, ".weight"), &mut pass.space.pack);
     pass.give(turned);

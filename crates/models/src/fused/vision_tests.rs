@@ -27,6 +27,8 @@ fn cases() -> Vec<Case> {
         (16, ImageNorm::Group, vec![(37, 41)], 2),
         (8, ImageNorm::Frozen, vec![(40, 40), (40, 40)], 1),
         (32, ImageNorm::Group, vec![(33, 64), (35, 33), (33, 64)], 1),
+        // more convolutions in tiles
+        (32, ImageNorm::Frozen, vec![(60, 52), (60, 52)], 4),
     ] {
         let config = VisionConfig { width, norm, ..VisionConfig::default() };
         let mut params = Params::new();

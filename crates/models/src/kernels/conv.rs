@@ -350,7 +350,7 @@ impl Conv {
 }
 
 /// Columns of a panel for `n` columns in all: one vector if that is enough, else two.
-fn panel_width(n: usize) -> usize {
+pub(super) fn panel_width(n: usize) -> usize {
     struct Lanes;
     impl WithSimd for Lanes {
         type Output = usize;
@@ -361,6 +361,31 @@ fn panel_width(n: usize) -> usize {
     }
     let lanes = dispatch(Lanes);
     if n <= lanes { lanes } else { 2 * lanes }
+}
+
+impl Grid {
+    /// Rows of a matrix, one after the other, and of what is made of them.
+    fn rows(count: usize, depth: usize, output: usize) -> Self {
+        let places = |column: usize| Places { start: 0, picture: 0, row: 0, column };
+        let (from, to) = (places(depth), places(output));
+        Self { pictures: 1, rows: 1, columns: count, from, to, stretches: 1, apart: 0, length: depth }
+    }
+}
+
+/// x: (`rows`, depth) times a matrix in panels of `panel_width` -> out: (`rows`, output)
+pub(super) fn multiply(rows: usize, (x, depth): (&[f32], usize), panels: &[f32], (out, output): (&mut [f32], usize)) {
+    dispatch(Windows { grid: Grid::rows(rows, depth, output), x, panels, output, add: false, out });
+}
+
+/// Adds grad: (`rows`, O), turned, times x: (`rows`, depth) to `into`: (O, depth).
+pub(super) fn add_products(
+    rows: usize,
+    (x, depth): (&[f32], usize),
+    (grad, output): (&[f32], usize),
+    into: &mut [f32],
+    pack: &mut Pack,
+) {
+    dispatch(WeightGradient { grid: Grid::rows(rows, depth, output), x, grad, output, into, pack });
 }
 
 /// `out[to] = sum over the window of x times panels`

@@ -1,4 +1,5 @@
 #![allow(clippy::unwrap_used)]
+use super::super::winograd::Winograd;
 use super::*;
 use crate::rng::Rng;
 use crate::simd::{Level, at_most};
@@ -135,5 +136,79 @@ fn all_three_products_are_those_of_the_definition() {
                 }
             });
         }
+    }
+}
+
+/// Maps of a ResNet, and sizes that tiles do not divide.
+fn tiled() -> Vec<Conv> {
+    let sizes = [(1, 21, 21, 32, 48), (3, 11, 10, 48, 32), (8, 6, 6, 64, 32), (40, 3, 3, 32, 64), (4, 9, 7, 32, 32)];
+    let mut all = Vec::new();
+    for (pictures, height, width, channels, output) in sizes {
+        for border in [(1, 1), (2, 3)] {
+            let input = Frame { pictures, height, width, channels, border };
+            all.push(Conv { input, output, kernel: (3, 3), stride: (1, 1) });
+        }
+    }
+    all
+}
+
+#[test]
+fn products_in_tiles_are_those_of_the_definition() {
+    for conv in tiled() {
+        let what = format!("{conv:?}");
+        let tiles = Winograd::of(&conv).expect("enough tiles and channels");
+        let mut rng = Rng::new(2, "tiles");
+        let (x, w) = (rng.normals(conv.input.inside()), rng.normals(conv.weights()));
+        let grad = rng.normals(conv.made((0, 0)).inside());
+        let (mut dx, mut dw) = (vec![0f64; x.len()], vec![0f64; w.len()]);
+        each(&conv, |to, from, weight| {
+            dx[from] += f64::from(grad[to]) * f64::from(w[weight]);
+            dw[weight] += f64::from(grad[to]) * f64::from(x[from]);
+        });
+        for level in Level::ALL {
+            at_most(level, || {
+                let frame = framed(&conv.input, &x);
+                let (forth, back) = tiles.panel_len();
+                let mut panels = vec![f32::NAN; forth];
+                tiles.pack(&w, &mut panels);
+                let mut scratch = vec![f32::NAN; tiles.scratch()];
+                let mut out = vec![f32::NAN; conv.made((0, 0)).inside()];
+                tiles.forward(&frame, &panels, false, &mut out, &mut scratch);
+                close(&out, &naive(&conv, &x, &w), &what);
+                tiles.forward(&frame, &panels, true, &mut out, &mut scratch);
+                close(&out, &naive(&conv, &x, &w).iter().map(|x| 2.0 * x).collect::<Vec<_>>(), &what);
+
+                let g = framed(&conv.made((1, 1)), &grad);
+                let mut panels = vec![f32::NAN; back];
+                tiles.pack_backward(&w, &mut panels);
+                let mut got = vec![f32::NAN; x.len()];
+                tiles.backward(&g, &panels, false, &mut got, &mut scratch);
+                close(&got, &dx, &what);
+
+                let mut into = vec![0.5; w.len()];
+                let mut points = vec![f32::NAN; tiles.weights()];
+                tiles.weight_gradient((&frame, &g), &mut into, &mut points, &mut scratch, &mut Pack::default());
+                close(&into, &dw.iter().map(|x| x + 0.5).collect::<Vec<_>>(), &what);
+            });
+        }
+    }
+}
+
+#[test]
+fn tiles_are_for_many_pictures_and_channels_only() {
+    let conv = |pictures, height, channels, output, kernel, stride| {
+        let input = Frame { pictures, height, width: height, channels, border: (1, 1) };
+        Conv { input, output, kernel: (kernel, kernel), stride: (stride, stride) }
+    };
+    assert!(Winograd::of(&conv(8, 21, 64, 64, 3, 1)).is_some());
+    for plain in [
+        conv(8, 21, 64, 64, 3, 2),
+        conv(8, 21, 64, 64, 1, 1),
+        conv(8, 21, 16, 64, 3, 1),
+        conv(8, 21, 40, 64, 3, 1),
+        conv(1, 6, 64, 64, 3, 1),
+        conv(64, 1, 64, 64, 3, 1),
+    ] {
+        assert!(Winograd::of(&plain).is_none(), "{plain:?}");
     }
 }

@@ -11,6 +11,7 @@ mod image;
 mod norm;
 mod pool;
 mod sequence;
+mod winograd;
 
 pub(crate) use attention::{Heads, attend, attend_backward};
 pub(crate) use conv::{Conv, Frame};
@@ -22,3 +23,4 @@ pub(crate) use image::{
 pub(crate) use norm::{layer_norm, layer_norm_backward};
 pub(crate) use pool::Pool;
 pub(crate) use sequence::{After, Film, add_bias, mish, mish_backward, mish_parts, norm_mish, norm_mish_backward};
+pub(crate) use winograd::Winograd;
