@@ -52,6 +52,9 @@ APART = {1.0: 0.035, -1.0: 0.055}
 # How far up or down a hand is asked to go at once.
 STEADY = 0.03
 
+# How many times further than it is away a hand that closes deep in a bin is asked to go.
+LEAN = 2.0
+
 # The fingers' height over the walls of the bins.
 OVER_WALLS = 1.04
 
@@ -155,7 +158,10 @@ class TwoArmTransportExpert:
         turn = self.hammer.turn(1.0, hand)
         target, fingers = self.holds[0].reach(self.hammer.grip(1.0), turn - hand)
         if not self.holds[0].held:
-            if float(np.linalg.norm((target - scene.hand)[:2])) > 0.05:
+            if self.holds[0].closing:
+                # deep in the bin the hand drifts towards its base while the fingers close: to the handle's very end
+                target[:2] += LEAN * (target - scene.hand)[:2]
+            elif float(np.linalg.norm((target - scene.hand)[:2])) > 0.05:
                 # out of the lid's place and over the bin's wall
                 target[:2] += (scene.hand - target)[:2] * funnel(OVER_WALLS - float(scene.hand[2]), 0.01, 0.05)
             return self._move(servo, target, fingers, about_z(turn) @ DOWN)
