@@ -354,18 +354,29 @@ fn names_say_what_is_depth_and_every_demo_must_have_it() {
         demo.datasets.insert("obs/images_depth/high".to_owned(), depth.clone());
         demo.datasets.insert("obs/heat".to_owned(), depth);
     }
+    for demo in &mut demos {
+        let raw: Vec<f32> = demo.datasets["obs/front_depth"].to_f32().unwrap().iter().map(|v| v / 4.0).collect();
+        let shape = demo.datasets["obs/front_depth"].shape.clone();
+        demo.datasets.insert("obs/raw_depth".to_owned(), Array::from_f32(shape, &raw));
+    }
     demos[2].datasets.remove("obs/side_depth");
+    let late = demos[1].datasets["obs/front_depth"].clone();
+    demos[1].datasets.insert("obs/late_depth".to_owned(), late);
     demos[1].datasets.get_mut("obs/wrist_depth").unwrap().shape = vec![6, WIDTH, HEIGHT, 1];
     write(&file, &demos);
     let report = convert(&file, &out, &options(), &mut quiet).unwrap();
     let set = Dataset::open(&out).unwrap();
     assert_eq!(set.cameras().collect::<Vec<_>>(), [FRONT, "observation.images.top_depth"]);
-    let depth =
-        ["front_depth", "images_depth.high", "depth.top_depth"].map(|name| format!("observation.images.{name}"));
+    let depth = ["front_depth", "images_depth.high", "raw_depth", "depth.top_depth"]
+        .map(|name| format!("observation.images.{name}"));
     assert_eq!(set.depth_names().collect::<Vec<_>>(), depth);
+    // z-buffers go from 0 to 1
+    let doubts: Vec<&String> = report.notes.iter().filter(|n| n.contains("lies between 0 and 1 throughout")).collect();
+    assert!(doubts.len() == 1 && doubts[0].starts_with("observation.images.raw_depth"), "{doubts:?}");
     let reason = |key: &str| report.notes.iter().find(|n| n.starts_with(key)).unwrap().clone();
     assert!(reason("obs/side_depth").contains("demo_2 has other depth than demo_0 or none"));
     assert!(reason("obs/wrist_depth").contains("demo_1 has other depth than demo_0 or none"));
+    assert!(reason("obs/late_depth").contains("not every demo has this depth"));
     assert!(reason("obs/heat").contains("nothing in its name says that it is depth"));
     sound(&out);
     export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();

@@ -440,8 +440,7 @@ impl Chooser<'_> {
     }
 
     /// What looks like pictures and becomes no column, with the reason: that of `known`, or that LeRobot has no place for
-    /// it. Its recorder takes pictures of three channels and depth alone, and so do its policies; a made-up channel
-    /// would not be the recording's.
+    /// it. Its recorder takes pictures of three channels and depth alone; a made-up channel would not be the recording's.
     fn pictures_left_out(
         &self,
         columns: &[Column],
@@ -457,8 +456,9 @@ impl Chooser<'_> {
                 _ if !path.starts_with("obs/") || self.files.contains_key(path) => continue,
                 _ if columns.iter().any(is_column) => continue,
                 ([_, _, 3], _) if key.is_image() => continue,
-                ([_, _, 1], Dtype::U8) => "LeRobot records no grey pictures, and its policies take three channels",
-                ([_, _, 4], Dtype::U8) => "LeRobot records no fourth channel, and its policies take three",
+                ([_, _, 1], Dtype::U8) => "LeRobot records no grey pictures, and its ACT takes three channels",
+                ([_, _, 4], Dtype::U8) => "LeRobot records no fourth channel, and its ACT takes three",
+                _ if depth::size(path, key).is_some() => "not every demo has this depth",
                 ([_, _, 1], Dtype::F32 | Dtype::F64 | Dtype::U16) => "nothing in its name says that it is depth",
                 ([_, _, 1], _) => "LeRobot's depth is float or uint16",
                 ([_, _, 3 | 4], _) => NO_COLOUR,

@@ -12,7 +12,8 @@ use std::time::Instant;
 /// `actrm/`, from which `actrm-data export` rebuilds the source; so are grey and RGBA pictures, which LeRobot does not
 /// record, and a note says so. Recorded JPEG files (newer ALOHA) stay the files they are. Depth (obs/<camera>_depth: float
 /// metres or uint16 millimetres, height x width x 1) becomes observation.images.<camera>_depth, a TIFF file a frame, as
-/// LeRobot records it. OUT appears whole or not at all.
+/// LeRobot records it; no file says its unit, and robosuite's own camera_depths, before robomimic makes metres of them,
+/// go from 0 to 1. OUT appears whole or not at all.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data convert data/lift.hdf5 lift
