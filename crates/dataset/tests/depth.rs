@@ -458,17 +458,20 @@ fn what_lerobot_recorded_is_read_checked_and_edited() {
     assert_eq!(cut.info().features, set.info().features);
 }
 
+/// What becomes of a picture's file.
+type Change<'c> = &'c dyn Fn(&[u8]) -> Vec<u8>;
+
 #[test]
 fn damaged_frames_are_named_wherever_they_are_read() {
     let dir = tempfile::tempdir().unwrap();
-    let broken = |name: &str, change: &dyn Fn(&[u8]) -> Vec<u8>| {
+    let broken = |name: &str, change: Change<'_>| {
         let root = dir.path().join(name);
         copy(&theirs(), &root);
         // the third frame of the second episode
         with_files(&root, FRONT_DEPTH, &|row, file| if row == 6 { change(file) } else { file.to_vec() });
         root
     };
-    let cases: [(&str, &dyn Fn(&[u8]) -> Vec<u8>, &str); 4] = [
+    let cases: [(&str, Change<'_>, &str); 4] = [
         ("cut", &|file| file[..file.len() - 9].to_vec(), "a broken TIFF file"),
         ("empty", &|_| Vec::new(), "no TIFF file"),
         ("png", &|_| b"\x89PNG\r\n".to_vec(), "no TIFF file"),
