@@ -20,6 +20,7 @@ from typing import Any
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 
+import depth
 import h5py
 import numpy as np
 import python_door
@@ -637,6 +638,9 @@ def main() -> None:
             "LeRobot shows PNG pictures pixel by pixel": lambda: compare_images(images, folder / "png", "png"),
             "LeRobot shows PPM pictures pixel by pixel": lambda: compare_images(images, folder / "ppm", "ppm"),
             "LeRobot shows recorded JPEG pictures": lambda: compare_jpeg(folder / "aloha", folder / "jpeg"),
+            "LeRobot shows depth as it was recorded": lambda: depth.compare_depth(
+                folder / "depth", ours, open_lerobot, compare_trees
+            ),
             "LeRobot reads and trains on our videos": lambda: compare_videos(images, folder / "video"),
             "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
@@ -646,6 +650,7 @@ def main() -> None:
             "LeRobot's policy that sees answers the same": lambda: import_seeing_entry(plain, folder / "seen"),
             "from Python: LeRobot's samples": lambda: python_door.compare_samples(root),
             "from Python: LeRobot's samples with pictures": lambda: python_door.compare_samples(plain),
+            "from Python: LeRobot's samples with depth": lambda: python_door.compare_samples(folder / "depth" / "set"),
             "from Python: LeRobot's samples with videos": lambda: python_door.compare_samples(folder / "video"),
             "from Python: PyTorch's loader": lambda: python_door.compare_loaders(root),
             "from Python: LeRobot's policy": lambda: python_door.compare_chunks(root, folder / "trained"),

@@ -29,9 +29,9 @@ mod windows;
 pub use error::{DatasetError, InputError, Result};
 pub use keys::{KeyItem, Moment};
 pub use lerobot::{
-    ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset,
-    ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm, Info,
-    PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, VideoOptions, VideoProvenance, convert,
+    ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset, DepthMaps,
+    DepthUnit, ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm,
+    Info, PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, VideoOptions, VideoProvenance, convert,
     convert_unless, edit, export, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};

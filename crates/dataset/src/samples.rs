@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::error::{DatasetError, Result};
-use crate::lerobot::{Dataset, Pictures};
+use crate::lerobot::{Dataset, DepthUnit, Pictures};
 use crate::windows::Resident;
 
 /// The most rows of one column in one sample.
@@ -27,6 +27,10 @@ pub struct SampleSpec {
     pub offsets: BTreeMap<String, Vec<i64>>,
     /// Cameras whose pictures belong to a sample.
     pub cameras: Vec<String>,
+    /// Depth that belongs to a sample, numbers of shape 1 x height x width.
+    pub depth: Vec<String>,
+    /// What that is given in.
+    pub depth_unit: DepthUnit,
     /// Episodes to take samples from, by episode index.
     pub episodes: Vec<usize>,
 }
@@ -156,10 +160,10 @@ impl Dataset {
         seconds.iter().map(offset).collect()
     }
 
-    /// Samples over some episodes: every numeric column, and the pictures of the cameras that are asked for.
+    /// Samples over some episodes: every numeric column, and the pictures and the depth that are asked for.
     ///
     /// # Errors
-    /// Episodes, cameras and columns that are not there, by name.
+    /// Episodes, cameras, depth and columns that are not there, by name.
     pub fn samples(&self, spec: &SampleSpec) -> Result<Samples> {
         let refused = |wanted: String, found: String| DatasetError::NotInDataset {
             path: self.root().to_path_buf(),
@@ -167,9 +171,9 @@ impl Dataset {
             found,
         };
         for (name, offsets) in &spec.offsets {
-            let camera = spec.cameras.contains(name);
-            if self.column(name).is_none() && !camera {
-                let names: Vec<&str> = self.column_names().chain(spec.cameras.iter().map(String::as_str)).collect();
+            let seen = || spec.cameras.iter().chain(&spec.depth);
+            if self.column(name).is_none() && !seen().any(|camera| camera == name) {
+                let names: Vec<&str> = self.column_names().chain(seen().map(String::as_str)).collect();
                 return Err(refused(format!("column {name}"), names.join(", ")));
             }
             if offsets.is_empty() || offsets.len() > MOST_OFFSETS {
@@ -191,6 +195,15 @@ impl Dataset {
             let boolean = feature.is_some_and(|f| f.dtype == "bool");
             numbers.push((SampleColumn::new(name, shape, spec.offsets.get(name), boolean), resident));
         }
+        for name in &spec.depth {
+            let maps = self.depth_of(name, 0..self.episodes().len())?;
+            let stored = maps.unit.as_deref();
+            let data: Vec<f32> = maps.data.iter().map(|&depth| spec.depth_unit.of(stored, depth)).collect();
+            let resident = Resident { data: data.into(), dim: maps.height * maps.width };
+            let shape = vec![1, maps.height, maps.width];
+            numbers.push((SampleColumn::new(name, shape, spec.offsets.get(name), false), resident));
+        }
+        numbers.sort_by(|(one, _), (other, _)| one.name.cmp(&other.name));
         let mut pictures = Vec::new();
         for name in &spec.cameras {
             let seen = self.pictures(name)?;
@@ -212,7 +225,7 @@ impl Samples {
         self.spans.is_empty()
     }
 
-    /// The columns of numbers, sorted by name.
+    /// The columns of numbers, depth among them, sorted by name.
     pub fn numbers(&self) -> impl ExactSizeIterator<Item = &SampleColumn> {
         self.numbers.iter().map(|(column, _)| column)
     }

@@ -372,7 +372,8 @@ fn pictures_that_are_not_colour_stay_beside_and_are_named() {
     let dir = tempfile::tempdir().unwrap();
     let (file, out, back) = (dir.path().join("a.hdf5"), dir.path().join("set"), dir.path().join("b.hdf5"));
     let mut demo = synthetic(0, 6, true);
-    demo.datasets.insert("obs/depth".to_owned(), Array::from_f32(vec![6, 4, 4, 1], &[0.5; 96]));
+    demo.datasets.insert("obs/depth".to_owned(), Array::from_i32(vec![6, 4, 4, 1], &[5; 96]));
+    demo.datasets.insert("obs/heat".to_owned(), Array::from_f32(vec![6, 4, 4, 1], &[0.5; 96]));
     demo.datasets.insert("obs/grey".to_owned(), Array::from_u8(vec![6, 4, 4, 1], &[7; 96]));
     demo.datasets.insert("obs/rgba".to_owned(), Array::from_u8(vec![6, 4, 4, 4], &[9; 384]));
     demo.datasets.insert("obs/images/cam_high".to_owned(), Array::from_u8(vec![6, 5], &[0xff; 30]));
@@ -380,14 +381,15 @@ fn pictures_that_are_not_colour_stay_beside_and_are_named() {
     let report = convert(&file, &out, &options(), &mut quiet).unwrap();
     let visual: Vec<&str> = report.features.iter().filter(|(_, t, _)| t == "image").map(|(n, ..)| n.as_str()).collect();
     assert_eq!(visual, ["observation.images.agentview"]);
-    for (name, what) in [
-        ("obs/depth", "float32 [4, 4, 1]"),
-        ("obs/grey", "uint8 [4, 4, 1]"),
-        ("obs/rgba", "uint8 [4, 4, 4]"),
-        ("obs/images/cam_high", "encoded images, uint8 [5]"),
+    for (name, what, why) in [
+        ("obs/depth", "int32 [4, 4, 1]", "LeRobot's depth is float or uint16"),
+        ("obs/heat", "float32 [4, 4, 1]", "nothing in its name says that it is depth"),
+        ("obs/grey", "uint8 [4, 4, 1]", "LeRobot records no grey pictures"),
+        ("obs/rgba", "uint8 [4, 4, 4]", "LeRobot records no fourth channel"),
+        ("obs/images/cam_high", "encoded images, uint8 [5]", "only uint8 [height, width, 3] and JPEG files do"),
     ] {
         let note = report.notes.iter().find(|n| n.starts_with(name)).unwrap();
-        assert!(note.contains(what) && note.contains("side folder"), "{note}");
+        assert!(note.contains(what) && note.contains(why) && note.contains("side folder"), "{note}");
     }
     export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
     assert!(content(&back) == content(&file));

@@ -15,7 +15,7 @@ use crate::work::interruptible;
 
 /// `actrm.convert` without its bar: `tell(done, total)` is called as frames are written.
 #[pyfunction]
-#[pyo3(signature = (src, dst, tell, *, state_keys, env_keys, entities, fps, images, actions, rotation, lossless, jobs))]
+#[pyo3(signature = (src, dst, tell, *, state_keys, env_keys, entities, fps, images, depth, actions, rotation, lossless, jobs))]
 #[expect(clippy::too_many_arguments, reason = "options by name")]
 pub(crate) fn convert<'py>(
     py: Python<'py>,
@@ -27,6 +27,7 @@ pub(crate) fn convert<'py>(
     entities: BTreeMap<String, Vec<String>>,
     fps: Option<f64>,
     images: &str,
+    depth: bool,
     actions: &str,
     rotation: &str,
     lossless: bool,
@@ -55,6 +56,7 @@ pub(crate) fn convert<'py>(
         fps,
         images,
         video,
+        depth,
         actions,
         rotation,
         lossless,

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use ::dataset::{SampleColumn, SampleSpec, Samples};
+use ::dataset::{DepthUnit, Feature, SampleColumn, SampleSpec, Samples};
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList, PyTuple};
@@ -19,7 +19,7 @@ const MOST_SAMPLES: usize = 1 << 24;
 /// A LeRobotDataset v3.0 folder, written by actrm or by LeRobot, as a map of samples.
 ///
 /// A sample is a dict with LeRobot's keys and shapes: a column of numbers as an array (a column of one number without
-/// an axis), a camera as (3, height, width). Sample `i` is the `i`-th frame of the chosen episodes. Numbers are float32,
+/// an axis), a camera as (3, height, width), depth as (1, height, width). Sample `i` is the `i`-th frame of the chosen episodes. Numbers are float32,
 /// truth values bool, the index columns int64; numeric columns and pictures stay in memory.
 ///
 /// Parameters
@@ -31,6 +31,8 @@ const MOST_SAMPLES: usize = 1 << 24;
 /// split: take the episodes of this mask only (`train`, `valid`, ...).
 /// episodes: or these.
 /// cameras: cameras whose pictures are read; all of them unless given.
+/// depth: depth that is read; all of it unless given.
+/// depth_output_unit: what depth and its statistics are given in, `mm` or `m`.
 /// return_uint8: pictures as they are stored, 0 to 255, instead of float32 from 0 to 1.
 ///
 /// Pickles (by path), and works in a `torch.utils.data.DataLoader` whose workers are forked or spawned.
@@ -49,13 +51,17 @@ struct Given {
     path: PathBuf,
     offsets: BTreeMap<String, Vec<i64>>,
     cameras: Vec<String>,
+    depth: Vec<String>,
+    depth_unit: DepthUnit,
     return_uint8: bool,
 }
 
 #[pymethods]
 impl PyDataset {
     #[new]
-    #[pyo3(signature = (path, delta_timestamps=None, split=None, *, episodes=None, cameras=None, return_uint8=false))]
+    #[pyo3(signature = (path, delta_timestamps=None, split=None, *, episodes=None, cameras=None, depth=None,
+                        depth_output_unit="mm", return_uint8=false))]
+    #[expect(clippy::too_many_arguments, reason = "options by name")]
     fn new(
         py: Python<'_>,
         path: PathBuf,
@@ -63,8 +69,13 @@ impl PyDataset {
         split: Option<&str>,
         episodes: Option<Vec<usize>>,
         cameras: Option<Vec<String>>,
+        depth: Option<Vec<String>>,
+        depth_output_unit: &str,
         return_uint8: bool,
     ) -> PyResult<Self> {
+        let depth_unit = DepthUnit::named(depth_output_unit).ok_or_else(|| {
+            PyValueError::new_err(format!("depth_output_unit: expected mm or m, found {depth_output_unit}"))
+        })?;
         let path = std::path::absolute(path)?;
         let dataset = unlocked(py, || run(|| dataset::Dataset::open(&path)).map_err(raised))?;
         let chosen = match (split, episodes) {
@@ -75,10 +86,12 @@ impl PyDataset {
         };
         let offsets = delta_timestamps.map_or_else(|| Ok(BTreeMap::new()), |given| offsets(&dataset, given))?;
         let cameras = cameras.unwrap_or_else(|| dataset.cameras().map(str::to_owned).collect());
-        let spec = SampleSpec { offsets, cameras, episodes: chosen.clone() };
+        let depth = depth.unwrap_or_else(|| dataset.depth_names().map(str::to_owned).collect());
+        let spec = SampleSpec { offsets, cameras, depth, depth_unit, episodes: chosen.clone() };
         let samples = unlocked(py, || run(|| dataset.samples(&spec)).map_err(raised))?;
         let tasks = task_indices(&dataset);
-        let given = Given { path, offsets: spec.offsets, cameras: spec.cameras, return_uint8 };
+        let SampleSpec { offsets, cameras, depth, .. } = spec;
+        let given = Given { path, offsets, cameras, depth, depth_unit, return_uint8 };
         Ok(Self { given, dataset, chosen, samples, tasks })
     }
 
@@ -136,7 +149,8 @@ impl PyDataset {
         Batches::new(slf.unbind(), batch_size, order, threads)
     }
 
-    /// Statistics over all episodes, as they are stored: by column `min`, `max`, `mean`, `std`, quantiles and `count`.
+    /// Statistics over all episodes, as they are stored, of depth in its output unit: by column `min`, `max`, `mean`,
+    /// `std`, quantiles and `count`.
     #[getter]
     fn stats<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
@@ -153,8 +167,11 @@ impl PyDataset {
                 ("q90", &stats.q90),
                 ("q99", &stats.q99),
             ];
+            let unit = self.dataset.info().features.get(name).and_then(Feature::depth_unit);
+            let factor = self.given.depth_unit.factor(unit);
             for (statistic, values) in lists {
-                of.set_item(statistic, array(py, &[values.len()], values)?)?;
+                let values: Vec<f64> = values.iter().map(|value| value * factor).collect();
+                of.set_item(statistic, array(py, &[values.len()], &values)?)?;
             }
             of.set_item("count", array(py, &[1], &[stats.count as i64])?)?;
             all.set_item(name, of)?;
@@ -250,11 +267,13 @@ impl PyDataset {
 
     fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyTuple>)> {
         let (py, this) = (slf.py(), slf.get());
-        let Given { path, offsets, cameras, return_uint8 } = &this.given;
+        let Given { path, offsets, cameras, depth, depth_unit, return_uint8 } = &this.given;
         let options = PyDict::new(py);
         options.set_item("delta_timestamps", offsets)?;
         options.set_item("episodes", &this.chosen)?;
         options.set_item("cameras", cameras)?;
+        options.set_item("depth", depth)?;
+        options.set_item("depth_output_unit", depth_unit.name())?;
         options.set_item("return_uint8", return_uint8)?;
         let partial = py.import("functools")?.getattr("partial")?;
         let make = partial.call((slf.get_type(), path), Some(&options))?;

@@ -6,7 +6,7 @@
 use super::check;
 use super::encode::{GroupOutput, Job};
 use super::encoded;
-use super::features::{ConvertOptions, Mapping};
+use super::features::{Column, ConvertOptions, Mapping};
 use super::info::{self, Info, Provenance, VideoProvenance};
 use super::meta;
 use super::schema::{self, CREATED_BY};
@@ -20,6 +20,7 @@ use super::work;
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::Plan;
 use crate::source::Source;
+use crate::stats::FeatureStats;
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -202,6 +203,20 @@ impl Conversion<'_> {
         (tasks, task_of)
     }
 
+    /// Depth in metres that may be none: what MuJoCo gives before anyone makes distances of it.
+    fn doubtful_depth(&self, stats: &BTreeMap<String, FeatureStats>) -> Vec<String> {
+        let metres = self.mapping.columns.iter().filter(|c| c.feature.depth_unit() == Some("m"));
+        let doubtful = metres.filter(|c| stats.get(&c.name).is_some_and(|s| s.min[0] >= 0.0 && s.max[0] <= 1.0));
+        let note = |c: &Column| {
+            format!(
+                "{} lies between 0 and 1 throughout: it is taken as metres, which robosuite's own camera_depths are not \
+                 (get_real_depth_map in its camera_utils makes metres of them)",
+                c.name
+            )
+        };
+        doubtful.map(note).collect()
+    }
+
     /// Whether any column becomes videos.
     fn films(&self) -> bool {
         self.mapping.columns.iter().any(|c| c.feature.dtype == "video")
@@ -246,6 +261,7 @@ impl Conversion<'_> {
                 .iter()
                 .chain(&self.mapping.notes)
                 .cloned()
+                .chain(self.doubtful_depth(&frames.told.stats))
                 .chain(self.plan.problems.iter().map(|p| p.message.clone()))
                 .collect(),
         })

@@ -1,16 +1,18 @@
 //! One row group of the data files: read from the source, turned into Arrow arrays, compressed.
 
+use super::depth;
 use super::features::{Column, ImageForm, Mapping, Origin, VideoOptions};
 use super::images;
 use super::schema::{element, image_fields};
 use super::shards::{EncodedGroup, GroupEncoder};
+use super::tiff;
 use super::values::{Position, Values, episode_values};
 use super::videos::Camera;
 use super::work::{Part, is_bulk};
 use crate::error::{DatasetError, InputError, Result};
 use crate::source::Source;
 use crate::stats::FeatureStats;
-use crate::tree::Demo;
+use crate::tree::{Array, Demo};
 use arrow::array::{
     ArrayRef, BinaryArray, BooleanArray, FixedSizeListArray, Float32Array, Int64Array, StringArray, StructArray,
 };
@@ -42,8 +44,12 @@ pub(crate) struct PictureSummary {
     pub samples: Vec<video::Sample>,
     /// Histogram of each channel over the sampled pixels of the sampled pictures.
     pub histograms: Vec<[u64; 256]>,
+    /// Depth of the sampled pixels of the sampled pictures.
+    pub depth: Vec<f32>,
     /// Pictures sampled.
     pub sampled: u64,
+    /// Statistics of all that, once nothing more is added.
+    pub settled: Option<FeatureStats>,
 }
 
 /// What an episode says about itself, once (with its first part) or in pieces (pictures).
@@ -120,6 +126,7 @@ impl Job<'_> {
                         summary.pictures.insert(index, film);
                     }
                 }
+                (Origin::Depth { .. }, _) => arrays.push(self.depth(index, column, loaded, &mut summaries)?),
                 _ => arrays.push(number_array(column, index, loaded)),
             }
         }
@@ -176,10 +183,59 @@ impl Job<'_> {
             })?;
             summary.pictures.insert(index, pictures);
         }
-        let offsets = OffsetBuffer::new(ScalarBuffer::from(offsets));
-        let bytes = BinaryArray::new(offsets, files.into(), None);
-        let columns: Vec<ArrayRef> = vec![Arc::new(bytes), Arc::new(StringArray::from_iter_values(names))];
-        Ok(Arc::new(StructArray::new(image_fields(), columns, None)))
+        Ok(picture_array(files, offsets, names))
+    }
+
+    /// Depth as LeRobot's recorder stores it, a TIFF file a frame.
+    fn depth(
+        &self,
+        index: usize,
+        column: &Column,
+        loaded: &[Loaded],
+        summaries: &mut [PartSummary],
+    ) -> Result<ArrayRef> {
+        let Origin::Depth { key, height, width, dtype, kind } = &column.origin else {
+            unreachable!("asked of columns of depth alone")
+        };
+        let (height, width, size) = (*height, *width, height * width * dtype.size().unwrap_or(0));
+        let (mut files, mut offsets, mut names, mut pixels) = (Vec::new(), vec![0_i32], Vec::new(), Vec::new());
+        for (l, summary) in loaded.iter().zip(summaries) {
+            let (rows, sampled) = (l.part.rows.clone(), sample(l.part.length));
+            let array = self.source.read_rows(l.part.episode, key, rows.start, rows.len())?;
+            if array.bytes.len() != size * rows.len() {
+                return Err(self.wrong_shape(l, key, format!("{} x {height} x {width} of depth", rows.len()), &array));
+            }
+            let mut found = PictureSummary::default();
+            for (frame, bytes) in rows.zip(array.bytes.chunks_exact(size)) {
+                pixels.clear();
+                depth::stored(dtype, bytes, &mut pixels);
+                if let Some(value) = depth::not_finite(*kind, width, &pixels) {
+                    let expected = "finite depth (--no-depth keeps it in the side folder alone)";
+                    return Err(self.bad_picture(l, key, frame, expected, value));
+                }
+                tiff::encode(*kind, height, width, &pixels, &mut files);
+                offsets.push(i32::try_from(files.len()).ok().ok_or_else(|| too_large(self.path, key))?);
+                names.push(format!("frame-{frame:06}.{}", tiff::EXTENSION));
+                found.digests.push(Sha256::digest(&pixels).into());
+                if sampled.binary_search(&frame).is_ok() {
+                    let values: Vec<f32> = kind.values(&pixels).collect();
+                    found.add_depth(height, width, &values);
+                }
+            }
+            summary.pictures.insert(index, found);
+        }
+        Ok(picture_array(files, offsets, names))
+    }
+
+    fn wrong_shape(&self, l: &Loaded, key: &str, expected: String, found: &Array) -> DatasetError {
+        InputError::WrongShape {
+            path: self.path.to_path_buf(),
+            demo: l.demo.id.clone(),
+            key: key.to_owned(),
+            expected,
+            found: format!("{} {:?}", found.dtype, found.shape),
+        }
+        .into()
     }
 
     fn bad_picture(&self, l: &Loaded, key: &str, frame: usize, expected: &str, found: String) -> DatasetError {
@@ -205,14 +261,7 @@ impl Job<'_> {
             return Ok(());
         }
         if array.bytes.len() != size * rows.len() {
-            return Err(InputError::WrongShape {
-                path: self.path.to_path_buf(),
-                demo: l.demo.id.clone(),
-                key: key.to_owned(),
-                expected: format!("{} images of {height} x {width} x 3", rows.len()),
-                found: format!("{} {:?}", array.dtype, array.shape),
-            }
-            .into());
+            return Err(self.wrong_shape(l, key, format!("{} images of {height} x {width} x 3", rows.len()), &array));
         }
         rows.zip(array.bytes.chunks_exact(size)).try_for_each(|(frame, pixels)| take(frame, None, pixels))
     }
@@ -255,6 +304,14 @@ impl<'a> Stored<'a> {
             _ => unreachable!("asked of columns of pictures alone"),
         }
     }
+}
+
+/// Files in a row, each with its end in `offsets` and its name, as a column.
+fn picture_array(files: Vec<u8>, offsets: Vec<i32>, names: Vec<String>) -> ArrayRef {
+    let offsets = OffsetBuffer::new(ScalarBuffer::from(offsets));
+    let bytes = BinaryArray::new(offsets, files.into(), None);
+    let columns: Vec<ArrayRef> = vec![Arc::new(bytes), Arc::new(StringArray::from_iter_values(names))];
+    Arc::new(StructArray::new(image_fields(), columns, None))
 }
 
 fn too_large(path: &Path, key: &str) -> DatasetError {
@@ -321,10 +378,15 @@ pub(crate) fn sample(length: usize) -> Vec<usize> {
 }
 
 /// LeRobot looks at every `k`-th pixel of pictures of 300 or more on a side, so that 150 are left.
-pub(crate) fn add_to_histograms(summary: &mut PictureSummary, height: usize, width: usize, pixels: &[u8]) {
+fn stride(height: usize, width: usize) -> usize {
     const LARGE: usize = 300;
     const TARGET: usize = 150;
-    let stride = if height.max(width) < LARGE { 1 } else { (height.max(width) / TARGET).max(1) };
+    if height.max(width) < LARGE { 1 } else { (height.max(width) / TARGET).max(1) }
+}
+
+/// Counts the pixels of a sampled picture.
+pub(crate) fn add_to_histograms(summary: &mut PictureSummary, height: usize, width: usize, pixels: &[u8]) {
+    let stride = stride(height, width);
     summary.sampled += 1;
     for row in pixels.chunks_exact(width * 3).step_by(stride) {
         for pixel in row.chunks_exact(3).step_by(stride) {
@@ -340,6 +402,7 @@ impl PictureSummary {
     pub(crate) fn extend(&mut self, next: Self) {
         self.digests.extend(next.digests);
         self.samples.extend(next.samples);
+        self.depth.extend(next.depth);
         self.add_counts(&next.histograms, next.sampled);
     }
 
@@ -352,6 +415,33 @@ impl PictureSummary {
             }
         }
         self.sampled += sampled;
+    }
+
+    /// Adds a sampled frame of depth.
+    pub(crate) fn add_depth(&mut self, height: usize, width: usize, values: &[f32]) {
+        let stride = stride(height, width);
+        self.sampled += 1;
+        for row in values.chunks_exact(width).step_by(stride) {
+            self.depth.extend(row.iter().step_by(stride));
+        }
+    }
+
+    /// Statistics of the sampled pictures: of depth in its unit, of colours from 0 to 1. `None` where none was sampled.
+    pub(crate) fn stats(&self) -> Option<FeatureStats> {
+        match (&self.settled, self.depth.is_empty()) {
+            (Some(settled), _) => Some(settled.clone()),
+            (None, false) => Some(FeatureStats { count: self.sampled, ..FeatureStats::of(&self.depth, 1)? }),
+            (None, true) if self.sampled > 0 => FeatureStats::of_histograms(&self.histograms, self.sampled),
+            (None, true) => None,
+        }
+    }
+
+    /// Keeps of depth its statistics alone.
+    pub(crate) fn settle(&mut self) {
+        if !self.depth.is_empty() {
+            self.settled = self.stats();
+            self.depth = Vec::new();
+        }
     }
 
     /// sha256 over the pictures' digests.

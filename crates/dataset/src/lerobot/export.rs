@@ -8,6 +8,7 @@ use super::read;
 use super::side::{
     FRAMES, Kind, LAYOUT_FILE, Layout, MANIFEST_FILE, Manifest, NO_EPISODE, OBJECTS, Object, SideColumn,
 };
+use super::tiff;
 use super::verify::hash_file;
 use crate::error::{DatasetError, Result};
 use crate::source::{RobomimicWriter, WriteOptions};
@@ -257,9 +258,10 @@ fn picture_array(
 ) -> Result<Array> {
     let wrong = || bad_object(root, object, "an image column of the data files");
     let feature = info.features.get(&object.name).ok_or_else(wrong)?;
-    let shape = object.array.as_ref().map(|a| a.shape.clone()).ok_or_else(wrong)?;
-    let &[rows, height, width, 3] = shape.as_slice() else { return Err(wrong()) };
-    if rows != length || feature.shape != [height, width, 3] {
+    let (dtype, shape) = object.array.as_ref().map(|a| (a.dtype.clone(), a.shape.clone())).ok_or_else(wrong)?;
+    let channels = if feature.is_depth() { 1 } else { 3 };
+    let &[rows, height, width, found] = shape.as_slice() else { return Err(wrong()) };
+    if rows != length || found != channels || feature.shape != [height, width, channels] {
         return Err(wrong());
     }
     if !open.contains_key(&object.name) {
@@ -268,9 +270,29 @@ fn picture_array(
     let cursor = open.get_mut(&object.name).expect("it was just opened");
     let mut bytes = Vec::with_capacity(shape.iter().product());
     for batch in cursor.take(length)? {
-        picture_pixels(root, &object.name, batch.column(0), height, width, &mut bytes)?;
+        match feature.is_depth() {
+            true => depth_pixels(root, &object.name, &batch, (height, width), &dtype, &mut bytes)?,
+            false => picture_pixels(root, &object.name, batch.column(0), height, width, &mut bytes)?,
+        }
     }
-    Ok(Array { dtype: Dtype::U8, shape, bytes })
+    let dtype = if feature.is_depth() { dtype } else { Dtype::U8 };
+    Ok(Array { dtype, shape, bytes })
+}
+
+/// Decodes the depth of a column, one frame after the other, which must be of the type that the source had.
+fn depth_pixels(
+    root: &Path,
+    name: &str,
+    batch: &RecordBatch,
+    (height, width): (usize, usize),
+    dtype: &Dtype,
+    out: &mut Vec<u8>,
+) -> Result<()> {
+    each_file(root, name, batch.column(0), (height, width), &mut |file| match tiff::decode(file, height, width, out) {
+        Ok(kind) if kind.dtype() == *dtype => Ok(()),
+        Ok(kind) => Err(format!("{} instead of {dtype}", kind.dtype())),
+        Err(found) => Err(found),
+    })
 }
 
 /// Decodes the pictures of a column, one after the other.
@@ -281,6 +303,17 @@ pub(crate) fn picture_pixels(
     height: usize,
     width: usize,
     out: &mut Vec<u8>,
+) -> Result<()> {
+    each_file(root, name, column, (height, width), &mut |file| images::decode(file, height, width, out))
+}
+
+/// Calls `take` with the file of every picture of a column; what it finds wrong is an error of the column's.
+fn each_file(
+    root: &Path,
+    name: &str,
+    column: &ArrayRef,
+    (height, width): (usize, usize),
+    take: &mut dyn FnMut(&[u8]) -> Result<(), String>,
 ) -> Result<()> {
     let bad = |found: String| DatasetError::BadDataset {
         path: root.join("data"),
@@ -296,7 +329,7 @@ pub(crate) fn picture_pixels(
     let files = files.as_any().downcast_ref::<BinaryArray>().expect("a binary column");
     for file in files {
         let file = file.ok_or_else(|| bad("a null".to_owned()))?;
-        images::decode(file, height, width, out).map_err(bad)?;
+        take(file).map_err(bad)?;
     }
     Ok(())
 }
@@ -444,21 +477,40 @@ impl Rows {
         let mut pieces = Vec::new();
         let mut missing = rows;
         while missing > 0 {
-            let Some(batch) = self.next_batch()? else {
-                return Err(DatasetError::BadDataset {
-                    path: self.root.join(self.prefix),
-                    object: "rows".to_owned(),
-                    expected: format!("{missing} more"),
-                    found: "the end".to_owned(),
-                });
-            };
-            if batch.num_rows() > missing {
-                self.rest = Some(batch.slice(missing, batch.num_rows() - missing));
-            }
-            let piece = batch.slice(0, batch.num_rows().min(missing));
+            let piece = self.next_rows(missing)?;
             missing -= piece.num_rows();
             pieces.push(piece);
         }
         Ok(pieces)
+    }
+
+    /// The next rows, `missing` of them or fewer: they lie in [`Rows::file`].
+    pub(crate) fn next_rows(&mut self, missing: usize) -> Result<RecordBatch> {
+        let Some(batch) = self.next_batch()? else {
+            return Err(DatasetError::BadDataset {
+                path: self.root.join(self.prefix),
+                object: "rows".to_owned(),
+                expected: format!("{missing} more"),
+                found: "the end".to_owned(),
+            });
+        };
+        if batch.num_rows() > missing {
+            self.rest = Some(batch.slice(missing, batch.num_rows() - missing));
+        }
+        Ok(batch.slice(0, batch.num_rows().min(missing)))
+    }
+
+    /// Passes over the next rows, with few of them in memory.
+    pub(crate) fn skip(&mut self, rows: usize) -> Result<()> {
+        let mut missing = rows;
+        while missing > 0 {
+            missing -= self.next_rows(missing)?.num_rows();
+        }
+        Ok(())
+    }
+
+    /// The file that was read last.
+    pub(crate) fn file(&self) -> &Path {
+        self.reader.as_ref().map_or(&self.root, |(path, _)| path)
     }
 }

@@ -1,10 +1,12 @@
 //! Which dataset of a demo becomes which column: resolved once from the plan, before anything is read.
 
+use super::depth::{self, DepthKind};
 use super::encoded::may_hold_files;
 use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm};
 use crate::error::{DatasetError, InputError, Result};
 use crate::keys::KeyItem;
 use crate::plan::{DemoPlan, KeyPlan, Plan};
+use crate::tree::Dtype;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -74,6 +76,8 @@ pub struct ConvertOptions {
     pub images: ImageForm,
     /// Store pictures as AV1 videos, which are not exact, instead of images.
     pub video: Option<VideoOptions>,
+    /// Make columns of depth; otherwise it is kept in the side folder alone.
+    pub depth: bool,
     /// Which actions to take.
     pub actions: ActionKind,
     /// How to write the rotation part of actions.
@@ -97,6 +101,7 @@ impl Default for ConvertOptions {
             fps: None,
             images: ImageForm::default(),
             video: None,
+            depth: true,
             actions: ActionKind::default(),
             rotation: RotationForm::default(),
             lossless: true,
@@ -122,6 +127,8 @@ pub(crate) enum Origin {
     Success,
     /// A dataset of 8-bit images, or of their JPEG files.
     Image { key: String, height: usize, width: usize, jpeg: bool },
+    /// A dataset of depth, `dtype` a pixel.
+    Depth { key: String, height: usize, width: usize, dtype: Dtype, kind: DepthKind },
     /// One of the five columns that every data set has.
     Index(IndexColumn),
 }
@@ -199,12 +206,14 @@ impl Mapping {
             let (path, reason) = (plan.path.clone(), reason.to_owned());
             return Err(InputError::ObservationKeys { path, column, reason }.into());
         }
-        columns.extend(chooser.images()?);
+        let (mut pictures, mut left_out) = (chooser.images()?, BTreeMap::new());
+        chooser.depth(options, &mut pictures, &mut left_out);
+        let mut notes = chooser.pictures_left_out(&pictures, left_out, options);
+        columns.extend(pictures);
         let (action, provenance) = chooser.action(options)?;
         columns.push(action);
         columns.extend(chooser.outcomes()?);
         columns.extend(index_columns());
-        let mut notes = chooser.pictures_left_out(options.lossless);
         let fps = chooser.fps(options, &mut notes)?;
         let entities = options.entities.clone();
         let mut mapping = Self { columns, fps, state_keys, env_keys, entities, action: provenance, notes };
@@ -214,10 +223,16 @@ impl Mapping {
         Ok(mapping)
     }
 
-    /// Makes videos of the columns of images.
+    /// Makes videos of the columns of colour images.
     fn film(&mut self, options: &VideoOptions, lossless: bool) {
         let exact = lossless && options.side_pictures;
         for column in &mut self.columns {
+            if column.feature.is_depth() {
+                self.notes.push(format!(
+                    "{} stays exact, a TIFF file a frame: LeRobot's depth videos are 12-bit HEVC, which is not written here",
+                    column.name
+                ));
+            }
             let Origin::Image { height, width, .. } = column.origin else { continue };
             column.feature.dtype = "video".to_owned();
             let fps = if self.fps.fract() == 0.0 { json!(self.fps as i64) } else { json!(self.fps) };
@@ -248,7 +263,7 @@ impl Mapping {
 
     /// Bytes of image data in a frame.
     pub(crate) fn image_bytes_per_frame(&self) -> usize {
-        self.columns.iter().filter(|c| c.feature.is_visual()).map(Column::dim).sum()
+        self.columns.iter().filter(|c| c.feature.is_visual()).map(|c| c.feature.picture_bytes()).sum()
     }
 }
 
@@ -390,26 +405,76 @@ impl Chooser<'_> {
         Ok(columns)
     }
 
-    /// What looks like pictures and becomes no column: LeRobot's policies take 8-bit colour images of three channels,
-    /// and a made-up channel would not be the recording's.
-    fn pictures_left_out(&self, lossless: bool) -> Vec<String> {
-        let mut found: BTreeMap<&str, String> = BTreeMap::new();
+    /// Every dataset of depth becomes `observation.images.<camera>_depth`, as LeRobot's recorder would store it; why one
+    /// does not goes to `left_out`.
+    fn depth(&self, options: &ConvertOptions, columns: &mut Vec<Column>, left_out: &mut BTreeMap<String, String>) {
+        for (path, key) in &self.first.keys {
+            let (Some((height, width)), Some(kind)) = (depth::size(path, key), DepthKind::of(&key.dtype)) else {
+                continue;
+            };
+            let differs = self.plan.demos.iter().find(|demo| {
+                let fits = |other: &KeyPlan| {
+                    (&other.dtype, other.shape.split_first()) == (&key.dtype, Some((&demo.length, &key.shape[1..])))
+                };
+                !demo.keys.get(path).is_some_and(fits)
+            });
+            let reason = match (options.depth, differs) {
+                (true, None) => {
+                    let name = path.trim_start_matches("obs/");
+                    // a colour camera keeps its name, and depth that has it already its whole path
+                    let short = name.trim_start_matches("images/").replace('/', ".");
+                    let taken = columns.iter().any(|c| c.name == format!("observation.images.{short}"));
+                    let camera = if taken { format!("depth.{}", name.replace('/', ".")) } else { short };
+                    columns.push(Column {
+                        name: format!("observation.images.{camera}"),
+                        feature: depth::feature(height, width, kind),
+                        origin: Origin::Depth { key: path.clone(), height, width, dtype: key.dtype.clone(), kind },
+                    });
+                    continue;
+                }
+                (true, Some(demo)) => format!("{} has other depth than {} or none", demo.id, self.first.id),
+                (false, _) => "no depth does (--no-depth)".to_owned(),
+            };
+            left_out.insert(path.clone(), reason);
+        }
+    }
+
+    /// What looks like pictures and becomes no column, with the reason: that of `known`, or that LeRobot has no place for
+    /// it. Its recorder takes pictures of three channels and depth alone; a made-up channel would not be the recording's.
+    fn pictures_left_out(
+        &self,
+        columns: &[Column],
+        known: BTreeMap<String, String>,
+        options: &ConvertOptions,
+    ) -> Vec<String> {
+        const NO_COLOUR: &str = "only uint8 [height, width, 3] and JPEG files do";
+        let mut found: BTreeMap<&str, (String, &str)> = BTreeMap::new();
         for (path, key) in self.plan.demos.iter().flat_map(|d| &d.keys) {
             let shape = key.shape.get(1..).unwrap_or_default();
-            let what = match shape {
+            let is_column = |c: &Column| matches!(&c.origin, Origin::Depth { key, .. } if key == path);
+            let reason = match (shape, &key.dtype) {
                 _ if !path.starts_with("obs/") || self.files.contains_key(path) => continue,
-                [_, _, 3] if key.is_image() => continue,
-                [_, _, 1 | 3 | 4] => format!("{} {shape:?}", key.dtype),
+                _ if columns.iter().any(is_column) => continue,
+                ([_, _, 3], _) if key.is_image() => continue,
+                ([_, _, 1], Dtype::U8) => "LeRobot records no grey pictures, and its ACT takes three channels",
+                ([_, _, 4], Dtype::U8) => "LeRobot records no fourth channel, and its ACT takes three",
+                _ if depth::size(path, key).is_some() => "not every demo has this depth",
+                ([_, _, 1], Dtype::F32 | Dtype::F64 | Dtype::U16) => "nothing in its name says that it is depth",
+                ([_, _, 1], _) => "LeRobot's depth is float or uint16",
+                ([_, _, 3 | 4], _) => NO_COLOUR,
                 // a row of bytes a step under the name of a camera that is no JPEG file
-                [_] | [] if path.starts_with("obs/images/") => format!("encoded images, {} {shape:?}", key.dtype),
+                ([_] | [], _) if path.starts_with("obs/images/") => NO_COLOUR,
                 _ => continue,
             };
-            found.entry(path).or_insert(what);
+            let reason = known.get(path).map_or(reason, String::as_str);
+            let encoded = if shape.len() < 2 { "encoded images, " } else { "" };
+            found.entry(path).or_insert((format!("{encoded}{} {shape:?}", key.dtype), reason));
         }
-        let fate = if lossless { "the side folder keeps it as stored" } else { "it is left out (--no-lossless)" };
-        let note = |(path, what)| {
-            format!("{path} ({what}) becomes no column, only uint8 [height, width, 3] and JPEG files do; {fate}")
+        let fate = match options.lossless {
+            true => "the side folder keeps it as stored",
+            false => "it is left out (--no-lossless)",
         };
+        let note = |(path, (what, reason))| format!("{path} ({what}) becomes no column: {reason}; {fate}");
         found.into_iter().map(note).collect()
     }
 

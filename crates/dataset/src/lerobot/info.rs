@@ -108,6 +108,23 @@ impl Feature {
     pub fn is_visual(&self) -> bool {
         self.dtype == "image" || self.dtype == "video"
     }
+
+    /// Whether the pictures are depth: one number a pixel, no colours.
+    pub fn is_depth(&self) -> bool {
+        // the second name is LeRobot's older one
+        let says = |key: &str| self.info.as_ref().and_then(|info| info.get(key)).and_then(Value::as_bool);
+        self.is_visual() && (says("is_depth_map") == Some(true) || says("video.is_depth_map") == Some(true))
+    }
+
+    /// The unit of depth, `m` or `mm`, where it is stated.
+    pub fn depth_unit(&self) -> Option<&str> {
+        self.info.as_ref()?.get("depth_unit")?.as_str().filter(|_| self.is_depth())
+    }
+
+    /// Bytes of one picture once it is decoded; of depth, at most.
+    pub(crate) fn picture_bytes(&self) -> usize {
+        self.dim() * if self.is_depth() { 4 } else { 1 }
+    }
 }
 
 /// Columns in order. JSON objects keep the order in which they were written, maps of `serde_json` do not.

@@ -2,6 +2,7 @@
 
 mod check;
 mod convert;
+mod depth;
 pub mod edit;
 mod encode;
 mod encoded;
@@ -19,12 +20,14 @@ mod shards;
 mod side;
 mod staging;
 mod tally;
+mod tiff;
 mod values;
 mod verify;
 mod videos;
 mod work;
 
 pub use convert::{ConvertReport, convert, convert_unless};
+pub use depth::{DepthMaps, DepthUnit};
 pub use export::{ExportReport, export};
 pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, VideoOptions};
 pub(crate) use images::encode_png;

@@ -108,7 +108,7 @@ impl Dataset {
     /// The fingerprint recorded, after comparing it with the content where the content is in memory.
     fn checked_fingerprint(&self) -> Result<String> {
         let recorded = self.info.actrm.as_ref().map(|p| &p.fingerprint);
-        let pictures = self.info.features.0.iter().any(|(_, f)| f.is_visual());
+        let pictures = self.has_pictures();
         if let (Some(recorded), true) = (recorded, pictures) {
             return Ok(recorded.clone());
         }
@@ -131,7 +131,7 @@ impl Dataset {
     /// When an episode is not below the number of [`Dataset::episodes`].
     pub fn fingerprint_of(&self, episodes: &[usize]) -> String {
         let numbers = self.numeric_fingerprint(episodes.iter().map(|&episode| &self.episodes[episode]));
-        match self.info.features.0.iter().any(|(_, feature)| feature.is_visual()) {
+        match self.has_pictures() {
             true => hex(&Sha256::digest(format!("{}\n{numbers}\n", self.fingerprint))),
             false => numbers,
         }

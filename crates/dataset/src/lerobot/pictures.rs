@@ -139,9 +139,15 @@ pub struct CameraFile {
 }
 
 impl Dataset {
-    /// Names of the features that are pictures, in the order of `info.json`.
+    /// Names of the features that are colour pictures, in the order of `info.json`.
     pub fn cameras(&self) -> impl Iterator<Item = &str> {
-        self.info().features.0.iter().filter(|(_, f)| f.is_visual()).map(|(name, _)| name.as_str())
+        let colour = self.info().features.0.iter().filter(|(_, f)| f.is_visual() && !f.is_depth());
+        colour.map(|(name, _)| name.as_str())
+    }
+
+    /// Whether any feature holds pictures, depth among them: what is not in memory.
+    pub fn has_pictures(&self) -> bool {
+        self.info().features.0.iter().any(|(_, f)| f.is_visual())
     }
 
     /// Decodes all pictures of a camera into memory, with as many threads as there are cores. The bytes are those that
@@ -221,7 +227,13 @@ impl Dataset {
     }
 
     /// The files that a camera's videos lie in, each opened; none for an image column.
+    ///
+    /// # Errors
+    /// No such camera, a file that cannot be opened, depth as video, which is not read.
     pub fn video_files(&self, name: &str) -> Result<Vec<CameraFile>> {
+        if self.info().features.get(name).is_some_and(Feature::is_depth) {
+            return self.depth_size(name).map(|_| Vec::new());
+        }
         let (feature, ..) = self.camera(name)?;
         if feature.dtype != "video" {
             return Ok(Vec::new());
@@ -233,15 +245,18 @@ impl Dataset {
         paths.into_iter().map(open).collect()
     }
 
-    /// A feature of pictures with its height and width.
+    /// A feature of colour pictures with its height and width.
     pub(crate) fn camera(&self, name: &str) -> Result<(&Feature, usize, usize)> {
-        let found = self.info().features.get(name).filter(|f| f.is_visual());
+        let found = self.info().features.get(name).filter(|f| f.is_visual() && !f.is_depth());
+        let depth = self.info().features.get(name).is_some_and(Feature::is_depth);
         let feature = found.ok_or_else(|| DatasetError::NotInDataset {
             path: self.root().to_path_buf(),
             wanted: format!("camera {name}"),
-            found: match self.cameras().collect::<Vec<_>>().join(", ") {
-                none if none.is_empty() => "no camera".to_owned(),
-                names => names,
+            found: match (self.cameras().collect::<Vec<_>>().join(", "), depth) {
+                (none, false) if none.is_empty() => "no camera".to_owned(),
+                (names, false) => names,
+                (none, true) if none.is_empty() => "depth of that name, which has no colours".to_owned(),
+                (names, true) => format!("depth of that name, which has no colours, and {names}"),
             },
         })?;
         match feature.shape.as_slice() {

@@ -231,6 +231,10 @@ impl SideEncoder {
                 (Origin::Image { key, jpeg: false, .. }, None) => {
                     pictures.insert(key.clone(), column.name.clone());
                 }
+                // float64 is not exact in its column
+                (Origin::Depth { key, dtype, kind, .. }, _) if kind.dtype() == *dtype => {
+                    pictures.insert(key.clone(), column.name.clone());
+                }
                 (Origin::Image { key, .. }, Some(options)) if !options.side_pictures => {
                     left_out.insert(key.replacen("obs/", "next_obs/", 1));
                     left_out.insert(key.clone());

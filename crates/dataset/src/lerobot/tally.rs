@@ -92,10 +92,10 @@ impl<'a> Tally<'a> {
                     row.videos.insert(name.clone(), film(index, &found.samples)?);
                 }
                 digest = found.digest();
-                if found.sampled > 0 {
+                if found.sampled > 0 && !feature.is_depth() {
                     self.totals.entry(index).or_default().add_counts(&found.histograms, found.sampled);
-                    stats = FeatureStats::of_histograms(&found.histograms, found.sampled);
                 }
+                stats = found.stats().or(stats);
             }
             if let Some(stats) = stats {
                 row.stats.insert(name.clone(), stats);
@@ -114,7 +114,7 @@ impl<'a> Tally<'a> {
         for (index, (name, feature)) in self.features.0.iter().enumerate() {
             let of_column = match self.totals.get(&index) {
                 Some(total) => FeatureStats::of_histograms(&total.histograms, total.sampled),
-                // pictures that were not looked at: what their episodes say, taken together
+                // depth, and pictures that were not looked at: what their episodes say, taken together
                 None if feature.is_visual() => {
                     let each: Option<Vec<&FeatureStats>> = self.rows.iter().map(|row| row.stats.get(name)).collect();
                     each.and_then(|each| FeatureStats::pooled(&each))

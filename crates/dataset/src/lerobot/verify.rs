@@ -1,5 +1,6 @@
 //! Every check that a data set can be given.
 
+use super::depth;
 use super::encode::PictureSummary;
 use super::export::{Rows, picture_pixels};
 use super::fingerprint::Fingerprint;
@@ -104,7 +105,7 @@ pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Che
     note("every number is finite", not_finite(&dataset));
     note("statistics follow from the frames", statistics_problem(&dataset)?);
     note("splits name episodes", split_problem(&dataset));
-    if dataset.cameras().next().is_some() {
+    if dataset.has_pictures() {
         note("pictures decode and have the content recorded", picture_problem(&dataset, progress)?);
     } else if dataset.provenance().is_some() {
         // opening compared it
@@ -189,14 +190,19 @@ pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u
     let info: &Info = dataset.info();
     let root = dataset.root();
     let mut cursors = BTreeMap::new();
-    for (name, feature) in info.features.0.iter().filter(|(_, f)| f.dtype == "image") {
+    for (name, feature) in info.features.0.iter().filter(|(_, f)| f.dtype == "image" && !f.is_depth()) {
         let &[height, width, 3] = feature.shape.as_slice() else {
             return Ok(Some(format!("{name}: pictures of shape {:?} are not read", feature.shape)));
         };
         cursors.insert(name.as_str(), (Rows::open(root, "data", Some(name), 32)?, height, width));
     }
+    let mut depths = BTreeMap::new();
+    for name in dataset.depth_names() {
+        let (_, width) = dataset.depth_size(name)?;
+        depths.insert(name, (Rows::open(root, "data", Some(name), 32)?, width));
+    }
     let mut films = Vec::new();
-    for (name, _) in info.features.0.iter().filter(|(_, f)| f.dtype == "video") {
+    for (name, _) in info.features.0.iter().filter(|(_, f)| f.dtype == "video" && !f.is_depth()) {
         let (_, height, width) = dataset.camera(name)?;
         films.push((name.as_str(), places(dataset, name)?, Film::new(info.fps, (height, width)), height * width * 3));
     }
@@ -216,6 +222,19 @@ pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u
                 }
                 let frames = pixels.chunks_exact(*height * *width * 3);
                 summary.digests.extend(frames.map(|p| <[u8; 32]>::from(Sha256::digest(p))));
+            }
+            fingerprint.column(name, summary.digest());
+        }
+        for (name, (rows, width)) in &mut depths {
+            let (mut summary, mut bad) = (PictureSummary::default(), None);
+            let looked = dataset.each_depth(rows, name, episode.index, &mut |frame, kind, pixels| {
+                let found = depth::not_finite(kind, *width, pixels);
+                bad = bad.take().or(found.map(|found| format!("frame {frame} of episode {}: {found}", episode.index)));
+                summary.digests.push(Sha256::digest(pixels).into());
+                Ok(())
+            });
+            if let Some(found) = looked.err().map(|e| in_full(&e)).or(bad.map(|found| format!("{name}: {found}"))) {
+                return Ok(Some(found));
             }
             fingerprint.column(name, summary.digest());
         }

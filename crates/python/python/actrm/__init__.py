@@ -54,6 +54,7 @@ def convert(
     entities: Mapping[str, Sequence[str]] | None = None,
     fps: float | None = None,
     images: Literal["png", "ppm", "video"] = "png",
+    depth: bool = True,
     actions: Literal["delta", "absolute"] = "delta",
     rotation: Literal["axis-angle", "6d"] = "axis-angle",
     lossless: bool = True,
@@ -75,6 +76,7 @@ def convert(
         what an episode began with (`first(key)`) may stand in the lists.
     fps: frames a second; the control frequency that the file states unless given.
     images: how pictures are stored.
+    depth: make columns of depth, as LeRobot records it; the side folder alone keeps it otherwise.
     actions: as the controller got them, or absolute poses.
     rotation: how rotations in actions are written.
     lossless: keep what the format has no place for in the side folder, from which `actrm-data export` rebuilds the
@@ -93,6 +95,7 @@ def convert(
             entities={name: list(keys) for name, keys in (entities or {}).items()},
             fps=fps,
             images=images,
+            depth=depth,
             actions=actions,
             rotation=rotation,
             lossless=lossless,

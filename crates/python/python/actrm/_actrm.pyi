@@ -20,6 +20,8 @@ class Dataset:
         *,
         episodes: Sequence[int] | None = None,
         cameras: Sequence[str] | None = None,
+        depth: Sequence[str] | None = None,
+        depth_output_unit: str = "mm",
         return_uint8: bool = False,
     ) -> None: ...
     def __len__(self) -> int: ...
@@ -141,6 +143,7 @@ def convert(
     entities: dict[str, list[str]],
     fps: float | None,
     images: str,
+    depth: bool,
     actions: str,
     rotation: str,
     lossless: bool,

@@ -87,6 +87,8 @@ pub(super) fn open(
         state_keys: Some(experiment.data.state_keys.clone()),
         env_keys: Some(experiment.data.env_keys.clone()),
         entities: experiment.data.entities.iter().map(|(name, e)| (name.clone(), e.keys.clone())).collect(),
+        // no policy reads it
+        depth: false,
         ..ConvertOptions::default()
     };
     dataset::convert(path, &folder, &options, progress)

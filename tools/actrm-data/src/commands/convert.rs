@@ -9,8 +9,11 @@ use std::time::Instant;
 ///
 /// Columns: observation.state, observation.environment_state, observation.entity.<name>, observation.images.<camera>, action, next.reward,
 /// next.done, next.success, and the five index columns. What the format has no place for is kept in the side folder
-/// `actrm/`, from which `actrm-data export` rebuilds the source; so are depth, grey and RGBA
-/// pictures, and a note says so. Recorded JPEG files (newer ALOHA) stay the files they are. OUT appears whole or not at all.
+/// `actrm/`, from which `actrm-data export` rebuilds the source; so are grey and RGBA pictures, which LeRobot does not
+/// record, and a note says so. Recorded JPEG files (newer ALOHA) stay the files they are. Depth (obs/<camera>_depth: float
+/// metres or uint16 millimetres, height x width x 1) becomes observation.images.<camera>_depth, a TIFF file a frame, as
+/// LeRobot records it; no file says its unit, and robosuite's own camera_depths, before robomimic makes metres of them,
+/// go from 0 to 1. OUT appears whole or not at all.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data convert data/lift.hdf5 lift
@@ -53,6 +56,9 @@ pub struct Args {
     /// With --video: leave the exact pictures out of the side folder: smaller, but the source cannot be rebuilt
     #[arg(long, requires = "video")]
     no_side_pictures: bool,
+    /// Make no columns of depth: the side folder alone keeps it, whatever its values
+    #[arg(long)]
+    no_depth: bool,
     /// Which actions to take: as the controller got them, or absolute poses (actions_abs)
     #[arg(long, value_enum, default_value_t = Actions::Delta)]
     actions: Actions,
@@ -123,6 +129,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             Images::Png => ImageForm::Png,
             Images::Ppm => ImageForm::Ppm,
         },
+        depth: !args.no_depth,
         actions: match args.actions {
             Actions::Delta => ActionKind::Delta,
             Actions::Absolute => ActionKind::Absolute,

@@ -58,6 +58,9 @@ struct KeyRow {
     demos: usize,
     min: Option<f64>,
     max: Option<f64>,
+    /// Unit of a feature that is depth, where it is stated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    depth: Option<String>,
     /// Codec, rate and files of a feature that is video.
     #[serde(skip_serializing_if = "Option::is_none")]
     video: Option<VideoRow>,
@@ -93,6 +96,16 @@ fn of(args: &Args) -> Result<Summary> {
     }
 }
 
+impl KeyRow {
+    /// Its type, for people.
+    fn shown_type(&self) -> String {
+        match &self.depth {
+            Some(unit) => format!("{}, depth in {unit}", self.dtype),
+            None => self.dtype.clone(),
+        }
+    }
+}
+
 impl Summary {
     /// Name, type, shape of a step, and range or codec of each feature.
     pub(super) fn features(&self) -> Vec<[String; 4]> {
@@ -106,7 +119,7 @@ impl Summary {
             });
             let range =
                 key.min.zip(key.max).map(|(low, high)| format!("{} to {}", cli::number(low), cli::number(high)));
-            [key.key.clone(), key.dtype.clone(), shapes.join(" or "), video.or(range).unwrap_or_default()]
+            [key.key.clone(), key.shown_type(), shapes.join(" or "), video.or(range).unwrap_or_default()]
         };
         self.keys.iter().map(row).collect()
     }
@@ -159,6 +172,7 @@ fn of_source(args: &Args) -> Result<Summary> {
                 demos: 0,
                 min: ranges.get(path).map(|r| r.0),
                 max: ranges.get(path).map(|r| r.1),
+                depth: None,
                 video: None,
             });
             row.demos += 1;
@@ -223,6 +237,7 @@ fn of_dataset(args: &Args) -> Result<Summary> {
             demos: lengths.len(),
             min: ranges(name).map(|r| r.0),
             max: ranges(name).map(|r| r.1),
+            depth: feature.is_depth().then(|| feature.depth_unit().unwrap_or("an unstated unit").to_owned()),
             video,
         });
     }
@@ -316,7 +331,7 @@ fn show(s: &Summary) -> String {
         .map(|k| {
             let shapes: Vec<String> = k.shapes.iter().map(|shape| cli::shape(shape)).collect();
             let demos = if k.demos == s.demos { "all".to_owned() } else { format!("{} of {}", k.demos, s.demos) };
-            vec![k.key.clone(), k.dtype.clone(), shapes.join(" or "), demos, range(k.min), range(k.max)]
+            vec![k.key.clone(), k.shown_type(), shapes.join(" or "), demos, range(k.min), range(k.max)]
         })
         .collect();
     text.push_str(&cli::table(&["key", "type", "shape of a step", "demos", "min", "max"], &rows, &[4, 5]));

@@ -1,4 +1,5 @@
 use crate::svg::{self, Content};
+use crate::view;
 use anyhow::{Context, Result, bail};
 use dataset::{Dataset, EpisodeMeta, Picture};
 use std::ffi::OsString;
@@ -11,7 +12,7 @@ use std::process::ExitCode;
 /// One row a dimension: on the left its course over the episode, on the right its histogram over all frames of the
 /// set. The file's ending decides: .svg is one picture, .html a page with one picture a column. Neither needs anything
 /// from the network. A .png file shows what the cameras saw: a row a camera, pictures of some frames from the first to the
-/// last.
+/// last; depth is grey, what is nearest in the episode white.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data plot lift --out lift.html
@@ -44,7 +45,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         bail!("{}: no episode {}; there are {}", args.dir.display(), args.episode, set.episodes().len());
     };
     let pictures = extension == "png";
-    let all: Vec<&str> = if pictures { set.cameras().collect() } else { set.column_names().collect() };
+    let all: Vec<&str> = match pictures {
+        true => set.cameras().chain(set.depth_names()).collect(),
+        false => set.column_names().collect(),
+    };
     if pictures && all.is_empty() {
         bail!("{}: no pictures to draw in it", args.dir.display());
     }
@@ -79,11 +83,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 fn contact_sheet(set: &Dataset, episode: &EpisodeMeta, cameras: &[&str], most: usize) -> Result<Vec<u8>> {
     let count = most.min(episode.length);
     let frames: Vec<usize> = (0..count).map(|i| i * (episode.length - 1) / (count - 1).max(1)).collect();
-    let row = |camera: &&str| -> Result<Vec<Picture>> {
-        let all = set.episode_pictures(camera, episode.index)?;
-        let one = |&frame: &usize| Picture { height: all.height, width: all.width, rgb: all.frame(frame).to_vec() };
-        Ok(frames.iter().map(one).collect())
-    };
+    let row = |camera: &&str| -> Result<Vec<Picture>> { view::pictures(set, camera, episode.index, &frames) };
     let rows = cameras.iter().map(row).collect::<Result<Vec<_>>>()?;
     Ok(Picture::sheet(&rows, 4).to_png()?)
 }

@@ -5,7 +5,7 @@
 
 mod read;
 
-pub use read::{Drawn, Episode, Opened};
+pub use read::{Drawn, Episode, Opened, pictures};
 
 use crate::svg::{self, Content, escape};
 use base64::Engine as _;

@@ -59,10 +59,10 @@ impl Opened {
         }
     }
 
-    /// Names of the cameras: columns of a data set, datasets of a file.
+    /// Names of the cameras, of colours and of depth: columns of a data set; those of colours: datasets of a file.
     pub fn cameras(&self) -> Vec<String> {
         match self {
-            Self::Set(set) => set.cameras().map(str::to_owned).collect(),
+            Self::Set(set) => set.cameras().chain(set.depth_names()).map(str::to_owned).collect(),
             Self::File(source) => {
                 let first = source.plan().demos.first();
                 let pictures = first.into_iter().flat_map(|demo| &demo.keys);
@@ -117,12 +117,7 @@ impl Opened {
     /// Pictures of a camera in some frames of an episode.
     pub fn pictures(&self, camera: &str, episode: usize, frames: &[usize]) -> Result<Vec<Picture>> {
         Ok(match self {
-            Self::Set(set) => {
-                let all = set.episode_pictures(camera, episode)?;
-                let one =
-                    |&frame: &usize| Picture { height: all.height, width: all.width, rgb: all.frame(frame).to_vec() };
-                frames.iter().map(one).collect()
-            }
+            Self::Set(set) => pictures(set, camera, episode, frames)?,
             Self::File(source) => {
                 let mut pictures = Vec::with_capacity(frames.len());
                 for &frame in frames {
@@ -134,6 +129,17 @@ impl Opened {
             }
         })
     }
+}
+
+/// Pictures of a camera of a set in some frames of an episode; depth in grey, what is near in white.
+pub fn pictures(set: &Dataset, camera: &str, episode: usize, frames: &[usize]) -> Result<Vec<Picture>> {
+    if set.depth_names().any(|name| name == camera) {
+        let all = set.depth_maps(camera, episode)?;
+        return Ok(frames.iter().map(|&frame| all.picture(frame)).collect());
+    }
+    let all = set.episode_pictures(camera, episode)?;
+    let one = |&frame: &usize| Picture { height: all.height, width: all.width, rgb: all.frame(frame).to_vec() };
+    Ok(frames.iter().map(one).collect())
 }
 
 /// Names of dimensions: those that are stated, or numbers.

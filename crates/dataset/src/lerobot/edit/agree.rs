@@ -40,6 +40,13 @@ pub(super) fn features(inputs: &[Input]) -> Result<Features> {
             if found.names != feature.names {
                 return Err(differ(&format!("{object}.names"), feature.names.to_string(), found.names.to_string()));
             }
+            let kind = |f: &Feature| match f.is_depth() {
+                true => format!("depth in {}", f.depth_unit().unwrap_or("a unit that is not stated")),
+                false => "no depth".to_owned(),
+            };
+            if kind(found) != kind(feature) {
+                return Err(differ(&format!("{object}.info"), kind(feature), kind(found)));
+            }
             join_info(feature, found);
         }
         if let Some(more) = two.features.names().find(|name| one.features.get(name).is_none()) {

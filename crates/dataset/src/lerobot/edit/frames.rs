@@ -1,6 +1,7 @@
 //! The rows of the data files: carried over in the types that they have, with new numbers, and looked at once on the way
 //! for statistics and digests. Pictures stay the files that they are.
 
+use super::super::depth;
 use super::super::encode::{ColumnSummary, PartSummary, PictureSummary, add_to_histograms, sample};
 use super::super::export::Rows;
 use super::super::images;
@@ -9,6 +10,7 @@ use super::super::open::{Dataset, EpisodeMeta};
 use super::super::read::{self, BadColumn};
 use super::super::schema;
 use super::super::shards::{GroupEncoder, Place, ShardWriter, WrittenFile};
+use super::super::tiff;
 use super::super::values::Values;
 use super::super::work::{GROUP_BYTES, Part};
 use super::groups::Groups;
@@ -46,7 +48,9 @@ pub(super) struct CopiedEpisode {
 
 /// Whether the pictures of a feature are decoded for their statistics; others keep what is stored of them.
 pub(super) fn is_looked_at(feature: &Feature) -> bool {
-    feature.dtype == "image" && matches!(feature.shape[..], [height, width, 3] if height > 0 && width > 0)
+    let channels = if feature.is_depth() { 1 } else { 3 };
+    feature.dtype == "image"
+        && matches!(feature.shape[..], [height, width, c] if height > 0 && width > 0 && c == channels)
 }
 
 /// Copies the rows of all episodes taken.
@@ -65,7 +69,8 @@ pub(super) fn copy(edit: &Edit<'_>, advance: &mut dyn FnMut(u64)) -> Result<Copi
     let mut append = |group, begins| shards.append(group, begins);
     let mut groups = Groups::new(edit.root, &encoder, limit);
     let mut copied = Copied { files: Vec::new(), tasks: Vec::new(), episodes: Vec::new() };
-    let picture_bytes: usize = edit.features.0.iter().filter(|(_, f)| f.dtype == "image").map(|(_, f)| f.dim()).sum();
+    let picture_bytes: usize =
+        edit.features.0.iter().filter(|(_, f)| f.dtype == "image").map(|(_, f)| f.picture_bytes()).sum();
     let batch_rows = (GROUP_BYTES as usize / picture_bytes.max(1)).clamp(1, 1024);
     let (mut frames, mut summaries) = (0, Vec::new());
     for (input, taken) in edit.inputs.iter().zip(&edit.taken) {
@@ -164,8 +169,14 @@ fn columns(root: &Path, batch: &RecordBatch, names: &[String], schema: &Schema) 
     names.iter().zip(schema.fields()).map(column).collect()
 }
 
+/// Pixels of a picture.
+enum Pixels {
+    Colours(Vec<u8>),
+    Depth(Vec<f32>),
+}
+
 /// A picture's digest, and its pixels where they count; neither of one that is not looked at.
-type Looked = Option<([u8; 32], Option<Vec<u8>>)>;
+type Looked = Option<([u8; 32], Option<Pixels>)>;
 
 /// An episode while its rows pass.
 struct Seen<'a> {
@@ -295,33 +306,52 @@ impl<'a> Seen<'a> {
             if !counts && !digests {
                 return Ok(None);
             }
-            let mut pixels = Vec::with_capacity(height * width * 3);
-            images::decode(files.value(row), height, width, &mut pixels).map_err(|found| DatasetError::BadDataset {
+            let mut pixels = Vec::with_capacity(feature.picture_bytes());
+            let file = files.value(row);
+            let decoded = match feature.is_depth() {
+                true => tiff::decode(file, height, width, &mut pixels)
+                    .and_then(|kind| depth::not_finite(kind, width, &pixels).map_or(Ok(Some(kind)), Err)),
+                false => images::decode(file, height, width, &mut pixels).map(|()| None),
+            };
+            let kind = decoded.map_err(|found| DatasetError::BadDataset {
                 path: self.set.root().join("data"),
                 object: format!("column {name}, frame {} of episode {}", first + row, self.episode),
-                expected: format!("a PNG or PPM picture of {height} x {width}"),
+                expected: match feature.is_depth() {
+                    true => format!("a TIFF file with {height} x {width} of finite depth"),
+                    false => format!("a PNG or PPM picture of {height} x {width}"),
+                },
                 found,
             })?;
             let digest = if digests { Sha256::digest(&pixels).into() } else { [0; 32] };
+            let pixels = match kind {
+                Some(kind) => Pixels::Depth(kind.values(&pixels).collect()),
+                None => Pixels::Colours(pixels),
+            };
             Ok(Some((digest, counts.then_some(pixels))))
         };
         let looked: Vec<_> = (0..files.len()).into_par_iter().map(look).collect();
         let summary = self.pictures.entry(index).or_default();
-        summary.histograms.resize(3, [0; 256]);
+        if !feature.is_depth() {
+            summary.histograms.resize(3, [0; 256]);
+        }
         for one in looked {
             let Some((digest, pixels)) = one? else { continue };
             if digests {
                 summary.digests.push(digest);
             }
-            if let Some(pixels) = pixels {
-                add_to_histograms(summary, height, width, &pixels);
+            match pixels {
+                Some(Pixels::Colours(pixels)) => add_to_histograms(summary, height, width, &pixels),
+                Some(Pixels::Depth(values)) => summary.add_depth(height, width, &values),
+                None => {}
             }
         }
         Ok(())
     }
 
     /// All that is known once every row has passed; `stored` are statistics of features that were not looked at.
-    fn summary(self, stored: &BTreeMap<String, Vec<FeatureStats>>) -> PartSummary {
+    fn summary(mut self, stored: &BTreeMap<String, Vec<FeatureStats>>) -> PartSummary {
+        // every episode's is kept until all have passed
+        self.pictures.values_mut().for_each(PictureSummary::settle);
         let column = |(values, (name, feature)): (Values, &(String, Feature))| ColumnSummary {
             stats: match stored.get(name) {
                 Some(each) => each.get(self.episode).cloned(),

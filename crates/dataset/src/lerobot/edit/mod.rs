@@ -75,9 +75,11 @@ impl Input {
     /// a set with a side folder have hashes; of one without, pictures are held against the fingerprint.
     fn open(root: &Path, progress: &mut Progress<'_>) -> Result<Self> {
         let set = Dataset::open(root)?;
+        // depth that could not be looked at is told of before anything is copied
+        set.depth_names().try_for_each(|name| set.depth_size(name).map(drop))?;
         let layout = match set.provenance() {
             Some(provenance) if provenance.lossless => Some(side_folder(root, set.info())?),
-            Some(_) if set.cameras().next().is_some() => match picture_problem(&set, progress)? {
+            Some(_) if set.has_pictures() => match picture_problem(&set, progress)? {
                 None => None,
                 Some(found) => {
                     return Err(DatasetError::BadDataset {
