@@ -367,6 +367,7 @@ struct Made<'a> {
 impl WithSimd for Made<'_> {
     type Output = ();
 
+    #[allow(clippy::needless_range_loop)] // rows and columns of a square
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { tiles, block, from, output, add, out } = self;
