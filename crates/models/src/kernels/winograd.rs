@@ -119,7 +119,7 @@ impl Winograd {
             let (of_seen, of_made) = (plane(count, depth), plane(count, output));
             let (seen, made) = scratch.split_at_mut(POINTS * of_seen);
             let made = &mut made[..POINTS * of_made];
-            dispatch(Seen { tiles: self, block: (first, count), x, frame, into: seen });
+            dispatch(Seen::<SEEN> { tiles: self, block: (first, count), x, frame, into: seen });
             let points = seen.chunks_exact(of_seen).zip(panels.chunks_exact(panels.len() / POINTS));
             for ((seen, panels), made) in points.zip(made.chunks_exact_mut(of_made)) {
                 multiply(count, (seen, depth), &panels[..panels.len() - APART], (made, output));
@@ -145,9 +145,10 @@ impl Winograd {
             let (of_seen, of_grad) = (plane(count, c), plane(count, o));
             // gradients first: what follows the inputs may be read and is not used
             let (grads, seen) = scratch.split_at_mut(POINTS * of_grad);
-            dispatch(Grads { tiles: self, block: (first, count), grad, frame: &self.conv.made((1, 1)), into: grads });
+            let frame = &self.conv.made((1, 1));
+            dispatch(Seen::<MADE> { tiles: self, block: (first, count), x: grad, frame, into: grads });
             let into = &mut seen[..POINTS * of_seen];
-            dispatch(Seen { tiles: self, block: (first, count), x, frame: &self.conv.input, into });
+            dispatch(Seen::<SEEN> { tiles: self, block: (first, count), x, frame: &self.conv.input, into });
             for (point, into) in points.chunks_exact_mut(o * c + APART).enumerate() {
                 let (seen, grads) = (&seen[point * of_seen..], &grads[point * of_grad..]);
                 add_products(count, (seen, c), (grads, o), &mut into[..o * c], pack);
@@ -247,8 +248,8 @@ fn both<S: Simd, O: Sums<F, T>, const F: usize, const T: usize>(
     whole
 }
 
-/// Tiles of a framed input at all points: (point, tile, channel).
-struct Seen<'a> {
+/// Squares of F x F pixels of a frame, one a tile, at all points: (point, tile, channel).
+struct Seen<'a, const F: usize> {
     tiles: &'a Winograd,
     /// the first one, and how many
     block: (usize, usize),
@@ -257,28 +258,47 @@ struct Seen<'a> {
     into: &'a mut [f32],
 }
 
-impl WithSimd for Seen<'_> {
-    type Output = ();
-
+impl<const F: usize> Seen<'_, F> {
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Sums<F, SEEN>>(self, simd: S) {
         let Self { tiles, block, x, frame, into } = self;
         let c = frame.channels;
         let zeros = vec![0f32; c];
-        // the padding's first row and column in the frame
-        let above = (frame.border.0 - 1, frame.border.1 - 1);
+        // inputs begin a pixel before the outputs that see them
+        let before = (F - MADE) / 2;
+        let first = (frame.border.0 - before, frame.border.1 - before);
         let all = (frame.height + 2 * frame.border.0, frame.width + 2 * frame.border.1);
         for t in 0..block.1 {
             let (picture, row, column) = tiles.place(block.0 + t);
-            let mut pixels = [&zeros[..]; POINTS];
-            for (k, pixel) in pixels.iter_mut().enumerate() {
-                let (row, column) = (row + above.0 + k / SEEN, column + above.1 + k % SEEN);
+            let mut pixels = [[&zeros[..]; F]; F];
+            for (k, pixel) in pixels.as_flattened_mut().iter_mut().enumerate() {
+                let (row, column) = (row + first.0 + k / F, column + first.1 + k % F);
                 if row < all.0 && column < all.1 {
                     *pixel = &x[picture * frame.picture() + row * frame.row() + column * c..][..c];
                 }
             }
-            at_points::<S, Inputs, SEEN>(simd, &pixels, (&mut *into, t));
+            at_points::<S, O, F>(simd, pixels.as_flattened(), (&mut *into, t));
         }
+    }
+}
+
+/// Inputs.
+impl WithSimd for Seen<'_, SEEN> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        self.run::<S, Inputs>(simd);
+    }
+}
+
+/// Gradients of outputs.
+impl WithSimd for Seen<'_, MADE> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        self.run::<S, Factors>(simd);
     }
 }
 
@@ -316,39 +336,6 @@ fn at_points<S: Simd, O: Sums<F, SEEN>, const F: usize>(simd: S, pixels: &[&[f32
             for y in 0..SEEN {
                 points[y * SEEN + x][l] = whole[x][y];
             }
-        }
-    }
-}
-
-/// Tiles of a framed gradient of outputs at all points: (point, tile, channel).
-struct Grads<'a> {
-    tiles: &'a Winograd,
-    /// the first one, and how many
-    block: (usize, usize),
-    grad: &'a [f32],
-    frame: &'a Frame,
-    into: &'a mut [f32],
-}
-
-impl WithSimd for Grads<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let Self { tiles, block, grad, frame, into } = self;
-        let c = frame.channels;
-        let zeros = vec![0f32; c];
-        for t in 0..block.1 {
-            let (picture, row, column) = tiles.place(block.0 + t);
-            // beyond the picture nothing was made
-            let mut pixels = [&zeros[..]; TAPS];
-            for (k, pixel) in pixels.iter_mut().enumerate() {
-                let (row, column) = (row + k / MADE, column + k % MADE);
-                if row < frame.height && column < frame.width {
-                    *pixel = &grad[frame.at(picture, row) + column * c..][..c];
-                }
-            }
-            at_points::<S, Factors, MADE>(simd, &pixels, (&mut *into, t));
         }
     }
 }
