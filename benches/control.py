@@ -37,7 +37,12 @@ from actrm_harness.simulators.robosuite.simulation import Robosuite  # noqa: E40
 from actrm_harness.tasks import TASKS  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
 
-SPEED_BARS = {"Lift": 5.0, "Stack": 5.0, "PickPlaceCan": 3.5, "NutAssemblySquare": 3.0, "Door": 4.5}
+SPEED_BARS = {
+    **{"Lift": 5.0, "Stack": 5.0, "PickPlaceCan": 3.5, "NutAssemblySquare": 3.0, "Door": 4.5},
+    **{"TwoArmLift": 2.5, "TwoArmTransport": 2.5},
+}
+OF_TWO_ARMS = ("speed", "parity")
+"""What is asked of two arms; a reset, a worker's share and its memory are bars of one."""
 RAW_BAR = 1.3
 RESET_BAR = 10.0
 FRAMING_BAR = 0.1
@@ -74,7 +79,8 @@ def main() -> int:
     args = parser.parse_args()
     rows: list[Row] = []
     for task in args.tasks.split(","):
-        found = (row for part in args.only.split(",") for row in PARTS[part](task, args))
+        parts = [part for part in args.only.split(",") if part in OF_TWO_ARMS or not task.startswith("TwoArm")]
+        found = (row for part in parts for row in PARTS[part](task, args))
         for row in found:
             if not rows:
                 print(line("work", "ours", "peer", "ratio", "bar", ""))
@@ -107,14 +113,15 @@ def verdict(row: Row) -> str:
     return "ok" if row.met else "over" if row.aim else "MISSED"
 
 
-def wander(seed: int, steps: int) -> Iterator[Array]:
+def wander(seed: int, steps: int, size: int) -> Iterator[Array]:
     """Actions that wander: down towards the table at first, fingers opening and closing."""
     rng = np.random.default_rng(seed)
-    action = np.zeros(7)
+    action = np.zeros(size)
+    scale = np.resize([0.15, 0.15, 0.15, 0.1, 0.1, 0.1, 1.0], size)
     for index in range(steps):
-        action = 0.9 * action + rng.normal(size=7) * [0.15, 0.15, 0.15, 0.1, 0.1, 0.1, 1.0]
+        action = 0.9 * action + rng.normal(size=size) * scale
         moved = np.clip(action, -1.0, 1.0)
-        moved[2] -= 0.3 if index < 20 else 0.0
+        moved[2::7] -= 0.3 if index < 20 else 0.0
         yield moved
 
 
@@ -149,7 +156,7 @@ def speed(task: str, args: argparse.Namespace) -> Iterator[Row]:
 
     loops: dict[str, Callable[[Array], Any]] = {"plain": plain.step, "ours": compiled.step, "raw": physics}
     seen: dict[str, list[float]] = {name: [] for name in loops}
-    for action in wander(1, steps + 10):
+    for action in wander(1, steps + 10, ours.action_dim):
         start = ours.sim.data._data
         data.qpos[:], data.qvel[:], data.ctrl[:] = start.qpos, start.qvel, start.ctrl
         for name, loop in loops.items():
@@ -198,7 +205,7 @@ def framing(task: str, args: argparse.Namespace) -> Iterator[Row]:
         envs.reset(session, 1)
         whole: list[float] = []
         inner: list[float] = []
-        actions = list(wander(1, max(args.steps, 2 * count)))
+        actions = list(wander(1, max(args.steps, 2 * count), session.env.action_dim))
         with open(os.devnull, "wb") as nothing:
             for index in range(0, len(actions) - 2 * count + 1, 2 * count):
                 request = io.BytesIO()
@@ -325,7 +332,7 @@ def positions(
     if moved is not None:
         env.sim.data.qpos[moved] = np.nextafter(env.sim.data.qpos[moved], 9.0)
     found: dict[int, Array] = {}
-    for index, action in enumerate(wander(seed, steps), start=1):
+    for index, action in enumerate(wander(seed, steps, env.action_dim), start=1):
         step(action)
         if index in MARKS:
             found[MARKS[index]] = env.sim.data.qpos.copy()

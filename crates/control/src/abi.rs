@@ -10,10 +10,10 @@ use crate::rotation::delta_rotation;
 use crate::substeps::{JacSiteFunction, Loop, PolicyArm, Status, StepFunction};
 
 /// Version of this interface.
-const ABI: u32 = 1;
+const ABI: u64 = 2;
 
-/// Everything of one simulation that the loop reads and writes, as addresses into the arrays of
-/// its `mjModel` and `mjData`, with the indices of the robot's parts in them.
+/// What the loop reads and writes of one simulation, as addresses into the arrays of its `mjModel`
+/// and `mjData`; where a robot is in them, its [`ArmBinding`] says.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct Binding {
@@ -57,6 +57,12 @@ pub struct Binding {
     pub nm: i32,
     /// Sites.
     pub nsite: i32,
+}
+
+/// Where a robot of one arm is in the simulation, and how it is controlled.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct ArmBinding {
     /// The site that the arm controller moves.
     pub grip_site: i32,
     /// The site whose frame goals are given in; its body must not move.
@@ -69,10 +75,38 @@ pub struct Binding {
     pub arm_actuator: [i32; DOF],
     /// The gripper's actuators.
     pub gripper_actuator: [i32; 2],
+    /// How many of them there are: two, or none of a hand without fingers.
+    pub fingers: i32,
     /// The arm controller's configuration.
     pub gains: Gains,
     /// The gripper's configuration.
     pub gripper: Gripper,
+}
+
+/// Numbers of an action for an arm: translation and rotation.
+const ARM_ACTION: usize = 6;
+
+impl ArmBinding {
+    /// How many numbers of an action are this robot's.
+    pub fn action(&self) -> usize {
+        ARM_ACTION + usize::from(self.fingers != 0)
+    }
+
+    /// Checks the indices against the sizes of a simulation.
+    pub(crate) fn check(&self, sizes: &Binding) -> Result<(), Status> {
+        let within = |indices: &[i32], size: i32| indices.iter().all(|&i| 0 <= i && i < size);
+        let fingers = match self.fingers {
+            0 => true,
+            2 => within(&self.gripper_actuator, sizes.nu),
+            _ => false,
+        };
+        let good = fingers
+            && within(&self.arm_qpos, sizes.nq)
+            && within(&self.arm_dof, sizes.nv)
+            && within(&self.arm_actuator, sizes.nu)
+            && within(&[self.grip_site, self.origin_site], sizes.nsite);
+        if good { Ok(()) } else { Err(Status::BadArgument) }
+    }
 }
 
 /// A two-finger gripper that integrates the sign of its action.
@@ -107,7 +141,7 @@ impl Gripper {
     }
 }
 
-/// The controllers' memory. Python owns it; the attributes of robosuite's controllers are views
+/// The memory of one robot's controllers. Python owns it; the attributes of robosuite's controllers are views
 /// into it, so that both sides see the same state at any time.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
@@ -131,7 +165,7 @@ pub struct State {
 }
 
 impl Binding {
-    /// Checks pointers, sizes and indices.
+    /// Checks pointers and functions.
     pub(crate) fn check(&self) -> Result<(), Status> {
         let pointers = [
             self.model,
@@ -148,30 +182,23 @@ impl Binding {
             self.dof_parent.cast(),
         ];
         let functions = self.step1.is_some() && self.step2.is_some() && self.jac_site.is_some();
-        let within = |indices: &[i32], size: i32| indices.iter().all(|&i| 0 <= i && i < size);
-        let good = functions
-            && pointers.iter().all(|p| !p.is_null())
-            && within(&self.arm_qpos, self.nq)
-            && within(&self.arm_dof, self.nv)
-            && within(&self.arm_actuator, self.nu)
-            && within(&self.gripper_actuator, self.nu)
-            && within(&[self.grip_site, self.origin_site], self.nsite);
+        let good = functions && pointers.iter().all(|p| !p.is_null());
         if good { Ok(()) } else { Err(Status::BadArgument) }
     }
 
-    /// The arm's block of the inertia matrix: what `mj_fullM` gives on its rows and columns.
+    /// An arm's block of the inertia matrix: what `mj_fullM` gives on its rows and columns.
     ///
     /// # Safety
-    /// The arrays must be those of a live simulation of the given sizes.
-    pub(crate) unsafe fn arm_mass(&self) -> [[f64; DOF]; DOF] {
+    /// The arrays must be those of a live simulation of the given sizes, and `arm_dof` below `nv`.
+    pub(crate) unsafe fn arm_mass(&self, arm_dof: &[i32; DOF]) -> [[f64; DOF]; DOF] {
         let mut mass = [[0.0; DOF]; DOF];
-        for (row, &dof) in self.arm_dof.iter().enumerate() {
+        for (row, &dof) in arm_dof.iter().enumerate() {
             // SAFETY: dof is below nv, and a row's ancestors follow its diagonal in qm
             unsafe {
                 let mut address = *self.dof_madr.add(dof as usize);
                 let mut ancestor = dof;
                 while ancestor >= 0 && 0 <= address && address < self.nm {
-                    if let Some(column) = self.arm_dof.iter().position(|&d| d == ancestor) {
+                    if let Some(column) = arm_dof.iter().position(|&d| d == ancestor) {
                         let value = *self.qm.add(address as usize);
                         mass[row][column] = value;
                         mass[column][row] = value;
@@ -198,50 +225,58 @@ impl Binding {
     }
 }
 
-/// The interface's version in the upper half, the sizes of [`Binding`] and [`State`] in the lower
-/// quarters: one number to compare before anything else is called.
+/// The interface's version and the sizes of [`Binding`], [`ArmBinding`] and [`State`], 16 bits each from the
+/// top: one number to compare before anything else is called.
 #[unsafe(no_mangle)]
 pub extern "C" fn control_abi() -> u64 {
-    (u64::from(ABI) << 32) | ((size_of::<Binding>() as u64) << 16) | size_of::<State>() as u64
+    [size_of::<Binding>(), size_of::<ArmBinding>(), size_of::<State>()]
+        .iter()
+        .fold(ABI, |number, &size| (number << 16) | size as u64)
 }
 
-/// Checks a binding and returns a loop over it, or null if the binding is not sound.
+/// Checks a binding and `count` robots in it, and returns a loop over them, or null if they are not sound.
 ///
 /// # Safety
-/// `binding` must be null or point to a [`Binding`].
+/// `binding` must be null or point to a [`Binding`], `arms` null or to `count` of [`ArmBinding`].
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn control_open(binding: *const Binding) -> *mut Loop {
+pub unsafe extern "C" fn control_open(binding: *const Binding, arms: *const ArmBinding, count: u32) -> *mut Loop {
     // SAFETY: the caller vouches for the pointer
-    let Some(binding) = (unsafe { binding.as_ref() }) else {
+    let Some(binding) = (unsafe { binding.as_ref() }).filter(|_| !arms.is_null()) else {
         return std::ptr::null_mut();
     };
-    match Loop::new(*binding) {
+    // SAFETY: not null, and the caller vouches for the rest
+    let arms = unsafe { std::slice::from_raw_parts(arms, count as usize) };
+    match Loop::new(*binding, arms) {
         Ok(made) => Box::into_raw(Box::new(made)),
         Err(_) => std::ptr::null_mut(),
     }
 }
 
-/// Takes `substeps` substeps; the first sets the goals from `action` (seven numbers) if
-/// `policy_step` is not zero. Returns a [`Status`].
+/// Takes `substeps` substeps; the first sets the goals from `action` if `policy_step` is not zero.
+/// Returns a [`Status`].
 ///
 /// # Safety
-/// `handle` must come from [`control_open`] and not be closed, `state` and `action` must be valid,
-/// and the simulation behind the binding must be alive and used by nobody else meanwhile.
+/// `handle` must come from [`control_open`] and not be closed, `states` and `action` must be null or point
+/// to a [`State`] for each robot and to the numbers of all robots' actions one after the other, and the
+/// simulation behind the binding must be alive and used by nobody else meanwhile.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn control_run(
     handle: *mut Loop,
-    state: *mut State,
-    action: *const [f64; 7],
+    states: *mut State,
+    action: *const f64,
     substeps: u32,
     policy_step: u32,
 ) -> i32 {
-    // SAFETY: the caller vouches for the pointers
-    let parts = unsafe { (handle.as_mut(), state.as_mut(), action.as_ref()) };
-    let (Some(handle), Some(state), Some(action)) = parts else {
+    // SAFETY: the caller vouches for the handle
+    let Some(handle) = (unsafe { handle.as_mut() }).filter(|_| !states.is_null() && !action.is_null()) else {
         return Status::BadArgument as i32;
     };
-    // SAFETY: the caller vouches for the simulation
-    unsafe { handle.run(state, action, substeps, policy_step != 0) as i32 }
+    // SAFETY: not null, and the caller vouches for their lengths and for the simulation
+    unsafe {
+        let states = std::slice::from_raw_parts_mut(states, handle.robots());
+        let action = std::slice::from_raw_parts(action, handle.action());
+        handle.run(states, action, substeps, policy_step != 0) as i32
+    }
 }
 
 /// Frees a loop; null is allowed.

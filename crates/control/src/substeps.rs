@@ -2,7 +2,7 @@
 
 use std::ffi::c_void;
 
-use crate::abi::{Binding, State};
+use crate::abi::{ArmBinding, Binding, State};
 use crate::osc::{self, DOF};
 
 /// How a run ended.
@@ -17,38 +17,62 @@ pub enum Status {
     BadArgument = 2,
 }
 
-/// A binding that has been checked, with room for Jacobians.
+/// A binding and the robots in it, checked, with room for Jacobians.
 pub struct Loop {
     binding: Binding,
+    arms: Vec<ArmBinding>,
     jacp: Vec<f64>,
     jacr: Vec<f64>,
 }
 
 impl Loop {
-    /// Takes a binding over; refuses one whose indices do not fit its sizes.
-    pub fn new(binding: Binding) -> Result<Self, Status> {
+    /// Takes a binding and its robots over; refuses indices that do not fit its sizes, and no robot at all.
+    pub fn new(binding: Binding, arms: &[ArmBinding]) -> Result<Self, Status> {
         binding.check()?;
+        if arms.is_empty() {
+            return Err(Status::BadArgument);
+        }
+        arms.iter().try_for_each(|arm| arm.check(&binding))?;
         let room = 3 * binding.nv as usize;
-        Ok(Self { binding, jacp: vec![0.0; room], jacr: vec![0.0; room] })
+        Ok(Self { binding, arms: arms.to_vec(), jacp: vec![0.0; room], jacr: vec![0.0; room] })
     }
 
-    /// Takes `substeps` substeps. With `policy_step` the first of them sets the goals from
-    /// `action` (six numbers for the arm, one for the gripper).
+    /// How many robots there are, each with one arm.
+    pub fn robots(&self) -> usize {
+        self.arms.len()
+    }
+
+    /// How many numbers an action has, all robots' together.
+    pub fn action(&self) -> usize {
+        self.arms.iter().map(ArmBinding::action).sum()
+    }
+
+    /// Takes `substeps` substeps. With `policy_step` the first of them sets the goals from `action`: for
+    /// each robot six numbers for the arm, and one for the gripper if it has fingers.
     ///
     /// # Safety
     /// The binding's model, data, arrays and functions must be those of one live simulation
     /// that nobody else touches during the call.
-    pub unsafe fn run(&mut self, state: &mut State, action: &[f64; 7], substeps: u32, policy_step: bool) -> Status {
+    pub unsafe fn run(&mut self, states: &mut [State], action: &[f64], substeps: u32, policy_step: bool) -> Status {
         let (model, data) = (self.binding.model, self.binding.data);
         let (Some(step1), Some(step2)) = (self.binding.step1, self.binding.step2) else {
             return Status::BadArgument;
         };
+        if states.len() != self.robots() || action.len() != self.action() {
+            return Status::BadArgument;
+        }
         for substep in 0..substeps {
             // SAFETY: the caller vouches for model, data and the function; see above
             unsafe { step1(model, data) };
-            // SAFETY: as above
-            if unsafe { self.control(state, action, policy_step && substep == 0) }.is_none() {
-                return Status::Diverged;
+            let mut rest = action;
+            for (robot, state) in states.iter_mut().enumerate() {
+                let (own, others) = rest.split_at(self.arms[robot].action());
+                rest = others;
+                let goal = (policy_step && substep == 0).then_some(own);
+                // SAFETY: as above
+                if unsafe { self.control(robot, state, goal) }.is_none() {
+                    return Status::Diverged;
+                }
             }
             // SAFETY: as above
             unsafe { step2(model, data) };
@@ -56,13 +80,14 @@ impl Loop {
         Status::Done
     }
 
-    /// Writes the controls of one substep; `None` if the arm's inertia makes no sense.
+    /// Writes a robot's controls of one substep, after setting its goals from its part of an action, if
+    /// there is one; `None` if the arm's inertia makes no sense.
     ///
     /// # Safety
     /// As for [`Loop::run`].
-    unsafe fn control(&mut self, state: &mut State, action: &[f64; 7], set_goal: bool) -> Option<()> {
-        let b = &self.binding;
-        let origin = b.origin_site as usize;
+    unsafe fn control(&mut self, robot: usize, state: &mut State, action: Option<&[f64]>) -> Option<()> {
+        let (b, arm) = (&self.binding, self.arms[robot]);
+        let origin = arm.origin_site as usize;
         // SAFETY: site indices were checked against nsite, whose arrays these are
         unsafe {
             state.origin.pos = std::array::from_fn(|i| *b.site_xpos.add(3 * origin + i));
@@ -70,43 +95,45 @@ impl Loop {
         }
         if state.new_update != 0 {
             // SAFETY: the caller vouches for the binding
-            unsafe { self.refresh(state) };
+            unsafe { self.refresh(&arm, state) };
         }
         let b = &self.binding;
-        if set_goal {
+        if let Some(action) = action {
             let arm_action = std::array::from_fn(|i| action[i]);
-            state.goal = osc::goal(&b.gains, &arm_action, &state.arm, &state.origin);
-            let step = b.gripper.speed * sign(action[6]);
-            for i in 0..2 {
-                let moved = state.gripper_action[i] + b.gripper.direction[i] * step;
-                state.gripper_action[i] = osc::clip(moved, -1.0, 1.0);
-                state.gripper_goal[i] = b.gripper.scaled(i, state.gripper_action[i]);
+            state.goal = osc::goal(&arm.gains, &arm_action, &state.arm, &state.origin);
+            if let Some(&grip) = action.get(6) {
+                let step = arm.gripper.speed * sign(grip);
+                for i in 0..2 {
+                    let moved = state.gripper_action[i] + arm.gripper.direction[i] * step;
+                    state.gripper_action[i] = osc::clip(moved, -1.0, 1.0);
+                    state.gripper_goal[i] = arm.gripper.scaled(i, state.gripper_action[i]);
+                }
             }
             state.policy_arm = PolicyArm::of(state);
         }
         // SAFETY: indices of degrees of freedom were checked against nv
-        let bias = b.arm_dof.map(|dof| unsafe { *b.qfrc_bias.add(dof as usize) });
-        state.torques = osc::torques(&b.gains, &state.arm, &state.origin, &state.goal, &bias)?;
+        let bias = arm.arm_dof.map(|dof| unsafe { *b.qfrc_bias.add(dof as usize) });
+        state.torques = osc::torques(&arm.gains, &state.arm, &state.origin, &state.goal, &bias)?;
         for i in 0..DOF {
             // SAFETY: indices of actuators were checked against nu
-            unsafe { b.write_ctrl(b.arm_actuator[i], state.torques[i]) };
+            unsafe { b.write_ctrl(arm.arm_actuator[i], state.torques[i]) };
         }
-        for i in 0..2 {
-            let ctrl = b.gripper.bias[i] + b.gripper.weight[i] * state.gripper_goal[i];
+        for i in 0..arm.fingers as usize {
+            let ctrl = arm.gripper.bias[i] + arm.gripper.weight[i] * state.gripper_goal[i];
             // SAFETY: as above
-            unsafe { b.write_ctrl(b.gripper_actuator[i], ctrl) };
+            unsafe { b.write_ctrl(arm.gripper_actuator[i], ctrl) };
         }
         state.new_update = 1;
         Some(())
     }
 
-    /// Reads the arm's state out of the simulator.
+    /// Reads an arm's state out of the simulator.
     ///
     /// # Safety
     /// As for [`Loop::run`].
-    unsafe fn refresh(&mut self, state: &mut State) {
+    unsafe fn refresh(&mut self, of: &ArmBinding, state: &mut State) {
         let b = &self.binding;
-        let site = b.grip_site as usize;
+        let site = of.grip_site as usize;
         let nv = b.nv as usize;
         let arm = &mut state.arm;
         // SAFETY: indices were checked against the sizes of these arrays; the scratch arrays
@@ -115,23 +142,23 @@ impl Loop {
             arm.ref_pos = std::array::from_fn(|i| *b.site_xpos.add(3 * site + i));
             arm.ref_ori = read_mat3(b.site_xmat.add(9 * site));
             if let Some(jac_site) = b.jac_site {
-                jac_site(b.model, b.data, self.jacp.as_mut_ptr(), self.jacr.as_mut_ptr(), b.grip_site);
+                jac_site(b.model, b.data, self.jacp.as_mut_ptr(), self.jacr.as_mut_ptr(), of.grip_site);
             }
             let qvel = std::slice::from_raw_parts(b.qvel, nv);
             for i in 0..3 {
                 arm.ref_pos_vel[i] = dot(&self.jacp[i * nv..(i + 1) * nv], qvel);
                 arm.ref_ori_vel[i] = dot(&self.jacr[i * nv..(i + 1) * nv], qvel);
             }
-            for (j, &dof) in b.arm_dof.iter().enumerate() {
+            for (j, &dof) in of.arm_dof.iter().enumerate() {
                 let dof = dof as usize;
                 for i in 0..3 {
                     arm.jacobian[i][j] = self.jacp[i * nv + dof];
                     arm.jacobian[3 + i][j] = self.jacr[i * nv + dof];
                 }
-                arm.joint_pos[j] = *b.qpos.add(b.arm_qpos[j] as usize);
+                arm.joint_pos[j] = *b.qpos.add(of.arm_qpos[j] as usize);
                 arm.joint_vel[j] = qvel[dof];
             }
-            arm.mass = b.arm_mass();
+            arm.mass = b.arm_mass(&of.arm_dof);
         }
     }
 }
@@ -191,6 +218,8 @@ pub type JacSiteFunction = unsafe extern "C" fn(*const c_void, *const c_void, *m
 
 #[cfg(test)]
 mod tests {
+    use std::slice;
+
     use super::*;
     use crate::abi::{Gripper, control_close, control_open, control_run};
     use crate::osc::{Arm, Gains, Pose};
@@ -300,12 +329,19 @@ mod tests {
                 nu: NV as i32,
                 nm: self.qm.len() as i32,
                 nsite: 2,
+            }
+        }
+
+        /// The robot of the first seven joints, with the last two as fingers.
+        fn arm() -> ArmBinding {
+            ArmBinding {
                 grip_site: 1,
                 origin_site: 0,
                 arm_qpos: [0, 1, 2, 3, 4, 5, 6],
                 arm_dof: [0, 1, 2, 3, 4, 5, 6],
                 arm_actuator: [0, 1, 2, 3, 4, 5, 6],
                 gripper_actuator: [7, 8],
+                fingers: 2,
                 gains: Gains {
                     kp: [150.0; 6],
                     kd: [2.0 * 150.0_f64.sqrt(); 6],
@@ -362,10 +398,10 @@ mod tests {
     #[test]
     fn substeps_alternate_and_the_arm_is_read_between_them() {
         let mut fake = Fake::new();
-        let mut made = Loop::new(fake.bind()).expect("sound");
+        let mut made = Loop::new(fake.bind(), &[Fake::arm()]).expect("sound");
         let mut state = state(1);
         // SAFETY: the fake outlives the loop
-        let status = unsafe { made.run(&mut state, &ACTION, 3, true) };
+        let status = unsafe { made.run(slice::from_mut(&mut state), &ACTION, 3, true) };
         assert_eq!(status, Status::Done);
         assert_eq!(fake.log, [1, 11, 2, 1, 11, 2, 1, 11, 2]);
         assert_eq!(state.arm.ref_pos, [fake.qpos[0] - 0.001, 0.0, 1.0]);
@@ -380,34 +416,34 @@ mod tests {
     #[test]
     fn the_first_substep_after_a_reset_uses_the_old_snapshot_and_the_live_bias() {
         let mut fake = Fake::new();
-        let binding = fake.bind();
-        let mut made = Loop::new(binding).expect("sound");
+        let gains = Fake::arm().gains;
+        let mut made = Loop::new(fake.bind(), &[Fake::arm()]).expect("sound");
         let mut state = state(0);
         let snapshot = state.arm;
         // SAFETY: the fake outlives the loop
-        unsafe { made.run(&mut state, &ACTION, 1, true) };
+        unsafe { made.run(slice::from_mut(&mut state), &ACTION, 1, true) };
         assert_eq!(fake.log, [1, 2], "the Jacobian is not asked for");
         let origin = Pose { pos: [0.0, 0.0, 0.9], ori: IDENTITY };
         let arm_action = [0.4, 0.0, -0.2, 0.0, 0.1, 0.0];
-        let goal = osc::goal(&binding.gains, &arm_action, &snapshot, &origin);
+        let goal = osc::goal(&gains, &arm_action, &snapshot, &origin);
         let bias = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
-        let expected = osc::torques(&binding.gains, &snapshot, &origin, &goal, &bias).expect("regular");
+        let expected = osc::torques(&gains, &snapshot, &origin, &goal, &bias).expect("regular");
         assert_eq!(state.torques, expected);
         // SAFETY: as above
-        unsafe { made.run(&mut state, &ACTION, 1, false) };
+        unsafe { made.run(slice::from_mut(&mut state), &ACTION, 1, false) };
         assert_ne!(state.arm.ref_pos, snapshot.ref_pos);
     }
 
     #[test]
     fn the_gripper_moves_once_a_control_step_and_stops_at_its_limits() {
         let mut fake = Fake::new();
-        let mut made = Loop::new(fake.bind()).expect("sound");
+        let mut made = Loop::new(fake.bind(), &[Fake::arm()]).expect("sound");
         let mut state = state(1);
         // commands after each control step: 0.2 a step, whatever the size of the action
         for (action, expected) in [(1.0, 0.2), (0.01, 0.4), (0.0, 0.4), (-0.5, 0.2)] {
             let full = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, action];
             // SAFETY: the fake outlives the loop
-            unsafe { made.run(&mut state, &full, 25, true) };
+            unsafe { made.run(slice::from_mut(&mut state), &full, 25, true) };
             assert!((state.gripper_action[1] - expected).abs() < 1e-15, "{:?}", state.gripper_action);
             assert_eq!(state.gripper_action[0], -state.gripper_action[1]);
             assert_eq!(fake.ctrl[7], 0.02 + 0.02 * state.gripper_action[0]);
@@ -415,7 +451,7 @@ mod tests {
         }
         for _ in 0..20 {
             // SAFETY: as above
-            unsafe { made.run(&mut state, &ACTION, 1, true) };
+            unsafe { made.run(slice::from_mut(&mut state), &ACTION, 1, true) };
         }
         assert_eq!(state.gripper_action, [-1.0, 1.0]);
         assert_eq!(fake.ctrl[7..], [0.0, 0.0]);
@@ -426,10 +462,10 @@ mod tests {
         let mut fake = Fake::new();
         fake.bias[2] = 1e4;
         fake.bias[3] = -1e4;
-        let mut made = Loop::new(fake.bind()).expect("sound");
+        let mut made = Loop::new(fake.bind(), &[Fake::arm()]).expect("sound");
         let mut state = state(1);
         // SAFETY: the fake outlives the loop
-        unsafe { made.run(&mut state, &ACTION, 1, true) };
+        unsafe { made.run(slice::from_mut(&mut state), &ACTION, 1, true) };
         assert_eq!((fake.ctrl[2], fake.ctrl[3]), (80.0, -80.0));
         assert!(state.torques[2] > 80.0);
     }
@@ -438,49 +474,87 @@ mod tests {
     fn a_diverged_simulation_is_reported() {
         let mut fake = Fake::new();
         fake.qm[0] = f64::NAN;
-        let mut made = Loop::new(fake.bind()).expect("sound");
+        let mut made = Loop::new(fake.bind(), &[Fake::arm()]).expect("sound");
         // SAFETY: the fake outlives the loop
-        assert_eq!(unsafe { made.run(&mut state(1), &ACTION, 5, true) }, Status::Diverged);
+        assert_eq!(unsafe { made.run(&mut [state(1)], &ACTION, 5, true) }, Status::Diverged);
         assert_eq!(fake.log, [1, 11], "nothing runs on");
+    }
+
+    #[test]
+    fn robots_take_their_parts_of_an_action_in_turn() {
+        let handless = ArmBinding { fingers: 0, ..Fake::arm() };
+        let both = [0.4, 0.0, -0.2, 0.0, 0.1, 0.0, -0.3, 0.1, 0.2, 0.0, 0.0, 0.2, -1.0];
+        let mut fake = Fake::new();
+        let mut made = Loop::new(fake.bind(), &[handless, Fake::arm()]).expect("sound");
+        assert_eq!((made.robots(), made.action()), (2, 13));
+        let mut states = [state(1), state(1)];
+        // SAFETY: the fake outlives the loop
+        assert_eq!(unsafe { made.run(&mut states, &both, 2, true) }, Status::Done);
+        assert_eq!(fake.log, [1, 11, 11, 2, 1, 11, 11, 2], "each arm is read in every substep");
+        for (of, own) in [(0, &both[..6]), (1, &both[6..])] {
+            let mut alone = Fake::new();
+            let arm = if of == 0 { handless } else { Fake::arm() };
+            let mut single = Loop::new(alone.bind(), &[arm]).expect("sound");
+            let mut expected = state(1);
+            // SAFETY: as above
+            unsafe { single.run(slice::from_mut(&mut expected), own, 2, true) };
+            assert_eq!(states[of].goal.pos, expected.goal.pos);
+            assert_eq!(states[of].torques, expected.torques);
+            assert_eq!(states[of].gripper_action, expected.gripper_action);
+        }
+        assert_eq!(states[0].gripper_action, [0.0; 2]);
+        assert_eq!(states[1].gripper_action, [0.2, -0.2]);
+        // SAFETY: as above
+        assert_eq!(unsafe { made.run(&mut states, &both[..12], 2, true) }, Status::BadArgument);
+        // SAFETY: as above
+        assert_eq!(unsafe { made.run(&mut states[..1], &both, 2, true) }, Status::BadArgument);
     }
 
     #[test]
     fn unsound_bindings_are_refused() {
         let mut fake = Fake::new();
-        let sound = fake.bind();
-        assert!(Loop::new(sound).is_ok());
-        let spoil: [fn(&mut Binding); 6] = [
-            |b| b.step2 = None,
-            |b| b.qm = std::ptr::null(),
-            |b| b.arm_dof[3] = NV as i32,
-            |b| b.arm_qpos[0] = -1,
-            |b| b.gripper_actuator[1] = 9,
-            |b| b.grip_site = 2,
+        let (sound, arm) = (fake.bind(), Fake::arm());
+        assert!(Loop::new(sound, &[arm]).is_ok());
+        assert_eq!(Loop::new(sound, &[]).err(), Some(Status::BadArgument));
+        let spoil: [fn(&mut Binding, &mut ArmBinding); 7] = [
+            |b, _| b.step2 = None,
+            |b, _| b.qm = std::ptr::null(),
+            |_, a| a.arm_dof[3] = NV as i32,
+            |_, a| a.arm_qpos[0] = -1,
+            |_, a| a.gripper_actuator[1] = 9,
+            |_, a| a.grip_site = 2,
+            |_, a| a.fingers = 1,
         ];
         for (index, spoil) in spoil.iter().enumerate() {
-            let mut binding = sound;
-            spoil(&mut binding);
-            assert_eq!(Loop::new(binding).err(), Some(Status::BadArgument), "{index}");
+            let (mut binding, mut other) = (sound, arm);
+            spoil(&mut binding, &mut other);
+            assert_eq!(Loop::new(binding, &[arm, other]).err(), Some(Status::BadArgument), "{index}");
         }
+        let handless = ArmBinding { fingers: 0, gripper_actuator: [-1, -1], ..arm };
+        assert!(Loop::new(sound, &[handless]).is_ok());
     }
 
     #[test]
     fn the_c_interface_runs_and_refuses() {
         let mut fake = Fake::new();
         let mut binding = fake.bind();
-        let mut state = state(1);
+        let (arm, mut state, null) = (Fake::arm(), state(1), std::ptr::null());
+        let action = ACTION.as_ptr();
         // SAFETY: every pointer is valid or null, and the fake outlives the handle
         unsafe {
-            let handle = control_open(&binding);
+            let handle = control_open(&binding, &arm, 1);
             assert!(!handle.is_null());
-            assert_eq!(control_run(handle, &mut state, &ACTION, 2, 1), 0);
-            assert_eq!(control_run(handle, &mut state, std::ptr::null(), 2, 1), Status::BadArgument as i32);
-            assert_eq!(control_run(std::ptr::null_mut(), &mut state, &ACTION, 2, 1), Status::BadArgument as i32);
+            assert_eq!(control_run(handle, &mut state, action, 2, 1), 0);
+            assert_eq!(control_run(handle, &mut state, null, 2, 1), Status::BadArgument as i32);
+            assert_eq!(control_run(handle, std::ptr::null_mut(), action, 2, 1), Status::BadArgument as i32);
+            assert_eq!(control_run(std::ptr::null_mut(), &mut state, action, 2, 1), Status::BadArgument as i32);
             control_close(handle);
             control_close(std::ptr::null_mut());
+            assert!(control_open(&binding, std::ptr::null(), 1).is_null());
+            assert!(control_open(&binding, &arm, 0).is_null());
             binding.nsite = 0;
-            assert!(control_open(&binding).is_null());
-            assert!(control_open(std::ptr::null()).is_null());
+            assert!(control_open(&binding, &arm, 1).is_null());
+            assert!(control_open(std::ptr::null(), &arm, 1).is_null());
         }
         assert_eq!(fake.log.len(), 6);
     }

@@ -11,8 +11,7 @@ from actrm_harness.wire import Array
 
 MUJOCO = "3.3.7"
 DOF = 7
-ACTION = 7
-ABI = 1
+ABI = 2
 
 _GRIP_SITE = [("ref_pos", "f8", 3), ("ref_ori", "f8", (3, 3)), ("ref_pos_vel", "f8", 3), ("ref_ori_vel", "f8", 3)]
 
@@ -34,24 +33,34 @@ STATE = np.dtype(
         ("new_update", "u8"),
     ]
 )
-"""`State` of crates/control/src/abi.rs: the controllers' memory."""
+"""`State` of crates/control/src/abi.rs: the memory of a robot's controllers."""
 
 _FUNCTIONS = {"step1": "mj_step1", "step2": "mj_step2", "jac_site": "mj_jacSite"}
 _ARRAYS = ["ctrl", "qpos", "qvel", "qm", "qfrc_bias", "site_xpos", "site_xmat", "ctrlrange", "dof_madr", "dof_parent"]
 _POINTERS = [*_FUNCTIONS, "model", "data", *_ARRAYS]
-_NUMBERS = ["nq", "nv", "nu", "nm", "nsite", "grip_site", "origin_site"]
+_NUMBERS = ["nq", "nv", "nu", "nm", "nsite"]
+_SITES = ["grip_site", "origin_site"]
 _INDICES = {"arm_qpos": DOF, "arm_dof": DOF, "arm_actuator": DOF, "gripper_actuator": 2}
 _GAINS = ["kp", "kd", "input_min", "input_max", "input_offset", "scale", "output_offset"]
 _GRIPPER = ["direction", "input_min", "input_max", "input_offset", "scale", "output_offset", "bias", "weight"]
 
 
 class Binding(ctypes.Structure):
-    """`Binding` of crates/control/src/abi.rs: one simulation and the robot in it."""
+    """`Binding` of crates/control/src/abi.rs: one simulation."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in _POINTERS),
         *((name, ctypes.c_int32) for name in _NUMBERS),
+    ]
+
+
+class ArmBinding(ctypes.Structure):
+    """`ArmBinding` of crates/control/src/abi.rs: a robot of one arm in it."""
+
+    _fields_ = [
+        *((name, ctypes.c_int32) for name in _SITES),
         *((name, ctypes.c_int32 * length) for name, length in _INDICES.items()),
+        ("fingers", ctypes.c_int32),
         *((name, ctypes.c_double * 6) for name in _GAINS),
         ("initial_joint", ctypes.c_double * DOF),
         ("gripper_speed", ctypes.c_double),
@@ -71,21 +80,24 @@ class Library:
             lib = ctypes.CDLL(str(path))
             size, pointer, count = ctypes.c_uint64, ctypes.c_void_p, ctypes.c_uint32
             self._abi = _typed(lib.control_abi, size)
-            self._open = _typed(lib.control_open, pointer, pointer)
+            self._open = _typed(lib.control_open, pointer, pointer, pointer, count)
             self.run = _typed(lib.control_run, ctypes.c_int32, pointer, pointer, pointer, count, count)
             self.close = _typed(lib.control_close, None, pointer)
             self._delta_rotation = _typed(lib.control_delta_rotation, None, pointer, pointer)
         except (OSError, AttributeError) as error:
             raise ControlError(f"{path} is not the control library: {error}") from error
-        expected = (ABI << 32) | (ctypes.sizeof(Binding) << 16) | STATE.itemsize
+        expected = ABI
+        for size in (ctypes.sizeof(Binding), ctypes.sizeof(ArmBinding), STATE.itemsize):
+            expected = expected << 16 | size
         if self._abi() != expected:
             raise ControlError(f"{path} has interface {self._abi():#x}, this package {expected:#x}: build both anew")
 
-    def open(self, binding: Binding) -> int:
-        """A loop over `binding`, to be given to `run` and at last to `close`."""
-        handle = self._open(ctypes.addressof(binding))
+    def open(self, binding: Binding, arms: list[ArmBinding]) -> int:
+        """A loop over `binding` and the robots in it, to be given to `run` and at last to `close`."""
+        each = (ArmBinding * len(arms))(*arms)
+        handle = self._open(ctypes.addressof(binding), ctypes.addressof(each), len(arms))
         if handle is None:
-            raise ControlError("the control library refuses the robot's indices")
+            raise ControlError("the control library refuses the robots' indices")
         return int(handle)
 
     def delta_rotation(self, axis: Array) -> Array:
