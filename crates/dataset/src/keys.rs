@@ -1,7 +1,9 @@
 //! Lists of observation keys, as experiments and conversions name them.
 //!
 //! An item of a list is a key (`cube_pos`), a part of one (`goal_rgb[0:3]`), either as it was at the first step of the
-//! episode (`first(goal_rgb)`, `first(goal_rgb)[0:3]`: what is remembered), or the difference of two of those
+//! episode (`first(goal_rgb)`, `first(goal_rgb)[0:3]`: what is remembered), the axes of an orientation
+//! (`axes(cube_quat)`: a quaternion x, y, z, w as the first two columns of its matrix, six numbers that do not jump
+//! where a quaternion changes its sign; Zhou et al. 2019), or the difference of two of those
 //! (`cube_pos - robot0_eef_pos`). The same item gives the same numbers whether it is read out of a file or out of a
 //! simulator: values become f32 first.
 
@@ -26,11 +28,17 @@ struct Term {
     moment: Moment,
     /// the numbers from the first to before the second
     range: Option<(usize, usize)>,
+    /// whether those are a quaternion of which the axes are taken
+    axes: bool,
 }
 
 impl Term {
     fn parse(text: &str) -> Result<Self, String> {
         let text = text.trim();
+        if let Some(inside) = text.strip_prefix("axes(").and_then(|rest| rest.strip_suffix(')')) {
+            let inner = Self::parse(inside).ok().filter(|term| !term.axes);
+            return Ok(Self { axes: true, ..inner.ok_or("axes(key), of a quaternion")? });
+        }
         if let Some((key, rest)) = text.strip_prefix("first(").and_then(|inside| inside.split_once(')')) {
             // what stands behind is read as behind any other key
             let plain = !key.is_empty() && !key.contains(['(', '[', ']']) && (rest.is_empty() || rest.starts_with('['));
@@ -40,13 +48,15 @@ impl Term {
         let moment = Moment::Now;
         let Some(open) = text.find('[') else {
             let good = !text.is_empty() && !text.contains([']', '(', ')']);
-            return good.then(|| Self { key: text.to_owned(), moment, range: None }).ok_or_else(|| "a key".to_owned());
+            return good
+                .then(|| Self { key: text.to_owned(), moment, range: None, axes: false })
+                .ok_or_else(|| "a key".to_owned());
         };
         let range = text[open + 1..].strip_suffix(']').and_then(|inside| inside.split_once(':'));
         let numbers = range.and_then(|(a, b)| Some((a.trim().parse().ok()?, b.trim().parse().ok()?)));
         match numbers {
             Some((from, to)) if from < to && open > 0 => {
-                Ok(Self { key: text[..open].to_owned(), moment, range: Some((from, to)) })
+                Ok(Self { key: text[..open].to_owned(), moment, range: Some((from, to)), axes: false })
             }
             _ => Err("key[from:to] with from below to".to_owned()),
         }
@@ -61,26 +71,51 @@ impl Term {
     }
 
     fn width(&self, of_key: usize) -> Result<usize, String> {
-        match self.range {
-            None => Ok(of_key),
-            Some((from, to)) if to <= of_key => Ok(to - from),
-            Some(_) => Err(format!("{self}: {} has {of_key} numbers", self.key)),
+        let width = match self.range {
+            None => of_key,
+            Some((from, to)) if to <= of_key => to - from,
+            Some(_) => return Err(format!("{self}: {} has {of_key} numbers", self.key)),
+        };
+        match self.axes {
+            false => Ok(width),
+            true if width == 4 => Ok(6),
+            true => Err(format!("{self}: a quaternion has 4 numbers, this has {width}")),
         }
     }
 
-    fn of<'v>(&self, values: &'v [f32]) -> &'v [f32] {
-        match self.range {
+    fn of<'v>(&self, values: &'v [f32]) -> Cow<'v, [f32]> {
+        let part = match self.range {
             None => values,
             Some((from, to)) => &values[from..to],
+        };
+        match *part {
+            [x, y, z, w] if self.axes => Cow::Owned(axes([x, y, z, w]).to_vec()),
+            _ => Cow::Borrowed(part),
         }
     }
 }
 
+/// The first two columns of the matrix of a quaternion x, y, z, w, one after the other; zeros of one without length.
+fn axes(quaternion: [f32; 4]) -> [f32; 6] {
+    let [x, y, z, w] = quaternion;
+    let squared = x * x + y * y + z * z + w * w;
+    let s = if squared > 0.0 { 2.0 / squared } else { return [0.0; 6] };
+    [
+        1.0 - s * (y * y + z * z),
+        s * (x * y + z * w),
+        s * (x * z - y * w),
+        s * (x * y - z * w),
+        1.0 - s * (x * x + z * z),
+        s * (y * z + x * w),
+    ]
+}
+
 impl fmt::Display for Term {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (before, behind) = if self.axes { ("axes(", ")") } else { ("", "") };
         match self.range {
-            None => f.write_str(&self.whole()),
-            Some((from, to)) => write!(f, "{}[{from}:{to}]", self.whole()),
+            None => write!(f, "{before}{}{behind}", self.whole()),
+            Some((from, to)) => write!(f, "{before}{}[{from}:{to}]{behind}", self.whole()),
         }
     }
 }
@@ -125,10 +160,10 @@ impl KeyItem {
     pub fn append<'v>(&self, values_of: impl Fn(&str, Moment) -> Option<&'v [f32]>, out: &mut Vec<f32>) -> Option<()> {
         let plus = self.plus.of(values_of(&self.plus.key, self.plus.moment)?);
         match &self.minus {
-            None => out.extend_from_slice(plus),
+            None => out.extend_from_slice(&plus),
             Some(minus) => {
                 let minus = minus.of(values_of(&minus.key, minus.moment)?);
-                out.extend(plus.iter().zip(minus).map(|(a, b)| a - b));
+                out.extend(plus.iter().zip(minus.iter()).map(|(a, b)| a - b));
             }
         }
         Some(())
@@ -149,13 +184,10 @@ impl KeyItem {
 
     /// Names of its numbers, as a column lists them.
     pub(crate) fn names(&self, width: usize) -> impl Iterator<Item = String> {
-        let from = match (&self.minus, self.plus.range) {
-            (None, Some((from, _))) => from,
-            _ => 0,
-        };
-        let (whole, base) = match &self.minus {
-            None => (self.plus.range.is_none(), self.plus.whole().into_owned()),
-            Some(_) => (true, self.to_string()),
+        // a difference and axes are called by what they are made of, a part by the key and where it is in it
+        let (whole, base, from) = match (&self.minus, self.plus.range) {
+            (None, Some((from, _))) if !self.plus.axes => (false, self.plus.whole().into_owned(), from),
+            _ => (true, self.to_string(), 0),
         };
         (0..width).map(move |i| match width {
             1 if whole => base.clone(),
@@ -243,6 +275,26 @@ mod tests {
     }
 
     #[test]
+    fn axes_are_those_of_the_quaternion_and_of_its_negative() {
+        // a quarter about z, then any other, beside the rotated unit vectors
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        let near = |found: [f32; 6], expected: [f32; 6]| found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6);
+        assert!(near(axes([0.0, 0.0, half, half]), [0.0, 1.0, 0.0, -1.0, 0.0, 0.0]));
+        assert!(near(axes([3.0, 0.0, 0.0, 0.0]), [1.0, 0.0, 0.0, 0.0, -1.0, 0.0]));
+        let quaternion = [0.1, -0.7, 0.3, 0.4];
+        assert_eq!(axes(quaternion), axes(quaternion.map(|value: f32| -value)));
+        let [a, b, c, d, e, f] = axes(quaternion);
+        assert!((a * d + b * e + c * f).abs() < 1e-6 && (a * a + b * b + c * c - 1.0).abs() < 1e-6);
+        assert_eq!(axes([0.0; 4]), [0.0; 6]);
+        // b is 10, 20, 30, 40: read as it is written, in a part and as it began
+        let b = axes([10.0, 20.0, 30.0, 40.0]).to_vec();
+        assert_eq!((read("axes(b)").unwrap(), read("axes(b[0:4])").unwrap()), (b.clone(), b.clone()));
+        assert_eq!(read("axes(b) - axes(b)").unwrap(), [0.0; 6]);
+        assert_eq!(read("axes(a)").unwrap_err(), "axes(a): a quaternion has 4 numbers, this has 3");
+        assert!(item("axes(first(b)[0:4])").remembers());
+    }
+
+    #[test]
     fn what_does_not_fit_is_named() {
         assert_eq!(read("b[2:5]").unwrap_err(), "b[2:5]: b has 4 numbers");
         assert_eq!(read("b - a").unwrap_err(), "b - a: 4 numbers minus 3");
@@ -259,6 +311,9 @@ mod tests {
             "first(a",
             "first(a[0:1])",
             "first(a)b",
+            "axes(a",
+            "axes()",
+            "axes(axes(a))",
             "last(a)",
         ] {
             let message = bad.parse::<KeyItem>().unwrap_err();
@@ -268,7 +323,9 @@ mod tests {
 
     #[test]
     fn items_are_written_as_they_are_read() {
-        for text in ["a", "b[1:3]", "b[0:3] - a", "first(a)", "b[0:1] - first(a)[1:2]"] {
+        for text in
+            ["a", "b[1:3]", "b[0:3] - a", "first(a)", "b[0:1] - first(a)[1:2]", "axes(b)", "axes(first(b)[0:4])"]
+        {
             assert_eq!(item(text).to_string(), text);
             assert_eq!(serde_json::from_str::<KeyItem>(&format!("\"{text}\"")).unwrap(), item(text));
         }
@@ -282,6 +339,7 @@ mod tests {
         assert_eq!(names("a", 3), ["a_0", "a_1", "a_2"]);
         assert_eq!(names("first(one)", 1), ["first(one)"]);
         assert_eq!(names("first(b)[1:3]", 2), ["first(b)_1", "first(b)_2"]);
+        assert_eq!(names("axes(b[0:4])", 6)[4..], ["axes(b[0:4])_4", "axes(b[0:4])_5"]);
         assert_eq!(names("one", 1), ["one"]);
         assert_eq!(names("b[1:3]", 2), ["b_1", "b_2"]);
         assert_eq!(names("b[1:2]", 1), ["b_1"]);

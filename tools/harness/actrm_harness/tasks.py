@@ -14,6 +14,10 @@ DEFAULT_MAX_STEPS = 400
 
 PACKAGE = "actrm_harness"
 
+TOWERS = {
+    "recoveries": ".experts.cubes:RecoveringTowerExpert",
+    "regrasps": ".experts.cubes:RegraspingTowerExpert",
+}
 PANDAS = {"robots": ["Panda", "Panda"]}
 
 
@@ -53,7 +57,13 @@ TASKS = {
         Task("PickPlaceCereal", expert=".experts.objects:CerealExpert", soft_reset=True),
         Task("PickPlace", expert=".experts.objects:AllThingsExpert", soft_reset=True, max_steps=1200),
         Task("NutAssemblyRound", expert=".experts.objects:RoundExpert", soft_reset=True),
-        Task("NutAssemblySquare", expert=".experts.objects:SquareExpert", soft_reset=True, bar=0.85),
+        Task(
+            "NutAssemblySquare",
+            expert=".experts.objects:SquareExpert",
+            experts={"recoveries": ".experts.objects:RecoveringSquareExpert"},
+            soft_reset=True,
+            bar=0.85,
+        ),
         Task("Door", expert=".experts.objects:DoorExpert", soft_reset=True, bar=0.85),
         Task(
             "Wipe", expert=".experts.wipes:WipeExpert", soft_reset=True, redraw=".simulators.robosuite.wipe_dirt:redraw"
@@ -62,7 +72,7 @@ TASKS = {
             "StackThreeCubes",
             defined_in=".environments.towers",
             expert=".experts.cubes:TowerExpert",
-            experts={"recoveries": ".experts.cubes:RecoveringTowerExpert"},
+            experts=TOWERS,
             soft_reset=True,
             max_steps=600,
         ),
@@ -70,7 +80,7 @@ TASKS = {
             "StackColor",
             defined_in=".environments.towers",
             expert=".experts.cubes:TowerExpert",
-            experts={"recoveries": ".experts.cubes:RecoveringTowerExpert"},
+            experts=TOWERS,
             soft_reset=True,
             max_steps=600,
         ),
@@ -78,7 +88,7 @@ TASKS = {
             "Recall",
             defined_in=".environments.towers",
             expert=".experts.cubes:TowerExpert",
-            experts={"recoveries": ".experts.cubes:RecoveringTowerExpert"},
+            experts=TOWERS,
             soft_reset=True,
             max_steps=600,
         ),

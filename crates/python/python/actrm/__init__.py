@@ -72,8 +72,8 @@ def convert(
         there is a bar where somebody can see it.
     state_keys, env_keys: observation keys of `observation.state` and `observation.environment_state`; those of the
         file's layout unless given.
-    entities: by name the observation keys of `observation.entity.<name>`; parts (`key[0:3]`), differences (`a - b`) and
-        what an episode began with (`first(key)`) may stand in the lists.
+    entities: by name the observation keys of `observation.entity.<name>`; parts (`key[0:3]`), differences (`a - b`),
+        what an episode began with (`first(key)`) and axes of a quaternion (`axes(key)`) may stand in the lists.
     fps: frames a second; the control frequency that the file states unless given.
     images: how pictures are stored.
     depth: make columns of depth, as LeRobot records it; the side folder alone keeps it otherwise.

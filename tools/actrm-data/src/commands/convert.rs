@@ -35,7 +35,8 @@ pub struct Args {
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     env_keys: Option<Vec<String>>,
     /// An entity: observation.entity.NAME of these observation keys, of parts of them (key[0:3]), of differences
-    /// ("a - b") and of what an episode began with ("first(key)"). May be given again
+    /// ("a - b"), of what an episode began with ("first(key)") and of a quaternion's axes ("axes(key)"). May be given
+    /// again
     #[arg(long = "entity", value_name = "NAME=KEYS", value_parser = entity)]
     entities: Vec<(String, Vec<String>)>,
     /// Frames a second [default: the control frequency that the file states]

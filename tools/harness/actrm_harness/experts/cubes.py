@@ -169,6 +169,8 @@ class RecoveringTowerExpert(TowerExpert):
         self.cube = self.order[1]
         self.spot: Array | None = None
         self.leaving = False
+        # how far beside a cube it reaches
+        self.miss = np.zeros(3)
 
     def _draw_beside(self, rng: np.random.Generator) -> list[Array]:
         beside: list[Array] = []
@@ -194,7 +196,7 @@ class RecoveringTowerExpert(TowerExpert):
                 self.beside[level] = np.zeros(3)
         else:
             turn = self._grip_yaw(self.cube)
-            target, grip = self.grasp.reach(thing, turn - hand)
+            target, grip = self.grasp.reach(thing + self.miss, turn - hand)
             if stands and not self.grasp.closing and np.linalg.norm((thing - scene.hand)[:2]) > 0.05:
                 target[2] = self.above
             if self.grasp.held:
@@ -252,3 +254,47 @@ class RecoveringTowerExpert(TowerExpert):
         places = [np.array([x, y, TABLE + 0.021]) for x in steps for y in steps]
         free = [p for p in places if min(float(np.linalg.norm((p - other)[:2])) for other in others) > 0.085]
         return min(free, key=lambda p: float(np.linalg.norm((p - here)[:2])))
+
+
+class RegraspingTowerExpert(RecoveringTowerExpert):
+    """Reach beside cubes as well: come to rest on a neighbour, or close on nothing, then rise and reach again.
+
+    Cubes that fell lie close together, and a hand that comes down a little beside one stands on another and is stuck
+    there for ever, unless it was shown that the way on leads up.
+    """
+
+    MISSING = 0.5
+    ASIDE = (0.012, 0.04)
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        super().__init__(scene, rng)
+        self.rng = rng
+        self.reached = ""
+        self.before = scene.hand
+        self.resting = 0
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        closing = self.grasp.closing
+        action = super().act()
+        if self.cube != self.reached:
+            self.reached = self.cube
+            self._draw_miss()
+        hand = self.scene.hand
+        low = float(hand[2]) < TABLE + 0.07 and not self.grasp.closing
+        self.resting = (self.resting + 1) * (low and float(np.linalg.norm(hand - self.before)) < 0.0006)
+        if self.resting == 4 or self.grasp.held or (closing and not self.grasp.closing):
+            self.miss = np.zeros(3)
+        self.before = hand
+        return action
+
+    def _draw_miss(self) -> None:
+        """Towards another cube as often as anywhere."""
+        here = self.scene.body(self.cube)
+        others = [self.scene.body(name) - here for name in self.order if name != self.cube]
+        away = min(others, key=lambda other: float(np.linalg.norm(other[:2])))
+        angle = self.rng.uniform(0, 2 * np.pi)
+        if self.rng.random() < 0.5:
+            angle = float(np.arctan2(away[1], away[0]))
+        far = self.rng.uniform(*self.ASIDE) * (self.rng.random() < self.MISSING)
+        self.miss = np.array([far * np.cos(angle), far * np.sin(angle), 0.0])

@@ -193,6 +193,11 @@ class NutExpert:
         self.grasp = Grasp(scene, self.servo.style, tall=0.02, mouth=(0.012, 0.025), close=(0.018, 0.015))
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
         self.final = min(self.FINAL, key=self._way)
+        self.handle = self.HANDLE
+        # what an expert that errs on purpose adds: an angle to its grasp, a way and an angle to the nut's place
+        self.askew = 0.0
+        self.beside = np.zeros(3)
+        self.turned = 0.0
 
     def act(self) -> Array:
         """The action for the current state."""
@@ -207,13 +212,18 @@ class NutExpert:
             if not self.grasp.closing:
                 best = min(self.FINAL, key=self._way)
                 self.final = best if self._way(best) < self._way(self.final) - 0.5 else self.final
-            wanted = self._at_handle(self.final)
-            target, grip = self.grasp.reach(nut + rotation @ np.array([self.HANDLE, 0.0, 0.0]), wanted - hand)
+            wanted = self._at_handle(self.final) + self.askew
+            target, grip = self.grasp.reach(nut + rotation @ np.array([self.handle, 0.0, 0.0]), wanted - hand)
             if self.grasp.held:
-                target = self.carry.bring(nut, goal, near=0.005, far=0.012)
+                turn = self.final + self.turned - nearest(self._at_handle(self.final), 2 * np.pi, hand)
+                target = self.carry.bring(nut, goal + self.beside, near=0.005, far=0.012, askew=self._askew(turn))
                 target[0] = min(float(target[0]), self.REACH)
-                wanted = self.final + hand - nearest(self._at_handle(self.final), 2 * np.pi, hand)
+                wanted = hand + turn
         return self.servo.move(target, grip, about_z(hand + float(np.clip(wanted - hand, -1.0, 1.0))) @ DOWN)
+
+    def _askew(self, turn: float) -> float:
+        """Whether a nut that still has to turn that far may not go down yet: who does not err comes turned enough."""
+        return 0.0
 
     def _hand(self) -> float:
         return self._unwrapped(hand_yaw(self.scene.hand_rotation))
@@ -236,6 +246,62 @@ class SquareExpert(NutExpert):
     """The square nut."""
 
     NUT, PEG, HANDLE = "SquareNut_main", "peg1", 0.054
+
+
+class RecoveringSquareExpert(SquareExpert):
+    """Make mistakes on the way, and show how each is made up for.
+
+    The handle is taken anywhere along it and askew, so that where the hand is no longer says where the nut is. And the
+    nut is brought down beside the peg or turned, and comes to rest on the peg's top: then it is lifted and brought
+    again. What is done next follows from where the nut is, the mistakes apart.
+    """
+
+    ALONG = (-0.012, 0.012)
+    ASKEW = 0.2
+    BESIDE = (0.010, 0.024)
+    TURNED = 0.25
+    # How often the nut is brought down wrong: never, once, twice.
+    MISSES = (0.5, 0.4, 0.1)
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        super().__init__(scene, rng)
+        self.rng = rng
+        self.misses = int(rng.choice(3, p=self.MISSES))
+        self.height = 0.0
+        self.resting = 0
+        self._draw_grasp()
+        self._draw_place()
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        held = self.grasp.held
+        action = super().act()
+        height = float(self.scene.body(self.NUT)[2])
+        if self.grasp.held and self.misses:
+            away = self.scene.body(self.NUT)[:2] - self.scene.body(self.PEG)[:2] - self.beside[:2]
+            rests = abs(height - self.height) < 0.0005 and float(np.linalg.norm(away)) < 0.012
+            self.resting = (self.resting + 1) * rests
+            if self.resting == 4:
+                self.misses -= 1
+                self._draw_place()
+        elif held and not self.grasp.held:
+            self._draw_grasp()
+        self.height = height
+        return action
+
+    def _askew(self, turn: float) -> float:
+        return funnel(abs(turn), 0.1, 0.2)
+
+    def _draw_grasp(self) -> None:
+        self.handle = self.HANDLE + self.rng.uniform(*self.ALONG)
+        self.askew = self.rng.uniform(-self.ASKEW, self.ASKEW)
+
+    def _draw_place(self) -> None:
+        self.resting = 0
+        angle, far = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(*self.BESIDE)
+        wrong = bool(self.misses)
+        self.beside = np.array([far * np.cos(angle), far * np.sin(angle), 0.0]) * wrong
+        self.turned = self.rng.uniform(-self.TURNED, self.TURNED) * wrong
 
 
 class RoundExpert(NutExpert):

@@ -329,10 +329,13 @@ class Carry:
         self.off = off
         self.released = False
 
-    def bring(self, thing: Array, goal: Array, near: float = 0.012, far: float = 0.06) -> Array:
-        """Where the hand should go to take `thing` to `goal`: up, across, and down once it is within `near` of it."""
+    def bring(self, thing: Array, goal: Array, near: float = 0.012, far: float = 0.06, askew: float = 0.0) -> Array:
+        """Where the hand should go to take `thing` to `goal`: up, across, and down once it is within `near` of it.
+
+        It stays up, too, while it is `askew`: 0 is good enough to go down, 1 is not.
+        """
         away = goal - thing
-        high = funnel(float(np.linalg.norm(away[:2])), near, far)
+        high = max(funnel(float(np.linalg.norm(away[:2])), near, far), askew)
         height = float(goal[2]) + max(self.clear - float(goal[2]), 0.0) * high
         across = 1.0 - funnel(height - float(thing[2]), 0.01, 0.05) * high
         wanted = np.array([*(thing[:2] + away[:2] * across), height])
