@@ -280,7 +280,8 @@ fn windows(set: &Dataset) -> Result<f64, AnyError> {
     let episodes = (0..set.episodes().len()).collect();
     let observation = [dataset::STATE, dataset::ENVIRONMENT_STATE].map(str::to_owned);
     let observation = observation.into_iter().filter(|name| set.column(name).is_some()).collect();
-    let mut windows = set.windows(&WindowSpec { observation, n_obs_steps: 1, action_horizon: 32, episodes })?;
+    let mut windows =
+        set.windows(&WindowSpec { observation, n_obs_steps: 1, action_horizon: 32, episodes, mistakes: false })?;
     for camera in set.cameras() {
         windows = windows.with_pictures(camera, Arc::new(set.pictures(camera)?));
     }

@@ -24,6 +24,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         n_obs_steps: 1,
         action_horizon: horizon.parse()?,
         episodes: dataset.required_split(split)?,
+        mistakes: false,
     })?;
     for camera in dataset.cameras() {
         windows = windows.with_pictures(camera, Arc::new(dataset.pictures(camera)?));

@@ -31,8 +31,8 @@ pub use keys::{KeyItem, Moment};
 pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset, DepthMaps,
     DepthUnit, ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm,
-    Info, PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, VideoOptions, VideoProvenance, convert,
-    convert_unless, edit, export, verify, verify_source,
+    Info, MISTAKE, PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, VideoOptions, VideoProvenance,
+    convert, convert_unless, edit, export, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};

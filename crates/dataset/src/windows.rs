@@ -23,6 +23,24 @@ pub struct WindowSpec {
     pub action_horizon: usize,
     /// Episodes to take windows from, by episode index; every frame of them starts one window.
     pub episodes: Vec<usize>,
+    /// Take the steps that the data marks as mistakes, too. Otherwise what lies between them, or before or after, is as
+    /// an episode of its own: no window begins at a mistake, and none asks for the actions from the next one on.
+    pub mistakes: bool,
+}
+
+/// The stretches of `ranges` in which no frame is marked.
+pub(crate) fn unmarked(ranges: &[(usize, usize)], marked: impl Fn(usize) -> bool) -> Vec<(usize, usize)> {
+    let mut stretches = Vec::new();
+    for &(from, to) in ranges {
+        let mut begin = from;
+        for frame in (from..to).filter(|&frame| marked(frame)).chain([to]) {
+            if begin < frame {
+                stretches.push((begin, frame));
+            }
+            begin = frame + 1;
+        }
+    }
+    stretches
 }
 
 /// A resident column: row-major values, `dim` to a frame. Cloning shares the memory.
@@ -265,6 +283,14 @@ mod tests {
     use crate::lerobot::Pictures;
     use proptest::prelude::*;
     use std::sync::Arc;
+
+    #[test]
+    fn stretches_lie_between_marked_frames() {
+        let marks = [0, 3, 4, 9, 12];
+        let stretches = unmarked(&[(0, 6), (6, 10), (12, 13), (20, 22)], |frame| marks.contains(&frame));
+        assert_eq!(stretches, [(1, 3), (5, 6), (6, 9), (20, 22)]);
+        assert_eq!(unmarked(&[(2, 5)], |_| false), [(2, 5)]);
+    }
 
     fn column(rows: usize, dim: usize, salt: f32) -> Resident {
         let data: Vec<f32> = (0..rows * dim).map(|i| i as f32 + salt).collect();

@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used)]
 
 use dataset::{
-    Array, ConvertOptions, Dataset, DatasetError, Demo, ImageForm, RobomimicWriter, RotationForm, Source, WindowBatch,
-    WindowSpec, WriteOptions, convert, export, verify, verify_source,
+    Array, ConvertOptions, Dataset, DatasetError, Demo, ImageForm, MISTAKE, RobomimicWriter, RotationForm, Source,
+    WindowBatch, WindowSpec, WriteOptions, convert, export, verify, verify_source,
 };
 use proptest::prelude::*;
 use std::collections::BTreeMap;
@@ -306,6 +306,7 @@ fn windows_of_a_split_come_in_a_seeded_order() {
         n_obs_steps: 1,
         action_horizon: 16,
         episodes: vec![0, 2],
+        mistakes: false,
     };
     let windows = set.windows(&spec).unwrap();
     let lengths: Vec<usize> = set.episodes().iter().map(|e| e.length).collect();
@@ -474,6 +475,50 @@ fn synthetic(number: usize, length: usize, pictures: bool) -> Demo {
         demo.datasets.insert("next_obs/agentview_image".to_owned(), Array::from_u8(vec![length, 84, 84, 3], &next));
     }
     demo
+}
+
+#[test]
+fn what_is_marked_as_a_mistake_is_not_asked_of_a_policy() {
+    let dir = tempfile::tempdir().unwrap();
+    let (file, out, back) = (dir.path().join("a.hdf5"), dir.path().join("set"), dir.path().join("back.hdf5"));
+    let mut demos = [synthetic(0, 9, false), synthetic(1, 4, false)];
+    for (demo, marks) in demos.iter_mut().zip([&[0, 0, 0, 1, 1, 0, 0, 0, 0][..], &[1, 0, 0, 0]]) {
+        demo.datasets.insert("mistakes".to_owned(), Array::from_i64(vec![marks.len()], marks));
+    }
+    write_demos(&file, &demos);
+    convert(&file, &out, &options(), &mut quiet).unwrap();
+    export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
+    assert_eq!(content(&back), content(&file));
+
+    let set = Dataset::open(&out).unwrap();
+    let (column, action) = (set.column(MISTAKE).unwrap(), set.column("action").unwrap());
+    assert_eq!(column.data[..], [0., 0., 0., 1., 1., 0., 0., 0., 0., 1., 0., 0., 0.]);
+    let state = vec!["observation.state".to_owned()];
+    let spec =
+        WindowSpec { observation: state, n_obs_steps: 2, action_horizon: 3, episodes: vec![0, 1], mistakes: false };
+    let windows = set.windows(&spec).unwrap();
+    let all = set.windows(&WindowSpec { mistakes: true, ..spec }).unwrap();
+    assert_eq!((windows.len(), all.len()), (10, 13));
+    let mut batch = WindowBatch::default();
+    let begins: Vec<u32> = (0..10).collect();
+    windows.gather(&begins, &mut batch);
+    for ((frame, actions), pad) in [0, 1, 2, 5, 6, 7, 8, 10, 11, 12]
+        .into_iter()
+        .zip(batch.actions.chunks_exact(3 * 7))
+        .zip(batch.is_pad.chunks_exact(3))
+    {
+        assert_eq!(actions[..7], action.data[frame * 7..(frame + 1) * 7], "the window of frame {frame}");
+        let end = [3, 9, 13].into_iter().find(|&end| frame < end).unwrap();
+        let asked = (end - frame).min(3);
+        assert_eq!(pad, [asked < 1, asked < 2, asked < 3], "the window of frame {frame}");
+    }
+
+    demos[1].datasets.insert("mistakes".to_owned(), Array::from_i64(vec![4, 2], &[0; 8]));
+    demos[0].datasets.insert("mistakes".to_owned(), Array::from_i64(vec![9, 2], &[0; 18]));
+    let wide = dir.path().join("wide.hdf5");
+    write_demos(&wide, &demos);
+    let error = convert(&wide, &dir.path().join("no"), &options(), &mut quiet).unwrap_err().to_string();
+    assert!(error.contains("mistakes") && error.contains("one number a step"), "{error}");
 }
 
 /// Any array that a file may hold.

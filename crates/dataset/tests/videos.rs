@@ -193,8 +193,13 @@ fn videos_are_written_read_and_checked_and_the_source_comes_back() {
         assert!(beyond.contains(&dir.path().display().to_string()) && beyond.contains("decoded pictures"), "{beyond}");
         let second = set.episode_pictures(CAMERA, 1).unwrap();
         assert_eq!(second.data, all.data[7 * one.len()..19 * one.len()]);
-        let spec =
-            WindowSpec { observation: vec![STATE.to_owned()], n_obs_steps: 2, action_horizon: 3, episodes: vec![0, 2] };
+        let spec = WindowSpec {
+            observation: vec![STATE.to_owned()],
+            n_obs_steps: 2,
+            action_horizon: 3,
+            episodes: vec![0, 2],
+            mistakes: false,
+        };
         let windows = || set.windows(&spec).unwrap();
         let (memory, disk) = (windows().with_pictures(CAMERA, Arc::new(all)), windows().with_pictures(CAMERA, file));
         assert_eq!((memory.reads_files(), disk.reads_files()), (false, true));

@@ -120,6 +120,10 @@ pub struct DataSection {
     /// What is drawn more often in training: the beginnings of episodes, where it is decided what to do.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub beginning: Option<BeginningSection>,
+    /// Learn the actions, too, that the demonstrations mark as mistakes; otherwise what lies between mistakes is learned
+    /// as if each stretch were an episode of its own.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub mistakes: bool,
     /// Observations that the policy sees at once: the present one and those before it.
     #[serde(skip_serializing_if = "is_one")]
     pub n_obs_steps: usize,
@@ -144,6 +148,7 @@ impl Default for DataSection {
             symmetries: BTreeMap::new(),
             exchange: BTreeMap::new(),
             beginning: None,
+            mistakes: false,
             n_obs_steps: 1,
             cameras: Vec::new(),
             train_mask: "train".to_owned(),

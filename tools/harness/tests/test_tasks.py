@@ -138,6 +138,8 @@ def test_further_experts_solve_the_task_otherwise(task: str, expert: str) -> Non
     further = [episodes.expert_episode(session, 1_000_000 + seed, True, expert) for seed in range(3)]
     session.env.close()
     assert sum(episode.success for episode in further) >= 2
+    marks = (task, expert) == ("NutAssemblySquare", "recoveries") or expert == "regrasps"
+    assert all(("mistakes" in episode.tensors) == marks for episode in further)
     assert [episode.steps for episode in further] != usual
 
 
@@ -178,6 +180,8 @@ def test_a_hand_that_rests_where_it_should_not_goes_on_and_succeeds(task: str, n
     rested = 0
     for seed in range(12):
         found = episodes.expert_episode(session, 1_000_000 + seed, True, name)
+        mistakes = found.tensors["mistakes"]
+        assert mistakes.shape == (found.steps,) and set(mistakes.tolist()) == {0, 1}
         hand = found.tensors["obs/robot0_eef_pos"]
         still = np.linalg.norm(np.diff(hand, axis=0), axis=1) < 0.0008
         # beside a cube, or high above the table with the nut

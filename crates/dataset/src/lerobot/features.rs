@@ -22,6 +22,9 @@ const STATE_DEFAULTS: [&[&str]; 4] = [
 /// What the names of columns of entities begin with.
 pub const ENTITY_PREFIX: &str = "observation.entity.";
 
+/// The column that says of every step whether its action is a mistake, for data that marks them.
+pub const MISTAKE: &str = "mistake";
+
 /// Default key of `observation.environment_state`.
 const ENV_DEFAULT: &str = "object";
 
@@ -125,6 +128,8 @@ pub(crate) enum Origin {
     Done,
     /// `rewards` at its maximum of 1: the task is solved at this step.
     Success,
+    /// `mistakes` as truth value.
+    Mistake,
     /// A dataset of 8-bit images, or of their JPEG files.
     Image { key: String, height: usize, width: usize, jpeg: bool },
     /// A dataset of depth, `dtype` a pixel.
@@ -496,6 +501,10 @@ impl Chooser<'_> {
         }
         if self.first.keys.contains_key("rewards") && self.rewards_tell_success() {
             columns.push(scalar("next.success", "bool", Origin::Success));
+        }
+        if self.first.keys.contains_key("mistakes") {
+            self.one_a_step("mistakes")?;
+            columns.push(scalar(MISTAKE, "bool", Origin::Mistake));
         }
         Ok(columns)
     }

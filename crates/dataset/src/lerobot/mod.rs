@@ -29,7 +29,7 @@ mod work;
 pub use convert::{ConvertReport, convert, convert_unless};
 pub use depth::{DepthMaps, DepthUnit};
 pub use export::{ExportReport, export};
-pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, VideoOptions};
+pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, MISTAKE, VideoOptions};
 pub(crate) use images::encode_png;
 pub use info::{ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm, VideoProvenance};
 pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};

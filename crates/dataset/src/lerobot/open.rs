@@ -1,6 +1,7 @@
 //! An opened data set: everything but pictures in memory, ready for training.
 
 use super::check;
+use super::features::MISTAKE;
 use super::fingerprint::{Fingerprint, INDEX_COLUMNS};
 use super::info::{Feature, Info, Provenance};
 use super::meta::parse_stats;
@@ -10,7 +11,7 @@ use super::values::Values;
 use crate::error::{DatasetError, Result};
 use crate::shuffle::SplitMix64;
 use crate::stats::FeatureStats;
-use crate::windows::{Resident, WindowSpec, Windows};
+use crate::windows::{Resident, WindowSpec, Windows, unmarked};
 use arrow::buffer::ScalarBuffer;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -324,7 +325,10 @@ impl Dataset {
                 });
             }
         }
-        let ranges = self.ranges(&spec.episodes)?;
+        let mut ranges = self.ranges(&spec.episodes)?;
+        if let Some(marks) = self.columns.get(MISTAKE).filter(|_| !spec.mistakes) {
+            ranges = unmarked(&ranges, |frame| marks.data[frame] != 0.0);
+        }
         let columns = spec.observation.iter().map(|name| Ok((name.clone(), self.required(name)?)));
         let observation = columns.collect::<Result<_>>()?;
         let lengths = (spec.n_obs_steps, spec.action_horizon);

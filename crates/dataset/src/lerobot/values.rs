@@ -113,6 +113,7 @@ pub(crate) fn column_values(path: &Path, column: &Column, demo: &Demo, fps: f64,
         }
         Origin::Reward => Values::F32(single("rewards")?),
         Origin::Done => Values::Bool(single("dones")?.iter().map(|&v| v != 0.0).collect()),
+        Origin::Mistake => Values::Bool(single("mistakes")?.iter().map(|&v| v != 0.0).collect()),
         Origin::Success => Values::Bool(single("rewards")?.iter().map(|&v| v >= 1.0).collect()),
         Origin::Image { .. } | Origin::Depth { .. } => Values::Pictures,
         Origin::Index(index) => index_values(*index, fps, position),

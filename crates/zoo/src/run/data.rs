@@ -223,6 +223,7 @@ pub(super) fn prepare(
             n_obs_steps: experiment.data.n_obs_steps,
             action_horizon,
             episodes,
+            mistakes: experiment.data.mistakes,
         };
         let past = experiment.policy.past_actions(experiment.data.n_obs_steps);
         dataset.windows(&spec).map(|windows| windows.with_past_actions(past)).map_err(failed)

@@ -8,7 +8,7 @@ use std::time::Instant;
 /// Convert demonstrations into a LeRobotDataset v3.0 directory.
 ///
 /// Columns: observation.state, observation.environment_state, observation.entity.<name>, observation.images.<camera>, action, next.reward,
-/// next.done, next.success, and the five index columns. What the format has no place for is kept in the side folder
+/// next.done, next.success, mistake (of a demo that marks its mistakes), and the five index columns. What the format has no place for is kept in the side folder
 /// `actrm/`, from which `actrm-data export` rebuilds the source; so are grey and RGBA pictures, which LeRobot does not
 /// record, and a note says so. Recorded JPEG files (newer ALOHA) stay the files they are. Depth (obs/<camera>_depth: float
 /// metres or uint16 millimetres, height x width x 1) becomes observation.images.<camera>_depth, a TIFF file a frame, as

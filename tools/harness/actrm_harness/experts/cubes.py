@@ -171,6 +171,8 @@ class RecoveringTowerExpert(TowerExpert):
         self.leaving = False
         # how far beside a cube it reaches
         self.miss = np.zeros(3)
+        # whether it is about to do wrong on purpose
+        self.wrong = False
 
     def _draw_beside(self, rng: np.random.Generator) -> list[Array]:
         beside: list[Array] = []
@@ -187,6 +189,7 @@ class RecoveringTowerExpert(TowerExpert):
         self._choose(stands)
         thing = scene.body(self.cube)
         carry, goal, level = self._job(stands)
+        beside = level is not None and bool(self.beside[level].any())
         hand = hand_yaw(scene.hand_rotation)
         turn = hand
         if carry.update(thing, goal, flat=0.006, height=0.006):
@@ -206,6 +209,8 @@ class RecoveringTowerExpert(TowerExpert):
                     # sideways against what stands
                     target = scene.hand + (scene.body(middle) - thing) * (1.0 if thing[2] > TABLE + 0.05 else 0.0)
                     target[2] += 0.05 * float(thing[2] < TABLE + 0.055)
+        carrying = self.grasp.held or carry.released
+        self.wrong = beside or (level == 1 and self.knocks) if carrying else bool(self.miss.any())
         return self.servo.move(target, grip, about_z(turn) @ DOWN)
 
     def _choose(self, stands: bool) -> None:
@@ -260,7 +265,7 @@ class RegraspingTowerExpert(RecoveringTowerExpert):
     """Reach beside cubes as well: come to rest on a neighbour, or close on nothing, then rise and reach again.
 
     Cubes that fell lie close together, and a hand that comes down a little beside one stands on another and is stuck
-    there for ever, unless it was shown that the way on leads up.
+    there for ever, unless it was shown that the way on leads up. What it does wrong it marks.
     """
 
     MISSING = 0.5
@@ -272,11 +277,13 @@ class RegraspingTowerExpert(RecoveringTowerExpert):
         self.reached = ""
         self.before = scene.hand
         self.resting = 0
+        self.erring = False
 
     def act(self) -> Array:
         """The action for the current state."""
         closing = self.grasp.closing
         action = super().act()
+        self.erring = self.servo.erring or self.wrong
         if self.cube != self.reached:
             self.reached = self.cube
             self._draw_miss()

@@ -253,10 +253,10 @@ class RecoveringSquareExpert(SquareExpert):
 
     The handle is taken anywhere along it and askew, so that where the hand is no longer says where the nut is. And the
     nut is brought down beside the peg or turned, and comes to rest on the peg's top: then it is lifted and brought
-    again. What is done next follows from where the nut is, the mistakes apart.
+    again. What is done next follows from where the nut is, the mistakes apart, which it marks.
     """
 
-    ALONG = (-0.012, 0.012)
+    ALONG = (-0.006, 0.012)
     ASKEW = 0.2
     BESIDE = (0.010, 0.024)
     TURNED = 0.25
@@ -269,6 +269,7 @@ class RecoveringSquareExpert(SquareExpert):
         self.misses = int(rng.choice(3, p=self.MISSES))
         self.height = 0.0
         self.resting = 0
+        self.erring = False
         self._draw_grasp()
         self._draw_place()
 
@@ -276,6 +277,7 @@ class RecoveringSquareExpert(SquareExpert):
         """The action for the current state."""
         held = self.grasp.held
         action = super().act()
+        self.erring = self.servo.erring or (self.grasp.held and bool(self.beside.any()))
         height = float(self.scene.body(self.NUT)[2])
         if self.grasp.held and self.misses:
             away = self.scene.body(self.NUT)[:2] - self.scene.body(self.PEG)[:2] - self.beside[:2]

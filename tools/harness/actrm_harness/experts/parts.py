@@ -8,7 +8,7 @@ who shows them (`skills`).
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -32,6 +32,13 @@ class Expert(Protocol):
     def act(self) -> Array:
         """The action for the current state, before it is clipped to +-1."""
         ...
+
+
+@runtime_checkable
+class Marking(Protocol):
+    """An expert that says whether the action it gave last is a mistake: to be made up for, not to be learned."""
+
+    erring: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +165,8 @@ class Servo:
         self._rng = rng
         self._noise = np.zeros(6)
         self._time = 0
+        # whether the last action was a push or a fumble
+        self.erring = False
         self._pushed = mishaps.pushed * scene.shown_by.slowness
         self._push_at: int = 3 + int(37 * rng.random())
         self._push = self._draw_push()
@@ -186,13 +195,14 @@ class Servo:
         goal = self.upright if rotation is None else rotation
         turn = limit(rotation_vector(goal @ self.scene.hand_rotation.T) / RADIANS_PER_UNIT, self.turn) * haste
         self._noise = 0.7 * self._noise + self._rng.normal(size=6) * noise * np.repeat([1.0, 0.3], 3)
-        if self._push_at <= self._time < self._push_at + 3:
+        self.erring = self._push_at <= self._time < self._push_at + 3
+        if self.erring:
             wanted = wanted + self._push
         elif self._time == self._push_at + 3 and math.isfinite(self._pushed):
             self._push_at += 4 + int(2 * (self._pushed - 4) * self._rng.random())
             self._push = self._draw_push()
         if self._fumble[0] <= self._time < self._fumble[1]:
-            grip = -grip
+            grip, self.erring = -grip, True
         elif self._time == self._fumble[1]:
             self._fumble = self._draw_fumble()
         self._time += 1

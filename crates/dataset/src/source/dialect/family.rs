@@ -210,7 +210,7 @@ fn length(file: &Walked, id: &str, attrs: &Attrs, keys: &BTreeMap<String, KeyPla
 
 /// Datasets that have one row per step wherever they occur.
 fn per_step(key: &str) -> bool {
-    matches!(key, "actions" | "actions_abs" | "rewards" | "dones" | "states")
+    matches!(key, "actions" | "actions_abs" | "rewards" | "dones" | "mistakes" | "states")
         || ["obs/", "next_obs/", "action_dict/"].iter().any(|p| key.starts_with(p))
 }
 

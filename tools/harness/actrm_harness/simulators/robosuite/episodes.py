@@ -2,7 +2,7 @@
 
 States, actions (as executed), rewards r(s') and dones are those of robomimic: states[t] and obs[t] are what was there
 before actions[t]; rewards[t], dones[t] and next_obs[t] are what it led to. dones follow done_mode 2: 1 where the task
-is solved, and in the last step.
+is solved, and in the last step. An expert that marks its mistakes adds mistakes: 1 where actions[t] is one.
 """
 
 import json
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from actrm_harness.experts.parts import Expert, Scene
+from actrm_harness.experts.parts import Expert, Marking, Scene
 from actrm_harness.experts.skills import USUAL, Demonstrator
 from actrm_harness.protocol import RequestError
 from actrm_harness.simulators import Episode
@@ -85,11 +85,14 @@ def expert_episode(
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
     expert: Expert = find(place)(Scene(env, shown_by=shown_by), np.random.default_rng([seed, 1]))
     held = 0
+    mistakes: list[bool] = []
     for _ in range(session.task.max_steps):
         before = envs.state(env)
         action = np.clip(expert.act(), -1.0, 1.0)
         result = envs.step_session(session, action)
         recorder.add(before, action, result)
+        if isinstance(expert, Marking):
+            mistakes.append(expert.erring)
         held = held + 1 if result.success else 0
         if held > STEPS_AFTER_SUCCESS or result.failure is not None:
             break
@@ -99,7 +102,10 @@ def expert_episode(
             raise RequestError("no_skill", text)
         attrs["skill"] = shown_by.skill.name
     progress = session.progress(any(recorder.successes))
-    return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors(), progress)
+    tensors = recorder.tensors()
+    if mistakes:
+        tensors["mistakes"] = np.array(mistakes, dtype=np.int64)
+    return Episode(recorder.successes[-1], len(recorder.actions), attrs, tensors, progress)
 
 
 def _expert_place(session: Session, name: str | None) -> Any:
