@@ -194,10 +194,9 @@ class NutExpert:
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
         self.final = min(self.FINAL, key=self._way)
         self.handle = self.HANDLE
-        # what an expert that errs on purpose adds: an angle to its grasp, a way and an angle to the nut's place
+        # what an expert that errs on purpose adds: an angle to its grasp, a way to the nut's place
         self.askew = 0.0
         self.beside = np.zeros(3)
-        self.turned = 0.0
 
     def act(self) -> Array:
         """The action for the current state."""
@@ -215,14 +214,18 @@ class NutExpert:
             wanted = self._at_handle(self.final) + self.askew
             target, grip = self.grasp.reach(nut + rotation @ np.array([self.handle, 0.0, 0.0]), wanted - hand)
             if self.grasp.held:
-                turn = self.final + self.turned - nearest(self._at_handle(self.final), 2 * np.pi, hand)
-                target = self.carry.bring(nut, goal + self.beside, near=0.005, far=0.012, askew=self._askew(turn))
+                handle = nearest(self._at_handle(self.final), 2 * np.pi, hand)
+                target = self.carry.bring(nut, goal + self.beside, near=0.005, far=0.012, askew=self._too_askew(handle))
                 target[0] = min(float(target[0]), self.REACH)
-                wanted = hand + turn
+                wanted = self._turned(hand, handle)
         return self.servo.move(target, grip, about_z(hand + float(np.clip(wanted - hand, -1.0, 1.0))) @ DOWN)
 
-    def _askew(self, turn: float) -> float:
-        """Whether a nut that still has to turn that far may not go down yet: who does not err comes turned enough."""
+    def _turned(self, hand: float, handle: float) -> float:
+        """The hand's angle at which a nut that it holds, its handle at this angle now, is as it should be."""
+        return self.final + hand - handle
+
+    def _too_askew(self, handle: float) -> float:
+        """Whether a nut with its handle at this angle may not go down yet: who does not err comes turned enough."""
         return 0.0
 
     def _hand(self) -> float:
@@ -269,6 +272,7 @@ class RecoveringSquareExpert(SquareExpert):
         self.misses = int(rng.choice(3, p=self.MISSES))
         self.height = 0.0
         self.resting = 0
+        self.turned = 0.0
         self.erring = False
         self._draw_grasp()
         self._draw_place()
@@ -291,8 +295,11 @@ class RecoveringSquareExpert(SquareExpert):
         self.height = height
         return action
 
-    def _askew(self, turn: float) -> float:
-        return funnel(abs(turn), 0.1, 0.2)
+    def _turned(self, hand: float, handle: float) -> float:
+        return hand + (self.final + self.turned - handle)
+
+    def _too_askew(self, handle: float) -> float:
+        return funnel(abs(self.final + self.turned - handle), 0.1, 0.2)
 
     def _draw_grasp(self) -> None:
         self.handle = self.HANDLE + self.rng.uniform(*self.ALONG)
