@@ -60,7 +60,10 @@ TASKS = {
         Task(
             "NutAssemblySquare",
             expert=".experts.objects:SquareExpert",
-            experts={"recoveries": ".experts.objects:RecoveringSquareExpert"},
+            experts={
+                "recoveries": ".experts.objects:RecoveringSquareExpert",
+                "regrasps": ".experts.objects:RegraspingSquareExpert",
+            },
             soft_reset=True,
             bar=0.85,
         ),

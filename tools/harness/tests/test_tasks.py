@@ -170,6 +170,30 @@ def test_what_the_recovering_expert_does_wrong_it_makes_up_for() -> None:
 
 
 @pytest.mark.usefixtures("library")
+def test_a_hand_that_closes_beside_the_nut_reaches_again_and_only_then_is_right() -> None:
+    """A marked reach that takes nothing, and after it the nut in the hand."""
+    session = envs.make("NutAssemblySquare")
+    session.control = control.attach(session.env)
+    missed = 0
+    for seed in range(12):
+        found = episodes.expert_episode(session, 1_000_000 + seed, True, "regrasps")
+        mistakes = found.tensors["mistakes"].astype(bool)
+        assert 0.0 < float(mistakes.mean()) < 0.8
+        closes = found.tensors["actions"][:, 6] > 0
+        # the table is 0.8 high, and the nut is let fall onto it at first
+        lifted = found.tensors["obs/object"][20:, 2] > 0.9
+        first = 20 + int(np.argmax(lifted)) if lifted.any() else found.steps
+        # longer than any push or fumble, before the nut is lifted for the first time
+        run = longest = 0
+        for wrong in mistakes[:first]:
+            run = (run + 1) * bool(wrong)
+            longest = max(longest, run)
+        missed += found.success and longest > 16 and bool(closes[:first].any())
+    session.env.close()
+    assert missed >= 3
+
+
+@pytest.mark.usefixtures("library")
 @pytest.mark.parametrize(
     ("task", "name", "low"), [("NutAssemblySquare", "recoveries", 0), ("StackColor", "regrasps", 1)]
 )

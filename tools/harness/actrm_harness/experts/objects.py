@@ -194,8 +194,9 @@ class NutExpert:
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
         self.final = min(self.FINAL, key=self._way)
         self.handle = self.HANDLE
-        # what an expert that errs on purpose adds: an angle to its grasp, a way to the nut's place
+        # what an expert that errs on purpose adds: an angle and a way to its grasp, a way to the nut's place
         self.askew = 0.0
+        self.miss = np.zeros(3)
         self.beside = np.zeros(3)
 
     def act(self) -> Array:
@@ -212,7 +213,8 @@ class NutExpert:
                 best = min(self.FINAL, key=self._way)
                 self.final = best if self._way(best) < self._way(self.final) - 0.5 else self.final
             wanted = self._at_handle(self.final) + self.askew
-            target, grip = self.grasp.reach(nut + rotation @ np.array([self.handle, 0.0, 0.0]), wanted - hand)
+            held_at = nut + rotation @ np.array([self.handle, 0.0, 0.0])
+            target, grip = self.grasp.reach(held_at + self.miss, wanted - hand)
             if self.grasp.held:
                 handle = nearest(self._at_handle(self.final), 2 * np.pi, hand)
                 target = self.carry.bring(nut, goal + self.beside, near=0.005, far=0.012, askew=self._too_askew(handle))
@@ -311,6 +313,70 @@ class RecoveringSquareExpert(SquareExpert):
         wrong = bool(self.misses)
         self.beside = np.array([far * np.cos(angle), far * np.sin(angle), 0.0]) * wrong
         self.turned = self.rng.uniform(-self.TURNED, self.TURNED) * wrong
+
+
+class RegraspingSquareExpert(RecoveringSquareExpert):
+    """Reach beside the handle and askew as well: come down on the nut or close on nothing, rise and reach again.
+
+    Whoever sees the nut in pictures is often a centimetre or two beside its handle, and stays there, hand closed on
+    nothing, unless it was shown the way on. The hand comes as it should, and errs only where it is near: at the handle,
+    and at the peg too, so that little of a demonstration is marked.
+    """
+
+    # How often a reach for the handle goes wrong: never, once, twice.
+    MISREACHES = (0.4, 0.4, 0.2)
+    ASIDE = (0.012, 0.035)
+    AMISS = 0.5
+    NEAR = 0.09
+    NEAR_PEG = 0.05
+    PATIENCE = 30
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        super().__init__(scene, rng)
+        self.misreaches = int(rng.choice(3, p=self.MISREACHES))
+        self.missing = False
+        self.before = scene.hand
+        self.low = self.tried = 0
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        closing = self.grasp.closing
+        away = self.scene.body(self.NUT) - self.scene.body(self.PEG)
+        near = float(np.linalg.norm(away[:2])) < self.NEAR_PEG or bool(self.beside.any())
+        self.beside, self.turned = self.place if near else (np.zeros(3), 0.0)
+        action = super().act()
+        self.erring = self.erring or self.missing
+        hand = self.scene.hand
+        if self.missing:
+            down = not self.grasp.closing and float(hand[2]) < float(self.scene.body(self.NUT)[2]) + 0.05
+            self.low = (self.low + 1) * (down and float(np.linalg.norm(hand - self.before)) < 0.0006)
+            self.tried += 1
+            lost = closing and not self.grasp.closing
+            if self.low == 4 or self.grasp.held or lost or self.tried == self.PATIENCE:
+                self._reach_well()
+        elif self.misreaches and not self.grasp.closing and not self.carry.released:
+            handle = self.scene.body_rotation(self.NUT) @ np.array([self.HANDLE, 0.0, 0.0])
+            if float(np.linalg.norm(self.scene.body(self.NUT) + handle - hand)) < self.NEAR:
+                self._reach_wrong()
+        self.before = hand
+        return action
+
+    def _draw_place(self) -> None:
+        super()._draw_place()
+        self.place = (self.beside, self.turned)
+        self.beside, self.turned = np.zeros(3), 0.0
+
+    def _reach_wrong(self) -> None:
+        self.misreaches -= 1
+        self.missing, self.low, self.tried = True, 0, 0
+        angle, far = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(*self.ASIDE)
+        self.miss = np.array([far * np.cos(angle), far * np.sin(angle), 0.0])
+        self.askew = self.rng.uniform(-self.AMISS, self.AMISS)
+
+    def _reach_well(self) -> None:
+        self.missing = False
+        self.miss = np.zeros(3)
+        self._draw_grasp()
 
 
 class RoundExpert(NutExpert):
