@@ -135,11 +135,19 @@ pub struct LearningSection {
     /// official TRM.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub release_solved: Option<f64>,
+    /// Probability per step that a puzzle's states are lost to noise or to another puzzle's states, so that its answer is
+    /// found from anywhere: stable fixed points (TRM).
+    #[serde(skip_serializing_if = "is_zero")]
+    pub disturbed: f64,
+}
+
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
 }
 
 impl Default for LearningSection {
     fn default() -> Self {
-        Self { probability: ClassProbability::Softmax, halt_weight: 0.1, release_solved: None }
+        Self { probability: ClassProbability::Softmax, halt_weight: 0.1, release_solved: None, disturbed: 0.0 }
     }
 }
 
@@ -150,6 +158,7 @@ impl LearningSection {
             probability: self.probability,
             halt_weight: self.halt_weight,
             release: self.release_solved.map_or(Release::Head, Release::Solved),
+            disturbed: self.disturbed,
             ..PuzzleConfig::default()
         }
     }
@@ -243,10 +252,13 @@ impl PuzzleExperiment {
         if self.train.accumulation != 1 {
             return invalid("train.accumulation", "1 for puzzles".to_owned(), self.train.accumulation.to_string());
         }
-        if let Some(p) = self.learning.release_solved
-            && !(0.0..=1.0).contains(&p)
-        {
-            return invalid("learning.release_solved", "0 to 1".to_owned(), p.to_string());
+        let LearningSection { release_solved, disturbed, .. } = self.learning;
+        for (key, p) in [("learning.release_solved", release_solved), ("learning.disturbed", Some(disturbed))] {
+            if let Some(p) = p
+                && !(0.0..=1.0).contains(&p)
+            {
+                return invalid(key, "0 to 1".to_owned(), p.to_string());
+            }
         }
         if let Some(rl) = &self.rl {
             if rl.episodes == 0 {

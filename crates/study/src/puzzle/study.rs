@@ -95,6 +95,13 @@ const DFS10: &[StudyTest] = &[
     StudyTest { task: Some("dfs16"), depth: 32, starts: STARTS, ..PLAIN },
     StudyTest { task: Some("dfs20"), depth: 32, starts: STARTS, ..PLAIN },
 ];
+const STABLE: &[StudyTest] = &[
+    with_bar(Bar { right: 0.995, exact: 0.995, parameters: Some(16_000), ..BAR }),
+    StudyTest { task: Some("dfs16"), depth: 32, ..PLAIN },
+    StudyTest { task: Some("dfs20"), depth: 32, ..PLAIN },
+    StudyTest { task: Some("dfs16"), depth: 128, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
+    StudyTest { task: Some("dfs20"), depth: 128, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
+];
 const OPEN8: &[StudyTest] = &[
     with_bar(Bar { right: 0.98, exact: 0.96, parameters: Some(9_922), cpu_seconds: None }),
     fresh(Bar { right: 0.98, exact: 0.96, ..BAR }),
@@ -117,6 +124,7 @@ pub const STUDY: &[StudyRow] = &[
     row("small-trm_maze10-original", 3, NONE),
     row("transformer_maze10-original", 1, NONE),
     row("trm_dfs10", 3, DFS10),
+    row("stable-trm_dfs10", 3, STABLE),
     row("trm_open8", 3, OPEN8),
     row("trm_sudoku4", 3, SUDOKU4),
     row("reinforce_mlp_maze5-rl", 5, MAZE5_RL),

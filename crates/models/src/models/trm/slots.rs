@@ -160,4 +160,36 @@ impl Slots {
             self.halted[slot] = steps >= max || wants;
         }
     }
+
+    /// Takes the states away from some puzzles, each with this probability: it goes on from normal noise or from the
+    /// states of the next slot's puzzle, as often the one as the other. What answers from anywhere answers from where a
+    /// long thought about a large puzzle has led.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    pub(super) fn disturb(&mut self, probability: f64, rng: &mut Rng) -> Result<()> {
+        let batch = self.batch();
+        let shape = self.carry.z_h.shape().clone();
+        let width = shape.elem_count() / batch;
+        let mut states =
+            [self.carry.z_h.flatten_all()?.to_vec1::<f32>()?, self.carry.z_l.flatten_all()?.to_vec1::<f32>()?];
+        let others = states.clone();
+        for slot in 0..batch {
+            let (chance, noisy) = (rng.uniform(), rng.uniform() < 0.5);
+            if f64::from(chance) >= probability {
+                continue;
+            }
+            let next = (slot + 1) % batch;
+            for (state, other) in states.iter_mut().zip(&others) {
+                let own = &mut state[slot * width..(slot + 1) * width];
+                match noisy {
+                    true => own.copy_from_slice(&rng.normals(width)),
+                    false => own.copy_from_slice(&other[next * width..(next + 1) * width]),
+                }
+            }
+        }
+        let [z_h, z_l] = states.map(|state| Tensor::from_vec(state, shape.clone(), &HERE));
+        self.carry = Carry { z_h: z_h?, z_l: z_l? };
+        Ok(())
+    }
 }

@@ -144,6 +144,10 @@ fn examples(config: &Config, count: usize, seed: u64) -> Vec<Example> {
 }
 
 fn trainer(config: &Config, release: Release) -> Trainer {
+    disturbed_trainer(config, release, 0.0)
+}
+
+fn disturbed_trainer(config: &Config, release: Release, disturbed: f64) -> Trainer {
     let train = TrainConfig {
         steps: 400,
         lr: 1e-2,
@@ -153,7 +157,7 @@ fn trainer(config: &Config, release: Release) -> Trainer {
         ema_decay: Some(0.9),
         ..TrainConfig::default()
     };
-    let puzzles = PuzzleConfig { batch_size: 8, release, ..PuzzleConfig::default() };
+    let puzzles = PuzzleConfig { batch_size: 8, release, disturbed, ..PuzzleConfig::default() };
     Trainer::new(Trm::new(config.clone(), 2).unwrap(), train, puzzles, 4).unwrap()
 }
 
@@ -196,6 +200,31 @@ fn training_carries_puzzles_and_lowers_the_loss() {
 }
 
 #[test]
+fn disturbed_puzzles_go_on_from_noise_or_from_another_puzzles_states() {
+    let config = Config { halt_max_steps: 50, ..configs()[0].clone() };
+    let states = |trainer: &Trainer| {
+        let rows: Vec<Vec<f32>> = trainer.slots().carry().z_h.flatten_from(1).unwrap().to_vec2().unwrap();
+        rows
+    };
+    let stepped = |disturbed: f64| {
+        let mut trainer = disturbed_trainer(&config, Release::Solved(0.0), disturbed);
+        let wanted = trainer.wanted();
+        trainer.step(&examples(&config, wanted, 1)).unwrap();
+        states(&trainer)
+    };
+    let (calm, lost) = (stepped(0.0), stepped(0.4));
+    let kept = (0..8).filter(|&slot| lost[slot] == calm[slot]).count();
+    let moved = (0..8).filter(|&slot| lost[slot] == calm[(slot + 1) % 8]).count();
+    let noisy: Vec<&Vec<f32>> = lost.iter().filter(|row| !calm.contains(row)).collect();
+    assert!(kept > 0 && moved > 0 && !noisy.is_empty() && kept + moved + noisy.len() == 8, "{kept} {moved}");
+    for row in noisy {
+        let square = row.iter().map(|x| x * x).sum::<f32>() / row.len() as f32;
+        assert!((0.5..2.0).contains(&square), "{square}");
+    }
+    assert!(stepped(1.0).iter().zip(&calm).all(|(lost, calm)| lost != calm));
+}
+
+#[test]
 fn a_restored_trainer_goes_on_with_the_same_bits() {
     let config = Config { halt_max_steps: 3, ..configs()[5].clone() };
     let run = |trainer: &mut Trainer, from: u64, to: u64| {
@@ -204,11 +233,11 @@ fn a_restored_trainer_goes_on_with_the_same_bits() {
             trainer.step(&examples(&config, wanted, step)).unwrap();
         }
     };
-    let mut one = trainer(&config, Release::Solved(0.5));
+    let mut one = disturbed_trainer(&config, Release::Solved(0.5), 0.3);
     run(&mut one, 0, 5);
     let (tensors, meta) = one.state().unwrap();
     run(&mut one, 5, 9);
-    let mut two = trainer(&config, Release::Solved(0.5));
+    let mut two = disturbed_trainer(&config, Release::Solved(0.5), 0.3);
     run(&mut two, 0, 2);
     two.restore(&tensors, &meta).unwrap();
     run(&mut two, 5, 9);

@@ -23,6 +23,9 @@ pub struct PuzzleConfig {
     pub halt_weight: f64,
     /// when a puzzle leaves its slot
     pub release: Release,
+    /// probability per step that a puzzle's states are lost: it is given noise, or another puzzle's states, and has to find
+    /// its answer from there
+    pub disturbed: f64,
     /// learning rate of the puzzle embeddings' sign descent
     pub puzzle_lr: f64,
     /// weight decay of the puzzle embeddings
@@ -36,6 +39,7 @@ impl Default for PuzzleConfig {
             probability: ClassProbability::Stablemax,
             halt_weight: 0.5,
             release: Release::Head,
+            disturbed: 0.0,
             puzzle_lr: 1e-4,
             puzzle_weight_decay: 1.0,
         }
@@ -161,6 +165,9 @@ impl Trainer {
 
         let q_halt = out.q_halt.to_vec1::<f32>()?;
         self.slots.advance(&self.model, out.carry, &q_halt, &solved, self.config.release, &mut self.rng);
+        if self.config.disturbed > 0.0 {
+            self.slots.disturb(self.config.disturbed, &mut self.rng)?;
+        }
         let halted: Vec<u32> = self.slots.vacant().iter().map(|&slot| self.slots.steps()[slot]).collect();
         let count = |of: usize| of as f64 / batch as f64;
         let (right, all) = grades.iter().fold((0, 0), |(a, b), (right, all)| (a + right, b + all));
