@@ -170,8 +170,8 @@ def test_what_the_recovering_expert_does_wrong_it_makes_up_for() -> None:
 
 
 @pytest.mark.usefixtures("library")
-def test_a_hand_that_closes_beside_the_nut_reaches_again_and_only_then_is_right() -> None:
-    """A marked reach that takes nothing, and after it the nut in the hand."""
+def test_a_hand_that_reached_beside_the_nut_reaches_again_and_succeeds() -> None:
+    """A marked reach, and after it the nut in the hand and around its peg."""
     session = envs.make("NutAssemblySquare")
     session.control = control.attach(session.env)
     missed = 0
@@ -179,7 +179,6 @@ def test_a_hand_that_closes_beside_the_nut_reaches_again_and_only_then_is_right(
         found = episodes.expert_episode(session, 1_000_000 + seed, True, "regrasps")
         mistakes = found.tensors["mistakes"].astype(bool)
         assert 0.0 < float(mistakes.mean()) < 0.8
-        closes = found.tensors["actions"][:, 6] > 0
         # the table is 0.8 high, and the nut is let fall onto it at first
         lifted = found.tensors["obs/object"][20:, 2] > 0.9
         first = 20 + int(np.argmax(lifted)) if lifted.any() else found.steps
@@ -188,7 +187,7 @@ def test_a_hand_that_closes_beside_the_nut_reaches_again_and_only_then_is_right(
         for wrong in mistakes[:first]:
             run = (run + 1) * bool(wrong)
             longest = max(longest, run)
-        missed += found.success and longest > 16 and bool(closes[:first].any())
+        missed += found.success and longest > 16
     session.env.close()
     assert missed >= 3
 
