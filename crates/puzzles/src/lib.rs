@@ -15,6 +15,7 @@ mod sudoku;
 mod symmetry;
 mod table;
 mod task;
+mod view;
 mod walker;
 
 pub use grid::{Grid, RIGHT_DOWN_LEFT_UP};
@@ -25,4 +26,5 @@ pub use sudoku::{Sudoku, SudokuTask};
 pub use symmetry::Symmetry;
 pub use table::table_mazes;
 pub use task::{Grade, Puzzle, Task};
+pub use view::View;
 pub use walker::{MAX_MOVES, MOVES, Moved, Walker};

@@ -145,6 +145,11 @@ impl SudokuTask {
         self.side() * self.side()
     }
 
+    /// Whether a box has as many rows as columns, so that a Sudoku on its side is one.
+    pub fn has_square_boxes(self) -> bool {
+        self.box_rows == self.box_columns
+    }
+
     /// Which box a cell lies in.
     fn box_of(self, cell: usize) -> usize {
         let (row, column) = (cell / self.side(), cell % self.side());

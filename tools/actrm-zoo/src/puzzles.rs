@@ -8,8 +8,8 @@ use puzzles::Task;
 use report::wilson_interval;
 use serde_json::{Value, json};
 use study::puzzle::{
-    EvaluatedPuzzles, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, Starts, TEST_SEED, evaluate_puzzles,
-    evaluate_puzzles_again,
+    EvaluatedPuzzles, MOST_VIEWS, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, Starts, TEST_SEED,
+    evaluate_puzzles, evaluate_puzzles_again,
 };
 use zoo::entry::Entry;
 
@@ -31,6 +31,11 @@ pub struct PuzzleArgs {
     /// Standard deviation of that noise
     #[arg(long, value_name = "STD", default_value_t = 1.0, requires = "starts")]
     noise: f64,
+    /// From how many sides a puzzle is seen, turned or in a mirror, a Sudoku with its digits renamed: each view's answer
+    /// has as many votes as the halting head gives it probability
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST_VIEWS))]
+    #[arg(conflicts_with = "starts")]
+    views: u64,
 }
 
 /// The family of that name, or an error that lists them.
@@ -66,6 +71,7 @@ pub fn evaluate_solver(
         depth: usize::try_from(args.depth)?,
         seed: seed.unwrap_or(TEST_SEED),
         starts: if args.starts == 1 { Starts::ONE } else { Starts { most: args.starts, noise: args.noise } },
+        views: args.views,
     };
     if again {
         let puzzles = evaluate_puzzles_again(&solver, results, &options)?.record.answers.puzzles;

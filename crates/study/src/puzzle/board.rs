@@ -45,6 +45,9 @@ fn task_text(row: &PuzzleEvaluation) -> String {
     if row.starts != Starts::ONE {
         text.push_str(&format!(", {} starts", row.starts.most));
     }
+    if row.views != 1 {
+        text.push_str(&format!(", {} views", row.views));
+    }
     text
 }
 
@@ -227,6 +230,7 @@ mod tests {
             seed: 20_000,
             depth: 16,
             starts: Starts::ONE,
+            views: 1,
             answers: counts(valid),
             steps: 500,
             sampled: None,

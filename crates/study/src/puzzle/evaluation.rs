@@ -18,7 +18,7 @@ use zoo::{ZooError, sha256_file, sha256_hex, write_atomic};
 
 use super::entry::{ProgressPoint, SolverEntry};
 use super::grade::{Baseline, Counts};
-use super::solver::{NoisyStart, Solver, Thought, settled};
+use super::solver::{Solver, Start, Thought, settled};
 use super::walk;
 
 /// Seed of the test puzzles: every solver answers the same ones.
@@ -37,6 +37,12 @@ const OUTCOMES_FILE: &str = "outcomes.parquet";
 /// Puzzles answered at once.
 const BATCH: usize = 50;
 
+/// What the vote of an answer that has not settled counts, against one of a settled one.
+const UNSETTLED: f32 = 0.01;
+
+/// Most views of a puzzle: a square has eight, and no more are worth their time where a Sudoku's digits are renamed.
+pub const MOST_VIEWS: u64 = 8;
+
 /// What to evaluate on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PuzzleEvaluationOptions {
@@ -52,6 +58,9 @@ pub struct PuzzleEvaluationOptions {
     pub seed: u64,
     /// How often a thought about a puzzle may begin.
     pub starts: Starts,
+    /// From how many sides a puzzle is seen: turned or in a mirror, a Sudoku with its digits renamed; up to
+    /// [`MOST_VIEWS`]. Each view's answer has as many votes as the halting head gives it probability.
+    pub views: u64,
 }
 
 /// How often a thought about a puzzle may begin: once as the solver was trained, and where it does not settle, again from
@@ -63,6 +72,34 @@ pub struct Starts {
     pub most: u64,
     /// Standard deviation of the noise on both states.
     pub noise: f64,
+}
+
+/// How a solver is asked.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Looks {
+    /// Most supervision steps of a thought.
+    pub(super) most: usize,
+    /// How often it may begin.
+    pub(super) starts: Starts,
+    /// From how many sides a puzzle is seen: turned or in a mirror, a Sudoku with its digits renamed. Every view is thought
+    /// about to its end, and each answer has as many votes as the halting head gives it probability.
+    pub(super) views: u64,
+}
+
+impl Looks {
+    /// Once, as it is.
+    pub(super) fn once(most: usize) -> Self {
+        Self { most, starts: Starts::ONE, views: 1 }
+    }
+}
+
+fn one() -> u64 {
+    1
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands over a reference")]
+fn is_one(views: &u64) -> bool {
+    *views == 1
 }
 
 impl Starts {
@@ -105,6 +142,9 @@ pub struct PuzzleEvaluation {
     /// How often a thought might begin.
     #[serde(default = "Starts::one", skip_serializing_if = "Starts::is_one")]
     pub starts: Starts,
+    /// From how many sides it saw every puzzle.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub views: u64,
     /// Its answers: once its halting head is sure of one that stays the same, or after the last step.
     pub answers: Counts,
     /// Supervision steps that these took, or moves of a walker, together.
@@ -133,9 +173,10 @@ impl PuzzleEvaluation {
     /// The name of its folder: readable, and different for anything that could change an answer.
     pub fn folder_name(&self) -> String {
         let whole = (&self.entry, &self.task, self.givens, self.seed, self.depth, self.answers.puzzles);
-        let text = match self.starts.is_one() {
-            true => serde_json::to_vec(&whole),
-            false => serde_json::to_vec(&(whole, self.starts)),
+        let text = match (self.starts.is_one(), self.views) {
+            (true, 1) => serde_json::to_vec(&whole),
+            (false, 1) => serde_json::to_vec(&(whole, self.starts)),
+            (_, views) => serde_json::to_vec(&(whole, self.starts, views)),
         };
         let hash = sha256_hex(&text.expect("plain fields are always JSON"));
         format!("{}_{}_test-{}_{}", self.entry, self.task, self.answers.puzzles, &hash[..8])
@@ -211,6 +252,12 @@ impl Kept {
         Self { thought: thoughts[at][place].clone(), steps: at + 1, settled: found.is_some() }
     }
 
+    /// What it says for its answer: the halting head's probability, or next to nothing if the answer still changes.
+    fn vote(&self) -> f32 {
+        let sure = self.thought.halt.unwrap_or(1.0);
+        if self.settled { sure } else { sure * UNSETTLED }
+    }
+
     /// Takes another start's answer where that is better, by the solver's own lights.
     fn weigh(&mut self, other: Self) {
         let steps = self.steps + other.steps;
@@ -221,14 +268,25 @@ impl Kept {
     }
 }
 
-/// Grades `solver` on `puzzles` after each number of steps in `depths` and where it halts, at the latest after `most`.
+/// The answer that most of the votes are for, the first of equals, with the steps of all.
+fn elected(views: Vec<Kept>) -> Kept {
+    let steps = views.iter().map(|view| view.steps).sum();
+    let votes_for =
+        |answer: &[u8]| -> f32 { views.iter().filter(|view| view.thought.answer == answer).map(Kept::vote).sum() };
+    let votes: Vec<f32> = views.iter().map(|view| votes_for(&view.thought.answer)).collect();
+    let best = (0..views.len()).fold(0, |best, at| if votes[at] > votes[best] { at } else { best });
+    let settled = views.iter().any(|view| view.settled && view.thought.answer == views[best].thought.answer);
+    Kept { thought: views[best].thought.clone(), steps, settled }
+}
+
+/// Grades `solver` on `puzzles` after each number of steps in `depths` and where it halts.
 pub(super) fn graded(
     solver: &Solver,
     puzzles: &[Puzzle],
     depths: &[usize],
-    most: usize,
-    starts: Starts,
+    looks: Looks,
 ) -> Result<Graded, ModelError> {
+    let Looks { most, starts, views } = looks;
     let mut graded = Graded {
         by_depth: BTreeMap::new(),
         halting: Counts::default(),
@@ -258,14 +316,21 @@ pub(super) fn graded(
                 }
             }
         }
-        kept.extend((0..batch.len()).map(|place| Kept::of(&thoughts, place)));
+        let first = kept.len();
+        let mut seen: Vec<Vec<Kept>> = (0..batch.len()).map(|place| vec![Kept::of(&thoughts, place)]).collect();
+        let numbers: Vec<usize> = (first..first + batch.len()).collect();
+        for number in 1..views {
+            let thoughts = solver.think_from(batch, most, &Start::Seen { number, puzzles: &numbers })?;
+            seen.iter_mut().enumerate().for_each(|(place, views)| views.push(Kept::of(&thoughts, place)));
+        }
+        kept.extend(seen.into_iter().map(elected));
     }
     for number in 1..starts.most {
         let open: Vec<usize> = (0..kept.len()).filter(|&i| !kept[i].settled).collect();
         for chunk in open.chunks(BATCH) {
             let batch: Vec<Puzzle> = chunk.iter().map(|&i| puzzles[i].clone()).collect();
-            let start = NoisyStart { noise: starts.noise, number, puzzles: chunk };
-            let thoughts = solver.think_from(&batch, most, Some(&start))?;
+            let start = Start::Noisy { noise: starts.noise, number, puzzles: chunk };
+            let thoughts = solver.think_from(&batch, most, &start)?;
             for (place, &i) in chunk.iter().enumerate() {
                 kept[i].weigh(Kept::of(&thoughts, place));
             }
@@ -306,6 +371,7 @@ fn plan(entry: &SolverEntry, options: &PuzzleEvaluationOptions) -> Result<(Task,
         givens,
         seed: options.seed,
         starts: if entry.solver().is_recursive() { options.starts } else { Starts::ONE },
+        views: if entry.solver().is_recursive() { options.views } else { 1 },
         depth: if entry.solver().is_recursive() { options.depth } else { 0 },
         answers: Counts { puzzles: options.puzzles, ..Counts::default() },
         steps: 0,
@@ -329,7 +395,8 @@ fn run(
         (0..options.puzzles).map(|index| task.numbered(Split::Test, givens, seed, index)).collect();
     let name = record.entry.to_string();
     let failed = |source| ZooError::Model { operation: "evaluate", name: name.clone(), source };
-    let graded = graded(entry.solver(), &puzzles, &DEPTHS, options.depth, record.starts).map_err(failed)?;
+    let looks = Looks { most: options.depth, starts: record.starts, views: record.views };
+    let graded = graded(entry.solver(), &puzzles, &DEPTHS, looks).map_err(failed)?;
     record.baselines = match entry.solver() {
         Solver::Walker { .. } => Baseline::of_walkers(&puzzles),
         _ => Baseline::grade_all(task, givens, &puzzles),
@@ -512,4 +579,26 @@ fn outcomes_bytes(path: &Path, rows: &[Row]) -> Result<Vec<u8>, ZooError> {
     }();
     written.map_err(|e| failed(Box::new(e)))?;
     Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn kept(answer: u8, halt: f32, settled: bool) -> Kept {
+        let thought = Thought { answer: vec![answer], confidence: Vec::new(), on_path: Vec::new(), halt: Some(halt) };
+        Kept { thought, steps: 3, settled }
+    }
+
+    #[test]
+    fn views_elect_the_answer_that_the_halting_head_believes_most() {
+        let answer = |views: Vec<Kept>| {
+            let kept = elected(views);
+            (kept.thought.answer[0], kept.settled, kept.steps)
+        };
+        assert_eq!(answer(vec![kept(1, 0.9, true), kept(2, 0.8, true), kept(2, 0.6, true)]), (2, true, 9));
+        assert_eq!(answer(vec![kept(1, 0.6, true), kept(2, 0.9, false), kept(2, 0.9, false)]), (1, true, 9));
+        assert_eq!(answer(vec![kept(1, 0.2, false), kept(2, 0.3, false)]), (2, false, 6));
+        assert_eq!(answer(vec![kept(1, 0.7, true), kept(2, 0.7, true)]), (1, true, 6), "the first of equals");
+    }
 }

@@ -45,7 +45,7 @@ As coded, none of these tasks can tell models apart:
 ";
 
 const FURTHER: &str = "
-### Fresh puzzles, longer thoughts, more starts
+### Fresh puzzles, longer thoughts, more starts, other views
 
 The settings of dfs10, open8 and sudoku4 were changed after misses on the test puzzles above: *fresh* are test puzzles of another
 stream, drawn by code that was written after the last change. Nothing was trained for the others either. *Starts*: where a thought
@@ -54,7 +54,10 @@ head is the judge (many noisy starts: arXiv 2605.19943). `stable-trm` is `trm` t
 puzzle in twenty loses its states to noise or to another puzzle's, so that its answer is to be found from anywhere
 (stable fixed points: arXiv 2605.21488). Chosen on 200 other mazes a size, up to 64 steps, one training each: 84% right in dfs16 and 49% in
 dfs20 as before, 85% and 53% with 16 steps and trained three times as long, 91% and 75% with 16 steps, states lost and no longer training, 95% and 79% with both, 93%
-and 69% with one puzzle in seven.
+and 69% with one puzzle in seven. *Views*: every maze is also thought about turned and in a mirror, each view to its end, and each
+answer has as many votes as the halting head gives it probability (an answer that still changes counts a hundredth). Tried on the same 200
+other mazes with one training: the first answer that settled was right in 95.5% of dfs16 and 85% of dfs20, the one with most votes in 100%
+and 97%; eight noisy starts with votes 100% and 89.5%.
 
 ";
 
@@ -289,11 +292,14 @@ fn further_tests(rows: &[Row]) -> String {
         if test.seed != TEST_SEED {
             how.push("fresh".to_owned());
         }
-        if test.depth > 32 {
+        if test.depth > 32 && test.views == 1 {
             how.push(format!("up to {} steps", test.depth));
         }
         if test.starts != Starts::ONE {
             how.push(format!("up to {} starts of {} steps", test.starts.most, test.depth));
+        }
+        if test.views != 1 {
+            how.push(format!("{} views, up to {} steps each", test.views, test.depth));
         }
         let _ = write!(text, "| {} | {} | {} |", tested_on(row, test, results), model(row), how.join(", "));
         if results.is_empty() {

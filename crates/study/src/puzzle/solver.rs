@@ -7,7 +7,7 @@ use models::baselines::{GridDims, GridModel, WalkerNet};
 use models::classification::ClassProbability;
 use models::trm::{Carry, Gradient, Trm};
 use models::{ModelError, Rng};
-use puzzles::{MazeTask, Puzzle, Task};
+use puzzles::{MazeTask, Puzzle, PuzzleRng, Task, View};
 
 /// A model for one family of puzzles.
 pub enum Solver {
@@ -95,7 +95,7 @@ impl Solver {
     /// # Errors
     /// Puzzles of another size than the model's.
     pub fn think(&self, puzzles: &[Puzzle], steps: usize) -> Result<Vec<Vec<Thought>>, ModelError> {
-        self.think_from(puzzles, steps, None)
+        self.think_from(puzzles, steps, &Start::Usual)
     }
 
     /// The same from another start, if it is a recursion.
@@ -103,21 +103,21 @@ impl Solver {
         &self,
         puzzles: &[Puzzle],
         steps: usize,
-        start: Option<&NoisyStart<'_>>,
+        start: &Start<'_>,
     ) -> Result<Vec<Vec<Thought>>, ModelError> {
         let mut thoughts = Vec::new();
         match self {
             Self::Trm { model, task, probability } => {
-                let inputs = tokens(puzzles)?;
-                let mut carry = model.initial_carry(puzzles.len())?;
-                if let Some(start) = start {
-                    carry = start.of(&carry)?;
-                }
+                let views = start.views(*task);
+                let inputs = tokens(puzzles, &views)?;
+                let mut carry = start.of(model.initial_carry(puzzles.len())?)?;
                 for _ in 0..steps {
                     let out = model.supervision_step(&carry, &inputs, None, Gradient::Off)?;
                     carry = out.carry;
                     let halt = out.q_halt.to_vec1::<f32>()?.into_iter().map(|q| 1.0 / (1.0 + (-q).exp()));
-                    thoughts.push(read(*task, *probability, &out.logits, halt.map(Some).collect())?);
+                    let mut now = read(*task, *probability, &out.logits, halt.map(Some).collect())?;
+                    now.iter_mut().zip(&views).for_each(|(thought, view)| thought.turn_back(view));
+                    thoughts.push(now);
                 }
             }
             Self::Grid { model, dims, task, probability } => {
@@ -138,26 +138,53 @@ impl Solver {
     }
 }
 
-/// Noise on the states that thoughts begin with.
-pub(super) struct NoisyStart<'a> {
-    /// Its standard deviation.
-    pub(super) noise: f64,
-    /// Which of a puzzle's starts it is.
-    pub(super) number: u64,
-    /// The puzzles' numbers: each has noise of its own, whatever it is thought about together with.
-    pub(super) puzzles: &'a [usize],
+/// What thoughts about puzzles begin with. Puzzles have numbers: each has noise and names of its own, whatever it is
+/// thought about together with.
+pub(super) enum Start<'a> {
+    /// As the solver was trained.
+    Usual,
+    /// Start number `number` of each puzzle, from normal noise on both states with this standard deviation.
+    Noisy { noise: f64, number: u64, puzzles: &'a [usize] },
+    /// As the solver was trained, of view number `number` of each puzzle.
+    Seen { number: u64, puzzles: &'a [usize] },
 }
 
-impl NoisyStart<'_> {
-    fn of(&self, carry: &Carry) -> Result<Carry, ModelError> {
+impl Start<'_> {
+    /// The states to begin with instead of `carry`.
+    fn of(&self, carry: Carry) -> Result<Carry, ModelError> {
+        let &Self::Noisy { noise, number, puzzles } = self else {
+            return Ok(carry);
+        };
         let (_, positions, width) = carry.z_h.dims3()?;
         let mut noises = [Vec::new(), Vec::new()];
-        for &puzzle in self.puzzles {
-            let mut rng = Rng::new(puzzle as u64, &format!("noisy start {}", self.number));
+        for &puzzle in puzzles {
+            let mut rng = Rng::new(puzzle as u64, &format!("noisy start {number}"));
             noises.iter_mut().for_each(|noise| noise.extend(rng.normals(positions * width)));
         }
         let [h, l] = noises.map(|noise| Tensor::from_vec(noise, carry.z_h.shape(), &Device::Cpu));
-        Ok(Carry { z_h: (&carry.z_h + (h? * self.noise)?)?, z_l: (&carry.z_l + (l? * self.noise)?)? })
+        Ok(Carry { z_h: (&carry.z_h + (h? * noise)?)?, z_l: (&carry.z_l + (l? * noise)?)? })
+    }
+
+    /// How each puzzle is seen; none where they are seen as they are.
+    fn views(&self, task: Task) -> Vec<View> {
+        match self {
+            Self::Seen { number, puzzles } => {
+                let view = |&puzzle: &usize| View::new(task, *number, &mut PuzzleRng::new(puzzle as u64, *number));
+                puzzles.iter().map(view).collect()
+            }
+            Self::Usual | Self::Noisy { .. } => Vec::new(),
+        }
+    }
+}
+
+impl Thought {
+    /// Makes a thought about what is seen one about the puzzle.
+    fn turn_back(&mut self, view: &View) {
+        self.answer = view.answer(&self.answer);
+        self.confidence = view.plane(&self.confidence);
+        if !self.on_path.is_empty() {
+            self.on_path = view.plane(&self.on_path);
+        }
     }
 }
 
@@ -167,9 +194,13 @@ pub(super) fn settled(halt: Option<f32>, answer: &[u8], before: Option<&[u8]>) -
     halt.is_some_and(|halt| halt > 0.5) && before == Some(answer)
 }
 
-/// `(batch, cells)` of token numbers.
-fn tokens(puzzles: &[Puzzle]) -> Result<Tensor, ModelError> {
-    let all: Vec<u32> = puzzles.iter().flat_map(|puzzle| puzzle.tokens().into_iter().map(u32::from)).collect();
+/// `(batch, cells)` of token numbers, each puzzle as its view sees it if there is one.
+fn tokens(puzzles: &[Puzzle], views: &[View]) -> Result<Tensor, ModelError> {
+    let seen = |(at, puzzle): (usize, &Puzzle)| match views.get(at) {
+        Some(view) => view.of(&puzzle.tokens()),
+        None => puzzle.tokens(),
+    };
+    let all: Vec<u32> = puzzles.iter().enumerate().flat_map(seen).map(u32::from).collect();
     let cells = puzzles.first().map_or(0, Puzzle::cells);
     Ok(Tensor::from_vec(all, (puzzles.len(), cells), &Device::Cpu)?)
 }

@@ -35,6 +35,8 @@ pub struct StudyTest {
     pub seed: u64,
     /// How often a thought may begin.
     pub starts: Starts,
+    /// From how many sides a puzzle is seen.
+    pub views: u64,
     /// What it should reach.
     pub bar: Option<Bar>,
 }
@@ -64,11 +66,13 @@ pub struct StudyRow {
 }
 
 const PLAIN: StudyTest =
-    StudyTest { task: None, givens: None, depth: 16, seed: TEST_SEED, starts: Starts::ONE, bar: None };
+    StudyTest { task: None, givens: None, depth: 16, seed: TEST_SEED, starts: Starts::ONE, views: 1, bar: None };
 /// Puzzles that were not looked at when settings were chosen and changed.
 const FRESH: u64 = 21_000;
 /// As often as a thought that does not settle may begin anew, and from how much noise.
 const STARTS: Starts = Starts { most: 8, noise: 1.0 };
+/// All the sides of a square.
+const VIEWS: u64 = 8;
 const BAR: Bar = Bar { right: 1.0, exact: 0.0, parameters: None, cpu_seconds: None };
 
 const fn with_bar(bar: Bar) -> StudyTest {
@@ -94,6 +98,8 @@ const DFS10: &[StudyTest] = &[
     StudyTest { task: Some("dfs20"), depth: 128, ..PLAIN },
     StudyTest { task: Some("dfs16"), depth: 32, starts: STARTS, ..PLAIN },
     StudyTest { task: Some("dfs20"), depth: 32, starts: STARTS, ..PLAIN },
+    StudyTest { task: Some("dfs16"), depth: 64, views: VIEWS, ..PLAIN },
+    StudyTest { task: Some("dfs20"), depth: 64, views: VIEWS, ..PLAIN },
 ];
 const STABLE: &[StudyTest] = &[
     with_bar(Bar { right: 0.995, exact: 0.995, parameters: Some(16_000), ..BAR }),
@@ -101,6 +107,8 @@ const STABLE: &[StudyTest] = &[
     StudyTest { task: Some("dfs20"), depth: 32, ..PLAIN },
     StudyTest { task: Some("dfs16"), depth: 128, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
     StudyTest { task: Some("dfs20"), depth: 128, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
+    StudyTest { task: Some("dfs16"), depth: 64, views: VIEWS, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
+    StudyTest { task: Some("dfs20"), depth: 64, views: VIEWS, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
 ];
 const OPEN8: &[StudyTest] = &[
     with_bar(Bar { right: 0.98, exact: 0.96, parameters: Some(9_922), cpu_seconds: None }),
@@ -160,12 +168,13 @@ impl StudyTest {
         let fresh = if self.seed == TEST_SEED { String::new() } else { format!("_puzzles-{}", self.seed) };
         let depth = if self.depth > 32 { format!("_depth-{}", self.depth) } else { String::new() };
         let starts = if self.starts == Starts::ONE { String::new() } else { format!("_{}-starts", self.starts.most) };
-        format!("{experiment}_seed-{seed}{other}{givens}{fresh}{depth}{starts}.json")
+        let views = if self.views == 1 { String::new() } else { format!("_{}-views", self.views) };
+        format!("{experiment}_seed-{seed}{other}{givens}{fresh}{depth}{starts}{views}.json")
     }
 
-    /// Whether it asks what the first tests of an experiment did not: other puzzles, longer thoughts, more starts.
+    /// Whether it asks what the first tests of an experiment did not: other puzzles, longer thoughts, more starts or views.
     pub fn is_further(&self) -> bool {
-        self.seed != TEST_SEED || self.depth > 32 || self.starts != Starts::ONE
+        self.seed != TEST_SEED || self.depth > 32 || self.starts != Starts::ONE || self.views != 1
     }
 }
 
@@ -298,8 +307,8 @@ fn run_row(
 }
 
 fn evaluate(entry: &Entry, task: Option<Task>, test: &StudyTest, results: &Path) -> Result<PuzzleEvaluation, ZooError> {
-    let StudyTest { givens, depth, seed, starts, .. } = *test;
-    let options = PuzzleEvaluationOptions { task, givens, puzzles: STUDY_PUZZLES, depth, seed, starts };
+    let StudyTest { givens, depth, seed, starts, views, .. } = *test;
+    let options = PuzzleEvaluationOptions { task, givens, puzzles: STUDY_PUZZLES, depth, seed, starts, views };
     Ok(evaluate_puzzles(&SolverEntry::load(entry, task)?, results, &options)?.record)
 }
 

@@ -17,7 +17,7 @@ use zoo::{ZooError, tensors};
 
 use super::cpu::cpu_seconds;
 use super::entry::{ProgressPoint, PuzzleMeta, SOLVER};
-use super::evaluation::{Starts, VALID_SEED, graded};
+use super::evaluation::{Looks, VALID_SEED, graded};
 use super::experiment::PuzzleExperiment;
 use super::solver::{Solver, labels, planes};
 use super::stream::Stream;
@@ -286,7 +286,7 @@ impl Training for PuzzleTraining<'_> {
         let before = cpu_seconds();
         self.take_evaluated()?;
         let depth = self.depth();
-        let (counts, _) = graded(&self.solver, &self.valid, &[depth], depth, Starts::ONE)
+        let (counts, _) = graded(&self.solver, &self.valid, &[depth], Looks::once(depth))
             .map_err(self.experiment.model_error("validate"))?
             .halting();
         self.cpu.1 += cpu_seconds() - before;
