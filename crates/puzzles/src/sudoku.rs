@@ -1,5 +1,5 @@
 //! Sudoku of 4×4, 6×6 and 9×9: an exact solver that counts solutions, a generator of full grids, and puzzles with a
-//! unique solution whose difficulty is the number of givens.
+//! unique solution whose difficulty is the number of givens, or the effort that a search has with them.
 
 use crate::rng::PuzzleRng;
 use crate::split::{Split, fingerprint};
@@ -9,6 +9,8 @@ use crate::split::{Split, fingerprint};
 pub struct SudokuTask {
     box_rows: usize,
     box_columns: usize,
+    /// How often a puzzle is changed for one that takes a search no less effort.
+    climbs: usize,
 }
 
 /// One puzzle with its only solution. Cells row by row, 0 for an empty one.
@@ -28,6 +30,7 @@ impl Sudoku {
 }
 
 /// Cells still to fill, with what rows, columns and boxes already hold as bit sets of digits.
+#[derive(Clone)]
 struct Board {
     task: SudokuTask,
     cells: Vec<u8>,
@@ -119,6 +122,75 @@ impl Board {
     }
 }
 
+impl Board {
+    /// Guesses of a search that tries every one; see [`SudokuTask::guesses`].
+    fn guesses(mut self, units: &[Vec<usize>]) -> u64 {
+        let Some(open) = self.fill_certain(units) else { return 0 };
+        let Some(cell) = open else { return 0 };
+        let mut candidates = self.candidates(cell);
+        let mut guesses = 0;
+        while candidates != 0 {
+            let digit = smallest(candidates);
+            candidates &= !(1 << digit);
+            let mut other = self.clone();
+            other.fill(cell, digit);
+            guesses += 1 + other.guesses(units);
+        }
+        guesses
+    }
+
+    fn fill(&mut self, cell: usize, digit: u8) {
+        self.put(cell, digit);
+        self.empty.retain(|&other| other != cell);
+    }
+
+    /// Fills in what is certain. None if that leads to a contradiction, else an empty cell with the fewest candidates if
+    /// one is left.
+    fn fill_certain(&mut self, units: &[Vec<usize>]) -> Option<Option<usize>> {
+        'again: loop {
+            let mut fewest = None;
+            for index in 0..self.empty.len() {
+                let cell = self.empty[index];
+                let candidates = self.candidates(cell);
+                match candidates.count_ones() {
+                    0 => return None,
+                    1 => {
+                        self.fill(cell, smallest(candidates));
+                        continue 'again;
+                    }
+                    count if fewest.is_none_or(|(least, _)| count < least) => fewest = Some((count, cell)),
+                    _ => (),
+                }
+            }
+            for unit in units {
+                // digits that may stand in one of its cells, and in several; those that stand in it already
+                let (mut once, mut more, mut stands) = (0_u16, 0_u16, 0_u16);
+                for &cell in unit {
+                    if self.cells[cell] == 0 {
+                        let candidates = self.candidates(cell);
+                        more |= once & candidates;
+                        once |= candidates;
+                    } else {
+                        stands |= 1 << self.cells[cell];
+                    }
+                }
+                if (once | stands).count_ones() < unit.len() as u32 {
+                    return None;
+                }
+                let only = once & !more;
+                if only != 0 {
+                    let digit = smallest(only);
+                    let holds = |cell: &&usize| self.cells[**cell] == 0 && self.candidates(**cell) >> digit & 1 == 1;
+                    let cell = *unit.iter().find(holds)?;
+                    self.fill(cell, digit);
+                    continue 'again;
+                }
+            }
+            return Some(fewest.map(|(_, cell)| cell));
+        }
+    }
+}
+
 /// The smallest digit of a bit set.
 fn smallest(candidates: u16) -> u8 {
     candidates.trailing_zeros() as u8
@@ -126,14 +198,16 @@ fn smallest(candidates: u16) -> u8 {
 
 impl SudokuTask {
     /// 4×4, boxes of 2×2: 288 full grids.
-    pub const FOUR: Self = Self { box_rows: 2, box_columns: 2 };
+    pub const FOUR: Self = Self { box_rows: 2, box_columns: 2, climbs: 0 };
     /// 6×6, boxes of 2×3: 28,200,960 full grids.
-    pub const SIX: Self = Self { box_rows: 2, box_columns: 3 };
+    pub const SIX: Self = Self { box_rows: 2, box_columns: 3, climbs: 0 };
     /// 9×9, boxes of 3×3.
-    pub const NINE: Self = Self { box_rows: 3, box_columns: 3 };
-    /// Every size, with the name it has in commands and files.
-    pub const ALL: [(&'static str, Self); 3] =
-        [("sudoku4", Self::FOUR), ("sudoku6", Self::SIX), ("sudoku9", Self::NINE)];
+    pub const NINE: Self = Self { box_rows: 3, box_columns: 3, climbs: 0 };
+    /// 9×9, with the same number of givens harder ones: rated by [`SudokuTask::guesses`].
+    pub const HARD_NINE: Self = Self { climbs: 30, ..Self::NINE };
+    /// Every family, with the name it has in commands and files.
+    pub const ALL: [(&'static str, Self); 4] =
+        [("sudoku4", Self::FOUR), ("sudoku6", Self::SIX), ("sudoku9", Self::NINE), ("sudoku9-hard", Self::HARD_NINE)];
 
     /// Number of rows, of columns and of digits.
     pub fn side(self) -> usize {
@@ -148,6 +222,11 @@ impl SudokuTask {
     /// Whether a box has as many rows as columns, so that a Sudoku on its side is one.
     pub fn has_square_boxes(self) -> bool {
         self.box_rows == self.box_columns
+    }
+
+    /// Whether its puzzles are made for the effort that they take, and told apart by it.
+    pub fn is_rated(self) -> bool {
+        self.climbs > 0
     }
 
     /// Which box a cell lies in.
@@ -228,18 +307,66 @@ impl SudokuTask {
             }
         };
         let mut puzzle = solution.clone();
-        let mut order: Vec<usize> = (0..self.cells()).collect();
+        self.empty_to(&mut puzzle, givens, rng);
+        if self.is_rated() {
+            self.climb(&mut puzzle, &solution, givens, rng);
+        }
+        Sudoku { puzzle, solution }
+    }
+
+    /// Empties cells in random order while the solution stays unique, until `givens` are left or no further cell can go.
+    fn empty_to(self, puzzle: &mut [u8], givens: usize, rng: &mut PuzzleRng) {
+        let mut order: Vec<usize> = (0..self.cells()).filter(|&cell| puzzle[cell] != 0).collect();
         rng.shuffle(&mut order);
-        let mut left = self.cells();
+        let mut left = order.len();
         for cell in order {
             if left <= givens {
                 break;
             }
-            if self.may_go(&mut puzzle, cell) {
+            if self.may_go(puzzle, cell) {
                 left -= 1;
             }
         }
-        Sudoku { puzzle, solution }
+    }
+
+    /// Makes a puzzle harder: a few more cells are given, others emptied instead, and what comes of it is kept if a search
+    /// has no less effort with it.
+    fn climb(self, puzzle: &mut Vec<u8>, solution: &[u8], givens: usize, rng: &mut PuzzleRng) {
+        let mut effort = self.guesses(puzzle);
+        for _ in 0..self.climbs {
+            let mut other = puzzle.clone();
+            let mut empty: Vec<usize> = (0..self.cells()).filter(|&cell| other[cell] == 0).collect();
+            rng.shuffle(&mut empty);
+            for &cell in &empty[..rng.between(2, 6).min(empty.len())] {
+                other[cell] = solution[cell];
+            }
+            self.empty_to(&mut other, givens, rng);
+            let its = self.guesses(&other);
+            if its >= effort {
+                (*puzzle, effort) = (other, its);
+            }
+        }
+    }
+
+    /// How hard a puzzle is: the guesses of a search that fills in what is certain, the only digit of a cell and the only
+    /// cell of a digit, guesses where nothing is, in a cell with the fewest candidates, and tries every guess. 0 if no
+    /// guess is needed.
+    ///
+    /// # Panics
+    /// If `puzzle` has another number of cells.
+    pub fn guesses(self, puzzle: &[u8]) -> u64 {
+        assert_eq!(puzzle.len(), self.cells(), "one value a cell");
+        let units = self.units();
+        Board::new(self, puzzle).map_or(0, |board| board.guesses(&units))
+    }
+
+    /// The cells of every row, column and box.
+    fn units(self) -> Vec<Vec<usize>> {
+        let (side, all) = (self.side(), 0..self.cells());
+        let of = |unit: &dyn Fn(usize) -> usize| -> Vec<Vec<usize>> {
+            (0..side).map(|number| all.clone().filter(|&cell| unit(cell) == number).collect()).collect()
+        };
+        [of(&|cell| cell / side), of(&|cell| cell % side), of(&|cell| self.box_of(cell))].concat()
     }
 
     /// Empty a given cell if no other digit could then stand in it; the other givens have a unique solution with it.
@@ -289,6 +416,36 @@ mod tests {
         assert!(!SudokuTask::NINE.is_solved(&wrong));
         let fewer = text.replace(['5', '7'], ".");
         assert_eq!(SudokuTask::NINE.solve(&digits(&fewer)), None, "5 and 7 can change places everywhere");
+    }
+
+    #[test]
+    fn a_hard_puzzle_takes_guesses_and_an_easy_one_none() {
+        let digits = |text: &str| text.bytes().map(|b| if b == b'.' { 0 } else { b - b'0' }).collect::<Vec<_>>();
+        let easy = "53..7....6..195....98....6.8...6...34..8.3..17...2...6.6....28....419..5....8..79";
+        assert_eq!(SudokuTask::NINE.guesses(&digits(easy)), 0);
+        // "AI Escargot", made by Arto Inkala to be hard
+        let hard = "1....7.9..3..2...8..96..5....53..9...1..8...26....4...3......1..4......7..7...3..";
+        let guesses = SudokuTask::NINE.guesses(&digits(hard));
+        assert!(guesses > 20, "{guesses}");
+        assert_eq!(SudokuTask::NINE.guesses(&[0; 81].map(|_: u8| 1)), 0, "a contradiction is seen at once");
+    }
+
+    #[test]
+    fn a_climb_makes_puzzles_harder_and_gives_no_more() {
+        let (mut plain, mut hard) = (Vec::new(), Vec::new());
+        for index in 0..6 {
+            for (task, into) in [(SudokuTask::NINE, &mut plain), (SudokuTask::HARD_NINE, &mut hard)] {
+                let sudoku = task.draw_from(Split::Test, 25, &mut PuzzleRng::new(4, index));
+                assert_eq!(task.solve(&sudoku.puzzle).as_ref(), Some(&sudoku.solution));
+                into.push((sudoku.solution.clone(), sudoku.givens(), task.guesses(&sudoku.puzzle)));
+            }
+        }
+        for (plain, hard) in plain.iter().zip(&hard) {
+            assert_eq!(plain.0, hard.0, "the same grid");
+            assert!(hard.1 <= plain.1.max(26) && hard.2 >= plain.2, "{plain:?} {hard:?}");
+        }
+        let sum = |of: &[(Vec<u8>, usize, u64)]| of.iter().map(|p| p.2).sum::<u64>();
+        assert!(sum(&hard) > sum(&plain) + 10, "{plain:?} {hard:?}");
     }
 
     #[test]

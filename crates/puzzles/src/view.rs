@@ -2,8 +2,9 @@
 //! the answer to it turns with it; a model that is not built so may do well on the one and badly on the other.
 
 use crate::rng::PuzzleRng;
+use crate::sudoku::Sudoku;
 use crate::symmetry::Symmetry;
-use crate::task::Task;
+use crate::task::{Puzzle, Task};
 
 /// One way to see puzzles of a task.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -18,10 +19,6 @@ impl View {
     /// View number `number` of puzzles of `task`, 0 the usual one. Numbers go round the symmetries that the task has: all
     /// eight of a square, four if a Sudoku's boxes are not square; from 1 on a Sudoku's digits are renamed by `rng`.
     pub fn new(task: Task, number: u64, rng: &mut PuzzleRng) -> Self {
-        let symmetries = match task {
-            Task::Sudoku(sudoku) if !sudoku.has_square_boxes() => 4,
-            _ => 8,
-        };
         let side = task.side();
         let names = match task {
             Task::Sudoku(_) if number > 0 => {
@@ -34,7 +31,36 @@ impl View {
             }
             _ => None,
         };
-        Self { side, symmetry: Symmetry::all()[(number % symmetries) as usize], names }
+        Self { side, symmetry: Symmetry::all()[(number % Self::sides(task)) as usize], names }
+    }
+
+    /// How many views of puzzles of `task` lay the square onto itself in different ways.
+    pub fn sides(task: Task) -> u64 {
+        match task {
+            Task::Sudoku(sudoku) if !sudoku.has_square_boxes() => 4,
+            _ => 8,
+        }
+    }
+
+    /// The puzzle that is seen, with its answer.
+    ///
+    /// # Panics
+    /// If it is not a puzzle of the task.
+    pub fn puzzle(&self, puzzle: &Puzzle) -> Puzzle {
+        match puzzle {
+            Puzzle::Maze(maze) => {
+                let laid = |cell: usize| self.symmetry.cell(self.side, cell);
+                let mut seen = maze.clone();
+                maze.grid.walls().iter().enumerate().for_each(|(cell, &wall)| seen.grid.set_wall(laid(cell), wall));
+                (seen.start, seen.goal) = (laid(maze.start), laid(maze.goal));
+                seen.path = maze.path.iter().map(|&cell| laid(cell)).collect();
+                Puzzle::Maze(seen)
+            }
+            Puzzle::Sudoku(task, sudoku) => {
+                let sudoku = Sudoku { puzzle: self.of(&sudoku.puzzle), solution: self.of(&sudoku.solution) };
+                Puzzle::Sudoku(*task, sudoku)
+            }
+        }
     }
 
     /// Tokens of a puzzle as they are seen, a number a cell.
@@ -76,7 +102,6 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::split::Split;
-    use crate::task::Puzzle;
 
     #[test]
     fn the_answer_to_a_view_is_the_puzzles_answer() {
@@ -101,6 +126,10 @@ mod tests {
                     _ => unreachable!(),
                 };
                 assert_eq!(view.answer(&answer), puzzle.answer(), "{name}, view {number}");
+                let whole = view.puzzle(&puzzle);
+                assert_eq!((whole.tokens(), view.answer(&whole.answer())), (tokens.clone(), puzzle.answer()));
+                assert_eq!(whole.distance(), puzzle.distance());
+                assert!(whole.grade(&whole.answer()).valid);
                 assert_eq!(view.plane(&view.symmetry.plane(task.side(), &puzzle.tokens())), puzzle.tokens());
                 assert!(number != 0 || tokens == puzzle.tokens());
                 seen.push(tokens);

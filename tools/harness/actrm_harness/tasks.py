@@ -96,6 +96,14 @@ TASKS = {
             max_steps=600,
         ),
         Task(
+            "RecallHeld",
+            defined_in=".environments.towers",
+            expert=".experts.cubes:TowerExpert",
+            experts=TOWERS,
+            soft_reset=True,
+            max_steps=600,
+        ),
+        Task(
             "PickChain",
             defined_in=".environments.picks",
             expert=".experts.picks:PickExpert",

@@ -3,13 +3,14 @@
 import dataclasses
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import Client
 
-from actrm_harness.simulators.robosuite import envs, episodes, suite
+from actrm_harness.simulators.robosuite import control, envs, episodes, suite
 from actrm_harness.wire import Array, Tensors
 
 suite.prepare()
@@ -151,4 +152,41 @@ def test_recall_shows_its_goal_for_a_second() -> None:
     for name in ("obs/goal_rgb", "obs/slot0_rgb"):
         assert np.array_equal(again.tensors[name], demo.tensors[name])
     assert demo.tensors["obs/goal_rgb"].any(axis=1).sum() == 20
+    session.env.close()
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_recall_held_moves_nothing_while_the_goal_is_shown(compiled: bool, library: Path) -> None:
+    session = envs.make("RecallHeld")
+    first = envs.reset(session, 5)
+    if compiled:
+        session.control = control.attach(session.env)
+        assert session.control is not None and library.is_file()
+    ask = np.array([1.0, 0.5, -1.0, 0.0, 0.0, 0.5, 1.0])
+
+    def moved(seen: Tensors, name: str) -> float:
+        return float(np.abs(seen[name] - first[name]).max())
+
+    for _ in range(23):
+        seen = envs.step_session(session, ask).observation
+        assert np.array_equal(seen["goal_rgb"], first["goal_rgb"])
+    seen = envs.step_session(session, ask).observation
+    assert not seen["goal_rgb"].any()
+    assert moved(seen, "robot0_eef_pos") < 2e-3 and moved(seen, "robot0_gripper_qpos") < 2e-3
+    # the same in one call, and from then on actions are done
+    after, rewards = envs.steps_session(session, np.array([ask] * 4))
+    assert moved(after.observation, "robot0_eef_pos") > 5e-3 and len(rewards) == 4
+    again = envs.reset(session, 5)
+    assert all(np.array_equal(again[key], first[key]) for key in first)
+    several, _ = envs.steps_session(session, np.array([ask] * 28))
+    assert np.array_equal(several.observation["robot0_eef_pos"], after.observation["robot0_eef_pos"])
+    session.env.close()
+
+
+def test_recall_held_demonstrations_wait_for_the_arm() -> None:
+    session = envs.make("RecallHeld")
+    session.task = dataclasses.replace(session.task, max_steps=40)
+    demo = episodes.expert_episode(session, 1_000_000)
+    assert not demo.tensors["actions"][:24].any() and demo.tensors["actions"][24:].any(axis=1).all()
+    assert demo.tensors["obs/goal_rgb"].any(axis=1).sum() == 24
     session.env.close()

@@ -29,6 +29,7 @@ TASKS = (
     "PickPlaceCereal",
     "PickPlaceMilk",
     "Recall",
+    "RecallHeld",
     "Stack",
     "StackColor",
     "StackThreeCubes",

@@ -235,6 +235,7 @@ mod tests {
             steps: 500,
             sampled: None,
             progress: Vec::new(),
+            by_effort: Vec::new(),
             by_depth: [(1, counts(valid / 2)), (2, counts(valid))].into(),
             baselines: [(Baseline::AllOff, counts(0)), (Baseline::Straight, counts(92))].into(),
         }

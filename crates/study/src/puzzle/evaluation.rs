@@ -17,7 +17,7 @@ use zoo::results::{EntryIdentity, SEAL_FILE, Seal, TrainingFacts, result_folders
 use zoo::{ZooError, sha256_file, sha256_hex, write_atomic};
 
 use super::entry::{ProgressPoint, SolverEntry};
-use super::grade::{Baseline, Counts};
+use super::grade::{Baseline, Counts, EffortBand};
 use super::solver::{Solver, Start, Thought, settled};
 use super::walk;
 
@@ -155,6 +155,9 @@ pub struct PuzzleEvaluation {
     /// How it did on the way of its training.
     #[serde(default)]
     pub progress: Vec<ProgressPoint>,
+    /// Its answers by the guesses that a search needs, of a family that is told apart by them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub by_effort: Vec<EffortBand>,
     /// Its answers after exactly so many steps.
     pub by_depth: BTreeMap<usize, Counts>,
     /// What answers are worth that need no thought.
@@ -377,6 +380,7 @@ fn plan(entry: &SolverEntry, options: &PuzzleEvaluationOptions) -> Result<(Task,
         steps: 0,
         sampled: None,
         progress: puzzle.progress.clone(),
+        by_effort: Vec::new(),
         by_depth: BTreeMap::new(),
         baselines: BTreeMap::new(),
     };
@@ -406,6 +410,7 @@ fn run(
         let walks = walk::walk_all(net.as_ref(), *task, &puzzles, Some(&mut rng)).map_err(failed)?;
         record.sampled = Some(walk::count(&puzzles, &walks));
     }
+    record.by_effort = EffortBand::of(&puzzles, graded.rows.iter().map(|row| row.valid));
     (record.answers, record.steps, record.by_depth) = (graded.halting, graded.steps, graded.by_depth);
     Ok(graded.rows)
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use models::classification::ClassProbability;
 use models::trm::{PuzzleConfig, Release};
-use puzzles::{MazeTask, Task};
+use puzzles::{MazeTask, Task, View};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
@@ -114,9 +114,21 @@ pub struct PuzzleTask {
     /// Number of different puzzles to train on, over and over; 0 for always new ones.
     #[serde(default)]
     pub train_puzzles: u64,
+    /// From how many sides puzzles to train on are seen, drawn anew for each: 1, as they are made, up to the 8 of a square;
+    /// of a Sudoku the digits are renamed, too.
+    #[serde(default = "one_view", skip_serializing_if = "is_one_view")]
+    pub views: u64,
     /// Number of puzzles of the validation split.
     #[serde(default = "default_valid_puzzles")]
     pub valid_puzzles: u64,
+}
+
+fn one_view() -> u64 {
+    1
+}
+
+fn is_one_view(views: &u64) -> bool {
+    *views == 1
 }
 
 fn default_valid_puzzles() -> u64 {
@@ -245,6 +257,17 @@ impl PuzzleExperiment {
         }
         if most > 0 && matches!(task, Task::Maze(_)) {
             return invalid("task.givens", "none: mazes have no givens".to_owned(), format!("[{fewest}, {most}]"));
+        }
+        let sides = View::sides(task);
+        if !(1..=sides).contains(&self.task.views) {
+            return invalid("task.views", format!("1 to {sides}"), self.task.views.to_string());
+        }
+        if self.task.views > 1 && self.rl.is_some() {
+            return invalid(
+                "task.views",
+                "1 with [rl], which has `rl.mirrored`".to_owned(),
+                self.task.views.to_string(),
+            );
         }
         if self.task.valid_puzzles == 0 {
             return invalid("task.valid_puzzles", "at least 1".to_owned(), "0".to_owned());

@@ -56,6 +56,46 @@ impl Counts {
     }
 }
 
+/// Answers to puzzles that take a search about as many guesses.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EffortBand {
+    /// Fewest guesses; the next band's are more than this one's.
+    pub guesses_from: u64,
+    /// Puzzles of the band.
+    pub puzzles: u64,
+    /// Answered right.
+    pub valid: u64,
+    /// Cells that they give, together.
+    pub givens: u64,
+}
+
+impl EffortBand {
+    /// Where bands begin: what needs no guess, and then ever wider.
+    pub const FROM: [u64; 5] = [0, 1, 5, 17, 33];
+
+    /// Bands of graded puzzles, given whether each was answered right; none of a family that is not told apart so.
+    pub(super) fn of(puzzles: &[Puzzle], valid: impl Iterator<Item = bool>) -> Vec<Self> {
+        let mut bands = Vec::new();
+        for (puzzle, valid) in puzzles.iter().zip(valid) {
+            let Puzzle::Sudoku(task, sudoku) = puzzle else { continue };
+            if !task.is_rated() {
+                continue;
+            }
+            if bands.is_empty() {
+                bands.extend(Self::FROM.map(|guesses_from| Self { guesses_from, ..Self::default() }));
+            }
+            let guesses = task.guesses(&sudoku.puzzle);
+            let place = Self::FROM.iter().rposition(|&from| from <= guesses).unwrap_or(0);
+            let band: &mut Self = &mut bands[place];
+            band.puzzles += 1;
+            band.valid += u64::from(valid);
+            band.givens += sudoku.givens() as u64;
+        }
+        bands
+    }
+}
+
 /// An answer that needs no thought: what a number is worth is how far it is above these.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -185,5 +225,23 @@ mod tests {
         assert_eq!((counts.exact, counts.valid, counts.walk), (50, 50, 50));
         assert!(counts.detours > 5 && counts.detours == counts.detours_valid);
         assert_eq!(counts.cell_accuracy(), 1.0);
+    }
+
+    #[test]
+    fn rated_puzzles_are_counted_by_the_guesses_they_take() {
+        let of = |name: &str, givens| -> Vec<Puzzle> {
+            let task = Task::by_name(name).unwrap();
+            (0..12).map(|index| task.numbered(Split::Test, (givens, givens), 1, index)).collect()
+        };
+        assert_eq!(EffortBand::of(&of("sudoku9", 30), std::iter::repeat(true)), []);
+        assert_eq!(EffortBand::of(&of("dfs10", 0), std::iter::repeat(true)), []);
+        let puzzles = of("sudoku9-hard", 26);
+        let bands = EffortBand::of(&puzzles, (0..12).map(|index| index % 2 == 0));
+        assert_eq!(bands.iter().map(|band| band.guesses_from).collect::<Vec<_>>(), EffortBand::FROM);
+        assert_eq!(bands.iter().map(|band| band.puzzles).sum::<u64>(), 12);
+        assert_eq!(bands.iter().map(|band| band.valid).sum::<u64>(), 6);
+        assert!(bands.iter().filter(|band| band.puzzles > 0).count() > 1, "{bands:?}");
+        let givens: usize = puzzles.iter().filter_map(Puzzle::givens).sum();
+        assert_eq!(bands.iter().map(|band| band.givens).sum::<u64>(), givens as u64);
     }
 }

@@ -13,6 +13,7 @@ mod experiment;
 mod grade;
 mod model;
 mod page;
+mod page_sudoku;
 mod solver;
 mod stream;
 mod study;
@@ -28,7 +29,7 @@ pub use evaluation::{
     audit_puzzles, evaluate_puzzles, evaluate_puzzles_again, list_puzzle_evaluations,
 };
 pub use experiment::{AnyExperiment, LearningSection, PuzzleExperiment, PuzzleTask};
-pub use grade::{Baseline, Counts};
+pub use grade::{Baseline, Counts, EffortBand};
 pub use model::{
     CnnSection, ConvSection, HierarchicalSection, MlpSection, SolverConfig, TransformerSection, TrmSection,
 };

@@ -66,8 +66,9 @@ and 97%; eight noisy starts with votes 100% and 89.5%.
 /// # Errors
 /// A result that cannot be read, an experiment that `library` lacks.
 pub fn study_page(library: &Library, results: &Path) -> Result<String, ZooError> {
-    let (further, rows): (Vec<Row>, Vec<Row>) =
-        study_results(library, results)?.into_iter().partition(|(_, test, _)| test.is_further());
+    let (rated, rest): (Vec<Row>, Vec<Row>) =
+        study_results(library, results)?.into_iter().partition(|(_, test, _)| test.is_rated());
+    let (further, rows): (Vec<Row>, Vec<Row>) = rest.into_iter().partition(|(_, test, _)| test.is_further());
     let of = |names: &[&str]| -> Vec<&Row> {
         rows.iter().filter(|(row, ..)| names.iter().any(|name| row.experiment.ends_with(name))).collect()
     };
@@ -98,6 +99,7 @@ pub fn study_page(library: &Library, results: &Path) -> Result<String, ZooError>
     page.push_str(&depths(&rows));
     page.push_str(FURTHER);
     page.push_str(&further_tests(&further));
+    page.push_str(&super::page_sudoku::section(&rows, &further, &rated));
     page.push_str("\n### 5x5 mazes with walls, walked\n\nHeld-out mazes, 5,000 episodes, each in a new maze (`search`: labels from search instead of rewards). PPO also learns from the mirror images of its episodes, as far as their mazes are training mazes; the weights that walk are a moving average. `trm2` is `trm` with two applications of its network instead of eight.\n\n");
     page.push_str(&walking(&of(&["maze5-walls"])));
     page.push_str("\nGreedy success on validation mazes on the way, mean (worst) of the seeds; *deepest fall*: the farthest that any seed \
@@ -110,17 +112,17 @@ pub fn study_page(library: &Library, results: &Path) -> Result<String, ZooError>
     Ok(page)
 }
 
-fn percent(share: f64) -> String {
+pub(super) fn percent(share: f64) -> String {
     format!("{:.1}%", 100.0 * share)
 }
 
-fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
+pub(super) fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     let count = values.len().max(1) as f64;
     values.sum::<f64>() / count
 }
 
 /// `99.3% (worst 98.8% [97.6-99.4])`
-fn spread(results: &[PuzzleEvaluation], part: impl Fn(&PuzzleEvaluation) -> (u64, u64)) -> String {
+pub(super) fn spread(results: &[PuzzleEvaluation], part: impl Fn(&PuzzleEvaluation) -> (u64, u64)) -> String {
     let parts: Vec<(u64, u64)> = results.iter().map(part).filter(|(_, of)| *of > 0).collect();
     let share = |&(part, of): &(u64, u64)| part as f64 / of as f64;
     match parts.iter().min_by(|a, b| share(a).total_cmp(&share(b))) {
@@ -140,7 +142,7 @@ fn tested_on(row: &StudyRow, test: &StudyTest, results: &[PuzzleEvaluation]) -> 
     givens.map_or(task.to_owned(), |givens| format!("{task}, {givens}+ givens"))
 }
 
-fn model(row: &StudyRow) -> &'static str {
+pub(super) fn model(row: &StudyRow) -> &'static str {
     row.experiment.rsplit_once('_').map_or(row.experiment, |(model, _)| model)
 }
 

@@ -1,6 +1,6 @@
 //! The puzzles of a training, one after the other: always new ones, or a fixed number in a new order each time around.
 
-use puzzles::{Puzzle, PuzzleRng, Split, Task};
+use puzzles::{Puzzle, PuzzleRng, Split, Task, View};
 
 use super::experiment::PuzzleExperiment;
 use zoo::ZooError;
@@ -12,6 +12,8 @@ pub(super) struct Stream {
     givens: (usize, usize),
     seed: u64,
     fixed: u64,
+    /// From how many sides puzzles are seen.
+    views: u64,
     taken: u64,
     /// The order of the fixed puzzles in one time around, and which.
     order: (u64, Vec<u64>),
@@ -24,6 +26,7 @@ impl Stream {
             givens: experiment.task.givens(),
             seed: experiment.train.seed,
             fixed: experiment.task.train_puzzles,
+            views: experiment.task.views,
             taken,
             order: (u64::MAX, Vec::new()),
         })
@@ -39,10 +42,23 @@ impl Stream {
         (0..count)
             .map(|_| {
                 let index = self.next();
+                let puzzle = self.task.numbered(Split::Train, self.givens, self.seed, index);
+                let seen = self.seen(puzzle);
                 self.taken += 1;
-                self.task.numbered(Split::Train, self.givens, self.seed, index)
+                seen
             })
             .collect()
+    }
+
+    /// The puzzle from one of its sides, another one each time around.
+    fn seen(&self, puzzle: Puzzle) -> Puzzle {
+        if self.views == 1 {
+            return puzzle;
+        }
+        // streams from the middle on: none is a puzzle's, none an order's
+        let mut rng = PuzzleRng::new(self.seed, (1 << 63) + self.taken);
+        let number = rng.below(self.views as usize) as u64;
+        View::new(self.task, number, &mut rng).puzzle(&puzzle)
     }
 
     fn next(&mut self) -> u64 {
@@ -63,10 +79,11 @@ impl Stream {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::BTreeSet;
 
     fn stream(fixed: u64, taken: u64) -> Stream {
         let task = Task::by_name("maze8-original").expect("a family");
-        Stream { task, givens: (0, 0), seed: 3, fixed, taken, order: (u64::MAX, Vec::new()) }
+        Stream { task, givens: (0, 0), seed: 3, fixed, views: 1, taken, order: (u64::MAX, Vec::new()) }
     }
 
     #[test]
@@ -92,5 +109,23 @@ mod tests {
             let all = stream(fixed, 0).take(30);
             assert_eq!(stream(fixed, 11).take(19), all[11..]);
         }
+    }
+
+    #[test]
+    fn a_puzzle_is_seen_from_all_its_sides_and_none_twice_alike() {
+        let seen = |taken| Stream { views: 8, ..stream(5, taken) };
+        let all = seen(0).take(400);
+        assert_eq!(seen(123).take(277), all[123..], "a stream goes on where it was");
+        let goals: BTreeSet<usize> = all
+            .iter()
+            .map(|puzzle| match puzzle {
+                Puzzle::Maze(maze) => maze.goal,
+                Puzzle::Sudoku(..) => unreachable!("mazes"),
+            })
+            .collect();
+        assert_eq!(goals, [0, 7, 56, 63].into(), "from the first corner to the last, whichever that is");
+        let different: BTreeSet<Vec<u8>> = all.iter().map(Puzzle::tokens).collect();
+        // five mazes from eight sides, each with its start in one of four corners
+        assert_eq!(different.len(), 40);
     }
 }

@@ -73,6 +73,10 @@ const FRESH: u64 = 21_000;
 const STARTS: Starts = Starts { most: 8, noise: 1.0 };
 /// All the sides of a square.
 const VIEWS: u64 = 8;
+/// The family that is told apart by the effort of a search.
+const RATED: &str = "sudoku9-hard";
+/// Fewer than a million weights.
+const LARGE: Bar = Bar { right: 1.0, exact: 0.0, parameters: Some(999_999), cpu_seconds: None };
 const BAR: Bar = Bar { right: 1.0, exact: 0.0, parameters: None, cpu_seconds: None };
 
 const fn with_bar(bar: Bar) -> StudyTest {
@@ -81,6 +85,11 @@ const fn with_bar(bar: Bar) -> StudyTest {
 
 const fn fresh(bar: Bar) -> StudyTest {
     StudyTest { seed: FRESH, ..with_bar(bar) }
+}
+
+/// Puzzles rated by search effort, of so many givens or as few as there can be.
+const fn hard(givens: usize, views: u64) -> StudyTest {
+    StudyTest { task: Some(RATED), givens: Some(givens), depth: 64, views, ..PLAIN }
 }
 
 const fn row(experiment: &'static str, seeds: u64, tests: &'static [StudyTest]) -> StudyRow {
@@ -116,7 +125,29 @@ const OPEN8: &[StudyTest] = &[
 ];
 const SUDOKU4: &[StudyTest] = &[with_bar(BAR), fresh(BAR)];
 const SUDOKU6: &[StudyTest] = &[with_bar(Bar { right: 0.99, ..BAR })];
-const SUDOKU9: &[StudyTest] = &[with_bar(Bar { right: 0.9, ..BAR }), StudyTest { givens: Some(30), ..PLAIN }];
+const SUDOKU9: &[StudyTest] = &[
+    with_bar(Bar { right: 0.9, ..BAR }),
+    StudyTest { givens: Some(30), ..PLAIN },
+    StudyTest { givens: Some(30), depth: 64, views: VIEWS, ..PLAIN },
+    hard(30, 1),
+    hard(30, VIEWS),
+    hard(24, 1),
+    hard(24, VIEWS),
+    hard(17, 1),
+    hard(17, VIEWS),
+];
+/// Trained on fewer givens: what is asked of `trm_sudoku9` first is asked of these, too.
+const LONG_SUDOKU9: &[StudyTest] = &[
+    StudyTest { givens: Some(36), ..PLAIN },
+    StudyTest { givens: Some(30), ..PLAIN },
+    StudyTest { givens: Some(30), depth: 64, views: VIEWS, bar: Some(Bar { right: 0.95, ..LARGE }), ..PLAIN },
+    hard(30, 1),
+    hard(30, VIEWS),
+    hard(24, 1),
+    hard(24, VIEWS),
+    hard(17, 1),
+    hard(17, VIEWS),
+];
 const NONE: &[StudyTest] = &[PLAIN];
 const MAZE5_RL: &[StudyTest] = &[with_bar(BAR)];
 const WALLS_PPO: &[StudyTest] = &[with_bar(Bar { right: 0.95, parameters: Some(6_100), ..BAR })];
@@ -133,6 +164,7 @@ pub const STUDY: &[StudyRow] = &[
     row("transformer_maze10-original", 1, NONE),
     row("trm_dfs10", 3, DFS10),
     row("stable-trm_dfs10", 3, STABLE),
+    row("views-trm_dfs10", 3, STABLE),
     row("trm_open8", 3, OPEN8),
     row("trm_sudoku4", 3, SUDOKU4),
     row("reinforce_mlp_maze5-rl", 5, MAZE5_RL),
@@ -158,6 +190,7 @@ pub const STUDY: &[StudyRow] = &[
     row("transformer_dfs10", 1, NONE),
     row("trm_sudoku6", 3, SUDOKU6),
     row("trm_sudoku9", 3, SUDOKU9),
+    row("long-trm_sudoku9", 3, LONG_SUDOKU9),
 ];
 
 impl StudyTest {
@@ -170,6 +203,11 @@ impl StudyTest {
         let starts = if self.starts == Starts::ONE { String::new() } else { format!("_{}-starts", self.starts.most) };
         let views = if self.views == 1 { String::new() } else { format!("_{}-views", self.views) };
         format!("{experiment}_seed-{seed}{other}{givens}{fresh}{depth}{starts}{views}.json")
+    }
+
+    /// Whether it is of puzzles that are told apart by the effort of a search.
+    pub fn is_rated(&self) -> bool {
+        self.task == Some(RATED)
     }
 
     /// Whether it asks what the first tests of an experiment did not: other puzzles, longer thoughts, more starts or views.

@@ -9,6 +9,7 @@ show four of the six orders in exact colours; evaluation asks for all six, with 
 before a reset, it decides them.
 
 `Recall`: StackColor whose goal is shown in the first second only, and is zeros from then on: it has to be remembered.
+`RecallHeld`: the same, and while the goal is shown the arm is held, so that where the hand is does not remember it.
 """
 
 import colorsys
@@ -33,6 +34,9 @@ APART = 0.06
 HUE_SHIFT = 0.05
 SHOWN = 1.0
 """For how many seconds Recall shows its goal."""
+HELD = 1.2
+"""And RecallHeld, which holds the arm meanwhile: 24 control steps, so that who plans 2, 3, 4, 6, 8 or 12 steps ahead
+has carried out what was planned in sight of the goal when the arm is free."""
 
 
 def stands_on(upper: Array, lower: Array) -> bool:
@@ -145,10 +149,22 @@ class StackColor(StackThreeCubes):
 class Recall(StackColor):
     """StackColor whose goal is to be seen in the first second only."""
 
+    shown = SHOWN
+
     def values(self) -> Values:
         """As StackColor; the goal is zeros after the first second."""
         values = super().values()
         goal = values["goal_rgb"]
         # the clock is part of a stored state, so that stored episodes look as they did
-        values["goal_rgb"] = lambda: goal() * float(self.sim.data.time < SHOWN - 1e-6)
+        values["goal_rgb"] = lambda: goal() * float(self.sim.data.time < self.shown - 1e-6)
         return values
+
+
+class RecallHeld(Recall):
+    """Recall whose arm does not move while the goal is shown."""
+
+    shown = HELD
+
+    def holds_arm(self) -> bool:
+        """Whether the next action moves nothing, whatever it is."""
+        return bool(self.sim.data.time < self.shown - 1e-6)

@@ -245,9 +245,10 @@ def steps_session(session: Session, actions: Array) -> tuple[StepResult, Array]:
     solved, lost = False, None
     blind = len(actions) - 1 if _ours(env) else 0
     with judged_once(env) as begin_step:
-        for index, action in enumerate(actions):
+        for index, asked in enumerate(actions):
             look = index >= blind
             begin_step()
+            action = carried_out(env, asked)
             raw, reward, _, _ = env.step(action) if control is None else control.step(action, look)
             rewards.append(float(reward))
             solved = success(env)
@@ -283,8 +284,20 @@ def renderer(session: Session) -> "Renderer":
     return session.renderer
 
 
+def holds_arm(env: Env) -> bool:
+    """Whether the environment holds the arm for the next step, so that it does not act (`RecallHeld`)."""
+    holds = getattr(env, "holds_arm", None)
+    return holds is not None and bool(holds())
+
+
+def carried_out(env: Env, action: Array) -> Array:
+    """What is done of an action: nothing while the arm is held."""
+    return np.zeros_like(action) if holds_arm(env) else action
+
+
 def step(env: Env, action: Array, control: Control | None) -> StepResult:
     """One control step, through robosuite's loop or through `control`."""
+    action = carried_out(env, action)
     with judged_once(env):
         raw, reward, _, _ = env.step(action) if control is None else control.step(action)
         solved = success(env)
