@@ -61,6 +61,15 @@ fn a_study_as_an_array_of_cells() {
     let data = "--data work/small/data/lift-3-seed1.hdf5";
     assert!(trains.starts_with("actrm-zoo train act_lift ") && trains.trim_end().ends_with(data), "{trains}");
 
+    let list = || {
+        let mut command = program("actrm-zoo");
+        let listed = command.args(["study", "small.toml", "--list"]).current_dir(folder.path()).output();
+        String::from_utf8(listed.expect("it runs").stdout).expect("text")
+    };
+    assert_eq!(list(), "act-on-lift-seed1: lift (0 of 2)\nact-on-lift-seed2: lift (0 of 2)\n");
+    fs::remove_file(folder.path().join("results").join(results[1])).expect("was there");
+    assert_eq!(list(), "act-on-lift-seed1: lift (0 of 2)\nact-on-lift-seed2: lift (not run)\n");
+
     let mut unknown = program("actrm-zoo");
     unknown.args(["study", "small.toml", "--work", "work", "--cell", "act-on-lift"]).current_dir(folder.path());
     refused(&mut unknown, &["cell `act-on-lift`", "--list"]);

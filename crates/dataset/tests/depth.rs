@@ -384,6 +384,38 @@ fn names_say_what_is_depth_and_every_demo_must_have_it() {
 }
 
 #[test]
+fn depth_needs_no_axis_for_its_channel() {
+    let dir = tempfile::tempdir().unwrap();
+    let (file, out, back) = (dir.path().join("a.hdf5"), dir.path().join("set"), dir.path().join("b.hdf5"));
+    let mut demos = three();
+    for demo in &mut demos {
+        for key in ["obs/front_depth", "next_obs/front_depth", "obs/side_depth", "obs/wrist_depth"] {
+            let shape = &mut demo.datasets.get_mut(key).unwrap().shape;
+            assert_eq!(shape.pop(), Some(1));
+        }
+        // too small for a picture
+        let table = Array::from_f32(
+            vec![demo.datasets["actions"].shape[0], 2, 3],
+            &vec![0.5; 6 * demo.datasets["actions"].shape[0]],
+        );
+        demo.datasets.insert("obs/depth_quantiles".to_owned(), table);
+    }
+    write(&file, &demos);
+    convert(&file, &out, &options(), &mut quiet).unwrap();
+    let set = Dataset::open(&out).unwrap();
+    assert_eq!(set.depth_names().collect::<Vec<_>>(), [FRONT_DEPTH, SIDE_DEPTH, WRIST_DEPTH]);
+    for (name, key) in [(FRONT_DEPTH, "front_depth"), (SIDE_DEPTH, "side_depth"), (WRIST_DEPTH, "wrist_depth")] {
+        for (episode, demo) in demos.iter().enumerate() {
+            assert!(set.depth_maps(name, episode).unwrap().data == expected(demo, &format!("obs/{key}")), "{name}");
+        }
+    }
+    sound(&out);
+    export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
+    assert!(content(&back) == content(&file));
+    assert_eq!(content(&back).1[0].datasets["obs/front_depth"].shape, [4, HEIGHT, WIDTH]);
+}
+
+#[test]
 fn an_edited_set_is_what_conversion_makes_of_the_same_demos() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);

@@ -67,16 +67,20 @@ impl DepthKind {
     }
 }
 
+/// Least height and width of depth maps whose dataset has no axis for the channel: what is smaller may be a table.
+const LEAST: usize = 8;
+
 /// Height and width of the depth maps in a dataset; `None` where it has none: they are a number a pixel, metres as floats
-/// or millimetres as uint16, under a name that says what they are.
+/// or millimetres as uint16, under a name that says what they are, with an axis for their one channel or without.
 pub(crate) fn size(path: &str, key: &KeyPlan) -> Option<(usize, usize)> {
     let name = path.strip_prefix("obs/")?.to_lowercase();
-    match key.shape[..] {
-        [rows, height, width, 1] if rows.min(height).min(width) > 0 => {
-            (name.contains("depth") && DepthKind::of(&key.dtype).is_some()).then_some((height, width))
-        }
-        _ => None,
-    }
+    let (rows, height, width, least) = match key.shape[..] {
+        [rows, height, width, 1] => (rows, height, width, 1),
+        [rows, height, width] => (rows, height, width, LEAST),
+        _ => return None,
+    };
+    let is_depth = rows > 0 && height.min(width) >= least && name.contains("depth");
+    (is_depth && DepthKind::of(&key.dtype).is_some()).then_some((height, width))
 }
 
 /// The column that LeRobot's recorder would make of depth.

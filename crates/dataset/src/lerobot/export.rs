@@ -260,7 +260,12 @@ fn picture_array(
     let feature = info.features.get(&object.name).ok_or_else(wrong)?;
     let (dtype, shape) = object.array.as_ref().map(|a| (a.dtype.clone(), a.shape.clone())).ok_or_else(wrong)?;
     let channels = if feature.is_depth() { 1 } else { 3 };
-    let &[rows, height, width, found] = shape.as_slice() else { return Err(wrong()) };
+    let (rows, height, width, found) = match *shape.as_slice() {
+        [rows, height, width, found] => (rows, height, width, found),
+        // depth may come without an axis for its channel
+        [rows, height, width] if feature.is_depth() => (rows, height, width, 1),
+        _ => return Err(wrong()),
+    };
     if rows != length || found != channels || feature.shape != [height, width, channels] {
         return Err(wrong());
     }

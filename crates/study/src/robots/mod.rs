@@ -14,4 +14,4 @@ pub use error::StudyError;
 pub use file::{Arm, CellRow, Comparison, Data, Study, Test};
 pub use page::robot_page;
 pub use result::{CellResult, EpisodeOutcome};
-pub use run::{RobotEvent, RobotStudyRequest, run_robot_study};
+pub use run::{RobotEvent, RobotStudyRequest, run_robot_study, stored_results};

@@ -124,23 +124,28 @@ pub fn run_robot_study(
     }
 }
 
-/// The tests of a cell that have no result of the settings as they are.
-fn missing_tests(request: &RobotStudyRequest, cell: &Cell) -> Result<Vec<String>, StudyError> {
-    let study = &request.study;
-    let (_, settings) = experiment(request, cell)?;
-    let mut missing = Vec::new();
-    for name in &cell.tests {
+/// The results of a cell's tests in their order, each of the settings as they are or none.
+///
+/// # Errors
+/// An experiment that `library` lacks or that its study changes to what cannot be, a result that cannot be read.
+pub fn stored_results(study: &Study, library: &Library, cell: &Cell) -> Result<Vec<Option<CellResult>>, StudyError> {
+    let (_, settings) = experiment(study, library, cell)?;
+    let stored = |name: &String| {
         let found = CellResult::read(&study.results.join(cell.file_name(name)))?;
-        let same = |result: &CellResult| {
+        Ok(found.filter(|result| {
             result.settings == settings
                 && result.data_definition == study.data[&cell.data]
                 && result.test_definition == study.tests[name]
-        };
-        if !found.is_some_and(|result| same(&result)) {
-            missing.push(name.clone());
-        }
-    }
-    Ok(missing)
+        }))
+    };
+    cell.tests.iter().map(stored).collect()
+}
+
+/// The tests of a cell that have no result of the settings as they are.
+fn missing_tests(request: &RobotStudyRequest, cell: &Cell) -> Result<Vec<String>, StudyError> {
+    let stored = stored_results(&request.study, &request.library, cell)?;
+    let missing = cell.tests.iter().zip(stored).filter(|(_, result)| result.is_none());
+    Ok(missing.map(|(name, _)| name.clone()).collect())
 }
 
 /// Writes into results that were made before operations were counted how many a query has, where the entry is still there.
@@ -148,7 +153,7 @@ fn count_operations(request: &RobotStudyRequest, cell: &Cell, missing: &[String]
     for test in cell.tests.iter().filter(|test| !missing.contains(test)) {
         let path = request.study.results.join(cell.file_name(test));
         let Some(result) = CellResult::read(&path)?.filter(|result| result.query_flops.is_none()) else { continue };
-        let (experiment, _) = experiment(request, cell)?;
+        let (experiment, _) = experiment(&request.study, &request.library, cell)?;
         let Some(entry) = request.trained(&experiment.entry, &result.settings)? else { continue };
         let query_flops = entry.load()?.model().query_flops();
         if query_flops.is_some() {
@@ -159,13 +164,13 @@ fn count_operations(request: &RobotStudyRequest, cell: &Cell, missing: &[String]
 }
 
 /// The experiment of a cell, under the name of its entry, and the hash of what it depends on.
-fn experiment(request: &RobotStudyRequest, cell: &Cell) -> Result<(Experiment, String), StudyError> {
-    let arm = &request.study.arms[&cell.arm];
+fn experiment(study: &Study, library: &Library, cell: &Cell) -> Result<(Experiment, String), StudyError> {
+    let arm = &study.arms[&cell.arm];
     let mut set = arm.set.clone();
     set.push(format!("train.seed={}", cell.seed));
-    let experiment = Experiment::load(&request.library, &request.study.experiment_on(&cell.arm, &cell.data), &set)?;
+    let experiment = Experiment::load(library, &study.experiment_on(&cell.arm, &cell.data), &set)?;
     let settings = settings_hash(&experiment);
-    let entry = match request.study.zoo {
+    let entry = match study.zoo {
         Some(_) => member_name(&experiment.entry, cell.seed),
         // another definition is another entry, so that a changed arm is trained anew
         None => run_name(cell, &settings),
@@ -274,7 +279,7 @@ impl Shared<'_> {
         if self.request.data_only {
             return Ok(CellEnd::Done);
         }
-        let (experiment, settings) = experiment(self.request, cell)?;
+        let (experiment, settings) = experiment(&self.request.study, &self.request.library, cell)?;
         let (zoo, name) = (self.request.zoo(), experiment.entry.clone());
         let run = self.request.work.join("runs").join(run_name(cell, &settings));
         let training = lock(&self.training[&cell.name()]);

@@ -1,10 +1,14 @@
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
 use cli::{INTERRUPTED, Screen, Stop, shown};
 use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, StudyRow, run_study, study_page};
-use study::robots::{CellResult, RobotEvent, RobotStudyRequest, Study, robot_page, run_robot_study};
+use study::robots::{
+    CellResult, RobotEvent, RobotStudyRequest, Study, cells, robot_page, run_robot_study, stored_results,
+};
+use zoo::config::Library;
 use zoo::run::TrainEvent;
 use zoo::write_atomic;
 
@@ -28,6 +32,7 @@ const GOES_ON: &str = "stopped; the same command goes on where it was";
   actrm-zoo study --page docs/puzzles.md
   actrm-zoo study --only trm_dfs10 --only trm_open8 --seeds 1
   actrm-zoo study --page-only --page docs/puzzles.md
+  actrm-zoo study studies/zoo.toml --list
   actrm-zoo study --list")]
 pub struct Args {
     /// Study of robot policies; its results and its page lie where it says
@@ -66,7 +71,7 @@ pub struct Args {
     /// Run nothing
     #[arg(long)]
     page_only: bool,
-    /// List the experiments of the study and end
+    /// List the experiments of the study, of robot policies its cells with their results, and end
     #[arg(long)]
     list: bool,
     #[command(flatten)]
@@ -125,8 +130,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
     let study = Study::open(file)?;
     if args.list {
-        let line = |cell: &study::robots::Cell| format!("{}: {}\n", cell.name(), cell.tests.join(", "));
-        cli::print(&study::robots::cells(&study).iter().map(line).collect::<String>())?;
+        cli::print(&listed(&study, &args.configs.library()?)?)?;
         return Ok(ExitCode::SUCCESS);
     }
     let mut whole = true;
@@ -179,15 +183,33 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// A line a cell: `k6-on-pickchain-200-seed1: chain (171 of 200), chain-2 (not run)`
+fn listed(study: &Study, library: &Library) -> anyhow::Result<String> {
+    let mut text = String::new();
+    for cell in cells(study) {
+        let results = stored_results(study, library, &cell)?;
+        let tests = cell.tests.iter().zip(results).map(|(test, result)| match result {
+            None => format!("{test} (not run)"),
+            Some(result) => format!("{test} ({} of {})", won(&result), result.episodes.len()),
+        });
+        let _ = writeln!(text, "{}: {}", cell.name(), tests.collect::<Vec<_>>().join(", "));
+    }
+    Ok(text)
+}
+
+fn won(result: &CellResult) -> usize {
+    result.episodes.iter().filter(|episode| episode.success).count()
+}
+
 /// `k6 on pickchain-200, seed 1, chain: 171 of 200, 2.9 minutes`
 fn cell_line(result: &CellResult) -> String {
-    let won = result.episodes.iter().filter(|episode| episode.success).count();
     format!(
-        "{} on {}, seed {}, {}: {won} of {}, {:.1} minutes",
+        "{} on {}, seed {}, {}: {} of {}, {:.1} minutes",
         result.arm,
         result.data,
         result.seed,
         result.test,
+        won(result),
         result.episodes.len(),
         result.training.minutes
     )
