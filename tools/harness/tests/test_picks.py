@@ -183,10 +183,12 @@ def test_recall_held_moves_nothing_while_the_goal_is_shown(compiled: bool, libra
     session.env.close()
 
 
-def test_recall_held_demonstrations_wait_for_the_arm() -> None:
+def test_recall_held_demonstrations_ask_while_the_arm_is_held() -> None:
     session = envs.make("RecallHeld")
     session.task = dataclasses.replace(session.task, max_steps=40)
     demo = episodes.expert_episode(session, 1_000_000)
-    assert not demo.tensors["actions"][:24].any() and demo.tensors["actions"][24:].any(axis=1).all()
+    assert demo.tensors["actions"][:, :6].any(axis=1).all()
+    hand = demo.tensors["obs/robot0_eef_pos"]
+    assert np.abs(hand[:25] - hand[0]).max() < 2e-3 and np.abs(hand[30] - hand[0]).max() > 5e-3
     assert demo.tensors["obs/goal_rgb"].any(axis=1).sum() == 24
     session.env.close()

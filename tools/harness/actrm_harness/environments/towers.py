@@ -161,7 +161,11 @@ class Recall(StackColor):
 
 
 class RecallHeld(Recall):
-    """Recall whose arm does not move while the goal is shown."""
+    """Recall whose arm does not move while the goal is shown.
+
+    Demonstrations say what is asked of it meanwhile, as if it moved: who waited for the arm would have to see that it
+    is free, and nothing that is seen says so but a goal that is gone.
+    """
 
     shown = HELD
 

@@ -284,15 +284,10 @@ def renderer(session: Session) -> "Renderer":
     return session.renderer
 
 
-def holds_arm(env: Env) -> bool:
-    """Whether the environment holds the arm for the next step, so that it does not act (`RecallHeld`)."""
-    holds = getattr(env, "holds_arm", None)
-    return holds is not None and bool(holds())
-
-
 def carried_out(env: Env, action: Array) -> Array:
-    """What is done of an action: nothing while the arm is held."""
-    return np.zeros_like(action) if holds_arm(env) else action
+    """What is done of an action: nothing while the environment holds the arm (`RecallHeld`)."""
+    holds = getattr(env, "holds_arm", None)
+    return np.zeros_like(action) if holds is not None and holds() else action
 
 
 def step(env: Env, action: Array, control: Control | None) -> StepResult:

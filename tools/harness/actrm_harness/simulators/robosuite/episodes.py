@@ -88,8 +88,7 @@ def expert_episode(
     mistakes: list[bool] = []
     for _ in range(session.task.max_steps):
         before = envs.state(env)
-        # nobody acts while the arm is held
-        action = np.zeros(env.action_dim) if envs.holds_arm(env) else np.clip(expert.act(), -1.0, 1.0)
+        action = np.clip(expert.act(), -1.0, 1.0)
         result = envs.step_session(session, action)
         recorder.add(before, action, result)
         if isinstance(expert, Marking):
