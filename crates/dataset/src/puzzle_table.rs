@@ -38,7 +38,7 @@ const PART: u64 = 8192;
 ///
 /// Columns: `index`, `task`, `split`, `seed`, `height`, `width`, `input` and `target` (lists of u8, row by row), `start`
 /// and `goal` (cell numbers), `distance` (steps of the shortest way), `detour` (whether it is longer than without walls)
-/// for mazes, `givens` for Sudoku. `progress` is told how many are drawn.
+/// for mazes, `givens` for Sudoku, and `guesses` where a family is told apart by them. `progress` is told how many are drawn.
 ///
 /// # Errors
 /// When the file cannot be written.
@@ -106,7 +106,7 @@ fn batch(
     fn goal(puzzle: &Puzzle) -> Option<usize> {
         matches!(puzzle, Puzzle::Maze(_)).then(|| position(puzzle, 3))?
     }
-    RecordBatch::try_from_iter_with_nullable([
+    let mut columns = vec![
         ("index", Arc::new(UInt64Array::from_iter_values(first..first + rows as u64)) as ArrayRef, false),
         ("task", same(set.task.name()), false),
         ("split", same(set.split.name()), false),
@@ -120,7 +120,12 @@ fn batch(
         ("distance", number(Puzzle::distance), true),
         ("detour", Arc::new(detours), true),
         ("givens", number(Puzzle::givens), true),
-    ])
+    ];
+    if matches!(set.task, Task::Sudoku(task) if task.is_rated()) {
+        let guesses: UInt64Array = puzzles.iter().map(Puzzle::guesses).collect();
+        columns.push(("guesses", Arc::new(guesses), true));
+    }
+    RecordBatch::try_from_iter_with_nullable(columns)
 }
 
 fn position(puzzle: &Puzzle, token: u8) -> Option<usize> {
@@ -152,7 +157,7 @@ mod tests {
     #[test]
     fn what_is_written_reads_back_and_repeats() {
         let folder = tempfile::tempdir().unwrap();
-        for name in ["open8", "maze10-original", "sudoku6"] {
+        for name in ["open8", "maze10-original", "sudoku6", "sudoku9-hard"] {
             let task = Task::by_name(name).unwrap();
             let set = PuzzleSet { task, split: Split::Valid, givens: 0, seed: 7, count: 12 };
             let path = folder.path().join(name);
@@ -172,6 +177,7 @@ mod tests {
                 assert_eq!((list(6), list(7)), (puzzle.tokens(), puzzle.answer()));
                 assert_eq!(row.get_uint(10).ok(), puzzle.distance().map(|d| d as u32), "{name}");
                 assert_eq!(row.get_uint(12).ok(), puzzle.givens().map(|g| g as u32));
+                assert_eq!(row.get_ulong(13).ok(), puzzle.guesses(), "{name}");
                 if let Puzzle::Maze(maze) = &puzzle {
                     assert_eq!(row.get_uint(8).unwrap() as usize, maze.start);
                     assert_eq!(row.get_bool(11).unwrap(), maze.has_detour());

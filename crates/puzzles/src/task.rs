@@ -177,6 +177,14 @@ impl Puzzle {
         }
     }
 
+    /// Guesses that a search needs, where puzzles are told apart by them ([`SudokuTask::is_rated`]).
+    pub fn guesses(&self) -> Option<u64> {
+        match self {
+            Self::Sudoku(task, sudoku) if task.is_rated() => Some(task.guesses(&sudoku.puzzle)),
+            Self::Maze(_) | Self::Sudoku(..) => None,
+        }
+    }
+
     /// The split that its content puts it in (original tasks are drawn without regard to it).
     pub fn split(&self) -> Split {
         Split::of(match self {

@@ -78,19 +78,15 @@ impl EffortBand {
     pub(super) fn of(puzzles: &[Puzzle], valid: impl Iterator<Item = bool>) -> Vec<Self> {
         let mut bands = Vec::new();
         for (puzzle, valid) in puzzles.iter().zip(valid) {
-            let Puzzle::Sudoku(task, sudoku) = puzzle else { continue };
-            if !task.is_rated() {
-                continue;
-            }
+            let Some(guesses) = puzzle.guesses() else { continue };
             if bands.is_empty() {
                 bands.extend(Self::FROM.map(|guesses_from| Self { guesses_from, ..Self::default() }));
             }
-            let guesses = task.guesses(&sudoku.puzzle);
             let place = Self::FROM.iter().rposition(|&from| from <= guesses).unwrap_or(0);
             let band: &mut Self = &mut bands[place];
             band.puzzles += 1;
             band.valid += u64::from(valid);
-            band.givens += sudoku.givens() as u64;
+            band.givens += puzzle.givens().unwrap_or(0) as u64;
         }
         bands
     }

@@ -119,6 +119,13 @@ const STABLE: &[StudyTest] = &[
     StudyTest { task: Some("dfs16"), depth: 64, views: VIEWS, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
     StudyTest { task: Some("dfs20"), depth: 64, views: VIEWS, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
 ];
+const LONG_DFS10: &[StudyTest] = &[
+    with_bar(Bar { right: 0.995, exact: 0.995, parameters: Some(16_000), ..BAR }),
+    StudyTest { task: Some("dfs16"), depth: 64, views: VIEWS, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
+    StudyTest { task: Some("dfs20"), depth: 64, views: VIEWS, bar: Some(Bar { right: 0.9, ..BAR }), ..PLAIN },
+    StudyTest { task: Some("dfs16"), depth: 128, ..PLAIN },
+    StudyTest { task: Some("dfs20"), depth: 128, ..PLAIN },
+];
 const OPEN8: &[StudyTest] = &[
     with_bar(Bar { right: 0.98, exact: 0.96, parameters: Some(9_922), cpu_seconds: None }),
     fresh(Bar { right: 0.98, exact: 0.96, ..BAR }),
@@ -164,7 +171,7 @@ pub const STUDY: &[StudyRow] = &[
     row("transformer_maze10-original", 1, NONE),
     row("trm_dfs10", 3, DFS10),
     row("stable-trm_dfs10", 3, STABLE),
-    row("views-trm_dfs10", 3, STABLE),
+    row("long-trm_dfs10", 3, LONG_DFS10),
     row("trm_open8", 3, OPEN8),
     row("trm_sudoku4", 3, SUDOKU4),
     row("reinforce_mlp_maze5-rl", 5, MAZE5_RL),

@@ -8,16 +8,18 @@ use std::process::ExitCode;
 ///
 /// A row has the grid as input and its answer as target (lists of numbers, row by row), start, goal and distance of a
 /// maze, givens of a Sudoku, its split and the seed. Mazes: 0 free, 1 wall, 2 start, 3 goal; target 1 on the shortest
-/// path. Sudoku: the digit, 0 where none is given. Puzzles of different splits never share a maze or a solution.
+/// path. Sudoku: the digit, 0 where none is given. sudoku9-hard are made for the effort of a search, and a row of it has the guesses
+/// that it needs. Puzzles of different splits never share a maze or a solution.
 #[derive(clap::Args)]
 #[command(
     after_help = "Tasks: maze8-original, maze10-original, maze5-rl, open8, dfs10, dfs16, dfs20, maze5-walls, sudoku4, sudoku6,
-sudoku9
+sudoku9, sudoku9-hard
 
 Examples:
   actrm-data puzzle open8 --count 10000 --seed 1 open8.parquet
   actrm-data puzzle dfs10 --count 500 --split test dfs10-test.parquet
-  actrm-data puzzle sudoku9 --count 1000 --givens 30 sudoku9.parquet"
+  actrm-data puzzle sudoku9 --count 1000 --givens 30 sudoku9.parquet
+  actrm-data puzzle sudoku9-hard --count 100 --givens 24 hard.parquet"
 )]
 pub struct Args {
     /// Family of puzzles
