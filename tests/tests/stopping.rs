@@ -42,8 +42,8 @@ fn one_signal_ends_a_program_that_starts_its_simulators() {
     let out = folder.path().join("out.hdf5");
     for (name, wait) in [("INT", 50), ("TERM", 50), ("INT", 1500)] {
         for mut command in [
-            zoo(["eval", "lift-act@1", "--episodes", "3", "--workers", "2", "--zoo", text(&entries)]),
-            data(["collect", "--task", "Lift", "--episodes", "3", "--workers", "2", "--out", text(&out)]),
+            zoo(["eval", "lift-act@1", "--episodes", "400", "--workers", "2", "--zoo", text(&entries)]),
+            data(["collect", "--task", "Lift", "--episodes", "400", "--workers", "2", "--out", text(&out)]),
         ] {
             let child = started(&mut command);
             let id = child.id();
