@@ -12,6 +12,6 @@ mod run;
 pub use cells::{Cell, cells};
 pub use error::StudyError;
 pub use file::{Arm, CellRow, Comparison, Data, Study, Test};
-pub use page::robot_page;
+pub use page::{robot_charts, robot_page};
 pub use result::{CellResult, EpisodeOutcome};
 pub use run::{RobotEvent, RobotStudyRequest, run_robot_study, stored_results};

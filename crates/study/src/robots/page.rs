@@ -1,5 +1,6 @@
 //! The page of a study: made of its committed results and of nothing else.
 
+mod charts;
 mod probes;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -9,6 +10,8 @@ use std::path::Path;
 use report::statistics::{Estimate, difference, hierarchical, holm};
 use zoo::ZooError;
 
+pub use self::charts::robot_charts;
+use self::charts::{by_arm, by_steps, shown};
 use self::probes::probes;
 use super::cells::cells;
 use super::file::{Comparison, Data, Study};
@@ -20,12 +23,12 @@ const BOOTSTRAP_SEED: u64 = 1;
 /// Results of one arm on one test, by the training's seed.
 type Trainings = BTreeMap<u64, CellResult>;
 
-/// The page of `study` from the results in its folder, as Markdown.
-///
-/// # Errors
-/// A result that cannot be read.
-pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
-    let mut results: BTreeMap<(String, String, String), Trainings> = BTreeMap::new();
+/// What there is of a study, by test, demonstrations and arm.
+type Results = BTreeMap<(String, String, String), Trainings>;
+
+/// What there is in the folder of `study`, and what is not, by stage.
+fn read_results(study: &Study) -> Result<(Results, BTreeMap<u8, Vec<String>>), ZooError> {
+    let mut results = Results::new();
     let mut missing: BTreeMap<u8, Vec<String>> = BTreeMap::new();
     for cell in cells(study) {
         for test in &cell.tests {
@@ -38,6 +41,16 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
             }
         }
     }
+    Ok((results, missing))
+}
+
+/// The page of `study` from the results in its folder, as Markdown.
+///
+/// # Errors
+/// A result that cannot be read.
+pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
+    let (results, missing) = read_results(study)?;
+    let charts = by_arm(study, &results);
     let mut text = format!("# {}\n\n", study.title);
     let _ = writeln!(
         text,
@@ -74,6 +87,9 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
                 test.episodes
             );
             table(&mut text, study, &of_test);
+            for (_, chart) in charts.iter().filter(|((test, of), _)| test == name && of == data) {
+                let _ = writeln!(text, "{}", shown(study, chart));
+            }
         }
     }
     for (stage, title) in [(1, "Comparisons"), (2, "Further comparisons, planned later")] {
@@ -115,7 +131,7 @@ fn one_level_down(page: &str) -> String {
 }
 
 /// Arms against demonstrations, where an arm was meant for several: success on the first test of each.
-fn overview(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
+fn overview(text: &mut String, study: &Study, results: &Results) {
     let mut columns: Vec<(&str, &str)> = Vec::new();
     let mut rows: Vec<&str> = Vec::new();
     let mut planned: BTreeMap<(&str, &str), u64> = BTreeMap::new();
@@ -237,7 +253,7 @@ fn mean_progress(trainings: &Trainings) -> Option<f64> {
 type Otherwise<'a> = (&'a str, String, &'a Trainings);
 
 /// What the same weights do where they think otherwise than they were trained to.
-fn thinking_otherwise(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
+fn thinking_otherwise(text: &mut String, study: &Study, results: &Results) {
     let mut rows: BTreeMap<(&str, &str), Vec<Otherwise<'_>>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results {
         let definition = &study.tests[test];
@@ -284,6 +300,9 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &BTreeMap<(Stri
             );
         }
         text.push('\n');
+        for (_, chart) in by_steps(study, results).iter().filter(|((of, its), _)| of == task && its == data) {
+            let _ = writeln!(text, "{}", shown(study, chart));
+        }
     }
 }
 
@@ -292,7 +311,7 @@ type Changed<'a> = Vec<(&'a str, &'a Trainings)>;
 
 /// What policies lose where their pictures are changed on the way to them: success on the plain test, then on each of the
 /// others of the same task and demonstrations.
-fn pictures_changed(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
+fn pictures_changed(text: &mut String, study: &Study, results: &Results) {
     let mut tables: BTreeMap<&str, BTreeMap<&str, Changed<'_>>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results {
         if let Some(perturb) = &study.tests[test].perturb {
@@ -355,12 +374,7 @@ fn percent(estimate: &Estimate) -> String {
     format!("{:.1}% [{:.0}-{:.0}]", 100.0 * value, 100.0 * low, 100.0 * high)
 }
 
-fn comparisons(
-    text: &mut String,
-    study: &Study,
-    results: &BTreeMap<(String, String, String), Trainings>,
-    (stage, title): (u8, &str),
-) {
+fn comparisons(text: &mut String, study: &Study, results: &Results, (stage, title): (u8, &str)) {
     let of_stage: Vec<&Comparison> = study.comparisons.iter().filter(|c| c.stage == stage).collect();
     if of_stage.is_empty() {
         return;
@@ -422,7 +436,7 @@ fn p_text(p: f64) -> String {
     if p < 0.001 { "< 0.001".to_owned() } else { format!("{p:.3}") }
 }
 
-fn costs(text: &mut String, study: &Study, results: &BTreeMap<(String, String, String), Trainings>) {
+fn costs(text: &mut String, study: &Study, results: &Results) {
     let _ = writeln!(
         text,
         "## What each costs\n\nMedians over all trainings of an arm; minutes are of a machine that did other work beside. MFLOP: \
@@ -446,12 +460,7 @@ fn costs(text: &mut String, study: &Study, results: &BTreeMap<(String, String, S
 }
 
 /// The row of an arm, on some demonstrations or on all.
-fn cost(
-    text: &mut String,
-    study: &Study,
-    results: &BTreeMap<(String, String, String), Trainings>,
-    (name, data): (&String, Option<&str>),
-) {
+fn cost(text: &mut String, study: &Study, results: &Results, (name, data): (&String, Option<&str>)) {
     let arm = &study.arms[name];
     let experiment = data.map_or_else(|| arm.experiment.clone(), |data| study.experiment_on(name, data));
     let settings: Vec<String> = arm.set.iter().map(|s| format!("`{s}`")).collect();

@@ -6,7 +6,7 @@ use anyhow::Context;
 use cli::{INTERRUPTED, Screen, Stop, shown};
 use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, StudyRow, run_study, study_page};
 use study::robots::{
-    CellResult, RobotEvent, RobotStudyRequest, Study, cells, robot_page, run_robot_study, stored_results,
+    CellResult, RobotEvent, RobotStudyRequest, Study, cells, robot_charts, robot_page, run_robot_study, stored_results,
 };
 use zoo::config::Library;
 use zoo::run::TrainEvent;
@@ -172,6 +172,9 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
     if args.cells.is_empty() && !args.data_only {
         if let Some(folder) = study.page.parent() {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", shown(folder)))?;
+        }
+        for (path, drawing) in robot_charts(&study)? {
+            write_atomic(&path, drawing.as_bytes())?;
         }
         write_atomic(&study.page, robot_page(&study, file)?.as_bytes())?;
         cli::print(&(shown(&study.page) + "\n"))?;
