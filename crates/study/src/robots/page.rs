@@ -667,6 +667,31 @@ mod tests {
     }
 
     #[test]
+    fn charts_are_drawn_where_there_are_groups_enough_and_shown_where_they_lie() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
+        let study = Study::open(&file).unwrap();
+        let write = |groups: usize| {
+            for cell in cells(&study).iter().filter(|cell| cell.stage == 1) {
+                let mut result = result(&study, cell, "t", [true, cell.arm == "six", true, false]);
+                for (i, episode) in result.episodes.iter_mut().enumerate() {
+                    episode.group = Some(format!("{} hops", i.min(groups - 1)));
+                }
+                result.write(&folder.path().join(cell.file_name("t"))).unwrap();
+            }
+            (robot_charts(&study).unwrap(), robot_page(&study, &file).unwrap())
+        };
+        let (charts, page) = write(3);
+        assert!(charts.is_empty() && !page.contains("!["), "{page}");
+        let (charts, page) = write(4);
+        let [(path, drawing)] = charts.as_slice() else { panic!("{} charts", charts.len()) };
+        assert_eq!(path, &folder.path().join("t_chain_by-arm.svg"));
+        assert!(page.contains("t_chain_by-arm.svg)\n"), "{page}");
+        assert!(drawing.contains(">six steps (2)</text>") && drawing.contains(">one step (2)</text>"), "{drawing}");
+    }
+
+    #[test]
     fn what_changed_pictures_cost_stands_beside_what_is_drawn_and_nowhere_else() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("study.toml");
