@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use puzzles::Task;
 use report::csv;
 use study::puzzle::{
-    AnyExperiment, Baseline, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest,
+    AnyExperiment, Baseline, Judge, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest,
     RECORD_FILE, SolverEntry, Starts, TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again,
     list_puzzle_evaluations, trace, train_puzzles,
 };
@@ -52,6 +52,7 @@ fn evaluated(entry: &Entry, root: &Path, puzzles: u64) -> PuzzleEvaluation {
         seed: TEST_SEED,
         starts: Starts::ONE,
         views: 1,
+        judge: Judge::Halting,
     };
     evaluate_puzzles(&SolverEntry::load(entry, None).unwrap(), &root.join("zoo/results"), &options).unwrap().record
 }
@@ -69,6 +70,7 @@ fn answers_are_the_same_again_and_a_fresh_stream_is_another_evaluation() {
         seed: TEST_SEED,
         starts: Starts::ONE,
         views: 1,
+        judge: Judge::Halting,
     };
     let error = evaluate_puzzles_again(&solver, &results, &options).unwrap_err().to_string();
     assert!(error.contains("nothing to run again"), "{error}");
@@ -117,19 +119,19 @@ fn walkers_learn_the_studys_maze_by_every_algorithm() {
 
 /// As `short`, with up to 16 supervision steps.
 fn learned(name: &str, overrides: &[&str]) -> PuzzleEvaluation {
-    let plain = (TEST_SEED, Starts::ONE, 1);
+    let plain = (TEST_SEED, Starts::ONE, 1, Judge::Halting);
     learned_and_asked(name, overrides, &[plain]).remove(0)
 }
 
 /// The same with an evaluation for each seed of test puzzles, number of starts and of views.
-fn learned_and_asked(name: &str, overrides: &[&str], asked: &[(u64, Starts, u64)]) -> Vec<PuzzleEvaluation> {
+fn learned_and_asked(name: &str, overrides: &[&str], asked: &[(u64, Starts, u64, Judge)]) -> Vec<PuzzleEvaluation> {
     let root = tempfile::tempdir().unwrap();
     let mut all = vec!["train.validate_every=1000000", "task.valid_puzzles=5"];
     all.extend(overrides);
     let entry = SolverEntry::load(&finish(&request(root.path(), name, &all)), None).unwrap();
-    let evaluate = |&(seed, starts, views): &(u64, Starts, u64)| {
+    let evaluate = |&(seed, starts, views, judge): &(u64, Starts, u64, Judge)| {
         let options =
-            PuzzleEvaluationOptions { task: None, givens: None, puzzles: 200, depth: 16, seed, starts, views };
+            PuzzleEvaluationOptions { task: None, givens: None, puzzles: 200, depth: 16, seed, starts, views, judge };
         evaluate_puzzles(&entry, &root.path().join("zoo/results"), &options).unwrap().record
     };
     asked.iter().map(evaluate).collect()
@@ -139,9 +141,10 @@ fn learned_and_asked(name: &str, overrides: &[&str], asked: &[(u64, Starts, u64)
 fn a_short_training_finds_ways_through_perfect_mazes_it_has_not_seen() {
     let short = ["train.steps=1700", "train.batch_size=16", "model.hidden_size=24", "model.inner_size=48"];
     let starts = |most: u64| Starts { most, noise: 1.0 };
-    let once = (TEST_SEED, Starts::ONE, 1);
-    let often = (TEST_SEED, starts(3), 1);
-    let asked = [once, often, often, (7, Starts::ONE, 1), (TEST_SEED, Starts::ONE, 8)];
+    let once = (TEST_SEED, Starts::ONE, 1, Judge::Halting);
+    let often = (TEST_SEED, starts(3), 1, Judge::Halting);
+    let seen = |judge: Judge| (TEST_SEED, Starts::ONE, 8, judge);
+    let asked = [once, often, often, (7, Starts::ONE, 1, Judge::Halting), seen(Judge::Halting), seen(Judge::Cells)];
     let results = learned_and_asked("trm_dfs10", &short, &asked);
     let result = &results[0];
     // more starts take more steps where a thought does not settle, the same ones every time; a network trained so briefly,
@@ -157,6 +160,9 @@ fn a_short_training_finds_ways_through_perfect_mazes_it_has_not_seen() {
     // mazes have walls of two cells to the right and below, in a mirror to the left or above; every view takes its steps
     assert!(results[4].answers.exact > 80 && results[4].answers != result.answers, "{:?}", results[4].answers);
     assert!(results[4].steps > 6 * result.steps && results[4].by_depth == result.by_depth, "{}", results[4].steps);
+    // the same views thought about in the same steps, their answers weighed otherwise
+    assert_eq!((results[5].judge, results[5].steps), (Judge::Cells, results[4].steps));
+    assert!(results[5].answers.exact > 80 && results[5].answers != results[4].answers, "{:?}", results[5].answers);
     // along the row and then along the column is the way in a quarter of them
     assert!(result.baselines.values().all(|counts| counts.exact < 70), "{:?}", result.baselines);
     assert!(result.answers.exact > 90, "{:?}", result.answers);

@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use anyhow::bail;
-use clap::Args;
+use clap::{Args, ValueEnum};
 use puzzles::Task;
 use report::wilson_interval;
 use serde_json::{Value, json};
 use study::puzzle::{
-    EvaluatedPuzzles, MOST_VIEWS, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, Starts, TEST_SEED,
+    EvaluatedPuzzles, Judge, MOST_VIEWS, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, Starts, TEST_SEED,
     evaluate_puzzles, evaluate_puzzles_again,
 };
 use zoo::entry::Entry;
@@ -32,10 +32,29 @@ pub struct PuzzleArgs {
     #[arg(long, value_name = "STD", default_value_t = 1.0, requires = "starts")]
     noise: f64,
     /// From how many sides a puzzle is seen, turned or in a mirror, a Sudoku with its digits renamed: each view's answer
-    /// has as many votes as the halting head gives it probability
+    /// has as many votes as the judge gives it probability
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST_VIEWS))]
     #[arg(conflicts_with = "starts")]
     views: u64,
+    /// Who weighs the views' answers: the halting head, or the probabilities of their cells
+    #[arg(long, value_name = "JUDGE", default_value = "halting", requires = "views")]
+    judge: JudgeArg,
+}
+
+/// Who weighs the answers of several views, on the command line.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum JudgeArg {
+    Halting,
+    Cells,
+}
+
+impl From<JudgeArg> for Judge {
+    fn from(judge: JudgeArg) -> Self {
+        match judge {
+            JudgeArg::Halting => Self::Halting,
+            JudgeArg::Cells => Self::Cells,
+        }
+    }
 }
 
 /// The family of that name, or an error that lists them.
@@ -72,6 +91,7 @@ pub fn evaluate_solver(
         seed: seed.unwrap_or(TEST_SEED),
         starts: if args.starts == 1 { Starts::ONE } else { Starts { most: args.starts, noise: args.noise } },
         views: args.views,
+        judge: args.judge.into(),
     };
     if again {
         let puzzles = evaluate_puzzles_again(&solver, results, &options)?.record.answers.puzzles;

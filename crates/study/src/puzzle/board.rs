@@ -8,7 +8,7 @@ use report::column::{Column, count, number, text};
 use report::html::{self, escape};
 use report::{count_text, wilson_interval};
 
-use super::evaluation::{PuzzleEvaluation, Starts, TEST_SEED};
+use super::evaluation::{Judge, PuzzleEvaluation, Starts, TEST_SEED};
 use super::grade::Counts;
 
 /// Best first inside each task; ties by what does not change.
@@ -47,6 +47,9 @@ fn task_text(row: &PuzzleEvaluation) -> String {
     }
     if row.views != 1 {
         text.push_str(&format!(", {} views", row.views));
+    }
+    if row.judge == Judge::Cells {
+        text.push_str(" weighed by cells");
     }
     text
 }
@@ -231,6 +234,7 @@ mod tests {
             depth: 16,
             starts: Starts::ONE,
             views: 1,
+            judge: Judge::Halting,
             answers: counts(valid),
             steps: 500,
             sampled: None,

@@ -59,8 +59,29 @@ pub struct PuzzleEvaluationOptions {
     /// How often a thought about a puzzle may begin.
     pub starts: Starts,
     /// From how many sides a puzzle is seen: turned or in a mirror, a Sudoku with its digits renamed; up to
-    /// [`MOST_VIEWS`]. Each view's answer has as many votes as the halting head gives it probability.
+    /// [`MOST_VIEWS`]. Each view's answer has as many votes as `judge` gives it.
     pub views: u64,
+    /// Who weighs the answers of several views.
+    pub judge: Judge,
+}
+
+/// Who says how many votes a view's answer has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Judge {
+    /// The halting head: its probability that the answer is right.
+    #[default]
+    Halting,
+    /// The answer itself: the product of the probabilities that its cells have. One cell in doubt is seen, where the halting
+    /// head's mean over many cells hides it.
+    Cells,
+}
+
+impl Judge {
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands over a reference")]
+    fn is_halting(&self) -> bool {
+        *self == Self::Halting
+    }
 }
 
 /// How often a thought about a puzzle may begin: once as the solver was trained, and where it does not settle, again from
@@ -82,14 +103,16 @@ pub(super) struct Looks {
     /// How often it may begin.
     pub(super) starts: Starts,
     /// From how many sides a puzzle is seen: turned or in a mirror, a Sudoku with its digits renamed. Every view is thought
-    /// about to its end, and each answer has as many votes as the halting head gives it probability.
+    /// about to its end.
     pub(super) views: u64,
+    /// Who weighs their answers.
+    pub(super) judge: Judge,
 }
 
 impl Looks {
     /// Once, as it is.
     pub(super) fn once(most: usize) -> Self {
-        Self { most, starts: Starts::ONE, views: 1 }
+        Self { most, starts: Starts::ONE, views: 1, judge: Judge::Halting }
     }
 }
 
@@ -145,6 +168,9 @@ pub struct PuzzleEvaluation {
     /// From how many sides it saw every puzzle.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub views: u64,
+    /// Who weighed the answers of its views.
+    #[serde(default, skip_serializing_if = "Judge::is_halting")]
+    pub judge: Judge,
     /// Its answers: once its halting head is sure of one that stays the same, or after the last step.
     pub answers: Counts,
     /// Supervision steps that these took, or moves of a walker, together.
@@ -176,10 +202,11 @@ impl PuzzleEvaluation {
     /// The name of its folder: readable, and different for anything that could change an answer.
     pub fn folder_name(&self) -> String {
         let whole = (&self.entry, &self.task, self.givens, self.seed, self.depth, self.answers.puzzles);
-        let text = match (self.starts.is_one(), self.views) {
-            (true, 1) => serde_json::to_vec(&whole),
-            (false, 1) => serde_json::to_vec(&(whole, self.starts)),
-            (_, views) => serde_json::to_vec(&(whole, self.starts, views)),
+        let text = match (self.starts.is_one(), self.views, self.judge) {
+            (true, 1, _) => serde_json::to_vec(&whole),
+            (false, 1, _) => serde_json::to_vec(&(whole, self.starts)),
+            (_, views, Judge::Halting) => serde_json::to_vec(&(whole, self.starts, views)),
+            (_, views, judge) => serde_json::to_vec(&(whole, self.starts, views, judge)),
         };
         let hash = sha256_hex(&text.expect("plain fields are always JSON"));
         format!("{}_{}_test-{}_{}", self.entry, self.task, self.answers.puzzles, &hash[..8])
@@ -255,9 +282,12 @@ impl Kept {
         Self { thought: thoughts[at][place].clone(), steps: at + 1, settled: found.is_some() }
     }
 
-    /// What it says for its answer: the halting head's probability, or next to nothing if the answer still changes.
-    fn vote(&self) -> f32 {
-        let sure = self.thought.halt.unwrap_or(1.0);
+    /// What it says for its answer: the probability that the judge gives it, or next to nothing if the answer still changes.
+    fn vote(&self, judge: Judge) -> f32 {
+        let sure = match judge {
+            Judge::Halting => self.thought.halt.unwrap_or(1.0),
+            Judge::Cells => self.thought.confidence.iter().map(|sure| sure.ln()).sum::<f32>().exp(),
+        };
         if self.settled { sure } else { sure * UNSETTLED }
     }
 
@@ -272,10 +302,11 @@ impl Kept {
 }
 
 /// The answer that most of the votes are for, the first of equals, with the steps of all.
-fn elected(views: Vec<Kept>) -> Kept {
+fn elected(views: Vec<Kept>, judge: Judge) -> Kept {
     let steps = views.iter().map(|view| view.steps).sum();
-    let votes_for =
-        |answer: &[u8]| -> f32 { views.iter().filter(|view| view.thought.answer == answer).map(Kept::vote).sum() };
+    let votes_for = |answer: &[u8]| -> f32 {
+        views.iter().filter(|view| view.thought.answer == answer).map(|view| view.vote(judge)).sum()
+    };
     let votes: Vec<f32> = views.iter().map(|view| votes_for(&view.thought.answer)).collect();
     let best = (0..views.len()).fold(0, |best, at| if votes[at] > votes[best] { at } else { best });
     let settled = views.iter().any(|view| view.settled && view.thought.answer == views[best].thought.answer);
@@ -289,7 +320,7 @@ pub(super) fn graded(
     depths: &[usize],
     looks: Looks,
 ) -> Result<Graded, ModelError> {
-    let Looks { most, starts, views } = looks;
+    let Looks { most, starts, views, judge } = looks;
     let mut graded = Graded {
         by_depth: BTreeMap::new(),
         halting: Counts::default(),
@@ -326,7 +357,7 @@ pub(super) fn graded(
             let thoughts = solver.think_from(batch, most, &Start::Seen { number, puzzles: &numbers })?;
             seen.iter_mut().enumerate().for_each(|(place, views)| views.push(Kept::of(&thoughts, place)));
         }
-        kept.extend(seen.into_iter().map(elected));
+        kept.extend(seen.into_iter().map(|views| elected(views, judge)));
     }
     for number in 1..starts.most {
         let open: Vec<usize> = (0..kept.len()).filter(|&i| !kept[i].settled).collect();
@@ -375,6 +406,7 @@ fn plan(entry: &SolverEntry, options: &PuzzleEvaluationOptions) -> Result<(Task,
         seed: options.seed,
         starts: if entry.solver().is_recursive() { options.starts } else { Starts::ONE },
         views: if entry.solver().is_recursive() { options.views } else { 1 },
+        judge: if entry.solver().is_recursive() && options.views > 1 { options.judge } else { Judge::Halting },
         depth: if entry.solver().is_recursive() { options.depth } else { 0 },
         answers: Counts { puzzles: options.puzzles, ..Counts::default() },
         steps: 0,
@@ -399,7 +431,7 @@ fn run(
         (0..options.puzzles).map(|index| task.numbered(Split::Test, givens, seed, index)).collect();
     let name = record.entry.to_string();
     let failed = |source| ZooError::Model { operation: "evaluate", name: name.clone(), source };
-    let looks = Looks { most: options.depth, starts: record.starts, views: record.views };
+    let looks = Looks { most: options.depth, starts: record.starts, views: record.views, judge: record.judge };
     let graded = graded(entry.solver(), &puzzles, &DEPTHS, looks).map_err(failed)?;
     record.baselines = match entry.solver() {
         Solver::Walker { .. } => Baseline::of_walkers(&puzzles),
@@ -598,12 +630,31 @@ mod tests {
     #[test]
     fn views_elect_the_answer_that_the_halting_head_believes_most() {
         let answer = |views: Vec<Kept>| {
-            let kept = elected(views);
+            let kept = elected(views, Judge::Halting);
             (kept.thought.answer[0], kept.settled, kept.steps)
         };
         assert_eq!(answer(vec![kept(1, 0.9, true), kept(2, 0.8, true), kept(2, 0.6, true)]), (2, true, 9));
         assert_eq!(answer(vec![kept(1, 0.6, true), kept(2, 0.9, false), kept(2, 0.9, false)]), (1, true, 9));
         assert_eq!(answer(vec![kept(1, 0.2, false), kept(2, 0.3, false)]), (2, false, 6));
         assert_eq!(answer(vec![kept(1, 0.7, true), kept(2, 0.7, true)]), (1, true, 6), "the first of equals");
+    }
+
+    #[test]
+    fn views_elect_the_answer_whose_cells_are_surest_where_these_are_the_judge() {
+        let kept = |answer: u8, cells: &[f32], settled: bool| {
+            let mut kept = kept(answer, 0.5, settled);
+            kept.thought.confidence = cells.to_vec();
+            kept
+        };
+        let answer = |views: Vec<Kept>| elected(views, Judge::Cells).thought.answer[0];
+        // one cell in doubt among many sure ones weighs more than all cells somewhat less sure
+        let doubt = [1.0, 1.0, 1.0, 0.6];
+        assert_eq!(answer(vec![kept(1, &doubt, true), kept(2, &[0.95; 4], true)]), 2);
+        assert_eq!(answer(vec![kept(1, &doubt, true), kept(2, &[0.95; 4], true), kept(1, &doubt, true)]), 1);
+        assert_eq!(
+            answer(vec![kept(1, &doubt, true), kept(2, &[0.95; 4], false)]),
+            1,
+            "what still changes hardly counts"
+        );
     }
 }

@@ -151,6 +151,10 @@ pub struct LearningSection {
     /// found from anywhere: stable fixed points (TRM).
     #[serde(skip_serializing_if = "is_zero")]
     pub disturbed: f64,
+    /// Standard deviation of the normal noise that is added to all states after every step of training, so that they say
+    /// things that survive it (TRM).
+    #[serde(skip_serializing_if = "is_zero")]
+    pub state_noise: f64,
 }
 
 fn is_zero(value: &f64) -> bool {
@@ -159,7 +163,13 @@ fn is_zero(value: &f64) -> bool {
 
 impl Default for LearningSection {
     fn default() -> Self {
-        Self { probability: ClassProbability::Softmax, halt_weight: 0.1, release_solved: None, disturbed: 0.0 }
+        Self {
+            probability: ClassProbability::Softmax,
+            halt_weight: 0.1,
+            release_solved: None,
+            disturbed: 0.0,
+            state_noise: 0.0,
+        }
     }
 }
 
@@ -171,6 +181,7 @@ impl LearningSection {
             halt_weight: self.halt_weight,
             release: self.release_solved.map_or(Release::Head, Release::Solved),
             disturbed: self.disturbed,
+            state_noise: self.state_noise,
             ..PuzzleConfig::default()
         }
     }
@@ -275,7 +286,14 @@ impl PuzzleExperiment {
         if self.train.accumulation != 1 {
             return invalid("train.accumulation", "1 for puzzles".to_owned(), self.train.accumulation.to_string());
         }
-        let LearningSection { release_solved, disturbed, .. } = self.learning;
+        let LearningSection { release_solved, disturbed, state_noise, .. } = self.learning;
+        if !(state_noise >= 0.0 && state_noise.is_finite()) {
+            return invalid(
+                "learning.state_noise",
+                "a standard deviation from 0 on".to_owned(),
+                state_noise.to_string(),
+            );
+        }
         for (key, p) in [("learning.release_solved", release_solved), ("learning.disturbed", Some(disturbed))] {
             if let Some(p) = p
                 && !(0.0..=1.0).contains(&p)

@@ -25,8 +25,8 @@ pub use board::{PUZZLE_COLUMNS, puzzle_section, rank_puzzles};
 pub use cpu::cpu_seconds;
 pub use entry::{ProgressPoint, PuzzleMeta, SOLVER, SolverEntry};
 pub use evaluation::{
-    DEPTHS, EvaluatedPuzzles, MOST_VIEWS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, Starts, TEST_SEED,
-    audit_puzzles, evaluate_puzzles, evaluate_puzzles_again, list_puzzle_evaluations,
+    DEPTHS, EvaluatedPuzzles, Judge, MOST_VIEWS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, Starts,
+    TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again, list_puzzle_evaluations,
 };
 pub use experiment::{AnyExperiment, LearningSection, PuzzleExperiment, PuzzleTask};
 pub use grade::{Baseline, Counts, EffortBand};

@@ -15,7 +15,7 @@ use zoo::run::{TrainEvent, TrainOutcome};
 use zoo::{ZooError, sha256_hex};
 
 use super::entry::SolverEntry;
-use super::evaluation::{PuzzleEvaluation, PuzzleEvaluationOptions, Starts, TEST_SEED, evaluate_puzzles};
+use super::evaluation::{Judge, PuzzleEvaluation, PuzzleEvaluationOptions, Starts, TEST_SEED, evaluate_puzzles};
 use super::experiment::{AnyExperiment, PuzzleExperiment};
 use super::training::{PuzzleTrainRequest, train_puzzles};
 
@@ -37,6 +37,8 @@ pub struct StudyTest {
     pub starts: Starts,
     /// From how many sides a puzzle is seen.
     pub views: u64,
+    /// Who weighs what was seen from several.
+    pub judge: Judge,
     /// What it should reach.
     pub bar: Option<Bar>,
 }
@@ -65,10 +67,20 @@ pub struct StudyRow {
     pub tests: &'static [StudyTest],
 }
 
-const PLAIN: StudyTest =
-    StudyTest { task: None, givens: None, depth: 16, seed: TEST_SEED, starts: Starts::ONE, views: 1, bar: None };
+const PLAIN: StudyTest = StudyTest {
+    task: None,
+    givens: None,
+    depth: 16,
+    seed: TEST_SEED,
+    starts: Starts::ONE,
+    views: 1,
+    judge: Judge::Halting,
+    bar: None,
+};
 /// Puzzles that were not looked at when settings were chosen and changed.
 const FRESH: u64 = 21_000;
+/// The same once more: `noisy-trm_dfs10` was trained for a shorter time after its answers to those above had been counted.
+const FRESHER: u64 = 23_000;
 /// As often as a thought that does not settle may begin anew, and from how much noise.
 const STARTS: Starts = Starts { most: 8, noise: 1.0 };
 /// All the sides of a square.
@@ -126,6 +138,16 @@ const LONG_DFS10: &[StudyTest] = &[
     StudyTest { task: Some("dfs16"), depth: 128, ..PLAIN },
     StudyTest { task: Some("dfs20"), depth: 128, ..PLAIN },
 ];
+/// Fresh mazes of another size, from all sides, the answers weighed by the probabilities of their cells.
+const fn weighed(task: &'static str) -> StudyTest {
+    let bar = Some(Bar { right: 0.9, ..BAR });
+    StudyTest { task: Some(task), depth: 64, seed: FRESHER, views: VIEWS, judge: Judge::Cells, bar, ..PLAIN }
+}
+const NOISY_DFS10: &[StudyTest] = &[
+    with_bar(Bar { right: 0.995, exact: 0.995, parameters: Some(16_000), ..BAR }),
+    weighed("dfs16"),
+    weighed("dfs20"),
+];
 const OPEN8: &[StudyTest] = &[
     with_bar(Bar { right: 0.98, exact: 0.96, parameters: Some(9_922), cpu_seconds: None }),
     fresh(Bar { right: 0.98, exact: 0.96, ..BAR }),
@@ -172,6 +194,7 @@ pub const STUDY: &[StudyRow] = &[
     row("trm_dfs10", 3, DFS10),
     row("stable-trm_dfs10", 3, STABLE),
     row("long-trm_dfs10", 3, LONG_DFS10),
+    row("noisy-trm_dfs10", 3, NOISY_DFS10),
     row("trm_open8", 3, OPEN8),
     row("trm_sudoku4", 3, SUDOKU4),
     row("reinforce_mlp_maze5-rl", 5, MAZE5_RL),
@@ -209,7 +232,8 @@ impl StudyTest {
         let depth = if self.depth > 32 { format!("_depth-{}", self.depth) } else { String::new() };
         let starts = if self.starts == Starts::ONE { String::new() } else { format!("_{}-starts", self.starts.most) };
         let views = if self.views == 1 { String::new() } else { format!("_{}-views", self.views) };
-        format!("{experiment}_seed-{seed}{other}{givens}{fresh}{depth}{starts}{views}.json")
+        let judge = if self.judge == Judge::Halting { "" } else { "_judged-by-cells" };
+        format!("{experiment}_seed-{seed}{other}{givens}{fresh}{depth}{starts}{views}{judge}.json")
     }
 
     /// Whether it is of puzzles that are told apart by the effort of a search.
@@ -352,8 +376,8 @@ fn run_row(
 }
 
 fn evaluate(entry: &Entry, task: Option<Task>, test: &StudyTest, results: &Path) -> Result<PuzzleEvaluation, ZooError> {
-    let StudyTest { givens, depth, seed, starts, views, .. } = *test;
-    let options = PuzzleEvaluationOptions { task, givens, puzzles: STUDY_PUZZLES, depth, seed, starts, views };
+    let StudyTest { givens, depth, seed, starts, views, judge, .. } = *test;
+    let options = PuzzleEvaluationOptions { task, givens, puzzles: STUDY_PUZZLES, depth, seed, starts, views, judge };
     Ok(evaluate_puzzles(&SolverEntry::load(entry, task)?, results, &options)?.record)
 }
 

@@ -192,4 +192,19 @@ impl Slots {
         self.carry = Carry { z_h: z_h?, z_l: z_l? };
         Ok(())
     }
+
+    /// Adds normal noise of standard deviation `deviation` to both states of every puzzle (the root mean square of a
+    /// cell's state is one). What is a matter of degree, such as how far something is, is lost in it from step to step;
+    /// what is one thing or the other can be restored, over any distance.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    pub(super) fn blur(&mut self, deviation: f64, rng: &mut Rng) -> Result<()> {
+        let mut blurred = |state: &Tensor| -> Result<Tensor> {
+            let noise = Tensor::from_vec(rng.normals(state.elem_count()), state.shape(), &HERE)?;
+            Ok((state + (noise * deviation)?)?)
+        };
+        self.carry = Carry { z_h: blurred(&self.carry.z_h)?, z_l: blurred(&self.carry.z_l)? };
+        Ok(())
+    }
 }

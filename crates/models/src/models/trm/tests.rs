@@ -144,10 +144,18 @@ fn examples(config: &Config, count: usize, seed: u64) -> Vec<Example> {
 }
 
 fn trainer(config: &Config, release: Release) -> Trainer {
-    disturbed_trainer(config, release, 0.0)
+    trainer_with(config, learning(release))
 }
 
 fn disturbed_trainer(config: &Config, release: Release, disturbed: f64) -> Trainer {
+    trainer_with(config, PuzzleConfig { disturbed, ..learning(release) })
+}
+
+fn learning(release: Release) -> PuzzleConfig {
+    PuzzleConfig { batch_size: 8, release, ..PuzzleConfig::default() }
+}
+
+fn trainer_with(config: &Config, puzzles: PuzzleConfig) -> Trainer {
     let train = TrainConfig {
         steps: 400,
         lr: 1e-2,
@@ -157,7 +165,6 @@ fn disturbed_trainer(config: &Config, release: Release, disturbed: f64) -> Train
         ema_decay: Some(0.9),
         ..TrainConfig::default()
     };
-    let puzzles = PuzzleConfig { batch_size: 8, release, disturbed, ..PuzzleConfig::default() };
     Trainer::new(Trm::new(config.clone(), 2).unwrap(), train, puzzles, 4).unwrap()
 }
 
@@ -225,6 +232,23 @@ fn disturbed_puzzles_go_on_from_noise_or_from_another_puzzles_states() {
 }
 
 #[test]
+fn states_are_blurred_by_as_much_noise_as_was_asked_for() {
+    let config = Config { halt_max_steps: 50, ..configs()[0].clone() };
+    let stepped = |state_noise: f64| {
+        let mut trainer = trainer_with(&config, PuzzleConfig { state_noise, ..learning(Release::Solved(0.0)) });
+        let wanted = trainer.wanted();
+        trainer.step(&examples(&config, wanted, 1)).unwrap();
+        let Carry { z_h, z_l } = trainer.slots().carry().clone();
+        Tensor::cat(&[z_h, z_l], 0).unwrap()
+    };
+    let off = (stepped(0.5) - stepped(0.0)).unwrap();
+    let deviation = off.sqr().unwrap().mean_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
+    assert!((0.45..0.55).contains(&deviation), "{deviation}");
+    let mean = off.mean_all().unwrap().to_scalar::<f32>().unwrap();
+    assert!(mean.abs() < 0.06, "{mean}");
+}
+
+#[test]
 fn a_restored_trainer_goes_on_with_the_same_bits() {
     let config = Config { halt_max_steps: 3, ..configs()[5].clone() };
     let run = |trainer: &mut Trainer, from: u64, to: u64| {
@@ -233,11 +257,12 @@ fn a_restored_trainer_goes_on_with_the_same_bits() {
             trainer.step(&examples(&config, wanted, step)).unwrap();
         }
     };
-    let mut one = disturbed_trainer(&config, Release::Solved(0.5), 0.3);
+    let noisy = PuzzleConfig { disturbed: 0.3, state_noise: 0.1, ..learning(Release::Solved(0.5)) };
+    let mut one = trainer_with(&config, noisy);
     run(&mut one, 0, 5);
     let (tensors, meta) = one.state().unwrap();
     run(&mut one, 5, 9);
-    let mut two = disturbed_trainer(&config, Release::Solved(0.5), 0.3);
+    let mut two = trainer_with(&config, noisy);
     run(&mut two, 0, 2);
     two.restore(&tensors, &meta).unwrap();
     run(&mut two, 5, 9);

@@ -26,6 +26,8 @@ pub struct PuzzleConfig {
     /// probability per step that a puzzle's states are lost: it is given noise, or another puzzle's states, and has to find
     /// its answer from there
     pub disturbed: f64,
+    /// standard deviation of the normal noise that is added to the states of all puzzles after every step
+    pub state_noise: f64,
     /// learning rate of the puzzle embeddings' sign descent
     pub puzzle_lr: f64,
     /// weight decay of the puzzle embeddings
@@ -40,6 +42,7 @@ impl Default for PuzzleConfig {
             halt_weight: 0.5,
             release: Release::Head,
             disturbed: 0.0,
+            state_noise: 0.0,
             puzzle_lr: 1e-4,
             puzzle_weight_decay: 1.0,
         }
@@ -167,6 +170,9 @@ impl Trainer {
         self.slots.advance(&self.model, out.carry, &q_halt, &solved, self.config.release, &mut self.rng);
         if self.config.disturbed > 0.0 {
             self.slots.disturb(self.config.disturbed, &mut self.rng)?;
+        }
+        if self.config.state_noise > 0.0 {
+            self.slots.blur(self.config.state_noise, &mut self.rng)?;
         }
         let halted: Vec<u32> = self.slots.vacant().iter().map(|&slot| self.slots.steps()[slot]).collect();
         let count = |of: usize| of as f64 / batch as f64;
