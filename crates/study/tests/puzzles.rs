@@ -144,7 +144,9 @@ fn a_short_training_finds_ways_through_perfect_mazes_it_has_not_seen() {
     let once = (TEST_SEED, Starts::ONE, 1, Judge::Halting);
     let often = (TEST_SEED, starts(3), 1, Judge::Halting);
     let seen = |judge: Judge| (TEST_SEED, Starts::ONE, 8, judge);
-    let asked = [once, often, often, (7, Starts::ONE, 1, Judge::Halting), seen(Judge::Halting), seen(Judge::Cells)];
+    let both = (TEST_SEED, starts(2), 8, Judge::Cells);
+    let asked =
+        [once, often, often, (7, Starts::ONE, 1, Judge::Halting), seen(Judge::Halting), seen(Judge::Cells), both];
     let results = learned_and_asked("trm_dfs10", &short, &asked);
     let result = &results[0];
     // more starts take more steps where a thought does not settle, the same ones every time; a network trained so briefly,
@@ -163,6 +165,11 @@ fn a_short_training_finds_ways_through_perfect_mazes_it_has_not_seen() {
     // the same views thought about in the same steps, their answers weighed otherwise
     assert_eq!((results[5].judge, results[5].steps), (Judge::Cells, results[4].steps));
     assert!(results[5].answers.exact > 80 && results[5].answers != results[4].answers, "{:?}", results[5].answers);
+    // a second thought about every view, from noise, settled or not: they take their steps as well, and all vote
+    let (steps, often) = (results[6].steps, results[6].starts.most);
+    assert!(often == 2 && steps > results[5].steps * 18 / 10, "{steps} {}", results[5].steps);
+    assert!(results[6].answers.exact > 80 && results[6].answers != results[5].answers, "{:?}", results[6].answers);
+    assert_eq!(results[6].by_depth, result.by_depth, "of the usual start, as it is seen");
     // along the row and then along the column is the way in a quarter of them
     assert!(result.baselines.values().all(|counts| counts.exact < 70), "{:?}", result.baselines);
     assert!(result.answers.exact > 90, "{:?}", result.answers);

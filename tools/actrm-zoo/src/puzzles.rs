@@ -25,7 +25,8 @@ pub struct PuzzleArgs {
     /// Givens of a Sudoku (the fewest that the solver was trained on)
     #[arg(long, value_name = "N")]
     givens: Option<usize>,
-    /// Most starts of a thought about a puzzle: where it does not settle it begins anew from noise
+    /// Most starts of a thought about a puzzle: where it does not settle it begins anew from noise; with --views, starts of
+    /// every view, the second and further ones from noise: all vote
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     starts: u64,
     /// Standard deviation of that noise
@@ -34,7 +35,6 @@ pub struct PuzzleArgs {
     /// From how many sides a puzzle is seen, turned or in a mirror, a Sudoku with its digits renamed: each view's answer
     /// has as many votes as the judge gives it probability
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST_VIEWS))]
-    #[arg(conflicts_with = "starts")]
     views: u64,
     /// Who weighs the views' answers: the halting head, or the probabilities of their cells
     #[arg(long, value_name = "JUDGE", default_value = "halting", requires = "views")]

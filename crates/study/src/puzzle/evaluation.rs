@@ -56,10 +56,10 @@ pub struct PuzzleEvaluationOptions {
     pub depth: usize,
     /// Seed of the puzzles: [`TEST_SEED`] for those that every solver answers, another for a fresh stream of the same split.
     pub seed: u64,
-    /// How often a thought about a puzzle may begin.
+    /// How often a thought about a puzzle may begin; of several views, how often a thought about each of them begins.
     pub starts: Starts,
     /// From how many sides a puzzle is seen: turned or in a mirror, a Sudoku with its digits renamed; up to
-    /// [`MOST_VIEWS`]. Each view's answer has as many votes as `judge` gives it.
+    /// [`MOST_VIEWS`]. Each thought's answer has as many votes as `judge` gives it.
     pub views: u64,
     /// Who weighs the answers of several views.
     pub judge: Judge,
@@ -85,7 +85,8 @@ impl Judge {
 }
 
 /// How often a thought about a puzzle may begin: once as the solver was trained, and where it does not settle, again from
-/// noise. The first answer that settles counts; where none does, the one that the halting head is most sure of.
+/// noise. The first answer that settles counts; where none does, the one that the halting head is most sure of. Where a puzzle
+/// is seen from several sides, a thought about every view begins so often, settled or not, and all answers are voted on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Starts {
@@ -353,17 +354,21 @@ pub(super) fn graded(
         let first = kept.len();
         let mut seen: Vec<Vec<Kept>> = (0..batch.len()).map(|place| vec![Kept::of(&thoughts, place)]).collect();
         let numbers: Vec<usize> = (first..first + batch.len()).collect();
-        for number in 1..views {
-            let thoughts = solver.think_from(batch, most, &Start::Seen { number, puzzles: &numbers })?;
+        // seen from several sides, every thought has its vote; else another start is for what has not settled
+        let begun = if views == 1 { 1 } else { starts.most };
+        for (number, view) in (0..begun).flat_map(|number| (0..views).map(move |view| (number, view))).skip(1) {
+            let start = Start { puzzles: &numbers, view, number, noise: starts.noise };
+            let thoughts = solver.think_from(batch, most, &start)?;
             seen.iter_mut().enumerate().for_each(|(place, views)| views.push(Kept::of(&thoughts, place)));
         }
         kept.extend(seen.into_iter().map(|views| elected(views, judge)));
     }
-    for number in 1..starts.most {
+    let again = if views == 1 { starts.most } else { 1 };
+    for number in 1..again {
         let open: Vec<usize> = (0..kept.len()).filter(|&i| !kept[i].settled).collect();
         for chunk in open.chunks(BATCH) {
             let batch: Vec<Puzzle> = chunk.iter().map(|&i| puzzles[i].clone()).collect();
-            let start = Start::Noisy { noise: starts.noise, number, puzzles: chunk };
+            let start = Start { puzzles: chunk, view: 0, number, noise: starts.noise };
             let thoughts = solver.think_from(&batch, most, &start)?;
             for (place, &i) in chunk.iter().enumerate() {
                 kept[i].weigh(Kept::of(&thoughts, place));

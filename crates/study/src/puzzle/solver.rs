@@ -95,7 +95,7 @@ impl Solver {
     /// # Errors
     /// Puzzles of another size than the model's.
     pub fn think(&self, puzzles: &[Puzzle], steps: usize) -> Result<Vec<Vec<Thought>>, ModelError> {
-        self.think_from(puzzles, steps, &Start::Usual)
+        self.think_from(puzzles, steps, &Start::default())
     }
 
     /// The same from another start, if it is a recursion.
@@ -138,42 +138,44 @@ impl Solver {
     }
 }
 
-/// What thoughts about puzzles begin with. Puzzles have numbers: each has noise and names of its own, whatever it is
-/// thought about together with.
-pub(super) enum Start<'a> {
-    /// As the solver was trained.
-    Usual,
-    /// Start number `number` of each puzzle, from normal noise on both states with this standard deviation.
-    Noisy { noise: f64, number: u64, puzzles: &'a [usize] },
-    /// As the solver was trained, of view number `number` of each puzzle.
-    Seen { number: u64, puzzles: &'a [usize] },
+/// What thoughts about puzzles begin with; of itself, what the solver was trained with, of puzzles as they are.
+#[derive(Default)]
+pub(super) struct Start<'a> {
+    /// Numbers of the puzzles: each has noise and names of its own, whatever it is thought about together with.
+    pub(super) puzzles: &'a [usize],
+    /// The side that each is seen from; 0: as it is.
+    pub(super) view: u64,
+    /// Which start from there; 0: as the solver was trained, any other from noise on both states.
+    pub(super) number: u64,
+    /// Standard deviation of that noise.
+    pub(super) noise: f64,
 }
 
 impl Start<'_> {
     /// The states to begin with instead of `carry`.
     fn of(&self, carry: Carry) -> Result<Carry, ModelError> {
-        let &Self::Noisy { noise, number, puzzles } = self else {
-            return Ok(carry);
+        let stream = match (self.number, self.view) {
+            (0, _) => return Ok(carry),
+            (number, 0) => format!("noisy start {number}"),
+            (number, view) => format!("noisy start {number} of view {view}"),
         };
         let (_, positions, width) = carry.z_h.dims3()?;
         let mut noises = [Vec::new(), Vec::new()];
-        for &puzzle in puzzles {
-            let mut rng = Rng::new(puzzle as u64, &format!("noisy start {number}"));
+        for &puzzle in self.puzzles {
+            let mut rng = Rng::new(puzzle as u64, &stream);
             noises.iter_mut().for_each(|noise| noise.extend(rng.normals(positions * width)));
         }
         let [h, l] = noises.map(|noise| Tensor::from_vec(noise, carry.z_h.shape(), &Device::Cpu));
-        Ok(Carry { z_h: (&carry.z_h + (h? * noise)?)?, z_l: (&carry.z_l + (l? * noise)?)? })
+        Ok(Carry { z_h: (&carry.z_h + (h? * self.noise)?)?, z_l: (&carry.z_l + (l? * self.noise)?)? })
     }
 
     /// How each puzzle is seen; none where they are seen as they are.
     fn views(&self, task: Task) -> Vec<View> {
-        match self {
-            Self::Seen { number, puzzles } => {
-                let view = |&puzzle: &usize| View::new(task, *number, &mut PuzzleRng::new(puzzle as u64, *number));
-                puzzles.iter().map(view).collect()
-            }
-            Self::Usual | Self::Noisy { .. } => Vec::new(),
+        if self.view == 0 {
+            return Vec::new();
         }
+        let view = |&puzzle: &usize| View::new(task, self.view, &mut PuzzleRng::new(puzzle as u64, self.view));
+        self.puzzles.iter().map(view).collect()
     }
 }
 

@@ -81,6 +81,8 @@ const PLAIN: StudyTest = StudyTest {
 const FRESH: u64 = 21_000;
 /// The same once more: `noisy-trm_dfs10` was trained for a shorter time after its answers to those above had been counted.
 const FRESHER: u64 = 23_000;
+/// And once more: that every view is thought about from noise as well was chosen after those.
+const FRESHEST: u64 = 24_000;
 /// As often as a thought that does not settle may begin anew, and from how much noise.
 const STARTS: Starts = Starts { most: 8, noise: 1.0 };
 /// All the sides of a square.
@@ -143,10 +145,16 @@ const fn weighed(task: &'static str) -> StudyTest {
     let bar = Some(Bar { right: 0.9, ..BAR });
     StudyTest { task: Some(task), depth: 64, seed: FRESHER, views: VIEWS, judge: Judge::Cells, bar, ..PLAIN }
 }
+/// The same with a second thought about every side, from noise.
+const fn weighed_twice(task: &'static str) -> StudyTest {
+    StudyTest { seed: FRESHEST, starts: Starts { most: 2, ..STARTS }, ..weighed(task) }
+}
 const NOISY_DFS10: &[StudyTest] = &[
     with_bar(Bar { right: 0.995, exact: 0.995, parameters: Some(16_000), ..BAR }),
     weighed("dfs16"),
     weighed("dfs20"),
+    weighed_twice("dfs16"),
+    weighed_twice("dfs20"),
 ];
 const OPEN8: &[StudyTest] = &[
     with_bar(Bar { right: 0.98, exact: 0.96, parameters: Some(9_922), cpu_seconds: None }),

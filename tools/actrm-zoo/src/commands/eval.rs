@@ -46,7 +46,7 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval trm-dfs10 --puzzles 600
   actrm-zoo eval trm-dfs10 --task dfs16 --depth 32
   actrm-zoo eval trm-dfs10 --task dfs20 --depth 32 --starts 8
-  actrm-zoo eval trm-dfs10 --task dfs20 --depth 64 --views 8 --judge cells
+  actrm-zoo eval trm-dfs10 --task dfs20 --depth 64 --views 8 --starts 2 --judge cells
   actrm-zoo eval lift-act --episodes 3 --video 3
   actrm-zoo eval lift-act-image --episodes 100 --video-failed 3
   actrm-zoo eval lift-act-image --episodes 100 --perturb black-agentview
