@@ -40,6 +40,15 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "n_modes": 2,
         "min_std": 0.01,
     },
+    "robomimic_bc_gru": {
+        "type": "bc_rnn",
+        "action_horizon": 5,
+        "hidden_dim": 11,
+        "n_layers": 2,
+        "cell": "gru",
+        "n_modes": 3,
+        "min_std": 1e-4,
+    },
     "robomimic_bc_transformer": {
         "type": "bc_transformer",
         "dim_model": 16,
@@ -88,6 +97,7 @@ def network(config: dict[str, Any]) -> torch.nn.Module:
             mlp_layer_dims=[],
             rnn_hidden_dim=config["hidden_dim"],
             rnn_num_layers=config["n_layers"],
+            rnn_type=config.get("cell", "lstm").upper(),
             rnn_kwargs={},
             **common,
         )

@@ -93,7 +93,7 @@ policies! {
     "actrm" => Actrm: actrm::Actrm,
     /// Behaviour cloning with a multi-layer perceptron
     "bc" => Bc: bc::Bc,
-    /// Behaviour cloning with an LSTM and a mixture of Gaussians
+    /// Behaviour cloning with an LSTM or gated recurrent units and a mixture of Gaussians
     "bc_rnn" => BcRnn: bc_rnn::BcRnn,
     /// Behaviour cloning with a causal transformer and a mixture of Gaussians
     "bc_transformer" => BcTransformer: bc_transformer::BcTransformer,

@@ -6,6 +6,7 @@
 
 use crate::error::{ModelError, Result, some_names};
 use crate::features::Signature;
+use crate::layers::Cell;
 use crate::models::{bc_rnn, bc_transformer};
 use crate::normaliser::{ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::registry::PolicyConfig;
@@ -225,19 +226,28 @@ fn policy(keys: &Keys) -> Result<PolicyConfig> {
     want("algo.gmm.low_noise_eval", &gmm.low_noise_eval, &true)?;
     let policy = match transformer {
         None => {
-            want("algo.rnn.rnn_type", &rnn.rnn_type, &"LSTM".to_string())?;
+            let cell = match rnn.rnn_type.as_str() {
+                "LSTM" => Cell::Lstm,
+                "GRU" => Cell::Gru,
+                other => return Err(refuse("algo.rnn.rnn_type", other, "LSTM or GRU")),
+            };
             want("algo.rnn.open_loop", &rnn.open_loop, &false)?;
             if let Some((key, value)) = rnn.kwargs.iter().find(|(k, v)| *k != "bidirectional" || **v != false) {
                 return Err(refuse("algo.rnn.kwargs", format!("{key} = {value}"), "bidirectional = false alone"));
             }
             if !keys.algo.actor_layer_dims.is_empty() {
                 let found = format!("{:?}", keys.algo.actor_layer_dims);
-                return Err(refuse("algo.actor_layer_dims", found, "none: no layers between LSTM and mixture"));
+                return Err(refuse(
+                    "algo.actor_layer_dims",
+                    found,
+                    "none: no layers between the recurrent ones and the mixture",
+                ));
             }
             PolicyConfig::BcRnn(bc_rnn::Config {
                 action_horizon: rnn.horizon,
                 hidden_dim: rnn.hidden_dim,
                 n_layers: rnn.num_layers,
+                cell,
                 n_modes: gmm.num_modes,
                 min_std: gmm.min_std,
                 vision: None,

@@ -82,7 +82,7 @@ fn away(got: &[f32], expected: &[f32]) -> f32 {
 fn imported_checkpoints_answer_as_robomimic_does() {
     // another order of the state's keys is another order of the same numbers
     let turned = ["robot0_gripper_qpos", "robot0_eef_pos", "robot0_eef_quat"];
-    for name in ["bc_rnn", "bc_rnn_normalised", "bc_transformer"] {
+    for name in ["bc_rnn", "bc_rnn_normalised", "bc_transformer", "bc_gru"] {
         for keys in [KEYS.map(|(key, _)| key)[..3].to_vec(), turned.to_vec()] {
             let zoo = tempfile::tempdir().unwrap();
             let options = ImportOptions { state_keys: keys.iter().map(|key| (*key).to_owned()).collect(), ..options() };
@@ -163,7 +163,7 @@ fn what_ours_cannot_hold_is_refused_by_name() {
     };
     let off = Value::Bool(false);
     for (path, value) in [
-        (&["algo", "rnn", "rnn_type"][..], Value::from("GRU")),
+        (&["algo", "rnn", "rnn_type"][..], Value::from("RNN")),
         (&["algo", "rnn", "open_loop"], true.into()),
         (&["algo", "rnn", "kwargs", "bidirectional"], true.into()),
         (&["algo", "rnn", "kwargs", "proj_size"], 3.into()),

@@ -31,7 +31,14 @@ pub(crate) struct Lstm {
 }
 
 /// `c += a bᵀ` or `c += a b`, with b in panels.
-fn add_product(pass: &mut Pass<'_>, a: &[f32], b: Mat<'_>, panels: &Packed, (n, k): (usize, usize), c: &mut [f32]) {
+pub(super) fn add_product(
+    pass: &mut Pass<'_>,
+    a: &[f32],
+    b: Mat<'_>,
+    panels: &Packed,
+    (n, k): (usize, usize),
+    c: &mut [f32],
+) {
     let pack = &mut pass.space.pack;
     gemm_with((a.len() / k, n, k), Mat::rows(a, k), (b, Some(panels)), Start::Add, c, n, pack, |_, _, _| ());
 }

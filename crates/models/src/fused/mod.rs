@@ -12,11 +12,13 @@ mod decoder;
 mod encoder;
 mod feed_forward;
 mod grid;
+mod gru;
 mod loss;
 mod lstm;
 mod mixture;
 mod observation;
 mod pointer;
+mod recurrent;
 #[cfg(test)]
 pub(crate) mod testing;
 mod vae;
@@ -28,10 +30,10 @@ pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::{Encoder, EncoderLayer};
 pub(crate) use grid::{GridLayer, cells_of, put_cells};
 pub(crate) use loss::AbsoluteError;
-pub(crate) use lstm::Lstm;
 pub(crate) use mixture::{Wanted, likelihood};
 pub(crate) use observation::{Data, Inputs, Tokens, inputs, positions_backward, uncovered};
 pub(crate) use pointer::{Pointed, PointerGrads};
+pub(crate) use recurrent::Recurrent;
 pub(crate) use vae::Vae;
 pub(crate) use vision::{Eyes, Looked};
 

@@ -1,83 +1,44 @@
 //! A long short-term memory (Hochreiter and Schmidhuber 1997) with torch's weights and gates, its cell by hand.
 
 use super::Linear;
+use super::recurrent::{RecurrentState, gate_layers};
 use crate::device::HERE;
 use crate::error::Result;
 use crate::kernels::elementwise::exp;
-use crate::params::{Init, Params};
+use crate::params::Params;
 use crate::rng::Rng;
 use crate::simd::vectorised;
-use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result as CandleResult, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp2, Layout, Result as CandleResult, Shape, Tensor};
 
 /// Layers of LSTM cells, as `torch.nn.LSTM` without dropout.
 #[derive(Debug, Clone)]
 pub struct Lstm {
-    layers: Vec<Layer>,
+    /// from what comes from below, (4 hidden, in), and from the state, (4 hidden, hidden): gates i, f, g, o
+    layers: Vec<(Linear, Linear)>,
     hidden: usize,
 }
 
-#[derive(Debug, Clone)]
-struct Layer {
-    /// (4 hidden, in): gates i, f, g, o
-    input: Linear,
-    /// (4 hidden, hidden)
-    recurrent: Linear,
-}
-
-/// What a layer carries from step to step: h and c, (b, hidden) each.
-pub type LstmState = Vec<(Tensor, Tensor)>;
-
 impl Lstm {
     /// Creates `{prefix}.weight_ih_l0` and so on, all uniform in ±1/sqrt(hidden).
-    pub fn new(
-        params: &mut Params,
-        prefix: &str,
-        (input, hidden, layers): (usize, usize, usize),
-        rng: &mut Rng,
-    ) -> Result<Self> {
-        let init = Init::Uniform { bound: 1.0 / (hidden as f64).sqrt() };
-        let mut linear = |side: &str, layer: usize, input: usize| -> Result<Linear> {
-            let weight = params.create(&format!("{prefix}.weight_{side}_l{layer}"), &[4 * hidden, input], init, rng)?;
-            let bias = params.create(&format!("{prefix}.bias_{side}_l{layer}"), &[4 * hidden], init, rng)?;
-            Ok(Linear { weight, bias: Some(bias) })
-        };
-        let layers = (0..layers)
-            .map(|l| {
-                let width = if l == 0 { input } else { hidden };
-                Ok(Layer { input: linear("ih", l, width)?, recurrent: linear("hh", l, hidden)? })
-            })
-            .collect::<Result<_>>()?;
-        Ok(Self { layers, hidden })
+    pub(super) fn new(params: &mut Params, prefix: &str, sizes: (usize, usize, usize), rng: &mut Rng) -> Result<Self> {
+        Ok(Self { layers: gate_layers(params, prefix, sizes, 4, rng)?, hidden: sizes.1 })
     }
 
-    /// The state before the first step of `rows` sequences.
-    ///
-    /// # Errors
-    /// If the tensor library fails.
-    pub fn zero_state(&self, rows: usize) -> Result<LstmState> {
-        let zeros = || Tensor::zeros((rows, self.hidden), DType::F32, &HERE);
-        self.layers.iter().map(|_| Ok((zeros()?, zeros()?))).collect()
-    }
-
-    /// x: (b, steps, in) -> (b, steps, hidden); `state` becomes that after the last step.
-    ///
-    /// # Errors
-    /// If the tensor library fails.
-    pub fn forward(&self, x: &Tensor, state: &mut LstmState) -> Result<Tensor> {
+    /// x: (b, steps, in) -> (b, steps, hidden); `state`, h and c of each layer, becomes that after the last step.
+    pub(super) fn forward(&self, x: &Tensor, state: &mut RecurrentState) -> Result<Tensor> {
         let mut x = x.clone();
-        for (layer, state) in self.layers.iter().zip(state) {
+        for ((input, recurrent), state) in self.layers.iter().zip(state) {
             // what comes from below does not wait for the steps before
-            let from_below = layer.input.forward(&x)?;
+            let from_below = input.forward(&x)?;
             let mut outputs = Vec::with_capacity(x.dim(1)?);
-            let (mut h, mut c) = state.clone();
+            let [h, c] = state.as_mut_slice() else { unreachable!("an LSTM's state is h and c") };
             for step in 0..x.dim(1)? {
-                let gates = (from_below.narrow(1, step, 1)?.squeeze(1)? + layer.recurrent.forward(&h)?)?;
+                let gates = (from_below.narrow(1, step, 1)?.squeeze(1)? + recurrent.forward(h)?)?;
                 let both = gates.apply_op2(&c.contiguous()?, Cell)?;
-                h = both.narrow(1, 0, self.hidden)?;
-                c = both.narrow(1, self.hidden, self.hidden)?;
+                *h = both.narrow(1, 0, self.hidden)?;
+                *c = both.narrow(1, self.hidden, self.hidden)?;
                 outputs.push(h.clone());
             }
-            *state = (h, c);
             x = Tensor::stack(&outputs, 1)?;
         }
         Ok(x)

@@ -79,7 +79,7 @@ pub struct Arm {
 }
 
 /// Episodes that no training has seen.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Test {
     /// The task.
@@ -131,7 +131,7 @@ impl Test {
 
     /// How policies think in it, in words; `None` where it is as they were trained.
     pub fn thinking_words(&self) -> Option<String> {
-        let Thinking { steps, halting, intervene } = self.thinking;
+        let Thinking { steps, halting, halt_threshold, change_threshold, intervene } = self.thinking;
         let steps = steps.map(|n| format!("{n} step{}", if n == 1 { "" } else { "s" }));
         let halting = match (&steps, halting) {
             (_, None) => None,
@@ -139,11 +139,13 @@ impl Test {
             (None, Some(true)) => Some("halting".to_owned()),
             (_, Some(false)) => Some("no halting".to_owned()),
         };
+        let sure = halt_threshold.map(|threshold| format!("once surer than {threshold}"));
+        let still = change_threshold.map(|threshold| format!("once the chunk changes by less than {threshold}"));
         let intervene = intervene.map(|intervention| match intervention {
             Intervention::Freeze => "reasoning frozen after the first step".to_owned(),
             Intervention::Shuffle => "reasoning of another episode".to_owned(),
         });
-        let words: Vec<String> = [steps, halting, intervene].into_iter().flatten().collect();
+        let words: Vec<String> = [steps, halting, sure, still, intervene].into_iter().flatten().collect();
         (!words.is_empty()).then(|| words.join(", "))
     }
 }
@@ -340,6 +342,10 @@ mod tests {
         assert_eq!(words("{ steps = 1 }").unwrap(), "1 step");
         assert_eq!(words("{ steps = 8, halting = true }").unwrap(), "8 steps, at most, halting");
         assert_eq!(words("{ halting = false }").unwrap(), "no halting");
+        assert_eq!(
+            words("{ halting = true, halt_threshold = 0.9, change_threshold = 0.005 }").unwrap(),
+            "halting, once surer than 0.9, once the chunk changes by less than 0.005"
+        );
         assert_eq!(words("{ steps = 6, intervene = \"shuffle\" }").unwrap(), "6 steps, reasoning of another episode");
         assert!(open(&with("{ step = 1 }")).unwrap_err().contains("step"));
         // a test as trained keeps its text

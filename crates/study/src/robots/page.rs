@@ -266,7 +266,7 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &Results) {
     let _ = writeln!(
         text,
         "## The same weights, thinking otherwise\n\nNothing is trained again: the policies above with another number of steps, \
-         without a way to stop early, with their reasoning frozen or taken from the thought about another episode's beginning.\n"
+         with or without a way to stop early, with their reasoning frozen or taken from the thought about another episode's beginning.\n"
     );
     for ((task, data), mut rows) in rows {
         rows.sort_by_key(|(arm, _, trainings)| {

@@ -142,7 +142,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         .iter()
         .map(|&steps| {
             let steps = Some(usize::try_from(steps)?);
-            Ok(Thinking { steps, halting: args.halting.then_some(true), intervene: args.intervene })
+            let halting = args.halting.then_some(true);
+            Ok(Thinking { steps, halting, intervene: args.intervene, ..Thinking::default() })
         })
         .collect::<anyhow::Result<_>>()?;
     // before anything is started: whether it can think so at all

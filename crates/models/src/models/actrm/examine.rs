@@ -36,7 +36,7 @@ impl Intervention {
 }
 
 /// How a trained policy thinks where that is not as its configuration says; it is not trained again for it.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Thinking {
     /// Supervision steps: exactly so many, or with halting at most
@@ -45,6 +45,12 @@ pub struct Thinking {
     /// Whether a thought may stop before its last step; by default as configured, and no where `steps` are given
     #[serde(skip_serializing_if = "Option::is_none")]
     pub halting: Option<bool>,
+    /// With halting: the probability of the halting head above which a thought stops; by default as configured
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub halt_threshold: Option<f64>,
+    /// With halting: the mean change of the chunk (network units) below which a thought stops; by default as configured
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub change_threshold: Option<f64>,
     /// What is done to its reasoning; such thoughts do not halt
     #[serde(skip_serializing_if = "Option::is_none")]
     pub intervene: Option<Intervention>,
@@ -54,7 +60,7 @@ impl Config {
     /// The configuration of a model with the same weights that thinks otherwise.
     ///
     /// # Errors
-    /// No steps; halting together with an intervention.
+    /// No steps; halting together with an intervention; a threshold of halting that is none or without it.
     pub fn thinking(&self, thinking: &Thinking) -> Result<Self> {
         let mut config = self.clone();
         let reasoning = &mut config.reasoning;
@@ -66,6 +72,22 @@ impl Config {
             (reasoning.max_steps, reasoning.budget_ms) = (thinking.steps, None);
         }
         let halting = thinking.halting.unwrap_or(thinking.steps.is_none() && thinking.intervene.is_none());
+        let thresholds = [
+            ("thinking.halt_threshold", thinking.halt_threshold),
+            ("thinking.change_threshold", thinking.change_threshold),
+        ];
+        if let Some((field, threshold)) = thresholds.into_iter().find(|(_, threshold)| threshold.is_some() && !halting)
+        {
+            let found = format!("{} without halting", threshold.unwrap_or_default());
+            return Err(ModelError::Config {
+                model: "actrm",
+                field,
+                found,
+                expected: "halting = true beside it".to_string(),
+            });
+        }
+        reasoning.halt_threshold = thinking.halt_threshold.unwrap_or(reasoning.halt_threshold);
+        reasoning.change_threshold = thinking.change_threshold.unwrap_or(reasoning.change_threshold);
         if !halting {
             (reasoning.halt_threshold, reasoning.change_threshold, reasoning.budget_ms) = (1.0, 0.0, None);
         }

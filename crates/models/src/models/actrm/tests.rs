@@ -443,6 +443,19 @@ fn a_trained_policy_can_be_asked_to_think_otherwise() {
     let both = Thinking { halting: Some(true), intervene: Some(Intervention::Freeze), ..Thinking::default() };
     assert!(config.thinking(&both).unwrap_err().to_string().contains("thinking.halting"));
     assert!(config.thinking(&Thinking { steps: Some(0), ..Thinking::default() }).is_err());
+    let early = Thinking {
+        halting: Some(true),
+        halt_threshold: Some(0.6),
+        change_threshold: Some(0.02),
+        ..Thinking::default()
+    };
+    assert_eq!((of(&early).halt_threshold, of(&early).change_threshold, of(&early).max_steps()), (0.6, 0.02, 3));
+    let one = Thinking { halt_threshold: None, ..early };
+    assert_eq!((of(&one).halt_threshold, of(&one).change_threshold), (config.reasoning.halt_threshold, 0.02));
+    let refused = |thinking: &Thinking| config.thinking(thinking).unwrap_err().to_string();
+    assert!(refused(&Thinking { halting: Some(false), ..early }).contains("thinking.halt_threshold"));
+    assert!(refused(&Thinking { steps: Some(7), halting: None, ..one }).contains("thinking.change_threshold"));
+    assert!(refused(&Thinking { halt_threshold: Some(1.5), ..early }).contains("halt_threshold"));
     let act = PolicyConfig::Act(act::Config::default());
     assert_eq!(act.thinking(&Thinking::default()).unwrap(), act);
     assert!(act.thinking(&Thinking { steps: Some(2), ..Thinking::default() }).is_err());

@@ -2,6 +2,7 @@
 
 use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
+use crate::layers::Cell;
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
 
@@ -14,8 +15,11 @@ pub struct Config {
     pub action_horizon: usize,
     /// numbers in a layer's state (robomimic: `rnn.hidden_dim`)
     pub hidden_dim: usize,
-    /// layers of the LSTM
+    /// layers of cells
     pub n_layers: usize,
+    /// lstm or gru (robomimic: `rnn.rnn_type`)
+    #[serde(skip_serializing_if = "is_lstm")]
+    pub cell: Cell,
     /// Gaussians of the mixture
     pub n_modes: usize,
     /// least deviation of a Gaussian in training
@@ -25,9 +29,23 @@ pub struct Config {
     pub vision: Option<VisionConfig>,
 }
 
+// it came later: left out where it is as before, so that a configuration keeps its text
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands over a reference")]
+fn is_lstm(cell: &Cell) -> bool {
+    *cell == Cell::Lstm
+}
+
 impl Default for Config {
     fn default() -> Self {
-        Self { action_horizon: 10, hidden_dim: 400, n_layers: 2, n_modes: 5, min_std: 1e-4, vision: None }
+        Self {
+            action_horizon: 10,
+            hidden_dim: 400,
+            n_layers: 2,
+            cell: Cell::Lstm,
+            n_modes: 5,
+            min_std: 1e-4,
+            vision: None,
+        }
     }
 }
 
@@ -35,8 +53,9 @@ impl Config {
     /// How large the model will be, without what depends on observation and action.
     pub fn size(&self) -> Size {
         let hidden = self.hidden_dim as f64;
-        let recurrent = 4.0 * hidden * hidden * (2.0 * self.n_layers as f64 - 1.0);
-        let biases = 8.0 * hidden * self.n_layers as f64;
+        let gates = self.cell.gates() as f64;
+        let recurrent = gates * hidden * hidden * (2.0 * self.n_layers as f64 - 1.0);
+        let biases = 2.0 * gates * hidden * self.n_layers as f64;
         Size {
             weights: recurrent + biases,
             activations: self.action_horizon as f64 * self.n_layers as f64 * 10.0 * hidden,

@@ -3,7 +3,7 @@
 use super::{BcRnn, beginnings};
 use crate::batch::Batch;
 use crate::error::Result;
-use crate::fused::{Lstm, Pass, Wanted, likelihood, with_weights};
+use crate::fused::{Pass, Recurrent, Wanted, likelihood, with_weights};
 use crate::gradients::Gradients;
 use crate::kernels::add;
 use crate::layers::{Activation, Shape};
@@ -60,10 +60,10 @@ impl BcRnn {
                     x.copy_from_slice(&seen[from * width..][..width]);
                 }
                 pass.give(seen);
-                let rnn = Lstm::forward(pass, "rnn", (config.n_layers, hidden), x, rows);
+                let rnn = Recurrent::forward(pass, "rnn", config.cell, (config.n_layers, hidden), x, rows);
                 let wanted = Wanted { actions: &actions, real: &real, total: batch.total_valid_steps };
                 let modes = (config.n_modes, config.min_std);
-                let (loss, grad) = likelihood(pass, "decoder", modes, &rnn.output, &wanted, grads);
+                let (loss, grad) = likelihood(pass, "decoder", modes, rnn.output(), &wanted, grads);
                 if let Some(of_x) = rnn.backward(pass, grad, self.steps.learns(), grads) {
                     let mut of_seen = pass.space.pool.zeros(of_x.len());
                     for (of_x, &from) in of_x.chunks_exact(width).zip(&from) {

@@ -1,4 +1,4 @@
-//! BC-RNN: an LSTM over the observations and a mixture of Gaussians over the action, of each step its own.
+//! BC-RNN: an LSTM, or gated recurrent units, over the observations and a mixture of Gaussians over the action, of each step its own.
 //!
 //! Paper: Mandlekar et al., "What Matters in Learning from Offline Human Demonstrations for Robot Manipulation" (arXiv
 //! 2108.03298). Reference implementation: robomimic 0.3's `BC_RNN_GMM` with the options of that study (two layers of 400, no
@@ -10,11 +10,11 @@
 //!
 //! Deviations: a sequence of training ends with a window's frame and is shorter at the beginning of an episode, where
 //! robomimic's begins with a frame and repeats the last of the episode, both in the loss; a step has the same share in the
-//! loss either way. Pictures become the cells of `[policy.vision]`'s feature map behind a step's numbers (robomimic: keypoints). No goals, no open loop, no GRU. The means lie in -1 to 1, so that actions have to be normalised by their
+//! loss either way. Pictures become the cells of `[policy.vision]`'s feature map behind a step's numbers (robomimic: keypoints). No goals, no open loop. The means lie in -1 to 1, so that actions have to be normalised by their
 //! range (`normalisation.action = "min_max"`).
 //!
 //! What it costs: one product a step and layer for the recurrence, one a layer for all that comes from below; the cell is by
-//! hand (`layers/lstm.rs`).
+//! hand (`layers/lstm.rs`; `layers/gru.rs` is composed).
 //!
 //! This file is the model as one reads it, on candle's autograd. Training steps run the same maths with hand-written backward
 //! passes (`fused.rs`); tests hold the two together.
@@ -32,7 +32,7 @@ use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Observation, Signature};
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
-use crate::layers::{Lstm, LstmState, Mixture, MixtureHead, Steps};
+use crate::layers::{Mixture, MixtureHead, Recurrent, RecurrentState, Steps};
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
 use crate::params::Params;
@@ -54,7 +54,7 @@ pub struct BcRnn {
     signature: Signature,
     params: Params,
     steps: Steps,
-    rnn: Lstm,
+    rnn: Recurrent,
     head: MixtureHead,
     workspaces: Workspaces,
 }
@@ -75,7 +75,8 @@ impl BcRnn {
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
         let steps = Steps::new(&mut p, "bc_rnn", signature, config.vision.as_ref(), rng)?;
-        let rnn = Lstm::new(&mut p, "rnn", (steps.width(), config.hidden_dim, config.n_layers), rng)?;
+        let sizes = (steps.width(), config.hidden_dim, config.n_layers);
+        let rnn = Recurrent::new(&mut p, "rnn", config.cell, sizes, rng)?;
         let sizes = (config.hidden_dim, config.n_modes, signature.action_dim);
         let head = MixtureHead::new(&mut p, "decoder", sizes, config.min_std, rng)?;
         Ok(Self {
@@ -90,7 +91,7 @@ impl BcRnn {
     }
 
     /// x: (b, T, D), from the state before it -> b*T mixtures
-    fn forward(&self, x: &Tensor, state: &mut LstmState) -> Result<Mixture> {
+    fn forward(&self, x: &Tensor, state: &mut RecurrentState) -> Result<Mixture> {
         let (b, steps, _) = x.dims3()?;
         let y = self.rnn.forward(x, state)?;
         self.head.forward(&y.reshape((b * steps, self.config.hidden_dim))?)
@@ -184,7 +185,7 @@ impl PolicyModel for BcRnn {
     }
 
     fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
-        Box::new(Recurrent { model: self, preprocess, state: None, steps: 0, rng: generator(0), clock, encoding: None })
+        Box::new(Carrying { model: self, preprocess, state: None, steps: 0, rng: generator(0), clock, encoding: None })
     }
 
     fn vision(&self) -> Option<&VisionConfig> {
@@ -196,11 +197,11 @@ impl PolicyModel for BcRnn {
     }
 }
 
-/// One episode of the policy: the LSTM's state and how many steps it has seen.
-struct Recurrent {
+/// One episode of the policy: the state and how many steps it has seen.
+struct Carrying {
     model: Arc<BcRnn>,
     preprocess: Arc<Preprocess>,
-    state: Option<LstmState>,
+    state: Option<RecurrentState>,
     steps: usize,
     rng: Rng,
     clock: Box<dyn Clock>,
@@ -212,7 +213,7 @@ fn generator(seed: u64) -> Rng {
     Rng::new(seed, "policy")
 }
 
-impl Policy for Recurrent {
+impl Policy for Carrying {
     /// One action.
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
         let (model, begun) = (&self.model, self.clock.milliseconds());
@@ -225,7 +226,7 @@ impl Policy for Recurrent {
             _ => model.rnn.zero_state(1)?,
         };
         let mixture = model.forward(&now, &mut state)?;
-        let state: LstmState = state.into_iter().map(|(h, c)| (h.detach(), c.detach())).collect();
+        state.iter_mut().flatten().for_each(|tensor| *tensor = tensor.detach());
         (self.state, self.steps) = (Some(state), self.steps + 1);
         self.preprocess.chunk(&mixture.sample(&mut self.rng)?.detach().unsqueeze(1)?)
     }

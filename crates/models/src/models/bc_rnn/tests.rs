@@ -5,6 +5,7 @@ use crate::fused::testing::{
     assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients, move_parameters,
     signatures,
 };
+use crate::layers::Cell;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
@@ -35,7 +36,8 @@ fn padded_before(signature: &Signature, rows: usize) -> Batch {
 #[test]
 fn the_gradient_is_the_slope_of_the_loss() {
     let signature = signatures().history;
-    for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }] {
+    let gru = Config { cell: Cell::Gru, ..small() };
+    for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }, gru] {
         let model = BcRnn::new(&config, &signature, 1).unwrap();
         assert_the_gradient_is_the_slope(&model, &padded_before(&signature, 4), &format!("{config:?}"));
     }
@@ -45,7 +47,8 @@ fn the_gradient_is_the_slope_of_the_loss() {
 fn the_step_by_hand_is_the_composed_one() {
     let signature = signatures().history;
     let other = Config { n_layers: 3, hidden_dim: 17, n_modes: 5, ..small() };
-    for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }, other] {
+    let gru = |config: Config| Config { cell: Cell::Gru, ..config };
+    for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }, gru(small()), gru(other.clone()), other] {
         let model = BcRnn::new(&config, &signature, 1).unwrap();
         assert!(model.composed_because().is_none());
         for rows in [1, 5] {
@@ -54,9 +57,11 @@ fn the_step_by_hand_is_the_composed_one() {
     }
     // sequences of one step
     let signature = Signature { n_obs_steps: 1, ..signature };
-    let config = Config { action_horizon: 1, ..small() };
-    let model = BcRnn::new(&config, &signature, 1).unwrap();
-    assert_the_step_is_the_composed_one(&model, &batch(&signature, 1, 4, 3), "one step");
+    for cell in [Cell::Lstm, Cell::Gru] {
+        let config = Config { action_horizon: 1, cell, ..small() };
+        let model = BcRnn::new(&config, &signature, 1).unwrap();
+        assert_the_step_is_the_composed_one(&model, &batch(&signature, 1, 4, 3), "one step");
+    }
 }
 
 /// What it sees of two cameras' pictures, a step after another.
@@ -108,15 +113,17 @@ fn from_pictures_the_policy_sees_one_step_at_a_time() {
 #[test]
 fn steps_need_no_more_memory_than_the_first() {
     let signature = signatures().history;
-    let model = BcRnn::new(&small(), &signature, 1).unwrap();
-    let batch = padded_before(&signature, 4);
-    let held = || {
-        gradients(&model, &batch);
-        model.workspaces.with(|space| space.pool.numbers())
-    };
-    let first = held();
-    for _ in 0..3 {
-        assert_eq!(held(), first);
+    for cell in [Cell::Lstm, Cell::Gru] {
+        let model = BcRnn::new(&Config { cell, ..small() }, &signature, 1).unwrap();
+        let batch = padded_before(&signature, 4);
+        let held = || {
+            gradients(&model, &batch);
+            model.workspaces.with(|space| space.pool.numbers())
+        };
+        let first = held();
+        for _ in 0..3 {
+            assert_eq!(held(), first);
+        }
     }
 }
 
@@ -148,7 +155,7 @@ fn the_policy_carries_its_state_and_begins_anew_after_its_horizon() {
     let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
     let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser).unwrap());
     let model = Arc::new(BcRnn::new(&Config { n_modes: 1, ..small() }, &signature, 1).unwrap());
-    let mut policy = Recurrent {
+    let mut policy = Carrying {
         model: Arc::clone(&model),
         preprocess: Arc::clone(&preprocess),
         state: None,
