@@ -39,7 +39,7 @@ fn fixtures() -> Vec<Fixture> {
         io: Tensor::read_npz(folder.join("robomimic.npz")).unwrap().into_iter().collect(),
         folder,
     };
-    common::fixtures(&common::ROBOMIMIC, 3).into_iter().map(read).collect()
+    common::fixtures(&common::ROBOMIMIC, 4).into_iter().map(read).collect()
 }
 
 fn largest_of(t: &Tensor) -> f32 {
