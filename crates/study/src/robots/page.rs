@@ -292,9 +292,11 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &Results) {
             let cells: Vec<String> = columns.iter().map(|group| cell_text(trainings, group.as_slice())).collect();
             let of_arm: Vec<&CellResult> = trainings.values().collect();
             let (label, cells) = (&study.arms[arm].label, cells.join(" | "));
+            let halts = of_arm.iter().any(|result| result.test_definition.thinking.halting == Some(true));
+            let most = if halts { "at most " } else { "" };
             let _ = writeln!(
                 text,
-                "| {label} | {words} | {cells} | {:.2} | {} |",
+                "| {label} | {words} | {cells} | {:.2} | {most}{} |",
                 median(&of_arm, |result| result.query_ms),
                 megaflops(&of_arm)
             );
@@ -517,6 +519,11 @@ mod tests {
         episodes = 4
         seed_start = 40000
         thinking = { steps = 32 }
+        [tests.t-halting]
+        task = "PickChain"
+        episodes = 4
+        seed_start = 40000
+        thinking = { halting = true, change_threshold = 0.01 }
         [[cells]]
         arms = ["one", "six"]
         data = "chain"
@@ -526,7 +533,7 @@ mod tests {
         arms = ["six"]
         data = "chain"
         seeds = 2
-        tests = ["t-32"]
+        tests = ["t-halting", "t-32"]
         stage = 2
         [[comparisons]]
         question = "Do they help?"
@@ -703,7 +710,7 @@ mod tests {
         let page = || robot_page(&study, &file).unwrap();
         assert!(!page().contains("## Pictures changed"), "{}", page());
         for cell in cells(&study).iter().filter(|cell| cell.seed == 1) {
-            for test in cell.tests.iter().filter(|test| *test != "t-32") {
+            for test in cell.tests.iter().filter(|test| !test.starts_with("t-")) {
                 let solved = [true, test == "t", test == "t", cell.arm == "six" || test == "t"];
                 result(&study, cell, test, solved).write(&folder.path().join(cell.file_name(test))).unwrap();
             }
@@ -755,8 +762,10 @@ mod tests {
             "## The same weights, thinking otherwise\n",
             "| six steps | 32 steps | 100.0%",
             "| 1.25 | 42.4 |",
+            "| six steps | halting, once the chunk changes by less than 0.01 | 75.0%",
+            "| 1.25 | at most 42.4 |",
             "| reasoning, after step | 0 hops | the end |\n|---|---|---|\n| 1 | 90% (25%) | 30% (25%) |",
-            "Stage 2:\n\n- six-on-chain-seed2 on t-32\n",
+            "Stage 2:\n\n- six-on-chain-seed2 on t-halting\n- six-on-chain-seed2 on t-32\n",
         ] {
             assert!(page.contains(there), "{there}\n---\n{page}");
         }
