@@ -710,7 +710,7 @@ mod tests {
         let page = || robot_page(&study, &file).unwrap();
         assert!(!page().contains("## Pictures changed"), "{}", page());
         for cell in cells(&study).iter().filter(|cell| cell.seed == 1) {
-            for test in cell.tests.iter().filter(|test| !test.starts_with("t-")) {
+            for test in cell.tests.iter().filter(|test| !["t-32", "t-halting"].contains(&test.as_str())) {
                 let solved = [true, test == "t", test == "t", cell.arm == "six" || test == "t"];
                 result(&study, cell, test, solved).write(&folder.path().join(cell.file_name(test))).unwrap();
             }
