@@ -258,7 +258,10 @@ fn the_page_of_a_study_survives_a_fault_at_any_call() {
     let root = root.path().canonicalize().expect("it is there");
     let (file, out) = (root.join("thinking.toml"), root.join("out"));
     let shipped = fs::read_to_string(e2e::root().join("studies/thinking.toml")).expect("a study");
-    let shipped = shipped.replace("\"docs/thinking\"", &format!("{:?}", e2e::root().join("docs/thinking")));
+    // charts are drawn beside the results
+    let results = root.join("results");
+    copy(&e2e::root().join("docs/thinking"), &results);
+    let shipped = shipped.replace("\"docs/thinking\"", &format!("{results:?}"));
     fs::write(&file, shipped.replace("\"docs/thinking.md\"", &format!("{:?}", out.join("page.md")))).expect("writable");
     let study = || zoo(["study", text(&file), "--page-only"]);
     fs::create_dir(&out).expect("creatable");
