@@ -135,7 +135,7 @@ impl Optimiser {
     pub fn new(config: OptimiserConfig, layout: Arc<ParamLayout>) -> Self {
         let zeros = || vec![0.0; layout.len()];
         let (first, second) = (zeros(), zeros());
-        Self { config, layout, first, second, step: 0, threads: 2 }
+        Self { config, layout, first, second, step: 0, threads: rayon::current_num_threads() }
     }
 
     /// Steps taken.
@@ -143,7 +143,7 @@ impl Optimiser {
         self.step
     }
 
-    /// Runs on at most `threads` threads (2 unless set). The result does not depend on it.
+    /// Runs on at most `threads` threads (unless set, as many as rayon has, at most two). The result does not depend on it.
     pub fn set_threads(&mut self, threads: usize) {
         self.threads = threads.max(1);
     }

@@ -75,19 +75,19 @@ impl Trainer {
     pub fn new(model: Box<dyn PolicyModel>, config: TrainConfig, seed: u64) -> Result<Self> {
         let core = Core::new(model.params(), config)?;
         let gradients = vec![Gradients::zeros(core.layout().clone()); SHARDS];
-        Ok(Self { model, core, gradients, rng: Rng::new(seed, "train"), threads: SHARDS })
+        Ok(Self { model, core, gradients, rng: Rng::new(seed, "train"), threads: rayon::current_num_threads() })
     }
 
-    /// Runs on at most `threads` threads (2 unless set). The weights do not depend on it.
+    /// Runs on at most `threads` threads (unless set, as many as `RAYON_NUM_THREADS` says, else as this process may use
+    /// processors; never more than two). The weights do not depend on it.
     pub fn set_threads(&mut self, threads: usize) {
         self.threads = threads.max(1);
         self.core.set_threads(threads);
     }
 
-    /// Threads that a step is spread over, as far as the machine has them.
+    /// Threads that a step is spread over.
     pub fn threads(&self) -> usize {
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        self.threads.min(SHARDS).min(cores)
+        self.threads.min(SHARDS)
     }
 
     /// The model as it is now.
