@@ -219,3 +219,20 @@ fn puzzles_refuse_what_is_the_robots_and_answer_again() {
     let table = String::from_utf8(stdout).expect("text");
     assert!(table.contains(", seed 7"), "{table}");
 }
+
+#[test]
+fn a_training_takes_the_threads_it_is_given_and_comes_to_the_same() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let trained_on = |threads: &str| {
+        let folder = folder.path().join(threads);
+        let mut command = train(&folder, "1", &[]);
+        said(command.env("RAYON_NUM_THREADS", threads));
+        let entry = folder.join("zoo/lift-act-s1/1");
+        let meta = fs::read_to_string(entry.join("entry.json")).expect("an entry");
+        let meta: Value = serde_json::from_str(&meta).expect("JSON");
+        (meta["training"]["threads"].clone(), fs::read(entry.join("model.safetensors")).expect("weights"))
+    };
+    let (one, two) = (trained_on("1"), trained_on("2"));
+    assert_eq!((one.0, two.0), (1.into(), 2.into()));
+    assert!(one.1 == two.1, "the weights depend on the number of threads");
+}
