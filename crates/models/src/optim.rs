@@ -143,7 +143,7 @@ impl Optimiser {
         self.step
     }
 
-    /// Runs on at most `threads` threads (unless set, as many as rayon has, at most two). The result does not depend on it.
+    /// Runs on at most `threads` threads (unless set: as many as rayon has, at most two). The result is the same.
     pub fn set_threads(&mut self, threads: usize) {
         self.threads = threads.max(1);
     }
