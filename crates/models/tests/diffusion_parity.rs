@@ -1,12 +1,13 @@
-//! Diffusion against LeRobot's `DiffusionPolicy` on PyTorch: the fixtures of this repository, and every folder of the same
-//! layout below `$ACTRM_PARITY_DIR` (`benches/peers/make_diffusion_fixture.py` makes fresh ones).
+//! Diffusion against LeRobot's `DiffusionPolicy` on PyTorch, and its transformer against Chi et al.'s: the fixtures of this
+//! repository, and every folder of the same layout below `$ACTRM_PARITY_DIR` (`benches/peers/make_diffusion_fixture.py` and
+//! `make_transformer_fixture.py` make fresh ones).
 #![allow(clippy::unwrap_used)]
 
 mod common;
 
 use candle_core::{DType, Device, Tensor};
-use models::diffusion::{Diffusion, Sampler, lerobot};
-use models::{Batch, Features, PolicyModel, Rng};
+use models::diffusion::{Config, Diffusion, Sampler, TransformerConfig, lerobot};
+use models::{Batch, Features, PolicyModel, Rng, Signature};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -147,4 +148,41 @@ fn what_is_written_for_lerobot_is_what_it_wrote() {
     let f = &fixtures()[0];
     let drawn = |seed| f.model().sample(&f.batch().observation, &mut Rng::new(seed, "policy")).unwrap();
     assert_eq!(drawn(1).to_vec3::<f32>().unwrap(), drawn(1).to_vec3::<f32>().unwrap());
+}
+
+#[test]
+fn the_transformer_its_error_and_its_gradients_are_chi_et_als() {
+    for folder in common::fixtures(&common::TRANSFORMER, 2) {
+        let name = folder.file_name().unwrap().to_string_lossy().into_owned();
+        let io = Tensor::read_npz(folder.join("transformer.npz")).unwrap().into_iter().collect();
+        let f = Fixture { name, io, folder };
+        let text = std::fs::read_to_string(f.folder.join("config.json")).unwrap();
+        let told: serde_json::Value = serde_json::from_str(&text).unwrap();
+        let number = |key: &str| usize::try_from(told[key].as_u64().unwrap()).unwrap();
+        let transformer: TransformerConfig = serde_json::from_value(told["transformer"].clone()).unwrap();
+        let width = |key: &str| f.get(key).dim(2).unwrap();
+        let sizes = Signature::low_dimensional(width("state"), width("env"), width("eps"));
+        let signature = Signature { n_obs_steps: number("n_obs_steps"), ..sizes };
+        let config = Config { action_horizon: number("horizon"), transformer: Some(transformer), ..Config::default() };
+        let model = Diffusion::new(&config, &signature, 0).unwrap();
+        let prefixed = |file: &str| -> BTreeMap<String, Tensor> {
+            tensors(&f.folder, file).into_iter().map(|(name, t)| (format!("transformer.{name}"), t)).collect()
+        };
+        model.params().load(&prefixed("model.safetensors")).unwrap();
+        // one observation has no axis of steps
+        let seen = |key: &str| if signature.n_obs_steps == 1 { f.get(key).squeeze(1).unwrap() } else { f.get(key) };
+        let observation = Features::low_dimensional(seen("state"), Some(seen("env")));
+        let output = model.denoise(&observation, &f.get("noisy"), &f.steps()).unwrap();
+        f.same("output", &output, &f.get("output"));
+        let loss = (output - f.get("eps")).unwrap().sqr().unwrap().mean_all().unwrap();
+        f.same("loss", &loss, &f.get("loss"));
+        let (gradients, expected) = (loss.backward().unwrap(), prefixed("gradients.safetensors"));
+        assert_eq!(expected.len(), model.params().iter().count());
+        for (name, var) in model.params().iter() {
+            let (got, expected) = (gradients.get(var).unwrap(), &expected[name]);
+            let off = largest_of(&(got - expected).unwrap());
+            let scale = largest_of(expected).max(1e-2);
+            assert!(off <= 2e-4 * scale, "{}: gradient of {name} is {off} away, largest {scale}", f.name);
+        }
+    }
 }

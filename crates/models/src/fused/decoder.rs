@@ -29,6 +29,13 @@ pub(crate) struct Memory<'a> {
     pub(crate) batch: usize,
 }
 
+/// The decoder's own tokens: their positions, (c, D), and whether one sees those after it.
+#[derive(Clone, Copy)]
+pub(crate) struct Own<'a> {
+    pub(crate) pos: &'a [f32],
+    pub(crate) causal: bool,
+}
+
 /// Gradients that decoder layers add to.
 pub(crate) struct DecoderGrads<'a> {
     pub(crate) memory: &'a mut [f32],
@@ -37,16 +44,11 @@ pub(crate) struct DecoderGrads<'a> {
 }
 
 impl DecoderLayer {
-    /// x: (b, c, D), or (c, D) if it is the same for the whole batch, as for the first layer, whose input is zero;
-    /// query_pos: (c, D) -> (b, c, D)
-    fn forward(
-        pass: &mut Pass<'_>,
-        prefix: String,
-        x: Vec<f32>,
-        query_pos: &[f32],
-        memory: Memory<'_>,
-    ) -> (Vec<f32>, Self) {
+    /// x: (b, c, D), or (c, D) if it is the same for the whole batch, as for the first layer, whose input is zero
+    /// -> (b, c, D)
+    fn forward(pass: &mut Pass<'_>, prefix: String, x: Vec<f32>, own: Own<'_>, memory: Memory<'_>) -> (Vec<f32>, Self) {
         let Shape { dim, heads, .. } = pass.shape;
+        let query_pos = own.pos;
         let (batch, queries) = (memory.batch, query_pos.len() / dim);
         let shared = x.len() == query_pos.len();
         let rows = Rows { computed: queries, all: queries };
@@ -59,7 +61,7 @@ impl DecoderLayer {
             dim,
             shared_queries: shared,
             shared_keys: shared,
-            causal: false,
+            causal: own.causal,
         };
         let name = |part: &str| format!("{prefix}.{part}");
 
@@ -73,7 +75,8 @@ impl DecoderLayer {
 
         let Entry { y: y2, x, norm } = enter(pass, &name("norm2"), x1);
         let key = Side { x: memory.x, pos: memory.pos };
-        let heads = Heads { keys: memory.pos.len() / dim, shared_queries: false, shared_keys: false, ..heads };
+        let keys = memory.pos.len() / dim;
+        let heads = Heads { keys, shared_queries: false, shared_keys: false, causal: false, ..heads };
         let query = Side { x: &y2, pos: query_pos };
         let (branch, cross) = Attention::forward(pass, &name("multihead_attn"), heads, query, key, None);
         let (x2, residual2) = Residual::leave(pass, &name("norm2"), norm, x.as_ref().unwrap_or(&y2), branch, rows);
@@ -251,6 +254,50 @@ impl Begun {
     }
 }
 
+/// Decoder layers over tokens that every sequence has its own of.
+#[derive(Debug)]
+pub(crate) struct DecoderLayers(Vec<DecoderLayer>);
+
+impl DecoderLayers {
+    /// Layers `{prefix}.0..n`. x: (b, c, D) -> (b, c, D)
+    pub(crate) fn forward(
+        pass: &mut Pass<'_>,
+        (prefix, n): (&str, usize),
+        mut x: Vec<f32>,
+        own: Own<'_>,
+        memory: Memory<'_>,
+    ) -> (Vec<f32>, Self) {
+        let mut layers = Vec::with_capacity(n);
+        for i in 0..n {
+            let (out, layer) = DecoderLayer::forward(pass, format!("{prefix}.{i}"), x, own, memory);
+            x = out;
+            layers.push(layer);
+        }
+        (x, Self(layers))
+    }
+
+    /// grad: that of the output, (b, c, D) -> that of x
+    pub(crate) fn backward(
+        self,
+        pass: &mut Pass<'_>,
+        mut grad: Vec<f32>,
+        own: Own<'_>,
+        memory: Memory<'_>,
+        into: &mut DecoderGrads<'_>,
+        grads: &mut Grads<'_>,
+    ) -> Vec<f32> {
+        for layer in self.0.into_iter().rev() {
+            grad = layer.backward(pass, grad, own.pos, memory, into, grads);
+        }
+        grad
+    }
+
+    /// Gives the buffers back without a backward pass.
+    pub(crate) fn free(self, pass: &mut Pass<'_>) {
+        self.0.into_iter().for_each(|layer| layer.free(pass));
+    }
+}
+
 /// What the backward pass of a decoder over the memory needs.
 #[derive(Debug)]
 pub(crate) struct Decoder {
@@ -273,7 +320,8 @@ impl Decoder {
             None => (pass.space.pool.zeros(query_pos.len()), 0),
         };
         for i in first..n {
-            let (out, layer) = DecoderLayer::forward(pass, format!("decoder.layers.{i}"), x, query_pos, memory);
+            let own = Own { pos: query_pos, causal: false };
+            let (out, layer) = DecoderLayer::forward(pass, format!("decoder.layers.{i}"), x, own, memory);
             x = out;
             layers.push(layer);
         }

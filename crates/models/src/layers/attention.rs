@@ -6,6 +6,10 @@ use crate::params::{Init, Params};
 use crate::rng::Rng;
 use candle_core::{D, Tensor};
 
+/// Added to the scores of keys that are not attended to: it underflows to exactly 0 after the exponential; -inf would make
+/// NaN gradients of (-inf) - (-inf).
+const LATER: f32 = -1e30;
+
 /// `torch.nn.MultiheadAttention`: rows 0..D, D..2D and 2D..3D of `in_proj_weight` are the query, key and value
 /// projections; scores are scaled by 1/sqrt(D/heads); dropout acts on the attention weights.
 #[derive(Debug, Clone)]
@@ -20,6 +24,8 @@ pub struct MultiHeadAttention {
     pub n_heads: usize,
     /// of the attention weights
     pub dropout: Dropout,
+    /// a query sees the keys of its own step and of those before
+    pub causal: bool,
 }
 
 impl MultiHeadAttention {
@@ -52,6 +58,7 @@ impl MultiHeadAttention {
             out_proj: Linear::with_init(params, &name, (dim, dim), out_proj, Some(Init::Zeros), rng)?,
             n_heads,
             dropout: Dropout { p },
+            causal: false,
         })
     }
 
@@ -74,7 +81,12 @@ impl MultiHeadAttention {
     pub fn weights(&self, q: &Tensor, k: &Tensor, key_pad: Option<&Tensor>) -> Result<Tensor> {
         let (q, k) = (self.project(q, 0)?, self.project(k, 1)?);
         let head = q.dim(D::Minus1)? as f64;
-        let scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / head.sqrt()))?;
+        let mut scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / head.sqrt()))?;
+        if self.causal {
+            let (t, s) = (scores.dim(2)?, scores.dim(3)?);
+            let later = (0..t * s).map(|i| if i % s > i / s { LATER } else { 0.0 }).collect::<Vec<f32>>();
+            scores = scores.broadcast_add(&Tensor::from_vec(later, (1, 1, t, s), scores.device())?)?;
+        }
         masked_softmax(&scores, key_pad)
     }
 
@@ -95,8 +107,7 @@ pub fn masked_softmax(scores: &Tensor, key_pad: Option<&Tensor>) -> Result<Tenso
     let scores = match key_pad {
         Some(pad) => {
             let (b, s) = pad.dims2()?;
-            // -1e30 underflows to exactly 0 after the exponential; -inf would make NaN gradients of (-inf) - (-inf)
-            scores.broadcast_add(&(pad.reshape((b, 1, 1, s))? * -1e30)?)?
+            scores.broadcast_add(&(pad.reshape((b, 1, 1, s))? * f64::from(LATER))?)?
         }
         None => scores.clone(),
     };

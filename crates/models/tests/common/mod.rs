@@ -15,6 +15,8 @@ pub const TRM: [&str; 3] = ["config.json", "model.safetensors", "io.safetensors"
 
 /// A folder is a fixture of LeRobot's diffusion if it holds these files.
 pub const DIFFUSION: [&str; 3] = ["config.json", "model.safetensors", "draws.npz"];
+/// A folder is a fixture of Chi et al.'s transformer if it holds these files.
+pub const TRANSFORMER: [&str; 3] = ["config.json", "model.safetensors", "transformer.npz"];
 /// A folder is a fixture of robomimic's if it holds these files.
 pub const ROBOMIMIC: [&str; 3] = ["config.json", "model.safetensors", "robomimic.npz"];
 
@@ -51,7 +53,7 @@ fn walk(folder: &Path, kind: &[&str], found: &mut Vec<PathBuf>) {
     if holds(kind) && sees == (kind == SEEING_ACT) {
         found.push(folder.to_path_buf());
     } else if holds(&["model.safetensors"]) {
-        let known = [&ACT, &TRM, &ENCODER, &DIFFUSION, &ROBOMIMIC].into_iter().any(|kind| holds(kind));
+        let known = [&ACT, &TRM, &ENCODER, &DIFFUSION, &TRANSFORMER, &ROBOMIMIC].into_iter().any(|kind| holds(kind));
         assert!(known, "{}: expected {ACT:?}, {TRM:?} or {ENCODER:?}, found {entries:?}", folder.display());
     }
     entries.iter().filter(|path| path.is_dir()).for_each(|path| walk(path, kind, found));

@@ -1,5 +1,6 @@
 //! Diffusion's options.
 
+use super::transformer::TransformerConfig;
 use super::unet::NetworkConfig;
 use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
@@ -34,8 +35,11 @@ pub enum Sampler {
 pub struct Config {
     /// actions in a sequence, beginning with that of the first observation seen (LeRobot: `horizon`)
     pub action_horizon: usize,
-    /// the network
+    /// the network, a UNet
     pub network: NetworkConfig,
+    /// a transformer in the UNet's place
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub transformer: Option<TransformerConfig>,
     /// steps of noise in training
     pub num_train_timesteps: usize,
     /// what the network gives
@@ -58,6 +62,7 @@ impl Default for Config {
         Self {
             action_horizon: 16,
             network: NetworkConfig::default(),
+            transformer: None,
             num_train_timesteps: 100,
             prediction: Prediction::Epsilon,
             sampler: Sampler::Ddim,
@@ -72,7 +77,10 @@ impl Default for Config {
 impl Config {
     /// How large the model will be.
     pub fn size(&self) -> Size {
-        self.network.size(self.action_horizon)
+        match &self.transformer {
+            Some(transformer) => transformer.size(self.action_horizon),
+            None => self.network.size(self.action_horizon),
+        }
     }
 
     /// Checks that a model with this configuration can exist.
@@ -83,7 +91,20 @@ impl Config {
         let refuse = |field, found: String, expected: String| {
             Err(ModelError::Config { model: "diffusion", field, found, expected })
         };
-        self.network.validate("diffusion", self.action_horizon)?;
+        match &self.transformer {
+            Some(transformer) => transformer.validate("diffusion")?,
+            None => self.network.validate("diffusion", self.action_horizon)?,
+        }
+        if self.transformer.is_some() && self.vision.is_some() {
+            return refuse(
+                "vision",
+                "given".to_string(),
+                "none with a transformer, which sees no pictures".to_string(),
+            );
+        }
+        if self.action_horizon == 0 {
+            return refuse("action_horizon", "0".to_string(), "at least 1".to_string());
+        }
         if self.num_train_timesteps == 0 {
             return refuse("num_train_timesteps", "0".to_string(), "at least 1".to_string());
         }

@@ -31,10 +31,10 @@ pub(crate) struct FusedUnet {
 
 /// What the network looks at: x (n, T, A), the step of each row, the condition (n, C).
 #[derive(Clone, Copy)]
-struct Asked<'a> {
-    x: &'a [f32],
-    steps: &'a [f32],
-    cond: &'a [f32],
+pub(super) struct Asked<'a> {
+    pub(super) x: &'a [f32],
+    pub(super) steps: &'a [f32],
+    pub(super) cond: &'a [f32],
 }
 
 /// What its answer is held to: (n, T, A), how much each step counts, (n, T), or all alike, and over how many numbers and
@@ -160,7 +160,7 @@ impl FusedUnet {
 
 impl Wanted {
     /// The mean squared error of an answer, (n, T, A), which becomes its gradient.
-    fn compare(&self, out: &mut [f32], width: usize) -> f64 {
+    pub(super) fn compare(&self, out: &mut [f32], width: usize) -> f64 {
         let mut sum = 0.0;
         let slope = (2.0 * self.share / self.entries) as f32;
         for (step, (out, wanted)) in out.chunks_exact_mut(width).zip(self.values.chunks_exact(width)).enumerate() {

@@ -201,6 +201,7 @@ pub fn read_config(config: &Value) -> Result<LerobotDiffusion> {
         inference_steps: keys.num_inference_steps.unwrap_or(keys.num_train_timesteps),
         clip_sample: if keys.clip_sample { keys.clip_sample_range } else { 0.0 },
         mask_padding: keys.do_mask_loss_for_padding,
+        transformer: None,
         vision: None,
     };
     config.validate()?;
@@ -211,9 +212,12 @@ pub fn read_config(config: &Value) -> Result<LerobotDiffusion> {
 /// Writes a `config.json` that LeRobot 0.6.1 loads.
 ///
 /// # Errors
-/// What LeRobot's diffusion cannot read: entities, or nothing but a state.
+/// What LeRobot's diffusion cannot read: entities, nothing but a state, or another network than its UNet.
 pub fn write_config(diffusion: &LerobotDiffusion) -> Result<Value> {
     let (c, signature) = (&diffusion.config, &diffusion.signature);
+    if c.transformer.is_some() {
+        return Err(refuse("transformer", "a transformer", "LeRobot's UNet, the only network that its diffusion has"));
+    }
     let mut inputs = json!({});
     for spec in &signature.observation {
         let kind = match spec.kind {
@@ -336,5 +340,10 @@ mod tests {
         let mut alone = example();
         alone.signature.observation.truncate(1);
         assert!(write_config(&alone).unwrap_err().to_string().contains("observation.state alone"));
+        let mut tokens = example();
+        tokens.config.transformer = Some(super::super::TransformerConfig::default());
+        assert!(
+            write_config(&tokens).unwrap_err().to_string().contains("transformer is a transformer, expected LeRobot")
+        );
     }
 }

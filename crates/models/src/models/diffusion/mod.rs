@@ -11,8 +11,11 @@
 //! in as many as were trained); every frame starts a window (LeRobot leaves out the last 7 of an episode). The moving average
 //! of the weights is the trainer's (`train.ema_decay`), with one decay; Chi et al.'s grows, LeRobot has none.
 //!
-//! `unet.rs` is the readable form; training steps and predictions run on `fused.rs`, the same maths written out, which
-//! `bench_policies` puts beside LeRobot's. One step of DDIM starts at the least noisy timestep, as diffusers' spacing
+//! The network is LeRobot's UNet or, with `[policy.transformer]`, Chi et al.'s transformer (`transformer.rs`), which LeRobot
+//! does not have; it is held to their own code.
+//!
+//! `unet.rs` and `transformer.rs` are the readable forms; training steps and predictions run on `fused.rs` and
+//! `transformer_fused.rs`, the same maths written out. `bench_policies` puts the UNet's beside LeRobot's. One step of DDIM starts at the least noisy timestep, as diffusers' spacing
 //! `leading` has it: it is there for parity, not to act by.
 
 pub(crate) mod condition;
@@ -20,10 +23,13 @@ mod config;
 pub(crate) mod fused;
 pub mod lerobot;
 mod schedule;
+mod transformer;
+mod transformer_fused;
 pub mod unet;
 
 pub use config::{Config, Prediction, Sampler};
 pub use schedule::NoiseSchedule;
+pub use transformer::TransformerConfig;
 
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
@@ -33,6 +39,7 @@ use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
 use crate::gradients::Gradients;
+use crate::layers::Mode;
 use crate::model::{LossParts, LossValues, PolicyModel};
 use crate::params::Params;
 use crate::policy::{Clock, Policy};
@@ -40,10 +47,12 @@ use crate::preprocess::Preprocess;
 use crate::rng::Rng;
 use crate::values::with_values;
 use candle_core::Tensor;
-use condition::Condition;
-use fused::{FusedUnet, Wanted};
+use condition::{Condition, Told};
+use fused::{Asked, FusedUnet, Wanted};
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use transformer::{Around, Transformer};
+use transformer_fused::FusedTransformer;
 use unet::Unet;
 
 /// The kinds of features that it reads.
@@ -58,8 +67,77 @@ pub struct Diffusion {
     params: Params,
     condition: Condition,
     schedule: NoiseSchedule,
-    unet: Unet,
-    fused: FusedUnet,
+    network: Network,
+}
+
+/// What takes the noise out, as one reads it and by hand.
+#[derive(Debug)]
+enum Network {
+    Unet(Unet, FusedUnet),
+    Transformer(Transformer, FusedTransformer),
+}
+
+impl Network {
+    fn new(
+        p: &mut Params,
+        config: &Config,
+        signature: &Signature,
+        condition: &Condition,
+        rng: &mut Rng,
+    ) -> Result<Self> {
+        let (horizon, action_dim, n_obs_steps) = (config.action_horizon, signature.action_dim, signature.n_obs_steps);
+        if let Some(transformer) = &config.transformer {
+            let around = Around { horizon, action_dim, n_obs_steps, width: condition.width() / n_obs_steps };
+            let network = Transformer::new(p, around, transformer, rng)?;
+            return Ok(Self::Transformer(network, FusedTransformer::new(transformer, around)));
+        }
+        let unet = Unet::new(p, "unet", (action_dim, condition.width()), &config.network, rng)?;
+        Ok(Self::Unet(unet, FusedUnet::new(&config.network, "unet", (horizon, action_dim))))
+    }
+
+    /// x: (b, T, A), the step of each row, cond: (b, C) -> (b, T, A), with a gradient
+    fn forward(&self, x: &Tensor, steps: &[f32], cond: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
+        match self {
+            Self::Unet(network, _) => network.forward(x, steps, cond),
+            Self::Transformer(network, _) => network.forward(x, steps, cond, mode),
+        }
+    }
+
+    /// The condition, (b, C), with what the cameras see.
+    fn seen(&self, params: &Params, rows: usize, told: Told<'_>) -> Result<Vec<f32>> {
+        match self {
+            Self::Unet(_, fused) => fused.seen(params, rows, told),
+            Self::Transformer(..) => Ok(told.numbers),
+        }
+    }
+
+    /// The answer without a gradient, (b, T, A) -> (b, T, A)
+    fn answered(&self, params: &Params, x: &Tensor, steps: &[f32], cond: &[f32]) -> Result<Tensor> {
+        match self {
+            Self::Unet(_, fused) => fused.answered(params, x, steps, cond),
+            Self::Transformer(_, fused) => fused.answered(params, x, steps, cond),
+        }
+    }
+
+    /// The mean squared error of the answer to x, (b, T, A), at these steps; gradients are added to `into`.
+    fn squared_error(
+        &self,
+        params: &Params,
+        told: Told<'_>,
+        (x, steps, wanted): (&[f32], &[f32], Wanted),
+        rng: &mut Rng,
+        into: &mut Gradients,
+    ) -> Result<f64> {
+        match self {
+            Self::Unet(_, fused) => {
+                let [error] = fused.squared_errors(params, told, [(x, steps, wanted)], into)?;
+                Ok(error)
+            }
+            Self::Transformer(_, fused) => {
+                fused.squared_error(params, Asked { x, steps, cond: &told.numbers }, &wanted, rng, into)
+            }
+        }
+    }
 }
 
 /// A tensor's numbers in order.
@@ -111,11 +189,9 @@ impl Diffusion {
         check_reaches("diffusion", signature, config.action_horizon)?;
         let (mut p, rng) = (Params::new(), &mut Rng::new(seed, "init"));
         let condition = Condition::new(&mut p, "diffusion", signature, config.vision.as_ref(), rng)?;
-        let dims = (signature.action_dim, condition.width());
-        let unet = Unet::new(&mut p, "unet", dims, &config.network, rng)?;
-        let fused = FusedUnet::new(&config.network, "unet", (config.action_horizon, signature.action_dim));
+        let network = Network::new(&mut p, config, signature, &condition, rng)?;
         let schedule = NoiseSchedule::new(config.num_train_timesteps);
-        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, condition, schedule, unet, fused })
+        Ok(Self { config: config.clone(), signature: signature.clone(), params: p, condition, schedule, network })
     }
 
     /// The same model drawing its actions otherwise.
@@ -133,20 +209,34 @@ impl Diffusion {
     /// # Errors
     /// An observation that does not fit.
     pub fn denoise(&self, observation: &Features<Tensor>, x: &Tensor, steps: &[u32]) -> Result<Tensor> {
+        self.denoised(observation, x, steps, &mut Mode::Eval)
+    }
+
+    fn denoised(
+        &self,
+        observation: &Features<Tensor>,
+        x: &Tensor,
+        steps: &[u32],
+        mode: &mut Mode<'_>,
+    ) -> Result<Tensor> {
         let rows = check_observation("diffusion", &self.signature, observation)?;
         let cond = self.condition.forward(rows, observation)?;
         let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
-        self.unet.forward(x, &steps, &cond)
+        self.network.forward(x, &steps, &cond, mode)
     }
 
-    /// The loss with this noise, (b, H, A), and these steps, one a row.
+    /// The loss with this noise, (b, H, A), and these steps, one a row, without dropout.
     ///
     /// # Errors
     /// A batch that does not fit.
     pub fn loss_with(&self, batch: &Batch, noise: &Tensor, steps: &[u32]) -> Result<Tensor> {
+        self.loss_in(batch, (noise, steps), &mut Mode::Eval)
+    }
+
+    fn loss_in(&self, batch: &Batch, (noise, steps): (&Tensor, &[u32]), mode: &mut Mode<'_>) -> Result<Tensor> {
         check_batch("diffusion", &self.signature, self.config.action_horizon, batch)?;
         let noisy = self.schedule.add_noise(&batch.actions, noise, steps)?;
-        let output = self.denoise(&batch.observation, &noisy, steps)?;
+        let output = self.denoised(&batch.observation, &noisy, steps, mode)?;
         let wanted = match self.config.prediction {
             Prediction::Epsilon => noise,
             Prediction::Sample => &batch.actions,
@@ -176,14 +266,14 @@ impl Diffusion {
         on_seen: &mut dyn FnMut(),
     ) -> Result<Tensor> {
         let rows = check_observation("diffusion", &self.signature, observation)?;
-        let cond = self.fused.seen(&self.params, rows, self.condition.told(rows, observation)?)?;
+        let cond = self.network.seen(&self.params, rows, self.condition.told(rows, observation)?)?;
         if self.condition.vision().is_some() {
             on_seen();
         }
         let mut x = noise.clone();
         for step in self.schedule.visited(self.config.inference_steps) {
             let steps = vec![step as f32; rows];
-            let output = self.fused.answered(&self.params, &x, &steps, &cond)?;
+            let output = self.network.answered(&self.params, &x, &steps, &cond)?;
             x = self.schedule.back(&self.config, &x, &output, step, drawn)?;
         }
         Ok(x)
@@ -227,14 +317,14 @@ impl PolicyModel for Diffusion {
             Prediction::Sample => &batch.actions,
         };
         let wanted = Wanted::of(wanted, batch, self.config.mask_padding, 1.0)?;
-        let [loss] = self.fused.squared_errors(&self.params, told, [(&noisy, &steps, wanted)], into)?;
+        let loss = self.network.squared_error(&self.params, told, (&noisy, &steps, wanted), rng, into)?;
         Ok(LossValues { total: loss as f32, parts: BTreeMap::from([("l2_loss".to_string(), loss as f32)]) })
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
         let batch = &self.condition.looked_at(batch, rng)?;
         let (noise, steps) = self.drawn(batch.rows(), rng)?;
-        let total = self.loss_with(batch, &noise, &steps)?;
+        let total = self.loss_in(batch, (&noise, &steps), &mut Mode::Train(rng))?;
         Ok(LossParts { parts: BTreeMap::from([("l2_loss".to_string(), total.detach())]), total })
     }
 

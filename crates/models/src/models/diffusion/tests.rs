@@ -14,6 +14,14 @@ fn small() -> Config {
     Config { action_horizon: 8, network, ..Config::default() }
 }
 
+fn tokens() -> TransformerConfig {
+    TransformerConfig { dim_model: 12, n_heads: 3, n_layers: 2, dropout: 0.0, causal: true }
+}
+
+fn attending(transformer: TransformerConfig) -> Config {
+    Config { transformer: Some(transformer), ..small() }
+}
+
 /// With pictures, whose network has too many kinks for slopes; of one step and of two.
 fn seeing() -> Vec<(Signature, Config)> {
     let of = signatures();
@@ -30,17 +38,20 @@ fn cases() -> Vec<(Signature, Config)> {
     let three = NetworkConfig { down_dims: vec![16, 24, 40], ..small().network };
     vec![
         (of.plain, small()),
-        (of.history, Config { prediction: Prediction::Sample, mask_padding: true, ..small() }),
-        (of.entities, Config { network: shifted, ..small() }),
+        (of.history.clone(), Config { prediction: Prediction::Sample, mask_padding: true, ..small() }),
+        (of.entities.clone(), Config { network: shifted, ..small() }),
         (of.no_env.clone(), Config { network: one_level, ..small() }),
         (of.no_env, Config { network: three, mask_padding: true, ..small() }),
+        (of.entities, attending(TransformerConfig { dropout: 0.2, ..tokens() })),
+        (of.history, Config { mask_padding: true, ..attending(TransformerConfig { causal: false, ..tokens() }) }),
     ]
 }
 
 #[test]
 fn the_gradient_is_the_slope_of_the_loss() {
-    for (signature, config) in cases().into_iter().take(3) {
+    for (signature, config) in cases().into_iter().filter(|(_, config)| config.network.down_dims.len() == 2) {
         let model = Diffusion::new(&config, &signature, 1).unwrap();
+        move_parameters(&model);
         let batch = batch(&signature, 8, 3, 3);
         assert_the_gradient_is_the_slope(&model, &batch, &format!("{config:?}"));
     }
@@ -73,8 +84,8 @@ fn answers_by_hand_are_the_composed_ones_also_when_weights_change() {
             for level in Level::ALL {
                 let got = at_most(level, || {
                     let told = model.condition.told(rows, &batch.observation).unwrap();
-                    let cond = model.fused.seen(&model.params, rows, told).unwrap();
-                    model.fused.answered(&model.params, &batch.actions, &steps, &cond).unwrap()
+                    let cond = model.network.seen(&model.params, rows, told).unwrap();
+                    model.network.answered(&model.params, &batch.actions, &steps, &cond).unwrap()
                 });
                 for (got, want) in values(&got).unwrap().iter().zip(&want) {
                     assert!((got - want).abs() < 1e-5 * want.abs().max(1.0), "{got} {want} {level:?} {config:?}");
@@ -173,6 +184,17 @@ fn impossible_configurations_name_the_field() {
     assert!(error(network(|n| n.down_dims = vec![])).contains("network.down_dims"));
     assert!(error(network(|n| n.down_dims = vec![12, 24])).contains("a multiple of 8 first"));
     assert!(error(network(|n| n.step_embed_dim = 5)).contains("step_embed_dim"));
+    let attends = |change: fn(&mut TransformerConfig)| {
+        let mut transformer = tokens();
+        change(&mut transformer);
+        error(attending(transformer))
+    };
+    assert!(attends(|t| t.n_heads = 5).contains("transformer.n_heads is 5, expected a divisor of dim_model, 12"));
+    assert!(attends(|t| t.dim_model = 9).contains("transformer.dim_model is 9"));
+    assert!(attends(|t| t.n_layers = 0).contains("transformer.n_layers is 0"));
+    assert!(attends(|t| t.dropout = 1.0).contains("transformer.dropout is 1"));
+    let both = Config { vision: Some(eyes()), ..attending(tokens()) };
+    assert!(error(both).contains("vision is given, expected none with a transformer"));
     let sees = |vision| {
         let config = Config { vision: Some(vision), ..small() };
         Diffusion::new(&config, &of.pictures, 0).unwrap_err().to_string()

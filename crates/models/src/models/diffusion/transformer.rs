@@ -1,0 +1,178 @@
+//! The transformer that takes noise out of an action sequence, in the UNet's place: Chi et al.'s `TransformerForDiffusion`
+//! (github.com/real-stanford/diffusion_policy) with its tensor names and its initial weights. The step and what is observed at
+//! every step are tokens, which a small network reads one by one; the decoder's tokens are the actions.
+//!
+//! Deviations: every action attends to all observations (there, with `causal_attn`, the first ones not to the last ones);
+//! no dropout of tokens (0 in their experiments on low-dimensional observations) and no encoder over the observations
+//! (`n_cond_layers`, 0 there); no pictures.
+//!
+//! This file is the network as one reads it; training steps and predictions run on `transformer_fused.rs`.
+
+use super::unet::embedding;
+use crate::device::HERE;
+use crate::error::{ModelError, Result};
+use crate::layers::{Activation, DecoderLayer, LayerNorm, Linear, Mode, Shape, mish};
+use crate::params::{Init, Params};
+use crate::rng::Rng;
+use crate::size::Size;
+use candle_core::{DType, Tensor};
+use serde::{Deserialize, Serialize};
+
+/// What the names of its parameters begin with.
+pub(super) const PREFIX: &str = "transformer";
+/// Deviation of initial matrices and positions.
+const STD: f64 = 0.02;
+
+/// Options of the network, with the values of Chi et al.'s experiments on low-dimensional observations.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TransformerConfig {
+    /// width of a token (there: `n_emb`)
+    pub dim_model: usize,
+    /// attention heads
+    pub n_heads: usize,
+    /// decoder layers
+    pub n_layers: usize,
+    /// of attention weights and of branches (there: `p_drop_attn`)
+    pub dropout: f64,
+    /// whether an action attends to itself and earlier ones only (there: `causal_attn`)
+    pub causal: bool,
+}
+
+impl Default for TransformerConfig {
+    fn default() -> Self {
+        Self { dim_model: 256, n_heads: 4, n_layers: 8, dropout: 0.3, causal: true }
+    }
+}
+
+impl TransformerConfig {
+    /// Checks that such a network can exist.
+    ///
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub fn validate(&self, model: &'static str) -> Result<()> {
+        let refuse = |field, found: String, expected: String| Err(ModelError::Config { model, field, found, expected });
+        if self.dim_model < 4 || !self.dim_model.is_multiple_of(2) {
+            let found = self.dim_model.to_string();
+            return refuse("transformer.dim_model", found, "an even number from 4".to_string());
+        }
+        if self.n_heads == 0 || !self.dim_model.is_multiple_of(self.n_heads) {
+            let expected = format!("a divisor of dim_model, {}", self.dim_model);
+            return refuse("transformer.n_heads", self.n_heads.to_string(), expected);
+        }
+        if self.n_layers == 0 {
+            return refuse("transformer.n_layers", "0".to_string(), "at least 1".to_string());
+        }
+        if !(0.0..1.0).contains(&self.dropout) {
+            return refuse("transformer.dropout", self.dropout.to_string(), "at least 0 and below 1".to_string());
+        }
+        Ok(())
+    }
+
+    /// How large the network will be over `action_horizon` steps, without what depends on observation and action.
+    pub fn size(&self, action_horizon: usize) -> Size {
+        let (dim, layers) = (self.dim_model as f64, self.n_layers as f64);
+        let layer = self.shape().size(2, action_horizon);
+        let before = Size { weights: 8.0 * dim * dim + action_horizon as f64 * dim, activations: 8.0 * dim };
+        before + Size { weights: layers * layer.weights, activations: layers * layer.activations }
+    }
+
+    /// What its layers share.
+    pub(super) fn shape(&self) -> Shape {
+        Shape {
+            dim: self.dim_model,
+            heads: self.n_heads,
+            hidden: 4 * self.dim_model,
+            activation: Activation::Gelu,
+            dropout: self.dropout,
+            pre_norm: true,
+        }
+    }
+}
+
+/// Sizes around the network.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Around {
+    pub(super) horizon: usize,
+    pub(super) action_dim: usize,
+    /// observations
+    pub(super) n_obs_steps: usize,
+    /// numbers of one of them
+    pub(super) width: usize,
+}
+
+/// The network.
+#[derive(Debug)]
+pub(super) struct Transformer {
+    dim: usize,
+    around: Around,
+    input_emb: Linear,
+    /// (1, T, D)
+    pos_emb: Tensor,
+    cond_obs_emb: Linear,
+    /// (1, 1 + observations, D)
+    cond_pos_emb: Tensor,
+    encoder: [Linear; 2],
+    layers: Vec<DecoderLayer>,
+    ln_f: LayerNorm,
+    head: Linear,
+}
+
+impl Transformer {
+    /// `config` was validated.
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub(super) fn new(p: &mut Params, around: Around, config: &TransformerConfig, rng: &mut Rng) -> Result<Self> {
+        let (dim, shape) = (config.dim_model, config.shape());
+        let Around { horizon, action_dim, n_obs_steps, width } = around;
+        let name = |last: &str| format!("{PREFIX}.{last}");
+        let normal = Init::Normal { std: STD };
+        let linear = |p: &mut Params, last: &str, sizes, rng: &mut Rng| {
+            Linear::with_init(p, &name(last), sizes, normal, Some(Init::Zeros), rng)
+        };
+        let mut layers = Vec::with_capacity(config.n_layers);
+        for i in 0..config.n_layers {
+            let mut layer = DecoderLayer::new(p, &name(&format!("decoder.layers.{i}")), shape, rng)?;
+            layer.self_attn.causal = config.causal;
+            layers.push(layer);
+        }
+        // the layers' matrices begin as everything else
+        let of_layers = name("decoder.");
+        for (_, var) in p.iter().filter(|(name, var)| name.starts_with(&of_layers) && var.dims().len() == 2) {
+            var.set(&Tensor::from_vec(normal.values(var.dims(), rng), var.dims(), &HERE)?)?;
+        }
+        Ok(Self {
+            dim,
+            around,
+            input_emb: linear(p, "input_emb", (action_dim, dim), rng)?,
+            pos_emb: p.create(&name("pos_emb"), &[1, horizon, dim], normal, rng)?,
+            cond_obs_emb: linear(p, "cond_obs_emb", (width, dim), rng)?,
+            cond_pos_emb: p.create(&name("cond_pos_emb"), &[1, 1 + n_obs_steps, dim], normal, rng)?,
+            encoder: [linear(p, "encoder.0", (dim, 4 * dim), rng)?, linear(p, "encoder.2", (4 * dim, dim), rng)?],
+            layers,
+            ln_f: LayerNorm::new(p, &name("ln_f"), dim, rng)?,
+            head: linear(p, "head", (dim, action_dim), rng)?,
+        })
+    }
+
+    /// x: (b, T, A), the step of each row, cond: (b, observations * width) -> (b, T, A)
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub(super) fn forward(&self, x: &Tensor, steps: &[f32], cond: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
+        let (rows, dim) = (steps.len(), self.dim);
+        let time = Tensor::from_vec(embedding(steps, dim), (rows, 1, dim), &HERE)?;
+        let seen = cond.reshape((rows, self.around.n_obs_steps, self.around.width))?;
+        let told = Tensor::cat(&[&time, &self.cond_obs_emb.forward(&seen)?], 1)?.broadcast_add(&self.cond_pos_emb)?;
+        let [first, second] = &self.encoder;
+        let memory = second.forward(&mish(&first.forward(&told)?)?)?;
+        // positions are in the tokens already
+        let none = Tensor::zeros((1, 1, dim), DType::F32, &HERE)?;
+        let mut x = self.input_emb.forward(x)?.broadcast_add(&self.pos_emb)?;
+        for layer in &self.layers {
+            x = layer.forward(&x, &none, &memory, &none, mode)?;
+        }
+        self.head.forward(&self.ln_f.forward(&x)?)
+    }
+}
