@@ -2,7 +2,7 @@
 
     python make_transformer_fixture.py OUT_FOLDER --reference CHECKOUT [--seed N]
 
-needs torch and a checkout of https://github.com/real-stanford/diffusion_policy (5ba07ac6661d, of 2024; it has no release).
+needs torch and a checkout of https://github.com/real-stanford/diffusion_policy (5ba07ac6661d; it has no releases).
 Each fixture is a folder with config.json, model.safetensors, transformer.npz (inputs, the network's output, the mean
 squared error to `eps`) and gradients.safetensors (of that error).
 `ACTRM_PARITY_DIR=OUT_FOLDER cargo test --release --test diffusion_parity` then holds ours to them.
