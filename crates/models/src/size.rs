@@ -57,6 +57,7 @@ mod tests {
         let layers = serde_json::json!({"hidden": [1024, 1024], "action_horizon": 16});
         let plain = serde_json::json!({});
         let levels = serde_json::json!({"network": {"down_dims": [32, 64, 128]}});
+        let tokens = serde_json::json!({"transformer": {"dim_model": 64, "n_layers": 3}});
         let recurrent = serde_json::json!({"action_horizon": 1, "hidden_dim": 64});
         let shallow = serde_json::json!({"dim_model": 64, "n_layers": 2});
         for kind in PolicyConfig::TYPES {
@@ -65,7 +66,8 @@ mod tests {
                 "bc" => vec![&layers],
                 "bc_rnn" => vec![&recurrent],
                 "bc_transformer" => vec![&shallow],
-                "diffusion" | "flow" | "mip" => vec![&levels],
+                "diffusion" => vec![&levels, &tokens],
+                "flow" | "mip" => vec![&levels],
                 _ => vec![&plain],
             };
             for keys in tried {

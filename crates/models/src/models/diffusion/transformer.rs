@@ -71,10 +71,9 @@ impl TransformerConfig {
 
     /// How large the network will be over `action_horizon` steps, without what depends on observation and action.
     pub fn size(&self, action_horizon: usize) -> Size {
-        let (dim, layers) = (self.dim_model as f64, self.n_layers as f64);
-        let layer = self.shape().size(2, action_horizon);
-        let before = Size { weights: 8.0 * dim * dim + action_horizon as f64 * dim, activations: 8.0 * dim };
-        before + Size { weights: layers * layer.weights, activations: layers * layer.activations }
+        let (dim, steps) = (self.dim_model as f64, action_horizon as f64);
+        let before = Size { weights: 8.0 * dim * dim + steps * dim, activations: 8.0 * dim };
+        before + self.shape().size(2, action_horizon) * self.n_layers
     }
 
     /// What its layers share.
