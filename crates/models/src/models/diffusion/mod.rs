@@ -71,6 +71,7 @@ pub struct Diffusion {
 }
 
 /// What takes the noise out, as one reads it and by hand.
+#[allow(clippy::large_enum_variant)] // a model has one
 #[derive(Debug)]
 enum Network {
     Unet(Unet, FusedUnet),
