@@ -42,7 +42,7 @@ fn size(name: &str) -> Size {
 fn signature() -> Signature {
     let pictures = CAMERAS.map(|name| FeatureSpec::image(name, SIDE, SIDE));
     let observation = std::iter::once(FeatureSpec::state(9)).chain(pictures).collect();
-    Signature { observation, n_obs_steps: 1, action_dim: 7 }
+    Signature { observation, action_dim: 7, ..Signature::default() }
 }
 
 impl Size {

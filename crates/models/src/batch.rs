@@ -18,6 +18,8 @@ pub struct Batch {
     pub taken: Option<Taken>,
     /// (b, cells): 1 where a demonstration comes by a cell of a grid now or later, else 0; `None` where nobody asked.
     pub visited: Option<Tensor>,
+    /// (b, K): numbers that the demonstrations know and the policy does not see, normalised; `None` where nobody asked.
+    pub auxiliary: Option<Tensor>,
     /// Rows of the whole batch that this one is a shard of: losses are averaged over this number.
     pub total_rows: usize,
     /// Steps of the whole batch that are not padding.
@@ -74,6 +76,7 @@ impl Batch {
             is_pad: Tensor::from_vec(pad, (n, action_horizon), dev)?,
             taken: None,
             visited: None,
+            auxiliary: None,
             total_rows: n,
             total_valid_steps: is_pad.iter().filter(|&&p| !p).count(),
             seed: 0,
@@ -122,6 +125,7 @@ impl Batch {
                         .as_ref()
                         .map(|taken| Taken { features: taken.features[from..to].to_vec(), ..*taken }),
                     visited: self.visited.as_ref().map(cut).transpose()?,
+                    auxiliary: self.auxiliary.as_ref().map(cut).transpose()?,
                     ..self.clone()
                 })
             })

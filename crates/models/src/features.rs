@@ -117,12 +117,19 @@ pub struct Signature {
     pub n_obs_steps: usize,
     /// numbers in an action
     pub action_dim: usize,
+    /// numbers that are asked for in training alone
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub auxiliary_dim: usize,
+}
+
+fn is_zero(count: &usize) -> bool {
+    *count == 0
 }
 
 impl Default for Signature {
     /// Sees nothing, does nothing.
     fn default() -> Self {
-        Self { observation: Vec::new(), n_obs_steps: 1, action_dim: 0 }
+        Self { observation: Vec::new(), n_obs_steps: 1, action_dim: 0, auxiliary_dim: 0 }
     }
 }
 
@@ -133,7 +140,7 @@ impl Signature {
         if environment_state > 0 {
             observation.push(FeatureSpec::environment_state(environment_state));
         }
-        Self { observation, n_obs_steps: 1, action_dim }
+        Self { observation, n_obs_steps: 1, action_dim, auxiliary_dim: 0 }
     }
 
     /// The feature of this name.
@@ -466,7 +473,7 @@ mod tests {
     #[test]
     fn features_that_do_not_go_together_are_refused_by_name() {
         let error = |specs: Vec<FeatureSpec>| {
-            let signature = Signature { observation: specs, n_obs_steps: 1, action_dim: 1 };
+            let signature = Signature { observation: specs, action_dim: 1, ..Signature::default() };
             signature.check("act", &READS).unwrap_err().to_string()
         };
         let cube = |name: &str, width| FeatureSpec::entity(name, width, "cubes", false);

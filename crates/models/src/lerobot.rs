@@ -20,6 +20,8 @@ const PREFIX: &str = "model.";
 const LEROBOTS_WIDTH: usize = 64;
 /// Buffers of ours that stand among LeRobot's statistics, not among its weights.
 const OF_PICTURES: [&str; 2] = [PICTURE_MEAN, PICTURE_STD];
+/// Weights of ours that only training reads (`layers/auxiliary.rs`).
+const OF_TRAINING: [&str; 2] = ["auxiliary_head.weight", "auxiliary_head.bias"];
 /// LeRobot saves this fixed table with the weights.
 const POSITION_BUFFER: &str = "vae_encoder_pos_enc";
 
@@ -234,6 +236,7 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
         kl_weight: keys.kl_weight,
         vision: if pictures.is_empty() { None } else { Some(vision(&keys)?) },
         pointer: None,
+        auxiliary: None,
     };
     config.validate()?;
     let mut signature = Signature::low_dimensional(state, env, action);
@@ -449,7 +452,8 @@ pub fn statistics_out(params: &Params, signature: &Signature) -> Result<BTreeMap
 /// # Errors
 /// If the tensor library fails.
 pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, Tensor>> {
-    let named = params.tensors().into_iter().filter(|(name, _)| !OF_PICTURES.contains(&name.as_str()));
+    let theirs = |name: &str| !OF_PICTURES.contains(&name) && !OF_TRAINING.contains(&name);
+    let named = params.tensors().into_iter().filter(|(name, _)| theirs(name));
     let named = named.map(|(name, t)| (format!("{PREFIX}{name}"), t));
     let mut tensors: BTreeMap<String, Tensor> = named.collect();
     if config.use_vae {
@@ -464,6 +468,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::features::FeatureSpec;
+    use crate::layers::AuxiliaryConfig;
     use crate::model::PolicyModel;
     use crate::models::act::Act;
 
@@ -511,6 +516,17 @@ mod tests {
         let table = &bad["model.vae_encoder_pos_enc"];
         bad.insert("model.vae_encoder_pos_enc".to_string(), (table * 1.1).unwrap());
         assert!(load_into_b(&bad).is_err());
+    }
+
+    #[test]
+    fn what_training_alone_reads_is_not_written() {
+        let one = example();
+        let told = Config { auxiliary: Some(AuxiliaryConfig::default()), ..one.config.clone() };
+        let signature = Signature { auxiliary_dim: 3, ..one.signature.clone() };
+        let act = Act::new(&told, &signature, 1).unwrap();
+        let names = |act: &Act, config| tensors_out(act.params(), config).unwrap().into_keys().collect::<Vec<_>>();
+        assert!(act.params().get("auxiliary_head.weight").is_some());
+        assert_eq!(names(&act, &told), names(&Act::new(&one.config, &one.signature, 1).unwrap(), &one.config));
     }
 
     #[test]

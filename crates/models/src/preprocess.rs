@@ -165,7 +165,7 @@ mod tests {
             FeatureSpec::entity("a", 1, "ab", false),
             FeatureSpec::entity("b", 1, "ab", false),
         ];
-        let signature = Signature { observation, n_obs_steps, action_dim: 1 };
+        let signature = Signature { observation, n_obs_steps, action_dim: 1, ..Signature::default() };
         let (mut modes, mut tensors) = (BTreeMap::new(), BTreeMap::new());
         let widths = signature.observation.iter().map(|spec| (spec.name.as_str(), spec.width(), 1.0, 2.0));
         for (name, width, mean, std) in widths.chain([(ACTION, 1, 10.0, 5.0)]) {

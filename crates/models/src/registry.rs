@@ -2,7 +2,7 @@
 
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
-use crate::layers::{GridConfig, PointerConfig};
+use crate::layers::{AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::model::PolicyModel;
 use crate::models::floors::{expert, nearest, random, replay, zero};
 use crate::models::{act, actrm, bc, bc_rnn, bc_transformer, diffusion, flow, mip};
@@ -139,6 +139,15 @@ impl PolicyConfig {
         match self {
             Self::Act(config) => config.pointer.as_ref(),
             Self::Actrm(config) => config.pointer.as_ref(),
+            _ => None,
+        }
+    }
+
+    /// What training asks for that it does not see, if it asks.
+    pub fn auxiliary(&self) -> Option<&AuxiliaryConfig> {
+        match self {
+            Self::Act(config) => config.auxiliary.as_ref(),
+            Self::Actrm(config) => config.auxiliary.as_ref(),
             _ => None,
         }
     }

@@ -51,7 +51,7 @@ mod tests {
     #[test]
     fn the_size_told_is_below_the_real_one_and_near_it() {
         let observation = vec![FeatureSpec::state(9), FeatureSpec::environment_state(10)];
-        let signature = Signature { observation, n_obs_steps: 1, action_dim: 7 };
+        let signature = Signature { observation, action_dim: 7, ..Signature::default() };
         let wide = serde_json::json!({"dim_model": 128, "n_heads": 4, "dim_feedforward": 256, "action_horizon": 16});
         let deep = serde_json::json!({"dim_model": 32, "n_heads": 4, "dim_feedforward": 64, "action_horizon": 100});
         let layers = serde_json::json!({"hidden": [1024, 1024], "action_horizon": 16});

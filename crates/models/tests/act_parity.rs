@@ -58,6 +58,7 @@ impl Fixture {
             total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
             taken: None,
             visited: None,
+            auxiliary: None,
             seed: 0,
         }
     }

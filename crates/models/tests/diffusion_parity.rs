@@ -52,6 +52,7 @@ impl Fixture {
             seed: 0,
             taken: None,
             visited: None,
+            auxiliary: None,
         }
     }
 

@@ -83,6 +83,7 @@ impl Fixture {
             total_valid_steps: rows * horizon,
             taken: None,
             visited: None,
+            auxiliary: None,
             seed: 0,
         }
     }

@@ -20,6 +20,8 @@ use crate::{FeatureKeys, ZooError};
 
 /// What the name of a camera's feature begins with, LeRobot's.
 pub(crate) const PICTURE_PREFIX: &str = "observation.images.";
+/// What the column of what is told in training alone is called, among the entities.
+pub(crate) const AUXILIARY: &str = "auxiliary";
 /// What a camera's observation key ends in, robomimic's.
 pub(crate) const PICTURE_SUFFIX: &str = "_image";
 
@@ -105,6 +107,9 @@ pub struct DataSection {
     pub state_keys: Vec<String>,
     /// Observation keys that make `observation.environment_state`, in order; may be empty.
     pub env_keys: Vec<String>,
+    /// Observation keys of what is known in training and not seen, in order: `policy.auxiliary` asks for them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub auxiliary_keys: Vec<String>,
     /// Things that are a token each, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub entities: BTreeMap<String, EntitySection>,
@@ -143,6 +148,7 @@ impl Default for DataSection {
             path: String::new(),
             state_keys: owned(&["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]),
             env_keys: owned(&["object"]),
+            auxiliary_keys: Vec::new(),
             entities: BTreeMap::new(),
             grids: BTreeMap::new(),
             symmetries: BTreeMap::new(),
@@ -396,9 +402,38 @@ impl Experiment {
         }
         self.policy.validate().map_err(self.model_error("build the policy of"))?;
         self.data.check(self.policy.reads())?;
+        self.check_auxiliary()?;
         self.check_pointer()?;
         self.check_grid()?;
         self.train.check()
+    }
+
+    /// What is asked for is told, and nothing else.
+    fn check_auxiliary(&self) -> Result<(), ZooError> {
+        let (keys, asked) = (&self.data.auxiliary_keys, self.policy.auxiliary().is_some());
+        let invalid = |expected: &str| {
+            let (key, found) = ("data.auxiliary_keys".to_owned(), keys.join(", "));
+            let found = if found.is_empty() { "none".to_owned() } else { found };
+            Err(ZooError::InvalidValue { key, expected: expected.to_owned(), found })
+        };
+        match (keys.is_empty(), asked) {
+            (true, true) => return invalid("observation keys, for policy.auxiliary asks for them"),
+            (false, false) => return invalid("none without policy.auxiliary"),
+            (true, false) => return Ok(()),
+            (false, true) => {}
+        }
+        let mut parsed = FeatureKeys::default();
+        if let Err(found) = parsed.insert(AUXILIARY, keys) {
+            return invalid(&format!("observation keys, parts of them (key[0:3]) and differences (a - b): {found}"));
+        }
+        // they would have to change with what is seen
+        if !self.data.symmetries.is_empty() || !self.data.exchange.is_empty() {
+            return invalid("none with data.symmetries or data.exchange");
+        }
+        match self.data.entities.contains_key(AUXILIARY) {
+            true => invalid("none beside an entity of this name"),
+            false => Ok(()),
+        }
     }
 
     /// The exchange that says which of the entities was taken that the policy's pointer is about: the one whose items lie in
@@ -616,6 +651,16 @@ mod tests {
         assert!(
             load(&[things[0], things[1], taken, "policy.pointer={ among = 'cube' }"]).unwrap_err().ends_with("`cube`")
         );
+        let (told, asks) = ("data.auxiliary_keys=['object[0:3] - robot0_eef_pos']", "policy.auxiliary.weight=0.5");
+        let experiment = load(&["data.env_keys=[]", told, asks]).unwrap();
+        assert_eq!(experiment.policy.auxiliary().unwrap().weight, 0.5);
+        assert_eq!(Experiment::from_toml("x", &experiment.to_toml()).unwrap(), experiment);
+        assert!(experiment.data.feature_keys().unwrap().keys().all(|key| key != "object"), "nobody sends it");
+        assert!(error(told).ends_with("expected none without policy.auxiliary, found object[0:3] - robot0_eef_pos"));
+        assert!(error(asks).contains("`data.auxiliary_keys`: expected observation keys, for policy.auxiliary asks"));
+        assert!(load(&["data.auxiliary_keys=['a[']", asks]).unwrap_err().contains("`a[`: expected key[from:to]"));
+        let both = load(&[told, asks, "data.symmetries.axes=['robot0_eef_pos', 'object']"]).unwrap_err();
+        assert!(both.contains("expected none with data.symmetries"), "{both}");
         assert!(load(&["data.beginning={ steps = 8, times = 4 }"]).is_ok());
         assert!(error("data.beginning={ steps = 8, times = 0 }").contains("found steps 8, times 0"));
         assert!(error("data.entities.cube=3").contains("a list of observation keys, or a table"));

@@ -6,6 +6,7 @@
 //! are computed once for the batch: `(x + pos) Wᵀ = x Wᵀ + pos Wᵀ`.
 
 mod attention;
+mod auxiliary;
 mod block;
 mod convolution;
 mod decoder;
@@ -24,6 +25,7 @@ pub(crate) mod testing;
 mod vae;
 mod vision;
 
+pub(crate) use auxiliary::{add_to_first, ask};
 pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_and_values_backward, scatter};
 pub(crate) use convolution::{convolve, framed, input_gradient, weight_gradient as convolution_gradient};
 pub(crate) use decoder::{Decoder, DecoderGrads, DecoderLayers, Memory, Own};

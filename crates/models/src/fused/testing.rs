@@ -44,6 +44,9 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
     let cells = signature.observation.iter().filter(|spec| spec.group() == "cell").count();
     let visited = (0..rows * cells).map(|_| rng.below(2) as f32).collect();
     batch.visited = (cells > 0).then(|| Tensor::from_vec(visited, (rows, cells), &Device::Cpu).unwrap());
+    let told = (rows, signature.auxiliary_dim);
+    let values = rng.normals(told.0 * told.1);
+    batch.auxiliary = (told.1 > 0).then(|| Tensor::from_vec(values, told, &Device::Cpu).unwrap());
     batch
 }
 
@@ -57,6 +60,8 @@ pub(crate) struct Signatures {
     pub(crate) history: Signature,
     pub(crate) pictures: Signature,
     pub(crate) film: Signature,
+    /// `plain`, with three numbers that training alone is told
+    pub(crate) told: Signature,
 }
 
 /// Eyes for the pictures: parts at random, colours changed, tokens of all maps.
@@ -81,7 +86,8 @@ pub(crate) fn signatures() -> Signatures {
     pictures.observation.push(cube("cube0"));
     let mut film = Signature { n_obs_steps: 2, ..no_env.clone() };
     film.observation.push(FeatureSpec::image("a", 36, 40));
-    Signatures { plain, no_env, entities, grid, history, pictures, film }
+    let told = Signature { auxiliary_dim: 3, ..plain.clone() };
+    Signatures { plain, no_env, entities, grid, history, pictures, film, told }
 }
 
 /// Loss and gradients as the trainer gets them.

@@ -8,7 +8,7 @@ use candle_core::{D, Tensor};
 
 /// Added to the scores of keys that are not attended to: it underflows to exactly 0 after the exponential; -inf would make
 /// NaN gradients of (-inf) - (-inf).
-const LATER: f32 = -1e30;
+const UNSEEN: f32 = -1e30;
 
 /// `torch.nn.MultiheadAttention`: rows 0..D, D..2D and 2D..3D of `in_proj_weight` are the query, key and value
 /// projections; scores are scaled by 1/sqrt(D/heads); dropout acts on the attention weights.
@@ -84,7 +84,7 @@ impl MultiHeadAttention {
         let mut scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / head.sqrt()))?;
         if self.causal {
             let (t, s) = (scores.dim(2)?, scores.dim(3)?);
-            let later = (0..t * s).map(|i| if i % s > i / s { LATER } else { 0.0 }).collect::<Vec<f32>>();
+            let later = (0..t * s).map(|i| if i % s > i / s { UNSEEN } else { 0.0 }).collect::<Vec<f32>>();
             scores = scores.broadcast_add(&Tensor::from_vec(later, (1, 1, t, s), scores.device())?)?;
         }
         masked_softmax(&scores, key_pad)
@@ -107,7 +107,7 @@ pub fn masked_softmax(scores: &Tensor, key_pad: Option<&Tensor>) -> Result<Tenso
     let scores = match key_pad {
         Some(pad) => {
             let (b, s) = pad.dims2()?;
-            scores.broadcast_add(&(pad.reshape((b, 1, 1, s))? * f64::from(LATER))?)?
+            scores.broadcast_add(&(pad.reshape((b, 1, 1, s))? * f64::from(UNSEEN))?)?
         }
         None => scores.clone(),
     };

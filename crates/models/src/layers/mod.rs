@@ -3,6 +3,7 @@
 //! Everything here has a gradient: candle-nn's `LayerNorm` and `softmax_last_dim` drop it in silence and are not used.
 
 mod attention;
+mod auxiliary;
 mod conv1d;
 mod dropout;
 mod embedding;
@@ -25,6 +26,8 @@ mod transformer;
 mod vae;
 
 pub use attention::{MultiHeadAttention, masked_softmax};
+pub use auxiliary::AuxiliaryConfig;
+pub(crate) use auxiliary::{AUXILIARY_HEAD, Auxiliary, Told};
 pub use conv1d::{Conv1d, Upsample1d};
 pub use dropout::{Dropout, DropoutMask, Mode};
 pub use embedding::Embedding;

@@ -330,7 +330,7 @@ mod tests {
             FeatureSpec::entity("cube1", 3, "cube", false),
             FeatureSpec::entity("goal1", 2, "goal", true),
         ];
-        let signature = Signature { observation, n_obs_steps: 2, action_dim: 1 };
+        let signature = Signature { observation, n_obs_steps: 2, action_dim: 1, ..Signature::default() };
         let layout = TokenLayout::new(&signature, None, 8).unwrap();
         let seen: Vec<_> = layout.tokens.iter().map(|t| (t.prefix.as_str(), t.width, t.position)).collect();
         assert_eq!(

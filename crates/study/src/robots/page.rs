@@ -52,12 +52,15 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
     let (results, missing) = read_results(study)?;
     let charts = by_arm(study, &results);
     let mut text = format!("# {}\n\n", study.title);
+    // a folder without a result may not be there
+    let from = match results.is_empty() {
+        true => "before any result was there".to_owned(),
+        false => format!("from the files in `{}`", study.results.display()),
+    };
     let _ = writeln!(
         text,
-        "Written by `actrm-zoo study {} --page-only` from the files in `{}`; without `--page-only` the same command runs \
-         what is missing.\n",
-        file.display(),
-        study.results.display()
+        "Written by `actrm-zoo study {} --page-only` {from}; without `--page-only` the same command runs what is missing.\n",
+        file.display()
     );
     if !study.introduction.is_empty() {
         let _ = writeln!(text, "{}\n", study.introduction.trim());

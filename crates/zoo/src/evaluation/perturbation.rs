@@ -148,7 +148,7 @@ mod tests {
         let pictures =
             cameras.iter().map(|(name, side)| FeatureSpec::image(&format!("{PICTURE_PREFIX}{name}"), *side, *side));
         let observation = std::iter::once(FeatureSpec::state(2)).chain(pictures).collect();
-        Signature { observation, n_obs_steps: 1, action_dim: 1 }
+        Signature { observation, action_dim: 1, ..Signature::default() }
     }
 
     fn seen() -> Observation {

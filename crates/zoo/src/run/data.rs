@@ -12,8 +12,9 @@ use models::{
 
 use crate::ZooError;
 use crate::entry::DataMeta;
-use crate::experiment::{DataSection, EntitySection, Experiment, PICTURE_PREFIX};
+use crate::experiment::{AUXILIARY, DataSection, EntitySection, Experiment, PICTURE_PREFIX};
 
+use super::auxiliary::{Told, is_told};
 use super::exchange::Exchanges;
 use super::preflight::picture_budget;
 use super::symmetry::Symmetries;
@@ -86,7 +87,7 @@ pub(super) fn open(
     let options = ConvertOptions {
         state_keys: Some(experiment.data.state_keys.clone()),
         env_keys: Some(experiment.data.env_keys.clone()),
-        entities: experiment.data.entities.iter().map(|(name, e)| (name.clone(), e.keys.clone())).collect(),
+        entities: columns(experiment).map(|(name, keys)| (name.to_owned(), keys.clone())).collect(),
         // no policy reads it
         depth: false,
         ..ConvertOptions::default()
@@ -137,6 +138,8 @@ pub(super) struct Demonstrations {
     pub symmetries: Symmetries,
     pub exchanges: Exchanges,
     pub ways: Ways,
+    /// What training alone is told.
+    pub told: Told,
     /// Mean and standard deviation of each camera's colours, on the scale from 0 to 1, where the data set has them.
     pub picture_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
     pub meta: DataMeta,
@@ -161,9 +164,11 @@ pub(super) fn prepare(
             ("data.state_keys".to_owned(), &experiment.data.state_keys, &provenance.state_keys),
             ("data.env_keys".to_owned(), &experiment.data.env_keys, &provenance.env_keys),
         ];
-        let entities = experiment.data.entities.iter().map(|(name, entity)| {
+        let entities = columns(experiment).map(|(name, keys)| {
             let found = provenance.entities.get(name).unwrap_or(&none);
-            (format!("data.entities.{name}"), &entity.keys, found)
+            let setting =
+                if name == AUXILIARY { "data.auxiliary_keys".to_owned() } else { format!("data.entities.{name}") };
+            (setting, keys, found)
         });
         for (key, expected, found) in named.into_iter().chain(entities) {
             if expected != found {
@@ -264,6 +269,7 @@ pub(super) fn prepare(
         valid = valid.map(|valid| valid.with_pictures(&name, pictures));
         picture_statistics.push(dataset.stats().get(&name).and_then(colours));
     }
+    let told = Told::new(experiment, &train, &statistics).map_err(experiment.model_error("take the statistics for"))?;
     let signature = signature(&train, experiment);
     let modes = experiment.normalisation.modes(&signature);
     let mut normaliser =
@@ -280,7 +286,7 @@ pub(super) fn prepare(
         Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
     let symmetries = Symmetries::new(experiment, dataset, path)?;
     let picture_statistics = picture_statistics.into_iter().collect();
-    Ok(Demonstrations { train, valid, preprocess, symmetries, exchanges, ways, picture_statistics, meta, notes })
+    Ok(Demonstrations { train, valid, preprocess, symmetries, exchanges, ways, told, picture_statistics, meta, notes })
 }
 
 /// The windows of the episodes that a training of `experiment` learns from, its symmetries, and the number of each episode's
@@ -320,8 +326,15 @@ fn observed(dataset: &Dataset, experiment: &Experiment) -> Vec<String> {
     if !experiment.data.env_keys.is_empty() && dataset.column(ENVIRONMENT_STATE).is_some() {
         columns.push(ENVIRONMENT_STATE.to_owned());
     }
-    columns.extend(experiment.data.entities.keys().map(|name| format!("{ENTITY_PREFIX}{name}")));
+    columns.extend(self::columns(experiment).map(|(name, _)| format!("{ENTITY_PREFIX}{name}")));
     columns
+}
+
+/// The columns beside those that every data set has, by the names of entities, and their keys.
+fn columns(experiment: &Experiment) -> impl Iterator<Item = (&str, &Vec<String>)> {
+    let data = &experiment.data;
+    let told = (!data.auxiliary_keys.is_empty()).then_some((AUXILIARY, &data.auxiliary_keys));
+    data.entities.iter().map(|(name, entity)| (name.as_str(), &entity.keys)).chain(told)
 }
 
 /// The columns of each group of entities.
@@ -345,8 +358,10 @@ fn signature(windows: &Windows, experiment: &Experiment) -> Signature {
         }
     };
     let pictures = windows.pictures().map(|(camera, (height, width))| FeatureSpec::image(camera, height, width));
-    let observation = windows.observation().map(spec).chain(pictures).collect();
-    Signature { observation, n_obs_steps: windows.n_obs_steps(), action_dim: windows.action_dim() }
+    let (told, seen): (Vec<_>, Vec<_>) = windows.observation().partition(|(column, _)| is_told(column));
+    let observation = seen.into_iter().map(spec).chain(pictures).collect();
+    let auxiliary_dim = told.iter().map(|(_, width)| width).sum();
+    Signature { observation, n_obs_steps: windows.n_obs_steps(), action_dim: windows.action_dim(), auxiliary_dim }
 }
 
 /// Turns gathered windows into a batch in network units.
@@ -358,9 +373,10 @@ pub(super) fn batch(
     let numbers = windows.observation.iter().map(|(name, values)| (name.clone(), ValuesRef::F32(values)));
     let pictures = windows.pictures.iter().map(|(name, values)| (name.clone(), ValuesRef::U8(values)));
     let observation = numbers.chain(pictures).collect();
-    demonstrations
-        .preprocess
-        .batch(experiment.policy.action_horizon(), &observation, &windows.actions, &windows.is_pad)
+    let (told, preprocess) = (&demonstrations.told, &demonstrations.preprocess);
+    let action_horizon = experiment.policy.action_horizon();
+    let made = preprocess.batch(action_horizon, &observation, &windows.actions, &windows.is_pad);
+    made.and_then(|batch| Ok(Batch { auxiliary: told.of(windows)?, ..batch }))
         .map_err(experiment.model_error("make a batch for"))
 }
 

@@ -1,5 +1,6 @@
 //! Training runs: a folder, checkpoints, metrics, the loop that makes an entry, and what it trains on demonstrations.
 
+mod auxiliary;
 mod checkpoint;
 mod data;
 mod exchange;

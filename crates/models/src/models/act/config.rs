@@ -2,7 +2,7 @@
 
 use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
-use crate::layers::{Activation, PointerConfig, Shape};
+use crate::layers::{Activation, AuxiliaryConfig, PointerConfig, Shape};
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
 
@@ -42,6 +42,9 @@ pub struct Config {
     /// whether the encoder's output is asked which entity is meant
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pointer: Option<PointerConfig>,
+    /// whether training asks for numbers that are not seen
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub auxiliary: Option<AuxiliaryConfig>,
 }
 
 impl Default for Config {
@@ -62,6 +65,7 @@ impl Default for Config {
             kl_weight: 10.0,
             vision: None,
             pointer: None,
+            auxiliary: None,
         }
     }
 }
@@ -128,6 +132,7 @@ impl Config {
             );
         }
         self.pointer.as_ref().map_or(Ok(()), |pointer| pointer.validate("act"))?;
+        self.auxiliary.as_ref().map_or(Ok(()), |auxiliary| auxiliary.validate("act"))?;
         self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)
     }
 }

@@ -11,11 +11,11 @@ use crate::error::Result;
 use crate::features::Features;
 use crate::fused::{
     AbsoluteError, Data, Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Pointed, PointerGrads, Tokens, Vae,
-    inputs, positions_backward, slot, with_weights,
+    add_to_first, ask, inputs, positions_backward, slot, with_weights,
 };
 use crate::gradients::Gradients;
 use crate::kernels::add;
-use crate::layers::Asked;
+use crate::layers::{Asked, Told};
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
 use crate::values::with_values;
@@ -56,10 +56,11 @@ impl Act {
         let data = Data::of(&Batch { observation, ..batch.clone() }, self.tokens.layout())?;
         let eps = with_values(eps, <[f32]>::to_vec)?;
         let asked = self.pointer.as_ref().map(|pointer| pointer.asked("act", batch)).transpose()?;
+        let told = self.auxiliary.as_ref().map(|asked| asked.told("act", batch)).transpose()?;
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass { weights, shape: self.config().shape(), space, rng, packed: None, on_seen: None };
-                self.step(pass, (&data, asked.as_ref()), eps, &mut into.views())
+                self.step(pass, (&data, asked.as_ref(), told.as_ref()), eps, &mut into.views())
             })
         })
     }
@@ -114,14 +115,15 @@ impl Act {
         Decoded { encoder, memory, pos, pointed, decoder, x, actions }
     }
 
-    /// Takes the gradients of the actions, (b, C, A), and of a pointer's scores; returns that of the latent, (b, L).
+    /// Takes the gradients of the actions, (b, C, A), of a pointer's scores, and of the encoder's first tokens, (b, D), where
+    /// those are asked for something; returns that of the latent, (b, L).
     fn decode_backward(
         &self,
         pass: &mut Pass<'_>,
         rows: usize,
         tokens: &Tokens<'_>,
         done: Decoded,
-        (grad, scores): (&[f32], Option<&[f32]>),
+        (grad, scores, first): (&[f32], Option<&[f32]>, Option<&[f32]>),
         grads: &mut Grads<'_>,
     ) -> Vec<f32> {
         let dim = pass.shape.dim;
@@ -145,6 +147,9 @@ impl Act {
             pass.give(before);
             before_grad = Some(tokens);
         }
+        if let Some(first) = first {
+            add_to_first(&mut memory, first, rows);
+        }
         let mut x = done.encoder.backward(pass, memory, pos, Some(&mut memory_pos), grads);
         if let Some(grad) = before_grad {
             add(&mut x, &grad);
@@ -163,7 +168,7 @@ impl Act {
     fn step(
         &self,
         pass: &mut Pass<'_>,
-        (data, asked): (&Data, Option<&Asked>),
+        (data, asked, told): (&Data, Option<&Asked>, Option<&Told>),
         eps: Vec<f32>,
         grads: &mut Grads<'_>,
     ) -> LossValues {
@@ -198,8 +203,16 @@ impl Act {
             loss.total += (answers.loss * pointer.weight) as f32;
             scores = Some(grad);
         }
-        let latent_grad = self.decode_backward(pass, rows, &tokens, decoded, (&grad, scores.as_deref()), grads);
-        [grad].into_iter().chain(scores).for_each(|buffer| pass.give(buffer));
+        let mut first = None;
+        if let (Some(auxiliary), Some(told)) = (&self.auxiliary, told) {
+            let (error, grad) = ask(pass, (told, auxiliary.weight), &decoded.memory, rows, grads);
+            loss.parts.insert("auxiliary_loss".to_string(), error as f32);
+            loss.total += (error * auxiliary.weight) as f32;
+            first = Some(grad);
+        }
+        let of_answers = (&*grad, scores.as_deref(), first.as_deref());
+        let latent_grad = self.decode_backward(pass, rows, &tokens, decoded, of_answers, grads);
+        [grad].into_iter().chain(scores).chain(first).for_each(|buffer| pass.give(buffer));
 
         if let Some(encoded) = encoded {
             let kld = vae.backward(pass, data, encoded, &latent_grad, config.kl_weight, grads);

@@ -6,9 +6,11 @@ use crate::fused::testing::{
     Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
-use crate::layers::{Activation, PointerConfig};
+use crate::gradients::ParamLayout;
+use crate::layers::{Activation, AuxiliaryConfig, PointerConfig};
 use crate::models::act::Config;
 use crate::simd::{Level, at_most};
+use std::sync::Arc;
 
 /// Odd sizes: no width is a multiple of a vector, chunks are longer and shorter than a register tile.
 fn configs() -> Vec<(Config, Signature, usize)> {
@@ -23,7 +25,8 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         dropout: 0.2,
         ..Default::default()
     };
-    let Signatures { plain, no_env, entities, history, .. } = signatures();
+    let Signatures { plain, no_env, entities, history, told, .. } = signatures();
+    let auxiliary = Some(AuxiliaryConfig { weight: 0.6 });
     let pointer = Some(PointerConfig { among: "cube".to_string(), weight: 0.7 });
     let gelu = Config { feedforward_activation: Activation::Gelu, ..base.clone() };
     vec![
@@ -34,6 +37,8 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         (Config { pointer: pointer.clone(), ..base.clone() }, entities.clone(), 4),
         (Config { pointer, pre_norm: true, use_vae: false, ..base.clone() }, entities, 1),
         (base.clone(), history, 4),
+        (Config { auxiliary: auxiliary.clone(), ..base.clone() }, told.clone(), 3),
+        (Config { auxiliary, pre_norm: true, use_vae: false, ..base.clone() }, told, 2),
         (Config { n_decoder_layers: 3, action_horizon: 17, n_vae_encoder_layers: 1, ..gelu.clone() }, no_env, 2),
         (Config { pre_norm: true, use_vae: false, ..gelu }, plain.clone(), 1),
         (Config { dim_model: 35, n_heads: 1, dim_feedforward: 70, action_horizon: 1, dropout: 0.0, ..base }, plain, 5),
@@ -157,4 +162,40 @@ fn a_pointer_needs_candidates_and_a_weight() {
     // the goals have positions
     assert!(error("goal", 1.0).contains("pointer.among is 0 of group goal"), "{}", error("goal", 1.0));
     assert!(error("cube", -1.0).contains("pointer.weight"));
+}
+
+/// Shards' losses add up to the batch's, a batch that tells nothing is refused, and when it acts nobody asks.
+#[test]
+fn what_is_told_in_training_alone_is_asked_there_alone() {
+    let (config, signature, rows) = configs().into_iter().find(|(config, ..)| config.auxiliary.is_some()).unwrap();
+    let act = Act::new(&config, &signature, 1).unwrap();
+    let batch = batch(&signature, config.action_horizon, rows, 3);
+    let loss = |batch: &Batch| {
+        let eps = Tensor::zeros((batch.rows(), config.latent_dim), candle_core::DType::F32, &HERE).unwrap();
+        let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(act.params())));
+        act.fused_gradients(batch, &eps, None, &mut grads).map(|loss| loss.parts["auxiliary_loss"])
+    };
+    let whole = loss(&batch).unwrap();
+    let shards: f32 = batch.shards(2).unwrap().iter().map(|shard| loss(shard).unwrap()).sum();
+    assert!(whole > 0.1 && (whole - shards).abs() < 1e-5, "{whole} {shards}");
+    let error = |auxiliary| loss(&Batch { auxiliary, ..batch.clone() }).unwrap_err().to_string();
+    assert!(error(None).contains("auxiliary numbers") && error(None).contains("nothing"), "{}", error(None));
+    let narrow = Tensor::zeros((rows, 2), candle_core::DType::F32, &HERE).unwrap();
+    assert!(error(Some(narrow)).contains("[3, 2], expected [3, 3]"));
+
+    let head = |params: &crate::params::Params| {
+        let (_, weight) = params.iter().find(|(name, _)| *name == "auxiliary_head.weight").unwrap();
+        weight.clone()
+    };
+    let before = act.predict(&batch.observation).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let weight = head(act.params());
+    weight.set(&(weight.as_tensor() + 1.0).unwrap()).unwrap();
+    let after = act.predict(&batch.observation).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert_eq!(before, after);
+
+    let refused = |config: &Config, signature: &Signature| Act::new(config, signature, 1).unwrap_err().to_string();
+    let silent = Signature { auxiliary_dim: 0, ..signature.clone() };
+    assert!(refused(&config, &silent).contains("auxiliary_dim is 0"), "{}", refused(&config, &silent));
+    let heavy = Config { auxiliary: Some(AuxiliaryConfig { weight: f64::INFINITY }), ..config };
+    assert!(refused(&heavy, &signature).contains("auxiliary.weight"));
 }

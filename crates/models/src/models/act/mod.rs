@@ -16,7 +16,8 @@
 //! LeRobot nothing tells cameras apart.
 //!
 //! With `pointer` (ours) the encoder's output is asked which entity a demonstration took, and the decoder reads that entity's
-//! token as one more; the answer has a loss of its own.
+//! token as one more; the answer has a loss of its own. With `auxiliary` (ours) training asks the encoder's output for numbers
+//! that are not seen.
 //!
 //! Deviations: none in the maths. `feedforward_activation = "glu"` is refused: LeRobot accepts it in its configuration,
 //! but its layer then cannot run (`glu` halves the width that `linear2` expects).
@@ -39,8 +40,8 @@ use crate::flops;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
-    Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Mode, Pointed, Pointer,
-    TokenLayout, Vae, environment_state, kl_divergence, sample, sinusoid_table,
+    Auxiliary, Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Mode, Pointed,
+    Pointer, TokenLayout, Vae, environment_state, kl_divergence, sample, sinusoid_table,
 };
 use crate::losses::absolute;
 use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
@@ -63,8 +64,17 @@ pub struct TrainOutput {
     pub actions: Tensor,
     /// mean and log-variance of the latent, (b, latent_dim) each; `None` without VAE
     pub latent: Option<(Tensor, Tensor)>,
-    /// which entity is meant, if that is asked
-    pub(crate) pointed: Option<Pointed>,
+    /// what is asked beside them
+    beside: Beside,
+}
+
+/// What is asked beside the actions.
+#[derive(Debug)]
+struct Beside {
+    /// which entity is meant
+    pointed: Option<Pointed>,
+    /// numbers that are not seen, (b, K), from a training forward pass
+    auxiliary: Option<Tensor>,
 }
 
 /// The model.
@@ -79,6 +89,7 @@ pub struct Act {
     pub(crate) tokens: InputTokens,
     pub(crate) action_head: Linear,
     pointer: Option<Pointer>,
+    auxiliary: Option<Auxiliary>,
     pub(crate) workspaces: Workspaces,
     /// (1, action_horizon + 2, D), fixed
     pub(crate) vae_encoder_pos_enc: Tensor,
@@ -121,6 +132,9 @@ impl Act {
         let pointer = config.pointer.as_ref();
         let pointer =
             pointer.map(|pointer| Pointer::new(&mut p, pointer, ("act", signature, layout), dim, rng)).transpose()?;
+        let auxiliary = config.auxiliary.as_ref();
+        let auxiliary =
+            auxiliary.map(|asked| Auxiliary::new(&mut p, asked, ("act", signature), dim, rng)).transpose()?;
         Ok(Self {
             vae,
             encoder,
@@ -128,6 +142,7 @@ impl Act {
             tokens,
             action_head,
             pointer,
+            auxiliary,
             workspaces: Workspaces::default(),
             position_table: table.flatten_all()?.to_vec1()?,
             vae_encoder_pos_enc: table,
@@ -147,13 +162,8 @@ impl Act {
         &self.position_table
     }
 
-    /// latent: (b, L), the features of the observation -> (b, C, A), and which entity is meant
-    fn decode(
-        &self,
-        latent: &Tensor,
-        observation: &Features<Tensor>,
-        mode: &mut Mode<'_>,
-    ) -> Result<(Tensor, Option<Pointed>)> {
+    /// latent: (b, L), the features of the observation -> (b, C, A), and what is asked beside them
+    fn decode(&self, latent: &Tensor, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<(Tensor, Beside)> {
         let tokens = self.tokens.forward(latent, observation)?;
         let mut pos = self.tokens.positions()?;
         let mut memory = self.encoder.forward(&tokens, &pos, None, mode)?;
@@ -161,7 +171,12 @@ impl Act {
         if let (Some(pointer), Some(pointed)) = (&self.pointer, &pointed) {
             (memory, pos) = pointer.beside(&memory, &pos, pointed)?;
         }
-        Ok((self.action_head.forward(&self.decoder.forward(&memory, &pos, mode)?)?, pointed))
+        let auxiliary = match mode {
+            Mode::Train(_) => self.auxiliary.as_ref().map(|asked| asked.forward(&memory)).transpose()?,
+            Mode::Eval => None,
+        };
+        let actions = self.action_head.forward(&self.decoder.forward(&memory, &pos, mode)?)?;
+        Ok((actions, Beside { pointed, auxiliary }))
     }
 
     /// The training forward pass with dropout from `mode` and the latent's noise `eps`: (b, L).
@@ -179,11 +194,12 @@ impl Act {
             Some(latent) => sample(latent, eps)?,
             None => eps.zeros_like()?,
         };
-        let (actions, pointed) = self.decode(&sample, &observation, mode)?;
-        Ok(TrainOutput { actions, latent, pointed })
+        let (actions, beside) = self.decode(&sample, &observation, mode)?;
+        Ok(TrainOutput { actions, latent, beside })
     }
 
-    /// L1 over valid steps plus weighted KL and, with a pointer, cross-entropy, from a training forward pass.
+    /// L1 over valid steps plus weighted KL, with a pointer cross-entropy, and what `auxiliary` asks, from a training forward
+    /// pass.
     pub fn loss_of(&self, output: &TrainOutput, batch: &Batch) -> Result<LossParts> {
         let (b, c, a) = batch.actions.dims3()?;
         let valid = (1.0 - batch.is_pad.reshape((b, c, 1))?)?;
@@ -197,12 +213,17 @@ impl Act {
             parts.insert("kld_loss".to_string(), kld.detach());
             total = (total + (kld * self.config.kl_weight)?)?;
         }
-        if let (Some(pointer), Some(pointed)) = (&self.pointer, &output.pointed) {
+        if let (Some(pointer), Some(pointed)) = (&self.pointer, &output.beside.pointed) {
             let asked = pointer.asked("act", batch)?;
             let loss = asked.loss(&pointed.scores)?;
             parts.insert("pointer_loss".to_string(), loss.detach());
             parts.insert("pointer_right".to_string(), asked.right(&pointed.scores)?);
             total = (total + (loss * pointer.weight)?)?;
+        }
+        if let (Some(asked), Some(found)) = (&self.auxiliary, &output.beside.auxiliary) {
+            let loss = asked.told("act", batch)?.loss(found)?;
+            parts.insert("auxiliary_loss".to_string(), loss.detach());
+            total = (total + (loss * asked.weight)?)?;
         }
         Ok(LossParts { total, parts })
     }

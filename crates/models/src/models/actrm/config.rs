@@ -2,7 +2,7 @@
 
 use crate::encoders::VisionConfig;
 use crate::error::{ModelError, Result};
-use crate::layers::{Activation, GridConfig, PointerConfig, Shape};
+use crate::layers::{Activation, AuxiliaryConfig, GridConfig, PointerConfig, Shape};
 use crate::models::act;
 use crate::size::Size;
 use serde::{Deserialize, Serialize};
@@ -198,6 +198,9 @@ pub struct Config {
     /// whether every supervision step is asked which entity is meant (`over = "tokens"`)
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pointer: Option<PointerConfig>,
+    /// whether training asks for numbers that are not seen (`over = "actions"` with a memory that is encoded)
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub auxiliary: Option<AuxiliaryConfig>,
 }
 
 impl Default for Config {
@@ -219,6 +222,7 @@ impl Default for Config {
             reasoning: ReasoningConfig::default(),
             vision: None,
             pointer: None,
+            auxiliary: None,
         }
     }
 }
@@ -259,6 +263,7 @@ impl Config {
             kl_weight: self.kl_weight,
             vision: self.vision.clone(),
             pointer: self.pointer.clone(),
+            auxiliary: self.auxiliary.clone(),
         }
     }
 
@@ -334,6 +339,12 @@ impl Config {
         }
         if let Some(pointer) = self.pointer.as_ref().filter(|_| r.over != Over::Tokens) {
             return refuse("pointer", format!("among {}", pointer.among), "absent but for reasoning.over = \"tokens\"");
+        }
+        if let Some(auxiliary) =
+            self.auxiliary.as_ref().filter(|_| r.over != Over::Actions || self.n_memory_layers == 0)
+        {
+            let expected = "absent but for reasoning.over = \"actions\" with n_memory_layers";
+            return refuse("auxiliary", format!("weight {}", auxiliary.weight), expected);
         }
         if let Some(grid) = &r.grid {
             grid.validate("actrm")?;

@@ -34,6 +34,8 @@
 //! Variants for comparison (`over = "actions"` and `"tokens"`): `reasoning.untied` gives every supervision step a block of its own,
 //! `start_noise` begins thoughts with noise in training, `deep_supervision = false` leaves only the last step its loss.
 //!
+//! `auxiliary` asks the encoded memory in training for numbers that are not seen, as in ACT (`over = "actions"`).
+//!
 //! Halting: a head reads the reasoning after each step and is trained on whether one more step
 //! would still lower this sample's chunk error. For the last step's target one more step runs
 //! without gradient.
@@ -62,7 +64,7 @@ use crate::flops;
 use crate::fused::Workspaces;
 use crate::gradients::Gradients;
 use crate::layers::{
-    Answers, Asked, Cells, Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, GridLayer,
+    Answers, Asked, Auxiliary, Cells, Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, GridLayer,
     InputTokens, LayerInit, LayerNorm, Linear, Mode, MultiHeadAttention, NEIGHBOURS, Pointer, Shape, TokenLayout, Vae,
     Visited, environment_state, kl_divergence, sample, sinusoid_table,
 };
@@ -241,6 +243,7 @@ pub struct Actrm {
     design: Design,
     action_head: Linear,
     halt_head: Linear,
+    auxiliary: Option<Auxiliary>,
     workspaces: Workspaces,
 }
 
@@ -321,6 +324,10 @@ impl Actrm {
             design,
             action_head: Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?,
             halt_head: Linear::new(&mut p, "halt_head", dim, 1, rng)?,
+            auxiliary: match &config.auxiliary {
+                Some(asked) => Some(Auxiliary::new(&mut p, asked, ("actrm", signature), dim, rng)?),
+                None => None,
+            },
             workspaces: Workspaces::default(),
             params: p,
             config: config.clone(),
@@ -662,6 +669,11 @@ impl PolicyModel for Actrm {
             }
         }
 
+        if let Some(asked) = &self.auxiliary {
+            let loss = asked.told("actrm", batch)?.loss(&asked.forward(&memory)?)?;
+            parts.insert("auxiliary_loss".to_string(), loss.detach());
+            total = (total + (loss * asked.weight)?)?;
+        }
         let mut halt = Tensor::zeros((), DType::F32, batch.device())?;
         let still = 1.0 - self.config.reasoning.halt_margin;
         for (i, logit) in halts.iter().enumerate() {

@@ -4,7 +4,7 @@ use crate::batch::Taken;
 use crate::features::{FeatureSpec, Features, Observation, ValuesRef};
 use crate::fused::testing::{assert_the_gradient_is_the_slope, move_parameters, signatures};
 use crate::gradients::ParamLayout;
-use crate::layers::{GridConfig, PointerConfig};
+use crate::layers::{AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::models::act::{self, Act};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::policy::Policy;
@@ -519,6 +519,11 @@ fn impossible_configurations_name_the_field() {
             "reasoning.warm_start",
         ),
         (with(&|c| c.pointer = Some(among("cube"))), "pointer is among cube"),
+        (with(&|c| c.auxiliary = Some(AuxiliaryConfig::default())), "auxiliary_dim is 0"),
+        (
+            with(&|c| (c.auxiliary, c.n_memory_layers) = (Some(AuxiliaryConfig::default()), 0)),
+            "auxiliary is weight 1, expected absent but for",
+        ),
         (with(&|c| (c.reasoning.over, c.pointer) = (Over::Tokens, Some(among("cube")))), "0 of group cube"),
         (
             with(&|c| {
@@ -653,7 +658,7 @@ fn a_pointer_learns_to_follow_a_relation_and_the_actions_go_there() {
     let thing = |i: usize| FeatureSpec::entity(&format!("thing{i}"), 9, "thing", false);
     let goal = FeatureSpec::entity("goal", 9, "thing", true);
     let observation = [FeatureSpec::state(1)].into_iter().chain((0..4).map(thing)).chain([goal]).collect();
-    let signature = Signature { observation, n_obs_steps: 1, action_dim: 1 };
+    let signature = Signature { observation, action_dim: 1, ..Signature::default() };
     let tokens = ReasoningConfig { over: Over::Tokens, supervision_steps: 3, ..ReasoningConfig::default() };
     let base = Config { use_vae: false, dim_model: 32, dim_feedforward: 64, action_horizon: 2, ..small(tokens) };
     let error = |pointer: Option<PointerConfig>| {

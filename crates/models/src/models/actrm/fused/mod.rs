@@ -14,7 +14,7 @@ use crate::error::Result;
 use crate::features::Features;
 use crate::fused::{AbsoluteError, Data, Grads, Inputs, Pass, Tokens, Vae, inputs, with_weights};
 use crate::gradients::Gradients;
-use crate::layers::Shape;
+use crate::layers::{Shape, Told};
 use crate::model::{LossValues, PolicyModel};
 use crate::rng::Rng;
 use crate::values::with_values;
@@ -77,6 +77,11 @@ trait Recursion<'m>: Sized {
         None
     }
 
+    /// Asks what was observed for what a shard tells, and keeps the gradient for the end; the loss, if this design is asked.
+    fn ask(&mut self, _: &mut Pass<'_>, _: (&Told, f64), _: &mut Grads<'_>) -> Option<f64> {
+        None
+    }
+
     /// Takes the gradient of the step's answer and of the carry that it left, if that flows; returns that of
     /// the carry it began with, if it does.
     fn backward(
@@ -135,7 +140,9 @@ impl Actrm {
         let data = Data::of(batch, self.tokens.layout())?;
         let steps = self.steps_of(batch);
         let asked = self.question(batch)?;
-        let asked = asked.as_ref();
+        let told = self.auxiliary.as_ref().map(|asked| asked.told("actrm", batch).map(|told| (told, asked.weight)));
+        let (asked, told) = (asked.as_ref(), told.transpose()?);
+        let asked = (asked, told.as_ref().map(|(told, weight)| (told, *weight)));
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass {
@@ -148,19 +155,20 @@ impl Actrm {
                 };
                 let grads = &mut into.views();
                 match self.config.reasoning.over {
-                    Over::Actions => self.supervise::<OverActions<'_>>(pass, (&data, asked), steps, grads),
-                    Over::Memory => self.supervise::<OverMemory<'_>>(pass, (&data, asked), steps, grads),
-                    Over::Tokens => self.supervise::<OverTokens<'_>>(pass, (&data, asked), steps, grads),
+                    Over::Actions => self.supervise::<OverActions<'_>>(pass, &data, asked, steps, grads),
+                    Over::Memory => self.supervise::<OverMemory<'_>>(pass, &data, asked, steps, grads),
+                    Over::Tokens => self.supervise::<OverTokens<'_>>(pass, &data, asked, steps, grads),
                 }
             })
         })
     }
 
-    /// One shard, forwards and backwards; what is asked beside the actions, and the weight of that.
+    /// One shard, forwards and backwards; what is asked beside the actions and what is told, and the weights of these.
     fn supervise<'m, R: Recursion<'m>>(
         &'m self,
         pass: &mut Pass<'_>,
-        (data, asked): (&Data, Option<&(Question, f64)>),
+        data: &Data,
+        (asked, told): (Option<&(Question, f64)>, Option<(&Told, f64)>),
         steps: usize,
         grads: &mut Grads<'_>,
     ) -> LossValues {
@@ -243,6 +251,12 @@ impl Actrm {
         loss.parts.insert("halt_loss".to_string(), halt as f32);
         loss.total += (halt * config.reasoning.halt_weight) as f32;
 
+        if let Some((told, weight)) = told
+            && let Some(error) = recursion.ask(pass, (told, weight), grads)
+        {
+            loss.parts.insert("auxiliary_loss".to_string(), error as f32);
+            loss.total += (error * weight) as f32;
+        }
         let mut carry_grad = Carry::default();
         for (step, grad) in done.into_iter().zip(answer_grads).rev() {
             carry_grad = recursion.backward(pass, step, &grad, carry_grad, grads);

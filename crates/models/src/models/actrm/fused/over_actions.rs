@@ -6,11 +6,11 @@
 
 use super::{AnswerGrad, Carry, Recursion, Step, mean_over_tokens, shaped};
 use crate::fused::{
-    BlockLayer, Encoder, Grads, Input, Part, Pass, Tokens, gather, keys_and_values, keys_and_values_backward,
-    positions_backward, scatter, slot,
+    BlockLayer, Encoder, Grads, Input, Part, Pass, Tokens, add_to_first, ask, gather, keys_and_values,
+    keys_and_values_backward, positions_backward, scatter, slot,
 };
 use crate::kernels::add;
-use crate::layers::Shape;
+use crate::layers::{Shape, Told};
 use crate::models::actrm::{Actrm, Config};
 
 pub(super) struct OverActions<'m> {
@@ -23,6 +23,8 @@ pub(super) struct OverActions<'m> {
     memory_kv: Vec<Vec<f32>>,
     /// and their gradients, once one is there
     memory_kv_grad: Vec<Vec<f32>>,
+    /// the gradient of the memory's first tokens, (b, D), where these were asked for something
+    first_grad: Option<Vec<f32>>,
 }
 
 /// One run of the block over z or y.
@@ -218,7 +220,7 @@ impl<'m> Recursion<'m> for OverActions<'m> {
         let memory_kv = layers
             .map(|i| keys_and_values(pass, &attention_prefix(i), Input { x: &memory, parameter: None }))
             .collect();
-        Self { config, rows, encoder, memory, memory_kv, memory_kv_grad: Vec::new() }
+        Self { config, rows, encoder, memory, memory_kv, memory_kv_grad: Vec::new(), first_grad: None }
     }
 
     fn step(&self, pass: &mut Pass<'_>, carry: &Carry, at: usize) -> Step<Round> {
@@ -237,6 +239,12 @@ impl<'m> Recursion<'m> for OverActions<'m> {
             let read = mean_over_tokens(pass, reasoning.expect("a round leaves a reasoning"), self.rows);
             Step { carry: after, chunk, read, trace: round }
         })
+    }
+
+    fn ask(&mut self, pass: &mut Pass<'_>, told: (&Told, f64), grads: &mut Grads<'_>) -> Option<f64> {
+        let (loss, grad) = ask(pass, told, &self.memory, self.rows, grads);
+        self.first_grad = Some(grad);
+        Some(loss)
     }
 
     fn backward(
@@ -288,6 +296,10 @@ impl<'m> Recursion<'m> for OverActions<'m> {
             keys_and_values_backward(pass, &attention_prefix(i), &self.memory, &kv_grad, &mut grad, grads);
             pass.give(kv_grad);
         }
+        if let Some(first) = self.first_grad.take() {
+            add_to_first(&mut grad, &first, self.rows);
+            pass.give(first);
+        }
         let mut pos_grad = pass.space.pool.zeros(pos.len());
         add_sequences(&mut pos_grad, &grad);
         if let Some(encoder) = self.encoder.take() {
@@ -305,7 +317,7 @@ impl<'m> Recursion<'m> for OverActions<'m> {
         if let Some(encoder) = self.encoder {
             encoder.free(pass);
         }
-        let buffers = self.memory_kv.into_iter().chain(self.memory_kv_grad).chain([self.memory]);
+        let buffers = self.memory_kv.into_iter().chain(self.memory_kv_grad).chain(self.first_grad).chain([self.memory]);
         buffers.for_each(|buffer| pass.give(buffer));
     }
 }

@@ -5,13 +5,14 @@ use crate::fused::testing::{
     Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
-use crate::layers::{Activation, GridConfig, PointerConfig};
+use crate::layers::{Activation, AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::models::actrm::{Config, ReasoningConfig, WarmStart};
 use crate::simd::{Level, at_most};
 
 /// Odd sizes in all designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
 fn configs() -> Vec<(Config, Signature, usize)> {
-    let Signatures { plain, no_env, entities, history, grid, .. } = signatures();
+    let Signatures { plain, no_env, entities, history, grid, told, .. } = signatures();
+    let auxiliary = Some(AuxiliaryConfig { weight: 0.6 });
     let cells = |way| Some(GridConfig { among: "cell".to_string(), columns: 3, way });
     let base = Config {
         action_horizon: 5,
@@ -50,6 +51,7 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         (reasoning(&|_| ()), plain.clone(), 3),
         (reasoning(&|r| r.warm_start = warm), entities.clone(), 3),
         (reasoning(&|_| ()), history.clone(), 2),
+        (Config { auxiliary, n_memory_layers: 2, ..reasoning(&|r| r.h_cycles = 2) }, told, 3),
         (reasoning(&|r| (r.untied, r.n_layers, r.h_cycles, r.l_cycles) = (true, 2, 2, 2)), entities.clone(), 3),
         (reasoning(&|r| (r.start_noise, r.deep_supervision) = (0.7, false)), plain.clone(), 3),
         (tokens(true, &|_| ()), entities.clone(), 4),

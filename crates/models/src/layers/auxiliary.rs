@@ -1,0 +1,122 @@
+//! Told in training, unseen afterwards: numbers that demonstrations know and the policy must find in what it sees.
+//!
+//! A policy that sees pictures learns where things are only by what its actions have to do with it, from few demonstrations
+//! slowly. So the encoder's output at the latent's token, the first one, is asked for those numbers as well, and the squared error is a part of the loss (Levine et al., "End-to-End Training of Deep Visuomotor Policies",
+//! arXiv 1504.00702, begin their convolutions so). When it acts a policy neither gets these numbers nor is asked for them.
+
+use super::Linear;
+use crate::batch::Batch;
+use crate::error::{ModelError, Result};
+use crate::features::Signature;
+use crate::params::Params;
+use crate::rng::Rng;
+use crate::values::with_values;
+use candle_core::Tensor;
+use serde::{Deserialize, Serialize};
+
+/// The layer's name.
+pub(crate) const AUXILIARY_HEAD: &str = "auxiliary_head";
+
+/// `[policy.auxiliary]`: ask in training for numbers that the policy does not see.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct AuxiliaryConfig {
+    /// weight of the squared error of these numbers
+    pub weight: f64,
+}
+
+impl Default for AuxiliaryConfig {
+    fn default() -> Self {
+        Self { weight: 1.0 }
+    }
+}
+
+impl AuxiliaryConfig {
+    /// # Errors
+    /// A weight that is none.
+    pub(crate) fn validate(&self, model: &'static str) -> Result<()> {
+        if self.weight.is_finite() && self.weight >= 0.0 {
+            return Ok(());
+        }
+        let (found, expected) = (self.weight.to_string(), "a finite number, at least 0".to_string());
+        Err(ModelError::Config { model, field: "auxiliary.weight", found, expected })
+    }
+}
+
+/// The layer.
+#[derive(Debug)]
+pub(crate) struct Auxiliary {
+    head: Linear,
+    pub(crate) weight: f64,
+}
+
+impl Auxiliary {
+    /// # Errors
+    /// A signature that tells nothing.
+    pub(crate) fn new(
+        p: &mut Params,
+        config: &AuxiliaryConfig,
+        (model, signature): (&'static str, &Signature),
+        dim: usize,
+        rng: &mut Rng,
+    ) -> Result<Self> {
+        if signature.auxiliary_dim == 0 {
+            let (found, expected) = ("0".to_string(), "at least 1 with policy.auxiliary".to_string());
+            return Err(ModelError::Config { model, field: "auxiliary_dim", found, expected });
+        }
+        Ok(Self { head: Linear::new(p, AUXILIARY_HEAD, dim, signature.auxiliary_dim, rng)?, weight: config.weight })
+    }
+
+    /// encoded: (b, M, D), the latent's token first -> (b, K)
+    pub(crate) fn forward(&self, encoded: &Tensor) -> Result<Tensor> {
+        self.head.forward(&encoded.narrow(1, 0, 1)?.squeeze(1)?.contiguous()?)
+    }
+
+    /// What a batch tells.
+    ///
+    /// # Errors
+    /// A batch that tells nothing, or something else.
+    pub(crate) fn told(&self, model: &'static str, batch: &Batch) -> Result<Told> {
+        let expected = [batch.rows(), self.head.weight.dim(0)?];
+        match &batch.auxiliary {
+            Some(told) if told.dims() == expected => {
+                let values = with_values(told, <[f32]>::to_vec)?;
+                Ok(Told { values, entries: (batch.total_rows * expected[1]).max(1) })
+            }
+            other => Err(ModelError::Input {
+                operation: model,
+                object: "auxiliary numbers",
+                found: other.as_ref().map_or_else(|| "nothing".to_string(), |told| format!("{:?}", told.dims())),
+                expected: format!("{expected:?}"),
+            }),
+        }
+    }
+}
+
+/// What a shard tells.
+#[derive(Debug)]
+pub(crate) struct Told {
+    /// (b, K), normalised
+    values: Vec<f32>,
+    /// numbers that the whole batch tells
+    entries: usize,
+}
+
+impl Told {
+    /// found: (b, K) -> the squared error, a share of the mean over the whole batch
+    pub(crate) fn loss(&self, found: &Tensor) -> Result<Tensor> {
+        let told = Tensor::from_slice(&self.values, found.dims(), found.device())?;
+        Ok(((found - told)?.sqr()?.sum_all()? / self.entries as f64)?)
+    }
+
+    /// The same on a slice; what was found becomes `weight` times the gradient of the loss.
+    pub(crate) fn gradient(&self, found: &mut [f32], weight: f64) -> f64 {
+        let (mut loss, share) = (0.0, weight * 2.0 / self.entries as f64);
+        for (found, told) in found.iter_mut().zip(&self.values) {
+            let off = f64::from(*found) - f64::from(*told);
+            loss += off * off;
+            *found = (off * share) as f32;
+        }
+        loss / self.entries as f64
+    }
+}
