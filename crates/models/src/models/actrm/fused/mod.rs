@@ -62,6 +62,14 @@ struct AnswerGrad {
     scores: Option<Vec<f32>>,
 }
 
+/// What a shard is asked beside the actions, with its weight.
+struct Beside<'a> {
+    /// after every step
+    asked: Option<&'a (Question, f64)>,
+    /// once, of what was observed
+    told: Option<(&'a Told, f64)>,
+}
+
 /// One of the designs, about one shard of observations.
 trait Recursion<'m>: Sized {
     type Trace;
@@ -142,7 +150,7 @@ impl Actrm {
         let asked = self.question(batch)?;
         let told = self.auxiliary.as_ref().map(|asked| asked.told("actrm", batch).map(|told| (told, asked.weight)));
         let (asked, told) = (asked.as_ref(), told.transpose()?);
-        let asked = (asked, told.as_ref().map(|(told, weight)| (told, *weight)));
+        let asked = Beside { asked, told: told.as_ref().map(|(told, weight)| (told, *weight)) };
         self.workspaces.with(|space| {
             with_weights(self.params(), |weights| {
                 let pass = &mut Pass {
@@ -163,12 +171,12 @@ impl Actrm {
         })
     }
 
-    /// One shard, forwards and backwards; what is asked beside the actions and what is told, and the weights of these.
+    /// One shard, forwards and backwards; what is asked beside the actions.
     fn supervise<'m, R: Recursion<'m>>(
         &'m self,
         pass: &mut Pass<'_>,
         data: &Data,
-        (asked, told): (Option<&(Question, f64)>, Option<(&Told, f64)>),
+        Beside { asked, told }: Beside<'_>,
         steps: usize,
         grads: &mut Grads<'_>,
     ) -> LossValues {
