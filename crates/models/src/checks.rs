@@ -30,6 +30,15 @@ pub(crate) fn check_signature(model: &'static str, signature: &Signature, reads:
     Ok(())
 }
 
+/// Checks the weight of a part of a loss.
+pub(crate) fn check_weight(model: &'static str, field: &'static str, weight: f64) -> Result<()> {
+    if weight.is_finite() && weight >= 0.0 {
+        return Ok(());
+    }
+    let (found, expected) = (weight.to_string(), "a finite number, at least 0".to_string());
+    Err(ModelError::Config { model, field, found, expected })
+}
+
 /// Checks a batch of windows against the model's signature.
 pub(crate) fn check_batch(
     operation: &'static str,

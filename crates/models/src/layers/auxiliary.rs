@@ -6,6 +6,7 @@
 
 use super::Linear;
 use crate::batch::Batch;
+use crate::checks::check_weight;
 use crate::error::{ModelError, Result};
 use crate::features::Signature;
 use crate::params::Params;
@@ -35,11 +36,7 @@ impl AuxiliaryConfig {
     /// # Errors
     /// A weight that is none.
     pub(crate) fn validate(&self, model: &'static str) -> Result<()> {
-        if self.weight.is_finite() && self.weight >= 0.0 {
-            return Ok(());
-        }
-        let (found, expected) = (self.weight.to_string(), "a finite number, at least 0".to_string());
-        Err(ModelError::Config { model, field: "auxiliary.weight", found, expected })
+        check_weight(model, "auxiliary.weight", self.weight)
     }
 }
 

@@ -7,6 +7,7 @@
 use super::tokens::TokenLayout;
 use super::{Embedding, Linear};
 use crate::batch::Batch;
+use crate::checks::check_weight;
 use crate::classification::{ClassProbability, IGNORE_LABEL, cross_entropy};
 use crate::device::HERE;
 use crate::error::{ModelError, Result};
@@ -35,11 +36,7 @@ impl PointerConfig {
     /// # Errors
     /// A weight that is none.
     pub(crate) fn validate(&self, model: &'static str) -> Result<()> {
-        if self.weight.is_finite() && self.weight >= 0.0 {
-            return Ok(());
-        }
-        let (found, expected) = (self.weight.to_string(), "a finite number, at least 0".to_string());
-        Err(ModelError::Config { model, field: "pointer.weight", found, expected })
+        check_weight(model, "pointer.weight", self.weight)
     }
 
     /// The features of a signature among which one is taken, by their places in it.
