@@ -4,7 +4,7 @@
 use crate::encoders::{Architecture, ImageEncoder, ImageNorm, PICTURE_MEAN, PICTURE_STD, TokenKind, VisionConfig};
 use crate::error::{ModelError, Result, some_names};
 use crate::features::{FeatureKind, FeatureSpec, Signature};
-use crate::layers::{Activation, sinusoid_table};
+use crate::layers::{AUXILIARY_HEAD, Activation, sinusoid_table};
 use crate::models::act::Config;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
 use crate::params::Params;
@@ -20,8 +20,6 @@ const PREFIX: &str = "model.";
 const LEROBOTS_WIDTH: usize = 64;
 /// Buffers of ours that stand among LeRobot's statistics, not among its weights.
 const OF_PICTURES: [&str; 2] = [PICTURE_MEAN, PICTURE_STD];
-/// Weights of ours that only training reads (`layers/auxiliary.rs`).
-const OF_TRAINING: [&str; 2] = ["auxiliary_head.weight", "auxiliary_head.bias"];
 /// LeRobot saves this fixed table with the weights.
 const POSITION_BUFFER: &str = "vae_encoder_pos_enc";
 
@@ -452,7 +450,8 @@ pub fn statistics_out(params: &Params, signature: &Signature) -> Result<BTreeMap
 /// # Errors
 /// If the tensor library fails.
 pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, Tensor>> {
-    let theirs = |name: &str| !OF_PICTURES.contains(&name) && !OF_TRAINING.contains(&name);
+    // what only training reads is of no use there
+    let theirs = |name: &str| !OF_PICTURES.contains(&name) && !name.starts_with(AUXILIARY_HEAD);
     let named = params.tensors().into_iter().filter(|(name, _)| theirs(name));
     let named = named.map(|(name, t)| (format!("{PREFIX}{name}"), t));
     let mut tensors: BTreeMap<String, Tensor> = named.collect();

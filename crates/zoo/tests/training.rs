@@ -169,6 +169,29 @@ fn entities_are_trained_on_sealed_and_asked_for_again() {
 }
 
 #[test]
+fn what_training_alone_is_told_is_asked_for_there_alone() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let told =
+        ["data.env_keys=[]", "data.auxiliary_keys=['object[0:3] - robot0_eef_pos']", "policy.auxiliary.weight=0.5"];
+    let entry = finish(&request(root.path(), &data, &told));
+    // what is asked reaches the weights
+    let deaf = [told[0], told[1], "policy.auxiliary.weight=0"];
+    assert!(model(&entry) != model(&finish(&request(root.path(), &data, &deaf))));
+    assert_eq!((entry.meta().signature.observation.len(), entry.meta().signature.auxiliary_dim), (1, 3));
+    // the robot's state is all that it reads
+    let mut policy = entry.load().unwrap().policy();
+    let chunk = policy.predict(&Observation::of_state(vec![0.1; 9], Vec::new())).unwrap();
+    assert!(chunk.actions.iter().all(|a| a.is_finite()));
+    // a data set without these numbers is refused by the setting's name
+    let converted = root.path().join("set");
+    dataset::convert(&data, &converted, &dataset::ConvertOptions::default(), &mut |_, _| {}).unwrap();
+    let refused = train(&request(root.path(), &converted, &told[1..]), &|| false, &mut |_| {}).unwrap_err();
+    let expected = "data.auxiliary_keys: expected object[0:3] - robot0_eef_pos, found none";
+    assert!(refused.to_string().contains(expected), "{refused}");
+}
+
+#[test]
 fn a_history_is_trained_on_and_kept_at_inference() {
     let root = tempfile::tempdir().unwrap();
     let data = demonstrations(root.path());
