@@ -92,7 +92,7 @@ impl Config {
             Err(ModelError::Config { model: "diffusion", field, found, expected })
         };
         match &self.transformer {
-            Some(transformer) => transformer.validate("diffusion")?,
+            Some(transformer) => transformer.validate("diffusion", self.action_horizon)?,
             None => self.network.validate("diffusion", self.action_horizon)?,
         }
         if self.transformer.is_some() && self.vision.is_some() {
@@ -101,9 +101,6 @@ impl Config {
                 "given".to_string(),
                 "none with a transformer, which sees no pictures".to_string(),
             );
-        }
-        if self.action_horizon == 0 {
-            return refuse("action_horizon", "0".to_string(), "at least 1".to_string());
         }
         if self.num_train_timesteps == 0 {
             return refuse("num_train_timesteps", "0".to_string(), "at least 1".to_string());

@@ -177,6 +177,9 @@ fn impossible_configurations_name_the_field() {
         config
     };
     assert!(error(Config { action_horizon: 6, ..small() }).contains("action_horizon is 6, expected a multiple of 2^2"));
+    assert!(error(Config { action_horizon: 0, ..small() }).contains("action_horizon is 0, expected a multiple of 2^2"));
+    let nothing = Config { action_horizon: 0, ..attending(tokens()) };
+    assert!(error(nothing).contains("action_horizon is 0, expected at least 1"));
     assert!(error(Config { inference_steps: 101, ..small() }).contains("inference_steps"));
     assert!(error(Config { clip_sample: -1.0, ..small() }).contains("clip_sample"));
     assert!(error(network(|n| n.n_groups = 3)).contains("network.n_groups is 3"));

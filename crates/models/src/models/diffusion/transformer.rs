@@ -46,12 +46,15 @@ impl Default for TransformerConfig {
 }
 
 impl TransformerConfig {
-    /// Checks that such a network can exist.
+    /// Checks that a network over `action_horizon` steps can exist.
     ///
     /// # Errors
     /// The first field that makes it impossible.
-    pub fn validate(&self, model: &'static str) -> Result<()> {
+    pub fn validate(&self, model: &'static str, action_horizon: usize) -> Result<()> {
         let refuse = |field, found: String, expected: String| Err(ModelError::Config { model, field, found, expected });
+        if action_horizon == 0 {
+            return refuse("action_horizon", "0".to_string(), "at least 1".to_string());
+        }
         if self.dim_model < 4 || !self.dim_model.is_multiple_of(2) {
             let found = self.dim_model.to_string();
             return refuse("transformer.dim_model", found, "an even number from 4".to_string());
