@@ -56,6 +56,7 @@ TASKS = {
         Task("PickPlaceBread", expert=".experts.objects:BreadExpert", soft_reset=True),
         Task("PickPlaceCereal", expert=".experts.objects:CerealExpert", soft_reset=True),
         Task("PickPlace", expert=".experts.objects:AllThingsExpert", soft_reset=True, max_steps=1200),
+        Task("NutAssembly", expert=".experts.objects:AllNutsExpert", soft_reset=True, max_steps=800),
         Task("NutAssemblyRound", expert=".experts.objects:RoundExpert", soft_reset=True),
         Task(
             "NutAssemblySquare",
@@ -145,7 +146,8 @@ TASKS = {
         ),
         Task("ToolHang", expert=".experts.tools:ToolHangExpert", soft_reset=True, max_steps=700),
         Task("TwoArmLift", expert=".experts.arms:TwoArmLiftExpert", soft_reset=True, arguments=PANDAS),
-        Task("TwoArmHandover", arguments=PANDAS),
+        Task("TwoArmHandover", expert=".experts.arms:TwoArmHandoverExpert", arguments=PANDAS),
+        Task("TwoArmPegInHole", expert=".experts.arms:TwoArmPegInHoleExpert", arguments=PANDAS),
         Task("TwoArmTransport", expert=".experts.arms:TwoArmTransportExpert", arguments=PANDAS, max_steps=700),
     )
 }

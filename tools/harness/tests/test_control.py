@@ -21,7 +21,7 @@ from actrm_harness.wire import Array  # noqa: E402
 
 TASKS = [
     *("Lift", "Stack", "PickPlaceCan", "PickPlace", "NutAssemblySquare", "NutAssemblyRound", "ToolHang", "Door"),
-    *("Wipe", "TwoArmLift", "TwoArmTransport"),
+    *("NutAssembly", "Wipe", "TwoArmLift", "TwoArmHandover", "TwoArmPegInHole", "TwoArmTransport"),
 ]
 
 CALM = {"TwoArmTransport": 8}

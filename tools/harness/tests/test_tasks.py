@@ -358,7 +358,7 @@ def test_the_documentation_shows_that_module() -> None:
 
 
 def test_a_task_without_an_expert_says_so() -> None:
-    client = Client("--task", "TwoArmHandover")
+    client = Client("--task", "PickPlaceSingle")
     with pytest.raises(WorkerError, match="no scripted expert"):
         client.ask("expert", seed=0)
     client.close()

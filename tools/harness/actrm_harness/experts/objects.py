@@ -385,6 +385,33 @@ class RoundExpert(NutExpert):
     NUT, PEG, HANDLE = "RoundNut_main", "peg2", 0.06
 
 
+class AllNutsExpert:
+    """Both nuts, the square one first; the next is reached for once the hand is over the peg's top."""
+
+    NUTS = (SquareExpert, RoundExpert)
+    OVER = 0.97
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.scene = scene
+        # who shows an episode shows all of it in one style
+        self.experts = [nut(scene, rng) for nut in self.NUTS]
+        for expert in self.experts[1:]:
+            expert.servo.style = self.experts[0].servo.style
+        self.at = 0
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        expert = self.experts[self.at]
+        if not expert.grasp.closing and float(self.scene.hand[2]) > self.OVER:
+            missing = [index for index, each in enumerate(self.experts) if not self._on_peg(each)]
+            self.at = missing[0] if missing else self.at
+        return self.experts[self.at].act()
+
+    def _on_peg(self, expert: NutExpert) -> bool:
+        away = self.scene.body(expert.NUT) - self.scene.body(expert.PEG)
+        return bool(np.all(np.abs(away[:2]) < 0.03)) and float(self.scene.body(expert.NUT)[2]) < 0.87
+
+
 class DoorExpert:
     """Take the lever, turn it down with the hand, and draw the door open by it.
 

@@ -79,8 +79,8 @@ class Scene:
         self.shown_by = shown_by or Demonstrator(SKILLS[USUAL], np.random.default_rng(0))
         self._robot: Any = env.robots[robot]
         self._site = int(self._robot.eef_site_id["right"])
-        self._fingers: list[int] = list(self._robot._ref_gripper_joint_pos_indexes["right"])
-        self._finger_speeds: list[int] = list(self._robot._ref_gripper_joint_vel_indexes["right"])
+        self._fingers: list[int] = list(self._robot._ref_gripper_joint_pos_indexes["right"] or [])
+        self._finger_speeds: list[int] = list(self._robot._ref_gripper_joint_vel_indexes["right"] or [])
 
     @property
     def task(self) -> Any:

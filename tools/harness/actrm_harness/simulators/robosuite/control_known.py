@@ -45,7 +45,7 @@ def _unknown_robot(env: Any, robot: Any) -> str | None:
     if type(composite) is not basic:
         return f"the composite controller is {type(composite).__name__}"
     parts = dict(composite._action_split_indexes)
-    known = ({"right": (0, 6), "right_gripper": (6, 6 + fingers)} for fingers in (0, 1))
+    known = ({"right": (0, 6)}, *({"right": (0, 6), "right_gripper": (6, 6 + fingers)} for fingers in (0, 1)))
     return _first(
         (parts in known, lambda: f"the parts of an action are {parts}"),
         (all(robot.enabled(part) for part in parts), lambda: "a part of the robot is disabled"),
@@ -83,9 +83,10 @@ def _unknown_arm(env: Any, robot: Any) -> str | None:
 
 def _unknown_gripper(robot: Any) -> str | None:
     gripper = robot.gripper["right"]
-    fingers = robot.composite_controller.part_controllers["right_gripper"]
-    if type(gripper) is robosuite_class("models.grippers.wiping_gripper", "WipingGripper"):
+    rigid = (("wiping_gripper", "WipingGripper"), ("null_gripper", "NullGripper"))
+    if any(type(gripper) is robosuite_class(f"models.grippers.{module}", name) for module, name in rigid):
         return None if gripper.dof == 0 else f"the gripper has {gripper.dof} degrees of freedom"
+    fingers = robot.composite_controller.part_controllers["right_gripper"]
     return _first(
         (
             type(gripper) is robosuite_class("models.grippers.panda_gripper", "PandaGripper"),

@@ -15,7 +15,8 @@ _POLICY_SITE = (STATE.fields or {})["policy_ref_pos"][1] // 8
 def arm_binding(env: Any, robot: Any) -> ArmBinding:
     """Where this robot is in the simulation, and its controllers' constants."""
     parts = robot.composite_controller.part_controllers
-    arm, fingers = parts["right"], parts["right_gripper"]
+    # a robot without a gripper has no such part
+    arm, fingers = parts["right"], parts.get("right_gripper")
     actuators = robot._ref_actuators_indexes_dict
     binding = ArmBinding(grip_site=env.sim.model.site_name2id(arm.ref_name), origin_site=origin_site(env, arm))
     numbers: dict[str, Any] = {
@@ -68,7 +69,7 @@ class SharedRobot:
         self._policy_site = np.frombuffer(state, dtype=np.float64)[_POLICY_SITE : _POLICY_SITE + 18]
         self._composite = robot.composite_controller
         self._arm = self._composite.part_controllers["right"]
-        self._fingers = self._composite.part_controllers["right_gripper"]
+        self._fingers = self._composite.part_controllers.get("right_gripper")
         self._gripper = robot.gripper["right"]
         self.action = robot.action_dim
         self._share()
@@ -94,7 +95,8 @@ class SharedRobot:
     def stepped(self) -> None:
         """Substeps are over: the controllers' numbers are of now."""
         self._arm.new_update = True
-        self._fingers.new_update = True
+        if self._fingers is not None:
+            self._fingers.new_update = True
 
     def _share(self) -> None:
         """Copy the controllers' state and put views of the copy in its place."""

@@ -105,6 +105,23 @@ def _nut(env: Any) -> tuple[Stage, ...]:
     return (*fetching(env, nut, place, grip), ("above", _above(place, peg, 0.03)))
 
 
+def _nuts(env: Any) -> tuple[Stage, ...]:
+    def on_pegs(count: int) -> bool:
+        places = [env.sim.data.body_xpos[env.obj_body_id[nut.name]] for nut in env.nuts]
+        return sum(bool(env.on_peg(place, index)) for index, place in enumerate(places)) >= count
+
+    def one_held() -> bool:
+        return any(held(env, nut) for nut in env.nuts)
+
+    # the other one, for the hand has to be off the first
+    return (
+        ("held", one_held),
+        ("one there", lambda: on_pegs(1)),
+        ("let go", lambda: not one_held()),
+        ("other held", one_held),
+    )
+
+
 def _door(env: Any) -> tuple[Stage, ...]:
     def open_by(angle: float) -> Callable[[], bool]:
         return lambda: float(env.sim.data.qpos[env.hinge_qpos_addr]) > angle
@@ -163,24 +180,45 @@ def _two_arm_transport(env: Any) -> tuple[Stage, ...]:
     payload = _body(env, group.payload_body_id)
     rest = float(payload()[2])
     covered = float(group.lid_handle_pos[0])
-
-    def holds(*arms: int) -> Callable[[], bool]:
-        """Whether these arms hold the hammer, and no other."""
-
-        def judge() -> bool:
-            grasps = [env._check_grasp(gripper=robot.gripper, object_geoms=group.payload) for robot in env.robots]
-            return all(bool(grasp) == (arm in arms) for arm, grasp in enumerate(grasps))
-
-        return judge
-
     return (
         ("uncovered", lambda: abs(float(group.lid_handle_pos[0]) - covered) > env.bin_size[0] / 2.0),
         ("trash out", lambda: bool(group.trash_in_trash_bin)),
-        ("first holds", holds(0)),
+        ("first holds", _holds(env, group.payload, 0)),
         ("lifted", lambda: float(payload()[2]) > rest + LIFTED),
-        ("both hold", holds(0, 1)),
-        ("second holds", holds(1)),
+        ("both hold", _holds(env, group.payload, 0, 1)),
+        ("second holds", _holds(env, group.payload, 1)),
     )
+
+
+def _two_arm_handover(env: Any) -> tuple[Stage, ...]:
+    hammer = _body(env, env.hammer_body_id)
+    rest = float(hammer()[2])
+    return (
+        ("first holds", _holds(env, env.hammer, 0)),
+        ("lifted", lambda: float(hammer()[2]) > rest + LIFTED),
+        ("both hold", _holds(env, env.hammer, 0, 1)),
+    )
+
+
+def _holds(env: Any, thing: Any, *arms: int) -> Callable[[], bool]:
+    """Whether these arms hold a thing, and no other."""
+
+    def judge() -> bool:
+        grasps = [env._check_grasp(gripper=robot.gripper, object_geoms=thing) for robot in env.robots]
+        return all(bool(grasp) == (arm in arms) for arm, grasp in enumerate(grasps))
+
+    return judge
+
+
+def _two_arm_peg_in_hole(env: Any) -> tuple[Stage, ...]:
+    # the peg's axis to the hole's: metres beside it, and how well the two agree, as success asks
+    def turned() -> bool:
+        return bool(env._compute_orientation()[2] > 0.95)
+
+    def in_line() -> bool:
+        return turned() and bool(env._compute_orientation()[1] < 0.06)
+
+    return (("turned", turned), ("in line", in_line))
 
 
 _STAGES: dict[str, Callable[[Any], tuple[Stage, ...]]] = {
@@ -193,8 +231,11 @@ _STAGES: dict[str, Callable[[Any], tuple[Stage, ...]]] = {
     "PickPlace": _pick_place_all,
     "NutAssemblySquare": _nut,
     "NutAssemblyRound": _nut,
+    "NutAssembly": _nuts,
     "Wipe": _wipe,
     "TwoArmLift": _two_arm_lift,
+    "TwoArmHandover": _two_arm_handover,
+    "TwoArmPegInHole": _two_arm_peg_in_hole,
     "TwoArmTransport": _two_arm_transport,
     "ToolHang": _tool_hang,
     "Door": _door,
