@@ -186,9 +186,9 @@ class NutExpert:
     FINAL = (0.0, np.pi)
     REACH = 0.185
 
-    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+    def __init__(self, scene: Scene, rng: np.random.Generator, fumbled: float = 100.0) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4, turn=0.8, mishaps=Mishaps(pushed=15.0, fumbled=100.0))
+        self.servo = Servo(scene, rng, pace=1.4, turn=0.8, mishaps=Mishaps(pushed=15.0, fumbled=fumbled))
         # the handle is long and thin: who waits for its very middle may wait for ever
         self.grasp = Grasp(scene, self.servo.style, tall=0.02, mouth=(0.012, 0.025), close=(0.018, 0.015))
         self.carry = Carry(scene, self.grasp, clear=rng.uniform(0.99, 1.01))
@@ -386,15 +386,20 @@ class RoundExpert(NutExpert):
 
 
 class AllNutsExpert:
-    """Both nuts, the square one first; the next is reached for once the hand is over the peg's top."""
+    """Both nuts, the square one first; the next is reached for once the hand is over the peg's top.
+
+    A nut that is let fall may come to lie on its edge or its back, where no hand takes it: as many are in an episode of
+    two as in one of one.
+    """
 
     NUTS = (SquareExpert, RoundExpert)
     OVER = 0.97
+    FUMBLED = 200.0
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
         # who shows an episode shows all of it in one style
-        self.experts = [nut(scene, rng) for nut in self.NUTS]
+        self.experts = [nut(scene, rng, self.FUMBLED) for nut in self.NUTS]
         for expert in self.experts[1:]:
             expert.servo.style = self.experts[0].servo.style
         self.at = 0
