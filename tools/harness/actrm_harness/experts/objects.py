@@ -1,5 +1,6 @@
 """Experts for robosuite's tasks with other things than cubes."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -388,13 +389,13 @@ class RoundExpert(NutExpert):
 class AllNutsExpert:
     """Both nuts, the square one first; the next is reached for once the hand is over the peg's top.
 
-    A nut that is let fall may come to lie on its edge or its back, where no hand takes it: as many are in an episode of
-    two as in one of one.
+    A nut that is let fall may come to lie on its edge, its back or askew on the peg, where no hand takes it: so the
+    fingers do not fumble here.
     """
 
     NUTS = (SquareExpert, RoundExpert)
     OVER = 0.97
-    FUMBLED = 200.0
+    FUMBLED = math.inf
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
