@@ -399,7 +399,7 @@ class AllNutsExpert:
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        # who shows an episode shows all of it in one style
+        # both nuts at the pace of the first
         self.experts = [nut(scene, rng, self.FUMBLED) for nut in self.NUTS]
         for expert in self.experts[1:]:
             expert.servo.style = self.experts[0].servo.style
