@@ -4,9 +4,11 @@ import numpy as np
 
 from actrm_harness.experts.parts import (
     CLOSE,
+    ONE_PUSH,
     OPEN,
     Carry,
     Grasp,
+    Mishaps,
     Scene,
     Servo,
     about,
@@ -74,9 +76,9 @@ class ToolHangExpert:
     The ring is laid flat around the hook's upturned end, the handle beyond: let go, the wrench swings down and hangs.
     """
 
-    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+    def __init__(self, scene: Scene, rng: np.random.Generator, mishaps: Mishaps = ONE_PUSH) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4, turn=FREE)
+        self.servo = Servo(scene, rng, pace=1.4, turn=FREE, mishaps=mishaps)
         style = self.servo.style
         self.frame = Grasp(scene, style, tall=0.02, mouth=(0.012, 0.03), close=(0.012, 0.012))
         self.tool = Grasp(scene, style, tall=0.05, mouth=(0.012, 0.03), close=(0.012, 0.012))
@@ -195,6 +197,20 @@ class ToolHangExpert:
     def _geom(self, name: str) -> Array:
         data, model = self.scene.env.sim.data, self.scene.env.sim.model
         return np.array(data.geom_xpos[model.geom_name2id(name)])
+
+
+class RecoveringToolHangExpert(ToolHangExpert):
+    """Pushed all the while: what brings the hand back where little is forgiven, at the stand and at the hook."""
+
+    PUSHED = 18.0
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        super().__init__(scene, rng, Mishaps(pushed=self.PUSHED))
+
+    @property
+    def erring(self) -> bool:
+        """Whether the last action was a push."""
+        return self.servo.erring
 
 
 def lean_of(tool: Array) -> float:
