@@ -160,7 +160,13 @@ TASKS = {
         Task("TwoArmLift", expert=".experts.arms:TwoArmLiftExpert", soft_reset=True, arguments=PANDAS),
         Task("TwoArmHandover", expert=".experts.arms:TwoArmHandoverExpert", arguments=PANDAS),
         Task("TwoArmPegInHole", expert=".experts.arms:TwoArmPegInHoleExpert", arguments=PANDAS),
-        Task("TwoArmTransport", expert=".experts.arms:TwoArmTransportExpert", arguments=PANDAS, max_steps=700),
+        Task(
+            "TwoArmTransport",
+            expert=".experts.arms:TwoArmTransportExpert",
+            experts={"recoveries": ".experts.arms:RecoveringTransportExpert"},
+            arguments=PANDAS,
+            max_steps=700,
+        ),
     )
 }
 

@@ -6,9 +6,12 @@ import numpy as np
 
 from actrm_harness.experts.parts import (
     DOWN,
+    ONE_PUSH,
     OPEN,
     Carry,
     Grasp,
+    Mishaps,
+    Misreach,
     Scene,
     Servo,
     about,
@@ -120,10 +123,12 @@ class _HandingExpert:
     BACK = np.array([0.0, -0.3, 1.2])
     WAITING = np.array([0.0, 0.14, 1.2])
 
+    MISHAPS = ONE_PUSH
+
     def __init__(self, scene: Scene, other: Scene, rng: np.random.Generator, hammer: Any, tall: float) -> None:
         """`tall`: how far up above the hammer the way to it is barred for the first arm."""
         self.scenes = [scene, other]
-        self.servos = [Servo(each, rng, pace=1.4) for each in self.scenes]
+        self.servos = [Servo(each, rng, pace=1.4, mishaps=self.MISHAPS) for each in self.scenes]
         self.servos[1].style = self.servos[0].style
         self.hammer = Hammer(scene, hammer)
         style = self.servos[0].style
@@ -278,7 +283,7 @@ class TwoArmTransportExpert(_HandingExpert):
     def _throw_out(self) -> Array:
         scene, servo, straight = self.scenes[1], self.servos[1], self._straight(1)
         trash, rotation = scene.body("trash_main"), scene.body_rotation("trash_main")
-        goal = _geom(scene, "transport_trash_bin_base") + np.array([0.0, 0.0, 0.07])
+        goal = self._trash_goal()
         away = np.abs(trash - goal)
         inside = float(trash[2]) < float(goal[2]) - 0.03 and float(away[:2].max()) < 0.12
         if self.throw.update(trash, goal, flat=0.04, height=0.02, lost=0.2) or inside:
@@ -290,10 +295,52 @@ class TwoArmTransportExpert(_HandingExpert):
         turn = nearest(yaw(rotation), np.pi / 2, hand)
         target, fingers = self.trash.reach(trash, turn - hand)
         if self.trash.held:
-            target = self.throw.bring(trash, goal, near=0.03, far=0.08)
-            target[1] = goal[1]
-            return self._move(servo, target, fingers, straight)
+            return self._move(servo, self._over_to_bin(trash), fingers, straight)
         return self._move(servo, target, fingers, about_z(turn) @ DOWN)
+
+    def _trash_goal(self) -> Array:
+        """Where the trash is let fall."""
+        return _geom(self.scenes[1], "transport_trash_bin_base") + np.array([0.0, 0.0, 0.07])
+
+    def _over_to_bin(self, trash: Array) -> Array:
+        """Where the second hand goes with the trash, over to its bin."""
+        goal = self._trash_goal()
+        target = self.throw.bring(trash, goal, near=0.03, far=0.08)
+        target[1] = goal[1]
+        return target
+
+
+class RecoveringTransportExpert(TwoArmTransportExpert):
+    """Both arms are pushed all the while, and some reaches for the trash go wrong; all of it is marked."""
+
+    MISHAPS = Mishaps(pushed=22.0)
+    # How often the second hand misses the trash: never, once, twice.
+    MISREACHES = (0.3, 0.5, 0.2)
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        super().__init__(scene, rng)
+        self.misreaches = int(rng.choice(3, p=self.MISREACHES))
+        self.misreach = Misreach(self.scenes[1], rng)
+        self.erring = False
+
+    def act(self) -> Array:
+        """The action for the current state, the first arm's before the second's."""
+        wrong = self.misreach.under_way
+        action = super().act()
+        self.erring = wrong or any(servo.erring for servo in self.servos)
+        return action
+
+    def _throw_out(self) -> Array:
+        trash = self.scenes[1].body("trash_main")
+        if self.misreach.under_way:
+            target, fingers, rotation = self.misreach.go_on(trash, self._over_to_bin(self.scenes[1].hand))
+            return self._move(self.servos[1], target, fingers, self._straight(1) if rotation is None else rotation)
+        action = super()._throw_out()
+        busy = self.trash.closing or self.throw.released
+        if self.misreaches and not busy and self.misreach.near(trash):
+            self.misreaches -= 1
+            self.misreach.begin()
+        return action
 
 
 class TwoArmPegInHoleExpert:

@@ -13,6 +13,7 @@ from actrm_harness.experts.parts import (
     Carry,
     Grasp,
     Mishaps,
+    Misreach,
     Scene,
     Servo,
     about_z,
@@ -147,80 +148,37 @@ class AllThingsExpert(BinsExpert):
 
 
 class RecoveringThingsExpert(AllThingsExpert):
-    """Make mistakes where a thing is near, and show how each is made up for.
+    """Some reaches go wrong, which is marked, and every one is made up for."""
 
-    The hand comes beside and above a thing, turned away from it. Then it reaches as it should; or it closes on nothing
-    first, may set out with that as if it held the thing, opens, and comes back. What is wrong is marked, and stays
-    above the thing: what falls over is lost.
-    """
-
-    # How often a reach goes wrong, for each thing: never, once, twice.
+    # How often, for each thing: never, once, twice.
     MISREACHES = (0.3, 0.5, 0.2)
-    NEAR = 0.12
-    ASIDE = 0.03
-    ABOVE = (0.075, 0.105)
-    AMISS = 1.0
-    # How often it closes on nothing, and for how long it goes on with that at most.
-    CLOSES = 0.5
-    ONWARD = 60
-    PATIENCE = 30
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         super().__init__(scene, rng)
-        self.rng = rng
         self.misreaches = [int(rng.choice(3, p=self.MISREACHES)) for _ in self.THINGS]
+        self.misreach = Misreach(scene, rng)
         self.erring = False
-        # where beside the thing the hand goes, and how it is turned there
-        self.miss: Array | None = None
-        self.amiss = 0.0
-        self.closes = False
-        self.tried = self.onward = 0
 
     def act(self) -> Array:
         """The action for the current state."""
-        self.erring = True
-        if self.onward:
-            return self._carry_nothing()
-        if self.miss is not None:
-            return self._reach_wrong(self.miss)
+        if self.misreach.under_way:
+            self.erring = True
+            goal = np.array(self.THINGS[self.at].place)
+            bring = self.carries[self.at].bring(self.scene.hand, goal, near=0.015, far=0.04)
+            target, grip, rotation = self.misreach.go_on(self._held_at(), bring)
+            return self.servo.move(target, grip, DOWN if rotation is None else rotation)
         action = super().act()
         self.erring = self.servo.erring
-        near = float(np.linalg.norm(self._held_at() - self.scene.hand)) < self.NEAR
         busy = self.grasp.closing or self.carries[self.at].released
-        if near and self.misreaches[self.at] and not busy:
-            self._draw_wrong()
+        if self.misreaches[self.at] and not busy and self.misreach.near(self._held_at()):
+            self.misreaches[self.at] -= 1
+            self.misreach.begin()
         return action
 
     def _held_at(self) -> Array:
         thing = self.THINGS[self.at]
         place, rotation = self._pose(thing)
         return place + rotation @ np.array([0.0, 0.0, thing.grip])
-
-    def _draw_wrong(self) -> None:
-        self.misreaches[self.at] -= 1
-        angle, far = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(0, self.ASIDE)
-        self.miss = np.array([far * np.cos(angle), far * np.sin(angle), self.rng.uniform(*self.ABOVE)])
-        self.amiss = hand_yaw(self.scene.hand_rotation) + self.rng.uniform(-self.AMISS, self.AMISS)
-        self.closes = bool(self.rng.random() < self.CLOSES)
-        self.tried = 0
-
-    def _reach_wrong(self, miss: Array) -> Array:
-        target = self._held_at() + miss
-        self.tried += 1
-        there = float(np.linalg.norm(target - self.scene.hand)) < 0.02 or self.tried > self.PATIENCE
-        met = self.scene.gap < Grasp.THINNEST
-        if met or (there and not self.closes):
-            self.miss = None
-            self.onward = int(self.rng.choice(self.ONWARD + 1)) * met
-        return self.servo.move(target, CLOSE if there and self.closes else OPEN, about_z(self.amiss) @ DOWN)
-
-    def _carry_nothing(self) -> Array:
-        """A step of the way that the hand would take with the thing, had it taken it."""
-        self.onward -= 1
-        target = self.carries[self.at].bring(
-            self.scene.hand, np.array(self.THINGS[self.at].place), near=0.015, far=0.04
-        )
-        return self.servo.move(target, CLOSE, DOWN)
 
 
 class CanExpert(BinsExpert):

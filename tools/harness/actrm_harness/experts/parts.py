@@ -366,3 +366,64 @@ class Carry:
         elif self.released and (distance > lost or abs(float(away[2])) > lost):
             self.released = False
         return self.released
+
+
+class Misreach:
+    """A reach that goes wrong, on purpose: the hand comes beside and above a thing, turned away from it.
+
+    There it may close on nothing, and may set out with that as if it held the thing, before it opens and comes back.
+    It stays above the thing, for what falls over is lost.
+    """
+
+    NEAR = 0.12
+    """How near to the thing the hand is when it begins."""
+    ASIDE = 0.03
+    ABOVE = (0.075, 0.105)
+    AMISS = 1.0
+    CLOSES = 0.5
+    ONWARD = 60
+    THERE = 0.02
+    PATIENCE = 30
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.scene = scene
+        self._rng = rng
+        self._miss: Array | None = None
+        self._turn = 0.0
+        self._closes = False
+        self._tried = self._onward = 0
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the hand errs now."""
+        return self._miss is not None or self._onward > 0
+
+    def near(self, point: Array) -> bool:
+        """Whether the hand is where a reach for `point` may begin to go wrong."""
+        return float(np.linalg.norm(point - self.scene.hand)) < self.NEAR
+
+    def begin(self) -> None:
+        """Draw where the hand goes, how it is turned there, and whether it closes."""
+        rng = self._rng
+        angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(0, self.ASIDE)
+        self._miss = np.array([far * np.cos(angle), far * np.sin(angle), rng.uniform(*self.ABOVE)])
+        self._turn = hand_yaw(self.scene.hand_rotation) + rng.uniform(-self.AMISS, self.AMISS)
+        self._closes = bool(rng.random() < self.CLOSES)
+        self._tried = 0
+
+    def go_on(self, point: Array, bring: Array) -> tuple[Array, float, Array | None]:
+        """Where the hand goes, what its fingers do, and its rotation where that is wrong.
+
+        `point` is where the thing would be taken, `bring` where the hand would go now if it held the thing.
+        """
+        if self._miss is None:
+            self._onward -= 1
+            return bring, CLOSE, None
+        target = point + self._miss
+        self._tried += 1
+        there = float(np.linalg.norm(target - self.scene.hand)) < self.THERE or self._tried > self.PATIENCE
+        met = self.scene.gap < Grasp.THINNEST
+        if met or (there and not self._closes):
+            self._miss = None
+            self._onward = int(self._rng.choice(self.ONWARD + 1)) * met
+        return target, CLOSE if there and self._closes else OPEN, about_z(self._turn) @ DOWN

@@ -76,9 +76,11 @@ class ToolHangExpert:
     The ring is laid flat around the hook's upturned end, the handle beyond: let go, the wrench swings down and hangs.
     """
 
-    def __init__(self, scene: Scene, rng: np.random.Generator, mishaps: Mishaps = ONE_PUSH) -> None:
+    MISHAPS = ONE_PUSH
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
-        self.servo = Servo(scene, rng, pace=1.4, turn=FREE, mishaps=mishaps)
+        self.servo = Servo(scene, rng, pace=1.4, turn=FREE, mishaps=self.MISHAPS)
         style = self.servo.style
         self.frame = Grasp(scene, style, tall=0.02, mouth=(0.012, 0.03), close=(0.012, 0.012))
         self.tool = Grasp(scene, style, tall=0.05, mouth=(0.012, 0.03), close=(0.012, 0.012))
@@ -202,10 +204,7 @@ class ToolHangExpert:
 class RecoveringToolHangExpert(ToolHangExpert):
     """Pushed all the while: what brings the hand back where little is forgiven, at the stand and at the hook."""
 
-    PUSHED = 18.0
-
-    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
-        super().__init__(scene, rng, Mishaps(pushed=self.PUSHED))
+    MISHAPS = Mishaps(pushed=18.0)
 
     @property
     def erring(self) -> bool:
