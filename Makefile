@@ -81,7 +81,7 @@ study-thinking: build ## does thinking help: the studies of robot policies, as f
 .PHONY: test
 test: wheel ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace
-	@.venv/bin/python -m pytest -q tools/harness/tests
+	@.venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests
 	@tools/test_wheel.sh
 
 .PHONY: lint
