@@ -147,32 +147,47 @@ class AllThingsExpert(BinsExpert):
     THINGS = (replace(CEREAL, rise=0.09), MILK, replace(CAN, place=(0.14, 0.33, 0.91), back=2.0), BREAD)
 
 
-class RecoveringThingsExpert(AllThingsExpert):
-    """Some reaches go wrong, which is marked, and every one is made up for."""
+class WrongTurn(Misreach):
+    """The hand turned by anything, down to the thing's top."""
 
-    # How often, for each thing: never, once, twice.
-    MISREACHES = (0.3, 0.5, 0.2)
+    ABOVE = (0.035, 0.105)
+    AMISS = 1.7
+    # joint 7's range, with some room
+    LOWEST, HIGHEST = -1.5, 2.5
+
+
+class RecoveringThingsExpert(AllThingsExpert):
+    """Some reaches go wrong, which is marked, and every one is made up for.
+
+    Most go wrong at what the hand has to turn to: two ways to turn are as good at a right angle, and who learns from
+    both does not turn. So the hand comes there turned by anything, and shows the way on.
+    """
+
+    # How often, for each thing: never, once, twice; then the same for what the hand has to turn to.
+    MISREACHES = (0.4, 0.5, 0.1)
+    WRONG_TURNS = (0.0, 0.5, 0.5)
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         super().__init__(scene, rng)
-        self.misreaches = [int(rng.choice(3, p=self.MISREACHES)) for _ in self.THINGS]
-        self.misreach = Misreach(scene, rng)
+        chances = [self.WRONG_TURNS if thing.flat else self.MISREACHES for thing in self.THINGS]
+        self.left = [int(rng.choice(3, p=each)) for each in chances]
+        self.misreaches = [(WrongTurn if thing.flat else Misreach)(scene, rng) for thing in self.THINGS]
         self.erring = False
 
     def act(self) -> Array:
         """The action for the current state."""
-        if self.misreach.under_way:
+        thing, carry, misreach = self.THINGS[self.at], self.carries[self.at], self.misreaches[self.at]
+        if misreach.under_way:
             self.erring = True
-            goal = np.array(self.THINGS[self.at].place)
-            bring = self.carries[self.at].bring(self.scene.hand, goal, near=0.015, far=0.04)
-            target, grip, rotation = self.misreach.go_on(self._held_at(), bring)
+            bring = carry.bring(self.scene.hand, np.array(thing.place), near=0.015, far=0.04)
+            target, grip, rotation = misreach.go_on(self._held_at(), bring)
             return self.servo.move(target, grip, DOWN if rotation is None else rotation)
         action = super().act()
         self.erring = self.servo.erring
         busy = self.grasp.closing or self.carries[self.at].released
-        if self.misreaches[self.at] and not busy and self.misreach.near(self._held_at()):
-            self.misreaches[self.at] -= 1
-            self.misreach.begin()
+        if self.left[self.at] and not busy and self.misreaches[self.at].near(self._held_at()):
+            self.left[self.at] -= 1
+            self.misreaches[self.at].begin()
         return action
 
     def _held_at(self) -> Array:

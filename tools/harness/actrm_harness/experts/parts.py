@@ -380,6 +380,8 @@ class Misreach:
     ASIDE = 0.03
     ABOVE = (0.075, 0.105)
     AMISS = 1.0
+    # How far the hand may be turned.
+    LOWEST, HIGHEST = -math.inf, math.inf
     CLOSES = 0.5
     ONWARD = 60
     THERE = 0.02
@@ -407,7 +409,8 @@ class Misreach:
         rng = self._rng
         angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(0, self.ASIDE)
         self._miss = np.array([far * np.cos(angle), far * np.sin(angle), rng.uniform(*self.ABOVE)])
-        self._turn = hand_yaw(self.scene.hand_rotation) + rng.uniform(-self.AMISS, self.AMISS)
+        turn = hand_yaw(self.scene.hand_rotation) + rng.uniform(-self.AMISS, self.AMISS)
+        self._turn = float(np.clip(turn, self.LOWEST, self.HIGHEST))
         self._closes = bool(rng.random() < self.CLOSES)
         self._tried = 0
 
