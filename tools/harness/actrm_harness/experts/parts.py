@@ -376,16 +376,21 @@ class Misreach:
     """
 
     NEAR = 0.12
-    """How near to the thing the hand is when it begins."""
+    """How near to the thing the hand is when it begins, in metres."""
     ASIDE = 0.03
     ABOVE = (0.075, 0.105)
+    """How far beside the thing at most, and how far above where it is taken: metres."""
     AMISS = 1.0
-    # How far the hand may be turned.
+    """By how much the hand is turned away at most, in radians."""
     LOWEST, HIGHEST = -math.inf, math.inf
+    """The angles about the vertical that it is kept between."""
     CLOSES = 0.5
+    """How often it closes on nothing."""
     ONWARD = 60
+    """For how many steps it goes on with that at most."""
     THERE = 0.02
     PATIENCE = 30
+    """Within how many metres of its wrong place, or after how many steps, it is there."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
