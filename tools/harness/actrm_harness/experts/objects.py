@@ -159,8 +159,8 @@ class WrongTurn(Misreach):
 class RecoveringThingsExpert(AllThingsExpert):
     """Some reaches go wrong, which is marked, and every one is made up for.
 
-    Most go wrong at what the hand has to turn to: two ways to turn are as good at a right angle, and who learns from
-    both does not turn. So the hand comes there turned by anything, and shows the way on.
+    Most go wrong at what the hand has to turn to: at a right angle two ways to turn are as good, and policies came down
+    there without turning. So the hand comes turned by anything, and shows the way on; that alone has not cured it.
     """
 
     # How often, for each thing: never, once, twice; then the same for what the hand has to turn to.
