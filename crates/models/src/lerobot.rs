@@ -284,6 +284,9 @@ fn write_vision(vision: &VisionConfig, into: &mut Value) -> Result<()> {
     if let Some(side) = vision.crop {
         return cannot("vision.crop", side.to_string(), "none: LeRobot's ACT does not crop");
     }
+    if let Some(blocks) = vision.blocks {
+        return cannot("vision.blocks", format!("{blocks:?}"), "none: LeRobot takes torchvision's networks");
+    }
     if vision.tokens != TokenKind::Map {
         return cannot("vision.tokens", "keypoints".to_string(), "map: LeRobot's ACT has no keypoints");
     }

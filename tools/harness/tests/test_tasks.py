@@ -308,7 +308,8 @@ def test_stack_color_has_to_be_read() -> None:
     firsts: set[bytes] = set()
     for demonstration in (True, False):
         for seed in range(60):
-            value = envs.reset(session, seed, demonstration=demonstration)["object"]
+            seen_now = envs.reset(session, seed, demonstration=demonstration)
+            value = seen_now["object"]
             meta = session.env.get_ep_meta()
             seen[demonstration].add(tuple(meta["order"]))
             colors = np.array([value[10 * slot + 7 : 10 * slot + 10] for slot in range(3)])
@@ -316,6 +317,11 @@ def test_stack_color_has_to_be_read() -> None:
             exact = bool(np.all((colors == 0) | (colors == 1)))
             assert exact == demonstration
             assert value.shape == (48,)
+            places = {tuple(value[39 + 3 * place : 42 + 3 * place]): place for place in range(3)}
+            for slot in range(3):
+                place = places[tuple(colors[slot].round())]
+                found = seen_now[f"gripper_to_place{place}"]
+                np.testing.assert_allclose(found, value[30 + 3 * slot : 33 + 3 * slot], atol=1e-9)
             if demonstration:
                 assert meta["group"] == "seen"
     assert len(seen[True]) == 4 and len(seen[False]) == 6 and seen[True] < seen[False]

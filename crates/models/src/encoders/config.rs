@@ -59,6 +59,9 @@ pub enum TokenKind {
 pub struct VisionConfig {
     /// the network
     pub encoder: Architecture,
+    /// blocks of each of its four layers, instead of the network's; the last ones may have none, which leaves a finer map
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub blocks: Option<[usize; 4]>,
     /// channels of its first layer
     pub width: usize,
     /// what follows its convolutions
@@ -80,18 +83,22 @@ pub struct VisionConfig {
     /// learning rate of the network relative to the rest; absent: 1, or 0.1 with weights
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lr_backbone: Option<f64>,
-    /// numbers that a cell of the map becomes for a model that reads one vector; absent: 32
+    /// numbers that a cell of the map, or a camera's keypoints, become for a model that reads one vector; absent: 32, or 64
+    /// for keypoints
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cell_features: Option<usize>,
 }
 
 /// What a cell of the map becomes where nothing else is said.
 const CELL_FEATURES: usize = 32;
+/// What a camera's keypoints become where nothing else is said, as in robomimic.
+const KEYPOINT_FEATURES: usize = 64;
 
 impl Default for VisionConfig {
     fn default() -> Self {
         Self {
             encoder: Architecture::Resnet18,
+            blocks: None,
             width: 16,
             norm: ImageNorm::Group,
             tokens: TokenKind::Map,
@@ -122,6 +129,12 @@ impl VisionConfig {
         if self.norm == ImageNorm::Group && self.width > 16 && !self.width.is_multiple_of(16) {
             return refuse("width", self.width.to_string(), "a multiple of 16 with norm = \"group\"");
         }
+        if let Some(blocks) = self.blocks
+            && (blocks[0] == 0 || blocks.windows(2).any(|pair| pair[0] == 0 && pair[1] > 0))
+        {
+            let expected = "at least 1 of the first layer, and none of a layer only where those behind have none";
+            return refuse("blocks", format!("{blocks:?}"), expected);
+        }
         if let TokenKind::Keypoints { count: 0 } = self.tokens {
             return refuse("tokens.keypoints.count", "0".to_string(), "at least 1");
         }
@@ -144,17 +157,20 @@ impl VisionConfig {
         Ok(())
     }
 
-    /// Numbers that a cell of the map becomes for a model that reads one vector.
+    /// Numbers that a cell of the map, or a camera's keypoints, become for a model that reads one vector.
     pub fn cell_features(&self) -> usize {
-        self.cell_features.unwrap_or(CELL_FEATURES)
+        self.cell_features.unwrap_or(match self.tokens {
+            TokenKind::Map => CELL_FEATURES,
+            TokenKind::Keypoints { .. } => KEYPOINT_FEATURES,
+        })
     }
 
     /// The network it describes.
     pub fn shape(&self) -> ResNetShape {
-        let blocks = match self.encoder {
+        let blocks = self.blocks.unwrap_or(match self.encoder {
             Architecture::Resnet18 => [2, 2, 2, 2],
             Architecture::Resnet34 => [3, 4, 6, 3],
-        };
+        });
         ResNetShape { blocks, width: self.width, norm: self.norm }
     }
 

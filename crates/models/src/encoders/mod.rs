@@ -17,6 +17,7 @@ pub use position::position_table;
 pub(crate) use resnet::EPS;
 pub use resnet::{ResNet, ResNetShape};
 pub use spatial_softmax::SpatialSoftmax;
+pub(crate) use spatial_softmax::line;
 
 use crate::device::HERE;
 use crate::error::{ModelError, Result, some_names};
@@ -50,7 +51,7 @@ enum Head {
     /// a dense layer for every cell
     Map { weight: Tensor, bias: Tensor, tables: Vec<Tensor> },
     /// where each keypoint is
-    Keypoints { softmax: SpatialSoftmax, project: Linear, embed: Tensor },
+    Keypoints { softmax: SpatialSoftmax, project: Linear, embed: Option<Tensor> },
 }
 
 /// Backbone and tokens of all cameras.
@@ -74,6 +75,25 @@ impl ImageEncoder {
     /// # Errors
     /// A configuration or a size that describes no possible network.
     pub fn new(params: &mut Params, config: &VisionConfig, given: &[Size], dim: usize, rng: &mut Rng) -> Result<Self> {
+        let mut encoder = Self::without_positions(params, config, given, dim, rng)?;
+        if let Head::Keypoints { embed, .. } = &mut encoder.head {
+            let name = format!("{CAMERA_EMBED}.weight");
+            *embed = Some(params.create(&name, &[given.len(), dim], Init::Normal { std: 1.0 }, rng)?);
+        }
+        Ok(encoder)
+    }
+
+    /// The same for a model whose tokens lie side by side, so that no position is learned.
+    ///
+    /// # Errors
+    /// As [`ImageEncoder::new`].
+    pub fn without_positions(
+        params: &mut Params,
+        config: &VisionConfig,
+        given: &[Size],
+        dim: usize,
+        rng: &mut Rng,
+    ) -> Result<Self> {
         config.validate()?;
         if given.is_empty() || given.iter().any(|&(h, w)| h == 0 || w == 0) {
             let expected = "one size a camera, at least 1 x 1".to_string();
@@ -114,12 +134,7 @@ impl ImageEncoder {
             TokenKind::Keypoints { count } => Head::Keypoints {
                 softmax: SpatialSoftmax::new(params, KEYPOINTS, channels, count, rng)?,
                 project: Linear::new(params, KEYPOINT_PROJECTION, 2 * count, dim, rng)?,
-                embed: params.create(
-                    &format!("{CAMERA_EMBED}.weight"),
-                    &[sizes.len(), dim],
-                    Init::Normal { std: 1.0 },
-                    rng,
-                )?,
+                embed: None,
             },
         };
         params.set_rate(&format!("{BACKBONE}."), config.backbone_rate());
@@ -189,11 +204,15 @@ impl ImageEncoder {
     /// Positions of all tokens: (T, D). Fixed for map tokens, learned for keypoints.
     ///
     /// # Errors
-    /// If the tensor library fails.
+    /// An encoder without positions.
     pub fn positions(&self) -> Result<Tensor> {
         match &self.head {
             Head::Map { tables, .. } => Ok(Tensor::cat(tables, 0)?),
-            Head::Keypoints { embed, .. } => Ok(embed.clone()),
+            Head::Keypoints { embed: Some(embed), .. } => Ok(embed.clone()),
+            Head::Keypoints { embed: None, .. } => {
+                let (found, expected) = ("none".to_string(), "learned ones".to_string());
+                Err(ModelError::Input { operation: "see", object: "positions", found, expected })
+            }
         }
     }
 

@@ -18,7 +18,7 @@ pub(crate) const EPS: f64 = 1e-5;
 /// What a ResNet is made of.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ResNetShape {
-    /// blocks of each of the four layers
+    /// blocks of each of the four layers; the last ones may have none, which leaves a finer map
     pub blocks: [usize; 4],
     /// channels of the first layer; each layer has twice those of the one before
     pub width: usize,
@@ -27,14 +27,19 @@ pub struct ResNetShape {
 }
 
 impl ResNetShape {
-    /// Channels of the last feature map.
-    pub fn channels_out(&self) -> usize {
-        self.width * 8
+    /// Layers that have blocks.
+    fn layers(&self) -> usize {
+        self.blocks.iter().take_while(|&&count| count > 0).count()
     }
 
-    /// Size of the last feature map: five times half, rounded up.
+    /// Channels of the last feature map.
+    pub fn channels_out(&self) -> usize {
+        self.width << self.layers().saturating_sub(1)
+    }
+
+    /// Size of the last feature map: once more than there are layers half, rounded up.
     pub fn map_size(&self, (h, w): (usize, usize)) -> (usize, usize) {
-        let halved = |n: usize| (0..5).fold(n, |n, _| n.div_ceil(2));
+        let halved = |n: usize| (0..=self.layers()).fold(n, |n, _| n.div_ceil(2));
         (halved(h), halved(w))
     }
 

@@ -3,6 +3,7 @@
 use super::vision::{Eyes, Looked};
 use super::{Grads, Pass, slot};
 use crate::batch::Batch;
+use crate::encoders::{CAMERA_EMBED, TokenKind};
 use crate::error::Result;
 use crate::features::{FeatureKind, FeatureSpec, Features, Signature};
 use crate::kernels::{Mat, Start, add, gemm};
@@ -94,8 +95,7 @@ impl<'a> Tokens<'a> {
     }
 
     fn eyes(&self) -> Option<Eyes<'a>> {
-        let cameras = self.layout.cameras.as_ref()?;
-        Some(Eyes { shape: &cameras.shape, sizes: &cameras.seen })
+        Some(self.layout.cameras.as_ref()?.eyes())
     }
 
     /// -> (b, tokens, D)
@@ -153,7 +153,11 @@ impl<'a> Tokens<'a> {
         let mut all = vec![0.0; self.layout.len() * dim];
         all[..dim].copy_from_slice(&features[..dim]);
         if let Some(cameras) = &self.layout.cameras {
-            all[self.layout.vectors() * dim..].copy_from_slice(&cameras.positions);
+            let positions = match cameras.config.tokens {
+                TokenKind::Map => &cameras.positions,
+                TokenKind::Keypoints { .. } => pass.weight(CAMERA_EMBED, ".weight"),
+            };
+            all[self.layout.vectors() * dim..].copy_from_slice(positions);
         }
         for (token, all) in self.layout.tokens.iter().zip(all[dim..].chunks_exact_mut(dim)) {
             match token.position {
@@ -192,5 +196,8 @@ pub(crate) fn positions_backward(layout: &TokenLayout, dim: usize, grad: &[f32],
             Position::Nowhere => continue,
         };
         add(&mut slot(grads, name, ".weight")[row * dim..(row + 1) * dim], grad);
+    }
+    if layout.cameras.as_ref().is_some_and(|cameras| cameras.config.tokens != TokenKind::Map) {
+        add(slot(grads, CAMERA_EMBED, ".weight"), &grad[layout.vectors() * dim..]);
     }
 }

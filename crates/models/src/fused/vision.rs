@@ -1,13 +1,15 @@
-//! ResNet and map tokens on slices, forwards and backwards: the maths of `encoders/resnet.rs`.
+//! ResNet and its tokens on slices, forwards and backwards: the maths of `encoders/resnet.rs` and `spatial_softmax.rs`.
 //!
 //! All cameras of the same size go through the network as one batch. Feature maps are kept in frames of zeros for the
 //! convolutions (`kernels/conv.rs`); normed values are kept for the backward pass, everything else is computed in passing.
 
 use super::convolution::{framed, input_gradient, weight_gradient};
 use super::{Grads, Pass, slot};
-use crate::encoders::{BACKBONE, EPS, ImageNorm, PROJECTION, ResNetShape, Size};
+use crate::encoders::{
+    BACKBONE, EPS, ImageNorm, KEYPOINT_PROJECTION, KEYPOINTS, PROJECTION, ResNetShape, Size, TokenKind, line,
+};
 use crate::kernels::{
-    Conv, Frame, Shortcut, add, group_norm, group_norm_backward, max_pool, max_pool_backward, relu_backward,
+    Conv, Frame, Shortcut, add, exp, group_norm, group_norm_backward, max_pool, max_pool_backward, relu_backward,
     scale_backward, scale_relu,
 };
 
@@ -278,16 +280,119 @@ impl Seen {
 pub(crate) struct Eyes<'a> {
     pub(crate) shape: &'a ResNetShape,
     pub(crate) sizes: &'a [Size],
+    pub(crate) tokens: TokenKind,
 }
 
-/// What the backward pass of `Eyes` needs: for every size of picture the network's values.
+/// What the backward pass of `Eyes` needs: for every size of picture the network's values, and the keypoints.
 #[derive(Debug)]
-pub(crate) struct Looked(Vec<Seen>);
+pub(crate) struct Looked(Vec<(Seen, Option<Keypoints>)>);
+
+/// Where keypoints are in feature maps: `encoders/spatial_softmax.rs`.
+#[derive(Debug)]
+struct Keypoints {
+    /// how much of each cell is each one's, (n, cells, K)
+    shares: Vec<f32>,
+    /// x and y of every keypoint in turn, (n, 2 K)
+    places: Vec<f32>,
+    /// x and y of every cell
+    grid: Vec<[f32; 2]>,
+    /// K
+    count: usize,
+}
+
+impl Keypoints {
+    /// map: (n, cells, C)
+    fn find(pass: &mut Pass<'_>, map: &[f32], count: usize, (h, w): Size) -> Self {
+        let (xs, ys) = (line(w), line(h));
+        let grid: Vec<[f32; 2]> = (0..h * w).map(|i| [xs[i % w], ys[i / w]]).collect();
+        let mut shares = pass.linear(&chosen(), map);
+        let mut places = pass.space.pool.zeros(shares.len() / grid.len() * 2);
+        let (mut largest, mut sums) = (pass.take(count), pass.take(count));
+        for (shares, places) in shares.chunks_exact_mut(grid.len() * count).zip(places.chunks_exact_mut(2 * count)) {
+            largest.fill(f32::NEG_INFINITY);
+            for cell in shares.chunks_exact(count) {
+                largest.iter_mut().zip(cell).for_each(|(largest, score)| *largest = largest.max(*score));
+            }
+            sums.fill(0.0);
+            for cell in shares.chunks_exact_mut(count) {
+                for ((share, largest), sum) in cell.iter_mut().zip(&largest).zip(&mut sums) {
+                    *share = exp(*share - largest);
+                    *sum += *share;
+                }
+            }
+            for (cell, at) in shares.chunks_exact_mut(count).zip(&grid) {
+                for ((share, sum), place) in cell.iter_mut().zip(&sums).zip(places.chunks_exact_mut(2)) {
+                    *share /= sum;
+                    place[0] += *share * at[0];
+                    place[1] += *share * at[1];
+                }
+            }
+        }
+        pass.give(largest);
+        pass.give(sums);
+        Self { shares, places, grid, count }
+    }
+
+    /// The gradient of the places, (n, 2 K), becomes that of the map; that of the layer is added to `grads`.
+    fn backward(
+        self,
+        pass: &mut Pass<'_>,
+        (map, channels): (&[f32], usize),
+        places: &[f32],
+        grads: &mut Grads<'_>,
+    ) -> Vec<f32> {
+        let (count, picture) = (self.count, self.grid.len() * self.count);
+        let mut scores = pass.take(self.shares.len());
+        let mut means = pass.take(count);
+        let all = scores.chunks_exact_mut(picture).zip(self.shares.chunks_exact(picture));
+        for ((scores, shares), places) in all.zip(places.chunks_exact(2 * count)) {
+            means.fill(0.0);
+            let cells = scores.chunks_exact_mut(count).zip(shares.chunks_exact(count));
+            for ((scores, shares), at) in cells.zip(&self.grid) {
+                let keypoints = scores.iter_mut().zip(shares).zip(places.chunks_exact(2)).zip(&mut means);
+                for (((score, share), place), mean) in keypoints {
+                    *score = at[0] * place[0] + at[1] * place[1];
+                    *mean += *share * *score;
+                }
+            }
+            for (scores, shares) in scores.chunks_exact_mut(count).zip(shares.chunks_exact(count)) {
+                for ((score, share), mean) in scores.iter_mut().zip(shares).zip(&means) {
+                    *score = share * (*score - mean);
+                }
+            }
+        }
+        pass.linear_backward(&chosen(), map, &scores, channels, grads);
+        let map = pass.linear_input(&chosen(), &scores, channels);
+        pass.give(scores);
+        pass.give(means);
+        self.free(pass);
+        map
+    }
+
+    fn free(self, pass: &mut Pass<'_>) {
+        pass.give(self.shares);
+        pass.give(self.places);
+    }
+}
+
+/// The layer that says how much a cell is a keypoint's.
+fn chosen() -> String {
+    format!("{KEYPOINTS}.nets")
+}
 
 impl Eyes<'_> {
+    /// Cells of a map.
     fn cells(&self, size: Size) -> usize {
         let (h, w) = self.shape.map_size(size);
         h * w
+    }
+
+    /// Tokens of a picture.
+    fn tokens(&self, size: Size) -> usize {
+        match self.tokens {
+            TokenKind::Map => self.cells(size),
+            TokenKind::Keypoints { .. } => 1,
+        }
     }
 
     /// Every size of picture with its cameras and where each one's tokens begin.
@@ -299,7 +404,7 @@ impl Eyes<'_> {
                 Some((_, cameras)) => cameras.push((camera, token)),
                 None => groups.push((size, vec![(camera, token)])),
             }
-            token += self.cells(size);
+            token += self.tokens(size);
         }
         groups
     }
@@ -328,14 +433,23 @@ impl Eyes<'_> {
             }
             let seen = net.forward(pass, input);
             let map = seen.maps.last().expect("a map a block");
-            let cells = self.cells((height, width));
-            let tokens = pass.linear(PROJECTION, &map[..rows * cameras.len() * cells * self.shape.channels_out()]);
-            for (n, from) in tokens.chunks_exact(cells * dim).enumerate() {
+            let size = (height, width);
+            let map = &map[..rows * cameras.len() * self.cells(size) * self.shape.channels_out()];
+            let keypoints = match self.tokens {
+                TokenKind::Map => None,
+                TokenKind::Keypoints { count } => Some(Keypoints::find(pass, map, count, self.shape.map_size(size))),
+            };
+            let tokens = match &keypoints {
+                None => pass.linear(PROJECTION, map),
+                Some(keypoints) => pass.linear(KEYPOINT_PROJECTION, &keypoints.places),
+            };
+            let len = self.tokens(size) * dim;
+            for (n, from) in tokens.chunks_exact(len).enumerate() {
                 let (row, (_, token)) = (n % rows, cameras[n / rows]);
-                x[(row * all + first + token) * dim..][..cells * dim].copy_from_slice(from);
+                x[(row * all + first + token) * dim..][..len].copy_from_slice(from);
             }
             pass.give(tokens);
-            looked.push(seen);
+            looked.push((seen, keypoints));
         }
         Looked(looked)
     }
@@ -351,18 +465,29 @@ impl Eyes<'_> {
     ) {
         let dim = pass.shape.dim;
         let rows = grad.len() / (all * dim);
-        for ((size, cameras), seen) in self.by_size().into_iter().zip(looked.0) {
-            let cells = self.cells(size);
-            let count = rows * cameras.len();
-            let mut tokens = pass.take(count * cells * dim);
-            for (n, to) in tokens.chunks_exact_mut(cells * dim).enumerate() {
+        for ((size, cameras), (seen, keypoints)) in self.by_size().into_iter().zip(looked.0) {
+            let (count, len) = (rows * cameras.len(), self.tokens(size) * dim);
+            let mut tokens = pass.take(count * len);
+            for (n, to) in tokens.chunks_exact_mut(len).enumerate() {
                 let (row, (_, token)) = (n % rows, cameras[n / rows]);
-                to.copy_from_slice(&grad[(row * all + first + token) * dim..][..cells * dim]);
+                to.copy_from_slice(&grad[(row * all + first + token) * dim..][..len]);
             }
             let channels = self.shape.channels_out();
-            let map = &seen.maps.last().expect("a map a block")[..count * cells * channels];
-            pass.linear_backward(PROJECTION, map, &tokens, channels, grads);
-            let map_grad = pass.linear_input(PROJECTION, &tokens, channels);
+            let map = &seen.maps.last().expect("a map a block")[..count * self.cells(size) * channels];
+            let map_grad = match keypoints {
+                None => {
+                    pass.linear_backward(PROJECTION, map, &tokens, channels, grads);
+                    pass.linear_input(PROJECTION, &tokens, channels)
+                }
+                Some(keypoints) => {
+                    let numbers = keypoints.places.len() / count;
+                    pass.linear_backward(KEYPOINT_PROJECTION, &keypoints.places, &tokens, numbers, grads);
+                    let places = pass.linear_input(KEYPOINT_PROJECTION, &tokens, numbers);
+                    let map_grad = keypoints.backward(pass, (map, channels), &places, grads);
+                    pass.give(places);
+                    map_grad
+                }
+            };
             pass.give(tokens);
             Net::new(self.shape, count, size).backward(pass, seen, map_grad, grads);
         }
@@ -372,7 +497,12 @@ impl Eyes<'_> {
 impl Looked {
     /// Gives the buffers back without a backward pass.
     pub(crate) fn free(self, pass: &mut Pass<'_>) {
-        self.0.into_iter().for_each(|seen| seen.free(pass));
+        for (seen, keypoints) in self.0 {
+            seen.free(pass);
+            if let Some(keypoints) = keypoints {
+                keypoints.free(pass);
+            }
+        }
     }
 }
 

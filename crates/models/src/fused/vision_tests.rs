@@ -18,22 +18,34 @@ struct Case {
     sizes: Vec<Size>,
     pictures: Vec<Vec<f32>>,
     rows: usize,
+    tokens: TokenKind,
+}
+
+impl Case {
+    fn eyes(&self) -> Eyes<'_> {
+        Eyes { shape: self.encoder.backbone().shape(), sizes: &self.sizes, tokens: self.tokens }
+    }
 }
 
 /// Both norms, one and two sizes of picture, odd ones among them.
 fn cases() -> Vec<Case> {
     let mut all = Vec::new();
-    for (width, norm, sizes, rows) in [
-        (16, ImageNorm::Group, vec![(37, 41)], 2),
-        (8, ImageNorm::Frozen, vec![(40, 40), (40, 40)], 1),
-        (32, ImageNorm::Group, vec![(33, 64), (35, 33), (33, 64)], 1),
+    let (map, five) = (TokenKind::Map, TokenKind::Keypoints { count: 5 });
+    for (width, norm, sizes, rows, tokens, blocks) in [
+        (16, ImageNorm::Group, vec![(37, 41)], 2, map, None),
+        (8, ImageNorm::Frozen, vec![(40, 40), (40, 40)], 1, map, None),
+        (32, ImageNorm::Group, vec![(33, 64), (35, 33), (33, 64)], 1, map, None),
         // more convolutions in tiles
-        (32, ImageNorm::Frozen, vec![(60, 52), (60, 52)], 4),
+        (32, ImageNorm::Frozen, vec![(60, 52), (60, 52)], 4, map, None),
+        // keypoints, finer maps
+        (16, ImageNorm::Group, vec![(33, 64), (35, 33), (33, 64)], 2, five, None),
+        (8, ImageNorm::Group, vec![(37, 41), (37, 41)], 3, five, Some([2, 1, 1, 0])),
+        (8, ImageNorm::Frozen, vec![(40, 33)], 2, map, Some([1, 2, 0, 0])),
     ] {
-        let config = VisionConfig { width, norm, ..VisionConfig::default() };
+        let config = VisionConfig { width, norm, tokens, blocks, ..VisionConfig::default() };
         let mut params = Params::new();
         let mut rng = Rng::new(5, "init");
-        let encoder = ImageEncoder::new(&mut params, &config, &sizes, DIM, &mut rng).unwrap();
+        let encoder = ImageEncoder::without_positions(&mut params, &config, &sizes, DIM, &mut rng).unwrap();
         for (name, var) in params.all() {
             // away from 1 and 0; variances stay positive
             let noise = Tensor::from_vec(rng.normals(var.elem_count()), var.dims(), &Device::Cpu).unwrap();
@@ -42,7 +54,7 @@ fn cases() -> Vec<Case> {
             var.set(&(var.as_tensor() + (noise * scale).unwrap()).unwrap()).unwrap();
         }
         let pictures = sizes.iter().map(|(h, w)| rng.normals(rows * h * w * 3)).collect();
-        all.push(Case { encoder, params, sizes, pictures, rows });
+        all.push(Case { encoder, params, sizes, pictures, rows, tokens });
     }
     all
 }
@@ -89,7 +101,7 @@ fn tokens_and_gradients_are_the_composed_ones() {
                 let mut runs = Vec::new();
                 for _ in 0..2 {
                     let mut grads = Gradients::zeros(layout.clone());
-                    let eyes = Eyes { shape: case.encoder.backbone().shape(), sizes: &case.sizes };
+                    let eyes = case.eyes();
                     spaces.with(|space| {
                         with_weights(&case.params, |weights_of| {
                             let pass =
@@ -115,7 +127,7 @@ fn tokens_and_gradients_are_the_composed_ones() {
         let packed = spaces.packed(&case.params);
         for _ in 0..2 {
             let mut x = spread(&vec![0.0; want.len()]);
-            let eyes = Eyes { shape: case.encoder.backbone().shape(), sizes: &case.sizes };
+            let eyes = case.eyes();
             spaces.with(|space| {
                 with_weights(&case.params, |weights| {
                     let pass = &mut Pass { weights, shape, space, rng: None, packed: Some(&packed), on_seen: None };

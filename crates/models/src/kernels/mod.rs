@@ -15,7 +15,7 @@ mod winograd;
 
 pub(crate) use attention::{Heads, attend, attend_backward};
 pub(crate) use conv::{Conv, Frame};
-pub(crate) use elementwise::{activate, activate_backward, add, column_sums, dot, drop_scale};
+pub(crate) use elementwise::{activate, activate_backward, add, column_sums, dot, drop_scale, exp};
 pub(crate) use gemm::{Mat, Pack, Packed, Start, gemm, gemm_with, product};
 pub(crate) use image::{
     Shortcut, group_norm, group_norm_backward, max_pool, max_pool_backward, relu_backward, scale_backward, scale_relu,

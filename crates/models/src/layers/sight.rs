@@ -1,8 +1,8 @@
 //! What cameras see as numbers beside other numbers, for models that read one vector: the cells of every camera's feature
-//! map, each through the same dense layer, side by side. Of a history every step is seen.
+//! map, each through the same dense layer, side by side, or its keypoints through one. Of a history every step is seen.
 
-use crate::encoders::{ImageEncoder, TokenKind, VisionConfig};
-use crate::error::{ModelError, Result};
+use crate::encoders::{ImageEncoder, VisionConfig};
+use crate::error::Result;
 use crate::features::{Features, Signature};
 use crate::fused::{Eyes, Grads, Looked, Pass};
 use crate::layers::Cameras;
@@ -29,12 +29,7 @@ impl Sight {
     ) -> Result<Option<Self>> {
         let cell = vision.unwrap_or(&VisionConfig::default()).cell_features();
         let Some(cameras) = Cameras::asked(signature, vision, cell)? else { return Ok(None) };
-        if cameras.config.tokens != TokenKind::Map {
-            let found = format!("{:?}", cameras.config.tokens);
-            let expected = "the map of a model that reads one vector".to_string();
-            return Err(ModelError::Config { model: "vision", field: "tokens", found, expected });
-        }
-        let encoder = ImageEncoder::new(p, &cameras.config, &cameras.given, cell, rng)?;
+        let encoder = ImageEncoder::without_positions(p, &cameras.config, &cameras.given, cell, rng)?;
         Ok(Some(Self { cameras, encoder, steps: signature.n_obs_steps }))
     }
 
@@ -50,7 +45,7 @@ impl Sight {
 
     /// The same by hand: its tokens are those of all cameras, of every step.
     pub(crate) fn eyes(&self) -> Eyes<'_> {
-        Eyes { shape: &self.cameras.shape, sizes: &self.cameras.seen }
+        self.cameras.eyes()
     }
 
     /// By hand: numbers, and behind them what the cameras see, in so many `lines` (one a row, or one a step of a row), and what
@@ -98,7 +93,7 @@ impl Sight {
         result
     }
 
-    /// Numbers of a row: those of all cells of all cameras, step after step.
+    /// Numbers of a row: those of all cells, or keypoints, of all cameras, step after step.
     pub(crate) fn width(&self) -> usize {
         self.steps * self.cameras.tokens * self.config().cell_features()
     }

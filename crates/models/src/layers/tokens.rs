@@ -8,6 +8,7 @@ use super::{Embedding, Linear};
 use crate::encoders::{ImageEncoder, ResNetShape, Size, TokenKind, VisionConfig, position_table};
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
+use crate::fused::Eyes;
 use crate::params::Params;
 use crate::rng::Rng;
 use candle_core::{DType, Tensor};
@@ -94,6 +95,11 @@ impl Cameras {
         }
         let features = specs.iter().map(|spec| spec.name.clone()).collect();
         Ok(Some(Self { config: config.clone(), shape, features, given, seen, tokens, positions }))
+    }
+
+    /// What their pictures go through, by hand.
+    pub(crate) fn eyes(&self) -> Eyes<'_> {
+        Eyes { shape: &self.shape, sizes: &self.seen, tokens: self.config.tokens }
     }
 
     /// The same with the default encoder where nothing is said; to say something where nothing is seen is an error.
@@ -264,13 +270,6 @@ impl InputTokens {
     /// How pictures are seen, if there are any.
     pub(crate) fn vision(&self) -> Option<&VisionConfig> {
         self.layout.cameras.as_ref().map(|cameras| &cameras.config)
-    }
-
-    /// Why the step by hand does not cover its pictures, if it does not.
-    pub(crate) fn composed_because(&self) -> Option<String> {
-        let cameras = self.layout.cameras.as_ref()?;
-        let keypoints = cameras.config.tokens != TokenKind::Map;
-        keypoints.then(|| "the step by hand does not cover tokens of keypoints".to_string())
     }
 
     /// Which tokens.

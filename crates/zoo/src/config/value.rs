@@ -165,6 +165,10 @@ impl<'de> de::Deserializer<'de> for ValueDeserializer<'_> {
     ) -> Result<V::Value, Refusal> {
         match self.0 {
             Value::String(text) => visitor.visit_enum(text.as_str().into_deserializer()),
+            Value::Table(table) if table.len() == 1 => {
+                let entries = Entries { rest: table.iter(), current: None };
+                visitor.visit_enum(de::value::MapAccessDeserializer::new(entries))
+            }
             other => Err(Refusal::new(Kind::Invalid {
                 expected: format!("one of {}", owned(variants).join(", ")),
                 found: other.type_str().to_owned(),
@@ -242,6 +246,7 @@ mod tests {
     enum Kinds {
         MeanStd,
         Identity,
+        Points { count: usize },
     }
 
     fn read(text: &str) -> Result<Outer, ZooError> {
@@ -254,6 +259,9 @@ mod tests {
         assert_eq!(outer.inner.rate, 1.0);
         assert_eq!(outer.kind, Some(Kinds::MeanStd));
         assert_eq!(outer.inner.keys, ["a"]);
+        let kind = |text: &str| read(&format!("{text}\n[inner]\nsteps = 5\nrate = 1")).unwrap().kind.unwrap();
+        assert_eq!(kind("kind = { points = { count = 3 } }"), Kinds::Points { count: 3 });
+        assert_eq!(kind("[kind.points]\ncount = 3"), Kinds::Points { count: 3 });
     }
 
     #[test]
@@ -272,11 +280,24 @@ mod tests {
         );
         assert_eq!(
             message("kind = 'nothing'\n[inner]\nrate = 1.0\nsteps = 1"),
-            "key `kind`: expected one of identity, mean_std, found `nothing`"
+            "key `kind`: expected one of identity, mean_std, points, found `nothing`"
         );
         assert_eq!(
             message("kind = 3\n[inner]\nrate = 1.0\nsteps = 1"),
-            "key `kind`: expected one of identity, mean_std, found integer"
+            "key `kind`: expected one of identity, mean_std, points, found integer"
+        );
+        let points = |inside: &str| message(&format!("kind = {inside}\n[inner]\nrate = 1.0\nsteps = 1"));
+        assert_eq!(
+            points("{ pointz = { count = 3 } }"),
+            "key `kind`: expected one of identity, mean_std, points, found `pointz`"
+        );
+        assert_eq!(
+            points("{ points = { count = 'x' } }"),
+            "key `kind.points.count`: expected usize, found string \"x\""
+        );
+        assert_eq!(
+            points("{ points = {}, identity = {} }"),
+            "key `kind`: expected one of identity, mean_std, points, found table"
         );
     }
 }

@@ -60,6 +60,10 @@ class OnTable:
         """What can be seen of the task, by name."""
         raise NotImplementedError
 
+    def told(self) -> Values:
+        """What a policy may be told in training beside, by name; no part of "object"."""
+        return {}
+
     def position(self, name: str) -> Array:
         """Centre of a thing."""
         return np.array(self.sim.data.body_xpos[self.body_ids[name]])
@@ -111,11 +115,12 @@ class OnTable:
     def _setup_observables(self) -> dict[str, Any]:
         observables: dict[str, Any] = super(Stack, self)._setup_observables()  # pyright: ignore
         if self.use_object_obs:
-            values = self.values()
-            self.parts = frozenset(values)
-            for name, read in values.items():
-                sensor = _Observables.sensor(modality="object")(_sensor(read))
-                observables[name] = _Observables.Observable(name=name, sensor=sensor, sampling_rate=self.control_freq)
+            for modality, values in (("object", self.values()), ("told", self.told())):
+                self.parts |= frozenset(values)
+                for name, read in values.items():
+                    sensor = _Observables.sensor(modality=modality)(_sensor(read))
+                    seen = _Observables.Observable(name=name, sensor=sensor, sampling_rate=self.control_freq)
+                    observables[name] = seen
         return observables
 
     def visualize(self, vis_settings: dict[str, bool]) -> None:

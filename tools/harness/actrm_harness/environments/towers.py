@@ -145,6 +145,13 @@ class StackColor(StackThreeCubes):
         values["goal_rgb"] = lambda: np.array([COLORS[name] for name in self.order]).ravel()
         return values
 
+    def told(self) -> Values:
+        """Where the cube of each place of the goal is from the hand: the answer to what has to be read."""
+        return {
+            f"gripper_to_place{place}": lambda place=place: self.position(self.order[place]) - self.hand()
+            for place in range(len(COLORS))
+        }
+
 
 class Recall(StackColor):
     """StackColor whose goal is to be seen in the first second only."""
@@ -158,6 +165,10 @@ class Recall(StackColor):
         # the clock is part of a stored state, so that stored episodes look as they did
         values["goal_rgb"] = lambda: goal() * float(self.sim.data.time < self.shown - 1e-6)
         return values
+
+    def told(self) -> Values:
+        """Nothing: it would remember the goal."""
+        return {}
 
 
 class RecallHeld(Recall):

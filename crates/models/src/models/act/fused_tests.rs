@@ -57,7 +57,9 @@ fn cases() -> impl Iterator<Item = (Act, Batch, String)> {
 fn seeing() -> impl Iterator<Item = (Act, Batch, String)> {
     let (first, _, _) = configs().swap_remove(0);
     let frozen = VisionConfig { norm: ImageNorm::Frozen, crop: None, ..eyes() };
-    [eyes(), frozen].into_iter().map(move |vision| {
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..eyes() };
+    let finer = VisionConfig { blocks: Some([2, 2, 1, 0]), ..eyes() };
+    [eyes(), frozen, keypoints, finer].into_iter().map(move |vision| {
         let config = Config { vision: Some(vision), ..first.clone() };
         let signature = signatures().pictures;
         let act = Act::new(&config, &signature, 1).unwrap();
@@ -137,12 +139,11 @@ fn features_that_act_cannot_read_are_refused_by_name() {
     let with = |vision: VisionConfig| Config { vision: Some(vision), ..config.clone() };
     let small = Act::new(&with(VisionConfig { crop: Some(9), ..eyes() }), &signature, 1).unwrap_err().to_string();
     assert_eq!(small, "config of vision: crop is 9, expected at most the picture's side, 8");
-    // what no step by hand covers runs composed, and says so
-    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, crop: None, ..eyes() };
-    let act = Act::new(&with(keypoints), &signature, 1).unwrap();
-    assert_eq!(act.composed_because().unwrap(), "the step by hand does not cover tokens of keypoints");
-    let batch = batch(&signature, config.action_horizon, 2, 1);
-    assert!(gradients(&act, &batch).1.values().iter().all(|g| g.is_finite()));
+    for blocks in [[0, 2, 2, 2], [2, 0, 2, 2], [0; 4]] {
+        let vision = VisionConfig { blocks: Some(blocks), crop: None, ..eyes() };
+        let refused = Act::new(&with(vision), &signature, 1).unwrap_err().to_string();
+        assert!(refused.starts_with(&format!("config of vision: blocks is {blocks:?}, expected")), "{refused}");
+    }
     signature.n_obs_steps = 2;
     assert!(error(signature.clone()).contains("n_obs_steps is 2, expected 1 with pictures"));
     signature.n_obs_steps = 1;

@@ -260,7 +260,7 @@ impl PolicyModel for Act {
     }
 
     fn composed_because(&self) -> Option<String> {
-        not_by_hand(&self.signature).or_else(|| self.tokens.composed_because())
+        not_by_hand(&self.signature)
     }
 
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {

@@ -1,5 +1,6 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
+use crate::encoders::{TokenKind, VisionConfig};
 use crate::features::Signature;
 use crate::fused::testing::{
     Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
@@ -99,12 +100,14 @@ fn seeing() -> Vec<(Config, Signature, usize)> {
     let plain = |config: &Config| config.use_vae && config.pointer.is_none() && config.reasoning.grid.is_none();
     let of = |over: Over| all.iter().find(|(config, ..)| config.reasoning.over == over && plain(config));
     let designs = [Over::Actions, Over::Memory, Over::Tokens].into_iter().filter_map(of);
-    designs.map(|(config, ..)| (Config { vision: Some(eyes()), ..config.clone() }, signatures().pictures, 2)).collect()
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..eyes() };
+    let sees = |config: &Config, vision| (Config { vision: Some(vision), ..config.clone() }, signatures().pictures, 2);
+    designs.flat_map(|(config, ..)| [sees(config, eyes()), sees(config, keypoints.clone())]).collect()
 }
 
 #[test]
 fn the_fused_step_is_the_composed_one_with_dropout() {
-    assert_eq!(seeing().len(), 3);
+    assert_eq!(seeing().len(), 6);
     for (config, signature, rows) in configs().into_iter().chain(seeing()) {
         let model = model(&config, &signature);
         for seed in [3, 4] {
