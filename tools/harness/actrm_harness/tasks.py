@@ -17,6 +17,7 @@ PACKAGE = "actrm_harness"
 TOWERS = {
     "recoveries": ".experts.cubes:RecoveringTowerExpert",
     "regrasps": ".experts.cubes:RegraspingTowerExpert",
+    "misreaches": ".experts.cubes:MisreachingTowerExpert",
 }
 PANDAS = {"robots": ["Panda", "Panda"]}
 

@@ -104,6 +104,8 @@ class TowerExpert:
         self.level = 0
         self.above = TABLE + rise + 0.12
         self.beside = self._draw_beside(rng)
+        # how far beside a cube it reaches
+        self.miss = np.zeros(3)
 
     def _draw_beside(self, rng: np.random.Generator) -> list[Array]:
         """How far beside their places the cubes are set down the first time, a level each; mostly not at all."""
@@ -133,7 +135,7 @@ class TowerExpert:
                 self.beside[level] = np.zeros(3)
         else:
             turn = self._grip_yaw(cube)
-            target, grip = self.grasp.reach(thing, turn - hand)
+            target, grip = self.grasp.reach(thing + self.miss, turn - hand)
             if level and not self.grasp.closing and np.linalg.norm((thing - scene.hand)[:2]) > 0.05:
                 target[2] = self.above
             if self.grasp.held:
@@ -154,6 +156,63 @@ class TowerExpert:
         return clear_yaw(here, [other for other in others if float(other[2]) > float(here[2]) - 0.03])
 
 
+class MisreachingTowerExpert(TowerExpert):
+    """Build the tower; once near, half of the reaches go wrong: the hand comes down beside the cube, and reaches again.
+
+    What is wrong is marked from there on only, so that every reach shows the way to its cube, and how a hand that came
+    down in the wrong place, on nothing or on another cube, finds back.
+    """
+
+    NEAR = 0.13
+    MISSING = 0.5
+    ASIDE = (0.012, 0.08)
+    PATIENCE = 45
+    """For how many steps a reach is wrong at most: a hand may push a cube before it, or hang on one."""
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        super().__init__(scene, rng)
+        self.rng = rng
+        self.rest = Rest(scene)
+        self.reached = 0
+        self.tried = 0
+        self.erring = False
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        closing, missing = self.grasp.closing, bool(self.miss.any())
+        action = super().act()
+        self.erring = self.servo.erring or missing
+        away = self.scene.body(self.order[1 + self.level]) - self.scene.hand
+        if self.reached == self.level and not self.grasp.held and float(np.linalg.norm(away)) < self.NEAR:
+            self.reached += 1
+            self.tried = 0
+            angle, far = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(*self.ASIDE)
+            far *= self.rng.random() < self.MISSING
+            self.miss = np.array([far * np.cos(angle), far * np.sin(angle), 0.0])
+        self.tried += 1
+        there = self.rest.reached(self.grasp) or self.grasp.held or (closing and not self.grasp.closing)
+        if there or self.tried > self.PATIENCE:
+            self.miss = np.zeros(3)
+        return action
+
+
+class Rest:
+    """Tells when a hand that goes down with open fingers is stuck on something."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.before = scene.hand
+        self.steps = 0
+
+    def reached(self, grasp: Grasp) -> bool:
+        """Whether it has been stuck for four steps, asked once a step."""
+        hand = self.scene.hand
+        low = float(hand[2]) < TABLE + 0.07 and not grasp.closing
+        self.steps = (self.steps + 1) * (low and float(np.linalg.norm(hand - self.before)) < 0.0006)
+        self.before = hand
+        return self.steps == 4
+
+
 class RecoveringTowerExpert(TowerExpert):
     """Build the tower, make more mistakes on the way, and show how each is made up for.
 
@@ -169,8 +228,6 @@ class RecoveringTowerExpert(TowerExpert):
         self.cube = self.order[1]
         self.spot: Array | None = None
         self.leaving = False
-        # how far beside a cube it reaches
-        self.miss = np.zeros(3)
         # whether it is about to do wrong on purpose
         self.wrong = False
 
@@ -275,8 +332,7 @@ class RegraspingTowerExpert(RecoveringTowerExpert):
         super().__init__(scene, rng)
         self.rng = rng
         self.reached = ""
-        self.before = scene.hand
-        self.resting = 0
+        self.rest = Rest(scene)
         self.erring = False
 
     def act(self) -> Array:
@@ -287,12 +343,8 @@ class RegraspingTowerExpert(RecoveringTowerExpert):
         if self.cube != self.reached:
             self.reached = self.cube
             self._draw_miss()
-        hand = self.scene.hand
-        low = float(hand[2]) < TABLE + 0.07 and not self.grasp.closing
-        self.resting = (self.resting + 1) * (low and float(np.linalg.norm(hand - self.before)) < 0.0006)
-        if self.resting == 4 or self.grasp.held or (closing and not self.grasp.closing):
+        if self.rest.reached(self.grasp) or self.grasp.held or (closing and not self.grasp.closing):
             self.miss = np.zeros(3)
-        self.before = hand
         return action
 
     def _draw_miss(self) -> None:
