@@ -36,7 +36,8 @@ pub struct Args {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     seed: u64,
     /// Another of the task's experts than the usual one, that makes more mistakes and shows how each is made up for:
-    /// `recoveries`, with towers of cubes and the square nut; `regrasps`, which reaches beside cubes and handle as well
+    /// `recoveries`, with towers of cubes, the square nut, PickPlace, ToolHang and TwoArmTransport; `regrasps`, which
+    /// reaches beside cubes and handle as well; `misreaches`, whose reaches for cubes go wrong near them
     #[arg(long, value_name = "NAME")]
     expert: Option<String>,
     /// How able whoever shows the task is: `good`, the expert as it is; `poor`, slow and hesitating, with detours and
