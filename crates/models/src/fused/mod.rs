@@ -14,6 +14,7 @@ mod encoder;
 mod feed_forward;
 mod grid;
 mod gru;
+mod keypoints;
 mod loss;
 mod lstm;
 mod mixture;
