@@ -241,7 +241,7 @@ def test_a_hand_that_rests_where_it_should_not_goes_on_and_succeeds(task: str, n
 
 def test_an_expert_that_a_task_has_not_is_refused_by_name() -> None:
     session = envs.make("StackColor")
-    with pytest.raises(RequestError, match=r"'careless'.*known: recoveries, regrasps"):
+    with pytest.raises(RequestError, match=r"'careless'.*known: misreaches, recoveries, regrasps"):
         episodes.expert_episode(session, 1, True, "careless")
     session.env.close()
 
