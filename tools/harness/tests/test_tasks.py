@@ -239,6 +239,24 @@ def test_a_hand_that_rests_where_it_should_not_goes_on_and_succeeds(task: str, n
     assert rested >= 2
 
 
+@pytest.mark.usefixtures("library")
+def test_a_misreach_is_marked_near_its_cube_only_and_ends() -> None:
+    """A push is marked for 3 steps, a fumble for 13 at most; what lasts longer is a reach, which begins near a cube."""
+    session = envs.make("StackThreeCubes")
+    session.control = control.attach(session.env)
+    reaches = 0
+    for seed in range(8):
+        found = episodes.expert_episode(session, 1_000_000 + seed, True, "misreaches")
+        away = [np.linalg.norm(found.tensors[f"obs/gripper_to_{name}"], axis=1) for name in ("red", "green", "blue")]
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], found.tensors["mistakes"], [0]])))
+        for begin, end in edges.reshape(-1, 2):
+            if end - begin > 16:
+                reaches += 1
+                assert end - begin < 90 and min(float(cube[begin]) for cube in away) < 0.14
+    session.env.close()
+    assert reaches >= 4
+
+
 def test_an_expert_that_a_task_has_not_is_refused_by_name() -> None:
     session = envs.make("StackColor")
     with pytest.raises(RequestError, match=r"'careless'.*known: misreaches, recoveries, regrasps"):
