@@ -3,7 +3,7 @@
 mod entities;
 mod grids;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use models::{
     ACTION, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureKind, ModelError, NormMode, PolicyConfig, PolicyType, STATE,
@@ -119,6 +119,10 @@ pub struct DataSection {
     /// Items of the lists above that are permuted alike in training, by the name of the symmetry.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub symmetries: BTreeMap<String, Vec<String>>,
+    /// Signs that a mirror gives the numbers of every item of the lists above, and of `action`: then half of the samples that are
+    /// trained on are what it shows, pictures too.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub mirror: BTreeMap<String, Vec<i8>>,
     /// Things that may change places in training, by a name for them.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub exchange: BTreeMap<String, ExchangeSection>,
@@ -152,6 +156,7 @@ impl Default for DataSection {
             entities: BTreeMap::new(),
             grids: BTreeMap::new(),
             symmetries: BTreeMap::new(),
+            mirror: BTreeMap::new(),
             exchange: BTreeMap::new(),
             beginning: None,
             mistakes: false,
@@ -192,6 +197,26 @@ impl DataSection {
             )?;
         }
         Ok(keys)
+    }
+
+    /// The same, and what training alone is told, under [`AUXILIARY`] as an entity would be.
+    ///
+    /// # Errors
+    /// As [`Self::feature_keys`].
+    pub(crate) fn told_and_feature_keys(&self) -> Result<FeatureKeys, ZooError> {
+        let mut keys = self.feature_keys()?;
+        if !self.auxiliary_keys.is_empty() {
+            let expected = "observation keys, parts of them (key[0:3]) and differences (a - b)".to_owned();
+            keys.insert(&format!("{ENTITY_PREFIX}{AUXILIARY}"), &self.auxiliary_keys)
+                .map_err(|found| ZooError::InvalidValue { key: "data.auxiliary_keys".to_owned(), expected, found })?;
+        }
+        Ok(keys)
+    }
+
+    /// The camera whose pictures an item stands for, if it does.
+    pub(crate) fn camera_of(&self, item: &str) -> Option<&str> {
+        let camera = item.strip_suffix(PICTURE_SUFFIX)?;
+        self.cameras.iter().find(|known| *known == camera).map(String::as_str)
     }
 
     fn check(&self, reads: &[FeatureKind]) -> Result<(), ZooError> {
@@ -239,7 +264,7 @@ impl DataSection {
             let expected = format!("none: this policy reads {}", kinds.join(", "));
             return invalid("data.cameras".to_owned(), &expected, self.cameras.join(", "));
         }
-        let keys = self.feature_keys()?;
+        let keys = self.told_and_feature_keys()?;
         let known: Vec<String> = keys.features().flat_map(|feature| keys.of(feature)).collect();
         let symmetries = self.symmetries.iter().map(|(name, items)| (format!("data.symmetries.{name}"), items));
         let exchanged = self.exchange.iter().flat_map(|(name, exchange)| {
@@ -270,11 +295,40 @@ impl DataSection {
                 }
             }
         }
+        self.check_mirror(&known)?;
         if let Some(beginning) = self.beginning.filter(|beginning| beginning.steps == 0 || beginning.times == 0) {
             let BeginningSection { steps, times } = beginning;
             return invalid("data.beginning".to_owned(), "1 or more", format!("steps {steps}, times {times}"));
         }
         Ok(())
+    }
+
+    /// A mirror says of every number whether it changes it: of `known` items but pictures, and of actions.
+    fn check_mirror(&self, known: &[String]) -> Result<(), ZooError> {
+        if self.mirror.is_empty() {
+            return Ok(());
+        }
+        let invalid = |expected: String, found: String| {
+            Err(ZooError::InvalidValue { key: "data.mirror".to_owned(), expected, found })
+        };
+        if !self.exchange.is_empty() || !self.grids.is_empty() {
+            let found = self.mirror.keys().cloned().collect::<Vec<_>>().join(", ");
+            return invalid("none with data.exchange or data.grids".to_owned(), found);
+        }
+        let numbers = known.iter().filter(|item| self.camera_of(item).is_none()).map(String::as_str);
+        let wanted: BTreeSet<&str> = numbers.chain([ACTION]).collect();
+        let given: BTreeSet<&str> = self.mirror.keys().map(String::as_str).collect();
+        if let Some(item) = given.difference(&wanted).next() {
+            let wanted: Vec<&str> = wanted.iter().copied().collect();
+            return invalid(format!("items of the lists of keys: {}", wanted.join(", ")), format!("`{item}`"));
+        }
+        if let Some(item) = wanted.difference(&given).next() {
+            return invalid("signs of every item and of action".to_owned(), format!("none of `{item}`"));
+        }
+        match self.mirror.iter().find(|(_, signs)| signs.is_empty() || signs.iter().any(|sign| sign.abs() != 1)) {
+            Some((item, signs)) => invalid("1 or -1 for each number".to_owned(), format!("{signs:?} of `{item}`")),
+            None => Ok(()),
+        }
     }
 }
 
@@ -426,9 +480,9 @@ impl Experiment {
         if let Err(found) = parsed.insert(AUXILIARY, keys) {
             return invalid(&format!("observation keys, parts of them (key[0:3]) and differences (a - b): {found}"));
         }
-        // they would have to change with what is seen
-        if !self.data.symmetries.is_empty() || !self.data.exchange.is_empty() {
-            return invalid("none with data.symmetries or data.exchange");
+        // they would have to change with what is seen; a symmetry can name them
+        if !self.data.exchange.is_empty() {
+            return invalid("none with data.exchange");
         }
         match self.data.entities.contains_key(AUXILIARY) {
             true => invalid("none beside an entity of this name"),
@@ -659,8 +713,22 @@ mod tests {
         assert!(error(told).ends_with("expected none without policy.auxiliary, found object[0:3] - robot0_eef_pos"));
         assert!(error(asks).contains("`data.auxiliary_keys`: expected observation keys, for policy.auxiliary asks"));
         assert!(load(&["data.auxiliary_keys=['a[']", asks]).unwrap_err().contains("`a[`: expected key[from:to]"));
-        let both = load(&[told, asks, "data.symmetries.axes=['robot0_eef_pos', 'object']"]).unwrap_err();
-        assert!(both.contains("expected none with data.symmetries"), "{both}");
+        let alike = "data.symmetries.axes=['robot0_eef_pos', 'object[0:3] - robot0_eef_pos']";
+        assert!(load(&[told, asks, alike]).is_ok(), "what is told can be permuted alike");
+        let both = load(&[told, asks, &exchange(&format!("{both}, items = [['object'], ['object']]"))]).unwrap_err();
+        assert!(both.contains("expected none with data.exchange"), "{both}");
+        let mirror = |of: &str| format!("data.mirror={{ {of} }}");
+        let signs = "robot0_eef_pos = [1, -1, 1], robot0_eef_quat = [1, -1, 1, -1], robot0_gripper_qpos = [1, 1]";
+        let all = mirror(&format!("{signs}, action = [1, -1], object = [1]"));
+        assert_eq!(load(&[&all]).unwrap().data.mirror["action"], [1, -1]);
+        assert!(error(&mirror(signs)).ends_with("expected signs of every item and of action, found none of `action`"));
+        let other = error(&mirror(&format!("{signs}, cube = [1]")));
+        assert!(
+            other.starts_with("key `data.mirror`: expected items of the lists of keys: action, object, rob"),
+            "{other}"
+        );
+        let twos = error(&mirror(&format!("{signs}, action = [1, 2], object = [1]")));
+        assert!(twos.ends_with("expected 1 or -1 for each number, found [1, 2] of `action`"), "{twos}");
         assert!(load(&["data.beginning={ steps = 8, times = 4 }"]).is_ok());
         assert!(error("data.beginning={ steps = 8, times = 0 }").contains("found steps 8, times 0"));
         assert!(error("data.entities.cube=3").contains("a list of observation keys, or a table"));

@@ -71,6 +71,7 @@ TASKS = {
             experts={
                 "recoveries": ".experts.objects:RecoveringSquareExpert",
                 "regrasps": ".experts.objects:RegraspingSquareExpert",
+                "misreaches": ".experts.objects:MisreachingSquareExpert",
             },
             soft_reset=True,
             bar=0.85,

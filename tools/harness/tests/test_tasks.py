@@ -257,6 +257,32 @@ def test_a_misreach_is_marked_near_its_cube_only_and_ends() -> None:
     assert reaches >= 4
 
 
+@pytest.mark.usefixtures("library")
+def test_a_nut_taken_at_its_ring_is_let_go_and_its_handle_reached() -> None:
+    """While fingers hold the ring it is marked; that they open again is not."""
+    session = envs.make("NutAssemblySquare")
+    session.control = control.attach(session.env)
+    let_go = 0
+    for seed in (3, 5, 7, 10):
+        found = episodes.expert_episode(session, 1_000_000 + seed, True, "misreaches")
+        assert found.success
+        hand, nut = found.tensors["obs/robot0_eef_pos"], found.tensors["obs/object"]
+        x, y, z, w = nut[:, 10:14].T
+        handle = nut[:, 7:10] + 0.054 * np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], 1)
+        beside = np.linalg.norm((hand - handle)[:, :2], axis=1) > 0.02
+        gap = found.tensors["obs/robot0_gripper_qpos"] @ [1.0, -1.0]
+        marked, action = found.tensors["mistakes"] == 1, found.tensors["actions"]
+        low = (hand[:, 2] < 0.88) & (nut[:, 7] < 0.0)
+        holds = low & beside & (gap > 0.01) & (gap < 0.07) & (action[:, 6] > 0)
+        assert not holds[~marked].any()
+        opens = beside & ~marked & (action[:, 6] < 0)
+        if holds.any():
+            last = int(np.flatnonzero(holds)[-1])
+            let_go += bool(opens[last : last + 12].sum() > 5)
+    session.env.close()
+    assert let_go == 3
+
+
 def test_an_expert_that_a_task_has_not_is_refused_by_name() -> None:
     session = envs.make("StackColor")
     with pytest.raises(RequestError, match=r"'careless'.*known: misreaches, recoveries, regrasps"):

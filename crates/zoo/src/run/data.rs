@@ -16,6 +16,7 @@ use crate::experiment::{AUXILIARY, DataSection, EntitySection, Experiment, PICTU
 
 use super::auxiliary::{Told, is_told};
 use super::exchange::Exchanges;
+use super::mirror::Mirror;
 use super::preflight::picture_budget;
 use super::symmetry::Symmetries;
 use super::way::Ways;
@@ -136,6 +137,7 @@ pub(super) struct Demonstrations {
     pub valid: Option<Windows>,
     pub preprocess: Preprocess,
     pub symmetries: Symmetries,
+    pub mirror: Mirror,
     pub exchanges: Exchanges,
     pub ways: Ways,
     /// What training alone is told.
@@ -285,8 +287,21 @@ pub(super) fn prepare(
     let preprocess =
         Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
     let symmetries = Symmetries::new(experiment, dataset, path)?;
+    let mirror = Mirror::new(experiment, dataset, &train, path)?;
     let picture_statistics = picture_statistics.into_iter().collect();
-    Ok(Demonstrations { train, valid, preprocess, symmetries, exchanges, ways, told, picture_statistics, meta, notes })
+    Ok(Demonstrations {
+        train,
+        valid,
+        preprocess,
+        symmetries,
+        mirror,
+        exchanges,
+        ways,
+        told,
+        picture_statistics,
+        meta,
+        notes,
+    })
 }
 
 /// The windows of the episodes that a training of `experiment` learns from, its symmetries, and the number of each episode's

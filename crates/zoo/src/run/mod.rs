@@ -11,6 +11,7 @@ mod list;
 mod loop_parts;
 mod memory;
 mod metrics;
+mod mirror;
 mod places;
 mod preflight;
 mod section;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use dataset::{Dataset, KeyItem, WindowBatch};
 
 use crate::ZooError;
-use crate::experiment::Experiment;
+use crate::experiment::{Experiment, PICTURE_PREFIX};
 
 /// Where an item stands: the feature that holds it, where its numbers begin there and how many they are.
 #[derive(Debug, Clone, PartialEq)]
@@ -50,9 +50,9 @@ impl Places {
     /// # Errors
     /// A column whose names do not say which keys it holds.
     pub fn new(experiment: &Experiment, dataset: &Dataset, path: &Path, section: &str) -> Result<Self, ZooError> {
-        let keys = experiment.data.feature_keys()?;
+        let keys = experiment.data.told_and_feature_keys()?;
         let mut spans = Vec::new();
-        for feature in keys.features() {
+        for feature in keys.features().filter(|feature| !feature.starts_with(PICTURE_PREFIX)) {
             let items = keys.items(feature);
             let widths = KeyItem::widths(items, &dataset.names(feature)).ok_or_else(|| ZooError::UnfitData {
                 path: path.to_owned(),

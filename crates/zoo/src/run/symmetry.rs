@@ -6,8 +6,9 @@
 //! colour = ["cube0_rgb", "cube1_rgb", "goal_rgb[0:3]", "goal_rgb[3:6]"]
 //! ```
 //!
-//! One order of the three channels is drawn for a sample, and all four vectors are put into it. A batch depends on the
-//! seed and the step alone, so that a resumed run needs no state of this.
+//! One order of the three channels is drawn for a sample, and all four vectors are put into it. The key of a camera's pictures
+//! (`agentview_image`) stands for the colour of every pixel. A batch depends on the seed and the step alone, so that a resumed
+//! run needs no state of this.
 
 use std::path::Path;
 
@@ -15,7 +16,7 @@ use dataset::shuffle::SplitMix64;
 use dataset::{Dataset, WindowBatch};
 
 use crate::ZooError;
-use crate::experiment::Experiment;
+use crate::experiment::{Experiment, PICTURE_PREFIX};
 
 use super::places::{Place, Places};
 
@@ -33,7 +34,12 @@ pub(crate) struct Symmetries {
 struct Symmetry {
     width: usize,
     places: Vec<Place>,
+    /// cameras of whose pictures every pixel is
+    pictures: Vec<String>,
 }
+
+/// Numbers of a pixel.
+const CHANNELS: usize = 3;
 
 impl Symmetries {
     /// Finds where the vectors of the experiment's symmetries stand in the columns of `dataset`.
@@ -45,8 +51,22 @@ impl Symmetries {
         if !experiment.data.symmetries.is_empty() {
             let spans = Places::new(experiment, dataset, path, "data.symmetries")?;
             for (name, items) in &experiment.data.symmetries {
-                let places = spans.alike(&format!("data.symmetries.{name}"), items)?;
-                all.push(Symmetry { width: places[0].width, places });
+                let key = format!("data.symmetries.{name}");
+                let (pictures, items): (Vec<_>, Vec<_>) =
+                    items.iter().partition(|item| experiment.data.camera_of(item).is_some());
+                let items: Vec<String> = items.into_iter().cloned().collect();
+                let places = spans.alike(&key, &items)?;
+                let width = places.first().map_or(CHANNELS, |place| place.width);
+                if width != CHANNELS && !pictures.is_empty() {
+                    let reason = format!("{key}: {} has {width} numbers, a pixel has {CHANNELS}", items[0]);
+                    return Err(ZooError::UnfitData { path: path.to_owned(), reason });
+                }
+                let pictures = pictures.into_iter().filter_map(|item| experiment.data.camera_of(item));
+                all.push(Symmetry {
+                    width,
+                    places,
+                    pictures: pictures.map(|c| format!("{PICTURE_PREFIX}{c}")).collect(),
+                });
             }
         }
         Ok(Self { seed: experiment.train.seed ^ PURPOSE, all })
@@ -68,6 +88,13 @@ impl Symmetries {
                         vector.iter_mut().zip(&order).for_each(|(value, &at)| *value = before[at]);
                     }
                 }
+                for (_, bytes) in windows.pictures.iter_mut().filter(|(name, _)| symmetry.pictures.contains(name)) {
+                    let share = bytes.len() / windows.n;
+                    for pixel in bytes[row * share..(row + 1) * share].chunks_exact_mut(CHANNELS) {
+                        let before = [pixel[0], pixel[1], pixel[2]];
+                        pixel.iter_mut().zip(&order).for_each(|(value, &at)| *value = before[at]);
+                    }
+                }
             }
         }
     }
@@ -83,13 +110,16 @@ mod tests {
     fn symmetries(seed: u64) -> Symmetries {
         let place = |feature: &str, from| Place { feature: feature.to_owned(), from, width: 3 };
         let places = vec![place("a", 1), place("b", 0), place("b", 3)];
-        Symmetries { seed, all: vec![Symmetry { width: 3, places }] }
+        Symmetries { seed, all: vec![Symmetry { width: 3, places, pictures: vec!["front".to_owned()] }] }
     }
 
     fn windows(n: usize, n_obs_steps: usize) -> WindowBatch {
         let column = |dim: usize| (0..n * n_obs_steps).flat_map(|_| (0..dim).map(|i| i as f32)).collect();
         let observation = vec![("a".to_owned(), column(5)), ("b".to_owned(), column(6))];
-        WindowBatch { n, n_obs_steps, observation, ..WindowBatch::default() }
+        // pictures of 1 x 2
+        let pictures = |first: u8| (0..n * n_obs_steps).flat_map(|_| first..first + 6).collect();
+        let pictures = vec![("front".to_owned(), pictures(0)), ("back".to_owned(), pictures(6))];
+        WindowBatch { n, n_obs_steps, observation, pictures, ..WindowBatch::default() }
     }
 
     #[test]
@@ -105,6 +135,9 @@ mod tests {
                 assert_eq!((a[0], a[4]), (0.0, 4.0), "what is not named stays");
                 assert_eq!(a[1..4], moved(1.0));
                 assert_eq!((&b[..3], &b[3..]), (&order[..], &moved(3.0)[..]));
+                let pixels = |camera: usize| &batch.pictures[camera].1[(window * 2 + step) * 6..][..6];
+                assert!(pixels(0).iter().map(|x| f32::from(*x)).eq(order.iter().copied().chain(moved(3.0))));
+                assert!(pixels(1).iter().copied().eq(6..12), "pictures that are not named stay");
             }
             seen.insert(order.iter().map(|x| *x as u32).collect::<Vec<_>>());
         }
@@ -116,7 +149,7 @@ mod tests {
         let after = |seed: u64, step: u64| {
             let mut batch = windows(20, 1);
             symmetries(seed).apply(step, &mut batch);
-            batch.observation
+            batch
         };
         assert_eq!(after(1, 7), after(1, 7));
         assert_ne!(after(1, 7), after(1, 8));

@@ -231,6 +231,7 @@ impl Training for PolicyTraining<'_> {
         let unreadable = data::unreadable(&self.demonstrations.meta.name);
         let windows = self.feed.take(&self.demonstrations.train, step).map_err(unreadable)?;
         self.demonstrations.symmetries.apply(step, windows);
+        self.demonstrations.mirror.apply(step, windows);
         self.demonstrations.exchanges.apply(step, windows);
         let (mut batch, rows) = (data::batch(windows, &self.demonstrations, self.experiment)?, windows.n);
         batch.taken = self.demonstrations.exchanges.taken(windows);

@@ -37,7 +37,8 @@ pub struct Args {
     seed: u64,
     /// Another of the task's experts than the usual one, that makes more mistakes and shows how each is made up for:
     /// `recoveries`, with towers of cubes, the square nut, PickPlace, ToolHang and TwoArmTransport; `regrasps`, which
-    /// reaches beside cubes and handle as well; `misreaches`, whose reaches for cubes go wrong near them
+    /// reaches beside cubes and handle as well; `misreaches`, whose reaches for cubes and for the square nut go wrong
+    /// near them
     #[arg(long, value_name = "NAME")]
     expert: Option<String>,
     /// How able whoever shows the task is: `good`, the expert as it is; `poor`, slow and hesitating, with detours and

@@ -430,6 +430,84 @@ class RegraspingSquareExpert(RecoveringSquareExpert):
         self._draw_grasp()
 
 
+class RisingGrasp(Grasp):
+    """A grasp that leaves a wrong place upwards, fingers open, before it goes on."""
+
+    ASIDE, LOW = 0.02, 0.045
+    """Farther than this beside its point and less than this above it, an open hand is in a wrong place."""
+
+    def reach(self, point: Array, askew: float = 0.0) -> tuple[Array, float]:
+        """As any grasp, but out of a wrong place straight up."""
+        target, grip = super().reach(point, askew)
+        away = self.scene.hand - point
+        if grip == OPEN and float(np.linalg.norm(away[:2])) > self.ASIDE and float(away[2]) < self.LOW:
+            return self.scene.hand + np.array([0.0, 0.0, 0.08 * funnel(self.scene.gap, 0.05, 0.07)]), OPEN
+        return target, grip
+
+
+class MisreachingSquareExpert(RecoveringSquareExpert):
+    """Take hold of the nut at a wrong place, or of nothing, let go and reach again.
+
+    Whoever sees the nut in pictures takes it for turned now and then, and holds on to its ring. So the hand comes near,
+    goes down anywhere around the handle, turned by anything, and closes. What is wrong is marked from there on, until
+    the fingers have closed or the hand is stuck; they open, the hand rises and reaches for the handle.
+    """
+
+    WRONG = 0.7
+    """How often the first reach goes wrong."""
+    ASIDE = (0.025, 0.11)
+    AMISS = 0.8
+    NEAR = 0.13
+    PATIENCE = 40
+    """For how many steps it is wrong at most."""
+    HOLDS = (2, 10)
+    """For how many steps the fingers stay where they closed."""
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        super().__init__(scene, rng)
+        self.grasp = RisingGrasp(scene, self.servo.style, tall=0.02, mouth=(0.012, 0.025), close=(0.018, 0.015))
+        self.carry.grasp = self.grasp
+        self.wrong = bool(rng.random() < self.WRONG)
+        self.missing = False
+        self.before = scene.hand
+        self.low = self.tried = self.holds = 0
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        closing = self.grasp.closing
+        action = super().act()
+        self.erring = self.erring or self.missing
+        hand = self.scene.hand
+        if self.missing:
+            down = not self.grasp.closing and float(hand[2]) < float(self.scene.body(self.NUT)[2]) + 0.05
+            self.low = (self.low + 1) * (down and float(np.linalg.norm(hand - self.before)) < 0.0006)
+            self.tried += 1
+            self.holds -= self.grasp.held
+            lost = closing and not self.grasp.closing
+            if self.low == 4 or self.holds == 0 or lost or self.tried == self.PATIENCE:
+                self._reach_well()
+        elif self.wrong and not self.grasp.closing and not self.carry.released:
+            handle = self.scene.body_rotation(self.NUT) @ np.array([self.HANDLE, 0.0, 0.0])
+            if float(np.linalg.norm(self.scene.body(self.NUT) + handle - hand)) < self.NEAR:
+                self._reach_wrong()
+        self.before = hand
+        return action
+
+    def _reach_wrong(self) -> None:
+        self.wrong = False
+        self.missing, self.low, self.tried = True, 0, 0
+        self.holds = int(self.rng.integers(*self.HOLDS))
+        angle, far = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(*self.ASIDE)
+        self.miss = np.array([far * np.cos(angle), far * np.sin(angle), 0.0])
+        self.askew = self.rng.uniform(-self.AMISS, self.AMISS)
+
+    def _reach_well(self) -> None:
+        self.missing = False
+        self.grasp.closing = self.grasp.held = False
+        self.miss = np.zeros(3)
+        self._draw_grasp()
+
+
 class RoundExpert(NutExpert):
     """The round nut."""
 
