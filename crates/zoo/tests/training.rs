@@ -192,6 +192,28 @@ fn what_training_alone_is_told_is_asked_for_there_alone() {
 }
 
 #[test]
+fn half_of_the_samples_can_be_what_a_mirror_shows() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let told =
+        ["data.env_keys=[]", "data.auxiliary_keys=['object[0:3] - robot0_eef_pos']", "policy.auxiliary.weight=0.5"];
+    let mirror = |action: &str| {
+        format!(
+            "data.mirror={{ robot0_eef_pos=[1, -1, 1], robot0_eef_quat=[1, 1, 1, 1], robot0_gripper_qpos=[1, 1], \
+             'object[0:3] - robot0_eef_pos'=[1, -1, 1], action={action} }}"
+        )
+    };
+    let with = |mirror: &str| request(root.path(), &data, &[told[0], told[1], told[2], mirror]);
+    let entry = finish(&with(&mirror("[1, -1, 1, -1, 1, -1, 1]")));
+    assert!(model(&entry) == model(&finish(&with(&mirror("[1, -1, 1, -1, 1, -1, 1]")))));
+    assert!(model(&entry) != model(&finish(&request(root.path(), &data, &told))));
+    // the actions' signs are their own
+    assert!(model(&entry) != model(&finish(&with(&mirror("[1, 1, 1, 1, 1, 1, 1]")))));
+    let refused = train(&with(&mirror("[1, -1]")), &|| false, &mut |_| {}).unwrap_err().to_string();
+    assert!(refused.contains("data.mirror.action: 2 signs, 7 numbers"), "{refused}");
+}
+
+#[test]
 fn a_history_is_trained_on_and_kept_at_inference() {
     let root = tempfile::tempdir().unwrap();
     let data = demonstrations(root.path());
