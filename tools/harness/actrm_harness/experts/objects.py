@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -496,7 +497,8 @@ class MisreachingSquareExpert(RecoveringSquareExpert):
     def _reach_wrong(self) -> None:
         self.wrong = False
         self.missing, self.low, self.tried = True, 0, 0
-        self.holds = int(self.rng.integers(*self.HOLDS))
+        rng: Any = self.rng
+        self.holds = int(rng.integers(*self.HOLDS))
         angle, far = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(*self.ASIDE)
         self.miss = np.array([far * np.cos(angle), far * np.sin(angle), 0.0])
         self.askew = self.rng.uniform(-self.AMISS, self.AMISS)
