@@ -172,3 +172,37 @@ fn cameras_that_do_not_fit_are_named() {
     );
     stopped(&mut train(&set, folder.path(), &["policy.vision.crop=30"]), &["crop", "30", "24"]);
 }
+
+#[test]
+fn pictures_are_seen_in_the_colours_of_three_entities() {
+    let (file, folder) = (seen().join("seen.hdf5"), tempfile::tempdir().expect("a temporary folder"));
+    let at = |name: &str| folder.path().join(name);
+    let things = [
+        "data.env_keys=[]",
+        "data.entities.a={keys=[\"object[0:3]\"], group=\"colour\", position=true}",
+        "data.entities.b={keys=[\"robot0_eef_pos\"], group=\"colour\", position=true}",
+        "data.entities.c={keys=[\"object[7:10]\"], group=\"colour\", position=true}",
+    ];
+    let painted = [&things[..], &["data.picture_colours=[\"a\", \"b\", \"c\"]"]].concat();
+    let other = [&things[..], &["data.picture_colours=[\"b\", \"a\", \"c\"]"]].concat();
+    for (name, more) in [("plain", &things[..]), ("painted", &painted), ("again", &painted), ("other", &other)] {
+        succeeds(&mut train(&file, &at(name), more));
+    }
+    let of = |name: &str| weights(&at(name).join("zoo"));
+    assert!(of("painted") == of("again"));
+    assert!(of("painted") != of("plain") && of("painted") != of("other"), "the colours change nothing");
+    let entry = fs::read(at("painted/zoo/lift-act-image/1/entry.json")).expect("an entry");
+    let entry: Value = serde_json::from_slice(&entry).expect("JSON");
+    let specs = entry["signature"]["observation"].as_array().expect("features");
+    let agent = specs.iter().find(|spec| spec["name"] == AGENT).expect("the camera is there");
+    let colours = ["a", "b", "c"].map(|name| format!("observation.entity.{name}"));
+    assert_eq!(agent["colours"], serde_json::json!(colours));
+    // evaluated in them, and again with the same outcomes
+    let entries = at("painted/zoo");
+    let shown = said(&mut eval("lift-act-image@1", &entries, &["--episodes", "1"]));
+    assert!(shown.contains("lift-act-image@1 on Lift: 0 of 1"), "{shown}");
+    let again = said(&mut eval("lift-act-image@1", &entries, &["--episodes", "1", "--again"]));
+    assert!(again.contains("1 episodes run again, every outcome the same"), "{again}");
+    let wide = [&painted[..], &["data.entities.c={keys=[\"object[3:7]\"]}"]].concat();
+    stopped(&mut train(&file, &at("wide"), &wide), &["colours", "observation.entity.c", "shape [4]", "3 numbers each"]);
+}

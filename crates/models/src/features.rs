@@ -57,6 +57,10 @@ pub struct FeatureSpec {
     /// of an entity: whether it gets a learned position of its own, which tells it from the others of its group
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub position: bool,
+    /// of a picture: three features, each a colour, that take the place of red, green and blue: a channel shows how much of
+    /// its colour a pixel has. Empty for a picture as it is.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub colours: Vec<String>,
 }
 
 /// What the name of an entity begins with.
@@ -65,30 +69,34 @@ pub const ENTITY_PREFIX: &str = "observation.entity.";
 impl FeatureSpec {
     /// `observation.state` of `width` numbers.
     pub fn state(width: usize) -> Self {
-        Self { name: STATE.to_string(), kind: FeatureKind::State, shape: vec![width], group: None, position: false }
+        Self::plain(STATE, FeatureKind::State, vec![width])
     }
 
     /// `observation.environment_state` of `width` numbers.
     pub fn environment_state(width: usize) -> Self {
-        let kind = FeatureKind::EnvironmentState;
-        Self { name: ENVIRONMENT_STATE.to_string(), kind, shape: vec![width], group: None, position: false }
+        Self::plain(ENVIRONMENT_STATE, FeatureKind::EnvironmentState, vec![width])
     }
 
     /// `observation.entity.<name>` of `width` numbers, in `group`.
     pub fn entity(name: &str, width: usize, group: &str, position: bool) -> Self {
-        Self {
-            name: format!("{ENTITY_PREFIX}{name}"),
-            kind: FeatureKind::Entity,
-            shape: vec![width],
-            group: Some(group.to_string()),
-            position,
-        }
+        let plain = Self::plain(&format!("{ENTITY_PREFIX}{name}"), FeatureKind::Entity, vec![width]);
+        Self { group: Some(group.to_string()), position, ..plain }
     }
 
     /// A picture of `height` by `width` pixels of three colours, under its whole name.
     pub fn image(name: &str, height: usize, width: usize) -> Self {
-        let shape = vec![height, width, 3];
-        Self { name: name.to_string(), kind: FeatureKind::Image, shape, group: None, position: false }
+        Self::plain(name, FeatureKind::Image, vec![height, width, 3])
+    }
+
+    /// The same picture in the colours that these features are.
+    #[must_use]
+    pub fn in_colours(self, colours: Vec<String>) -> Self {
+        Self { colours, ..self }
+    }
+
+    /// A feature of which nothing more is said.
+    fn plain(name: &str, kind: FeatureKind, shape: Vec<usize>) -> Self {
+        Self { name: name.to_string(), kind, shape, group: None, position: false, colours: Vec::new() }
     }
 
     /// Number of values of one step.
@@ -202,8 +210,28 @@ impl Signature {
                 let found = format!("{} of shape {:?} in group {}", spec.name, spec.shape, spec.group());
                 return refuse("observation", found, format!("{:?}, as {}", other.shape, other.name));
             }
+            if let Some(fault) = self.fault_of_colours(spec) {
+                return refuse("colours", fault, "three features of 3 numbers each, of a picture".to_string());
+            }
         }
         Ok(())
+    }
+
+    /// What is wrong with a feature's colours, if anything is.
+    fn fault_of_colours(&self, spec: &FeatureSpec) -> Option<String> {
+        if spec.colours.is_empty() {
+            return None;
+        }
+        if spec.kind != FeatureKind::Image || spec.colours.len() != 3 {
+            return Some(format!("{} of {} of kind {}", spec.colours.join(", "), spec.name, spec.kind));
+        }
+        spec.colours.iter().find_map(|name| match self.get(name) {
+            None => Some(format!("{name}, which is not there, of {}", spec.name)),
+            Some(colour) if colour.kind == FeatureKind::Image || colour.width() != 3 => {
+                Some(format!("{name} of kind {} and shape {:?}, of {}", colour.kind, colour.shape, spec.name))
+            }
+            Some(_) => None,
+        })
     }
 }
 
@@ -457,13 +485,7 @@ mod tests {
     fn a_feature_that_a_model_cannot_read_is_refused_by_name() {
         let mut signature = Signature::low_dimensional(3, 2, 2);
         signature.check("act", &READS).unwrap();
-        signature.observation.push(FeatureSpec {
-            name: "observation.images.front".to_string(),
-            kind: FeatureKind::Image,
-            shape: vec![8, 8, 3],
-            group: None,
-            position: false,
-        });
+        signature.observation.push(FeatureSpec::image("observation.images.front", 8, 8));
         assert_eq!(
             signature.check("act", &READS).unwrap_err().to_string(),
             "act cannot read feature observation.images.front of kind image; it reads state, environment_state, entity"
@@ -486,6 +508,31 @@ mod tests {
         assert!(error(vec![FeatureSpec::state(3), other]).contains("one feature of kind state"));
         let none = Signature::default().check("act", &READS).unwrap_err().to_string();
         assert!(none.contains("action_dim is 0"), "{none}");
+    }
+
+    #[test]
+    fn colours_of_a_picture_are_three_features_of_three_numbers() {
+        let error = |width: usize, colours: &[&str], of: usize| {
+            let colours = colours.iter().map(|name| format!("{ENTITY_PREFIX}{name}")).collect();
+            let mut observation = vec![FeatureSpec::state(2), FeatureSpec::image("front", 8, 8)];
+            observation.extend(["a", "b", "c"].map(|name| FeatureSpec::entity(name, width, "place", true)));
+            observation[of] = observation[of].clone().in_colours(colours);
+            let signature = Signature { observation, action_dim: 1, ..Signature::default() };
+            let checked = signature.check("act", &[FeatureKind::State, FeatureKind::Entity, FeatureKind::Image]);
+            checked.err().map(|e| e.to_string())
+        };
+        assert_eq!(error(3, &["a", "b", "c"], 1), None);
+        let faults = [
+            (error(3, &["a", "b"], 1), "observation.entity.a, observation.entity.b of front of kind image"),
+            (error(3, &["a", "b", "d"], 1), "observation.entity.d, which is not there, of front"),
+            (error(4, &["a", "b", "c"], 1), "observation.entity.a of kind entity and shape [4], of front"),
+            (error(3, &["a", "b", "c"], 0), "of observation.state of kind state"),
+        ];
+        for (error, expected) in faults {
+            let error = error.unwrap();
+            assert!(error.contains(expected), "{error}");
+            assert!(error.contains("three features of 3 numbers each, of a picture"), "{error}");
+        }
     }
 
     #[test]

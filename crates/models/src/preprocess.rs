@@ -2,7 +2,7 @@
 //! reasoning.
 //!
 //! Numbers are normalised per feature. Pictures stay bytes: they are scaled where they are encoded, after they have
-//! travelled.
+//! travelled. A picture in the colours of other features is painted in them here.
 
 use crate::batch::{Batch, tensor};
 use crate::error::{ModelError, Result};
@@ -51,11 +51,11 @@ impl Preprocess {
         actions: &[f32],
         is_pad: &[bool],
     ) -> Result<Batch> {
-        let mut seen = Features::new();
+        let mut raw = Features::new();
         for spec in &self.signature.observation {
-            let values = observation.require("batch", &spec.name)?;
-            seen.insert(&spec.name, self.normalised(spec, values.to_values())?);
+            raw.insert(&spec.name, observation.require("batch", &spec.name)?.to_values());
         }
+        let seen = self.read(raw)?;
         let mut actions = actions.to_vec();
         self.normaliser.normalise(ACTION, &mut actions)?;
         Batch::new(&self.signature, action_horizon, seen, actions, is_pad)
@@ -75,7 +75,7 @@ impl Preprocess {
             return Err(ModelError::Input { operation: "predict", object: "history", found, expected });
         };
         let shown: Vec<&Observation> = (0..steps).map(|k| &history[(last + k + 1).saturating_sub(steps)]).collect();
-        let mut tensors = Features::new();
+        let mut raw = Features::new();
         for spec in &self.signature.observation {
             let mut joined = empty(spec);
             for observation in &shown {
@@ -90,10 +90,50 @@ impl Preprocess {
                 }
                 join(spec, &mut joined, values)?;
             }
-            let values = self.normalised(spec, joined)?;
+            raw.insert(&spec.name, joined);
+        }
+        let mut read = self.read(raw)?;
+        let mut tensors = Features::new();
+        for spec in &self.signature.observation {
+            let values = read.take("predict", &spec.name)?;
             tensors.insert(&spec.name, tensor(&spec.name, values, &self.signature.batch_shape(spec, 1))?);
         }
         Ok(tensors)
+    }
+
+    /// Raw values of every feature, of any number of steps -> what a network reads.
+    fn read(&self, mut raw: Features<Values>) -> Result<Features<Values>> {
+        for spec in self.signature.observation.iter().filter(|spec| !spec.colours.is_empty()) {
+            let Values::U8(mut pictures) = raw.require("see", &spec.name)?.clone() else {
+                return Err(wrong_type(spec, "numbers", "bytes"));
+            };
+            for (step, picture) in pictures.chunks_exact_mut(spec.width()).enumerate() {
+                let mut colours = [[0.0; 3]; 3];
+                for (name, colour) in spec.colours.iter().zip(&mut colours) {
+                    let numbers = raw.require("see", name)?.numbers().unwrap_or_default();
+                    match numbers.get(3 * step..3 * step + 3) {
+                        Some(numbers) => colour.copy_from_slice(numbers),
+                        None => {
+                            let (expected, found) = (vec![step + 1, 3], vec![numbers.len()]);
+                            return Err(ModelError::FeatureShape {
+                                operation: "see",
+                                name: name.clone(),
+                                expected,
+                                found,
+                            });
+                        }
+                    }
+                }
+                paint(picture, colours);
+            }
+            raw.insert(&spec.name, Values::U8(pictures));
+        }
+        let mut read = Features::new();
+        for spec in &self.signature.observation {
+            let values = raw.take("see", &spec.name)?;
+            read.insert(&spec.name, self.normalised(spec, values)?);
+        }
+        Ok(read)
     }
 
     /// A predicted chunk in raw units. actions: (1, H, A)
@@ -128,6 +168,23 @@ impl Preprocess {
     }
 }
 
+/// Channel k of every pixel becomes how much of `colours[k]` it has: its product with that colour, over the colour's sum, so
+/// that grey stays as it is and red, green and blue as colours are those channels. A colour of zeros has none.
+fn paint(picture: &mut [u8], colours: [[f32; 3]; 3]) {
+    let shares = colours.map(|colour| {
+        let sum: f32 = colour.iter().map(|part| part.abs()).sum();
+        colour.map(|part| if sum > 0.0 { part / sum } else { 0.0 })
+    });
+    for pixel in picture.chunks_exact_mut(3) {
+        let seen = [0, 1, 2].map(|c| f32::from(pixel[c]));
+        for (channel, share) in pixel.iter_mut().zip(&shares) {
+            let product: f32 = share.iter().zip(&seen).map(|(share, seen)| share * seen).sum();
+            // saturates
+            *channel = product.round() as u8;
+        }
+    }
+}
+
 fn empty(spec: &FeatureSpec) -> Values {
     match spec.kind {
         FeatureKind::Image => Values::U8(Vec::new()),
@@ -153,6 +210,7 @@ fn wrong_type(spec: &FeatureSpec, found: &'static str, expected: &'static str) -
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::features::ENTITY_PREFIX;
     use crate::normaliser::{ENVIRONMENT_STATE, NormMode, STATE};
     use candle_core::Device;
     use proptest::prelude::*;
@@ -223,6 +281,57 @@ mod tests {
             }
             prop_assert_eq!(batch.actions.to_vec3::<f32>().unwrap(), [[[2.0]]]);
         }
+    }
+
+    #[test]
+    fn pictures_are_painted_in_the_colours_of_other_features() {
+        let names = ["a", "b", "c"].map(|name| format!("{ENTITY_PREFIX}{name}"));
+        let observation = vec![
+            FeatureSpec::state(2),
+            FeatureSpec::entity("a", 3, "colour", true),
+            FeatureSpec::entity("b", 3, "colour", true),
+            FeatureSpec::entity("c", 3, "colour", true),
+            FeatureSpec::image("front", 1, 2).in_colours(names.to_vec()),
+        ];
+        let signature = Signature { observation, n_obs_steps: 2, action_dim: 1, ..Signature::default() };
+        let modes = [STATE, ACTION].into_iter().chain(names.iter().map(String::as_str));
+        let modes = modes.map(|name| (name.to_string(), NormMode::Identity)).collect();
+        let preprocess = Preprocess::new(signature, Normaliser::new(&modes, &BTreeMap::new()).unwrap()).unwrap();
+        let step = |colours: [[f32; 3]; 3], pixels: [u8; 6]| {
+            let mut step = Observation::of_state(vec![0.0; 2], vec![]);
+            names.iter().zip(colours).for_each(|(name, colour)| step.insert(name, colour.to_vec().into()));
+            step.insert("front", Values::U8(pixels.to_vec()));
+            step
+        };
+        let (red, green, blue) = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]);
+        // the colours of each step are that step's
+        let history = [
+            step([blue, red, green], [10, 20, 30, 77, 77, 77]),
+            step([[0.5, 0.5, 0.0], [0.0; 3], [0.0, -1.0, 3.0]], [10, 20, 200, 77, 77, 77]),
+        ];
+        let seen = preprocess.observation(&history).unwrap();
+        let front = seen.get("front").unwrap();
+        assert_eq!(front.dims(), [1, 2, 1, 2, 3]);
+        let bytes = front.flatten_all().unwrap().to_vec1::<u8>().unwrap();
+        assert_eq!(bytes, [30, 10, 20, 77, 77, 77, 15, 0, 145, 77, 0, 39]);
+        // in training the same
+        let rows = history[0].names().map(|name| {
+            let of = |step: &Observation| step.get(name).unwrap().clone();
+            let both = match (of(&history[0]), of(&history[1])) {
+                (Values::F32(a), Values::F32(b)) => Values::F32([a, b].concat()),
+                (Values::U8(a), Values::U8(b)) => Values::U8([a, b].concat()),
+                other => panic!("{other:?}"),
+            };
+            (name.to_string(), both)
+        });
+        let rows = Features::from_iter(rows);
+        let batch = preprocess.batch(1, &rows.map(|_, values| values.as_ref()), &[0.0], &[false]).unwrap();
+        assert_eq!(batch.observation.get("front").unwrap().flatten_all().unwrap().to_vec1::<u8>().unwrap(), bytes);
+        // without them there is no picture
+        let mut blind = history[1].clone();
+        blind.take("test", &names[1]).unwrap();
+        let error = preprocess.observation(&[blind]).unwrap_err().to_string();
+        assert!(error.contains("feature observation.entity.b is missing"), "{error}");
     }
 
     #[test]

@@ -139,6 +139,10 @@ pub struct DataSection {
     /// Cameras whose pictures are seen, by the simulator's names.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub cameras: Vec<String>,
+    /// Three entities, each a colour, in which all cameras' pictures are seen: the first channel shows how much of the first one's
+    /// colour a pixel has, and so on. Empty: red, green and blue.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub picture_colours: Vec<String>,
     /// Mask of the episodes to train on; a data set without masks is trained on whole, and so is any with "" here.
     pub train_mask: String,
     /// Mask of the episodes to validate on; "" for none.
@@ -162,6 +166,7 @@ impl Default for DataSection {
             mistakes: false,
             n_obs_steps: 1,
             cameras: Vec::new(),
+            picture_colours: Vec::new(),
             train_mask: "train".to_owned(),
             valid_mask: "valid".to_owned(),
         }
@@ -263,6 +268,14 @@ impl DataSection {
             let kinds: Vec<&str> = reads.iter().map(|kind| kind.name()).collect();
             let expected = format!("none: this policy reads {}", kinds.join(", "));
             return invalid("data.cameras".to_owned(), &expected, self.cameras.join(", "));
+        }
+        let colours = &self.picture_colours;
+        if !colours.is_empty()
+            && (colours.len() != 3 || self.cameras.is_empty() || colours.iter().any(|n| !self.entities.contains_key(n)))
+        {
+            let names: Vec<&str> = self.entities.keys().map(String::as_str).collect();
+            let expected = format!("none without data.cameras, or three of the entities: {}", names.join(", "));
+            return invalid("data.picture_colours".to_owned(), &expected, colours.join(", "));
         }
         let keys = self.told_and_feature_keys()?;
         let known: Vec<String> = keys.features().flat_map(|feature| keys.of(feature)).collect();
@@ -675,6 +688,18 @@ mod tests {
         );
         assert!(error("data.entities.Cube=['a']").contains("lower-case letters, digits and _, found `Cube`"));
         assert!(error("data.entities.cube=[]").contains("at least one key"));
+        let colours = "data.picture_colours=['cube0', 'goal', 'cube0']";
+        let things = ["data.entities.cube0=['a']", "data.entities.goal=['c[0:3]']"];
+        let experiment = load(&[things[0], things[1], colours, "data.cameras=['front']"]).unwrap();
+        assert_eq!(Experiment::from_toml("x", &experiment.to_toml()).unwrap(), experiment);
+        let blind = load(&[things[0], things[1], colours]).unwrap_err();
+        assert_eq!(
+            blind,
+            "key `data.picture_colours`: expected none without data.cameras, or three of the entities: cube0, goal, \
+             found cube0, goal, cube0"
+        );
+        let one = load(&[things[0], colours, "data.cameras=['front']"]).unwrap_err();
+        assert!(one.ends_with("three of the entities: cube0, found cube0, goal, cube0"), "{one}");
         assert!(load(&["data.symmetries.axes=['robot0_eef_pos', 'object']"]).is_ok());
         let message = error("data.symmetries.axes=['robot0_eef_pos', 'cube_rgb']");
         assert!(

@@ -372,7 +372,10 @@ fn signature(windows: &Windows, experiment: &Experiment) -> Signature {
             FeatureSpec::entity(name, width, entity.group_of(name), entity.position)
         }
     };
-    let pictures = windows.pictures().map(|(camera, (height, width))| FeatureSpec::image(camera, height, width));
+    let colours = experiment.data.picture_colours.iter().map(|name| format!("{ENTITY_PREFIX}{name}"));
+    let colours: Vec<String> = colours.collect();
+    let pictures = windows.pictures();
+    let pictures = pictures.map(|(camera, (h, w))| FeatureSpec::image(camera, h, w).in_colours(colours.clone()));
     let (told, seen): (Vec<_>, Vec<_>) = windows.observation().partition(|(column, _)| is_told(column));
     let observation = seen.into_iter().map(spec).chain(pictures).collect();
     let auxiliary_dim = told.iter().map(|(_, width)| width).sum();
