@@ -367,25 +367,25 @@ class RecoveringSquareExpert(SquareExpert):
         self.turned = self.rng.uniform(-self.TURNED, self.TURNED) * wrong
 
 
-class RegraspingSquareExpert(RecoveringSquareExpert):
-    """Reach beside the handle and askew as well: come down on the nut or close on nothing, rise and reach again.
+class AmissSquareExpert(RecoveringSquareExpert):
+    """Reach for a place that is not the handle, now and then, and show how that is made up for.
 
-    Whoever sees the nut in pictures is often a centimetre or two beside its handle, and stays there, hand closed on
-    nothing, unless it was shown the way on. The hand comes as it should, and errs only where it is near: at the handle,
-    and at the peg too, so that little of a demonstration is marked.
+    The hand comes as it should, and errs only where it is near, so that little of a demonstration is marked. It is
+    wrong until it is stuck, its fingers opened again, or it was long enough; then it reaches for the handle.
     """
 
-    # How often a reach for the handle goes wrong: never, once, twice.
-    MISREACHES = (0.4, 0.4, 0.2)
-    ASIDE = (0.012, 0.035)
-    AMISS = 0.5
-    NEAR = 0.09
-    NEAR_PEG = 0.05
-    PATIENCE = 30
+    ASIDE: tuple[float, float]
+    """How far beside the handle it reaches."""
+    AMISS: float
+    """How far it turns wrong."""
+    NEAR: float
+    """How near the handle it begins to be wrong."""
+    PATIENCE: int
+    """For how many steps it is wrong at most."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         super().__init__(scene, rng)
-        self.misreaches = int(rng.choice(3, p=self.MISREACHES))
+        self.misreaches = self._count()
         self.missing = False
         self.before = scene.hand
         self.low = self.tried = 0
@@ -393,9 +393,6 @@ class RegraspingSquareExpert(RecoveringSquareExpert):
     def act(self) -> Array:
         """The action for the current state."""
         closing = self.grasp.closing
-        away = self.scene.body(self.NUT) - self.scene.body(self.PEG)
-        near = float(np.linalg.norm(away[:2])) < self.NEAR_PEG or bool(self.beside.any())
-        self.beside, self.turned = self.place if near else (np.zeros(3), 0.0)
         action = super().act()
         self.erring = self.erring or self.missing
         hand = self.scene.hand
@@ -404,7 +401,7 @@ class RegraspingSquareExpert(RecoveringSquareExpert):
             self.low = (self.low + 1) * (down and float(np.linalg.norm(hand - self.before)) < 0.0006)
             self.tried += 1
             lost = closing and not self.grasp.closing
-            if self.low == 4 or self.grasp.held or lost or self.tried == self.PATIENCE:
+            if self._was_held() or self.low == 4 or lost or self.tried == self.PATIENCE:
                 self._reach_well()
         elif self.misreaches and not self.grasp.closing and not self.carry.released:
             handle = self.scene.body_rotation(self.NUT) @ np.array([self.HANDLE, 0.0, 0.0])
@@ -413,10 +410,13 @@ class RegraspingSquareExpert(RecoveringSquareExpert):
         self.before = hand
         return action
 
-    def _draw_place(self) -> None:
-        super()._draw_place()
-        self.place = (self.beside, self.turned)
-        self.beside, self.turned = np.zeros(3), 0.0
+    def _count(self) -> int:
+        """How many reaches go wrong."""
+        raise NotImplementedError
+
+    def _was_held(self) -> bool:
+        """Whether what the hand holds at a wrong place was held for long enough."""
+        return self.grasp.held
 
     def _reach_wrong(self) -> None:
         self.misreaches -= 1
@@ -429,6 +429,37 @@ class RegraspingSquareExpert(RecoveringSquareExpert):
         self.missing = False
         self.miss = np.zeros(3)
         self._draw_grasp()
+
+
+class RegraspingSquareExpert(AmissSquareExpert):
+    """Reach beside the handle and askew as well: come down on the nut or close on nothing, rise and reach again.
+
+    Whoever sees the nut in pictures is often a centimetre or two beside its handle, and stays there, hand closed on
+    nothing, unless it was shown the way on. At the peg, too, the hand errs only where it is near.
+    """
+
+    # How often a reach for the handle goes wrong: never, once, twice.
+    MISREACHES = (0.4, 0.4, 0.2)
+    ASIDE = (0.012, 0.035)
+    AMISS = 0.5
+    NEAR = 0.09
+    NEAR_PEG = 0.05
+    PATIENCE = 30
+
+    def act(self) -> Array:
+        """The action for the current state."""
+        away = self.scene.body(self.NUT) - self.scene.body(self.PEG)
+        near = float(np.linalg.norm(away[:2])) < self.NEAR_PEG or bool(self.beside.any())
+        self.beside, self.turned = self.place if near else (np.zeros(3), 0.0)
+        return super().act()
+
+    def _count(self) -> int:
+        return int(self.rng.choice(3, p=self.MISREACHES))
+
+    def _draw_place(self) -> None:
+        super()._draw_place()
+        self.place = (self.beside, self.turned)
+        self.beside, self.turned = np.zeros(3), 0.0
 
 
 class RisingGrasp(Grasp):
@@ -446,12 +477,12 @@ class RisingGrasp(Grasp):
         return target, grip
 
 
-class MisreachingSquareExpert(RecoveringSquareExpert):
+class MisreachingSquareExpert(AmissSquareExpert):
     """Take hold of the nut at a wrong place, or of nothing, let go and reach again.
 
     Whoever sees the nut in pictures takes it for turned now and then, and holds on to its ring. So the hand comes near,
-    goes down anywhere around the handle, turned by anything, and closes. What is wrong is marked from there on, until
-    the fingers have closed or the hand is stuck; they open, the hand rises and reaches for the handle.
+    goes down anywhere around the handle, turned by anything, and closes; the fingers open, the hand rises and reaches
+    for the handle.
     """
 
     WRONG = 0.7
@@ -460,7 +491,6 @@ class MisreachingSquareExpert(RecoveringSquareExpert):
     AMISS = 0.8
     NEAR = 0.13
     PATIENCE = 40
-    """For how many steps it is wrong at most."""
     HOLDS = (2, 10)
     """For how many steps the fingers stay where they closed."""
 
@@ -468,46 +498,23 @@ class MisreachingSquareExpert(RecoveringSquareExpert):
         super().__init__(scene, rng)
         self.grasp = RisingGrasp(scene, self.servo.style, tall=0.02, mouth=(0.012, 0.025), close=(0.018, 0.015))
         self.carry.grasp = self.grasp
-        self.wrong = bool(rng.random() < self.WRONG)
-        self.missing = False
-        self.before = scene.hand
-        self.low = self.tried = self.holds = 0
+        self.holds = 0
 
-    def act(self) -> Array:
-        """The action for the current state."""
-        closing = self.grasp.closing
-        action = super().act()
-        self.erring = self.erring or self.missing
-        hand = self.scene.hand
-        if self.missing:
-            down = not self.grasp.closing and float(hand[2]) < float(self.scene.body(self.NUT)[2]) + 0.05
-            self.low = (self.low + 1) * (down and float(np.linalg.norm(hand - self.before)) < 0.0006)
-            self.tried += 1
-            self.holds -= self.grasp.held
-            lost = closing and not self.grasp.closing
-            if self.low == 4 or self.holds == 0 or lost or self.tried == self.PATIENCE:
-                self._reach_well()
-        elif self.wrong and not self.grasp.closing and not self.carry.released:
-            handle = self.scene.body_rotation(self.NUT) @ np.array([self.HANDLE, 0.0, 0.0])
-            if float(np.linalg.norm(self.scene.body(self.NUT) + handle - hand)) < self.NEAR:
-                self._reach_wrong()
-        self.before = hand
-        return action
+    def _count(self) -> int:
+        return int(self.rng.random() < self.WRONG)
+
+    def _was_held(self) -> bool:
+        self.holds -= self.grasp.held
+        return self.holds == 0
 
     def _reach_wrong(self) -> None:
-        self.wrong = False
-        self.missing, self.low, self.tried = True, 0, 0
         rng: Any = self.rng
         self.holds = int(rng.integers(*self.HOLDS))
-        angle, far = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(*self.ASIDE)
-        self.miss = np.array([far * np.cos(angle), far * np.sin(angle), 0.0])
-        self.askew = self.rng.uniform(-self.AMISS, self.AMISS)
+        super()._reach_wrong()
 
     def _reach_well(self) -> None:
-        self.missing = False
         self.grasp.closing = self.grasp.held = False
-        self.miss = np.zeros(3)
-        self._draw_grasp()
+        super()._reach_well()
 
 
 class RoundExpert(NutExpert):
