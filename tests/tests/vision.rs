@@ -203,6 +203,7 @@ fn pictures_are_seen_in_the_colours_of_three_entities() {
     assert!(shown.contains("lift-act-image@1 on Lift: 0 of 1"), "{shown}");
     let again = said(&mut eval("lift-act-image@1", &entries, &["--episodes", "1", "--again"]));
     assert!(again.contains("1 episodes run again, every outcome the same"), "{again}");
-    let wide = [&painted[..], &["data.entities.c={keys=[\"object[3:7]\"]}"]].concat();
+    let mut wide = painted.clone();
+    wide[3] = "data.entities.c={keys=[\"object[3:7]\"]}";
     stopped(&mut train(&file, &at("wide"), &wide), &["colours", "observation.entity.c", "shape [4]", "3 numbers each"]);
 }
