@@ -1,7 +1,8 @@
 //! Lists of observation keys, as experiments and conversions name them.
 //!
 //! An item of a list is a key (`cube_pos`), a part of one (`goal_rgb[0:3]`), either as it was at the first step of the
-//! episode (`first(goal_rgb)`, `first(goal_rgb)[0:3]`: what is remembered), the axes of an orientation
+//! episode (`first(goal_rgb)`, `first(goal_rgb)[0:3]`: what is remembered) or some control steps before
+//! (`before(robot0_gripper_qpos:8)`; at the first step where the episode had not begun yet), the axes of an orientation
 //! (`axes(cube_quat)`: a quaternion x, y, z, w as the first two columns of its matrix, six numbers that do not jump
 //! where a quaternion changes its sign; Zhou et al. 2019), or the difference of two of those
 //! (`cube_pos - robot0_eef_pos`). The same item gives the same numbers whether it is read out of a file or out of a
@@ -19,7 +20,23 @@ pub enum Moment {
     Now,
     /// at the first step of its episode
     First,
+    /// so many control steps before, or at the first step of its episode where that is later
+    Before(usize),
 }
+
+impl Moment {
+    /// The step of the episode that is read, where `now` is asked about.
+    pub fn step(self, now: usize) -> usize {
+        match self {
+            Self::Now => now,
+            Self::First => 0,
+            Self::Before(steps) => now.saturating_sub(steps),
+        }
+    }
+}
+
+/// What is read as a key at an earlier step, in errors.
+const BEFORE: &str = "before(key:steps) or before(key:steps)[from:to] with steps of at least 1";
 
 /// A key, or some of its numbers.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -40,10 +57,13 @@ impl Term {
             return Ok(Self { axes: true, ..inner.ok_or("axes(key), of a quaternion")? });
         }
         if let Some((key, rest)) = text.strip_prefix("first(").and_then(|inside| inside.split_once(')')) {
-            // what stands behind is read as behind any other key
-            let plain = !key.is_empty() && !key.contains(['(', '[', ']']) && (rest.is_empty() || rest.starts_with('['));
-            let term = plain.then(|| Self::parse(&format!("{key}{rest}")));
-            return Ok(Self { moment: Moment::First, ..term.ok_or("first(key) or first(key)[from:to]")?? });
+            let term = Self::plain(key, rest).ok_or("first(key) or first(key)[from:to]")??;
+            return Ok(Self { moment: Moment::First, ..term });
+        }
+        if let Some((inside, rest)) = text.strip_prefix("before(").and_then(|inside| inside.split_once(')')) {
+            let parts = inside.rsplit_once(':').and_then(|(key, steps)| Some((key, steps.trim().parse().ok()?)));
+            let (key, steps) = parts.filter(|&(_, steps)| steps > 0).ok_or(BEFORE)?;
+            return Ok(Self { moment: Moment::Before(steps), ..Self::plain(key, rest).ok_or(BEFORE)?? });
         }
         let moment = Moment::Now;
         let Some(open) = text.find('[') else {
@@ -62,11 +82,18 @@ impl Term {
         }
     }
 
+    /// A key without a moment and what stands behind it, which is read as behind any other key; `None` if it is no such key.
+    fn plain(key: &str, rest: &str) -> Option<Result<Self, String>> {
+        let plain = !key.is_empty() && !key.contains(['(', '[', ']']) && (rest.is_empty() || rest.starts_with('['));
+        plain.then(|| Self::parse(&format!("{key}{rest}")))
+    }
+
     /// The key with when it is read, without the part.
     fn whole(&self) -> Cow<'_, str> {
         match self.moment {
             Moment::Now => Cow::Borrowed(&self.key),
             Moment::First => Cow::Owned(format!("first({})", self.key)),
+            Moment::Before(steps) => Cow::Owned(format!("before({}:{steps})", self.key)),
         }
     }
 
@@ -147,9 +174,10 @@ impl KeyItem {
         }
     }
 
-    /// Whether it remembers how an episode began.
-    pub fn remembers(&self) -> bool {
-        std::iter::once(&self.plus).chain(&self.minus).any(|term| term.moment == Moment::First)
+    /// The keys that it reads at another step than the one that is asked about, and when.
+    pub fn remembered(&self) -> impl Iterator<Item = (&str, Moment)> {
+        let terms = std::iter::once(&self.plus).chain(&self.minus);
+        terms.filter(|term| term.moment != Moment::Now).map(|term| (term.key.as_str(), term.moment))
     }
 
     /// Appends its numbers to `out`, where `values_of` gives the numbers of a key at a moment; `None`, with nothing appended, if a key
@@ -245,6 +273,7 @@ mod tests {
     fn values(key: &str, moment: Moment) -> Option<&'static [f32]> {
         match key {
             "a" if moment == Moment::First => Some(&[0.5, 0.6, 0.7]),
+            "a" if moment == Moment::Before(8) => Some(&[0.8, 0.9, 1.0]),
             "a" => Some(&[1.0, 2.0, 3.0]),
             "b" => Some(&[10.0, 20.0, 30.0, 40.0]),
             "one" => Some(&[7.0]),
@@ -269,7 +298,14 @@ mod tests {
         assert_eq!(read("a[2:3] - one").unwrap(), [-4.0]);
         assert_eq!(read("first(a)").unwrap(), [0.5, 0.6, 0.7]);
         assert_eq!(read("a[0:2] - first(a)[0:2]").unwrap(), [0.5, 1.4]);
-        assert!(item("a - first(a)").remembers() && !item("a").remembers());
+        assert_eq!(read("before(a:8)").unwrap(), [0.8, 0.9, 1.0]);
+        assert_eq!(read("before( a: 8 )[1:3]").unwrap(), [0.9, 1.0]);
+        let moments = |text: &str| item(text).remembered().map(|(_, moment)| moment).collect::<Vec<_>>();
+        assert_eq!(moments("a - first(a)"), [Moment::First]);
+        assert_eq!(moments("before(a:3) - before(a:5)"), [Moment::Before(3), Moment::Before(5)]);
+        assert!(moments("a").is_empty());
+        assert_eq!([Moment::Now, Moment::First, Moment::Before(8)].map(|moment| moment.step(5)), [5, 0, 0]);
+        assert_eq!(Moment::Before(3).step(5), 2);
         assert_eq!(item("first(b)[1:3]").keys().collect::<Vec<_>>(), ["b"]);
         assert_eq!(item("b[1:3] - a[0:2]").keys().collect::<Vec<_>>(), ["b", "a"]);
     }
@@ -291,7 +327,8 @@ mod tests {
         assert_eq!((read("axes(b)").unwrap(), read("axes(b[0:4])").unwrap()), (b.clone(), b.clone()));
         assert_eq!(read("axes(b) - axes(b)").unwrap(), [0.0; 6]);
         assert_eq!(read("axes(a)").unwrap_err(), "axes(a): a quaternion has 4 numbers, this has 3");
-        assert!(item("axes(first(b)[0:4])").remembers());
+        assert_eq!(item("axes(first(b)[0:4])").remembered().collect::<Vec<_>>(), [("b", Moment::First)]);
+        assert_eq!(item("axes(before(b:2))").remembered().collect::<Vec<_>>(), [("b", Moment::Before(2))]);
     }
 
     #[test]
@@ -315,6 +352,13 @@ mod tests {
             "axes()",
             "axes(axes(a))",
             "last(a)",
+            "before(a)",
+            "before(a:0)",
+            "before(a:-1)",
+            "before(:3)",
+            "before(a[0:1])",
+            "before(a[0:1]:2)",
+            "before(axes(a):2)",
         ] {
             let message = bad.parse::<KeyItem>().unwrap_err();
             assert!(message.starts_with(&format!("`{bad}`: expected ")), "{message}");
@@ -323,9 +367,17 @@ mod tests {
 
     #[test]
     fn items_are_written_as_they_are_read() {
-        for text in
-            ["a", "b[1:3]", "b[0:3] - a", "first(a)", "b[0:1] - first(a)[1:2]", "axes(b)", "axes(first(b)[0:4])"]
-        {
+        for text in [
+            "a",
+            "b[1:3]",
+            "b[0:3] - a",
+            "first(a)",
+            "b[0:1] - first(a)[1:2]",
+            "axes(b)",
+            "axes(first(b)[0:4])",
+            "a - before(a:8)",
+            "axes(before(b:2)[0:4])",
+        ] {
             assert_eq!(item(text).to_string(), text);
             assert_eq!(serde_json::from_str::<KeyItem>(&format!("\"{text}\"")).unwrap(), item(text));
         }
@@ -339,6 +391,7 @@ mod tests {
         assert_eq!(names("a", 3), ["a_0", "a_1", "a_2"]);
         assert_eq!(names("first(one)", 1), ["first(one)"]);
         assert_eq!(names("first(b)[1:3]", 2), ["first(b)_1", "first(b)_2"]);
+        assert_eq!(names("before(b:8)[1:3]", 2), ["before(b:8)_1", "before(b:8)_2"]);
         assert_eq!(names("axes(b[0:4])", 6)[4..], ["axes(b[0:4])_4", "axes(b[0:4])_5"]);
         assert_eq!(names("one", 1), ["one"]);
         assert_eq!(names("b[1:3]", 2), ["b_1", "b_2"]);

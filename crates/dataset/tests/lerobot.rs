@@ -222,6 +222,7 @@ fn entities_are_columns_of_keys_their_parts_and_differences() {
     let mut options = with("cube", &["object[0:3]", "object[0:3] - robot0_eef_pos"]);
     options.entities.insert("hand".to_owned(), list(&["robot0_eef_pos", "robot0_gripper_qpos[1:2]"]));
     options.entities.insert("begun".to_owned(), list(&["first(robot0_eef_pos)", "first(object)[0:1] - object[0:1]"]));
+    options.entities.insert("before".to_owned(), list(&["before(robot0_eef_pos:2)", "before(object:3)[0:1]"]));
     convert(&fixture(), &out, &options, &mut quiet).unwrap();
     let set = Dataset::open(&out).unwrap();
     let (_, demos) = content(&fixture());
@@ -237,6 +238,9 @@ fn entities_are_columns_of_keys_their_parts_and_differences() {
             assert_eq!(cube.data[at * 6..at * 6 + 6], [place, &away].concat());
             let begun = set.column("observation.entity.begun").unwrap();
             assert_eq!(begun.data[at * 4..at * 4 + 4], [&pos[..3], &[object[0] - object[t * 10]]].concat());
+            let before = set.column("observation.entity.before").unwrap();
+            let (two, three) = (t.saturating_sub(2), t.saturating_sub(3));
+            assert_eq!(before.data[at * 4..at * 4 + 4], [&pos[two * 3..two * 3 + 3], &[object[three * 10]]].concat());
             assert_eq!(hand.data[at * 4..at * 4 + 4], [&pos[t * 3..t * 3 + 3], &grip[t * 2 + 1..t * 2 + 2]].concat());
         }
     }

@@ -9,9 +9,9 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use rollout::{
-    Control, Initial, Observations, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder,
+    Control, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder,
 };
-use zoo::FeatureKeys;
+use zoo::{FeatureKeys, Past};
 use zoo::evaluation::Environment;
 use zoo::experiment::DataSection;
 
@@ -26,8 +26,7 @@ pub(crate) struct Simulator {
     ready: Ready,
     keys: FeatureKeys,
     pool: Mutex<Option<Pool>>,
-    /// what the episode began with
-    first: Mutex<Option<Observations>>,
+    past: Mutex<Past>,
 }
 
 #[pymethods]
@@ -78,7 +77,7 @@ impl Simulator {
             Ok((keys, pool))
         };
         let (keys, pool) = interruptible(py, |_, _| start(), |()| Ok(()))??;
-        Ok(Self { ready: pool.ready().clone(), keys, pool: Mutex::new(Some(pool)), first: Mutex::new(None) })
+        Ok(Self { ready: pool.ready().clone(), keys, pool: Mutex::new(Some(pool)), past: Mutex::default() })
     }
 
     /// Begins the episode of `seed`: the observation, and what is known of the episode.
@@ -89,9 +88,10 @@ impl Simulator {
         info.set_item("seed", seed)?;
         info.set_item("fingerprint", fingerprint)?;
         info.set_item("group", group)?;
-        let seen = self.seen(py, &self.keys.observe(&observations, &observations))?;
-        *self.first() = Some(observations);
-        Ok((seen, info))
+        let mut past = Past::default();
+        let seen = self.keys.observe(&observations, &mut past).map_err(Error::new_err)?;
+        *self.past() = past;
+        Ok((self.seen(py, &seen)?, info))
     }
 
     /// Executes an action, clipped to its limits: the observation, the reward, whether the task is done, and in a word
@@ -105,7 +105,11 @@ impl Simulator {
         let action = self.executable(&shape, &values)?;
         let Stepped { rewards, success, failure, observations, .. } =
             unlocked(py, || self.worker(|worker| worker.step(&[action]).map_err(raised)))?;
-        let seen = self.keys.observe(&observations, self.first().as_ref().unwrap_or(&observations));
+        let seen = {
+            let mut past = self.past();
+            past.pass(1);
+            self.keys.observe(&observations, &mut past).map_err(Error::new_err)?
+        };
         Ok((self.seen(py, &seen)?, rewards.iter().sum(), success, failure))
     }
 
@@ -185,8 +189,8 @@ impl Simulator {
 }
 
 impl Simulator {
-    fn first(&self) -> MutexGuard<'_, Option<Observations>> {
-        self.first.lock().unwrap_or_else(PoisonError::into_inner)
+    fn past(&self) -> MutexGuard<'_, Past> {
+        self.past.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn lock(&self) -> MutexGuard<'_, Option<Pool>> {

@@ -45,6 +45,24 @@ def test_an_episode_is_the_evaluation_s(zoo: Path) -> None:
         env.unwrapped.reset(seed=1)
 
 
+def test_what_was_before_is_what_was_shown_before() -> None:
+    hand = "robot0_eef_pos"
+    keys = {"observation.state": [hand, f"before({hand}:3)", f"first({hand})", f"{hand} - before({hand}:1)"]}
+    env = actrm.envs.RobotEnv("Lift", keys=keys)
+    up = np.array([0.2, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0], np.float32)
+    # the second episode remembers nothing of the first
+    for seed in (5, 6):
+        shown = [env.reset(seed=seed)[0]["observation.state"]]
+        shown += [env.step(up)[0]["observation.state"] for _ in range(8)]
+        hands = [state[:3] for state in shown]
+        assert not np.array_equal(hands[0], hands[8])
+        for step, state in enumerate(shown):
+            np.testing.assert_array_equal(state[3:6], hands[max(step - 3, 0)])
+            np.testing.assert_array_equal(state[6:9], hands[0])
+            np.testing.assert_array_equal(state[9:], hands[step] - hands[max(step - 1, 0)])
+    env.close()
+
+
 def test_a_cap_truncates_and_bad_actions_are_refused() -> None:
     env = actrm.envs.RobotEnv("Lift", max_steps=3)
     env.reset(seed=5)

@@ -57,21 +57,39 @@ impl FeatureKeys {
         self.0.get(feature).into_iter().flatten().map(|item| item.width(width_of)).sum()
     }
 
-    /// Whether it is remembered how an episode began.
-    pub fn remember(&self) -> bool {
-        self.0.values().flatten().any(KeyItem::remembers)
+    /// The keys that are read at an earlier step than the present one, and when.
+    fn remembered(&self) -> impl Iterator<Item = (&str, Moment)> {
+        self.0.values().flatten().flat_map(KeyItem::remembered)
     }
 
-    /// The observation of a step, of an episode that began with `first`. A feature of which a key is missing is left out.
-    pub fn observe(&self, observations: &Observations, first: &Observations) -> Observation {
-        let read = |observations: &Observations| -> BTreeMap<&str, Vec<f32>> {
-            let of = |key| Some((key, observations.get(key)?.iter().map(|&value| value as f32).collect()));
-            self.keys().filter_map(of).collect()
-        };
-        let (now, begun) = (read(observations), if self.remember() { read(first) } else { BTreeMap::new() });
-        let values_of = |key: &str, moment: Moment| {
-            let read = if moment == Moment::First { &begun } else { &now };
-            read.get(key).map(Vec::as_slice)
+    /// How many steps are done between observations, so that of plans of `steps` every step is seen that is asked about later;
+    /// `None` if none is.
+    pub fn stride(&self, steps: usize) -> Option<usize> {
+        let lags = self.remembered().filter_map(|(_, moment)| match moment {
+            Moment::Before(steps) => Some(steps),
+            Moment::Now | Moment::First => None,
+        });
+        lags.reduce(greatest_common_divisor).map(|lag| greatest_common_divisor(lag, steps))
+    }
+
+    /// The observation of the step at which `past` is, which remembers of it what is asked about later. A feature of which a key is
+    /// missing is left out.
+    ///
+    /// # Errors
+    /// In words: a step that `past` was not shown.
+    pub fn observe(&self, observations: &Observations, past: &mut Past) -> Result<Observation, String> {
+        let values = |key| Some(observations.get(key)?.iter().map(|&value| value as f32).collect::<Vec<f32>>());
+        past.remember(self.remembered().map(|(key, moment)| (key, moment, values(key))));
+        for (_, moment) in self.remembered() {
+            let step = moment.step(past.step);
+            if !past.seen.contains_key(&step) {
+                return Err(format!("the observation of step {step} is needed at step {} and was not seen", past.step));
+            }
+        }
+        let now: BTreeMap<&str, Vec<f32>> = self.keys().filter_map(|key| Some((key, values(key)?))).collect();
+        let values_of = |key: &str, moment: Moment| match moment {
+            Moment::Now => now.get(key).map(Vec::as_slice),
+            Moment::First | Moment::Before(_) => past.seen[&moment.step(past.step)].get(key).map(Vec::as_slice),
         };
         let feature = |items: &Vec<KeyItem>| {
             let mut values = Vec::new();
@@ -83,8 +101,43 @@ impl FeatureKeys {
             _ => None,
         };
         let seen = |items| picture(items).or_else(|| feature(items));
-        self.0.iter().filter_map(|(name, items)| Some((name.clone(), seen(items)?))).collect()
+        Ok(self.0.iter().filter_map(|(name, items)| Some((name.clone(), seen(items)?))).collect())
     }
+}
+
+/// What an episode showed before, as far as it is asked about again.
+#[derive(Debug, Clone, Default)]
+pub struct Past {
+    /// of the episode, the present one
+    step: usize,
+    /// by step, the numbers of the keys that are remembered
+    seen: BTreeMap<usize, BTreeMap<String, Vec<f32>>>,
+}
+
+impl Past {
+    /// Takes in that `steps` were done since the last observation.
+    pub fn pass(&mut self, steps: usize) {
+        self.step += steps;
+    }
+
+    /// Takes in the present values of keys and when they are asked about; forgets what never is again.
+    fn remember<'k>(&mut self, values: impl Iterator<Item = (&'k str, Moment, Option<Vec<f32>>)>) {
+        let (step, mut longest) = (self.step, 0);
+        for (key, moment, values) in values {
+            if let Moment::Before(steps) = moment {
+                longest = longest.max(steps);
+            }
+            let present = self.seen.entry(step).or_default();
+            if let Some(values) = values {
+                present.insert(key.to_owned(), values);
+            }
+        }
+        self.seen.retain(|&seen, _| seen == 0 || seen + longest >= step);
+    }
+}
+
+fn greatest_common_divisor(a: usize, b: usize) -> usize {
+    if b == 0 { a } else { greatest_common_divisor(b, a % b) }
 }
 
 #[cfg(test)]
@@ -104,13 +157,44 @@ mod tests {
         let observations = [("a", vec![1.0]), ("b", vec![2.0, 3.0]), ("c", vec![4.0])];
         keys.insert("observation.entity.kept", &["a".into(), "first(b)[0:1]".into()]).unwrap();
         let first = [("b", vec![9.0, 8.0])].map(|(key, values)| (key.to_owned(), values)).into();
-        let seen = keys.observe(&observations.map(|(key, values)| (key.to_owned(), values)).into(), &first);
+        let mut past = Past::default();
+        keys.observe(&first, &mut past).unwrap();
+        past.pass(7);
+        let seen = keys.observe(&observations.map(|(key, values)| (key.to_owned(), values)).into(), &mut past).unwrap();
         let numbers = |name: &str| seen.get(name).cloned();
         assert_eq!(numbers(STATE), Some(vec![2.0, 3.0, 1.0].into()));
         assert_eq!(numbers(ENVIRONMENT_STATE), Some(vec![4.0].into()));
         assert_eq!(numbers("observation.entity.thing"), Some(vec![3.0, -3.0].into()));
         assert_eq!(numbers("observation.entity.kept"), Some(vec![1.0, 9.0].into()));
         assert_eq!(numbers("observation.entity.gone"), None);
+    }
+
+    #[test]
+    fn steps_before_are_those_of_the_episode() {
+        let mut keys = FeatureKeys::default();
+        keys.insert(STATE, &["a".into(), "before(a:4)".into(), "a - before(a:6)".into(), "first(a)".into()]).unwrap();
+        assert_eq!([8, 4, 3].map(|steps| keys.stride(steps)), [2, 2, 1].map(Some));
+        let at = |value: f64| [("a".to_owned(), vec![value])].into();
+        let mut past = Past::default();
+        // every second step is seen
+        for step in 0..20_usize {
+            let value = |step: usize| 10.0 + step as f64;
+            if step > 0 {
+                past.pass(2);
+            }
+            let seen = keys.observe(&at(value(2 * step)), &mut past).unwrap();
+            let before = |steps: usize| value((2 * step).saturating_sub(steps));
+            let now = value(2 * step);
+            let expected: Vec<f32> = [now, before(4), now - before(6), value(0)].map(|value| value as f32).into();
+            assert_eq!(seen.get(STATE).cloned(), Some(expected.into()), "step {step}");
+        }
+        // what nobody asks about is not kept: the first step, the present one and six steps before it
+        assert_eq!(past.seen.len(), 5);
+        past.pass(3);
+        let error = keys.observe(&at(0.0), &mut past).unwrap_err();
+        assert_eq!(error, "the observation of step 37 is needed at step 41 and was not seen");
+        keys.insert(STATE, &["a".into()]).unwrap();
+        assert_eq!(keys.stride(8), None);
     }
 
     #[test]

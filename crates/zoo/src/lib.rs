@@ -29,7 +29,7 @@ pub mod rerun;
 pub mod results;
 
 pub use error::ZooError;
-pub use feature_keys::FeatureKeys;
+pub use feature_keys::{FeatureKeys, Past};
 pub use files::{sha256_file, sha256_hex, write_atomic, write_together};
 
 /// What makes entries, by name: the software's versions, the compiler, what it compiled for, and the vectors of this

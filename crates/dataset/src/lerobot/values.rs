@@ -156,7 +156,7 @@ fn concat(
         for (step, out) in out.chunks_exact_mut(width).enumerate() {
             let values_of = |key: &str, moment: Moment| {
                 let (_, width, values) = datasets.iter().find(|(name, ..)| *name == key)?;
-                let step = if moment == Moment::First { 0 } else { step };
+                let step = moment.step(step);
                 Some(&values[step * width..(step + 1) * width])
             };
             row.clear();

@@ -73,7 +73,8 @@ def convert(
     state_keys, env_keys: observation keys of `observation.state` and `observation.environment_state`; those of the
         file's layout unless given.
     entities: by name the observation keys of `observation.entity.<name>`; parts (`key[0:3]`), differences (`a - b`),
-        what an episode began with (`first(key)`) and axes of a quaternion (`axes(key)`) may stand in the lists.
+        what an episode began with (`first(key)`), what was so many control steps before (`before(key:8)`) and
+        axes of a quaternion (`axes(key)`) may stand in the lists.
     fps: frames a second; the control frequency that the file states unless given.
     images: how pictures are stored.
     depth: make columns of depth, as LeRobot records it; the side folder alone keeps it otherwise.

@@ -11,7 +11,7 @@ use super::agent::{PolicyAgent, QueryTimes, Timed};
 use super::{EvaluationOptions, Perturbation};
 use crate::entry::CamerasMeta;
 use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, Seeds, TrainingFacts};
-use crate::{FeatureKeys, ZooError};
+use crate::{FeatureKeys, Past, ZooError};
 
 /// The entry under evaluation, as far as an evaluation needs to know it.
 pub struct Subject<'a> {
@@ -124,7 +124,7 @@ impl Subject<'_> {
     /// The pictures that a policy sees of an observation, side by side, each pixel as a square of `scale`; `None` without any.
     pub(super) fn seen(&self, observations: &Observations, scale: usize) -> Option<Image> {
         // pictures are not remembered
-        let mut seen = self.keys.observe(observations, observations);
+        let mut seen = self.keys.observe(observations, &mut Past::default()).ok()?;
         if let Some(perturbation) = &self.perturbation {
             perturbation.apply(&self.signature, &mut seen);
         }
@@ -164,8 +164,13 @@ impl Subject<'_> {
 
     /// `policy` acting as the execution says.
     pub(super) fn acting(&self, policy: impl Policy + 'static) -> Result<PolicyAgent, ModelError> {
+        let steps = match self.execution {
+            // a policy that looks back itself is shown the last steps of a plan one by one
+            Execution::RecedingHorizon { n_action_steps } if policy.n_obs_steps() == 1 => n_action_steps,
+            Execution::RecedingHorizon { .. } | Execution::TemporalEnsemble { .. } => 1,
+        };
         let actor = acting(policy, self.execution)?;
-        Ok(PolicyAgent::new(actor, self.keys.clone()).perturbed(self.perturbation.clone(), &self.signature))
+        Ok(PolicyAgent::new(actor, steps, self.keys.clone()).perturbed(self.perturbation.clone(), &self.signature))
     }
 }
 

@@ -11,7 +11,7 @@ use models::actrm::{DisturbedPolicy, Intervention, Thinking};
 use rollout::{Pool, RolloutError, Worker};
 
 use crate::entry::LoadedEntry;
-use crate::{FeatureKeys, ZooError};
+use crate::{FeatureKeys, Past, ZooError};
 
 use super::Subject;
 
@@ -33,7 +33,8 @@ pub fn starts(keys: &FeatureKeys, pool: &mut Pool, seeds: &[u64]) -> Result<Opti
     let work = |(): &mut (), worker: &mut Worker, job: u64| {
         let seed = seed_of(job);
         let begun = worker.reset(seed)?.observations;
-        Ok(Start { seed, observation: keys.observe(&begun, &begun) })
+        let observation = keys.observe(&begun, &mut Past::default()).expect("an episode that begins has no past");
+        Ok(Start { seed, observation })
     };
     let (mut found, mut failure) = (Vec::new(), None);
     pool.run(0..seeds.len() as u64, &seed_of, &|| Ok(()), &work, &mut |_, result| match result {
