@@ -8,12 +8,10 @@ use models::{ENVIRONMENT_STATE, Observation, STATE, Values};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use rollout::{
-    Control, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder,
-};
-use zoo::{FeatureKeys, Past};
+use rollout::{Control, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder};
 use zoo::evaluation::Environment;
 use zoo::experiment::DataSection;
+use zoo::{FeatureKeys, Past};
 
 use crate::arrays::{array, filled, read};
 use crate::error::{Error, raised};
