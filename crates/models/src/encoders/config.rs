@@ -43,7 +43,8 @@ pub enum Normalisation {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
 pub enum TokenKind {
-    /// a token a cell, with fixed positions
+    /// a token a cell, with fixed positions, the same for every camera as in LeRobot: nothing but what is seen says which
+    /// camera saw it, and cameras that are taken for each other change no action
     #[default]
     Map,
     /// one token a camera: where so many keypoints are
