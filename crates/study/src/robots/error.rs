@@ -24,6 +24,20 @@ pub enum StudyError {
         /// What was asked for.
         cell: String,
     },
+    /// Cells have results of trainings that are not here, and what is here is not the same.
+    #[error(
+        "cells {}: their results in {} are of trainings whose weights are not in {}; bring those entries there, or remove \
+         these results, so that all of a cell's tests are of one training",
+        cells.join(", "), results.display(), zoo.display()
+    )]
+    OtherTrainings {
+        /// Their names.
+        cells: Vec<String>,
+        /// The folder of results.
+        results: std::path::PathBuf,
+        /// Where entries are looked for.
+        zoo: std::path::PathBuf,
+    },
     /// A simulator could not be started.
     #[error(transparent)]
     Rollout(#[from] rollout::RolloutError),

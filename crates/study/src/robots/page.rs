@@ -102,6 +102,7 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
     thinking_otherwise(&mut text, study, &results);
     probes(&mut text, study)?;
     costs(&mut text, study, &results);
+    trained_twice(&mut text, &results);
     if !missing.is_empty() {
         let _ = writeln!(text, "## Not run\n");
     }
@@ -354,6 +355,32 @@ fn pictures_changed(text: &mut String, study: &Study, results: &Results) {
 }
 
 /// The middle value, the upper one of two.
+/// Cells whose tests are of two trainings, of which nobody can tell whether they are the same.
+fn trained_twice(text: &mut String, results: &Results) {
+    let mut by_training: BTreeMap<(&String, &String, u64), Vec<&CellResult>> = BTreeMap::new();
+    for ((_, data, arm), trainings) in results {
+        for (seed, result) in trainings {
+            by_training.entry((data, arm, *seed)).or_default().push(result);
+        }
+    }
+    by_training.retain(|_, tests| tests.iter().any(|test| test.may_differ_from(tests[0])));
+    if by_training.is_empty() {
+        return;
+    }
+    let _ = writeln!(
+        text,
+        "## Trained twice\n\nTheir tests are of more than one training with the same settings and the same seed. What is done in the \
+         same order gives the same weights on the same kind of processor; of these it was not written down whether it did.\n"
+    );
+    for ((data, arm, seed), tests) in by_training {
+        let mut entries: BTreeMap<&String, Vec<&str>> = BTreeMap::new();
+        tests.iter().for_each(|test| entries.entry(&test.entry.hash).or_default().push(&test.test));
+        let groups: Vec<String> = entries.values().map(|tests| tests.join(", ")).collect();
+        let _ = writeln!(text, "- {arm} on {data}, seed {seed}: {}", groups.join("; "));
+    }
+    text.push('\n');
+}
+
 fn median(results: &[&CellResult], value: fn(&CellResult) -> f64) -> f64 {
     let mut values: Vec<f64> = results.iter().map(|result| value(result)).collect();
     values.sort_by(f64::total_cmp);
@@ -630,6 +657,30 @@ mod tests {
         assert!(error.contains("careless"), "{error}");
         std::fs::write(&file, shown).unwrap();
         assert!(page.contains("| Better? | one step, lift | one step, chain | all | not run |"), "{page}");
+    }
+
+    #[test]
+    fn tests_of_two_trainings_are_named_where_their_weights_may_differ() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
+        let study = Study::open(&file).unwrap();
+        let six: Vec<Cell> = cells(&study).into_iter().filter(|cell| cell.arm == "six" && cell.seed == 1).collect();
+        let (first, later) = (&six[0], six.last().unwrap());
+        let page = |hash: &str, weights: Option<&str>| {
+            for (cell, test, hash) in [(first, "t", "h"), (later, "t-32", hash)] {
+                let mut one = result(&study, cell, test, [true; 4]);
+                one.entry.hash = hash.to_owned();
+                one.weights = weights.map(str::to_owned);
+                one.write(&folder.path().join(cell.file_name(test))).unwrap();
+            }
+            robot_page(&study, &file).unwrap()
+        };
+        assert!(!page("h", None).contains("Trained twice"));
+        assert!(!page("other", Some("w")).contains("Trained twice"));
+        let page = page("other", None);
+        assert!(page.contains("## Trained twice"), "{page}");
+        assert!(page.contains("- six on chain, seed 1: t; t-32\n") || page.contains("seed 1: t-32; t\n"), "{page}");
     }
 
     #[test]

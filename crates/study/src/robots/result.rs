@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
+use zoo::entry::{EntryMeta, MODEL_FILE};
 use zoo::results::{EntryIdentity, Protocol, Seeds, StoredEvaluation, TrainingFacts};
 use zoo::{ZooError, write_atomic};
 
@@ -34,6 +35,9 @@ pub struct CellResult {
     pub settings: String,
     /// The entry.
     pub entry: EntryIdentity,
+    /// sha256 of its weights, where it has some and that was told.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub weights: Option<String>,
     /// Where it comes from.
     pub training: TrainingFacts,
     /// The rules of the evaluation.
@@ -75,6 +79,11 @@ pub struct EpisodeOutcome {
     pub progress: Option<f64>,
 }
 
+/// sha256 of an entry's weights, where it has some.
+fn weights(entry: &EntryMeta) -> Option<String> {
+    entry.files.get(MODEL_FILE).map(|file| file.sha256.clone())
+}
+
 impl CellResult {
     /// The result of `evaluation`.
     pub(super) fn new(
@@ -83,6 +92,7 @@ impl CellResult {
         (test, definition): (&str, &Test),
         settings: String,
         query_flops: Option<f64>,
+        entry: &EntryMeta,
         evaluation: &StoredEvaluation,
     ) -> Self {
         let mut times: Vec<f64> = evaluation.timings.iter().flat_map(|t| t.inference_ms.iter().copied()).collect();
@@ -99,6 +109,7 @@ impl CellResult {
             seed: cell.seed,
             settings,
             entry: record.entry.clone(),
+            weights: weights(entry),
             training: record.training.clone(),
             protocol: record.protocol.clone(),
             seeds: record.seeds,
@@ -119,6 +130,30 @@ impl CellResult {
                 })
                 .collect(),
         }
+    }
+
+    /// Whether it can be told of an entry that is trained again if it is the same.
+    pub(super) fn names_its_weights(&self) -> bool {
+        self.weights.is_some() || self.training.parameters == 0
+    }
+
+    /// Whether it is a result of this entry, or of one with the same weights.
+    pub(super) fn is_of(&self, entry: &EntryMeta) -> bool {
+        let weights = weights(entry);
+        weights.is_none() || weights == self.weights || entry.content_sha256() == self.entry.hash
+    }
+
+    /// It with its weights named, where it is of this entry.
+    pub(super) fn with_weights_of(self, entry: &EntryMeta) -> Self {
+        match entry.content_sha256() == self.entry.hash {
+            true => Self { weights: weights(entry), ..self },
+            false => self,
+        }
+    }
+
+    /// Whether two results may be of different weights.
+    pub(super) fn may_differ_from(&self, other: &Self) -> bool {
+        self.entry.hash != other.entry.hash && (self.weights.is_none() || self.weights != other.weights)
     }
 
     /// Reads a result; nothing where there is no such file.

@@ -64,12 +64,14 @@ pub enum RobotEvent<'a> {
 enum CellEnd {
     Done,
     Stopped,
+    /// its results are of another training
+    Left,
 }
 
 /// Runs every cell that was chosen and has no result; whether nothing was stopped.
 ///
 /// # Errors
-/// The first failure; what was done stays.
+/// The first failure; what was done stays. Or, after all else was done, cells whose results are of another training.
 pub fn run_robot_study(
     request: &RobotStudyRequest,
     on_event: &mut (dyn FnMut(RobotEvent<'_>) + Send),
@@ -95,7 +97,7 @@ pub fn run_robot_study(
     let mut there = 0;
     for cell in all {
         let missing = missing_tests(request, &cell).map_err(|error| error.of(&cell))?;
-        count_operations(request, &cell, &missing)?;
+        complete(request, &cell, &missing)?;
         there += cell.tests.len() - missing.len();
         if !missing.is_empty() && chosen(&cell) {
             due.push_back(cell);
@@ -112,15 +114,18 @@ pub fn run_robot_study(
         collecting: study.data.keys().map(|name| (name.clone(), Mutex::new(()))).collect(),
         training,
         failure: Mutex::new(None),
+        left: Mutex::new(Vec::new()),
     };
     std::thread::scope(|scope| {
         for _ in 0..request.jobs.max(1) {
             scope.spawn(|| shared.work());
         }
     });
+    let left = shared.left.into_inner().unwrap_or_else(PoisonError::into_inner);
     match shared.failure.into_inner().unwrap_or_else(PoisonError::into_inner) {
         Some(error) => Err(error),
-        None => Ok(!shared.stopped.into_inner()),
+        None if left.is_empty() => Ok(!shared.stopped.into_inner()),
+        None => Err(StudyError::OtherTrainings { cells: left, results: study.results.clone(), zoo: request.zoo() }),
     }
 }
 
@@ -141,6 +146,15 @@ pub fn stored_results(study: &Study, library: &Library, cell: &Cell) -> Result<V
     cell.tests.iter().map(stored).collect()
 }
 
+/// What is stored of a cell's training, of whatever stage, with the settings as they are.
+fn results_of_training(study: &Study, library: &Library, cell: &Cell) -> Result<Vec<CellResult>, StudyError> {
+    let mut results = Vec::new();
+    for same in cells(study).iter().filter(|other| other.name() == cell.name()) {
+        results.extend(stored_results(study, library, same)?.into_iter().flatten());
+    }
+    Ok(results)
+}
+
 /// The tests of a cell that have no result of the settings as they are.
 fn missing_tests(request: &RobotStudyRequest, cell: &Cell) -> Result<Vec<String>, StudyError> {
     let stored = stored_results(&request.study, &request.library, cell)?;
@@ -148,16 +162,22 @@ fn missing_tests(request: &RobotStudyRequest, cell: &Cell) -> Result<Vec<String>
     Ok(missing.map(|(name, _)| name.clone()).collect())
 }
 
-/// Writes into results that were made before operations were counted how many a query has, where the entry is still there.
-fn count_operations(request: &RobotStudyRequest, cell: &Cell, missing: &[String]) -> Result<(), StudyError> {
+/// Writes into results that were made before operations were counted how many a query has, and into those made before weights
+/// were named which they are, where the entry is still there.
+fn complete(request: &RobotStudyRequest, cell: &Cell, missing: &[String]) -> Result<(), StudyError> {
     for test in cell.tests.iter().filter(|test| !missing.contains(test)) {
         let path = request.study.results.join(cell.file_name(test));
-        let Some(result) = CellResult::read(&path)?.filter(|result| result.query_flops.is_none()) else { continue };
+        let whole = |result: &CellResult| result.query_flops.is_some() && result.names_its_weights();
+        let Some(result) = CellResult::read(&path)?.filter(|result| !whole(result)) else { continue };
         let (experiment, _) = experiment(&request.study, &request.library, cell)?;
         let Some(entry) = request.trained(&experiment.entry, &result.settings)? else { continue };
-        let query_flops = entry.load()?.model().query_flops();
-        if query_flops.is_some() {
-            CellResult { query_flops, ..result }.write(&path)?;
+        let query_flops = match result.query_flops {
+            None => entry.load()?.model().query_flops(),
+            counted => counted,
+        };
+        let complete = CellResult { query_flops, ..result.clone() }.with_weights_of(entry.meta());
+        if complete != result {
+            complete.write(&path)?;
         }
     }
     Ok(())
@@ -236,6 +256,8 @@ struct Shared<'a> {
     /// held while the training of that cell is under way
     training: BTreeMap<String, Mutex<()>>,
     failure: Mutex<Option<StudyError>>,
+    /// cells that were not tested further, because their results are of another training
+    left: Mutex<Vec<String>>,
     /// whether a cell was left because an end was asked for
     stopped: AtomicBool,
 }
@@ -260,6 +282,7 @@ impl Shared<'_> {
             let end = if self.stopped() { Ok(CellEnd::Stopped) } else { self.cell(&cell) };
             match end {
                 Ok(CellEnd::Done) => {}
+                Ok(CellEnd::Left) => lock(&self.left).push(cell.name()),
                 Ok(CellEnd::Stopped) => {
                     self.stopped.store(true, Ordering::Relaxed);
                     return;
@@ -275,12 +298,17 @@ impl Shared<'_> {
     fn cell(&self, cell: &Cell) -> Result<CellEnd, StudyError> {
         let study = &self.request.study;
         let (arm, data) = (&study.arms[&cell.arm], &study.data[&cell.data]);
+        let (experiment, settings) = experiment(study, &self.request.library, cell)?;
+        let (zoo, name) = (self.request.zoo(), experiment.entry.clone());
+        let earlier = results_of_training(study, &self.request.library, cell)?;
+        let told = earlier.iter().all(CellResult::names_its_weights);
+        if !told && !self.request.data_only && self.request.trained(&name, &settings)?.is_none() {
+            return Ok(CellEnd::Left);
+        }
         let Some(file) = self.demonstrations(&cell.data, data)? else { return Ok(CellEnd::Stopped) };
         if self.request.data_only {
             return Ok(CellEnd::Done);
         }
-        let (experiment, settings) = experiment(&self.request.study, &self.request.library, cell)?;
-        let (zoo, name) = (self.request.zoo(), experiment.entry.clone());
         let run = self.request.work.join("runs").join(run_name(cell, &settings));
         let training = lock(&self.training[&cell.name()]);
         if self.request.trained(&name, &settings)?.is_none() {
@@ -307,6 +335,9 @@ impl Shared<'_> {
         }
         drop(training);
         let stored = Registry::open(&zoo).entry(&name)?;
+        if !earlier.iter().all(|result| result.is_of(stored.meta())) {
+            return Ok(CellEnd::Left);
+        }
         let entry = stored.load()?;
         for test in missing_tests(self.request, cell)? {
             let definition = &study.tests[&test];
@@ -321,7 +352,8 @@ impl Shared<'_> {
             };
             let of_test = (test.as_str(), definition);
             let flops = entry.thinking(&definition.thinking)?.model().query_flops();
-            let result = CellResult::new(cell, (arm, data), of_test, settings.clone(), flops, &evaluation);
+            let result =
+                CellResult::new(cell, (arm, data), of_test, settings.clone(), flops, stored.meta(), &evaluation);
             result.write(&study.results.join(cell.file_name(&test)))?;
             self.tell(RobotEvent::Result(&result));
             let mut done = lock(&self.done);
@@ -417,5 +449,108 @@ impl Shared<'_> {
             EvaluationEnd::Stopped { .. } => Ok(None),
             EvaluationEnd::Failed { mut errors, .. } => Err(errors.pop().expect("a failed evaluation says why").into()),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    const STUDY: &str = r#"
+        title = "T"
+        results = "RESULTS/results"
+        page = "RESULTS/page.md"
+        [data.lift]
+        task = "Lift"
+        episodes = 20
+        [arms.act]
+        label = "ACT"
+        experiment = "act_{data}"
+        [tests.t]
+        task = "Lift"
+        episodes = 4
+        seed_start = 40000
+        [tests.u]
+        task = "Lift"
+        episodes = 8
+        seed_start = 40000
+        [[cells]]
+        arms = ["act"]
+        data = "lift"
+        seeds = 1
+        tests = ["t"]
+        [[cells]]
+        arms = ["act"]
+        data = "lift"
+        seeds = 1
+        tests = ["u"]
+        stage = 2
+    "#;
+
+    /// A cell with a result whose entry is gone is left before anything is collected or trained for it.
+    #[test]
+    fn further_tests_are_not_of_another_training() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
+        let study = Study::open(&file).unwrap();
+        let library = Library::built_in();
+        let cell = cells(&study).into_iter().next().unwrap();
+        let (_, settings) = experiment(&study, &library, &cell).unwrap();
+        let of = |weights: Option<&str>, parameters: u64| -> CellResult {
+            serde_json::from_value(serde_json::json!({
+                "format": 1, "arm": cell.arm, "arm_definition": study.arms[&cell.arm], "data": cell.data,
+                "data_definition": study.data[&cell.data], "test": "t", "test_definition": study.tests["t"],
+                "seed": 1, "settings": settings, "entry": {"name": "e", "version": 1, "hash": "h"}, "weights": weights,
+                "training": {
+                    "policy": "act", "parameters": parameters, "steps": 9, "minutes": 3.0, "seed": 1, "data_set": "d",
+                    "data_fingerprint": "f", "data_simulator": "1.5.1", "demos": 18,
+                },
+                "protocol": {
+                    "rules": 1, "task": "Lift", "env_name": "Lift", "env_module": null, "env_module_sha256": null,
+                    "env_args_sha256": null, "control": "compiled", "max_steps": 200,
+                },
+                "seeds": {"start": 40_000, "count": 4}, "versions": {}, "query_ms": 1.0, "episodes": [],
+            }))
+            .unwrap()
+        };
+        std::fs::create_dir_all(&study.results).unwrap();
+        of(None, 100).write(&study.results.join(cell.file_name("t"))).unwrap();
+        let request = RobotStudyRequest {
+            study: study.clone(),
+            library,
+            work: folder.path().join("work"),
+            only: Vec::new(),
+            cells: Vec::new(),
+            stage: None,
+            data_only: false,
+            jobs: 1,
+            python: Python { path: "nowhere".into(), origin: "a test".to_owned() },
+            stop: Arc::new(|| false),
+        };
+        let error = run_robot_study(&request, &mut |_| {}).unwrap_err();
+        assert!(
+            matches!(&error, StudyError::OtherTrainings { cells, .. } if *cells == ["act-on-lift-seed1"]),
+            "{error}"
+        );
+        assert!(!request.work.exists(), "nothing was begun");
+
+        // an entry of other weights, of the same weights, the entry itself, and what has none
+        let meta = |entry: &str| {
+            let zoo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
+            Registry::open(&zoo).entry(entry).unwrap().meta().clone()
+        };
+        let lift = meta("lift-act");
+        let weights = lift.files[zoo::entry::MODEL_FILE].sha256.clone();
+        let itself = CellResult {
+            entry: zoo::results::EntryIdentity { name: lift.name.clone(), version: 1, hash: lift.content_sha256() },
+            ..of(None, 100)
+        };
+        assert!(of(Some(&weights), 100).is_of(&lift) && itself.is_of(&lift));
+        assert!(!of(None, 100).is_of(&lift) && !of(Some(&weights), 100).is_of(&meta("door-act")));
+        assert!(of(None, 0).names_its_weights() && !of(None, 100).names_its_weights());
+        assert_eq!(itself.with_weights_of(&lift).weights, Some(weights));
+        assert_eq!(of(None, 100).with_weights_of(&lift).weights, None);
     }
 }
