@@ -121,7 +121,10 @@ pub fn run_robot_study(
             scope.spawn(|| shared.work());
         }
     });
-    let left = shared.left.into_inner().unwrap_or_else(PoisonError::into_inner);
+    let mut left = shared.left.into_inner().unwrap_or_else(PoisonError::into_inner);
+    // a cell of two stages is there twice
+    left.sort();
+    left.dedup();
     match shared.failure.into_inner().unwrap_or_else(PoisonError::into_inner) {
         Some(error) => Err(error),
         None if left.is_empty() => Ok(!shared.stopped.into_inner()),
@@ -471,6 +474,10 @@ mod tests {
         task = "Lift"
         episodes = 4
         seed_start = 40000
+        [tests.v]
+        task = "Lift"
+        episodes = 6
+        seed_start = 40000
         [tests.u]
         task = "Lift"
         episodes = 8
@@ -479,7 +486,7 @@ mod tests {
         arms = ["act"]
         data = "lift"
         seeds = 1
-        tests = ["t"]
+        tests = ["t", "v"]
         [[cells]]
         arms = ["act"]
         data = "lift"
