@@ -6,7 +6,8 @@ use anyhow::Context;
 use cli::{INTERRUPTED, Screen, Stop, shown};
 use study::puzzle::{PuzzleEvaluation, STUDY, StudyEvent, StudyRequest, StudyRow, run_study, study_page};
 use study::robots::{
-    CellResult, RobotEvent, RobotStudyRequest, Study, cells, robot_charts, robot_page, run_robot_study, stored_results,
+    CellResult, RobotEvent, RobotStudyRequest, Study, StudyError, cells, robot_charts, robot_page, run_robot_study,
+    stored_results,
 };
 use zoo::config::Library;
 use zoo::run::TrainEvent;
@@ -129,6 +130,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 /// A study of robot policies.
 fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
     let study = Study::open(file)?;
+    let mut left = None;
     if args.list {
         cli::print(&listed(&study, &args.configs.library()?)?)?;
         return Ok(ExitCode::SUCCESS);
@@ -152,7 +154,7 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
         let mut screen = Screen::new();
         screen.begin("results", 1);
         let mut printed = Ok(());
-        whole = run_robot_study(&request, &mut |event| match event {
+        let ran = run_robot_study(&request, &mut |event| match event {
             RobotEvent::Done(done, total) => screen.begin_at("results", done as u64, total as u64),
             RobotEvent::Collecting(name, done, all) => {
                 screen.message(&format!("{name}: {done} of {all} demonstrations"))
@@ -165,8 +167,13 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
                     printed = one;
                 }
             }
-        })?;
+        });
         drop(screen);
+        match ran {
+            // all else was done, and stands on the page
+            Err(error @ StudyError::OtherTrainings { .. }) => left = Some(error),
+            ran => whole = ran?,
+        }
         printed?;
     }
     if args.cells.is_empty() && !args.data_only {
@@ -178,6 +185,9 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
         }
         write_atomic(&study.page, robot_page(&study, file)?.as_bytes())?;
         cli::print(&(shown(&study.page) + "\n"))?;
+    }
+    if let Some(error) = left {
+        return Err(error.into());
     }
     if !whole {
         cli::note(GOES_ON);
