@@ -121,13 +121,15 @@ pub fn run_robot_study(
             scope.spawn(|| shared.work());
         }
     });
+    let stopped = shared.stopped.into_inner();
     let mut left = shared.left.into_inner().unwrap_or_else(PoisonError::into_inner);
     // a cell of two stages is there twice
     left.sort();
     left.dedup();
     match shared.failure.into_inner().unwrap_or_else(PoisonError::into_inner) {
         Some(error) => Err(error),
-        None if left.is_empty() => Ok(!shared.stopped.into_inner()),
+        // who stopped it goes on later, and hears of these then
+        None if stopped || left.is_empty() => Ok(!stopped),
         None => Err(StudyError::OtherTrainings { cells: left, results: study.results.clone(), zoo: request.zoo() }),
     }
 }
