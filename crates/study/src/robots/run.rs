@@ -175,7 +175,8 @@ fn complete(request: &RobotStudyRequest, cell: &Cell, missing: &[String]) -> Res
         let whole = |result: &CellResult| result.query_flops.is_some() && result.names_its_weights();
         let Some(result) = CellResult::read(&path)?.filter(|result| !whole(result)) else { continue };
         let (experiment, _) = experiment(&request.study, &request.library, cell)?;
-        let Some(entry) = request.trained(&experiment.entry, &result.settings)? else { continue };
+        let data = &request.study.data[&cell.data];
+        let Some(entry) = request.trained(&experiment.entry, &result.settings, data)? else { continue };
         let query_flops = match result.query_flops {
             None => entry.load()?.model().query_flops(),
             counted => counted,
@@ -236,16 +237,20 @@ impl RobotStudyRequest {
         self.study.zoo.clone().unwrap_or_else(|| self.work.join("zoo"))
     }
 
-    /// The newest entry called `name`, if it was trained with these settings.
-    fn trained(&self, name: &str, settings: &str) -> Result<Option<Entry>, ZooError> {
+    /// The newest entry called `name` that was trained with these settings after these demonstrations. Cells of one experiment
+    /// after different demonstrations are versions of one name.
+    fn trained(&self, name: &str, settings: &str, data: &Data) -> Result<Option<Entry>, ZooError> {
         let zoo = Registry::open(&self.zoo());
-        // a folder of that name says nothing: whoever was killed while he made the entry leaves it, too
-        if !zoo.ids()?.iter().any(|id| id.name == name) {
-            return Ok(None);
+        // the ids are of whole entries: whoever was killed while he made one leaves a folder, too
+        for id in zoo.ids()?.into_iter().rev().filter(|id| id.name == name) {
+            let entry = zoo.entry(&id.to_string())?;
+            let its = Experiment::from_toml(&id.to_string(), &entry.config_text()?)?;
+            let after = entry.meta().data.as_ref().map(|data| data.name.as_str());
+            if settings_hash(&its) == settings && after == Some(data.file_name().as_str()) {
+                return Ok(Some(entry));
+            }
         }
-        let entry = zoo.entry(name)?;
-        let its = Experiment::from_toml(&entry.id().to_string(), &entry.config_text()?)?;
-        Ok((settings_hash(&its) == settings).then_some(entry))
+        Ok(None)
     }
 }
 
@@ -307,39 +312,44 @@ impl Shared<'_> {
         let (zoo, name) = (self.request.zoo(), experiment.entry.clone());
         let earlier = results_of_training(study, &self.request.library, cell)?;
         let told = earlier.iter().all(CellResult::names_its_weights);
-        if !told && !self.request.data_only && self.request.trained(&name, &settings)?.is_none() {
-            return Ok(CellEnd::Left);
-        }
-        let Some(file) = self.demonstrations(&cell.data, data)? else { return Ok(CellEnd::Stopped) };
+        let trained = || self.request.trained(&name, &settings, data);
         if self.request.data_only {
-            return Ok(CellEnd::Done);
+            let collected = self.demonstrations(&cell.data, data)?;
+            return Ok(if collected.is_some() { CellEnd::Done } else { CellEnd::Stopped });
+        }
+        if !told && trained()?.is_none() {
+            return Ok(CellEnd::Left);
         }
         let run = self.request.work.join("runs").join(run_name(cell, &settings));
         let training = lock(&self.training[&cell.name()]);
-        if self.request.trained(&name, &settings)?.is_none() {
-            let request = TrainRequest {
-                name: self.request.study.experiment_on(&cell.arm, &cell.data),
-                command: Some(train_command(&self.request.study, cell, &name, &file)),
-                experiment,
-                data: Some(file),
-                runs: self.request.work.join("runs"),
-                resume: run.join("config.toml").exists(),
-                run: Some(run),
-                zoo: zoo.clone(),
-                image_memory: None,
-            };
-            let mut steps = 0;
-            let outcome = train(&request, &|| self.stopped(), &mut |event| match event {
-                TrainEvent::Begin { steps: all, .. } => steps = all,
-                TrainEvent::Step(row) => self.tell(RobotEvent::Training(&cell.name(), row.step, steps)),
-                _ => {}
-            })?;
-            if matches!(outcome, TrainOutcome::Stopped { .. }) {
-                return Ok(CellEnd::Stopped);
+        let stored = match trained()? {
+            Some(entry) => entry,
+            None => {
+                let Some(file) = self.demonstrations(&cell.data, data)? else { return Ok(CellEnd::Stopped) };
+                let request = TrainRequest {
+                    name: study.experiment_on(&cell.arm, &cell.data),
+                    command: Some(train_command(study, cell, &name, &file)),
+                    experiment,
+                    data: Some(file),
+                    runs: self.request.work.join("runs"),
+                    resume: run.join("config.toml").exists(),
+                    run: Some(run),
+                    zoo: zoo.clone(),
+                    image_memory: None,
+                };
+                let mut steps = 0;
+                let outcome = train(&request, &|| self.stopped(), &mut |event| match event {
+                    TrainEvent::Begin { steps: all, .. } => steps = all,
+                    TrainEvent::Step(row) => self.tell(RobotEvent::Training(&cell.name(), row.step, steps)),
+                    _ => {}
+                })?;
+                match outcome {
+                    TrainOutcome::Finished { entry, .. } => Registry::open(&zoo).entry(&entry.to_string())?,
+                    TrainOutcome::Stopped { .. } => return Ok(CellEnd::Stopped),
+                }
             }
-        }
+        };
         drop(training);
-        let stored = Registry::open(&zoo).entry(&name)?;
         if !earlier.iter().all(|result| result.is_of(stored.meta())) {
             return Ok(CellEnd::Left);
         }
@@ -561,5 +571,36 @@ mod tests {
         assert!(of(None, 0).names_its_weights() && !of(None, 100).names_its_weights());
         assert_eq!(itself.with_weights_of(&lift).weights, Some(weights));
         assert_eq!(of(None, 100).with_weights_of(&lift).weights, None);
+    }
+
+    /// What was trained after other demonstrations, or with other settings, is another training under whatever name.
+    #[test]
+    fn an_entry_is_of_its_demonstrations() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("study.toml");
+        std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
+        let zoo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
+        let request = RobotStudyRequest {
+            study: Study { zoo: Some(zoo.clone()), ..Study::open(&file).unwrap() },
+            library: Library::built_in(),
+            work: folder.path().join("work"),
+            only: Vec::new(),
+            cells: Vec::new(),
+            stage: None,
+            data_only: false,
+            jobs: 1,
+            python: Python { path: "nowhere".into(), origin: "a test".to_owned() },
+            stop: Arc::new(|| false),
+        };
+        let entry = Registry::open(&zoo).entry("lift-act-s1").unwrap();
+        let settings = settings_hash(&Experiment::from_toml("lift-act-s1", &entry.config_text().unwrap()).unwrap());
+        let found = |settings: &str, data: &Data| {
+            request.trained("lift-act-s1", settings, data).unwrap().map(|found| found.id().to_string())
+        };
+        let usual = Data { episodes: 200, ..request.study.data["lift"].clone() };
+        assert_eq!(found(&settings, &usual), Some("lift-act-s1@1".to_owned()));
+        assert_eq!(found(&settings, &Data { expert: Some("recoveries".to_owned()), ..usual.clone() }), None);
+        assert_eq!(found(&settings, &Data { seed: 2, ..usual.clone() }), None);
+        assert_eq!(found(&settings[1..], &usual), None);
     }
 }
