@@ -58,6 +58,6 @@ pub(crate) fn leaderboard<'py>(
         }
         Ok(dict)
     };
-    let reading = Reading { families: entries.families(), protocols: Protocols::built_in() };
+    let reading = Reading::of(&entries, Protocols::built_in());
     PyList::new(py, rank(&found.standing, &reading).iter().map(row).collect::<PyResult<Vec<_>>>()?)
 }

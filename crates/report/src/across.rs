@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use zoo::protocols::Block;
 
 use crate::column::{Column, count, number, text};
-use crate::leaderboard::{Counts, LeaderboardRow, group};
+use crate::leaderboard::{Asked, Counts, LeaderboardRow, asked};
 use crate::statistics::{Estimate, interquartile};
 
 /// Seed of the bootstrap: the same results give the same table.
@@ -15,7 +15,7 @@ const BOOTSTRAP_SEED: u64 = 1;
 /// One kind of policy over the tasks that it was evaluated on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AcrossTasks {
-    /// The kind of policy.
+    /// The kind of policy, and whether it sees pictures.
     pub policy: String,
     /// The tasks, with the row that speaks for the policy in each: `Lift lift-act@1`.
     pub tasks: BTreeMap<String, String>,
@@ -54,27 +54,24 @@ impl AcrossTasks {
     }
 }
 
-/// Task, named block and rules: what rows are ranked in.
-type Group = (String, String, String);
-
 /// The row that speaks for each kind of policy in each task: `table[policy][task]`.
 ///
 /// For each task the protocol with most episodes counts, a named test block before others, and in it the policy's first
 /// row, floors and ceilings among them.
 pub(crate) fn speaking(rows: &[LeaderboardRow]) -> BTreeMap<String, BTreeMap<String, &LeaderboardRow>> {
-    let mut protocols: BTreeMap<&str, BTreeMap<Group, (bool, u64)>> = BTreeMap::new();
+    let mut protocols: BTreeMap<&str, BTreeMap<Asked, (bool, u64)>> = BTreeMap::new();
     for row in rows {
         let test = row.named.as_ref().is_some_and(|(_, block)| *block == Block::Test);
-        let weight = protocols.entry(row.task()).or_default().entry(group(row)).or_insert((test, 0));
+        let weight = protocols.entry(row.task()).or_default().entry(asked(row)).or_insert((test, 0));
         weight.1 += row.counts.episodes;
     }
-    let first = |of: BTreeMap<Group, (bool, u64)>| {
-        of.into_iter().max_by_key(|(group, weight)| (*weight, Reverse(group.clone()))).map(|(group, _)| group)
+    let first = |of: BTreeMap<Asked, (bool, u64)>| {
+        of.into_iter().max_by_key(|(asked, weight)| (*weight, Reverse(asked.clone()))).map(|(asked, _)| asked)
     };
     let chosen: BTreeMap<&str, _> = protocols.into_iter().filter_map(|(task, of)| Some((task, first(of)?))).collect();
     let mut table: BTreeMap<String, BTreeMap<String, &LeaderboardRow>> = BTreeMap::new();
-    for row in rows.iter().filter(|row| chosen.get(row.task()) == Some(&group(row))) {
-        table.entry(row.policy().to_owned()).or_default().entry(row.task().to_owned()).or_insert(row);
+    for row in rows.iter().filter(|row| chosen.get(row.task()) == Some(&asked(row))) {
+        table.entry(row.kind()).or_default().entry(row.task().to_owned()).or_insert(row);
     }
     table
 }

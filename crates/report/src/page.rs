@@ -22,7 +22,7 @@ pub(crate) use self::plot::COLOURS;
 use crate::across::{ACROSS_COLUMNS, across_tasks, speaking};
 use crate::charts;
 use crate::html::{self, escape};
-use crate::leaderboard::{COLUMNS, LeaderboardRow, group, interval_text};
+use crate::leaderboard::{COLUMNS, Group, LeaderboardRow, group, interval_text};
 
 /// An entry's training loss over optimiser steps.
 #[derive(Debug, Clone, PartialEq)]
@@ -88,7 +88,7 @@ const MOST_PAIR_CELLS: usize = 3000;
 /// The report over ranked rows as HTML, with what is known beside them.
 pub fn to_html(rows: &[LeaderboardRow], beside: &Beside) -> String {
     let section = beside.section.as_str();
-    let mut groups: BTreeMap<(String, String, String), Vec<&LeaderboardRow>> = BTreeMap::new();
+    let mut groups: BTreeMap<Group, Vec<&LeaderboardRow>> = BTreeMap::new();
     for row in rows {
         groups.entry(group(row)).or_default().push(row);
     }
@@ -255,15 +255,10 @@ fn turning(rows: usize) -> String {
     )
 }
 
-fn contents(
-    groups: &BTreeMap<(String, String, String), Vec<&LeaderboardRow>>,
-    thinking: &str,
-    section: &str,
-    html: &mut String,
-) {
+fn contents(groups: &BTreeMap<Group, Vec<&LeaderboardRow>>, thinking: &str, section: &str, html: &mut String) {
     html.push_str("<nav aria-label=\"Contents\"><ul class=\"contents\">");
     for rows in groups.values() {
-        let (task, protocol) = (escape(rows[0].task()), escape(&rows[0].protocol_text()));
+        let (task, protocol) = (escape(&title(rows[0])), escape(&rows[0].protocol_text()));
         let _ = write!(html, "<li><a href=\"#{}\">{task}</a> <small>{protocol}</small></li>", heading(rows[0]));
     }
     if !thinking.is_empty() {
@@ -303,7 +298,7 @@ fn task(rows: &[&LeaderboardRow], beside: &Beside, room: &mut Room, html: &mut S
         html,
         "<section>\n<h2 id=\"{}\">{}</h2>\n<p class=\"lead\">Protocol <code>{}</code></p>",
         heading(rows[0]),
-        escape(rows[0].task()),
+        escape(&title(rows[0])),
         escape(&rows[0].protocol_text())
     );
     let drawn = &rows[..rows.len().min(room.each).min(room.drawn)];
@@ -416,8 +411,13 @@ fn anchor(row: &LeaderboardRow) -> String {
     slug(&format!("{} {} {} {}", row.name(), row.protocol_text(), row.record().seeds, row.execution_text()))
 }
 
+/// What its rows have in common: `Lift`, `Lift from pictures`.
+fn title(row: &LeaderboardRow) -> String {
+    row.task().to_owned() + if row.sees_pictures() { " from pictures" } else { "" }
+}
+
 fn heading(row: &LeaderboardRow) -> String {
-    slug(&format!("task {} {}", row.task(), row.protocol_text()))
+    slug(&format!("task {} {}", title(row), row.protocol_text()))
 }
 
 fn slug(text: &str) -> String {

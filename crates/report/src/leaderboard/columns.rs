@@ -5,7 +5,7 @@ use crate::column::{Column, count, number, text};
 
 /// The statistics of the leaderboard, in their order.
 pub const COLUMNS: &[Column<LeaderboardRow>] = &[
-    text(LeaderboardRow::name).table("entry").page("entry").left().kept(),
+    text(LeaderboardRow::name_lines).table("entry").page("entry").left().kept(),
     text(LeaderboardRow::stem).csv("entry"),
     text(|row: &LeaderboardRow| row.joined(|one| one.record.entry.version.to_string())).csv("version"),
     text(|row: &LeaderboardRow| row.policy().to_owned()).csv("policy").page("policy"),
@@ -73,6 +73,9 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     number(|row: &LeaderboardRow| Some(row.progress?.value), 4, 4).csv("progress"),
     number(|row: &LeaderboardRow| Some(row.progress?.low), 4, 4).csv("progress_ci95_low"),
     number(|row: &LeaderboardRow| Some(row.progress?.high), 4, 4).csv("progress_ci95_high"),
+    text(|row: &LeaderboardRow| row.cameras.join(" ")).csv("cameras"),
+    number(|row: &LeaderboardRow| Some(row.seeing()?.rendering), 3, 3).csv("rendering_ms_median"),
+    number(|row: &LeaderboardRow| Some(row.seeing()?.encoding), 3, 3).csv("encoding_ms_median"),
 ];
 
 /// `1-3`: the ranks that it may have.

@@ -8,10 +8,10 @@ mod rank;
 mod row;
 
 pub use columns::{COLUMNS, count_text};
-pub(crate) use rank::group;
+pub(crate) use rank::{Asked, Group, asked, group};
 pub use rank::{Reading, rank};
 pub(crate) use row::interval_text;
-pub use row::{Bound, Counts, FEWEST_TO_RANK, LeaderboardRow};
+pub use row::{Bound, Counts, FEWEST_TO_RANK, LeaderboardRow, Seeing};
 
 #[cfg(test)]
 mod tests {
@@ -107,6 +107,59 @@ mod tests {
         assert!(rank(&[all[5].clone(), other]).iter().all(|row| row.rank == Some(1)));
     }
 
+    /// Who sees pictures is ranked apart from who is told the state, in the same task and protocol.
+    #[test]
+    fn pictures_have_ranks_of_their_own() {
+        let dir = tempfile::tempdir().unwrap();
+        let stored = |name: &str, successes: usize| {
+            let mut stored = finished(dir.path(), &sample(name, 1, 40));
+            stored.episodes.iter_mut().enumerate().for_each(|(k, e)| e.success = k < successes);
+            stored
+        };
+        let all = [stored("told", 40), stored("told-less", 38), stored("sees", 36), stored("sees-less", 20)];
+        let mut reading = Reading::default();
+        for name in ["sees", "sees-less"] {
+            let id = zoo::entry::EntryId { name: name.to_owned(), version: 1 };
+            reading.cameras.insert(id, vec!["agentview".into(), "robot0_eye_in_hand".into()]);
+        }
+        let rows = super::rank(&all, &reading);
+        let places: Vec<(String, Option<u64>)> =
+            rows.iter().map(|row| (row.record().entry.name.clone(), row.rank)).collect();
+        let expected = [("told", 1), ("told-less", 2), ("sees", 1), ("sees-less", 2)];
+        assert_eq!(places, expected.map(|(name, rank)| (name.to_owned(), Some(rank))));
+        // two that differ beyond doubt, and no letter of theirs is another group's
+        assert_eq!(rows[2].standing.as_ref().unwrap().ranks, (1, 1));
+        assert_eq!(rows[3].standing.as_ref().unwrap().ranks, (2, 2));
+        assert_eq!((rows[0].kind().as_str(), rows[2].kind().as_str()), ("act", "act from pictures"));
+        let table = csv::table(COLUMNS, &rows);
+        let ends: Vec<bool> =
+            table.lines().skip(1).map(|line| line.ends_with(",agentview robot0_eye_in_hand,,")).collect();
+        assert_eq!(ends, [false, false, true, true]);
+        assert_eq!(rows[2].details()[0].cameras, rows[2].cameras);
+        assert!(cells(COLUMNS, &rows).rows[2][0].ends_with("from pictures"));
+    }
+
+    /// Where pictures are seen a row says what drawing and encoding them takes, beside the query that holds the second.
+    #[test]
+    fn what_pictures_take_is_split() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut evaluation = finished(dir.path(), &sample("sees", 1, 20));
+        assert!(LeaderboardRow::new(&evaluation).seeing().is_none());
+        assert!(!LeaderboardRow::new(&evaluation).summary().contains("rendering"));
+        for timing in &mut evaluation.timings {
+            (timing.rendering_ms, timing.encoding_ms) = (vec![8.0, 9.0, 100.0], vec![3.0, 4.0, 50.0]);
+            timing.inference_ms = vec![5.0, 6.5, 60.0];
+        }
+        let row = LeaderboardRow::new(&evaluation);
+        assert_eq!(row.seeing(), Some(Seeing { rendering: 9.0, encoding: 4.0 }));
+        let shown = cells(COLUMNS, [&row]).rows[0].join("|");
+        assert!(shown.contains("|6.5 / 60.0\nencoding 4.0\nrendering +9.0|"), "{shown}");
+        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",9.000,4.000"));
+        assert!(
+            row.summary().contains("9.0 ms of rendering before it, 6.5 ms of its own: 4.0 of encoding, 2.5 of policy")
+        );
+    }
+
     #[test]
     fn progress_is_shown_where_every_episode_says_it() {
         let dir = tempfile::tempdir().unwrap();
@@ -157,7 +210,7 @@ mod tests {
         assert_eq!(row.groups_text(), "seen 12/15, unseen 4/5");
         assert_eq!(cells(COLUMNS, [&row]).rows[0][3], "16/20\nseen 12/15\nunseen 4/5");
         assert!(markdown::table(COLUMNS, [&row]).contains(" | 16/20<br>seen 12/15<br>unseen 4/5 | "));
-        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\",,,,"));
+        assert!(csv::table(COLUMNS, [&row]).trim_end().ends_with(",\"seen 12/15, unseen 4/5\",,,,,,,"));
         assert!(!row.summary().contains(" in "), "{}", row.summary());
         for (k, episode) in evaluation.episodes.iter_mut().enumerate().filter(|(_, episode)| !episode.success) {
             episode.failure = Some(if k < 5 { "late" } else { "wrong" }.to_owned());

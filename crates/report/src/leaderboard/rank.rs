@@ -3,20 +3,37 @@
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet};
 
-use zoo::entry::Families;
+use zoo::audit::KnownEntries;
+use zoo::entry::{EntryId, Families};
 use zoo::protocols::Protocols;
 use zoo::results::{EntryIdentity, StoredEvaluation};
 
 use super::row::LeaderboardRow;
 use crate::comparison::standings;
 
-/// How evaluations are read: which entries are trainings of one family, and which protocols have names.
+/// How evaluations are read: which entries are trainings of one family, what they see, and which protocols have names.
 #[derive(Debug, Clone, Default)]
 pub struct Reading {
     /// The families of the zoo's entries.
     pub families: Families,
+    /// The cameras of those that see pictures.
+    pub cameras: BTreeMap<EntryId, Vec<String>>,
     /// Named protocols.
     pub protocols: Protocols,
+}
+
+impl Reading {
+    /// As `entries` and `protocols` say.
+    pub fn of(entries: &KnownEntries, protocols: Protocols) -> Self {
+        let cameras = entries.good().map(|entry| (entry.id(), entry.meta().camera_names()));
+        let cameras = cameras.filter(|(_, names)| !names.is_empty()).collect();
+        Self { families: entries.families(), cameras, protocols }
+    }
+
+    fn cameras_of(&self, entry: &EntryIdentity) -> Vec<String> {
+        let id = EntryId { name: entry.name.clone(), version: entry.version };
+        self.cameras.get(&id).cloned().unwrap_or_default()
+    }
 }
 
 /// The rows of all whole evaluations (shards wait until they are merged), best first in each task and protocol.
@@ -48,9 +65,20 @@ pub fn rank(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<Leaderbo
     rows
 }
 
-/// Rows that are ranked against each other agree in this: task, the named block of seeds, and rules with the simulator that
-/// plays by them.
-pub(crate) fn group(row: &LeaderboardRow) -> (String, String, String) {
+/// Rows that are ranked against each other agree in this: what they were asked, and whether they see pictures. Who is told
+/// where everything stands has no part in the place of who must see it.
+pub(crate) type Group = (Asked, bool);
+
+/// Task, the named block of seeds, and rules with the simulator that plays by them.
+pub(crate) type Asked = (String, String, String);
+
+/// What a row is ranked in.
+pub(crate) fn group(row: &LeaderboardRow) -> Group {
+    (asked(row), row.sees_pictures())
+}
+
+/// What a row was asked.
+pub(crate) fn asked(row: &LeaderboardRow) -> Asked {
     let block = row.named.as_ref().map_or(String::new(), |(name, block)| format!("{name} {block}"));
     let simulator: Vec<String> = simulator(row).map(|(name, version)| format!("{name} {version}")).collect();
     (row.task().to_owned(), block, format!("{} {}", row.record().protocol.id(), simulator.join(" ")))
@@ -111,6 +139,7 @@ fn joined(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<Leaderboar
         let mut row = LeaderboardRow::of(trainings);
         row.family = reading.families.key(&row.record().entry).map(str::to_owned);
         row.named = reading.protocols.block_of(row.record());
+        row.cameras = reading.cameras_of(&row.record().entry);
         row
     };
     alike.into_values().map(row).collect()

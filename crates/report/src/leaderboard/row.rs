@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use zoo::protocols::Block;
-use zoo::results::{EvaluationRecord, Execution, StoredEvaluation};
+use zoo::results::{EpisodeTiming, EvaluationRecord, Execution, StoredEvaluation};
 
 use crate::comparison::Standing;
 use crate::statistics::{Estimate, hierarchical, mean, mean_interval, percent, quantile, wilson_interval};
@@ -58,6 +58,8 @@ pub struct LeaderboardRow {
     pub interval: (f64, f64),
     /// The family, where the entry was trained here.
     pub family: Option<String>,
+    /// The cameras that it sees through, by their names; none where it sees no pictures.
+    pub cameras: Vec<String>,
     /// The named protocol and the block of its seeds that were run, if they are one.
     pub named: Option<(String, Block)>,
     /// What of the simulator is of another version than in other rows under the same rules: `mujoco 3.2.7`; empty where
@@ -75,6 +77,30 @@ pub struct LeaderboardRow {
     pub progress: Option<Estimate>,
     /// Median and 95% quantile of a query's duration in milliseconds.
     latency: (f64, f64),
+    /// Median durations of what pictures take, in milliseconds; none where the policy sees none.
+    seeing: Option<Seeing>,
+}
+
+/// What pictures take of a query, in milliseconds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Seeing {
+    /// Drawing them, in the simulator and before the query.
+    pub rendering: f64,
+    /// Until they are tokens, within the query.
+    pub encoding: f64,
+}
+
+impl Seeing {
+    /// The medians of all queries of `trainings`, where any of them saw pictures.
+    fn of(trainings: &[StoredEvaluation]) -> Option<Self> {
+        let median = |times: fn(&EpisodeTiming) -> &[f64]| {
+            let timings = trainings.iter().flat_map(|one| &one.timings);
+            let mut all: Vec<f64> = timings.flat_map(|timing| times(timing).iter().copied()).collect();
+            all.sort_by(f64::total_cmp);
+            quantile(&all, 0.5)
+        };
+        Some(Self { rendering: median(|t| &t.rendering_ms)?, encoding: median(|t| &t.encoding_ms)? })
+    }
 }
 
 /// Episodes in which the task was done, of those that were run.
@@ -162,9 +188,25 @@ impl LeaderboardRow {
         let mut queries: Vec<f64> = timings.flat_map(|t| t.inference_ms.iter().copied()).collect();
         queries.sort_by(f64::total_cmp);
         let latency = (quantile(&queries, 0.5).unwrap_or(0.0), quantile(&queries, 0.95).unwrap_or(0.0));
+        let seeing = Seeing::of(&trainings);
         let (simulator, apart) = (String::new(), String::new());
         let (family, named, rank, standing) = (None, None, None, None);
-        Self { trainings, counts, groups, interval, family, named, simulator, apart, rank, standing, progress, latency }
+        Self {
+            trainings,
+            counts,
+            groups,
+            interval,
+            family,
+            cameras: Vec::new(),
+            named,
+            simulator,
+            apart,
+            rank,
+            standing,
+            progress,
+            latency,
+            seeing,
+        }
     }
 
     /// What each training was measured, by the training's seed.
@@ -176,6 +218,7 @@ impl LeaderboardRow {
     pub fn details(&self) -> Vec<Self> {
         let one = |evaluation| Self {
             family: self.family.clone(),
+            cameras: self.cameras.clone(),
             named: self.named.clone(),
             simulator: self.simulator.clone(),
             apart: self.apart.clone(),
@@ -202,6 +245,21 @@ impl LeaderboardRow {
     /// The kind of policy.
     pub fn policy(&self) -> &str {
         &self.record().training.policy
+    }
+
+    /// Whether it sees pictures.
+    pub fn sees_pictures(&self) -> bool {
+        !self.cameras.is_empty()
+    }
+
+    /// The kind of policy, and whether it sees pictures: `act`, `act from pictures`.
+    pub fn kind(&self) -> String {
+        self.policy().to_owned() + if self.sees_pictures() { " from pictures" } else { "" }
+    }
+
+    /// Its name, with what it sees in a second line where that is pictures.
+    pub(super) fn name_lines(&self) -> String {
+        self.name() + if self.sees_pictures() { "\nfrom pictures" } else { "" }
     }
 
     /// Which bound of its task it is, if it is one.
@@ -266,17 +324,26 @@ impl LeaderboardRow {
         self.latency
     }
 
+    /// What pictures take of it; none where the policy sees none.
+    pub fn seeing(&self) -> Option<Seeing> {
+        self.seeing
+    }
+
     /// Minutes of training: the median of several.
     pub fn minutes(&self) -> f64 {
         self.median_of(|one| one.record.training.minutes)
     }
 
-    /// `0.6 / 1.2`: median and 95% quantile of a query in milliseconds; nothing where none was asked.
+    /// `0.6 / 1.2`: median and 95% quantile of a query in milliseconds; nothing where none was asked. Where pictures are seen,
+    /// what they take stands in further lines.
     pub(super) fn inference_text(&self, digits: usize) -> String {
-        match self.trainings.iter().flat_map(|one| &one.timings).any(|timing| !timing.inference_ms.is_empty()) {
-            true => format!("{:.digits$} / {:.digits$}", self.latency.0, self.latency.1),
-            false => "-".to_owned(),
+        if self.trainings.iter().flat_map(|one| &one.timings).all(|timing| timing.inference_ms.is_empty()) {
+            return "-".to_owned();
         }
+        let whole = format!("{:.digits$} / {:.digits$}", self.latency.0, self.latency.1);
+        self.seeing.map_or(whole.clone(), |Seeing { rendering, encoding }| {
+            format!("{whole}\nencoding {encoding:.digits$}\nrendering +{rendering:.digits$}")
+        })
     }
 
     /// `93.4 [90-96]`: how far episodes come on their way, in percent; nothing where that is not known.
@@ -418,6 +485,13 @@ impl LeaderboardRow {
         }
         if let Some(progress) = self.progress.filter(|progress| progress.value < 1.0) {
             text.push_str(&format!(", {:.1}% of the way on average", progress.value * 1e2));
+        }
+        if let Some(Seeing { rendering, encoding }) = self.seeing {
+            let (query, policy) = (self.latency.0, (self.latency.0 - encoding).max(0.0));
+            text.push_str(&format!(
+                "\n  a query: {rendering:.1} ms of rendering before it, {query:.1} ms of its own: {encoding:.1} of encoding, \
+                 {policy:.1} of policy (medians)"
+            ));
         }
         if self.record().time_decides {
             text.push_str("\n  it thinks by the clock: these episodes may end otherwise next time");

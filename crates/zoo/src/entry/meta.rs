@@ -191,18 +191,23 @@ pub struct FileMeta {
 }
 
 impl EntryMeta {
+    /// The cameras that it sees through, by their names; none if it sees no pictures.
+    pub fn camera_names(&self) -> Vec<String> {
+        let name = |feature: &str| {
+            let key = self.keys.of(feature).concat();
+            key.strip_suffix(PICTURE_SUFFIX).unwrap_or(&key).to_owned()
+        };
+        self.signature.of_kind(FeatureKind::Image).map(|spec| name(&spec.name)).collect()
+    }
+
     /// The cameras that it sees through; `None` if it sees no pictures.
     ///
     /// # Errors
     /// Pictures that no worker draws: of several sizes, or not square.
     pub fn cameras(&self) -> Result<Option<CamerasMeta>, ZooError> {
-        let mut names = Vec::new();
-        let mut sizes = Vec::new();
-        for spec in self.signature.of_kind(FeatureKind::Image) {
-            let key = self.keys.of(&spec.name).concat();
-            names.push(key.strip_suffix(PICTURE_SUFFIX).unwrap_or(&key).to_owned());
-            sizes.extend(spec.shape.iter().take(2).copied());
-        }
+        let names = self.camera_names();
+        let sizes: Vec<usize> =
+            self.signature.of_kind(FeatureKind::Image).flat_map(|spec| spec.shape.iter().take(2).copied()).collect();
         let Some(&size) = sizes.first() else { return Ok(None) };
         if sizes.iter().any(|other| *other != size) {
             return Err(ZooError::UnfitEntry {

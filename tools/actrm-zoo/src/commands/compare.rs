@@ -72,7 +72,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     for left in &audit.left_out {
         cli::note(&format!("note: left out: {}: {}", shown(&left.folder), left.reason));
     }
-    let reading = Reading { families: entries.families(), protocols: args.protocols.protocols()? };
+    let reading = Reading::of(&entries, args.protocols.protocols()?);
     let rows = |ids: &[EntryId]| {
         let of = |one: &&StoredEvaluation| {
             ids.iter().any(|id| id.name == one.record.entry.name && id.version == one.record.entry.version)

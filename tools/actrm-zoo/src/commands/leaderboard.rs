@@ -83,7 +83,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         cli::note(&format!("no evaluations in {}; make one with: actrm-zoo eval --all", shown(&results)));
         return Ok(ExitCode::SUCCESS);
     }
-    let reading = Reading { families: entries.families(), protocols: args.protocols.protocols()? };
+    let reading = Reading::of(&entries, args.protocols.protocols()?);
     let rows = rank(&evaluations, &reading);
     let across = across_tasks(&rows);
 
