@@ -507,6 +507,22 @@ mod tests {
         stage = 2
     "#;
 
+    /// A study that runs nothing: there is no Python.
+    fn request(study: Study, folder: &Path) -> RobotStudyRequest {
+        RobotStudyRequest {
+            study,
+            library: Library::built_in(),
+            work: folder.join("work"),
+            only: Vec::new(),
+            cells: Vec::new(),
+            stage: None,
+            data_only: false,
+            jobs: 1,
+            python: Python { path: "nowhere".into(), origin: "a test".to_owned() },
+            stop: Arc::new(|| false),
+        }
+    }
+
     /// A cell with a result whose entry is gone is left before anything is collected or trained for it.
     #[test]
     fn further_tests_are_not_of_another_training() {
@@ -536,18 +552,7 @@ mod tests {
         };
         std::fs::create_dir_all(&study.results).unwrap();
         of(None, 100).write(&study.results.join(cell.file_name("t"))).unwrap();
-        let request = RobotStudyRequest {
-            study: study.clone(),
-            library,
-            work: folder.path().join("work"),
-            only: Vec::new(),
-            cells: Vec::new(),
-            stage: None,
-            data_only: false,
-            jobs: 1,
-            python: Python { path: "nowhere".into(), origin: "a test".to_owned() },
-            stop: Arc::new(|| false),
-        };
+        let request = request(study.clone(), folder.path());
         let error = run_robot_study(&request, &mut |_| {}).unwrap_err();
         assert!(
             matches!(&error, StudyError::OtherTrainings { cells, .. } if *cells == ["act-on-lift-seed1"]),
@@ -580,18 +585,8 @@ mod tests {
         let file = folder.path().join("study.toml");
         std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
         let zoo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
-        let request = RobotStudyRequest {
-            study: Study { zoo: Some(zoo.clone()), ..Study::open(&file).unwrap() },
-            library: Library::built_in(),
-            work: folder.path().join("work"),
-            only: Vec::new(),
-            cells: Vec::new(),
-            stage: None,
-            data_only: false,
-            jobs: 1,
-            python: Python { path: "nowhere".into(), origin: "a test".to_owned() },
-            stop: Arc::new(|| false),
-        };
+        let study = Study { zoo: Some(zoo.clone()), ..Study::open(&file).unwrap() };
+        let request = request(study, folder.path());
         let entry = Registry::open(&zoo).entry("lift-act-s1").unwrap();
         let settings = settings_hash(&Experiment::from_toml("lift-act-s1", &entry.config_text().unwrap()).unwrap());
         let found = |settings: &str, data: &Data| {
