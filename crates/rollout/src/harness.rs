@@ -130,7 +130,8 @@ pub fn find_python(named: Option<&Path>) -> Result<Python, RolloutError> {
         }
     }
     let here = std::env::current_dir().ok();
-    let binary = std::env::current_exe().ok().and_then(|exe| exe.canonicalize().ok());
+    // one that was built anew while it runs has no path any more; its folder is the same
+    let binary = std::env::current_exe().ok().map(|exe| exe.canonicalize().unwrap_or(exe));
     let mut searched = Vec::new();
     for (start, what) in [(here, "current folder"), (binary, "this program")] {
         let Some(start) = start else { continue };

@@ -150,8 +150,14 @@ fn control_library() -> Option<PathBuf> {
     if let Some(path) = CONTROL_LIBRARY.get() {
         return Some(path.clone());
     }
+    library_of(&std::env::current_exe().ok()?)
+}
+
+/// The library beside `program`, or in the `lib` folder beside its folder.
+fn library_of(program: &Path) -> Option<PathBuf> {
     let name = format!("{}control{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
-    let program = std::env::current_exe().ok()?.canonicalize().ok()?;
+    // one that was built anew while it runs has no path any more; its folder is the same
+    let program = program.canonicalize().unwrap_or_else(|_| program.to_owned());
     let folder = program.parent()?;
     let places = [folder.join(&name), folder.join("..").join(&name), folder.join("../lib").join(&name)];
     places.into_iter().find(|path| path.is_file())
@@ -197,5 +203,22 @@ mod tests {
         let set = command.get_envs().find(|(name, _)| *name == BLAS_KERNELS).and_then(|(_, value)| value);
         let chosen = std::env::var_os(BLAS_KERNELS).is_some();
         assert_eq!(set, (!chosen && has_haswells_kernels()).then(|| "Haswell".as_ref()));
+    }
+
+    /// A program that was built anew while it runs is found under a path that is none, `… (deleted)` on Linux; a study that
+    /// begins another worker then must not go on with another control loop.
+    #[test]
+    fn the_library_is_found_beside_a_program_that_was_replaced() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let library =
+            folder.path().join(format!("{}control{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX));
+        std::fs::write(&library, "").expect("a file");
+        assert_eq!(library_of(&folder.path().join("actrm-zoo (deleted)")), Some(library.clone()));
+        std::fs::create_dir_all(folder.path().join("deps/bin")).expect("a folder");
+        assert_eq!(
+            library_of(&folder.path().join("deps/test")).map(|path| path.canonicalize().expect("it is there")),
+            Some(library.canonicalize().expect("it is there"))
+        );
+        assert_eq!(library_of(&folder.path().join("deps/bin/test")), None);
     }
 }
