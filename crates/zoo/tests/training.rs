@@ -10,7 +10,7 @@ use std::path::Path;
 
 use common::{SMALL, demonstrations};
 use dataset::{RobomimicWriter, Source, WriteOptions};
-use models::{Observation, Policy};
+use models::{FeatureKind, FeatureSpec, Observation, Policy, Values};
 use zoo::ZooError;
 use zoo::config::Library;
 use zoo::entry::Entry;
@@ -244,9 +244,12 @@ fn shipped_entries_open_and_answer() {
         let loaded = registry.entry(&id.to_string()).unwrap().load().unwrap();
         let signature = &loaded.entry().meta().signature;
         assert_eq!(signature.action_dim, 7, "{id}");
-        let observation = signature.observation.iter();
+        let values = |spec: &FeatureSpec| match spec.kind {
+            FeatureKind::Image => Values::U8(vec![100; spec.width()]),
+            _ => Values::F32(vec![0.1; spec.width()]),
+        };
         let observation: Observation =
-            observation.map(|spec| (spec.name.clone(), vec![0.1; spec.width()].into())).collect();
+            signature.observation.iter().map(|spec| (spec.name.clone(), values(spec))).collect();
         assert!(observation.len() >= 2, "{id}");
         assert!(signature.observation.iter().all(|spec| !loaded.entry().meta().keys.of(&spec.name).is_empty()));
         let chunk = loaded.policy().predict(&observation).unwrap();
