@@ -197,7 +197,7 @@ fn chaos_among_the_workers_does_not_change_a_byte() {
     let expected = run(&mut calm, &dir.path().join("calm"), &wanted(40));
     drop(calm);
 
-    // every third start prints into its pipe after a while; never two of a worker's in a row, which would use up its attempts
+    // every third start prints into its pipe after a while: not the first ones, which have only three attempts each
     let garble = "echo >> \"$0.starts\"; N=$(wc -l < \"$0.starts\")\n\
         if [ $((N % 3)) -eq 0 ]; then ( sleep $((4 + N % 5)).$((N % 10)); echo 'Welcome to the simulator, have fun' ) & fi\n\
         exec \"$PY\" \"$@\"";
