@@ -102,6 +102,9 @@ pub(crate) fn track(name: &str, bytes: &Bytes) -> Result<Track> {
     let &[(trak, mdia)] = tracks.as_slice() else {
         return Err(unsupported(format!("a file with {} video tracks", tracks.len())));
     };
+    if child(name, "trak", trak, *b"tkhd")?.is_some_and(turns) {
+        return Err(unsupported("a video that is to be turned or mirrored (matrix of box tkhd)".to_owned()));
+    }
     let timescale = timescale(name, "mdhd", needed(name, "mdia", mdia, *b"mdhd")?)?;
     let movie = timescale_of_movie(name, &moov)?;
     let stbl = needed(name, "minf", needed(name, "mdia", mdia, *b"minf")?, *b"stbl")?;
@@ -112,6 +115,16 @@ pub(crate) fn track(name: &str, bytes: &Bytes) -> Result<Track> {
     shift(name, edits, movie, timescale, &mut places)?;
     let (codec, width, height, config) = entry;
     Ok(Track { codec, width, height, timescale, places, config: config.to_vec() })
+}
+
+/// Whether box `tkhd` asks players to turn, mirror or scale the pictures. LeRobot's readers do not agree on what that means.
+fn turns(tkhd: &[u8]) -> bool {
+    let before = if tkhd.first() == Some(&1) { 52 } else { 40 };
+    let Some(matrix) = tkhd.get(before..before + 36) else { return false };
+    let number = |i: usize| matrix[4 * i..4 * i + 4].iter().fold(0_u32, |n, &byte| n << 8 | u32::from(byte));
+    // a and d on the diagonal, b and c beside it; where the picture is put on a screen is nothing to us
+    let linear = [0, 1, 3, 4].map(number);
+    linear != [0x0001_0000, 0, 0, 0x0001_0000] && linear != [0; 4]
 }
 
 /// The content of box `moov`.

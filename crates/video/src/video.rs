@@ -199,24 +199,31 @@ pub struct Frames<'v> {
 
 impl<'v> Frames<'v> {
     fn new(video: &'v Video, range: Range<usize>) -> Self {
-        // decoding begins with the last key frame before the first frame wanted
+        // decoding begins with the last key frame that is decoded and shown before the first frame wanted: one that is shown
+        // after it (of an open group) follows pictures that the wanted one is made of
         let wanted = video.order.get(range.start).map_or(0, |&s| s as usize);
-        let key = video.track.places[..=wanted].iter().rposition(|p| p.key).unwrap_or(0);
+        let (places, due) = (&video.track.places, video.track.places[wanted].time);
+        let key = places[..=wanted].iter().rposition(|p| p.key && p.time <= due).unwrap_or(0);
         Self { video, range, decoder: None, sample: key, data: Vec::new(), waiting: BTreeMap::new() }
     }
 
     /// Writes the next picture into `out`, [`Info::picture_bytes`] long, and says which it is.
     pub fn next_into(&mut self, out: &mut [u8]) -> Option<Result<usize>> {
+        self.next_watched(out, &mut || {})
+    }
+
+    /// The same; `decoded` is called after every sample that had to be decoded for it, which may be hundreds.
+    pub fn next_watched(&mut self, out: &mut [u8], decoded: &mut dyn FnMut()) -> Option<Result<usize>> {
         if self.range.is_empty() {
             return None;
         }
         let index = self.range.start;
-        let result = self.advance(index, out);
+        let result = self.advance(index, out, decoded);
         self.range.start = if result.is_ok() { index + 1 } else { self.range.end };
         Some(result.map(|()| index))
     }
 
-    fn advance(&mut self, index: usize, out: &mut [u8]) -> Result<()> {
+    fn advance(&mut self, index: usize, out: &mut [u8], decoded: &mut dyn FnMut()) -> Result<()> {
         let video = self.video;
         let expected = video.info.picture_bytes();
         if out.len() != expected {
@@ -242,6 +249,7 @@ impl<'v> Frames<'v> {
             let decoder = self.decoder.as_mut().expect("it was made above");
             decoder.decode(&self.data, key, out).map_err(|e| failed(sample, e))?;
             self.sample += 1;
+            decoded();
             if sample == wanted {
                 break;
             }

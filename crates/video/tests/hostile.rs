@@ -67,6 +67,29 @@ fn what_is_no_video_is_told_apart() {
 }
 
 #[test]
+fn pictures_that_are_to_be_turned_are_refused() {
+    let original = std::fs::read(fixture("av1_agentview.mp4")).unwrap();
+    let tkhd = original.windows(4).position(|kind| kind == b"tkhd").unwrap() + 4;
+    assert_eq!(original[tkhd], 0);
+    let with = |a: u32, b: u32, c: u32, d: u32| {
+        let mut bytes = original.clone();
+        for (i, number) in [(0, a), (1, b), (3, c), (4, d)] {
+            bytes[tkhd + 40 + 4 * i..][..4].copy_from_slice(&number.to_be_bytes());
+        }
+        Video::from_bytes("f", bytes).map(|_| ())
+    };
+    let (one, minus) = (0x0001_0000, 0xffff_0000);
+    assert!(with(one, 0, 0, one).is_ok() && with(0, 0, 0, 0).is_ok());
+    for (a, b, c, d) in [(minus, 0, 0, minus), (0, one, minus, 0), (minus, 0, 0, one)] {
+        let told = with(a, b, c, d).unwrap_err().to_string();
+        assert!(
+            told.starts_with("f: a video that is to be turned or mirrored (matrix of box tkhd) is not read"),
+            "{told}"
+        );
+    }
+}
+
+#[test]
 fn a_file_cut_short_anywhere_says_so() {
     for name in ["av1_agentview.mp4", "h264_agentview.mp4"] {
         let bytes = std::fs::read(fixture(name)).unwrap();

@@ -64,6 +64,19 @@ fn any_frame_is_found_by_its_time_and_by_its_number() {
 }
 
 #[test]
+fn a_frame_before_the_key_frame_of_an_open_group_needs_the_group_before() {
+    let (name, expected) = ("h264_open_group", hashes("h264_open_group"));
+    let video = Video::open(&fixture("h264_open_group.mp4")).unwrap();
+    assert_eq!(expected.len(), video.info().frames);
+    let all: Vec<String> = video.frames().map(|frame| hash(&frame.unwrap().rgb)).collect();
+    assert_eq!(all, expected);
+    for (i, wanted) in expected.iter().enumerate() {
+        let one = video.range(i..i + 1).unwrap().next().unwrap().unwrap();
+        assert_eq!(&hash(&one.rgb), wanted, "{name}: frame {i} asked for alone");
+    }
+}
+
+#[test]
 fn samples_of_whole_stretches_make_another_file_of_the_same_pictures() {
     let video = Video::open(&fixture("av1_agentview.mp4")).unwrap();
     let keys: Vec<usize> = (0..36).filter(|&i| video.samples(i..i + 1).is_ok()).collect();

@@ -42,7 +42,7 @@ pub(super) const PLAN: u8 = b'P';
 const DEMO: u8 = b'D';
 pub(super) const ARRAY: u8 = b'A';
 pub(super) const ERROR: u8 = b'E';
-const BEAT: u8 = b'.';
+pub(super) const BEAT: u8 = b'.';
 
 /// The program that reads, once one is known.
 static READER: OnceLock<PathBuf> = OnceLock::new();

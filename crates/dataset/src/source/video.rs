@@ -2,12 +2,13 @@
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use video::{Frames, TOLERANCE, Video, VideoError};
 
 use super::isolation::{
-    self, ARRAY, Ask, ERROR, PLAN, Remote, VIDEO_VARIABLE, limit_cpu, limit_self, next_request, send,
+    self, ARRAY, Ask, BEAT, ERROR, PLAN, Remote, VIDEO_VARIABLE, limit_cpu, limit_self, next_request, send,
 };
 use crate::error::InputError;
 
@@ -16,6 +17,8 @@ const OPEN_SECONDS: u64 = 6;
 /// Pixels that are decoded in a second, at least; and how often a file may be read from its beginning to its end.
 const PIXELS_PER_CPU_SECOND: u64 = 500_000;
 const READINGS: u64 = 4;
+/// How often a reading process that decodes says that it does.
+const BEAT_EVERY: Duration = Duration::from_secs(1);
 /// Bytes of pictures in an answer.
 const ANSWER: usize = 16 << 20;
 
@@ -194,9 +197,18 @@ pub(super) fn serve(path: &Path) -> std::io::Result<()> {
                 wanted: format!("frames {first} to {}", first + count),
                 found: format!("{} frames", video.info().frames),
             };
-            filled = body
-                .chunks_exact_mut(size)
-                .try_for_each(|picture| frames.next_into(picture).unwrap_or_else(|| Err(missing())).map(|_| ()));
+            // a sound file may have its last key frame minutes before what is wanted
+            let mut told = Instant::now();
+            let mut beat = || {
+                if told.elapsed() >= BEAT_EVERY {
+                    told = Instant::now();
+                    // a parent that has gone is noticed when the answer is sent
+                    let _ = send(&mut out, BEAT, &[]);
+                }
+            };
+            filled = body.chunks_exact_mut(size).try_for_each(|picture| {
+                frames.next_watched(picture, &mut beat).unwrap_or_else(|| Err(missing())).map(|_| ())
+            });
         }
         match frames.and_then(|frames| filled.map(|()| frames)) {
             Ok(frames) => {
