@@ -2,13 +2,19 @@
 
 #![allow(clippy::unwrap_used)]
 
+use arrow::array::{ArrayRef, AsArray, Float64Array, RecordBatch};
+use arrow::datatypes::Float64Type;
 use dataset::edit::{Destination, EditReport, Parts, Renames, Selection, keep, merge, rename, split, without};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, ImageForm, RobomimicWriter, Source, VideoOptions, WriteOptions, convert,
     export, verify,
 };
+use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 const CAMERA: &str = "observation.images.agentview";
 
@@ -419,6 +425,59 @@ fn h264_is_carried_over_in_whole_files_and_never_cut() {
     let told = keep(&set, &Destination::New(part.clone()), &numbers(&[0]), &mut quiet).unwrap_err().to_string();
     assert!(told.contains("file-000.mp4: frames 0 to ") && told.contains("expected av1, found h264"), "{told}");
     assert!(!part.exists());
+}
+
+/// Writes `meta/episodes` anew with the columns that `stays` says of, each as `changed` makes it.
+fn rewrite_episodes(set: &Path, stays: impl Fn(&str) -> bool, changed: impl Fn(&str, &ArrayRef) -> ArrayRef) {
+    let path = set.join("meta/episodes/chunk-000/file-000.parquet");
+    let mut reader = ParquetRecordBatchReaderBuilder::try_new(File::open(&path).unwrap()).unwrap().build().unwrap();
+    let batch = reader.next().unwrap().unwrap();
+    let schema = batch.schema();
+    let columns = schema.fields().iter().zip(batch.columns()).filter(|(field, _)| stays(field.name()));
+    let columns: Vec<(&str, ArrayRef)> =
+        columns.map(|(field, column)| (field.name().as_str(), changed(field.name(), column))).collect();
+    let batch = RecordBatch::try_from_iter(columns).unwrap();
+    let mut writer = ArrowWriter::try_new(File::create(&path).unwrap(), batch.schema(), None).unwrap();
+    writer.write(&batch).unwrap();
+    writer.close().unwrap();
+}
+
+#[test]
+fn videos_whose_pictures_nobody_counted_keep_their_places() {
+    let dir = tempfile::tempdir().unwrap();
+    let (set, out) = (dir.path().join("set"), dir.path().join("out"));
+    keep(&lerobot(), &Destination::New(set.clone()), &numbers(&[0, 1, 2]), &mut quiet).unwrap();
+    let wanted = Dataset::open(&set).unwrap().pictures(CAMERA).unwrap();
+    rewrite_episodes(&set, |name| !name.starts_with("stats/observation.images."), |_, column| Arc::clone(column));
+    without(&set, &Destination::InPlace, &numbers(&[2]), &mut quiet).unwrap();
+    let part = Dataset::open(&set).unwrap();
+    assert!(wanted.data.starts_with(&part.pictures(CAMERA).unwrap().data));
+    // beside one that is counted
+    merge(&[lerobot(), set.clone()], &out, &mut quiet).unwrap();
+    let both = Dataset::open(&out).unwrap();
+    assert_eq!(both.pictures(CAMERA).unwrap().data, [&wanted.data[..], &part.pictures(CAMERA).unwrap().data].concat());
+}
+
+#[test]
+fn videos_that_are_not_their_sets_are_not_carried_over() {
+    let dir = tempfile::tempdir().unwrap();
+    let (set, out) = (dir.path().join("set"), dir.path().join("out"));
+    keep(&lerobot(), &Destination::New(set.clone()), &numbers(&[0, 1, 2]), &mut quiet).unwrap();
+    let later = |name: &str, column: &ArrayRef| match name == format!("videos/{CAMERA}/from_timestamp") {
+        true => Arc::new(Float64Array::from_iter_values(
+            column.as_primitive::<Float64Type>().values().iter().map(|seconds| seconds + 0.6),
+        )),
+        false => Arc::clone(column),
+    };
+    rewrite_episodes(&set, |_| true, later);
+    for some in [&[0, 1, 2][..], &[1, 2]] {
+        let told = keep(&set, &Destination::New(out.clone()), &numbers(some), &mut quiet).unwrap_err().to_string();
+        assert!(
+            told.contains("file-000.mp4: frame") && told.contains("of episode 2: expected a frame within"),
+            "{told}"
+        );
+        assert!(!out.exists());
+    }
 }
 
 #[test]

@@ -193,6 +193,8 @@ fn videos_are_written_read_and_checked_and_the_source_comes_back() {
         assert!(beyond.contains(&dir.path().display().to_string()) && beyond.contains("decoded pictures"), "{beyond}");
         let second = set.episode_pictures(CAMERA, 1).unwrap();
         assert_eq!(second.data, all.data[7 * one.len()..19 * one.len()]);
+        let some = set.pictures_of(CAMERA, 1, &mut |frame| [3, 11].contains(&frame)).unwrap();
+        assert_eq!(some.data, [second.frame(3), second.frame(11)].concat());
         let spec = WindowSpec {
             observation: vec![STATE.to_owned()],
             n_obs_steps: 2,

@@ -98,6 +98,10 @@ pub struct Feature {
     pub info: Option<Value>,
 }
 
+/// Largest side of a picture, and most pixels: as of videos.
+pub(crate) const MAX_SIDE: usize = 8192;
+pub(crate) const MAX_PIXELS: usize = 1 << 24;
+
 impl Feature {
     /// Number of values in one frame.
     pub fn dim(&self) -> usize {
@@ -107,6 +111,19 @@ impl Feature {
     /// Whether the column holds pictures.
     pub fn is_visual(&self) -> bool {
         self.dtype == "image" || self.dtype == "video"
+    }
+
+    /// Height and width of colour pictures: shape `[height, width, 3]`, or `[3, height, width]` where the first name says that
+    /// channels come first. None of anything else, and of what no picture is as large as.
+    pub fn picture_size(&self) -> Option<(usize, usize)> {
+        let channels_first = self.names.get(0).and_then(Value::as_str).is_some_and(|name| name.starts_with("channel"));
+        let (height, width) = match self.shape.as_slice() {
+            &[3, height, width] if channels_first => (height, width),
+            &[height, width, 3] if !channels_first => (height, width),
+            _ => return None,
+        };
+        let sides = 1..=MAX_SIDE;
+        (sides.contains(&height) && sides.contains(&width) && height * width <= MAX_PIXELS).then_some((height, width))
     }
 
     /// Whether the pictures are depth: one number a pixel, no colours.
@@ -281,6 +298,32 @@ pub enum RotationForm {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn channels_come_first_where_the_names_say_so() {
+        let feature = |shape: &[usize], names: Value| Feature {
+            dtype: "video".to_owned(),
+            shape: shape.to_vec(),
+            names,
+            info: None,
+        };
+        let (last, first) = (json!(["height", "width", "channels"]), json!(["channels", "height", "width"]));
+        assert_eq!(feature(&[96, 128, 3], last.clone()).picture_size(), Some((96, 128)));
+        assert_eq!(feature(&[96, 128, 3], Value::Null).picture_size(), Some((96, 128)));
+        assert_eq!(feature(&[3, 96, 128], first.clone()).picture_size(), Some((96, 128)));
+        for (shape, names) in [
+            (&[3, 96, 128][..], &last),
+            (&[96, 128, 3], &first),
+            (&[96, 128, 4], &last),
+            (&[0, 128, 3], &last),
+            (&[8193, 1, 3], &last),
+            (&[8192, 8192, 3], &last),
+            (&[1 << 40, 1 << 40, 3], &last),
+        ] {
+            assert_eq!(feature(shape, names.clone()).picture_size(), None, "{shape:?} {names}");
+        }
+    }
 
     #[test]
     fn features_keep_their_order_and_whole_rates_are_integers() {

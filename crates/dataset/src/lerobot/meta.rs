@@ -84,8 +84,14 @@ pub(crate) fn write_episodes(
     let mut groups = Vec::new();
     let mut schema = None;
     let mut start = 0;
+    // a camera has its places whether or not somebody counted its pictures
+    let filmed = rows.first().into_iter().flat_map(|row| row.videos.keys());
+    let filmed: Vec<&String> = filmed.filter(|&name| rows.iter().all(|row| row.videos.contains_key(name))).collect();
+    // an episode without frames has no statistics
+    let counted = features.iter().filter(|(name, _)| rows.iter().all(|row| row.stats.contains_key(name)));
+    let counted: Vec<&(String, bool)> = counted.collect();
     for part in rows.chunks(EPISODES_PER_GROUP) {
-        let columns = episode_columns(start, tasks, features, part);
+        let columns = episode_columns(start, tasks, &filmed, &counted, part);
         start += part.len();
         if schema.is_none() {
             let fields: Vec<Field> =
@@ -101,7 +107,8 @@ pub(crate) fn write_episodes(
 fn episode_columns(
     start: usize,
     tasks: &[String],
-    features: &[(String, bool)],
+    filmed: &[&String],
+    counted: &[&(String, bool)],
     rows: &[EpisodeRow],
 ) -> Vec<(String, ArrayRef)> {
     let ints = |f: &dyn Fn(usize, &EpisodeRow) -> usize| -> ArrayRef {
@@ -122,7 +129,7 @@ fn episode_columns(
         ("dataset_from_index".to_owned(), ints(&|_, row| row.from)),
         ("dataset_to_index".to_owned(), ints(&|_, row| row.from + row.length)),
     ];
-    for (name, _) in features.iter().filter(|(name, _)| rows.iter().all(|r| r.videos.contains_key(name))) {
+    for &name in filmed {
         let seconds = |f: &dyn Fn(&Stretch) -> f64| -> ArrayRef {
             Arc::new(Float64Array::from_iter_values(rows.iter().map(|row| f(&row.videos[name]))))
         };
@@ -133,7 +140,7 @@ fn episode_columns(
             (format!("videos/{name}/to_timestamp"), seconds(&|s| s.to)),
         ]);
     }
-    for (feature, is_image) in features {
+    for (feature, is_image) in counted {
         // sets written before quantiles were stored have none
         for (name, get) in
             STATISTICS.into_iter().filter(|(_, get)| !rows.iter().any(|r| get(&r.stats[feature]).is_empty()))

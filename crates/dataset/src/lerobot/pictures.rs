@@ -2,7 +2,7 @@
 
 use super::export::Rows;
 use super::images;
-use super::info::{Feature, Info};
+use super::info::{Feature, Info, MAX_PIXELS, MAX_SIDE};
 use super::open::{Dataset, EpisodeMeta};
 use super::read;
 use crate::error::{DatasetError, Result};
@@ -48,6 +48,8 @@ impl Pictures {
 
 /// Bytes of decoded pictures that are on their way to a file at once.
 const BLOCK: usize = 64 << 20;
+/// Bytes of decoded pictures that are looked at one by one.
+const PIECE: usize = 16 << 20;
 
 /// All pictures of one camera in a file of their own: decoded once, read one by one, for those that memory cannot hold.
 /// The file has no name any more and goes when nobody uses it.
@@ -151,7 +153,7 @@ impl Dataset {
     }
 
     /// Decodes all pictures of a camera into memory, with as many threads as there are cores. The bytes are those that
-    /// LeRobot reads.
+    /// LeRobot reads; of JPEG pictures, whose decoders may round otherwise, close to them.
     pub fn pictures(&self, name: &str) -> Result<Pictures> {
         let (_, height, width) = self.camera(name)?;
         let mut data = Vec::with_capacity(self.frames() * height * width * 3);
@@ -167,10 +169,24 @@ impl Dataset {
     /// # Panics
     /// When there is no such episode.
     pub fn episode_pictures(&self, name: &str, episode: usize) -> Result<Pictures> {
+        self.pictures_of(name, episode, &mut |_| true)
+    }
+
+    /// The pictures of some frames of an episode, in their order: those that `wanted` says of, numbered from 0. However long
+    /// the episode is, some megabytes of the others are in memory.
+    ///
+    /// # Panics
+    /// When there is no such episode.
+    pub fn pictures_of(&self, name: &str, episode: usize, wanted: &mut dyn FnMut(usize) -> bool) -> Result<Pictures> {
         let (_, height, width) = self.camera(name)?;
-        let mut data = Vec::new();
-        self.decode(name, episode..episode + 1, usize::MAX, &mut |block| {
-            data.extend_from_slice(block);
+        let (mut data, mut frame) = (Vec::new(), 0);
+        self.decode(name, episode..episode + 1, BLOCK, &mut |block| {
+            for picture in block.chunks_exact(height * width * 3) {
+                if wanted(frame) {
+                    data.extend_from_slice(picture);
+                }
+                frame += 1;
+            }
             Ok(())
         })?;
         Ok(Pictures { height, width, data })
@@ -198,8 +214,8 @@ impl Dataset {
         Ok(PictureFile { height, width, file: Arc::new(file), folder: folder.to_path_buf() })
     }
 
-    /// Decodes the pictures of some episodes, in order, in blocks of whole pictures: of one episode at least, of no more
-    /// than `limit` bytes otherwise.
+    /// Decodes the pictures of some episodes, in order, in blocks of whole pictures: one at least, no more than `limit` bytes
+    /// otherwise.
     fn decode(
         &self,
         name: &str,
@@ -211,16 +227,25 @@ impl Dataset {
         if feature.dtype != "video" {
             return self.unpack(name, (height, width), episodes, sink);
         }
+        let places = places(self, name)?;
         let (mut from, size) = (episodes.start, height * width * 3);
+        let most = (limit / size).max(1);
         while from < episodes.end {
-            let (mut to, mut bytes) = (from, 0);
-            while to < episodes.end && (to == from || bytes + self.episodes()[to].length * size <= limit) {
-                bytes += self.episodes()[to].length * size;
+            let (mut to, mut frames) = (from, 0);
+            while to < episodes.end && frames + self.episodes()[to].length <= most {
+                frames += self.episodes()[to].length;
                 to += 1;
             }
-            let mut block = vec![0; bytes];
-            self.film(name, (height, width), from..to, &mut block)?;
-            sink(&block)?;
+            if to > from {
+                let mut block = vec![0; frames * size];
+                self.film((height, width), &places, from..to, &mut block)?;
+                sink(&block)?;
+            } else {
+                // longer than a block by itself
+                let mut film = Film::new(self.info().fps, (height, width));
+                film.blocks(&self.episodes()[from], &places[from], most, sink)?;
+                to = from + 1;
+            }
             from = to;
         }
         Ok(())
@@ -259,24 +284,32 @@ impl Dataset {
                 (names, true) => format!("depth of that name, which has no colours, and {names}"),
             },
         })?;
-        match feature.shape.as_slice() {
-            &[height, width, 3] if height > 0 && width > 0 => Ok((feature, height, width)),
-            shape => Err(DatasetError::BadDataset {
+        match feature.picture_size() {
+            Some((height, width)) => Ok((feature, height, width)),
+            None => Err(DatasetError::BadDataset {
                 path: self.root().join("meta/info.json"),
                 object: name.to_owned(),
-                expected: "pictures of shape [height, width, 3]".to_owned(),
-                found: format!("{shape:?}"),
+                expected: format!(
+                    "pictures of shape [height, width, 3], or [3, height, width] where its names say so, up to {MAX_SIDE} on a side \
+                     and {MAX_PIXELS} pixels"
+                ),
+                found: format!("shape {:?}, names {}", feature.shape, feature.names),
             }),
         }
     }
 
     /// Videos: episodes lie one after the other in files, so each thread takes a run of episodes.
-    fn film(&self, name: &str, (height, width): (usize, usize), episodes: Range<usize>, data: &mut [u8]) -> Result<()> {
+    fn film(
+        &self,
+        (height, width): (usize, usize),
+        places: &[VideoPlace],
+        episodes: Range<usize>,
+        data: &mut [u8],
+    ) -> Result<()> {
         let size = height * width * 3;
-        let places = places(self, name)?;
         let mut tasks = Vec::with_capacity(episodes.len());
         let mut rest = data;
-        for (episode, place) in self.episodes().iter().zip(&places).take(episodes.end).skip(episodes.start) {
+        for (episode, place) in self.episodes().iter().zip(places).take(episodes.end).skip(episodes.start) {
             let (mine, after) = rest.split_at_mut(episode.length * size);
             tasks.push((episode, place, mine));
             rest = after;
@@ -284,7 +317,7 @@ impl Dataset {
         let run = tasks.len().div_ceil(rayon::current_num_threads()).max(1);
         tasks.par_chunks_mut(run).try_for_each(|run| {
             let mut film = Film::new(self.info().fps, (height, width));
-            run.iter_mut().try_for_each(|(episode, place, out)| film.read(episode, place, out))
+            run.iter_mut().try_for_each(|(episode, place, out)| film.read(episode, place, 0..episode.length, out))
         })
     }
 
@@ -314,7 +347,8 @@ impl Dataset {
             let pairs = files.par_iter().zip(block.par_chunks_mut(size)).enumerate();
             pairs.try_for_each(|(i, (file, out))| {
                 let mut pixels = Vec::with_capacity(size);
-                images::decode(file, height, width, &mut pixels).map_err(|found| self.bad(name, i, found))?;
+                let decoded = images::decode(file, height, width, &mut pixels);
+                decoded.map_err(|found| self.bad(name, &format!("frame {}", before + from + i), found))?;
                 out.copy_from_slice(&pixels);
                 Ok::<(), DatasetError>(())
             })?;
@@ -323,11 +357,11 @@ impl Dataset {
         Ok(())
     }
 
-    fn bad(&self, name: &str, row: usize, found: String) -> DatasetError {
+    fn bad(&self, name: &str, what: &str, found: String) -> DatasetError {
         DatasetError::BadDataset {
             path: self.root().join("data"),
-            object: format!("column {name}, picture {row} of a block of {ROWS}"),
-            expected: "a PNG or PPM picture of the size that info.json says".to_owned(),
+            object: format!("column {name}, {what}"),
+            expected: "PNG, PPM or JPEG pictures of the size that info.json says".to_owned(),
             found,
         }
     }
@@ -335,14 +369,17 @@ impl Dataset {
     /// Pictures of a column as files.
     pub(crate) fn files(&self, name: &str, column: &ArrayRef) -> Result<BinaryArray> {
         let inner = match column.as_any().downcast_ref::<StructArray>() {
-            Some(fields) => fields.column_by_name("bytes").ok_or_else(|| self.bad(name, 0, "no bytes".to_owned()))?,
+            Some(fields) => {
+                fields.column_by_name("bytes").ok_or_else(|| self.bad(name, "its fields", "no bytes".to_owned()))?
+            }
             None => column,
         };
-        let cast = arrow::compute::cast(inner, &DataType::Binary).map_err(|e| self.bad(name, 0, e.to_string()))?;
+        let cast =
+            arrow::compute::cast(inner, &DataType::Binary).map_err(|e| self.bad(name, "its type", e.to_string()))?;
         let files = cast.as_any().downcast_ref::<BinaryArray>().expect("a binary column");
         match files.null_count() {
             0 => Ok(files.clone()),
-            nulls => Err(self.bad(name, 0, format!("{nulls} nulls"))),
+            nulls => Err(self.bad(name, "some rows", format!("{nulls} nulls"))),
         }
     }
 }
@@ -405,8 +442,57 @@ impl Film {
         Self { fps, size, open: None }
     }
 
-    /// Fills `out` with the pictures of an episode, once each of them is known to be shown when it should.
-    pub fn read(&mut self, episode: &EpisodeMeta, place: &VideoPlace, out: &mut [u8]) -> Result<()> {
+    /// Fills `out` with the pictures of some frames of an episode, once each of the episode's is known to be shown when it
+    /// should.
+    pub fn read(
+        &mut self,
+        episode: &EpisodeMeta,
+        place: &VideoPlace,
+        frames: Range<usize>,
+        out: &mut [u8],
+    ) -> Result<()> {
+        let first = self.locate(episode, place)? + frames.start;
+        let size = self.size.0 * self.size.1 * 3;
+        if let (Some((_, file)), false) = (&self.open, frames.is_empty()) {
+            file.read(first..first + frames.len(), &mut |frame, rgb| {
+                out[(frame - first) * size..(frame - first + 1) * size].copy_from_slice(rgb);
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Gives the pictures of an episode to `sink` in blocks of up to `most`; decoding goes on from one to the next.
+    pub fn blocks(
+        &mut self,
+        episode: &EpisodeMeta,
+        place: &VideoPlace,
+        most: usize,
+        sink: &mut dyn FnMut(&[u8]) -> Result<()>,
+    ) -> Result<()> {
+        let size = self.size.0 * self.size.1 * 3;
+        let mut block = vec![0; most.min(episode.length) * size];
+        for from in (0..episode.length).step_by(most) {
+            let to = (from + most).min(episode.length);
+            let block = &mut block[..(to - from) * size];
+            self.read(episode, place, from..to, block)?;
+            sink(block)?;
+        }
+        Ok(())
+    }
+
+    /// Gives the pictures of an episode to `take`, one by one.
+    pub fn each(&mut self, episode: &EpisodeMeta, place: &VideoPlace, take: &mut dyn FnMut(&[u8])) -> Result<()> {
+        let size = self.size.0 * self.size.1 * 3;
+        self.locate(episode, place)?;
+        self.blocks(episode, place, (PIECE / size).max(1), &mut |block| {
+            block.chunks_exact(size).for_each(&mut *take);
+            Ok(())
+        })
+    }
+
+    /// The file's frame that an episode begins with, once each of the episode's is known to be shown when it should and to
+    /// have the set's size. Reads the file's tables, decodes nothing.
+    pub fn locate(&mut self, episode: &EpisodeMeta, place: &VideoPlace) -> Result<usize> {
         if self.open.as_ref().is_none_or(|(path, _)| *path != place.path) {
             self.open = None;
             self.open = Some((place.path.clone(), VideoFile::open(&place.path)?));
@@ -425,7 +511,7 @@ impl Film {
             return Err(bad("pictures".to_owned(), format!("{height} x {width}, as info.json says"), found));
         }
         if episode.length == 0 {
-            return Ok(());
+            return Ok(0);
         }
         let what = |i: usize| format!("frame {i} of episode {}", episode.index);
         let last = info.seconds(info.frames.saturating_sub(1)).unwrap_or(0.0);
@@ -443,10 +529,32 @@ impl Film {
                 }
             }
         }
-        let size = height * width * 3;
-        file.read(first..first + episode.length, &mut |frame, rgb| {
-            out[(frame - first) * size..(frame - first + 1) * size].copy_from_slice(rgb);
-        })?;
-        Ok(())
+        Ok(first)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn blocks_of_any_size_are_the_same_pictures() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/lerobot_video_av1");
+        let set = Dataset::open(&root).unwrap();
+        let name = "observation.images.agentview";
+        let all = set.pictures(name).unwrap();
+        // three episodes of 12 frames: shorter than one, one and a half, all
+        for most in [1, 5, 12, 18, 100] {
+            let (mut data, mut largest) = (Vec::new(), 0);
+            let limit = most * all.picture_bytes();
+            set.decode(name, 0..3, limit, &mut |block| {
+                largest = largest.max(block.len());
+                data.extend_from_slice(block);
+                Ok(())
+            })
+            .unwrap();
+            assert!(data == all.data && largest <= limit, "{most} at once: {largest} bytes");
+        }
     }
 }

@@ -191,20 +191,25 @@ pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u
     let root = dataset.root();
     let mut cursors = BTreeMap::new();
     for (name, feature) in info.features.0.iter().filter(|(_, f)| f.dtype == "image" && !f.is_depth()) {
-        let &[height, width, 3] = feature.shape.as_slice() else {
+        let Some((height, width)) = feature.picture_size() else {
             return Ok(Some(format!("{name}: pictures of shape {:?} are not read", feature.shape)));
         };
         cursors.insert(name.as_str(), (Rows::open(root, "data", Some(name), 32)?, height, width));
     }
     let mut depths = BTreeMap::new();
     for name in dataset.depth_names() {
-        let (_, width) = dataset.depth_size(name)?;
+        let (_, width) = match dataset.depth_size(name) {
+            Ok(size) => size,
+            Err(e) => return Ok(Some(in_full(&e))),
+        };
         depths.insert(name, (Rows::open(root, "data", Some(name), 32)?, width));
     }
     let mut films = Vec::new();
     for (name, _) in info.features.0.iter().filter(|(_, f)| f.dtype == "video" && !f.is_depth()) {
-        let (_, height, width) = dataset.camera(name)?;
-        films.push((name.as_str(), places(dataset, name)?, Film::new(info.fps, (height, width)), height * width * 3));
+        match dataset.camera(name).and_then(|(_, height, width)| Ok(((height, width), places(dataset, name)?))) {
+            Ok((size, places)) => films.push((name.as_str(), places, Film::new(info.fps, size))),
+            Err(e) => return Ok(Some(in_full(&e))),
+        }
     }
     let mut fingerprint = Fingerprint::new(&info.features, info.fps);
     let mut pixels = Vec::new();
@@ -238,13 +243,14 @@ pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u
             }
             fingerprint.column(name, summary.digest());
         }
-        for (name, places, film, size) in &mut films {
-            pixels.clear();
-            pixels.resize(episode.length * *size, 0);
-            if let Err(e) = film.read(episode, &places[episode.index], &mut pixels) {
+        for (name, places, film) in &mut films {
+            let mut digests = Vec::with_capacity(episode.length);
+            let looked = film.each(episode, &places[episode.index], &mut |picture| {
+                digests.push(Sha256::digest(picture).into());
+            });
+            if let Err(e) = looked {
                 return Ok(Some(format!("{name}: episode {}: {}", episode.index, in_full(&e))));
             }
-            let digests = pixels.chunks_exact(*size).map(|p| Sha256::digest(p).into()).collect();
             fingerprint.column(name, PictureSummary { digests, ..PictureSummary::default() }.digest());
         }
         progress(episode.to as u64, dataset.frames() as u64);

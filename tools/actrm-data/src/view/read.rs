@@ -137,8 +137,14 @@ pub fn pictures(set: &Dataset, camera: &str, episode: usize, frames: &[usize]) -
         let all = set.depth_maps(camera, episode)?;
         return Ok(frames.iter().map(|&frame| all.picture(frame)).collect());
     }
-    let all = set.episode_pictures(camera, episode)?;
-    let one = |&frame: &usize| Picture { height: all.height, width: all.width, rgb: all.frame(frame).to_vec() };
+    let mut sorted = frames.to_vec();
+    sorted.sort_unstable();
+    sorted.dedup();
+    let some = set.pictures_of(camera, episode, &mut |frame| sorted.binary_search(&frame).is_ok())?;
+    let one = |frame: &usize| {
+        let at = sorted.partition_point(|other| other < frame);
+        Picture { height: some.height, width: some.width, rgb: some.frame(at).to_vec() }
+    };
     Ok(frames.iter().map(one).collect())
 }
 

@@ -12,7 +12,7 @@ use crate::error::{DatasetError, Result};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::fs::File;
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::path::Path;
 use video::{Muxer, Sample, Video, VideoError};
 
@@ -35,6 +35,8 @@ pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) ->
     let mut copied = Copied { stretches: Vec::new(), pictures: Vec::new(), files: Vec::new() };
     for (input, taken) in edit.inputs.iter().zip(&edit.taken) {
         let (set, places) = (&input.set, places(&input.set, old)?);
+        let (_, height, width) = set.camera(old)?;
+        let mut film = Film::new(set.info().fps, (height, width));
         let mut stretches: Vec<Option<Stretch>> = vec![None; places.len()];
         for &episode in taken {
             if stretches[episode].is_some() {
@@ -43,6 +45,8 @@ pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) ->
             // every episode of the file that this one is in
             let of_file: Vec<usize> = (0..places.len()).filter(|&e| places[e].path == places[episode].path).collect();
             let wanted: Vec<usize> = of_file.iter().copied().filter(|e| taken.binary_search(e).is_ok()).collect();
+            // what does not fit its set is not made to look as if it did
+            wanted.iter().try_for_each(|&e| film.locate(&set.episodes()[e], &places[e]).map(|_| ()))?;
             let (folder, file) = (copied.files.len() / FILES_PER_FOLDER, copied.files.len() % FILES_PER_FOLDER);
             let target = Target { edit, relative: format!("videos/{name}/chunk-{folder:03}/file-{file:03}.mp4") };
             let (written, spans) = match wanted.len() == of_file.len() {
@@ -60,6 +64,9 @@ pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) ->
     }
     Ok(copied)
 }
+
+/// Bytes that are copied at once.
+const COPIED: usize = 1 << 20;
 
 /// Seconds of each episode in a file, from and to.
 type Spans = Vec<(f64, f64)>;
@@ -88,7 +95,13 @@ impl Target<'_> {
         let read = |source_error| DatasetError::Io { path: source.clone(), operation: "read it", source: source_error };
         let mut from = File::open(source).map_err(read)?;
         let mut to = self.create()?;
-        io::copy(&mut from, &mut to).map_err(self.failed())?;
+        let mut part = vec![0; COPIED];
+        loop {
+            match from.read(&mut part).map_err(read)? {
+                0 => break,
+                count => to.write_all(&part[..count]).map_err(self.failed())?,
+            }
+        }
         let spans = episodes.iter().map(|&e| (places[e].from, places[e].to)).collect();
         Ok((to.written(&self.relative), spans))
     }
@@ -131,6 +144,9 @@ impl Source {
     }
 
     fn samples(&self, episode: &EpisodeMeta, place: &VideoPlace) -> Result<Vec<Sample>> {
+        if episode.length == 0 {
+            return Ok(Vec::new());
+        }
         let first = self.0.info().frame_at(place.from).ok_or_else(|| VideoError::NoSuchFrame {
             name: place.path.display().to_string(),
             wanted: format!("frame at {} s, where episode {} begins", place.from, episode.index),
@@ -152,7 +168,6 @@ fn digests(
         return Ok(taken.iter().map(|_| PictureSummary::default()).collect());
     }
     let (_, height, width) = set.camera(name)?;
-    let size = height * width * 3;
     // each thread keeps the file open that it reads
     let run = taken.len().div_ceil(rayon::current_num_threads()).max(1);
     let runs: Vec<Result<Vec<PictureSummary>>> = taken
@@ -160,9 +175,10 @@ fn digests(
         .map(|run| {
             let mut film = Film::new(set.info().fps, (height, width));
             let of_episode = |&episode: &usize| {
-                let mut pixels = vec![0; set.episodes()[episode].length * size];
-                film.read(&set.episodes()[episode], &places[episode], &mut pixels)?;
-                let digests = pixels.chunks_exact(size).map(|p| Sha256::digest(p).into()).collect();
+                let mut digests = Vec::with_capacity(set.episodes()[episode].length);
+                film.each(&set.episodes()[episode], &places[episode], &mut |picture| {
+                    digests.push(Sha256::digest(picture).into());
+                })?;
                 Ok(PictureSummary { digests, ..PictureSummary::default() })
             };
             run.iter().map(of_episode).collect()
