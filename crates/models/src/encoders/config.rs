@@ -178,8 +178,16 @@ impl VisionConfig {
     /// Size of what the network sees of a picture.
     ///
     /// # Errors
-    /// A crop that is larger than the picture.
+    /// A crop that is larger than the picture, a shift that would move it out of sight.
     pub fn seen(&self, (h, w): (usize, usize)) -> Result<(usize, usize)> {
+        if self.shift > 0 && self.shift >= h.min(w) {
+            return Err(ModelError::Config {
+                model: "vision",
+                field: "shift",
+                found: self.shift.to_string(),
+                expected: format!("less than the picture's side, {}", h.min(w)),
+            });
+        }
         match self.crop {
             None => Ok((h, w)),
             Some(side) if side <= h.min(w) => Ok((side, side)),

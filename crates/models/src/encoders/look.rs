@@ -155,6 +155,8 @@ impl ImageEncoder {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::encoders::{ImageEncoder, TokenKind};
+    use crate::params::Params;
 
     fn picture((h, w): Size) -> Vec<u8> {
         (0..h * w * 3).map(|i| (i * 7 % 251) as u8).collect()
@@ -191,6 +193,25 @@ mod tests {
         let look = Look { top: -1, left: 0, colour: [1.0; 3] };
         look.take(&bytes, (8, 9), (6, 6), ([0.0; 3], [1.0; 3]), &mut out);
         assert_eq!(out[..18], out[18..36]);
+    }
+
+    #[test]
+    fn what_could_not_be_seen_is_refused() {
+        let told = |config: &VisionConfig| config.seen((8, 9)).unwrap_err().to_string();
+        let shifted = |shift| VisionConfig { shift, ..VisionConfig::default() };
+        assert!(shifted(7).seen((8, 9)).is_ok());
+        for shift in [8, usize::MAX] {
+            assert!(told(&shifted(shift)).contains("shift is") && told(&shifted(shift)).contains("side, 8"));
+        }
+        // a keypoint in a map of one cell says nothing
+        let keypoints = |size| {
+            let config = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..VisionConfig::default() };
+            let mut rng = Rng::new(1, "init");
+            ImageEncoder::without_positions(&mut Params::new(), &config, &[size, (5, 3)], 8, &mut rng)
+        };
+        assert!(keypoints((33, 33)).is_ok());
+        let blind = keypoints((32, 32)).map(|_| ()).unwrap_err().to_string();
+        assert!(blind.contains("tokens is keypoints in maps of one cell"), "{blind}");
     }
 
     #[test]

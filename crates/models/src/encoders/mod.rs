@@ -131,6 +131,14 @@ impl ImageEncoder {
                 };
                 Head::Map { weight, bias, tables: sizes.iter().map(table).collect::<Result<_>>()? }
             }
+            TokenKind::Keypoints { .. } if sizes.iter().all(|&size| shape.map_size(size) == (1, 1)) => {
+                return Err(ModelError::Config {
+                    model: "vision",
+                    field: "tokens",
+                    found: "keypoints in maps of one cell, which are always in the same place".to_string(),
+                    expected: "map, fewer blocks or larger pictures".to_string(),
+                });
+            }
             TokenKind::Keypoints { count } => Head::Keypoints {
                 softmax: SpatialSoftmax::new(params, KEYPOINTS, channels, count, rng)?,
                 project: Linear::new(params, KEYPOINT_PROJECTION, 2 * count, dim, rng)?,

@@ -63,6 +63,6 @@ impl Config {
         if self.hidden.contains(&0) {
             return refuse("hidden", "widths of at least 1");
         }
-        Ok(())
+        self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)
     }
 }

@@ -83,6 +83,6 @@ impl Config {
         if !(self.min_std.is_finite() && self.min_std > 0.0) {
             return refuse("min_std", self.min_std.to_string(), "a positive number");
         }
-        Ok(())
+        self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)
     }
 }

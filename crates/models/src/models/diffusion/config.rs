@@ -112,6 +112,6 @@ impl Config {
         if !(self.clip_sample.is_finite() && self.clip_sample >= 0.0) {
             return refuse("clip_sample", self.clip_sample.to_string(), "0 or more".to_string());
         }
-        Ok(())
+        self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)
     }
 }

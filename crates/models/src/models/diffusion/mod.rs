@@ -187,6 +187,15 @@ impl Diffusion {
     pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
         config.validate()?;
         signature.check("diffusion", READS)?;
+        let pictures: Vec<&str> = signature.of_kind(FeatureKind::Image).map(|spec| spec.name.as_str()).collect();
+        if config.transformer.is_some() && !pictures.is_empty() {
+            return Err(ModelError::Config {
+                model: "diffusion",
+                field: "transformer",
+                found: format!("one beside {}", pictures.join(", ")),
+                expected: "none where there are pictures, which it does not see".to_string(),
+            });
+        }
         check_reaches("diffusion", signature, config.action_horizon)?;
         let (mut p, rng) = (Params::new(), &mut Rng::new(seed, "init"));
         let condition = Condition::new(&mut p, "diffusion", signature, config.vision.as_ref(), rng)?;

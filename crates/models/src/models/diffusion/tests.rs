@@ -203,6 +203,9 @@ fn impossible_configurations_name_the_field() {
     assert!(attends(|t| t.dropout = 1.0).contains("transformer.dropout is 1"));
     let both = Config { vision: Some(eyes()), ..attending(tokens()) };
     assert!(error(both).contains("vision is given, expected none with a transformer"));
+    // a signature with pictures brings an encoder of its own
+    let unseen = Diffusion::new(&attending(tokens()), &of.pictures, 0).unwrap_err().to_string();
+    assert!(unseen.contains("transformer is one beside a, b, c, expected none where there are pictures"), "{unseen}");
     let sees = |vision| {
         let config = Config { vision: Some(vision), ..small() };
         Diffusion::new(&config, &of.pictures, 0).unwrap_err().to_string()

@@ -51,6 +51,6 @@ impl Config {
             let (found, expected) = ("0".to_string(), "at least 1".to_string());
             return Err(ModelError::Config { model: "flow", field: "inference_steps", found, expected });
         }
-        Ok(())
+        self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)
     }
 }

@@ -52,6 +52,6 @@ impl Config {
             let (found, expected) = (self.second_time.to_string(), "between 0 and 1".to_string());
             return Err(ModelError::Config { model: "mip", field: "second_time", found, expected });
         }
-        Ok(())
+        self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)
     }
 }
