@@ -46,6 +46,7 @@ pub(crate) fn sample(name: &str, version: u32, count: u64) -> EvaluationRecord {
         shard: None,
         versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),
         kernels: None,
+        renderer: None,
     }
 }
 

@@ -138,6 +138,9 @@ pub struct Ready {
     /// what is computed depend on them.
     #[serde(default)]
     pub kernels: Option<String>,
+    /// What draws the worker's pictures, where it draws any: another device or driver draws others.
+    #[serde(default)]
+    pub renderer: Option<String>,
     /// robomimic's `env_args` of this environment.
     #[serde(default)]
     pub env_args: serde_json::Value,

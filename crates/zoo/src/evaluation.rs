@@ -98,7 +98,7 @@ pub fn finished(
     options: &EvaluationOptions,
 ) -> Result<Option<StoredEvaluation>, ZooError> {
     let record = subject.record(ready, options)?;
-    let stored = StoredEvaluation::read_if_there(&results.join(record.folder_name()))?;
+    let stored = StoredEvaluation::read_if_there(&record.folder_in(results))?;
     Ok(stored.filter(|stored| stored.record.is_same(&record)))
 }
 

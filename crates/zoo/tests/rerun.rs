@@ -91,6 +91,7 @@ fn result(zoo: &Path, entry: &Entry) -> StoredEvaluation {
         shard: None,
         versions: [("mujoco".to_owned(), "3.3.7".to_owned())].into(),
         kernels: None,
+        renderer: None,
     };
     let mut folder = ResultsFolder::open(&zoo.join("results"), &record).unwrap();
     let episode = EpisodeRecord {

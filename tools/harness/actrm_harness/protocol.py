@@ -35,6 +35,8 @@ class Ready:
     env_args: dict[str, Any]
     kernels: str | None = None
     """Which kernels numpy's linear algebra runs, where that can be told: the last bits depend on them."""
+    renderer: str | None = None
+    """What draws the pictures, where there are cameras: another device or driver draws others."""
 
 
 @dataclass(frozen=True, slots=True)

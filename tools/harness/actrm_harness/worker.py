@@ -150,6 +150,7 @@ def describe(args: argparse.Namespace, simulation: Simulation) -> protocol.Ready
         observations=found.observations,
         stages=found.stages,
         kernels=found.kernels,
+        renderer=found.renderer,
         env_args=arguments,
     )
 

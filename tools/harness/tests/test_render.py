@@ -126,6 +126,7 @@ def test_the_worker_renders_and_observes_cameras() -> None:
     client = Client("--task", "Lift", "--cameras", "agentview,robot0_eye_in_hand", "--size", "32")
     assert client.ready["observations"]["agentview_image"] == [32, 32, 3]
     assert client.ready["env_args"]["env_kwargs"]["camera_names"] == ["agentview", "robot0_eye_in_hand"]
+    assert "OpenGL" in client.ready["renderer"] and " bits" not in client.ready["renderer"]
     _, seen = client.ask("reset", seed=3)
     _, drawn = client.ask("render", camera="agentview", size=[32, 32])
     assert drawn["image"].dtype == np.uint8
@@ -147,6 +148,28 @@ def test_where_nothing_can_draw_the_error_names_a_package(
     monkeypatch.setattr(session, "renderer", None)
     with pytest.raises(envs.RequestError, match="libosmesa6") as caught:
         envs.image(session, "agentview", 32, 32)
+    assert caught.value.kind == "no_renderer"
+
+
+@pytest.mark.parametrize("devices", ["", "-1", "GPU-1a2b", "77,0"])
+def test_a_gpu_that_is_hidden_from_others_does_not_stop_drawing(
+    session: envs.Session, monkeypatch: pytest.MonkeyPatch, devices: str
+) -> None:
+    """Where CUDA may compute is nothing to EGL, unless one of its devices can be meant."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", devices)
+    monkeypatch.delenv("MUJOCO_EGL_DEVICE_ID", raising=False)
+    module: Any = importlib.import_module("robosuite.renderers.context.egl_context")
+    monkeypatch.setattr(module, "EGL_DISPLAY", None)
+    assert render.Renderer().name()
+    assert render.os.environ["CUDA_VISIBLE_DEVICES"] == devices
+
+
+def test_a_device_that_is_not_there_is_named(session: envs.Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "77")
+    module: Any = importlib.import_module("robosuite.renderers.context.egl_context")
+    monkeypatch.setattr(module, "EGL_DISPLAY", None)
+    with pytest.raises(envs.RequestError, match="MUJOCO_EGL_DEVICE_ID") as caught:
+        render.Renderer()
     assert caught.value.kind == "no_renderer"
 
 

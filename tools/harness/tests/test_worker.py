@@ -20,6 +20,7 @@ def test_the_handshake_says_what_the_worker_is(lift: Client) -> None:
     assert ready["simulator"] == "robosuite" and sorted(ready["versions"]) == ["mujoco", "numpy", "python", "robosuite"]
     assert (ready["versions"]["robosuite"], ready["versions"]["mujoco"]) == ("1.5.2", "3.3.7")
     assert ready["module_sha256"] is None and ready["kernels"].startswith("openblas ")
+    assert ready["renderer"] is None
     assert (ready["action_dim"], ready["control_freq"]) == (7, 20)
     assert ready["action_low"] == [-1.0] * 7 and ready["action_high"] == [1.0] * 7
     for name, shape in {"object": [10], "robot0_eef_pos": [3], "robot0_gripper_qpos": [2]}.items():

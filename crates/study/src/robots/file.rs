@@ -241,6 +241,7 @@ impl Study {
             row.arms.iter().try_for_each(|name| arms(format!("cells[{i}].arms"), name))?;
             data(format!("cells[{i}].data"), &row.data)?;
             row.tests.iter().try_for_each(|name| tests(format!("cells[{i}].tests"), name))?;
+            row.tests.iter().try_for_each(|name| self.check_camera(name, &row.data))?;
         }
         for (i, comparison) in self.comparisons.iter().enumerate() {
             arms(format!("comparisons[{i}].first"), &comparison.first)?;
@@ -270,6 +271,26 @@ impl Study {
             }
         }
         Ok(())
+    }
+
+    /// A test that changes pictures, after demonstrations that have them: said before anything is trained.
+    fn check_camera(&self, test: &str, data: &str) -> Result<(), ZooError> {
+        let Some(change) = self.tests[test].perturbation() else { return Ok(()) };
+        let names = self.data[data].cameras.as_ref().map_or(&[][..], |cameras| cameras.names.as_slice());
+        let there = match &change {
+            Perturbation::Black(camera) => names.contains(camera),
+            Perturbation::SwapCameras => names.len() > 1,
+            _ => !names.is_empty(),
+        };
+        if there {
+            return Ok(());
+        }
+        let cameras = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+        Err(ZooError::InvalidValue {
+            key: format!("tests.{test}.perturb"),
+            expected: format!("a change of cameras that data.{data} has: {cameras}"),
+            found: change.to_string(),
+        })
     }
 }
 
@@ -363,6 +384,14 @@ mod tests {
         assert_eq!(open(TEXT).unwrap().data["lift"].file_name(), "lift-10-seed1.hdf5");
         let with =
             |perturb: &str| TEXT.replace("seed_start = 40000", &format!("seed_start = 40000\nperturb = \"{perturb}\""));
+        let error = open(&with("black-agentview")).unwrap_err();
+        assert_eq!(
+            error,
+            "key `tests.lift.perturb`: expected a change of cameras that data.lift has: none, found black-agentview"
+        );
+        let seen = "[data.lift]\ncameras = { names = [\"agentview\"], size = 84, fast_render = true }";
+        let with = |perturb: &str| with(perturb).replace("[data.lift]", seen);
+        assert!(open(&with("black-sideview")).unwrap_err().contains("data.lift has: agentview, found black-sideview"));
         let test = open(&with("black-agentview")).unwrap().tests["lift"].clone();
         assert_eq!((test.is_plain(), test.perturbation()), (false, Some(Perturbation::Black("agentview".to_owned()))));
         assert!(open(TEXT).unwrap().tests["lift"].is_plain());

@@ -28,13 +28,15 @@ type Trainings = BTreeMap<u64, CellResult>;
 /// What there is of a study, by test, demonstrations and arm.
 type Results = BTreeMap<(String, String, String), Trainings>;
 
-/// What there is in the folder of `study`, and what is not, by stage.
+/// What there is in the folder of `study`, and what is not, by stage. A result of another definition of its demonstrations or
+/// its test, from before the study's file was changed, is none of this study's.
 fn read_results(study: &Study) -> Result<(Results, BTreeMap<u8, Vec<String>>), ZooError> {
     let mut results = Results::new();
     let mut missing: BTreeMap<u8, Vec<String>> = BTreeMap::new();
     for cell in cells(study) {
         for test in &cell.tests {
-            match CellResult::read(&study.results.join(cell.file_name(test)))? {
+            let found = CellResult::read(&study.results.join(cell.file_name(test)))?;
+            match found.filter(|result| result.answers(study, &cell, test)) {
                 Some(result) => {
                     let key = (test.clone(), cell.data.clone(), cell.arm.clone());
                     results.entry(key).or_default().insert(cell.seed, result);

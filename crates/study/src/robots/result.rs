@@ -9,7 +9,7 @@ use zoo::results::{EntryIdentity, Protocol, Seeds, StoredEvaluation, TrainingFac
 use zoo::{ZooError, write_atomic};
 
 use super::cells::Cell;
-use super::file::{Arm, Data, Test};
+use super::file::{Arm, Data, Study, Test};
 
 /// One training's outcomes on one test, with all that they depend on.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -49,6 +49,9 @@ pub struct CellResult {
     /// Which kernels numpy's linear algebra ran, where that was told.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kernels: Option<String>,
+    /// What drew the policy's pictures, where that was told.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub renderer: Option<String>,
     /// Median duration of a query in milliseconds.
     pub query_ms: f64,
     /// Floating-point operations of a query that thinks as long as it may, where they are counted.
@@ -115,6 +118,7 @@ impl CellResult {
             seeds: record.seeds,
             versions: record.versions.clone(),
             kernels: record.kernels.clone(),
+            renderer: record.renderer.clone(),
             query_ms: times.get(times.len() / 2).copied().unwrap_or_default(),
             query_flops,
             episodes: evaluation
@@ -130,6 +134,15 @@ impl CellResult {
                 })
                 .collect(),
         }
+    }
+
+    /// Whether it is of this cell and test, with demonstrations and rules as the study has them now.
+    pub(super) fn answers(&self, study: &Study, cell: &Cell, test: &str) -> bool {
+        let of_cell = (&self.arm, &self.data, self.seed) == (&cell.arm, &cell.data, cell.seed);
+        of_cell
+            && self.test == test
+            && study.data.get(&cell.data) == Some(&self.data_definition)
+            && study.tests.get(test) == Some(&self.test_definition)
     }
 
     /// Whether it can be told of an entry that is trained again if it is the same.

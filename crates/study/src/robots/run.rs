@@ -142,11 +142,7 @@ pub fn stored_results(study: &Study, library: &Library, cell: &Cell) -> Result<V
     let (_, settings) = experiment(study, library, cell)?;
     let stored = |name: &String| {
         let found = CellResult::read(&study.results.join(cell.file_name(name)))?;
-        Ok(found.filter(|result| {
-            result.settings == settings
-                && result.data_definition == study.data[&cell.data]
-                && result.test_definition == study.tests[name]
-        }))
+        Ok(found.filter(|result| result.settings == settings && result.answers(study, cell, name)))
     };
     cell.tests.iter().map(stored).collect()
 }

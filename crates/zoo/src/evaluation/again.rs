@@ -100,7 +100,7 @@ pub fn evaluate_again(
 /// The finished evaluation that holds the seeds of `record`.
 fn find(results: &Path, record: &EvaluationRecord) -> Result<StoredEvaluation, ZooError> {
     // the one of exactly this record is read first, so that damage there is told
-    if let Some(stored) = StoredEvaluation::read_if_there(&results.join(record.folder_name()))? {
+    if let Some(stored) = StoredEvaluation::read_if_there(&record.folder_in(results))? {
         return Ok(stored);
     }
     let seeds = record.own_seeds();
@@ -124,13 +124,18 @@ fn find(results: &Path, record: &EvaluationRecord) -> Result<StoredEvaluation, Z
     })
 }
 
-/// Versions that are not the same: name, stored and now; kernels, too, where they were told.
+/// Versions that are not the same: name, stored and now; kernels and renderers, too, where they were told.
 pub(crate) fn differences(stored: &EvaluationRecord, now: &EvaluationRecord) -> Vec<(String, String, String)> {
     let names = stored.versions.keys().chain(now.versions.keys().filter(|name| !stored.versions.contains_key(*name)));
     let of =
         |record: &EvaluationRecord, name: &str| record.versions.get(name).cloned().unwrap_or_else(|| "none".into());
-    let kernels = stored.kernels.clone().zip(now.kernels.clone());
-    let kernels = kernels.map(|(stored, now)| ("kernels".to_owned(), stored, now));
-    let all = names.map(|name| (name.clone(), of(stored, name), of(now, name))).chain(kernels);
+    let told = |name: &str, of: fn(&EvaluationRecord) -> Option<&String>| {
+        let both = of(stored).cloned().zip(of(now).cloned());
+        both.map(|(stored, now)| (name.to_owned(), stored, now))
+    };
+    let all = names
+        .map(|name| (name.clone(), of(stored, name), of(now, name)))
+        .chain(told("kernels", |record| record.kernels.as_ref()))
+        .chain(told("renderer", |record| record.renderer.as_ref()));
     all.filter(|(_, stored, now)| stored != now).collect()
 }

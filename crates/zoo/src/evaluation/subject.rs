@@ -85,6 +85,7 @@ impl Subject<'_> {
             shard: options.shard,
             versions: ready.versions.clone(),
             kernels: ready.kernels.clone(),
+            renderer: ready.renderer.clone(),
         })
     }
 

@@ -166,7 +166,7 @@ impl ResultsFolder {
     /// # Errors
     /// [`ZooError::ResultsBusy`] while another process works there; damaged files.
     pub fn open(results: &Path, record: &EvaluationRecord) -> Result<Self, ZooError> {
-        let folder = results.join(record.folder_name());
+        let folder = record.folder_in(results);
         fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
         let path = folder.join(LOCK);
         let lock = File::create(&path).map_err(ZooError::io("create", &path))?;

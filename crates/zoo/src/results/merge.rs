@@ -71,6 +71,7 @@ fn difference(a: &EvaluationRecord, b: &EvaluationRecord) -> Option<(&'static st
         ("protocol", text(&a.protocol), text(&b.protocol)),
         ("versions", text(&a.versions), text(&b.versions)),
         ("kernels", text(&a.kernels), text(&b.kernels)),
+        ("renderer", text(&a.renderer), text(&b.renderer)),
         ("execution", text(&a.execution), text(&b.execution)),
         ("seeds", text(&a.seeds), text(&b.seeds)),
         ("training", text(&a.training), text(&b.training)),

@@ -1,10 +1,12 @@
 //! The records of an evaluation.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use rollout::Control;
 use serde::{Deserialize, Serialize};
 
+use crate::ZooError;
 use crate::files::sha256_hex;
 
 /// The rules of an evaluation that entries must share to be compared.
@@ -67,6 +69,33 @@ pub enum Execution {
         /// Decay of the weights, oldest prediction first.
         coefficient: f64,
     },
+}
+
+impl Execution {
+    /// Checks that predictions of `action_horizon` actions can become actions so.
+    ///
+    /// # Errors
+    /// No action or more than there are; a coefficient that is no number, or with which a weight would overflow or leave one
+    /// action alone.
+    pub fn check(&self, action_horizon: usize) -> Result<(), ZooError> {
+        let invalid = |key: &str, expected, found| Err(ZooError::InvalidValue { key: key.to_owned(), expected, found });
+        match *self {
+            Self::RecedingHorizon { n_action_steps } if !(1..=action_horizon).contains(&n_action_steps) => {
+                let expected = format!("1 to the action horizon, {action_horizon}");
+                invalid("n_action_steps", expected, n_action_steps.to_string())
+            }
+            Self::TemporalEnsemble { coefficient } => {
+                // beyond 10 the oldest prediction alone counts; exp(700) is near the largest number
+                let least = -(700.0 / action_horizon.max(1) as f64).min(10.0);
+                if (least..=10.0).contains(&coefficient) {
+                    return Ok(());
+                }
+                let expected = format!("a finite number from {least:.1} to 10");
+                invalid("temporal_ensemble", expected, format!("{coefficient:?}"))
+            }
+            Self::RecedingHorizon { .. } => Ok(()),
+        }
+    }
 }
 
 /// Which entry was evaluated.
@@ -216,6 +245,10 @@ pub struct EvaluationRecord {
     /// can depend on them, so workers run one set everywhere unless the user chose another.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kernels: Option<String>,
+    /// What drew the policy's pictures, such as `llvmpipe (LLVM 15.0.6), OpenGL 4.5 ...`: another one draws others. None
+    /// of policies that see no pictures, and of evaluations from before it was written down.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub renderer: Option<String>,
 }
 
 impl EvaluationRecord {
@@ -228,28 +261,44 @@ impl EvaluationRecord {
         self.seeds.iter().filter(|seed| mine(seed - self.seeds.start)).collect()
     }
 
-    /// Whether both are of one evaluation. Kernels that only one of them tells, being older, tell nothing.
+    /// Whether both are of one evaluation. Kernels and renderers that only one of them tells, the other being older, tell
+    /// nothing.
     pub fn is_same(&self, other: &Self) -> bool {
-        let kernels = self.kernels.as_ref().zip(other.kernels.as_ref()).is_none_or(|(one, two)| one == two);
-        kernels && Self { kernels: None, ..self.clone() } == Self { kernels: None, ..other.clone() }
+        let told = |of: fn(&Self) -> Option<&String>| of(self).zip(of(other)).is_none_or(|(one, two)| one == two);
+        let rest = |of: &Self| Self { kernels: None, renderer: None, ..of.clone() };
+        told(|of| of.kernels.as_ref()) && told(|of| of.renderer.as_ref()) && rest(self) == rest(other)
     }
 
     /// Eight hexadecimal digits, the same for evaluations that differ in nothing but their seeds: an episode of one seed is
     /// the same in all of them.
     pub fn conditions(&self) -> String {
         let Self { entry, protocol, execution, versions, .. } = self;
-        let whole = serde_json::to_vec(&(entry, protocol, execution, versions));
-        sha256_hex(&whole.expect("plain fields are always JSON"))[..8].to_owned()
+        self.short_hash(&(entry, protocol, execution, versions))
     }
 
     /// The name of its folder: readable, and different for anything that could change an outcome.
     pub fn folder_name(&self) -> String {
         let Self { entry, protocol, execution, seeds, versions, .. } = self;
-        let whole = serde_json::to_vec(&(entry, protocol, execution, seeds, versions));
-        let hash = sha256_hex(&whole.expect("plain fields are always JSON"));
+        let hash = self.short_hash(&(entry, protocol, execution, seeds, versions));
         let shard = self.shard.map(|s| format!("_shard-{}-of-{}", s.index, s.count));
         let (task, shard) = (&protocol.task, shard.unwrap_or_default());
-        format!("{entry}_{task}_{seeds}_{}{shard}", &hash[..8])
+        format!("{entry}_{task}_{seeds}_{hash}{shard}")
+    }
+
+    /// Eight digits of a hash over `parts` and, where it is known, over what drew the pictures.
+    fn short_hash(&self, parts: &impl Serialize) -> String {
+        let whole = match &self.renderer {
+            None => serde_json::to_vec(parts),
+            Some(renderer) => serde_json::to_vec(&(parts, renderer)),
+        };
+        sha256_hex(&whole.expect("plain fields are always JSON"))[..8].to_owned()
+    }
+
+    /// Its folder under `results`: where there is only one from before renderers were written down, that one.
+    pub fn folder_in(&self, results: &Path) -> PathBuf {
+        let own = results.join(self.folder_name());
+        let before = results.join(Self { renderer: None, ..self.clone() }.folder_name());
+        if !own.exists() && before.exists() { before } else { own }
     }
 }
 
@@ -385,6 +434,7 @@ pub(crate) mod tests {
             shard: None,
             versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),
             kernels: None,
+            renderer: None,
         }
     }
 
@@ -399,6 +449,24 @@ pub(crate) mod tests {
             }
             all.sort_unstable();
             assert_eq!(all, (10_000..10_017).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn predictions_become_actions_in_ways_that_can_be() {
+        let steps = |n_action_steps| Execution::RecedingHorizon { n_action_steps }.check(16);
+        assert!(steps(1).is_ok() && steps(16).is_ok());
+        assert_eq!(
+            steps(17).unwrap_err().to_string(),
+            "key `n_action_steps`: expected 1 to the action horizon, 16, found 17"
+        );
+        assert!(steps(0).is_err());
+        let averaged = |coefficient| Execution::TemporalEnsemble { coefficient }.check(100);
+        for fine in [0.0, 0.01, -0.01, -7.0, 10.0] {
+            averaged(fine).unwrap();
+        }
+        for wrong in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e308, -1e308, -7.1, 10.1] {
+            assert!(averaged(wrong).unwrap_err().to_string().contains("finite"), "{wrong}");
         }
     }
 
@@ -433,6 +501,22 @@ pub(crate) mod tests {
         assert!(!old.is_same(&EvaluationRecord { demonstrated: true, ..with("openblas Zen") }));
         // they are one evaluation's, whoever tells
         assert_eq!(old.folder_name(), with("openblas Zen").folder_name());
+    }
+
+    #[test]
+    fn another_renderer_is_another_evaluation_and_one_of_before_is_found() {
+        let dir = tempfile::tempdir().unwrap();
+        let old = sample("a", 1, 20);
+        let with = |renderer: &str| EvaluationRecord { renderer: Some(renderer.into()), ..old.clone() };
+        let (one, other) = (with("llvmpipe"), with("a GPU"));
+        assert!(old.is_same(&one) && one.is_same(&old) && !one.is_same(&other));
+        assert!(one.folder_name() != other.folder_name() && one.conditions() != other.conditions());
+        assert_eq!(one.folder_in(dir.path()), dir.path().join(one.folder_name()));
+        std::fs::create_dir(dir.path().join(old.folder_name())).unwrap();
+        assert_eq!(one.folder_in(dir.path()), dir.path().join(old.folder_name()));
+        std::fs::create_dir(dir.path().join(one.folder_name())).unwrap();
+        assert_eq!(one.folder_in(dir.path()), dir.path().join(one.folder_name()));
+        assert_eq!(other.folder_in(dir.path()), dir.path().join(old.folder_name()));
     }
 
     #[test]

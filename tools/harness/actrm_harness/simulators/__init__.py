@@ -47,6 +47,8 @@ class Description:
     """What an episode passes before the task is solved, in order, where that is known."""
     kernels: str | None = None
     """Which kernels numpy's linear algebra runs, where that can be told."""
+    renderer: str | None = None
+    """What draws the pictures, where there are cameras."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,9 @@ import ctypes
 import ctypes.util
 import importlib
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,11 @@ from actrm_harness.wire import Array
 
 _MAX_GEOMS = 10_000
 _EGL_PLATFORM_DEVICE = 0x313F
+_GL_RENDERER, _GL_VERSION = 0x1F01, 0x1F02
+_NO_RENDERER = (
+    "images need EGL or OSMesa, and {}; "
+    "Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6"
+)
 
 
 class Renderer:
@@ -48,6 +55,16 @@ class Renderer:
     def make_current(self) -> None:
         """Make this the OpenGL context that mujoco draws with."""
         self._gl.make_current()
+
+    def name(self) -> str:
+        """What draws, as OpenGL names it: device or software, and driver. Another one draws other pictures."""
+        self.make_current()
+        lookup = importlib.import_module("OpenGL.platform").PLATFORM.getExtensionProcedure
+        get_string = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_uint)(lookup(b"glGetString"))
+        told = (get_string(_GL_RENDERER), get_string(_GL_VERSION))
+        text = ", OpenGL ".join(text.decode("ascii", "replace") for text in told if text)
+        # llvmpipe says how wide a processor's vectors are, and draws the same pixels with all of them
+        return re.sub(r"(llvmpipe \(LLVM [\d.]+), \d+ bits", r"\1", text)
 
     def image(self, sim: Sim, camera: str, height: int, width: int) -> Array:
         """Draw what `camera` sees: uint8 of (height, width, 3), upright."""
@@ -125,35 +142,79 @@ def _gl_context() -> Any:
     wanted = suite.WANTED_GL
     if wanted not in ("", "egl", "osmesa"):
         raise RequestError("no_renderer", f"MUJOCO_GL is {wanted!r}; images are drawn with egl or osmesa")
-    if wanted != "osmesa" and (wanted == "egl" or _egl_works()):
-        os.environ["PYOPENGL_PLATFORM"] = "egl"
-        return importlib.import_module("robosuite.renderers.context.egl_context").EGLGLContext(0, 0, device_id=-1)
-    if wanted == "osmesa" or ctypes.util.find_library("OSMesa"):
-        os.environ["PYOPENGL_PLATFORM"] = "osmesa"
+    works = {"egl": _egl_works, "osmesa": lambda: ctypes.util.find_library("OSMesa") is not None}
+    chosen = next((name for name in works if wanted in ("", name) and works[name]()), None)
+    if chosen is None:
+        found = f"MUJOCO_GL is {wanted!r}, which does not work here" if wanted else "neither works here"
+        raise RequestError("no_renderer", _NO_RENDERER.format(found))
+    os.environ["PYOPENGL_PLATFORM"] = chosen
+    if chosen == "osmesa":
         return importlib.import_module("robosuite.renderers.context.osmesa_context").OSMesaGLContext(640, 480)
-    raise RequestError(
-        "no_renderer",
-        "images need EGL or OSMesa, and neither works here; "
-        "Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6",
-    )
+    context = importlib.import_module("robosuite.renderers.context.egl_context").EGLGLContext
+    with _egl_device():
+        try:
+            return context(0, 0, device_id=-1)
+        except (ImportError, RuntimeError, ValueError) as error:
+            named = {name: os.environ[name] for name in _DEVICES if name in os.environ}
+            found = f"EGL gives no context ({error}; {named or 'no device was named'})"
+            raise RequestError("no_renderer", _NO_RENDERER.format(found)) from error
+
+
+_DEVICES = ("MUJOCO_EGL_DEVICE_ID", "CUDA_VISIBLE_DEVICES")
+
+
+@contextmanager
+def _egl_device() -> Generator[None]:
+    """While EGL's device is chosen: CUDA's devices are taken for EGL's only where one of them can be meant.
+
+    robosuite reads the first of CUDA_VISIBLE_DEVICES as a number of EGL's devices. It may be empty or -1, which keeps
+    other programs off a GPU, a name, or a GPU where EGL has none; MUJOCO_EGL_DEVICE_ID is for drawing, and is left as
+    it is.
+    """
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    meant = visible is not None and visible.split(",")[0].strip().isdecimal()
+    if visible is None or (meant and int(visible.split(",")[0]) < _egl_devices()):
+        yield
+        return
+    del os.environ["CUDA_VISIBLE_DEVICES"]
+    try:
+        yield
+    finally:
+        os.environ["CUDA_VISIBLE_DEVICES"] = visible
 
 
 def _egl_works() -> bool:
     """Whether the first EGL device can be initialised; asked before OpenGL is imported, which binds to one platform."""
-    try:
-        egl = ctypes.CDLL("libEGL.so.1")
-    except OSError:
-        return False
-    lookup = egl.eglGetProcAddress
-    lookup.restype, lookup.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
-    query, display_of = lookup(b"eglQueryDevicesEXT"), lookup(b"eglGetPlatformDisplayEXT")
-    if not query or not display_of:
+    egl = _egl()
+    if egl is None or _egl_devices() < 1:
         return False
     device, count = ctypes.c_void_p(), ctypes.c_int()
-    query_devices = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(query)
-    if not query_devices(1, ctypes.byref(device), ctypes.byref(count)) or count.value < 1:
+    display_of = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
+    if not display_of or not _query_devices(egl)(1, ctypes.byref(device), ctypes.byref(count)):
         return False
     platform_display = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p)(display_of)
     display = platform_display(_EGL_PLATFORM_DEVICE, device, None)
     egl.eglInitialize.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
     return bool(display) and bool(egl.eglInitialize(display, None, None))
+
+
+def _egl_devices() -> int:
+    """How many devices EGL has."""
+    egl, count = _egl(), ctypes.c_int()
+    if egl is None or not egl.eglGetProcAddress(b"eglQueryDevicesEXT"):
+        return 0
+    return count.value if _query_devices(egl)(0, None, ctypes.byref(count)) else 0
+
+
+def _query_devices(egl: ctypes.CDLL) -> Any:
+    address = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
+    return ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(address)
+
+
+def _egl() -> ctypes.CDLL | None:
+    try:
+        egl = ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return None
+    egl.eglGetProcAddress.restype, egl.eglGetProcAddress.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    return egl

@@ -54,6 +54,7 @@ class Robosuite:
             unusual=self.session.unusual,
             stages=[name for name, _ in self.session.stages],
             kernels=kernels(),
+            renderer=envs.renderer(self.session).name() if self.session.cameras else None,
         )
 
     def reset(self, seed: int, demonstration: bool) -> Initial:
