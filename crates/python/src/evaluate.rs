@@ -87,6 +87,7 @@ pub(crate) fn evaluate<'py>(
             let mut subject = loaded.subject();
             subject.max_steps = max_steps.or(subject.max_steps);
             subject.execution = execution.unwrap_or(subject.execution);
+            subject.execution.check(loaded.experiment().policy.action_horizon())?;
             let mut spec = environment.worker(find_python(python.as_deref())?, harness_folder()?);
             spec.control = control;
             let options = EvaluationOptions {

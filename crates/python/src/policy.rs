@@ -331,6 +331,9 @@ impl PyPolicy {
     }
 }
 
+/// How far beyond 0 to 1 a picture's values may lie and are still taken for rounding.
+const BEYOND: f64 = 1e-3;
+
 /// The shape and values of a feature; pictures with their colours last.
 fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>, Values)> {
     if spec.kind != FeatureKind::Image {
@@ -342,6 +345,14 @@ fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>
     let kind: String = picture.getattr("dtype")?.getattr("name")?.extract()?;
     if kind.starts_with("float") {
         // 0 to 1, as PyTorch has them: back to the bytes that they were made of
+        let (least, most) = (picture.call_method0("min")?, picture.call_method0("max")?);
+        let (least, most): (f64, f64) = (least.extract()?, most.extract()?);
+        // rounding may have left a little above 1; what is no number is in no range
+        if !(-BEYOND..=1.0 + BEYOND).contains(&least) || !(-BEYOND..=1.0 + BEYOND).contains(&most) {
+            let found = format!("values from {least} to {most}");
+            let text = format!("predict: {} holds {kind}, expected values from 0 to 1, found {found}", spec.name);
+            return Err(PyValueError::new_err(text));
+        }
         let scaled = numpy.call_method1("clip", (&picture, 0.0, 1.0))?.mul(255.0)?;
         picture = numpy.call_method1("rint", (scaled,))?.call_method1("astype", ("uint8",))?;
     } else if kind != "uint8" {

@@ -62,6 +62,16 @@ def test_pictures_are_what_training_reads(seen: Path) -> None:
     np.testing.assert_array_equal(np.concatenate(ours), read)
 
 
+def test_pictures_of_another_range_are_refused(seen: Path, entry: Path) -> None:
+    policy = actrm.load_policy(entry)
+    bright = actrm.Dataset(seen)[0]
+    one = {key: bright[key] for key in policy.input_features}
+    camera = CAMERAS[1]
+    for wrong in (one[camera] * 255, one[camera] - 0.5, np.full_like(one[camera], np.nan)):
+        with pytest.raises(ValueError, match=f"{camera} holds float32, expected values from 0 to 1, found"):
+            policy.predict_action_chunk({**one, camera: wrong})
+
+
 def test_pictures_are_taken_as_they_come(seen: Path, entry: Path) -> None:
     """Bytes or 0 to 1, colours first or last, one or several: the bits that the entry computes."""
     policy = actrm.load_policy(entry)

@@ -194,7 +194,7 @@ except KeyboardInterrupt:
     assert told[0] >= 1 and told[-1] == 12 and len(episodes["seed"]) == 12
 
 
-def test_what_cannot_be_evaluated_is_an_exception(zoo: Path) -> None:
+def test_what_cannot_be_evaluated_is_an_exception(zoo: Path, tmp_path: Path) -> None:
     evaluate = actrm.evaluate
     for arguments, words in [
         ({"episodes": 0}, "episodes: expected 1"),
@@ -205,6 +205,15 @@ def test_what_cannot_be_evaluated_is_an_exception(zoo: Path) -> None:
     ]:
         with pytest.raises(ValueError, match=words):
             evaluate(zoo / "lift-act", **arguments)
+    for arguments, words in [
+        ({"temporal_ensemble": float("nan")}, "temporal_ensemble`: expected a finite number"),
+        ({"temporal_ensemble": float("inf")}, "temporal_ensemble`: expected a finite number"),
+        ({"n_action_steps": 0}, "n_action_steps`: expected 1 to the action horizon"),
+        ({"n_action_steps": 10_000}, "n_action_steps`: expected 1 to the action horizon"),
+    ]:
+        with pytest.raises(actrm.Error, match=words):
+            evaluate(zoo / "lift-act", results=tmp_path / "none", **arguments)
+    assert not (tmp_path / "none").exists()
     with pytest.raises(actrm.Error, match="unknown entry `x`"):
         evaluate("x", zoo=zoo)
     with pytest.raises(actrm.Error, match="/no/such/python"):

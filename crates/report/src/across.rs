@@ -57,10 +57,11 @@ impl AcrossTasks {
 /// The row that speaks for each kind of policy in each task: `table[policy][task]`.
 ///
 /// For each task the protocol with most episodes counts, a named test block before others, and in it the policy's first
-/// row, floors and ceilings among them.
+/// row, floors and ceilings among them. What became of a policy whose pictures were changed does not speak for it.
 pub(crate) fn speaking(rows: &[LeaderboardRow]) -> BTreeMap<String, BTreeMap<String, &LeaderboardRow>> {
+    let as_seen = || rows.iter().filter(|row| row.record().protocol.perturbation.is_none());
     let mut protocols: BTreeMap<&str, BTreeMap<Asked, (bool, u64)>> = BTreeMap::new();
-    for row in rows {
+    for row in as_seen() {
         let test = row.named.as_ref().is_some_and(|(_, block)| *block == Block::Test);
         let weight = protocols.entry(row.task()).or_default().entry(asked(row)).or_insert((test, 0));
         weight.1 += row.counts.episodes;
@@ -70,7 +71,7 @@ pub(crate) fn speaking(rows: &[LeaderboardRow]) -> BTreeMap<String, BTreeMap<Str
     };
     let chosen: BTreeMap<&str, _> = protocols.into_iter().filter_map(|(task, of)| Some((task, first(of)?))).collect();
     let mut table: BTreeMap<String, BTreeMap<String, &LeaderboardRow>> = BTreeMap::new();
-    for row in rows.iter().filter(|row| chosen.get(row.task()) == Some(&asked(row))) {
+    for row in as_seen().filter(|row| chosen.get(row.task()) == Some(&asked(row))) {
         table.entry(row.kind()).or_default().entry(row.task().to_owned()).or_insert(row);
     }
     table
@@ -136,5 +137,25 @@ mod tests {
         let found = across_tasks(&rank(&single, &reading));
         assert_eq!((found[0].trainings, found[0].interval), (3, None));
         assert!(across_tasks(&rank(&all[..3], &reading)).is_empty());
+    }
+
+    #[test]
+    fn changed_pictures_do_not_speak_for_a_policy() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut all = Vec::new();
+        // more episodes under the change than without it
+        for (perturbation, episodes, won) in [(None, 30, 30), (Some("black-agentview"), 40, 4)] {
+            for task in ["Lift", "Stack"] {
+                let mut record = sample(&task.to_lowercase(), 1, episodes);
+                record.protocol.task = task.to_owned();
+                record.protocol.perturbation = perturbation.map(str::to_owned);
+                let mut stored = finished(dir.path(), &record);
+                stored.episodes.iter_mut().enumerate().for_each(|(k, episode)| episode.success = k < won);
+                all.push(stored);
+            }
+        }
+        let found = across_tasks(&rank(&all, &Reading::default()));
+        assert_eq!((found.len(), found[0].mean), (1, 1.0));
+        assert!(across_tasks(&rank(&all[2..], &Reading::default())).is_empty());
     }
 }

@@ -168,6 +168,8 @@ pub struct Flips {
     pub sequential: EProcess,
     /// Seeds after which the bet was decided at [`ALPHA`], if it was.
     pub decided_after: Option<usize>,
+    /// Whether it was decided for the first; seeds after that may have turned the lead.
+    pub first_is_better: Option<bool>,
 }
 
 impl Flips {
@@ -179,6 +181,7 @@ impl Flips {
             second_only: Vec::new(),
             sequential: EProcess::default(),
             decided_after: None,
+            first_is_better: None,
         };
         let mut seen = Vec::new();
         for (&seed, &one) in first {
@@ -192,6 +195,7 @@ impl Flips {
             flips.sequential.add(one, two);
             if flips.decided_after.is_none() && flips.sequential.is_decided(ALPHA) {
                 flips.decided_after = Some(seen.len());
+                flips.first_is_better = Some(flips.sequential.lead() > 0);
             }
         }
         flips.counts = Paired::of(seen);
@@ -322,5 +326,11 @@ mod tests {
         let flips = Flips::of(&all, &none);
         // 2^n B(n + 1/2, 1/2) / B(1/2, 1/2) first reaches 20 at n = 7
         assert_eq!(flips.decided_after, Some(7), "{:?}", flips.sequential);
+        assert_eq!(flips.first_is_better, Some(true));
+        // what was decided stays so, whatever came later
+        let (early, late) = ((0..20).map(|s| (s, s < 7)).collect(), (0..20).map(|s| (s, s >= 7)).collect());
+        let flips = Flips::of(&early, &late);
+        assert_eq!((flips.decided_after, flips.first_is_better, flips.sequential.lead()), (Some(7), Some(true), -6));
+        assert_eq!(Flips::of(&late, &early).first_is_better, Some(false));
     }
 }

@@ -308,6 +308,11 @@ impl DataSection {
                 }
             }
         }
+        if !self.exchange.is_empty() && !self.cameras.is_empty() {
+            let names: Vec<&str> = self.exchange.keys().map(String::as_str).collect();
+            let expected = "none with data.cameras, whose pictures show what was exchanged where it was";
+            return invalid("data.exchange".to_owned(), expected, names.join(", "));
+        }
         self.check_mirror(&known)?;
         if let Some(beginning) = self.beginning.filter(|beginning| beginning.steps == 0 || beginning.times == 0) {
             let BeginningSection { steps, times } = beginning;
@@ -463,6 +468,12 @@ impl Experiment {
         if self.rollout.temporal_ensemble.is_some() && steps != 1 {
             let expected = "1, because rollout.temporal_ensemble asks at every step".to_owned();
             return invalid("rollout.n_action_steps", expected, steps.to_string());
+        }
+        if let Some(coefficient) = self.rollout.temporal_ensemble {
+            let checked = crate::results::Execution::TemporalEnsemble { coefficient }.check(action_horizon);
+            if let Err(ZooError::InvalidValue { key, expected, found }) = checked {
+                return invalid(&format!("rollout.{key}"), expected, found);
+            }
         }
         if self.rollout.max_steps == Some(0) {
             return invalid("rollout.max_steps", "at least 1".to_owned(), "0".to_owned());
@@ -656,6 +667,10 @@ mod tests {
         );
         assert!(error(&["rollout.temporal_ensemble=0.01"]).starts_with("key `rollout.n_action_steps`: expected 1, "));
         assert!(load(&["rollout.temporal_ensemble=0.01", "rollout.n_action_steps=1"]).is_ok());
+        assert_eq!(
+            error(&["rollout.temporal_ensemble=nan", "rollout.n_action_steps=1"]),
+            "key `rollout.temporal_ensemble`: expected a finite number from -10.0 to 10, found NaN"
+        );
         assert_eq!(error(&["rollout.max_steps=0"]), "key `rollout.max_steps`: expected at least 1, found 0");
         assert_eq!(error(&["policy.kl_weight=-1"]), "cannot build the policy of `lift-act`");
         assert!(error(&["train.batch_size=0"]).starts_with("key `train.batch_size`: expected at least 1"));
@@ -742,6 +757,8 @@ mod tests {
         assert!(load(&[told, asks, alike]).is_ok(), "what is told can be permuted alike");
         let both = load(&[told, asks, &exchange(&format!("{both}, items = [['object'], ['object']]"))]).unwrap_err();
         assert!(both.contains("expected none with data.exchange"), "{both}");
+        let pictured = load(&[things[0], things[1], taken, "data.cameras=['front']"]).unwrap_err();
+        assert!(pictured.contains("key `data.exchange`: expected none with data.cameras"), "{pictured}");
         let mirror = |of: &str| format!("data.mirror={{ {of} }}");
         let signs = "robot0_eef_pos = [1, -1, 1], robot0_eef_quat = [1, -1, 1, -1], robot0_gripper_qpos = [1, 1]";
         let all = mirror(&format!("{signs}, action = [1, -1], object = [1]"));

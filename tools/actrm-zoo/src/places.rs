@@ -1,17 +1,17 @@
 //! Where the zoo and the experiments are, and the names in them for completion.
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use clap_complete::engine::{ArgValueCandidates, CompletionCandidate};
 use cli::completions::{candidates, given};
 use zoo::config::Library;
-use zoo::entry::EntryId;
 use zoo::protocols::{Block, Protocols};
 use zoo::registry::Registry;
 
 /// The error of an entry, which names the entry once.
-pub fn of_entry(id: &EntryId, error: anyhow::Error) -> anyhow::Error {
+pub fn of_entry(id: &impl Display, error: anyhow::Error) -> anyhow::Error {
     let name = format!("entry {id}");
     if error.to_string().starts_with(&name) { error } else { error.context(name) }
 }

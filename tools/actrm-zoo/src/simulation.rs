@@ -12,6 +12,8 @@ use zoo::entry::EntryMeta;
 use zoo::evaluation::{Environment, EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate};
 use zoo::results::StoredEvaluation;
 
+use crate::places::of_entry;
+
 /// How entries are run.
 #[derive(Args)]
 pub struct RunArgs {
@@ -103,7 +105,7 @@ pub fn run_missing(
         }
     });
     drop(screen);
-    match end.with_context(|| format!("entry {id}"))? {
+    match end.map_err(|error| of_entry(&id, error.into()))? {
         EvaluationEnd::Complete(evaluation) => Ok(Some(Evaluated { evaluation, was_there })),
         EvaluationEnd::Stopped { done, total } => {
             cli::note(&format!("{id}: {done} of {total} episodes done"));

@@ -20,19 +20,6 @@ pub fn check_seeds(start: u64, count: u64) -> Result<()> {
     Ok(())
 }
 
-/// A coefficient of temporal ensembling: weights are `exp(-coefficient * age)`, with ages up to `horizon`.
-///
-/// # Errors
-/// Where it is no number, or a weight would overflow or leave one action alone.
-pub fn check_coefficient(coefficient: f64, horizon: usize) -> Result<()> {
-    // beyond 10 the oldest prediction alone counts; exp(700) is near the largest number
-    let least = -(700.0 / horizon.max(1) as f64).min(10.0);
-    if !(least..=10.0).contains(&coefficient) {
-        bail!("--temporal-ensemble: expected a finite number from {least:.1} to 10, found {coefficient:?}");
-    }
-    Ok(())
-}
-
 /// A size on the command line: `500M`, `2G`, `1.5G`, or a number of bytes.
 ///
 /// # Errors
@@ -106,13 +93,6 @@ mod tests {
         check_seeds(10_000, 1_000_000).unwrap();
         check_seeds(u64::MAX - 1, 1).unwrap();
         assert!(check_seeds(u64::MAX, 1).unwrap_err().to_string().contains("--seed-start"));
-        for fine in [0.01, -0.01, 0.0, 10.0] {
-            check_coefficient(fine, 100).unwrap();
-        }
-        for wrong in [1e308, -1e308, f64::NAN, f64::INFINITY, -8.0] {
-            assert!(check_coefficient(wrong, 100).unwrap_err().to_string().contains("finite"), "{wrong}");
-        }
-        assert!((-(0.0_f64)..=10.0).contains(&0.0));
         workers(None).unwrap();
         workers(Some(1)).unwrap();
         let error = workers(Some(usize::MAX)).unwrap_err().to_string();

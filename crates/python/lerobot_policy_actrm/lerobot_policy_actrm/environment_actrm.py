@@ -46,9 +46,12 @@ for _task in TASKS:
 @EnvConfig.register_subclass("actrm")
 @dataclass
 class ActrmEnv(EnvConfig):
-    """One of actrm's tasks, with the features of an entry where one is named."""
+    """One of actrm's tasks, with the features of an entry where one is named.
 
-    task: str | None = "Stack"
+    Its task is the one named, else the entry's, else Stack.
+    """
+
+    task: str | None = None
     fps: int = 20
     entry: str | None = None
     python: str | None = None
@@ -58,7 +61,10 @@ class ActrmEnv(EnvConfig):
 
     def __post_init__(self) -> None:
         """Ask an environment what it shows."""
+        if self.task is None and self.entry is None:
+            self.task = "Stack"
         env = RobotEnv(self.task, entry=self.entry, python=self.python)
+        self.task = env.task
         shape = env.action_space.shape or ()
         self.features = {"action": PolicyFeature(FeatureType.ACTION, shape)}
         self.features_map = {"action": "action"}

@@ -479,7 +479,8 @@ impl LeaderboardRow {
             let (rate, interval) = (counts.percent(1), interval_text(counts.interval(), 1, '-'));
             format!("{} of {} ({rate}, 95% interval {interval})", counts.successes, counts.episodes)
         };
-        let mut text = format!("{} on {}: {}", self.record().entry, self.task(), rate(&self.counts));
+        let changed = self.record().protocol.perturbation.as_ref().map(|word| format!(", {word}")).unwrap_or_default();
+        let mut text = format!("{} on {}{changed}: {}", self.record().entry, self.task(), rate(&self.counts));
         if let Some(steps) = self.mean_steps_to_success() {
             text.push_str(&format!(", mean {steps:.1} steps to success"));
         }

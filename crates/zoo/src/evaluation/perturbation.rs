@@ -131,7 +131,8 @@ fn turned(rgb: [u8; 3], turn: f32) -> [u8; 3] {
         m if m == g => (b - r) / range + 2.0,
         _ => (r - g) / range + 4.0,
     };
-    let sixth = (sixth + 6.0 * turn).rem_euclid(6.0);
+    // the circle is round: of many turns the last part counts
+    let sixth = (sixth + 6.0 * turn.fract()).rem_euclid(6.0);
     [5.0, 3.0, 1.0].map(|n| {
         let k = (n + sixth) % 6.0;
         rounded(most - range * k.min(4.0 - k).clamp(0.0, 1.0))

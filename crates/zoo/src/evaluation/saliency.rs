@@ -203,14 +203,16 @@ fn covered(
     let (height, width) = (picture.height, picture.width);
     let stride = height.max(width).div_ceil(SQUARES).max(1);
     let side = 2 * stride;
-    let colour = mean_colour(&picture);
+    // what is covered is the picture as the network sees it, which may be painted; what is shown is the camera's
+    let own = last_picture(seen, camera, &picture)?;
+    let colour = mean_colour(&own);
     let tops = (0..height).step_by(stride);
     let squares: Vec<(usize, usize)> =
         tops.flat_map(|top| (0..width).step_by(stride).map(move |left| (top, left))).collect();
     let clipped = |(top, left): (usize, usize)| (top..(top + side).min(height), left..(left + side).min(width));
     let cover = |square: (usize, usize)| {
         let (rows, columns) = clipped(square);
-        let mut rgb = picture.rgb.clone();
+        let mut rgb = own.rgb.clone();
         for row in rows {
             for pixel in rgb[(row * width + columns.start) * 3..(row * width + columns.end) * 3].chunks_exact_mut(3) {
                 pixel.copy_from_slice(&colour);
@@ -218,22 +220,23 @@ fn covered(
         }
         rgb
     };
-    let base = predict(seen)?;
     let moved = |pictures: &[Vec<u8>]| -> Result<Vec<f32>, ModelError> {
         let rows = pictures.len();
         let batch = seen.try_map(|name, tensor| {
+            if name != camera.name {
+                return repeated(tensor, rows);
+            }
             let mut shape = tensor.dims().to_vec();
             shape[0] = rows;
-            if name != camera.name {
-                return tensor.broadcast_as(shape)?.contiguous();
-            }
             // of a history the last picture is covered
             let before = tensor.flatten_all()?.to_vec1::<u8>()?;
             let before = &before[..before.len() - picture.rgb.len()];
             let bytes: Vec<u8> = pictures.iter().flat_map(|last| before.iter().chain(last).copied()).collect();
             Tensor::from_vec(bytes, shape, &Device::Cpu)
         })?;
-        let difference = predict(&batch)?.broadcast_sub(&base)?.abs()?;
+        // asked alike, as many rows at once: a policy that draws noise draws the same for the picture as it is
+        let base = predict(&seen.try_map(|_, tensor| repeated(tensor, rows))?)?;
+        let difference = predict(&batch)?.sub(&base)?.abs()?;
         Ok(difference.mean((1, 2))?.to_vec1()?)
     };
     let whole = moved(&[colour.repeat(height * width)])?[0];
@@ -255,6 +258,20 @@ fn covered(
     let place = ((rows.start + rows.end) / 2, (columns.start + columns.end) / 2);
     let name = camera.name.strip_prefix(PICTURE_PREFIX).unwrap_or(&camera.name).to_owned();
     Ok(SalientCamera { camera: name, whole, most: values[best], place, picture, heat })
+}
+
+/// The last picture of `camera` in the one row of `seen`, which is of `picture`'s size.
+fn last_picture(seen: &Features<Tensor>, camera: &FeatureSpec, picture: &Picture) -> Result<Picture, ModelError> {
+    let bytes = seen.require("saliency", &camera.name)?.flatten_all()?.to_vec1::<u8>()?;
+    let rgb = bytes[bytes.len() - picture.rgb.len()..].to_vec();
+    Ok(Picture { rgb, ..picture.clone() })
+}
+
+/// The one row of `tensor`, `rows` times.
+fn repeated(tensor: &Tensor, rows: usize) -> candle_core::Result<Tensor> {
+    let mut shape = tensor.dims().to_vec();
+    shape[0] = rows;
+    tensor.broadcast_as(shape)?.contiguous()
 }
 
 fn mean_colour(picture: &Picture) -> [u8; 3] {
@@ -309,6 +326,38 @@ mod tests {
         let picture = seen.require("test", "observation.images.front")?;
         let pixel = picture.narrow(1, 6, 1)?.narrow(2, 15, 1)?.to_dtype(DType::F32)?;
         Ok(pixel.flatten_from(1)?.unsqueeze(1)?)
+    }
+
+    /// Draws for every row, in order, and adds nothing that it sees.
+    fn noise(seen: &Features<Tensor>) -> Result<Tensor, ModelError> {
+        let rows = seen.require("test", "observation.images.front")?.dim(0)?;
+        let drawn: Vec<f32> = (0..rows).map(|row| (row * 7 % 5) as f32).collect();
+        Ok(Tensor::from_vec(drawn, (rows, 1, 1), &Device::Cpu)?)
+    }
+
+    fn seen(bytes: &[u8]) -> Features<Tensor> {
+        let mut seen = Features::new();
+        let bytes = Tensor::from_vec(bytes.to_vec(), (1, 24, 24, 3), &Device::Cpu).unwrap();
+        seen.insert("observation.images.front", bytes);
+        seen
+    }
+
+    #[test]
+    fn noise_that_a_policy_draws_is_no_answer_to_what_it_sees() {
+        let camera = FeatureSpec::image("observation.images.front", 24, 24);
+        let picture = Picture::plain(24, 24, [9; 3]);
+        let looked = covered(&noise, &seen(&picture.rgb), &camera, picture).unwrap();
+        assert_eq!((looked.whole, looked.most), (0.0, 0.0));
+    }
+
+    #[test]
+    fn what_is_covered_is_what_the_network_sees() {
+        let camera = FeatureSpec::image("observation.images.front", 24, 24);
+        // painted in one colour: no cover of that colour changes anything, whatever the camera's picture is
+        let mut picture = Picture::plain(24, 24, [0; 3]);
+        picture.rgb[(6 * 24 + 15) * 3..][..3].copy_from_slice(&[200, 100, 0]);
+        let looked = covered(&one_pixel, &seen(&[50; 24 * 24 * 3]), &camera, picture.clone()).unwrap();
+        assert_eq!((looked.whole, looked.most, &looked.picture), (0.0, 0.0, &picture));
     }
 
     #[test]

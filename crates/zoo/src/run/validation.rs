@@ -13,6 +13,9 @@ use super::data::{self, Demonstrations};
 const MOST_WINDOWS: usize = 512;
 /// Windows at once.
 const BATCH: usize = 128;
+/// Pixels at once, where windows have pictures: those of [`BATCH`] windows with four of 84 x 84. A network's maps take some
+/// hundred bytes for each.
+const PIXELS: usize = BATCH * 4 * 84 * 84;
 
 /// Mean absolute error in network units over all steps that are not padding.
 pub(super) fn validation_loss(
@@ -25,7 +28,9 @@ pub(super) fn validation_loss(
     let indices: Vec<u32> = (0..windows.len()).step_by(stride).map(|i| i as u32).collect();
     let (mut sum, mut count) = (0.0, 0.0);
     let mut gathered = WindowBatch::default();
-    for chunk in indices.chunks(BATCH) {
+    let pixels: usize = windows.pictures().map(|(_, (height, width))| height * width).sum();
+    let at_once = (PIXELS / (pixels * windows.n_obs_steps()).max(1)).clamp(1, BATCH);
+    for chunk in indices.chunks(at_once) {
         windows.try_gather(chunk, &mut gathered).map_err(data::unreadable(&demonstrations.meta.name))?;
         let batch = data::batch(&gathered, demonstrations, experiment)?;
         let (error, entries) = absolute_error(model, &batch).map_err(experiment.model_error("validate"))?;

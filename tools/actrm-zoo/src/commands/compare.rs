@@ -248,6 +248,7 @@ fn flips_json(flips: &Flips) -> Value {
         "both": flips.counts.both, "neither": flips.counts.neither, "first_only": flips.first_only,
         "second_only": flips.second_only, "e_value": flips.sequential.e_value(),
         "sequential_p_value": flips.sequential.p_value(), "decided_after": flips.decided_after,
+        "decided_for_first": flips.first_is_better,
     })
 }
 
@@ -269,7 +270,7 @@ fn sequential_text(flips: &Flips, first: &str, second: &str) -> String {
     let p = format!("p {} at any time", p_text(flips.sequential.p_value()));
     match flips.decided_after {
         Some(seeds) => {
-            let better = if flips.sequential.lead() > 0 { first } else { second };
+            let better = if flips.first_is_better == Some(true) { first } else { second };
             format!("sequential: decided after {seeds} seeds, {better} is better ({p})")
         }
         None => format!("sequential: not decided ({p})"),

@@ -329,8 +329,8 @@ fn subject(args: &Args, asked: &Asked<'_>, loaded: &LoadedEntry) -> anyhow::Resu
         subject.execution = Execution::RecedingHorizon { n_action_steps };
     }
     if let Some(coefficient) = args.temporal_ensemble {
-        limits::check_coefficient(coefficient, loaded.experiment().policy.action_horizon())?;
         subject.execution = Execution::TemporalEnsemble { coefficient };
+        subject.execution.check(loaded.experiment().policy.action_horizon()).context("--temporal-ensemble")?;
     }
     if let Some((protocol, fixed)) = asked.protocol.and_then(|protocol| Some((protocol, protocol.execution?)))
         && fixed != subject.execution

@@ -58,7 +58,8 @@ fn shard_folders(results: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut folders = Vec::new();
     for item in results.read_dir().with_context(|| format!("cannot read folder {}", shown(results)))? {
         let path = item?.path();
-        if path.is_dir() && path.to_string_lossy().contains(MARK) {
+        let marked = path.file_name().is_some_and(|name| name.to_string_lossy().contains(MARK));
+        if marked && path.is_dir() {
             folders.push(path);
         }
     }
