@@ -298,7 +298,7 @@ impl EvaluationRecord {
     pub fn folder_in(&self, results: &Path) -> PathBuf {
         let own = results.join(self.folder_name());
         let before = results.join(Self { renderer: None, ..self.clone() }.folder_name());
-        if !own.exists() && before.exists() { before } else { own }
+        if !own.exists() && before.join(super::folder::RECORD).exists() { before } else { own }
     }
 }
 
@@ -512,7 +512,7 @@ pub(crate) mod tests {
         assert!(old.is_same(&one) && one.is_same(&old) && !one.is_same(&other));
         assert!(one.folder_name() != other.folder_name() && one.conditions() != other.conditions());
         assert_eq!(one.folder_in(dir.path()), dir.path().join(one.folder_name()));
-        std::fs::create_dir(dir.path().join(old.folder_name())).unwrap();
+        drop(super::super::folder::ResultsFolder::open(dir.path(), &old).unwrap());
         assert_eq!(one.folder_in(dir.path()), dir.path().join(old.folder_name()));
         std::fs::create_dir(dir.path().join(one.folder_name())).unwrap();
         assert_eq!(one.folder_in(dir.path()), dir.path().join(one.folder_name()));
