@@ -117,9 +117,9 @@ impl Feature {
     /// channels come first. None of anything else, and of what no picture is as large as.
     pub fn picture_size(&self) -> Option<(usize, usize)> {
         let channels_first = self.names.get(0).and_then(Value::as_str).is_some_and(|name| name.starts_with("channel"));
-        let (height, width) = match self.shape.as_slice() {
-            &[3, height, width] if channels_first => (height, width),
-            &[height, width, 3] if !channels_first => (height, width),
+        let (height, width) = match *self.shape.as_slice() {
+            [3, height, width] if channels_first => (height, width),
+            [height, width, 3] if !channels_first => (height, width),
             _ => return None,
         };
         let sides = 1..=MAX_SIDE;
