@@ -393,6 +393,29 @@ mod tests {
     }
 
     #[test]
+    fn one_entry_drawn_by_two_renderers_is_not_two_trainings() {
+        let dir = tempfile::tempdir().unwrap();
+        let by = |name: &str, renderer: Option<&str>| {
+            let mut record = sample(name, 1, 40);
+            record.renderer = renderer.map(str::to_owned);
+            finished(dir.path(), &record)
+        };
+        let all = [by("a", Some("llvmpipe (LLVM 15.0.6), OpenGL 4.5")), by("a", Some("a GPU")), by("b", Some("a GPU"))];
+        let mut told: Vec<(String, String, usize)> =
+            rank(&all).iter().map(|row| (row.name(), row.apart.clone(), row.each().len())).collect();
+        told.sort();
+        let expected = [("a@1", "drawn by a GPU", 1), ("a@1", "drawn by llvmpipe (LLVM 15.0.6)", 1), ("b@1", "", 1)];
+        assert_eq!(told, expected.map(|(name, apart, count)| (name.to_owned(), apart.to_owned(), count)));
+        // one of before, and another training of now: nothing says that they differ
+        let mut reading = Reading::default();
+        let family = ["c-s1", "c-s2"].map(|name| {
+            reading.families.insert(name, 1, "c".to_owned());
+            by(name, (name == "c-s2").then_some("a GPU"))
+        });
+        assert_eq!(super::rank(&family, &reading).iter().map(|row| row.each().len()).collect::<Vec<_>>(), [2]);
+    }
+
+    #[test]
     fn a_row_that_another_one_holds_is_left_out() {
         let dir = tempfile::tempdir().unwrap();
         let all = [10, 12, 30].map(|count| finished(dir.path(), &sample("a", 1, count)));

@@ -107,21 +107,24 @@ fn name_simulators(rows: &mut [LeaderboardRow]) {
     }
 }
 
-/// Lets rows of one entry under the same protocol say in what they differ: their seeds, how chunks are executed.
+/// Lets rows of one entry under the same protocol say in what they differ: their seeds, how chunks are executed, what drew
+/// their pictures.
 fn tell_apart(rows: &mut [LeaderboardRow]) {
-    type Differing = (BTreeSet<String>, BTreeSet<String>);
+    type Differing = (BTreeSet<String>, BTreeSet<String>, BTreeSet<String>);
     let key = |row: &LeaderboardRow| (row.name(), row.protocol_text());
     let mut found: BTreeMap<(String, String), Differing> = BTreeMap::new();
     for row in rows.iter() {
-        let (seeds, executions) = found.entry(key(row)).or_default();
+        let (seeds, executions, renderers) = found.entry(key(row)).or_default();
         seeds.insert(row.record().seeds.to_string());
         executions.insert(row.execution_text());
+        renderers.insert(row.renderer_text());
     }
     for row in rows {
-        let (seeds, executions) = &found[&key(row)];
+        let (seeds, executions, renderers) = &found[&key(row)];
         let seeds = (seeds.len() > 1).then(|| format!("seeds {}", row.record().seeds));
         let execution = (executions.len() > 1).then(|| row.execution_text());
-        row.apart = seeds.into_iter().chain(execution).collect::<Vec<_>>().join(", ");
+        let renderer = (renderers.len() > 1).then(|| row.renderer_text());
+        row.apart = seeds.into_iter().chain(execution).chain(renderer).collect::<Vec<_>>().join(", ");
     }
 }
 
@@ -142,7 +145,20 @@ fn joined(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<Leaderboar
         row.cameras = reading.cameras_of(&row.record().entry);
         row
     };
-    alike.into_values().map(row).collect()
+    alike.into_values().flat_map(by_renderer).map(row).collect()
+}
+
+/// Evaluations of several trainings; where one is there more than once, drawn by different renderers, a list for each of those.
+fn by_renderer(evaluations: Vec<StoredEvaluation>) -> Vec<Vec<StoredEvaluation>> {
+    let entries: BTreeSet<&EntryIdentity> = evaluations.iter().map(|one| &one.record.entry).collect();
+    if entries.len() == evaluations.len() {
+        return vec![evaluations];
+    }
+    let mut lists: BTreeMap<Option<String>, Vec<StoredEvaluation>> = BTreeMap::new();
+    for one in evaluations {
+        lists.entry(one.record.renderer.clone()).or_default().push(one);
+    }
+    lists.into_values().collect()
 }
 
 /// Leaves out what another row holds already.

@@ -385,6 +385,12 @@ impl LeaderboardRow {
         each.join(", ")
     }
 
+    /// `drawn by llvmpipe (LLVM 15.0.6)`, or that it was not written down.
+    pub(super) fn renderer_text(&self) -> String {
+        let name = self.record().renderer.as_deref().map(|name| name.split(", OpenGL").next().unwrap_or(name));
+        format!("drawn by {}", name.unwrap_or("what was not written down"))
+    }
+
     /// `8 steps` or `ensemble 0.01`.
     pub fn execution_text(&self) -> String {
         match self.record().execution {

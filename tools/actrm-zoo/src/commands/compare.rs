@@ -307,7 +307,7 @@ impl Side {
         let own = self.subject.record(ready, options)?;
         let alike = |record: &EvaluationRecord| {
             EvaluationRecord { seeds: own.seeds, shard: own.shard, demonstrated: own.demonstrated, ..record.clone() }
-                == own
+                .is_same(&own)
         };
         let all: BTreeMap<u64, bool> = standing
             .iter()
