@@ -10,6 +10,8 @@ use crate::error::RolloutError;
 
 const PREFIX: &str = "actrm-workers-";
 const LOCK: &str = "lock";
+/// The lock before it is held.
+const UNLOCKED: &str = "lock.new";
 
 /// A folder without a lock file is one that is being made, or whose maker was killed at that moment.
 const BEING_MADE: Duration = Duration::from_secs(3600);
@@ -33,8 +35,13 @@ impl LogFolder {
         sweep(parent);
         let made = tempfile::Builder::new().prefix(PREFIX).tempdir_in(parent);
         let folder = made.map_err(RolloutError::file("creating log folder", parent))?;
-        let path = folder.path().join(LOCK);
-        let lock = File::create(&path).and_then(|lock| lock.lock().map(|()| lock));
+        // a lock under its own name is held from the start: whoever sweeps at this moment sees a folder that is being made
+        let (unlocked, path) = (folder.path().join(UNLOCKED), folder.path().join(LOCK));
+        let lock = File::create(&unlocked).and_then(|lock| {
+            lock.lock()?;
+            fs::rename(&unlocked, &path)?;
+            Ok(lock)
+        });
         let lock = lock.map_err(RolloutError::file("locking", path))?;
         Ok(Self { folder, _lock: lock })
     }
@@ -95,5 +102,22 @@ mod tests {
         let gone = alive.path();
         drop(alive);
         assert!(!gone.exists());
+    }
+
+    #[test]
+    fn folders_made_at_the_same_time_do_not_take_each_other_for_abandoned() {
+        let parent = tempfile::tempdir().unwrap();
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| {
+                    for _ in 0..300 {
+                        let folder = LogFolder::make_in(parent.path()).unwrap();
+                        fs::write(folder.path().join("worker-0.0.stderr"), "here").unwrap();
+                        std::thread::yield_now();
+                        assert!(folder.path().join("worker-0.0.stderr").exists());
+                    }
+                });
+            }
+        });
     }
 }

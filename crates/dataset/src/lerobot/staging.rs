@@ -55,9 +55,12 @@ impl Staging {
                 .prefix(&prefix)
                 .tempdir_in(parent)
                 .map_err(io_error(parent, "create a folder in it"))?;
-            let lock = File::open(folder.path()).map_err(io_error(folder.path(), "open it"))?;
-            lock.lock().map_err(io_error(folder.path(), "lock it"))?;
             // somebody who swept between creation and lock has removed it: take another
+            let lock = match File::open(folder.path()) {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+                opened => opened.map_err(io_error(folder.path(), "open it"))?,
+            };
+            lock.lock().map_err(io_error(folder.path(), "lock it"))?;
             if folder.path().exists() {
                 widen_permissions(folder.path())?;
                 let path = folder.keep();
@@ -243,5 +246,23 @@ mod tests {
         let second = Staging::create(&target).unwrap();
         assert!(alive.path().exists() && second.path().exists());
         assert!(!dir.path().join(".set.partial-dead").exists());
+    }
+
+    #[test]
+    fn folders_begun_at_the_same_time_leave_each_other_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| {
+                    for _ in 0..100 {
+                        let staging = Staging::create(&dir.path().join("set")).unwrap();
+                        std::fs::write(staging.path().join("x"), "1").unwrap();
+                        std::thread::yield_now();
+                        assert!(staging.path().join("x").exists());
+                    }
+                });
+            }
+        });
+        assert!(names(dir.path()).is_empty());
     }
 }
