@@ -172,7 +172,10 @@ fn another_way_to_act_is_another_evaluation() {
     succeeds(&mut eval(&entries, "1", &["--n-action-steps", "2"]));
     succeeds(&mut eval(&entries, "1", &["--temporal-ensemble", "0.01"]));
     assert_eq!(listing(&entries.join("results")).len(), 3);
-    refused(&mut eval(&entries, "1", &["--n-action-steps", "17"]), &["--n-action-steps", "at most", "16", "17"]);
+    refused(
+        &mut eval(&entries, "1", &["--n-action-steps", "17"]),
+        &["--n-action-steps", "1 to the action horizon, 16", "17"],
+    );
     refused(&mut eval(&entries, "1", &["--temporal-ensemble", "nan"]), &["--temporal-ensemble", "finite", "NaN"]);
 }
 

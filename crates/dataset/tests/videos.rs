@@ -116,6 +116,11 @@ fn a_camera_that_is_not_as_the_set_says_is_told() {
 
 /// Demos with two cameras that show something smooth that moves.
 fn demos(path: &Path, lengths: &[usize]) {
+    demos_of(path, lengths, (48, 48));
+}
+
+/// The same with a hand's camera of another height and width.
+fn demos_of(path: &Path, lengths: &[usize], hand: (usize, usize)) {
     let mut writer = RobomimicWriter::create(path, &WriteOptions::default()).unwrap();
     for (number, &length) in lengths.iter().enumerate() {
         let mut demo = Demo { id: format!("demo_{number}"), ..Demo::default() };
@@ -125,15 +130,15 @@ fn demos(path: &Path, lengths: &[usize]) {
             demo.datasets.insert(format!("obs/{key}"), Array::from_f64(vec![length, width], &values));
         }
         demo.datasets.insert("actions".to_owned(), Array::from_f64(vec![length, 7], &vec![0.5; length * 7]));
-        for (camera, side) in [("agentview", 84), ("robot0_eye_in_hand", 48)] {
+        for (camera, (height, width)) in [("agentview", (84, 84)), ("robot0_eye_in_hand", hand)] {
             let picture = |frame: usize| {
-                (0..side * side * 3).map(move |i| {
-                    let (x, y) = ((i / 3 % side) as f64 / 20.0, (i / 3 / side) as f64 / 25.0);
+                (0..height * width * 3).map(move |i| {
+                    let (x, y) = ((i / 3 % width) as f64 / 20.0, (i / 3 / width) as f64 / 25.0);
                     let t = (frame + 5 * number) as f64 * 0.2 + (i % 3) as f64;
                     (127.5 + 90.0 * (x + t).sin() * (y - 0.5 * t).cos()) as u8
                 })
             };
-            let shape = vec![length, side, side, 3];
+            let shape = vec![length, height, width, 3];
             let bytes: Vec<u8> = (0..length).flat_map(picture).collect();
             let next: Vec<u8> = (1..=length).flat_map(picture).collect();
             demo.datasets.insert(format!("obs/{camera}_image"), Array::from_u8(shape.clone(), &bytes));
@@ -283,4 +288,35 @@ fn what_is_left_out_is_said_and_not_made_up() {
     let odd = ConvertOptions { fps: Some(std::f64::consts::PI), ..options(Some(VideoOptions::default())) };
     let refused = convert(&source, &dir.path().join("pi"), &odd, &mut quiet).unwrap_err().to_string();
     assert!(refused.contains("84 x 84 at 3.14159") && refused.contains("no fraction"), "{refused}");
+}
+
+#[test]
+fn a_size_that_no_video_has_is_told_before_any_work() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("a.hdf5"), dir.path().join("set"));
+    demos_of(&source, &[5], (47, 48));
+    let mut begun = |_: u64, _: u64| panic!("work began");
+    let refused = convert(&source, &out, &options(Some(VideoOptions::default())), &mut begun).unwrap_err().to_string();
+    for part in ["a.hdf5: demo_0: obs/robot0_eye_in_hand_image: expected", "--video", "47 x 48", "odd"] {
+        assert!(refused.contains(part), "{part}: {refused}");
+    }
+    assert!(!out.exists());
+    convert(&source, &out, &options(None), &mut quiet).unwrap();
+    assert_eq!(Dataset::open(&out).unwrap().frames(), 5);
+}
+
+#[test]
+fn an_image_that_cannot_be_decoded_is_named_by_its_episode() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("a.hdf5"), dir.path().join("set"));
+    demos(&source, &[5, 3]);
+    convert(&source, &out, &options(None), &mut quiet).unwrap();
+    let path = out.join("meta/info.json");
+    let mut info: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    info["features"][CAMERA]["shape"] = serde_json::json!([84, 80, 3]);
+    info["actrm"].as_object_mut().unwrap().remove("seal").unwrap();
+    std::fs::write(&path, info.to_string()).unwrap();
+    let set = Dataset::open(&out).unwrap();
+    let refused = set.pictures_of(CAMERA, 1, &mut |_| true).unwrap_err().to_string();
+    assert!(refused.contains(CAMERA) && refused.contains("of episode 1: expected"), "{refused}");
 }

@@ -38,16 +38,25 @@ pub struct Encoder {
     samples: Vec<Sample>,
 }
 
+/// Checks that pictures of this size can become a video, and says why they cannot.
+///
+/// # Errors
+/// An odd height, sides that are not 16 to 8192 pixels.
+pub fn check_size(width: usize, height: usize) -> std::result::Result<(), &'static str> {
+    if height % 2 == 1 {
+        return Err("the height is odd, and readers of 4:2:0 disagree about such pictures");
+    }
+    if !(16..=8192).contains(&width) || !(16..=8192).contains(&height) {
+        return Err("sides are 16 to 8192 pixels");
+    }
+    Ok(())
+}
+
 impl Encoder {
-    /// Starts a stream. Sides are 16 to 8192 pixels, the height is even.
+    /// Starts a stream. The size is as [`check_size`] wants it.
     pub fn new(width: usize, height: usize, rate: Rate, options: &EncodeOptions) -> Result<Self> {
         let refused = |reason: &str| refused(width, height, rate, reason);
-        if height % 2 == 1 {
-            return Err(refused("the height is odd, and readers of 4:2:0 disagree about such pictures"));
-        }
-        if !(16..=8192).contains(&width) || !(16..=8192).contains(&height) {
-            return Err(refused("sides are 16 to 8192 pixels"));
-        }
+        check_size(width, height).map_err(refused)?;
         let mut config = EncoderConfig::with_speed_preset(options.speed.min(10));
         config.width = width;
         config.height = height;

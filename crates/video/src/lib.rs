@@ -24,7 +24,7 @@ mod table;
 mod video;
 
 pub use demux::Codec;
-pub use encode::{EncodeOptions, Encoder};
+pub use encode::{EncodeOptions, Encoder, check_size};
 pub use error::{Result, VideoError};
 pub use mux::{Muxer, Rate};
 pub use video::{Frame, Frames, Info, TOLERANCE, Video};

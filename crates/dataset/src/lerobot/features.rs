@@ -223,6 +223,7 @@ impl Mapping {
         let entities = options.entities.clone();
         let mut mapping = Self { columns, fps, state_keys, env_keys, entities, action: provenance, notes };
         if let Some(video) = &options.video {
+            chooser.check_films(&mapping.columns)?;
             mapping.film(video, options.lossless);
         }
         Ok(mapping)
@@ -279,6 +280,21 @@ struct Chooser<'a> {
 }
 
 impl Chooser<'_> {
+    /// Refuses pictures of a size that no video has.
+    fn check_films(&self, columns: &[Column]) -> Result<()> {
+        for column in columns {
+            let Origin::Image { key, height, width, .. } = &column.origin else { continue };
+            video::check_size(*width, *height).map_err(|reason| InputError::WrongShape {
+                path: self.plan.path.clone(),
+                demo: self.first.id.clone(),
+                key: key.clone(),
+                expected: "pictures that can become a video (without --video every size can be converted)".to_owned(),
+                found: format!("{height} x {width}: {reason}"),
+            })?;
+        }
+        Ok(())
+    }
+
     fn state_keys(&self, options: &ConvertOptions) -> Result<Vec<String>> {
         if let Some(keys) = &options.state_keys {
             return Ok(keys.clone());

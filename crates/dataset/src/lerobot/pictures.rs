@@ -348,13 +348,25 @@ impl Dataset {
             pairs.try_for_each(|(i, (file, out))| {
                 let mut pixels = Vec::with_capacity(size);
                 let decoded = images::decode(file, height, width, &mut pixels);
-                decoded.map_err(|found| self.bad(name, &format!("frame {}", before + from + i), found))?;
+                decoded.map_err(|found| self.bad(name, &self.episode_frame(before + from + i), found))?;
                 out.copy_from_slice(&pixels);
                 Ok::<(), DatasetError>(())
             })?;
             sink(block)?;
         }
         Ok(())
+    }
+
+    /// The episode that a frame of the data set is of, and which of its frames it is.
+    fn episode_frame(&self, frame: usize) -> String {
+        let mut before = 0;
+        for episode in self.episodes() {
+            if frame < before + episode.length {
+                return format!("frame {} of episode {}", frame - before, episode.index);
+            }
+            before += episode.length;
+        }
+        format!("row {frame}")
     }
 
     fn bad(&self, name: &str, what: &str, found: String) -> DatasetError {

@@ -4,6 +4,9 @@ use super::ResNetShape;
 use crate::error::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
+/// Blocks of one layer; ResNet-152 has 36.
+const MOST_BLOCKS: usize = 36;
+
 /// Blocks of the network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
@@ -136,6 +139,11 @@ impl VisionConfig {
             let expected = "at least 1 of the first layer, and none of a layer only where those behind have none";
             return refuse("blocks", format!("{blocks:?}"), expected);
         }
+        if let Some(blocks) = self.blocks
+            && blocks.iter().any(|blocks| *blocks > MOST_BLOCKS)
+        {
+            return refuse("blocks", format!("{blocks:?}"), &format!("at most {MOST_BLOCKS} a layer"));
+        }
         if let TokenKind::Keypoints { count: 0 } = self.tokens {
             return refuse("tokens.keypoints.count", "0".to_string(), "at least 1");
         }
@@ -203,5 +211,22 @@ impl VisionConfig {
     /// Learning rate of the backbone as a share of the rest's.
     pub fn backbone_rate(&self) -> f64 {
         self.lr_backbone.unwrap_or(if self.weights.is_some() { 0.1 } else { 1.0 })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn blocks_that_are_no_network_are_refused() {
+        let of = |blocks| VisionConfig { blocks: Some(blocks), ..VisionConfig::default() }.validate();
+        for blocks in [[1, 0, 0, 0], [2, 2, 2, 2], [3, 8, 36, 3]] {
+            of(blocks).unwrap();
+        }
+        for blocks in [[0, 2, 2, 2], [2, 0, 2, 2], [2, 2, 2, 1_000_000_000]] {
+            assert!(of(blocks).unwrap_err().to_string().contains("blocks"));
+        }
     }
 }

@@ -316,8 +316,8 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &Results) {
     }
 }
 
-/// What became of the pictures, and what came of it.
-type Changed<'a> = Vec<(&'a str, &'a Trainings)>;
+/// What became of the pictures, in which test, and what came of it.
+type Changed<'a> = Vec<(&'a str, &'a str, &'a Trainings)>;
 
 /// What policies lose where their pictures are changed on the way to them: success on the plain test, then on each of the
 /// others of the same task and demonstrations.
@@ -325,7 +325,7 @@ fn pictures_changed(text: &mut String, study: &Study, results: &Results) {
     let mut tables: BTreeMap<&str, BTreeMap<&str, Changed<'_>>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results {
         if let Some(perturb) = &study.tests[test].perturb {
-            tables.entry(data).or_default().entry(arm).or_default().push((perturb, trainings));
+            tables.entry(data).or_default().entry(arm).or_default().push((perturb, test, trainings));
         }
     }
     if tables.is_empty() {
@@ -337,7 +337,7 @@ fn pictures_changed(text: &mut String, study: &Study, results: &Results) {
          other, one of them black, colours turned, less light (`actrm-zoo eval --perturb`). The episodes are the first of those above.\n"
     );
     for (data, arms) in tables {
-        let changes: BTreeSet<&str> = arms.values().flatten().map(|(perturb, _)| *perturb).collect();
+        let changes: BTreeSet<&str> = arms.values().flatten().map(|(perturb, ..)| *perturb).collect();
         let heads: Vec<&str> = changes.iter().copied().collect();
         let task = &study.data[data].task;
         let _ =
@@ -347,18 +347,27 @@ fn pictures_changed(text: &mut String, study: &Study, results: &Results) {
                 study.tests[test].is_plain() && study.tests[test].task == *task && of == data && its == arm
             });
             let plain = plain.map_or("not run".to_owned(), |(_, trainings)| cell_text(trainings, &[]));
-            let cells: Vec<String> = changes
-                .iter()
-                .map(|change| changed.iter().find(|(perturb, _)| perturb == change))
-                .map(|found| found.map_or("not run".to_owned(), |(_, trainings)| cell_text(trainings, &[])))
-                .collect();
+            let cells: Vec<String> = changes.iter().map(|change| changed_text(&changed, change)).collect();
             let _ = writeln!(text, "| {} | {plain} | {} |", study.arms[arm].label, cells.join(" | "));
         }
         text.push('\n');
     }
 }
 
-/// The middle value, the upper one of two.
+/// The results under one change of pictures; several tests of it go by their names.
+fn changed_text(changed: &Changed<'_>, change: &str) -> String {
+    let of_change: Vec<_> = changed.iter().filter(|(perturb, ..)| *perturb == change).collect();
+    match of_change.as_slice() {
+        [] => "not run".to_owned(),
+        [(_, _, trainings)] => cell_text(trainings, &[]),
+        several => {
+            let cells: Vec<String> =
+                several.iter().map(|(_, test, trainings)| format!("{test}: {}", cell_text(trainings, &[]))).collect();
+            cells.join("<br>")
+        }
+    }
+}
+
 /// Cells whose tests are of two trainings, of which nobody can tell whether they are the same.
 fn trained_twice(text: &mut String, results: &Results) {
     let mut by_training: BTreeMap<(&String, &String, u64), Vec<&CellResult>> = BTreeMap::new();
@@ -385,6 +394,7 @@ fn trained_twice(text: &mut String, results: &Results) {
     text.push('\n');
 }
 
+/// The middle value, the upper one of two.
 fn median(results: &[&CellResult], value: fn(&CellResult) -> f64) -> f64 {
     let mut values: Vec<f64> = results.iter().map(|result| value(result)).collect();
     values.sort_by(f64::total_cmp);

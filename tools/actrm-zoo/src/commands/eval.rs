@@ -322,11 +322,8 @@ fn subject(args: &Args, asked: &Asked<'_>, loaded: &LoadedEntry) -> anyhow::Resu
         subject.max_steps = Some(usize::try_from(max_steps)?);
     }
     if let Some(n_action_steps) = args.n_action_steps {
-        let (n_action_steps, most) = (usize::try_from(n_action_steps)?, loaded.experiment().policy.action_horizon());
-        if n_action_steps > most {
-            bail!("--n-action-steps: expected at most the action horizon, {most}, found {n_action_steps}");
-        }
-        subject.execution = Execution::RecedingHorizon { n_action_steps };
+        subject.execution = Execution::RecedingHorizon { n_action_steps: usize::try_from(n_action_steps)? };
+        subject.execution.check(loaded.experiment().policy.action_horizon()).context("--n-action-steps")?;
     }
     if let Some(coefficient) = args.temporal_ensemble {
         subject.execution = Execution::TemporalEnsemble { coefficient };

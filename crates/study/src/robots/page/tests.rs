@@ -238,7 +238,9 @@ fn what_changed_pictures_cost_stands_beside_what_is_drawn_and_nowhere_else() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("study.toml");
     let dark = "[tests.t-dark]\ntask = \"PickChain\"\nepisodes = 4\nseed_start = 40000\nperturb = \"black-agentview\"\n\
-                [[cells]]\narms = [\"one\", \"six\"]\ndata = \"chain\"\nseeds = 1\ntests = [\"t-dark\"]\nstage = 2\n";
+                [[cells]]\narms = [\"one\", \"six\"]\ndata = \"chain\"\nseeds = 1\ntests = [\"t-dark\"]\nstage = 2\n\
+                [tests.t-later]\ntask = \"PickChain\"\nepisodes = 4\nseed_start = 50000\nperturb = \"black-agentview\"\n\
+                [[cells]]\narms = [\"one\"]\ndata = \"chain\"\nseeds = 1\ntests = [\"t-later\"]\nstage = 3\n";
     let seen = "[data.chain]\ncameras = { names = [\"agentview\"], size = 84, fast_render = true }";
     let text = STUDY.replace("RESULTS", &folder.path().display().to_string()).replace("[data.chain]", seen) + dark;
     std::fs::write(&file, text).unwrap();
@@ -258,7 +260,12 @@ fn what_changed_pictures_cost_stands_beside_what_is_drawn_and_nowhere_else() {
         rows.last().copied().unwrap_or_default().to_owned()
     };
     assert!(page.contains("| PickChain | as drawn | black-agentview |\n|---|---|---|\n"), "{page}");
-    assert!(row("one step").contains("<br>4 of 4 | 25.0% [") && row("one step").ends_with("<br>1 of 4 |"), "{page}");
+    // two tests of one change: both are shown, each by its name
+    assert!(
+        row("one step").contains("<br>4 of 4 | t-dark: 25.0% [") && row("one step").ends_with("<br>1 of 4 |"),
+        "{page}"
+    );
+    assert!(row("one step").contains("<br>1 of 4<br>t-later: 25.0% ["), "{page}");
     assert!(row("six steps").ends_with("<br>2 of 4 |"), "{page}");
     assert!(!page.contains("PickChain after 200 demonstrations:\n"), "{page}");
 }
