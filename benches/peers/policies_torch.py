@@ -43,7 +43,7 @@ def trained(module: torch.nn.Module, loss: Callable[[], torch.Tensor]) -> Callab
 
 
 def diffusion() -> Work:
-    """LeRobot's, at the size of `configs/_unet.toml`."""
+    """LeRobot's, at the size of `configs/policy/_unet.toml`."""
     config = DiffusionConfig(
         input_features={
             "observation.state": PolicyFeature(FeatureType.STATE, (STATE,)),

@@ -81,22 +81,9 @@ class Cell:
 CELLS = [Cell(arm, task, seed) for seed in (1,) for task in TASKS for arm in ARMS]
 
 
-def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """The tables of `above` over those of `below`."""
-    both = dict(below)
-    for key, value in above.items():
-        both[key] = merged(both[key], value) if isinstance(value, dict) and isinstance(both.get(key), dict) else value
-    return both
-
-
 def experiment(name: str) -> dict[str, Any]:
-    """An experiment of `configs/` with all that it extends."""
-    own = tomllib.loads((ROOT / "configs" / f"{name}.toml").read_text())
-    parents = own.pop("extends", [])
-    whole: dict[str, Any] = {}
-    for parent in [parents] if isinstance(parents, str) else parents:
-        whole = merged(whole, experiment(parent))
-    return merged(whole, own)
+    """An experiment as the program resolves it."""
+    return tomllib.loads(run([BIN / "actrm-zoo", "train", name, "--print-config"]))
 
 
 def write(path: Path, value: Any) -> None:

@@ -19,23 +19,34 @@ fn compiler() -> String {
     said.split_whitespace().nth(1).unwrap_or("unknown").to_owned()
 }
 
-/// Writes name and text of every TOML file in `folder` as a Rust expression.
+/// Writes name and text of every TOML file below `folder` as a Rust expression.
 fn list(folder: &str, out: &str) {
     // asked when it runs: a checkout may have moved, its built script with it
     let here = std::env::var_os("CARGO_MANIFEST_DIR").expect("cargo says where the package is");
     let folder = Path::new(&here).join(folder);
-    println!("cargo:rerun-if-changed={}", folder.display());
-    let items = std::fs::read_dir(&folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display()));
-    let mut files: Vec<PathBuf> = items.map(|item| item.expect("a folder can be listed").path()).collect();
-    files.retain(|path| path.extension().is_some_and(|extension| extension == "toml"));
+    let mut files = Vec::new();
+    below(&folder, &mut files);
     files.sort();
     let mut list = String::from("&[\n");
     for file in &files {
-        let name = file.file_stem().and_then(|name| name.to_str()).expect("these files have plain names");
+        let name = file.strip_prefix(&folder).expect("below the folder").with_extension("");
+        let name = name.to_str().expect("these files have plain names");
         let path = file.canonicalize().expect("a file that was listed");
         writeln!(list, "    ({name:?}, include_str!({path:?})),").expect("a string takes all");
     }
     list.push(']');
     let out = PathBuf::from(std::env::var_os("OUT_DIR").expect("cargo sets OUT_DIR")).join(out);
     std::fs::write(&out, list).unwrap_or_else(|e| panic!("{}: {e}", out.display()));
+}
+
+fn below(folder: &Path, into: &mut Vec<PathBuf>) {
+    println!("cargo:rerun-if-changed={}", folder.display());
+    for item in std::fs::read_dir(folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display())) {
+        let path = item.expect("a folder can be listed").path();
+        match path.is_dir() {
+            true => below(&path, into),
+            false if path.extension().is_some_and(|extension| extension == "toml") => into.push(path),
+            false => {}
+        }
+    }
 }

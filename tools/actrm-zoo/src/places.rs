@@ -20,7 +20,7 @@ pub fn of_entry(id: &impl Display, error: anyhow::Error) -> anyhow::Error {
 const USUAL_ZOO: &str = "zoo";
 
 /// Where the zoo is.
-#[derive(Args)]
+#[derive(Args, Clone)]
 pub struct ZooArgs {
     /// Folder of the zoo
     #[arg(long, value_name = "DIR", default_value = USUAL_ZOO, env = "ACTRM_ZOO_DIR")]
@@ -60,7 +60,7 @@ impl ResultsArgs {
 }
 
 /// Where experiments are.
-#[derive(Args)]
+#[derive(Args, Clone)]
 pub struct ConfigArgs {
     /// Folder of experiment files that come before those built in
     #[arg(long, value_name = "DIR", env = "ACTRM_CONFIGS")]

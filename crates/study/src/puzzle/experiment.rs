@@ -339,18 +339,3 @@ impl PuzzleExperiment {
         move |source| ZooError::Model { operation, name, source }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::*;
-
-    #[test]
-    fn every_experiment_built_in_is_sound() {
-        let library = Library::built_in();
-        for name in library.names().unwrap() {
-            let experiment = AnyExperiment::load(&library, &name, &[]).unwrap();
-            assert!(!experiment.description().is_empty(), "{name}");
-        }
-    }
-}

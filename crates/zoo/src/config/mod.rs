@@ -1,8 +1,13 @@
-//! Experiment files: TOML, composed by `extends`, changed by dotted overrides.
+//! Experiments: TOML, composed from the files of `configs/`, changed by dotted overrides.
 //!
-//! The experiments of `configs/` are built into the binary; a folder given by the user comes first. A name
-//! that starts with `_` is a part that others extend, not an experiment to train.
+//! An experiment is a policy on a task with some inputs. Its name says so, `act_stack` or `act_stack_image`, and its settings are laid
+//! over each other in this order (`compose.rs`):
+//!
+//! `base.toml` < `policy/` < `task/` < `inputs/` < `recipe/` < the command line
+//!
+//! The files are built into the binary. A folder given by the user comes first: its own experiments, and files of the same groups.
 
+mod compose;
 mod embedded;
 mod overrides;
 mod value;
@@ -63,15 +68,17 @@ impl Library {
         Ok(Self { folder: Some(folder.to_owned()) })
     }
 
-    /// Names of every experiment that can be trained, sorted.
-    ///
-    /// # Errors
-    /// When the folder cannot be read.
-    pub fn names(&self) -> Result<Vec<String>, ZooError> {
-        let mut names: Vec<String> = embedded::FILES.iter().map(|(n, _)| (*n).to_owned()).collect();
-        if let Some(folder) = &self.folder {
-            for item in std::fs::read_dir(folder).map_err(ZooError::io("read folder", folder))? {
-                let path = item.map_err(ZooError::io("read folder", folder))?.path();
+    /// Names of the files of a group (`policy`, `task`, ...; the empty one: the user's own experiments), sorted, without parts that
+    /// others extend (`_name`).
+    fn group(&self, group: &str) -> Result<Vec<String>, ZooError> {
+        let mut names: Vec<String> = embedded::FILES
+            .iter()
+            .filter_map(|(path, _)| path.rsplit_once('/').filter(|(folder, _)| *folder == group))
+            .map(|(_, name)| name.to_owned())
+            .collect();
+        if let Some(folder) = self.folder.as_ref().map(|f| f.join(group)).filter(|folder| folder.is_dir()) {
+            for item in std::fs::read_dir(&folder).map_err(ZooError::io("read folder", &folder))? {
+                let path = item.map_err(ZooError::io("read folder", &folder))?.path();
                 let stem = path.file_stem().and_then(|s| s.to_str());
                 if let (Some(stem), Some("toml")) = (stem, path.extension().and_then(|e| e.to_str())) {
                     names.push(stem.to_owned());
@@ -84,68 +91,23 @@ impl Library {
         Ok(names)
     }
 
-    /// The table of experiment `name` with everything it extends merged beneath it: one experiment, or a list of them, of
-    /// which later ones lie over earlier ones.
-    ///
-    /// Tables merge key by key; anything else is replaced by the extending file.
-    ///
-    /// # Errors
-    /// When a file is unknown, not TOML, or extends itself.
-    pub fn resolve(&self, name: &str) -> Result<Table, ZooError> {
-        self.resolve_below(name, &mut Vec::new())
-    }
-
-    /// The same for an experiment that those of `chain` extend.
-    fn resolve_below(&self, name: &str, chain: &mut Vec<String>) -> Result<Table, ZooError> {
-        let cycle = chain.iter().any(|seen| seen == name);
-        chain.push(name.to_owned());
-        if cycle {
-            return Err(ZooError::ExtendsCycle { chain: chain.clone() });
-        }
-        let mut table = self.read(name)?;
-        let parents = match table.remove("extends") {
-            None => Vec::new(),
-            Some(toml::Value::Array(parents)) => parents,
-            Some(parent) => vec![parent],
-        };
-        let mut merged = Table::new();
-        for parent in parents {
-            let Some(parent) = parent.as_str() else {
-                return Err(ZooError::InvalidValue {
-                    key: "extends".to_owned(),
-                    expected: "the name of an experiment, or a list of names".to_owned(),
-                    found: parent.to_string(),
-                });
-            };
-            merge(&mut merged, self.resolve_below(parent, chain)?);
-        }
-        merge(&mut merged, table);
-        chain.pop();
-        Ok(merged)
-    }
-
-    fn read(&self, name: &str) -> Result<Table, ZooError> {
-        check_experiment_name(name)?;
-        let text = match self.folder.as_ref().map(|f| f.join(format!("{name}.toml"))) {
-            Some(path) if path.is_file() => std::fs::read_to_string(&path).map_err(ZooError::io("read", path))?,
-            _ => match embedded::FILES.iter().find(|(n, _)| *n == name) {
+    /// The file `path` (`policy/act`, `base`, or the user's `my_experiment`), if there is one.
+    fn file(&self, path: &str) -> Result<Option<Table>, ZooError> {
+        let own = self.folder.as_ref().map(|folder| folder.join(format!("{path}.toml"))).filter(|file| file.is_file());
+        let text = match own {
+            Some(file) => std::fs::read_to_string(&file).map_err(ZooError::io("read", file))?,
+            None => match embedded::FILES.iter().find(|(name, _)| *name == path) {
                 Some((_, text)) => (*text).to_owned(),
-                None => {
-                    let available = self.names()?;
-                    return Err(ZooError::UnknownExperiment {
-                        name: name.to_owned(),
-                        nearest: nearest(name, &available),
-                        available,
-                    });
-                }
+                None => return Ok(None),
             },
         };
         toml::from_str(&text)
-            .map_err(|source| ZooError::ExperimentSyntax { experiment: name.to_owned(), source: Box::new(source) })
+            .map(Some)
+            .map_err(|source| ZooError::ExperimentSyntax { experiment: path.to_owned(), source: Box::new(source) })
     }
 }
 
-/// Lays `above` over `below`.
+/// Lays `above` over `below`: tables merge key by key, anything else is replaced.
 fn merge(below: &mut Table, above: Table) {
     for (key, value) in above {
         match (below.get_mut(&key), value) {
@@ -165,7 +127,9 @@ mod tests {
     fn library(files: &[(&str, &str)]) -> (tempfile::TempDir, Library) {
         let folder = tempfile::tempdir().unwrap();
         for (name, text) in files {
-            std::fs::write(folder.path().join(format!("{name}.toml")), text).unwrap();
+            let file = folder.path().join(format!("{name}.toml"));
+            std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+            std::fs::write(file, text).unwrap();
         }
         let library = Library::with_folder(folder.path()).unwrap();
         (folder, library)
@@ -179,7 +143,8 @@ mod tests {
             ("c", "extends = '_b'\ny = 2\n[train]\nkeys = [3]"),
         ]);
         let table = library.resolve("c").unwrap();
-        let expected: Table = toml::from_str("x = 1\ny = 2\n[train]\nsteps = 20\nlr = 0.1\nkeys = [3]").unwrap();
+        let expected: Table =
+            toml::from_str("x = 1\ny = 2\nentry = 'c'\n[train]\nsteps = 20\nlr = 0.1\nkeys = [3]").unwrap();
         assert_eq!(table, expected);
         let names = library.names().unwrap();
         assert!(names.contains(&"c".to_owned()) && !names.contains(&"_a".to_owned()));
@@ -216,8 +181,15 @@ mod tests {
 
     #[test]
     fn a_file_that_extends_itself_is_named() {
-        let (_folder, library) = library(&[("p", "extends = 'q'"), ("q", "extends = 'p'")]);
+        let (_folder, library) = library(&[
+            ("p", "extends = 'q'"),
+            ("q", "extends = 'p'"),
+            ("task/here", "extends = '_there'"),
+            ("task/_there", "extends = 'here'"),
+        ]);
         assert_eq!(library.resolve("p").unwrap_err().to_string(), "experiment `p` extends itself: p -> q -> p");
+        let error = library.resolve("act_here").unwrap_err().to_string();
+        assert!(error.ends_with("task/here -> task/_there -> task/here"), "{error}");
     }
 
     #[test]
@@ -231,20 +203,24 @@ mod tests {
 
     #[test]
     fn every_file_of_configs_is_built_in() {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
-        let mut on_disk: Vec<(String, String)> = std::fs::read_dir(folder)
-            .unwrap()
-            .map(|item| item.unwrap().path())
-            .filter(|path| path.extension().is_some_and(|e| e == "toml"))
-            .map(|path| {
-                let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
-                (name, std::fs::read_to_string(path).unwrap())
-            })
-            .collect();
+        fn below(folder: &Path, group: &str, into: &mut Vec<(String, String)>) {
+            for item in std::fs::read_dir(folder).unwrap() {
+                let path = item.unwrap().path();
+                let name = format!("{group}{}", path.file_stem().unwrap().to_str().unwrap());
+                match path.is_dir() {
+                    true => below(&path, &format!("{name}/"), into),
+                    false => into.push((name, std::fs::read_to_string(path).unwrap())),
+                }
+            }
+        }
+        let mut on_disk = Vec::new();
+        below(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs"), "", &mut on_disk);
         on_disk.sort();
-        let built_in: Vec<(String, String)> =
+        let mut built_in: Vec<(String, String)> =
             embedded::FILES.iter().map(|(n, t)| ((*n).to_owned(), (*t).to_owned())).collect();
+        built_in.sort();
         assert_eq!(on_disk, built_in);
+        assert!(on_disk.len() <= 120, "{} files: a combination is composed, not listed", on_disk.len());
     }
 
     #[test]
@@ -252,5 +228,44 @@ mod tests {
         let names = ["steps".to_owned(), "lr".to_owned()];
         assert_eq!(nearest("stpes", &names), Some("steps".to_owned()));
         assert_eq!(nearest("batch_size", &names), None);
+    }
+
+    #[test]
+    fn the_user_s_groups_come_first_and_numbers_of_one_combination_are_laid_over_all_others() {
+        let (_folder, library) = library(&[
+            (
+                "policy/mine",
+                "title = 'Mine'\n[policy]\ntype = 'bc'\n[train]\nsteps = 1\n[for.image.train]\nsteps = 2\n\
+                 [for.sweep.train]\nsteps = 3\n[for.sweep_image.train]\nlr = 0.5",
+            ),
+            (
+                "task/sweep",
+                "title = 'Sweep'\ninputs = ['state', 'image']\n[task]\nname = 'Sweep'\n[for.state.data]\nenv_keys = ['dirt']\n\
+                 [for.image.data]\npath = 'seen.hdf5'",
+            ),
+            ("recipe/mine_sweep", "[train]\nlr = 0.25"),
+        ]);
+        let state = library.resolve("mine_sweep").unwrap();
+        assert_eq!(state["train"]["steps"].as_integer(), Some(3));
+        assert_eq!(state["train"]["lr"].as_float(), Some(0.25), "a recipe lies over everything");
+        assert_eq!(state["data"]["env_keys"][0].as_str(), Some("dirt"));
+        assert_eq!(state["entry"].as_str(), Some("sweep-mine"));
+        assert_eq!(state["description"].as_str(), Some("Mine on Sweep, low-dimensional observations."));
+        let image = library.resolve("mine_sweep_image").unwrap();
+        assert_eq!(
+            image["train"]["steps"].as_integer(),
+            Some(2),
+            "the numbers of the combination with state are not its"
+        );
+        assert_eq!(image["train"]["lr"].as_float(), Some(0.5));
+        assert_eq!(image["data"]["env_keys"].as_array().unwrap().len(), 0);
+        assert_eq!(image["data"]["path"].as_str(), Some("seen.hdf5"));
+        assert_eq!(image["entry"].as_str(), Some("sweep-mine-image"));
+        let names = library.names().unwrap();
+        for name in ["mine_sweep", "mine_sweep_image", "mine_stack", "act_sweep_image", "trm_sudoku9"] {
+            assert!(names.contains(&name.to_owned()), "{name}");
+        }
+        let refused = library.resolve("mine_sweep_image_told").unwrap_err().to_string();
+        assert!(refused.contains("inputs `image_told`") && refused.contains("state, image"), "{refused}");
     }
 }

@@ -56,8 +56,8 @@ pub struct TrainSection {
     pub grad_clip_norm: f64,
     /// Parts that a batch is cut into, one after the other, to save memory.
     pub accumulation: usize,
-    /// Decay of the moving average of the weights; absent: no average.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    /// Decay of the moving average of the weights; absent or 0: no average.
+    #[serde(skip_serializing_if = "Option::is_none", deserialize_with = "zero_is_none")]
     pub ema_decay: Option<f64>,
     /// How an entry stores its weights; absent: as they were trained, in 32 bits.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -169,4 +169,8 @@ impl TrainSection {
             accumulation: self.accumulation,
         }
     }
+}
+/// No average, whatever is extended: TOML has no word for "absent".
+fn zero_is_none<'de, D: serde::Deserializer<'de>>(decay: D) -> Result<Option<f64>, D::Error> {
+    Ok(Option::deserialize(decay)?.filter(|decay| *decay != 0.0))
 }

@@ -20,20 +20,22 @@ use crate::training::show;
 /// `--seeds 1..8` trains eight times, with the seeds 1 to 8, one entry each (`lift-act-s1` to `lift-act-s8`): a family,
 /// which the leaderboard shows as one row with the chance of training in its interval. The same command goes on where it
 /// was; what is trained already is not trained again.
-#[derive(clap::Args)]
+#[derive(clap::Args, Clone)]
 #[command(after_help = "Examples:
   actrm-zoo train act_lift
   actrm-zoo train act_lift train.steps=2000 policy.dim_model=256
+  actrm-zoo train policy=diffusion task=stack
+  actrm-zoo train act_stack inputs=image
   actrm-zoo train act_lift --data demos.hdf5 --zoo my-zoo
   actrm-zoo train act_lift --resume
   actrm-zoo train act_lift --seeds 1..8
   actrm-zoo train trm_dfs10 train.seed=2
   actrm-zoo train act_lift --print-config")]
 pub struct Args {
-    /// Experiment, by name (`actrm-zoo list --experiments`)
+    /// Experiment, by name (`act_stack`; see `actrm-zoo list --experiments`) or by its parts (`policy=act task=stack inputs=image`)
     #[arg(add = experiment_names())]
     experiment: String,
-    /// Changes to it: `train.steps=5000`, `task.name=Stack`
+    /// Changes to it: `train.steps=5000`, `inputs=image`
     #[arg(value_name = "KEY=VALUE")]
     overrides: Vec<String>,
     /// Demonstrations: an HDF5 file or a LeRobotDataset folder, instead of the experiment's
@@ -92,6 +94,9 @@ impl std::str::FromStr for TrainingSeeds {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let library = args.configs.library()?;
+    let words: Vec<String> = [&args.experiment].into_iter().chain(&args.overrides).cloned().collect();
+    let (experiment, overrides) = library.choose(&words)?;
+    let args = &Args { experiment, overrides, ..args.clone() };
     let load = |overrides: &[String]| {
         AnyExperiment::load(&library, &args.experiment, overrides)
             .with_context(|| format!("experiment `{}`", args.experiment))
