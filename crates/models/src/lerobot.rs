@@ -22,6 +22,8 @@ const LEROBOTS_WIDTH: usize = 64;
 const OF_PICTURES: [&str; 2] = [PICTURE_MEAN, PICTURE_STD];
 /// LeRobot saves this fixed table with the weights.
 const POSITION_BUFFER: &str = "vae_encoder_pos_enc";
+/// How far its sines and cosines may be off: bf16 rounds numbers below 1 to 1/512.
+const TABLE_TOLERANCE: f32 = 1.0 / 256.0;
 
 /// Keys that LeRobot knows and that do not matter to a policy at rest.
 const OF_NO_MATTER: [&str; 15] = [
@@ -383,13 +385,12 @@ pub fn load_tensors(params: &Params, config: &Config, tensors: &BTreeMap<String,
             return Err(ModelError::MisshapenTensor { name, expected, found });
         }
         let off = (table - expected)?.abs()?.flatten_all()?.max(0)?.to_scalar::<f32>()?;
-        // the table is sines and cosines in f32
-        if off.is_nan() || off > 1e-5 {
+        if off.is_nan() || off > TABLE_TOLERANCE {
             return Err(ModelError::Input {
                 operation: "load LeRobot act",
                 object: POSITION_BUFFER,
                 found: format!("{off} away from the sinusoid"),
-                expected: "LeRobot's sinusoid to 1e-5".to_string(),
+                expected: format!("LeRobot's sinusoid to {TABLE_TOLERANCE}"),
             });
         }
     }

@@ -37,6 +37,7 @@ const ROBOSUITE: u64 = 1;
 /// misshapen, each by name.
 pub fn import(path: &Path, options: &ImportOptions, python: &Python, zoo: &Path) -> Result<EntryId, ZooError> {
     let (given, stored) = tensors::from_bytes(path, &rollout::read_robomimic(python, path)?)?;
+    let given = tensors::in_f32(path, given)?;
     tensors::check_finite(path, &given)?;
     let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
     let misfit = |error: models::ModelError| malformed(error.to_string());

@@ -1,10 +1,10 @@
 //! Named tensors to safetensors bytes and back, the same bytes for the same tensors.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
 use candle_core::{DType, Device, Tensor};
-use half::f16;
+use half::{bf16, f16};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView, serialize};
 
@@ -92,13 +92,87 @@ fn tensor(view: &TensorView<'_>) -> candle_core::Result<Tensor> {
     match view.dtype() {
         // what is stored in half is computed with in full
         Dtype::F16 => values!(f16)?.to_dtype(DType::F32),
+        Dtype::BF16 => values!(bf16)?.to_dtype(DType::F32),
         Dtype::F32 => values!(f32),
         Dtype::F64 => values!(f64),
         Dtype::I64 => values!(i64),
         Dtype::U32 => values!(u32),
         Dtype::U8 => values!(u8),
-        other => candle_core::bail!("dtype {other:?} is not one of f16, f32, f64, i64, u32, u8"),
+        other => candle_core::bail!("expected dtype f16, bf16, f32, f64, i64, u32 or u8, found {other:?}"),
     }
+}
+
+/// The list of files that a checkpoint in several files has beside them.
+const INDEX_SUFFIX: &str = ".index.json";
+
+/// Reads the weights that another program wrote to `path`, in f32 whatever floating-point type they are stored in. Where there is
+/// no such file but Hugging Face's list of its parts (`model.safetensors.index.json`), all of those are read.
+///
+/// # Errors
+/// A file that cannot be read or is something else; a tensor of another type, or too large for f32; parts that do not hold what
+/// the list says.
+pub fn read_weights(path: &Path) -> Result<BTreeMap<String, Tensor>, ZooError> {
+    let mut index = path.as_os_str().to_owned();
+    index.push(INDEX_SUFFIX);
+    let index = Path::new(&index);
+    match !path.exists() && index.exists() {
+        true => read_parts(index),
+        false => in_f32(path, read(path)?.0),
+    }
+}
+
+#[derive(serde::Deserialize)]
+struct Index {
+    /// The file of each tensor.
+    weight_map: BTreeMap<String, String>,
+}
+
+fn read_parts(index: &Path) -> Result<BTreeMap<String, Tensor>, ZooError> {
+    let malformed = |reason: String| ZooError::Malformed { path: index.to_owned(), reason };
+    let text = std::fs::read(index).map_err(ZooError::io("read", index))?;
+    let Index { weight_map } =
+        serde_json::from_slice(&text).map_err(|e| malformed(format!("not a list of safetensors files: {e}")))?;
+    let mut all = BTreeMap::new();
+    for file in weight_map.values().collect::<BTreeSet<_>>() {
+        if file.contains(['/', '\\']) {
+            return Err(malformed(format!("weight_map: expected files beside this one, found `{file}`")));
+        }
+        let path = index.with_file_name(file);
+        for (name, tensor) in in_f32(&path, read(&path)?.0)? {
+            match weight_map.get(&name) {
+                Some(expected) if expected == file => all.insert(name, tensor),
+                Some(expected) => {
+                    return Err(malformed(format!("tensor `{name}`: expected in {expected}, found in {file}")));
+                }
+                None => return Err(malformed(format!("weight_map: no tensor `{name}`, which {file} holds"))),
+            };
+        }
+    }
+    match weight_map.iter().find(|(name, _)| !all.contains_key(*name)) {
+        Some((name, file)) => Err(malformed(format!("tensor `{name}`: expected in {file}, which does not hold it"))),
+        None => Ok(all),
+    }
+}
+
+/// Weights that another program wrote to `path`, in f32.
+///
+/// # Errors
+/// A number too large for f32, by name.
+pub fn in_f32(path: &Path, tensors: BTreeMap<String, Tensor>) -> Result<BTreeMap<String, Tensor>, ZooError> {
+    let single = |(name, tensor): (String, Tensor)| {
+        let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
+        if tensor.dtype() != DType::F64 {
+            return Ok((name, tensor));
+        }
+        let values = tensor.flatten_all().and_then(|flat| flat.to_vec1::<f64>());
+        let values = values.map_err(|e| malformed(format!("tensor `{name}`: {e}")))?;
+        if let Some(large) = values.into_iter().find(|value| value.is_finite() && value.abs() > f64::from(f32::MAX)) {
+            return Err(malformed(format!("tensor `{name}`: expected numbers that fit into f32, found {large:e}")));
+        }
+        let single = tensor.to_dtype(DType::F32).map_err(|e| malformed(format!("tensor `{name}`: {e}")))?;
+        Ok((name, single))
+    };
+    tensors.into_iter().map(single).collect()
 }
 
 /// Tensors with their 32-bit numbers rounded to 16 bits; `path` is named.
@@ -176,6 +250,70 @@ mod tests {
             refused.contains("x.safetensors: tensor `w`: expected numbers up to 65504 for f16, found 100000"),
             "{refused}"
         );
+    }
+
+    /// A safetensors file of one tensor `w` of these bytes.
+    fn stored(dtype: Dtype, bytes: &[u8]) -> Vec<u8> {
+        let count = 8 * bytes.len() / dtype.bitsize();
+        serialize([("w", TensorView::new(dtype, vec![count], bytes).unwrap())], None).unwrap()
+    }
+
+    #[test]
+    fn weights_of_others_are_read_in_f32_whatever_they_are_stored_in() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.safetensors");
+        let read_as = |dtype: Dtype, bytes: &[u8]| {
+            std::fs::write(&path, stored(dtype, bytes)).unwrap();
+            read_weights(&path).map(|weights| weights["w"].to_vec1::<f32>().unwrap()).map_err(|e| e.to_string())
+        };
+        let values = [1.5_f64, -0.25, 3e4];
+        let expected = values.map(|value| value as f32);
+        let bytes = |of: fn(f64) -> Vec<u8>| values.iter().flat_map(|&value| of(value)).collect::<Vec<u8>>();
+        assert_eq!(read_as(Dtype::F64, &bytes(|x| x.to_le_bytes().to_vec())).unwrap(), expected);
+        assert_eq!(read_as(Dtype::F32, &bytes(|x| (x as f32).to_le_bytes().to_vec())).unwrap(), expected);
+        assert_eq!(read_as(Dtype::F16, &bytes(|x| f16::from_f64(x).to_le_bytes().to_vec())).unwrap(), expected);
+        let rounded = values.map(|x| bf16::from_f64(x).to_f32());
+        assert_eq!(read_as(Dtype::BF16, &bytes(|x| bf16::from_f64(x).to_le_bytes().to_vec())).unwrap(), rounded);
+        let place = path.display();
+        assert_eq!(
+            read_as(Dtype::F64, &1e300_f64.to_le_bytes()).unwrap_err(),
+            format!("{place}: tensor `w`: expected numbers that fit into f32, found 1e300")
+        );
+        assert_eq!(
+            read_as(Dtype::I8, &[1, 2]).unwrap_err(),
+            format!("{place}: tensor `w`: expected dtype f16, bf16, f32, f64, i64, u32 or u8, found I8")
+        );
+    }
+
+    #[test]
+    fn weights_in_several_files_are_read_and_must_be_what_the_list_says() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let put = |file: &str, names: &[&str]| {
+            let one = Tensor::new(&[1.0_f32], &Device::Cpu).unwrap();
+            let tensors = names.iter().map(|name| ((*name).to_owned(), one.clone())).collect();
+            std::fs::write(at(file), to_bytes(&at(file), &tensors, &serde_json::Value::Null).unwrap()).unwrap();
+        };
+        let read_by = |map: serde_json::Value| {
+            let text = serde_json::json!({"metadata": {"total_size": 12}, "weight_map": map}).to_string();
+            std::fs::write(at("model.safetensors.index.json"), text).unwrap();
+            read_weights(&at("model.safetensors")).map(|weights| weights.into_keys().collect::<Vec<_>>())
+        };
+        put("model-1.safetensors", &["a", "b"]);
+        put("model-2.safetensors", &["c"]);
+        let (one, two) = ("model-1.safetensors", "model-2.safetensors");
+        assert_eq!(read_by(serde_json::json!({"a": one, "b": one, "c": two})).unwrap(), ["a", "b", "c"]);
+        for (map, expected) in [
+            (serde_json::json!({"a": one, "b": one, "c": two, "d": two}), "tensor `d`: expected in model-2"),
+            (serde_json::json!({"a": one, "c": two}), "no tensor `b`, which model-1.safetensors holds"),
+            (serde_json::json!({"a": one, "b": two, "c": two}), "tensor `b`: expected in model-2"),
+            (serde_json::json!({"a": "../x.safetensors"}), "expected files beside this one, found `../x"),
+            (serde_json::json!({"a": "gone.safetensors"}), "gone.safetensors"),
+            (serde_json::json!(["a"]), "not a list of safetensors files"),
+        ] {
+            let error = read_by(map).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
+        }
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use models::{Observation, Policy};
+use safetensors::tensor::{Dtype, TensorView, serialize};
 use safetensors::SafeTensors;
 use zoo::entry::Entry;
 use zoo::lerobot::{ImportOptions, export, import};
@@ -121,15 +122,138 @@ fn an_entry_that_went_out_and_in_still_says_what_it_was_trained_on() {
     assert_eq!(trained_further.experiment, "imported from LeRobot");
 }
 
-/// A copy of a fixture in which one file was changed, and the error that importing it gives.
-fn refusal(change: impl Fn(&Path)) -> String {
-    let root = tempfile::tempdir().unwrap();
-    let copy = root.path().join("checkpoint");
+/// A copy of a fixture in `root`.
+fn copied(root: &Path, name: &str) -> PathBuf {
+    let copy = root.join("checkpoint");
     fs::create_dir(&copy).unwrap();
-    for item in fs::read_dir(fixture("environment_raw")).unwrap() {
+    for item in fs::read_dir(fixture(name)).unwrap() {
         let item = item.unwrap();
         fs::copy(item.path(), copy.join(item.file_name())).unwrap();
     }
+    copy
+}
+
+/// Every tensor of a safetensors file with its shape and the bytes of its f32.
+fn f32_tensors(path: &Path) -> Vec<(String, Vec<usize>, Vec<u8>)> {
+    let bytes = fs::read(path).unwrap();
+    let parsed = SafeTensors::deserialize(&bytes).unwrap();
+    let all = parsed.iter().inspect(|(_, view)| assert_eq!(view.dtype(), Dtype::F32));
+    all.map(|(name, view)| (name.to_owned(), view.shape().to_vec(), view.data().to_vec())).collect()
+}
+
+fn write_tensors(path: &Path, dtype: Dtype, tensors: &[(String, Vec<usize>, Vec<u8>)]) {
+    let views = tensors.iter().map(|(name, shape, data)| {
+        (name.as_str(), TensorView::new(dtype, shape.clone(), data).unwrap())
+    });
+    fs::write(path, serialize(views, None).unwrap()).unwrap();
+}
+
+#[test]
+fn weights_of_other_floating_point_types_are_read() {
+    type Stored = fn(f32) -> Vec<u8>;
+    // what rounding to them does to an action
+    let kinds: [(Dtype, Stored, f32); 3] = [
+        (Dtype::F64, |x| f64::from(x).to_le_bytes().to_vec(), 1e-5),
+        (Dtype::F16, |x| half::f16::from_f32(x).to_le_bytes().to_vec(), 1e-2),
+        (Dtype::BF16, |x| half::bf16::from_f32(x).to_le_bytes().to_vec(), 1e-1),
+    ];
+    for (dtype, stored, tolerance) in kinds {
+        let root = tempfile::tempdir().unwrap();
+        let copy = copied(root.path(), "environment_raw");
+        let model = copy.join("model.safetensors");
+        let mut tensors = f32_tensors(&model);
+        for (_, _, data) in &mut tensors {
+            *data = data.as_chunks().0.iter().flat_map(|bytes| stored(f32::from_le_bytes(*bytes))).collect();
+        }
+        write_tensors(&model, dtype, &tensors);
+        let zoo = root.path().join("zoo");
+        let entry = Entry::open(&zoo, &import(&copy, &options(), &zoo).unwrap()).unwrap();
+        let largest = difference(&entry, &copy);
+        assert!(largest <= tolerance, "{dtype:?}: {largest:e}");
+    }
+}
+
+#[test]
+fn weights_in_several_files_are_the_same_entry() {
+    let root = tempfile::tempdir().unwrap();
+    let (copy, zoo) = (copied(root.path(), "environment_raw"), root.path().join("zoo"));
+    let one = Entry::open(&zoo, &import(&copy, &options(), &zoo).unwrap()).unwrap();
+    let tensors = f32_tensors(&copy.join("model.safetensors"));
+    fs::remove_file(copy.join("model.safetensors")).unwrap();
+    let mut map = serde_json::Map::new();
+    for (part, tensors) in tensors.chunks(tensors.len().div_ceil(3)).enumerate() {
+        let file = format!("model-{:05}-of-00003.safetensors", part + 1);
+        write_tensors(&copy.join(&file), Dtype::F32, tensors);
+        map.extend(tensors.iter().map(|(name, ..)| (name.clone(), file.clone().into())));
+    }
+    let index = serde_json::json!({"metadata": {"total_size": 1}, "weight_map": map});
+    fs::write(copy.join("model.safetensors.index.json"), index.to_string()).unwrap();
+    let parts = Entry::open(&zoo, &import(&copy, &options(), &zoo).unwrap()).unwrap();
+    assert_eq!(parts.meta().content_sha256(), one.meta().content_sha256());
+    fs::remove_file(copy.join("model-00002-of-00003.safetensors")).unwrap();
+    let error = import(&copy, &options(), &zoo).unwrap_err().to_string();
+    assert!(error.contains("model-00002-of-00003.safetensors"), "{error}");
+}
+
+/// Moves the statistics of a checkpoint's processors into its weights, where LeRobot 0.3 had them.
+fn make_older(copy: &Path) {
+    let model = copy.join("model.safetensors");
+    let mut tensors = f32_tensors(&model);
+    for (name, prefixes) in [
+        ("policy_preprocessor_step_3_normalizer_processor", &["normalize_inputs", "normalize_targets"][..]),
+        ("policy_postprocessor_step_0_unnormalizer_processor", &["unnormalize_outputs"]),
+    ] {
+        let path = copy.join(format!("{name}.safetensors"));
+        for (name, shape, data) in f32_tensors(&path) {
+            let (feature, statistic) = name.rsplit_once('.').unwrap();
+            // LeRobot had buffers of what it normalised alone
+            let used = ["mean", "std"].contains(&statistic);
+            for prefix in prefixes.iter().filter(|prefix| used && (feature == "action") != (**prefix == "normalize_inputs")) {
+                tensors.push((format!("{prefix}.buffer_{}.{statistic}", feature.replace('.', "_")), shape.clone(), data.clone()));
+            }
+        }
+        fs::remove_file(path).unwrap();
+    }
+    write_tensors(&model, Dtype::F32, &tensors);
+    for name in ["policy_preprocessor.json", "policy_postprocessor.json"] {
+        fs::remove_file(copy.join(name)).unwrap();
+    }
+}
+
+#[test]
+fn checkpoints_with_statistics_among_the_weights_are_read() {
+    for name in ["environment_raw", "environment_normalised"] {
+        let root = tempfile::tempdir().unwrap();
+        let (copy, zoo) = (copied(root.path(), name), root.path().join("zoo"));
+        let later = Entry::open(&zoo, &import(&copy, &options(), &zoo).unwrap()).unwrap();
+        make_older(&copy);
+        let older = Entry::open(&zoo, &import(&copy, &options(), &zoo).unwrap()).unwrap();
+        assert_eq!(older.meta().content_sha256(), later.meta().content_sha256(), "{name}");
+    }
+    let text = refusal(|f| {
+        make_older(f);
+        rename(&f.join("model.safetensors"), "unnormalize_outputs.buffer_action.std", "unnormalize_outputs.buffer_action.stx");
+    });
+    assert!(text.contains("action.std"), "{text}");
+}
+
+#[test]
+fn what_lerobot_says_of_a_training_is_recorded() {
+    let root = tempfile::tempdir().unwrap();
+    let (copy, zoo) = (copied(root.path(), "environment_raw"), root.path().join("zoo"));
+    let text = r#"{"dataset": {"repo_id": "me/lift"}, "batch_size": 8, "steps": 100000, "seed": 1000}"#;
+    fs::write(copy.join("train_config.json"), text).unwrap();
+    fs::create_dir(root.path().join("training_state")).unwrap();
+    let imported = || Entry::open(&zoo, &import(&copy, &options(), &zoo).unwrap()).unwrap().meta().experiment.clone();
+    assert_eq!(imported(), "imported from LeRobot, trained on me/lift, 100000 steps of 8, seed 1000");
+    fs::write(root.path().join("training_state/training_step.json"), r#"{"step": 20000}"#).unwrap();
+    assert_eq!(imported(), "imported from LeRobot, trained on me/lift, 20000 steps of 8, seed 1000");
+}
+
+/// A copy of a fixture in which one file was changed, and the error that importing it gives.
+fn refusal(change: impl Fn(&Path)) -> String {
+    let root = tempfile::tempdir().unwrap();
+    let copy = copied(root.path(), "environment_raw");
     change(&copy);
     let zoo = root.path().join("zoo");
     let error = import(&copy, &options(), &zoo).unwrap_err();

@@ -1,7 +1,9 @@
 //! Ctrl-C and the signals that ask a program to end: once is enough, at any time.
+//!
+//! A second signal asks for nothing new: `timeout` sends two, and people press Ctrl-C twice. The third ends the program at once.
 
 use std::io::{IsTerminal, Write};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -13,11 +15,15 @@ pub const INTERRUPTED: u8 = 130;
 /// How long work may take to end by itself once it is asked to.
 const PATIENCE: Duration = Duration::from_millis(1500);
 
+/// The signal that ends the program at once, whatever it is doing.
+const AT_ONCE: usize = 3;
+
 /// Whether the program was asked to end. Everything that is finished is on disk already, so that a program whose work
-/// does not end in time is ended as it is; the second signal ends it at once.
+/// does not end in time is ended as it is.
 #[derive(Clone)]
 pub struct Stop {
-    asked: Arc<AtomicBool>,
+    /// signals that came
+    asked: Arc<AtomicUsize>,
     patient: Arc<AtomicBool>,
     last_act: Arc<Mutex<Option<LastAct>>>,
 }
@@ -33,12 +39,15 @@ impl Stop {
         let stop = Self { asked: Arc::default(), patient: Arc::default(), last_act: Arc::default() };
         let handled = stop.clone();
         ctrlc::set_handler(move || {
-            if handled.asked.swap(true, Ordering::SeqCst) {
-                handled.end(last_words);
+            match handled.asked.fetch_add(1, Ordering::SeqCst) + 1 {
+                1 => {
+                    let waiting = handled.clone();
+                    // this thread has to listen for further signals
+                    std::thread::spawn(move || waiting.end_after_patience(last_words));
+                }
+                AT_ONCE.. => handled.end(last_words),
+                _ => {}
             }
-            let waiting = handled.clone();
-            // this thread has to go on listening for the second signal
-            std::thread::spawn(move || waiting.end_after_patience(last_words));
         })
         .context("cannot handle Ctrl-C")?;
         Ok(stop)
@@ -46,7 +55,7 @@ impl Stop {
 
     /// Whether somebody asked.
     pub fn asked(&self) -> bool {
-        self.asked.load(Ordering::SeqCst)
+        self.asked.load(Ordering::SeqCst) > 0
     }
 
     /// While `yes`, work is waited for however long it takes to end: a training, which has a checkpoint to save.
@@ -57,7 +66,7 @@ impl Stop {
     /// The same question for other threads.
     pub fn flag(&self) -> Arc<dyn Fn() -> bool + Send + Sync> {
         let asked = Arc::clone(&self.asked);
-        Arc::new(move || asked.load(Ordering::SeqCst))
+        Arc::new(move || asked.load(Ordering::SeqCst) > 0)
     }
 
     /// What a program that is ended as it is does last: it removes what it has begun to write.

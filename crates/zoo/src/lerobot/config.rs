@@ -25,7 +25,7 @@ pub(super) struct Step {
 }
 
 /// The normalising step's part that matters.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct NormaliserStep {
     pub eps: f64,
     /// Type and shape by name.

@@ -8,6 +8,7 @@ use models::{
     ACTION, ENVIRONMENT_STATE, FeatureKind, FeatureSpec, ModelError, NormMode, Normaliser, PolicyConfig, Preprocess,
     Signature, lerobot,
 };
+use serde_json::Value;
 
 use crate::entry::{CamerasMeta, CardWords, EntryDraft, EntryId, EntryMeta, ParentMeta, reference};
 use crate::experiment::{DataSection, Experiment, NormalisationSection, PICTURE_PREFIX, RolloutSection, TaskSection};
@@ -16,8 +17,9 @@ use crate::{ZooError, tensors};
 
 use super::checkpoint::Checkpoint;
 use super::config::{self, NormaliserStep, Pipeline};
+use super::older;
 use super::provenance;
-use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR};
+use super::{CONFIG_FILE, MODEL_FILE, POSTPROCESSOR, PREPROCESSOR, TRAIN_CONFIG};
 
 /// What the checkpoint does not say about itself.
 #[derive(Debug, Clone)]
@@ -40,7 +42,8 @@ pub struct ImportOptions {
 /// Files, keys, tensors or statistics that are missing, extra or misshapen, each by name.
 pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<EntryId, ZooError> {
     let config_path = folder.join(CONFIG_FILE);
-    let checkpoint = Checkpoint::read(&config::read(&config_path)?).map_err(config::misfit(&config_path))?;
+    let config: Value = config::read(&config_path)?;
+    let checkpoint = Checkpoint::read(&config).map_err(config::misfit(&config_path))?;
     let Checkpoint { policy, signature, n_action_steps, temporal_ensemble, .. } = &checkpoint;
 
     if options.fast_render && signature.of_kind(FeatureKind::Image).next().is_none() {
@@ -50,8 +53,26 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             found: "one that sees none".to_owned(),
         });
     }
-    let before = step(folder, PREPROCESSOR, "normalizer_processor")?;
-    let after = step(folder, POSTPROCESSOR, "unnormalizer_processor")?;
+    let model_path = folder.join(MODEL_FILE);
+    let mut weights = tensors::read_weights(&model_path)?;
+    let (before, after) = match is_older(folder) {
+        false => (
+            step(folder, PREPROCESSOR, "normalizer_processor")?,
+            step(folder, POSTPROCESSOR, "unnormalizer_processor")?,
+        ),
+        true => {
+            let statistics = older::take(&mut weights, signature).ok_or_else(|| ZooError::Malformed {
+                path: folder.join(format!("{PREPROCESSOR}.json")),
+                reason: format!(
+                    "expected this file, or statistics in {MODEL_FILE} (normalize_inputs.buffer_observation_state.mean, \
+                     as LeRobot 0.3 and before wrote them); found neither"
+                ),
+            })?;
+            let (path, config) = (config_path.clone(), older::step(&config));
+            let before = Normalising { path: path.clone(), config: config.clone(), statistics: statistics.before };
+            (before, Normalising { path, config, statistics: statistics.after })
+        }
+    };
     let normalisation = NormalisationSection {
         state: before.mode("STATE")?,
         environment_state: before.mode("ENV")?,
@@ -89,8 +110,6 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     experiment.check()?;
 
     let model = experiment.policy.build(signature, 0).map_err(experiment.model_error("build the policy of"))?;
-    let model_path = folder.join(MODEL_FILE);
-    let (weights, _) = tensors::read(&model_path)?;
     checkpoint
         .load(model.params(), &weights, &before.config.norm_map, &before.statistics)
         .map_err(config::misfit(&model_path))?;
@@ -123,7 +142,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             description: experiment.description.clone(),
             experiment: match of_origin {
                 Some(origin) => format!("{}, exported to LeRobot as {} and imported", origin.experiment, origin.id()),
-                None => "imported from LeRobot".to_owned(),
+                None => format!("imported from LeRobot{}", trained_as(folder)),
             },
             policy: experiment.policy_type(),
             task: options.task.clone(),
@@ -151,6 +170,29 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
         normaliser: tensors::to_bytes(&model_path, &statistics, &serde_json::json!({"format": 1}))?,
     };
     draft.seal(zoo)
+}
+
+/// Whether LeRobot wrote the checkpoint before it had processors.
+fn is_older(folder: &Path) -> bool {
+    [PREPROCESSOR, POSTPROCESSOR].iter().all(|name| !folder.join(format!("{name}.json")).exists())
+}
+
+/// What `lerobot-train` left beside the checkpoint about its training: `, trained on lerobot/pusht, 100000 steps of 8, seed 1000`.
+fn trained_as(folder: &Path) -> String {
+    let read = |path: &Path| {
+        let text = std::fs::read(path).ok()?;
+        serde_json::from_slice::<Value>(&text).ok()
+    };
+    let Some(config) = read(&folder.join(TRAIN_CONFIG)) else { return String::new() };
+    let state = folder.parent().and_then(|parent| read(&parent.join("training_state/training_step.json")));
+    let steps = state.as_ref().and_then(|state| state["step"].as_u64()).or_else(|| config["steps"].as_u64());
+    let data = config["dataset"]["repo_id"].as_str().map(|name| format!(", trained on {name}"));
+    let steps = steps.map(|steps| match config["batch_size"].as_u64() {
+        Some(batch) => format!(", {steps} steps of {batch}"),
+        None => format!(", {steps} steps"),
+    });
+    let seed = config["seed"].as_u64().map(|seed| format!(", seed {seed}"));
+    [data, steps, seed].into_iter().flatten().collect()
 }
 
 /// The policy in the words of a description.
@@ -210,6 +252,6 @@ fn step(folder: &Path, name: &str, registry_name: &str) -> Result<Normalising, Z
     if file.contains('/') {
         return Err(malformed(format!("state_file: expected a file beside this one, found `{file}`")));
     }
-    let (statistics, _) = tensors::read(&folder.join(file))?;
+    let statistics = tensors::read_weights(&folder.join(file))?;
     Ok(Normalising { path, config, statistics })
 }

@@ -8,6 +8,7 @@ mod checkpoint;
 mod config;
 mod export;
 mod import;
+mod older;
 mod provenance;
 
 pub use export::export;
@@ -15,5 +16,7 @@ pub use import::{ImportOptions, import};
 
 const MODEL_FILE: &str = "model.safetensors";
 const CONFIG_FILE: &str = "config.json";
+/// What `lerobot-train` was asked for; not read for anything but the description of an entry.
+const TRAIN_CONFIG: &str = "train_config.json";
 const PREPROCESSOR: &str = "policy_preprocessor";
 const POSTPROCESSOR: &str = "policy_postprocessor";

@@ -57,6 +57,8 @@ pub(super) fn read(folder: &Path) -> Result<Option<EntryMeta>, ZooError> {
     if found.format != FORMAT {
         return Err(malformed(format!("format: expected {FORMAT}, found {}", found.format)));
     }
-    let same = found.model_sha256 == sha256_file(&folder.join(MODEL_FILE))?;
+    let model = folder.join(MODEL_FILE);
+    // an export is one file
+    let same = model.is_file() && found.model_sha256 == sha256_file(&model)?;
     Ok(same.then_some(found.meta))
 }

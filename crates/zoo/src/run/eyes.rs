@@ -33,7 +33,7 @@ pub(super) fn open(
             .map_err(experiment.model_error("take the statistics of pictures for"))?;
     }
     if let Some(path) = &vision.weights {
-        let (weights, _) = tensors::read(&locate(Path::new(path))?)?;
+        let weights = tensors::read_weights(&locate(Path::new(path))?)?;
         ImageEncoder::load_backbone(model.params(), vision.norm, &weights)
             .map_err(experiment.model_error("take the image encoder's weights for"))?;
     }

@@ -106,7 +106,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         cli::print(&experiment.to_toml())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let asked = Stop::install("stopped before the first step")?;
+    let asked = Stop::install("stopped without a new checkpoint; --resume continues from the last one, if there is one")?;
     let Some(TrainingSeeds(seeds)) = &args.seeds else {
         let one = One { run: args.run.clone(), resume: args.resume, seeded: false, own: Vec::new() };
         return train_one(args, experiment, &one, &asked);
