@@ -1,5 +1,6 @@
 //! Ctrl-C and SIGTERM, once, at any time: the program ends within two seconds, says how to go on, and that works.
 
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -113,6 +114,60 @@ fn a_stopped_training_says_the_command_that_goes_on_and_runs_lists_it() {
     assert!(error.contains("resumed after step") && error.contains(&hint), "{error}");
     assert!(listed()[0]["step"].as_u64() >= before, "{:?}", listed());
     assert_eq!(listing(&runs.join("act_lift")), ["001"]);
+}
+
+/// Reads standard error until a line contains `words`.
+fn said(errors: &mut impl BufRead, words: &str) {
+    let mut line = String::new();
+    while !line.contains(words) {
+        line.clear();
+        assert!(errors.read_line(&mut line).expect("text") > 0, "it ended without {words:?}");
+    }
+}
+
+/// Sends as many signals, one after the other, once the first step can have begun.
+fn signalled(command: &mut Command, count: usize, between: &str) -> (Option<i32>, String) {
+    let mut child = started(command);
+    let mut errors = BufReader::new(child.stderr.take().expect("piped"));
+    said(&mut errors, " steps");
+    let kills = vec![format!("kill -TERM {}", child.id()); count].join(between) + "; true";
+    assert!(Command::new("bash").args(["-c", &kills]).status().expect("bash runs").success());
+    let mut rest = String::new();
+    errors.read_to_string(&mut rest).expect("text");
+    (child.wait().expect("a child").code(), rest)
+}
+
+#[test]
+fn two_signals_at_once_save_the_checkpoint_like_one() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let run = folder.path().join("run");
+    let mut before = 0;
+    for time in 0..50 {
+        let mut command = long_training(folder.path());
+        command.args(["--run", text(&run)]);
+        if time > 0 {
+            command.arg("--resume");
+        }
+        let (code, errors) = signalled(&mut command, 2, "; ");
+        assert_eq!(code, Some(130), "time {time}: {errors}");
+        let step = errors.lines().find_map(|line| line.strip_prefix("stopped after step ")?.split(';').next());
+        let step: u64 = step.and_then(|step| step.parse().ok()).unwrap_or_else(|| panic!("time {time}: {errors}"));
+        let checkpoint = run.join(format!("checkpoints/{step:08}.safetensors"));
+        assert!(step >= before && checkpoint.is_file(), "time {time}: {before} {step}: {errors}");
+        before = step;
+    }
+}
+
+#[test]
+fn a_third_signal_ends_a_training_at_once() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    // a step that takes longer than the signals
+    let mut command = long_training(folder.path());
+    command.args(["train.batch_size=1000", "policy.dim_model=256"]);
+    // signals that come at the same moment are one
+    let (code, errors) = signalled(&mut command, 10, "; sleep 0.02; ");
+    assert_eq!(code, Some(130), "{errors}");
+    assert!(errors.contains("stopped without a new checkpoint"), "{errors}");
 }
 
 #[test]

@@ -211,7 +211,7 @@ impl KeyItem {
     }
 
     /// Names of its numbers, as a column lists them.
-    pub(crate) fn names(&self, width: usize) -> impl Iterator<Item = String> {
+    pub fn names(&self, width: usize) -> impl Iterator<Item = String> {
         // a difference and axes are called by what they are made of, a part by the key and where it is in it
         let (whole, base, from) = match (&self.minus, self.plus.range) {
             (None, Some((from, _))) if !self.plus.axes => (false, self.plus.whole().into_owned(), from),

@@ -12,6 +12,7 @@ use dataset::shuffle::SplitMix64;
 use dataset::{Array, DatasetError, RobomimicWriter, WriteOptions};
 use rollout::collection::{Attempt, Collection, CollectionRecord};
 use rollout::{Pool, RunEnd, Skill};
+use serde_json::Value;
 
 use crate::demo::demo;
 use crate::error::{RecordingError, Result};
@@ -135,7 +136,8 @@ pub fn collect(
         let (successes, wanted) = (good.len(), options.episodes);
         return Err(RecordingError::TooFewSuccesses { task, successes, attempts, wanted });
     }
-    write(&task, options, &collection, &good, &record.env_args)?;
+    let env_args = with_rate(record.env_args.clone(), pool.ready().control_freq);
+    write(&task, options, &collection, &good, &env_args)?;
     collection.discard()?;
     let steps = good.iter().map(|attempt| attempt.steps).sum();
     Ok(CollectEnd::Written(Collected { demos: good.len(), steps, attempts, first_seed }))
@@ -149,13 +151,25 @@ fn attempts_folder(out: &Path) -> PathBuf {
     out.with_file_name(name)
 }
 
+/// robosuite's `env_args` with the control frequency, which it leaves out where it is the default.
+fn with_rate(mut env_args: Value, control_freq: f64) -> Value {
+    const ROBOSUITE: i64 = 1;
+    let robosuite = env_args["type"].as_i64() == Some(ROBOSUITE);
+    if let Some(kwargs) = env_args.get_mut("env_kwargs").and_then(Value::as_object_mut).filter(|_| robosuite) {
+        let whole = control_freq.fract() == 0.0 && control_freq.abs() < 1e9;
+        let rate = if whole { Value::from(control_freq as i64) } else { Value::from(control_freq) };
+        kwargs.entry("control_freq").or_insert(rate);
+    }
+    env_args
+}
+
 /// Writes the file from the attempts that succeeded.
 fn write(
     task: &str,
     options: &CollectOptions,
     collection: &Collection,
     good: &[Attempt],
-    env_args: &serde_json::Value,
+    env_args: &Value,
 ) -> Result<()> {
     let mut writer = RobomimicWriter::create(&options.out, &WriteOptions { gzip: options.gzip })?;
     let mut ids = Vec::new();
@@ -203,7 +217,20 @@ fn masks(ids: &[String], seed: u64) -> (Vec<String>, Vec<String>) {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
+
+    #[test]
+    fn the_control_frequency_is_recorded_where_robosuite_leaves_it_out() {
+        let robosuite = |kwargs: Value| json!({"type": 1, "env_kwargs": kwargs});
+        assert_eq!(with_rate(robosuite(json!({})), 20.0), robosuite(json!({"control_freq": 20})));
+        assert_eq!(with_rate(robosuite(json!({})), 12.5), robosuite(json!({"control_freq": 12.5})));
+        assert_eq!(with_rate(robosuite(json!({"control_freq": 10})), 20.0), robosuite(json!({"control_freq": 10})));
+        for other in [json!({"type": 2, "env_kwargs": {}}), json!({"type": 1}), Value::Null] {
+            assert_eq!(with_rate(other.clone(), 20.0), other);
+        }
+    }
 
     #[test]
     fn masks_split_the_demos_once_and_by_seed() {

@@ -407,14 +407,24 @@ pub struct RolloutSection {
 }
 
 impl Experiment {
-    /// Resolves experiment `name` of `library` with dotted `overrides` laid over it.
+    /// Resolves experiment `name` of `library` with dotted `overrides` laid over it. With another task than its own it is no longer
+    /// what its description says, and gets one that is true.
     ///
     /// # Errors
     /// Unknown experiments, keys and values; combinations that cannot work.
     pub fn load(library: &Library, name: &str, overrides: &[String]) -> Result<Self, ZooError> {
         let mut table = library.resolve(name)?;
+        let task = |table: &Table| table.get("task").and_then(|task| task.get("name")).cloned();
+        let (own_task, own_description) = (task(&table), table.get("description").cloned());
         apply_overrides(&mut table, overrides)?;
-        Self::from_table(table)
+        let mut experiment = Self::from_table(table)?;
+        let own = |own: Option<Value>, now: &str| own.as_ref().and_then(Value::as_str) == Some(now);
+        if !own(own_task, &experiment.task.name) && own(own_description, &experiment.description) {
+            let Self { policy, task, .. } = &experiment;
+            experiment.description =
+                format!("A policy of type {} for {}, with the settings of {name}.", policy.policy_type(), task.name);
+        }
+        Ok(experiment)
     }
 
     /// Reads the text of a saved `config.toml`.
@@ -634,6 +644,16 @@ mod tests {
         let back = Experiment::from_toml("x", &text).unwrap();
         assert_eq!(back, experiment);
         assert_eq!(back.to_toml(), text);
+    }
+
+    #[test]
+    fn another_task_has_another_description() {
+        let lift = load(&[]).unwrap();
+        assert!(lift.description.contains("robosuite's Lift"));
+        assert_eq!(load(&["task.name=Lift"]).unwrap(), lift);
+        let other = load(&["task.name=transfer_cube"]).unwrap();
+        assert_eq!(other.description, "A policy of type act for transfer_cube, with the settings of act_lift.");
+        assert_eq!(load(&["task.name=transfer_cube", "description='Mine.'"]).unwrap().description, "Mine.");
     }
 
     #[test]

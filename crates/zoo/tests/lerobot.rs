@@ -6,8 +6,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use models::{Observation, Policy};
-use safetensors::tensor::{Dtype, TensorView, serialize};
 use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, TensorView, serialize};
 use zoo::entry::Entry;
 use zoo::lerobot::{ImportOptions, export, import};
 
@@ -142,9 +142,8 @@ fn f32_tensors(path: &Path) -> Vec<(String, Vec<usize>, Vec<u8>)> {
 }
 
 fn write_tensors(path: &Path, dtype: Dtype, tensors: &[(String, Vec<usize>, Vec<u8>)]) {
-    let views = tensors.iter().map(|(name, shape, data)| {
-        (name.as_str(), TensorView::new(dtype, shape.clone(), data).unwrap())
-    });
+    let views =
+        tensors.iter().map(|(name, shape, data)| (name.as_str(), TensorView::new(dtype, shape.clone(), data).unwrap()));
     fs::write(path, serialize(views, None).unwrap()).unwrap();
 }
 
@@ -208,8 +207,14 @@ fn make_older(copy: &Path) {
             let (feature, statistic) = name.rsplit_once('.').unwrap();
             // LeRobot had buffers of what it normalised alone
             let used = ["mean", "std"].contains(&statistic);
-            for prefix in prefixes.iter().filter(|prefix| used && (feature == "action") != (**prefix == "normalize_inputs")) {
-                tensors.push((format!("{prefix}.buffer_{}.{statistic}", feature.replace('.', "_")), shape.clone(), data.clone()));
+            for prefix in
+                prefixes.iter().filter(|prefix| used && (feature == "action") != (**prefix == "normalize_inputs"))
+            {
+                tensors.push((
+                    format!("{prefix}.buffer_{}.{statistic}", feature.replace('.', "_")),
+                    shape.clone(),
+                    data.clone(),
+                ));
             }
         }
         fs::remove_file(path).unwrap();
@@ -232,7 +237,11 @@ fn checkpoints_with_statistics_among_the_weights_are_read() {
     }
     let text = refusal(|f| {
         make_older(f);
-        rename(&f.join("model.safetensors"), "unnormalize_outputs.buffer_action.std", "unnormalize_outputs.buffer_action.stx");
+        rename(
+            &f.join("model.safetensors"),
+            "unnormalize_outputs.buffer_action.std",
+            "unnormalize_outputs.buffer_action.stx",
+        );
     });
     assert!(text.contains("action.std"), "{text}");
 }

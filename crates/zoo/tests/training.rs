@@ -9,7 +9,7 @@ use std::fs;
 use std::path::Path;
 
 use common::{SMALL, demonstrations};
-use dataset::{RobomimicWriter, Source, WriteOptions};
+use dataset::{ConvertOptions, RobomimicWriter, Source, WriteOptions};
 use models::{FeatureKind, FeatureSpec, Observation, Policy, Values};
 use zoo::ZooError;
 use zoo::config::Library;
@@ -31,6 +31,7 @@ fn request(root: &Path, data: &Path, extra: &[&str]) -> TrainRequest {
         run: None,
         resume: false,
         zoo: root.join("zoo"),
+        force: false,
         image_memory: None,
         command: None,
     }
@@ -417,6 +418,199 @@ fn a_mask_that_is_not_there_is_an_error_that_lists_those_that_are() {
     assert!(typo.contains("data.train_mask: no mask `trian`; there is train, valid"), "{typo}");
     // none asked for: none held out
     let entry = finish(&request(root.path(), &data, &["data.valid_mask=\"\""]));
+    assert_eq!(entry.meta().data.as_ref().unwrap().valid_episodes, 0);
+}
+
+/// What a training is refused for, which leaves nothing behind.
+fn refused(request: &TrainRequest) -> String {
+    let error = train(request, &|| false, &mut |_| {}).unwrap_err().to_string();
+    assert!(!request.zoo.exists() && !request.runs.exists(), "{error}");
+    error
+}
+
+/// What a training noted, and the entry that it made.
+fn noted(request: &TrainRequest) -> (String, Entry) {
+    let mut notes = Vec::new();
+    let outcome = train(request, &|| false, &mut |event| {
+        if let TrainEvent::Note(note) = event {
+            notes.push(note.to_owned());
+        }
+    });
+    let TrainOutcome::Finished { entry, .. } = outcome.unwrap() else { panic!("not finished") };
+    (notes.join("\n"), Entry::open(&request.zoo, &entry).unwrap())
+}
+
+const STATE: [&str; 3] = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"];
+
+/// The demonstrations as a LeRobotDataset whose state is made of these keys, as LeRobot writes one: without our section in info.json,
+/// and with names of the state and of the actions as JSON.
+fn lerobots(data: &Path, out: &Path, keys: &[&str], names: [&str; 2]) {
+    let keys = keys.iter().map(|key| (*key).to_owned()).collect();
+    let options = ConvertOptions { state_keys: Some(keys), ..ConvertOptions::default() };
+    dataset::convert(data, out, &options, &mut |_, _| {}).unwrap();
+    let path = out.join("meta/info.json");
+    let mut info: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+    assert!(info.as_object_mut().unwrap().remove("actrm").is_some());
+    for (feature, names) in ["observation.state", "action"].into_iter().zip(names) {
+        info["features"][feature]["names"] = serde_json::from_str(names).unwrap();
+    }
+    fs::write(&path, info.to_string()).unwrap();
+}
+
+const NO_MASKS: [&str; 1] = ["data.valid_mask=''"];
+
+#[test]
+fn numbers_in_another_order_are_put_into_the_one_that_is_read() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let turned: Vec<&str> = STATE.into_iter().rev().collect();
+    let usual = root.path().join("usual");
+    lerobots(&data, &usual, &STATE, ["null", "null"]);
+    let (notes, usual) = noted(&request(root.path(), &usual, &NO_MASKS));
+    let unnamed = "observation.state: the data set does not say what its 9 numbers are (has no names); taken as robot0_eef_pos, \
+                   robot0_eef_quat, robot0_gripper_qpos, in this order";
+    assert!(notes.contains(unnamed) && notes.contains("action: the data set does not say"), "{notes}");
+    assert!(usual.card().unwrap().contains("robot0_gripper_qpos; which the data set does not name"));
+
+    let named = r#"["gripper_0", "gripper_1", "qx", "qy", "qz", "qw", "x", "y", "z"]"#;
+    let action = r#"{"motors": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]}"#;
+    let theirs = root.path().join("theirs");
+    lerobots(&data, &theirs, &turned, [named, action]);
+    let (notes, entry) = noted(&request(root.path(), &theirs, &NO_MASKS));
+    assert!(notes.contains("observation.state: put into the order robot0_eef_pos"), "{notes}");
+    assert!(model(&entry) == model(&usual), "other weights than of the same numbers in the usual order");
+    let card = entry.card().unwrap();
+    assert!(card.contains("robot0_gripper_qpos; in the data set: gripper_0, gripper_1, qx, qy"), "{card}");
+    assert!(card.contains("| action | 7 numbers, in the data set: x, y, z, roll"), "{card}");
+    // the demonstrations are found again by what is in their files
+    let stored = dataset::Dataset::open(&theirs).unwrap();
+    let recorded = entry.meta().data.as_ref().unwrap();
+    assert_eq!(recorded.train_fingerprint.as_deref(), Some(&*stored.fingerprint_of(&[0, 1, 2])));
+
+    // so with a set of ours
+    let ours = root.path().join("ours");
+    let keys = turned.iter().map(|key| (*key).to_owned()).collect();
+    let options = ConvertOptions { state_keys: Some(keys), ..ConvertOptions::default() };
+    dataset::convert(&data, &ours, &options, &mut |_, _| {}).unwrap();
+    let (notes, entry) = noted(&request(root.path(), &ours, &[]));
+    assert!(notes.contains("put into the order"), "{notes}");
+    let (notes, straight) = noted(&request(root.path(), &data, &[]));
+    assert!(!notes.contains("order"), "{notes}");
+    assert!(model(&entry) == model(&straight));
+    assert!(straight.meta().data.as_ref().unwrap().names.is_empty());
+}
+
+#[test]
+fn numbers_of_other_names_are_refused_or_forced() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let joints = r#"["waist", "shoulder", "elbow", "wrist", "roll", "gripper", "a", "b", "c"]"#;
+    let set = root.path().join("set");
+    lerobots(&data, &set, &STATE, [joints, "null"]);
+    let mut request = request(root.path(), &set, &NO_MASKS);
+    let error = refused(&request);
+    let expected =
+        "observation.state: expected robot0_eef_pos, robot0_eef_quat, robot0_gripper_qpos, found waist, shoulder";
+    assert!(error.contains(expected) && error.contains("--force"), "{error}");
+    request.force = true;
+    let (notes, entry) = noted(&request);
+    assert!(notes.contains(expected) && notes.contains("(--force)"), "{notes}");
+    assert!(entry.card().unwrap().contains("in the data set: waist, shoulder"));
+
+    let set = root.path().join("actions");
+    lerobots(&data, &set, &STATE, ["null", r#"["j1", "j2", "elbow", "j4", "j5", "j6", "gripper"]"#]);
+    let elsewhere = root.path().join("elsewhere");
+    let error = refused(&self::request(&elsewhere, &set, &NO_MASKS));
+    assert!(error.contains("action: expected position, rotation and gripper, found j1, j2, elbow"), "{error}");
+}
+
+#[test]
+fn demonstrations_of_another_task_are_refused_or_forced() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    // by their environment, and by the instruction where LeRobot's set names none
+    let set = root.path().join("set");
+    lerobots(&data, &set, &STATE, ["null", "null"]);
+    for (path, task) in [(&data, "Stack"), (&data, "anything"), (&set, "Stack"), (&set, "anything")] {
+        let error = refused(&request(root.path(), path, &[&format!("task.name={task}"), NO_MASKS[0]]));
+        let expected =
+            format!("demonstrations of Lift, but the experiment's task is {task}; train with task.name=Lift");
+        assert!(error.contains(&expected) && error.contains("--force"), "{error}");
+    }
+    let mut request = request(root.path(), &data, &["task.name=Stack"]);
+    request.force = true;
+    let (notes, entry) = noted(&request);
+    assert!(notes.contains("demonstrations of Lift, but the experiment's task is Stack"), "{notes}");
+    let card = entry.card().unwrap();
+    assert!(card.contains("| task | Stack |") && card.contains("| recorded in | Lift, "), "{card}");
+    assert!(card.contains("A policy of type act for Stack, with the settings of act_lift."), "{card}");
+}
+
+/// Three demonstrations of a task that no simulator has, without an environment.
+fn of_no_simulator(data: &Path, out: &Path, names: &str) {
+    let source = Source::open(data).unwrap();
+    let other = data.with_file_name("other.hdf5");
+    let mut writer = RobomimicWriter::create(&other, &WriteOptions::default()).unwrap();
+    let mut group = source.root().unwrap();
+    group.datasets.retain(|name, _| !name.starts_with("mask"));
+    writer.set_root(&group).unwrap();
+    writer
+        .set_data_attr(
+            "env_args",
+            &dataset::Array::from_str(r#"{"env_name": "pour the tea", "type": 1, "env_kwargs": {}}"#),
+        )
+        .unwrap();
+    for index in 0..source.plan().demos.len() {
+        writer.add_demo(&source.read_demo(index).unwrap()).unwrap();
+    }
+    writer.finish().unwrap();
+    lerobots(&other, out, &STATE, [names, names]);
+}
+
+#[test]
+fn a_task_without_a_simulator_has_the_keys_of_its_data_and_a_true_card() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let set = root.path().join("tea");
+    of_no_simulator(&data, &set, r#"{"motors": ["waist", "shoulder", "elbow", "b1", "b2", "b3", "b4", "b5", "b6"]}"#);
+    let free = [NO_MASKS[0], "task.name=tea", "entry=tea-act"];
+    let (_, entry) = noted(&request(root.path(), &set, &free));
+    let card = entry.card().unwrap();
+    assert!(card.contains("| observation.state | 9 numbers, in the data set: waist, shoulder, elbow, b1"), "{card}");
+    assert!(card.contains("no simulator has the task above") && card.contains("\"tea-act@1\""), "{card}");
+    for false_word in ["robot0", "robosuite", "Lift", "actrm-zoo eval"] {
+        assert!(!card.contains(false_word), "{false_word} in {card}");
+    }
+    // what it was trained with trains the same again
+    let config = fs::read_to_string(entry.folder().join("config.toml")).unwrap();
+    let again = TrainRequest {
+        experiment: Experiment::from_toml("tea", &config).unwrap(),
+        ..request(root.path(), &set, &free)
+    };
+    let (_, second) = noted(&again);
+    assert_eq!(second.meta().content_sha256(), entry.meta().content_sha256());
+    let chunk = entry.load().unwrap().policy().predict(&Observation::of_state(vec![0.1; 9], vec![0.1; 10])).unwrap();
+    assert_eq!(chunk.action_dim, 7);
+}
+
+#[test]
+fn what_a_conversion_notes_a_training_notes() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let source = Source::open(&data).unwrap();
+    let path = root.path().join("masked.hdf5");
+    let mut writer = RobomimicWriter::create(&path, &WriteOptions::default()).unwrap();
+    let mut group = source.root().unwrap();
+    group.datasets.retain(|name, _| !name.starts_with("mask"));
+    writer.set_root(&group).unwrap();
+    for index in 0..3 {
+        writer.add_demo(&source.read_demo(index).unwrap()).unwrap();
+    }
+    writer.set_mask("train", &["demo_0".to_owned(), "demo_1".to_owned()]).unwrap();
+    writer.set_mask("valid", &["demo_99".to_owned()]).unwrap();
+    writer.finish().unwrap();
+    let (notes, entry) = noted(&request(root.path(), &path, &[]));
+    assert!(notes.contains("demo_99"), "{notes}");
     assert_eq!(entry.meta().data.as_ref().unwrap().valid_episodes, 0);
 }
 

@@ -108,6 +108,24 @@ impl Feature {
         self.shape.iter().product()
     }
 
+    /// A name for each of its numbers; empty where it does not name them. LeRobot's sets hold a list, a list in a list, lists by
+    /// the name of an axis (`{"motors": [...]}`), or places by name (`{"x": 0}`).
+    pub fn number_names(&self) -> Vec<String> {
+        let mut names = Vec::new();
+        match &self.names {
+            Value::Object(places) if !places.is_empty() && places.values().all(Value::is_u64) => {
+                let mut places: Vec<_> = places.iter().map(|(name, place)| (place.as_u64(), name.clone())).collect();
+                places.sort();
+                if places.iter().map(|(place, _)| *place).eq((0..self.dim() as u64).map(Some)) {
+                    names.extend(places.into_iter().map(|(_, name)| name));
+                }
+            }
+            Value::Object(axes) => axes.values().for_each(|axis| gather_names(axis, &mut names)),
+            other => gather_names(other, &mut names),
+        }
+        if names.len() == self.dim() { names } else { Vec::new() }
+    }
+
     /// Whether the column holds pictures.
     pub fn is_visual(&self) -> bool {
         self.dtype == "image" || self.dtype == "video"
@@ -141,6 +159,15 @@ impl Feature {
     /// Bytes of one picture once it is decoded; of depth, at most.
     pub(crate) fn picture_bytes(&self) -> usize {
         self.dim() * if self.is_depth() { 4 } else { 1 }
+    }
+}
+
+fn gather_names(value: &Value, names: &mut Vec<String>) {
+    match value {
+        Value::Array(values) => values.iter().for_each(|value| gather_names(value, names)),
+        Value::String(name) => names.push(name.clone()),
+        Value::Number(number) => names.push(number.to_string()),
+        _ => {}
     }
 }
 
@@ -299,6 +326,23 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use serde_json::json;
+
+    #[test]
+    fn numbers_are_named_in_every_form_that_lerobot_writes() {
+        let named = |names: Value| {
+            Feature { dtype: "float32".to_owned(), shape: vec![3], names, info: None }.number_names().join(" ")
+        };
+        let json = |text: &str| serde_json::from_str::<Value>(text).unwrap();
+        assert_eq!(named(json(r#"["a", "b", "c"]"#)), "a b c");
+        assert_eq!(named(json(r#"[["a", "b", "c"]]"#)), "a b c");
+        assert_eq!(named(json(r#"{"motors": ["a", "b", "c"]}"#)), "a b c");
+        assert_eq!(named(json(r#"{"b": 1, "c": 2, "a": 0}"#)), "a b c");
+        assert_eq!(named(json("[0, 1, 2]")), "0 1 2");
+        // the name of the axis, too few, none
+        for none in [r#"["state"]"#, r#"{"axes": ["x", "y"]}"#, r#"{"a": 0, "b": 1, "c": 5}"#, "null", "{}", "[]"] {
+            assert_eq!(named(json(none)), "", "{none}");
+        }
+    }
 
     #[test]
     fn channels_come_first_where_the_names_say_so() {

@@ -25,7 +25,7 @@ pub const ENVIRONMENT_STATE: &str = "observation.environment_state";
 pub const ACTION: &str = "action";
 
 /// A LeRobotDataset v3.0 directory, written by us or by LeRobot, with its numeric columns in memory.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Dataset {
     root: PathBuf,
     info: Info,
@@ -208,10 +208,39 @@ impl Dataset {
         self.columns.keys().map(String::as_str)
     }
 
-    /// Names of a column's numbers, where it lists them.
+    /// Names of a column's numbers; empty where it does not name each.
     pub fn names(&self, column: &str) -> Vec<String> {
-        let names = self.info.features.get(column).and_then(|feature| feature.names.as_array());
-        names.into_iter().flatten().filter_map(|name| name.as_str().map(str::to_owned)).collect()
+        self.info.features.get(column).map(Feature::number_names).unwrap_or_default()
+    }
+
+    /// The same set in memory with the numbers of a column in another order and under other names: number `i` is the one that was
+    /// at `order[i]`. The fingerprint stays that of the files.
+    ///
+    /// # Errors
+    /// A column that is not there, or an order that is none of its numbers.
+    pub fn reordered(&self, column: &str, order: &[usize], names: &[String]) -> Result<Self> {
+        let old = self.required(column)?;
+        let mut sorted = order.to_vec();
+        sorted.sort_unstable();
+        if !sorted.iter().copied().eq(0..old.dim) || names.len() != old.dim {
+            return Err(DatasetError::NotInDataset {
+                path: self.root.clone(),
+                wanted: format!("the numbers {order:?} of column {column}"),
+                found: format!("0 to {}", old.dim.saturating_sub(1)),
+            });
+        }
+        let mut data = Vec::with_capacity(old.data.len());
+        for row in old.data.chunks_exact(old.dim.max(1)) {
+            data.extend(order.iter().map(|&from| row[from]));
+        }
+        let mut dataset = self.clone();
+        dataset.columns.insert(column.to_owned(), Resident { data: data.into(), dim: old.dim });
+        // those of all episodes, as they are stored, are of the other order
+        dataset.stats.remove(column);
+        if let Some((_, feature)) = dataset.info.features.0.iter_mut().find(|(name, _)| name == column) {
+            feature.names = serde_json::Value::from(names.to_vec());
+        }
+        Ok(dataset)
     }
 
     /// Statistics over all episodes as they are stored; empty where the directory has none.

@@ -37,7 +37,7 @@ impl AnyExperiment {
         let is_puzzle = table.get("task").and_then(|task| task.get("puzzle")).is_some();
         Ok(match is_puzzle {
             true => Self::Puzzle(Box::new(PuzzleExperiment::from_table(table)?)),
-            false => Self::Robot(Box::new(Experiment::from_table(table)?)),
+            false => Self::Robot(Box::new(Experiment::load(library, name, overrides)?)),
         })
     }
 

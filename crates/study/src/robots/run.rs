@@ -331,6 +331,7 @@ impl Shared<'_> {
                     resume: run.join("config.toml").exists(),
                     run: Some(run),
                     zoo: zoo.clone(),
+                    force: false,
                     image_memory: None,
                 };
                 let mut steps = 0;

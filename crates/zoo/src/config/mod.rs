@@ -12,7 +12,9 @@ mod embedded;
 mod overrides;
 mod value;
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 
 use toml::Table;
 
@@ -107,6 +109,16 @@ impl Library {
     }
 }
 
+/// Whether an experiment that is built in is about this task: one that a simulator has.
+pub(crate) fn is_built_in_task(name: &str) -> bool {
+    static TASKS: OnceLock<BTreeSet<String>> = OnceLock::new();
+    let tasks = TASKS.get_or_init(|| {
+        let tables = embedded::FILES.iter().filter_map(|(_, text)| toml::from_str::<Table>(text).ok());
+        tables.filter_map(|table| Some(table.get("task")?.get("name")?.as_str()?.to_owned())).collect()
+    });
+    tasks.contains(name)
+}
+
 /// Lays `above` over `below`: tables merge key by key, anything else is replaced.
 fn merge(below: &mut Table, above: Table) {
     for (key, value) in above {
@@ -133,6 +145,14 @@ mod tests {
         }
         let library = Library::with_folder(folder.path()).unwrap();
         (folder, library)
+    }
+
+    #[test]
+    fn tasks_of_the_experiments_are_known() {
+        for task in ["Lift", "PickPlaceCan", "TwoArmTransport"] {
+            assert!(is_built_in_task(task), "{task}");
+        }
+        assert!(!is_built_in_task("transfer_cube") && !is_built_in_task("lift"));
     }
 
     #[test]

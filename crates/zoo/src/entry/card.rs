@@ -2,7 +2,10 @@
 
 use std::fmt::Write;
 
+use models::ACTION;
+
 use super::{EntryMeta, hub};
+use crate::run::is_whole;
 
 /// What the card of another kind of entry says differently from a robot policy's.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -35,7 +38,10 @@ fn render_into(meta: &EntryMeta, words: &CardWords, card: &mut String) -> std::f
     row("parameters", grouped(meta.parameters))?;
     if meta.is_robot_policy() {
         for spec in &meta.signature.observation {
-            row(&spec.name, keys(&meta.keys.of(&spec.name)))?;
+            row(&spec.name, feature(meta, &spec.name))?;
+        }
+        if let Some(names) = meta.data.as_ref().and_then(|data| data.names.get(ACTION)) {
+            row(ACTION, format!("{} numbers, {}", meta.signature.action_dim, called(names)))?;
         }
     }
     for (what, value) in &words.rows {
@@ -88,6 +94,16 @@ fn render_into(meta: &EntryMeta, words: &CardWords, card: &mut String) -> std::f
             words.usage.replace("{id}", &meta.id().to_string())
         );
     }
+    if meta.is_of_data_alone() {
+        return writeln!(
+            card,
+            "\nUse: `actrm.load_policy(\"{id}\")` in Python; no simulator has the task above. Provenance and the hash of every \
+             file: `entry.json`; the whole experiment: `config.toml`.\n\n\
+             Intended for the robot and the task of its demonstrations, in their observation and action spaces; nothing is known \
+             about it elsewhere.",
+            id = meta.id()
+        );
+    }
     writeln!(
         card,
         "\nUse: `actrm-zoo eval {id} --episodes 50`. Provenance and the hash of every file: `entry.json`; \
@@ -98,10 +114,27 @@ fn render_into(meta: &EntryMeta, words: &CardWords, card: &mut String) -> std::f
     )
 }
 
-fn keys(names: &[String]) -> String {
+/// What a feature is made of, and what the data set calls its numbers where that is something else.
+fn feature(meta: &EntryMeta, name: &str) -> String {
+    let keys = meta.keys.of(name);
+    let names = meta.data.as_ref().and_then(|data| data.names.get(name));
+    let whole = is_whole(name, &keys);
+    match (names, keys.is_empty()) {
+        (Some(names), _) if whole => {
+            let width = meta.signature.get(name).map_or(names.len(), models::FeatureSpec::width);
+            format!("{width} numbers, {}", called(names))
+        }
+        (Some(names), _) => format!("{}; {}", keys.join(", "), called(names)),
+        (None, true) => "none".to_owned(),
+        (None, false) => keys.join(", "),
+    }
+}
+
+/// What a data set calls numbers.
+fn called(names: &[String]) -> String {
     match names.is_empty() {
-        true => "none".to_owned(),
-        false => names.join(", "),
+        true => "which the data set does not name".to_owned(),
+        false => format!("in the data set: {}", names.join(", ")),
     }
 }
 
@@ -120,7 +153,32 @@ pub fn grouped(number: u64) -> String {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use super::*;
+
+    #[test]
+    fn a_card_says_what_the_data_set_calls_its_numbers() {
+        let mut meta = super::super::test_draft("cube").meta;
+        let names = |text: &str| text.split(' ').map(str::to_owned).collect::<Vec<_>>();
+        let data = meta.data.as_mut().unwrap();
+        data.names.insert(models::STATE.to_owned(), names("z y x"));
+        data.names.insert(ACTION.to_owned(), Vec::new());
+        let card = render(&meta, &CardWords::default());
+        for expected in [
+            "| observation.state | robot0_eef_pos; in the data set: z, y, x |",
+            "| observation.environment_state | object |",
+            "| action | 7 numbers, which the data set does not name |",
+            "actrm-zoo eval",
+        ] {
+            assert!(card.contains(expected), "{expected} in\n{card}");
+        }
+        // a task of one's own on columns of one's own
+        (meta.task, meta.env_name, meta.env_version) = ("transfer_cube".to_owned(), None, None);
+        meta.keys.insert(models::STATE, &[models::STATE.to_owned()]).unwrap();
+        let card = render(&meta, &CardWords::default());
+        assert!(card.contains("| observation.state | 9 numbers, in the data set: z, y, x |"), "{card}");
+        assert!(card.contains("no simulator has the task") && !card.contains("actrm-zoo eval"), "{card}");
+    }
 
     #[test]
     fn the_card_says_what_it_is() {

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use models::{FeatureKind, Signature};
 use serde::{Deserialize, Serialize};
 
+use crate::config::is_built_in_task;
 use crate::experiment::PICTURE_SUFFIX;
 use crate::results::Seeds;
 use crate::{FeatureKeys, ZooError, sha256_hex};
@@ -146,6 +147,10 @@ pub struct DataMeta {
     /// How able whoever showed them is, where that is not as usual.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub skill: Option<String>,
+    /// What the data set calls the numbers of a feature, in its order, where those are not the keys that make it; an empty list
+    /// where it does not name them.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub names: BTreeMap<String, Vec<String>>,
 }
 
 /// How an entry was trained.
@@ -220,6 +225,12 @@ impl EntryMeta {
         }
         let fast_render = self.env_args.as_ref().is_some_and(CamerasMeta::draws_fast);
         Ok(Some(CamerasMeta { names, size, fast_render }))
+    }
+
+    /// Whether no simulator is known to have its task: it was trained here on demonstrations that name no environment.
+    pub fn is_of_data_alone(&self) -> bool {
+        let trained_on_data = self.is_robot_policy() && self.training.is_some() && self.data.is_some();
+        trained_on_data && self.env_name.is_none() && !is_built_in_task(&self.task)
     }
 
     /// Whether it is a policy for a robot's task.

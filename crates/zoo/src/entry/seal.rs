@@ -182,6 +182,7 @@ pub(crate) mod tests {
                     seeds: None,
                     expert: None,
                     skill: None,
+                    names: BTreeMap::new(),
                 }),
                 kind: None,
                 section: None,

@@ -132,6 +132,8 @@ impl Rerun {
                     resume: run.join("config.toml").is_file(),
                     run: Some(run.clone()),
                     zoo: zoo.clone(),
+                    // what was refused then would have made no entry
+                    force: true,
                     image_memory: how.image_memory,
                     command: None,
                 };

@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
-use dataset::{ConvertOptions, Dataset, DatasetError, FeatureStats, PictureStore, WindowBatch, WindowSpec, Windows};
+use dataset::{
+    ConvertOptions, Dataset, DatasetError, FeatureStats, PictureStore, Source, WindowBatch, WindowSpec, Windows,
+};
 use models::{
     Batch, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureSpec, Normaliser, Preprocess, STATE, Signature, ValuesRef,
 };
@@ -14,6 +16,7 @@ use crate::ZooError;
 use crate::entry::DataMeta;
 use crate::experiment::{AUXILIARY, DataSection, EntitySection, Experiment, PICTURE_PREFIX};
 
+use super::agreement::{Agreed, agree, takes_keys};
 use super::auxiliary::{Told, is_told};
 use super::exchange::Exchanges;
 use super::mirror::Mirror;
@@ -57,7 +60,7 @@ fn locate_from(path: &Path, roots: &[PathBuf]) -> Result<PathBuf, ZooError> {
     Err(ZooError::DataNotFound { path: path.to_owned(), tried })
 }
 
-/// Opens a LeRobotDataset folder, or converts an HDF5 file into the run's folder and opens that.
+/// Opens a LeRobotDataset folder, or converts an HDF5 file into the run's folder and opens that; with what the conversion noted.
 ///
 /// # Errors
 /// What `dataset` refuses.
@@ -66,9 +69,11 @@ pub(super) fn open(
     run: &Path,
     experiment: &Experiment,
     progress: &mut dyn FnMut(u64, u64),
-) -> Result<Dataset, ZooError> {
+) -> Result<(Dataset, Vec<String>), ZooError> {
     let opened = |folder: PathBuf| {
-        Dataset::open(&folder).map_err(|source| ZooError::Dataset { path: folder, source: Box::new(source) })
+        let dataset =
+            Dataset::open(&folder).map_err(|source| ZooError::Dataset { path: folder, source: Box::new(source) })?;
+        Ok((dataset, Vec::new()))
     };
     if path.is_dir() {
         return opened(path.to_owned());
@@ -76,26 +81,43 @@ pub(super) fn open(
     let folder = run.join(CONVERTED);
     if folder.exists() {
         // an earlier session's conversion, of this file or of another
-        let dataset = opened(folder)?;
+        let (dataset, notes) = opened(folder)?;
         let expected = dataset.provenance().map_or_else(String::new, |p| p.source_sha256.clone());
         let found = crate::sha256_file(path)?;
         if expected != found {
             let (folder, what) = (run.to_owned(), "data set".to_owned());
             return Err(ZooError::ResumeMismatch { folder, what, expected, found });
         }
-        return Ok(dataset);
+        return Ok((dataset, notes));
     }
+    let keys = match lacks_usual_keys(path, experiment) {
+        false => Some((experiment.data.state_keys.clone(), experiment.data.env_keys.clone())),
+        // as `convert` does by itself; the experiment takes them over
+        true => None,
+    };
+    let (state_keys, env_keys) = keys.unzip();
     let options = ConvertOptions {
-        state_keys: Some(experiment.data.state_keys.clone()),
-        env_keys: Some(experiment.data.env_keys.clone()),
+        state_keys,
+        env_keys,
         entities: columns(experiment).map(|(name, keys)| (name.to_owned(), keys.clone())).collect(),
         // no policy reads it
         depth: false,
         ..ConvertOptions::default()
     };
-    dataset::convert(path, &folder, &options, progress)
+    let converted = dataset::convert(path, &folder, &options, progress)
         .map_err(|source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) })?;
-    opened(folder)
+    Ok((opened(folder)?.0, converted.notes))
+}
+
+/// Whether an HDF5 file, for a task that no simulator has, lacks the keys that experiments have by default.
+fn lacks_usual_keys(path: &Path, experiment: &Experiment) -> bool {
+    let (data, usual) = (&experiment.data, DataSection::default());
+    if !takes_keys(experiment) || data.state_keys != usual.state_keys {
+        return false;
+    }
+    let Ok(source) = Source::open(path) else { return false };
+    let Some(demo) = source.plan().demos.first() else { return false };
+    usual.state_keys.iter().any(|key| !demo.keys.contains_key(&format!("obs/{key}")))
 }
 
 /// The data set that a training of `experiment` on `path` reads, and its folder: `path` itself, or what an HDF5 file is
@@ -111,13 +133,13 @@ pub(crate) fn demonstrations(
 ) -> Result<(PathBuf, Dataset), ZooError> {
     let path = locate(path)?;
     if path.is_dir() {
-        let dataset = open(&path, work, experiment, progress)?;
+        let (dataset, _) = open(&path, work, experiment, progress)?;
         return Ok((path, dataset));
     }
     // a folder for each file: another one may be tried in the same place
     let folder = work.join(format!("demonstrations-{}", &crate::sha256_file(&path)?[..8]));
     std::fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
-    let dataset = open(&path, &folder, experiment, progress)?;
+    let (dataset, _) = open(&path, &folder, experiment, progress)?;
     Ok((folder.join(CONVERTED), dataset))
 }
 
@@ -149,36 +171,19 @@ pub(super) struct Demonstrations {
     pub notes: Vec<String>,
 }
 
-/// Splits `dataset` by the experiment's masks and takes the statistics of the training episodes.
+/// Splits a data set by the experiment's masks and takes the statistics of the training episodes. `stored` is the set as it is in
+/// its files, `agreed` what is read of it.
 pub(super) fn prepare(
-    dataset: &Dataset,
+    stored: &Dataset,
     path: &Path,
     name: &str,
-    experiment: &Experiment,
+    agreed: &Agreed,
     memory: &PictureMemory<'_>,
 ) -> Result<Demonstrations, ZooError> {
+    let Agreed { dataset, experiment, .. } = agreed;
     let unfit = |reason: String| ZooError::UnfitData { path: path.to_owned(), reason };
     let failed = |source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) };
     let mut notes = Vec::new();
-    if let Some(provenance) = dataset.provenance() {
-        let none = Vec::new();
-        let named = [
-            ("data.state_keys".to_owned(), &experiment.data.state_keys, &provenance.state_keys),
-            ("data.env_keys".to_owned(), &experiment.data.env_keys, &provenance.env_keys),
-        ];
-        let entities = columns(experiment).map(|(name, keys)| {
-            let found = provenance.entities.get(name).unwrap_or(&none);
-            let setting =
-                if name == AUXILIARY { "data.auxiliary_keys".to_owned() } else { format!("data.entities.{name}") };
-            (setting, keys, found)
-        });
-        for (key, expected, found) in named.into_iter().chain(entities) {
-            if expected != found {
-                let found = if found.is_empty() { "none".to_owned() } else { found.join(", ") };
-                return Err(unfit(format!("{key}: expected {}, found {found}", expected.join(", "))));
-            }
-        }
-    }
     let all: Vec<usize> = (0..dataset.episodes().len()).collect();
     let usual = DataSection::default();
     let mask = &experiment.data.train_mask;
@@ -238,13 +243,14 @@ pub(super) fn prepare(
     let meta = DataMeta {
         name: name.to_owned(),
         fingerprint: dataset.fingerprint().to_owned(),
-        train_fingerprint: Some(dataset.fingerprint_of(&train)),
+        train_fingerprint: Some(stored.fingerprint_of(&train)),
         train_episodes: train.len() as u64,
         train_frames: train.iter().map(|e| dataset.episodes()[*e].length as u64).sum(),
         valid_episodes: valid.len() as u64,
         seeds: dataset.env().and_then(|env| env.seeds.as_deref()?.parse().ok()),
         expert: dataset.env().and_then(|env| env.expert.clone()),
         skill: dataset.env().and_then(|env| env.skill.clone()),
+        names: agreed.names.clone(),
     };
     let mut train = windows(train)?;
     let mut valid = match valid.is_empty() {
@@ -315,13 +321,15 @@ pub(crate) fn first_windows(
     experiment: &Experiment,
 ) -> Result<(Windows, Symmetries, Vec<u32>), ZooError> {
     std::fs::create_dir_all(work).map_err(ZooError::io("create folder", work))?;
-    let dataset = open(path, work, experiment, &mut |_, _| {})?;
+    let (dataset, _) = open(path, work, experiment, &mut |_, _| {})?;
     let all = || (0..dataset.episodes().len()).collect();
     let episodes: Vec<usize> = dataset.split(&experiment.data.train_mask).unwrap_or_else(all);
     let lengths = episodes.iter().map(|&episode| dataset.episodes()[episode].length as u32);
     let firsts = lengths.scan(0, |next, length| Some(std::mem::replace(next, *next + length))).collect();
     let memory = PictureMemory { budget: picture_budget(), folder: work };
-    let demonstrations = prepare(&dataset, path, &path.display().to_string(), experiment, &memory)?;
+    // what an entry was trained on is not asked again
+    let agreed = agree(&dataset, path, experiment, true)?;
+    let demonstrations = prepare(&dataset, path, &path.display().to_string(), &agreed, &memory)?;
     Ok((demonstrations.train, demonstrations.symmetries, firsts))
 }
 
@@ -346,7 +354,7 @@ fn observed(dataset: &Dataset, experiment: &Experiment) -> Vec<String> {
 }
 
 /// The columns beside those that every data set has, by the names of entities, and their keys.
-fn columns(experiment: &Experiment) -> impl Iterator<Item = (&str, &Vec<String>)> {
+pub(super) fn columns(experiment: &Experiment) -> impl Iterator<Item = (&str, &Vec<String>)> {
     let data = &experiment.data;
     let told = (!data.auxiliary_keys.is_empty()).then_some((AUXILIARY, &data.auxiliary_keys));
     data.entities.iter().map(|(name, entity)| (name.as_str(), &entity.keys)).chain(told)

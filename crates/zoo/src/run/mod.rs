@@ -1,5 +1,6 @@
 //! Training runs: a folder, checkpoints, metrics, the loop that makes an entry, and what it trains on demonstrations.
 
+mod agreement;
 mod auxiliary;
 mod checkpoint;
 mod data;
@@ -12,6 +13,7 @@ mod loop_parts;
 mod memory;
 mod metrics;
 mod mirror;
+mod names;
 mod places;
 mod preflight;
 mod section;
@@ -22,6 +24,7 @@ mod training;
 mod validation;
 mod way;
 
+pub(crate) use agreement::is_whole;
 pub use checkpoint::Checkpoint;
 pub use data::locate;
 pub(crate) use data::{demonstrations, first_windows};

@@ -14,6 +14,7 @@ use crate::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, ModuleMeta, Traini
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors, write_atomic};
 
+use super::agreement::agree;
 use super::checkpoint::Checkpoint;
 use super::data::{self, Demonstrations, PictureMemory};
 use super::feed::Feed;
@@ -41,6 +42,8 @@ pub struct TrainRequest {
     pub resume: bool,
     /// The zoo that gets the entry.
     pub zoo: PathBuf,
+    /// Train on demonstrations of another task, or of other names, all the same.
+    pub force: bool,
     /// Bytes that pictures may take in memory; more are kept in a file and read ahead. `None`: half of what is free.
     pub image_memory: Option<u64>,
     /// The command that trains it, for the entry.
@@ -126,8 +129,9 @@ fn begun(note_path: &Path, folder: &RunFolder, request: &TrainRequest) -> Result
 }
 
 /// A policy that learns from demonstrations.
-struct PolicyTraining<'a> {
-    experiment: &'a Experiment,
+struct PolicyTraining {
+    /// With the keys of the data set, where it has none of its own.
+    experiment: Experiment,
     demonstrations: Demonstrations,
     /// The environment of the demonstrations and its version.
     env: Option<EnvMeta>,
@@ -139,9 +143,9 @@ struct PolicyTraining<'a> {
     rate: (Instant, u64),
 }
 
-impl<'a> PolicyTraining<'a> {
+impl PolicyTraining {
     fn make(
-        request: &'a TrainRequest,
+        request: &TrainRequest,
         folder: &RunFolder,
         on_event: &mut dyn FnMut(TrainEvent<'_>),
     ) -> Result<Self, ZooError> {
@@ -154,7 +158,7 @@ impl<'a> PolicyTraining<'a> {
             (None, None) => PathBuf::from(&experiment.data.path),
         };
         let path = data::locate(&wanted)?;
-        let dataset = data::open(&path, folder.path(), experiment, &mut |done, total| {
+        let (dataset, converted) = data::open(&path, folder.path(), experiment, &mut |done, total| {
             on_event(TrainEvent::Converting(done, total));
         })?;
         let name = match dataset.provenance() {
@@ -163,10 +167,6 @@ impl<'a> PolicyTraining<'a> {
         };
         let budget = request.image_memory.unwrap_or_else(picture_budget);
         let memory = PictureMemory { budget, folder: folder.path() };
-        let demonstrations = data::prepare(&dataset, &path, &name, experiment, &memory)?;
-        for note in &demonstrations.notes {
-            on_event(TrainEvent::Note(note));
-        }
         if let Some(note) = &earlier
             && note.fingerprint != dataset.fingerprint()
         {
@@ -177,12 +177,18 @@ impl<'a> PolicyTraining<'a> {
                 found: dataset.fingerprint().to_owned(),
             });
         }
+        let agreed = agree(&dataset, &path, experiment, request.force)?;
+        let demonstrations = data::prepare(&dataset, &path, &name, &agreed, &memory)?;
+        let experiment = agreed.experiment;
+        for note in converted.iter().chain(&agreed.notes).chain(&demonstrations.notes) {
+            on_event(TrainEvent::Note(note));
+        }
         let section = &experiment.train;
         let build = || {
             let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed);
             let model = model.map_err(experiment.model_error("build the policy of"))?;
-            super::eyes::open(model.as_ref(), &demonstrations, experiment)?;
-            super::memory::fill(model.as_ref(), &demonstrations, experiment)?;
+            super::eyes::open(model.as_ref(), &demonstrations, &experiment)?;
+            super::memory::fill(model.as_ref(), &demonstrations, &experiment)?;
             Ok::<_, ZooError>(model)
         };
         let trainer = Trainer::new(build()?, section.trainer_config(), section.seed)
@@ -197,13 +203,15 @@ impl<'a> PolicyTraining<'a> {
             let text = serde_json::to_string_pretty(&note).expect("strings become JSON") + "\n";
             write_atomic(&note_path, text.as_bytes())?;
         }
+        let sampler = Sampler::new(section.seed, section.batch_size);
+        let feed = Feed::new(sampler, experiment.data.beginning, section.steps);
         Ok(Self {
             experiment,
             demonstrations,
             env: dataset.env().cloned(),
             trainer,
             evaluated,
-            feed: Feed::new(Sampler::new(section.seed, section.batch_size), experiment.data.beginning, section.steps),
+            feed,
             rate: (Instant::now(), 0),
         })
     }
@@ -214,7 +222,7 @@ impl<'a> PolicyTraining<'a> {
     }
 }
 
-impl Training for PolicyTraining<'_> {
+impl Training for PolicyTraining {
     fn parameters(&self) -> u64 {
         self.evaluated.params().count() as u64
     }
@@ -233,7 +241,7 @@ impl Training for PolicyTraining<'_> {
         self.demonstrations.symmetries.apply(step, windows);
         self.demonstrations.mirror.apply(step, windows);
         self.demonstrations.exchanges.apply(step, windows);
-        let (mut batch, rows) = (data::batch(windows, &self.demonstrations, self.experiment)?, windows.n);
+        let (mut batch, rows) = (data::batch(windows, &self.demonstrations, &self.experiment)?, windows.n);
         batch.taken = self.demonstrations.exchanges.taken(windows);
         let unfit = |source: candle_core::Error| self.experiment.model_error("train")(source.into());
         batch.visited = self.demonstrations.ways.of(windows).map_err(unfit)?;
@@ -252,7 +260,7 @@ impl Training for PolicyTraining<'_> {
     fn validate(&mut self) -> Result<BTreeMap<String, f64>, ZooError> {
         self.take_evaluated()?;
         let Some(valid) = &self.demonstrations.valid else { return Ok(BTreeMap::new()) };
-        let loss = validation_loss(self.evaluated.as_ref(), valid, &self.demonstrations, self.experiment)?;
+        let loss = validation_loss(self.evaluated.as_ref(), valid, &self.demonstrations, &self.experiment)?;
         Ok([("valid_loss".to_owned(), loss)].into())
     }
 
@@ -272,7 +280,7 @@ impl Training for PolicyTraining<'_> {
 
     fn draft(&mut self, name: &str, training: TrainingMeta, _: &[MetricsRow]) -> Result<EntryDraft, ZooError> {
         self.take_evaluated()?;
-        let (experiment, demonstrations) = (self.experiment, &self.demonstrations);
+        let (experiment, demonstrations) = (&self.experiment, &self.demonstrations);
         let env = self.env.as_ref();
         let signature = demonstrations.preprocess.signature().clone();
         let mut keys = experiment.data.feature_keys()?;

@@ -45,6 +45,9 @@ struct NamedArgs {
 }
 
 /// A checkpoint folder of LeRobot's ACT or diffusion
+///
+/// Weights may be stored in f16, bf16, f32 or f64, and in several files with their `model.safetensors.index.json`. Checkpoints of
+/// LeRobot 0.3 and before have no processors: their statistics are among the weights.
 #[derive(clap::Args)]
 struct LerobotArgs {
     /// Folder with config.json, model.safetensors and the two processors

@@ -17,6 +17,10 @@ use crate::training::show;
 /// Ctrl-C saves a checkpoint; `--resume` goes on from it to the same bytes that an uninterrupted training gives.
 /// `actrm-zoo runs` lists what can go on, with the command that does it.
 ///
+/// Demonstrations must be of the experiment's task, and the names that a LeRobot data set gives to its numbers must be those of
+/// the experiment's observation keys: in another order they are reordered, others are refused. A task that no simulator
+/// has (`task.name`) takes the keys of the data set.
+///
 /// `--seeds 1..8` trains eight times, with the seeds 1 to 8, one entry each (`lift-act-s1` to `lift-act-s8`): a family,
 /// which the leaderboard shows as one row with the chance of training in its interval. The same command goes on where it
 /// was; what is trained already is not trained again.
@@ -27,6 +31,7 @@ use crate::training::show;
   actrm-zoo train policy=diffusion task=stack
   actrm-zoo train act_stack inputs=image
   actrm-zoo train act_lift --data demos.hdf5 --zoo my-zoo
+  actrm-zoo train act_lift --data aloha task.name=transfer_cube entry=aloha-act
   actrm-zoo train act_lift --resume
   actrm-zoo train act_lift --seeds 1..8
   actrm-zoo train trm_dfs10 train.seed=2
@@ -41,6 +46,9 @@ pub struct Args {
     /// Demonstrations: an HDF5 file or a LeRobotDataset folder, instead of the experiment's
     #[arg(long, value_name = "PATH")]
     data: Option<PathBuf>,
+    /// Train even where the demonstrations are of another task, or their numbers have other names
+    #[arg(long)]
+    force: bool,
     /// Folder of runs; this one becomes RUNS/EXPERIMENT/NUMBER
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
@@ -168,9 +176,10 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
     let outcome = match experiment {
         AnyExperiment::Robot(experiment) => {
             let data = args.data.clone();
-            let image_memory = args.image_memory;
+            let (image_memory, force) = (args.image_memory, args.force);
+            let experiment = *experiment;
             let request =
-                TrainRequest { name, experiment: *experiment, data, runs, run, resume, zoo, image_memory, command };
+                TrainRequest { name, experiment, data, runs, run, resume, zoo, force, image_memory, command };
             train(&request, &stop, &mut on_event)
         }
         AnyExperiment::Puzzle(experiment) => {
@@ -208,6 +217,9 @@ fn trains(args: &Args, own: &[String]) -> Vec<OsString> {
     }
     if let Some(configs) = &args.configs.configs {
         option("--configs", configs);
+    }
+    if args.force {
+        words.push("--force".into());
     }
     words
 }
