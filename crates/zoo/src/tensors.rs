@@ -279,10 +279,9 @@ mod tests {
             read_as(Dtype::F64, &1e300_f64.to_le_bytes()).unwrap_err(),
             format!("{place}: tensor `w`: expected numbers that fit into f32, found 1e300")
         );
-        assert_eq!(
-            read_as(Dtype::I8, &[1, 2]).unwrap_err(),
-            format!("{place}: tensor `w`: expected dtype f16, bf16, f32, f64, i64, u32 or u8, found I8")
-        );
+        let expected = format!("{place}: tensor `w`: expected dtype f16, bf16, f32, f64, i64, u32 or u8, found I8");
+        let refused = read_as(Dtype::I8, &[1, 2]).unwrap_err();
+        assert!(refused.starts_with(&expected), "{refused}");
     }
 
     #[test]

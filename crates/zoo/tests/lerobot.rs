@@ -206,7 +206,8 @@ fn make_older(copy: &Path) {
         for (name, shape, data) in f32_tensors(&path) {
             let (feature, statistic) = name.rsplit_once('.').unwrap();
             // LeRobot had buffers of what it normalised alone
-            let used = ["mean", "std"].contains(&statistic);
+            let used = ["mean", "std"].contains(&statistic)
+                && ["action", "observation"].iter().any(|of| feature.starts_with(of));
             for prefix in
                 prefixes.iter().filter(|prefix| used && (feature == "action") != (**prefix == "normalize_inputs"))
             {

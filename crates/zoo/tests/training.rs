@@ -553,13 +553,9 @@ fn of_no_simulator(data: &Path, out: &Path, names: &str) {
     let mut writer = RobomimicWriter::create(&other, &WriteOptions::default()).unwrap();
     let mut group = source.root().unwrap();
     group.datasets.retain(|name, _| !name.starts_with("mask"));
+    let args = dataset::Array::from_str(r#"{"env_name": "pour the tea", "type": 1, "env_kwargs": {}}"#);
+    group.inner_attrs.get_mut("data").unwrap().insert("env_args".to_owned(), args);
     writer.set_root(&group).unwrap();
-    writer
-        .set_data_attr(
-            "env_args",
-            &dataset::Array::from_str(r#"{"env_name": "pour the tea", "type": 1, "env_kwargs": {}}"#),
-        )
-        .unwrap();
     for index in 0..source.plan().demos.len() {
         writer.add_demo(&source.read_demo(index).unwrap()).unwrap();
     }

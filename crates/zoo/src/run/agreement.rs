@@ -68,7 +68,9 @@ pub(super) fn agree(dataset: &Dataset, path: &Path, experiment: &Experiment, for
             continue;
         };
         let (items, stated) = (keys.items(feature), dataset.names(feature));
-        if is_whole(feature, &keys.of(feature)) || (free && feature == ACTION) {
+        // nobody knows what the actions of a task without a simulator are
+        let any_action = free && feature == ACTION && !names::is_counted(&stated);
+        if is_whole(feature, &keys.of(feature)) || any_action {
             agreed.names.insert(feature.to_owned(), stated);
             continue;
         }
@@ -157,6 +159,10 @@ fn take_keys(agreed: &mut Agreed) {
     }
     if data.env_keys == usual.env_keys {
         data.env_keys = env;
+    }
+    if is_whole(STATE, &data.state_keys) {
+        let task = &agreed.experiment.task.name;
+        agreed.notes.push(format!("no simulator is known to have {task}: what is read are the data set's own columns"));
     }
 }
 

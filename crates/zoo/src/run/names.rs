@@ -35,9 +35,7 @@ pub(super) fn of_action(names: &[String]) -> Names {
         let names = (0..order.len()).map(|i| format!("{ACTION}_{i}")).collect();
         Names::Are { order, names }
     };
-    // a converter's: `action_0`, `action_1`, …
-    if let Some(order) = places_of(names.iter().map(|name| name.strip_prefix(ACTION)?.strip_prefix('_')?.parse().ok()))
-    {
+    if let Some(order) = counted(names) {
         return are(order);
     }
     let canonical = canonical_of(names);
@@ -46,6 +44,15 @@ pub(super) fn of_action(names: &[String]) -> Names {
         None if says_nothing(&canonical) => Names::Silent,
         None => Names::Other,
     }
+}
+
+/// Whether they are a converter's: `action_0`, `action_1`, …
+pub(super) fn is_counted(names: &[String]) -> bool {
+    counted(names).is_some_and(|order| order.is_sorted())
+}
+
+fn counted(names: &[String]) -> Option<Vec<usize>> {
+    places_of(names.iter().map(|name| name.strip_prefix(ACTION)?.strip_prefix('_')?.parse().ok()))
 }
 
 /// Where each of the numbers 0, 1, … is in a list that holds each once.
