@@ -135,6 +135,13 @@ pub enum InputError {
         found: String,
     },
 
+    /// git-lfs left a pointer where the file belongs.
+    #[error("{path}: a git-lfs pointer, not the file itself; run `git lfs pull` to download it", path = path.display())]
+    LfsPointer {
+        /// The file.
+        path: PathBuf,
+    },
+
     /// The file ends before the length that its own header states.
     #[error("{path}: truncated: its header states {expected} bytes, the file has {found}", path = path.display())]
     Truncated {
@@ -233,7 +240,7 @@ pub enum InputError {
         found: String,
     },
 
-    /// An action is NaN or infinite.
+    /// A value is NaN, infinite or, where it goes into a float32 column, too large for one.
     #[error("{path}: {demo}: {key}: step {step}, dimension {dimension}: expected a finite number, found {found}", path = path.display())]
     NotFinite {
         /// The file.
@@ -265,21 +272,6 @@ pub enum InputError {
         found: String,
     },
 
-    /// A mask names demos that the file does not have.
-    #[error("{path}: mask/{mask}: {count} of the {named} demos it names are not in the file: {demos}", path = path.display())]
-    UnknownMaskDemos {
-        /// The file.
-        path: PathBuf,
-        /// The mask.
-        mask: String,
-        /// Demos that it names.
-        named: usize,
-        /// Those that are not there.
-        count: usize,
-        /// Their ids, or the first of them.
-        demos: String,
-    },
-
     /// An element type, link or storage that is not read.
     #[error("{path}: {object}: {what} is not supported", path = path.display())]
     Unsupported {
@@ -289,6 +281,17 @@ pub enum InputError {
         object: String,
         /// The type, link or storage in words.
         what: String,
+    },
+
+    /// A dataset or a link that cannot be followed to its values.
+    #[error("{path}: {object} cannot be read: {reason}", path = path.display())]
+    Unavailable {
+        /// The file.
+        path: PathBuf,
+        /// The dataset or link.
+        object: String,
+        /// Why, and what to do.
+        reason: String,
     },
 
     /// A size that cannot be right, or that is beyond what one call may return.
@@ -361,6 +364,19 @@ pub enum InputError {
         /// Why.
         reason: String,
     },
+}
+
+impl InputError {
+    /// The demo that is at fault, where it is one.
+    pub fn demo(&self) -> Option<&str> {
+        match self {
+            Self::MissingKey { demo, .. }
+            | Self::WrongLength { demo, .. }
+            | Self::WrongShape { demo, .. }
+            | Self::NotFinite { demo, .. } => Some(demo),
+            _ => None,
+        }
+    }
 }
 
 /// Result of this library.

@@ -31,14 +31,14 @@ pub use keys::{KeyItem, Moment};
 pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset, DepthMaps,
     DepthUnit, ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm,
-    Info, MISTAKE, PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, VideoOptions, VideoProvenance,
-    convert, convert_unless, edit, export, verify, verify_source,
+    Info, MISTAKE, PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, SkippedDemo, VideoOptions,
+    VideoProvenance, convert, convert_unless, edit, export, notes, source_hash, verify, verify_source,
 };
 pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};
 pub use samples::{SampleColumn, SamplePlace, SampleSpec, Samples};
 pub use sheet::Picture;
-pub use source::{RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation};
+pub use source::{NonFinite, RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};
 pub use windows::{WindowBatch, WindowSpec, Windows};

@@ -70,7 +70,8 @@ pub struct Plan {
     pub texts: BTreeMap<String, String>,
     /// Facts worth knowing that are no fault: camera orientation, a dropped tail.
     pub notes: Vec<String>,
-    /// Everything that is wrong. What is fatal is refused by `read_demo`.
+    /// Everything that is wrong. What is fatal is refused by `read_demo`; a demo that is named here and not among
+    /// `demos` cannot be opened.
     pub problems: Vec<Problem>,
 }
 
@@ -78,6 +79,23 @@ impl Plan {
     /// Steps of all demos together.
     pub fn frames(&self) -> usize {
         self.demos.iter().map(|d| d.length).sum()
+    }
+
+    /// Demos that the source names and that cannot be opened at all, by id, and why.
+    pub fn lost(&self) -> impl Iterator<Item = (&str, &InputError)> {
+        let lost = |p: &'_ &Problem| p.fatal && p.demo.as_ref().is_some_and(|id| self.position(id).is_none());
+        self.problems.iter().filter(lost).filter_map(|p| Some((p.demo.as_deref()?, &p.error)))
+    }
+
+    /// Why a dataset of a demo cannot be read, where it is there and cannot.
+    pub fn unreadable(&self, demo: &DemoPlan, key: &str) -> Option<&InputError> {
+        let found = self.problems.iter().find(|p| {
+            p.fatal
+                && p.key.as_deref() == Some(key)
+                && p.demo.as_ref().is_none_or(|id| *id == demo.id)
+                && !demo.keys.contains_key(key)
+        });
+        found.map(|p| &p.error)
     }
 
     /// Position of the demo with this id.
@@ -140,6 +158,13 @@ pub struct Place {
     pub first_row: usize,
     /// Position in the file of the demo's first element, where they lie there as they are in memory.
     pub offset: Option<u64>,
+}
+
+impl Problem {
+    pub(crate) fn new(demo: Option<&str>, key: Option<&str>, fatal: bool, error: InputError) -> Self {
+        let (demo, key) = (demo.map(str::to_owned), key.map(str::to_owned));
+        Self { demo, key, fatal, message: error.to_string(), error }
+    }
 }
 
 /// Something wrong with a source.

@@ -1,5 +1,6 @@
 //! Statistics of a feature: what a normaliser needs and what a LeRobotDataset stores.
 //!
+//! Values that are NaN or infinite do not count; a dimension without any other has zeros.
 //! Mean and standard deviation (population, ddof 0) are computed in f64 in two passes; quantiles are
 //! exact, with linear interpolation between order statistics as numpy's default does it.
 
@@ -184,16 +185,29 @@ impl FeatureStats {
         [&self.q01, &self.q10, &self.q50, &self.q90, &self.q99]
     }
 
+    fn vectors_mut(&mut self) -> [&mut Vec<f64>; 9] {
+        let Self { min, max, mean, std, count: _, q01, q10, q50, q90, q99 } = self;
+        [min, max, mean, std, q01, q10, q50, q90, q99]
+    }
+
     fn quantiles_mut(&mut self) -> [&mut Vec<f64>; 5] {
         [&mut self.q01, &mut self.q10, &mut self.q50, &mut self.q90, &mut self.q99]
     }
 
-    fn push_dimension<T: Sample>(&mut self, values: &mut [T]) {
+    fn push_dimension<T: Sample>(&mut self, values: &mut Vec<T>) {
+        let mut sum = values.iter().map(|v| v.to_f64()).sum::<f64>();
+        if !sum.is_finite() {
+            values.retain(|v| v.to_f64().is_finite());
+            sum = values.iter().map(|v| v.to_f64()).sum();
+        }
+        if values.is_empty() {
+            return self.vectors_mut().into_iter().for_each(|vector| vector.push(0.0));
+        }
         let n = values.len() as f64;
         let low = values.iter().fold(f64::INFINITY, |m, v| m.min(v.to_f64()));
         let high = values.iter().fold(f64::NEG_INFINITY, |m, v| m.max(v.to_f64()));
         // rounding must not push the mean of a constant column beside its only value
-        let mean = (values.iter().map(|v| v.to_f64()).sum::<f64>() / n).max(low).min(high);
+        let mean = (sum / n).max(low).min(high);
         let variance = values.iter().map(|v| (v.to_f64() - mean).powi(2)).sum::<f64>() / n;
         let mut wanted = Vec::with_capacity(2 * QUANTILES.len());
         for (_, q) in QUANTILES {

@@ -198,6 +198,26 @@ impl Array {
         })
     }
 
+    /// Position of the first element that is NaN or infinite, or that becomes infinite as `f32` where `as_f32`; none of
+    /// what is no float.
+    pub fn first_not_finite(&self, as_f32: bool) -> Option<usize> {
+        fn first<const N: usize>(bytes: &[u8], good: impl Fn([u8; N]) -> bool) -> Option<usize> {
+            // without a branch for each element: nearly always all are good
+            const BLOCK: usize = 4096;
+            let (elements, _) = bytes.as_chunks::<N>();
+            let blocks = elements.chunks(BLOCK).enumerate();
+            let mut bad = blocks.filter(|(_, block)| !block.iter().fold(true, |all, &e| all & good(e)));
+            let (block, elements) = bad.next()?;
+            elements.iter().position(|&e| !good(e)).map(|at| block * BLOCK + at)
+        }
+        match self.dtype {
+            Dtype::F32 => first(&self.bytes, |b| f32::from_le_bytes(b).is_finite()),
+            Dtype::F64 if as_f32 => first(&self.bytes, |b| (f64::from_le_bytes(b) as f32).is_finite()),
+            Dtype::F64 => first(&self.bytes, |b| f64::from_le_bytes(b).is_finite()),
+            _ => None,
+        }
+    }
+
     /// The single integer of a scalar or one-element array; `None` for anything else.
     pub fn to_i64(&self) -> Option<i64> {
         if self.len() != 1 {

@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
-use dataset::{ActionKind, ConvertOptions, ImageForm, RotationForm, VideoOptions, convert_unless};
+use dataset::{ActionKind, ConvertOptions, ImageForm, NonFinite, RotationForm, VideoOptions, convert_unless};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -15,7 +15,7 @@ use crate::work::interruptible;
 
 /// `actrm.convert` without its bar: `tell(done, total)` is called as frames are written.
 #[pyfunction]
-#[pyo3(signature = (src, dst, tell, *, state_keys, env_keys, entities, fps, images, depth, actions, rotation, lossless, jobs))]
+#[pyo3(signature = (src, dst, tell, *, state_keys, env_keys, entities, fps, images, depth, actions, rotation, nonfinite, skip_bad, lossless, jobs))]
 #[expect(clippy::too_many_arguments, reason = "options by name")]
 pub(crate) fn convert<'py>(
     py: Python<'py>,
@@ -30,6 +30,8 @@ pub(crate) fn convert<'py>(
     depth: bool,
     actions: &str,
     rotation: &str,
+    nonfinite: &str,
+    skip_bad: bool,
     lossless: bool,
     jobs: usize,
 ) -> PyResult<Bound<'py, PyDict>> {
@@ -49,6 +51,11 @@ pub(crate) fn convert<'py>(
         "6d" => RotationForm::SixD,
         other => return Err(unknown("rotation", "axis-angle or 6d", other)),
     };
+    let nonfinite = match nonfinite {
+        "refuse" => NonFinite::Refuse,
+        "keep" => NonFinite::Keep,
+        other => return Err(unknown("nonfinite", "refuse or keep", other)),
+    };
     let options = ConvertOptions {
         state_keys,
         env_keys,
@@ -59,6 +66,8 @@ pub(crate) fn convert<'py>(
         depth,
         actions,
         rotation,
+        nonfinite,
+        skip_bad,
         lossless,
         jobs,
         ..ConvertOptions::default()
@@ -87,6 +96,8 @@ pub(crate) fn convert<'py>(
     summary.set_item("bytes", report.bytes)?;
     summary.set_item("fingerprint", report.fingerprint)?;
     summary.set_item("notes", report.notes)?;
+    let skipped: Vec<(String, String)> = report.skipped.into_iter().map(|s| (s.demo, s.reason)).collect();
+    summary.set_item("skipped", skipped)?;
     Ok(summary)
 }
 

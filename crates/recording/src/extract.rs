@@ -71,6 +71,28 @@ pub fn recorded_task(raw: &Path, source: &Source) -> Result<String> {
     plan.env_name.clone().ok_or_else(|| unfit(None, "the environment's name", "env_args, env_info or env"))
 }
 
+/// Refuses a recording of another generation of robosuite: its models do not load there, or mean something else.
+fn same_generation(raw: &Path, recorded: Option<&str>, simulator: &str, running: Option<&str>) -> Result<()> {
+    let generation = |version: &str| {
+        let mut parts = version.split('.').map(|part| part.trim().parse::<u32>().ok());
+        Some((parts.next()??, parts.next()??))
+    };
+    let (Some(recorded), Some(running), "robosuite") = (recorded, running, simulator) else { return Ok(()) };
+    match (generation(recorded), generation(running)) {
+        (Some(a), Some(b)) if a != b => Err(RecordingError::Unfit {
+            path: raw.to_owned(),
+            demo: None,
+            what: "simulator".to_owned(),
+            expected: format!(
+                "robosuite {}.{}, which recorded it ({recorded}); --python names one that has it",
+                a.0, a.1
+            ),
+            found: format!("robosuite {running}"),
+        }),
+        _ => Ok(()),
+    }
+}
+
 /// Replays all demos of `source` with the workers of `pool`; `progress` is told how many are done.
 ///
 /// # Errors
@@ -82,6 +104,11 @@ pub fn extract(
     progress: &mut dyn FnMut(u64),
 ) -> Result<ExtractEnd> {
     let plan = source.plan();
+    if let Some((_, error)) = plan.lost().next() {
+        return Err(dataset::DatasetError::from(error.clone()).into());
+    }
+    let ready = pool.ready();
+    same_generation(&options.raw, plan.env_version.as_deref(), &ready.simulator, ready.simulator_version())?;
     let mut writer = RobomimicWriter::create(&options.out, &WriteOptions { gzip: options.gzip })?;
     let env_args = env_args(plan.env_args.as_ref(), &pool.ready().env_args);
     let (mut steps, mut done) = (0_u64, 0_usize);
@@ -152,4 +179,21 @@ fn env_args(recorded: Option<&Value>, now: &Value) -> Value {
         }
     }
     merged
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_generation_of_robosuite_is_named_with_both_versions() {
+        let check = |recorded, simulator, running| same_generation(Path::new("a.hdf5"), recorded, simulator, running);
+        for (recorded, running) in [(Some("1.5.0"), Some("1.5.2")), (None, Some("1.5.2")), (Some("x"), Some("1.5.2"))] {
+            assert!(check(recorded, "robosuite", running).is_ok(), "{recorded:?} {running:?}");
+        }
+        assert!(check(Some("1.4.1"), "another", Some("1.5.2")).is_ok());
+        let text = check(Some("1.4.1"), "robosuite", Some("1.5.2")).map_or_else(|e| e.to_string(), |()| String::new());
+        assert!(text.contains("1.4.1") && text.contains("1.5.2") && text.contains("a.hdf5"), "{text}");
+        assert!(!text.contains('\n'), "{text}");
+    }
 }

@@ -4,24 +4,26 @@
 //! episodes say about themselves. The bytes written do not depend on the number of threads.
 
 use super::check;
+use super::depth;
 use super::encode::{GroupOutput, Job};
 use super::encoded;
 use super::features::{Column, ConvertOptions, Mapping};
-use super::info::{self, Info, Provenance, VideoProvenance};
+use super::info::{self, Info, Provenance, SkippedDemo, VideoProvenance};
 use super::meta;
 use super::schema::{self, CREATED_BY};
 use super::shards::{GroupEncoder, ShardWriter, WrittenFile};
 use super::side::{self, SideEncoder, SideOutput, SideWriter};
+use super::skip;
 use super::staging::Staging;
 use super::tally::{Tally, Told};
-use super::verify::hash_source;
+use super::verify::hash_files;
 use super::videos::{self, VideoWriter};
 use super::work;
 use crate::error::{DatasetError, InputError, Result};
-use crate::plan::Plan;
+use crate::plan::{Plan, Problem};
 use crate::source::Source;
 use crate::stats::FeatureStats;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::ControlFlow;
 use std::path::Path;
 
@@ -44,6 +46,8 @@ pub struct ConvertReport {
     pub bytes: u64,
     /// sha256 of the content.
     pub fingerprint: String,
+    /// Demos that were left out ([`ConvertOptions::skip_bad`]), and why.
+    pub skipped: Vec<SkippedDemo>,
     /// Facts and faults of the source that did not prevent the conversion.
     pub notes: Vec<String>,
 }
@@ -73,17 +77,30 @@ pub fn convert_unless(
     options: &ConvertOptions,
     progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
 ) -> Result<ConvertReport> {
-    let input = Source::open_guarded(source)?;
-    let plan = input.plan();
-    if plan.dialect.needs_extraction() {
+    let mut input = Source::open_guarded(source)?.nonfinite(options.nonfinite);
+    if input.plan().dialect.needs_extraction() {
         return Err(InputError::NeedsExtraction { path: source.to_path_buf() }.into());
     }
-    let mapping = Mapping::resolve(plan, options, &encoded::sizes(&input)?)?;
+    if !options.depth {
+        // the side folder keeps it, whatever its values
+        let keys = input.plan().demos.iter().flat_map(|demo| &demo.keys);
+        let depth = keys.filter(|(path, key)| depth::size(&path.replacen("next_obs/", "obs/", 1), key).is_some());
+        let depth = depth.map(|(path, _)| path.clone()).collect();
+        input.exempt(depth);
+    }
     let staging = Staging::create(out)?;
-    let conversion = Conversion { source, plan, mapping: &mapping, options, root: staging.path() };
+    let (mapping, skipped) = match options.skip_bad {
+        true => skip::bad(&mut input, options, staging.path())?,
+        false => {
+            skip::none(&input)?;
+            (Mapping::resolve(input.plan(), options, &encoded::sizes(&input)?)?, Vec::new())
+        }
+    };
+    let plan = input.plan();
+    let conversion = Conversion { source, plan, mapping: &mapping, options, skipped, root: staging.path() };
     let report = std::thread::scope(|scope| {
         // the file's hash needs nothing of what the conversion does
-        let hash = scope.spawn(|| hash_source(source));
+        let hash = scope.spawn(|| hash_files(&plan.files));
         let frames = conversion.write_frames(&input, progress)?;
         let hash = hash.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         conversion.write_meta(frames, hash)
@@ -92,11 +109,29 @@ pub fn convert_unless(
     Ok(report)
 }
 
+/// Task texts in order of first use, and each episode's.
+pub(crate) fn tasks(source: &Path, plan: &Plan) -> (Vec<String>, Vec<usize>) {
+    let mut tasks: Vec<String> = Vec::new();
+    let mut task_of = Vec::with_capacity(plan.demos.len());
+    let stem = source.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+    for demo in &plan.demos {
+        // no instruction: the environment names the task; a file that names none is known by its own name
+        let text = demo.task.as_ref().or(plan.env_name.as_ref()).unwrap_or(&stem);
+        let index = tasks.iter().position(|t| t == text).unwrap_or_else(|| {
+            tasks.push(text.clone());
+            tasks.len() - 1
+        });
+        task_of.push(index);
+    }
+    (tasks, task_of)
+}
+
 struct Conversion<'a> {
     source: &'a Path,
     plan: &'a Plan,
     mapping: &'a Mapping,
     options: &'a ConvertOptions,
+    skipped: Vec<SkippedDemo>,
     root: &'a Path,
 }
 
@@ -113,7 +148,7 @@ impl Conversion<'_> {
             ControlFlow::Continue(()) => Ok(()),
             ControlFlow::Break(()) => Err(DatasetError::Stopped { path: self.source.to_owned() }),
         };
-        let (tasks, task_of) = self.tasks();
+        let (tasks, task_of) = tasks(self.source, self.plan);
         let features = self.mapping.features();
         let arrow_schema = schema::data_schema(&features);
         let metadata = vec![schema::huggingface_metadata(&features)];
@@ -130,6 +165,7 @@ impl Conversion<'_> {
             mapping: self.mapping,
             images: self.options.images,
             video: self.options.video.as_ref(),
+            nonfinite: self.options.nonfinite,
             encoder: &encoder,
             task_of: &task_of,
         };
@@ -139,7 +175,12 @@ impl Conversion<'_> {
         let side = match self.options.lossless {
             true => {
                 let side = SideEncoder::new(self.root, self.plan, &self.mapping.columns, self.options.video.as_ref())?;
-                Some((side, side::object_encoder(self.root)?, input.root()?))
+                let mut rest = input.root()?;
+                if let (false, Some(data)) = (self.skipped.is_empty(), rest.inner_attrs.get_mut("data")) {
+                    side::count(data, "total", self.plan.frames());
+                    side::count(data, "num_demos", self.plan.demos.len());
+                }
+                Some((side, side::object_encoder(self.root)?, rest))
             }
             false => None,
         };
@@ -157,7 +198,7 @@ impl Conversion<'_> {
         tell(0, total)?;
         work::in_order(
             groups.len(),
-            self.jobs(),
+            self.options.threads(),
             |index| {
                 let mut loaded = job.load(&groups[index])?;
                 let beside = side.as_ref().map(|(side, _, _)| side.encode(&job, &loaded)).transpose()?;
@@ -186,23 +227,6 @@ impl Conversion<'_> {
         Ok(Frames { tasks, told, files })
     }
 
-    /// Task texts in order of first use, and each episode's.
-    fn tasks(&self) -> (Vec<String>, Vec<usize>) {
-        let mut tasks: Vec<String> = Vec::new();
-        let mut task_of = Vec::with_capacity(self.plan.demos.len());
-        let stem = self.source.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-        for demo in &self.plan.demos {
-            // no instruction: the environment names the task; a file that names none is known by its own name
-            let text = demo.task.as_ref().or(self.plan.env_name.as_ref()).unwrap_or(&stem);
-            let index = tasks.iter().position(|t| t == text).unwrap_or_else(|| {
-                tasks.push(text.clone());
-                tasks.len() - 1
-            });
-            task_of.push(index);
-        }
-        (tasks, task_of)
-    }
-
     /// Depth in metres that may be none: what MuJoCo gives before anyone makes distances of it.
     fn doubtful_depth(&self, stats: &BTreeMap<String, FeatureStats>) -> Vec<String> {
         let metres = self.mapping.columns.iter().filter(|c| c.feature.depth_unit() == Some("m"));
@@ -222,13 +246,6 @@ impl Conversion<'_> {
         self.mapping.columns.iter().any(|c| c.feature.dtype == "video")
     }
 
-    fn jobs(&self) -> usize {
-        match self.options.jobs {
-            0 => std::thread::available_parallelism().map_or(1, usize::from),
-            n => n,
-        }
-    }
-
     fn write_meta(&self, frames: Frames, source_sha256: String) -> Result<ConvertReport> {
         let statistical: Vec<(String, bool)> =
             self.mapping.columns.iter().map(|c| (c.name.clone(), c.feature.is_visual())).collect();
@@ -236,7 +253,9 @@ impl Conversion<'_> {
         files.push(meta::write_tasks(self.root, &frames.tasks)?);
         files.push(meta::write_episodes(self.root, &frames.tasks, &statistical, &frames.told.rows)?);
         files.push(meta::write_stats(self.root, &statistical, &frames.told.stats)?);
-        let info = check::sealed(self.info(&frames.tasks, &frames.told.fingerprint, source_sha256), self.root)?;
+        let (left_out, left_out_notes) = self.left_out();
+        let info = self.info(&frames.tasks, &frames.told.fingerprint, source_sha256, left_out);
+        let info = check::sealed(info, self.root)?;
         files.push(meta::write_json(self.root, "meta/info.json", &info)?);
         if self.options.lossless {
             files.push(side::write_manifest(self.root, &files)?);
@@ -255,6 +274,7 @@ impl Conversion<'_> {
             bytes: files.iter().map(|f| f.bytes).sum(),
             fingerprint: frames.told.fingerprint,
             tasks: frames.tasks,
+            skipped: self.skipped.clone(),
             notes: self
                 .plan
                 .notes
@@ -262,12 +282,34 @@ impl Conversion<'_> {
                 .chain(&self.mapping.notes)
                 .cloned()
                 .chain(self.doubtful_depth(&frames.told.stats))
-                .chain(self.plan.problems.iter().map(|p| p.message.clone()))
+                .chain(left_out_notes)
+                .chain(self.plan.problems.iter().filter(|p| !p.fatal).map(|p| p.message.clone()))
                 .collect(),
         })
     }
 
-    fn info(&self, tasks: &[String], fingerprint: &str, source_sha256: String) -> Info {
+    /// Datasets that cannot be read and that no column needs, and what to say about them.
+    fn left_out(&self) -> (Vec<String>, Vec<String>) {
+        let mut found: BTreeMap<&str, (usize, String)> = BTreeMap::new();
+        for demo in &self.plan.demos {
+            let mine = |p: &&Problem| p.fatal && p.demo.as_ref().is_none_or(|id| *id == demo.id);
+            let keys = self.plan.problems.iter().filter(mine).filter_map(|p| p.key.as_deref());
+            let keys: BTreeSet<&str> = keys.collect();
+            for key in keys {
+                if let Some(error) = self.plan.unreadable(demo, key) {
+                    found.entry(key).or_insert_with(|| (0, error.to_string())).0 += 1;
+                }
+            }
+        }
+        let demos = self.plan.demos.len();
+        let note = |(key, (count, error)): (&&str, &(usize, String))| {
+            let side = if self.options.lossless { ", from the side folder too" } else { "" };
+            format!("{key} is left out in {count} of {demos} demos{side}: {error}")
+        };
+        (found.keys().map(|key| (*key).to_owned()).collect(), found.iter().map(note).collect())
+    }
+
+    fn info(&self, tasks: &[String], fingerprint: &str, source_sha256: String, left_out: Vec<String>) -> Info {
         let plan = self.plan;
         // demos that a mask names and the file lacks are a note; the side folder keeps the mask as it is
         let masks = plan.masks.iter().map(|(name, demos)| {
@@ -276,6 +318,10 @@ impl Conversion<'_> {
             (name.clone(), episodes)
         });
         let masks: BTreeMap<String, Vec<usize>> = masks.collect();
+        let absent = plan.masks.iter().map(|(name, demos)| {
+            (name.clone(), demos.iter().filter(|demo| plan.position(demo).is_none()).cloned().collect::<Vec<_>>())
+        });
+        let masks_absent = absent.filter(|(_, demos)| !demos.is_empty()).collect();
         let robots = plan.env_args.as_ref().and_then(|args| args.get("env_kwargs")?.get("robots").cloned());
         let robot_type = match robots {
             Some(serde_json::Value::String(name)) => Some(name),
@@ -319,6 +365,9 @@ impl Conversion<'_> {
                 action: self.mapping.action.clone(),
                 demos: plan.demos.iter().map(|d| d.id.clone()).collect(),
                 masks,
+                masks_absent,
+                skipped: self.skipped.clone(),
+                left_out,
                 lossless: self.options.lossless,
                 seal: None,
                 video: self.options.video.filter(|_| self.films()).map(|v| VideoProvenance {

@@ -10,7 +10,7 @@ use super::values::{Position, Values, episode_values};
 use super::videos::Camera;
 use super::work::{Part, is_bulk};
 use crate::error::{DatasetError, InputError, Result};
-use crate::source::Source;
+use crate::source::{NonFinite, Source};
 use crate::stats::FeatureStats;
 use crate::tree::{Array, Demo};
 use arrow::array::{
@@ -30,6 +30,7 @@ pub(crate) struct Job<'a> {
     pub mapping: &'a Mapping,
     pub images: ImageForm,
     pub video: Option<&'a VideoOptions>,
+    pub nonfinite: NonFinite,
     pub encoder: &'a GroupEncoder,
     /// Task of each episode.
     pub task_of: &'a [usize],
@@ -89,7 +90,8 @@ impl Job<'_> {
         let mut loaded = Vec::with_capacity(parts.len());
         for part in parts {
             let plan = &self.source.plan().demos[part.episode];
-            let small = |key: &str| plan.keys.get(key).is_none_or(|k| !is_bulk(k, plan.length));
+            // what cannot be read and no column needs is no key of the plan
+            let small = |key: &str| plan.keys.get(key).is_some_and(|k| !is_bulk(k, plan.length));
             let small = |key: &str| small(key) && !self.is_picture(key);
             let demo = self.source.read_demo_where(part.episode, &small)?;
             let position = Position {
@@ -99,9 +101,41 @@ impl Job<'_> {
                 length: part.length,
             };
             let values = episode_values(self.path, self.mapping, &demo, position)?;
+            if self.nonfinite == NonFinite::Refuse {
+                self.mapping.columns.iter().zip(&values).try_for_each(|(c, values)| self.finite(c, values, &demo))?;
+            }
             loaded.push(Loaded { part: part.clone(), demo, values });
         }
         Ok(loaded)
+    }
+
+    /// Refuses values of a column that are not finite: float32 cannot hold them, or they follow from others.
+    fn finite(&self, column: &Column, values: &Values, demo: &Demo) -> Result<()> {
+        let Values::F32(values) = values else { return Ok(()) };
+        if values.iter().fold(true, |all, v| all & v.is_finite()) {
+            return Ok(());
+        }
+        let keys: Vec<String> = match &column.origin {
+            Origin::Concat(parts) => {
+                parts.iter().flat_map(|(_, widths)| widths.keys()).map(|key| format!("obs/{key}")).collect()
+            }
+            Origin::Action { key, .. } => vec![key.clone()],
+            Origin::Reward => vec!["rewards".to_owned()],
+            _ => Vec::new(),
+        };
+        let of_key = |key: &String| self.source.first_not_finite(&demo.id, key, demo.datasets.get(key)?, 0, true);
+        let computed = || {
+            let at = values.iter().position(|v| !v.is_finite()).unwrap_or(0);
+            InputError::NotFinite {
+                path: self.path.to_path_buf(),
+                demo: demo.id.clone(),
+                key: column.name.clone(),
+                step: at / column.dim(),
+                dimension: at % column.dim(),
+                found: format!("{}, computed from finite numbers", values[at]),
+            }
+        };
+        Err(keys.iter().find_map(of_key).unwrap_or_else(computed).into())
     }
 
     fn is_picture(&self, key: &str) -> bool {
@@ -209,7 +243,8 @@ impl Job<'_> {
             for (frame, bytes) in rows.zip(array.bytes.chunks_exact(size)) {
                 pixels.clear();
                 depth::stored(dtype, bytes, &mut pixels);
-                if let Some(value) = depth::not_finite(*kind, width, &pixels) {
+                let bad = depth::not_finite(*kind, width, &pixels);
+                if let Some(value) = bad.filter(|_| self.nonfinite == NonFinite::Refuse) {
                     let expected = "finite depth (--no-depth keeps it in the side folder alone)";
                     return Err(self.bad_picture(l, key, frame, expected, value));
                 }

@@ -18,16 +18,18 @@ pub(crate) fn may_hold_files(path: &str, key: &KeyPlan) -> bool {
         && matches!(key.shape[..], [rows, bytes] if rows > 0 && bytes > 0)
 }
 
-/// Height and width of the pictures of such datasets, by path: those of the first demo's first step. What begins with no
+/// Height and width of the pictures of such datasets, by path: those of the first step of the first demo that has one. What begins with no
 /// JPEG file is left out.
 pub(crate) fn sizes(source: &Source) -> Result<BTreeMap<String, (usize, usize)>> {
     let mut found = BTreeMap::new();
-    let Some(first) = source.plan().demos.first() else { return Ok(found) };
-    for (path, _) in first.keys.iter().filter(|(path, key)| may_hold_files(path, key)) {
-        let row = source.read_rows(0, path, 0, 1)?;
-        if let Some(size) = images::jpeg(&row.bytes).and_then(|file| images::jpeg_size(file).ok()) {
-            found.insert(path.clone(), size);
+    for (index, demo) in source.plan().demos.iter().enumerate() {
+        for (path, _) in demo.keys.iter().filter(|(path, key)| may_hold_files(path, key)) {
+            if !found.contains_key(path) {
+                let row = source.read_rows(index, path, 0, 1)?;
+                let size = images::jpeg(&row.bytes).and_then(|file| images::jpeg_size(file).ok());
+                found.insert(path.clone(), size);
+            }
         }
     }
-    Ok(found)
+    Ok(found.into_iter().filter_map(|(path, size)| Some((path, size?))).collect())
 }

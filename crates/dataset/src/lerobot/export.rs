@@ -342,7 +342,8 @@ fn each_file(
 /// The objects in order, an episode at a time.
 pub(crate) struct Objects {
     root: PathBuf,
-    rows: Rows,
+    /// None in a set without objects.
+    rows: Option<Rows>,
     /// The first object of an episode that was not asked for yet.
     peeked: std::collections::VecDeque<(i64, Object)>,
 }
@@ -350,7 +351,7 @@ pub(crate) struct Objects {
 impl Objects {
     /// Before the first one.
     pub(crate) fn open(root: &Path) -> Result<Self> {
-        let rows = Rows::open(root, OBJECTS, None, 256)?;
+        let rows = root.join(OBJECTS).exists().then(|| Rows::open(root, OBJECTS, None, 256)).transpose()?;
         Ok(Self { root: root.to_path_buf(), rows, peeked: std::collections::VecDeque::new() })
     }
 
@@ -359,7 +360,7 @@ impl Objects {
         let mut found = Vec::new();
         loop {
             if self.peeked.is_empty() {
-                match self.rows.next_batch()? {
+                match self.rows.as_mut().map(Rows::next_batch).transpose()?.flatten() {
                     Some(batch) => self.peeked.extend(parse_objects(&self.root, &batch)?),
                     None => return Ok(found),
                 }
@@ -466,7 +467,8 @@ impl Rows {
                 source,
             })?;
             let mut builder =
-                ParquetRecordBatchReaderBuilder::try_new(file).map_err(failed)?.with_batch_size(self.batch_rows);
+                ParquetRecordBatchReaderBuilder::try_new(file).map_err(|source| read::unreadable(&path, source))?;
+            builder = builder.with_batch_size(self.batch_rows);
             if let Some(column) = &self.column {
                 let index = builder.schema().index_of(column).map_err(|e| failed(e.into()))?;
                 let mask = ProjectionMask::roots(builder.parquet_schema(), [index]);

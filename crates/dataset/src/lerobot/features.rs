@@ -6,6 +6,7 @@ use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm}
 use crate::error::{DatasetError, InputError, Result};
 use crate::keys::KeyItem;
 use crate::plan::{DemoPlan, KeyPlan, Plan};
+use crate::source::NonFinite;
 use crate::tree::Dtype;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -85,6 +86,10 @@ pub struct ConvertOptions {
     pub actions: ActionKind,
     /// How to write the rotation part of actions.
     pub rotation: RotationForm,
+    /// What is done with values that are NaN or infinite.
+    pub nonfinite: NonFinite,
+    /// Leave out demos that cannot be converted, instead of refusing the source.
+    pub skip_bad: bool,
     /// Keep everything that the format has no place for in the side folder.
     pub lossless: bool,
     /// Threads that encode, besides the one that reads; 0 takes the number of cores.
@@ -107,10 +112,22 @@ impl Default for ConvertOptions {
             depth: true,
             actions: ActionKind::default(),
             rotation: RotationForm::default(),
+            nonfinite: NonFinite::default(),
+            skip_bad: false,
             lossless: true,
             jobs: 0,
             data_file_mb: 100.0,
             video_file_mb: 200.0,
+        }
+    }
+}
+
+impl ConvertOptions {
+    /// Threads that encode.
+    pub(crate) fn threads(&self) -> usize {
+        match self.jobs {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            n => n,
         }
     }
 }
@@ -184,11 +201,13 @@ impl Mapping {
         options: &ConvertOptions,
         files: &BTreeMap<String, (usize, usize)>,
     ) -> Result<Self> {
-        let first = plan
-            .demos
-            .first()
-            .ok_or_else(|| InputError::NoDemos { path: plan.path.clone(), found: "none".to_owned() })?;
-        let chooser = Chooser { plan, first, files };
+        let first = match options.skip_bad {
+            true => usual(plan),
+            false => plan.demos.first(),
+        };
+        let first = first.ok_or_else(|| InputError::NoDemos { path: plan.path.clone(), found: "none".to_owned() })?;
+        let least = if options.skip_bad { plan.demos.len().div_ceil(2) } else { 1 };
+        let chooser = Chooser { plan, first, files, least };
         let state_keys = chooser.state_keys(options)?;
         let env_keys = chooser.env_keys(options)?;
         let mut columns = Vec::new();
@@ -273,10 +292,25 @@ impl Mapping {
     }
 }
 
+/// The first of the demos whose datasets most demos have, by type and shape of a step.
+fn usual(plan: &Plan) -> Option<&DemoPlan> {
+    let mut kinds: BTreeMap<Vec<(&str, &Dtype, &[usize])>, (usize, usize)> = BTreeMap::new();
+    for (index, demo) in plan.demos.iter().enumerate() {
+        let step = |key: &'_ KeyPlan| key.shape.len().min(1);
+        let keys = demo.keys.iter().map(|(path, key)| (path.as_str(), &key.dtype, &key.shape[step(key)..])).collect();
+        kinds.entry(keys).or_insert((0, index)).0 += 1;
+    }
+    let most = kinds.into_values().max_by_key(|&(count, index)| (count, std::cmp::Reverse(index)));
+    most.map(|(_, index)| &plan.demos[index])
+}
+
 struct Chooser<'a> {
     plan: &'a Plan,
+    /// What the others are compared with.
     first: &'a DemoPlan,
     files: &'a BTreeMap<String, (usize, usize)>,
+    /// So many demos that have a dataset make it one that all should have.
+    least: usize,
 }
 
 impl Chooser<'_> {
@@ -299,7 +333,7 @@ impl Chooser<'_> {
         if let Some(keys) = &options.state_keys {
             return Ok(keys.clone());
         }
-        let has = |key: &str| self.first.keys.contains_key(&format!("obs/{key}"));
+        let has = |key: &str| self.usual(&format!("obs/{key}"));
         let chosen = STATE_DEFAULTS.iter().find(|set| set.iter().all(|key| has(key)));
         let Some(set) = chosen else {
             // name what robomimic's set lacks, and what there is to choose from
@@ -320,7 +354,7 @@ impl Chooser<'_> {
     fn env_keys(&self, options: &ConvertOptions) -> Result<Vec<String>> {
         Ok(match &options.env_keys {
             Some(keys) => keys.clone(),
-            None if self.first.keys.contains_key(&format!("obs/{ENV_DEFAULT}")) => {
+            None if self.usual(&format!("obs/{ENV_DEFAULT}")) => {
                 vec![ENV_DEFAULT.to_owned()]
             }
             None => Vec::new(),
@@ -383,7 +417,13 @@ impl Chooser<'_> {
     fn images(&self) -> Result<Vec<Column>> {
         let mut columns = Vec::new();
         let mut taken = BTreeSet::new();
-        for (path, key) in &self.first.keys {
+        let mut cameras: BTreeMap<&String, &KeyPlan> = BTreeMap::new();
+        for (path, key) in std::iter::once(self.first).chain(&self.plan.demos).flat_map(|demo| &demo.keys) {
+            if self.files.contains_key(path) || key.is_image() {
+                cameras.entry(path).or_insert(key);
+            }
+        }
+        for (path, key) in cameras.into_iter().filter(|(path, _)| self.usual(path)) {
             let Some(name) = path.strip_prefix("obs/") else { continue };
             let (jpeg, (height, width)) = match (self.files.get(path), key.is_image()) {
                 (Some(&size), _) => (true, size),
@@ -507,18 +547,18 @@ impl Chooser<'_> {
             origin,
         };
         let mut columns = Vec::new();
-        if self.first.keys.contains_key("rewards") {
+        if self.usual("rewards") {
             self.one_a_step("rewards")?;
             columns.push(scalar("next.reward", "float32", Origin::Reward));
         }
-        if self.first.keys.contains_key("dones") {
+        if self.usual("dones") {
             self.one_a_step("dones")?;
             columns.push(scalar("next.done", "bool", Origin::Done));
         }
-        if self.first.keys.contains_key("rewards") && self.rewards_tell_success() {
+        if self.usual("rewards") && self.rewards_tell_success() {
             columns.push(scalar("next.success", "bool", Origin::Success));
         }
-        if self.first.keys.contains_key("mistakes") {
+        if self.usual("mistakes") {
             self.one_a_step("mistakes")?;
             columns.push(scalar(MISTAKE, "bool", Origin::Mistake));
         }
@@ -597,11 +637,19 @@ impl Chooser<'_> {
         Ok(width)
     }
 
+    /// Whether enough demos have this dataset for all to need it.
+    fn usual(&self, path: &str) -> bool {
+        self.plan.demos.iter().filter(|demo| demo.keys.contains_key(path)).take(self.least).count() == self.least
+    }
+
     fn key<'d>(&self, demo: &'d DemoPlan, path: &str) -> Result<&'d KeyPlan> {
         demo.keys.get(path).ok_or_else(|| DatasetError::from(self.missing(demo, path)))
     }
 
     fn missing(&self, demo: &DemoPlan, path: &str) -> InputError {
+        if let Some(error) = self.plan.unreadable(demo, path) {
+            return error.clone();
+        }
         let folder = path.rsplit_once('/').map_or("", |(folder, _)| folder);
         let near: Vec<&str> = demo
             .keys
@@ -614,7 +662,14 @@ impl Chooser<'_> {
             path: self.plan.path.clone(),
             demo: demo.id.clone(),
             key: path.to_owned(),
-            found: found.join(", "),
+            found: match self.plan.demos.iter().filter(|demo| demo.keys.contains_key(path)).count() {
+                0 => found.join(", "),
+                n => format!(
+                    "{}; {n} of {} demos have it (--skip-bad leaves out the others)",
+                    found.join(", "),
+                    self.plan.demos.len()
+                ),
+            },
         }
     }
 

@@ -261,6 +261,15 @@ pub struct Provenance {
     pub demos: Vec<String>,
     /// Masks of the source as episode indices.
     pub masks: BTreeMap<String, Vec<usize>>,
+    /// Demos that masks of the source name and that it has not, by mask.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub masks_absent: BTreeMap<String, Vec<String>>,
+    /// Demos of the source that were left out, and why (`--skip-bad`).
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub skipped: Vec<SkippedDemo>,
+    /// Datasets of the source that could not be read in some demos, and are left out there.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub left_out: Vec<String>,
     /// Whether the side folder is there.
     pub lossless: bool,
     /// sha256 of everything else in `info.json`, so that an edited number does not train other weights in silence.
@@ -269,6 +278,15 @@ pub struct Provenance {
     /// How pictures were encoded, where they are videos.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub video: Option<VideoProvenance>,
+}
+
+/// A demo that a conversion left out.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SkippedDemo {
+    /// Its id.
+    pub demo: String,
+    /// What is wrong with it.
+    pub reason: String,
 }
 
 /// How the pictures of a data set were made videos.

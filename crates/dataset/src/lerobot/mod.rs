@@ -12,12 +12,14 @@ mod fingerprint;
 mod images;
 mod info;
 mod meta;
+mod notes;
 mod open;
 mod pictures;
 mod read;
 mod schema;
 mod shards;
 mod side;
+mod skip;
 mod staging;
 mod tally;
 mod tiff;
@@ -31,7 +33,11 @@ pub use depth::{DepthMaps, DepthUnit};
 pub use export::{ExportReport, export};
 pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, MISTAKE, VideoOptions};
 pub(crate) use images::encode_png;
-pub use info::{ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm, VideoProvenance};
+pub use info::{
+    ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm, SkippedDemo, VideoProvenance,
+};
+pub use notes::notes;
+pub(crate) use notes::{mask_note, shared_notes};
 pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};
 pub use pictures::{CameraFile, PictureFile, PictureStore, Pictures};
-pub use verify::{Check, verify, verify_source};
+pub use verify::{Check, source_hash, verify, verify_source};

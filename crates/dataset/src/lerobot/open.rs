@@ -8,8 +8,9 @@ use super::meta::parse_stats;
 use super::read;
 use super::schema::hex;
 use super::values::Values;
-use crate::error::{DatasetError, Result};
+use crate::error::{DatasetError, InputError, Result};
 use crate::shuffle::SplitMix64;
+use crate::source::is_lfs_pointer;
 use crate::stats::FeatureStats;
 use crate::windows::{Resident, WindowSpec, Windows, unmarked};
 use arrow::buffer::ScalarBuffer;
@@ -387,7 +388,15 @@ impl Dataset {
 
 /// A JSON file.
 pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
-    serde_json::from_slice(&read_file(path)?).map_err(|source| DatasetError::Json { path: path.to_path_buf(), source })
+    serde_json::from_slice(&read_file(path)?).map_err(|source| no_json(path, source))
+}
+
+/// The error of a JSON file that is none, or not the one that belongs there.
+fn no_json(path: &Path, source: serde_json::Error) -> DatasetError {
+    match is_lfs_pointer(path) {
+        true => InputError::LfsPointer { path: path.to_path_buf() }.into(),
+        false => DatasetError::Json { path: path.to_path_buf(), source },
+    }
 }
 
 fn read_file(path: &Path) -> Result<Vec<u8>> {
@@ -413,8 +422,7 @@ pub(crate) fn read_info(root: &Path) -> Result<Info> {
         });
     }
     let text = read_file(&path)?;
-    let info: Info =
-        serde_json::from_slice(&text).map_err(|source| DatasetError::Json { path: path.clone(), source })?;
+    let info: Info = serde_json::from_slice(&text).map_err(|source| no_json(&path, source))?;
     if !info.codebase_version.starts_with("v3.") {
         return Err(DatasetError::BadDataset {
             path,

@@ -1,6 +1,7 @@
 //! Parquet files as plain vectors: columns of numbers of any width, lists of any kind.
 
-use crate::error::{DatasetError, Result};
+use crate::error::{DatasetError, InputError, Result};
+use crate::source::is_lfs_pointer;
 use crate::windows::Resident;
 use arrow::array::{
     Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, LargeListArray, ListArray, RecordBatch,
@@ -10,6 +11,7 @@ use arrow::compute::{cast, concat};
 use arrow::datatypes::DataType;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use parquet::errors::ParquetError;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -48,7 +50,7 @@ pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<Array
         operation: "open it",
         source,
     })?;
-    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(failed)?;
+    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(|source| unreadable(path, source))?;
     let rows = builder.metadata().file_metadata().num_rows();
     let rows = usize::try_from(rows).ok().ok_or_else(|| bad_count(path, rows))?;
     let mut indices = Vec::with_capacity(columns.len());
@@ -75,6 +77,14 @@ pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<Array
         });
     }
     Ok((rows, arrays))
+}
+
+/// The error of a Parquet file that cannot be opened as one.
+pub(crate) fn unreadable(path: &Path, source: ParquetError) -> DatasetError {
+    match is_lfs_pointer(path) {
+        true => InputError::LfsPointer { path: path.to_path_buf() }.into(),
+        false => DatasetError::Parquet { path: path.to_path_buf(), operation: "read it", source },
+    }
 }
 
 fn bad_count(path: &Path, rows: i64) -> DatasetError {

@@ -408,6 +408,19 @@ impl Object {
     }
 }
 
+/// Sets an attribute that is there to a number, in its type where that is a whole number.
+pub(crate) fn count(attrs: &mut Attrs, name: &str, value: usize) {
+    let Some(array) = attrs.get_mut(name) else { return };
+    let bytes = (value as u64).to_le_bytes();
+    *array = match (&array.dtype, array.len()) {
+        (Dtype::I64 | Dtype::U64 | Dtype::I32 | Dtype::U32, 1) => {
+            let size = array.dtype.size().unwrap_or(8);
+            Array { bytes: bytes[..size].to_vec(), ..array.clone() }
+        }
+        _ => Array::from_i64(Vec::new(), &[value as i64]),
+    };
+}
+
 fn attributes(path: &str, attrs: &Attrs, objects: &mut Vec<Object>) {
     objects.extend(attrs.iter().map(|(name, value)| Object {
         kind: Kind::Attribute,

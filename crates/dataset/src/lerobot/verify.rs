@@ -10,13 +10,13 @@ use super::pictures::{Film, places};
 use super::schema;
 use super::side::{MANIFEST_FILE, Manifest};
 use crate::error::{DatasetError, Result};
-use crate::source;
+use crate::source::{self, Source};
 use crate::stats::FeatureStats;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Relative difference up to which a stored statistic counts as right: LeRobot computes some in f32.
 const STATISTICS_TOLERANCE: f64 = 1e-5;
@@ -35,18 +35,26 @@ pub(crate) fn hash_file(path: &Path) -> Result<String> {
     }
 }
 
-/// sha256 of a source file; of a folder, of the lines `<sha256>  <name>` of its files.
-pub(crate) fn hash_source(path: &Path) -> Result<String> {
-    let files = source::files(path)?;
-    if let [single] = files.as_slice() {
+/// sha256 of a source file; of several, of the lines `<sha256>  <name>`.
+pub(crate) fn hash_files(files: &[(PathBuf, u64)]) -> Result<String> {
+    if let [(single, _)] = files {
         return hash_file(single);
     }
     let mut lines = String::new();
-    for file in &files {
+    for (file, _) in files {
         let name = file.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
         lines.push_str(&format!("{}  {name}\n", hash_file(file)?));
     }
     Ok(schema::hex(&Sha256::digest(lines)))
+}
+
+/// [`hash_files`] of a file, of a folder, and of the files that links in them lead to.
+pub fn source_hash(path: &Path) -> Result<String> {
+    match Source::open_guarded(path) {
+        Ok(source) => hash_files(&source.plan().files),
+        // what cannot be opened any more has another hash
+        Err(_) => hash_files(&source::files(path)?.into_iter().map(|file| (file, 0)).collect::<Vec<_>>()),
+    }
 }
 
 /// What a check found.
@@ -71,7 +79,7 @@ pub fn verify_source(root: &Path, source: &Path) -> Result<Check> {
             found: "a data set that was not converted from demonstrations".to_owned(),
         });
     };
-    let found = hash_source(source)?;
+    let found = source_hash(source)?;
     let problem = (found != provenance.source_sha256).then(|| {
         let name = source.display();
         format!("{name}: expected sha256 {} as at the conversion, found {found}", provenance.source_sha256)

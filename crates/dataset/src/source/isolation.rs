@@ -124,8 +124,9 @@ fn source_bytes(path: &Path) -> u64 {
 }
 
 fn serve(path: &Path) -> std::io::Result<()> {
-    let seconds = CPU_SECONDS + source_bytes(path) / BYTES_PER_CPU_SECOND;
-    limit_self(seconds, Some(seconds))?;
+    let allowed = |bytes: u64| CPU_SECONDS + bytes / BYTES_PER_CPU_SECOND;
+    let bytes = source_bytes(path);
+    limit_self(allowed(bytes), None)?;
     let mut out = std::io::stdout().lock();
     let _ = rustix::pipe::fcntl_setpipe_size(&out, 1 << 20);
     let mut beat_out = std::io::stdout();
@@ -140,6 +141,9 @@ fn serve(path: &Path) -> std::io::Result<()> {
     out = std::io::stdout().lock();
     let local = match opened {
         Ok((local, plan)) => {
+            // links may lead to more files
+            let seconds = allowed(bytes.max(plan.files.iter().map(|(_, bytes)| bytes).sum()));
+            limit_cpu(seconds, Some(seconds))?;
             send(&mut out, PLAN, &serde_json::to_vec(&plan)?)?;
             local
         }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use super::dialect::{self, DemoDraft, Draft, Survey};
 use super::walk::{Walked, check_signature};
 use crate::error::InputError;
-use crate::plan::Plan;
+use crate::plan::{Plan, Problem};
 use crate::tree::{Array, Demo};
 
 /// What a source can be asked for, in this process or in another.
@@ -35,15 +35,35 @@ impl Local {
     pub fn open(path: &Path, beat: &mut dyn FnMut()) -> Result<(Self, Plan), InputError> {
         let paths = files(path)?;
         let keep = paths.len() <= KEEP_OPEN;
-        let files = paths.iter().map(|p| Walked::open(p, keep, beat)).collect::<Result<Vec<_>, _>>()?;
+        let (mut files, mut lost) = (Vec::new(), Vec::new());
+        for (index, file) in paths.iter().enumerate() {
+            match Walked::open(file, keep, beat) {
+                Ok(walked) => files.push(walked),
+                Err(error) if path.is_dir() => {
+                    let id = format!("demo_{}", dialect::number_of(file, index));
+                    lost.push(Problem::new(Some(&id), None, true, error));
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        if let (true, Some(problem)) = (files.is_empty(), lost.first()) {
+            return Err(problem.error.clone());
+        }
         let survey = Survey { path: path.to_owned(), files };
         let Draft { dialect, demos, env_args, env_name, env_version, masks, texts, notes, problems } =
             dialect::draft(&survey, beat)?;
+        let problems = lost.into_iter().chain(problems).collect();
+        let mut linked: Vec<(PathBuf, u64)> = Vec::new();
+        for file in survey.files.iter().flat_map(|f| &f.linked) {
+            if !linked.contains(file) && !survey.files.iter().any(|f| f.path == file.0) {
+                linked.push(file.clone());
+            }
+        }
         let mut drafts = demos;
         drafts.sort_by(|a, b| (a.plan.number, &a.plan.id).cmp(&(b.plan.number, &b.plan.id)));
         let plan = Plan {
             path: path.to_owned(),
-            files: survey.files.iter().map(|f| (f.path.clone(), f.bytes)).collect(),
+            files: survey.files.iter().map(|f| (f.path.clone(), f.bytes)).chain(linked).collect(),
             dialect,
             demos: drafts.iter().map(|d| d.plan.clone()).collect(),
             env_args,
@@ -72,8 +92,11 @@ pub(crate) fn files(path: &Path) -> Result<Vec<PathBuf>, InputError> {
     if path.is_dir() { files_of(path) } else { Ok(vec![path.to_owned()]) }
 }
 
-/// The HDF5 files of a folder, by the number in their names and then by name. Hidden ones are somebody's work in
-/// progress.
+/// What HDF5 files are called.
+const EXTENSIONS: [&str; 4] = ["hdf5", "h5", "hdf", "he5"];
+
+/// The HDF5 files of a folder, by the number in their names and then by name, with those that are only called so: an
+/// episode may have been cut off, or be a pointer of git-lfs. Hidden ones are somebody's work in progress.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
     let unreadable = |e: std::io::Error| InputError::Unreadable { path: folder.to_owned(), reason: e.to_string() };
     let mut found = Vec::new();
@@ -81,7 +104,8 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
     for entry in std::fs::read_dir(folder).map_err(unreadable)? {
         let path = entry.map_err(unreadable)?.path();
         let hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-        if !hidden && path.is_file() && check_signature(&path).is_ok() {
+        let named = path.extension().is_some_and(|e| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known)));
+        if !hidden && path.is_file() && (named || check_signature(&path).is_ok()) {
             found.push(path);
         } else if let Some(name) = path.file_name() {
             others.insert(name.to_string_lossy().into_owned());

@@ -9,6 +9,7 @@ mod video;
 mod walk;
 mod writer;
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::path::Path;
 
@@ -16,11 +17,13 @@ use rustix::buffer::spare_capacity;
 
 use crate::error::{InputError, Result};
 use crate::plan::{DemoPlan, KeyPlan, Plan};
-use crate::tree::{Array, Demo, Dtype};
+use crate::tree::{Array, Demo};
 use local::{Backend, Local};
 
+pub(crate) use dialect::list;
 pub(crate) use local::files;
 pub use video::{VideoFile, VideoInfo};
+pub(crate) use walk::is_lfs_pointer;
 pub use writer::{RobomimicWriter, WriteOptions};
 
 /// The most that [`Source::read_demo`] reads at once.
@@ -28,12 +31,27 @@ const MAX_DEMO: u64 = 512 << 20;
 /// How much is asked of the HDF5 library in one go.
 const WINDOW: u64 = 16 << 20;
 
+/// What is done with values that are NaN or infinite.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum NonFinite {
+    /// They are an error, with demo, key and step.
+    #[default]
+    Refuse,
+    /// They are kept as they are.
+    Keep,
+}
+
 /// An opened file or folder of demonstrations. Shared freely between threads: what lies in the file as it is in
 /// memory is read in parallel and without libhdf5, the rest one request at a time.
 pub struct Source {
     plan: Plan,
     files: Vec<File>,
     backend: Box<dyn Backend>,
+    /// The backend's position of each demo, once some are left out.
+    positions: Option<Vec<usize>>,
+    nonfinite: NonFinite,
+    /// Keys whose values may be NaN or infinite whatever `nonfinite` says.
+    exempt: BTreeSet<String>,
 }
 
 impl std::fmt::Debug for Source {
@@ -71,7 +89,35 @@ impl Source {
                 files.push(open_file(path)?);
             }
         }
-        Ok(Self { plan, files, backend })
+        let exempt = BTreeSet::new();
+        Ok(Self { plan, files, backend, positions: None, nonfinite: NonFinite::default(), exempt })
+    }
+
+    /// Says what is done with values that are NaN or infinite; they are refused unless it is called.
+    pub fn nonfinite(mut self, nonfinite: NonFinite) -> Self {
+        self.nonfinite = nonfinite;
+        self
+    }
+
+    /// Lets the values of these keys be NaN or infinite.
+    pub(crate) fn exempt(&mut self, keys: BTreeSet<String>) {
+        self.exempt = keys;
+    }
+
+    /// Leaves out the demos for which `bad` gives true of their position, and every problem that is theirs.
+    pub(crate) fn leave_out(&mut self, bad: &dyn Fn(usize) -> bool) {
+        let all = self.plan.demos.len();
+        let before = self.positions.take().unwrap_or_else(|| (0..all).collect());
+        let kept: Vec<usize> = (0..all).filter(|&index| !bad(index)).collect();
+        self.positions = Some(kept.iter().map(|&index| before[index]).collect());
+        self.plan.demos = kept.into_iter().map(|index| self.plan.demos[index].clone()).collect();
+        let Plan { demos, problems, .. } = &mut self.plan;
+        problems.retain(|p| p.demo.as_ref().is_none_or(|id| demos.iter().any(|demo| demo.id == *id)));
+    }
+
+    /// Where the backend has a demo.
+    fn position(&self, index: usize) -> usize {
+        self.positions.as_ref().map_or(index, |positions| positions[index])
     }
 
     /// What there is.
@@ -117,7 +163,7 @@ impl Source {
             if batch.is_empty() && (demo.is_some() || !last) {
                 return Ok(());
             }
-            let part = self.backend.demo(index, batch)?;
+            let part = self.backend.demo(self.position(index), batch)?;
             batch.clear();
             match &mut demo {
                 Some(demo) => demo.datasets.extend(part.datasets),
@@ -179,7 +225,7 @@ impl Source {
         let mut at = first;
         while at < first + count {
             let end = ((at / window + 1) * window).min(first + count);
-            let part = self.backend.rows(index, key, at, end - at)?;
+            let part = self.backend.rows(self.position(index), key, at, end - at)?;
             bytes.extend_from_slice(&part.bytes);
             at = end;
         }
@@ -230,32 +276,40 @@ impl Source {
         Ok(Array { dtype: k.dtype.clone(), shape, bytes })
     }
 
-    /// Actions have to be finite; `first` is the step of the array's first row.
+    /// Values have to be finite; `first` is the step of the array's first row.
     fn check_values(&self, demo: &str, key: &str, array: &Array, first: usize) -> Result<(), InputError> {
-        if !matches!(key, "actions" | "actions_abs") {
-            return Ok(());
+        match self.nonfinite == NonFinite::Keep || self.exempt.contains(key) {
+            true => Ok(()),
+            false => self.first_not_finite(demo, key, array, first, false).map_or(Ok(()), Err),
         }
-        let bad = match array.dtype {
-            Dtype::F64 => {
-                let (values, _) = array.bytes.as_chunks();
-                values.iter().map(|b| f64::from_le_bytes(*b)).position(|v| !v.is_finite())
-            }
-            Dtype::F32 => {
-                let (values, _) = array.bytes.as_chunks();
-                values.iter().map(|b| f32::from_le_bytes(*b)).position(|v| !v.is_finite())
-            }
-            _ => None,
-        };
-        let Some(at) = bad else { return Ok(()) };
+    }
+
+    /// The first value of an array of a demo that is NaN or infinite, or that no float32 column of it could hold; `first`
+    /// is the step of its first row.
+    pub fn not_finite(&self, demo: &str, key: &str, array: &Array, first: usize) -> Option<InputError> {
+        let column = key.starts_with("obs/") || matches!(key, "actions" | "actions_abs" | "rewards");
+        self.first_not_finite(demo, key, array, first, column)
+    }
+
+    /// The first value of an array that is NaN or infinite, or that float32 cannot hold where `as_f32`.
+    pub(crate) fn first_not_finite(
+        &self,
+        demo: &str,
+        key: &str,
+        array: &Array,
+        first: usize,
+        as_f32: bool,
+    ) -> Option<InputError> {
+        let at = array.first_not_finite(as_f32)?;
         let width = array.shape.iter().skip(1).product::<usize>().max(1);
         let value = array.to_f64().and_then(|v| v.get(at).copied()).unwrap_or(f64::NAN);
-        Err(InputError::NotFinite {
+        Some(InputError::NotFinite {
             path: self.plan.path.clone(),
             demo: demo.to_owned(),
             key: key.to_owned(),
             step: first + at / width,
             dimension: at % width,
-            found: value.to_string(),
+            found: if value.is_finite() { format!("{value:e}, which float32 cannot hold") } else { value.to_string() },
         })
     }
 }

@@ -352,12 +352,12 @@ fn ragged_keys_masks_and_totals_are_problems_not_failures() {
         root.inner_attrs.get_mut("data").unwrap().insert("total".to_owned(), Array::from_i64(vec![], &[9]));
     });
     let source = Source::open(&path).unwrap();
+    assert_eq!(source.plan().notes, ["mask/train: 1 of the 2 demos it names are not in the file: demo_7"]);
     let messages: Vec<_> = source.plan().problems.iter().map(|p| p.message.split_once("hdf5: ").unwrap().1).collect();
     assert_eq!(
         messages,
         [
             "data: attribute total: expected 6, the steps of all demos, found 9",
-            "mask/train: 1 of the 2 demos it names are not in the file: demo_7",
             "demo_1: obs/object: expected float64 [3] per step as in demo_0, found float32 [4] per step",
             "demo_0: no obs/extra; found it in demo_1; here actions, dones, obs/object, rewards",
         ]

@@ -10,6 +10,7 @@ use video::{Frames, TOLERANCE, Video, VideoError};
 use super::isolation::{
     self, ARRAY, Ask, BEAT, ERROR, PLAN, Remote, VIDEO_VARIABLE, limit_cpu, limit_self, next_request, send,
 };
+use super::walk::is_lfs_pointer;
 use crate::error::InputError;
 
 /// Processor time for opening a file.
@@ -96,6 +97,7 @@ pub(crate) fn plain(path: &Path, error: &VideoError) -> InputError {
         VideoError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {
             InputError::NotFound { path: path.to_owned() }
         }
+        _ if is_lfs_pointer(path) => InputError::LfsPointer { path: path.to_owned() },
         _ => {
             let text = causes.fold(error.to_string(), |text, cause| format!("{text}: {cause}"));
             InputError::Video { path: path.to_owned(), text }

@@ -6,6 +6,7 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use hdf5::dataset::Layout;
+use hdf5::filters::Filter;
 use hdf5::{Dataset, Datatype, Group, IndexType, IterationOrder, LinkType, LocationType};
 
 use super::value::{self, Part, dtype_of, one_line, reason};
@@ -48,9 +49,16 @@ pub(super) struct Walked {
     pub datasets: BTreeMap<String, DatasetNode>,
     /// Numbers that are converted when read: another byte order, another precision.
     pub foreign: Vec<String>,
-    /// Links that lead nowhere or out of the file.
+    /// Files that links lead to, with their sizes.
+    pub linked: Vec<(PathBuf, u64)>,
+    /// Links that are not followed: they lead nowhere, in a circle or out of the file's folder.
+    pub broken: BTreeMap<String, InputError>,
+    /// Objects that are neither group nor dataset.
     pub faults: Vec<InputError>,
 }
+
+/// Groups from the file's own down to the one that is walked: file and place of each.
+type Above = Vec<(u64, hdf5::LocationToken)>;
 
 const SIGNATURE: [u8; 8] = [0x89, b'H', b'D', b'F', b'\r', b'\n', 0x1a, b'\n'];
 /// Nesting beyond this is a loop or an attack; real files have at most about six levels.
@@ -88,6 +96,9 @@ pub(super) fn check_signature(path: &Path) -> Result<u64, InputError> {
         }
         at = if at == 0 { 512 } else { at * 2 };
     }
+    if is_lfs_pointer(path) {
+        return Err(InputError::LfsPointer { path: path.to_owned() });
+    }
     let mut first = Vec::new();
     file.seek(SeekFrom::Start(0)).map_err(unreadable)?;
     file.take(8).read_to_end(&mut first).map_err(unreadable)?;
@@ -97,6 +108,14 @@ pub(super) fn check_signature(path: &Path) -> Result<u64, InputError> {
         format!("the bytes {}", first.iter().map(|b| format!("{b:02x}")).collect::<Vec<_>>().join(" "))
     };
     Err(InputError::NotHdf5 { path: path.to_owned(), found })
+}
+
+/// Whether git-lfs left a pointer where the file belongs.
+pub(crate) fn is_lfs_pointer(path: &Path) -> bool {
+    const BEGINS: &[u8] = b"version https://git-lfs";
+    let mut first = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(BEGINS.len() as u64).read_to_end(&mut first));
+    read.is_ok() && first == BEGINS
 }
 
 /// The two sizes in libhdf5's words about a truncated file.
@@ -130,14 +149,16 @@ impl Walked {
             groups: BTreeMap::new(),
             datasets: BTreeMap::new(),
             foreign: Vec::new(),
+            linked: Vec::new(),
+            broken: BTreeMap::new(),
             faults: Vec::new(),
             file: None,
         };
         let types = NativeTypes::new().map_err(|e| damaged(path, "the library", "set up", reason(&e)))?;
         let root: Group = (*file).clone();
-        let attrs = root.loc_info().map_err(|e| damaged(path, "/", "look at", reason(&e)))?.num_attrs;
-        let mut above = Vec::new();
-        walked.group(&root, "", attrs, &types, &mut above, beat)?;
+        let info = root.loc_info().map_err(|e| damaged(path, "/", "look at", reason(&e)))?;
+        let mut above = vec![(info.fileno, info.token)];
+        walked.group(&root, "", info.num_attrs, None, &types, &mut above, beat)?;
         if keep {
             walked.file = Some(file);
         }
@@ -151,13 +172,16 @@ impl Walked {
         }
     }
 
+    /// Walks a group that lies in this file, or in the linked one of this position.
+    #[allow(clippy::too_many_arguments)] // what a recursion hands down
     fn group(
         &mut self,
         group: &Group,
         path: &str,
         attrs: usize,
+        from: Option<usize>,
         types: &NativeTypes,
-        above: &mut Vec<hdf5::LocationToken>,
+        above: &mut Above,
         beat: &mut dyn FnMut(),
     ) -> Result<(), InputError> {
         let links = group
@@ -167,12 +191,15 @@ impl Walked {
         for (name, link) in links {
             let full = if path.is_empty() { name.clone() } else { format!("{path}/{name}") };
             self.check_name(&name, &full)?;
-            if link.link_type == LinkType::External {
-                let what = "a link to another file".to_owned();
-                let path = self.path.clone();
-                self.faults.push(InputError::Unsupported { path, object: full, what });
-                continue;
-            }
+            let is_link = link.link_type != LinkType::Hard;
+            let from = match is_link.then(|| self.follow(group, &name, above)).transpose() {
+                Ok(followed) => followed.unwrap_or(from),
+                Err(reason) => {
+                    let error = InputError::Unavailable { path: self.path.clone(), object: full.clone(), reason };
+                    self.broken.insert(full, error);
+                    continue;
+                }
+            };
             let info = match group.loc_info_by_name(&name) {
                 Ok(info) => info,
                 Err(e) => return Err(damaged(&self.path, &full, "follow the link", reason(&e))),
@@ -182,7 +209,7 @@ impl Walked {
             if found.is_multiple_of(256) {
                 beat();
             }
-            let limit = 1_000 + self.bytes / 32;
+            let limit = 1_000 + (self.bytes + self.linked.iter().map(|(_, bytes)| bytes).sum::<u64>()) / 32;
             if found > limit {
                 return Err(InputError::TooLarge {
                     path: self.path.clone(),
@@ -193,18 +220,18 @@ impl Walked {
             }
             match info.loc_type {
                 LocationType::Group => {
-                    if above.contains(&info.token) || above.len() >= MAX_DEPTH {
+                    if above.contains(&(info.fileno, info.token)) || above.len() > MAX_DEPTH {
                         let reason = "a group that contains itself, or nested too deep".to_owned();
                         return Err(damaged(&self.path, &full, "walk", reason));
                     }
                     let inner = group.group(&name).map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
-                    above.push(info.token);
-                    self.group(&inner, &full, info.num_attrs, types, above, beat)?;
+                    above.push((info.fileno, info.token));
+                    self.group(&inner, &full, info.num_attrs, from, types, above, beat)?;
                     above.pop();
                 }
                 LocationType::Dataset => {
                     let dataset = group.dataset(&name).map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
-                    let (node, native) = self.dataset(&dataset, &full, info.num_attrs, types)?;
+                    let (node, native) = self.dataset(&dataset, &full, info.num_attrs, from, types)?;
                     if node.dtype.is_numeric() && node.dtype != Dtype::Bool && !native {
                         self.foreign.push(full.clone());
                     }
@@ -218,6 +245,47 @@ impl Walked {
             }
         }
         Ok(())
+    }
+
+    /// Follows a soft or external link, which may lead to this file and to files in its folder: gives the position among
+    /// the linked ones, or why the link is not followed.
+    fn follow(&mut self, group: &Group, name: &str, above: &Above) -> Result<Option<usize>, String> {
+        let info = group.loc_info_by_name(name).map_err(|e| {
+            let text = reason(&e);
+            match text.split_once("external link file name = '").and_then(|(_, tail)| tail.split_once('\'')) {
+                Some((file, _)) => format!("a link to the file {file}, which cannot be opened; put it beside this one"),
+                None if text.contains("too many links") => "a link that leads in a circle".to_owned(),
+                None => "a link that leads nowhere".to_owned(),
+            }
+        })?;
+        if info.loc_type == LocationType::Group && above.contains(&(info.fileno, info.token)) {
+            return Err("a link to a group that contains it".to_owned());
+        }
+        let unreadable = |e: hdf5::Error| format!("the target of its link: {}", reason(&e));
+        let target = match info.loc_type {
+            LocationType::Dataset => group.dataset(name).map_err(unreadable)?.filename(),
+            LocationType::Group => group.group(name).map_err(unreadable)?.filename(),
+            _ => return Ok(None),
+        };
+        let target = PathBuf::from(target);
+        let resolved = |path: &Path| path.canonicalize().map_err(|e| format!("{}: {e}", path.display()));
+        let folder = |path: &Path| match path.parent() {
+            Some(folder) if !folder.as_os_str().is_empty() => resolved(folder),
+            _ => resolved(Path::new(".")),
+        };
+        if resolved(&target)? == resolved(&self.path)? {
+            return Ok(None);
+        }
+        if !folder(&target)?.starts_with(folder(&self.path)?) {
+            let file = one_line(&target.to_string_lossy());
+            return Err(format!("a link to the file {file}, which is outside the folder of this one; put it there"));
+        }
+        if let Some(known) = self.linked.iter().position(|(path, _)| *path == target) {
+            return Ok(Some(known));
+        }
+        let bytes = std::fs::metadata(&target).map_err(|e| format!("{}: {e}", target.display()))?.len();
+        self.linked.push((target, bytes));
+        Ok(Some(self.linked.len() - 1))
     }
 
     /// Refuses names that no program writes and that would command the terminal they are shown on.
@@ -234,11 +302,14 @@ impl Walked {
         dataset: &Dataset,
         full: &str,
         attrs: usize,
+        from: Option<usize>,
         types: &NativeTypes,
     ) -> Result<(DatasetNode, bool), InputError> {
         let bad = |operation: &str, e: hdf5::Error| damaged(&self.path, full, operation, reason(&e));
         let unsupported =
             |what: String| InputError::Unsupported { path: self.path.clone(), object: full.to_owned(), what };
+        let unavailable =
+            |reason: String| InputError::Unavailable { path: self.path.clone(), object: full.to_owned(), reason };
         let space = dataset.space().map_err(|e| bad("read the shape of", e))?;
         let null = space.is_null();
         let shape = if null { Vec::new() } else { space.shape() };
@@ -256,9 +327,10 @@ impl Walked {
             .unwrap_or(u64::MAX);
         let too_large = |limit| InputError::TooLarge { path: self.path.clone(), object: full.to_owned(), bytes, limit };
         if let Some(offset) = dataset.offset() {
-            if offset.checked_add(bytes).is_none_or(|end| end > self.bytes) {
-                node.fault = Some(too_large(self.bytes.saturating_sub(offset)));
-            } else if native {
+            let size = from.map_or(self.bytes, |file| self.linked[file].1);
+            if offset.checked_add(bytes).is_none_or(|end| end > size) {
+                node.fault = Some(too_large(size.saturating_sub(offset)));
+            } else if native && from.is_none() {
                 node.offset = Some(offset);
             }
             return Ok((node, native));
@@ -285,12 +357,18 @@ impl Walked {
                         });
                     }
                 }
-                if !plist.all_filters_avail() {
-                    let names: Vec<_> = plist.filters().iter().map(|f| format!("{f:?}")).collect();
-                    node.fault = Some(unsupported(format!("the compression {}", names.join(", "))));
-                }
-                let limit = MAX_UNSTORED.max(dataset.storage_size().saturating_mul(MAX_RATIO));
-                if bytes > limit {
+                let stored = dataset.storage_size();
+                let limit = MAX_UNSTORED.max(stored.saturating_mul(MAX_RATIO));
+                let unknown: Vec<Filter> = plist.filters().into_iter().filter(|f| !f.is_available()).collect();
+                if !unknown.is_empty() {
+                    let names: Vec<String> = unknown.iter().map(filter_name).collect();
+                    node.fault = Some(unavailable(format!(
+                        "it is packed with {}; `h5repack -f NONE`, where that is installed, unpacks the file",
+                        names.join(" and ")
+                    )));
+                } else if stored == 0 && bytes > 0 && !null && node.dtype.size().is_some() {
+                    node.fault = Some(unavailable(format!("it was never written: {bytes} bytes stated, none stored")));
+                } else if bytes > limit {
                     node.fault = Some(too_large(limit));
                 }
             }
@@ -336,8 +414,7 @@ impl Walked {
         let bad = |e: hdf5::Error| damaged(&self.path, &full(), "read", reason(&e));
         let attr = location.attr(name).map_err(bad)?;
         let space = attr.space().map_err(bad)?;
-        let descriptor = attr.dtype().and_then(|t| t.to_descriptor()).map_err(bad)?;
-        let dtype = dtype_of(&descriptor);
+        let dtype = carrier(&attr.dtype().map_err(bad)?);
         if let Dtype::Other(text) = &dtype {
             return Err(InputError::Unsupported {
                 path: self.path.clone(),
@@ -432,11 +509,34 @@ impl NativeTypes {
         {
             return (dtype.clone(), true);
         }
-        match file_type.to_descriptor() {
-            Ok(descriptor) => (dtype_of(&descriptor), false),
-            Err(e) => (Dtype::Other(reason(&e)), false),
-        }
+        (carrier(file_type), false)
     }
+}
+
+/// The type that carries a file's type, which libhdf5 converts where they differ.
+fn carrier(file_type: &Datatype) -> Dtype {
+    match file_type.to_descriptor() {
+        Ok(descriptor) => dtype_of(&descriptor),
+        // float16 and bfloat16, which float32 holds exactly
+        Err(_) if file_type.size() == 2 && file_type.conv_to::<f32>().is_some() => Dtype::F32,
+        Err(e) => Dtype::Other(reason(&e)),
+    }
+}
+
+/// What people call a filter.
+fn filter_name(filter: &Filter) -> String {
+    let known = match filter.id() {
+        4 => "szip",
+        307 => "bzip2",
+        32001 => "blosc",
+        32004 => "lz4",
+        32008 => "bitshuffle",
+        32013 => "zfp",
+        32015 => "zstd",
+        32026 => "blosc2",
+        id => return format!("a filter that is not known here (HDF5 filter {id})"),
+    };
+    format!("{known} (HDF5 filter {})", filter.id())
 }
 
 fn damaged(path: &Path, object: &str, operation: &str, reason: String) -> InputError {

@@ -57,6 +57,8 @@ def convert(
     depth: bool = True,
     actions: Literal["delta", "absolute"] = "delta",
     rotation: Literal["axis-angle", "6d"] = "axis-angle",
+    nonfinite: Literal["refuse", "keep"] = "refuse",
+    skip_bad: bool = False,
     lossless: bool = True,
     jobs: int = 0,
 ) -> dict[str, Any]:
@@ -80,11 +82,15 @@ def convert(
     depth: make columns of depth, as LeRobot records it; the side folder alone keeps it otherwise.
     actions: as the controller got them, or absolute poses.
     rotation: how rotations in actions are written.
+    nonfinite: refuse a source with values that are NaN or infinite, naming demo, key and step, or keep them; statistics
+        are those of the finite values.
+    skip_bad: leave out demos that cannot be converted, instead of refusing the source.
     lossless: keep what the format has no place for in the side folder, from which `actrm-data export` rebuilds the
         source.
     jobs: threads; one a core for 0.
 
-    Returns what was written: `episodes`, `frames`, `tasks`, `files`, `bytes`, `fingerprint`, `layout`, `notes`.
+    Returns what was written: `episodes`, `frames`, `tasks`, `files`, `bytes`, `fingerprint`, `layout`, `notes`, and
+    `skipped`, the demos left out, each with the reason.
     """
     with teller("convert", progress) as tell:
         return _actrm.convert(
@@ -99,6 +105,8 @@ def convert(
             depth=depth,
             actions=actions,
             rotation=rotation,
+            nonfinite=nonfinite,
+            skip_bad=skip_bad,
             lossless=lossless,
             jobs=jobs,
         )

@@ -146,6 +146,8 @@ def convert(
     depth: bool,
     actions: str,
     rotation: str,
+    nonfinite: str,
+    skip_bad: bool,
     lossless: bool,
     jobs: int,
 ) -> dict[str, Any]: ...

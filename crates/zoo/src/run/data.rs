@@ -83,7 +83,8 @@ pub(super) fn open(
         // an earlier session's conversion, of this file or of another
         let (dataset, notes) = opened(folder)?;
         let expected = dataset.provenance().map_or_else(String::new, |p| p.source_sha256.clone());
-        let found = crate::sha256_file(path)?;
+        let found = dataset::source_hash(path)
+            .map_err(|source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) })?;
         if expected != found {
             let (folder, what) = (run.to_owned(), "data set".to_owned());
             return Err(ZooError::ResumeMismatch { folder, what, expected, found });
@@ -214,6 +215,10 @@ pub(super) fn prepare(
             Vec::new()
         }
     };
+    notes.extend(dataset.provenance().map_or_else(Vec::new, |provenance| provenance.mask_notes()));
+    if valid.is_empty() && dataset.split(held_out).is_some() {
+        notes.push(format!("mask `{held_out}` names no episode: none is held out for validation"));
+    }
     if let Some(both) = valid.iter().find(|episode| train.contains(episode)) {
         return Err(unfit(format!(
             "masks `{mask}` and `{}` share episode {both}: a validation on training data says nothing",
@@ -222,6 +227,13 @@ pub(super) fn prepare(
     }
 
     let observation = observed(dataset, experiment);
+    for column in observation.iter().map(String::as_str).chain([dataset::ACTION]) {
+        if let Some(found) = dataset.not_finite(column, &train).or_else(|| dataset.not_finite(column, &valid)) {
+            return Err(unfit(format!(
+                "{found}: nothing can be learnt from it (convert --skip-bad leaves such demos out)"
+            )));
+        }
+    }
     let mut statistics = dataset.statistics_of(&train).map_err(failed)?;
     for columns in groups(&experiment.data.entities) {
         let pooled = dataset.pooled_statistics(&columns, &train).map_err(failed)?;

@@ -1,5 +1,7 @@
-use anyhow::Result;
-use dataset::{ActionKind, ConvertOptions, ImageForm, RotationForm, VideoOptions};
+use anyhow::{Result, anyhow};
+use dataset::{
+    ActionKind, ConvertOptions, DatasetError, ImageForm, InputError, NonFinite, RotationForm, VideoOptions,
+};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -66,6 +68,14 @@ pub struct Args {
     /// How to write rotations in actions
     #[arg(long, value_enum, default_value_t = Rotation::AxisAngle)]
     rotation: Rotation,
+    /// Values that are NaN or infinite, or too large for the float32 of their column: refuse the file, naming demo, key and
+    /// step, or keep them. Statistics are those of the finite values
+    #[arg(long, value_enum, default_value_t = Nonfinite::Refuse)]
+    nonfinite: Nonfinite,
+    /// Leave out demos that cannot be converted and say why, instead of refusing the file. A key counts as wanted when half
+    /// of the demos have it
+    #[arg(long)]
+    skip_bad: bool,
     /// Leave the side folder out: smaller, but the source cannot be rebuilt
     #[arg(long)]
     no_lossless: bool,
@@ -87,6 +97,12 @@ pub struct Args {
 enum Images {
     Png,
     Ppm,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Nonfinite {
+    Refuse,
+    Keep,
 }
 
 #[derive(Clone, Copy, clap::ValueEnum)]
@@ -145,6 +161,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             side_pictures: !args.no_side_pictures,
             ..VideoOptions::default()
         }),
+        nonfinite: match args.nonfinite {
+            Nonfinite::Refuse => NonFinite::Refuse,
+            Nonfinite::Keep => NonFinite::Keep,
+        },
+        skip_bad: args.skip_bad,
         lossless: !args.no_lossless,
         jobs: args.jobs,
         data_file_mb: args.file_size,
@@ -154,11 +175,23 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut screen = cli::Screen::new();
     let report = dataset::convert(&args.source, &args.out, &options, &mut screen.advance("converting"));
     screen.clear();
-    let report = report?;
+    let report = report.map_err(|error| match error {
+        DatasetError::Input(InputError::NotFinite { .. }) => {
+            anyhow!("{error} (--skip-bad leaves such demos out, --nonfinite keep stores such values)")
+        }
+        DatasetError::Input(InputError::WrongLength { .. }) if !args.skip_bad => {
+            anyhow!("{error} (--skip-bad leaves such demos out)")
+        }
+        error => error.into(),
+    })?;
     let seconds = start.elapsed().as_secs_f64();
     for note in &report.notes {
         cli::note(&format!("note: {note}"));
     }
+    for demo in &report.skipped {
+        cli::note(&format!("left out: {}: {}", demo.demo, demo.reason));
+    }
+    let skipped: Vec<_> = report.skipped.iter().map(|s| json!({"demo": s.demo, "reason": s.reason})).collect();
     if args.json {
         let features: serde_json::Map<_, _> = report
             .features
@@ -169,6 +202,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             "source": cli::lossy(&args.source), "out": cli::lossy(&args.out), "layout": report.dialect, "episodes": report.episodes,
             "frames": report.frames, "tasks": report.tasks, "features": features, "files": report.files,
             "bytes": report.bytes, "fingerprint": report.fingerprint, "seconds": seconds, "notes": report.notes,
+            "skipped": skipped,
         }))?;
         return Ok(ExitCode::SUCCESS);
     }
@@ -186,6 +220,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         report.files,
         cli::bytes(report.bytes),
     ));
+    if !skipped.is_empty() {
+        text.push_str(&format!("{} of {} demos left out\n", skipped.len(), skipped.len() + report.episodes));
+    }
     cli::print(&text)?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,5 +1,5 @@
 use anyhow::Result;
-use dataset::{Dataset, Dtype, Source};
+use dataset::{Dataset, Dtype, NonFinite, Source};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -136,7 +136,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 }
 
 fn of_source(args: &Args) -> Result<Summary> {
-    let source = Source::open_guarded(&args.path)?;
+    let source = Source::open_guarded(&args.path)?.nonfinite(NonFinite::Keep);
     let plan = source.plan();
     let mut problems: Vec<String> = plan.problems.iter().map(|p| p.message.clone()).collect();
     let mut ranges: BTreeMap<String, (f64, f64)> = BTreeMap::new();
@@ -150,6 +150,7 @@ fn of_source(args: &Args) -> Result<Summary> {
             match source.read_demo_where(index, &small) {
                 Ok(read) => {
                     for (key, array) in &read.datasets {
+                        problems.extend(source.not_finite(&demo.id, key, array, 0).map(|e| e.to_string()));
                         for value in array.to_f64().unwrap_or_default() {
                             let range = ranges.entry(key.clone()).or_insert((f64::INFINITY, f64::NEG_INFINITY));
                             *range = (range.0.min(value), range.1.max(value));
@@ -268,7 +269,11 @@ fn of_dataset(args: &Args) -> Result<Summary> {
             .filter_map(|name| Some((name.to_owned(), set.split(name)?.len())))
             .collect(),
         tasks: set.tasks().to_vec(),
-        notes: lossless.into_iter().chain([format!("fingerprint {}", set.fingerprint())]).collect(),
+        notes: lossless
+            .into_iter()
+            .chain([format!("fingerprint {}", set.fingerprint())])
+            .chain(set.provenance().map_or_else(Vec::new, |provenance| provenance.notes()))
+            .collect(),
         problems,
         each: if args.demos { each.collect() } else { Vec::new() },
     })

@@ -1,5 +1,5 @@
 use anyhow::{Result, bail};
-use dataset::{Check, Source};
+use dataset::{Check, NonFinite, Source};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -28,11 +28,14 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
+    let mut notes = Vec::new();
     let checks = if args.path.join("meta/info.json").exists() {
         let mut screen = cli::Screen::new();
         let checks = dataset::verify(&args.path, &mut screen.advance("checking"));
         screen.clear();
         let mut checks = checks?;
+        // where they cannot be had, a check says why
+        notes = dataset::notes(&args.path).unwrap_or_default();
         if let Some(source) = &args.source {
             checks.push(dataset::verify_source(&args.path, source)?);
         }
@@ -40,13 +43,13 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     } else if args.source.is_some() {
         bail!("{}: --source belongs to a data set directory, expected meta/info.json in it", args.path.display());
     } else {
-        check_source(args)?
+        check_source(args, &mut notes)?
     };
     let problems = checks.iter().filter(|c| c.problem.is_some()).count();
     if args.json {
         let list: Vec<_> =
             checks.iter().map(|c| json!({"check": c.name, "ok": c.problem.is_none(), "problem": c.problem})).collect();
-        cli::print_json(&json!({"path": cli::lossy(&args.path), "ok": problems == 0, "checks": list}))?;
+        cli::print_json(&json!({"path": cli::lossy(&args.path), "ok": problems == 0, "checks": list, "notes": notes}))?;
     } else {
         let mut text = String::new();
         for check in &checks {
@@ -54,6 +57,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 None => text.push_str(&format!("ok      {}\n", check.name)),
                 Some(problem) => text.push_str(&format!("WRONG   {}: {problem}\n", check.name)),
             }
+        }
+        for note in &notes {
+            text.push_str(&format!("note    {note}\n"));
         }
         cli::print(&text)?;
     }
@@ -63,9 +69,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 /// Bytes of a large dataset that are read at once.
 const BLOCK_BYTES: u64 = 8 << 20;
 
-fn check_source(args: &Args) -> Result<Vec<Check>> {
-    let source = Source::open_guarded(&args.path)?;
+fn check_source(args: &Args, notes: &mut Vec<String>) -> Result<Vec<Check>> {
+    let source = Source::open_guarded(&args.path)?.nonfinite(NonFinite::Keep);
     let plan = source.plan();
+    notes.extend(plan.notes.iter().cloned());
     let mut checks = Vec::new();
     let mut note = |name, problem| checks.push(Check { name, problem });
     note("it opens: a known layout with demos", None);
@@ -77,13 +84,22 @@ fn check_source(args: &Args) -> Result<Vec<Check>> {
     for (index, demo) in plan.demos.iter().enumerate() {
         // large datasets by rows, the rest whole
         let large = |key: &str| demo.keys.get(key).and_then(|k| k.bytes()).is_some_and(|b| b > BLOCK_BYTES);
-        let mut outcome = source.read_demo_where(index, &|key| !large(key)).map(drop);
+        let wanted = |key: &str| demo.keys.contains_key(key) && !large(key);
+        let mut outcome = source.read_demo_where(index, &wanted).map(|read| {
+            let found = read.datasets.iter().filter_map(|(key, array)| source.not_finite(&demo.id, key, array, 0));
+            failed.extend(found.map(|error| error.to_string()));
+        });
         for (path, key) in demo.keys.iter().filter(|(path, _)| large(path)) {
             let rows = key.shape.first().copied().unwrap_or(0);
             let step = (BLOCK_BYTES as usize * rows / key.bytes().unwrap_or(1).max(1) as usize).max(1);
+            let mut finite = true;
             for first in (0..rows).step_by(step) {
                 if outcome.is_ok() {
-                    outcome = source.read_rows(index, path, first, step.min(rows - first)).map(drop);
+                    outcome = source.read_rows(index, path, first, step.min(rows - first)).map(|array| {
+                        let found = source.not_finite(&demo.id, path, &array, first).filter(|_| finite);
+                        finite &= found.is_none();
+                        failed.extend(found.map(|error| error.to_string()));
+                    });
                 }
             }
         }
@@ -92,6 +108,6 @@ fn check_source(args: &Args) -> Result<Vec<Check>> {
         }
         advance(index as u64 + 1, plan.demos.len() as u64);
     }
-    note("every demo can be read and holds finite actions", (!failed.is_empty()).then(|| failed.join("; ")));
+    note("every demo can be read and every number is finite", (!failed.is_empty()).then(|| failed.join("; ")));
     Ok(checks)
 }

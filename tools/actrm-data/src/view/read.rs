@@ -1,7 +1,7 @@
 //! What a page shows of a data set or of a file of demonstrations, an episode at a time.
 
 use anyhow::Result;
-use dataset::{Dataset, EpisodeMeta, Picture, Source};
+use dataset::{Dataset, EpisodeMeta, NonFinite, Picture, Source};
 use std::path::Path;
 
 /// Dimensions of a column of which curves are drawn unless it was asked for.
@@ -40,7 +40,7 @@ impl Opened {
     pub fn open(path: &Path) -> Result<Self> {
         Ok(match path.join("meta/info.json").exists() {
             true => Self::Set(Box::new(Dataset::open(path)?)),
-            false => Self::File(Box::new(Source::open_guarded(path)?)),
+            false => Self::File(Box::new(Source::open_guarded(path)?.nonfinite(NonFinite::Keep))),
         })
     }
 

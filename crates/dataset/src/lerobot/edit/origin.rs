@@ -106,6 +106,10 @@ pub(super) fn of(edit: &Edit<'_>, fingerprint: &str, notes: &mut Vec<String>) ->
         action: first.action.clone(),
         demos: demos(edit, notes),
         masks: masks(edit),
+        // of several sets a mask's demos get new numbers, and those that are not there none
+        masks_absent: if all.len() == 1 { first.masks_absent.clone() } else { BTreeMap::new() },
+        skipped: all.iter().flat_map(|p| p.skipped.clone()).collect(),
+        left_out: all.iter().flat_map(|p| p.left_out.clone()).collect::<BTreeSet<_>>().into_iter().collect(),
         lossless,
         seal: None,
         video,

@@ -4,12 +4,12 @@ use super::super::export::{Objects, Rows, column_array, rest};
 use super::super::info::Provenance;
 use super::super::shards::WrittenFile;
 use super::super::side::{
-    FRAMES, Kind, Layout, NO_EPISODE, Object, SideColumn, SideWriter, frame_encoder, object_encoder,
+    FRAMES, Kind, Layout, NO_EPISODE, Object, SideColumn, SideWriter, count, frame_encoder, object_encoder,
 };
 use super::Edit;
 use super::groups::Groups;
 use crate::error::Result;
-use crate::tree::{Array, Attrs, Demo, Dtype};
+use crate::tree::{Array, Demo, Dtype};
 use arrow::array::{ArrayRef, RecordBatch, new_null_array};
 use std::collections::BTreeMap;
 
@@ -206,19 +206,6 @@ impl Rest<'_> {
             |(like, ids): (Array, Option<Vec<String>>)| ids.map_or(like.clone(), |ids| texts_like(&like, &ids));
         masks.into_iter().map(|(path, mask)| (path, stored(mask))).collect()
     }
-}
-
-/// Sets an attribute that is there to a number, in its type where that is a whole number.
-fn count(attrs: &mut Attrs, name: &str, value: usize) {
-    let Some(array) = attrs.get_mut(name) else { return };
-    let bytes = (value as u64).to_le_bytes();
-    *array = match (&array.dtype, array.len()) {
-        (Dtype::I64 | Dtype::U64 | Dtype::I32 | Dtype::U32, 1) => {
-            let size = array.dtype.size().unwrap_or(8);
-            Array { bytes: bytes[..size].to_vec(), ..array.clone() }
-        }
-        _ => Array::from_i64(Vec::new(), &[value as i64]),
-    };
 }
 
 /// Texts in the type of another array of texts, at least as wide.

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{DemoDraft, Draft, Layout, Survey, key_plan, list};
+use super::{DemoDraft, Draft, Layout, Survey, key_plan, list, number_of};
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Dialect, Problem};
 use crate::source::walk::Walked;
@@ -20,7 +20,7 @@ impl Layout for Aloha {
     }
 
     fn recognises(&self, survey: &Survey) -> bool {
-        survey.files.first().is_some_and(is_episode)
+        survey.files.iter().any(is_episode)
     }
 
     fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
@@ -36,25 +36,22 @@ impl Layout for Aloha {
             problems: Vec::new(),
         };
         for (index, file) in survey.files.iter().enumerate() {
-            if !is_episode(file) {
-                return Err(InputError::UnknownLayout {
+            if is_episode(file) {
+                episode(index, file, &mut out)?;
+            } else {
+                let unknown = || InputError::UnknownLayout {
                     path: file.path.clone(),
                     expected: "action and observations/qpos as in the other files".to_owned(),
                     found: list(file.datasets.keys().map(String::as_str)),
-                });
+                };
+                let error = file.broken.values().next().cloned().unwrap_or_else(unknown);
+                let id = format!("demo_{}", number_of(&file.path, index));
+                out.problems.push(Problem::new(Some(&id), None, true, error));
             }
-            episode(index, file, &mut out)?;
             beat();
         }
         Ok(out)
     }
-}
-
-/// The number at the end of a file's name; its position in the folder if there is none.
-fn number_of(file: &Walked, index: usize) -> u64 {
-    let stem = file.path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-    let digits = stem.len() - stem.bytes().rev().take_while(u8::is_ascii_digit).count();
-    stem[digits..].parse().unwrap_or(index as u64)
 }
 
 /// robomimic's names for ALOHA's datasets.
@@ -70,27 +67,21 @@ fn episode(index: usize, file: &Walked, out: &mut Draft) -> Result<(), InputErro
     let (attr_names, _) = file.some_attrs("/", &[])?;
     let mut keys = BTreeMap::new();
     let mut inner = Vec::new();
-    let number = number_of(file, index);
+    let number = number_of(&file.path, index);
     let mut id = format!("demo_{number}");
     if out.demos.iter().any(|d| d.plan.id == id) {
         id = format!("demo_{number}_{index}");
     }
     let length = file.datasets["action"].shape.first().copied().unwrap_or(0);
-    let mut add = |key: &str, error: InputError| {
-        out.problems.push(Problem {
-            demo: Some(id.clone()),
-            key: Some(key.to_owned()),
-            fatal: true,
-            message: error.to_string(),
-            error,
-        });
-    };
+    let mut add = |key: &str, error: InputError| out.problems.push(Problem::new(Some(&id), Some(key), true, error));
+    for (path, error) in &file.broken {
+        add(&name_of(path), error.clone());
+    }
     for (path, node) in &file.datasets {
         let key = name_of(path);
         if let Some(fault) = &node.fault {
             add(&key, fault.clone());
-        }
-        if (key.starts_with("obs/") || key == "actions") && node.shape.first() != Some(&length) {
+        } else if (key.starts_with("obs/") || key == "actions") && node.shape.first() != Some(&length) {
             let error = InputError::WrongLength {
                 path: file.path.clone(),
                 demo: id.clone(),

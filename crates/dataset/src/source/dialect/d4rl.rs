@@ -49,14 +49,11 @@ impl Layout for D4rl {
         let mut problems = Vec::new();
         for (path, node) in &file.datasets {
             if let Some(error) = node.fault.clone() {
-                problems.push(Problem {
-                    demo: None,
-                    key: Some(path.clone()),
-                    fatal: true,
-                    message: error.to_string(),
-                    error,
-                });
+                problems.push(Problem::new(None, Some(&name_of(path)), true, error));
             }
+        }
+        for (path, error) in &file.broken {
+            problems.push(Problem::new(None, Some(&name_of(path)), true, error.clone()));
         }
         if demos.is_empty() {
             return Err(InputError::NoDemos {

@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{DemoDraft, Draft, Survey, key_plan, list, number_after};
+use super::{DemoDraft, Draft, Survey, key_plan, list, number_after, per_step};
 use crate::error::InputError;
+use crate::lerobot::{mask_note, shared_notes};
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Problem};
 use crate::source::value::one_line;
 use crate::source::walk::Walked;
@@ -55,6 +56,9 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -
     };
     let ids = demo_ids(file);
     if ids.is_empty() {
+        if let Some(error) = file.broken.values().next() {
+            return Err(error.clone());
+        }
         let members = file
             .groups
             .keys()
@@ -72,8 +76,14 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -
         masks: BTreeMap::new(),
         texts: BTreeMap::new(),
         notes: Vec::new(),
-        problems: file.faults.iter().map(|fault| problem(None, None, false, fault.clone())).collect(),
+        problems: Vec::new(),
     };
+    for (path, error) in &file.broken {
+        let below = path.strip_prefix("data/").unwrap_or_default();
+        let (id, key) = below.split_once('/').map_or((below, None), |(id, key)| (id, Some(key)));
+        let of_demo = number_after(id, "demo_").is_some();
+        out.problems.push(Problem::new(of_demo.then_some(id), key.filter(|_| of_demo), of_demo, error.clone()));
+    }
     let data_attrs = file.attrs("data")?;
     for (place, attrs) in [("", file.attrs("")?), ("data/", data_attrs.clone())] {
         for (name, value) in attrs {
@@ -96,12 +106,7 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -
     }
     total(file, &data_attrs, &mut out);
     masks(file, &mut out)?;
-    ragged(file, &mut out);
     Ok(out)
-}
-
-fn problem(demo: Option<&str>, key: Option<&str>, fatal: bool, error: InputError) -> Problem {
-    Problem { demo: demo.map(str::to_owned), key: key.map(str::to_owned), fatal, message: error.to_string(), error }
 }
 
 fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
@@ -117,7 +122,7 @@ fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
             out.env_version = text("env_version");
             out.env_args = Some(json);
         }
-        Err(found) => out.problems.push(problem(
+        Err(found) => out.problems.push(Problem::new(
             None,
             None,
             false,
@@ -153,7 +158,7 @@ fn demo(file: &Walked, number: u64, id: &str, language: Option<&str>, out: &mut 
             inner.push((key.clone(), 0, path.clone()));
         }
         if let Some(fault) = &node.fault {
-            out.problems.push(problem(Some(id), Some(&key), true, fault.clone()));
+            out.problems.push(Problem::new(Some(id), Some(&key), true, fault.clone()));
         }
         if let Some(plan) = key_plan(0, file, path) {
             keys.insert(key, plan);
@@ -201,17 +206,11 @@ fn length(file: &Walked, id: &str, attrs: &Attrs, keys: &BTreeMap<String, KeyPla
                         Some(value) => format!("{} of shape {:?}", value.dtype, value.shape),
                     },
                 };
-                out.problems.push(problem(Some(id), None, stated.is_some(), error));
+                out.problems.push(Problem::new(Some(id), None, stated.is_some(), error));
             }
             rows
         }
     }
-}
-
-/// Datasets that have one row per step wherever they occur.
-fn per_step(key: &str) -> bool {
-    matches!(key, "actions" | "actions_abs" | "rewards" | "dones" | "mistakes" | "states")
-        || ["obs/", "next_obs/", "action_dict/"].iter().any(|p| key.starts_with(p))
 }
 
 fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
@@ -220,8 +219,22 @@ fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
     let found = || list(plan.keys.keys().map(String::as_str));
     let missing =
         |key: &str| InputError::MissingKey { path: path(), demo: id.to_owned(), key: key.to_owned(), found: found() };
+    if plan.length == 0 {
+        let error = InputError::WrongLength {
+            path: path(),
+            demo: id.to_owned(),
+            key: "actions".to_owned(),
+            expected: "at least 1".to_owned(),
+            found: "0: the demo is empty".to_owned(),
+        };
+        return out.problems.push(Problem::new(Some(id), None, true, error));
+    }
+    let known: Vec<String> =
+        out.problems.iter().filter(|p| p.demo.as_deref() == Some(id)).filter_map(|p| p.key.clone()).collect();
     let mut add = |key: &str, fatal: bool, error: InputError| {
-        out.problems.push(problem(Some(id), Some(key), fatal, error));
+        if !known.iter().any(|known| known == key || key == "obs" && known.starts_with("obs/")) {
+            out.problems.push(Problem::new(Some(id), Some(key), fatal, error));
+        }
     };
     match plan.keys.get("actions") {
         None => add("actions", true, missing("actions")),
@@ -249,16 +262,6 @@ fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
             }
         }
     }
-    if plan.length == 0 {
-        let error = InputError::WrongLength {
-            path: path(),
-            demo: id.to_owned(),
-            key: "actions".to_owned(),
-            expected: "at least 1".to_owned(),
-            found: "0".to_owned(),
-        };
-        add("actions", true, error);
-    }
     for (key, plan_of_key) in plan.keys.iter().filter(|(key, _)| per_step(key)) {
         if plan_of_key.shape.first() != Some(&plan.length) {
             let error = InputError::WrongLength {
@@ -284,7 +287,7 @@ fn total(file: &Walked, attrs: &Attrs, out: &mut Draft) {
             expected: format!("{steps}, the steps of all demos"),
             found: stated.to_i64().map_or_else(|| "no integer".to_owned(), |n| n.to_string()),
         };
-        out.problems.push(problem(None, None, false, error));
+        out.problems.push(Problem::new(None, None, false, error));
     }
 }
 
@@ -307,64 +310,16 @@ fn masks(file: &Walked, out: &mut Draft) -> Result<(), InputError> {
                 expected: "a list of demo ids".to_owned(),
                 found: format!("{} of shape {:?}", array.dtype, array.shape),
             };
-            out.problems.push(problem(None, None, false, error));
+            out.problems.push(Problem::new(None, None, false, error));
             continue;
         };
         // robomimic's own `dataset_states_to_obs --n 3` copies the masks of the whole file
         let absent: Vec<String> = ids.iter().filter(|id| !known.contains(*id)).map(|id| one_line(id)).collect();
         if !absent.is_empty() {
-            let error = InputError::UnknownMaskDemos {
-                path: file.path.clone(),
-                mask: name.clone(),
-                named: ids.len(),
-                count: absent.len(),
-                demos: list(absent.iter().map(String::as_str)),
-            };
-            out.problems.push(problem(None, None, false, error));
+            out.notes.push(mask_note(&name, ids.len(), &absent));
         }
         out.masks.insert(name, ids);
     }
+    out.notes.extend(shared_notes(&out.masks));
     Ok(())
-}
-
-/// Keys that some demos have and others lack, and keys whose elements differ in shape or type.
-fn ragged(file: &Walked, out: &mut Draft) {
-    let mut all: BTreeMap<String, (String, Dtype, Vec<usize>)> = BTreeMap::new();
-    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
-    let mut problems = Vec::new();
-    for DemoDraft { plan, .. } in &out.demos {
-        for (key, k) in plan.keys.iter().filter(|(key, _)| per_step(key)) {
-            let step = k.shape.get(1..).unwrap_or_default().to_vec();
-            *counts.entry(key.clone()).or_default() += 1;
-            let (first, dtype, shape) =
-                all.entry(key.clone()).or_insert_with(|| (plan.id.clone(), k.dtype.clone(), step.clone()));
-            if (&*dtype, &*shape) != (&k.dtype, &step) {
-                let error = InputError::WrongShape {
-                    path: file.path.clone(),
-                    demo: plan.id.clone(),
-                    key: key.clone(),
-                    expected: format!("{dtype} {shape:?} per step as in {first}"),
-                    found: format!("{} {step:?} per step", k.dtype),
-                };
-                problems.push(problem(Some(&plan.id), Some(key), false, error));
-            }
-        }
-    }
-    for DemoDraft { plan, .. } in &out.demos {
-        for (key, (first, ..)) in &all {
-            let everywhere = counts.get(key) == Some(&out.demos.len());
-            // actions, rewards and dones have been asked for already
-            if everywhere || plan.keys.contains_key(key) || matches!(key.as_str(), "actions" | "rewards" | "dones") {
-                continue;
-            }
-            let error = InputError::MissingKey {
-                path: file.path.clone(),
-                demo: plan.id.clone(),
-                key: key.clone(),
-                found: format!("it in {first}; here {}", list(plan.keys.keys().map(String::as_str))),
-            };
-            problems.push(problem(Some(&plan.id), Some(key), false, error));
-        }
-    }
-    out.problems.append(&mut problems);
 }

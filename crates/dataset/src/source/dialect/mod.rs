@@ -10,11 +10,12 @@ mod robomimic;
 mod robosuite_raw;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::walk::Walked;
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Place, Problem};
+use crate::tree::Dtype;
 
 /// A source as walked: one file, or every file of a folder in numeric order of their names.
 pub(super) struct Survey {
@@ -98,22 +99,89 @@ const LAYOUTS: [&dyn Layout; 7] = [
 
 /// Recognises the layout and finds the demos.
 pub(super) fn draft(survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
-    match LAYOUTS.iter().find(|layout| layout.recognises(survey)) {
-        Some(layout) => layout.draft(survey, beat),
-        None => {
-            let expected: Vec<_> = LAYOUTS.iter().map(|layout| layout.expected()).collect();
-            Err(InputError::UnknownLayout {
-                path: survey.path.clone(),
-                expected: expected.join(", or "),
-                found: survey.contents(),
-            })
+    let Some(layout) = LAYOUTS.iter().find(|layout| layout.recognises(survey)) else {
+        // a link that is not followed may be what is missed
+        if let Some(error) = survey.files.iter().find_map(|file| file.broken.values().next()) {
+            return Err(error.clone());
         }
-    }
+        let expected: Vec<_> = LAYOUTS.iter().map(|layout| layout.expected()).collect();
+        return Err(InputError::UnknownLayout {
+            path: survey.path.clone(),
+            expected: expected.join(", or "),
+            found: survey.contents(),
+        });
+    };
+    let mut draft = layout.draft(survey, beat)?;
+    let faults = survey.files.iter().flat_map(|file| &file.faults);
+    draft.problems.splice(0..0, faults.map(|fault| Problem::new(None, None, false, fault.clone())));
+    ragged(survey, &mut draft);
+    Ok(draft)
 }
 
-/// A dataset as a demo's key: all of it.
+/// Datasets that have one row per step wherever they occur.
+fn per_step(key: &str) -> bool {
+    matches!(key, "actions" | "actions_abs" | "rewards" | "dones" | "mistakes" | "states")
+        || ["obs/", "next_obs/", "action_dict/"].iter().any(|p| key.starts_with(p))
+}
+
+/// Keys that some demos have and others lack, and keys whose elements differ in shape or type.
+fn ragged(survey: &Survey, out: &mut Draft) {
+    let hopeless = |id: &str| out.problems.iter().any(|p| p.fatal && p.key.is_none() && p.demo.as_deref() == Some(id));
+    let demos: Vec<&DemoPlan> = out.demos.iter().map(|demo| &demo.plan).filter(|plan| !hopeless(&plan.id)).collect();
+    let mut all: BTreeMap<&str, (&str, &Dtype, &[usize])> = BTreeMap::new();
+    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+    let mut problems = Vec::new();
+    for plan in &demos {
+        for (key, k) in &plan.keys {
+            let step = k.shape.get(1..).unwrap_or_default();
+            *counts.entry(key).or_default() += 1;
+            let (first, dtype, shape) = all.entry(key).or_insert((&plan.id, &k.dtype, step));
+            if per_step(key) && (*dtype, *shape) != (&k.dtype, step) {
+                let error = InputError::WrongShape {
+                    path: survey.path.clone(),
+                    demo: plan.id.clone(),
+                    key: key.clone(),
+                    expected: format!("{dtype} {shape:?} per step as in {first}"),
+                    found: format!("{} {step:?} per step", k.dtype),
+                };
+                problems.push(Problem::new(Some(&plan.id), Some(key), false, error));
+            }
+        }
+    }
+    // actions, rewards and dones have been asked for already
+    let asked = |key: &str| out.dialect != Dialect::Aloha && matches!(key, "actions" | "rewards" | "dones");
+    let some = counts.into_iter().filter(|&(key, count)| count < demos.len() && !asked(key));
+    let (mut notes, mut missing) = (Vec::new(), Vec::new());
+    for (key, count) in some {
+        let lacking = || demos.iter().enumerate().filter(|(_, plan)| !plan.keys.contains_key(key));
+        if !per_step(key) {
+            let without = list(lacking().map(|(_, plan)| plan.id.as_str()));
+            notes.push(format!("{key} is in {count} of {} demos, not in {without}", demos.len()));
+            continue;
+        }
+        for (position, plan) in lacking() {
+            let known = |p: &Problem| p.demo.as_deref() == Some(&plan.id) && p.key.as_deref() == Some(key);
+            if out.problems.iter().any(known) {
+                continue;
+            }
+            let error = InputError::MissingKey {
+                path: survey.path.clone(),
+                demo: plan.id.clone(),
+                key: key.to_owned(),
+                found: format!("it in {}; here {}", all[key].0, list(plan.keys.keys().map(String::as_str))),
+            };
+            missing.push((position, Problem::new(Some(&plan.id), Some(key), false, error)));
+        }
+    }
+    missing.sort_by_key(|(position, _)| *position);
+    problems.extend(missing.into_iter().map(|(_, problem)| problem));
+    out.notes.append(&mut notes);
+    out.problems.append(&mut problems);
+}
+
+/// A dataset as a demo's key: all of it; `None` where it cannot be read.
 fn key_plan(file: usize, walked: &Walked, path: &str) -> Option<KeyPlan> {
-    let node = walked.datasets.get(path)?;
+    let node = walked.datasets.get(path).filter(|node| node.fault.is_none())?;
     Some(KeyPlan {
         dtype: node.dtype.clone(),
         shape: node.shape.clone(),
@@ -131,8 +199,15 @@ fn number_after(name: &str, prefix: &str) -> Option<u64> {
     digits.parse().ok()
 }
 
+/// The number at the end of a file's name; its position in the folder if there is none.
+pub(super) fn number_of(file: &Path, index: usize) -> u64 {
+    let stem = file.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+    let digits = stem.len() - stem.bytes().rev().take_while(u8::is_ascii_digit).count();
+    stem[digits..].parse().unwrap_or(index as u64)
+}
+
 /// Names in a line; at most twenty of them.
-pub(super) fn list<'a>(names: impl Iterator<Item = &'a str>) -> String {
+pub(crate) fn list<'a>(names: impl Iterator<Item = &'a str>) -> String {
     let all: Vec<&str> = names.collect();
     match all.len() {
         0 => "nothing".to_owned(),
