@@ -85,7 +85,7 @@ pub fn convert_unless(
         // the side folder keeps it, whatever its values
         let keys = input.plan().demos.iter().flat_map(|demo| &demo.keys);
         let depth = keys.filter(|(path, key)| depth::size(&path.replacen("next_obs/", "obs/", 1), key).is_some());
-        let depth = depth.map(|(path, _)| path.clone()).collect();
+        let depth: BTreeSet<String> = depth.map(|(path, _)| path.clone()).collect();
         input.exempt(depth);
     }
     let staging = Staging::create(out)?;
@@ -93,7 +93,9 @@ pub fn convert_unless(
         true => skip::bad(&mut input, options, staging.path())?,
         false => {
             skip::none(&input)?;
-            (Mapping::resolve(input.plan(), options, &encoded::sizes(&input)?)?, Vec::new())
+            let mapping = Mapping::resolve(input.plan(), options, &encoded::sizes(&input)?)?;
+            input.exempt(mapping.depth_keys());
+            (mapping, Vec::new())
         }
     };
     let plan = input.plan();

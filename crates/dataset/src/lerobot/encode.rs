@@ -19,7 +19,7 @@ use arrow::array::{
 use arrow::buffer::{OffsetBuffer, ScalarBuffer};
 use arrow::datatypes::DataType;
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -88,10 +88,12 @@ impl Job<'_> {
     /// Reads what is small of the demos of a row group.
     pub(crate) fn load(&self, parts: &[Part]) -> Result<Vec<Loaded>> {
         let mut loaded = Vec::with_capacity(parts.len());
+        let needed: BTreeSet<String> = self.mapping.columns.iter().flat_map(Column::keys).collect();
         for part in parts {
             let plan = &self.source.plan().demos[part.episode];
             // what cannot be read and no column needs is no key of the plan
-            let small = |key: &str| plan.keys.get(key).is_some_and(|k| !is_bulk(k, plan.length));
+            let small =
+                |key: &str| plan.keys.get(key).is_some_and(|k| needed.contains(key) || !is_bulk(k, plan.length));
             let small = |key: &str| small(key) && !self.is_picture(key);
             let demo = self.source.read_demo_where(part.episode, &small)?;
             let position = Position {
@@ -115,14 +117,6 @@ impl Job<'_> {
         if values.iter().fold(true, |all, v| all & v.is_finite()) {
             return Ok(());
         }
-        let keys: Vec<String> = match &column.origin {
-            Origin::Concat(parts) => {
-                parts.iter().flat_map(|(_, widths)| widths.keys()).map(|key| format!("obs/{key}")).collect()
-            }
-            Origin::Action { key, .. } => vec![key.clone()],
-            Origin::Reward => vec!["rewards".to_owned()],
-            _ => Vec::new(),
-        };
         let of_key = |key: &String| self.source.first_not_finite(&demo.id, key, demo.datasets.get(key)?, 0, true);
         let computed = || {
             let at = values.iter().position(|v| !v.is_finite()).unwrap_or(0);
@@ -135,7 +129,7 @@ impl Job<'_> {
                 found: format!("{}, computed from finite numbers", values[at]),
             }
         };
-        Err(keys.iter().find_map(of_key).unwrap_or_else(computed).into())
+        Err(column.keys().iter().find_map(of_key).unwrap_or_else(computed).into())
     }
 
     fn is_picture(&self, key: &str) -> bool {

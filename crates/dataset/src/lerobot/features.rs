@@ -174,6 +174,20 @@ pub(crate) struct Column {
 }
 
 impl Column {
+    /// The datasets that its numbers are taken from.
+    pub(crate) fn keys(&self) -> Vec<String> {
+        match &self.origin {
+            Origin::Concat(parts) => {
+                parts.iter().flat_map(|(_, widths)| widths.keys()).map(|key| format!("obs/{key}")).collect()
+            }
+            Origin::Action { key, .. } => vec![key.clone()],
+            Origin::Reward | Origin::Success => vec!["rewards".to_owned()],
+            Origin::Done => vec!["dones".to_owned()],
+            Origin::Mistake => vec!["mistakes".to_owned()],
+            Origin::Image { .. } | Origin::Depth { .. } | Origin::Index(_) => Vec::new(),
+        }
+    }
+
     /// Number of values a frame.
     pub(crate) fn dim(&self) -> usize {
         self.feature.dim()
@@ -284,6 +298,15 @@ impl Mapping {
     /// The columns as `info.json` lists them.
     pub(crate) fn features(&self) -> Features {
         Features(self.columns.iter().map(|c| (c.name.clone(), c.feature.clone())).collect())
+    }
+
+    /// Datasets of depth that become columns: those are looked at picture by picture.
+    pub(crate) fn depth_keys(&self) -> Vec<String> {
+        let key = |column: &Column| match &column.origin {
+            Origin::Depth { key, .. } => Some(key.clone()),
+            _ => None,
+        };
+        self.columns.iter().filter_map(key).collect()
     }
 
     /// Bytes of image data in a frame.

@@ -70,6 +70,7 @@ pub(super) fn bad(source: &mut Source, options: &ConvertOptions, root: &Path) ->
             None => return Err(error.into()),
         }
     };
+    source.exempt(mapping.depth_keys());
     let before = source.plan().demos.len();
     for (index, error) in failing(source, &mapping, options, root)?.into_iter().rev() {
         let id = source.plan().demos[index].id.clone();

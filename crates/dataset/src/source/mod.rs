@@ -100,8 +100,8 @@ impl Source {
     }
 
     /// Lets the values of these keys be NaN or infinite.
-    pub(crate) fn exempt(&mut self, keys: BTreeSet<String>) {
-        self.exempt = keys;
+    pub(crate) fn exempt(&mut self, keys: impl IntoIterator<Item = String>) {
+        self.exempt.extend(keys);
     }
 
     /// Leaves out the demos for which `bad` gives true of their position, and every problem that is theirs.

@@ -6,6 +6,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::tree::Attrs;
+use crate::tree::Dtype;
 
 fn dtype() -> impl Strategy<Value = Dtype> {
     prop_oneof![

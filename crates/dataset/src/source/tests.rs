@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use super::*;
 use crate::plan::Dialect;
-use crate::tree::Attrs;
+use crate::tree::{Attrs, Dtype};
 
 fn fixture(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)

@@ -251,10 +251,12 @@ impl Walked {
     /// the linked ones, or why the link is not followed.
     fn follow(&mut self, group: &Group, name: &str, above: &Above) -> Result<Option<usize>, String> {
         let info = group.loc_info_by_name(name).map_err(|e| {
-            let text = reason(&e);
+            // the deepest of the library's words, which its error leaves out
+            let stack = e.stack().map(|stack| stack.iter().map(|frame| frame.desc().to_owned()).collect::<Vec<_>>());
+            let text = stack.unwrap_or_default().join("; ");
             match text.split_once("external link file name = '").and_then(|(_, tail)| tail.split_once('\'')) {
                 Some((file, _)) => format!("a link to the file {file}, which cannot be opened; put it beside this one"),
-                None if text.contains("too many links") => "a link that leads in a circle".to_owned(),
+                None if text.contains("too many") => "a link that leads in a circle".to_owned(),
                 None => "a link that leads nowhere".to_owned(),
             }
         })?;
@@ -328,7 +330,9 @@ impl Walked {
         let too_large = |limit| InputError::TooLarge { path: self.path.clone(), object: full.to_owned(), bytes, limit };
         if let Some(offset) = dataset.offset() {
             let size = from.map_or(self.bytes, |file| self.linked[file].1);
-            if offset.checked_add(bytes).is_none_or(|end| end > size) {
+            // float16 takes more room in memory than in the file
+            let stored = node.shape.iter().try_fold(file_type.size() as u64, |n, &e| n.checked_mul(e as u64));
+            if stored.and_then(|stored| offset.checked_add(stored)).is_none_or(|end| end > size) {
                 node.fault = Some(too_large(size.saturating_sub(offset)));
             } else if native && from.is_none() {
                 node.offset = Some(offset);
