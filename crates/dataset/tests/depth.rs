@@ -33,7 +33,7 @@ fn options() -> ConvertOptions {
 }
 
 fn content(path: &Path) -> (Demo, Vec<Demo>) {
-    let source = Source::open(path).unwrap();
+    let source = Source::open(path).unwrap().nonfinite(dataset::NonFinite::Keep);
     let demos = (0..source.plan().demos.len()).map(|i| source.read_demo(i).unwrap()).collect();
     (source.root().unwrap(), demos)
 }

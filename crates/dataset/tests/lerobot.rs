@@ -424,7 +424,8 @@ fn a_file_cut_down_by_robomimic_keeps_the_masks_of_the_whole() {
     writer.finish().unwrap();
     assert!(mask(&file, "train").to_strings().unwrap().contains(&"demo_3".to_owned()));
     let report = convert(&file, &out, &ConvertOptions::default(), &mut quiet).unwrap();
-    assert_eq!(report.notes, ["mask/train: 1 of the 3 demos it names are not in the file: demo_3"]);
+    let notes: Vec<&String> = report.notes.iter().filter(|note| note.contains("mask")).collect();
+    assert_eq!(notes, ["mask/train: 1 of the 3 demos it names are not in the file: demo_3"]);
     let set = Dataset::open(&out).unwrap();
     assert_eq!(set.split("train"), Some(vec![0, 1]));
     assert!(verify(&out, &mut quiet).unwrap().iter().all(|c| c.problem.is_none()));
