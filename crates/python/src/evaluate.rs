@@ -109,6 +109,10 @@ pub(crate) fn evaluate<'py>(
             let mut at = (0, 0);
             let end = run_missing(&subject, &mut pool, &results, &options, &mut |progress| {
                 at = match progress {
+                    Progress::Apart(other) => {
+                        note(other.to_string());
+                        return;
+                    }
                     Progress::Begin { done, total, .. } => (done, total),
                     Progress::Episode(_) => (at.0 + 1, at.1),
                 };

@@ -47,6 +47,7 @@ pub(crate) fn sample(name: &str, version: u32, count: u64) -> EvaluationRecord {
         versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),
         kernels: None,
         renderer: None,
+        sources: std::collections::BTreeMap::new(),
     }
 }
 

@@ -5,7 +5,7 @@
 //! removed when the demonstrations have been written to their file.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path, PathBuf};
@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::episode::no_expert;
 use crate::error::RolloutError;
 use crate::files::write_atomic;
+use crate::locks;
 use crate::message::{Control, Ready, Skill};
 use crate::pool::{Pool, RunEnd};
 use crate::recorded::RecordedEpisode;
@@ -47,6 +48,9 @@ pub struct CollectionRecord {
     pub env_args: serde_json::Value,
     /// Versions of the simulator and what it stands on.
     pub versions: BTreeMap<String, String>,
+    /// SHA-256 by package of the sources that were imported to simulate.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub sources: BTreeMap<String, String>,
 }
 
 impl CollectionRecord {
@@ -62,6 +66,7 @@ impl CollectionRecord {
             skill: Skill::Good,
             env_args: ready.env_args.clone(),
             versions: ready.versions.clone(),
+            sources: ready.sources.clone(),
         }
     }
 }
@@ -103,10 +108,8 @@ impl Collection {
         fs::create_dir_all(folder).map_err(RolloutError::file("creating folder", folder))?;
         let path = folder.join(LOCK);
         let lock = File::create(&path).map_err(RolloutError::file("creating", &path))?;
-        match lock.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => return Err(RolloutError::CollectionBusy { folder: folder.to_owned() }),
-            Err(TryLockError::Error(error)) => return Err(RolloutError::file("locking", &path)(error)),
+        if !locks::try_lock(&lock, folder).map_err(RolloutError::file("locking", &path))? {
+            return Err(RolloutError::CollectionBusy { folder: folder.to_owned() });
         }
         let path = folder.join(RECORD);
         let mut text = serde_json::to_vec_pretty(record).expect("plain fields are always JSON");
@@ -241,6 +244,7 @@ mod tests {
             skill: Skill::Good,
             env_args: serde_json::json!({"env_name": "Lift", "env_kwargs": {"camera_names": ["agentview"]}}),
             versions: [("mujoco".to_owned(), "3.3.7".to_owned())].into(),
+            sources: [("robosuite".to_owned(), "a".repeat(64))].into(),
         }
     }
 
@@ -289,6 +293,9 @@ mod tests {
         let mixed = CollectionRecord { skill: Skill::Mixed, ..record() };
         let error = Collection::open(dir.path(), &mixed).unwrap_err().to_string();
         assert!(error.contains("skill: expected \"mixed\", found \"good\""), "{error}");
+        let shadow = CollectionRecord { sources: [("robosuite".to_owned(), "b".repeat(64))].into(), ..record() };
+        let error = Collection::open(dir.path(), &shadow).unwrap_err().to_string();
+        assert!(error.contains("sources: expected {\"robosuite\":\"bbbb"), "{error}");
     }
 
     #[test]

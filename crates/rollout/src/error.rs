@@ -113,6 +113,21 @@ pub enum RolloutError {
         /// The last failure.
         fault: Box<WorkerFault>,
     },
+    /// Several episodes hang, each on its own worker.
+    #[error(
+        "task {task:?}: episodes of {} seeds ({}) hang, the last one: {fault}; \
+         see what the environment does then, or allow it more time with --step-timeout",
+        seeds.len(),
+        seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")
+    )]
+    Hangs {
+        /// The task.
+        task: String,
+        /// The seeds.
+        seeds: Vec<u64>,
+        /// The last failure.
+        fault: Box<WorkerFault>,
+    },
     /// The policy or another part on our side failed during an episode.
     #[error("episode with seed {seed}, step {step}: {operation}")]
     Policy {
@@ -247,6 +262,12 @@ pub enum FaultKind {
     /// It answered with values that cannot be.
     #[error("answer: {0}")]
     Values(String),
+    /// Its environment gave what is no number: a fresh worker would give the same.
+    #[error("{0}")]
+    Environment(String),
+    /// It is a worker of the process that this one was forked from.
+    #[error("it belongs to the process that this one was forked from; start a simulator of its own here")]
+    Foreign,
     /// It reported an error of its own.
     #[error("it reports {kind}: {message}")]
     Reported {

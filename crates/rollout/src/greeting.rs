@@ -1,14 +1,16 @@
 //! What workers said of themselves the last time: enough to know what an evaluation would be called, without starting one.
 //!
 //! Remembered in the cache folder, under a name that holds everything a greeting depends on: the harness, the
-//! interpreter, its versions of the simulator and of what that stands on, the task, the control loop and which kernels
-//! were asked for. An environment module of the user's may say something else every time; workers that load one are not
+//! interpreter, the task, the control loop and which kernels were asked for. Versions and sources of the simulator and of
+//! what that stands on are asked for again, without importing any of it. An environment module of the user's may say something else every time; workers that load one are not
 //! remembered.
 
+use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 
+use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use crate::files::write_atomic;
@@ -19,7 +21,9 @@ use crate::spec::{BLAS_KERNELS, WorkerSpec};
 /// The greeting that workers of `spec` would give, if they gave it before and nothing that it depends on has changed.
 pub fn remembered_greeting(spec: &WorkerSpec) -> Option<Ready> {
     let ready: Ready = serde_json::from_slice(&std::fs::read(path(spec)?).ok()?).ok()?;
-    (installed(spec, &ready)? == ready.versions).then_some(ready)
+    let installed = installed(spec, &ready)?;
+    let same = installed.versions == ready.versions && installed.sources == ready.sources;
+    (same && !ready.sources.is_empty()).then_some(ready)
 }
 
 /// Keeps a greeting for the next time. Whether that succeeds matters to nobody.
@@ -51,13 +55,17 @@ fn path(spec: &WorkerSpec) -> Option<PathBuf> {
     Some(cache_folder().join("greetings").join(name + ".json"))
 }
 
-/// The versions that the interpreter would load now of everything that `ready` names, asked without importing any.
-fn installed(spec: &WorkerSpec, ready: &Ready) -> Option<std::collections::BTreeMap<String, String>> {
-    let script = "import sys, platform, importlib.metadata as m\n\
-         for n in sys.argv[1:]: print(n, platform.python_version() if n == 'python' else m.version(n))";
-    let mut command = Command::new(&spec.python.path);
-    command.arg("-c").arg(script).args(ready.versions.keys()).stdin(Stdio::null()).stderr(Stdio::null());
-    let output = command.output().ok().filter(|output| output.status.success())?;
-    let text = String::from_utf8(output.stdout).ok()?;
-    text.lines().map(|line| line.split_once(' ').map(|(n, v)| (n.to_owned(), v.to_owned()))).collect()
+/// What the harness says of packages as the interpreter would import them now.
+#[derive(Deserialize)]
+struct Installed {
+    versions: BTreeMap<String, String>,
+    sources: BTreeMap<String, String>,
+}
+
+/// The same of everything that `ready` names.
+fn installed(spec: &WorkerSpec, ready: &Ready) -> Option<Installed> {
+    let mut command = spec.python("actrm_harness.source");
+    command.args(ready.versions.keys()).arg("--").args(ready.sources.keys());
+    let output = command.stdin(Stdio::null()).stderr(Stdio::null()).output().ok()?;
+    output.status.success().then(|| serde_json::from_slice(&output.stdout).ok()).flatten()
 }

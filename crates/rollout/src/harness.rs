@@ -3,6 +3,7 @@
 
 use std::fs;
 use std::io::Write;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
@@ -40,14 +41,36 @@ pub fn harness_folder() -> Result<PathBuf, RolloutError> {
     unpack(&cache_folder(), FILES)
 }
 
-/// The folder for things that can be made again: `$ACTRM_CACHE`, else `$XDG_CACHE_HOME/actrm`, else
-/// `~/.cache/actrm`, else a folder under the system's temporary one.
+/// The folder for things that can be made again: `$ACTRM_CACHE`, else the first of `$XDG_CACHE_HOME/actrm`,
+/// `~/.cache/actrm` and a folder of this user's under the system's temporary one that can be written to.
 pub fn cache_folder() -> PathBuf {
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    set("ACTRM_CACHE")
-        .or_else(|| set("XDG_CACHE_HOME").map(|path| path.join("actrm")))
-        .or_else(|| set("HOME").map(|path| path.join(".cache").join("actrm")))
-        .unwrap_or_else(|| std::env::temp_dir().join("actrm-cache"))
+    let usual = || {
+        let places = [
+            set("XDG_CACHE_HOME").map(|path| path.join("actrm")),
+            set("HOME").map(|path| path.join(".cache").join("actrm")),
+        ];
+        places.into_iter().flatten().find(|path| is_writable(path))
+    };
+    set("ACTRM_CACHE").or_else(usual).unwrap_or_else(|| temporary_cache(&std::env::temp_dir()))
+}
+
+/// Whether something can be put into a folder, which is made if it is not there.
+fn is_writable(folder: &Path) -> bool {
+    fs::create_dir_all(folder).is_ok() && rustix::fs::access(folder, rustix::fs::Access::WRITE_OK).is_ok()
+}
+
+/// A folder under `parent` that nobody else can put anything into: what lies in a cache is run.
+fn temporary_cache(parent: &Path) -> PathBuf {
+    let user = rustix::process::getuid();
+    let folder = parent.join(format!("actrm-cache-{}", user.as_raw()));
+    let _ = fs::DirBuilder::new().mode(0o700).create(&folder);
+    let own = |data: &fs::Metadata| data.is_dir() && data.uid() == user.as_raw() && data.mode() & 0o022 == 0;
+    match fs::symlink_metadata(&folder) {
+        Ok(data) if own(&data) => folder,
+        // somebody else's, under our name: one for this process
+        _ => parent.join(format!("actrm-cache-{}-{}", user.as_raw(), std::process::id())),
+    }
 }
 
 fn hash_of(files: &[(&str, &[u8])]) -> String {
@@ -68,7 +91,7 @@ fn unpack(cache: &Path, files: &[(&str, &[u8])]) -> Result<PathBuf, RolloutError
     };
     let target = cache.join(format!("harness-{}", hash_of(files)));
     if !target.is_dir() {
-        fs::create_dir_all(cache).map_err(error("creating cache folder", cache))?;
+        fs::create_dir_all(cache).map_err(error("creating cache folder (ACTRM_CACHE names another)", cache))?;
         let temporary = tempfile::Builder::new()
             .prefix(".harness-")
             .tempdir_in(cache)
@@ -214,6 +237,23 @@ mod tests {
         fs::write(folder.join("actrm_harness/a.py"), "changed").unwrap();
         let error = unpack(&cache, files).unwrap_err();
         assert!(error.to_string().contains("a.py"), "{error}");
+    }
+
+    #[test]
+    fn a_cache_is_a_folder_that_can_be_written_to_and_nobody_elses() {
+        let dir = tempfile::tempdir().unwrap();
+        assert!(is_writable(&dir.path().join("a/b")));
+        fs::write(dir.path().join("file"), "").unwrap();
+        // a home that cannot be written, whoever asks: nothing can be made below a file
+        assert!(!is_writable(&dir.path().join("file/.cache")));
+        let own = temporary_cache(dir.path());
+        assert_eq!(fs::metadata(&own).unwrap().permissions().mode() & 0o777, 0o700);
+        assert_eq!(temporary_cache(dir.path()), own);
+        fs::set_permissions(&own, fs::Permissions::from_mode(0o777)).unwrap();
+        assert_ne!(temporary_cache(dir.path()), own, "others may have put something there");
+        fs::remove_dir(&own).unwrap();
+        std::os::unix::fs::symlink(dir.path(), &own).unwrap();
+        assert_ne!(temporary_cache(dir.path()), own, "a link that others may turn");
     }
 
     #[test]

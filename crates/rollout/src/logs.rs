@@ -7,6 +7,7 @@ use std::time::Duration;
 use tempfile::TempDir;
 
 use crate::error::RolloutError;
+use crate::locks;
 
 const PREFIX: &str = "actrm-workers-";
 const LOCK: &str = "lock";
@@ -19,7 +20,15 @@ const BEING_MADE: Duration = Duration::from_secs(3600);
 /// A temporary folder of this process.
 pub(crate) struct LogFolder {
     folder: TempDir,
+    /// The process that made it: one that was forked from it must not remove it.
+    owner: u32,
     _lock: File,
+}
+
+impl Drop for LogFolder {
+    fn drop(&mut self) {
+        self.folder.disable_cleanup(self.owner != std::process::id());
+    }
 }
 
 impl LogFolder {
@@ -38,12 +47,13 @@ impl LogFolder {
         // a lock under its own name is held from the start: whoever sweeps at this moment sees a folder that is being made
         let (unlocked, path) = (folder.path().join(UNLOCKED), folder.path().join(LOCK));
         let lock = File::create(&unlocked).and_then(|lock| {
-            lock.lock()?;
+            // where nothing can be locked nobody takes it for abandoned
+            locks::lock(&lock, folder.path())?;
             fs::rename(&unlocked, &path)?;
             Ok(lock)
         });
         let lock = lock.map_err(RolloutError::file("locking", path))?;
-        Ok(Self { folder, _lock: lock })
+        Ok(Self { folder, owner: std::process::id(), _lock: lock })
     }
 
     /// Where it is.

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 /// The protocol version that this program speaks.
 pub const PROTOCOL: u32 = 2;
@@ -125,9 +125,11 @@ pub struct Ready {
     pub max_steps: usize,
     /// Number of action values.
     pub action_dim: usize,
-    /// Smallest action, per value.
+    /// Smallest action, per value; minus infinity, null on the wire, where it has no limit.
+    #[serde(deserialize_with = "lower")]
     pub action_low: Vec<f64>,
-    /// Largest action, per value.
+    /// Largest action, per value; infinity, null on the wire, where it has no limit.
+    #[serde(deserialize_with = "upper")]
     pub action_high: Vec<f64>,
     /// Observation keys with their shapes.
     pub observations: BTreeMap<String, Vec<usize>>,
@@ -144,6 +146,23 @@ pub struct Ready {
     /// robomimic's `env_args` of this environment.
     #[serde(default)]
     pub env_args: serde_json::Value,
+    /// SHA-256 by package of the sources that were imported to simulate: the simulator, what it stands on, the harness.
+    #[serde(default)]
+    pub sources: BTreeMap<String, String>,
+}
+
+/// Limits with `unlimited` for null: JSON has no infinity.
+fn limits<'de, D: Deserializer<'de>>(deserializer: D, unlimited: f64) -> Result<Vec<f64>, D::Error> {
+    let found = Vec::<Option<f64>>::deserialize(deserializer)?;
+    Ok(found.into_iter().map(|limit| limit.unwrap_or(unlimited)).collect())
+}
+
+fn lower<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f64>, D::Error> {
+    limits(deserializer, f64::NEG_INFINITY)
+}
+
+fn upper<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f64>, D::Error> {
+    limits(deserializer, f64::INFINITY)
 }
 
 impl Ready {

@@ -17,6 +17,9 @@ use crate::worker::{StartFailure, Worker};
 /// How far workers may run ahead of the next result to deliver, in jobs.
 const LOOK_AHEAD: u64 = 64;
 
+/// Seeds that hang in the same way, none of which a fresh worker has done, after which no more are tried.
+const HANGS: usize = 3;
+
 /// What a pool is made of.
 #[derive(Clone)]
 pub struct PoolOptions {
@@ -103,6 +106,8 @@ struct Shared<'a> {
     stop: &'a Stop,
     ready: Option<&'a Ready>,
     incidents: Mutex<&'a mut Vec<Incident>>,
+    /// Seeds whose episodes hung and have no result, and in which request.
+    hung: Mutex<BTreeMap<u64, &'static str>>,
 }
 
 struct Progress {
@@ -131,8 +136,8 @@ impl Pool {
         let mut incidents = Vec::new();
         let mut slots: Vec<Slot> = (0..options.workers).map(|_| Slot::default()).collect();
         let stop = Stop::new(Arc::clone(&options.stop));
-        let shared =
-            Shared { options: &options, logs: &logs, stop: &stop, ready: None, incidents: Mutex::new(&mut incidents) };
+        let (failed, hung) = (Mutex::new(&mut incidents), Mutex::default());
+        let shared = Shared { options: &options, logs: &logs, stop: &stop, ready: None, incidents: failed, hung };
         let results: Vec<Result<(), RolloutError>> = std::thread::scope(|scope| {
             let threads: Vec<_> = slots
                 .iter_mut()
@@ -200,7 +205,8 @@ impl Pool {
         deliver: &mut dyn FnMut(u64, Result<T, RolloutError>) -> ControlFlow<()>,
     ) -> Result<RunEnd, RolloutError> {
         let Self { options, logs, stop, ready, slots, incidents, .. } = self;
-        let shared = Shared { options, logs, stop, ready: Some(ready), incidents: Mutex::new(incidents) };
+        let (incidents, hung) = (Mutex::new(incidents), Mutex::default());
+        let shared = Shared { options, logs, stop, ready: Some(ready), incidents, hung };
         let progress = Mutex::new(Progress { next: jobs.start, delivered: jobs.start, halted: false });
         let moved = Condvar::new();
         let (sender, receiver) = mpsc::channel::<(u64, Result<T, JobError>)>();
@@ -296,6 +302,20 @@ fn claim(progress: &Mutex<Progress>, moved: &Condvar, stop: &Stop, jobs: &Range<
     Some(progress.next - 1)
 }
 
+impl Shared<'_> {
+    /// The seeds that hang as this one does, once they are enough to say that it is the environment and no accident.
+    fn hang(&self, seed: u64, fault: &WorkerFault) -> Option<Vec<u64>> {
+        if !matches!(fault.kind, FaultKind::TimedOut(_)) {
+            return None;
+        }
+        let mut hung = lock(&self.hung);
+        hung.insert(seed, fault.phase);
+        let alike = hung.iter().filter(|(_, phase)| **phase == fault.phase).map(|(seed, _)| *seed);
+        let alike: Vec<u64> = alike.collect();
+        (alike.len() >= HANGS).then_some(alike)
+    }
+}
+
 impl Slot {
     /// The slot's worker, started if there is none.
     fn ensure(&mut self, index: usize, shared: &Shared<'_>, job: Option<u64>) -> Result<&mut Worker, RolloutError> {
@@ -347,7 +367,10 @@ impl Slot {
                 None => kept.insert(state()?),
             };
             let fault = match work(kept, worker, job) {
-                Ok(value) => return Ok(value),
+                Ok(value) => {
+                    lock(&shared.hung).remove(&seed);
+                    return Ok(value);
+                }
                 Err(JobError::Worker(fault)) => fault,
                 Err(error) => return Err(error),
             };
@@ -358,7 +381,12 @@ impl Slot {
             // dropped, and with it the process and its children
             self.worker = None;
             lock(&shared.incidents).push(Incident { job: Some(job), text: fault.to_string() });
-            if attempts >= shared.options.attempts {
+            if let Some(seeds) = shared.hang(seed, &fault) {
+                let (task, fault) = (shared.options.spec.task.clone(), Box::new(fault));
+                return Err(RolloutError::Hangs { task, seeds, fault }.into());
+            }
+            let helpless = matches!(fault.kind, FaultKind::Environment(_) | FaultKind::Foreign);
+            if helpless || attempts >= shared.options.attempts {
                 let fault = Box::new(fault);
                 return Err(RolloutError::Episode { seed, attempts, fault }.into());
             }

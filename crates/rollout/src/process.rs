@@ -8,7 +8,7 @@ use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::sync::{LazyLock, Mutex, PoisonError, mpsc};
+use std::sync::{Mutex, PoisonError, mpsc};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -28,6 +28,8 @@ pub(super) struct Process {
     stdin: Option<ChildStdin>,
     stdout: ChildStdout,
     log: PathBuf,
+    /// The process that started it; after a fork the other one has only a copy of this.
+    owner: u32,
 }
 
 impl Process {
@@ -41,7 +43,7 @@ impl Process {
         let mut child = spawn_for_good(command).map_err(spawned)?;
         let stdin = child.stdin.take().expect("stdin is piped");
         let stdout = child.stdout.take().expect("stdout is piped");
-        let process = Self { child, stdin: Some(stdin), stdout, log: log.to_owned() };
+        let process = Self { child, stdin: Some(stdin), stdout, log: log.to_owned(), owner: std::process::id() };
         process.prepare(memory_limit).map_err(spawned)?;
         Ok(process)
     }
@@ -56,6 +58,11 @@ impl Process {
             prlimit(Some(Pid::from_child(&self.child)), Resource::Data, limit)?;
         }
         Ok(())
+    }
+
+    /// Whether this process started it, and not the one that this one was forked from.
+    pub(super) fn is_own(&self) -> bool {
+        self.owner == std::process::id()
     }
 
     /// The process id, which is also the id of its group.
@@ -159,6 +166,9 @@ impl Process {
     /// Closes its stdin and gives it `patience` to end; kills it otherwise.
     pub(super) fn finish(mut self, patience: Duration) {
         self.stdin = None;
+        if !self.is_own() {
+            return;
+        }
         let until = Instant::now() + patience;
         while Instant::now() < until {
             match self.child.try_wait() {
@@ -171,6 +181,9 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
+        if !self.is_own() {
+            return;
+        }
         // The whole group, before the leader is reaped: its id cannot have been reused yet. A leader
         // that has been reaped leaves a group only if children of it live on.
         let _ = kill_process_group(Pid::from_child(&self.child), Signal::KILL);
@@ -182,24 +195,30 @@ impl Drop for Process {
 /// when its parent ends comes, on Linux, when the *thread* that started it ends.
 fn spawn_for_good(command: Command) -> std::io::Result<Child> {
     type Order = (Command, mpsc::Sender<std::io::Result<Child>>);
-    static STARTER: LazyLock<Mutex<mpsc::Sender<Order>>> = LazyLock::new(|| {
-        let (sender, orders) = mpsc::channel::<Order>();
-        let run = move || {
-            for (mut command, answer) in orders {
-                // nobody waiting any more is no reason to end
-                let _ = answer.send(command.spawn());
+    // with the process whose thread it is: a fork has the sender and not the thread
+    static STARTER: Mutex<Option<(u32, mpsc::Sender<Order>)>> = Mutex::new(None);
+    let starter = {
+        let mut starter = STARTER.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*starter {
+            Some((owner, sender)) if *owner == std::process::id() => sender.clone(),
+            _ => {
+                let (sender, orders) = mpsc::channel::<Order>();
+                let run = move || {
+                    for (mut command, answer) in orders {
+                        // nobody waiting any more is no reason to end
+                        let _ = answer.send(command.spawn());
+                    }
+                };
+                std::thread::Builder::new().name("worker starter".to_owned()).spawn(run)?;
+                *starter = Some((std::process::id(), sender.clone()));
+                sender
             }
-        };
-        std::thread::Builder::new()
-            .name("worker starter".to_owned())
-            .spawn(run)
-            .expect("a program that cannot start one thread can do nothing here");
-        Mutex::new(sender)
-    });
+        }
+    };
+    let gone = |_| std::io::Error::other("the thread that starts workers ended");
     let (answer, answered) = mpsc::channel();
-    let starter = STARTER.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    starter.send((command, answer)).expect("the starter lives as long as its sender");
-    answered.recv().expect("the starter answers every order")
+    starter.send((command, answer)).map_err(|_| gone(mpsc::RecvError))?;
+    answered.recv().map_err(gone)?
 }
 
 /// A moment until which one exchange may last.

@@ -76,10 +76,23 @@ impl WorkerSpec {
         self
     }
 
+    /// A command that runs a module of the harness, finding packages where a worker finds them.
+    pub(super) fn python(&self, module: &str) -> Command {
+        let mut command = Command::new(&self.python.path);
+        command.args(["-c", &boot(module)]);
+        let mut path = OsString::from(&self.harness);
+        if let Some(rest) = std::env::var_os("PYTHONPATH").filter(|rest| !rest.is_empty()) {
+            path.push(":");
+            path.push(rest);
+        }
+        command.env("PYTHONPATH", path);
+        command
+    }
+
     /// The command that starts such a worker.
     pub(super) fn command(&self) -> Command {
-        let mut command = Command::new(&self.python.path);
-        command.args(["-c", &boot("actrm_harness.worker"), "--task", &self.task]);
+        let mut command = self.python("actrm_harness.worker");
+        command.args(["--task", &self.task]);
         command.args(["--control", self.control.as_str()]);
         if let Some(module) = &self.env_module {
             command.args(["--env-module", module]);
@@ -94,12 +107,6 @@ impl WorkerSpec {
                 command.arg("--fast-render");
             }
         }
-        let mut path = OsString::from(&self.harness);
-        if let Some(rest) = std::env::var_os("PYTHONPATH").filter(|rest| !rest.is_empty()) {
-            path.push(":");
-            path.push(rest);
-        }
-        command.env("PYTHONPATH", path);
         if std::env::var_os("NUMBA_CACHE_DIR").is_none() {
             command.env("NUMBA_CACHE_DIR", cache_folder().join("numba"));
         }
@@ -166,8 +173,7 @@ fn library_of(program: &Path) -> Option<PathBuf> {
 /// How long a worker may take before it counts as hung.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TimeLimits {
-    /// From the start of the process to its greeting, and for the first request of each kind, when a
-    /// simulator may still compile.
+    /// From the start of the process to its greeting: imports, compilation, the first reset.
     pub start: Duration,
     /// For a reset.
     pub reset: Duration,

@@ -109,8 +109,6 @@ pub struct Worker {
     limits: TimeLimits,
     stop: Stop,
     next_id: u64,
-    /// Kinds of request answered before, as bits: later ones get the short limit.
-    warm: u8,
 }
 
 /// Why a worker did not start: because of this try, or for good.
@@ -142,7 +140,7 @@ impl Worker {
             Ok(Reply::Ready(ready)) => {
                 check_handshake(&ready, spec).map_err(StartFailure::Final)?;
                 let (name, stop, limits) = (name.to_owned(), stop.clone(), spec.limits);
-                Ok(Self { process, name, ready: *ready, limits, stop, next_id: 0, warm: 0 })
+                Ok(Self { process, name, ready: *ready, limits, stop, next_id: 0 })
             }
             Ok(Reply::Error { kind, message, .. }) => {
                 let refused = RolloutError::Refused { task: spec.task.clone(), kind: kind.clone(), message };
@@ -190,7 +188,7 @@ impl Worker {
     pub fn reset(&mut self, seed: u64) -> Result<Initial, WorkerFault> {
         self.next_id += 1;
         let request = Request::Reset { id: self.next_id, seed };
-        let (reply, mut frame) = self.ask(&request, Vec::new(), self.limits.reset, 1)?;
+        let (reply, mut frame) = self.ask(&request, Vec::new(), self.limits.reset)?;
         match reply {
             Reply::Reset { fingerprint, group, drawing_ms, .. } => {
                 let observations = self.observations("reset", &mut frame)?;
@@ -209,7 +207,7 @@ impl Worker {
         let request = Request::Step { id: self.next_id };
         let shape = [actions.len(), actions.first().map_or(0, Vec::len)];
         let tensors = vec![("action", FrameTensor::from_f64(&shape, &actions.concat()))];
-        let (reply, mut frame) = self.ask(&request, tensors, self.limits.step, 2)?;
+        let (reply, mut frame) = self.ask(&request, tensors, self.limits.step)?;
         match reply {
             Reply::Step { success, failure, drawing_ms, progress, .. } => {
                 let progress = share(progress).map_err(|kind| self.fault("step", kind))?;
@@ -230,9 +228,7 @@ impl Worker {
         if done == 0 || done > actions || (done < actions && !over) {
             return Err(FaultKind::Values(format!("rewards: expected {actions} values, found {done}")));
         }
-        if let Some(reward) = rewards.iter().find(|reward| !reward.is_finite()) {
-            return Err(FaultKind::Values(format!("reward {reward}")));
-        }
+        numbers(&rewards)?;
         Ok(rewards)
     }
 
@@ -258,6 +254,7 @@ impl Worker {
         let fault = |what: String| self.fault("expert", FaultKind::Values(what));
         let (rewards, name) = read("rewards").map_err(fault)?;
         let rewards = rewards.to_f64(&name).map_err(|error| self.fault("expert", FaultKind::Nonsense(error)))?;
+        numbers(&rewards).map_err(|kind| self.fault("expert", kind))?;
         let (dones, name) = read("dones").map_err(fault)?;
         let mut solved = dones.to_i64(&name).map_err(|error| self.fault("expert", FaultKind::Nonsense(error)))?;
         // in robomimic's arrays the last step is done in any case
@@ -276,7 +273,7 @@ impl Worker {
     ) -> Result<(RecordedEpisode, Option<f64>), WorkerFault> {
         self.next_id += 1;
         let request = Request::Expert { id: self.next_id, seed, split, expert, skill };
-        let (reply, frame) = self.ask(&request, Vec::new(), self.limits.episode, 4)?;
+        let (reply, frame) = self.ask(&request, Vec::new(), self.limits.episode)?;
         match reply {
             Reply::Expert(reply) => {
                 let progress = share(reply.progress).map_err(|kind| self.fault("expert", kind))?;
@@ -301,7 +298,7 @@ impl Worker {
         self.next_id += 1;
         let request = Request::Extract { id: self.next_id, model_file, ep_meta };
         let tensors = vec![("states", states), ("actions", actions)];
-        let (reply, frame) = self.ask(&request, tensors, self.limits.episode, 8)?;
+        let (reply, frame) = self.ask(&request, tensors, self.limits.episode)?;
         match reply {
             Reply::Extract(reply) => self.recorded("extract", reply, frame),
             other => Err(self.fault("extract", unexpected("extract", &other))),
@@ -315,7 +312,7 @@ impl Worker {
     pub fn render(&mut self, camera: &str, height: usize, width: usize) -> Result<Image, WorkerFault> {
         self.next_id += 1;
         let request = Request::Render { id: self.next_id, camera, size: [height, width] };
-        let (reply, mut frame) = self.ask(&request, Vec::new(), self.limits.step, 16)?;
+        let (reply, mut frame) = self.ask(&request, Vec::new(), self.limits.step)?;
         if !matches!(reply, Reply::Render { .. }) {
             return Err(self.fault("render", unexpected("render", &reply)));
         }
@@ -344,9 +341,12 @@ impl Worker {
 
     /// Asks the worker to end and waits for it, a moment.
     pub fn close(mut self) {
+        if !self.process.is_own() {
+            return;
+        }
         self.next_id += 1;
         let request = Request::Close { id: self.next_id };
-        let _ = self.ask(&request, Vec::new(), Duration::from_secs(2), 32);
+        let _ = self.ask(&request, Vec::new(), Duration::from_secs(2));
         self.process.finish(Duration::from_secs(2));
     }
 
@@ -355,15 +355,17 @@ impl Worker {
         request: &Request<'_>,
         tensors: Vec<(&str, FrameTensor)>,
         allowed: Duration,
-        kind: u8,
     ) -> Result<(Reply, Frame), WorkerFault> {
         let phase = request.name();
-        let exchanged = self.exchange(request, tensors, allowed, kind);
+        let exchanged = self.exchange(request, tensors, allowed);
         let (reply, frame) = exchanged.map_err(|fault| self.fault(phase, fault))?;
         if let Reply::Error { kind, message, .. } = reply {
-            return Err(self.fault(phase, FaultKind::Reported { kind, message }));
+            let fault = match kind == "environment" {
+                true => FaultKind::Environment(message),
+                false => FaultKind::Reported { kind, message },
+            };
+            return Err(self.fault(phase, fault));
         }
-        self.warm |= kind;
         Ok((reply, frame))
     }
 
@@ -372,8 +374,10 @@ impl Worker {
         request: &Request<'_>,
         tensors: Vec<(&str, FrameTensor)>,
         allowed: Duration,
-        kind: u8,
     ) -> Result<(Reply, Frame), FaultKind> {
+        if !self.process.is_own() {
+            return Err(FaultKind::Foreign);
+        }
         if self.process.has_unread() {
             // either it died, or it wrote without being asked: reading tells which
             return Err(match self.process.receive(Limit::of(Duration::from_secs(1))) {
@@ -385,8 +389,7 @@ impl Worker {
         for (name, tensor) in tensors {
             frame.tensors.insert(name.to_owned(), tensor);
         }
-        let first = self.warm & kind == 0;
-        let limit = Limit::of(if first { allowed.max(self.limits.start) } else { allowed }).unless(&self.stop);
+        let limit = Limit::of(allowed).unless(&self.stop);
         let bytes = frame.encode().map_err(FaultKind::Nonsense)?;
         self.process.send(&bytes, limit)?;
         let body = self.process.receive(limit)?;
@@ -430,8 +433,8 @@ impl Worker {
                 continue;
             };
             if let Some(at) = values.iter().position(|value| !value.is_finite()) {
-                let what = format!("{name}[{at}] is {}", values[at]);
-                return Err(self.fault(phase, FaultKind::Values(what)));
+                let what = format!("the environment's observation {name}[{at}] is {}", values[at]);
+                return Err(self.fault(phase, FaultKind::Environment(what)));
             }
             observations.values.insert(key.clone(), values);
         }
@@ -465,6 +468,14 @@ impl Worker {
             stderr: self.process.stderr_tail(),
             log: self.process.log().to_owned(),
         }
+    }
+}
+
+/// Rewards have to be numbers.
+fn numbers(rewards: &[f64]) -> Result<(), FaultKind> {
+    match rewards.iter().find(|reward| !reward.is_finite()) {
+        Some(reward) => Err(FaultKind::Environment(format!("the environment's reward is {reward}"))),
+        None => Ok(()),
     }
 }
 
@@ -504,8 +515,8 @@ fn check_handshake(ready: &Ready, spec: &WorkerSpec) -> Result<(), RolloutError>
         }
     }
     for (low, high) in ready.action_low.iter().zip(&ready.action_high) {
-        if !(low.is_finite() && high.is_finite() && low < high) {
-            return differs("action limits", &"finite, low below high", &format!("{low} and {high}"));
+        if low.is_nan() || high.is_nan() || low >= high {
+            return differs("action limits", &"low below high", &format!("{low} and {high}"));
         }
     }
     if ready.observations.is_empty() {

@@ -364,3 +364,83 @@ fn images_are_drawn_of_every_step() {
     assert_ne!(images[0], images[5], "the arm has moved");
     assert!(images.iter().all(|image| (image.height, image.width, image.rgb.len()) == (96, 128, 96 * 128 * 3)));
 }
+
+/// Workers of `tools/harness/tests/odd_simulator.py`, whose tasks are what can be wrong with an environment.
+fn odd(folder: &std::path::Path, task: &str) -> rollout::WorkerSpec {
+    let tests = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tools/harness/tests");
+    let body = format!("export PYTHONPATH=\"$PYTHONPATH:{}\"\nexec \"$PY\" \"$@\"", tests.display());
+    let mut spec = spec(task);
+    spec.python = wrapped(folder, task, &body);
+    spec.env_module = Some("odd_simulator".to_owned());
+    spec
+}
+
+/// One action a job: what is delivered, and the end.
+fn stepped(pool: &mut Pool, jobs: u64) -> (Vec<Result<bool, RolloutError>>, Result<RunEnd, RolloutError>) {
+    let work = |(): &mut (), worker: &mut Worker, job: u64| {
+        worker.reset(10_000 + job)?;
+        Ok(worker.step(&[vec![-1.0]])?.success)
+    };
+    let mut results = Vec::new();
+    let end = pool.run(0..jobs, &|job| 10_000 + job, &|| Ok(()), &work, &mut |_, result| {
+        results.push(result);
+        ControlFlow::Continue(())
+    });
+    (results, end)
+}
+
+#[test]
+fn an_environment_that_hangs_ends_the_run_after_three_seeds_from_the_first_step_on() {
+    let dir = tempfile::tempdir().unwrap();
+    for (task, phase) in [("StepHangs", "step"), ("ResetHangs", "reset")] {
+        let mut spec = odd(dir.path(), task);
+        let limit = Duration::from_secs(1);
+        // a start may take as long as it did; nothing after it has that long
+        spec.limits = TimeLimits { step: limit, reset: limit, ..TimeLimits::default() };
+        let mut pool = Pool::start(PoolOptions::new(spec, 2)).unwrap();
+        let (results, end) = stepped(&mut pool, 50);
+        let error = end.unwrap_err();
+        let RolloutError::Hangs { seeds, fault, .. } = &error else { panic!("{error}") };
+        assert_eq!((seeds.len(), fault.phase), (3, phase), "{error}");
+        assert!(error.to_string().contains("no answer within 1.0 s"), "{error}");
+        assert!(results.iter().all(Result::is_err), "no episode has a result");
+        assert!(pool.incidents().len() <= 9, "{:?}", pool.incidents());
+    }
+}
+
+#[test]
+fn what_is_no_number_is_the_environment_s_error_and_no_fresh_worker_is_tried() {
+    let dir = tempfile::tempdir().unwrap();
+    let cases = [
+        ("NanReward", "the environment's reward is nan"),
+        ("NanSuccess", "the environment's success is nan"),
+        ("NanSeen", "the environment's observation obs/place[0] is NaN"),
+        ("NanProgress", "cannot be sent"),
+        ("NanMeta", "cannot be sent"),
+    ];
+    for (task, text) in cases {
+        let mut pool = Pool::start(PoolOptions::new(odd(dir.path(), task), 1)).unwrap();
+        let (results, end) = stepped(&mut pool, 2);
+        assert_eq!((end.unwrap(), results.len()), (RunEnd::Complete, 2));
+        for result in results {
+            let error = result.unwrap_err();
+            assert!(matches!(error, RolloutError::Episode { attempts: 1, .. }), "{task}: {error}");
+            assert!(error.to_string().contains(text), "{task}: {error}");
+        }
+    }
+}
+
+#[test]
+fn actions_without_limits_are_taken_and_limits_that_are_no_numbers_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut pool = Pool::start(PoolOptions::new(odd(dir.path(), "Unlimited"), 1)).unwrap();
+    assert_eq!(pool.ready().action_low, [f64::NEG_INFINITY]);
+    assert_eq!(pool.ready().action_high, [f64::INFINITY]);
+    // a greeting that is kept is read as it was
+    let text = serde_json::to_string(pool.ready()).unwrap();
+    assert_eq!(&serde_json::from_str::<rollout::Ready>(&text).unwrap(), pool.ready());
+    assert!(!stepped(&mut pool, 1).0[0].as_ref().unwrap());
+    assert!(pool.ready().sources.contains_key("odd_simulator") && pool.ready().sources.contains_key("actrm_harness"));
+    let error = Pool::start(PoolOptions::new(odd(dir.path(), "NanLimit"), 1)).err().unwrap().to_string();
+    assert!(error.contains("limits of an action"), "{error}");
+}

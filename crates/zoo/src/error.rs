@@ -383,7 +383,7 @@ pub enum ZooError {
         entry: String,
         /// The simulator.
         simulator: String,
-        /// The version recorded with the data set, or `unknown`.
+        /// The version recorded with the data set.
         recorded: String,
         /// The version that the worker runs.
         running: String,

@@ -21,7 +21,6 @@ use std::time::Duration;
 
 use rollout::{EpisodePlan, FaultKind, Image, JobError, Observations, Pool, Ready, RolloutError, Worker, WorkerFault};
 
-pub(crate) use self::again::differences;
 pub use self::again::{Again, evaluate_again};
 pub use self::agent::{PolicyAgent, QueryTime, QueryTimes};
 pub use self::clock::WallClock;
@@ -32,7 +31,7 @@ pub use self::subject::{Subject, acting};
 pub use self::thinking::{Start, starts, thinking_subject};
 pub use self::trace::{Examiner, PolicyTrace, TracedQuery, TracedThought, trace};
 use crate::ZooError;
-use crate::results::{EpisodeRecord, EpisodeTiming, ResultsFolder, Seeds, Shard, StoredEvaluation};
+use crate::results::{EpisodeRecord, EpisodeTiming, OtherSimulator, ResultsFolder, Seeds, Shard, StoredEvaluation};
 
 /// The first seed of an evaluation unless another is asked for: demonstrations never use these.
 pub const FIRST_SEED: u64 = 10_000;
@@ -74,6 +73,8 @@ pub enum EvaluationEnd {
 /// News from an evaluation under way.
 #[derive(Debug)]
 pub enum Progress<'a> {
+    /// Before it begins: episodes of another simulator are there, and stay apart.
+    Apart(&'a OtherSimulator),
     /// It begins, or goes on.
     Begin {
         /// Episodes that were on disk already.
@@ -118,6 +119,9 @@ pub fn evaluate(
     let mut folder = ResultsFolder::open(results, &record)?;
     folder.adopt(results)?;
     let missing = folder.missing();
+    if !missing.is_empty() {
+        folder.others(results).iter().for_each(|other| progress(Progress::Apart(other)));
+    }
     let total = record.own_seeds().len() as u64;
     progress(Progress::Begin { done: total - missing.len() as u64, total, folder: folder.path() });
     if folder.is_finished() {

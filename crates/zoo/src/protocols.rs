@@ -120,6 +120,7 @@ impl NamedProtocol {
             // the task's own environment
             && rules.env_module.is_none()
             && rules.env_args_sha256.is_none()
+            && record.changed_sources().is_empty()
             && self.execution.is_none_or(|execution| execution == record.execution)
             && self.versions.iter().all(|(name, version)| record.versions.get(name) == Some(version));
         let whole = |block: &Block| self.seeds(*block) == record.seeds;
@@ -238,13 +239,14 @@ mod tests {
         record.seeds = Seeds { start: 40_000, count: 200 };
         assert_eq!(protocol.block_of(&record), Some(Block::Test));
         #[allow(clippy::type_complexity)]
-        let changes: [fn(&mut EvaluationRecord); 7] = [
+        let changes: [fn(&mut EvaluationRecord); 8] = [
             |r| r.seeds.count = 199,
             |r| r.protocol.max_steps = 500,
             |r| r.protocol.control = Control::Compiled,
             |r| r.protocol.env_args_sha256 = Some("0".repeat(64)),
             |r| r.shard = Some(crate::results::Shard { index: 1, count: 2 }),
             |r| drop(r.versions.insert("mujoco".into(), "3.9.0".into())),
+            |r| drop(r.sources.insert("robosuite".into(), "0".repeat(64))),
             |r| r.protocol.task = "Stack".into(),
         ];
         for change in changes {

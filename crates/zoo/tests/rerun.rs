@@ -93,6 +93,7 @@ fn result(zoo: &Path, entry: &Entry) -> StoredEvaluation {
         versions: [("mujoco".to_owned(), "3.3.7".to_owned())].into(),
         kernels: None,
         renderer: None,
+        sources: std::collections::BTreeMap::new(),
     };
     let mut folder = ResultsFolder::open(&zoo.join("results"), &record).unwrap();
     let episode = EpisodeRecord {

@@ -31,9 +31,12 @@ pub struct RunArgs {
     /// Evaluate although the demonstrations were recorded in another simulator generation, or with these seeds
     #[arg(long)]
     pub force: bool,
-    /// Seconds without an answer after which a worker counts as hung
+    /// Seconds without an answer to a step after which a worker counts as hung, from the first step on
     #[arg(long, value_name = "S", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     step_timeout: u64,
+    /// Seconds that a worker may take to start: imports, compilation, making the environment
+    #[arg(long, value_name = "S", default_value_t = 180, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    start_timeout: u64,
     /// Keep what workers say on standard error in this folder
     #[arg(long, value_name = "DIR")]
     pub worker_logs: Option<PathBuf>,
@@ -72,6 +75,7 @@ pub fn worker(environment: &Environment, simulator: &SimulatorArgs, control: Con
 pub fn limited_worker(environment: &Environment, args: &RunArgs, control: Control) -> anyhow::Result<WorkerSpec> {
     let mut spec = worker(environment, &args.simulator, control)?;
     spec.limits.step = Duration::from_secs(args.step_timeout);
+    spec.limits.start = Duration::from_secs(args.start_timeout);
     Ok(spec)
 }
 
@@ -93,6 +97,7 @@ pub fn run_missing(
     let mut successes = 0_u64;
     let mut was_there = false;
     let end = evaluate(subject, pool, results, options, &mut |progress| match progress {
+        Progress::Apart(other) => screen.note(&format!("note: {id}: {other}")),
         Progress::Begin { done, total, .. } => {
             was_there = done == total;
             screen.begin_at("eval", done, total);

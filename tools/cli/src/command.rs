@@ -32,6 +32,12 @@ macro_rules! commands {
 
 /// The end of a program: its exit code, or an error in one line on standard error.
 pub fn end(result: Result<ExitCode>) -> ExitCode {
+    if let Some(folder) = rollout::without_locks() {
+        let folder = crate::shown(folder);
+        crate::note(&format!(
+            "note: {folder} is on a file system without locks: do not run two programs on the same folder at once"
+        ));
+    }
     match result {
         Ok(code) => code,
         Err(error) => {

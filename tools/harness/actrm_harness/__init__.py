@@ -6,3 +6,4 @@ clocks, time-outs and files are Rust's business, not this package's.
 """
 
 PROTOCOL = 2
+PACKAGE = "actrm_harness"

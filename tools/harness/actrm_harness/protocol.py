@@ -27,8 +27,9 @@ class Ready:
     control_freq: int
     max_steps: int
     action_dim: int
-    action_low: list[float]
-    action_high: list[float]
+    action_low: list[float | None]
+    """Of each value its smallest; None where it has no limit."""
+    action_high: list[float | None]
     observations: dict[str, list[int]]
     stages: list[str]
     """What an episode passes before the task is solved, in order, where that is known."""
@@ -37,6 +38,8 @@ class Ready:
     """Which kernels numpy's linear algebra runs, where that can be told: the last bits depend on them."""
     renderer: str | None = None
     """What draws the pictures, where there are cameras: another device or driver draws others."""
+    sources: dict[str, str] = field(default_factory=dict[str, str])
+    """SHA-256 by package of what was imported to simulate: the simulator, what it stands on, this harness."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,15 +8,18 @@ can get into the stream.
 import argparse
 import importlib
 import json
+import math
 import os
 import platform
 import sys
 import traceback
 from typing import Any, BinaryIO, NoReturn, cast
 
-from actrm_harness import PROTOCOL, protocol, simulators, source, tasks, wire
+import numpy as np
+
+from actrm_harness import PACKAGE, PROTOCOL, protocol, simulators, source, tasks, wire
 from actrm_harness.protocol import RequestError, error_message
-from actrm_harness.simulators import Episode, Simulation, Stored
+from actrm_harness.simulators import Episode, Simulation, Stored, finite, packages, verdict
 
 # What has to be set before the interpreter starts. Sets of names must not be ordered by chance (robosuite draws from
 # one), and one thread a library keeps their buffers small: a worker computes on one core.
@@ -131,6 +134,9 @@ def describe(args: argparse.Namespace, simulation: Simulation) -> protocol.Ready
     arguments, sha256 = found.env_args, None
     if args.env_module:
         sha256 = source.digest(args.env_module)
+        if sha256 is None:
+            text = f"environment module {args.env_module!r} has no source file to take a sum of"
+            raise RequestError("env_module", text)
         # robomimic's readers take what they know of it
         arguments = {**arguments, "env_module": {"name": args.env_module, "sha256": sha256}}
     return protocol.Ready(
@@ -145,14 +151,22 @@ def describe(args: argparse.Namespace, simulation: Simulation) -> protocol.Ready
         control_freq=found.control_freq,
         max_steps=task.max_steps,
         action_dim=int(found.action_low.shape[0]),
-        action_low=found.action_low.tolist(),
-        action_high=found.action_high.tolist(),
+        action_low=limits(found.action_low, -math.inf),
+        action_high=limits(found.action_high, math.inf),
         observations=found.observations,
         stages=found.stages,
         kernels=found.kernels,
         renderer=found.renderer,
         env_args=arguments,
+        sources=source.sums({PACKAGE, task.simulator.split(".")[0], *found.packages, *packages(simulation)}),
     )
+
+
+def limits(values: wire.Array, none: float) -> list[float | None]:
+    """An action's limits; None where there is none, which is `none`."""
+    if np.isnan(values).any():
+        raise RequestError("environment", f"the environment's limits of an action are {values.tolist()}")
+    return [None if limit == none else limit for limit in values.tolist()]
 
 
 def serve(simulation: Simulation, requests: BinaryIO, replies: BinaryIO) -> int:
@@ -179,7 +193,12 @@ def serve(simulation: Simulation, requests: BinaryIO, replies: BinaryIO) -> int:
         except Exception as error:
             traceback.print_exc()
             reply, data = error_message("failed", f"{type(error).__name__}: {error}", number), {}
-        wire.write_frame(replies, reply, data)
+        try:
+            wire.write_frame(replies, reply, data)
+        except ValueError as error:
+            # JSON has no NaN and no infinity; nothing was written yet
+            text = f"{message.get('type')}: what the environment gave cannot be sent: {error}: {reply}"
+            wire.write_frame(replies, error_message("environment", text, number))
 
 
 Answer = tuple[wire.Message, wire.Tensors]
@@ -190,15 +209,16 @@ def answer(simulation: Simulation, request: protocol.Request, tensors: wire.Tens
     # first what is asked most, between two steps of physics
     if isinstance(request, protocol.Step):
         stepped = simulation.step(tensor(tensors, "action"))
+        rewards = finite("reward", stepped.rewards)
         reply: wire.Message = {
             "type": "step",
             "id": request.id,
-            "reward": float(stepped.rewards[-1]),
-            "success": stepped.success,
+            "reward": float(rewards[-1]),
+            "success": verdict(stepped.success),
             "failure": stepped.failure,
             "progress": stepped.progress,
         }
-        return drawn(reply, stepped.drawing_ms), {"rewards": stepped.rewards, **observed(stepped.observation)}
+        return drawn(reply, stepped.drawing_ms), {"rewards": rewards, **observed(stepped.observation)}
     if isinstance(request, protocol.Reset):
         first = simulation.reset(request.seed, request.split == "demonstration")
         reply = {
@@ -237,10 +257,12 @@ def observed(observation: wire.Tensors) -> wire.Tensors:
 
 def episode_reply(kind: str, number: int, episode: Episode) -> wire.Message:
     """The message that goes with a recorded episode's tensors."""
+    if "rewards" in episode.tensors:
+        finite("reward", episode.tensors["rewards"])
     return {
         "type": kind,
         "id": number,
-        "success": episode.success,
+        "success": verdict(episode.success),
         "steps": episode.steps,
         "attrs": episode.attrs,
         "progress": episode.progress,

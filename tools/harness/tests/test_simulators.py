@@ -141,3 +141,83 @@ def test_a_modules_sum_says_what_it_says(tmp_path: Path) -> None:
     second = digest()
     (tmp_path / "changed.py").write_text((tmp_path / "changed.py").read_text() + "# another\n")
     assert len({first, second, digest()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("task", "text"),
+    [
+        ("NanReward", r"environment: the environment's reward is nan \(step 2\)"),
+        ("NanSuccess", "environment: the environment's success is nan, neither true nor false"),
+        ("NanProgress", "environment: step: .*cannot be sent.*'progress': nan"),
+    ],
+)
+def test_what_is_no_number_is_the_environments_error_and_the_worker_stays(task: str, text: str) -> None:
+    client = Client("--task", task, "--env-module", "odd_simulator", env=PATHS)
+    for seed in (1, 2):
+        client.ask("reset", seed=seed)
+        with pytest.raises(WorkerError, match=text):
+            client.ask("step", {"action": np.zeros((2, 1))})
+    assert client.close() == 0
+
+
+def test_descriptions_that_are_no_json_are_the_environments_error() -> None:
+    client = Client("--task", "NanMeta", "--env-module", "odd_simulator", env=PATHS)
+    with pytest.raises(WorkerError, match="environment: reset: .*cannot be sent"):
+        client.ask("reset", seed=1)
+    assert client.close() == 0
+
+
+def test_actions_without_limits_are_null_and_limits_that_are_no_numbers_an_error() -> None:
+    from test_worker import start_error
+
+    client = Client("--task", "Unlimited", "--env-module", "odd_simulator", env=PATHS)
+    assert (client.ready["action_low"], client.ready["action_high"]) == ([None], [None])
+    client.ask("reset", seed=1)
+    assert client.step(np.full(1, -30.0))[0]["success"] is False
+    client.close()
+    message, code = start_error("--task", "NanLimit", "--env-module", "odd_simulator", env=PATHS)
+    assert (message["kind"], code) == ("environment", 1) and "limits of an action" in message["message"]
+
+
+def test_a_humanoid_is_stepped() -> None:
+    """GR1's arms take targets without limits; one robot with two arms has no stages of two robots."""
+    for task in ("Lift", "TwoArmLift"):
+        client = Client("--task", task, "--env-args", env_args(robots="GR1ArmsOnly"))
+        assert None in client.ready["action_low"] and (task == "Lift" or client.ready["stages"] == [])
+        client.ask("reset", seed=1)
+        message, _ = client.step(np.zeros((2, client.ready["action_dim"])))
+        assert message["success"] is False
+        client.close()
+
+
+def test_a_success_of_robosuite_that_is_no_number_is_named(tmp_path: Path) -> None:
+    (tmp_path / "nowhere.py").write_text((HERE / "example_env.py").read_text().replace("return height >", "return np.nan + "))
+    paths = {"PYTHONPATH": f"{tmp_path}:{HERE.parent}"}
+    client = Client("--task", "LiftHigh", "--env-module", "nowhere", env=paths)
+    client.ask("reset", seed=1)
+    with pytest.raises(WorkerError, match="success is nan"):
+        client.step(np.zeros(7))
+    client.close()
+
+
+def test_what_was_imported_is_summed(lift: Client, tmp_path: Path) -> None:
+    """The simulator, what it stands on, the harness; a copy that says otherwise has another sum."""
+    assert sorted(lift.ready["sources"]) == ["actrm_harness", "mujoco", "robosuite"]
+    # evaluations from before sources were written down count as run on this release
+    released = HERE.parents[2] / "crates/zoo/src/results/record.rs"
+    assert f'"1.5.2", "{lift.ready["sources"]["robosuite"]}"' in released.read_text()
+
+    def sums() -> dict[str, str]:
+        paths = {"PYTHONPATH": f"{tmp_path}:{HERE}:{HERE.parent}"}
+        client = Client("--task", "Slide", "--env-module", "toy_simulator", env=paths)
+        client.close()
+        return client.ready["sources"]
+
+    first = sums()
+    assert sorted(first) == ["actrm_harness", "toy_simulator"]
+    assert first["actrm_harness"] == lift.ready["sources"]["actrm_harness"]
+    text = (HERE / "toy_simulator.py").read_text()
+    (tmp_path / "toy_simulator.py").write_text(text)
+    assert sums() == first, "where it lies does not matter"
+    (tmp_path / "toy_simulator.py").write_text(text.replace("< 0.1)", "< 0.2)"))
+    assert sums()["toy_simulator"] != first["toy_simulator"]

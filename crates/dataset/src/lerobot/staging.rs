@@ -60,7 +60,11 @@ impl Staging {
                 Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
                 opened => opened.map_err(io_error(folder.path(), "open it"))?,
             };
-            lock.lock().map_err(io_error(folder.path(), "lock it"))?;
+            match lock.lock() {
+                // where nothing can be locked nothing is swept
+                Err(error) if !has_no_locks(&error) => return Err(io_error(folder.path(), "lock it")(error)),
+                _ => {}
+            }
             if folder.path().exists() {
                 widen_permissions(folder.path())?;
                 let path = folder.keep();
@@ -147,6 +151,13 @@ fn sweep(parent: &Path, prefix: &str) {
             let _ = std::fs::remove_dir_all(entry.path());
         }
     }
+}
+
+/// Whether a file system says that it has no locks: ENOSYS, EOPNOTSUPP, ENOLCK.
+fn has_no_locks(error: &io::Error) -> bool {
+    use rustix::io::Errno;
+    let errno = Errno::from_io_error(error);
+    [Errno::NOSYS, Errno::OPNOTSUPP, Errno::NOLCK].map(Some).contains(&errno)
 }
 
 /// `tempfile` makes folders that only the owner may enter; a data set is for whoever the umask lets in.

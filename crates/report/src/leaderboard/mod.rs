@@ -393,6 +393,35 @@ mod tests {
     }
 
     #[test]
+    fn another_simulator_under_the_same_version_is_ranked_apart_and_told_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let with = |name: &str, sum: Option<&str>| {
+            let mut record = sample(name, 1, 40);
+            record.sources.extend(sum.map(|sum| ("robosuite".to_owned(), sum.to_owned())));
+            finished(dir.path(), &record)
+        };
+        let shadow = "1".repeat(64);
+        let all = [with("a", None), with("a", Some(&shadow)), with("b", None)];
+        let id = all[0].record.protocol.id();
+        let rows = rank(&all);
+        let told: Vec<(String, String, Option<u64>)> =
+            rows.iter().map(|row| (row.name(), row.protocol_text(), row.rank)).collect();
+        let expected = [
+            ("a@1", "robosuite 1.5.2", Some(1)),
+            ("b@1", "robosuite 1.5.2", Some(1)),
+            ("a@1", "robosuite 1.5.2 (sources 11111111)", Some(1)),
+        ];
+        assert_eq!(told, expected.map(|(name, text, rank)| (name.to_owned(), format!("{id} {text}"), rank)));
+        // trainings of one family are no one row where one of them ran on another simulator
+        let mut reading = Reading::default();
+        let family = [("c-s1", None), ("c-s2", Some(shadow.as_str()))].map(|(name, sum)| {
+            reading.families.insert(name, 1, "c".to_owned());
+            with(name, sum)
+        });
+        assert_eq!(super::rank(&family, &reading).iter().map(|row| row.each().len()).collect::<Vec<_>>(), [1, 1]);
+    }
+
+    #[test]
     fn one_entry_drawn_by_two_renderers_is_not_two_trainings() {
         let dir = tempfile::tempdir().unwrap();
         let by = |name: &str, renderer: Option<&str>| {

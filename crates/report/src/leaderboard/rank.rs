@@ -84,9 +84,19 @@ pub(crate) fn asked(row: &LeaderboardRow) -> Asked {
     (row.task().to_owned(), block, format!("{} {}", row.record().protocol.id(), simulator.join(" ")))
 }
 
-/// Versions of what moves the world. Python and its arrays only carry it: `eval --again` says where they differ.
-fn simulator(row: &LeaderboardRow) -> impl Iterator<Item = (&String, &String)> {
-    row.record().versions.iter().filter(|(name, _)| !["python", "numpy"].contains(&name.as_str()))
+/// Versions of what moves the world, with the sources' sum where they are not those of the release. Python and its arrays
+/// only carry it: `eval --again` says where they differ.
+fn simulator(row: &LeaderboardRow) -> impl Iterator<Item = (String, String)> {
+    let mut changed = row.record().changed_sources();
+    let mut all: BTreeMap<String, String> = BTreeMap::new();
+    for (name, version) in
+        row.record().versions.iter().filter(|(name, _)| !["python", "numpy"].contains(&name.as_str()))
+    {
+        let sources = changed.remove(name.as_str()).map_or(String::new(), |sum| format!(" (sources {sum})"));
+        all.insert(name.clone(), format!("{version}{sources}"));
+    }
+    all.extend(changed.into_iter().map(|(name, sum)| (name.to_owned(), format!("(sources {sum})"))));
+    all.into_iter()
 }
 
 /// Lets rows of the same rules say the versions of the simulator in which they differ from others.
@@ -96,35 +106,40 @@ fn name_simulators(rows: &mut [LeaderboardRow]) {
     for row in rows.iter() {
         let rules = found.entry(row.record().protocol.id()).or_default();
         for (name, version) in simulator(row) {
-            rules.entry(name.clone()).or_default().insert(version.clone());
+            rules.entry(name).or_default().insert(version);
         }
     }
     for row in rows {
         let rules = &found[&row.record().protocol.id()];
-        let differing = simulator(row).filter(|(name, _)| rules[*name].len() > 1);
+        // one that only some have tells them apart, too
+        let everywhere =
+            |name: &str| rules[name].len() == 1 && !rules[name].iter().any(|text| text.contains("(sources"));
+        let differing = simulator(row).filter(|(name, _)| !everywhere(name));
         let texts: Vec<String> = differing.map(|(name, version)| format!("{name} {version}")).collect();
         row.simulator = texts.join(", ");
     }
 }
 
 /// Lets rows of one entry under the same protocol say in what they differ: their seeds, how chunks are executed, what drew
-/// their pictures.
+/// their pictures, the sources of what simulated.
 fn tell_apart(rows: &mut [LeaderboardRow]) {
-    type Differing = (BTreeSet<String>, BTreeSet<String>, BTreeSet<String>);
+    type Differing = (BTreeSet<String>, BTreeSet<String>, BTreeSet<String>, BTreeSet<String>);
     let key = |row: &LeaderboardRow| (row.name(), row.protocol_text());
     let mut found: BTreeMap<(String, String), Differing> = BTreeMap::new();
     for row in rows.iter() {
-        let (seeds, executions, renderers) = found.entry(key(row)).or_default();
+        let (seeds, executions, renderers, sources) = found.entry(key(row)).or_default();
         seeds.insert(row.record().seeds.to_string());
         executions.insert(row.execution_text());
         renderers.insert(row.renderer_text());
+        sources.insert(row.sources_text());
     }
     for row in rows {
-        let (seeds, executions, renderers) = &found[&key(row)];
+        let (seeds, executions, renderers, sources) = &found[&key(row)];
         let seeds = (seeds.len() > 1).then(|| format!("seeds {}", row.record().seeds));
         let execution = (executions.len() > 1).then(|| row.execution_text());
         let renderer = (renderers.len() > 1).then(|| row.renderer_text());
-        row.apart = seeds.into_iter().chain(execution).chain(renderer).collect::<Vec<_>>().join(", ");
+        let sources = (sources.len() > 1).then(|| row.sources_text());
+        row.apart = seeds.into_iter().chain(execution).chain(renderer).chain(sources).collect::<Vec<_>>().join(", ");
     }
 }
 
@@ -134,7 +149,7 @@ fn joined(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<Leaderboar
     for evaluation in evaluations.iter().filter(|evaluation| evaluation.record.shard.is_none()) {
         let record = &evaluation.record;
         let who = reading.families.key(&record.entry).map_or_else(|| format!("entry {}", record.entry), str::to_owned);
-        let how = (&record.protocol, &record.execution, record.seeds, &record.versions);
+        let how = (&record.protocol, &record.execution, record.seeds, &record.versions, &record.sources);
         let marks = (record.time_decides, record.demonstrated);
         alike.entry(format!("{who} {how:?} {marks:?}")).or_default().push(evaluation.clone());
     }
@@ -166,7 +181,8 @@ fn without_parts(rows: Vec<LeaderboardRow>) -> Vec<LeaderboardRow> {
     let within = |part: &LeaderboardRow, whole: &LeaderboardRow| {
         let (a, b) = (part.record(), whole.record());
         let seeds = b.seeds.start <= a.seeds.start && a.seeds.iter().end <= b.seeds.iter().end && a.seeds != b.seeds;
-        let rules = (&a.protocol, &a.execution, &a.versions) == (&b.protocol, &b.execution, &b.versions);
+        let rules = (&a.protocol, &a.execution, &a.versions, &a.sources)
+            == (&b.protocol, &b.execution, &b.versions, &b.sources);
         let entries = part.evaluations().all(|one| whole.evaluations().any(|two| one.record.entry == two.record.entry));
         seeds && rules && part.named.is_none() && entries
     };
@@ -212,5 +228,6 @@ fn order(one: &LeaderboardRow, two: &LeaderboardRow) -> Ordering {
         .then_with(|| one.record().entry.cmp(&two.record().entry))
         .then_with(|| seeds(one).cmp(&seeds(two)))
         .then_with(|| one.record().versions.cmp(&two.record().versions))
+        .then_with(|| one.record().sources.cmp(&two.record().sources))
         .then_with(|| one.execution_text().cmp(&two.execution_text()))
 }

@@ -391,6 +391,16 @@ impl LeaderboardRow {
         format!("drawn by {}", name.unwrap_or("what was not written down"))
     }
 
+    /// `sources 1a2b3c4d`, a sum over those of all packages, or that they were not written down.
+    pub(super) fn sources_text(&self) -> String {
+        let sources = &self.record().sources;
+        if sources.is_empty() {
+            return "sources not written down".to_owned();
+        }
+        let all: Vec<String> = sources.iter().map(|(name, sum)| format!("{name} {sum}\n")).collect();
+        format!("sources {}", &zoo::sha256_hex(all.concat().as_bytes())[..8])
+    }
+
     /// `8 steps` or `ensemble 0.01`.
     pub fn execution_text(&self) -> String {
         match self.record().execution {

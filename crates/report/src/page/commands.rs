@@ -140,7 +140,9 @@ fn forced(record: &EvaluationRecord) -> bool {
     };
     let recorded = record.training.data_simulator.as_deref().and_then(generation);
     let ran = |name: &str| record.versions.get(name).map(String::as_str).and_then(generation);
-    record.demonstrated || (ran("robosuite").is_some() && ran("robosuite") != recorded)
+    // one that nobody wrote down is no other
+    let told = record.training.data_simulator.is_some();
+    record.demonstrated || (told && ran("robosuite").is_some() && ran("robosuite") != recorded)
 }
 
 #[cfg(test)]

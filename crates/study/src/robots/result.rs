@@ -52,6 +52,9 @@ pub struct CellResult {
     /// What drew the policy's pictures, where that was told.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub renderer: Option<String>,
+    /// SHA-256 by package of the sources that were imported to simulate, where they were told.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub sources: BTreeMap<String, String>,
     /// Median duration of a query in milliseconds.
     pub query_ms: f64,
     /// Floating-point operations of a query that thinks as long as it may, where they are counted.
@@ -119,6 +122,7 @@ impl CellResult {
             versions: record.versions.clone(),
             kernels: record.kernels.clone(),
             renderer: record.renderer.clone(),
+            sources: record.sources.clone(),
             query_ms: times.get(times.len() / 2).copied().unwrap_or_default(),
             query_flops,
             episodes: evaluation

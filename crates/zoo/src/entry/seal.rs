@@ -111,7 +111,7 @@ impl EntryDraft {
 pub(crate) fn lock_name(parent: &Path) -> Result<File, ZooError> {
     let path = parent.join(".lock");
     let lock = File::create(&path).map_err(ZooError::io("create", &path))?;
-    lock.lock().map_err(ZooError::io("lock", &path))?;
+    rollout::lock(&lock, parent).map_err(ZooError::io("lock", &path))?;
     Ok(lock)
 }
 

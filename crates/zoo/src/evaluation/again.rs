@@ -7,7 +7,7 @@ use rollout::{Pool, RolloutError};
 
 use super::{EvaluationOptions, Subject, run_episodes};
 use crate::ZooError;
-use crate::results::{EpisodeRecord, EvaluationRecord, ResultsFolder, StoredEvaluation, evaluation_folders};
+use crate::results::{EpisodeRecord, EvaluationRecord, ResultsFolder, StoredEvaluation, differing, evaluation_folders};
 
 /// How running again ended.
 #[derive(Debug)]
@@ -66,7 +66,7 @@ pub fn evaluate_again(
         wanted,
         stored: before.len() as u64,
         different: Vec::new(),
-        versions: differences(&stored.record, &record),
+        versions: differing(&stored.record, &record),
         errors: Vec::new(),
         sealed: false,
         progress: false,
@@ -114,28 +114,14 @@ fn find(results: &Path, record: &EvaluationRecord) -> Result<StoredEvaluation, Z
         let own = stored.record.own_seeds();
         seeds.iter().all(|seed| own.binary_search(seed).is_ok())
     };
-    let found =
-        all.iter().filter(|stored| holds(stored)).max_by_key(|stored| stored.record.versions == record.versions);
+    let found = all.iter().filter(|stored| holds(stored)).max_by_key(|stored| {
+        let stored = &stored.record;
+        (stored.versions == record.versions, stored.sources == record.sources, stored.sources.is_empty())
+    });
     found.cloned().ok_or_else(|| ZooError::NothingToCompare {
         entry: record.entry.to_string(),
         seeds: record.seeds.to_string(),
         results: results.to_owned(),
         stored: all.iter().map(|stored| stored.record.seeds.to_string()).collect(),
     })
-}
-
-/// Versions that are not the same: name, stored and now; kernels and renderers, too, where they were told.
-pub(crate) fn differences(stored: &EvaluationRecord, now: &EvaluationRecord) -> Vec<(String, String, String)> {
-    let names = stored.versions.keys().chain(now.versions.keys().filter(|name| !stored.versions.contains_key(*name)));
-    let of =
-        |record: &EvaluationRecord, name: &str| record.versions.get(name).cloned().unwrap_or_else(|| "none".into());
-    let told = |name: &str, of: fn(&EvaluationRecord) -> Option<&String>| {
-        let both = of(stored).cloned().zip(of(now).cloned());
-        both.map(|(stored, now)| (name.to_owned(), stored, now))
-    };
-    let all = names
-        .map(|name| (name.clone(), of(stored, name), of(now, name)))
-        .chain(told("kernels", |record| record.kernels.as_ref()))
-        .chain(told("renderer", |record| record.renderer.as_ref()));
-    all.filter(|(_, stored, now)| stored != now).collect()
 }

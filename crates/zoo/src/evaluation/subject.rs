@@ -86,6 +86,7 @@ impl Subject<'_> {
             versions: ready.versions.clone(),
             kernels: ready.kernels.clone(),
             renderer: ready.renderer.clone(),
+            sources: ready.sources.clone(),
         })
     }
 
@@ -206,13 +207,14 @@ fn check_generation(
     simulator: &str,
     running: Option<&str>,
 ) -> Result<(), ZooError> {
-    let runs = running.and_then(generation);
-    if recorded.is_some_and(|r| generation(r).is_some() && generation(r) == runs) {
+    // what nobody wrote down is no other generation
+    let Some(recorded) = recorded else { return Ok(()) };
+    if generation(recorded).is_some() && generation(recorded) == running.and_then(generation) {
         return Ok(());
     }
     Err(ZooError::SimulatorGeneration {
         entry: entry.to_string(),
-        recorded: recorded.unwrap_or("unknown (none is recorded)").to_owned(),
+        recorded: recorded.to_owned(),
         simulator: simulator.to_owned(),
         running: running.unwrap_or("of an unknown version").to_owned(),
     })
@@ -229,7 +231,8 @@ mod tests {
         let check = |recorded| check_generation(&entry, recorded, "robosuite", Some("1.5.2"));
         check(Some("1.5.2")).unwrap();
         check(Some("1.5.0")).unwrap();
-        for other in [Some("1.4.1"), Some("2.5.2"), Some(""), None] {
+        check(None).unwrap();
+        for other in [Some("1.4.1"), Some("2.5.2"), Some("")] {
             let error = check(other).unwrap_err().to_string();
             assert!(error.contains("a@1") && error.contains("--force"), "{error}");
         }

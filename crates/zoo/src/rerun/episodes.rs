@@ -9,8 +9,8 @@ use super::Rerun;
 use super::report::{EPISODES, RULES, Report};
 use crate::ZooError;
 use crate::entry::Entry;
-use crate::evaluation::{Environment, EvaluationOptions, Perturbation, Subject, differences};
-use crate::results::{EpisodeRecord, Seeds, StoredEvaluation};
+use crate::evaluation::{Environment, EvaluationOptions, Perturbation, Subject};
+use crate::results::{EpisodeRecord, Seeds, StoredEvaluation, differing};
 
 impl Rerun {
     /// Whether outcomes may be another each time, because the policy thinks by the clock; then `report` says so and there
@@ -88,7 +88,7 @@ impl Rerun {
 
     /// Compares what was evaluated now with what is stored, outcome by outcome.
     pub fn compare_episodes(&self, now: &StoredEvaluation, report: &mut Report) {
-        let versions = differences(&self.stored.record, &now.record);
+        let versions = differing(&self.stored.record, &now.record);
         report.add_versions(versions.into_iter().map(|(name, stored, now)| (name, Some(stored), now)));
         match other_rule(self, now) {
             Some(told) => report.differs(RULES, told),

@@ -1,13 +1,13 @@
 //! One evaluation's folder: its life from the first episode to the last.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::record::{EpisodeRecord, EpisodeTiming, EvaluationRecord};
+use super::record::{EpisodeRecord, EpisodeTiming, EvaluationRecord, differing};
 use super::seal::{SEAL_FILE, seal_of};
 use super::tables;
 use crate::ZooError;
@@ -46,7 +46,7 @@ impl StoredEvaluation {
         let outcomes = folder.join(OUTCOMES);
         let sealed = folder.join(SEAL_FILE).exists();
         // a journal beside tables without a seal: killed while they were written, and written again from it
-        if !sealed && (!outcomes.exists() || folder.join(JOURNAL).exists()) {
+        if !is_finished(folder) {
             return Ok(None);
         }
         // before anything is read from the tables
@@ -129,6 +129,11 @@ pub fn result_folders(results: &Path) -> Result<Vec<PathBuf>, ZooError> {
     Ok(folders)
 }
 
+/// Whether every episode is done and sealed. Evaluations from before there were seals have tables and no journal.
+pub(super) fn is_finished(folder: &Path) -> bool {
+    folder.join(SEAL_FILE).exists() || (folder.join(OUTCOMES).exists() && !folder.join(JOURNAL).exists())
+}
+
 /// What an evaluation in `folder` is of, finished or not.
 pub(crate) fn read_record(folder: &Path) -> Result<EvaluationRecord, ZooError> {
     let path = folder.join(RECORD);
@@ -147,6 +152,27 @@ pub(crate) fn read_record(folder: &Path) -> Result<EvaluationRecord, ZooError> {
 struct JournalLine {
     episode: EpisodeRecord,
     timing: EpisodeTiming,
+}
+
+/// An evaluation that differs from another in nothing but the simulator.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OtherSimulator {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// Episodes that it has.
+    pub done: u64,
+    /// In what its simulator is another: name, there and here.
+    pub differing: Vec<(String, String, String)>,
+}
+
+impl std::fmt::Display for OtherSimulator {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { folder, done, differing } = self;
+        let each: Vec<String> =
+            differing.iter().map(|(name, there, here)| format!("{name}: there {there}, here {here}")).collect();
+        let how = if each.is_empty() { "whose sources were not written down".to_owned() } else { each.join("; ") };
+        write!(f, "{done} episodes of another simulator ({how}) stay apart, in {}", folder.display())
+    }
 }
 
 /// An evaluation under way. Holds the folder's lock.
@@ -170,10 +196,8 @@ impl ResultsFolder {
         fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
         let path = folder.join(LOCK);
         let lock = File::create(&path).map_err(ZooError::io("create", &path))?;
-        match lock.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => return Err(ZooError::ResultsBusy { folder }),
-            Err(TryLockError::Error(error)) => return Err(ZooError::io("lock", &path)(error)),
+        if !rollout::try_lock(&lock, &folder).map_err(ZooError::io("lock", &path))? {
+            return Err(ZooError::ResultsBusy { folder });
         }
         sweep(&folder)?;
         let mut own = record.clone();
@@ -214,6 +238,31 @@ impl ResultsFolder {
         Ok(Self { folder, record: own, journal, done, torn: false, _lock: lock })
     }
 
+    /// Evaluations under `results` that are the same but for the simulator, with how many episodes each has: they are kept
+    /// apart from this one.
+    pub fn others(&self, results: &Path) -> Vec<OtherSimulator> {
+        let record = &self.record;
+        let of = |folder: PathBuf| {
+            let other = read_record(&folder).ok().filter(|other| !other.joins(record))?;
+            let alike = |of: &EvaluationRecord| EvaluationRecord {
+                versions: BTreeMap::new(),
+                sources: BTreeMap::new(),
+                ..of.clone()
+            };
+            if !alike(&other).is_same(&alike(record)) {
+                return None;
+            }
+            let done = match StoredEvaluation::read(&folder) {
+                Ok(Some(stored)) => stored.episodes.len(),
+                Ok(None) => read_journal(&folder.join(JOURNAL), &other).map_or(0, |done| done.len()),
+                Err(_) => return None,
+            };
+            let differing = differing(&other, record);
+            (done > 0).then_some(OtherSimulator { folder, done: done as u64, differing })
+        };
+        evaluation_folders(results).unwrap_or_default().into_iter().filter_map(of).collect()
+    }
+
     /// Where it is.
     pub fn path(&self) -> &Path {
         &self.folder
@@ -251,7 +300,7 @@ impl ResultsFolder {
                     shard: self.record.shard,
                     ..record.clone()
                 };
-                seeds(other).is_same(&self.record)
+                seeds(other).joins(&self.record)
             };
             if !read_record(&folder).is_ok_and(|other| same(&other)) {
                 continue;

@@ -72,6 +72,7 @@ fn difference(a: &EvaluationRecord, b: &EvaluationRecord) -> Option<(&'static st
         ("versions", text(&a.versions), text(&b.versions)),
         ("kernels", text(&a.kernels), text(&b.kernels)),
         ("renderer", text(&a.renderer), text(&b.renderer)),
+        ("sources", text(&a.sources), text(&b.sources)),
         ("execution", text(&a.execution), text(&b.execution)),
         ("seeds", text(&a.seeds), text(&b.seeds)),
         ("training", text(&a.training), text(&b.training)),

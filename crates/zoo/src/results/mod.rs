@@ -15,8 +15,9 @@ mod seal;
 mod tables;
 
 pub(crate) use folder::{OUTCOMES, RECORD, evaluation_folders, read_record};
-pub use folder::{ResultsFolder, StoredEvaluation, list_evaluations, result_folders};
+pub use folder::{OtherSimulator, ResultsFolder, StoredEvaluation, list_evaluations, result_folders};
 pub use merge::merge_shards;
+pub(crate) use record::differing;
 pub use record::{
     EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Execution, Protocol, Seeds, Shard, TrainingFacts,
 };

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use rollout::Control;
 use serde::{Deserialize, Serialize};
 
+use super::folder::is_finished;
 use crate::ZooError;
 use crate::files::sha256_hex;
 
@@ -249,6 +250,10 @@ pub struct EvaluationRecord {
     /// of policies that see no pictures, and of evaluations from before it was written down.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub renderer: Option<String>,
+    /// SHA-256 by package of the sources that were imported to simulate: the simulator, what it stands on, the harness.
+    /// Empty in evaluations from before they were written down.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub sources: BTreeMap<String, String>,
 }
 
 impl EvaluationRecord {
@@ -262,11 +267,19 @@ impl EvaluationRecord {
     }
 
     /// Whether both are of one evaluation. Kernels and renderers that only one of them tells, the other being older, tell
-    /// nothing.
+    /// nothing; an evaluation from before sources were written down ran on a simulator as it was released.
     pub fn is_same(&self, other: &Self) -> bool {
         let told = |of: fn(&Self) -> Option<&String>| of(self).zip(of(other)).is_none_or(|(one, two)| one == two);
-        let rest = |of: &Self| Self { kernels: None, renderer: None, ..of.clone() };
-        told(|of| of.kernels.as_ref()) && told(|of| of.renderer.as_ref()) && rest(self) == rest(other)
+        let unknown = self.sources.is_empty() || other.sources.is_empty();
+        let as_released = || self.changed_sources().is_empty() && other.changed_sources().is_empty();
+        let sources = self.sources == other.sources || (unknown && as_released());
+        let rest = |of: &Self| Self { kernels: None, renderer: None, sources: BTreeMap::new(), ..of.clone() };
+        sources && told(|of| of.kernels.as_ref()) && told(|of| of.renderer.as_ref()) && rest(self) == rest(other)
+    }
+
+    /// Whether episodes of both may stand in one row: one evaluation, and the same sources or none known of either.
+    pub fn joins(&self, other: &Self) -> bool {
+        self.sources == other.sources && self.is_same(other)
     }
 
     /// Eight hexadecimal digits, the same for evaluations that differ in nothing but their seeds: an episode of one seed is
@@ -274,6 +287,19 @@ impl EvaluationRecord {
     pub fn conditions(&self) -> String {
         let Self { entry, protocol, execution, versions, .. } = self;
         self.short_hash(&(entry, protocol, execution, versions))
+    }
+
+    /// Which simulator this is, beyond its version: its packages whose sources are not those of a release that is known, with
+    /// the first digits of their sums. The harness and MuJoCo's libraries are left out, which differ between releases of this
+    /// program and between platforms, and so is the environment's module, whose sum is one of the rules.
+    pub fn changed_sources(&self) -> BTreeMap<&str, &str> {
+        let module = self.protocol.env_module.as_deref().and_then(|module| module.split('.').next());
+        let known = |name: &str, sum: &str| {
+            let version = self.versions.get(name).map_or("", String::as_str);
+            RELEASED.contains(&(name, version, sum)) || CARRIERS.contains(&name) || module == Some(name)
+        };
+        let all = self.sources.iter().filter(|(name, sum)| !known(name, sum));
+        all.map(|(name, sum)| (name.as_str(), sum.get(..8).unwrap_or(sum))).collect()
     }
 
     /// The name of its folder: readable, and different for anything that could change an outcome.
@@ -285,21 +311,64 @@ impl EvaluationRecord {
         format!("{entry}_{task}_{seeds}_{hash}{shard}")
     }
 
-    /// Eight digits of a hash over `parts` and, where it is known, over what drew the pictures.
+    /// Eight digits of a hash over `parts` and, where they are known, over what drew the pictures and the sources.
     fn short_hash(&self, parts: &impl Serialize) -> String {
-        let whole = match &self.renderer {
-            None => serde_json::to_vec(parts),
-            Some(renderer) => serde_json::to_vec(&(parts, renderer)),
+        let whole = match (&self.renderer, self.sources.is_empty()) {
+            (None, true) => serde_json::to_vec(parts),
+            (Some(renderer), true) => serde_json::to_vec(&(parts, renderer)),
+            (renderer, false) => serde_json::to_vec(&(parts, renderer, &self.sources)),
         };
         sha256_hex(&whole.expect("plain fields are always JSON"))[..8].to_owned()
     }
 
-    /// Its folder under `results`: where there is only one from before renderers were written down, that one.
+    /// Its folder under `results`: where there is only one from before renderers or sources were written down, that one; the
+    /// latter for a simulator as it was released, and if it is finished: no episode joins those of an unknown simulator.
     pub fn folder_in(&self, results: &Path) -> PathBuf {
         let own = results.join(self.folder_name());
-        let before = results.join(Self { renderer: None, ..self.clone() }.folder_name());
-        if !own.exists() && before.join(super::folder::RECORD).exists() { before } else { own }
+        if own.exists() {
+            return own;
+        }
+        let unknown = Self { sources: BTreeMap::new(), ..self.clone() };
+        let undrawn = |record: &Self| Self { renderer: None, ..record.clone() };
+        let is_there = |folder: &PathBuf| folder.join(super::folder::RECORD).exists();
+        let place = |record: &Self| results.join(record.folder_name());
+        let before = place(&undrawn(self));
+        if is_there(&before) {
+            return before;
+        }
+        let mut older = [place(&unknown), place(&undrawn(&unknown))].into_iter();
+        let fits = |folder: &PathBuf| self.changed_sources().is_empty() && is_there(folder) && is_finished(folder);
+        older.find(fits).unwrap_or(own)
     }
+}
+
+/// Packages whose sums say nothing of which simulator it is: this program's own, and libraries compiled for a platform.
+const CARRIERS: [&str; 2] = ["actrm_harness", "mujoco"];
+
+/// Name, version and sum of simulators as they were released: what evaluations ran on of which no sources are known.
+const RELEASED: [(&str, &str, &str); 1] =
+    [("robosuite", "1.5.2", "0e2527c1748089447b1dd4c381d6761193e5999a5b09b39c297db00056df68ba")];
+
+/// In what two evaluations have other simulators: name, of the first and of the second. Versions; kernels, renderers and
+/// sources, too, where both tell them.
+pub(crate) fn differing(one: &EvaluationRecord, two: &EvaluationRecord) -> Vec<(String, String, String)> {
+    let names = one.versions.keys().chain(two.versions.keys().filter(|name| !one.versions.contains_key(*name)));
+    let of =
+        |record: &EvaluationRecord, name: &str| record.versions.get(name).cloned().unwrap_or_else(|| "none".into());
+    let told = |name: &str, of: fn(&EvaluationRecord) -> Option<&String>| {
+        let both = of(one).cloned().zip(of(two).cloned());
+        both.map(|(one, two)| (name.to_owned(), one, two))
+    };
+    let sources = one.sources.iter().filter_map(|(name, sum)| {
+        let short = |sum: &String| format!("sources {}", sum.get(..8).unwrap_or(sum));
+        Some((name.clone(), short(sum), short(two.sources.get(name)?)))
+    });
+    let all = names
+        .map(|name| (name.clone(), of(one, name), of(two, name)))
+        .chain(told("kernels", |record| record.kernels.as_ref()))
+        .chain(told("renderer", |record| record.renderer.as_ref()))
+        .chain(sources);
+    all.filter(|(_, one, two)| one != two).collect()
 }
 
 /// The outcome of one episode: depends on task, seed, entry and protocol alone.
@@ -435,6 +504,7 @@ pub(crate) mod tests {
             versions: versions.map(|(name, v)| (name.to_owned(), v.to_owned())).into(),
             kernels: None,
             renderer: None,
+            sources: BTreeMap::new(),
         }
     }
 
@@ -519,10 +589,46 @@ pub(crate) mod tests {
         assert_eq!(other.folder_in(dir.path()), dir.path().join(old.folder_name()));
     }
 
+    /// Episodes of two simulators never come together; what was finished before sources were written down is an answer still.
+    #[test]
+    fn another_simulator_is_another_evaluation_and_a_finished_one_of_before_is_found() {
+        let dir = tempfile::tempdir().unwrap();
+        let old = sample("a", 1, 20);
+        let with = |sum: &str| EvaluationRecord { sources: [("robosuite".into(), sum.into())].into(), ..old.clone() };
+        let (one, other) = (with(RELEASED[0].2), with(&"1".repeat(64)));
+        assert!(!one.is_same(&other) && one.is_same(&old) && old.is_same(&one));
+        assert!(!other.is_same(&old) && !old.is_same(&other), "it was not run on this one");
+        assert!(!one.joins(&old) && !one.joins(&other) && one.joins(&one.clone()) && old.joins(&old.clone()));
+        assert!(one.folder_name() != other.folder_name() && one.conditions() != other.conditions());
+        // under way: an episode of a known simulator does not join those of an unknown one
+        drop(super::super::folder::ResultsFolder::open(dir.path(), &old).unwrap());
+        assert_eq!(one.folder_in(dir.path()), dir.path().join(one.folder_name()));
+        super::super::folder::tests::finished(dir.path(), &old);
+        assert_eq!(one.folder_in(dir.path()), dir.path().join(old.folder_name()));
+        assert_eq!(other.folder_in(dir.path()), dir.path().join(other.folder_name()));
+        drop(super::super::folder::ResultsFolder::open(&dir.path().join("new"), &one).unwrap());
+        assert_eq!(other.folder_in(&dir.path().join("new")), dir.path().join("new").join(other.folder_name()));
+        // what it drew counts as before
+        let drawn = EvaluationRecord { renderer: Some("llvmpipe".into()), ..one.clone() };
+        assert_eq!(drawn.folder_in(dir.path()), dir.path().join(old.folder_name()));
+        assert_eq!(other.changed_sources(), [("robosuite", "11111111")].into());
+        let mut module = other.clone();
+        module.protocol.env_module = Some("robosuite.mine".into());
+        assert!(module.changed_sources().is_empty());
+        let released = |name: &str, version: &str, sum: &str| {
+            let mut record = EvaluationRecord { sources: [(name.into(), sum.into())].into(), ..old.clone() };
+            record.versions.insert(name.into(), version.into());
+            record.changed_sources().is_empty()
+        };
+        let (name, version, sum) = RELEASED[0];
+        assert!(released(name, version, sum) && !released(name, "1.5.3", sum) && !released("other", version, sum));
+        assert!(released("actrm_harness", "1", "00") && old.changed_sources().is_empty());
+    }
+
     #[test]
     fn whatever_can_change_an_outcome_changes_the_folder() {
         let first = sample("a", 1, 20);
-        let changes: [fn(&mut EvaluationRecord); 11] = [
+        let changes: [fn(&mut EvaluationRecord); 13] = [
             |r| r.entry.hash = "0".repeat(64),
             |r| r.entry.version = 2,
             |r| r.protocol.max_steps = 401,
@@ -534,6 +640,8 @@ pub(crate) mod tests {
             |r| r.seeds.count = 21,
             |r| drop(r.versions.insert("mujoco".into(), "3.3.8".into())),
             |r| r.shard = Some(Shard { index: 1, count: 2 }),
+            |r| drop(r.sources.insert("robosuite".into(), "0".repeat(64))),
+            |r| drop(r.sources.insert("robosuite".into(), "1".repeat(64))),
         ];
         let mut names = vec![first.folder_name()];
         for change in changes {

@@ -1,6 +1,6 @@
 //! The folder of a run: `runs/<experiment>/<number>/`, one training at a time.
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use crate::ZooError;
@@ -87,16 +87,13 @@ impl RunFolder {
     fn lock(path: PathBuf) -> Result<Self, ZooError> {
         let file_path = path.join("lock");
         let file = File::create(&file_path).map_err(ZooError::io("create", &file_path))?;
-        match file.try_lock() {
-            Ok(()) => {
-                let folder = Self { path, _lock: file };
-                sweep(&folder.path)?;
-                sweep(&folder.checkpoints())?;
-                Ok(folder)
-            }
-            Err(TryLockError::WouldBlock) => Err(ZooError::RunLocked { folder: path }),
-            Err(TryLockError::Error(e)) => Err(ZooError::io("lock", file_path)(e)),
+        if !rollout::try_lock(&file, &path).map_err(ZooError::io("lock", file_path))? {
+            return Err(ZooError::RunLocked { folder: path });
         }
+        let folder = Self { path, _lock: file };
+        sweep(&folder.path)?;
+        sweep(&folder.checkpoints())?;
+        Ok(folder)
     }
 
     /// Removes what a run that never began has put here, and the folders that are empty without it. Files of others

@@ -1,6 +1,6 @@
 //! Which runs there are under a folder: what is training, what was stopped and can go on, what is finished.
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -86,10 +86,9 @@ fn state(folder: &Path) -> Result<RunState, ZooError> {
     let path = folder.join("lock");
     let Ok(lock) = File::open(&path) else { return Ok(RunState::Stopped) };
     // shared, and given back at once
-    match lock.try_lock_shared() {
-        Ok(()) => Ok(RunState::Stopped),
-        Err(TryLockError::WouldBlock) => Ok(RunState::Training),
-        Err(TryLockError::Error(error)) => Err(ZooError::io("lock", path)(error)),
+    match rollout::try_lock_shared(&lock, folder).map_err(ZooError::io("lock", path))? {
+        true => Ok(RunState::Stopped),
+        false => Ok(RunState::Training),
     }
 }
 

@@ -154,6 +154,9 @@ impl<'a> Told<'a> {
                 .filter(|(name, version)| theirs.versions.get(*name) != Some(*version))
                 .map(|(name, version)| format!("{name} {version}"))
                 .collect();
+            if mine.changed_sources() != theirs.changed_sources() {
+                parts.extend(mine.changed_sources().iter().map(|(name, sum)| format!("{name} sources {sum}")));
+            }
             if mine.execution != theirs.execution {
                 parts.push(row.execution_text());
             }

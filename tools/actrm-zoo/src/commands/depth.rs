@@ -170,6 +170,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 screen.begin_at(format!("{} steps", thinking.steps.unwrap_or_default()), done, total);
             }
             Progress::Episode(_) => screen.step(),
+            Progress::Apart(other) => screen.note(&format!("note: {other}")),
         });
         drop(screen);
         match end.with_context(|| format!("entry {}", entry.id()))? {

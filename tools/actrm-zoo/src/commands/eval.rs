@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, Stop, limits, shown};
 use models::FeatureKind;
 use report::{COLUMNS, LeaderboardRow, json};
-use rollout::{Pool, remembered_greeting};
+use rollout::{Pool, Ready, remembered_greeting};
 use serde_json::{Value, json};
 use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
 use zoo::evaluation::{
@@ -217,6 +217,18 @@ fn note_other_module(meta: &EntryMeta, running: Option<&str>) {
     }
 }
 
+/// Says so where nobody wrote down which simulator the demonstrations were recorded in.
+fn note_unrecorded(meta: &EntryMeta, ready: &Ready) {
+    if meta.env_version.is_none() {
+        let (id, simulator, rate) = (meta.id(), &ready.simulator, ready.control_freq);
+        let version = ready.simulator_version().unwrap_or("of an unknown version");
+        cli::note(&format!(
+            "note: {id}: version and control frequency of its demonstrations' simulator are not recorded; this is \
+             {simulator} {version} at {rate} Hz"
+        ));
+    }
+}
+
 /// An entry whose policy is to be evaluated; one that solves puzzles is evaluated at once.
 fn open(
     args: &Args,
@@ -293,6 +305,7 @@ fn evaluate_on(
     let Some(mut pool) = args.run.simulator.start(spec, args.run.worker_logs.clone(), stop)? else { return Ok(()) };
     for entry in entries {
         note_other_module(entry.entry().meta(), pool.ready().module_sha256.as_deref());
+        note_unrecorded(entry.entry().meta(), pool.ready());
     }
     for subject in &subjects {
         if let Err(error) = evaluate_entry((args, asked), &options, subject, &mut pool, stop, says) {

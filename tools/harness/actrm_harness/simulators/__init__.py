@@ -7,9 +7,13 @@ function `prepare()`, if there is one, sets what has to be set before anybody im
 
 import importlib
 import importlib.util
+import math
 from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
+import numpy as np
+
+from actrm_harness.protocol import RequestError
 from actrm_harness.tasks import Task
 from actrm_harness.wire import Array, Tensors
 
@@ -49,6 +53,8 @@ class Description:
     """Which kernels numpy's linear algebra runs, where that can be told."""
     renderer: str | None = None
     """What draws the pictures, where there are cameras."""
+    packages: frozenset[str] = frozenset()
+    """Top-level modules that decide what happens, beside those of the simulation's class and of the simulator's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +133,26 @@ class Simulation(Protocol):
     def image(self, camera: str, height: int, width: int) -> Array:
         """What a camera sees now: U8 of (height, width, 3)."""
         ...
+
+
+def packages(thing: object) -> frozenset[str]:
+    """The top-level modules that define the class of `thing`."""
+    return frozenset(each.__module__.split(".")[0] for each in type(thing).__mro__)
+
+
+def verdict(value: object) -> bool:
+    """Whether the task is solved; RequestError where the environment says neither yes nor no."""
+    if isinstance(value, float | np.floating) and not math.isfinite(value):
+        raise RequestError("environment", f"the environment's success is {float(value)}, neither true nor false")
+    return bool(value)
+
+
+def finite(what: str, values: Array) -> Array:
+    """Numbers that the environment gave; RequestError where one of them is none."""
+    if not np.isfinite(values).all():
+        step = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise RequestError("environment", f"the environment's {what} is {float(values.flat[step])} (step {step + 1})")
+    return values
 
 
 def start(options: Options) -> Simulation:

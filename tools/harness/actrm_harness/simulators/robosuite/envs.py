@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import numpy as np
 
 from actrm_harness.protocol import RequestError
+from actrm_harness.simulators import verdict
 from actrm_harness.simulators.robosuite import lean, suite
 from actrm_harness.simulators.robosuite.stages import Stage, stages
 from actrm_harness.simulators.robosuite.suite import Env
@@ -341,7 +342,7 @@ def _once(judge: Callable[[], Any], name: str, verdicts: dict[str, Any]) -> Call
 
 def success(env: Env) -> bool:
     """Whether the task is solved in the current state."""
-    return bool(env._check_success())  # pyright: ignore[reportPrivateUsage]
+    return verdict(env._check_success())  # pyright: ignore[reportPrivateUsage]
 
 
 def failure(env: Env) -> str | None:

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped, Stored
+from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped, Stored, packages
 from actrm_harness.simulators.robosuite import control, envs, episodes, suite
 from actrm_harness.wire import Array
 
@@ -37,6 +37,7 @@ class Robosuite:
         """Versions, shapes and the environment's arguments."""
         env = self.session.env
         low, high = env.action_spec
+        models = [getattr(robot, "robot_model", None) for robot in env.robots]
         return Description(
             env_name=self.session.task.name,
             control="robosuite" if self.session.control is None else "compiled",
@@ -55,6 +56,7 @@ class Robosuite:
             stages=[name for name, _ in self.session.stages],
             kernels=kernels(),
             renderer=envs.renderer(self.session).name() if self.session.cameras else None,
+            packages=frozenset({"mujoco"}).union(*map(packages, (env, *env.robots, *models))),
         )
 
     def reset(self, seed: int, demonstration: bool) -> Initial:

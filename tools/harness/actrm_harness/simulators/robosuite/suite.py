@@ -6,6 +6,7 @@ module imports the simulator; `prepare` must have run before (it sets what they 
 
 import importlib
 import os
+import tempfile
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -65,11 +66,24 @@ class Env(Protocol):
 
 
 def cache_dir() -> Path:
-    """Where compiled numba functions are kept, shared by all workers of a user."""
+    """Where compiled numba functions are kept, shared by all workers of a user; a new folder where no such place is.
+
+    Rust names a place (`NUMBA_CACHE_DIR`); this is for workers that are started by hand.
+    """
     base = os.environ.get("ACTRM_CACHE")
-    if base:
-        return Path(base)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "actrm"
+    places = [Path(base)] if base else []
+    if xdg := os.environ.get("XDG_CACHE_HOME"):
+        places.append(Path(xdg) / "actrm")
+    places.append(Path(os.path.expanduser("~")) / ".cache" / "actrm")
+    for place in places:
+        folder = place / "numba"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return Path(tempfile.mkdtemp(prefix="actrm-numba-"))
 
 
 def prepare() -> None:
@@ -80,9 +94,7 @@ def prepare() -> None:
     """
     os.environ["MUJOCO_GL"] = "disable"
     if "NUMBA_CACHE_DIR" not in os.environ:
-        folder = cache_dir() / "numba"
-        folder.mkdir(parents=True, exist_ok=True)
-        os.environ["NUMBA_CACHE_DIR"] = str(folder)
+        os.environ["NUMBA_CACHE_DIR"] = str(cache_dir())
 
 
 def robosuite() -> Any:
