@@ -315,3 +315,66 @@ fn episodes_and_demonstrations_become_videos() {
     refused(eval(&entries, "1", &["--video", "1"]).env("MUJOCO_GL", "glx"), &["egl or osmesa"]);
     assert!(!at("none.mp4").exists());
 }
+
+/// A copy of robosuite under `folder`, made of links but for `lift.py`, whose cube has to be lifted by 1 m.
+fn shadow_of_robosuite(folder: &Path) {
+    let python = std::env::var("ACTRM_PYTHON").unwrap_or_else(|_| {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../.venv/bin/python").to_str().expect("text").to_owned()
+    });
+    let script = "import importlib.util as u; print(u.find_spec('robosuite').submodule_search_locations[0])";
+    let package = said(Command::new(python).args(["-c", script]));
+    let (mut from, mut to) = (PathBuf::from(package.trim()), folder.join("robosuite"));
+    for inside in ["environments", "manipulation", "lift.py"] {
+        fs::create_dir(&to).expect("a folder");
+        for entry in fs::read_dir(&from).expect("a package").flatten() {
+            let name = entry.file_name();
+            if name != inside && name != "__pycache__" {
+                std::os::unix::fs::symlink(entry.path(), to.join(name)).expect("a link");
+            }
+        }
+        (from, to) = (from.join(inside), to.join(inside));
+    }
+    let source = fs::read_to_string(from).expect("robosuite's lift.py");
+    let changed = source.replace("cube_height > table_height + 0.04", "cube_height > table_height + 1.0");
+    assert_ne!(source, changed, "robosuite says otherwise what success is");
+    fs::write(to, changed).expect("a file");
+}
+
+/// The same version under another success: its episodes join none of the installed simulator's, and say whose they are.
+#[test]
+fn another_simulator_of_the_same_version_is_kept_apart() {
+    let (folder, entries) = copied_zoo();
+    shadow_of_robosuite(folder.path());
+    let results = entries.join("told");
+    let command = |shadow: bool, episodes: &str| {
+        let mut command = eval(&entries, episodes, &["--workers", "1", "--results", text(&results)]);
+        if shadow {
+            command.env("PYTHONPATH", folder.path());
+        }
+        command
+    };
+    said(&mut command(false, "3"));
+    // not shown as the answer, and nothing of it taken over
+    let output = succeeds(&mut command(true, "3"));
+    let (out, error) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(!out.contains("evaluated before"), "{out}");
+    assert!(error.contains("3 episodes of another simulator (robosuite: there sources"), "{error}");
+    said(&mut command(true, "4"));
+    let sources = |name: &String| {
+        let record = fs::read(results.join(name).join("evaluation.json")).expect("a record");
+        let record: serde_json::Value = serde_json::from_slice(&record).expect("JSON");
+        assert_eq!(record["versions"]["robosuite"], "1.5.2");
+        record["sources"]["robosuite"].as_str().expect("a sum").to_owned()
+    };
+    let sums: Vec<String> = listing(&results).iter().map(sources).collect();
+    let kinds: std::collections::BTreeSet<&String> = sums.iter().collect();
+    assert_eq!((sums.len(), kinds.len()), (3, 2), "{sums:?}");
+    // each is shown again to its own simulator
+    for shadow in [false, true] {
+        let again = said(&mut command(shadow, "3"));
+        assert!(again.contains("evaluated before"), "{again}");
+    }
+    assert_eq!(listing(&results).len(), 3);
+    let table = said(&mut zoo(["leaderboard", "--json", "--zoo", text(&entries), "--results", text(&results)]));
+    assert!(table.contains("(sources "), "{table}");
+}

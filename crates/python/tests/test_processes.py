@@ -38,6 +38,78 @@ def test_data_and_policies_cross_into_other_processes(lift: Path, zoo: Path, met
     assert [process.exitcode for process in processes] == [0, 0]
 
 
+def fly(queue: multiprocessing.Queue) -> None:
+    """A simulator of this process's own: the first observation, by seed alone."""
+    pytest.importorskip("gymnasium")
+    from actrm.envs import RobotEnv
+
+    env = RobotEnv("Lift")
+    observation, info = env.reset(seed=5)
+    env.step(np.zeros(7, np.float32))
+    env.close()
+    queue.put((info["fingerprint"], observation["observation.state"]))
+
+
+def use_anothers(env: object, queue: multiprocessing.Queue) -> None:
+    try:
+        env.reset(seed=5)  # pyright: ignore
+    except actrm.Error as error:
+        queue.put(str(error))
+    del env
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_simulators_run_in_other_processes(method: str) -> None:
+    """After this process has started one of its own: its threads do not exist in a fork."""
+    pytest.importorskip("gymnasium")
+    from actrm.envs import RobotEnv
+
+    env = RobotEnv("Lift")
+    fingerprint = env.reset(seed=5)[1]["fingerprint"]
+    context = multiprocessing.get_context(method)
+    queue = context.Queue()
+    processes = [context.Process(target=fly, args=(queue,)) for _ in range(2)]
+    [process.start() for process in processes]
+    assert [queue.get(timeout=240)[0] for _ in processes] == [fingerprint] * 2
+    [process.join(60) for process in processes]
+    assert [process.exitcode for process in processes] == [0, 0]
+    # and this one's still answers
+    assert env.reset(seed=5)[1]["fingerprint"] == fingerprint
+    env.close()
+
+
+def test_a_simulator_of_the_process_before_a_fork_is_refused_and_lives_on() -> None:
+    pytest.importorskip("gymnasium")
+    from actrm.envs import RobotEnv
+
+    env = RobotEnv("Lift")
+    fingerprint = env.reset(seed=5)[1]["fingerprint"]
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    process = context.Process(target=use_anothers, args=(env, queue))
+    process.start()
+    assert "forked" in queue.get(timeout=60)
+    process.join(60)
+    assert process.exitcode == 0
+    assert env.reset(seed=5)[1]["fingerprint"] == fingerprint
+    env.close()
+
+
+def test_gymnasium_s_vector_environments_run_in_forks() -> None:
+    gymnasium = pytest.importorskip("gymnasium")
+    import actrm.envs
+
+    make = actrm.envs.RobotEnv
+    alone = make("Lift")
+    state = alone.reset(seed=3)[0]["observation.state"]
+    both = gymnasium.vector.AsyncVectorEnv([lambda: make("Lift"), lambda: make("Lift")], context="fork")
+    seen, _ = both.reset(seed=[3, 4])
+    np.testing.assert_array_equal(seen["observation.state"][0], state)
+    both.step(np.zeros((2, 7), np.float32))
+    both.close()
+    alone.close()
+
+
 def ask_on(batches: Iterator[dict[str, object]], queue: multiprocessing.Queue) -> None:
     try:
         next(batches)

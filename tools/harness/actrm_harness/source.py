@@ -13,7 +13,9 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-CONTENT = frozenset({".py", ".xml", ".mjcf", ".urdf", ".xacro", ".json", ".yaml", ".yml", ".so", ".dylib", ".dll", ".pyd"})
+CONTENT = frozenset(
+    {".py", ".xml", ".mjcf", ".urdf", ".xacro", ".json", ".yaml", ".yml", ".so", ".dylib", ".dll", ".pyd"}
+)
 """Files whose content counts: code, models, configurations, libraries."""
 SIZE = frozenset({".obj", ".stl", ".msh", ".dae", ".mtl", ".png", ".jpg", ".jpeg"})
 """Meshes and textures, of which name and size count: robosuite has half a gigabyte of them."""
@@ -41,7 +43,7 @@ def digest(module: str) -> str | None:
 
 
 def sums(names: Iterable[str]) -> dict[str, str]:
-    """SHA-256 of each of these top-level modules as imported, or as they would be; those that nobody finds are left out.
+    """SHA-256 of each of these top-level modules as imported, or as they would be; what nobody finds is left out.
 
     A package counts with every file below its folders: `CONTENT` by content, `SIZE` by size, nothing else, and with
     those of its modules that were imported from elsewhere.
@@ -86,11 +88,12 @@ def _files(name: str) -> dict[str, str]:
                     path = os.path.join(parent, each)
                     prefix = f"{number}/" if number else ""
                     files[prefix + os.path.relpath(path, folder).replace(os.sep, "/")] = path
-    inside = tuple(os.path.join(folder, "") for folder in folders)
-    for module in list(sys.modules):
-        path = _file(module) if module.startswith(f"{name}.") else None
-        if path is not None and not str(path).startswith(inside):
-            files[f"{module} from elsewhere"] = str(path)
+    # by the names that they were imported by: an installation may be made of links
+    own = tuple(os.path.join(folder, "") for folder in folders)
+    for module, loaded in list(sys.modules.items()):
+        path = getattr(loaded, "__file__", None) if module.startswith(f"{name}.") else None
+        if isinstance(path, str) and path.endswith(".py") and not os.path.abspath(path).startswith(own):
+            files[f"{module} from elsewhere"] = path
     return files
 
 
@@ -107,8 +110,8 @@ def _place(name: str) -> tuple[list[str], str | None]:
         if spec is None:
             return [], None
         folders, file = spec.submodule_search_locations, spec.origin
-    real = [os.path.realpath(folder) for folder in folders or ()]
-    return real, file if isinstance(file, str) and os.path.isfile(file) else None
+    paths = [os.path.abspath(folder) for folder in folders or ()]
+    return paths, file if isinstance(file, str) and os.path.isfile(file) else None
 
 
 def _suffix(name: str) -> str:

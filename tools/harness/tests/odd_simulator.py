@@ -50,6 +50,16 @@ def start(options: Options) -> Odd:
     return Odd(task=options.task.name)
 
 
-NAMES = ("Unlimited", "NanLimit", "ResetHangs", "StepHangs", "NanMeta", "NanReward", "NanSuccess", "NanProgress", "NanSeen")
+NAMES = (
+    "Unlimited",
+    "NanLimit",
+    "ResetHangs",
+    "StepHangs",
+    "NanMeta",
+    "NanReward",
+    "NanSuccess",
+    "NanProgress",
+    "NanSeen",
+)
 for name in NAMES:
     register(Task(name, simulator=__name__, max_steps=30))

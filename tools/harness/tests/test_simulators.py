@@ -162,7 +162,7 @@ def test_what_is_no_number_is_the_environments_error_and_the_worker_stays(task: 
 
 def test_descriptions_that_are_no_json_are_the_environments_error() -> None:
     client = Client("--task", "NanMeta", "--env-module", "odd_simulator", env=PATHS)
-    with pytest.raises(WorkerError, match="environment: reset: .*cannot be sent"):
+    with pytest.raises(WorkerError, match=r"environment: reset: .*cannot be sent"):
         client.ask("reset", seed=1)
     assert client.close() == 0
 
@@ -191,7 +191,9 @@ def test_a_humanoid_is_stepped() -> None:
 
 
 def test_a_success_of_robosuite_that_is_no_number_is_named(tmp_path: Path) -> None:
-    (tmp_path / "nowhere.py").write_text((HERE / "example_env.py").read_text().replace("return height >", "return np.nan + "))
+    (tmp_path / "nowhere.py").write_text(
+        (HERE / "example_env.py").read_text().replace("return height >", "return np.nan + ")
+    )
     paths = {"PYTHONPATH": f"{tmp_path}:{HERE.parent}"}
     client = Client("--task", "LiftHigh", "--env-module", "nowhere", env=paths)
     client.ask("reset", seed=1)

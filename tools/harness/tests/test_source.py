@@ -19,7 +19,9 @@ def summed(folder: Path, *names: str) -> dict[str, str]:
 
 def imported(folder: Path, name: str, first: str = "") -> dict[str, str]:
     """What is said of a package that was imported."""
-    script = f"{first}\nimport {name}, json\nfrom actrm_harness import source\nprint(json.dumps(source.sums(['{name}'])))"
+    script = (
+        f"{first}\nimport {name}, json\nfrom actrm_harness import source\nprint(json.dumps(source.sums(['{name}'])))"
+    )
     said = subprocess.run(
         [sys.executable, "-c", script],
         env={"PYTHONPATH": f"{folder}:{HARNESS}"},
@@ -44,7 +46,12 @@ def test_a_package_is_its_code_its_models_and_the_sizes_of_its_meshes(tmp_path: 
     (package / ".hidden.py").write_text("nothing\n")
     assert summed(tmp_path, "world") == first
     seen = {first["world"]}
-    changes = {"rules.py": b"HEIGHT = 0.05\n", "assets/arena.xml": b"<mujoco />", "assets/cube.stl": b"123456", "more.py": b""}
+    changes = {
+        "rules.py": b"HEIGHT = 0.05\n",
+        "assets/arena.xml": b"<mujoco />",
+        "assets/cube.stl": b"123456",
+        "more.py": b"",
+    }
     for name, content in changes.items():
         (package / name).write_bytes(content)
         seen.add(summed(tmp_path, "world")["world"])

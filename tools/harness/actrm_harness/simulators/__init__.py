@@ -54,7 +54,7 @@ class Description:
     renderer: str | None = None
     """What draws the pictures, where there are cameras."""
     packages: frozenset[str] = frozenset()
-    """Top-level modules that decide what happens, beside those of the simulation's class and of the simulator's name."""
+    """Modules that decide what happens, beside those of the simulation's class and of the simulator's name."""
 
 
 @dataclass(frozen=True, slots=True)
