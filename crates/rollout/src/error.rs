@@ -115,10 +115,10 @@ pub enum RolloutError {
     },
     /// Several episodes hang, each on its own worker.
     #[error(
-        "task {task:?}: episodes of {} seeds ({}) hang, the last one: {fault}; \
-         see what the environment does then, or allow it more time with --step-timeout",
+        "task {task:?}: episodes of {} seeds ({}) hang, the last one: {fault}; see what the environment does then{}",
         seeds.len(),
-        seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")
+        seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", "),
+        if fault.phase == "step" { ", or allow it more time (--step-timeout)" } else { "" }
     )]
     Hangs {
         /// The task.

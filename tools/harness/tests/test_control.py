@@ -95,10 +95,12 @@ def test_where_a_contact_tips_robosuite_leaves_itself_as_the_compiled_loop_leave
         actions[-1][2::7] -= 0.3 if index < 20 else 0.0
     plain, ours = envs.make("TwoArmTransport").env, envs.make("TwoArmTransport").env
     compiled = attached(ours)
-    seeded(plain, 17), seeded(ours, 17)
+    seeded(plain, 17)
+    seeded(ours, 17)
     apart: list[float] = []
     for step in actions:
-        plain.step(step), compiled.step(step)
+        plain.step(step)
+        compiled.step(step)
         apart.append(distance(plain, ours))
     assert max(apart[:10]) < 1e-12 and apart[10] < 1e-5, apart
     itself: list[float] = []

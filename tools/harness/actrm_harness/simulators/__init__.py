@@ -7,7 +7,6 @@ function `prepare()`, if there is one, sets what has to be set before anybody im
 
 import importlib
 import importlib.util
-import math
 from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
@@ -140,10 +139,12 @@ def packages(thing: object) -> frozenset[str]:
     return frozenset(each.__module__.split(".")[0] for each in type(thing).__mro__)
 
 
-def verdict(value: object) -> bool:
+def verdict(value: Any) -> bool:
     """Whether the task is solved; RequestError where the environment says neither yes nor no."""
-    if isinstance(value, float | np.floating) and not math.isfinite(value):
-        raise RequestError("environment", f"the environment's success is {float(value)}, neither true nor false")
+    if not isinstance(value, bool | np.bool_):
+        number: Array = np.asarray(value)
+        if number.dtype.kind == "f" and not np.isfinite(number).all():
+            raise RequestError("environment", f"the environment's success is {number.tolist()}, neither true nor false")
     return bool(value)
 
 

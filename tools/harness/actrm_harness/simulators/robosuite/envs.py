@@ -219,6 +219,13 @@ def reset(session: Session, seed: int, demonstration: bool = False) -> Tensors:
     return {**observation(env, raw), **images(session)}
 
 
+def compile_control(env: Env) -> None:
+    """Let numba compile what robosuite's own loop calls, which takes longer than a step may; a reset undoes it."""
+    for robot in env.robots:
+        for policy_step in (True, False):
+            robot.control(np.zeros(robot.action_dim), policy_step=policy_step)
+
+
 def slim(session: Session) -> None:
     """Give back what only writing the model as MJCF needs, where the model is kept; loading it again restores it."""
     if session.task.soft_reset and not session.xml_forgotten:

@@ -38,13 +38,16 @@ class Robosuite:
         env = self.session.env
         low, high = env.action_spec
         models = [getattr(robot, "robot_model", None) for robot in env.robots]
+        seen = {name: list(value.shape) for name, value in envs.reset(self.session, 0).items()}
+        if self.session.control is None:
+            envs.compile_control(env)
         return Description(
             env_name=self.session.task.name,
             control="robosuite" if self.session.control is None else "compiled",
             control_freq=int(env.control_freq),
             action_low=low,
             action_high=high,
-            observations={name: list(value.shape) for name, value in envs.reset(self.session, 0).items()},
+            observations=seen,
             versions={
                 "robosuite": suite.robosuite().__version__,
                 "mujoco": suite.mujoco().__version__,
