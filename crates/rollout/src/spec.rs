@@ -186,7 +186,7 @@ pub struct TimeLimits {
 impl Default for TimeLimits {
     fn default() -> Self {
         Self {
-            start: Duration::from_secs(180),
+            start: Duration::from_secs(300),
             reset: Duration::from_secs(60),
             step: Duration::from_secs(30),
             episode: Duration::from_secs(300),

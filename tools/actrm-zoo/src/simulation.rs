@@ -35,7 +35,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "S", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     step_timeout: u64,
     /// Seconds that a worker may take to start: imports, compilation, making the environment
-    #[arg(long, value_name = "S", default_value_t = 180, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    #[arg(long, value_name = "S", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     start_timeout: u64,
     /// Keep what workers say on standard error in this folder
     #[arg(long, value_name = "DIR")]
