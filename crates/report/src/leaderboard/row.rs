@@ -379,9 +379,15 @@ impl LeaderboardRow {
         steps
     }
 
-    /// `mujoco 3.3.7, robosuite 1.5.2, ...`
+    /// `mujoco 3.3.7, robosuite 1.5.2, ...`, with the sources' sum where they are not those of the release.
     pub fn versions_text(&self) -> String {
-        let each: Vec<String> = self.record().versions.iter().map(|(name, v)| format!("{name} {v}")).collect();
+        let mut changed = self.record().changed_sources();
+        let version = |(name, version): (&String, &String)| match changed.remove(name.as_str()) {
+            Some(sum) => format!("{name} {version} (sources {sum})"),
+            None => format!("{name} {version}"),
+        };
+        let mut each: Vec<String> = self.record().versions.iter().map(version).collect();
+        each.extend(changed.into_iter().map(|(name, sum)| format!("{name} (sources {sum})")));
         each.join(", ")
     }
 
