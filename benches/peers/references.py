@@ -245,7 +245,7 @@ def evaluate(cell: Cell, said: dict[str, Any], checkpoint: Path, demonstrations:
 
     out = RESULTS / f"{cell.name}.json"
     settings = experiment(said["experiment"])
-    info = json.loads((converted(cell.task, settings, demonstrations) / "meta" / "info.json").read_text())["actrm"]
+    info = json.loads((converted(cell.task, settings, demonstrations) / "actrm" / "info.json").read_text())
     if info["source_sha256"] != said["demonstrations_sha256"]:
         raise SystemExit(f"{WORK / 'data' / cell.task}: not of the demonstrations that {cell.name} learned from")
     about = {"format": 1, "training": said, "data_fingerprint": info["fingerprint"]}

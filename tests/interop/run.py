@@ -616,7 +616,7 @@ def study_on_ray(folder: Path) -> str:
 def main() -> None:
     """Run every check; the first difference ends it."""
     python_door.install()
-    # LeRobot warns of video decoders that are not needed here, and of our entry in info.json
+    # LeRobot warns of video decoders that are not needed here
     logging.disable(logging.WARNING)
     source = ROOT / "data" / "lift.hdf5"
     with tempfile.TemporaryDirectory() as name:

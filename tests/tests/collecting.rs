@@ -48,9 +48,9 @@ fn killed_and_run_again_it_writes_the_same_bytes_and_leaves_nothing_else() {
     // the seeds that its attempts used go with the demonstrations, so that no evaluation begins as they did
     let set = folder.path().join("set");
     succeeds(&mut data(["convert", text(&straight), text(&set)]));
-    let info = fs::read(set.join("meta/info.json")).expect("a data set");
-    let info: serde_json::Value = serde_json::from_slice(&info).expect("JSON");
-    let seeds = info["actrm"]["seeds"].as_str().expect("the seeds are recorded");
+    let origin = fs::read(set.join("actrm/info.json")).expect("a data set");
+    let origin: serde_json::Value = serde_json::from_slice(&origin).expect("JSON");
+    let seeds = origin["seeds"].as_str().expect("the seeds are recorded");
     let (first, last) = seeds.split_once('-').expect("FIRST-LAST");
     assert_eq!(first, "1000000");
     assert!((1_000_002..1_000_100).contains(&last.parse::<u64>().expect("a seed")), "{seeds}");
@@ -68,9 +68,9 @@ fn which_expert_recorded_demonstrations_goes_with_them() {
     refused(&mut one("Lift", "recoveries"), &["Lift", "recoveries", "known: none"]);
     succeeds(&mut one("StackColor", "recoveries"));
     succeeds(&mut data(["convert", text(&file), text(&set)]));
-    let info = fs::read(set.join("meta/info.json")).expect("a data set");
-    let info: serde_json::Value = serde_json::from_slice(&info).expect("JSON");
-    assert_eq!(info["actrm"]["expert"], "recoveries");
+    let origin = fs::read(set.join("actrm/info.json")).expect("a data set");
+    let origin: serde_json::Value = serde_json::from_slice(&origin).expect("JSON");
+    assert_eq!(origin["expert"], "recoveries");
     // back in the file it says so, too
     let again = folder.path().join("again.hdf5");
     succeeds(&mut data(["export", text(&set), text(&again)]));
@@ -114,9 +114,9 @@ fn who_showed_demonstrations_goes_with_them() {
 
     let (set, again) = (place("set"), place("again.hdf5"));
     succeeds(&mut data(["convert", text(&mixed), text(&set)]));
-    let info = fs::read(set.join("meta/info.json")).expect("a data set");
-    let info: serde_json::Value = serde_json::from_slice(&info).expect("JSON");
-    assert_eq!(info["actrm"]["skill"], "mixed");
+    let origin = fs::read(set.join("actrm/info.json")).expect("a data set");
+    let origin: serde_json::Value = serde_json::from_slice(&origin).expect("JSON");
+    assert_eq!(origin["skill"], "mixed");
     succeeds(&mut data(["export", text(&set), text(&again)]));
     assert_eq!(shown_by(&again), who);
 }

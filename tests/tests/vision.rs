@@ -75,9 +75,9 @@ fn weights(zoo_folder: &Path) -> Vec<u8> {
 #[test]
 fn from_cameras_to_the_leaderboard() {
     let entries = trained().join("zoo");
-    let info: Value =
-        serde_json::from_slice(&fs::read(seen().join("set/meta/info.json")).expect("info")).expect("JSON");
-    assert_eq!(info["actrm"]["env_args"]["fast_render"], true, "{}", info["actrm"]["env_args"]);
+    let origin: Value =
+        serde_json::from_slice(&fs::read(seen().join("set/actrm/info.json")).expect("info")).expect("JSON");
+    assert_eq!(origin["env_args"]["fast_render"], true, "{}", origin["env_args"]);
     let entry = fs::read(entries.join("lift-act-image/1/entry.json")).expect("an entry");
     let entry: Value = serde_json::from_slice(&entry).expect("JSON");
     assert_eq!(entry["env_args"]["fast_render"], true);

@@ -1,4 +1,4 @@
-//! One number of a data set's metadata edited at a time: opening refuses it, or what is trained on stays as it was.
+//! One number of a data set's metadata edited at a time: opening refuses it or says so, or what is trained on stays as it was.
 
 #![allow(clippy::unwrap_used)]
 
@@ -22,9 +22,9 @@ fn converted() -> (tempfile::TempDir, PathBuf) {
     (dir, out)
 }
 
-/// Everything that training takes from a data set, or `None` where it is refused.
+/// Everything that training takes from a data set, or `None` where it is refused or opens with a note.
 fn trained_on(root: &Path) -> Option<String> {
-    let set = Dataset::open(root).ok()?;
+    let set = Dataset::open(root).ok().filter(|set| set.notes().is_empty())?;
     let columns: Vec<_> = set.column_names().map(|name| (name, set.column(name))).collect();
     let splits: Vec<_> = set.split_names().into_iter().map(|name| (name, set.split(name))).collect();
     let origin = set.provenance().map(|p| (&p.state_keys, &p.env_keys, &p.action, &p.source_sha256));
@@ -108,14 +108,42 @@ fn without_influence(root: &Path, file: &str) -> Vec<String> {
 #[test]
 fn no_number_of_our_info_can_be_edited() {
     let (_dir, set) = converted();
-    let mut places = Vec::new();
+    for (file, expected) in [("meta/info.json", "/total_frames"), ("actrm/info.json", "/masks/train/1")] {
+        let mut places = Vec::new();
+        let info: Value = serde_json::from_slice(&std::fs::read(set.join(file)).unwrap()).unwrap();
+        numbers(&info, String::new(), &mut places);
+        assert!(places.len() > 15 && places.iter().any(|p| p == expected), "{places:?}");
+        assert_eq!(without_influence(&set, file), Vec::<String>::new());
+        // spaces and the order of keys say nothing
+        std::fs::write(set.join(file), serde_json::to_vec(&info).unwrap()).unwrap();
+        Dataset::open(&set).unwrap();
+    }
+}
+
+/// The set as earlier versions wrote it: provenance in `meta/info.json`.
+fn with_provenance_inside(set: &Path) {
+    let (path, beside) = (set.join("meta/info.json"), set.join("actrm/info.json"));
+    let mut info: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    info["actrm"] = serde_json::from_slice(&std::fs::read(&beside).unwrap()).unwrap();
+    std::fs::write(&path, serde_json::to_vec_pretty(&info).unwrap()).unwrap();
+    std::fs::remove_file(beside).unwrap();
+}
+
+#[test]
+fn sets_with_their_provenance_in_info_json_open_as_before() {
+    let (dir, set) = converted();
     let info: Value = serde_json::from_slice(&std::fs::read(set.join("meta/info.json")).unwrap()).unwrap();
-    numbers(&info, String::new(), &mut places);
-    assert!(places.len() > 40 && places.iter().any(|p| p == "/actrm/masks/train/1"), "{places:?}");
+    assert_eq!(info.get("actrm"), None);
+    let as_it_was = trained_on(&set).unwrap();
+    with_provenance_inside(&set);
+    assert_eq!(trained_on(&set).unwrap(), as_it_was);
     assert_eq!(without_influence(&set, "meta/info.json"), Vec::<String>::new());
-    // spaces and the order of keys say nothing
-    std::fs::write(set.join("meta/info.json"), serde_json::to_vec(&info).unwrap()).unwrap();
-    Dataset::open(&set).unwrap();
+    // an edit moves it
+    let (out, all) =
+        (dir.path().join("out"), dataset::edit::Selection { episodes: vec![0, 1, 2], ..Default::default() });
+    dataset::edit::keep(&set, &dataset::edit::Destination::New(out.clone()), &all, &mut |_, _| {}).unwrap();
+    assert_eq!(trained_on(&out).unwrap(), as_it_was);
+    assert!(out.join("actrm/info.json").exists());
 }
 
 #[test]
@@ -123,7 +151,7 @@ fn of_a_set_that_lerobot_wrote_the_sizes_of_files_can_be_edited_only() {
     let (_dir, set) = converted();
     let path = set.join("meta/info.json");
     let mut info: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
-    info.as_object_mut().unwrap().remove("actrm");
+    std::fs::remove_file(set.join("actrm/info.json")).unwrap();
     for splits in [json!({"train": "0:3"}), json!({"train": "0:2", "valid": "2:3"})] {
         info["splits"] = splits;
         std::fs::write(&path, serde_json::to_vec(&info).unwrap()).unwrap();
@@ -172,10 +200,7 @@ fn numbers_of_the_episodes() {
     for ours in [true, false] {
         let (_dir, set) = converted();
         if !ours {
-            let path = set.join("meta/info.json");
-            let mut info: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
-            info.as_object_mut().unwrap().remove("actrm");
-            std::fs::write(&path, serde_json::to_vec(&info).unwrap()).unwrap();
+            std::fs::remove_file(set.join("actrm/info.json")).unwrap();
         }
         let as_it_was = trained_on(&set).unwrap();
         let path = set.join("meta/episodes/chunk-000/file-000.parquet");

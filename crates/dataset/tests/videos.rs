@@ -314,8 +314,11 @@ fn an_image_that_cannot_be_decoded_is_named_by_its_episode() {
     let path = out.join("meta/info.json");
     let mut info: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
     info["features"][CAMERA]["shape"] = serde_json::json!([84, 80, 3]);
-    info["actrm"].as_object_mut().unwrap().remove("seal").unwrap();
     std::fs::write(&path, info.to_string()).unwrap();
+    let path = out.join("actrm/info.json");
+    let mut origin: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    origin.as_object_mut().unwrap().remove("seal").unwrap();
+    std::fs::write(&path, origin.to_string()).unwrap();
     let set = Dataset::open(&out).unwrap();
     let refused = set.pictures_of(CAMERA, 1, &mut |_| true).unwrap_err().to_string();
     assert!(refused.contains(CAMERA) && refused.contains("of episode 1: expected"), "{refused}");

@@ -229,6 +229,12 @@ impl PyDataset {
         self.dataset.tasks().to_vec()
     }
 
+    /// What is not as it should be and was read as LeRobot reads it.
+    #[getter]
+    fn notes(&self) -> Vec<String> {
+        self.dataset.notes().to_vec()
+    }
+
     /// Names that `split` knows.
     #[getter]
     fn splits(&self) -> Vec<&str> {

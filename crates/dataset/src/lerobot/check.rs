@@ -1,35 +1,33 @@
 //! What `info.json` says, held against itself and against the frames whenever a data set is opened.
 //!
-//! Each check is cheap: a hash of one small file, the types of columns, the times of frames. An edited number is refused, or nothing
-//! that is trained on depends on it (the sizes at which a writer closes files).
+//! Each check is cheap: a hash of one small file, the types of columns, the times of frames. An edited number is refused or noted, or
+//! nothing that is trained on depends on it (the sizes at which a writer closes files).
 
 use super::fingerprint::INDEX_COLUMNS;
 use super::info::Info;
-use super::open::EpisodeMeta;
 use super::schema::hex;
 use crate::error::{DatasetError, Result};
 use arrow::datatypes::DataType;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 use std::path::Path;
-
-/// Seconds that a time may be off, as LeRobot has it, and the share of it that a 32-bit number may round away.
-const TIME_TOLERANCE: (f64, f64) = (1e-4, 1e-6);
 
 /// Records in `info` the hash of everything else in it.
 pub(super) fn sealed(mut info: Info, root: &Path) -> Result<Info> {
     let failed = |source| DatasetError::Json { path: root.join("meta/info.json"), source };
     // hashed as it will be read: numbers pass through text
-    let text = serde_json::to_vec(&info).map_err(failed)?;
-    let seal = seal(&serde_json::from_slice(&text).map_err(failed)?);
+    let reread = |text: Vec<u8>| serde_json::from_slice::<Value>(&text);
+    let mut value = serde_json::to_vec(&info).and_then(reread).map_err(failed)?;
     if let Some(provenance) = &mut info.actrm {
-        provenance.seal = Some(seal);
+        value["actrm"] = serde_json::to_vec(provenance).and_then(reread).map_err(failed)?;
+        provenance.seal = Some(seal(&value));
     }
     Ok(info)
 }
 
 /// sha256 of a JSON value whatever its spaces and the order of its keys, but for `/actrm/seal`.
-fn seal(value: &Value) -> String {
+pub(super) fn seal(value: &Value) -> String {
     let mut text = String::new();
     canonical(value, "", &mut text);
     hex(&Sha256::digest(text))
@@ -57,22 +55,24 @@ fn canonical(value: &Value, path: &str, out: &mut String) {
     }
 }
 
-/// Checks `info` (of the file `path`, whose content is `text`) by itself.
-pub(super) fn info(path: &Path, text: &[u8], info: &Info) -> Result<()> {
+/// Checks what a set says of itself: `info`, and `value`, the JSON that it was read from, with the provenance at `actrm`.
+pub(super) fn info(root: &Path, value: &Value, info: &Info) -> Result<()> {
+    let path = root.join("meta/info.json");
     let bad = |object: &str, expected: String, found: String| {
-        Err(DatasetError::BadDataset { path: path.to_path_buf(), object: object.to_owned(), expected, found })
+        Err(DatasetError::BadDataset { path: path.clone(), object: object.to_owned(), expected, found })
     };
     if let Some(provenance) = &info.actrm {
         if provenance.format != 1 {
             return bad("actrm.format", "1".to_owned(), provenance.format.to_string());
         }
         if let Some(expected) = &provenance.seal {
-            let value = serde_json::from_slice(text)
-                .map_err(|source| DatasetError::Json { path: path.to_path_buf(), source })?;
-            let found = seal(&value);
+            let found = seal(value);
             if found != *expected {
-                let found = format!("{found}: something in it was changed");
-                return bad("content", format!("sha256 {expected}, recorded when it was made (actrm.seal)"), found);
+                let expected = format!("sha256 {expected}, recorded when it was made (actrm.seal)");
+                let found = format!(
+                    "{found}: something in it was changed; `actrm-data validate` says what, `actrm-data edit repair` corrects it"
+                );
+                return bad("content", expected, found);
             }
         }
         if provenance.demos.len() != info.total_episodes {
@@ -94,14 +94,21 @@ pub(super) fn info(path: &Path, text: &[u8], info: &Info) -> Result<()> {
             return bad(&format!("features.{name}.shape"), "[1]".to_owned(), format!("{:?}", feature.shape));
         }
     }
-    splits(info).or_else(|(expected, found)| bad("splits", expected, found))
+    Ok(())
+}
+
+/// Leaves out splits that cannot be right for the episodes that there are, with a note.
+pub(super) fn leave_out_stale_splits(info: &mut Info, notes: &mut Vec<String>) {
+    if let Err((expected, found)) = splits(&info.splits, info.total_episodes) {
+        notes.push(format!("meta/info.json: splits: expected {expected}, found {found}: they are not used"));
+        info.splits.clear();
+    }
 }
 
 /// Named ranges lie side by side and leave no episode out.
-fn splits(info: &Info) -> Result<(), (String, String)> {
-    let total = info.total_episodes;
-    let mut ranges = Vec::with_capacity(info.splits.len());
-    for (name, text) in &info.splits {
+pub(super) fn splits(splits: &BTreeMap<String, String>, total: usize) -> Result<(), (String, String)> {
+    let mut ranges = Vec::with_capacity(splits.len());
+    for (name, text) in splits {
         let number = |text: &str| text.trim().parse::<usize>().ok();
         match text.split_once(':').and_then(|(from, to)| Some((number(from)?, number(to)?))) {
             Some((from, to)) if from <= to && to <= total => ranges.push((from, to)),
@@ -120,12 +127,13 @@ fn splits(info: &Info) -> Result<(), (String, String)> {
     if ranges.is_empty() || (end, covered) == (total, total) {
         return Ok(());
     }
-    let found = info.splits.iter().map(|(name, text)| format!("{name} {text}")).collect::<Vec<_>>().join(", ");
+    let found = splits.iter().map(|(name, text)| format!("{name} {text}")).collect::<Vec<_>>().join(", ");
     Err((format!("each of {total} episodes in one of them"), found))
 }
 
-/// A column's type in the file `path` is the one that `info.json` gives it.
-pub(super) fn stored_as(path: &Path, name: &str, dtype: &str, column: &DataType) -> Result<()> {
+/// Whether a column of this type can be read as `dtype`, as LeRobot casts it: `None` if it has that type, its own type's name
+/// otherwise.
+pub(super) fn stored_as(path: &Path, name: &str, dtype: &str, column: &DataType) -> Result<Option<String>> {
     let mut leaf = column;
     while let DataType::List(field) | DataType::LargeList(field) | DataType::FixedSizeList(field, _) = leaf {
         leaf = field.data_type();
@@ -135,7 +143,12 @@ pub(super) fn stored_as(path: &Path, name: &str, dtype: &str, column: &DataType)
         other => other.to_string().to_lowercase(),
     };
     if found == dtype {
-        return Ok(());
+        return Ok(None);
+    }
+    let numeric = |dtype: &str| ["float", "int", "uint", "bool"].iter().any(|kind| dtype.starts_with(kind));
+    // of a float LeRobot makes no whole number
+    if numeric(dtype) && numeric(&found) && (dtype.starts_with("float") || !found.starts_with("float")) {
+        return Ok(Some(found));
     }
     Err(DatasetError::BadDataset {
         path: path.to_path_buf(),
@@ -145,25 +158,13 @@ pub(super) fn stored_as(path: &Path, name: &str, dtype: &str, column: &DataType)
     })
 }
 
-/// The times of the frames from row `first` on follow from their number in the episode and the rate.
-pub(super) fn rate(path: &Path, fps: f64, episodes: &[EpisodeMeta], first: usize, times: &[f32]) -> Result<()> {
-    let mut episode = episodes.partition_point(|e| e.to <= first);
-    for (row, &time) in (first..).zip(times) {
-        while episodes.get(episode).is_some_and(|e| row >= e.to) {
-            episode += 1;
-        }
-        // rows beyond the last episode are refused where they are counted
-        let Some(start) = episodes.get(episode).map(|e| e.from) else { return Ok(()) };
-        let (time, expected) = (f64::from(time), (row - start) as f64 / fps);
-        let close = (time - expected).abs() <= TIME_TOLERANCE.0 + TIME_TOLERANCE.1 * expected;
-        if !close {
-            return Err(DatasetError::BadDataset {
-                path: path.to_path_buf(),
-                object: format!("timestamp of frame {row}"),
-                expected: format!("{expected} s, frame {} of episode {episode} at {fps} a second", row - start),
-                found: time.to_string(),
-            });
-        }
-    }
-    Ok(())
+/// Seconds that a time may be off, as LeRobot's `tolerance_s` has it.
+pub const TIME_TOLERANCE: f64 = 1e-4;
+
+/// How far a frame's time is from its number in the episode over the rate, if that is more than `tolerance`.
+pub(super) fn time_off(time: f64, frame: usize, fps: f64, tolerance: f64) -> Option<f64> {
+    let due = frame as f64 / fps;
+    let off = (time - due).abs();
+    // written so that NaN is off; a 32-bit number rounds the second term away
+    (!(off <= tolerance + 1e-6 * due)).then_some(off)
 }

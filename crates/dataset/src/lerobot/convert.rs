@@ -258,7 +258,7 @@ impl Conversion<'_> {
         let (left_out, left_out_notes) = self.left_out();
         let info = self.info(&frames.tasks, &frames.told.fingerprint, source_sha256, left_out);
         let info = check::sealed(info, self.root)?;
-        files.push(meta::write_json(self.root, "meta/info.json", &info)?);
+        files.extend(meta::write_info(self.root, &info)?);
         if self.options.lossless {
             files.push(side::write_manifest(self.root, &files)?);
         }

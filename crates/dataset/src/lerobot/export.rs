@@ -4,6 +4,7 @@
 use super::images;
 use super::info::Info;
 use super::open::{read_episodes, read_info, read_json};
+use super::pictures::image_files;
 use super::read;
 use super::side::{
     FRAMES, Kind, LAYOUT_FILE, Layout, MANIFEST_FILE, Manifest, NO_EPISODE, OBJECTS, Object, SideColumn,
@@ -15,13 +16,11 @@ use crate::source::{RobomimicWriter, WriteOptions};
 use crate::tree::{Array, Attrs, Demo, Dtype};
 use arrow::array::{
     Array as _, ArrayRef, BinaryArray, FixedSizeBinaryArray, FixedSizeListArray, Float32Array, Float64Array,
-    Int32Array, Int64Array, ListArray, RecordBatch, StringArray, StructArray,
+    Int32Array, Int64Array, ListArray, RecordBatch, StringArray,
 };
-use arrow::datatypes::DataType;
 use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::{ParquetRecordBatchReader, ParquetRecordBatchReaderBuilder};
+use parquet::arrow::arrow_reader::ParquetRecordBatchReader;
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
 /// What an export did.
@@ -107,6 +106,11 @@ pub fn export(
 
 /// The layout of the side folder, once its files are known to be those that were written.
 pub(crate) fn side_folder(root: &Path, info: &Info) -> Result<Layout> {
+    side_folder_of(root, info, &|_| true)
+}
+
+/// [`side_folder`] that compares only the hashes of the files that are `checked`.
+pub(crate) fn side_folder_of(root: &Path, info: &Info, checked: &dyn Fn(&str) -> bool) -> Result<Layout> {
     let manifest_path = root.join(MANIFEST_FILE);
     if !manifest_path.exists() {
         let found = match info.actrm {
@@ -120,7 +124,7 @@ pub(crate) fn side_folder(root: &Path, info: &Info) -> Result<Layout> {
         });
     }
     let manifest: Manifest = read_json(&manifest_path)?;
-    for (name, expected) in &manifest.files {
+    for (name, expected) in manifest.files.iter().filter(|(name, _)| checked(name)) {
         let found = hash_file(&root.join(name))?;
         if found != *expected {
             return Err(DatasetError::BadDataset {
@@ -326,17 +330,8 @@ fn each_file(
         expected: format!("{height} x {width} pictures"),
         found,
     };
-    let files = match column.as_any().downcast_ref::<StructArray>() {
-        Some(fields) => fields.column_by_name("bytes").ok_or_else(|| bad("no bytes".to_owned()))?,
-        None => column,
-    };
-    let files = arrow::compute::cast(files, &DataType::Binary).map_err(|e| bad(e.to_string()))?;
-    let files = files.as_any().downcast_ref::<BinaryArray>().expect("a binary column");
-    for file in files {
-        let file = file.ok_or_else(|| bad("a null".to_owned()))?;
-        take(file).map_err(bad)?;
-    }
-    Ok(())
+    let files = image_files(root, column).map_err(bad)?;
+    files.iter().flatten().try_for_each(|file| take(file).map_err(bad))
 }
 
 /// The objects in order, an episode at a time.
@@ -461,14 +456,7 @@ impl Rows {
             }
             let Some(path) = self.files.next() else { return Ok(None) };
             let failed = |source| DatasetError::Parquet { path: path.clone(), operation: "read it", source };
-            let file = File::open(&path).map_err(|source| DatasetError::Io {
-                path: path.clone(),
-                operation: "open it",
-                source,
-            })?;
-            let mut builder =
-                ParquetRecordBatchReaderBuilder::try_new(file).map_err(|source| read::unreadable(&path, source))?;
-            builder = builder.with_batch_size(self.batch_rows);
+            let mut builder = read::open(&path)?.with_batch_size(self.batch_rows);
             if let Some(column) = &self.column {
                 let index = builder.schema().index_of(column).map_err(|e| failed(e.into()))?;
                 let mask = ProjectionMask::roots(builder.parquet_schema(), [index]);

@@ -23,10 +23,13 @@ pub struct Info {
     #[serde(default)]
     pub robot_type: Option<String>,
     /// Number of episodes.
+    #[serde(default)]
     pub total_episodes: usize,
     /// Number of frames over all episodes.
+    #[serde(default)]
     pub total_frames: usize,
     /// Number of task texts.
+    #[serde(default)]
     pub total_tasks: usize,
     /// Files in one folder before the next begins.
     #[serde(default = "files_per_folder")]
@@ -51,8 +54,9 @@ pub struct Info {
     pub video_path: Option<String>,
     /// The columns, in their order in the data files.
     pub features: Features,
-    /// What we add: where the data came from. Absent in data sets that LeRobot wrote.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// What we add: where the data came from, in `actrm/info.json` (in this file in sets of earlier versions). Absent in data
+    /// sets that LeRobot wrote.
+    #[serde(default, skip_serializing)]
     pub actrm: Option<Provenance>,
     /// Keys that nothing here reads: those that LeRobot has besides, or may add later.
     #[serde(flatten)]
@@ -129,6 +133,11 @@ impl Feature {
     /// Whether the column holds pictures.
     pub fn is_visual(&self) -> bool {
         self.dtype == "image" || self.dtype == "video"
+    }
+
+    /// Whether the column holds words: texts, or LeRobot's `language`.
+    pub(crate) fn is_text(&self) -> bool {
+        self.dtype == "string" || self.dtype == "language"
     }
 
     /// Height and width of colour pictures: shape `[height, width, 3]`, or `[3, height, width]` where the first name says that
@@ -217,7 +226,7 @@ impl<'de> Deserialize<'de> for Features {
     }
 }
 
-/// Where a converted data set came from and what it holds, in `info.json` under `actrm`.
+/// Where a converted data set came from and what it holds: `actrm/info.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
     /// Version of this object.
@@ -272,7 +281,7 @@ pub struct Provenance {
     pub left_out: Vec<String>,
     /// Whether the side folder is there.
     pub lossless: bool,
-    /// sha256 of everything else in `info.json`, so that an edited number does not train other weights in silence.
+    /// sha256 of everything else in it and of `meta/info.json`, so that an edited number does not train other weights in silence.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seal: Option<String>,
     /// How pictures were encoded, where they are videos.

@@ -1,5 +1,6 @@
 //! `meta/`: tasks, episodes and statistics.
 
+use super::info::Info;
 use super::schema::{element, writer_properties};
 use super::shards::{GroupEncoder, HashingFile, Place, WrittenFile, write_parquet};
 use super::videos::Stretch;
@@ -222,12 +223,50 @@ pub(crate) fn write_stats(
     write_json(root, "meta/stats.json", &Value::Object(all))
 }
 
+/// Where provenance lies.
+pub(crate) const PROVENANCE_FILE: &str = "actrm/info.json";
+
+/// `meta/info.json`, and `actrm/info.json` where there is provenance.
+pub(crate) fn write_info(root: &Path, info: &Info) -> Result<Vec<WrittenFile>> {
+    let mut files = vec![write_json(root, "meta/info.json", info)?];
+    if let Some(provenance) = &info.actrm {
+        files.push(write_json(root, PROVENANCE_FILE, provenance)?);
+    }
+    Ok(files)
+}
+
 /// Indented JSON with a final newline.
 pub(crate) fn write_json<T: serde::Serialize>(root: &Path, relative: &str, value: &T) -> Result<WrittenFile> {
     let mut text = serde_json::to_string_pretty(value)
         .map_err(|source| DatasetError::Json { path: root.join(relative), source })?;
     text.push('\n');
     HashingFile::write_whole(root, relative, text.as_bytes())
+}
+
+/// JSON in which Python wrote numbers that JSON does not have (`NaN`, `Infinity`, `-Infinity`): they become null.
+pub(crate) fn python_json(text: &[u8]) -> serde_json::Result<Value> {
+    let mut plain = Vec::with_capacity(text.len());
+    let (mut at, mut quoted) = (0, false);
+    while at < text.len() {
+        let word = [&b"NaN"[..], b"Infinity", b"-Infinity"].into_iter().find(|word| text[at..].starts_with(word));
+        match (text[at], word) {
+            (_, Some(word)) if !quoted => {
+                plain.extend_from_slice(b"null");
+                at += word.len();
+                continue;
+            }
+            (b'\\', _) if quoted => {
+                plain.extend_from_slice(&text[at..(at + 2).min(text.len())]);
+                at += 2;
+                continue;
+            }
+            (b'"', _) => quoted = !quoted,
+            _ => {}
+        }
+        plain.push(text[at]);
+        at += 1;
+    }
+    serde_json::from_slice(&plain)
 }
 
 /// Reads statistics as LeRobot or we write them: vectors, or 3 x 1 x 1 for images.
@@ -264,9 +303,19 @@ pub(crate) fn parse_stats(value: &Value) -> Result<BTreeMap<String, FeatureStats
     Ok(all)
 }
 
+/// Whether all of them are numbers.
+pub(crate) fn are_finite(stats: &FeatureStats) -> bool {
+    STATISTICS.iter().all(|(_, get)| get(stats).iter().all(|value| value.is_finite()))
+}
+
 fn flatten(value: &Value, out: &mut Vec<f64>) -> Result<(), String> {
     match value {
         Value::Array(items) => items.iter().try_for_each(|item| flatten(item, out)),
+        // as JSON writes what is not finite
+        Value::Null => {
+            out.push(f64::NAN);
+            Ok(())
+        }
         Value::Bool(b) => {
             out.push(f64::from(u8::from(*b)));
             Ok(())

@@ -1,19 +1,19 @@
 //! An opened data set: everything but pictures in memory, ready for training.
 
-use super::check;
+use super::check::{self, TIME_TOLERANCE};
 use super::features::MISTAKE;
 use super::fingerprint::{Fingerprint, INDEX_COLUMNS};
 use super::info::{Feature, Info, Provenance};
-use super::meta::parse_stats;
+use super::meta::{PROVENANCE_FILE, are_finite, parse_stats, python_json};
 use super::read;
 use super::schema::hex;
 use super::values::Values;
-use crate::error::{DatasetError, InputError, Result};
+use crate::error::{DatasetError, Result};
 use crate::shuffle::SplitMix64;
-use crate::source::is_lfs_pointer;
 use crate::stats::FeatureStats;
 use crate::windows::{Resident, WindowSpec, Windows, unmarked};
 use arrow::buffer::ScalarBuffer;
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -36,6 +36,11 @@ pub struct Dataset {
     stats: BTreeMap<String, FeatureStats>,
     fingerprint: String,
     env: Option<EnvMeta>,
+    /// The number that frames have of each task: from 0 on, unless the table is in disorder.
+    task_numbers: Vec<i64>,
+    /// The row of each episode in the table of episodes, where that is not its number.
+    table_rows: Option<Vec<usize>>,
+    notes: Vec<String>,
 }
 
 /// One episode of a data set.
@@ -83,15 +88,48 @@ pub struct Column<'a> {
 
 impl Dataset {
     /// Opens the directory `root` and reads its numeric columns. A data set of ours without pictures is checked
-    /// against the fingerprint that was recorded when it was made.
+    /// against the fingerprint that was recorded when it was made. What LeRobot accepts and is not as it should be is read as
+    /// LeRobot reads it and named in [`Dataset::notes`].
     pub fn open(root: &Path) -> Result<Self> {
-        let info = read_info(root)?;
-        let tasks = read_tasks(root, &info)?;
+        let mut notes = Vec::new();
+        let mut info = read_info(root)?;
+        let table = read_tasks(root, &info)?;
         let episodes = read_episodes(root, &info)?;
-        let columns = read_columns(root, &info, &episodes)?;
-        let stats = read_stats(root)?;
-        let provenance = info.actrm.as_ref();
-        let env = provenance.and_then(|p| {
+        correct_totals(&mut info, &episodes, table.texts.len(), &mut notes);
+        check::leave_out_stale_splits(&mut info, &mut notes);
+        let (task_numbers, tasks) = table.read_as(root, &episodes, &mut notes)?;
+        let columns = read_columns(root, &info, &episodes, true, &mut notes)?;
+        let mut dataset = Self::of(root, info, episodes, (task_numbers, tasks), columns, notes)?;
+        dataset.fingerprint = dataset.checked_fingerprint()?;
+        Ok(dataset)
+    }
+
+    /// A data set whose episodes and tasks were derived from its frames, with the row of each episode in the table of episodes.
+    pub(super) fn derived(
+        root: &Path,
+        info: Info,
+        episodes: Vec<EpisodeMeta>,
+        tasks: (Vec<i64>, Vec<String>),
+        table_rows: Option<Vec<usize>>,
+    ) -> Result<Self> {
+        let mut notes = Vec::new();
+        let columns = read_columns(root, &info, &episodes, false, &mut notes)?;
+        let mut dataset = Self::of(root, info, episodes, tasks, columns, notes)?;
+        dataset.table_rows = table_rows;
+        dataset.fingerprint = dataset.content_fingerprint();
+        Ok(dataset)
+    }
+
+    fn of(
+        root: &Path,
+        info: Info,
+        episodes: Vec<EpisodeMeta>,
+        (task_numbers, tasks): (Vec<i64>, Vec<String>),
+        columns: BTreeMap<String, Resident>,
+        mut notes: Vec<String>,
+    ) -> Result<Self> {
+        let stats = read_stats(root, &mut notes)?;
+        let env = info.actrm.as_ref().and_then(|p| {
             p.env_name.clone().map(|env_name| EnvMeta {
                 env_name,
                 env_version: p.env_version.clone(),
@@ -101,10 +139,44 @@ impl Dataset {
                 skill: p.skill.clone(),
             })
         });
-        let mut dataset =
-            Self { root: root.to_path_buf(), info, episodes, tasks, columns, stats, fingerprint: String::new(), env };
-        dataset.fingerprint = dataset.checked_fingerprint()?;
-        Ok(dataset)
+        let (root, fingerprint, table_rows) = (root.to_path_buf(), String::new(), None);
+        Ok(Self { root, info, episodes, tasks, columns, stats, fingerprint, env, task_numbers, table_rows, notes })
+    }
+
+    /// What is not as it should be and was read as LeRobot reads it.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
+    }
+
+    /// The text of the task that frames call `number`.
+    pub(super) fn task(&self, number: i64) -> Option<&str> {
+        self.task_numbers.iter().position(|&n| n == number).map(|at| self.tasks[at].as_str())
+    }
+
+    /// What the table of episodes says in each row, in the order of the episodes.
+    pub(super) fn in_order<T: Clone>(&self, rows: Vec<T>) -> Result<Vec<T>> {
+        let Some(order) = &self.table_rows else { return Ok(rows) };
+        let found = rows.len();
+        order.iter().map(|&row| rows.get(row).cloned()).collect::<Option<_>>().ok_or_else(|| DatasetError::BadDataset {
+            path: self.root.join("meta/episodes"),
+            object: "rows".to_owned(),
+            expected: format!(
+                "one for each of {} episodes, for what it says of videos and images",
+                self.episodes.len()
+            ),
+            found: found.to_string(),
+        })
+    }
+
+    /// Leaves out where it came from: what follows is a set of its own.
+    pub(super) fn forget_provenance(&mut self) {
+        (self.info.actrm, self.env) = (None, None);
+        self.episodes.iter_mut().for_each(|episode| episode.demo = None);
+    }
+
+    /// The fingerprint of the columns in memory.
+    pub(super) fn content_fingerprint(&self) -> String {
+        self.numeric_fingerprint(&self.episodes)
     }
 
     /// The fingerprint recorded, after comparing it with the content where the content is in memory.
@@ -114,7 +186,7 @@ impl Dataset {
         if let (Some(recorded), true) = (recorded, pictures) {
             return Ok(recorded.clone());
         }
-        let computed = self.numeric_fingerprint(&self.episodes);
+        let computed = self.content_fingerprint();
         match recorded {
             Some(recorded) if *recorded != computed => Err(DatasetError::BadDataset {
                 path: self.root.clone(),
@@ -388,23 +460,17 @@ impl Dataset {
 
 /// A JSON file.
 pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
-    serde_json::from_slice(&read_file(path)?).map_err(|source| no_json(path, source))
-}
-
-/// The error of a JSON file that is none, or not the one that belongs there.
-fn no_json(path: &Path, source: serde_json::Error) -> DatasetError {
-    match is_lfs_pointer(path) {
-        true => InputError::LfsPointer { path: path.to_path_buf() }.into(),
-        false => DatasetError::Json { path: path.to_path_buf(), source },
-    }
+    serde_json::from_slice(&read_file(path)?).map_err(|source| DatasetError::Json { path: path.to_path_buf(), source })
 }
 
 fn read_file(path: &Path) -> Result<Vec<u8>> {
+    read::refuse_pointer(path)?;
     std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_path_buf(), operation: "read it", source })
 }
 
-/// `meta/info.json`, checked for a version that is understood.
-pub(crate) fn read_info(root: &Path) -> Result<Info> {
+/// `meta/info.json` with `actrm/info.json`, checked for a version that is understood, and the JSON of both, the second one's at
+/// `actrm`.
+pub(crate) fn parse_info(root: &Path) -> Result<(Info, Value)> {
     let path = root.join("meta/info.json");
     if !path.exists() {
         let found = if root.is_dir() {
@@ -422,7 +488,12 @@ pub(crate) fn read_info(root: &Path) -> Result<Info> {
         });
     }
     let text = read_file(&path)?;
-    let info: Info = serde_json::from_slice(&text).map_err(|source| no_json(&path, source))?;
+    let failed = |path: &Path| {
+        let path = path.to_path_buf();
+        |source| DatasetError::Json { path, source }
+    };
+    let mut value: Value = serde_json::from_slice(&text).map_err(failed(&path))?;
+    let mut info: Info = serde_json::from_slice(&text).map_err(failed(&path))?;
     if !info.codebase_version.starts_with("v3.") {
         return Err(DatasetError::BadDataset {
             path,
@@ -431,45 +502,130 @@ pub(crate) fn read_info(root: &Path) -> Result<Info> {
             found: info.codebase_version,
         });
     }
-    check::info(&path, &text, &info)?;
+    let beside = root.join(PROVENANCE_FILE);
+    if info.actrm.is_none() && beside.exists() {
+        let text = read_file(&beside)?;
+        info.actrm = Some(serde_json::from_slice(&text).map_err(failed(&beside))?);
+        value["actrm"] = serde_json::from_slice(&text).map_err(failed(&beside))?;
+    }
+    Ok((info, value))
+}
+
+/// [`parse_info`], checked to be as it was made.
+pub(crate) fn read_info(root: &Path) -> Result<Info> {
+    let (info, value) = parse_info(root)?;
+    check::info(root, &value, &info)?;
     Ok(info)
 }
 
-fn read_stats(root: &Path) -> Result<BTreeMap<String, FeatureStats>> {
+/// The numbers of episodes, frames and tasks are those that there are.
+fn correct_totals(info: &mut Info, episodes: &[EpisodeMeta], tasks: usize, notes: &mut Vec<String>) {
+    let frames = episodes.last().map_or(0, |e| e.to);
+    for (name, stated, there) in [
+        ("total_episodes", &mut info.total_episodes, episodes.len()),
+        ("total_frames", &mut info.total_frames, frames),
+        ("total_tasks", &mut info.total_tasks, tasks),
+    ] {
+        if *stated != there {
+            notes.push(format!("meta/info.json: {name}: expected {there}, found {stated}: read as {there}"));
+            *stated = there;
+        }
+    }
+}
+
+fn read_stats(root: &Path, notes: &mut Vec<String>) -> Result<BTreeMap<String, FeatureStats>> {
     let path = root.join("meta/stats.json");
     if !path.exists() {
         return Ok(BTreeMap::new());
     }
-    let value = read_json(&path)?;
-    parse_stats(&value).map_err(|found| DatasetError::BadDataset {
+    let value = python_json(&read_file(&path)?).map_err(|source| DatasetError::Json { path: path.clone(), source })?;
+    let stats = parse_stats(&value).map_err(|found| DatasetError::BadDataset {
         path,
         object: "statistics".to_owned(),
         expected: "min, max, mean, std and count of every feature".to_owned(),
         found,
-    })
+    })?;
+    let unusable: Vec<&str> = stats.iter().filter(|(_, s)| !are_finite(s)).map(|(name, _)| name.as_str()).collect();
+    if !unusable.is_empty() {
+        let names = unusable.join(", ");
+        notes.push(format!("meta/stats.json: statistics of {names} are not finite: used only where they are"));
+    }
+    Ok(stats)
 }
 
-fn read_tasks(root: &Path, info: &Info) -> Result<Vec<String>> {
-    let path = root.join("meta/tasks.parquet");
-    if info.total_tasks == 0 && !path.exists() {
-        return Ok(Vec::new());
+/// `meta/tasks.parquet`: the number and text of each row.
+pub(super) struct TaskTable {
+    pub numbers: Vec<i64>,
+    pub texts: Vec<String>,
+}
+
+impl TaskTable {
+    pub(super) fn read(root: &Path) -> Result<Self> {
+        let path = root.join("meta/tasks.parquet");
+        // pandas calls an index without a name `__index_level_0__`
+        let (_, arrays) = match read::columns(&path, &["task_index", "task"]) {
+            Err(DatasetError::NotInDataset { .. }) => read::columns(&path, &["task_index", "__index_level_0__"])?,
+            other => other?,
+        };
+        let numbers = read::integers(&path, "task_index", &arrays[0])?.to_vec();
+        Ok(Self { numbers, texts: read::texts(&path, "task", &arrays[1])? })
     }
-    // pandas calls an index without a name `__index_level_0__`
-    let (rows, arrays) = match read::columns(&path, &["task_index", "task"]) {
-        Err(DatasetError::NotInDataset { .. }) => read::columns(&path, &["task_index", "__index_level_0__"])?,
-        other => other?,
-    };
-    let indices = read::integers(&path, "task_index", &arrays[0])?;
-    let texts = read::texts(&path, "task", &arrays[1])?;
-    if rows != info.total_tasks || indices.iter().enumerate().any(|(i, &index)| index != i as i64) {
-        return Err(DatasetError::BadDataset {
-            path,
-            object: "column task_index".to_owned(),
-            expected: format!("{} tasks from 0 on, in order, as info.json says", info.total_tasks),
-            found: format!("{rows}: {:?}", &indices[..indices.len().min(10)]),
-        });
+
+    /// Whether row i has the number i.
+    pub(super) fn is_in_order(&self) -> bool {
+        self.numbers.iter().enumerate().all(|(i, &number)| number == i as i64)
     }
-    Ok(texts)
+
+    /// Numbers and texts as frames count them: by row, as LeRobot looks tasks up, unless only the numbers of the table agree
+    /// with what episodes say of their tasks. `frames` are each episode's texts and the numbers of its frames.
+    pub(super) fn meant<'a>(&self, frames: impl Iterator<Item = (&'a [String], &'a [i64])>) -> (Vec<i64>, Vec<String>) {
+        let by_row: Vec<(i64, &String)> = (0..).zip(&self.texts).collect();
+        let mut by_number: Vec<(i64, &String)> = self.numbers.iter().copied().zip(&self.texts).collect();
+        by_number.sort_unstable();
+        let (mut rows, mut numbers) = (0, 0);
+        for (texts, frames) in frames {
+            let mut distinct = frames.to_vec();
+            distinct.sort_unstable();
+            distinct.dedup();
+            let agree = |table: &[(i64, &String)]| {
+                let text = |number: i64| table.iter().find(|(n, _)| *n == number).map(|(_, text)| *text);
+                distinct.iter().all(|&number| text(number).is_some_and(|text| texts.contains(text)))
+            };
+            rows += usize::from(agree(&by_row));
+            numbers += usize::from(agree(&by_number));
+        }
+        let meant = if numbers > rows { by_number } else { by_row };
+        meant.into_iter().map(|(number, text)| (number, text.clone())).unzip()
+    }
+
+    /// [`TaskTable::meant`] for the frames of a set; they are looked at only where the table is in disorder.
+    fn read_as(
+        self,
+        root: &Path,
+        episodes: &[EpisodeMeta],
+        notes: &mut Vec<String>,
+    ) -> Result<(Vec<i64>, Vec<String>)> {
+        if self.is_in_order() {
+            return Ok((self.numbers, self.texts));
+        }
+        let mut frames = Vec::new();
+        for path in read::files(root, "data")? {
+            let (_, arrays) = read::columns(&path, &["task_index"])?;
+            frames.extend_from_slice(&read::integers(&path, "task_index", &arrays[0])?);
+        }
+        let of_episode = |e: &'_ EpisodeMeta| frames.get(e.from..e.to).unwrap_or_default();
+        let meant = self.meant(episodes.iter().map(|e| (e.tasks.as_slice(), of_episode(e))));
+        let numbers = &self.numbers[..self.numbers.len().min(10)];
+        notes.push(format!("meta/tasks.parquet: task_index: expected 0, 1, 2, ... in order, found {numbers:?}"));
+        Ok(meant)
+    }
+}
+
+fn read_tasks(root: &Path, info: &Info) -> Result<TaskTable> {
+    if info.total_tasks == 0 && !root.join("meta/tasks.parquet").exists() {
+        return Ok(TaskTable { numbers: Vec::new(), texts: Vec::new() });
+    }
+    TaskTable::read(root)
 }
 
 /// The episodes, checked to follow each other.
@@ -509,71 +665,96 @@ pub(crate) fn read_episodes(root: &Path, info: &Info) -> Result<Vec<EpisodeMeta>
             });
         }
     }
-    let frames = episodes.last().map_or(0, |e| e.to);
-    if (episodes.len(), frames) != (info.total_episodes, info.total_frames) {
-        return Err(DatasetError::BadDataset {
-            path: root.to_path_buf(),
-            object: "meta/episodes".to_owned(),
-            expected: format!("{} episodes with {} frames, as info.json says", info.total_episodes, info.total_frames),
-            found: format!("{} with {frames}", episodes.len()),
-        });
-    }
     Ok(episodes)
 }
 
-fn read_columns(root: &Path, info: &Info, episodes: &[EpisodeMeta]) -> Result<BTreeMap<String, Resident>> {
+/// The numeric columns; `owned`: each frame must be of the episode that it lies in.
+fn read_columns(
+    root: &Path,
+    info: &Info,
+    episodes: &[EpisodeMeta],
+    owned: bool,
+    notes: &mut Vec<String>,
+) -> Result<BTreeMap<String, Resident>> {
     // whole numbers do not fit f32; the index columns follow from the episodes
     let wanted: Vec<(&str, &Feature)> = info
         .features
         .0
         .iter()
-        .filter(|(name, f)| !INDEX_COLUMNS.contains(&name.as_str()) && !f.is_visual() && f.dtype != "string")
+        .filter(|(name, f)| !INDEX_COLUMNS.contains(&name.as_str()) && !f.is_visual() && !f.is_text())
         .map(|(name, f)| (name.as_str(), f))
         .collect();
     let mut names: Vec<&str> = wanted.iter().map(|(name, _)| *name).collect();
-    names.push("episode_index");
-    let timed = info.features.get("timestamp").is_some();
+    let timed = owned && info.features.get("timestamp").is_some();
+    if owned {
+        names.push("episode_index");
+    }
     if timed {
         names.push("timestamp");
     }
     let mut pieces: Vec<Vec<Resident>> = wanted.iter().map(|_| Vec::new()).collect();
+    let mut casts: BTreeMap<&str, String> = BTreeMap::new();
+    let mut late = Late::default();
     let mut row = 0;
     let mut episode = 0;
     for path in read::files(root, "data")? {
-        let (rows, arrays) = read::columns(&path, &names)?;
+        let (rows, arrays) = match names.is_empty() {
+            true => (read::columns_there(&path, &[])?.0, Vec::new()),
+            false => read::columns(&path, &names)?,
+        };
         for ((name, feature), (array, out)) in wanted.iter().zip(arrays.iter().zip(&mut pieces)) {
-            check::stored_as(&path, name, &feature.dtype, array.data_type())?;
-            out.push(read::numbers(&path, name, array, feature.dim())?);
+            let other = check::stored_as(&path, name, &feature.dtype, array.data_type())?;
+            let mut numbers = read::numbers(&path, name, array, feature.dim())?;
+            if let Some(other) = other {
+                if feature.dtype == "bool" {
+                    numbers.data = numbers.data.iter().map(|&v| f32::from(u8::from(v != 0.0))).collect();
+                }
+                casts.entry(name).or_insert(other);
+            }
+            out.push(numbers);
+        }
+        let first = row;
+        row += rows;
+        if !owned {
+            continue;
         }
         let owners = read::integers(&path, "episode_index", &arrays[wanted.len()])?;
-        if timed {
-            let times = read::numbers(&path, "timestamp", &arrays[wanted.len() + 1], 1)?;
-            check::rate(&path, info.fps, episodes, row, &times.data)?;
-        }
-        for &owner in owners.iter() {
-            while episodes.get(episode).is_some_and(|e| row >= e.to) {
+        let times = match timed {
+            true => Some(read::numbers(&path, "timestamp", &arrays[wanted.len() + 1], 1)?.data),
+            false => None,
+        };
+        for (at, &owner) in owners.iter().enumerate() {
+            let frame = first + at;
+            while episodes.get(episode).is_some_and(|e| frame >= e.to) {
                 episode += 1;
             }
-            if episodes.get(episode).is_none() || owner != episode as i64 {
+            let Some(mine) = episodes.get(episode).filter(|_| owner == episode as i64) else {
                 return Err(DatasetError::BadDataset {
                     path,
-                    object: format!("frame {row}"),
+                    object: format!("frame {frame}"),
                     expected: format!("episode {episode} of {}", episodes.len()),
                     found: format!("episode_index {owner}"),
                 });
+            };
+            if let Some(times) = &times {
+                late.look(f64::from(times[at]), mine, frame - mine.from, info.fps);
             }
-            row += 1;
         }
-        debug_assert!(rows == owners.len());
     }
-    if row != info.total_frames {
+    let frames = episodes.last().map_or(0, |e| e.to);
+    if row != frames {
         return Err(DatasetError::BadDataset {
             path: root.to_path_buf(),
             object: "data".to_owned(),
-            expected: format!("{} frames", info.total_frames),
+            expected: format!("{frames} frames, as the episodes say"),
             found: row.to_string(),
         });
     }
+    for (name, found) in casts {
+        let dtype = info.features.get(name).map_or("", |feature| &feature.dtype);
+        notes.push(format!("column {name}: expected {dtype}, as info.json says, found {found}: cast, as LeRobot does"));
+    }
+    notes.extend(late.note());
     let mut columns = BTreeMap::new();
     for ((name, feature), mut files) in wanted.into_iter().zip(pieces) {
         let data = match files.len() {
@@ -583,4 +764,36 @@ fn read_columns(root: &Path, info: &Info, episodes: &[EpisodeMeta]) -> Result<BT
         columns.insert(name.to_owned(), Resident { data, dim: feature.dim() });
     }
     Ok(columns)
+}
+
+/// Frames whose times are not those of the rate.
+#[derive(Default)]
+struct Late {
+    frames: usize,
+    /// Seconds.
+    most: f64,
+    /// Episode and frame of the first.
+    first: (usize, usize),
+}
+
+impl Late {
+    fn look(&mut self, time: f64, episode: &EpisodeMeta, frame: usize, fps: f64) {
+        if let Some(off) = check::time_off(time, frame, fps, TIME_TOLERANCE) {
+            if self.frames == 0 {
+                self.first = (episode.index, frame);
+            }
+            self.frames += 1;
+            self.most = self.most.max(off);
+        }
+    }
+
+    fn note(self) -> Option<String> {
+        let Self { frames, most, first: (episode, frame) } = self;
+        (frames > 0).then(|| {
+            format!(
+                "timestamp: {frames} frames are not at frame_index / fps, by up to {most:.6} s (LeRobot's tolerance_s is \
+                 {TIME_TOLERANCE} s); the first is frame {frame} of episode {episode}"
+            )
+        })
+    }
 }

@@ -7,7 +7,7 @@ use super::open::{Dataset, EpisodeMeta};
 use super::read;
 use crate::error::{DatasetError, Result};
 use crate::source::{VideoFile, VideoInfo};
-use arrow::array::{Array, ArrayRef, BinaryArray, StructArray};
+use arrow::array::{Array, ArrayRef, BinaryArray, BinaryBuilder, StringArray, StructArray};
 use arrow::datatypes::DataType;
 use rayon::prelude::*;
 use std::fs::File;
@@ -266,7 +266,10 @@ impl Dataset {
         let mut paths: Vec<PathBuf> = places(self, name)?.into_iter().map(|p| p.path).collect();
         paths.sort();
         paths.dedup();
-        let open = |path: PathBuf| Ok(CameraFile { info: VideoFile::open(&path)?.info().clone(), path });
+        let open = |path: PathBuf| {
+            read::refuse_pointer(&path)?;
+            Ok(CameraFile { info: VideoFile::open(&path)?.info().clone(), path })
+        };
         paths.into_iter().map(open).collect()
     }
 
@@ -378,22 +381,45 @@ impl Dataset {
         }
     }
 
-    /// Pictures of a column as files.
+    /// Images of a column as files.
     pub(crate) fn files(&self, name: &str, column: &ArrayRef) -> Result<BinaryArray> {
-        let inner = match column.as_any().downcast_ref::<StructArray>() {
-            Some(fields) => {
-                fields.column_by_name("bytes").ok_or_else(|| self.bad(name, "its fields", "no bytes".to_owned()))?
-            }
-            None => column,
-        };
-        let cast =
-            arrow::compute::cast(inner, &DataType::Binary).map_err(|e| self.bad(name, "its type", e.to_string()))?;
-        let files = cast.as_any().downcast_ref::<BinaryArray>().expect("a binary column");
-        match files.null_count() {
-            0 => Ok(files.clone()),
-            nulls => Err(self.bad(name, "some rows", format!("{nulls} nulls"))),
-        }
+        image_files(self.root(), column).map_err(|found| self.bad(name, "its rows", found))
     }
+}
+
+/// Images of a column of the set `root` as encoded files. Where a row has no bytes, its path names a file inside the set.
+pub(crate) fn image_files(root: &Path, column: &ArrayRef) -> Result<BinaryArray, String> {
+    let fields = column.as_any().downcast_ref::<StructArray>();
+    let (bytes, paths) = match fields {
+        Some(fields) => (fields.column_by_name("bytes"), fields.column_by_name("path")),
+        None => (Some(column), None),
+    };
+    let binary = |array: &ArrayRef| arrow::compute::cast(array, &DataType::Binary).map_err(|e| e.to_string());
+    let files = bytes.map(binary).transpose()?;
+    let files = files.as_ref().and_then(|array| array.as_any().downcast_ref::<BinaryArray>());
+    if let Some(files) = files.filter(|files| files.null_count() == 0) {
+        return Ok(files.clone());
+    }
+    let paths =
+        paths.map(|array| arrow::compute::cast(array, &DataType::Utf8).map_err(|e| e.to_string())).transpose()?;
+    let paths = paths.as_ref().and_then(|array| array.as_any().downcast_ref::<StringArray>());
+    let mut all = BinaryBuilder::new();
+    for row in 0..column.len() {
+        if let Some(file) = files.filter(|files| files.is_valid(row)) {
+            all.append_value(file.value(row));
+            continue;
+        }
+        let Some(path) = paths.filter(|paths| paths.is_valid(row)).map(|paths| Path::new(paths.value(row))) else {
+            return Err(format!("neither bytes nor a path in row {row}"));
+        };
+        if !path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir)) {
+            return Err(format!("no bytes, and the path {} that leads outside the data set", path.display()));
+        }
+        let file = root.join(path);
+        read::refuse_pointer(&file).map_err(|e| e.to_string())?;
+        all.append_value(std::fs::read(&file).map_err(|e| format!("no bytes, and {}: {e}", file.display()))?);
+    }
+    Ok(all.finish())
 }
 
 /// Where an episode's pictures lie in a camera's files.
@@ -428,11 +454,11 @@ pub(crate) fn places(dataset: &Dataset, name: &str) -> Result<Vec<VideoPlace>> {
             places.push(VideoPlace { path: root.join(relative), from: from[row], to: to[row] });
         }
     }
-    Ok(places)
+    dataset.in_order(places)
 }
 
 /// Fills in `video_path`, which is in Python's format language.
-fn relative(info: &Info, name: &str, chunk: i64, file: i64) -> Option<PathBuf> {
+pub(super) fn relative(info: &Info, name: &str, chunk: i64, file: i64) -> Option<PathBuf> {
     let (chunk, file) = (u32::try_from(chunk).ok()?, u32::try_from(file).ok()?);
     let text = info.video_path.as_ref()?.replace("{video_key}", name);
     let text =
@@ -507,6 +533,7 @@ impl Film {
     pub fn locate(&mut self, episode: &EpisodeMeta, place: &VideoPlace) -> Result<usize> {
         if self.open.as_ref().is_none_or(|(path, _)| *path != place.path) {
             self.open = None;
+            read::refuse_pointer(&place.path)?;
             self.open = Some((place.path.clone(), VideoFile::open(&place.path)?));
         }
         let (_, file) = self.open.as_ref().expect("it was just opened");

@@ -11,7 +11,7 @@ use arrow::compute::{cast, concat};
 use arrow::datatypes::DataType;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
-use parquet::errors::ParquetError;
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -42,15 +42,46 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     entries.map(|entry| entry.map(|e| e.path()).map_err(failed)).collect()
 }
 
-/// Reads columns of one file whole, each as one array, in the order of `columns`; a missing one is an error.
-pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<ArrayRef>)> {
-    let failed = |source| DatasetError::Parquet { path: path.to_path_buf(), operation: "read it", source };
+/// Refuses a git-lfs pointer that stands in for the file `path`.
+pub(crate) fn refuse_pointer(path: &Path) -> Result<()> {
+    match is_lfs_pointer(path) {
+        true => Err(InputError::LfsPointer { path: path.to_path_buf() }.into()),
+        // whoever opens it says what else may be wrong
+        false => Ok(()),
+    }
+}
+
+/// Opens a Parquet file.
+pub(crate) fn open(path: &Path) -> Result<ParquetRecordBatchReaderBuilder<File>> {
+    refuse_pointer(path)?;
     let file = File::open(path).map_err(|source| DatasetError::Io {
         path: path.to_path_buf(),
         operation: "open it",
         source,
     })?;
-    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(|source| unreadable(path, source))?;
+    ParquetRecordBatchReaderBuilder::try_new(file).map_err(|source| DatasetError::Parquet {
+        path: path.to_path_buf(),
+        operation: "read it",
+        source,
+    })
+}
+
+/// Reads those of `wanted` that a file has, by name, and the number of its rows.
+pub(crate) fn columns_there(path: &Path, wanted: &[&str]) -> Result<(usize, BTreeMap<String, ArrayRef>)> {
+    let builder = open(path)?;
+    let there: Vec<&str> = wanted.iter().copied().filter(|name| builder.schema().index_of(name).is_ok()).collect();
+    let rows = builder.metadata().file_metadata().num_rows();
+    if there.is_empty() {
+        return Ok((usize::try_from(rows).ok().ok_or_else(|| bad_count(path, rows))?, BTreeMap::new()));
+    }
+    let (rows, arrays) = columns(path, &there)?;
+    Ok((rows, there.into_iter().map(str::to_owned).zip(arrays).collect()))
+}
+
+/// Reads columns of one file whole, each as one array, in the order of `columns`; a missing one is an error.
+pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<ArrayRef>)> {
+    let failed = |source| DatasetError::Parquet { path: path.to_path_buf(), operation: "read it", source };
+    let builder = open(path)?;
     let rows = builder.metadata().file_metadata().num_rows();
     let rows = usize::try_from(rows).ok().ok_or_else(|| bad_count(path, rows))?;
     let mut indices = Vec::with_capacity(columns.len());
@@ -77,14 +108,6 @@ pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<Array
         });
     }
     Ok((rows, arrays))
-}
-
-/// The error of a Parquet file that cannot be opened as one.
-pub(crate) fn unreadable(path: &Path, source: ParquetError) -> DatasetError {
-    match is_lfs_pointer(path) {
-        true => InputError::LfsPointer { path: path.to_path_buf() }.into(),
-        false => DatasetError::Parquet { path: path.to_path_buf(), operation: "read it", source },
-    }
 }
 
 fn bad_count(path: &Path, rows: i64) -> DatasetError {

@@ -6,6 +6,7 @@
 //!   type or shape there.
 //! - `actrm/objects/chunk-NNN/file-NNN.parquet`: a row for each attribute, empty group and dataset that is no such
 //!   column, with its bytes. `next_obs/x` is kept as the rows in which it differs from `obs/x` one step later.
+//! - `actrm/info.json`: where the data came from (also without the rest of the folder).
 //! - `actrm/layout.json`: the columns' types and shapes.
 //! - `actrm/manifest.json`: sha256 of every other file of the data set.
 

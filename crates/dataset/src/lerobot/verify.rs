@@ -1,11 +1,13 @@
 //! Every check that a data set can be given.
 
+use super::check::TIME_TOLERANCE;
 use super::depth;
 use super::encode::PictureSummary;
 use super::export::{Rows, picture_pixels};
+use super::faults::{Area, Tables, listed};
 use super::fingerprint::Fingerprint;
 use super::info::Info;
-use super::open::{Dataset, read_json};
+use super::open::{Dataset, parse_info, read_json};
 use super::pictures::{Film, places};
 use super::schema;
 use super::side::{MANIFEST_FILE, Manifest};
@@ -17,9 +19,6 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
-
-/// Relative difference up to which a stored statistic counts as right: LeRobot computes some in f32.
-const STATISTICS_TOLERANCE: f64 = 1e-5;
 
 /// sha256 of a file in hexadecimal.
 pub(crate) fn hash_file(path: &Path) -> Result<String> {
@@ -62,8 +61,10 @@ pub fn source_hash(path: &Path) -> Result<String> {
 pub struct Check {
     /// What was checked.
     pub name: &'static str,
-    /// `None` when all is well, what is wrong otherwise.
+    /// `None` when all is well, what is wrong otherwise, a line each.
     pub problem: Option<String>,
+    /// What is not as it should be and was read as LeRobot reads it.
+    pub notes: Vec<String>,
 }
 
 const FILES_CHECK: &str = "files have the hashes recorded";
@@ -71,7 +72,7 @@ const FILES_CHECK: &str = "files have the hashes recorded";
 /// Compares a file or folder of demonstrations with the hash that was recorded when the data set at `root` was made
 /// of it: a change that every reader accepts in silence shows here.
 pub fn verify_source(root: &Path, source: &Path) -> Result<Check> {
-    let info: Info = read_json(&root.join("meta/info.json"))?;
+    let (info, _) = parse_info(root)?;
     let Some(provenance) = info.actrm else {
         return Err(DatasetError::NotInDataset {
             path: root.to_path_buf(),
@@ -84,40 +85,64 @@ pub fn verify_source(root: &Path, source: &Path) -> Result<Check> {
         let name = source.display();
         format!("{name}: expected sha256 {} as at the conversion, found {found}", provenance.source_sha256)
     });
-    Ok(Check { name: "the source is what was converted", problem })
+    Ok(Check { name: "the source is what was converted", problem, notes: Vec::new() })
 }
 
-/// Runs every check on the data set at `root`: that it opens, that its columns are finite, that its statistics
-/// follow from its frames, that its content has the recorded fingerprint and its files the recorded hashes.
-/// An error means that a check could not be made.
+/// Runs every check on the data set at `root`: that it opens, that its tables agree with its frames, that its columns are
+/// finite, that its statistics follow from its frames, that its content has the recorded fingerprint and its files the
+/// recorded hashes. An error means that a check could not be made.
 pub fn verify(root: &Path, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Check>> {
+    verify_within(root, TIME_TOLERANCE, progress)
+}
+
+/// [`verify`] with so many seconds that timestamps may be off.
+pub fn verify_within(root: &Path, tolerance: f64, progress: &mut dyn FnMut(u64, u64)) -> Result<Vec<Check>> {
+    const OPENS: &str = "it opens: columns, episodes and tasks agree";
     let mut checks = Vec::new();
-    let mut note = |name, problem| checks.push(Check { name, problem });
+    let mut note = |name, problem| checks.push(Check { name, problem, notes: Vec::new() });
     let manifest = root.join(MANIFEST_FILE).exists();
     if manifest {
         note(FILES_CHECK, manifest_problem(root)?);
     }
-    let dataset = match Dataset::open(root) {
-        Ok(dataset) => {
-            note("it opens: columns, episodes and tasks agree", None);
-            dataset
+    let opened = Dataset::open(root);
+    let tables = Tables::read(root);
+    let problem = opened.as_ref().err().or(tables.as_ref().err()).map(|e| in_full(e));
+    note(OPENS, problem);
+    let mut set = opened.ok();
+    let sound = set.is_some();
+    if let Ok(tables) = &tables {
+        let mut faults = tables.faults(tolerance);
+        if set.is_none() {
+            set = tables.derived().ok();
         }
-        Err(e) => {
-            note("it opens: columns, episodes and tasks agree", Some(in_full(&e)));
-            return Ok(checks);
+        if let Some(set) = &set {
+            faults.extend(tables.statistics_faults(set)?);
         }
-    };
-    if !manifest && dataset.provenance().is_some_and(|p| p.lossless) {
-        note(FILES_CHECK, Some(format!("{MANIFEST_FILE} is missing")));
+        for (area, name) in Area::ALL {
+            let mine: Vec<_> = faults.iter().filter(|fault| fault.area == area).collect();
+            // what was not looked at is not said to be right
+            if area != Area::Statistics || set.is_some() {
+                note(name, listed(&mine));
+            }
+        }
     }
-    note("every number is finite", not_finite(&dataset));
-    note("statistics follow from the frames", statistics_problem(&dataset)?);
-    note("splits name episodes", split_problem(&dataset));
-    if dataset.has_pictures() {
-        note("pictures decode and have the content recorded", picture_problem(&dataset, progress)?);
-    } else if dataset.provenance().is_some() {
-        // opening compared it
-        note("content has the fingerprint recorded", None);
+    if let Some(set) = &set {
+        note("every number is finite", not_finite(set));
+    }
+    if let Some(set) = set.filter(|_| sound) {
+        if !manifest && set.provenance().is_some_and(|p| p.lossless) {
+            note(FILES_CHECK, Some(format!("{MANIFEST_FILE} is missing")));
+        }
+        note("splits name episodes", split_problem(&set));
+        if set.has_pictures() {
+            note("pictures decode and have the content recorded", picture_problem(&set, progress)?);
+        } else if set.provenance().is_some() {
+            // opening compared it
+            note("content has the fingerprint recorded", None);
+        }
+        if let Some(check) = checks.iter_mut().find(|check| check.name == OPENS) {
+            check.notes = set.notes().to_vec();
+        }
     }
     Ok(checks)
 }
@@ -127,57 +152,46 @@ fn manifest_problem(root: &Path) -> Result<Option<String>> {
         Ok(manifest) => manifest,
         Err(e) => return Ok(Some(in_full(&e))),
     };
-    for (name, expected) in &manifest.files {
-        match hash_file(&root.join(name)) {
-            Ok(found) if found == *expected => {}
-            Ok(found) => return Ok(Some(format!("{name}: expected sha256 {expected}, found {found}"))),
-            Err(e) => return Ok(Some(in_full(&e))),
-        }
-    }
-    Ok(None)
+    let problem = |(name, expected): (&String, &String)| match hash_file(&root.join(name)) {
+        Ok(found) if found == *expected => None,
+        Ok(found) => Some(format!("{name}: expected sha256 {expected}, found {found}")),
+        Err(e) => Some(in_full(&e)),
+    };
+    Ok(listed(&manifest.files.iter().filter_map(problem).collect::<Vec<_>>()))
 }
 
 /// An error with what caused it, in a line.
-fn in_full(error: &dyn std::error::Error) -> String {
+pub(super) fn in_full(error: &dyn std::error::Error) -> String {
     let causes = std::iter::successors(error.source(), |e| e.source());
     causes.fold(error.to_string(), |text, cause| format!("{text}: {cause}"))
 }
 
-fn not_finite(dataset: &Dataset) -> Option<String> {
+/// Numbers that are NaN or infinite: the first of each dimension of each episode.
+pub(super) fn not_finite(dataset: &Dataset) -> Option<String> {
+    let mut found = Vec::new();
     for name in dataset.column_names() {
         let column = dataset.column(name)?;
-        if let Some(at) = column.data.iter().position(|v| !v.is_finite()) {
-            let (frame, dimension) = (at / column.dim, at % column.dim);
-            return Some(format!("{name}: frame {frame}, dimension {dimension}: {}", column.data[at]));
-        }
-    }
-    None
-}
-
-fn statistics_problem(dataset: &Dataset) -> Result<Option<String>> {
-    let episodes: Vec<usize> = (0..dataset.episodes().len()).collect();
-    if dataset.stats().is_empty() {
-        return Ok(Some("there are none (meta/stats.json)".to_owned()));
-    }
-    for (name, computed) in dataset.statistics_of(&episodes)? {
-        let Some(stored) = dataset.stats().get(&name) else {
-            return Ok(Some(format!("{name}: none stored")));
-        };
-        if stored.count != computed.count {
-            return Ok(Some(format!("{name}: count: expected {}, found {}", computed.count, stored.count)));
-        }
-        type Get = fn(&FeatureStats) -> &Vec<f64>;
-        let vectors: [(&str, Get); 4] =
-            [("min", |s| &s.min), ("max", |s| &s.max), ("mean", |s| &s.mean), ("std", |s| &s.std)];
-        for (statistic, get) in vectors {
-            let (a, b) = (get(&computed), get(stored));
-            let close = |x: f64, y: f64| (x - y).abs() <= STATISTICS_TOLERANCE * x.abs().max(1.0);
-            if a.len() != b.len() || !a.iter().zip(b).all(|(&x, &y)| close(x, y)) {
-                return Ok(Some(format!("{name}: {statistic}: expected {a:?}, found {b:?}")));
+        for episode in dataset.episodes() {
+            let values = &column.data[episode.from * column.dim..episode.to * column.dim];
+            if values.iter().all(|v| v.is_finite()) {
+                continue;
+            }
+            for dimension in 0..column.dim {
+                let mut bad =
+                    values.iter().skip(dimension).step_by(column.dim).enumerate().filter(|(_, v)| !v.is_finite());
+                let Some((frame, value)) = bad.next() else { continue };
+                let more = match bad.count() {
+                    0 => String::new(),
+                    more => format!(" ({more} more frames of it)"),
+                };
+                found.push(format!(
+                    "{name}: episode {}, frame {frame}, dimension {dimension}: {value}{more}",
+                    episode.index
+                ));
             }
         }
     }
-    Ok(None)
+    listed(&found)
 }
 
 fn split_problem(dataset: &Dataset) -> Option<String> {

@@ -184,7 +184,7 @@ pub(super) fn prepare(
     let Agreed { dataset, experiment, .. } = agreed;
     let unfit = |reason: String| ZooError::UnfitData { path: path.to_owned(), reason };
     let failed = |source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) };
-    let mut notes = Vec::new();
+    let mut notes = dataset.notes().to_vec();
     let all: Vec<usize> = (0..dataset.episodes().len()).collect();
     let usual = DataSection::default();
     let mask = &experiment.data.train_mask;
@@ -348,8 +348,8 @@ pub(crate) fn first_windows(
 /// Mean and standard deviation of three colours.
 fn colours(stats: &FeatureStats) -> Option<([f32; 3], [f32; 3])> {
     let three = |values: &[f64]| -> Option<[f32; 3]> {
-        let values: Vec<f32> = values.iter().map(|&x| x as f32).collect();
-        values.try_into().ok()
+        let values: [f32; 3] = values.iter().map(|&x| x as f32).collect::<Vec<_>>().try_into().ok()?;
+        values.iter().all(|x| x.is_finite()).then_some(values)
     };
     Some((three(&stats.mean)?, three(&stats.std)?))
 }

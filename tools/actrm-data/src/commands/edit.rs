@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// Make a data set of data sets: leave episodes out, split, merge, rename features.
+/// Make a data set of data sets: leave episodes out, split, merge, rename features, repair tables.
 ///
 /// Works on LeRobotDataset v3.0 directories, ours or LeRobot's. Pictures and videos are carried over as they are stored;
 /// numbers, tasks, masks, statistics, fingerprint and the side folder follow from the episodes that the result has, as if it
@@ -19,7 +19,8 @@ use std::process::ExitCode;
   actrm-data edit keep lift lift_train --mask train
   actrm-data edit split lift parts --fractions train=0.8,valid=0.2
   actrm-data edit merge lift more_lift --out all
-  actrm-data edit rename lift lift_front --feature observation.images.agentview=observation.images.front"
+  actrm-data edit rename lift lift_front --feature observation.images.agentview=observation.images.front
+  actrm-data edit repair recorded recorded_fixed"
 )]
 pub struct Args {
     #[command(subcommand)]
@@ -57,6 +58,25 @@ enum Operation {
   actrm-data edit rename lift lift_front --feature observation.images.agentview=observation.images.front
   actrm-data edit rename lift --in-place --feature next.reward=reward")]
     Rename(Rename),
+    /// Correct what follows from the frames: indices, tasks, episodes, statistics, totals, splits
+    ///
+    /// Frames stay as they are. What `actrm-data validate` finds wrong is corrected and printed; a set in which nothing is to be
+    /// corrected is left alone, and nothing is written. The exit code is 1 when something is wrong that does not follow from the
+    /// frames.
+    #[command(after_help = "Examples:
+  actrm-data edit repair recorded recorded_fixed
+  actrm-data edit repair recorded --in-place
+  actrm-data edit repair recorded --in-place --timestamps")]
+    Repair(Repair),
+}
+
+#[derive(clap::Args)]
+struct Repair {
+    #[command(flatten)]
+    sets: OneSet,
+    /// Also rewrite timestamps that are not frame_index / fps. Times of a real clock are lost
+    #[arg(long)]
+    timestamps: bool,
 }
 
 #[derive(clap::Args)]
@@ -223,11 +243,42 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             let report = edit::rename(&sets.set, &sets.destination(), &renames, &mut advance)?;
             (vec![(sets.result().to_path_buf(), report)], sets.json)
         }
+        Operation::Repair(Repair { sets, timestamps }) => {
+            let what = edit::Repair { timestamps: *timestamps };
+            let report = edit::repair(&sets.set, &sets.destination(), what, &mut advance)?;
+            drop(advance);
+            screen.clear();
+            return tell_repair(sets, report);
+        }
     };
     drop(advance);
     screen.clear();
     tell(&made, json)?;
     Ok(ExitCode::SUCCESS)
+}
+
+fn tell_repair(sets: &OneSet, report: edit::RepairReport) -> Result<ExitCode> {
+    let code = if report.left.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE };
+    if sets.json {
+        let made = report.made.as_ref();
+        made.iter().flat_map(|made| &made.notes).for_each(|note| cli::note(&format!("note: {note}")));
+        cli::print_json(&json!({
+            "out": made.map(|_| cli::lossy(sets.result())), "corrected": report.corrected, "left": report.left,
+            "fingerprint": made.map(|made| &made.fingerprint), "notes": made.map(|made| &made.notes),
+        }))?;
+        return Ok(code);
+    }
+    let mut text = String::new();
+    report.corrected.iter().for_each(|line| text.push_str(&format!("corrected  {line}\n")));
+    report.left.iter().for_each(|line| text.push_str(&format!("left       {line}\n")));
+    if report.made.is_none() {
+        text.push_str(&format!("{}: nothing to repair; nothing was written\n", sets.set.display()));
+    }
+    cli::print(&text)?;
+    if let Some(made) = report.made {
+        tell(&[(sets.result().to_path_buf(), made)], false)?;
+    }
+    Ok(code)
 }
 
 fn tell(made: &[(PathBuf, EditReport)], json: bool) -> Result<()> {

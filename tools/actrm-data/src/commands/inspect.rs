@@ -273,6 +273,7 @@ fn of_dataset(args: &Args) -> Result<Summary> {
             .into_iter()
             .chain([format!("fingerprint {}", set.fingerprint())])
             .chain(set.provenance().map_or_else(Vec::new, |provenance| provenance.notes()))
+            .chain(set.notes().iter().cloned())
             .collect(),
         problems,
         each: if args.demos { each.collect() } else { Vec::new() },

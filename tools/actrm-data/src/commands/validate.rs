@@ -6,9 +6,9 @@ use std::process::ExitCode;
 
 /// Make every check of a data set or of a file of demonstrations.
 ///
-/// A data set: hashes of its files, agreement of columns, episodes and tasks, finite numbers, statistics, splits,
-/// pictures, and the fingerprint of its content; with --source also whether the file that it was converted from is still
-/// the same, down to the last bit. A file: its structure, and every value of every demo. The exit code is 1 when
+/// A data set: hashes of its files, agreement of columns, episodes, tasks, totals and timestamps with its frames, finite
+/// numbers, statistics, splits, pictures, and the fingerprint of its content; with --source also whether the file that it was converted from is still
+/// the same, down to the last bit. `actrm-data edit repair` corrects what follows from the frames. A file: its structure, and every value of every demo. The exit code is 1 when
 /// anything is wrong.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
@@ -22,6 +22,9 @@ pub struct Args {
     /// File or folder that the data set was converted from: compare it with the hash recorded then
     #[arg(long, value_name = "FILE")]
     source: Option<PathBuf>,
+    /// Seconds that timestamps of a data set may be off, as LeRobot's tolerance_s
+    #[arg(long, value_name = "SECONDS", default_value_t = dataset::TIME_TOLERANCE)]
+    tolerance: f64,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -31,7 +34,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut notes = Vec::new();
     let checks = if args.path.join("meta/info.json").exists() {
         let mut screen = cli::Screen::new();
-        let checks = dataset::verify(&args.path, &mut screen.advance("checking"));
+        let checks = dataset::verify_within(&args.path, args.tolerance, &mut screen.advance("checking"));
         screen.clear();
         let mut checks = checks?;
         // where they cannot be had, a check says why
@@ -48,15 +51,19 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let problems = checks.iter().filter(|c| c.problem.is_some()).count();
     if args.json {
         let list: Vec<_> =
-            checks.iter().map(|c| json!({"check": c.name, "ok": c.problem.is_none(), "problem": c.problem})).collect();
+            checks.iter().map(|c| json!({"check": c.name, "ok": c.problem.is_none(), "problem": c.problem, "notes": c.notes})).collect();
         cli::print_json(&json!({"path": cli::lossy(&args.path), "ok": problems == 0, "checks": list, "notes": notes}))?;
     } else {
         let mut text = String::new();
         for check in &checks {
             match &check.problem {
                 None => text.push_str(&format!("ok      {}\n", check.name)),
-                Some(problem) => text.push_str(&format!("WRONG   {}: {problem}\n", check.name)),
+                Some(problem) => {
+                    let problem = problem.replace('\n', "\n        ");
+                    text.push_str(&format!("WRONG   {}: {problem}\n", check.name));
+                }
             }
+            check.notes.iter().for_each(|note| text.push_str(&format!("note    {note}\n")));
         }
         for note in &notes {
             text.push_str(&format!("note    {note}\n"));
@@ -74,7 +81,7 @@ fn check_source(args: &Args, notes: &mut Vec<String>) -> Result<Vec<Check>> {
     let plan = source.plan();
     notes.extend(plan.notes.iter().cloned());
     let mut checks = Vec::new();
-    let mut note = |name, problem| checks.push(Check { name, problem });
+    let mut note = |name, problem| checks.push(Check { name, problem, notes: Vec::new() });
     note("it opens: a known layout with demos", None);
     let structure: Vec<&str> = plan.problems.iter().map(|p| p.message.as_str()).collect();
     note("demos have what they must have", (!structure.is_empty()).then(|| structure.join("; ")));

@@ -5,6 +5,7 @@ use super::super::encode::PictureSummary;
 use super::super::info::FILES_PER_FOLDER;
 use super::super::open::{Dataset, EpisodeMeta};
 use super::super::pictures::{Film, VideoPlace, places};
+use super::super::read::refuse_pointer;
 use super::super::shards::{HashingFile, WrittenFile, create_parent};
 use super::super::videos::{Stretch, rate};
 use super::Edit;
@@ -93,6 +94,7 @@ impl Target<'_> {
     fn whole(&self, places: &[VideoPlace], episodes: &[usize]) -> Result<(WrittenFile, Spans)> {
         let source = &places[episodes[0]].path;
         let read = |source_error| DatasetError::Io { path: source.clone(), operation: "read it", source: source_error };
+        refuse_pointer(source)?;
         let mut from = File::open(source).map_err(read)?;
         let mut to = self.create()?;
         let mut part = vec![0; COPIED];
@@ -140,6 +142,7 @@ struct Source(Video);
 
 impl Source {
     fn open(path: &Path) -> Result<Self> {
+        refuse_pointer(path)?;
         Ok(Self(Video::open(path)?))
     }
 

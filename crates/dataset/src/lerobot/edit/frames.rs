@@ -7,6 +7,7 @@ use super::super::export::Rows;
 use super::super::images;
 use super::super::info::{FILES_PER_FOLDER, Feature};
 use super::super::open::{Dataset, EpisodeMeta};
+use super::super::pictures::image_files;
 use super::super::read::{self, BadColumn};
 use super::super::schema;
 use super::super::shards::{GroupEncoder, Place, ShardWriter, WrittenFile};
@@ -17,16 +18,14 @@ use super::groups::Groups;
 use super::{Edit, Renames};
 use crate::error::{DatasetError, Result};
 use crate::stats::FeatureStats;
-use arrow::array::{Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, RecordBatch};
+use arrow::array::{Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, RecordBatch, StructArray};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::file::metadata::KeyValue;
 use rayon::prelude::*;
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -68,7 +67,7 @@ pub(super) fn copy(edit: &Edit<'_>, advance: &mut dyn FnMut(u64)) -> Result<Copi
     let mut shards = ShardWriter::new(edit.root, "data", &encoder, limit, FILES_PER_FOLDER);
     let mut append = |group, begins| shards.append(group, begins);
     let mut groups = Groups::new(edit.root, &encoder, limit);
-    let mut copied = Copied { files: Vec::new(), tasks: Vec::new(), episodes: Vec::new() };
+    let mut copied = Copied { files: Vec::new(), tasks: edit.tasks(), episodes: Vec::new() };
     let picture_bytes: usize =
         edit.features.0.iter().filter(|(_, f)| f.dtype == "image").map(|(_, f)| f.picture_bytes()).sum();
     let batch_rows = (GROUP_BYTES as usize / picture_bytes.max(1)).clamp(1, 1024);
@@ -120,10 +119,7 @@ fn number_of(tasks: &mut Vec<String>, text: &str) -> usize {
 /// Face's `datasets`.
 fn written_as(root: &Path, renames: &Renames) -> Result<(Vec<String>, SchemaRef, Option<KeyValue>)> {
     let path = read::files(root, "data")?.swap_remove(0);
-    let failed = |source| DatasetError::Parquet { path: path.clone(), operation: "read it", source };
-    let file =
-        File::open(&path).map_err(|source| DatasetError::Io { path: path.clone(), operation: "open it", source })?;
-    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(failed)?;
+    let builder = read::open(&path)?;
     let names: Vec<String> = builder.schema().fields().iter().map(|f| f.name().clone()).collect();
     let new = |name: &String| renames.get(name).unwrap_or(name).clone();
     let field = |field: &Arc<Field>| {
@@ -158,6 +154,7 @@ fn columns(root: &Path, batch: &RecordBatch, names: &[String], schema: &Schema) 
             wanted: format!("column {name}"),
             found: batch.schema().fields().iter().map(|f| f.name().as_str()).collect::<Vec<_>>().join(", "),
         })?;
+        let array = &with_bytes(root, name, array)?;
         match array.data_type() == field.data_type() {
             true => Ok(ArrayRef::clone(array)),
             false => cast(array, field.data_type()).map_err(|e| {
@@ -167,6 +164,25 @@ fn columns(root: &Path, batch: &RecordBatch, names: &[String], schema: &Schema) 
         }
     };
     names.iter().zip(schema.fields()).map(column).collect()
+}
+
+/// An image column whose rows have their files in them: those that are named by path are read, for the result lies elsewhere.
+fn with_bytes(root: &Path, name: &str, array: &ArrayRef) -> Result<ArrayRef> {
+    let Some(images) = array.as_any().downcast_ref::<StructArray>() else { return Ok(ArrayRef::clone(array)) };
+    let Some(at) = images.column_names().iter().position(|field| *field == "bytes") else {
+        return Ok(ArrayRef::clone(array));
+    };
+    if images.column(at).null_count() == 0 {
+        return Ok(ArrayRef::clone(array));
+    }
+    let path = root.join("data");
+    let column = BadColumn { path: &path, name };
+    let bad = |found: String| column.because("an image in every row", found);
+    let files: ArrayRef = Arc::new(image_files(root, array).map_err(bad)?);
+    let mut columns = images.columns().to_vec();
+    columns[at] = cast(&files, images.column(at).data_type()).map_err(|e| bad(e.to_string()))?;
+    let whole = StructArray::try_new(images.fields().clone(), columns, images.nulls().cloned());
+    Ok(Arc::new(whole.map_err(|e| bad(e.to_string()))?))
 }
 
 /// Pixels of a picture.
@@ -189,8 +205,10 @@ struct Seen<'a> {
     episode: usize,
     /// Column of the data files of each feature; none for videos.
     columns: Vec<Option<usize>>,
-    /// Columns of episode, frame and task numbers.
-    numbers: [Option<usize>; 3],
+    /// Columns of the numbers of episodes, frames (in the set and in the episode) and tasks.
+    numbers: [Option<usize>; 4],
+    /// The column of times, where they are made anew.
+    times: Option<usize>,
     /// Frames whose pictures enter the statistics.
     sampled: Vec<usize>,
     values: Vec<Values>,
@@ -201,7 +219,7 @@ impl<'a> Seen<'a> {
     fn new(edit: &'a Edit<'a>, set: &'a Dataset, schema: &Schema, part: Part, episode: &EpisodeMeta) -> Self {
         let place = |name: &str| schema.index_of(name).ok();
         let values = edit.features.0.iter().map(|(_, feature)| match feature.dtype.as_str() {
-            "image" | "video" | "string" => Values::Pictures,
+            _ if feature.is_visual() || feature.is_text() => Values::Pictures,
             "bool" => Values::Bool(Vec::new()),
             "float64" => Values::F64(Vec::new()),
             whole if whole.contains("int") => Values::I64(Vec::new()),
@@ -213,7 +231,8 @@ impl<'a> Seen<'a> {
             rows: 0,
             episode: episode.index,
             columns: edit.features.0.iter().map(|(name, _)| place(name)).collect(),
-            numbers: ["episode_index", "index", "task_index"].map(place),
+            numbers: ["episode_index", "index", "frame_index", "task_index"].map(place),
+            times: edit.repair.and_then(|repair| if repair.timestamps { place("timestamp") } else { None }),
             sampled: sample(part.length),
             values: values.collect(),
             pictures: BTreeMap::new(),
@@ -225,11 +244,23 @@ impl<'a> Seen<'a> {
     fn numbered(&self, mut arrays: Vec<ArrayRef>, tasks: &mut Vec<String>) -> Result<Vec<ArrayRef>> {
         let path = self.set.root().join("data");
         let rows = arrays.first().map_or(0, |a| a.len());
-        let first = (self.part.first_frame + self.rows) as i64;
-        let [episode, index, task] = self.numbers;
-        let mut numbers =
-            vec![(episode, vec![self.part.episode as i64; rows]), (index, (first..first + rows as i64).collect())];
-        if let Some(at) = task {
+        let as_type = |array: &ArrayRef, to: &DataType| {
+            cast(array, to).map_err(|source| DatasetError::Parquet {
+                path: path.clone(),
+                operation: "number its rows",
+                source: source.into(),
+            })
+        };
+        let [episode, index, frame, task] = self.numbers;
+        let counting = |from: usize| (from as i64..(from + rows) as i64).collect::<Vec<_>>();
+        let mut numbers = vec![
+            (episode, vec![self.part.episode as i64; rows]),
+            (index, counting(self.part.first_frame + self.rows)),
+            (frame, counting(self.rows)),
+        ];
+        if let (Some(at), Some(_), [task]) = (task, self.edit.repair, self.tasks()) {
+            numbers.push((Some(at), vec![number_of(tasks, task) as i64; rows]));
+        } else if let Some(at) = task {
             let mut known: BTreeMap<i64, i64> = BTreeMap::new();
             let mut new = Vec::with_capacity(rows);
             for &old in read::integers(&path, "task_index", &arrays[at])?.iter() {
@@ -246,18 +277,24 @@ impl<'a> Seen<'a> {
         for (column, numbers) in numbers {
             let Some(at) = column else { continue };
             let numbers: ArrayRef = Arc::new(Int64Array::from(numbers));
-            arrays[at] = cast(&numbers, arrays[at].data_type()).map_err(|source| DatasetError::Parquet {
-                path: path.clone(),
-                operation: "number its rows",
-                source: source.into(),
-            })?;
+            arrays[at] = as_type(&numbers, arrays[at].data_type())?;
+        }
+        if let Some(at) = self.times {
+            let fps = self.set.info().fps;
+            let times = (self.rows..self.rows + rows).map(|frame| frame as f64 / fps);
+            let times: ArrayRef = Arc::new(Float64Array::from_iter_values(times));
+            arrays[at] = as_type(&times, arrays[at].data_type())?;
         }
         Ok(arrays)
     }
 
+    /// Task texts of the episode.
+    fn tasks(&self) -> &[String] {
+        &self.set.episodes()[self.episode].tasks
+    }
+
     fn task(&self, path: &Path, number: i64) -> Result<&str> {
-        let text = usize::try_from(number).ok().and_then(|number| self.set.tasks().get(number));
-        text.map(String::as_str).ok_or_else(|| DatasetError::BadDataset {
+        self.set.task(number).ok_or_else(|| DatasetError::BadDataset {
             path: path.to_path_buf(),
             object: format!("task_index in episode {}", self.episode),
             expected: format!("one of {} tasks", self.set.tasks().len()),
@@ -378,14 +415,14 @@ fn stored_statistics(edit: &Edit<'_>, set: &Dataset) -> Result<BTreeMap<String, 
             each.extend(statistics_in(&path, edit.before(name))?);
         }
         if !each.is_empty() {
-            stored.insert(name.clone(), each);
+            stored.insert(name.clone(), set.in_order(each)?);
         }
     }
     Ok(stored)
 }
 
 /// A feature's statistics in one file of episodes; nothing where it has none, no quantiles where they were not stored yet.
-fn statistics_in(path: &Path, feature: &str) -> Result<Vec<FeatureStats>> {
+pub(crate) fn statistics_in(path: &Path, feature: &str) -> Result<Vec<FeatureStats>> {
     let read = |statistics: [&str; 5]| -> Result<Option<Vec<Vec<Vec<f64>>>>> {
         let names = statistics.map(|statistic| format!("stats/{feature}/{statistic}"));
         match read::columns(path, &names.each_ref().map(String::as_str)) {

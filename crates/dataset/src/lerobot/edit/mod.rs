@@ -9,9 +9,12 @@ mod films;
 mod frames;
 mod groups;
 mod origin;
+mod repair;
 mod select;
 mod side;
 
+pub(crate) use frames::statistics_in;
+pub use repair::{Repair, RepairReport, repair};
 pub use select::{Parts, Selection};
 
 use super::check;
@@ -104,6 +107,8 @@ struct Edit<'a> {
     /// The columns of the result.
     features: Features,
     renames: &'a Renames,
+    /// Whether the tables are made anew from the frames.
+    repair: Option<Repair>,
     /// Where it is written.
     root: &'a Path,
 }
@@ -115,7 +120,7 @@ struct Edit<'a> {
 pub fn keep(set: &Path, to: &Destination, chosen: &Selection, progress: &mut Progress<'_>) -> Result<EditReport> {
     let input = Input::open(set, progress)?;
     let episodes = chosen.resolve(&input.set)?.into_iter().collect();
-    one(input, to, episodes, &Renames::new(), progress)
+    one(input, to, episodes, &Renames::new(), None, progress)
 }
 
 /// `set` without the episodes that are `chosen`.
@@ -133,7 +138,7 @@ pub fn without(set: &Path, to: &Destination, chosen: &Selection, progress: &mut 
             found: format!("{}, each to be dropped", gone.len()),
         });
     }
-    one(input, to, left, &Renames::new(), progress)
+    one(input, to, left, &Renames::new(), None, progress)
 }
 
 /// `set` with features under other names. The five index columns keep theirs, and so does `action` where its origin is
@@ -145,7 +150,7 @@ pub fn rename(set: &Path, to: &Destination, renames: &Renames, progress: &mut Pr
     let input = Input::open(set, progress)?;
     check_names(&input.set, renames)?;
     let all = (0..input.set.episodes().len()).collect();
-    one(input, to, all, renames, progress)
+    one(input, to, all, renames, None, progress)
 }
 
 /// Several data sets of some of the episodes of `set`, each in a folder of its name in the new directory `out`, which
@@ -177,7 +182,7 @@ pub fn split(
             operation: "create the folder",
             source,
         })?;
-        made.push((name, compose(&inputs, vec![taken], &Renames::new(), &root, &mut advance)?));
+        made.push((name, compose(&inputs, vec![taken], &Renames::new(), None, &root, &mut advance)?));
     }
     staging.publish()?;
     Ok(made)
@@ -192,7 +197,7 @@ pub fn merge(sets: &[PathBuf], out: &Path, progress: &mut Progress<'_>) -> Resul
     let inputs = sets.iter().map(|set| Input::open(set, progress)).collect::<Result<Vec<_>>>()?;
     let taken: Vec<Vec<usize>> = inputs.iter().map(|input| (0..input.set.episodes().len()).collect()).collect();
     let staging = Staging::create(out)?;
-    let report = told(&inputs, taken, &Renames::new(), staging.path(), progress)?;
+    let report = told(&inputs, taken, &Renames::new(), None, staging.path(), progress)?;
     staging.publish()?;
     Ok(report)
 }
@@ -203,13 +208,14 @@ fn one(
     to: &Destination,
     taken: Vec<usize>,
     renames: &Renames,
+    repair: Option<Repair>,
     progress: &mut Progress<'_>,
 ) -> Result<EditReport> {
     let staging = match to {
         Destination::New(out) => Staging::create(out)?,
         Destination::InPlace => Staging::replacing(input.set.root())?,
     };
-    let report = told(&[input], vec![taken], renames, staging.path(), progress)?;
+    let report = told(&[input], vec![taken], renames, repair, staging.path(), progress)?;
     staging.publish()?;
     Ok(report)
 }
@@ -219,13 +225,14 @@ fn told(
     inputs: &[Input],
     taken: Vec<Vec<usize>>,
     renames: &Renames,
+    repair: Option<Repair>,
     root: &Path,
     progress: &mut Progress<'_>,
 ) -> Result<EditReport> {
     let total = inputs.iter().zip(&taken).map(|(input, taken)| work_of(&input.set, taken)).sum();
     let mut done = 0;
     progress(0, total);
-    compose(inputs, taken, renames, root, &mut |frames| {
+    compose(inputs, taken, renames, repair, root, &mut |frames| {
         done += frames;
         progress(done, total);
     })
@@ -243,12 +250,13 @@ fn compose(
     inputs: &[Input],
     taken: Vec<Vec<usize>>,
     renames: &Renames,
+    repair: Option<Repair>,
     root: &Path,
     advance: &mut dyn FnMut(u64),
 ) -> Result<EditReport> {
-    let mut notes = Vec::new();
+    let mut notes: Vec<String> = inputs.iter().flat_map(|input| input.set.notes()).cloned().collect();
     let features = renamed(agree::features(inputs)?, renames);
-    let edit = Edit { inputs, taken, features, renames, root };
+    let edit = Edit { inputs, taken, features, renames, repair, root };
     let first = inputs[0].set.info();
     let mut copied = frames::copy(&edit, advance)?;
     let mut files = std::mem::take(&mut copied.files);
@@ -296,7 +304,7 @@ fn compose(
         actrm: origin,
         ..first.clone()
     };
-    files.push(meta::write_json(root, "meta/info.json", &check::sealed(info, root)?)?);
+    files.extend(meta::write_info(root, &check::sealed(info, root)?)?);
     if lossless {
         files.push(write_manifest(root, &files)?);
     }
@@ -319,6 +327,17 @@ impl Edit<'_> {
         self.renames.iter().find(|(_, new)| *new == name).map_or(name, |(old, _)| old)
     }
 
+    /// Task texts that the result has whichever of them its frames do.
+    fn tasks(&self) -> Vec<String> {
+        let mut tasks: Vec<String> = Vec::new();
+        for text in self.inputs.iter().filter(|_| self.repair.is_some()).flat_map(|input| input.set.tasks()) {
+            if !tasks.contains(text) {
+                tasks.push(text.clone());
+            }
+        }
+        tasks
+    }
+
     /// Whether content is hashed: of sets that LeRobot wrote, pictures are no part of the fingerprint.
     fn digests(&self) -> bool {
         self.inputs.iter().all(|input| input.set.provenance().is_some())
@@ -338,7 +357,7 @@ impl Edit<'_> {
         }
         for (name, feature) in self.features.0.iter().filter(|(_, f)| f.is_visual()) {
             let stored = input.set.stats().get(self.before(name));
-            if let (false, Some(stored)) = (frames::is_looked_at(feature), stored) {
+            if let (false, Some(stored)) = (frames::is_looked_at(feature), stored.filter(|s| meta::are_finite(s))) {
                 stats.insert(name.clone(), stored.clone());
             }
         }

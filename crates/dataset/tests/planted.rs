@@ -1,0 +1,660 @@
+//! Faults planted in sound data sets, one at a time: `verify` names each, and `edit repair` corrects those that follow from the
+//! frames.
+
+#![allow(clippy::unwrap_used)]
+
+use arrow::array::{
+    Array as _, ArrayRef, AsArray, BinaryArray, Float32Array, Float64Array, Int64Array, ListBuilder, RecordBatch,
+    StringArray, StringBuilder, StructArray,
+};
+use arrow::compute::{cast, concat_batches, take_record_batch};
+use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int64Type};
+use dataset::edit::{Destination, Repair, Selection, keep, repair};
+use dataset::{
+    Array, Check, ConvertOptions, Dataset, Demo, RobomimicWriter, WriteOptions, convert, verify, verify_within,
+};
+use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+const DATA: &str = "data/chunk-000/file-000.parquet";
+const LATER: &str = "data/chunk-000/file-001.parquet";
+const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
+const TASKS: &str = "meta/tasks.parquet";
+const INFO: &str = "meta/info.json";
+const STATS: &str = "meta/stats.json";
+const DEMOS: usize = 12;
+const FRAMES: usize = 400;
+
+fn quiet(_: u64, _: u64) {}
+
+/// Twelve demos of three tasks, whose frames lie in two files.
+fn sound(out: &Path) {
+    let file = out.with_extension("hdf5");
+    let mut writer = RobomimicWriter::create(&file, &WriteOptions::default()).unwrap();
+    writer.set_root(&Demo::default()).unwrap();
+    for number in 0..DEMOS {
+        let mut demo = Demo { id: format!("demo_{number}"), ..Demo::default() };
+        demo.attrs.insert("num_samples".to_owned(), Array::from_i64(vec![], &[FRAMES as i64]));
+        demo.attrs.insert("ep_meta".to_owned(), Array::from_str(&format!("{{\"lang\": \"task {}\"}}", number % 3)));
+        for (key, width) in [("robot0_eef_pos", 3), ("robot0_eef_quat", 4), ("robot0_gripper_qpos", 2), ("object", 4)] {
+            let values: Vec<f64> = (0..FRAMES * width).map(|i| ((i + 31 * number) as f64 * 0.37).sin()).collect();
+            demo.datasets.insert(format!("obs/{key}"), Array::from_f64(vec![FRAMES, width], &values));
+        }
+        let actions: Vec<f64> = (0..FRAMES * 7).map(|i| ((i * i + number) as f64).cos()).collect();
+        demo.datasets.insert("actions".to_owned(), Array::from_f64(vec![FRAMES, 7], &actions));
+        let rewards: Vec<f64> = (0..FRAMES).map(|i| f64::from(i + 1 == FRAMES)).collect();
+        demo.datasets.insert("rewards".to_owned(), Array::from_f64(vec![FRAMES], &rewards));
+        demo.datasets.insert("dones".to_owned(), Array::from_f64(vec![FRAMES], &rewards));
+        writer.add_demo(&demo).unwrap();
+    }
+    writer.finish().unwrap();
+    let options = ConvertOptions { fps: Some(20.0), data_file_mb: 0.001, ..ConvertOptions::default() };
+    convert(&file, out, &options, &mut quiet).unwrap();
+}
+
+fn copy(from: &Path, to: &Path) {
+    std::fs::create_dir(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap() {
+        let (path, target) = (entry.as_ref().unwrap().path(), to.join(entry.unwrap().file_name()));
+        match path.is_dir() {
+            true => copy(&path, &target),
+            false => drop(std::fs::copy(&path, &target).unwrap()),
+        }
+    }
+}
+
+fn files(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in std::fs::read_dir(root).unwrap() {
+        let path = entry.unwrap().path();
+        let name = PathBuf::from(path.file_name().unwrap());
+        match path.is_dir() {
+            true => found.extend(files(&path).into_iter().map(|(k, v)| (name.join(k), v))),
+            false => drop(found.insert(name, std::fs::read(&path).unwrap())),
+        }
+    }
+    found
+}
+
+fn edit_json(root: &Path, file: &str, edit: impl Fn(&mut Value)) {
+    let path = root.join(file);
+    let mut value: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    edit(&mut value);
+    std::fs::write(path, serde_json::to_vec_pretty(&value).unwrap()).unwrap();
+}
+
+fn read_table(path: &Path) -> RecordBatch {
+    let reader = ParquetRecordBatchReaderBuilder::try_new(File::open(path).unwrap()).unwrap().build().unwrap();
+    let batches: Vec<RecordBatch> = reader.map(Result::unwrap).collect();
+    concat_batches(&batches[0].schema(), &batches).unwrap()
+}
+
+fn edit_table(root: &Path, file: &str, edit: impl Fn(RecordBatch) -> RecordBatch) {
+    let path = root.join(file);
+    let table = edit(read_table(&path));
+    let mut writer = ArrowWriter::try_new(File::create(&path).unwrap(), table.schema(), None).unwrap();
+    writer.write(&table).unwrap();
+    writer.close().unwrap();
+}
+
+/// The table with a column of another type.
+fn with_column(table: &RecordBatch, name: &str, edit: impl Fn(&ArrayRef) -> ArrayRef) -> RecordBatch {
+    let schema = table.schema();
+    let column = |(field, column): (&Arc<Field>, &ArrayRef)| match field.name() == name {
+        true => (field.name().clone(), edit(column)),
+        false => (field.name().clone(), Arc::clone(column)),
+    };
+    RecordBatch::try_from_iter(schema.fields().iter().zip(table.columns()).map(column)).unwrap()
+}
+
+fn edit_column(root: &Path, file: &str, name: &str, edit: impl Fn(&ArrayRef) -> ArrayRef) {
+    edit_table(root, file, |table| {
+        let at = table.schema().index_of(name).unwrap();
+        let mut columns = table.columns().to_vec();
+        columns[at] = edit(&columns[at]);
+        RecordBatch::try_new(table.schema(), columns).unwrap()
+    });
+}
+
+/// Edits the whole numbers of a column, by row.
+fn edit_numbers(root: &Path, file: &str, name: &str, edit: impl Fn(usize, i64) -> i64) {
+    edit_column(root, file, name, |column| {
+        let numbers = column.as_primitive::<Int64Type>().values();
+        Arc::new(Int64Array::from_iter_values(numbers.iter().enumerate().map(|(row, &number)| edit(row, number))))
+    });
+}
+
+fn edit_times(root: &Path, edit: impl Fn(usize, f32) -> f32) {
+    edit_column(root, DATA, "timestamp", |column| {
+        let times = column.as_primitive::<Float32Type>().values();
+        Arc::new(Float32Array::from_iter_values(times.iter().enumerate().map(|(row, &time)| edit(row, time))))
+    });
+}
+
+/// Edits the numbers that lie in a column of lists, one after the other.
+fn edit_list(root: &Path, file: &str, name: &str, edit: impl Fn(usize, f64) -> f64) {
+    edit_column(root, file, name, |column| {
+        let inner = match column.data_type() {
+            DataType::FixedSizeList(..) => Arc::clone(column.as_fixed_size_list().values()),
+            _ => Arc::clone(column.as_list::<i32>().values()),
+        };
+        let numbers = cast(&inner, &DataType::Float64).unwrap();
+        let numbers = numbers.as_primitive::<Float64Type>().values();
+        let edited = Float64Array::from_iter_values(numbers.iter().enumerate().map(|(i, &number)| edit(i, number)));
+        let edited = cast(&edited, inner.data_type()).unwrap();
+        arrow::array::make_array(column.to_data().into_builder().child_data(vec![edited.to_data()]).build().unwrap())
+    });
+}
+
+/// The rows of a table in another order, or fewer or more of them.
+fn edit_rows(root: &Path, file: &str, rows: &[u32]) {
+    let rows = arrow::array::UInt32Array::from(rows.to_vec());
+    edit_table(root, file, |table| take_record_batch(&table, &rows).unwrap());
+}
+
+fn set_tasks(root: &Path, episode: usize, texts: &[&str]) {
+    edit_column(root, EPISODES, "tasks", |column| {
+        let field = match column.data_type() {
+            DataType::List(field) => Arc::clone(field),
+            other => panic!("{other}"),
+        };
+        let mut lists = ListBuilder::new(StringBuilder::new()).with_field(field);
+        for (row, list) in column.as_list::<i32>().iter().enumerate() {
+            match row == episode {
+                true => texts.iter().for_each(|text| lists.values().append_value(text)),
+                false => list.unwrap().as_string::<i32>().iter().for_each(|text| lists.values().append_option(text)),
+            }
+            lists.append(true);
+        }
+        Arc::new(lists.finish())
+    });
+}
+
+fn set_table_of_tasks(root: &Path, numbers: &[i64], texts: &[&str]) {
+    edit_table(root, TASKS, |table| {
+        let columns: Vec<ArrayRef> =
+            vec![Arc::new(Int64Array::from(numbers.to_vec())), Arc::new(StringArray::from(texts.to_vec()))];
+        RecordBatch::try_new(table.schema(), columns).unwrap()
+    });
+}
+
+/// A fault: its name, how it is planted, what the checks say of it.
+type Planted = (&'static str, fn(&Path), &'static [&'static str]);
+
+/// Faults that the frames correct.
+const REPAIRABLE: &[Planted] = &[
+    (
+        "episodes counted wrongly",
+        |s| edit_json(s, INFO, |i| i["total_episodes"] = json!(9)),
+        &["total_episodes", "expected 12, found 9"],
+    ),
+    (
+        "frames counted wrongly",
+        |s| edit_json(s, INFO, |i| i["total_frames"] = json!(4801)),
+        &["total_frames", "expected 4800, found 4801"],
+    ),
+    (
+        "tasks counted wrongly",
+        |s| edit_json(s, INFO, |i| i["total_tasks"] = json!(4)),
+        &["total_tasks", "expected 3, found 4"],
+    ),
+    (
+        "no total",
+        |s| edit_json(s, INFO, |i| drop(i.as_object_mut().unwrap().remove("total_frames"))),
+        &["total_frames"],
+    ),
+    (
+        "splits of fewer episodes",
+        |s| edit_json(s, INFO, |i| i["splits"] = json!({"train": "0:10"})),
+        &["splits", "train 0:10"],
+    ),
+    (
+        "splits of more episodes",
+        |s| edit_json(s, INFO, |i| i["splits"] = json!({"train": "0:13"})),
+        &["splits", "0:13"],
+    ),
+    (
+        "a path of the data that is another",
+        |s| edit_json(s, INFO, |i| i["data_path"] = json!("data/{chunk_index:03d}.parquet")),
+        &["data_path"],
+    ),
+    (
+        "the table of tasks in another order",
+        |s| edit_rows(s, TASKS, &[1, 0, 2]),
+        &["tasks.parquet", "task_index", "row 0: expected 0, found 1"],
+    ),
+    (
+        "tasks numbered from 1",
+        |s| set_table_of_tasks(s, &[1, 2, 3], &["task 0", "task 1", "task 2"]),
+        &["task_index", "expected 0, found 1"],
+    ),
+    ("a task that the table lacks", |s| edit_rows(s, TASKS, &[0, 1]), &["task 2", "none"]),
+    (
+        "a task twice",
+        |s| set_table_of_tasks(s, &[0, 1, 2, 3], &["task 0", "task 1", "task 2", "task 1"]),
+        &["task 1", "again"],
+    ),
+    ("no table of tasks", |s| std::fs::remove_file(s.join(TASKS)).unwrap(), &["tasks.parquet", "no such file"]),
+    (
+        "tasks of an episode that are another's",
+        |s| set_tasks(s, 4, &["a task of nobody"]),
+        &["tasks", "episode 4", "a task of nobody"],
+    ),
+    ("an episode without tasks", |s| set_tasks(s, 5, &[]), &["tasks", "episode 5", "[]"]),
+    (
+        "episodes numbered with gaps",
+        |s| edit_numbers(s, EPISODES, "episode_index", |_, n| if n > 4 { n + 1 } else { n }),
+        &["episode_index", "episode 5", "expected 5, found 6"],
+    ),
+    (
+        "a length",
+        |s| edit_numbers(s, EPISODES, "length", |row, n| if row == 3 { n + 1 } else { n }),
+        &["length", "episode 3", "expected 400, found 401"],
+    ),
+    (
+        "a first frame",
+        |s| edit_numbers(s, EPISODES, "dataset_from_index", |row, n| if row == 3 { n - 1 } else { n }),
+        &["dataset_from_index", "episode 3", "expected 1200, found 1199"],
+    ),
+    (
+        "a last frame",
+        |s| edit_numbers(s, EPISODES, "dataset_to_index", |row, n| if row == 3 { n + 1 } else { n }),
+        &["dataset_to_index", "episode 3", "expected 1600, found 1601"],
+    ),
+    (
+        "ranges that begin anew",
+        |s| {
+            edit_numbers(s, EPISODES, "dataset_from_index", |row, n| if row > 5 { n - 2400 } else { n });
+            edit_numbers(s, EPISODES, "dataset_to_index", |row, n| if row > 5 { n - 2400 } else { n });
+        },
+        &["dataset_from_index", "episode 6", "expected 2400, found 0"],
+    ),
+    (
+        "episodes in the first file only",
+        |s| edit_numbers(s, EPISODES, "data/file_index", |_, _| 0),
+        &["data/file_index", "episode 11", "expected 1, found 0"],
+    ),
+    (
+        "another folder",
+        |s| edit_numbers(s, EPISODES, "data/chunk_index", |_, n| n + 1),
+        &["data/chunk_index", "episode 0", "expected 0, found 1"],
+    ),
+    (
+        "another file of episodes",
+        |s| edit_numbers(s, EPISODES, "meta/episodes/file_index", |_, _| 2),
+        &["meta/episodes/file_index", "expected 0, found 2"],
+    ),
+    (
+        "rows of episodes in another order",
+        |s| edit_rows(s, EPISODES, &[0, 1, 3, 2, 4, 5, 6, 7, 8, 9, 10, 11]),
+        &["order of rows", "episode 2"],
+    ),
+    (
+        "an episode that the table lacks",
+        |s| edit_rows(s, EPISODES, &[0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11]),
+        &["12 episodes", "11 rows"],
+    ),
+    (
+        "an episode twice",
+        |s| edit_rows(s, EPISODES, &[0, 1, 2, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]),
+        &["12 episodes", "13 rows"],
+    ),
+    (
+        "frames that are counted anew in the second file",
+        |s| edit_numbers(s, LATER, "index", |row, _| row as i64),
+        &["file-001.parquet: index", "row 0", "expected 4000, found 0"],
+    ),
+    (
+        "one frame's number",
+        |s| edit_numbers(s, DATA, "index", |row, n| if row == 7 { n + 1 } else { n }),
+        &["index", "episode 0, row 7", "expected 7, found 8"],
+    ),
+    (
+        "one frame's number in its episode",
+        |s| edit_numbers(s, DATA, "frame_index", |row, n| if row == 407 { 0 } else { n }),
+        &["frame_index", "episode 1, row 407", "expected 7, found 0"],
+    ),
+    (
+        "frames of an episode from 1 on",
+        |s| edit_numbers(s, DATA, "frame_index", |_, n| n + 1),
+        &["frame_index", "row 0", "399 more"],
+    ),
+    (
+        "frames' episodes with gaps",
+        |s| edit_numbers(s, DATA, "episode_index", |_, n| if n > 2 { n + 4 } else { n }),
+        &["episode_index", "episode 3, row 1200", "expected 3, found 7"],
+    ),
+    (
+        "a frame of another episode",
+        |s| edit_numbers(s, DATA, "episode_index", |row, n| if row == 399 { n + 1 } else { n }),
+        &["episode_index", "episode 0, row 399", "expected 0, found 1"],
+    ),
+    (
+        "all frames of one episode",
+        |s| edit_numbers(s, DATA, "episode_index", |_, _| 0),
+        &["episode_index", "episode 1, row 400", "expected 1, found 0"],
+    ),
+    ("a task that is none", |s| edit_numbers(s, DATA, "task_index", |_, _| 7), &["task_index", "expected 0, found 7"]),
+    (
+        "a task that is another's",
+        |s| edit_numbers(s, DATA, "task_index", |row, n| if row < 400 { 2 } else { n }),
+        &["task_index", "episode 0", "expected 0, found 2"],
+    ),
+    ("a mean", |s| edit_json(s, STATS, |i| i["action"]["mean"][3] = json!(0.5)), &["stats.json", "action: mean"]),
+    (
+        "a count",
+        |s| edit_json(s, STATS, |i| i["action"]["count"] = json!([4799])),
+        &["action: count", "expected 4800, found 4799"],
+    ),
+    (
+        "statistics of index",
+        |s| edit_json(s, STATS, |i| i["index"]["max"] = json!([399])),
+        &["index: max", "4799", "399"],
+    ),
+    (
+        "statistics that are no numbers",
+        |s| {
+            edit_json(s, STATS, |i| i["action"]["std"][0] = json!("here"));
+            let text = std::fs::read_to_string(s.join(STATS)).unwrap();
+            std::fs::write(s.join(STATS), text.replace("\"here\"", "NaN")).unwrap();
+        },
+        &["action: std", "NaN"],
+    ),
+    (
+        "statistics of one feature missing",
+        |s| edit_json(s, STATS, |i| drop(i.as_object_mut().unwrap().remove("observation.state"))),
+        &["observation.state", "none"],
+    ),
+    ("no statistics", |s| std::fs::remove_file(s.join(STATS)).unwrap(), &["stats.json", "none"]),
+    (
+        "statistics of an episode",
+        |s| edit_list(s, EPISODES, "stats/action/max", |i, n| if i == 15 { 3.0 } else { n }),
+        &["stats/action/max", "episode 2"],
+    ),
+    (
+        "statistics of an episode's index",
+        |s| edit_list(s, EPISODES, "stats/index/min", |_, _| 0.0),
+        &["stats/index/min", "episode 1", "400"],
+    ),
+];
+
+/// Faults that they do not.
+const OTHERS: &[Planted] = &[
+    (
+        "a number that is none",
+        |s| edit_list(s, LATER, "action", |i, n| if i == 7 * 403 + 2 { f64::NAN } else { n }),
+        &["action: episode 11, frame 3, dimension 2: NaN"],
+    ),
+    (
+        "infinite numbers",
+        |s| edit_list(s, DATA, "observation.state", |i, n| if i % 900 == 4 { f64::INFINITY } else { n }),
+        &["observation.state: episode 0, frame 0, dimension 4: inf", "3 more", "episode 9"],
+    ),
+    (
+        "times of a clock",
+        |s| edit_times(s, |row, time| time + (row % 7) as f32 * 1e-3),
+        &["timestamp", "episode 0, row 1", "0.05", "0.006"],
+    ),
+    (
+        "times that begin later",
+        |s| edit_times(s, |_, time| time + 1.5),
+        &["timestamp", "row 0: expected 0 s, found 1.5 s"],
+    ),
+];
+
+fn problems(checks: &[Check]) -> Vec<String> {
+    checks.iter().filter_map(|c| Some(format!("{}: {}", c.name, c.problem.as_ref()?))).collect()
+}
+
+fn named(checks: &[Check], name: &str, words: &[&str]) {
+    let problems = problems(checks);
+    let lines: Vec<&str> = problems.iter().flat_map(|p| p.lines()).collect();
+    // hashes of files are no names of what is wrong in them
+    let found = |word: &&&str| lines.iter().any(|line| line.contains(**word) && !line.contains("sha256"));
+    let missing: Vec<&&str> = words.iter().filter(|word| !found(word)).collect();
+    assert!(missing.is_empty(), "{name}: {missing:?} not in {problems:#?}");
+}
+
+#[test]
+fn each_fault_is_named_and_what_follows_from_the_frames_is_corrected() {
+    let dir = tempfile::tempdir().unwrap();
+    let (ours, theirs) = (dir.path().join("ours"), dir.path().join("theirs"));
+    sound(&ours);
+    copy(&ours, &theirs);
+    std::fs::remove_dir_all(theirs.join("actrm")).unwrap();
+    for whole in [&ours, &theirs] {
+        // a sound set gives no false alarm, and is left alone
+        assert_eq!(problems(&verify(whole, &mut quiet).unwrap()), Vec::<String>::new());
+        assert_eq!(Dataset::open(whole).unwrap().notes(), Vec::<String>::new());
+        let out = dir.path().join("out");
+        let report = repair(whole, &Destination::New(out.clone()), Repair::default(), &mut quiet).unwrap();
+        assert!(report.corrected.is_empty() && report.left.is_empty() && report.made.is_none() && !out.exists());
+        let as_it_was = files(whole);
+        for (name, plant, words) in REPAIRABLE {
+            let set = dir.path().join("set");
+            copy(whole, &set);
+            plant(&set);
+            named(&verify(&set, &mut quiet).unwrap(), name, words);
+            let report = repair(&set, &Destination::InPlace, Repair::default(), &mut quiet);
+            let report = report.unwrap_or_else(|e| panic!("{name}: {e}"));
+            assert!(report.made.is_some() && report.left.is_empty(), "{name}: {report:?}");
+            assert!(words.iter().all(|word| report.corrected.iter().any(|l| l.contains(word))), "{name}: {report:#?}");
+            let now = files(&set);
+            let changed: Vec<_> = as_it_was.iter().filter(|(k, v)| now.get(*k) != Some(v)).map(|(k, _)| k).collect();
+            assert!(changed.is_empty() && now.len() == as_it_was.len(), "{name}: {changed:?} differ: {report:#?}");
+            std::fs::remove_dir_all(&set).unwrap();
+        }
+    }
+    for (name, plant, words) in OTHERS {
+        let set = dir.path().join("set");
+        copy(&theirs, &set);
+        plant(&set);
+        named(&verify(&set, &mut quiet).unwrap(), name, words);
+        let report = repair(&set, &Destination::InPlace, Repair::default(), &mut quiet).unwrap();
+        assert!(!report.left.is_empty(), "{name}: {report:?}");
+        named(&verify(&set, &mut quiet).unwrap(), name, words);
+        std::fs::remove_dir_all(&set).unwrap();
+    }
+}
+
+#[test]
+fn frames_that_were_changed_are_no_longer_those_that_were_converted() {
+    let dir = tempfile::tempdir().unwrap();
+    let set = dir.path().join("set");
+    sound(&set);
+    edit_list(&set, DATA, "action", |i, n| if i == 9 { n + 0.5 } else { n });
+    assert!(Dataset::open(&set).is_err());
+    let report = repair(&set, &Destination::InPlace, Repair::default(), &mut quiet).unwrap();
+    let notes = report.made.unwrap().notes;
+    assert!(notes.iter().any(|n| n.contains("not those that were converted")), "{notes:?}");
+    assert!(Dataset::open(&set).unwrap().provenance().is_none() && !set.join("actrm").exists());
+    assert_eq!(problems(&verify(&set, &mut quiet).unwrap()), Vec::<String>::new());
+}
+
+#[test]
+fn times_of_a_clock_open_with_a_note_and_are_rewritten_when_asked_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let set = dir.path().join("set");
+    sound(&set);
+    std::fs::remove_dir_all(set.join("actrm")).unwrap();
+    edit_times(&set, |row, time| time + (row % 7) as f32 * 1e-3);
+    let notes = Dataset::open(&set).unwrap().notes().to_vec();
+    assert!(matches!(notes.as_slice(), [note] if note.contains("timestamp") && note.contains("0.006")), "{notes:?}");
+    let times = |checks: Vec<Check>| problems(&checks).iter().filter(|p| p.starts_with("timestamps")).count();
+    assert_eq!(times(verify(&set, &mut quiet).unwrap()), 1);
+    assert_eq!(times(verify_within(&set, 0.007, &mut quiet).unwrap()), 0);
+    let report = repair(&set, &Destination::InPlace, Repair { timestamps: true }, &mut quiet).unwrap();
+    assert!(report.left.is_empty() && report.corrected.iter().any(|l| l.contains("timestamp")), "{report:?}");
+    assert_eq!(problems(&verify(&set, &mut quiet).unwrap()), Vec::<String>::new());
+}
+
+#[test]
+fn other_types_are_cast_as_lerobot_casts_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let set = dir.path().join("set");
+    sound(&set);
+    std::fs::remove_dir_all(set.join("actrm")).unwrap();
+    let before = Dataset::open(&set).unwrap();
+    for file in [DATA, LATER] {
+        for (name, to) in [("next.done", DataType::Int64), ("next.reward", DataType::Float64)] {
+            edit_table(&set, file, |table| with_column(&table, name, |column| cast(column, &to).unwrap()));
+        }
+    }
+    let after = Dataset::open(&set).unwrap();
+    assert_eq!(after.notes().len(), 2, "{:?}", after.notes());
+    assert!(after.notes()[0].contains("next.done: expected bool, as info.json says, found int64"));
+    assert_eq!(
+        (before.column("next.done"), before.column("next.reward")),
+        (after.column("next.done"), after.column("next.reward"))
+    );
+    assert_eq!(before.fingerprint(), after.fingerprint());
+    // texts are no numbers
+    edit_table(&set, DATA, |table| with_column(&table, "next.reward", |column| cast(column, &DataType::Utf8).unwrap()));
+    let refused = Dataset::open(&set).unwrap_err().to_string();
+    assert!(refused.contains("next.reward") && refused.contains("found utf8"), "{refused}");
+}
+
+#[test]
+fn parts_of_videos_that_cannot_be_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/lerobot_video_av1");
+    assert_eq!(problems(&verify(&fixture, &mut quiet).unwrap()), Vec::<String>::new());
+    const CAMERA: &str = "observation.images.agentview";
+    let seconds = |set: &Path, what: &str, edit: &dyn Fn(usize, f64) -> f64| {
+        edit_column(set, EPISODES, &format!("videos/{CAMERA}/{what}"), |column| {
+            let numbers = column.as_primitive::<Float64Type>().values();
+            Arc::new(Float64Array::from_iter_values(numbers.iter().enumerate().map(|(row, &n)| edit(row, n))))
+        });
+    };
+    let planted: [(&str, &dyn Fn(&Path), &[&str]); 3] = [
+        (
+            "an end",
+            &|set| seconds(set, "to_timestamp", &|row, n| if row == 1 { n + 1.0 } else { n }),
+            &["to_timestamp", "episode 1"],
+        ),
+        (
+            "another's part",
+            &|set| {
+                let from = |row, n: f64| if row == 2 { n - 0.6 } else { n };
+                seconds(set, "from_timestamp", &from);
+                seconds(set, "to_timestamp", &from);
+            },
+            &["from_timestamp", "episode 2"],
+        ),
+        (
+            "a file that is not there",
+            &|set| edit_numbers(set, EPISODES, &format!("videos/{CAMERA}/file_index"), |_, _| 4),
+            &["file_index", "file-004.mp4"],
+        ),
+    ];
+    for (name, plant, words) in planted {
+        let set = dir.path().join("set");
+        copy(&fixture, &set);
+        plant(&set);
+        named(&verify(&set, &mut quiet).unwrap(), name, words);
+        std::fs::remove_dir_all(&set).unwrap();
+    }
+}
+
+#[test]
+fn a_git_lfs_pointer_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let whole = dir.path().join("whole");
+    sound(&whole);
+    std::fs::remove_dir_all(whole.join("actrm")).unwrap();
+    let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n";
+    for file in [DATA, LATER, EPISODES, TASKS, INFO, STATS] {
+        let set = dir.path().join("set");
+        copy(&whole, &set);
+        std::fs::write(set.join(file), pointer).unwrap();
+        let refused = Dataset::open(&set).unwrap_err().to_string();
+        assert!(refused.contains(file) && refused.contains("git lfs pull"), "{refused}");
+        named(&verify(&set, &mut quiet).unwrap(), file, &[file, "git lfs pull"]);
+        assert!(repair(&set, &Destination::InPlace, Repair::default(), &mut quiet).is_err());
+        std::fs::remove_dir_all(&set).unwrap();
+    }
+}
+
+/// A set whose table of tasks is in disorder, in either way: numbers as LeRobot looks them up, and as the table has them.
+#[test]
+fn tasks_in_disorder_are_those_of_the_episodes() {
+    let dir = tempfile::tempdir().unwrap();
+    let whole = dir.path().join("whole");
+    sound(&whole);
+    std::fs::remove_dir_all(whole.join("actrm")).unwrap();
+    let before = Dataset::open(&whole).unwrap();
+    for by_row in [true, false] {
+        let set = dir.path().join(format!("by_row_{by_row}"));
+        copy(&whole, &set);
+        match by_row {
+            true => set_table_of_tasks(&set, &[2, 0, 1], &["task 0", "task 1", "task 2"]),
+            false => edit_rows(&set, TASKS, &[2, 0, 1]),
+        }
+        let after = Dataset::open(&set).unwrap();
+        assert_eq!(after.tasks(), before.tasks(), "by row: {by_row}");
+        assert!(after.notes()[0].contains("task_index: expected 0, 1, 2, ... in order"), "{:?}", after.notes());
+        assert_eq!(after.fingerprint(), before.fingerprint());
+    }
+}
+
+#[test]
+fn images_stored_by_path_are_read_and_embedded_by_edits() {
+    const CAMERA: &str = "observation.images.agentview";
+    let dir = tempfile::tempdir().unwrap();
+    let (file, set) = (dir.path().join("a.hdf5"), dir.path().join("set"));
+    let mut writer = RobomimicWriter::create(&file, &WriteOptions::default()).unwrap();
+    writer.set_root(&Demo::default()).unwrap();
+    for number in 0..3_u8 {
+        let mut demo = Demo { id: format!("demo_{number}"), ..Demo::default() };
+        for (key, width) in [("robot0_eef_pos", 3), ("robot0_eef_quat", 4), ("robot0_gripper_qpos", 2)] {
+            demo.datasets.insert(format!("obs/{key}"), Array::from_f64(vec![5, width], &vec![0.5; 5 * width]));
+        }
+        demo.datasets.insert("actions".to_owned(), Array::from_f64(vec![5, 7], &[0.25; 35]));
+        let pixels: Vec<u8> = (0..5 * 8 * 8 * 3).map(|i| (i % 251) as u8 ^ (number * 16)).collect();
+        demo.datasets.insert("obs/agentview_image".to_owned(), Array::from_u8(vec![5, 8, 8, 3], &pixels));
+        writer.add_demo(&demo).unwrap();
+    }
+    writer.finish().unwrap();
+    convert(&file, &set, &ConvertOptions { fps: Some(20.0), ..ConvertOptions::default() }, &mut quiet).unwrap();
+    std::fs::remove_dir_all(set.join("actrm")).unwrap();
+    let before = Dataset::open(&set).unwrap().pictures(CAMERA).unwrap();
+    std::fs::create_dir(set.join("images")).unwrap();
+    let by_path = |column: &ArrayRef| -> ArrayRef {
+        let images = column.as_struct().column(0).as_binary::<i32>();
+        let path = |row: usize| format!("images/frame-{row:06}.png");
+        (0..images.len()).for_each(|row| std::fs::write(set.join(path(row)), images.value(row)).unwrap());
+        let bytes: ArrayRef = Arc::new(BinaryArray::from_iter((0..images.len()).map(|_| None::<&[u8]>)));
+        let paths: ArrayRef = Arc::new(StringArray::from_iter_values((0..images.len()).map(path)));
+        Arc::new(StructArray::try_from(vec![("bytes", bytes), ("path", paths)]).unwrap())
+    };
+    edit_table(&set, DATA, |table| with_column(&table, CAMERA, by_path));
+    assert_eq!(Dataset::open(&set).unwrap().pictures(CAMERA).unwrap(), before);
+    assert_eq!(problems(&verify(&set, &mut quiet).unwrap()), Vec::<String>::new());
+    let (out, all) = (dir.path().join("out"), Selection { episodes: vec![0, 1, 2], ..Selection::default() });
+    keep(&set, &Destination::New(out.clone()), &all, &mut quiet).unwrap();
+    assert_eq!(Dataset::open(&out).unwrap().pictures(CAMERA).unwrap(), before);
+    std::fs::remove_file(set.join("images/frame-000007.png")).unwrap();
+    let refused = Dataset::open(&set).unwrap().pictures(CAMERA).unwrap_err().to_string();
+    assert!(refused.contains(CAMERA) && refused.contains("images/frame-000007.png"), "{refused}");
+}
+
+#[test]
+fn language_columns_are_carried_through_edits() {
+    let dir = tempfile::tempdir().unwrap();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/lerobot_language");
+    assert_eq!(problems(&verify(&fixture, &mut quiet).unwrap()), Vec::<String>::new());
+    let (out, last) = (dir.path().join("out"), Selection { episodes: vec![1, 2], ..Selection::default() });
+    keep(&fixture, &Destination::New(out.clone()), &last, &mut quiet).unwrap();
+    assert_eq!(problems(&verify(&out, &mut quiet).unwrap()), Vec::<String>::new());
+    let (before, after) = (read_table(&fixture.join(DATA)), read_table(&out.join(DATA)));
+    let from = before.num_rows() - after.num_rows();
+    for name in ["language_persistent", "language_events"] {
+        let whole = before.column_by_name(name).unwrap();
+        assert_eq!(&whole.slice(from, after.num_rows()), after.column_by_name(name).unwrap(), "{name}");
+    }
+}
