@@ -470,7 +470,8 @@ impl Tables {
     }
 
     fn videos(&self) -> impl Iterator<Item = &(String, Feature)> {
-        self.info.features.0.iter().filter(|(_, feature)| feature.dtype == "video")
+        // depth as video is not read: it is refused by name
+        self.info.features.0.iter().filter(|(_, feature)| feature.dtype == "video" && !feature.is_depth())
     }
 
     /// The file that a row names for a camera.
