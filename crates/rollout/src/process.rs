@@ -217,7 +217,7 @@ fn spawn_for_good(command: Command) -> std::io::Result<Child> {
     };
     let gone = |_| std::io::Error::other("the thread that starts workers ended");
     let (answer, answered) = mpsc::channel();
-    starter.send((command, answer)).map_err(|_| gone(mpsc::RecvError))?;
+    starter.send((command, answer)).map_err(|_gone| gone(mpsc::RecvError))?;
     answered.recv().map_err(gone)?
 }
 

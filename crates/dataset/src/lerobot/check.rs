@@ -165,6 +165,6 @@ pub const TIME_TOLERANCE: f64 = 1e-4;
 pub(super) fn time_off(time: f64, frame: usize, fps: f64, tolerance: f64) -> Option<f64> {
     let due = frame as f64 / fps;
     let off = (time - due).abs();
-    // written so that NaN is off; a 32-bit number rounds the second term away
-    (!(off <= tolerance + 1e-6 * due)).then_some(off)
+    // a 32-bit number rounds the second term away
+    (off.is_nan() || off > tolerance + 1e-6 * due).then_some(off)
 }

@@ -317,7 +317,8 @@ impl Mapping {
 
 /// The first of the demos whose datasets most demos have, by type and shape of a step.
 fn usual(plan: &Plan) -> Option<&DemoPlan> {
-    let mut kinds: BTreeMap<Vec<(&str, &Dtype, &[usize])>, (usize, usize)> = BTreeMap::new();
+    type Kind<'a> = Vec<(&'a str, &'a Dtype, &'a [usize])>;
+    let mut kinds: BTreeMap<Kind<'_>, (usize, usize)> = BTreeMap::new();
     for (index, demo) in plan.demos.iter().enumerate() {
         let step = |key: &'_ KeyPlan| key.shape.len().min(1);
         let keys = demo.keys.iter().map(|(path, key)| (path.as_str(), &key.dtype, &key.shape[step(key)..])).collect();

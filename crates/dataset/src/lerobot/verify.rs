@@ -13,7 +13,6 @@ use super::schema;
 use super::side::{MANIFEST_FILE, Manifest};
 use crate::error::{DatasetError, Result};
 use crate::source::{self, Source};
-use crate::stats::FeatureStats;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fs::File;
