@@ -561,7 +561,8 @@ fn parts_of_videos_that_cannot_be_are_named() {
             Arc::new(Float64Array::from_iter_values(numbers.iter().enumerate().map(|(row, &n)| edit(row, n))))
         });
     };
-    let planted: [(&str, &dyn Fn(&Path), &[&str]); 3] = [
+    type Planted<'a> = (&'a str, &'a dyn Fn(&Path), &'a [&'a str]);
+    let planted: [Planted<'_>; 3] = [
         (
             "an end",
             &|set| seconds(set, "to_timestamp", &|row, n| if row == 1 { n + 1.0 } else { n }),
