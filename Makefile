@@ -14,6 +14,9 @@ PYTHON ?= $(shell tools/find-python 3.11 3.13)
 # LeRobot 0.6.1 wants 3.12 or later.
 PEER_PYTHON ?= $(shell tools/find-python 3.12 3.13)
 
+# The pages are tested in Chromium where there is one, and in continuous integration (CI=true) always.
+BROWSER := $(or $(ACTRM_CHROMIUM),$(shell command -v chromium || command -v chromium-browser || command -v google-chrome))
+
 CARGO := cargo
 CARGO_FLAGS := --release --locked
 # cmake (HDF5 is built from source) comes from .venv; pip must not look outside the lock file's hashes.
@@ -81,6 +84,9 @@ study-thinking: build ## does thinking help: the studies of robot policies, as f
 .PHONY: test
 test: wheel ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace
+	@if [ -n "$(BROWSER)$${CI:-}" ]; then \
+	    $(CARGO) test $(CARGO_FLAGS) -p report -p e2e --test many_rows --test page -- --ignored; \
+	  else echo "not run: the tests of the pages in a browser (no Chromium on the PATH; ACTRM_CHROMIUM names one)"; fi
 	@.venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests
 	@tools/test_wheel.sh
 

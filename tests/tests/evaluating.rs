@@ -236,7 +236,7 @@ fn a_page_shows_the_film_of_a_failure_and_its_commands_are_taken() {
     };
     let page = board(&folder.path().join("out"));
     let films = between(&page, "<video controls preload=\"none\" aria-label=\"", "\"");
-    let expected = [10_000, 10_001].map(|seed| format!("lift-act@1, seed {seed}: failed after 6 steps"));
+    let expected = [10_000, 10_001].map(|seed| format!("lift-act@1, seed {seed}: failure after 6 steps"));
     assert_eq!(films, expected, "each once: in the row that was filmed");
     let mp4 = between(&page, "src=\"data:video/mp4;base64,", "\"");
     assert!(mp4.len() == 2 && mp4.iter().all(|film| film.starts_with("AAAA") && film.len() > 1000), "{}", mp4.len());

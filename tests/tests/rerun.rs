@@ -144,7 +144,7 @@ fn a_rerun_that_was_interrupted_goes_on() {
     let output = child.wait_with_output().expect("it ends");
     let notes = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(130), "{notes}");
-    assert!(notes.contains("the same command goes on where it was"), "{notes}");
+    assert!(notes.contains("run the same command again to resume"), "{notes}");
     let again = told(&mut rerun(folder.path(), &["--data", text(&lift()), "--episodes", "1"]), 0);
     assert_eq!(again["same"], true);
 }

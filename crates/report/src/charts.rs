@@ -6,12 +6,12 @@ use zoo::results::StoredEvaluation;
 
 use crate::html::escape;
 use crate::leaderboard::LeaderboardRow;
-use crate::page::{COLOURS, Curve};
+use crate::page::{COLOURS, Curve, Palette};
 
 const WIDTH: f64 = 1040.0;
 
 /// Success rates with their 95% intervals, one line a row.
-pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
+pub(super) fn intervals(rows: &[&LeaderboardRow], palette: &Palette) -> String {
     let (left, right, step) = (250.0, 130.0, 30.0);
     let scale = |rate: f64| left + rate * (WIDTH - left - right);
     let height = 16.0 + step * rows.len() as f64 + 26.0;
@@ -29,10 +29,10 @@ pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
         let y = 16.0 + step * (index as f64 + 0.5);
         let (low, high) = row.interval;
         let (low_x, high_x, rate_x) = (scale(low), scale(high), scale(row.counts.rate()));
-        let name = escape(&row.name());
+        let (name, colour) = (escape(&row.name()), palette.colour(row));
         let _ = write!(
             svg,
-            r##"<g><title>{name}: {}/{}, 95% interval {:.1}% to {:.1}%</title><text class="label" x="0" y="{:.1}">{name}</text><line x1="{low_x:.1}" x2="{high_x:.1}" y1="{y:.1}" y2="{y:.1}" stroke="var(--good-soft)" stroke-width="12" stroke-linecap="round"/><circle cx="{rate_x:.1}" cy="{y:.1}" r="5.5" fill="var(--good)"/><text x="{:.1}" y="{:.1}" text-anchor="end">{}/{} · {}</text></g>"##,
+            r##"<g><title>{name}: {}/{}, 95% interval {:.1}% to {:.1}%</title><text class="label" x="0" y="{:.1}">{name}</text><line x1="{low_x:.1}" x2="{high_x:.1}" y1="{y:.1}" y2="{y:.1}" stroke="{colour}" stroke-opacity=".3" stroke-width="12" stroke-linecap="round"/><circle cx="{rate_x:.1}" cy="{y:.1}" r="5.5" fill="{colour}"/><text x="{:.1}" y="{:.1}" text-anchor="end">{}/{} · {}</text></g>"##,
             row.counts.successes,
             row.counts.episodes,
             low * 1e2,
@@ -51,20 +51,62 @@ pub(super) fn intervals(rows: &[&LeaderboardRow]) -> String {
 
 /// Success against a query's duration, the number of weights and the minutes of training: three pictures, each with a line
 /// through the rows that no other one beats at no higher cost.
-pub(super) fn costs(rows: &[&LeaderboardRow]) -> String {
+pub(super) fn costs(rows: &[&LeaderboardRow], palette: &Palette) -> String {
     type Cost = fn(&LeaderboardRow) -> f64;
     let measures: [(&str, Cost); 3] = [
         ("median query, ms", |row| row.inference_ms().0),
         ("weights", |row| row.record().training.parameters as f64),
         ("minutes of training", LeaderboardRow::minutes),
     ];
-    let drawn: String = measures.iter().map(|(name, cost)| cost_chart(rows, name, cost)).collect();
-    format!("<div class=\"costs\">{drawn}</div>")
+    let drawn: String = measures.iter().map(|(name, cost)| cost_chart(rows, palette, name, cost)).collect();
+    let mut policies: Vec<(&str, &str)> = rows.iter().map(|row| (row.policy(), palette.colour(row))).collect();
+    policies.sort_unstable();
+    policies.dedup();
+    let legend: String = policies
+        .iter()
+        .map(|(policy, colour)| {
+            let dot = format!(r#"<svg width="12" height="12" aria-hidden="true"><circle cx="6" cy="6" r="5" fill="{colour}"/></svg>"#);
+            format!("<li>{dot}{}</li>", escape(policy))
+        })
+        .collect();
+    format!("<div class=\"costs\">{drawn}</div>\n<ul class=\"legend\">{legend}</ul>")
 }
 
-fn cost_chart(rows: &[&LeaderboardRow], name: &str, cost: &dyn Fn(&LeaderboardRow) -> f64) -> String {
+/// Values between two costs where a logarithmic axis is labelled: 1, 2 and 5 times powers of ten, or the powers alone where
+/// those are many; the ends where there would be fewer than two.
+fn log_ticks(low: f64, high: f64) -> Vec<f64> {
+    let decades = low.log10().floor() as i32..=high.log10().ceil() as i32;
+    let within = |digits: &'static [f64]| -> Vec<f64> {
+        let all = decades.clone().flat_map(|decade| digits.iter().map(move |digit| digit * 10f64.powi(decade)));
+        all.filter(|value| (low..=high).contains(value)).collect()
+    };
+    let fine = within(&[1.0, 2.0, 5.0]);
+    let ticks = if fine.len() > 5 { within(&[1.0]) } else { fine };
+    match ticks.len() {
+        0 | 1 if high / low < 1.05 => vec![low],
+        0 | 1 => vec![low, high],
+        _ => ticks,
+    }
+}
+
+/// A cost with two significant digits, or in thousands and millions: `0.04`, `1.5`, `20`, `1.87M`.
+fn cost_text(cost: f64) -> String {
+    if cost >= 1e4 {
+        return crate::count_text(cost as u64);
+    }
+    let digits = (1 - cost.log10().floor() as i32).clamp(0, 6) as usize;
+    let text = format!("{cost:.digits$}");
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+}
+
+fn cost_chart(
+    rows: &[&LeaderboardRow],
+    palette: &Palette,
+    name: &str,
+    cost: &dyn Fn(&LeaderboardRow) -> f64,
+) -> String {
     let points: Vec<(f64, &LeaderboardRow)> =
-        rows.iter().map(|row| (cost(row), *row)).filter(|(x, _)| x.is_finite() && *x > 0.0).collect();
+        rows.iter().filter(|row| row.is_trained()).map(|row| (cost(row), *row)).filter(|(x, _)| x.is_finite() && *x > 0.0).collect();
     let low = points.iter().map(|(x, _)| *x).fold(f64::INFINITY, f64::min);
     let high = points.iter().map(|(x, _)| *x).fold(0.0, f64::max);
     if points.is_empty() {
@@ -88,16 +130,17 @@ fn cost_chart(rows: &[&LeaderboardRow], name: &str, cost: &dyn Fn(&LeaderboardRo
             y + 4.0
         );
     }
-    for (x, anchor) in [(low, "start"), (high, "end")] {
-        if anchor == "end" && (high / low) < 1.05 {
-            break;
-        }
-        let text = if x >= 1e4 { crate::count_text(x as u64) } else { format!("{x:.1}") };
-        let _ =
-            write!(svg, r#"<text x="{:.1}" y="{:.1}" text-anchor="{anchor}">{text}</text>"#, x_of(x), bottom + 16.0);
+    for x in log_ticks(10f64.powf(from), 10f64.powf(to)) {
+        let (at, text) = (x_of(x), cost_text(x));
+        let _ = write!(
+            svg,
+            r#"<line class="axis" x1="{at:.1}" x2="{at:.1}" y1="{bottom}" y2="{:.1}"/><text x="{at:.1}" y="{:.1}" text-anchor="middle">{text}</text>"#,
+            bottom + 4.0,
+            bottom + 17.0
+        );
     }
     let _ =
-        write!(svg, r#"<text class="label" x="{left}" y="{:.1}">{} (logarithmic)</text>"#, bottom + 34.0, escape(name));
+        write!(svg, r#"<text class="label" x="{left}" y="{:.1}">{} (logarithmic)</text>"#, bottom + 36.0, escape(name));
     let mut sorted = points.clone();
     sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.counts.rate().total_cmp(&a.1.counts.rate())));
     let mut best = -1.0;
@@ -113,11 +156,8 @@ fn cost_chart(rows: &[&LeaderboardRow], name: &str, cost: &dyn Fn(&LeaderboardRo
         r#"<polyline points="{}" fill="none" stroke="var(--faint)" stroke-dasharray="3 3"/>"#,
         front.join(" ")
     );
-    let mut policies: Vec<&str> = rows.iter().map(|row| row.policy()).collect();
-    policies.sort_unstable();
-    policies.dedup();
     for (x, row) in points {
-        let colour = COLOURS[policies.iter().position(|policy| *policy == row.policy()).unwrap_or(0) % COLOURS.len()];
+        let colour = palette.colour(row);
         let _ = write!(
             svg,
             r#"<circle cx="{:.1}" cy="{:.1}" r="5" fill="{colour}" fill-opacity=".75"><title>{} ({}): {}, {x:.2} {}</title></circle>"#,
@@ -141,7 +181,7 @@ pub(super) fn strip(evaluation: &StoredEvaluation) -> String {
     let (baseline, full) = (height - 14.0, height - 18.0);
     let pitch = (WIDTH / count).min(18.0);
     let bar = (pitch - 2.0).max(pitch * 0.6);
-    // the tallest success fills most of the strip, so that quick and slow ones can be told apart
+    // the tallest success fills most of the strip, so that quick and slow ones differ visibly
     let slowest = evaluation.episodes.iter().filter(|e| e.success).map(|e| e.steps).max();
     let top = slowest.map_or(cap, |steps| f64::from(steps) * 1.25).min(cap).max(1.0);
     let mut svg = open(height, "Episodes in the order of their seeds");
@@ -280,6 +320,15 @@ fn open(height: f64, title: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn logarithmic_axes_have_round_labels_and_no_zeros() {
+        let texts = |low, high| log_ticks(low, high).into_iter().map(cost_text).collect::<Vec<_>>();
+        assert_eq!(texts(0.03, 0.3), ["0.05", "0.1", "0.2"]);
+        assert_eq!(texts(0.04, 90.0), ["0.1", "1", "10"]);
+        assert_eq!(texts(1.06e6, 1.87e6), ["1.06M", "1.87M"]);
+        assert_eq!(texts(0.042, 0.042), ["0.042"]);
+    }
 
     #[test]
     fn thinning_keeps_order_and_extremes() {

@@ -40,6 +40,7 @@ pub struct Column<R: 'static> {
     value: Value<R>,
     align: Align,
     kept: bool,
+    more: bool,
     csv: Option<&'static str>,
     table: Option<&'static str>,
     page: Option<&'static str>,
@@ -47,18 +48,18 @@ pub struct Column<R: 'static> {
 
 /// A column of words, in no form yet.
 pub const fn text<R>(value: fn(&R) -> String) -> Column<R> {
-    Column { value: Value::Text(value), align: Align::Right, kept: false, csv: None, table: None, page: None }
+    Column { value: Value::Text(value), align: Align::Right, kept: false, more: false, csv: None, table: None, page: None }
 }
 
 /// A column of numbers, in no form yet: `exact` decimal places in CSV, `shown` in tables for people.
 pub const fn number<R>(value: fn(&R) -> Option<f64>, exact: usize, shown: usize) -> Column<R> {
     let value = Value::Number(value, exact, shown);
-    Column { value, align: Align::Right, kept: false, csv: None, table: None, page: None }
+    Column { value, align: Align::Right, kept: false, more: false, csv: None, table: None, page: None }
 }
 
 /// A column of whole numbers, in no form yet.
 pub const fn count<R>(value: fn(&R) -> Option<u64>) -> Column<R> {
-    Column { value: Value::Count(value), align: Align::Right, kept: false, csv: None, table: None, page: None }
+    Column { value: Value::Count(value), align: Align::Right, kept: false, more: false, csv: None, table: None, page: None }
 }
 
 impl<R> Column<R> {
@@ -85,6 +86,16 @@ impl<R> Column<R> {
     /// Shown however narrow the terminal is.
     pub const fn kept(self) -> Self {
         Self { kept: true, ..self }
+    }
+
+    /// On a page behind the choice of columns, not shown at first.
+    pub const fn more(self) -> Self {
+        Self { more: true, ..self }
+    }
+
+    /// Whether a page shows it only where it is chosen.
+    pub fn is_more(&self) -> bool {
+        self.more
     }
 
     /// Whether it is shown however narrow the terminal is.
@@ -179,8 +190,8 @@ mod tests {
             "| who | value |\n| --- | ---: |\n| a\\|b | 1.2 |\n| <c>, \"d\"<br>more | - |\n"
         );
         let page = html::table(COLUMNS, &rows);
-        assert!(page.contains("<tr><th scope=\"col\">who</th><th scope=\"col\">value</th></tr>"), "{page}");
-        assert!(page.contains("<td>&lt;c&gt;, &quot;d&quot;<br><small>more</small></td><td>-</td>"), "{page}");
+        assert!(page.contains("<tr><th scope=\"col\" class=\"words\">who</th><th scope=\"col\">value</th></tr>"), "{page}");
+        assert!(page.contains("<td class=\"words\">&lt;c&gt;, &quot;d&quot;<br><small>more</small></td><td>-</td>"), "{page}");
         let json = json::rows(COLUMNS, &rows);
         assert_eq!(json[0], serde_json::json!({"name": "a|b", "value": 1.25, "whole": 7}));
         assert_eq!((&json[1]["value"], &json[1]["whole"]), (&serde_json::Value::Null, &serde_json::Value::Null));

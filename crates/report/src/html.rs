@@ -1,6 +1,6 @@
 //! Tables as HTML, and text made safe for it.
 
-use crate::column::Column;
+use crate::column::{Align, Column};
 
 /// Every column that pages show; the lines of a cell after its first are small.
 pub fn table<'r, R: 'static>(columns: &[Column<R>], rows: impl IntoIterator<Item = &'r R>) -> String {
@@ -17,13 +17,18 @@ pub fn table_of<'r, R: 'static>(
     let shown: Vec<(&Column<R>, &str)> = columns.iter().filter_map(|c| Some((c, c.page_heading()?))).collect();
     let id = if id.is_empty() { String::new() } else { format!(" id=\"{}\"", escape(id)) };
     let mut html = format!("<table{id}><thead><tr>");
-    shown.iter().for_each(|(_, heading)| {
-        html.push_str(&format!("<th scope=\"col\">{}</th>", escape(heading).replace('\n', "<br>")));
+    let words = |column: &Column<R>| if column.align() == Align::Left { " class=\"words\"" } else { "" };
+    shown.iter().for_each(|(column, heading)| {
+        let more = if column.is_more() { " data-more" } else { "" };
+        let heading = escape(heading).replace('\n', "<br>");
+        html.push_str(&format!("<th scope=\"col\"{}{more}>{heading}</th>", words(column)));
     });
     html.push_str("</tr></thead><tbody>\n");
     for row in rows {
         html.push_str(&format!("<tr{}>", attributes(row)));
-        shown.iter().for_each(|(column, _)| html.push_str(&format!("<td>{}</td>", cell(&column.shown(row)))));
+        shown.iter().for_each(|(column, _)| {
+            html.push_str(&format!("<td{}>{}</td>", words(column), cell(&column.shown(row))));
+        });
         html.push_str("</tr>\n");
     }
     html.push_str("</tbody></table>");

@@ -9,12 +9,14 @@
   const texts = (cell) => [...cell.childNodes].filter((node) => node.nodeName !== "BR").map((node) => node.textContent);
   const rows = [...body.rows].map((row) => ({ row, id: row.id, ...row.dataset, cells: [...row.cells].map(texts) }));
   rows.push(...after.map((data) => ({ ...data, row: null, cells: data.cells.map((cell) => cell.split("\n")) })));
+  const headings = [...table.tHead.rows[0].cells];
   const element = (one) => {
     if (one.row) return one.row;
     one.row = document.createElement("tr");
     one.row.id = one.id;
-    one.cells.forEach(([first, ...others]) => {
+    one.cells.forEach(([first, ...others], column) => {
       const cell = one.row.insertCell();
+      if (headings[column].className) cell.className = headings[column].className;
       cell.textContent = first;
       others.forEach((other) => {
         const small = document.createElement("small");
@@ -60,7 +62,6 @@
   document.querySelector("form.tools").addEventListener("submit", (event) => event.preventDefault());
   // sorting: a button in every heading
   const compare = new Intl.Collator().compare;
-  const headings = [...table.tHead.rows[0].cells];
   headings.forEach((heading, column) => {
     const button = document.createElement("button");
     button.type = "button";
@@ -88,6 +89,22 @@
     });
   });
   apply();
+  // columns: the first always, the others as they are chosen
+  const chosen = document.getElementById("columns");
+  const rules = document.head.appendChild(document.createElement("style"));
+  const hide = () => {
+    const hidden = [...chosen.querySelectorAll("input:not(:checked)")].map((box) => `#all tr > :nth-child(${+box.value + 1})`);
+    rules.textContent = hidden.length ? `${hidden.join(", ")} { display: none; }` : "";
+  };
+  headings.slice(1).forEach((heading, at) => {
+    const [label, box] = ["label", "input"].map((name) => document.createElement(name));
+    [box.type, box.value, box.checked] = ["checkbox", at + 1, !("more" in heading.dataset)];
+    label.append(box, ` ${texts(heading.firstChild).join(" ")}`);
+    chosen.append(label);
+  });
+  chosen.addEventListener("change", hide);
+  chosen.parentElement.hidden = false;
+  hide();
   const copy = async (text) => {
     try {
       await navigator.clipboard.writeText(text);
@@ -131,7 +148,9 @@
   const open = () => {
     const name = decodeURIComponent(location.hash.slice(1));
     const details = document.getElementById(`details-${name}`) || document.getElementById(name);
-    if (details instanceof HTMLDetailsElement) details.open = true;
+    for (let one = details; one; one = one.parentElement?.closest("details")) {
+      if (one instanceof HTMLDetailsElement) one.open = true;
+    }
     const linked = rows.find((one) => one.id === name);
     if (!linked || linked.row?.isConnected) return;
     if (!fitting.includes(linked)) {

@@ -18,7 +18,7 @@ use std::fmt::Write as _;
 pub use self::commands::Places;
 pub use self::depth::{DEPTH_COLUMNS, Depth};
 pub use self::films::{Film, MOST_FILM_BYTES};
-pub(crate) use self::plot::COLOURS;
+pub(crate) use self::plot::{COLOURS, Palette};
 use crate::across::{ACROSS_COLUMNS, across_tasks, speaking};
 use crate::charts;
 use crate::html::{self, escape};
@@ -111,27 +111,32 @@ pub fn to_html(rows: &[LeaderboardRow], beside: &Beside) -> String {
         let _ = writeln!(
             html,
             "<p class=\"lead\">{} evaluations of {} trainings, {} episodes. Rows of a task and protocol that share a letter \
-             cannot be told apart by these episodes.</p>",
+             are not significantly different.</p>",
             rows.len(),
             trainings,
             episodes
         );
+        contents(&groups, &thinking, section, &mut html);
         html.push_str(&overview(rows));
         html.push_str(&all_rows(rows));
-        contents(&groups, &thinking, section, &mut html);
     }
     let mut room = Room::for_groups(groups.len());
+    if groups.len() > 1 {
+        html.push_str("<h2 id=\"tasks\">Tasks</h2>\n");
+    }
+    let palette = Palette::of(rows);
     for rows in groups.values() {
-        task(rows, beside, &mut room, &mut html);
+        task(rows, beside, groups.len() == 1, &palette, &mut room, &mut html);
     }
     html.push_str(&thinking);
     html.push_str(section);
     let _ = writeln!(
         html,
-        "<footer>Intervals are 95%: Wilson's for one training; for several a bootstrap over trainings and episodes. Ranks go \
-         by the lower end. Letters and ranges of ranks: exact McNemar tests on equal seeds (Barnard's on others, a bootstrap \
-         between families), Holm's correction over the whole table. Made by <code>actrm-zoo leaderboard</code> {} from the \
-         results in the zoo; nothing here is loaded from elsewhere.</footer>\n</main>\n{}<script>\n{}</script>\n</body>\n</html>",
+        "<footer>All intervals are 95% intervals: Wilson's for one training, a bootstrap over trainings and episodes for several. \
+         Rows are ranked by the lower end of their interval. Letters and ranges of ranks come from exact McNemar tests on \
+         equal seeds (Barnard's on different seeds, a bootstrap between families) with Holm's correction over the whole \
+         table. Made by <code>actrm-zoo leaderboard</code> {} from the results in the zoo. The page loads nothing from \
+         elsewhere.</footer>\n</main>\n{}<script>\n{}</script>\n</body>\n</html>",
         env!("CARGO_PKG_VERSION"),
         rows_after(rows),
         include_str!("page.js")
@@ -143,11 +148,12 @@ pub fn to_html(rows: &[LeaderboardRow], beside: &Beside) -> String {
 fn overview(rows: &[LeaderboardRow]) -> String {
     let table = speaking(rows);
     let tasks: BTreeMap<&str, String> =
-        table.values().flatten().map(|(task, row)| (task.as_str(), row.protocol_text())).collect();
+        table.values().flatten().map(|(task, row)| (task.as_str(), row.protocol_words())).collect();
     let mut html = String::from(
-        "<div class=\"card\" role=\"region\" aria-label=\"Policies by task\" tabindex=\"0\"><table id=\"overview\">\
-         <caption>The first row of each kind of policy in each task: success, 95% interval, group. Choosing it by its \
-         success flatters it a little.</caption><thead><tr><th scope=\"col\">policy</th>",
+        "<h2 id=\"policies\">Policies by task</h2>\n<p class=\"lead\">Success, 95% interval and letter of the highest \
+         ranked row of each policy in each task. The highest of several rows is slightly optimistic.</p>\n<div class=\"card \
+         scroll\" role=\"region\" aria-label=\"Policies by task\" tabindex=\"0\"><table id=\"overview\"><thead><tr><th \
+         scope=\"col\" class=\"words\">policy</th>",
     );
     for (task, protocol) in &tasks {
         let _ = write!(html, "<th scope=\"col\">{}<br><small>{}</small></th>", escape(task), escape(protocol));
@@ -179,7 +185,7 @@ fn overview(rows: &[LeaderboardRow]) -> String {
         let _ = writeln!(
             html,
             "<h2 id=\"across\">Across tasks</h2>\n<p class=\"lead\">The interquartile mean of the success rates, with a \
-             bootstrap that draws trainings within each task.</p>\n<div class=\"card\" role=\"region\" aria-label=\"Across \
+             bootstrap that draws trainings within each task.</p>\n<div class=\"card scroll\" role=\"region\" aria-label=\"Across \
              tasks\" tabindex=\"0\">{}</div>",
             html::table(ACROSS_COLUMNS, &across)
         );
@@ -232,8 +238,9 @@ fn all_rows(rows: &[LeaderboardRow]) -> String {
     format!(
         "<h2 id=\"rows\">All rows</h2>\n<form class=\"tools\" role=\"search\" aria-label=\"Filter rows\">\n{}{}{}<label>entry \
          <input type=\"search\" data-filter=\"text\" placeholder=\"any\"></label>\n<button type=\"button\" id=\"copy\">Copy \
-         as CSV</button>\n<output id=\"shown\" aria-live=\"polite\"></output>\n</form>\n{}<div class=\"card\" role=\"region\" \
-         aria-label=\"All rows\" tabindex=\"0\">{}</div>\n",
+         as CSV</button>\n<output id=\"shown\" aria-live=\"polite\"></output>\n</form>\n<details class=\"choose\" \
+         hidden><summary>Columns</summary><fieldset id=\"columns\"><legend>Columns that are shown</legend></fieldset></details>\n{}\
+         <div class=\"card scroll\" role=\"region\" aria-label=\"All rows\" tabindex=\"0\">{}</div>\n",
         choice("task", &|row| row.task().to_owned()),
         choice("policy", &|row| row.policy().to_owned()),
         choice("protocol", &LeaderboardRow::protocol_text),
@@ -256,9 +263,12 @@ fn turning(rows: usize) -> String {
 }
 
 fn contents(groups: &BTreeMap<Group, Vec<&LeaderboardRow>>, thinking: &str, section: &str, html: &mut String) {
-    html.push_str("<nav aria-label=\"Contents\"><ul class=\"contents\">");
+    html.push_str(
+        "<nav aria-label=\"Contents\"><ul class=\"contents\"><li><a href=\"#policies\">Policies by task</a></li><li><a \
+         href=\"#rows\">All rows</a></li>",
+    );
     for rows in groups.values() {
-        let (task, protocol) = (escape(&title(rows[0])), escape(&rows[0].protocol_text()));
+        let (task, protocol) = (escape(&title(rows[0])), escape(&rows[0].protocol_words()));
         let _ = write!(html, "<li><a href=\"#{}\">{task}</a> <small>{protocol}</small></li>", heading(rows[0]));
     }
     if !thinking.is_empty() {
@@ -293,13 +303,30 @@ impl Room {
 }
 
 /// A task under one protocol: its charts, its rows beside each other, and each row's details while there is room.
-fn task(rows: &[&LeaderboardRow], beside: &Beside, room: &mut Room, html: &mut String) {
+///
+/// It is folded unless it is the only one.
+fn task(
+    rows: &[&LeaderboardRow],
+    beside: &Beside,
+    open: bool,
+    palette: &Palette,
+    room: &mut Room,
+    html: &mut String,
+) {
+    let first = rows[0];
+    let best = rows.iter().find(|row| row.rank == Some(1)).map_or(String::new(), |row| {
+        format!(", best {} {}", escape(&row.name()), row.counts.percent(1))
+    });
+    let count = if rows.len() == 1 { "1 row".to_owned() } else { format!("{} rows", rows.len()) };
     let _ = writeln!(
         html,
-        "<section>\n<h2 id=\"{}\">{}</h2>\n<p class=\"lead\">Protocol <code>{}</code></p>",
-        heading(rows[0]),
-        escape(&title(rows[0])),
-        escape(&rows[0].protocol_text())
+        "<details class=\"task\" id=\"{}\"{}>\n<summary><h3>{}</h3> <small>{}, {count}{best}</small></summary>\n<p \
+         class=\"lead\">Protocol <code>{}</code></p>",
+        heading(first),
+        if open { " open" } else { "" },
+        escape(&title(first)),
+        escape(&first.protocol_words()),
+        escape(&first.protocol_text())
     );
     let drawn = &rows[..rows.len().min(room.each).min(room.drawn)];
     room.drawn -= drawn.len();
@@ -309,18 +336,18 @@ fn task(rows: &[&LeaderboardRow], beside: &Beside, room: &mut Room, html: &mut S
         more => format!("<p class=\"lead\">and {more} more rows in the table above</p>"),
     };
     if !drawn.is_empty() {
-        html.push_str(&card("Success rates with their intervals", &charts::intervals(drawn)));
+        html.push_str(&card("Success rates with their intervals", &charts::intervals(drawn, palette)));
     }
     let _ = writeln!(html, "{more}");
     if drawn.len() > 1 {
-        let costs = charts::costs(drawn);
+        let costs = charts::costs(drawn, palette);
         let _ = writeln!(html, "{}", card("Success against what it costs", &costs));
     }
     let hertz = rows.iter().find_map(|row| beside.entry(row)).map(|entry| entry.hertz);
     for (title, content) in [
         ("Rows beside each other", pairs::table(rows, &mut room.pairs)),
-        ("Episodes solved by each control step", solving::chart(drawn, hertz)),
-        ("Success over demonstrations", demonstrations::chart(drawn)),
+        ("Episodes solved by each control step", solving::chart(drawn, hertz, palette)),
+        ("Success over demonstrations", demonstrations::chart(drawn, palette)),
     ] {
         if !content.is_empty() {
             let _ = writeln!(html, "{}", card(title, &content));
@@ -330,12 +357,12 @@ fn task(rows: &[&LeaderboardRow], beside: &Beside, room: &mut Room, html: &mut S
         details(row, beside, &mut room.films, html);
     }
     room.detailed = room.detailed.saturating_sub(rows.len());
-    html.push_str("</section>\n");
+    html.push_str("</details>\n");
 }
 
 fn card(title: &str, content: &str) -> String {
     format!(
-        "<div class=\"card\" role=\"region\" aria-label=\"{0}\" tabindex=\"0\">\n<h3>{0}</h3>\n{content}</div>",
+        "<div class=\"card\" role=\"region\" aria-label=\"{0}\" tabindex=\"0\">\n<h4>{0}</h4>\n{content}</div>",
         escape(title)
     )
 }
@@ -351,12 +378,12 @@ fn details(row: &LeaderboardRow, beside: &Beside, films: &mut usize, html: &mut 
         row.counts.percent(1),
         interval_text(row.interval, 1, '–')
     );
-    let _ = writeln!(html, "<p><a href=\"#{}\">in the table</a></p>", anchor(row));
+    let _ = writeln!(html, "<p><a href=\"#{}\">This row in the table</a></p>", anchor(row));
     let trainings = row.details();
     if trainings.len() > 1 {
         let _ = writeln!(html, "{}", card("Each training", &html::table(COLUMNS, &trainings)));
     }
-    html.push_str("<div class=\"card\">\n<h3>Episodes by seed: bar height is steps taken, hatched bars failed</h3>\n");
+    html.push_str("<div class=\"card\">\n<h4>Episodes by seed: bar height is steps taken, hatched bars failed</h4>\n");
     for training in &trainings {
         let strips: String = training.evaluations().map(charts::strip).collect();
         let _ = writeln!(
@@ -369,18 +396,18 @@ fn details(row: &LeaderboardRow, beside: &Beside, films: &mut usize, html: &mut 
         );
     }
     html.push_str("</div>\n");
-    let filmed: String = trainings.iter().map(|training| films::failures(training, beside, films)).collect();
+    let filmed: String = trainings.iter().map(|training| films::filmed(training, beside, films)).collect();
     if !filmed.is_empty() {
-        let _ = writeln!(html, "{}", card("Failed episodes", &filmed));
+        let _ = writeln!(html, "{}", card("Films", &filmed));
     }
     let names: Vec<String> = trainings.iter().map(LeaderboardRow::name).collect();
-    let mut shown: Vec<&Curve> = beside.curves.iter().filter(|curve| names.contains(&curve.entry)).collect();
+    let mut shown: Vec<&Curve> = beside.curves.iter().filter(|curve| row.is_trained() && names.contains(&curve.entry)).collect();
     shown.sort_by(|a, b| a.entry.cmp(&b.entry));
     let drawn = charts::curves(&shown);
     if !drawn.is_empty() {
         let _ = writeln!(html, "{}", card("Training loss over optimiser steps", &drawn));
     }
-    html.push_str("<div class=\"card\">\n<h3>Where these numbers come from</h3>\n");
+    html.push_str("<div class=\"card\">\n<h4>Where these numbers come from</h4>\n");
     trainings.iter().for_each(|training| html.push_str(&provenance(training, beside)));
     html.push_str("</div>\n</details>\n");
 }
@@ -411,9 +438,9 @@ fn anchor(row: &LeaderboardRow) -> String {
     slug(&format!("{} {} {} {}", row.name(), row.protocol_text(), row.record().seeds, row.execution_text()))
 }
 
-/// What its rows have in common: `Lift`, `Lift from pictures`.
+/// What its rows have in common: `Lift`, `Lift from images`.
 fn title(row: &LeaderboardRow) -> String {
-    row.task().to_owned() + if row.sees_pictures() { " from pictures" } else { "" }
+    row.task().to_owned() + if row.sees_pictures() { " from images" } else { "" }
 }
 
 fn heading(row: &LeaderboardRow) -> String {
@@ -428,7 +455,7 @@ fn slug(text: &str) -> String {
 fn provenance(row: &LeaderboardRow, beside: &Beside) -> String {
     let t = &row.record().training;
     let again = commands::again(row, beside.task(row), &beside.places).map_or_else(
-        || "it thinks by the clock: its episodes may end otherwise next time".to_owned(),
+        || "It refines its actions by the clock, so its episodes may end otherwise next time.".to_owned(),
         |line| command(&line),
     );
     let facts = [
@@ -445,16 +472,21 @@ fn provenance(row: &LeaderboardRow, beside: &Beside) -> String {
         ),
         (
             "training",
-            format!("{} steps in {:.1} min, seed {}, {} parameters", t.steps, t.minutes, t.seed, t.parameters),
+            match row.is_trained() {
+                true => {
+                    format!("{} steps in {:.1} min, seed {}, {} parameters", t.steps, t.minutes, t.seed, t.parameters)
+                }
+                false => "not trained".to_owned(),
+            },
         ),
         ("execution", escape(&row.execution_text())),
         ("rules", format!("<code>{}</code>", escape(&row.record().protocol.id()))),
         ("seeds", escape(&row.seeds_text())),
         ("versions", escape(&row.versions_text())),
-        ("its episodes again", again),
-        ("all of it again, from its demonstrations", command(&commands::rerun(row, &beside.places))),
+        ("run its episodes again", again),
+        ("reproduce it from its demonstrations", command(&commands::rerun(row, &beside.places))),
     ];
-    let mut html = format!("<h4>{}</h4><dl>", escape(&row.name()));
+    let mut html = format!("<h5>{}</h5><dl>", escape(&row.name()));
     for (name, value) in facts {
         let _ = write!(html, "<dt>{name}</dt><dd>{value}</dd>");
     }

@@ -12,6 +12,11 @@ fn hint(nearest: &Option<String>) -> String {
     nearest.as_ref().map(|n| format!(" (did you mean `{n}`?)")).unwrap_or_default()
 }
 
+/// ` (did you mean `x`, `y`?)`, or nothing.
+fn hints(nearest: &[String]) -> String {
+    if nearest.is_empty() { String::new() } else { format!(" (did you mean `{}`?)", nearest.join("`, `")) }
+}
+
 /// An operation of this crate that failed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -39,14 +44,12 @@ pub enum ZooError {
 
     // ---- experiments -------------------------------------------------------------------------
     /// No experiment of that name.
-    #[error("unknown experiment `{name}`{}; experiments: {}", hint(nearest), list(available))]
+    #[error("unknown experiment `{name}`{}. `actrm-zoo list --experiments` lists all of them", hints(nearest))]
     UnknownExperiment {
         /// The name asked for.
         name: String,
-        /// The most similar name, where one is similar at all.
-        nearest: Option<String>,
-        /// Every experiment there is.
-        available: Vec<String>,
+        /// The most similar names, as far as they are similar.
+        nearest: Vec<String>,
     },
     /// Not a name that an experiment can have.
     #[error("experiment name `{name}`: {reason}")]
@@ -376,7 +379,7 @@ pub enum ZooError {
     },
     /// The entry was trained on demonstrations of another simulator generation.
     #[error(
-        "entry {entry} was trained on data of {simulator} {recorded}, this is {simulator} {running}: another generation, in which policies fail in silence; --force evaluates all the same"
+        "entry {entry} was trained on data recorded in {simulator} {recorded}; this is {simulator} {running}. Behaviour differs between these versions and success rates are not comparable. Use --force to evaluate anyway"
     )]
     SimulatorGeneration {
         /// The entry.

@@ -55,11 +55,20 @@ impl Registry {
         Ok(ids)
     }
 
-    /// The entry that `name` (newest version) or `name@version` means.
+    /// The entry that `name` (newest version) or `name@version` means, or a path in this zoo (`zoo/stack-act`).
     ///
     /// # Errors
     /// [`ZooError::UnknownEntry`] with what there is, [`ZooError::EntryName`] for what cannot be a name.
     pub fn resolve(&self, text: &str) -> Result<EntryId, ZooError> {
+        if text.contains(std::path::MAIN_SEPARATOR) {
+            let (zoo, name) = parts(Path::new(text));
+            let same = |one: &Path| one.canonicalize().ok().is_some_and(|one| self.folder.canonicalize().ok() == Some(one));
+            if name.is_empty() || !same(&zoo) {
+                let reason = "expected a name or a path in this zoo; --zoo names another one";
+                return Err(ZooError::EntryName { name: text.to_owned(), reason });
+            }
+            return self.resolve(&name);
+        }
         let mut request: EntryRequest = text.parse()?;
         let ids = self.ids()?;
         if let Some(alias) = request.alias.take().filter(|_| ids.iter().any(|id| id.name == request.name)) {
@@ -206,18 +215,8 @@ impl Registry {
         if !text.contains(std::path::MAIN_SEPARATOR) && !path.is_dir() {
             return self.entry(text);
         }
-        // `..` and a slash at the end have no name
-        let whole = match path.canonicalize() {
-            Ok(path) if path.is_dir() => path,
-            _ => path.to_owned(),
-        };
-        let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let above = |path: &Path| path.parent().map(Path::to_owned).unwrap_or_default();
-        if !whole.join(ENTRY_FILE).is_file() {
-            return Self::open(&above(&whole)).entry(&name(&whole));
-        }
-        let parent = above(&whole);
-        Self::open(&above(&parent)).entry(&format!("{}@{}", name(&parent), name(&whole)))
+        let (zoo, name) = parts(path);
+        Self::open(&zoo).entry(&name)
     }
 
     /// The newest version of every name.
@@ -231,6 +230,22 @@ impl Registry {
         ids.reverse();
         Ok(ids)
     }
+}
+
+/// The zoo and the name of an entry from its path.
+fn parts(path: &Path) -> (PathBuf, String) {
+    // `..` and a slash at the end have no name
+    let whole = match path.canonicalize() {
+        Ok(path) if path.is_dir() => path,
+        _ => path.to_owned(),
+    };
+    let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let above = |path: &Path| path.parent().map(Path::to_owned).unwrap_or_default();
+    if !whole.join(ENTRY_FILE).is_file() {
+        return (above(&whole), name(&whole));
+    }
+    let parent = above(&whole);
+    (above(&parent), format!("{}@{}", name(&parent), name(&whole)))
 }
 
 fn names(folder: &Path) -> Result<Vec<String>, ZooError> {

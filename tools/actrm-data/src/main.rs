@@ -23,8 +23,13 @@ struct Cli {
 fn main() -> ExitCode {
     // in a reading process this never returns
     dataset::isolation::serve_if_child();
-    cli::completions::answer(Cli::command);
-    cli::end(Cli::parse().command.run())
+    cli::completions::answer(command);
+    cli::end(cli::parse::<Cli>(command(), &|_, _| None).command.run())
+}
+
+/// The command line, as its help shows it.
+fn command() -> clap::Command {
+    cli::dressed(Cli::command(), commands::Command::GROUPS)
 }
 
 #[cfg(test)]
@@ -33,6 +38,6 @@ mod tests {
 
     #[test]
     fn the_command_line_is_sound_and_every_command_shows_examples() {
-        cli::every_command_shows_examples(&Cli::command());
+        cli::every_command_shows_examples(&command());
     }
 }

@@ -17,6 +17,8 @@ pub enum Content<'a> {
     Line(&'a [f32]),
     /// How often values occur, in even bins between the extremes.
     Histogram(&'a [f32]),
+    /// The same between two bounds that hold every value.
+    HistogramWithin(&'a [f32], (f32, f32)),
 }
 
 /// A chart in a group at `(x, y)`.
@@ -26,7 +28,10 @@ pub fn chart(x: f64, y: f64, title: &str, content: &Content<'_>) -> String {
     let _ = writeln!(out, "<rect width=\"{WIDTH}\" height=\"{HEIGHT}\" class=\"frame\"/>");
     match content {
         Content::Line(values) => line(&mut out, values),
-        Content::Histogram(values) => histogram(&mut out, values),
+        Content::Histogram(values) => histogram(&mut out, values, extremes(values)),
+        Content::HistogramWithin(values, (low, high)) => {
+            histogram(&mut out, values, (f64::from(*low), f64::from(*high)));
+        }
     }
     out.push_str("</g>\n");
     out
@@ -91,9 +96,8 @@ fn line(out: &mut String, values: &[f32]) {
     label(out, WIDTH, HEIGHT + 14.0, "end", &values.len().saturating_sub(1).to_string());
 }
 
-fn histogram(out: &mut String, values: &[f32]) {
+fn histogram(out: &mut String, values: &[f32], (low, high): (f64, f64)) {
     const BINS: usize = 60;
-    let (low, high) = extremes(values);
     let span = if high > low { high - low } else { 1.0 };
     let mut counts = [0_usize; BINS];
     for v in values.iter().filter(|v| v.is_finite()) {
@@ -132,6 +136,8 @@ mod tests {
         assert_eq!(text.matches('M').count(), 2, "a gap where there is no number: {text}");
         let bars = chart(0.0, 0.0, "h", &Content::Histogram(&[1.0, 1.0, 2.0]));
         assert_eq!(bars.matches("class=\"bar\"").count(), 2);
+        let within = chart(0.0, 0.0, "h", &Content::HistogramWithin(&[1.0, 1.0, 2.0], (0.0, 4.0)));
+        assert!(within.contains("x=\"105.0\"") && within.contains("x=\"210.0\"") && within.contains(">4</text>"), "{within}");
         for empty in [&[][..], &[f32::NAN][..], &[3.0][..]] {
             let page = page("x", &[("l".into(), Content::Line(empty)), ("h".into(), Content::Histogram(empty))], 2);
             assert!(!page.contains("NaN") && !page.contains("inf\""), "{page}");

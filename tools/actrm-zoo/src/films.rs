@@ -23,10 +23,11 @@ fn stem(task: &str, seed: u64, success: bool, seen: bool) -> String {
     format!("{task}-{seed}-{word}{}", if seen { "-seen" } else { "" })
 }
 
-/// The films of failed episodes of these rows, in the rows' order. As many are read as a page takes, the others are named.
+/// The films of episodes of these rows, in the rows' order, those of failures first. As many are read as a page takes, the
+/// others are named.
 ///
 /// A film without conditions counts where it can be of one result only.
-pub fn of_failures(rows: &[LeaderboardRow], zoo: &Path) -> Vec<Film> {
+pub fn of_episodes(rows: &[LeaderboardRow], zoo: &Path) -> Vec<Film> {
     let all: Vec<&StoredEvaluation> = rows.iter().flat_map(LeaderboardRow::evaluations).collect();
     let mut films = Vec::new();
     let mut room = MOST_FILM_BYTES;
@@ -37,14 +38,16 @@ pub fn of_failures(rows: &[LeaderboardRow], zoo: &Path) -> Vec<Film> {
             continue;
         };
         let conditions = one.record.conditions();
-        for seed in one.episodes.iter().filter(|episode| !episode.success).map(|episode| episode.seed) {
+        let mut episodes: Vec<(bool, u64)> = one.episodes.iter().map(|episode| (episode.success, episode.seed)).collect();
+        episodes.sort_by_key(|(success, _)| *success);
+        for (success, seed) in episodes {
             let holds = |other: &&&StoredEvaluation| {
                 let record = &other.record;
                 (&record.entry, &record.protocol.task) == (entry, task) && record.seeds.iter().contains(&seed)
             };
             for seen in [false, true] {
-                let named = folder.join(name(task, seed, false, seen, &conditions));
-                let unnamed = folder.join(format!("{}.mp4", stem(task, seed, false, seen)));
+                let named = folder.join(name(task, seed, success, seen, &conditions));
+                let unnamed = folder.join(format!("{}.mp4", stem(task, seed, success, seen)));
                 let path = match (named.is_file(), unnamed.is_file()) {
                     (true, _) => named,
                     (false, true) if all.iter().filter(holds).count() == 1 => unnamed,

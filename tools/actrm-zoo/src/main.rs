@@ -27,8 +27,25 @@ struct Cli {
 fn main() -> ExitCode {
     // converting an HDF5 file reads it in a process of its own, which is this program again
     dataset::isolation::serve_if_child();
-    cli::completions::answer(Cli::command);
-    cli::end(Cli::parse().command.run())
+    cli::completions::answer(command);
+    cli::end(cli::parse::<Cli>(command(), &setting_hint).command.run())
+}
+
+/// The command line, as its help shows it.
+fn command() -> clap::Command {
+    cli::dressed(Cli::command(), commands::Command::GROUPS)
+}
+
+/// For `train --steps 100`: the setting of an experiment that is called so, as an override.
+fn setting_hint(option: &str, value: Option<&str>) -> Option<String> {
+    let name = option.strip_prefix("--")?.replace('-', "_");
+    if std::env::args().nth(1)? != "train" {
+        return None;
+    }
+    let settings = zoo::config::Library::built_in().resolve("act_lift").ok()?;
+    let mut sections = settings.iter().filter_map(|(section, keys)| Some((section, keys.as_table()?)));
+    let (section, _) = sections.find(|(_, keys)| keys.contains_key(&name))?;
+    Some(format!("settings of an experiment have no dashes: `{section}.{name}={}`", value.unwrap_or("VALUE")))
 }
 
 #[cfg(test)]
@@ -37,6 +54,6 @@ mod tests {
 
     #[test]
     fn the_command_line_is_sound_and_every_command_shows_examples() {
-        cli::every_command_shows_examples(&Cli::command());
+        cli::every_command_shows_examples(&command());
     }
 }

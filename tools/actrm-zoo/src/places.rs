@@ -42,7 +42,7 @@ impl ZooArgs {
 /// Where results are.
 #[derive(Args)]
 pub struct ResultsArgs {
-    /// Folder of results (`results` in the zoo)
+    /// Folder of results [default: `results` in the zoo]
     #[arg(long, value_name = "DIR")]
     results: Option<PathBuf>,
 }
@@ -62,7 +62,7 @@ impl ResultsArgs {
 /// Where experiments are.
 #[derive(Args, Clone)]
 pub struct ConfigArgs {
-    /// Folder of experiment files that come before those built in
+    /// Folder of your own experiment files, which take precedence over the built-in ones
     #[arg(long, value_name = "DIR", env = "ACTRM_CONFIGS")]
     pub configs: Option<PathBuf>,
 }
@@ -77,7 +77,7 @@ impl ConfigArgs {
 /// Where named protocols are.
 #[derive(Args)]
 pub struct ProtocolArgs {
-    /// Folder of protocol files beside those built in
+    /// Folder of your own protocol files, in addition to the built-in ones
     #[arg(long, value_name = "DIR", env = "ACTRM_PROTOCOLS")]
     protocols: Option<PathBuf>,
 }

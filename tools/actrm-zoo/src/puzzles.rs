@@ -16,27 +16,27 @@ use zoo::entry::Entry;
 /// How solvers are evaluated.
 #[derive(Args)]
 pub struct PuzzleArgs {
-    /// Test puzzles a solver
+    /// Number of test puzzles
     #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u64).range(1..))]
     puzzles: u64,
-    /// Most supervision steps of a solver
+    /// Largest number of supervision steps on a puzzle
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u64).range(1..=1000))]
     depth: u64,
-    /// Givens of a Sudoku (the fewest that the solver was trained on)
+    /// Givens of a Sudoku [default: the fewest that the solver was trained on]
     #[arg(long, value_name = "N")]
     givens: Option<usize>,
-    /// Most starts of a thought about a puzzle: where it does not settle it begins anew from noise; with --views, starts of
-    /// every view, the second and further ones from noise: all vote
+    /// Largest number of starts on a puzzle: without a stable answer the solver starts again from noise. With --views it is
+    /// the number of starts of every view, and all of them vote
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     starts: u64,
-    /// Standard deviation of that noise
+    /// Standard deviation of the noise of --starts
     #[arg(long, value_name = "STD", default_value_t = 1.0, requires = "starts")]
     noise: f64,
-    /// From how many sides a puzzle is seen, turned or in a mirror, a Sudoku with its digits renamed: each view's answer
-    /// has as many votes as the judge gives it probability
+    /// Number of views of a puzzle, rotated or mirrored, a Sudoku with its digits renamed. The answer of each view is
+    /// weighted by the probability that --judge gives it
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST_VIEWS))]
     views: u64,
-    /// Who weighs the views' answers: the halting head, or the probabilities of their cells
+    /// Weight of a view's answer: the halting head or the cell probabilities
     #[arg(long, value_name = "JUDGE", default_value = "halting", requires = "views")]
     judge: JudgeArg,
 }

@@ -17,27 +17,27 @@ use crate::places::of_entry;
 /// How entries are run.
 #[derive(Args)]
 pub struct RunArgs {
-    /// Control steps after which an episode has failed (the entry's or the task's own cap)
+    /// Control steps after which an episode counts as failed [default: the entry's or the task's]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_STEPS))]
     pub max_steps: Option<u64>,
     #[command(flatten)]
     pub simulator: SimulatorArgs,
-    /// Another task than the entry's
+    /// Task, if not the entry's
     #[arg(long)]
     pub task: Option<String>,
     /// Control loop inside the simulator: `compiled` or `robosuite`
     #[arg(long, default_value_t = Control::Compiled)]
     pub control: Control,
-    /// Evaluate although the demonstrations were recorded in another simulator generation, or with these seeds
+    /// Evaluate even if the demonstrations were recorded in another simulator version or with these seeds
     #[arg(long)]
     pub force: bool,
-    /// Seconds without an answer to a step after which a worker counts as hung, from the first step on
+    /// Seconds without an answer to a step after which a worker is restarted
     #[arg(long, value_name = "S", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     step_timeout: u64,
-    /// Seconds that a worker may take to start: imports, compilation, making the environment
+    /// Seconds that a worker may take to start, with imports and compilation
     #[arg(long, value_name = "S", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     start_timeout: u64,
-    /// Keep what workers say on standard error in this folder
+    /// Folder for the standard error output of the workers
     #[arg(long, value_name = "DIR")]
     pub worker_logs: Option<PathBuf>,
 }

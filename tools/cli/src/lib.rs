@@ -19,7 +19,7 @@ mod stop;
 mod table;
 mod text;
 
-pub use command::{end, every_command_shows_examples};
+pub use command::{dressed, end, every_command_shows_examples, parse};
 pub use film::{Film, film};
 pub use output::{note, print, print_json};
 pub use screen::Screen;

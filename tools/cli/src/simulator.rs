@@ -11,10 +11,10 @@ use crate::{Screen, Stop, limits, note};
 /// Options of every command that runs the simulator.
 #[derive(clap::Args)]
 pub struct SimulatorArgs {
-    /// Simulators at once [default: one a core]
-    #[arg(long, value_name = "N")]
+    /// Number of simulators at once [default: one per core]
+    #[arg(long, short = 'j', value_name = "N")]
     pub workers: Option<usize>,
-    /// Python module of your own that registers environments
+    /// Python module that registers your own environments
     #[arg(long, value_name = "MODULE")]
     pub env_module: Option<String>,
     /// Python with robosuite [default: $ACTRM_PYTHON, else .venv/bin/python here or above, else python3]

@@ -130,13 +130,13 @@ mod tests {
         // two that differ beyond doubt, and no letter of theirs is another group's
         assert_eq!(rows[2].standing.as_ref().unwrap().ranks, (1, 1));
         assert_eq!(rows[3].standing.as_ref().unwrap().ranks, (2, 2));
-        assert_eq!((rows[0].kind().as_str(), rows[2].kind().as_str()), ("act", "act from pictures"));
+        assert_eq!((rows[0].kind().as_str(), rows[2].kind().as_str()), ("act", "act from images"));
         let table = csv::table(COLUMNS, &rows);
         let ends: Vec<bool> =
             table.lines().skip(1).map(|line| line.ends_with(",agentview robot0_eye_in_hand,,")).collect();
         assert_eq!(ends, [false, false, true, true]);
         assert_eq!(rows[2].details()[0].cameras, rows[2].cameras);
-        assert!(cells(COLUMNS, &rows).rows[2][0].ends_with("from pictures"));
+        assert!(cells(COLUMNS, &rows).rows[2][0].ends_with("from images"));
     }
 
     /// Where pictures are seen a row says what drawing and encoding them takes, beside the query that holds the second.

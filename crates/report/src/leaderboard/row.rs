@@ -252,14 +252,19 @@ impl LeaderboardRow {
         !self.cameras.is_empty()
     }
 
-    /// The kind of policy, and whether it sees pictures: `act`, `act from pictures`.
+    /// The kind of policy, and whether it sees pictures: `act`, `act from images`.
     pub fn kind(&self) -> String {
-        self.policy().to_owned() + if self.sees_pictures() { " from pictures" } else { "" }
+        self.policy().to_owned() + if self.sees_pictures() { " from images" } else { "" }
     }
 
     /// Its name, with what it sees in a second line where that is pictures.
     pub(super) fn name_lines(&self) -> String {
-        self.name() + if self.sees_pictures() { "\nfrom pictures" } else { "" }
+        self.name() + if self.sees_pictures() { "\nfrom images" } else { "" }
+    }
+
+    /// Whether it has weights that training found.
+    pub(crate) fn is_trained(&self) -> bool {
+        self.bound().is_none() && self.policy() != "nearest"
     }
 
     /// Which bound of its task it is, if it is one.
@@ -424,6 +429,19 @@ impl LeaderboardRow {
         }
     }
 
+    /// The same for headings, without a hash: `400 steps, compiled control`.
+    pub(crate) fn protocol_words(&self) -> String {
+        if self.named.is_some() {
+            return self.protocol_text();
+        }
+        let protocol = &self.record().protocol;
+        let mut text = format!("{} steps, {} control", protocol.max_steps, protocol.control);
+        for more in protocol.perturbation.iter().chain(Some(&self.simulator).filter(|text| !text.is_empty())) {
+            text.push_str(&format!(", {more}"));
+        }
+        text
+    }
+
     /// The same, and below it what tells the row from others of its entry there.
     pub(super) fn protocol_lines(&self) -> String {
         if self.apart.is_empty() { self.protocol_text() } else { format!("{}\n{}", self.protocol_text(), self.apart) }
@@ -490,7 +508,11 @@ impl LeaderboardRow {
         self.each().iter().map(|counts| counts.successes.to_string()).collect::<Vec<_>>().join(between)
     }
 
-    pub(super) fn trained_text(&self, between: &str) -> String {
+    /// `500 steps, 0.5 min`; that nothing was trained, where that is so.
+    pub(crate) fn trained_text(&self, between: &str) -> String {
+        if !self.is_trained() {
+            return "not trained".to_owned();
+        }
         format!("{} steps{between}{:.1} min", self.record().training.steps, self.minutes())
     }
 

@@ -2,13 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::plot::{COLOURS, Plot};
+use super::plot::{COLOURS, Palette, Plot};
 use crate::leaderboard::LeaderboardRow;
 
 /// A line a kind of policy whose rows had different numbers of demonstrations; nothing where there is no such kind.
 ///
 /// A line leads through the row of each number that stands first; every row is a point.
-pub(super) fn chart(rows: &[&LeaderboardRow]) -> String {
+pub(super) fn chart(rows: &[&LeaderboardRow], palette: &Palette) -> String {
     let mut policies: BTreeMap<&str, Vec<(u64, &LeaderboardRow)>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.bound().is_none() && row.record().training.demos > 0) {
         policies.entry(row.policy()).or_default().push((row.record().training.demos, row));
@@ -40,13 +40,14 @@ pub(super) fn chart(rows: &[&LeaderboardRow]) -> String {
         let x = |demos: u64| Plot::x(share(demos)) + 5.0 * (index as f64 - (policies.len() - 1) as f64 / 2.0);
         let corners: Vec<String> =
             firsts.iter().map(|(&demos, row)| format!("{:.1} {:.1}", x(demos), Plot::y(row.counts.rate()))).collect();
-        plot.line(index, &format!("M{}", corners.join("L")), policy);
+        let colour = palette.index(points[0].1);
+        plot.line(colour, index, &format!("M{}", corners.join("L")), policy);
         for (demos, row) in points {
             let title = format!("{} ({policy}): {demos} demonstrations, {}", row.name(), rate(row));
-            plot.point(index, x(*demos), row.counts.rate(), row.interval, &title);
+            plot.point(colour, x(*demos), row.counts.rate(), row.interval, &title);
         }
         let said: Vec<String> = firsts.iter().map(|(demos, row)| format!("{demos}: {}", rate(row))).collect();
-        legend.push(((*policy).to_owned(), said.join(" · ")));
+        legend.push((colour, (*policy).to_owned(), said.join(" · ")));
     }
     plot.finish(&legend)
 }
@@ -78,7 +79,7 @@ mod tests {
 
     fn drawn(of: &[(&str, u64, usize)]) -> String {
         let rows = rows(of);
-        chart(&rows.iter().collect::<Vec<_>>())
+        chart(&rows.iter().collect::<Vec<_>>(), &Palette::of(&rows))
     }
 
     #[test]

@@ -155,13 +155,13 @@ fn chart(depths: &[&Depth]) -> String {
         let x = |depth: &Depth| Plot::x(share(depth.steps)) + 5.0 * (index as f64 - (lines.len() - 1) as f64 / 2.0);
         let corners: Vec<String> =
             line.iter().map(|depth| format!("{:.1} {:.1}", x(depth), Plot::y(depth.counts().rate()))).collect();
-        plot.line(index, &format!("M{}", corners.join("L")), how);
+        plot.line(index, index, &format!("M{}", corners.join("L")), how);
         for depth in *line {
             let title = format!("{how}, {} steps: {}, {:.2} ms", depth.steps, depth.counts(), depth.query_ms().0);
             plot.point(index, x(depth), depth.counts().rate(), depth.row.interval, &title);
         }
         let steps: Vec<String> = line.iter().map(|depth| depth.steps.to_string()).collect();
-        legend.push((how.to_owned(), format!("at {} steps", steps.join(", "))));
+        legend.push((index, how.to_owned(), format!("at {} steps", steps.join(", "))));
     }
     plot.finish(&legend)
 }

@@ -1,4 +1,4 @@
-//! Films of failed episodes, in the page as far as there is room.
+//! Films of episodes, in the page as far as there is room.
 
 use std::fmt::Write as _;
 
@@ -25,16 +25,17 @@ pub struct Film {
     pub video: Option<Vec<u8>>,
 }
 
-/// The films of a row of one training whose episodes failed, each with the command that shows it again; `room`, in
-/// characters, becomes less by what they take.
-pub(super) fn failures(row: &LeaderboardRow, beside: &Beside, room: &mut usize) -> String {
+/// The films of a row of one training, each with the command that shows it again; `room`, in characters, becomes less by what
+/// they take.
+pub(super) fn filmed(row: &LeaderboardRow, beside: &Beside, room: &mut usize) -> String {
     let mut html = String::new();
     for one in row.evaluations() {
         let Some(folder) = one.folder.file_name().and_then(|name| name.to_str()) else { continue };
         for film in beside.films.iter().filter(|film| film.result == folder) {
-            let Some(episode) = one.episodes.iter().find(|e| e.seed == film.seed && !e.success) else { continue };
+            let Some(episode) = one.episodes.iter().find(|e| e.seed == film.seed) else { continue };
             let why = episode.failure.as_ref().map_or(String::new(), |word| format!(", {word}"));
-            let title = format!("{}, seed {}: failed after {} steps{why}", row.name(), film.seed, episode.steps);
+            let outcome = if episode.success { "success" } else { "failure" };
+            let title = format!("{}, seed {}: {outcome} after {} steps{why}", row.name(), film.seed, episode.steps);
             let fits = film.video.as_ref().filter(|video| base64_length(video.len()) <= *room);
             let shown = match fits {
                 Some(video) => {
@@ -67,7 +68,7 @@ mod tests {
     use crate::testing::{finished, sample};
 
     #[test]
-    fn films_of_failures_are_shown_while_there_is_room() {
+    fn films_are_shown_while_there_is_room() {
         let dir = tempfile::tempdir().unwrap();
         let stored = finished(dir.path(), &sample("a", 1, 20));
         let result = stored.folder.file_name().unwrap().to_str().unwrap().to_owned();
@@ -91,14 +92,15 @@ mod tests {
         beside.films[3].video = None;
         let row = LeaderboardRow::new(&stored);
         let mut room = 15;
-        let html = failures(&row, &beside, &mut room);
-        assert_eq!((html.matches("<video").count(), html.matches("<figure").count(), room), (1, 3, 7), "{html}");
+        let html = filmed(&row, &beside, &mut room);
+        assert_eq!((html.matches("<video").count(), html.matches("<figure").count(), room), (1, 4, 7), "{html}");
         assert!(html.contains("src=\"data:video/mp4;base64,Zm9vYmFy\""), "{html}");
         assert!(html.contains("<code>two.mp4</code>") && html.contains("<code>three.mp4</code>"), "{html}");
         assert!(
-            html.contains("a@1, seed 10000: failed after 400 steps") && html.contains("--seed-start 10000 "),
+            html.contains("a@1, seed 10000: failure after 400 steps") && html.contains("--seed-start 10000 "),
             "{html}"
         );
-        assert!(!html.contains("solved.mp4") && !html.contains("other.mp4"), "{html}");
+        assert!(html.contains("a@1, seed 10001: success after ") && html.contains("<code>solved.mp4</code>"), "{html}");
+        assert!(!html.contains("other.mp4"), "{html}");
     }
 }

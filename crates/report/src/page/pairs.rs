@@ -23,8 +23,8 @@ pub(super) fn table(rows: &[&LeaderboardRow], room: &mut usize) -> String {
     let first = if ranked > n { format!("The first {n} of {ranked} rows. ") } else { String::new() };
     let mut html = format!(
         "<table class=\"pairs\"><caption>{first}Success of the row less that of the column, in percentage points, and the \
-         p-value after Holm's correction over all comparisons of this page. ▲: the row is better, ▼: it is worse, told apart \
-         at {:.0}%; without a mark they cannot be told apart.</caption><thead><tr><th scope=\"col\">row less column</th>",
+         p-value after Holm's correction over all comparisons of this page. ▲: the row is better, ▼: it is worse, \
+         significant at {:.0}%. Without a mark the difference is not significant.</caption><thead><tr><th scope=\"col\">row less column</th>",
         ALPHA * 1e2
     );
     for (place, (row, _)) in compared.iter().enumerate() {
@@ -48,8 +48,9 @@ fn name(row: &LeaderboardRow) -> String {
 fn cell(pair: &Pair) -> String {
     let Pair { comparison, adjusted, distinct } = pair;
     let points = comparison.difference * 1e2;
-    // no negative nothing
-    let difference = if format!("{points:.1}") == "-0.0" { "0.0".to_owned() } else { format!("{points:+.1}") };
+    // a difference that rounds to nothing has no sign
+    let difference = format!("{points:+.1}");
+    let difference = if difference.ends_with("0.0") && difference.len() == 4 { "0.0".to_owned() } else { difference };
     let (class, mark) = match (distinct, comparison.difference > 0.0) {
         (false, _) => ("", ""),
         (true, true) => (" class=\"better\"", " ▲"),

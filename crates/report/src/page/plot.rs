@@ -5,6 +5,7 @@
 use std::fmt::Write as _;
 
 use crate::html::escape;
+use crate::leaderboard::LeaderboardRow;
 
 /// Colours of lines, in order, readable on light and dark ground.
 pub(crate) const COLOURS: [&str; 8] =
@@ -19,11 +20,34 @@ const RIGHT: f64 = 540.0;
 const TOP: f64 = 14.0;
 const BOTTOM: f64 = 214.0;
 
-/// How line `index` looks, as attributes.
-pub(super) fn stroke(index: usize) -> String {
-    let dash = DASHES[index % DASHES.len()];
+/// The colour of each kind of policy, the same in every chart of a page. Floors and ceilings are grey.
+pub(crate) struct Palette(Vec<String>);
+
+impl Palette {
+    pub(crate) fn of(rows: &[LeaderboardRow]) -> Self {
+        let learned = rows.iter().filter(|row| row.bound().is_none());
+        let mut policies: Vec<String> = learned.map(|row| row.policy().to_owned()).collect();
+        policies.sort();
+        policies.dedup();
+        Self(policies)
+    }
+
+    /// The place of a row's colour in [`COLOURS`].
+    pub(crate) fn index(&self, row: &LeaderboardRow) -> usize {
+        let grey = COLOURS.len() - 1;
+        self.0.binary_search_by(|policy| policy.as_str().cmp(row.policy())).map_or(grey, |at| at % grey)
+    }
+
+    pub(crate) fn colour(&self, row: &LeaderboardRow) -> &'static str {
+        COLOURS[self.index(row)]
+    }
+}
+
+/// Colour and dash of a line, as attributes.
+fn stroke(colour: usize, dash: usize) -> String {
+    let dash = DASHES[dash % DASHES.len()];
     let dash = if dash.is_empty() { String::new() } else { format!(" stroke-dasharray=\"{dash}\"") };
-    format!("stroke=\"{}\"{dash}", COLOURS[index % COLOURS.len()])
+    format!("stroke=\"{}\"{dash}", COLOURS[colour % COLOURS.len()])
 }
 
 /// A chart under way: success from bottom to top over something from left to right.
@@ -73,19 +97,19 @@ impl Plot {
         let _ = write!(self.svg, r#"<text class="label" x="{x}" y="{y}" text-anchor="middle">{}</text>"#, escape(text));
     }
 
-    /// Line `index` through points, as SVG's path has them.
-    pub(super) fn line(&mut self, index: usize, path: &str, title: &str) {
+    /// A line of a colour and a dash through points, as SVG's path has them.
+    pub(super) fn line(&mut self, colour: usize, dash: usize, path: &str, title: &str) {
         let _ = write!(
             self.svg,
             r#"<path d="{path}" fill="none" {} stroke-width="2" stroke-linejoin="round"><title>{}</title></path>"#,
-            stroke(index),
+            stroke(colour, dash),
             escape(title)
         );
     }
 
-    /// A point of line `index` with its interval.
-    pub(super) fn point(&mut self, index: usize, x: f64, rate: f64, (low, high): (f64, f64), title: &str) {
-        let colour = COLOURS[index % COLOURS.len()];
+    /// A point of a colour with its interval.
+    pub(super) fn point(&mut self, colour: usize, x: f64, rate: f64, (low, high): (f64, f64), title: &str) {
+        let colour = COLOURS[colour % COLOURS.len()];
         let (y, from, to) = (Self::y(rate), Self::y(low), Self::y(high));
         let _ = write!(
             self.svg,
@@ -94,19 +118,19 @@ impl Plot {
         );
     }
 
-    /// The chart, and what its lines are: each a name and what else is to be said of it.
-    pub(super) fn finish(mut self, legend: &[(String, String)]) -> String {
+    /// The chart and its legend: the colour of each line in order, its name and what else is to be said of it.
+    pub(super) fn finish(mut self, legend: &[(usize, String, String)]) -> String {
         self.svg.push_str("</svg>");
         let mut html = format!("<figure class=\"lines\">{}", self.svg);
         if !legend.is_empty() {
             html.push_str("<figcaption><ul class=\"legend\">");
         }
-        for (index, (name, said)) in legend.iter().enumerate() {
+        for (dash, (colour, name, said)) in legend.iter().enumerate() {
             let _ = write!(
                 html,
                 "<li><svg width=\"28\" height=\"8\" aria-hidden=\"true\"><line x1=\"0\" x2=\"28\" y1=\"4\" y2=\"4\" {} \
                  stroke-width=\"3\"/></svg>{} <small>{}</small></li>",
-                stroke(index),
+                stroke(*colour, dash),
                 escape(name),
                 escape(said)
             );

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::plot::{COLOURS, Plot};
+use super::plot::{COLOURS, Palette, Plot};
 use crate::leaderboard::LeaderboardRow;
 
 /// Lines of a chart: as many as have colours of their own.
@@ -12,7 +12,7 @@ const MOST_LINES: usize = COLOURS.len();
 const MOST_CORNERS: usize = 160;
 
 /// A line a row, for the first ones; nothing where none solved an episode. `hertz`: control steps a second, if that is known.
-pub(super) fn chart(rows: &[&LeaderboardRow], hertz: Option<f64>) -> String {
+pub(super) fn chart(rows: &[&LeaderboardRow], hertz: Option<f64>, palette: &Palette) -> String {
     let drawn = &rows[..rows.len().min(MOST_LINES)];
     let steps: Vec<Vec<f64>> = drawn.iter().map(|row| row.steps_to_success()).collect();
     let Some(last) = steps.iter().filter_map(|steps| steps.last().copied()).max_by(f64::total_cmp) else {
@@ -46,8 +46,8 @@ pub(super) fn chart(rows: &[&LeaderboardRow], hertz: Option<f64>) -> String {
                 seconds => format!("half by step {step:.0} ({seconds})"),
             },
         );
-        plot.line(index, &path, &format!("{}: {}, {half}", row.name(), row.counts.percent(1)));
-        legend.push((row.name(), format!("{} in the end, {half}", row.counts.percent(1))));
+        plot.line(palette.index(row), index, &path, &format!("{}: {}, {half}", row.name(), row.counts.percent(1)));
+        legend.push((palette.index(row), row.name(), format!("{} in the end, {half}", row.counts.percent(1))));
     }
     plot.finish(&legend)
 }
@@ -127,20 +127,21 @@ mod tests {
         fails.episodes.iter_mut().for_each(|episode| episode.success = false);
         let half = finished(dir.path(), &sample("half", 1, 20));
         let rows = rank(&[fails.clone(), half], &Reading::default());
+        let palette = Palette::of(&rows);
         let rows: Vec<&LeaderboardRow> = rows.iter().collect();
         // the sample: seeds 10,000 to 10,019, every fifth fails, the others take 40 + seed % 7 steps
         let mut steps: Vec<u64> = (10_000..10_020).filter(|seed| seed % 5 != 0).map(|seed| 40 + seed % 7).collect();
         steps.sort_unstable();
         let median = steps[9];
-        let html = chart(&rows, Some(20.0));
+        let html = chart(&rows, Some(20.0), &palette);
         let seconds = short(median as f64 / 20.0);
         assert!(html.contains(&format!("80.0% in the end, half by step {median} ({seconds} s)")), "{html}");
         assert!(html.contains("0.0% in the end, half never"), "{html}");
         assert!(html.contains(">60</text>") && html.contains(">3 s</text>"), "{html}");
         // the line that never rises: from left to right along the bottom
         assert!(html.contains("<path d=\"M58.0 214.0H540.0\""), "{html}");
-        assert!(!chart(&rows, None).contains(" s</text>"));
+        assert!(!chart(&rows, None, &palette).contains(" s</text>"));
         let none = LeaderboardRow::new(&fails);
-        assert_eq!(chart(&[&none], None), "");
+        assert_eq!(chart(&[&none], None, &palette), "");
     }
 }

@@ -11,7 +11,7 @@
 
 use toml::{Table, Value};
 
-use super::{Library, check_experiment_name, merge, nearest};
+use super::{Library, check_experiment_name, merge, nearest_of};
 use crate::ZooError;
 
 const STATE: &str = "state";
@@ -186,7 +186,7 @@ impl Library {
     fn unknown(&self, name: &str) -> ZooError {
         match self.names() {
             Ok(available) => {
-                ZooError::UnknownExperiment { name: name.to_owned(), nearest: nearest(name, &available), available }
+                ZooError::UnknownExperiment { name: name.to_owned(), nearest: nearest_of(name, &available, 3) }
             }
             Err(error) => error,
         }

@@ -25,12 +25,18 @@ pub use value::{from_value, from_value_as};
 
 /// The name most like `name`, if one is like it: at most a third of its letters differ.
 pub fn nearest(name: &str, names: &[String]) -> Option<String> {
-    names
+    nearest_of(name, names, 1).pop()
+}
+
+/// The names most like `name`, best first, at most `count` of them.
+pub fn nearest_of(name: &str, names: &[String], count: usize) -> Vec<String> {
+    let mut near: Vec<(usize, &String)> = names
         .iter()
         .map(|n| (strsim::damerau_levenshtein(&name.to_lowercase(), &n.to_lowercase()), n))
         .filter(|(distance, n)| *distance <= (name.len().max(n.len()) / 3).max(1))
-        .min()
-        .map(|(_, n)| n.clone())
+        .collect();
+    near.sort();
+    near.into_iter().take(count).map(|(_, n)| n.clone()).collect()
 }
 
 /// Refuses names that are not the plain name of a file: an experiment's folder of runs is called like it.
@@ -213,12 +219,11 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_experiment_lists_what_there_is() {
+    fn an_unknown_experiment_has_the_nearest_names() {
         let message = Library::built_in().resolve("act_lfit").unwrap_err().to_string();
-        assert!(
-            message.starts_with("unknown experiment `act_lfit` (did you mean `act_lift`?); experiments: "),
-            "{message}"
-        );
+        assert!(message.starts_with("unknown experiment `act_lfit` (did you mean `act_lift`, `"), "{message}");
+        assert!(message.ends_with("`?). `actrm-zoo list --experiments` lists all of them"), "{message}");
+        assert_eq!(message.matches('`').count(), 10, "three names: {message}");
     }
 
     #[test]

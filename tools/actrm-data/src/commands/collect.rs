@@ -8,16 +8,16 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Instant;
 
-const GOES_ON: &str = "stopped; the same command goes on where it was";
+const GOES_ON: &str = "stopped; run the same command again to resume";
 
 /// Collect demonstrations of a task from its scripted expert in the simulator.
 ///
-/// Attempt k runs in an environment seeded with 1000000 * SEED + k, and attempts are taken in this order until
-/// enough have succeeded, so that the same command writes the same bytes with any number of workers. Failures are
-/// counted and not stored. The file is in robomimic's layout, with masks `train` (90%) and `valid` (10%).
+/// Attempt k runs in an environment seeded with 1000000 * SEED + k. Attempts are taken in this order until enough have
+/// succeeded. The same command writes the same bytes with any number of workers. Failures are counted and not stored. The file
+/// is in robomimic's layout, with masks `train` (90%) and `valid` (10%).
 ///
-/// Attempts are kept in a hidden folder beside the file until it is written: stopped or killed, the same command goes on
-/// where it was, and ends in the same bytes.
+/// Attempts are kept in a hidden folder beside the file until it is written. If collection is stopped or killed, the same
+/// command resumes it and ends in the same bytes.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data collect --task Lift --episodes 50 --seed 1 --out lift.hdf5
@@ -30,23 +30,22 @@ pub struct Args {
     #[arg(long)]
     task: String,
     /// Demonstrations to store
-    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=CollectOptions::SEED_STRIDE))]
+    #[arg(long, short = 'n', value_name = "N", value_parser = clap::value_parser!(u64).range(1..=CollectOptions::SEED_STRIDE))]
     episodes: u64,
     /// Seed of the whole collection, 1 or more
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     seed: u64,
-    /// Another of the task's experts than the usual one, that makes more mistakes and shows how each is made up for:
-    /// `recoveries`, with towers of cubes, the square nut, PickPlace, ToolHang and TwoArmTransport; `regrasps`, which
-    /// reaches beside cubes and handle as well; `misreaches`, whose reaches for cubes and for the square nut go wrong
-    /// near them
+    /// An expert that makes mistakes and recovers from them. `recoveries`: towers of cubes, the square nut, PickPlace, ToolHang
+    /// and TwoArmTransport. `regrasps` also misses grasps of cubes and handle. `misreaches` misses cubes and the square nut at
+    /// the last moment
     #[arg(long, value_name = "NAME")]
     expert: Option<String>,
-    /// How able whoever shows the task is: `good`, the expert as it is; `poor`, slow and hesitating, with detours and
-    /// grasps that miss; `mixed`, every episode draws good, middling or poor, and its demo's attribute `skill` says which
+    /// Skill of the scripted expert. `good`: the expert unchanged. `poor`: slow, with hesitation, detours and missed grasps.
+    /// `mixed`: each episode draws good, middling or poor, and the demo's attribute `skill` records it
     #[arg(long, default_value_t = Skill::Good)]
     skill: Skill,
     /// File to create
-    #[arg(long)]
+    #[arg(long, short)]
     out: PathBuf,
     #[command(flatten)]
     cameras: CameraArgs,
@@ -58,7 +57,7 @@ pub struct Args {
     /// Compress datasets with gzip of this level; 0 stores them as they are, which is smaller for short demos
     #[arg(long, value_parser = clap::value_parser!(u8).range(0..=9), default_value_t = 0)]
     gzip: u8,
-    /// Report as JSON
+    /// Print the report as JSON
     #[arg(long)]
     json: bool,
 }
@@ -100,7 +99,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         CollectEnd::Written(collected) => collected,
         CollectEnd::Stopped(done) => {
             cli::note(&format!(
-                "stopped after {done} of {} demos; the same command goes on where it was",
+                "stopped after {done} of {} demos; run the same command again to resume",
                 args.episodes
             ));
             return Ok(ExitCode::from(INTERRUPTED));

@@ -2,14 +2,14 @@ use anyhow::Result;
 use cli::completions::{Shell, script};
 use std::process::ExitCode;
 
-/// Print a script that completes this command line in your shell.
+/// Print a completion script for a shell
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data completions bash > ~/.local/share/bash-completion/completions/actrm-data
   actrm-data completions zsh > ~/.zfunc/_actrm-data
   actrm-data completions fish > ~/.config/fish/completions/actrm-data.fish")]
 pub struct Args {
-    /// Shell to print it for
+    /// Shell that the script is for
     shell: Shell,
 }
 

@@ -20,7 +20,7 @@ pub struct Args {
     /// Compress datasets with gzip of this level
     #[arg(long, value_parser = clap::value_parser!(u8).range(1..=9), value_name = "LEVEL")]
     gzip: Option<u8>,
-    /// Report as JSON
+    /// Print the report as JSON
     #[arg(long)]
     json: bool,
 }

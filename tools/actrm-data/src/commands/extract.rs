@@ -9,9 +9,9 @@ use std::process::ExitCode;
 
 /// Add observations, rewards and dones to a raw robosuite recording by replaying its states.
 ///
-/// The environment named in the file is built by the simulator's workers, every stored state is set in turn, and what
-/// is observed there is written in robomimic's layout: obs, next_obs, rewards, dones, with the recorded states, actions
-/// and model. Works for every task, with any number of workers, and writes the same bytes with any number.
+/// The simulator's workers build the environment named in the file and set every stored state in turn. The observations are
+/// written in robomimic's layout: obs, next_obs, rewards and dones, with the recorded states, actions and model. This works for
+/// every task and writes the same bytes with any number of workers.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data extract demo.hdf5 low_dim.hdf5
@@ -31,7 +31,7 @@ pub struct Args {
     /// Compress datasets with gzip of this level; 0 stores them as they are
     #[arg(long, value_parser = clap::value_parser!(u8).range(0..=9), default_value_t = 0)]
     gzip: u8,
-    /// Report as JSON
+    /// Print the report as JSON
     #[arg(long)]
     json: bool,
 }

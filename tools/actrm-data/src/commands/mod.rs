@@ -1,5 +1,8 @@
 //! One file a command: its arguments, whose doc comment is its help, and what it does.
 
 cli::commands! {
-    inspect, convert, collect, extract, replay, export, validate, edit, stats, query, plot, view, puzzle, completions,
+    "Look": inspect, view, stats, plot, query, replay;
+    "Record": collect, extract, puzzle;
+    "Convert and edit": convert, validate, edit, export;
+    "Shell": completions;
 }

@@ -7,12 +7,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// Draw an episode and the whole set, dimension by dimension, or an episode's pictures.
+/// Plot an episode and the whole set, dimension by dimension, or the images of an episode.
 ///
-/// One row a dimension: on the left its course over the episode, on the right its histogram over all frames of the
-/// set. The file's ending decides: .svg is one picture, .html a page with one picture a column. Neither needs anything
-/// from the network. A .png file shows what the cameras saw: a row a camera, pictures of some frames from the first to the
-/// last; depth is grey, what is nearest in the episode white.
+/// Each row is one dimension: on the left its curve over the episode, on the right its histogram over all frames of the set. The
+/// file extension decides the format: .svg is one chart, .html a page with one chart per column. Neither needs a network. A .png
+/// file shows camera images, one row per camera, from the first frame to the last. Depth is grey, the nearest point white.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data plot lift --out lift.html
@@ -21,17 +20,17 @@ use std::process::ExitCode;
 pub struct Args {
     /// Data set directory
     dir: PathBuf,
-    /// Episode to draw
+    /// Episode to plot
     #[arg(long, default_value_t = 0)]
     episode: usize,
-    /// Columns to draw, or cameras, by name; may be repeated [default: actions, observations and rewards; all cameras]
+    /// Column or camera to plot, by name; may be repeated [default: actions, observations and rewards; all cameras]
     #[arg(long, value_name = "NAME")]
     column: Vec<String>,
-    /// Frames of a .png file, evenly spread
+    /// Number of frames of a .png file, evenly spread
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u16).range(1..=1000))]
     frames: u16,
     /// File to create: .svg, .html or .png
-    #[arg(long)]
+    #[arg(long, short)]
     out: PathBuf,
 }
 

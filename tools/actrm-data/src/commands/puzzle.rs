@@ -4,12 +4,12 @@ use puzzles::{Split, Task};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Draw puzzles and write them to a Parquet file, one row a puzzle.
+/// Generate puzzles and write them to a Parquet file, one row per puzzle.
 ///
-/// A row has the grid as input and its answer as target (lists of numbers, row by row), start, goal and distance of a
-/// maze, givens of a Sudoku, its split and the seed. Mazes: 0 free, 1 wall, 2 start, 3 goal; target 1 on the shortest
-/// path. Sudoku: the digit, 0 where none is given. sudoku9-hard are made for the effort of a search, and a row of it has the guesses
-/// that it needs. Puzzles of different splits never share a maze or a solution.
+/// A row has the grid as input and the answer as target, both as lists of numbers, row by row. It also has start, goal and
+/// distance of a maze, givens of a Sudoku, the split and the seed. Mazes: 0 is free, 1 wall, 2 start, 3 goal; the target is 1 on
+/// the shortest path. Sudoku: 0 is an empty cell. Puzzles of sudoku9-hard are generated for search effort, and their rows have
+/// the number of guesses. Puzzles of different splits never share a maze or a solution.
 #[derive(clap::Args)]
 #[command(
     after_help = "Tasks: maze8-original, maze10-original, maze5-rl, open8, dfs10, dfs16, dfs20, maze5-walls, sudoku4, sudoku6,
@@ -29,16 +29,16 @@ pub struct Args {
     /// Number of puzzles
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     count: u64,
-    /// Seed: the same one gives the same file
+    /// Seed; the same seed gives the same file
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// train, valid or test
+    /// Split: train, valid or test
     #[arg(long, default_value = "train", value_parser = split)]
     split: Split,
-    /// Cells that a Sudoku keeps at least; 0 removes as many as leave the solution unique
+    /// Fewest givens of a Sudoku; 0 removes as many as keep the solution unique
     #[arg(long, default_value_t = 0)]
     givens: usize,
-    /// As JSON
+    /// Print the report as JSON
     #[arg(long)]
     json: bool,
 }

@@ -6,7 +6,7 @@ use std::process::{Command, ExitCode};
 /// The program that has the SQL engine, beside this one: it takes longer to compile than all the rest.
 const PROGRAM: &str = "actrm-query";
 
-/// Ask a data set in SQL.
+/// Query a data set in SQL.
 ///
 /// Tables: `frames` (episode_index, frame_index, index, timestamp, task, a column for each dimension such as
 /// action_0 or object_3, and next_reward, next_done, next_success) and `episodes` (episode_index, demo, length, task,
@@ -19,16 +19,16 @@ const PROGRAM: &str = "actrm-query";
 pub struct Args {
     /// Data set directory
     dir: PathBuf,
-    /// The query
+    /// SQL query
     #[arg(required_unless_present = "tables")]
     sql: Option<String>,
     /// List the tables and their columns instead
     #[arg(long, conflicts_with = "sql")]
     tables: bool,
-    /// Rows to show at most; 0 shows all
+    /// Largest number of rows to show; 0 shows all
     #[arg(long, default_value_t = 100)]
     limit: usize,
-    /// As JSON: a list of objects, all rows
+    /// Print all rows as a JSON list of objects
     #[arg(long)]
     json: bool,
 }

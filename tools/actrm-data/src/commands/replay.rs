@@ -12,11 +12,10 @@ use std::process::ExitCode;
 /// Steps that a worker is asked to draw at a time.
 const PART: usize = 32;
 
-/// Show a demonstration: its recorded states, put into the simulator one after the other, as a video.
+/// Show a demonstration as a video, by setting its recorded states in the simulator one after the other.
 ///
-/// Works for robomimic files and raw robosuite recordings, which hold the states, and for converted data sets with
-/// their side folder `actrm/`, from which the states are taken back. Nothing is simulated but what follows the last
-/// action. Drawing needs EGL or OSMesa.
+/// This works for robomimic files and raw robosuite recordings, and for converted data sets whose side folder `actrm/` keeps the
+/// states. Only the step after the last action is simulated. Rendering needs EGL or OSMesa.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data replay lift.hdf5 --demo 3 --video lift_3.mp4
@@ -24,13 +23,13 @@ const PART: usize = 32;
 pub struct Args {
     /// File or data set directory
     input: PathBuf,
-    /// Demonstration: its number or its name
+    /// Number or name of the demonstration
     #[arg(long, value_name = "DEMO")]
     demo: String,
     /// Video to create (AV1 in MP4)
     #[arg(long, value_name = "OUT")]
     video: PathBuf,
-    /// Camera
+    /// Camera of the video
     #[arg(long, value_name = "NAME", default_value = "agentview")]
     camera: String,
     /// Side of the images, in pixels: an even number
@@ -38,7 +37,7 @@ pub struct Args {
     size: u16,
     #[command(flatten)]
     simulator: SimulatorArgs,
-    /// Report as JSON
+    /// Print the report as JSON
     #[arg(long)]
     json: bool,
 }

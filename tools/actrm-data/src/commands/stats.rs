@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 /// Show a data set's statistics, dimension by dimension.
 ///
-/// Those of the whole set are the stored ones; those of a split or of single episodes are computed.
+/// Statistics of the whole set are read from its files. Statistics of a split or of single episodes are computed.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data stats lift
@@ -24,7 +24,7 @@ pub struct Args {
     /// Only features whose name contains this
     #[arg(long, value_name = "TEXT")]
     feature: Option<String>,
-    /// As JSON
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

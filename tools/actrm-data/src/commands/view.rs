@@ -6,10 +6,10 @@ use std::process::ExitCode;
 
 /// Make one HTML page of a data set or a file of demonstrations, to be read in any browser without a network.
 ///
-/// Summary, features, problems, histograms of lengths and actions, and every episode with its length, return and success; an
-/// episode that is opened shows what the cameras saw in some frames, and the curves of its actions and observations. Curves of
-/// long episodes are thinned, and episodes that would make the page larger than --limit are listed without curves and
-/// pictures: the page says so.
+/// The page has a summary, the features with their ranges, problems, histograms of lengths and actions, and every episode with
+/// its length, return and success. An episode that is opened shows images of its cameras and the curves of its actions and
+/// observations. Curves of long episodes are thinned. Episodes that would make the page larger than --limit are listed without
+/// curves and images. The page says where that is so.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data view lift
@@ -20,21 +20,21 @@ pub struct Args {
     /// Data set directory, HDF5 file, or folder with one file an episode
     set: PathBuf,
     /// File to create
-    #[arg(long, default_value = "view.html")]
+    #[arg(long, short, default_value = "view.html")]
     out: PathBuf,
-    /// Pictures of each camera in an episode, evenly spread; 0 for none
+    /// Images of each camera in an episode, evenly spread; 0 for none
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u16).range(..=1000))]
     frames: u16,
-    /// Points of a curve at most
+    /// Largest number of points of a curve
     #[arg(long, value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u32).range(2..))]
     points: u32,
-    /// Columns to draw, by name; may be repeated [default: actions, observations and rewards of up to 64 numbers]
+    /// Column to draw, by name; may be repeated [default: actions, observations and rewards of up to 64 dimensions]
     #[arg(long, value_name = "NAME")]
     column: Vec<String>,
     /// Size of the page beyond which episodes are only listed
     #[arg(long, value_name = "SIZE", default_value = "32M", value_parser = cli::limits::bytes)]
     limit: u64,
-    /// Do not check the data: problems that only a look at every value and picture shows are not found
+    /// Do not check every value and image, which is faster but finds fewer problems
     #[arg(long)]
     quick: bool,
 }

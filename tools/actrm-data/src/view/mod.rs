@@ -37,6 +37,8 @@ pub struct Page {
     lengths: Vec<f32>,
     /// Every value of each dimension of the first column, the actions.
     actions: Vec<Vec<f32>>,
+    /// The smallest and the largest value of each column.
+    ranges: Vec<Option<(f32, f32)>>,
     /// Episodes that were told of.
     count: usize,
     /// The first episode without curves, once the page is full.
@@ -48,6 +50,7 @@ impl Page {
     pub fn new(columns: Vec<Drawn>, cameras: Vec<String>, points: usize, limit: usize) -> Self {
         let actions = columns.first().map_or(0, |column| column.names.len());
         Self {
+            ranges: vec![None; columns.len()],
             columns,
             cameras,
             points: points.max(2),
@@ -83,6 +86,12 @@ impl Page {
                 all.extend(values.iter().skip(d).step_by(dim));
             }
         }
+        for (range, values) in self.ranges.iter_mut().zip(&episode.columns) {
+            for &value in values.iter().filter(|value| value.is_finite()) {
+                let (low, high) = range.unwrap_or((value, value));
+                *range = Some((low.min(value), high.max(value)));
+            }
+        }
         let stride = episode.length.div_ceil(self.points).max(1);
         self.thinned |= stride > 1;
         let mut data =
@@ -104,7 +113,7 @@ impl Page {
         let inside = match self.full {
             None => {
                 self.data.push_str(&data);
-                "<p class=\"wait\">Curves and pictures are drawn by a script.</p>"
+                "<p class=\"wait\">Curves and images are drawn by a script.</p>"
             }
             Some(_) => "<p class=\"wait\">Left out: the page would be larger than its limit.</p>",
         };
@@ -116,7 +125,7 @@ impl Page {
         let mut notes = head.notes.clone();
         if let Some(first) = self.full {
             notes.push(format!(
-                "episodes from {first} on are listed without curves and pictures: the page would be larger than {} (--limit)",
+                "episodes from {first} on are listed without curves and images: the page would be larger than {} (--limit)",
                 cli::bytes(self.limit as u64)
             ));
         }
@@ -149,14 +158,26 @@ impl Page {
         }
         html.push_str("</tr></thead><tbody>\n");
         for feature in &head.features {
-            let cells: String = feature.iter().map(|cell| format!("<td>{}</td>", escape(cell))).collect();
+            let [name, kind, shape, range] = feature;
+            let range = match self.columns.iter().position(|column| column.name == *name).and_then(|at| self.ranges[at]) {
+                Some((low, high)) if range.is_empty() => {
+                    format!("{} to {}", cli::number(f64::from(low)), cli::number(f64::from(high)))
+                }
+                _ => range.clone(),
+            };
+            let cells: String =
+                [name, kind, shape, &range].iter().map(|cell| format!("<td>{}</td>", escape(cell))).collect();
             let _ = writeln!(html, "<tr>{cells}</tr>");
         }
-        html.push_str("</tbody></table></div>\n<h2>Distributions</h2>\n<p class=\"lead\">Lengths of the episodes, and every dimension of the actions over all frames that could be read.</p>\n<div class=\"card charts\">");
-        html.push_str(&histogram("length of an episode, steps", &self.lengths));
+        html.push_str("</tbody></table></div>\n<h2>Distributions</h2>\n<p class=\"lead\">Lengths of the episodes, and every dimension of the actions over all readable frames. The dimensions share an axis.</p>\n<div class=\"card charts\">");
+        html.push_str(&histogram("length of an episode, steps", &Content::Histogram(&self.lengths)));
         if let Some(column) = self.columns.first() {
             for (name, values) in column.names.iter().zip(&self.actions) {
-                html.push_str(&histogram(&format!("{} {name}", column.name), values));
+                let content = match self.ranges[0] {
+                    Some(range) => Content::HistogramWithin(values, range),
+                    None => Content::Histogram(values),
+                };
+                html.push_str(&histogram(&format!("{}: {name}", column.name), &content));
             }
         }
         html.push_str("</div>\n");
@@ -164,12 +185,17 @@ impl Page {
             html,
             "<h2>Episodes</h2>\n<form class=\"tools\" role=\"search\"><label>find <input id=\"find\" type=\"search\" placeholder=\"demo, task\"></label>\
              <label>order <select id=\"order\"><option value=\"number\">number</option><option value=\"length\">length</option>\
-             <option value=\"reward\">return</option></select></label><span id=\"shown\" aria-live=\"polite\">{} episodes</span></form>\n\
+             <option value=\"reward\">return</option></select></label><label><input id=\"own\" type=\"checkbox\"> an axis for each \
+             curve</label><span id=\"shown\" aria-live=\"polite\">{} episodes</span></form>\n\
              <div id=\"episodes\">\n{}</div>\n",
             self.count, self.rows
         );
-        let columns: Vec<_> =
-            self.columns.iter().map(|c| serde_json::json!({"name": c.name, "names": c.names})).collect();
+        let columns: Vec<_> = self
+            .columns
+            .iter()
+            .zip(&self.ranges)
+            .map(|(c, range)| serde_json::json!({"name": c.name, "names": c.names, "range": range}))
+            .collect();
         let described = serde_json::json!({
             "columns": columns, "cameras": self.cameras, "width": svg::WIDTH, "height": svg::HEIGHT, "margin": svg::MARGIN,
         });
@@ -218,9 +244,9 @@ fn list(heading: &str, id: &str, items: &[String]) -> String {
     format!("<h2>{heading}</h2>\n<ul id=\"{id}\">{items}</ul>\n")
 }
 
-fn histogram(title: &str, values: &[f32]) -> String {
+fn histogram(title: &str, content: &Content<'_>) -> String {
     let (width, height) = svg::SIZE;
-    let chart = svg::chart(0.0, 0.0, title, &Content::Histogram(values));
+    let chart = svg::chart(0.0, 0.0, title, content);
     format!(
         "<svg viewBox=\"0 0 {width} {height}\" width=\"{width}\" height=\"{height}\" role=\"img\" aria-label=\"{}\">{chart}</svg>\n",
         escape(title)
@@ -250,12 +276,15 @@ mod tests {
         let mut page = Page::new(vec![drawn], vec!["front".to_owned()], points, limit);
         page.push(&episode("demo_0", 10), &[0, 9], &[vec![b"one".to_vec(), b"two".to_vec()]]);
         page.push(&episode("demo_1", 3), &[], &[]);
-        page.html(&Head { title: "a & b".to_owned(), ..Head::default() })
+        let features = ["action", "other"].map(|name| [name, "float32", "2", ""].map(str::to_owned)).to_vec();
+        page.html(&Head { title: "a & b".to_owned(), features, ..Head::default() })
     }
 
     #[test]
     fn a_page_holds_its_episodes_and_nothing_from_elsewhere() {
         let html = page(100, 1 << 20);
+        assert!(html.contains("<td>action</td><td>float32</td><td>2</td><td>0 to 19</td>"), "{html}");
+        assert!(html.contains("<td>other</td><td>float32</td><td>2</td><td></td>") && html.contains("\"range\":[0.0,19.0]"));
         assert!(html.contains("<title>a &amp; b</title>") && html.contains("No problems found."));
         assert!(html.contains("0 · demo_0 <small>10 steps · return 1.5 · success · &lt;lift&gt;</small>"), "{html}");
         let floats: Vec<u8> = (0..6).flat_map(|i| (i as f32).to_le_bytes()).collect();

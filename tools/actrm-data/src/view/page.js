@@ -17,13 +17,15 @@
     return Float32Array.from({ length: bytes.length / 4 }, (_, i) => view.getFloat32(4 * i, true));
   };
   const short = (value) => (value === 0 || (Math.abs(value) >= 1e-3 && Math.abs(value) < 1e5) ? String(+value.toPrecision(4)) : value.toExponential(2));
+  const bounds = (values) => {
+    const known = [...values].filter(Number.isFinite);
+    return known.length ? [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))] : [0, 1];
+  };
   // one dimension's course, as `actrm-data plot` draws it
-  const chart = (title, values, stride, length) => {
+  const chart = (title, values, [low, high], stride, length) => {
     const size = [left + width + right, top + height + bottom];
     const svg = made("svg", { viewBox: `0 0 ${size[0]} ${size[1]}`, width: size[0], height: size[1], role: "img", "aria-label": title });
     const group = made("g", { transform: `translate(${left},${top})` });
-    const known = [...values].filter(Number.isFinite);
-    const [low, high] = known.length ? [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))] : [0, 1];
     const x = (i) => (i * stride * width) / Math.max(length - 1, 1);
     const y = (v) => (high > low ? height - ((v - low) / (high - low)) * height : height / 2);
     let path = "", down = false;
@@ -49,7 +51,8 @@
     const drawn = made("div", { class: "curves" });
     column.names.forEach((name, d) => {
       const mine = values.filter((_, i) => i % dim === d);
-      drawn.append(chart(dim > 1 ? `${column.name}: ${name}` : column.name, mine, stride, length));
+      const range = of("own").checked ? null : column.range;
+      drawn.append(chart(dim > 1 ? `${column.name}: ${name}` : column.name, mine, range || bounds(mine), stride, length));
     });
     return drawn;
   };
@@ -79,6 +82,10 @@
       details.append(made("summary", {}, `${column.name} (${column.names.length})`));
       const show = () => details.open && details.children.length < 2 && details.append(curves(column, values, stride, length));
       details.addEventListener("toggle", show);
+      of("own").addEventListener("change", () => {
+        details.querySelectorAll(".curves").forEach((drawn) => drawn.remove());
+        show();
+      });
       details.open = at === 0;
       show();
       episode.append(details);

@@ -92,7 +92,7 @@ impl Opened {
                     let rows = key.shape.first() == Some(&demo.length);
                     let dim: usize = key.shape.get(1..).unwrap_or_default().iter().product();
                     (wanted && rows && key.dtype.is_numeric() && !key.is_image())
-                        .then(|| Drawn { name: path.clone(), names: names_of(&[], dim) })
+                        .then(|| Drawn { name: path.clone(), names: names_of(&usual_names(source, path, dim), dim) })
                 });
                 drawn.collect()
             }
@@ -146,6 +146,19 @@ pub fn pictures(set: &Dataset, camera: &str, episode: usize, frames: &[usize]) -
         Picture { height: some.height, width: some.width, rgb: some.frame(at).to_vec() }
     };
     Ok(frames.iter().map(one).collect())
+}
+
+/// Names of the dimensions of a dataset of a file, as robosuite and robomimic order them; none where that is not known.
+fn usual_names(source: &Source, path: &str, dim: usize) -> Vec<String> {
+    const POSE: [&str; 7] = ["x", "y", "z", "rotation x", "rotation y", "rotation z", "gripper"];
+    let poses = || source.plan().env_args.as_ref().is_some_and(|args| args.to_string().contains("\"OSC_POSE\""));
+    let names: &[&str] = match dim {
+        7 if path == "actions" && poses() => &POSE,
+        3 if path.ends_with("_pos") => &POSE[..3],
+        4 if path.ends_with("_quat") => &["x", "y", "z", "w"],
+        _ => &[],
+    };
+    names.iter().map(|name| (*name).to_owned()).collect()
 }
 
 /// Names of dimensions: those that are stated, or numbers.

@@ -9,11 +9,11 @@ use zoo::results::StoredEvaluation;
 
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
-/// Name versions of an entry: `lift-act@best` for `lift-act@3`
+/// Name a version of an entry, such as `lift-act@best` for `lift-act@3`
 ///
-/// Versions are never rewritten; an alias points at one of them and can be set anew. `latest` is always the newest. With
-/// `--by-results` the version is the one whose success rate is at least the highest (the lower end of its interval) on
-/// the dev block of a named protocol: choosing on the seeds that are reported would flatter it.
+/// Versions are never rewritten. An alias points at one of them and can be moved. `latest` is always the newest version.
+/// `--by-results` chooses the version whose interval has the highest lower end on the dev block of a named protocol. A choice
+/// on the test seeds would make the reported results too good.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo alias lift-act@3 best
@@ -26,10 +26,10 @@ pub struct Args {
     entry: String,
     /// Alias to set
     alias: Option<String>,
-    /// Set it to the best version by its results on a dev block
+    /// Point the alias at the best version on a dev block
     #[arg(long, requires = "alias", conflicts_with = "remove")]
     by_results: bool,
-    /// Take the alias away
+    /// Remove the alias
     #[arg(long, requires = "alias")]
     remove: bool,
     #[command(flatten)]

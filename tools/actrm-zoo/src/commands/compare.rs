@@ -16,38 +16,39 @@ use zoo::results::{EvaluationRecord, Seeds, StoredEvaluation};
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 use crate::simulation::{RunArgs, environment, limited_worker, run_missing};
 
-const GOES_ON: &str = "stopped; the same command goes on where it was";
+const GOES_ON: &str = "stopped; run the same command again to resume";
 
-/// Compare two entries, or two families, on the seeds that both were run on
+/// Compare two entries, or two families, on the seeds that both were evaluated on
 ///
-/// Seed by seed: who succeeded where the other failed, the difference of success with its interval, McNemar's exact test,
-/// and a sequential test that holds however often one looks. `--until-decided` runs more and more episodes of both until
-/// that test tells them apart at 5%, or the most are run. Results have to stand as in `actrm-zoo leaderboard`. An entry
-/// beside itself is compared where it was evaluated in several ways, such as under other versions of the simulator.
+/// The comparison counts the seeds on which only one of the two succeeded. It reports the difference in success with its
+/// interval, McNemar's exact test, and a sequential test that is valid however often one looks. `--until-decided` runs episodes
+/// of both until the sequential test is significant at 5% or --max-episodes is reached. Results must be valid, as for
+/// `actrm-zoo leaderboard`. An entry can be compared with itself where it was evaluated in several ways, for example with two
+/// versions of the simulator.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo compare lift-act lift-actrm
   actrm-zoo compare 'lift-act-s*' 'lift-actrm-s*'
-  actrm-zoo compare stack-act@1 stack-act@2 --until-decided --most 500
+  actrm-zoo compare stack-act@1 stack-act@2 --until-decided --max-episodes 500
   actrm-zoo compare lift-act lift-act --json")]
 pub struct Args {
-    /// Entry: `name` (its newest version), `name@version`, or with a `*` the trainings of a family
+    /// First entry: `name` (its newest version), `name@version`, or a pattern with `*` for the trainings of a family
     #[arg(add = entry_names())]
     first: String,
-    /// The same
+    /// Second entry or family, named like the first
     #[arg(add = entry_names())]
     second: String,
-    /// Run episodes of both, on equal seeds, until it is decided
+    /// Run episodes of both on equal seeds until the difference is significant
     #[arg(long)]
     until_decided: bool,
-    /// Most episodes of each then
-    #[arg(long, value_name = "N", default_value_t = 1000, requires = "until_decided",
+    /// Stop `--until-decided` after this number of episodes per entry
+    #[arg(long = "max-episodes", alias = "most", value_name = "N", default_value_t = 1000, requires = "until_decided",
         value_parser = clap::value_parser!(u64).range(20..=limits::MOST_EPISODES))]
     most: u64,
-    /// Seed of the first episode then
+    /// First seed that `--until-decided` uses
     #[arg(long, value_name = "SEED", default_value_t = FIRST_SEED, requires = "until_decided")]
     seed_start: u64,
-    /// As JSON
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
     #[command(flatten)]

@@ -10,17 +10,17 @@ use zoo::write_atomic;
 
 use crate::places::{ZooArgs, entry_names};
 
-/// Show how training losses went: of entries, in one table, or as a picture
+/// Show training losses of entries as a table or a chart
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo curves lift-act
   actrm-zoo curves 'lift-act-s*' --svg curves.svg
   actrm-zoo curves lift-act@1 lift-act@2 --json")]
 pub struct Args {
-    /// Entries: `name` (its newest version), `name@version`, or with a `*` every name that fits
+    /// Entries: `name` (its newest version), `name@version`, or a pattern with `*`
     #[arg(required = true, add = entry_names())]
     entries: Vec<String>,
-    /// Write a picture
+    /// Write a chart to this SVG file
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
     /// Print every point as JSON

@@ -15,7 +15,7 @@ use zoo::results::{Seeds, StoredEvaluation};
 
 use crate::places::{ZooArgs, entry_names};
 
-const GOES_ON: &str = "stopped; the same command goes on where it was";
+const GOES_ON: &str = "stopped; run the same command again to resume";
 
 /// Where the outcomes go unless another folder is named.
 pub(super) const WORK: &str = "out/depth";
@@ -49,12 +49,11 @@ pub(super) fn depths(work: &Path, entries: &KnownEntries) -> anyhow::Result<(Vec
     Ok((depths, left_out))
 }
 
-/// Let a trained policy think more or fewer steps, or tamper with its reasoning, and count what it still solves
+/// Evaluate a recursive policy with more or fewer refinement steps, or with its latent state changed
 ///
-/// Nothing is trained: the entry's weights are applied so many times, to the last step, or until they halt. `freeze` leaves
-/// the reasoning as the first step made it, `shuffle` puts that of a thought about another episode's beginning in its place
-/// after every update. The outcomes are no results of the entry and are kept apart from the zoo's; the page of
-/// `leaderboard` shows them in a section of their own.
+/// Nothing is trained. The entry's weights are applied the given number of times, or until they halt. `freeze` keeps the latent
+/// state of the first step. `shuffle` replaces it after every update by that of another episode's beginning. The outcomes are
+/// kept apart from the zoo's results. `leaderboard` shows them in a section of their own.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo depth pickchain-actrm --steps 1,2,4,8,16,32
@@ -64,20 +63,20 @@ pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
     entry: String,
-    /// Supervision steps, each number for itself
+    /// Numbers of supervision steps, separated by commas
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "1,2,4,8,16,32",
         value_parser = clap::value_parser!(u64).range(1..=1000))]
     steps: Vec<u64>,
-    /// Let it stop earlier, as it was trained to
+    /// Allow it to halt earlier, as it was trained to
     #[arg(long, conflicts_with = "intervene")]
     halting: bool,
-    /// What is done to its reasoning: `freeze` or `shuffle`
+    /// Change of the latent state: `freeze` or `shuffle`
     #[arg(long, value_name = "HOW", value_parser = intervention)]
     intervene: Option<Intervention>,
     /// Episodes for each number of steps
-    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    #[arg(long, short = 'n', value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
     episodes: u64,
-    /// Seed of the first episode; the others count up from it
+    /// Seed of the first episode; the seeds after it count up
     #[arg(long = "seed-start", value_name = "SEED", default_value_t = 30_000)]
     seed: u64,
     #[command(flatten)]

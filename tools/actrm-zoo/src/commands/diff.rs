@@ -12,22 +12,22 @@ use zoo::results::StoredEvaluation;
 
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
-/// Show in what two entries differ: settings, demonstrations, training, files and results
+/// Show how two entries differ: settings, demonstrations, training, files and results
 ///
-/// Their training curves are compared at every step that both have: where they first differ, and by how much at some of
-/// these steps.
+/// Training curves are compared at every step that both have: the first step at which they differ, and the difference at
+/// some steps.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo diff lift-act@1 lift-act@2
   actrm-zoo diff lift-act lift-actrm --json")]
 pub struct Args {
-    /// Entry: `name` (its newest version), `name@version` or `name@alias`
+    /// First entry: `name` (its newest version), `name@version` or `name@alias`
     #[arg(add = entry_names())]
     first: String,
-    /// The same
+    /// Second entry, named like the first
     #[arg(add = entry_names())]
     second: String,
-    /// As JSON
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
     #[command(flatten)]

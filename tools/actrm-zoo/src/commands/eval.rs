@@ -23,7 +23,13 @@ use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names, o
 use crate::puzzles::{PuzzleArgs, evaluate_solver};
 use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
 
-const GOES_ON: &str = "stopped; the same command goes on where it was";
+/// Headings of its help.
+const EPISODES: &str = "Episodes";
+const EXECUTION: &str = "Execution";
+const VIDEO: &str = "Videos";
+const OUTPUT: &str = "Output";
+
+const GOES_ON: &str = "stopped; run the same command again to resume";
 /// Behind the line of an evaluation for which nothing was run.
 const THERE: &str = " (evaluated before; --again runs it again)";
 /// The same for one without a seal.
@@ -33,10 +39,10 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
     if evaluation.sealed { THERE } else { UNSEALED }
 }
 
-/// Evaluate entries: policies in simulation, one episode a seed; puzzle solvers here, on test puzzles
+/// Evaluate entries: robot policies in the simulator, puzzle solvers on test puzzles
 ///
-/// Finished episodes are on disk: an interrupted evaluation goes on where it was, a finished one is shown again. The
-/// outcome of an episode does not depend on the number of workers, on their failures or on what ran before.
+/// Every finished episode is saved. The same command resumes an interrupted evaluation and shows a finished one. The outcome
+/// of an episode does not depend on the number of workers, on their failures or on earlier episodes.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo eval lift-act --episodes 50
@@ -45,7 +51,6 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval --all --episodes 20
   actrm-zoo eval trm-dfs10 --puzzles 600
   actrm-zoo eval trm-dfs10 --task dfs16 --depth 32
-  actrm-zoo eval trm-dfs10 --task dfs20 --depth 32 --starts 8
   actrm-zoo eval trm-dfs10 --task dfs20 --depth 64 --views 8 --starts 2 --judge cells
   actrm-zoo eval lift-act --episodes 3 --video 3
   actrm-zoo eval lift-act-image --episodes 100 --video-failed 3
@@ -53,7 +58,7 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval lift-act --episodes 50 --again
   actrm-zoo eval lift-act --episodes 200 --shard 2/8")]
 pub struct Args {
-    /// Entries: `name` (its newest version), `name@version`, or with a `*` every name that fits
+    /// Entries: `name` (its newest version), `name@version`, or a pattern with `*`
     #[arg(required_unless_present_any = ["all", "all_versions"], add = entry_names())]
     entries: Vec<String>,
     /// The newest version of every entry of the zoo
@@ -62,57 +67,57 @@ pub struct Args {
     /// Every version of every entry of the zoo
     #[arg(long, conflicts_with = "entries")]
     all_versions: bool,
-    /// A named protocol: its seeds, cap and control loop [protocols: those of `protocols/`]
-    #[arg(long, value_name = "NAME", conflicts_with_all = ["episodes", "seed", "max_steps", "control", "shard"])]
+    /// Use the seeds, step limit and control loop of a named protocol, such as lift-v1
+    #[arg(long, help_heading = EPISODES, value_name = "NAME", conflicts_with_all = ["episodes", "seed", "max_steps", "control", "shard"])]
     protocol: Option<String>,
-    /// Which of the protocol's seeds: `test` for reporting, `dev` for choosing
-    #[arg(long, value_name = "BLOCK", default_value = "test", requires = "protocol")]
+    /// Seeds of the protocol: `test` to report results, `dev` to choose between policies
+    #[arg(long, help_heading = EPISODES, value_name = "BLOCK", default_value = "test", requires = "protocol")]
     block: BlockArg,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = EPISODES)]
     protocols: ProtocolArgs,
-    /// Episodes an entry [default: 20]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    /// Episodes per entry [default: 20]
+    #[arg(long, short = 'n', help_heading = EPISODES, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
     episodes: Option<u64>,
-    /// Seed of the first episode, the others count up from it [default: 10000]; of a solver, seed of the puzzles
-    #[arg(long = "seed-start", alias = "seed", value_name = "SEED")]
+    /// Seed of the first episode, or of the puzzles of a solver; the seeds after it count up [default: 10000]
+    #[arg(long = "seed-start", help_heading = EPISODES, alias = "seed", value_name = "SEED")]
     seed: Option<u64>,
-    /// Actions that are executed before the policy is asked again (the entry's)
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    /// Actions that are executed before the next query of the policy [default: the entry's]
+    #[arg(long, help_heading = EXECUTION, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     n_action_steps: Option<u64>,
-    /// Ask at every step and average all predictions for it, with this coefficient (ACT's paper: 0.01)
-    #[arg(long, value_name = "C", conflicts_with = "n_action_steps", allow_negative_numbers = true)]
+    /// Query at every step and average the predictions for it with this coefficient (ACT's paper: 0.01)
+    #[arg(long, help_heading = EXECUTION, value_name = "C", conflicts_with = "n_action_steps", allow_negative_numbers = true)]
     temporal_ensemble: Option<f64>,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = EXECUTION)]
     run: RunArgs,
-    /// Only this part of the episodes, for several machines
-    #[arg(long, value_name = "I/N")]
+    /// Run only this part of the episodes, so that several machines can share them
+    #[arg(long, help_heading = EPISODES, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Run finished evaluations again, and fail where an outcome is not the same
-    #[arg(long)]
+    /// Run finished evaluations again and fail if an outcome differs
+    #[arg(long, help_heading = EPISODES)]
     again: bool,
-    /// Then write videos of the first N episodes into `videos` in the zoo
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    /// Write videos of the first N episodes into `videos` in the zoo
+    #[arg(long, help_heading = VIDEO, value_name = "N", default_value_t = 0)]
     video: u64,
-    /// Then write videos of the first N failed episodes: what the policy saw, its cameras side by side
-    #[arg(long, value_name = "N", default_value_t = 0, conflicts_with_all = ["shard", "again"])]
+    /// Write videos of the first N failed episodes, with the policy's cameras side by side
+    #[arg(long, help_heading = VIDEO, value_name = "N", default_value_t = 0, conflicts_with_all = ["shard", "again"])]
     video_failed: u64,
-    /// Change the pictures on their way to the policy: swap-cameras, black-CAMERA, hue[=TURN], light[=FACTOR]
-    #[arg(long, value_name = "HOW", conflicts_with = "protocol")]
+    /// Perturb the images that the policy gets: swap-cameras, black-CAMERA, hue[=TURN] or light[=FACTOR]
+    #[arg(long, help_heading = EXECUTION, value_name = "HOW", conflicts_with = "protocol")]
     perturb: Option<Perturbation>,
     /// Camera of the videos
-    #[arg(long, value_name = "NAME", default_value = "agentview")]
+    #[arg(long, help_heading = VIDEO, value_name = "NAME", default_value = "agentview")]
     camera: String,
-    /// Side of the videos in pixels: an even number
-    #[arg(long, value_name = "PIXELS", default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=2048))]
+    /// Width and height of the videos in pixels, an even number
+    #[arg(long, help_heading = VIDEO, value_name = "PIXELS", default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=2048))]
     video_size: u16,
-    /// Print what came of it as JSON, with the names of the leaderboard's columns
-    #[arg(long)]
+    /// Print the results as JSON, with the names of the leaderboard's columns
+    #[arg(long, help_heading = OUTPUT)]
     json: bool,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = OUTPUT)]
     results: ResultsArgs,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Puzzle solvers")]
     puzzles: PuzzleArgs,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = OUTPUT)]
     zoo: ZooArgs,
 }
 

@@ -8,7 +8,7 @@ use zoo::lerobot::export;
 use crate::card::model_index_of;
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
-/// Write an entry in the form of another library
+/// Export an entry to LeRobot or as a folder for the Hugging Face Hub
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo export lerobot lift-act@1 lift-act-lerobot
@@ -24,16 +24,16 @@ enum To {
     Hub(HubArgs),
 }
 
-/// A folder for the Hugging Face Hub: the entry's files, with the results that stand in its model card
+/// Write a folder for the Hugging Face Hub: the entry's files, with its valid results in the model card
 ///
-/// An entry's own folder can be pushed as it is, too; its card then has no results, because it was sealed before there were
-/// any. Copied to ZOO/NAME/VERSION, such a folder is the entry again: results in its card are not part of its seal.
+/// The entry's own folder can also be pushed. Its card has no results, because it was sealed before there were any. An exported
+/// folder that is copied to ZOO/NAME/VERSION is the entry again, since results in the card are not part of its seal.
 #[derive(clap::Args)]
 struct HubArgs {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
     entry: String,
-    /// New folder
+    /// Folder to create
     folder: PathBuf,
     #[command(flatten)]
     results: ResultsArgs,
@@ -43,13 +43,13 @@ struct HubArgs {
     zoo: ZooArgs,
 }
 
-/// A checkpoint folder that LeRobot 0.6.1 loads
+/// Write a checkpoint folder that LeRobot 0.6.1 loads
 #[derive(clap::Args)]
 struct LerobotArgs {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
     entry: String,
-    /// New folder
+    /// Folder to create
     folder: PathBuf,
     #[command(flatten)]
     zoo: ZooArgs,

@@ -6,7 +6,7 @@ use zoo::{lerobot, robomimic};
 
 use crate::places::ZooArgs;
 
-/// Make an entry of a policy that was trained elsewhere
+/// Import a policy of LeRobot or robomimic as an entry
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo import lerobot outputs/train/checkpoints/last/pretrained_model --name lift-theirs --task Lift
@@ -31,7 +31,7 @@ struct NamedArgs {
     /// Task that the policy was trained for
     #[arg(long)]
     task: String,
-    /// Observation keys that make its state, in order
+    /// Observation keys of the robot state, in order
     #[arg(
         long,
         value_delimiter = ',',
@@ -39,12 +39,12 @@ struct NamedArgs {
         default_value = "robot0_eef_pos,robot0_eef_quat,robot0_gripper_qpos"
     )]
     state_keys: Vec<String>,
-    /// Observation keys that make its environment state, in order
+    /// Observation keys of the environment state, in order
     #[arg(long, value_delimiter = ',', value_name = "KEYS", default_value = "object")]
     env_keys: Vec<String>,
 }
 
-/// A checkpoint folder of LeRobot's ACT or diffusion
+/// Import a checkpoint folder of LeRobot's ACT or diffusion
 ///
 /// Weights may be stored in f16, bf16, f32 or f64, and in several files with their `model.safetensors.index.json`. Checkpoints of
 /// LeRobot 0.3 and before have no processors: their statistics are among the weights.
@@ -54,17 +54,17 @@ struct LerobotArgs {
     folder: PathBuf,
     #[command(flatten)]
     named: NamedArgs,
-    /// Its pictures were drawn without reflections and multisampling, as `collect --fast-render` draws
+    /// The images of its demonstrations were rendered as by `collect --fast-render`
     #[arg(long)]
     fast_render: bool,
     #[command(flatten)]
     zoo: ZooArgs,
 }
 
-/// A checkpoint of robomimic's BC-RNN or BC-Transformer with a mixture of Gaussians
+/// Import a checkpoint of robomimic's BC-RNN or BC-Transformer with a mixture of Gaussians
 ///
-/// The file is a pickle. It is read by the harness in a process of its own, which takes tensors and plain values from it and
-/// runs nothing of what it says; anything else in it is an error with its name.
+/// The file is a pickle. A separate process reads tensors and plain values from it and executes nothing. Anything else in the
+/// file is an error that names it.
 #[derive(clap::Args)]
 struct RobomimicArgs {
     /// File that robomimic 0.3's training saved: models/model_epoch_N.pth

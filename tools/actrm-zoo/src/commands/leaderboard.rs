@@ -1,7 +1,8 @@
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use cli::{Table, shown};
 use report::column::{Align, Column};
 use report::{
@@ -17,45 +18,49 @@ use super::depth::{WORK, depths};
 use crate::films;
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs};
 
-/// Rank all evaluations: tables here, leaderboard.csv and its like for puzzles and across tasks, and report.html in the zoo
+/// Rank all evaluations on screen, as leaderboard.csv and as report.html in the zoo
 ///
-/// A family (trainings that differ in their seed alone, as `train --seeds` makes them) is one row, with an interval that
-/// holds the chance of training. Ranks go by the lower end of the 95% interval; a row of fewer than 20 episodes has none.
-/// Rows of a task and protocol that share a letter cannot be told apart: exact McNemar tests on equal seeds (Barnard's where
-/// seeds differ, a bootstrap between families), Holm's correction over the whole table. Results that are not as they
-/// were sealed, without a seal, in a folder of another name, or of an entry that is not in the zoo or says otherwise, are
-/// named and left out; the others are ranked, and the exit code is 1. Where policies were evaluated on several tasks under
-/// one protocol, leaderboard_across.csv has their interquartile means over those tasks.
+/// Trainings that differ only in their seed (`train --seeds`) share one row, whose interval includes the variance between seeds.
+/// Rows are ranked by the lower end of their 95% interval. A row with fewer than 20 episodes has no rank. Rows of a task and
+/// protocol that share a letter are not significantly different. The tests are McNemar's on equal seeds, Barnard's on different
+/// seeds and a bootstrap between families, with Holm's correction over the whole table.
 ///
-/// The page is one file that loads nothing: beside the tables it shows rows pair by pair, success over control steps, over
-/// demonstrations and over reasoning depth, films of failed episodes (`eval --video`, `--video-failed`; 20 MB of them, the
-/// others by their paths), and the commands that run a row again.
+/// A result without a valid seal or a matching entry is named and left out, and the exit code is 1. Policies that were evaluated
+/// on several tasks are also compared across tasks, in leaderboard_across.csv.
+///
+/// The report is one file that needs no network. It has the tables, pairwise comparisons, and success over control steps,
+/// demonstrations and refinement steps. It also has films (`eval --video`, `--video-failed`, at most 20 MB) and the commands
+/// that reproduce each row.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo leaderboard
   actrm-zoo leaderboard --zoo my-zoo --out public
+  actrm-zoo leaderboard --task Lift
   actrm-zoo leaderboard --trainings
   actrm-zoo leaderboard --json
   actrm-zoo leaderboard --markdown RESULTS.md")]
 pub struct Args {
     #[command(flatten)]
     results: ResultsArgs,
-    /// Folder for leaderboard.csv and report.html (the zoo)
-    #[arg(long, value_name = "DIR")]
+    /// Show only rows of this task on screen and in JSON; the files have all rows
+    #[arg(long)]
+    task: Option<String>,
+    /// Folder for leaderboard.csv and report.html [default: the zoo]
+    #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Also write the table as Markdown
+    /// Also write the table to this Markdown file
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
-    /// Folder of what `depth` counted; it stands in a section of its own
+    /// Folder of the results of `actrm-zoo depth`, which are shown in a section of their own
     #[arg(long, value_name = "DIR", default_value = WORK)]
     depths: PathBuf,
-    /// Show each training of a family below it
+    /// Also show each training of a family
     #[arg(long)]
     trainings: bool,
-    /// Print the rows as JSON instead of tables, with the names of the CSV's columns
+    /// Print the rows as JSON, with the names of the columns of the CSV
     #[arg(long)]
     json: bool,
-    /// Show all columns, however narrow the terminal is
+    /// Show all columns, even in a narrow terminal
     #[arg(long)]
     wide: bool,
     #[command(flatten)]
@@ -85,6 +90,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let reading = Reading::of(&entries, args.protocols.protocols()?);
     let rows = rank(&evaluations, &reading);
+    let there: BTreeSet<&str> = rows.iter().map(LeaderboardRow::task).collect();
+    if let Some(task) = args.task.as_deref().filter(|task| !there.contains(task)) {
+        bail!("--task {task}: no results of this task; there are results of {}", Vec::from_iter(there).join(", "));
+    }
     let across = across_tasks(&rows);
 
     // first the files: whoever reads the tables may go away before their end
@@ -95,7 +104,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         section: puzzle_section(&puzzles),
         entries: entries.good().map(facts).collect(),
         depths,
-        films: films::of_failures(&rows, &args.zoo.zoo),
+        films: films::of_episodes(&rows, &args.zoo.zoo),
         places: Places { zoo: args.zoo.named(), results: args.results.named(), protocols: args.protocols.named() },
     };
     let page = to_html(&rows, &beside);
@@ -118,11 +127,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     // all of them or none: a table beside a report of other results would be worse than an old pair
     write_together(&files)?;
+    let chosen = |row: &LeaderboardRow| args.task.as_deref().is_none_or(|task| row.task() == task);
+    let told: Vec<LeaderboardRow> = rows.iter().filter(|row| chosen(row)).cloned().collect();
 
     if args.json {
         cli::print_json(&serde_json::json!({
-            "rows": json::rows(COLUMNS, &rows),
-            "trainings": json::rows(COLUMNS, &details),
+            "rows": json::rows(COLUMNS, &told),
+            "trainings": json::rows(COLUMNS, details.iter().filter(|row| chosen(row))),
             "across_tasks": json::rows(ACROSS_COLUMNS, &across),
             "puzzles": json::rows(PUZZLE_COLUMNS, &puzzles),
             "depths": json::rows(DEPTH_COLUMNS, &beside.depths),
@@ -131,11 +142,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(end());
     }
     let written: String = files.iter().map(|(path, _)| shown(path) + "\n").collect();
-    let told = if args.trainings { with_trainings(&rows) } else { rows };
+    let told = if args.trainings { with_trainings(&told) } else { told };
+    let all = args.task.is_none();
     let mut tables = vec![
         table(COLUMNS, &told, args.wide),
-        table(ACROSS_COLUMNS, &across, args.wide),
-        table(PUZZLE_COLUMNS, &puzzles, args.wide),
+        if all { table(ACROSS_COLUMNS, &across, args.wide) } else { String::new() },
+        if all { table(PUZZLE_COLUMNS, &puzzles, args.wide) } else { String::new() },
         written,
     ];
     tables.retain(|table| !table.is_empty());

@@ -3,26 +3,33 @@ use std::process::ExitCode;
 use anyhow::Context;
 use cli::{Column, Table, shown};
 use serde_json::Value;
-use study::puzzle::PuzzleMeta;
+use study::puzzle::{AnyExperiment, PuzzleMeta};
 use zoo::entry::Entry;
 
 use crate::places::{ConfigArgs, ZooArgs};
 
-/// List the entries of the zoo, or the experiments that can be trained
+/// List the entries of the zoo, or the experiments
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo list
   actrm-zoo list --zoo my-zoo
   actrm-zoo list --json
-  actrm-zoo list --experiments")]
+  actrm-zoo list --experiments --policy act --task Lift
+  actrm-zoo list --experiments --json")]
 pub struct Args {
     /// List experiments instead of entries
     #[arg(long)]
     experiments: bool,
-    /// As JSON: what each entry says of itself, without its training curve
+    /// Only entries or experiments of this policy
+    #[arg(long)]
+    policy: Option<String>,
+    /// Only entries or experiments of this task
+    #[arg(long)]
+    task: Option<String>,
+    /// Print JSON: the metadata of each entry without its training curve, or the names of the experiments
     #[arg(long)]
     json: bool,
-    /// Show all columns, however narrow the terminal is
+    /// Show all columns, even in a narrow terminal
     #[arg(long)]
     wide: bool,
     #[command(flatten)]
@@ -31,15 +38,55 @@ pub struct Args {
     zoo: ZooArgs,
 }
 
+impl Args {
+    fn wanted(&self, policy: &str, task: &str) -> bool {
+        let is = |wanted: &Option<String>, found: &str| wanted.as_ref().is_none_or(|w| w.eq_ignore_ascii_case(found));
+        is(&self.policy, policy) && is(&self.task, task)
+    }
+}
+
+/// The experiments: what each trains, on which task, and what the policy gets.
+fn experiments(args: &Args) -> anyhow::Result<ExitCode> {
+    let library = args.configs.library()?;
+    let mut table = Table::new(["experiment", "policy", "task", "inputs"].map(Column::new).to_vec());
+    let (mut names, mut failures) = (Vec::new(), Vec::new());
+    for name in library.names()? {
+        let (policy, task, inputs) = match AnyExperiment::load(&library, &name, &[]) {
+            Ok(AnyExperiment::Robot(one)) => {
+                let data = &one.data;
+                let things = !data.entities.is_empty() || !data.grids.is_empty();
+                let kinds = [(!data.cameras.is_empty(), "images"), (things, "objects"), (true, "state")];
+                let inputs: Vec<&str> = kinds.into_iter().filter(|(given, _)| *given).map(|(_, kind)| kind).collect();
+                (one.policy.policy_type().to_string(), one.task.name.clone(), inputs.join(", "))
+            }
+            Ok(AnyExperiment::Puzzle(one)) => {
+                let policy = name.split('_').next().unwrap_or_default().to_owned();
+                (policy, one.task.puzzle.clone(), "puzzle".to_owned())
+            }
+            // one bad file must not hide the others
+            Err(error) => {
+                failures.push(anyhow::Error::new(error).context(format!("experiment {name}")));
+                continue;
+            }
+        };
+        if args.wanted(&policy, &task) {
+            table.push(vec![name.clone(), policy, task, inputs]);
+            names.push(name);
+        }
+    }
+    match args.json {
+        true => cli::print_json(&names)?,
+        false => cli::print(&table.text(args.wide))?,
+    }
+    for failure in &failures {
+        cli::note(&format!("error: {failure:#}"));
+    }
+    Ok(if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.experiments {
-        let names = args.configs.library()?.names()?;
-        if args.json {
-            cli::print_json(&names)?;
-            return Ok(ExitCode::SUCCESS);
-        }
-        cli::print(&names.iter().map(|name| format!("{name}\n")).collect::<String>())?;
-        return Ok(ExitCode::SUCCESS);
+        return experiments(args);
     }
     let registry = args.zoo.registry();
     let ids = registry.ids()?;
@@ -68,6 +115,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             }
         };
         let meta = entry.meta();
+        if !args.wanted(&meta.policy, &meta.task) {
+            continue;
+        }
         if args.json {
             all.push(json(&entry)?);
             continue;

@@ -11,7 +11,7 @@ use crate::places::{ResultsArgs, ZooArgs};
 /// Between an evaluation's name and the number of its shard.
 const MARK: &str = "_shard-";
 
-/// Join the shards of an evaluation that several machines ran
+/// Merge the shards of an evaluation that several machines ran
 ///
 /// Shards that differ in entry, protocol, seeds or versions are refused.
 #[derive(clap::Args)]
@@ -21,7 +21,7 @@ const MARK: &str = "_shard-";
   actrm-zoo merge
   actrm-zoo merge zoo/results/*_shard-*")]
 pub struct Args {
-    /// Result folders of all shards of one evaluation (every evaluation's in the folder of results)
+    /// Result folders of all shards of one evaluation [default: every evaluation with shards in the results folder]
     #[arg(value_name = "FOLDER")]
     shards: Vec<PathBuf>,
     #[command(flatten)]

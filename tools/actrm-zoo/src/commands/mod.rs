@@ -1,6 +1,10 @@
 //! One file a command: its arguments, whose doc comment is its help, and what it does.
 
 cli::commands! {
-    train, runs, eval, rerun, merge, compare, leaderboard, list, show, diff, curves, alias, remove,
-    verify, trace, saliency, depth, probe, study, import, export, completions,
+    "Train": train, runs, curves, study;
+    "Evaluate": eval, merge, rerun, verify;
+    "Compare": leaderboard, compare, diff;
+    "Analyse": trace, saliency, depth, probe;
+    "Manage entries": list, show, alias, remove, import, export;
+    "Shell": completions;
 }

@@ -8,12 +8,12 @@ use zoo::results::Seeds;
 
 use crate::places::{ZooArgs, entry_names};
 
-/// Read from a policy's thoughts, step by step, which thing a chain has reached
+/// Probe the latent state of a recursive policy: which object of a chain it has reached at each step
 ///
-/// A linear regression for every supervision step and number of hops, from the recursion's state to the colour of the cube
-/// after so many hops (tasks such as PickChain, whose things point to one another). It is fitted to how demonstrations
-/// begin, with colours renamed at random, and read on the beginnings of fresh episodes; an untrained network of the same shape
-/// says what the observation alone gives away.
+/// The probe is a linear regression for every supervision step and number of hops. It predicts the colour of the cube after that
+/// number of hops from the latent state, in tasks such as PickChain. It is fitted to the beginnings of demonstrations, with
+/// colours renamed at random, and tested on the beginnings of new episodes. An untrained network of the same shape shows what
+/// the observation alone reveals.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo probe pickchain-actrm --data out/robots/pickchain.hdf5
@@ -22,19 +22,19 @@ pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
     entry: String,
-    /// Its demonstrations: an HDF5 file or a data set
+    /// Demonstrations of the entry: an HDF5 file or a data set
     #[arg(long, value_name = "PATH")]
     data: PathBuf,
-    /// Supervision steps [default: as many as it may take]
+    /// Supervision steps [default: the entry's largest number]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1000))]
     steps: Option<u64>,
-    /// How often each demonstration is shown, each time with other names for its colours
+    /// Number of random colour renamings of each demonstration
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u64).range(1..=1000))]
     renamings: u64,
-    /// Fresh episodes
-    #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    /// New episodes to test on
+    #[arg(long, short = 'n', value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
     episodes: u64,
-    /// Seed of the first fresh episode; the others count up from it
+    /// Seed of the first new episode; the seeds after it count up
     #[arg(long = "seed-start", value_name = "SEED", default_value_t = 30_000)]
     seed: u64,
     #[command(flatten)]
@@ -42,8 +42,8 @@ pub struct Args {
     /// Folder that an HDF5 file is converted into
     #[arg(long, value_name = "DIR", default_value = "out/probe")]
     work: PathBuf,
-    /// Write the result to this file too
-    #[arg(long, value_name = "FILE")]
+    /// Also write the result to this file
+    #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Print JSON instead of tables
     #[arg(long)]

@@ -4,9 +4,9 @@ use cli::shown;
 
 use crate::places::{ResultsArgs, ZooArgs, entry_names};
 
-/// Remove versions of entries that no result and no alias is of
+/// Remove versions of entries that have neither results nor aliases
 ///
-/// The number of a removed version is never given again.
+/// The number of a removed version is never used again.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo remove lift-act@2")]

@@ -15,62 +15,62 @@ use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 use crate::simulation::{run_missing, worker};
 use crate::training::show;
 
-const GOES_ON: &str = "stopped; the same command goes on where it was";
+const GOES_ON: &str = "stopped; run the same command again to resume";
 /// Folder of the work, below it one for each entry.
 const RERUNS: &str = "runs/rerun";
 /// Demonstrations that were collected again, in the folder of the work.
 const DEMONSTRATIONS: &str = "demonstrations.hdf5";
 
-/// Make a row of the leaderboard again, from its demonstrations to its last episode, and say which step differs
+/// Reproduce a row of the leaderboard from its demonstrations to its last episode, and report the first step that differs
 ///
-/// Checks entry and result, finds the demonstrations, or collects them again where they are the scripted expert's, knows them by
-/// their fingerprint, trains on them as the entry's experiment says, runs the row's episodes with what came of it, and compares
-/// each step with what is stored: weights byte by byte, episodes outcome by outcome. Where something differs, versions that are
-/// not as they were recorded are named. Neither the zoo nor its results are changed; the work lies in a folder of its own, and
-/// a rerun that was interrupted goes on there. The exit code is 0 where all that was asked for is the same, 1 otherwise. Solvers of puzzles are run again by `eval --again`.
+/// The command checks entry and result and finds the demonstrations by their fingerprint, or collects those of a scripted expert
+/// again. It trains as the entry's experiment says and runs the row's episodes. Each step is compared with what is stored:
+/// weights byte by byte, episodes outcome by outcome. Where something differs, versions that changed are named. The zoo and its
+/// results are not changed. The work is done in its own folder, where an interrupted rerun resumes. The exit code is 0 if every
+/// requested step is the same, and 1 otherwise. For puzzle solvers use `eval --again`.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  actrm-zoo rerun lift-act@1 --protocol lift-v1 --data lift.hdf5
+  actrm-zoo rerun lift-act-s1 --protocol lift-v1 --collect
   actrm-zoo rerun lift-act@1 --protocol lift-v1 --block dev --skip-training --episodes 10
   actrm-zoo rerun stack-act@1_Stack_40000-40199_c839488e
-  actrm-zoo rerun stack-act-s1 --protocol stack-v1 --collect
+  actrm-zoo rerun stack-act-s1 --protocol stack-v1 --data stack.hdf5
   actrm-zoo rerun my-act --work /tmp/again --json")]
 pub struct Args {
-    /// Result: its folder's name, or its entry (`name`, `name@version`) where that has one, or one is chosen below
+    /// Result folder by name, or entry (`name`, `name@version`) whose only or chosen result is meant
     #[arg(add = entry_names())]
     row: String,
-    /// Of several results of an entry, the one of this named protocol
+    /// Choose the result of this named protocol
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
-    /// And of this block of it
+    /// Choose the result of this block of the protocol
     #[arg(long, value_name = "BLOCK", default_value = "test", requires = "protocol")]
     block: BlockArg,
     #[command(flatten)]
     protocols: ProtocolArgs,
-    /// Of several results of an entry, the one on this task
+    /// Choose the result on this task
     #[arg(long)]
     task: Option<String>,
-    /// Demonstrations: an HDF5 file or a LeRobotDataset folder, where they are not at the experiment's path
+    /// Demonstrations, an HDF5 file or a LeRobotDataset folder [default: the experiment's path]
     #[arg(long, value_name = "PATH")]
     data: Option<PathBuf>,
-    /// Collect the demonstrations again, with the seeds that the entry names, also where the experiment's path has some
+    /// Collect the demonstrations again with the recorded seeds, even if the experiment's path has some
     #[arg(long, conflicts_with_all = ["data", "skip_training"])]
     collect: bool,
-    /// Folder of the work [default: runs/rerun/ENTRY@VERSION-HASH]
+    /// Folder of the intermediate files [default: runs/rerun/ENTRY@VERSION-HASH]
     #[arg(long, value_name = "DIR")]
     work: Option<PathBuf>,
-    /// Only the row's first episodes
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    /// Run only the first N episodes of the row
+    #[arg(long, short = 'n', value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
     episodes: Option<u64>,
-    /// Run the episodes with the weights that are stored, and do not train
+    /// Do not train; run the episodes with the stored weights
     #[arg(long, conflicts_with_all = ["data", "image_memory"])]
     skip_training: bool,
-    /// Memory for pictures, such as 2G or 500M: more of them are kept in a file and read ahead [default: half of what is free]
+    /// Memory for images, such as 2G or 500M; the rest is kept in a file [default: half of the free memory]
     #[arg(long, value_name = "SIZE", value_parser = limits::bytes)]
     image_memory: Option<u64>,
     #[command(flatten)]
     simulator: SimulatorArgs,
-    /// As JSON
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
     #[command(flatten)]

@@ -6,9 +6,10 @@ use cli::{Column, Table, command_line, lossy, shown};
 use serde_json::json;
 use zoo::run::{FoundRun, RunState, list_runs};
 
-/// List the trainings that are under way or can go on, where they are and how far
+/// List trainings that are running or can be resumed, with their progress
 ///
-/// For each that was stopped, the command that goes on with it to the same bytes that an uninterrupted training gives.
+/// For each stopped training the list has the command that resumes it. A resumed training ends in the same bytes as an
+/// uninterrupted one.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo runs
@@ -18,10 +19,10 @@ pub struct Args {
     /// Folder of runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Also those that are finished
+    /// Also list finished trainings
     #[arg(long)]
     all: bool,
-    /// As JSON
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

@@ -11,12 +11,12 @@ use zoo::write_atomic;
 use crate::places::{ZooArgs, entry_names};
 use crate::simulation::{drawn, worker};
 
-/// Show what a policy looks at: one episode's pictures with what matters in red, as a PNG file
+/// Show what an image policy looks at: images of an episode with the important regions in red, as PNG
 ///
-/// Parts of a picture are covered one after the other, and the predicted actions compared with those of the whole picture.
-/// The file has a column a query; for each camera its picture, and below it the same in grey with the places in red that
-/// move the actions most. The table says how far the actions move without a camera's picture (mean over the chunk, in
-/// standard deviations of the demonstrations' actions), and where the most important square lies.
+/// Each region of an image is covered in turn, and the predicted actions are compared with those for the whole image. The file
+/// has one column per query. For each camera it shows the image, and below it the image in grey with the regions in red that
+/// change the actions most. The table has the change of the actions without each camera (mean over the chunk, in standard
+/// deviations of the demonstrations' actions) and the place of the most important square.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo saliency lift-act-image --out saliency.png
@@ -28,13 +28,13 @@ pub struct Args {
     /// Seed of the episode
     #[arg(long, value_name = "SEED", default_value_t = FIRST_SEED)]
     seed: u64,
-    /// Queries to look at, evenly spread over the episode
+    /// Number of queries, evenly spread over the episode
     #[arg(long, value_name = "N", default_value_t = 6, value_parser = clap::value_parser!(u16).range(1..=100))]
     queries: u16,
-    /// File to write
-    #[arg(long, value_name = "FILE.png")]
+    /// PNG file to write
+    #[arg(long, short, value_name = "FILE.png")]
     out: PathBuf,
-    /// Another task than the entry's
+    /// Task, if not the entry's
     #[arg(long)]
     task: Option<String>,
     /// Control loop inside the simulator: `compiled` or `robosuite`

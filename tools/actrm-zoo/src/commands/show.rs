@@ -3,7 +3,7 @@ use std::process::ExitCode;
 use crate::card::model_index_of;
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
-/// Verify an entry and print its model card, its experiment or its provenance
+/// Verify an entry and print its model card, experiment or provenance
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo show lift-act
@@ -14,7 +14,7 @@ pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
     entry: String,
-    /// Print the model card for the Hugging Face Hub: with its metadata, and the results that stand as `model-index`
+    /// Print the model card for the Hugging Face Hub, with metadata and its valid results as `model-index`
     #[arg(long, conflicts_with_all = ["config", "json"])]
     card: bool,
     /// Print the resolved experiment

@@ -15,14 +15,13 @@ use zoo::write_atomic;
 
 use crate::places::ConfigArgs;
 
-const GOES_ON: &str = "stopped; the same command goes on where it was";
+const GOES_ON: &str = "stopped; run the same command again to resume";
 
-/// Run a study, as far as it has no results yet, and write its page
+/// Run the missing parts of a study and write its page
 ///
-/// A study file says what is trained on which demonstrations with how many seeds, what it is tested on, and what is
-/// compared; without one it is the puzzle study. Every training's result on a test is one small file in the study's results
-/// folder; Ctrl-C saves checkpoints and the same command goes on from them. One thread (RAYON_NUM_THREADS=1) costs the
-/// least processor time.
+/// A study file lists the trainings, their demonstrations and seeds, the tests, and the comparisons. Without a file this
+/// runs the puzzle study. The result of each training on a test is one small file in the study's results folder. Ctrl-C saves
+/// checkpoints, and the same command resumes from them. One thread (RAYON_NUM_THREADS=1) needs the least processor time.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo study studies/thinking.toml --jobs 2
@@ -36,43 +35,43 @@ const GOES_ON: &str = "stopped; the same command goes on where it was";
   actrm-zoo study studies/zoo.toml --list
   actrm-zoo study --list")]
 pub struct Args {
-    /// Study of robot policies; its results and its page lie where it says
+    /// Study file of robot policies; it names the folder of its results and its page
     #[arg(conflicts_with_all = ["results", "page", "seeds"])]
     study: Option<PathBuf>,
-    /// Trainings at once, of a study of robot policies
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64), requires = "study")]
+    /// Number of trainings at once, for a study of robot policies
+    #[arg(long, short, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64), requires = "study")]
     jobs: u16,
     /// Python with robosuite, for a study of robot policies
     #[arg(long, value_name = "PATH", env = "ACTRM_PYTHON")]
     python: Option<PathBuf>,
-    /// Folder of results, one file a row [puzzles]
+    /// Folder of results of the puzzle study, one file per row
     #[arg(long, value_name = "DIR", default_value = "docs/puzzles")]
     results: PathBuf,
     /// Folder for demonstrations, runs and entries
     #[arg(long, value_name = "DIR", default_value = "out/study")]
     work: PathBuf,
-    /// Only this experiment (of robot policies: cells whose name holds this); may be repeated
+    /// Only this experiment, or only cells whose name contains this text; may be repeated
     #[arg(long, value_name = "EXPERIMENT")]
     only: Vec<String>,
-    /// Only this cell, by its whole name in --list; may be repeated: no page is written, so that many machines can share a study
+    /// Only the cell with this name in --list; may be repeated. No page is written, so that several machines can share a study
     #[arg(long = "cell", value_name = "CELL", requires = "study", conflicts_with_all = ["only", "page_only"])]
     cells: Vec<String>,
-    /// Only collect the demonstrations, of a study of robot policies
+    /// Only collect the demonstrations of a study of robot policies
     #[arg(long, requires = "study", conflicts_with = "page_only")]
     data_only: bool,
-    /// Only what was planned up to this stage, of a study of robot policies
+    /// Only the stages up to this one of a study of robot policies
     #[arg(long, value_name = "N", requires = "study")]
     stage: Option<u8>,
-    /// Only the seeds up to this
+    /// Only training seeds up to this one
     #[arg(long, value_name = "N")]
     seeds: Option<u64>,
-    /// Write the page here
+    /// File of the page
     #[arg(long, value_name = "FILE")]
     page: Option<PathBuf>,
-    /// Run nothing
+    /// Only write the page
     #[arg(long)]
     page_only: bool,
-    /// List the experiments of the study, of robot policies its cells with their results, and end
+    /// List the experiments or cells of the study with their results, and run nothing
     #[arg(long)]
     list: bool,
     #[command(flatten)]

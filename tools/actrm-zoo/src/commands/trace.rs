@@ -13,11 +13,11 @@ use crate::places::{ZooArgs, entry_names};
 use crate::puzzles::family;
 use crate::simulation::{drawn, worker};
 
-/// Show what an entry thought, step by step: a puzzle solver about a puzzle, a robot policy in an episode
+/// Show the refinement steps of a puzzle solver on a puzzle, or of a robot policy in an episode
 ///
-/// Of a puzzle: the grid, how sure the solver was of each cell, whether it would stop. Of an episode: every query and every
-/// step of the thought behind it, with the answer's change, the halting head's probability and the time; in JSON, Parquet and
-/// the drawing also what the actions attended to, or where a policy that thinks over a grid took the way to go on.
+/// For a puzzle the output has the grid, the confidence of each cell, and the halting decision. For an episode it has every
+/// query and every refinement step, with the change of the prediction, the halting probability and the time. JSON, Parquet and
+/// SVG also hold the attention of the actions, or the path that a policy on a grid predicts.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo trace trm-dfs10
@@ -38,16 +38,16 @@ pub struct Args {
     /// Most supervision steps on a puzzle [default: 8]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1000))]
     depth: Option<u64>,
-    /// Another task, or family of puzzles, than the entry's
+    /// Task or family of puzzles, if not the entry's
     #[arg(long)]
     task: Option<String>,
-    /// Givens of a Sudoku (the fewest that the solver was trained on)
+    /// Givens of a Sudoku [default: the fewest that the solver was trained on]
     #[arg(long, value_name = "N")]
     givens: Option<usize>,
     /// Seed of the episode [default: the first that evaluations use]
     #[arg(long, value_name = "SEED")]
     seed: Option<u64>,
-    /// Write an episode's answers, every action of them, to this file too
+    /// Also write all predicted actions of the episode to this Parquet file
     #[arg(long, value_name = "FILE")]
     parquet: Option<PathBuf>,
     /// Control loop inside the simulator: `compiled` or `robosuite`
@@ -58,7 +58,7 @@ pub struct Args {
     /// Print JSON instead of text
     #[arg(long)]
     json: bool,
-    /// Draw to this file: of a puzzle, instead of text, a strip of pictures; of an episode what its actions attended to, or the way
+    /// Draw to this SVG file: the steps on a puzzle, or the attention or path in an episode
     #[arg(long, value_name = "FILE", conflicts_with = "json")]
     svg: Option<PathBuf>,
     #[command(flatten)]

@@ -2,9 +2,11 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use study::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
+use zoo::ZooError;
+use zoo::config::{Library, nearest_of};
 use zoo::entry::member_name;
 use zoo::run::{COMMAND_FILE, TrainEvent, TrainOutcome, TrainRequest, finished_entry, train};
 use zoo::write_atomic;
@@ -12,18 +14,18 @@ use zoo::write_atomic;
 use crate::places::{ConfigArgs, ZooArgs, experiment_names};
 use crate::training::show;
 
-/// Train an experiment and put the result into the zoo
+/// Train an experiment and add the result to the zoo
 ///
-/// Ctrl-C saves a checkpoint; `--resume` goes on from it to the same bytes that an uninterrupted training gives.
-/// `actrm-zoo runs` lists what can go on, with the command that does it.
+/// Ctrl-C saves a checkpoint. `--resume` continues from it and ends in the same bytes as an uninterrupted training.
+/// `actrm-zoo runs` lists interrupted runs with the command that resumes each.
 ///
-/// Demonstrations must be of the experiment's task, and the names that a LeRobot data set gives to its numbers must be those of
-/// the experiment's observation keys: in another order they are reordered, others are refused. A task that no simulator
+/// Demonstrations must be of the experiment's task. The names that a LeRobot data set gives to its dimensions must be those of the
+/// experiment's observation keys. Dimensions in another order are reordered, other names are refused. A task that no simulator
 /// has (`task.name`) takes the keys of the data set.
 ///
-/// `--seeds 1..8` trains eight times, with the seeds 1 to 8, one entry each (`lift-act-s1` to `lift-act-s8`): a family,
-/// which the leaderboard shows as one row with the chance of training in its interval. The same command goes on where it
-/// was; what is trained already is not trained again.
+/// `--seeds 1..8` trains eight entries with the seeds 1 to 8 (`lift-act-s1` to `lift-act-s8`). The leaderboard shows such a
+/// family as one row, whose interval includes the variance between seeds. The same command resumes, and does not repeat
+/// finished trainings.
 #[derive(clap::Args, Clone)]
 #[command(after_help = "Examples:
   actrm-zoo train act_lift
@@ -32,39 +34,40 @@ use crate::training::show;
   actrm-zoo train act_stack inputs=image
   actrm-zoo train act_lift --data demos.hdf5 --zoo my-zoo
   actrm-zoo train act_lift --data aloha task.name=transfer_cube entry=aloha-act
+  actrm-zoo train my.toml
   actrm-zoo train act_lift --resume
   actrm-zoo train act_lift --seeds 1..8
   actrm-zoo train trm_dfs10 train.seed=2
   actrm-zoo train act_lift --print-config")]
 pub struct Args {
-    /// Experiment, by name (`act_stack`; see `actrm-zoo list --experiments`) or by its parts (`policy=act task=stack inputs=image`)
+    /// Experiment: a name of `actrm-zoo list --experiments`, the path of a TOML file, or parts such as `policy=act`
     #[arg(add = experiment_names())]
     experiment: String,
-    /// Changes to it: `train.steps=5000`, `inputs=image`
+    /// Settings to override, such as `train.steps=5000` or `inputs=image`; `--print-config` shows all
     #[arg(value_name = "KEY=VALUE")]
     overrides: Vec<String>,
-    /// Demonstrations: an HDF5 file or a LeRobotDataset folder, instead of the experiment's
+    /// Demonstrations: an HDF5 file or a LeRobotDataset folder [default: the experiment's]
     #[arg(long, value_name = "PATH")]
     data: Option<PathBuf>,
-    /// Train even where the demonstrations are of another task, or their numbers have other names
+    /// Train even if the demonstrations are of another task or their dimensions have other names
     #[arg(long)]
     force: bool,
-    /// Folder of runs; this one becomes RUNS/EXPERIMENT/NUMBER
+    /// Folder of runs; this run is stored in DIR/EXPERIMENT/NUMBER
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Exactly this folder for the run
+    /// Folder of this run
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
-    /// Go on with the latest run of this experiment, or with the one in --run
+    /// Resume the latest run of this experiment, or the one in --run
     #[arg(long)]
     resume: bool,
-    /// One training with each of these seeds: `1..8` (both ends included), `3` or `1,4,7`
+    /// Train once with each of these seeds: `1..8` (both ends included), `3` or `1,4,7`
     #[arg(long, value_name = "SEEDS", conflicts_with_all = ["run", "resume"])]
     seeds: Option<TrainingSeeds>,
-    /// Memory for pictures, such as 2G or 500M: more of them are kept in a file and read ahead [default: half of what is free]
+    /// Memory for images, such as 2G or 500M; the rest is kept in a file [default: half of the free memory]
     #[arg(long, value_name = "SIZE", value_parser = limits::bytes)]
     image_memory: Option<u64>,
-    /// Print the resolved experiment and end
+    /// Print the resolved experiment and do not train
     #[arg(long)]
     print_config: bool,
     #[command(flatten)]
@@ -100,14 +103,43 @@ impl std::str::FromStr for TrainingSeeds {
     }
 }
 
+impl Args {
+    /// The same with an experiment that is a path taken apart: `mine/my.toml` is `my` of the folder `mine`.
+    fn named(&self) -> anyhow::Result<Self> {
+        let path = Path::new(&self.experiment);
+        if path.extension().is_none_or(|extension| extension != "toml") {
+            return Ok(self.clone());
+        }
+        if !path.is_file() {
+            bail!("experiment {}: no such file", shown(path));
+        }
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Self { experiment: name, configs: ConfigArgs { configs: Some(folder.to_owned()) }, ..self.clone() })
+    }
+}
+
+/// What to do about a change of the policy's type, which leaves the other settings of another policy behind.
+fn other_policy(args: &Args, library: &Library) -> Option<String> {
+    let policy = args.overrides.iter().find_map(|set| set.strip_prefix("policy.type="))?.replace('-', "_");
+    let (_, task) = args.experiment.split_once('_')?;
+    let names = library.names().ok()?;
+    let near = nearest_of(&format!("{policy}_{task}"), &names, 1).pop()?;
+    Some(format!("another policy has other settings; did you mean the experiment `{near}`?"))
+}
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let args = &args.named()?;
     let library = args.configs.library()?;
     let words: Vec<String> = [&args.experiment].into_iter().chain(&args.overrides).cloned().collect();
     let (experiment, overrides) = library.choose(&words)?;
     let args = &Args { experiment, overrides, ..args.clone() };
     let load = |overrides: &[String]| {
         AnyExperiment::load(&library, &args.experiment, overrides)
-            .with_context(|| format!("experiment `{}`", args.experiment))
+            .with_context(|| match other_policy(args, &library) {
+                Some(hint) => format!("experiment `{}`: {hint}", args.experiment),
+                None => format!("experiment `{}`", args.experiment),
+            })
     };
     let experiment = load(&args.overrides)?;
     if args.print_config {
@@ -173,8 +205,10 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
         }
         show(&event, &mut screen, asked);
     };
+    let mut task = None;
     let outcome = match experiment {
         AnyExperiment::Robot(experiment) => {
+            task = Some(experiment.task.name.clone());
             let data = args.data.clone();
             let (image_memory, force) = (args.image_memory, args.force);
             let experiment = *experiment;
@@ -194,7 +228,16 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
     if let Some(error) = unwritten {
         cli::note(&format!("note: {error}"));
     }
-    match outcome? {
+    let task = task.unwrap_or_default();
+    let outcome = outcome.map_err(|error| match error {
+        ZooError::DataNotFound { path, .. } => anyhow!(
+            "no demonstrations at {}: name yours with --data PATH, or record some with `actrm-data collect --task {task} \
+             --episodes 200 --out demos.hdf5`",
+            shown(&path)
+        ),
+        other => other.into(),
+    })?;
+    match outcome {
         TrainOutcome::Finished { entry, run, minutes } => {
             let (zoo, run) = (shown(&args.zoo.zoo), shown(&run));
             cli::print(&format!("{entry} is in {zoo} after {minutes:.1} minutes of training (run {run})\n"))?;

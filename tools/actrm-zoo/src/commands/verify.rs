@@ -9,21 +9,21 @@ use zoo::tensors;
 
 use crate::places::{ResultsArgs, ZooArgs, entry_names, of_entry};
 
-/// Check entries and their results: every hash and seal, and with --deep every tensor and what the policy answers
+/// Check the hashes and seals of entries and results, and with --deep every tensor and predicted action
 ///
-/// A result has to be as it was sealed, in the folder that its record belongs in, and of an entry in the zoo that says the
-/// same of its training. Hashes tell damage and edits; that a result was measured, `eval --again` shows.
+/// A valid result equals its seal, lies in the folder that its record names, and agrees with its entry in the zoo about the
+/// training. Hashes detect damage and edits. `eval --again` shows whether a result can be measured again.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo verify
   actrm-zoo verify lift-act stack-act@1 --deep
   actrm-zoo verify --zoo my-zoo --results elsewhere")]
 pub struct Args {
-    /// Entries: `name` (its newest version) or `name@version` (all, with whatever lies in the folder of results)
+    /// Entries: `name` (its newest version) or `name@version` [default: all entries and all results]
     #[arg(add = entry_names())]
     entries: Vec<String>,
-    /// Also build each network and compare the names and shapes of its tensors, all values of which have to be finite, and
-    /// ask it once more for the actions that are stored with it
+    /// Also build each network, check the names, shapes and values of its tensors, and compare its actions with those stored
+    /// with it
     #[arg(long)]
     deep: bool,
     #[command(flatten)]
