@@ -52,7 +52,7 @@ fn ctrl_c_once_finishes_the_episode_and_saves_and_the_same_command_goes_on() {
     let output = child.wait_with_output().expect("it ends");
     let error = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(130), "{error}");
-    assert!(error.contains("of 24 episodes done") && error.contains("the same command goes on"), "{error}");
+    assert!(error.contains("of 24 episodes done") && error.contains("run the same command again"), "{error}");
     let done = fs::read_to_string(&journal).expect("a journal").lines().count();
     assert!((1..24).contains(&done), "{done} episodes on disk");
 

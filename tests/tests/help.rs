@@ -99,7 +99,8 @@ fn sentences_are_short() {
 
 #[test]
 fn long_sentences_are_found() {
-    let (paragraphs, cells) = parts("One two three. Four five.\n\n    code that is not counted at all\n- six seven eight\n| a | b c |");
+    let (paragraphs, cells) =
+        parts("One two three. Four five.\n\n    code that is not counted at all\n- six seven eight\n| a | b c |");
     assert_eq!(long(&paragraphs, 2), ["One two three.", "- six seven eight"]);
     assert!(cells.contains(&"b c".to_owned()));
 }

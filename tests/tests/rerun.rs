@@ -106,7 +106,7 @@ fn a_row_comes_out_the_same_from_its_demonstrations_to_its_last_episode() {
     let mut command = zoo(["rerun", &name, "--zoo", text(&entries), "--work", text(&folder.path().join("work"))]);
     let output = succeeds(command.args(["--data", text(&lift())]));
     let (out, notes) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(out.contains(&format!("{name}: all that was asked for is the same")), "{out}");
+    assert!(out.contains(&format!("{name}: every requested step is the same")), "{out}");
     assert!(notes.contains("trained by an earlier call") && notes.contains("run by an earlier call"), "{notes}");
 }
 

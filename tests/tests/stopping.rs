@@ -56,7 +56,7 @@ fn one_signal_ends_a_program_that_starts_its_simulators() {
             }
             std::thread::sleep(Duration::from_millis(wait));
             let error = ends(child, name);
-            assert!(error.contains("the same command goes on"), "{error}");
+            assert!(error.contains("run the same command again"), "{error}");
         }
     }
     assert!(!out.exists());
@@ -89,7 +89,7 @@ fn a_stopped_training_says_the_command_that_goes_on_and_runs_lists_it() {
     }
     assert_eq!((&listed()[0]["state"], &listed()[0]["steps"]), (&"training".into(), &1_000_000.into()));
     let error = ends(child, "TERM");
-    let hint = error.lines().find_map(|line| line.split_once("go on with: ")).expect("a hint").1.to_owned();
+    let hint = error.lines().find_map(|line| line.split_once("resume with: ")).expect("a hint").1.to_owned();
 
     let run = listed()[0].clone();
     assert_eq!((&run["state"], &run["command"]), (&"stopped".into(), &hint.clone().into()));

@@ -123,7 +123,7 @@ fn what_a_policy_looks_at_is_drawn() {
         assert!(cameras.iter().all(|camera| camera["most"].as_f64().is_some_and(|x| x > 0.0)), "{query}");
     }
     assert!(fs::read(&out).expect("a picture").starts_with(b"\x89PNG"));
-    refused(&mut saliency("lift-act@1", &e2e::root().join("zoo")), &["lift-act@1", "it sees no pictures"]);
+    refused(&mut saliency("lift-act@1", &e2e::root().join("zoo")), &["lift-act@1", "not an image policy"]);
     // a thought about pictures is traced in the environment of its demonstrations
     let traced = said(&mut zoo(["trace", "lift-act-image@1", "--zoo", text(&entries)]));
     assert!(traced.starts_with("lift-act-image@1 on Lift, seed 10000: "), "{traced}");

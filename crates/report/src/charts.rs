@@ -65,7 +65,9 @@ pub(super) fn costs(rows: &[&LeaderboardRow], palette: &Palette) -> String {
     let legend: String = policies
         .iter()
         .map(|(policy, colour)| {
-            let dot = format!(r#"<svg width="12" height="12" aria-hidden="true"><circle cx="6" cy="6" r="5" fill="{colour}"/></svg>"#);
+            let dot = format!(
+                r#"<svg width="12" height="12" aria-hidden="true"><circle cx="6" cy="6" r="5" fill="{colour}"/></svg>"#
+            );
             format!("<li>{dot}{}</li>", escape(policy))
         })
         .collect();
@@ -105,8 +107,12 @@ fn cost_chart(
     name: &str,
     cost: &dyn Fn(&LeaderboardRow) -> f64,
 ) -> String {
-    let points: Vec<(f64, &LeaderboardRow)> =
-        rows.iter().filter(|row| row.is_trained()).map(|row| (cost(row), *row)).filter(|(x, _)| x.is_finite() && *x > 0.0).collect();
+    let points: Vec<(f64, &LeaderboardRow)> = rows
+        .iter()
+        .filter(|row| row.is_trained())
+        .map(|row| (cost(row), *row))
+        .filter(|(x, _)| x.is_finite() && *x > 0.0)
+        .collect();
     let low = points.iter().map(|(x, _)| *x).fold(f64::INFINITY, f64::min);
     let high = points.iter().map(|(x, _)| *x).fold(0.0, f64::max);
     if points.is_empty() {
@@ -219,7 +225,7 @@ pub(super) fn patterns() -> &'static str {
 /// Training curves as a picture of their own, which looks alike wherever it is shown.
 pub fn curves_svg(of: &[Curve]) -> String {
     let style = "<style>text{font:12px sans-serif;fill:#5b6470}.grid{stroke:#e3e7ec}</style>";
-    let drawn = curves(&of.iter().collect::<Vec<_>>());
+    let drawn = curves(&of.iter().collect::<Vec<_>>(), 0);
     if drawn.is_empty() {
         return "<svg xmlns=\"http://www.w3.org/2000/svg\"></svg>\n".to_owned();
     }
@@ -227,8 +233,8 @@ pub fn curves_svg(of: &[Curve]) -> String {
     drawn.replacen('>', &format!(">{style}"), 1) + "\n"
 }
 
-/// Training loss over optimiser steps, logarithmic.
-pub(super) fn curves(curves: &[&Curve]) -> String {
+/// Training loss over optimiser steps, logarithmic; the first curve has colour `first`.
+pub(super) fn curves(curves: &[&Curve], first: usize) -> String {
     let points = || curves.iter().flat_map(|curve| &curve.points);
     let drawable = || points().filter(|(_, loss)| loss.is_finite() && *loss > 0.0);
     let last = drawable().map(|(step, _)| *step).max().unwrap_or(1).max(1) as f64;
@@ -268,7 +274,7 @@ pub(super) fn curves(curves: &[&Curve]) -> String {
         );
     }
     for (index, curve) in curves.iter().enumerate() {
-        let colour = COLOURS[index % COLOURS.len()];
+        let colour = COLOURS[(first + index) % COLOURS.len()];
         let drawn: Vec<(f64, f64)> = curve
             .points
             .iter()
@@ -344,6 +350,6 @@ mod tests {
     #[test]
     fn a_curve_without_a_drawable_point_is_no_picture() {
         let curve = Curve { entry: "a@1".into(), points: vec![(1, f64::NAN), (2, 0.0)] };
-        assert_eq!(curves(&[&curve]), "");
+        assert_eq!(curves(&[&curve], 0), "");
     }
 }

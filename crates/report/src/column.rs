@@ -48,7 +48,15 @@ pub struct Column<R: 'static> {
 
 /// A column of words, in no form yet.
 pub const fn text<R>(value: fn(&R) -> String) -> Column<R> {
-    Column { value: Value::Text(value), align: Align::Right, kept: false, more: false, csv: None, table: None, page: None }
+    Column {
+        value: Value::Text(value),
+        align: Align::Right,
+        kept: false,
+        more: false,
+        csv: None,
+        table: None,
+        page: None,
+    }
 }
 
 /// A column of numbers, in no form yet: `exact` decimal places in CSV, `shown` in tables for people.
@@ -59,7 +67,15 @@ pub const fn number<R>(value: fn(&R) -> Option<f64>, exact: usize, shown: usize)
 
 /// A column of whole numbers, in no form yet.
 pub const fn count<R>(value: fn(&R) -> Option<u64>) -> Column<R> {
-    Column { value: Value::Count(value), align: Align::Right, kept: false, more: false, csv: None, table: None, page: None }
+    Column {
+        value: Value::Count(value),
+        align: Align::Right,
+        kept: false,
+        more: false,
+        csv: None,
+        table: None,
+        page: None,
+    }
 }
 
 impl<R> Column<R> {
@@ -190,8 +206,14 @@ mod tests {
             "| who | value |\n| --- | ---: |\n| a\\|b | 1.2 |\n| <c>, \"d\"<br>more | - |\n"
         );
         let page = html::table(COLUMNS, &rows);
-        assert!(page.contains("<tr><th scope=\"col\" class=\"words\">who</th><th scope=\"col\">value</th></tr>"), "{page}");
-        assert!(page.contains("<td class=\"words\">&lt;c&gt;, &quot;d&quot;<br><small>more</small></td><td>-</td>"), "{page}");
+        assert!(
+            page.contains("<tr><th scope=\"col\" class=\"words\">who</th><th scope=\"col\">value</th></tr>"),
+            "{page}"
+        );
+        assert!(
+            page.contains("<td class=\"words\">&lt;c&gt;, &quot;d&quot;<br><small>more</small></td><td>-</td>"),
+            "{page}"
+        );
         let json = json::rows(COLUMNS, &rows);
         assert_eq!(json[0], serde_json::json!({"name": "a|b", "value": 1.25, "whole": 7}));
         assert_eq!((&json[1]["value"], &json[1]["whole"]), (&serde_json::Value::Null, &serde_json::Value::Null));

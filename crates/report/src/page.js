@@ -120,9 +120,9 @@
   };
   // beside every command a button that copies it, once its details are open
   document.addEventListener("toggle", ({ target }) => {
-    if (!(target instanceof HTMLDetailsElement) || !target.open || target.dataset.copied) return;
-    target.dataset.copied = "yes";
-    target.querySelectorAll("code.command").forEach((command) => {
+    if (!(target instanceof HTMLDetailsElement) || !target.open) return;
+    target.querySelectorAll("code.command:not([data-copies])").forEach((command) => {
+      command.dataset.copies = "yes";
       const button = document.createElement("button");
       [button.type, button.className, button.textContent] = ["button", "copy", "Copy"];
       button.setAttribute("aria-label", `Copy ${command.textContent}`);

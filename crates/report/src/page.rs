@@ -305,18 +305,12 @@ impl Room {
 /// A task under one protocol: its charts, its rows beside each other, and each row's details while there is room.
 ///
 /// It is folded unless it is the only one.
-fn task(
-    rows: &[&LeaderboardRow],
-    beside: &Beside,
-    open: bool,
-    palette: &Palette,
-    room: &mut Room,
-    html: &mut String,
-) {
+fn task(rows: &[&LeaderboardRow], beside: &Beside, open: bool, palette: &Palette, room: &mut Room, html: &mut String) {
     let first = rows[0];
-    let best = rows.iter().find(|row| row.rank == Some(1)).map_or(String::new(), |row| {
-        format!(", best {} {}", escape(&row.name()), row.counts.percent(1))
-    });
+    let best = rows
+        .iter()
+        .find(|row| row.rank == Some(1))
+        .map_or(String::new(), |row| format!(", best {} {}", escape(&row.name()), row.counts.percent(1)));
     let count = if rows.len() == 1 { "1 row".to_owned() } else { format!("{} rows", rows.len()) };
     let _ = writeln!(
         html,
@@ -354,7 +348,7 @@ fn task(
         }
     }
     for row in rows.iter().take(room.detailed) {
-        details(row, beside, &mut room.films, html);
+        details(row, beside, palette, &mut room.films, html);
     }
     room.detailed = room.detailed.saturating_sub(rows.len());
     html.push_str("</details>\n");
@@ -368,7 +362,7 @@ fn card(title: &str, content: &str) -> String {
 }
 
 /// What lies behind a row: each training's episodes, its curve, and where it comes from.
-fn details(row: &LeaderboardRow, beside: &Beside, films: &mut usize, html: &mut String) {
+fn details(row: &LeaderboardRow, beside: &Beside, palette: &Palette, films: &mut usize, html: &mut String) {
     let _ = writeln!(
         html,
         "<details class=\"row\" id=\"details-{}\"><summary>{} <small>{}, {} [{}%]</small></summary>",
@@ -383,11 +377,11 @@ fn details(row: &LeaderboardRow, beside: &Beside, films: &mut usize, html: &mut 
     if trainings.len() > 1 {
         let _ = writeln!(html, "{}", card("Each training", &html::table(COLUMNS, &trainings)));
     }
-    html.push_str("<div class=\"card\">\n<h4>Episodes by seed: bar height is steps taken, hatched bars failed</h4>\n");
+    let mut episodes = String::new();
     for training in &trainings {
         let strips: String = training.evaluations().map(charts::strip).collect();
         let _ = writeln!(
-            html,
+            episodes,
             "<div class=\"strip\"><p><b>{}</b> {} · seeds {}</p>{strips}{}</div>",
             escape(&training.name()),
             training.counts,
@@ -395,21 +389,21 @@ fn details(row: &LeaderboardRow, beside: &Beside, films: &mut usize, html: &mut 
             failed(training, beside)
         );
     }
-    html.push_str("</div>\n");
+    let _ = writeln!(html, "{}", card("Episodes by seed: bar height is steps taken, hatched bars failed", &episodes));
     let filmed: String = trainings.iter().map(|training| films::filmed(training, beside, films)).collect();
     if !filmed.is_empty() {
         let _ = writeln!(html, "{}", card("Films", &filmed));
     }
     let names: Vec<String> = trainings.iter().map(LeaderboardRow::name).collect();
-    let mut shown: Vec<&Curve> = beside.curves.iter().filter(|curve| row.is_trained() && names.contains(&curve.entry)).collect();
+    let mut shown: Vec<&Curve> =
+        beside.curves.iter().filter(|curve| row.is_trained() && names.contains(&curve.entry)).collect();
     shown.sort_by(|a, b| a.entry.cmp(&b.entry));
-    let drawn = charts::curves(&shown);
+    let drawn = charts::curves(&shown, palette.index(row));
     if !drawn.is_empty() {
         let _ = writeln!(html, "{}", card("Training loss over optimiser steps", &drawn));
     }
-    html.push_str("<div class=\"card\">\n<h4>Where these numbers come from</h4>\n");
-    trainings.iter().for_each(|training| html.push_str(&provenance(training, beside)));
-    html.push_str("</div>\n</details>\n");
+    let origins: String = trainings.iter().map(|training| provenance(training, beside)).collect();
+    let _ = writeln!(html, "{}\n</details>", card("Where these numbers come from", &origins));
 }
 
 /// The first seeds that failed, with the command that shows one.
@@ -455,7 +449,7 @@ fn slug(text: &str) -> String {
 fn provenance(row: &LeaderboardRow, beside: &Beside) -> String {
     let t = &row.record().training;
     let again = commands::again(row, beside.task(row), &beside.places).map_or_else(
-        || "It refines its actions by the clock, so its episodes may end otherwise next time.".to_owned(),
+        || "It has a time budget, so its episodes may end differently next time.".to_owned(),
         |line| command(&line),
     );
     let facts = [

@@ -62,7 +62,10 @@ fn rows_that_are_not_shown_yet_are_sorted_found_linked_and_copied() {
     assert_eq!(told["last"], json!([200, "rows 1001 to 1200 of 1200", false, true]), "{told}");
     let [written, drawn] = [0, 1].map(|k| &told["like_the_written"][k]);
     assert_eq!(written, drawn, "rows that the script draws are like those that the page is written with");
-    assert!(written.as_array().is_some_and(|columns| columns.iter().all(|column| column.as_str() != Some(""))), "{told}");
+    assert!(
+        written.as_array().is_some_and(|columns| columns.iter().all(|column| column.as_str() != Some(""))),
+        "{told}"
+    );
     // entry k succeeds in k / 4 of 50 episodes
     assert_eq!(told["best"], json!(["10.0%", "10.0%", "10.0%"]), "{told}");
     assert_eq!(told["worst"], json!(["0.0%", "0.0%", "0.0%"]), "{told}");

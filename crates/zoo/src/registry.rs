@@ -62,7 +62,8 @@ impl Registry {
     pub fn resolve(&self, text: &str) -> Result<EntryId, ZooError> {
         if text.contains(std::path::MAIN_SEPARATOR) {
             let (zoo, name) = parts(Path::new(text));
-            let same = |one: &Path| one.canonicalize().ok().is_some_and(|one| self.folder.canonicalize().ok() == Some(one));
+            let same =
+                |one: &Path| one.canonicalize().ok().is_some_and(|one| self.folder.canonicalize().ok() == Some(one));
             if name.is_empty() || !same(&zoo) {
                 let reason = "expected a name or a path in this zoo; --zoo names another one";
                 return Err(ZooError::EntryName { name: text.to_owned(), reason });

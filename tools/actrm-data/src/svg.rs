@@ -137,7 +137,10 @@ mod tests {
         let bars = chart(0.0, 0.0, "h", &Content::Histogram(&[1.0, 1.0, 2.0]));
         assert_eq!(bars.matches("class=\"bar\"").count(), 2);
         let within = chart(0.0, 0.0, "h", &Content::HistogramWithin(&[1.0, 1.0, 2.0], (0.0, 4.0)));
-        assert!(within.contains("x=\"105.0\"") && within.contains("x=\"210.0\"") && within.contains(">4</text>"), "{within}");
+        assert!(
+            within.contains("x=\"105.0\"") && within.contains("x=\"210.0\"") && within.contains(">4</text>"),
+            "{within}"
+        );
         for empty in [&[][..], &[f32::NAN][..], &[3.0][..]] {
             let page = page("x", &[("l".into(), Content::Line(empty)), ("h".into(), Content::Histogram(empty))], 2);
             assert!(!page.contains("NaN") && !page.contains("inf\""), "{page}");

@@ -38,7 +38,8 @@ pub fn of_episodes(rows: &[LeaderboardRow], zoo: &Path) -> Vec<Film> {
             continue;
         };
         let conditions = one.record.conditions();
-        let mut episodes: Vec<(bool, u64)> = one.episodes.iter().map(|episode| (episode.success, episode.seed)).collect();
+        let mut episodes: Vec<(bool, u64)> =
+            one.episodes.iter().map(|episode| (episode.success, episode.seed)).collect();
         episodes.sort_by_key(|(success, _)| *success);
         for (success, seed) in episodes {
             let holds = |other: &&&StoredEvaluation| {

@@ -26,7 +26,7 @@ impl Film {
     pub fn begin(path: &Path, size: (usize, usize), rate: f64) -> Result<Self> {
         let shown = crate::shown(path);
         let Some(rate) = Rate::of(rate) else {
-            bail!("video {shown}: pictures a second: expected 1 or more, found {rate}")
+            bail!("video {shown}: frames per second: expected 1 or more, found {rate}")
         };
         let encoder = Encoder::new(size.1, size.0, rate, &OPTIONS).with_context(|| format!("video {shown}"))?;
         Ok(Self { path: path.to_owned(), size, rate, encoder })
@@ -40,7 +40,7 @@ impl Film {
         let (height, width) = self.size;
         if (image.height, image.width) != self.size {
             let (h, w) = (image.height, image.width);
-            bail!("video {}: expected pictures of {height}x{width}, found {h}x{w}", crate::shown(&self.path));
+            bail!("video {}: expected images of {height}x{width}, found {h}x{w}", crate::shown(&self.path));
         }
         self.encoder.push(&image.rgb).with_context(|| format!("video {}", crate::shown(&self.path)))
     }
@@ -54,11 +54,12 @@ impl Film {
         let shown = crate::shown(&path);
         let samples = encoder.finish().with_context(|| format!("video {shown}"))?;
         if samples.is_empty() {
-            bail!("video {shown}: no pictures");
+            bail!("video {shown}: no images");
         }
         let mut muxer = Muxer::new(u16::try_from(width)?, u16::try_from(height)?, rate);
         samples.iter().try_for_each(|sample| muxer.push(sample)).with_context(|| format!("video {shown}"))?;
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        crate::make_parent(&path)?;
         let written = || -> std::io::Result<()> {
             let mut file = tempfile::Builder::new()
                 .prefix(".video-")
@@ -79,7 +80,7 @@ impl Film {
 /// # Errors
 /// As [`Film`].
 pub fn film(path: &Path, images: &[Image], rate: f64) -> Result<()> {
-    let Some(first) = images.first() else { bail!("video {}: no pictures", crate::shown(path)) };
+    let Some(first) = images.first() else { bail!("video {}: no images", crate::shown(path)) };
     let mut film = Film::begin(path, (first.height, first.width), rate)?;
     images.iter().try_for_each(|image| film.push(image))?;
     film.finish()
@@ -103,9 +104,9 @@ mod tests {
         assert_eq!((info.codec, info.width, info.height, info.frames), (Codec::Av1, 48, 32, 5));
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
         let error = |result: Result<()>| format!("{:#}", result.unwrap_err());
-        assert!(error(film(&path, &[], 20.0)).contains("no pictures"));
+        assert!(error(film(&path, &[], 20.0)).contains("no images"));
         let other = Image { height: 16, width: 16, rgb: vec![0; 768] };
-        assert!(error(film(&path, &[image(0), other], 20.0)).contains("expected pictures of 32x48"));
+        assert!(error(film(&path, &[image(0), other], 20.0)).contains("expected images of 32x48"));
         let odd = Image { height: 33, width: 48, rgb: vec![0; 33 * 48 * 3] };
         assert!(error(film(&path, &[odd], 20.0)).contains("odd"));
     }

@@ -21,7 +21,7 @@ mod text;
 
 pub use command::{dressed, end, every_command_shows_examples, parse};
 pub use film::{Film, film};
-pub use output::{note, print, print_json};
+pub use output::{make_parent, note, print, print_json};
 pub use screen::Screen;
 pub use simulator::{SimulatorArgs, close};
 pub use stop::{INTERRUPTED, Stop};

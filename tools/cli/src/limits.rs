@@ -20,6 +20,15 @@ pub fn check_seeds(start: u64, count: u64) -> Result<()> {
     Ok(())
 }
 
+/// A number of episodes on the command line.
+///
+/// # Errors
+/// Anything else, in words.
+pub fn episodes(text: &str) -> Result<u64, String> {
+    let count = text.parse().ok().filter(|count| (1..=MOST_EPISODES).contains(count));
+    count.ok_or_else(|| format!("expected a number from 1 to {MOST_EPISODES}"))
+}
+
 /// A size on the command line: `500M`, `2G`, `1.5G`, or a number of bytes.
 ///
 /// # Errors

@@ -1,6 +1,7 @@
 //! Writing to standard output and standard error.
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
 
 use anyhow::{Context, Result};
 use serde::Serialize;
@@ -34,6 +35,17 @@ pub fn note(text: &str) {
     let line = plain(text) + "\n";
     // there is no other place left to complain to
     let _ = std::io::stderr().lock().write_all(line.as_bytes());
+}
+
+/// Makes the folders that a file or folder at `path` will be in.
+///
+/// # Errors
+/// A folder that cannot be made.
+pub fn make_parent(path: &Path) -> Result<()> {
+    let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty() && !parent.exists());
+    parent
+        .map_or(Ok(()), std::fs::create_dir_all)
+        .with_context(|| format!("cannot create the folder of {}", crate::shown(path)))
 }
 
 /// `error: …` in one line.

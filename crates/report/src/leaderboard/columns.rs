@@ -30,9 +30,7 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     number(|row: &LeaderboardRow| Some(row.interval.1), 4, 4).csv("ci95_high"),
     text(LeaderboardRow::rate_text).table("rate [95%]").kept(),
     count(|row: &LeaderboardRow| row.rank).csv("rank"),
-    text(|row: &LeaderboardRow| row.rank.map_or(String::new(), |rank| rank.to_string()))
-        .table("rank")
-        .kept(),
+    text(|row: &LeaderboardRow| row.rank.map_or(String::new(), |rank| rank.to_string())).table("rank").kept(),
     text(|row: &LeaderboardRow| row.rank.map_or(row.unranked_text().to_owned(), |rank| rank.to_string())).page("rank"),
     count(|row: &LeaderboardRow| Some(row.standing.as_ref()?.ranks.0 as u64)).csv("rank_first"),
     count(|row: &LeaderboardRow| Some(row.standing.as_ref()?.ranks.1 as u64)).csv("rank_last"),

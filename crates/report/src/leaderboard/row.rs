@@ -539,7 +539,7 @@ impl LeaderboardRow {
             ));
         }
         if self.record().time_decides {
-            text.push_str("\n  it thinks by the clock: these episodes may end otherwise next time");
+            text.push_str("\n  it has a time budget, so these episodes may end differently next time");
         }
         let lost = |group: Option<&String>| {
             let failures = self.failures(group).into_iter();

@@ -49,7 +49,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         false => set.column_names().collect(),
     };
     if pictures && all.is_empty() {
-        bail!("{}: no pictures to draw in it", args.dir.display());
+        bail!("{}: no images in it", args.dir.display());
     }
     for name in &args.column {
         if !all.contains(&name.as_str()) {
@@ -139,6 +139,7 @@ pub(super) fn create(path: &Path, bytes: &[u8]) -> Result<()> {
     if path.exists() {
         bail!("{}: exists already; choose another path or remove it first", path.display());
     }
+    cli::make_parent(path)?;
     let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut name = OsString::from(".");
     name.push(path.file_name().unwrap_or_default());

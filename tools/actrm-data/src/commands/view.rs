@@ -4,7 +4,7 @@ use anyhow::{Result, bail};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Make one HTML page of a data set or a file of demonstrations, to be read in any browser without a network.
+/// Make one HTML page of a data set or a file of demonstrations, which needs no network.
 ///
 /// The page has a summary, the features with their ranges, problems, histograms of lengths and actions, and every episode with
 /// its length, return and success. An episode that is opened shows images of its cameras and the curves of its actions and

@@ -159,7 +159,8 @@ impl Page {
         html.push_str("</tr></thead><tbody>\n");
         for feature in &head.features {
             let [name, kind, shape, range] = feature;
-            let range = match self.columns.iter().position(|column| column.name == *name).and_then(|at| self.ranges[at]) {
+            let range = match self.columns.iter().position(|column| column.name == *name).and_then(|at| self.ranges[at])
+            {
                 Some((low, high)) if range.is_empty() => {
                     format!("{} to {}", cli::number(f64::from(low)), cli::number(f64::from(high)))
                 }
@@ -284,7 +285,9 @@ mod tests {
     fn a_page_holds_its_episodes_and_nothing_from_elsewhere() {
         let html = page(100, 1 << 20);
         assert!(html.contains("<td>action</td><td>float32</td><td>2</td><td>0 to 19</td>"), "{html}");
-        assert!(html.contains("<td>other</td><td>float32</td><td>2</td><td></td>") && html.contains("\"range\":[0.0,19.0]"));
+        assert!(
+            html.contains("<td>other</td><td>float32</td><td>2</td><td></td>") && html.contains("\"range\":[0.0,19.0]")
+        );
         assert!(html.contains("<title>a &amp; b</title>") && html.contains("No problems found."));
         assert!(html.contains("0 · demo_0 <small>10 steps · return 1.5 · success · &lt;lift&gt;</small>"), "{html}");
         let floats: Vec<u8> = (0..6).flat_map(|i| (i as f32).to_le_bytes()).collect();

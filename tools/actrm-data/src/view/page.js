@@ -64,7 +64,7 @@
     const length = +episode.dataset.length;
     episode.querySelector(".wait").remove();
     pictures.forEach((files, camera) => {
-      episode.append(made("h4", {}, cameras[camera]));
+      episode.append(made("h3", {}, cameras[camera]));
       const row = made("div", { class: "frames", tabindex: 0, role: "region", "aria-label": cameras[camera] });
       files.forEach((file, i) => {
         const figure = made("figure");

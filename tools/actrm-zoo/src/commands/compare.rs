@@ -373,7 +373,7 @@ fn until_decided(args: &Args, sides: &[Vec<EntryId>; 2]) -> anyhow::Result<ExitC
         }
         if subject.time_decides {
             bail!(
-                "entry {}: it thinks by the clock, so that its episodes may end otherwise: nothing to compare",
+                "entry {}: it has a time budget, so its episodes may end differently and cannot be compared",
                 subject.entry
             );
         }

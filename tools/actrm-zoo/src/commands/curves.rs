@@ -56,6 +56,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Some(Curve { entry: entry.id().to_string(), points })
         };
         let curves: Vec<Curve> = entries.iter().filter_map(curve).collect();
+        cli::make_parent(path)?;
         write_atomic(path, curves_svg(&curves).as_bytes())?;
         cli::print(&(shown(path) + "\n"))?;
         return Ok(ExitCode::SUCCESS);

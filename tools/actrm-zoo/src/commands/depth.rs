@@ -74,7 +74,7 @@ pub struct Args {
     #[arg(long, value_name = "HOW", value_parser = intervention)]
     intervene: Option<Intervention>,
     /// Episodes for each number of steps
-    #[arg(long, short = 'n', value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    #[arg(long, short = 'n', value_name = "N", default_value_t = 50, value_parser = limits::episodes)]
     episodes: u64,
     /// Seed of the first episode; the seeds after it count up
     #[arg(long = "seed-start", value_name = "SEED", default_value_t = 30_000)]

@@ -76,7 +76,7 @@ pub struct Args {
     #[command(flatten, next_help_heading = EPISODES)]
     protocols: ProtocolArgs,
     /// Episodes per entry [default: 20]
-    #[arg(long, short = 'n', help_heading = EPISODES, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    #[arg(long, short = 'n', help_heading = EPISODES, value_name = "N", value_parser = limits::episodes)]
     episodes: Option<u64>,
     /// Seed of the first episode, or of the puzzles of a solver; the seeds after it count up [default: 10000]
     #[arg(long = "seed-start", help_heading = EPISODES, alias = "seed", value_name = "SEED")]
@@ -424,7 +424,10 @@ fn again(
     says: &mut Says,
 ) -> anyhow::Result<bool> {
     if subject.time_decides {
-        bail!("entry {}: it thinks by the clock, so its episodes may end otherwise: nothing to compare", subject.entry);
+        bail!(
+            "entry {}: it has a time budget, so its episodes may end differently and cannot be compared",
+            subject.entry
+        );
     }
     let id = subject.entry.to_string();
     let mut screen = Screen::new();

@@ -59,12 +59,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (entry, folder) = match &args.to {
         To::Lerobot(args) => {
             let entry = args.zoo.registry().entry(&args.entry)?;
+            cli::make_parent(&args.folder)?;
             export(&entry, &args.folder)?;
             (entry, &args.folder)
         }
         To::Hub(args) => {
             let entry = args.zoo.registry().entry(&args.entry)?;
             let results = model_index_of(&entry, &args.zoo, &args.results, &args.protocols)?;
+            cli::make_parent(&args.folder)?;
             export_hub(&entry, &args.folder, &results)?;
             (entry, &args.folder)
         }

@@ -123,6 +123,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         files.push((out.join("leaderboard_puzzles.csv"), csv::table(PUZZLE_COLUMNS, &puzzles).into_bytes()));
     }
     if let Some(file) = &args.markdown {
+        cli::make_parent(file)?;
         files.push((file.clone(), markdown::table(COLUMNS, &rows).into_bytes()));
     }
     // all of them or none: a table beside a report of other results would be worse than an old pair

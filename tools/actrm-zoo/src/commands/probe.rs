@@ -32,7 +32,7 @@ pub struct Args {
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u64).range(1..=1000))]
     renamings: u64,
     /// New episodes to test on
-    #[arg(long, short = 'n', value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    #[arg(long, short = 'n', value_name = "N", default_value_t = 400, value_parser = limits::episodes)]
     episodes: u64,
     /// Seed of the first new episode; the seeds after it count up
     #[arg(long = "seed-start", value_name = "SEED", default_value_t = 30_000)]

@@ -21,7 +21,7 @@ const RERUNS: &str = "runs/rerun";
 /// Demonstrations that were collected again, in the folder of the work.
 const DEMONSTRATIONS: &str = "demonstrations.hdf5";
 
-/// Reproduce a row of the leaderboard from its demonstrations to its last episode, and report the first step that differs
+/// Reproduce a leaderboard row from its demonstrations and report the first step that differs
 ///
 /// The command checks entry and result and finds the demonstrations by their fingerprint, or collects those of a scripted expert
 /// again. It trains as the entry's experiment says and runs the row's episodes. Each step is compared with what is stored:
@@ -60,7 +60,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR")]
     work: Option<PathBuf>,
     /// Run only the first N episodes of the row
-    #[arg(long, short = 'n', value_name = "N", value_parser = clap::value_parser!(u64).range(1..=limits::MOST_EPISODES))]
+    #[arg(long, short = 'n', value_name = "N", value_parser = limits::episodes)]
     episodes: Option<u64>,
     /// Do not train; run the episodes with the stored weights
     #[arg(long, conflicts_with_all = ["data", "image_memory"])]
@@ -179,7 +179,7 @@ fn collected(args: &Args, rerun: &Rerun, stop: &Stop) -> anyhow::Result<Collecti
     let episodes = data.train_episodes + data.valid_episodes;
     std::fs::create_dir_all(rerun.work()).with_context(|| format!("cannot create {}", shown(rerun.work())))?;
     let environment = Environment::of(meta, None, None)?;
-    cli::note(&format!("demonstrations: {episodes} of {}'s expert again, seed {seed}", environment.task));
+    cli::note(&format!("collecting {episodes} demonstrations of {}'s expert, seed {seed}", environment.task));
     let skill = data.skill.as_deref().map_or(Ok(Skill::Good), str::parse::<Skill>).map_err(anyhow::Error::msg)?;
     let options = CollectOptions {
         out: out.clone(),
@@ -237,7 +237,7 @@ fn tell(args: &Args, folder: &Path, rerun: Option<&Rerun>, report: &Report) -> a
     }
     let mut text = table.text(false);
     if !reasons.is_empty() {
-        let word = if report.is_same() { "the same in spite of" } else { "possible reasons" };
+        let word = if report.is_same() { "the same although these differ" } else { "possible reasons" };
         text.push_str(&format!("\n{word}:\n"));
         for reason in reasons {
             let recorded = reason.recorded.as_deref().unwrap_or("not recorded");
@@ -246,9 +246,9 @@ fn tell(args: &Args, folder: &Path, rerun: Option<&Rerun>, report: &Report) -> a
     }
     let name = cli::lossy(Path::new(folder.file_name().unwrap_or_default()));
     let told = match (report.is_same(), report.first_difference()) {
-        (true, _) => "all that was asked for is the same".to_owned(),
+        (true, _) => "every requested step is the same".to_owned(),
         (false, Some(step)) => format!("the first step that differs: {}", step.step),
-        (false, None) => "not all that was asked for could be compared".to_owned(),
+        (false, None) => "not every requested step could be compared".to_owned(),
     };
     cli::print(&format!("{text}\n{name}: {told}\n"))
 }

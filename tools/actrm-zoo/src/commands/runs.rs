@@ -60,7 +60,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut text = table.text(false);
     let commands: Vec<String> = runs.iter().filter_map(command).collect();
     if !commands.is_empty() {
-        text.push_str("\ngo on with:\n");
+        text.push_str("\nresume with:\n");
         text.extend(commands.iter().map(|command| format!("  {command}\n")));
     }
     cli::print(&text)?;

@@ -55,7 +55,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if entry.meta().signature.of_kind(FeatureKind::Image).next().is_none() {
         let names: Vec<&str> = entry.meta().signature.observation.iter().map(|spec| spec.name.as_str()).collect();
         let seen = if names.is_empty() { "no observation".to_owned() } else { names.join(", ") };
-        bail!("entry {id}: it sees no pictures; it sees {seen}");
+        bail!("entry {id} is not an image policy; its inputs are {seen}");
     }
     let loaded = entry.load()?;
     let subject = loaded.subject();
@@ -74,6 +74,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::from(INTERRUPTED));
     };
     let file = looked.strip().to_png().with_context(|| format!("{}: cannot draw it", shown(&args.out)))?;
+    cli::make_parent(&args.out)?;
     write_atomic(&args.out, &file)?;
     match args.json {
         true => cli::print_json(&looked)?,

@@ -112,6 +112,7 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
         traced.write_parquet(path)?;
     }
     if let (Some(path), Some(svg)) = (&args.svg, traced.way_svg().or_else(|| traced.attention_svg())) {
+        cli::make_parent(path)?;
         write_atomic(path, svg.as_bytes())?;
         cli::note(&shown(path));
     }
@@ -142,6 +143,7 @@ fn trace_solver(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     let trace = trace(&solver, task, givens, args.index.unwrap_or(0), depth)?;
     match &args.svg {
         Some(path) => {
+            cli::make_parent(path)?;
             write_atomic(path, trace.to_svg().as_bytes())?;
             cli::print(&(shown(path) + "\n"))?;
         }

@@ -119,6 +119,18 @@ impl Args {
     }
 }
 
+/// The error of a value, with Rust's names of numbers in words.
+fn in_words(error: ZooError) -> ZooError {
+    match error {
+        ZooError::InvalidValue { key, expected, found }
+            if ["u64", "u32", "u16", "u8", "usize"].contains(&&*expected) =>
+        {
+            ZooError::InvalidValue { key, expected: "a positive integer".to_owned(), found }
+        }
+        other => other,
+    }
+}
+
 /// What to do about a change of the policy's type, which leaves the other settings of another policy behind.
 fn other_policy(args: &Args, library: &Library) -> Option<String> {
     let policy = args.overrides.iter().find_map(|set| set.strip_prefix("policy.type="))?.replace('-', "_");
@@ -135,11 +147,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (experiment, overrides) = library.choose(&words)?;
     let args = &Args { experiment, overrides, ..args.clone() };
     let load = |overrides: &[String]| {
-        AnyExperiment::load(&library, &args.experiment, overrides)
-            .with_context(|| match other_policy(args, &library) {
+        AnyExperiment::load(&library, &args.experiment, overrides).map_err(in_words).with_context(
+            || match other_policy(args, &library) {
                 Some(hint) => format!("experiment `{}`: {hint}", args.experiment),
                 None => format!("experiment `{}`", args.experiment),
-            })
+            },
+        )
     };
     let experiment = load(&args.overrides)?;
     if args.print_config {
@@ -244,7 +257,7 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
             Ok(ExitCode::SUCCESS)
         }
         TrainOutcome::Stopped { step, run } => {
-            cli::note(&format!("stopped after step {step}; go on with: {}", going_on(args, &run, one.seeded)));
+            cli::note(&format!("stopped after step {step}; resume with: {}", going_on(args, &run, one.seeded)));
             Ok(ExitCode::from(INTERRUPTED))
         }
     }
