@@ -10,7 +10,8 @@ const CELL: usize = 30;
 
 /// The help of a command and of all below it, each after a line with its name.
 fn help(program: &str, path: &[&str], text: &mut String) {
-    let mut command = if program == "actrm-zoo" { zoo(path) } else { data(path) };
+    let mut command = if program == "actrm-zoo" { zoo([]) } else { data([]) };
+    command.args(path);
     for variable in ["ACTRM_ZOO_DIR", "ACTRM_CONFIGS", "ACTRM_PROTOCOLS", "ACTRM_PYTHON"] {
         command.env_remove(variable);
     }
@@ -88,10 +89,18 @@ fn sentences_are_short() {
         let wide: Vec<&String> = cells.iter().filter(|cell| cell.split_whitespace().count() > CELL).collect();
         assert!(wide.is_empty(), "{page}: {wide:#?}");
     }
-    let mut paragraphs = Vec::new();
-    for block in all_help().split("\n\n") {
-        if !block.starts_with("Examples:") && !block.starts_with("Usage:") {
-            paragraphs.push(block.to_owned());
+    let mut paragraphs = vec![String::new()];
+    for block in all_help().split("\n\n").filter(|block| !block.starts_with("Examples:")) {
+        paragraphs.push(String::new());
+        for line in block.lines() {
+            // a command or an option with its own text
+            let named = line.strip_prefix("  ").is_some_and(|rest| !rest.starts_with(' '));
+            if named || line.trim_start().starts_with('-') {
+                paragraphs.push(String::new());
+            }
+            if let Some(last) = paragraphs.last_mut() {
+                last.push_str(&format!(" {line}"));
+            }
         }
     }
     assert_eq!(long(&paragraphs, SENTENCE), [""; 0], "help");
