@@ -20,13 +20,16 @@ page=$work/rollouts.html
 echo '<body style="margin:0;font:600 13px system-ui;display:grid;grid-template-columns:repeat(5,160px)">' >"$page"
 for entry in stack-act door-act-s1 stackcolor-actrm-s1 nutassemblysquare-actrm-s1; do
     cp -r "zoo/$entry" "$work/zoo/"
-    target/release/actrm-zoo eval "$entry" --episodes 1 --seed-start 40000 --video 1 --video-size 160 --zoo "$work/zoo" >/dev/null
+    target/release/actrm-zoo eval "$entry" --episodes 1 --seed-start 40000 --video 1 --video-size 160 -j 1 --zoo "$work/zoo" >/dev/null
     film=$(ls "$work"/zoo/videos/"$entry"@*/*.mp4)
     for moment in 0.02 0.25 0.5 0.75 0.98; do
         echo "<video muted width=160 height=160 data-at=$moment src=\"data:video/mp4;base64,$(base64 -w0 "$film")\"></video>" >>"$page"
     done
 done
-echo '<script>document.querySelectorAll("video").forEach((v) => { v.onloadedmetadata = () => { v.currentTime = v.dataset.at * v.duration; }; })</script>' >>"$page"
+echo '<script>document.querySelectorAll("video").forEach((v) => {
+  const seek = () => { v.currentTime = v.dataset.at * v.duration; };
+  if (v.readyState > 0) seek(); else v.onloadedmetadata = seek;
+});</script>' >>"$page"
 shot "$page" 800 640 docs/pictures/rollouts.png
 
 target/release/actrm-zoo leaderboard --out "$work/report" >/dev/null

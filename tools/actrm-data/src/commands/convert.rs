@@ -11,10 +11,10 @@ use std::time::Instant;
 ///
 /// Columns: observation.state, observation.environment_state, observation.entity.<name>, observation.images.<camera>, action, next.reward,
 /// next.done, next.success, mistake (of a demo that marks its mistakes), and the five index columns. What the format has no place for is kept in the side folder
-/// `actrm/`, from which `actrm-data export` rebuilds the source; so are grey and RGBA pictures, which LeRobot does not
+/// `actrm/`, from which `actrm-data export` rebuilds the source. So are grey and RGBA images, which LeRobot does not
 /// record, and a note says so. Recorded JPEG files (newer ALOHA) stay the files they are. Depth (obs/<camera>_depth: float
 /// metres or uint16 millimetres, height x width x 1) becomes observation.images.<camera>_depth, a TIFF file a frame, as
-/// LeRobot records it; no file says its unit, and robosuite's own camera_depths, before robomimic makes metres of them,
+/// LeRobot records it. No file says its unit, and robosuite's own camera_depths, before robomimic makes metres of them,
 /// go from 0 to 1. OUT appears whole or not at all.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:

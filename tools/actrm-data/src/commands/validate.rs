@@ -7,8 +7,9 @@ use std::process::ExitCode;
 /// Make every check of a data set or of a file of demonstrations.
 ///
 /// A data set: hashes of its files, agreement of columns, episodes, tasks, totals and timestamps with its frames, finite
-/// numbers, statistics, splits, pictures, and the fingerprint of its content; with --source also whether the file that it was converted from is still
-/// the same, down to the last bit. `actrm-data edit repair` corrects what follows from the frames. A file: its structure, and every value of every demo. The exit code is 1 when
+/// numbers, statistics, splits, images, and the fingerprint of its content. With --source also whether the file that it was
+/// converted from is still the same, down to the last bit. `actrm-data edit repair` corrects what follows from the frames. A
+/// file: its structure, and every value of every demo. The exit code is 1 when
 /// anything is wrong.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
