@@ -4,6 +4,6 @@ use std::sync::LazyLock;
 
 use candle_core::Device;
 
-/// The device of parameters, batches and all that is composed of them. Another one is named here alone; steps written by
+/// The device of parameters, batches and all that is composed of them. Steps written by
 /// hand read the processor's memory, and say so where they do not find it.
 pub(crate) static HERE: LazyLock<Device> = LazyLock::new(|| Device::Cpu);

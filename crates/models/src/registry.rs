@@ -1,4 +1,4 @@
-//! The policy models by name. This is the only place where their names stand: another model is a row of the table.
+//! The policy models by name. A new model is a row of this table and a folder of `models`.
 
 use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};

@@ -1,7 +1,5 @@
 use anyhow::{Result, anyhow};
-use dataset::{
-    ActionKind, ConvertOptions, DatasetError, ImageForm, InputError, NonFinite, RotationForm, VideoOptions,
-};
+use dataset::{ActionKind, ConvertOptions, DatasetError, ImageForm, InputError, NonFinite, RotationForm, VideoOptions};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -159,7 +159,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         cli::print(&experiment.to_toml())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let asked = Stop::install("stopped without a new checkpoint; --resume continues from the last one, if there is one")?;
+    let asked =
+        Stop::install("stopped without a new checkpoint; --resume continues from the last one, if there is one")?;
     let Some(TrainingSeeds(seeds)) = &args.seeds else {
         let one = One { run: args.run.clone(), resume: args.resume, seeded: false, own: Vec::new() };
         return train_one(args, experiment, &one, &asked);
@@ -225,8 +226,7 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
             let data = args.data.clone();
             let (image_memory, force) = (args.image_memory, args.force);
             let experiment = *experiment;
-            let request =
-                TrainRequest { name, experiment, data, runs, run, resume, zoo, force, image_memory, command };
+            let request = TrainRequest { name, experiment, data, runs, run, resume, zoo, force, image_memory, command };
             train(&request, &stop, &mut on_event)
         }
         AnyExperiment::Puzzle(experiment) => {
