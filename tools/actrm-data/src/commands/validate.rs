@@ -51,8 +51,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     };
     let problems = checks.iter().filter(|c| c.problem.is_some()).count();
     if args.json {
-        let list: Vec<_> =
-            checks.iter().map(|c| json!({"check": c.name, "ok": c.problem.is_none(), "problem": c.problem, "notes": c.notes})).collect();
+        let list: Vec<_> = checks
+            .iter()
+            .map(|c| json!({"check": c.name, "ok": c.problem.is_none(), "problem": c.problem, "notes": c.notes}))
+            .collect();
         cli::print_json(&json!({"path": cli::lossy(&args.path), "ok": problems == 0, "checks": list, "notes": notes}))?;
     } else {
         let mut text = String::new();
