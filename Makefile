@@ -85,7 +85,7 @@ study-thinking: build ## does thinking help: the studies of robot policies, as f
 test: wheel ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace
 	@if [ -n "$(BROWSER)$${CI:-}" ]; then \
-	    $(CARGO) test $(CARGO_FLAGS) -p report -p e2e --test many_rows --test page -- --ignored; \
+	    $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test page -- --ignored; \
 	  else echo "not run: the tests of the pages in a browser (no Chromium on the PATH; ACTRM_CHROMIUM names one)"; fi
 	@.venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests
 	@tools/test_wheel.sh
