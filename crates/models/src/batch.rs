@@ -1,9 +1,9 @@
 //! A batch of training windows in network units.
 
-use crate::device::HERE;
-use crate::error::{ModelError, Result};
 use crate::features::{Features, Signature, Values, ValuesRef};
 use candle_core::{Device, Tensor};
+use nn::device::HERE;
+use nn::{ModelError, Result};
 
 /// Windows as tensors.
 #[derive(Debug, Clone)]

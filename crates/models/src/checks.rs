@@ -1,9 +1,9 @@
 //! Checks of what comes into a model, each naming what does not fit.
 
 use crate::batch::Batch;
-use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
 use candle_core::{DType, Tensor};
+use nn::{ModelError, Result};
 
 pub(crate) fn check_shape(
     operation: &'static str,

@@ -1,13 +1,13 @@
 //! The policy of a model whose prediction depends on what it is shown, and perhaps on chance: nothing else is carried from
 //! query to query.
 
-use crate::error::Result;
 use crate::features::Observation;
 use crate::history::History;
 use crate::model::PolicyModel;
 use crate::policy::{ActionChunk, Clock, Policy};
 use crate::preprocess::Preprocess;
-use crate::rng::Rng;
+use nn::Result;
+use nn::Rng;
 use std::sync::Arc;
 
 /// A model's policy in one environment, in raw units.
@@ -84,12 +84,12 @@ mod tests {
     use super::*;
     use crate::batch::Batch;
     use crate::features::{Features, Signature};
-    use crate::model::LossParts;
     use crate::models::act::{self, Act};
     use crate::normaliser::{ACTION, NormMode, Normaliser, STATE};
-    use crate::params::Params;
     use crate::policy::{Actor, RecedingHorizon};
     use candle_core::{Device, Tensor};
+    use nn::LossParts;
+    use nn::Params;
     use std::collections::BTreeMap;
 
     fn preprocess(n_obs_steps: usize) -> Arc<Preprocess> {

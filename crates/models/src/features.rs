@@ -4,8 +4,8 @@
 //! signature's order. Names are LeRobot's (`observation.state`, `observation.environment_state`,
 //! `observation.images.<camera>`); entities, which LeRobot does not have, are `observation.entity.<name>`.
 
-use crate::error::{ModelError, Result, some_names};
 use crate::normaliser::{ENVIRONMENT_STATE, STATE};
+use nn::{ModelError, Result, some_names};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 

@@ -1,9 +1,9 @@
 //! The observations that a policy still remembers.
 
-use crate::error::Result;
 use crate::features::{Features, Observation};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
+use nn::Result;
 
 /// The last observations of an episode, as many as the signature's `n_obs_steps` say.
 #[derive(Debug, Clone)]

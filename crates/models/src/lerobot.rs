@@ -2,13 +2,13 @@
 //! place that knows them; files are read and written in `zoo`.
 
 use crate::encoders::{Architecture, ImageEncoder, ImageNorm, PICTURE_MEAN, PICTURE_STD, TokenKind, VisionConfig};
-use crate::error::{ModelError, Result, some_names};
 use crate::features::{FeatureKind, FeatureSpec, Signature};
 use crate::layers::{AUXILIARY_HEAD, Activation, sinusoid_table};
 use crate::models::act::Config;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
-use crate::params::Params;
 use candle_core::{DType, Tensor};
+use nn::Params;
+use nn::{ModelError, Result, some_names};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use serde_json::{Map, Value, json};

@@ -2,60 +2,12 @@
 
 use crate::batch::Batch;
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
 use crate::features::{Features, Signature};
-use crate::gradients::Gradients;
-use crate::params::Params;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
-use crate::rng::Rng;
 use candle_core::Tensor;
-use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use nn::{Cache, Context, Gradients, Loss, LossParts, LossValues, ModelError, Params, Result, Rng};
 use std::sync::Arc;
-
-/// A loss and the parts it is made of, each averaged over the whole batch.
-#[derive(Debug, Clone)]
-pub struct LossParts {
-    /// scalar, differentiable
-    pub total: Tensor,
-    /// scalars for the metrics, for example `l1_loss`
-    pub parts: BTreeMap<String, Tensor>,
-}
-
-/// A loss as numbers.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct LossValues {
-    /// what is minimised
-    pub total: f32,
-    /// the parts
-    pub parts: BTreeMap<String, f32>,
-}
-
-impl LossValues {
-    /// Reads the scalars.
-    pub fn from_parts(parts: &LossParts) -> Result<Self> {
-        let mut values = BTreeMap::new();
-        for (name, tensor) in &parts.parts {
-            values.insert(name.clone(), tensor.to_scalar::<f32>()?);
-        }
-        Ok(Self { total: parts.total.to_scalar::<f32>()?, parts: values })
-    }
-
-    /// Adds another shard's.
-    pub fn add(&mut self, other: &Self) {
-        self.total += other.total;
-        for (name, value) in &other.parts {
-            *self.parts.entry(name.clone()).or_default() += value;
-        }
-    }
-
-    /// Divides by `n`.
-    pub fn scale(&mut self, factor: f32) {
-        self.total *= factor;
-        self.parts.values_mut().for_each(|v| *v *= factor);
-    }
-}
 
 /// A model that maps observations to action chunks and can be trained on windows.
 pub trait PolicyModel: Send + Sync {
@@ -68,16 +20,40 @@ pub trait PolicyModel: Send + Sync {
     /// Why its training step runs on candle's autograd; `None` where a step by hand covers it.
     fn composed_because(&self) -> Option<String>;
 
-    /// Training forward pass. Sums over the rows of `batch` are divided by `batch.total_rows` or
-    /// `batch.total_valid_steps`, so that the losses of shards add up.
-    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts>;
+    /// Buffers of its passes and weights prepared for predictions, of a model that states its loss as [`Self::forward_loss`].
+    fn cache(&self) -> Option<&Cache> {
+        None
+    }
 
-    /// Loss, and its gradient added to `into`. The default runs candle's backward pass over `loss`.
+    /// Training forward pass. Sums over the rows of `batch` are divided by `batch.total_rows` or `batch.total_valid_steps`, so
+    /// that the losses of shards add up.
+    ///
+    /// # Errors
+    /// A batch that does not fit.
+    fn forward_loss(&self, _cx: &mut Context<'_>, _batch: &Batch) -> Result<Loss> {
+        let (found, expected) = ("none".to_string(), "one on the operations of `nn`".to_string());
+        Err(ModelError::Input { operation: "train", object: "loss", found, expected })
+    }
+
+    /// The loss on candle's operations, with their graph.
+    ///
+    /// # Errors
+    /// As [`Self::forward_loss`].
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
+        let cache = Cache::default();
+        let cache = self.cache().unwrap_or(&cache);
+        cache.composed_loss(self.params(), Some(rng), |cx| self.forward_loss(cx, batch))
+    }
+
+    /// Loss, and its gradient added to `into`.
     ///
     /// # Errors
     /// `NoGradient` if the loss does not reach a parameter.
     fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
-        autograd(self, batch, rng, into)
+        match self.cache() {
+            Some(cache) => cache.step(self.params(), Some(rng), into, |cx| self.forward_loss(cx, batch)),
+            None => autograd(self, batch, rng, into),
+        }
     }
 
     /// The signature's features, (b, …) each -> (b, action_horizon, A), all in network units

@@ -1,8 +1,8 @@
 //! Raw units to network units and back, per feature, with LeRobot's formulas and names.
 
-use crate::device::HERE;
-use crate::error::{ModelError, Result, some_names};
 use candle_core::{DType, Tensor};
+use nn::device::HERE;
+use nn::{ModelError, Result, some_names};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 

@@ -5,11 +5,11 @@
 //! travelled. A picture in the colours of other features is painted in them here.
 
 use crate::batch::{Batch, tensor};
-use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, FeatureSpec, Features, Observation, Signature, Values, ValuesRef};
 use crate::normaliser::{ACTION, Normaliser};
 use crate::policy::ActionChunk;
 use candle_core::Tensor;
+use nn::{ModelError, Result};
 
 /// A signature and the statistics of its features and of the actions.
 #[derive(Debug, Clone, PartialEq)]

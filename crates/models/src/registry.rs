@@ -1,12 +1,12 @@
 //! The policy models by name. A new model is a row of this table and a folder of `models`.
 
-use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
 use crate::layers::{AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::model::PolicyModel;
 use crate::models::floors::{expert, nearest, random, replay, zero};
 use crate::models::{act, actrm, bc, bc_rnn, bc_transformer, diffusion, flow, mip};
-use crate::size::Size;
+use nn::Size;
+use nn::{ModelError, Result};
 use serde::de::{DeserializeSeed, Deserializer};
 use serde::{Deserialize, Serialize};
 

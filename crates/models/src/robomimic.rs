@@ -4,13 +4,13 @@
 //! What stands in a checkpoint and what ours cannot hold is an error with its name; robomimic's options of training (its
 //! optimiser, its losses, its data loader) do not matter to a policy at rest.
 
-use crate::error::{ModelError, Result, some_names};
 use crate::features::Signature;
 use crate::layers::Cell;
 use crate::models::{bc_rnn, bc_transformer};
 use crate::normaliser::{ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::registry::PolicyConfig;
 use candle_core::{Device, Tensor};
+use nn::{ModelError, Result, some_names};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;

@@ -6,7 +6,6 @@ mod common;
 
 use candle_core::{DType, Device, Tensor};
 use models::act::{Act, Config};
-use models::layers::Mode;
 use models::{Batch, Features, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -90,13 +89,15 @@ fn the_training_forward_pass_and_the_loss_are_lerobots() {
             true => f.get("eps"),
             false => Tensor::zeros(shape, DType::F32, &Device::Cpu).unwrap(),
         };
-        let output = f.act.train_forward(&batch, &eps, &mut Mode::Eval).unwrap();
-        f.same("training output", &output.actions, &f.get("out_train"));
-        if let Some((mu, log_variance)) = &output.latent {
-            f.same("mu", mu, &f.get("mu"));
-            f.same("logvar", log_variance, &f.get("logvar"));
+        let (actions, latent) = f.act.training_output(&batch, &eps).unwrap();
+        f.same("training output", &actions, &f.get("out_train"));
+        if let Some(latent) = &latent {
+            let width = latent.dim(1).unwrap() / 2;
+            for (part, name) in ["mu", "logvar"].into_iter().enumerate() {
+                f.same(name, &latent.narrow(1, part * width, width).unwrap(), &f.get(name));
+            }
         }
-        let loss = f.act.loss_of(&output, &batch).unwrap();
+        let loss = f.act.composed_loss_with(&batch, &eps).unwrap();
         // a loss of some tens has fewer digits behind the point
         let expected = f.get("loss").to_scalar::<f32>().unwrap();
         let got = loss.total.to_scalar::<f32>().unwrap();
@@ -124,7 +125,7 @@ fn the_training_forward_pass_and_the_loss_are_lerobots() {
             let at = batch.rows() / 2;
             for (from, shard) in [0, at].into_iter().zip(batch.shards(2).unwrap()) {
                 let eps = eps.narrow(0, from, shard.rows()).unwrap().contiguous().unwrap();
-                values.add(&f.act.fused_gradients(&shard, &eps, None, &mut sum).unwrap());
+                values.add(&f.act.gradients_with(&shard, &eps, None, &mut sum).unwrap());
             }
             assert!((values.total - got).abs() <= TOLERANCE * got.abs().max(1.0), "{}: {values:?} {got}", f.name);
             for (name, _) in f.act.params().iter() {

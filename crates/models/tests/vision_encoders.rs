@@ -9,6 +9,7 @@ use common::npz::{self, Array};
 use common::recipe::{self, assert_probes};
 use models::encoders::{ImageNorm, ResNet, ResNetShape, SpatialSoftmax, position_table};
 use models::{Params, Rng};
+use nn::{Value, compose};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -55,7 +56,12 @@ fn a_narrow_resnet_with_group_norm_is_torchs() {
     let shape = ResNetShape { blocks: [2, 2, 2, 2], width: 16, norm: ImageNorm::Group };
     let net = ResNet::new(&mut params, "", &shape, &mut Rng::new(0, "init")).unwrap();
     fill(&params);
-    check("encoder_resnet18_w16_group_norm", &params, |x| net.forward(x).unwrap());
+    // torch's order is channels before rows
+    check("encoder_resnet18_w16_group_norm", &params, |x| {
+        let x = x.permute((0, 2, 3, 1)).unwrap().contiguous().unwrap();
+        let map = compose(&Device::Cpu, |cx| net.forward(cx, &Value::with_graph(&x))).unwrap().into_graph();
+        map.permute((0, 3, 1, 2)).unwrap().contiguous().unwrap()
+    });
 }
 
 #[test]
@@ -81,7 +87,9 @@ fn keypoints_are_robomimics() {
             let y = x.conv2d(weight, 1, *stride, 1, 1).unwrap();
             x = y.broadcast_add(&bias.reshape((1, 32, 1, 1)).unwrap()).unwrap().relu().unwrap();
         }
-        softmax.forward(&x).unwrap().matmul(&weight.t().unwrap()).unwrap().broadcast_add(&bias).unwrap()
+        let x = x.permute((0, 2, 3, 1)).unwrap().contiguous().unwrap();
+        let found = compose(&Device::Cpu, |cx| softmax.forward(cx, &Value::with_graph(&x))).unwrap().into_graph();
+        found.matmul(&weight.t().unwrap()).unwrap().broadcast_add(&bias).unwrap()
     });
 }
 

@@ -9,7 +9,6 @@ use candle_core::{DType, Device, Tensor};
 use common::npz::{self, Array};
 use common::recipe::{self, assert_probes};
 use models::act::Act;
-use models::layers::Mode;
 use models::lerobot::{self, LerobotAct};
 use models::{
     Batch, FeatureKind, Features, Gradients, LossValues, OptimiserConfig, ParamLayout, PolicyModel, Schedule,
@@ -153,9 +152,9 @@ fn inference_is_lerobots() {
 fn training_is_lerobots() {
     for f in folders().iter().map(|folder| read(folder)) {
         let (batch, eps) = (f.batch(), f.eps());
-        let output = f.act.train_forward(&batch, &eps, &mut Mode::Eval).unwrap();
-        close(&format!("{}: output", f.name), &values(&output.actions), &values(&f.io["out_train"]), TOLERANCE);
-        let loss = f.act.loss_of(&output, &batch).unwrap();
+        let (actions, _) = f.act.training_output(&batch, &eps).unwrap();
+        close(&format!("{}: output", f.name), &values(&actions), &values(&f.io["out_train"]), TOLERANCE);
+        let loss = f.act.composed_loss_with(&batch, &eps).unwrap();
         let want = values(&f.io["loss"])[0];
         let got = loss.total.to_scalar::<f32>().unwrap();
         assert!((got - want).abs() <= TOLERANCE * want.abs().max(1.0), "{}: loss {got} {want}", f.name);
@@ -168,7 +167,7 @@ fn training_is_lerobots() {
         let at = batch.rows() / 2;
         for (from, shard) in [0, at].into_iter().zip(batch.shards(2).unwrap()) {
             let eps = eps.narrow(0, from, shard.rows()).unwrap().contiguous().unwrap();
-            total.add(&f.act.fused_gradients(&shard, &eps, None, &mut sum).unwrap());
+            total.add(&f.act.gradients_with(&shard, &eps, None, &mut sum).unwrap());
         }
         assert!((total.total - want).abs() <= TOLERANCE * want.abs().max(1.0), "{}: {total:?} {want}", f.name);
         f.check_gradients("by hand", |name| sum.get(name).unwrap().to_vec());
@@ -197,7 +196,7 @@ fn three_steps_with_two_rates_are_lerobots() {
         let (batch, eps) = (f.batch(), f.eps());
         for step in 0..3 {
             let mut grads = Gradients::zeros(layout.clone());
-            let loss = f.act.fused_gradients(&batch, &eps, None, &mut grads).unwrap().total;
+            let loss = f.act.gradients_with(&batch, &eps, None, &mut grads).unwrap().total;
             let want = steps["losses"][step].as_f64().unwrap() as f32;
             assert!((loss - want).abs() < 1e-4 * want, "{}: step {step}: {loss} {want}", f.name);
             let norm = grads.values().iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();

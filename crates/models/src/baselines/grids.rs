@@ -5,11 +5,11 @@
 //! counts agree: CNN 74,850, Transformer 616,514, small TRM 9,922 and 28,258. Initial weights
 //! come from our own generator.
 
-use crate::error::{ModelError, Result};
 use crate::layers::{Activation, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention};
-use crate::params::{Init, Params};
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Rng;
+use nn::{Init, Params};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// A network that classifies the cells of a grid.

@@ -9,9 +9,9 @@ pub use grids::{GridDims, GridModel};
 pub use small_trm::{SmallTrm, SmallTrmConfig, Stem};
 pub use walkers::{ConvWalker, MlpWalker, TrmWalker, WalkerConfig, WalkerNet, WalkerOutput};
 
-use crate::error::Result;
-use crate::rng::Rng;
 use grids::{Cnn, Mlp, Transformer};
+use nn::Result;
+use nn::Rng;
 use serde::{Deserialize, Serialize};
 
 /// Which network from grids, and its sizes.

@@ -7,12 +7,12 @@
 //! first answer is the uniform one.
 
 use super::grids::{Conv3x3, GridDims, GridModel, channels_last};
-use crate::device::HERE;
-use crate::error::Result;
 use crate::layers::Linear;
-use crate::params::{Init, Params};
-use crate::rng::Rng;
 use candle_core::{D, DType, Tensor};
+use nn::Result;
+use nn::Rng;
+use nn::device::HERE;
+use nn::{Init, Params};
 use serde::{Deserialize, Serialize};
 
 /// What turns the grid into features per cell.

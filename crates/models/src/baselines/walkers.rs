@@ -6,12 +6,12 @@
 //! is ours and optional. [`ConvWalker`] is ours: a small TRM with 3x3 convolutions over the maze.
 
 use super::grids::dense;
-use crate::error::{ModelError, Result};
 use crate::layers::{LayerNorm, Linear};
 use crate::models::trm::{self, Fused};
-use crate::params::{Init, Params};
-use crate::rng::Rng;
 use candle_core::{D, Tensor};
+use nn::Rng;
+use nn::{Init, Params};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// What a policy network says about a batch of observations.

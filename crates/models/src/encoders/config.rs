@@ -1,7 +1,7 @@
 //! `[policy.vision]`: how pictures are seen.
 
-use super::ResNetShape;
-use crate::error::{ModelError, Result};
+use super::{ImageNorm, ResNetShape};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// Blocks of one layer; ResNet-152 has 36.
@@ -16,17 +16,6 @@ pub enum Architecture {
     Resnet18,
     /// 3, 4, 6, 3
     Resnet34,
-}
-
-/// What follows a convolution.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
-#[serde(rename_all = "snake_case")]
-pub enum ImageNorm {
-    /// GroupNorm: for networks that begin with random weights
-    #[default]
-    Group,
-    /// batch norm whose statistics stay as they came with the weights; normalises nothing without any
-    Frozen,
 }
 
 /// What pictures are normalised by, after division by 255.

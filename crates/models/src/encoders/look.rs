@@ -2,10 +2,10 @@
 
 use super::config::{Normalisation, VisionConfig};
 use super::{ImageEncoder, Size};
-use crate::device::HERE;
-use crate::error::{ModelError, Result};
-use crate::rng::Rng;
 use candle_core::{DType, Tensor};
+use nn::Rng;
+use nn::device::HERE;
+use nn::{ModelError, Result};
 
 /// ImageNet's mean and standard deviation of red, green and blue, of numbers from 0 to 1.
 const IMAGENET: ([f32; 3], [f32; 3]) = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]);
@@ -156,7 +156,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::encoders::{ImageEncoder, TokenKind};
-    use crate::params::Params;
+    use nn::Params;
 
     fn picture((h, w): Size) -> Vec<u8> {
         (0..h * w * 3).map(|i| (i * 7 % 251) as u8).collect()

@@ -8,23 +8,20 @@
 mod config;
 mod look;
 mod position;
-mod resnet;
-mod spatial_softmax;
 
-pub use config::{Architecture, ImageNorm, Normalisation, TokenKind, VisionConfig};
+pub use config::{Architecture, Normalisation, TokenKind, VisionConfig};
 pub use look::Look;
+pub use nn::layers::{ImageNorm, ResNet, ResNetShape, SpatialSoftmax};
 pub use position::position_table;
-pub(crate) use resnet::EPS;
-pub use resnet::{ResNet, ResNetShape};
-pub use spatial_softmax::SpatialSoftmax;
-pub(crate) use spatial_softmax::line;
 
-use crate::device::HERE;
-use crate::error::{ModelError, Result, some_names};
 use crate::layers::Linear;
-use crate::params::{Init, Params};
-use crate::rng::Rng;
 use candle_core::{DType, Tensor};
+use nn::Rng;
+use nn::device::HERE;
+use nn::ops::{cat_tokens, linear, narrow_tokens};
+use nn::{Context, Value, compose};
+use nn::{Init, Params};
+use nn::{ModelError, Result, some_names};
 use std::collections::BTreeMap;
 
 /// Prefix of the backbone's tensors, LeRobot's.
@@ -224,27 +221,58 @@ impl ImageEncoder {
         }
     }
 
-    /// pictures: one (b, H, W, 3) a camera, normalised -> (b, T, D)
+    /// pictures: one (b, H, W, 3) a camera, normalised -> (b, T, D), with candle's graph
     ///
     /// # Errors
     /// Another number of cameras or another size of picture.
     pub fn forward(&self, pictures: &[Tensor]) -> Result<Tensor> {
+        compose(&HERE, |cx| Ok(self.apply(cx, pictures)?.into_graph()))
+    }
+
+    /// pictures: one (b, H, W, 3) a camera, normalised -> (b, T, D). Cameras of one size go through the network as one batch.
+    ///
+    /// # Errors
+    /// Another number of cameras or another size of picture.
+    pub fn apply(&self, cx: &mut Context<'_>, pictures: &[Tensor]) -> Result<Value> {
         self.check(pictures)?;
-        let mut tokens = Vec::with_capacity(pictures.len());
-        for x in pictures {
-            // torch's order: channels before rows
-            let map = self.backbone.forward(&x.to_dtype(DType::F32)?.permute((0, 3, 1, 2))?.contiguous()?)?;
-            tokens.push(match &self.head {
+        let b = pictures[0].dim(0)?;
+        let mut tokens: Vec<Option<Value>> = vec![None; pictures.len()];
+        // backwards, so that gradients are added in the order of the cameras
+        for first in (0..pictures.len()).rev() {
+            let alike: Vec<usize> = (0..pictures.len()).filter(|&i| self.sizes[i] == self.sizes[first]).collect();
+            if alike[0] != first {
+                continue;
+            }
+            let of_size =
+                alike.iter().map(|&i| pictures[i].to_dtype(DType::F32)).collect::<candle_core::Result<Vec<_>>>()?;
+            let map = self.backbone.forward(cx, &Value::from(&Tensor::cat(&of_size, 0)?))?;
+            let all = match &self.head {
                 Head::Map { weight, bias, .. } => {
-                    let (b, c, h, w) = map.dims4()?;
-                    let rows = map.permute((0, 2, 3, 1))?.reshape((b * h * w, c))?;
-                    let dim = weight.dim(0)?;
-                    rows.matmul(&weight.reshape((dim, c))?.t()?)?.broadcast_add(bias)?.reshape((b, h * w, dim))?
+                    let &[n, h, w, c] = map.dims() else { unreachable!("a map has four dimensions") };
+                    let layer = Linear { weight: weight.clone(), bias: Some(bias.clone()) };
+                    linear(cx, &map.reshape((n, h * w, c))?, &layer)?
                 }
-                Head::Keypoints { softmax, project, .. } => project.forward(&softmax.forward(&map)?)?.unsqueeze(1)?,
-            });
+                Head::Keypoints { softmax, project, .. } => {
+                    let places = softmax.forward(cx, &map)?;
+                    let (n, width) = places.dims2()?;
+                    linear(cx, &places.reshape((n, 1, width))?, project)?
+                }
+            };
+            // one picture after the other, camera by camera: as one sequence its parts are the cameras'
+            let (n, t, dim) = all.dims3()?;
+            let all = all.reshape((1, n * t, dim))?;
+            for (at, &i) in alike.iter().enumerate() {
+                tokens[i] = Some(narrow_tokens(cx, &all, at * b * t, b * t)?.reshape((b, t, dim))?);
+            }
         }
-        Ok(Tensor::cat(&tokens, 1)?)
+        let tokens: Vec<&Value> = tokens.iter().flatten().collect();
+        cx.seen();
+        if let [one] = tokens[..] { Ok(one.clone()) } else { cat_tokens(cx, b, &tokens) }
+    }
+
+    /// Whether the positions are a parameter.
+    pub(crate) fn learns_positions(&self) -> bool {
+        matches!(self.head, Head::Keypoints { .. })
     }
 
     /// Checks number and sizes of the pictures.

@@ -1,8 +1,8 @@
 //! The attention branch: projections, positions, attention, output projection.
 
 use super::{Grads, Pass, Workspace, slot, sum_over_sequences, weight_gradient};
-use crate::kernels::{Heads, Mat, Start, attend, attend_backward, column_sums, product};
 use crate::layers::DropoutMask;
+use nn::kernels::{Heads, Mat, Start, attend, attend_backward, column_sums, product};
 
 /// What attention's backward pass needs.
 #[derive(Debug)]

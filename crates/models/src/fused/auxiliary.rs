@@ -1,8 +1,8 @@
 //! Numbers asked for in training alone: the maths of `layers/auxiliary.rs`, written out forwards and backwards.
 
 use super::{Grads, Pass};
-use crate::kernels::add;
 use crate::layers::{AUXILIARY_HEAD, Told};
+use nn::kernels::add;
 
 /// Asks for what a shard tells.
 ///

@@ -3,7 +3,7 @@
 
 use super::feed_forward::FeedForward;
 use super::{Grads, Pass, Residual, Rows, Workspace, slot, sum_over_sequences, weight_gradient};
-use crate::kernels::{Heads, Mat, Start, add, attend, attend_backward, column_sums, product};
+use nn::kernels::{Heads, Mat, Start, add, attend, attend_backward, column_sums, product};
 use std::ops::Range;
 
 /// What a layer's backward pass needs.

@@ -1,7 +1,7 @@
 //! Convolutions of a pass: weights in panels, gradients into their buffers.
 
 use super::{Grads, Pass, slot};
-use crate::kernels::{Conv, Frame, Winograd};
+use nn::kernels::{Conv, Frame, Winograd};
 
 /// A frame with its border of zeros.
 pub(crate) fn framed(pass: &mut Pass<'_>, frame: &Frame) -> Vec<f32> {

@@ -3,8 +3,8 @@
 use super::attention::{Attention, Side};
 use super::feed_forward::FeedForward;
 use super::{Entry, Grads, Norm, Pass, Residual, Rows, enter, enter_backward};
-use crate::kernels::{Heads, Start, add};
 use crate::layers::Shape;
+use nn::kernels::{Heads, Start, add};
 
 /// What an encoder layer's backward pass needs.
 #[derive(Debug)]

@@ -1,9 +1,9 @@
 //! The feed-forward branch.
 
 use super::{Grads, Pass, Rows};
-use crate::kernels::{Mat, Start, activate, activate_backward, gemm_with};
 use crate::layers::{Activation, DropoutMask, Shape};
-use crate::simd::vectorised;
+use nn::kernels::{Mat, Start, activate, activate_backward, gemm_with};
+use nn::simd::vectorised;
 
 /// What the feed-forward branch's backward pass needs.
 #[derive(Debug)]

@@ -2,8 +2,8 @@
 
 use super::feed_forward::FeedForward;
 use super::{Entry, Grads, Pass, Residual, Rows, enter, enter_backward};
-use crate::kernels::add;
 use crate::layers::{Grid, NEIGHBOURS};
+use nn::kernels::add;
 
 /// What the layer's backward pass needs.
 #[derive(Debug)]

@@ -3,9 +3,9 @@
 
 use super::lstm::add_product;
 use super::{Grads, Pass, slot, weight_gradient};
-use crate::kernels::{Mat, Packed, Start, add_bias, column_sums, product};
 use crate::layers::{sigmoid, tanh};
-use crate::simd::vectorised;
+use nn::kernels::{Mat, Packed, Start, add_bias, column_sums, product};
+use nn::simd::vectorised;
 
 /// What the backward pass of a layer needs.
 #[derive(Debug)]

@@ -1,8 +1,9 @@
 //! Keypoints of feature maps on slices, forwards and backwards: the maths of `encoders/spatial_softmax.rs`.
 
 use super::{Grads, Pass};
-use crate::encoders::{KEYPOINTS, Size, line};
-use crate::kernels::exp;
+use crate::encoders::{KEYPOINTS, Size};
+use nn::kernels::exp;
+use nn::layers::cell_places;
 
 /// Where keypoints are in feature maps.
 #[derive(Debug)]
@@ -20,8 +21,7 @@ pub(super) struct Keypoints {
 impl Keypoints {
     /// map: (n, cells, C)
     pub(super) fn find(pass: &mut Pass<'_>, map: &[f32], count: usize, (h, w): Size) -> Self {
-        let (xs, ys) = (line(w), line(h));
-        let grid: Vec<[f32; 2]> = (0..h * w).map(|i| [xs[i % w], ys[i / w]]).collect();
+        let grid = cell_places((h, w));
         let mut shares = pass.linear(&chosen(), map);
         let mut places = pass.space.pool.zeros(shares.len() / grid.len() * 2);
         let (mut largest, mut sums) = (pass.take(count), pass.take(count));

@@ -4,9 +4,9 @@
 //! gradients of the weights are one product over all steps instead of one a step.
 
 use super::{Grads, Pass, slot, weight_gradient};
-use crate::kernels::{Mat, Packed, Start, add, column_sums, gemm_with, product};
 use crate::layers::{sigmoid, tanh};
-use crate::simd::vectorised;
+use nn::kernels::{Mat, Packed, Start, add, column_sums, gemm_with, product};
+use nn::simd::vectorised;
 
 /// What the backward pass of a layer needs.
 #[derive(Debug)]

@@ -1,7 +1,7 @@
 //! The loss of a mixture of Gaussians and its gradient: the maths of `layers/mixture.rs` in one go.
 
 use super::{Grads, Pass};
-use crate::kernels::add;
+use nn::kernels::add;
 
 /// What is to be likely: actions, and how much each counts.
 pub(crate) struct Wanted<'a> {

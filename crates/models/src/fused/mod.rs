@@ -40,16 +40,16 @@ pub(crate) use recurrent::Recurrent;
 pub(crate) use vae::Vae;
 pub(crate) use vision::{Eyes, Looked};
 
-use crate::error::{ModelError, Result};
+use nn::{ModelError, Result};
 
-use crate::kernels::{
+use crate::layers::{DropoutMask, Shape};
+use candle_core::Storage;
+use nn::Params;
+use nn::Rng;
+use nn::kernels::{
     Mat, Pack, Packed, Pool, Start, add, column_sums, drop_scale, gemm_with, layer_norm, layer_norm_backward, product,
 };
-use crate::layers::{DropoutMask, Shape};
-use crate::params::Params;
-use crate::rng::Rng;
-use crate::simd::vectorised;
-use candle_core::Storage;
+use nn::simd::vectorised;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 

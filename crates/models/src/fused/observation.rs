@@ -4,12 +4,12 @@ use super::vision::{Eyes, Looked};
 use super::{Grads, Pass, slot};
 use crate::batch::Batch;
 use crate::encoders::{CAMERA_EMBED, TokenKind};
-use crate::error::Result;
 use crate::features::{FeatureKind, FeatureSpec, Features, Signature};
-use crate::kernels::{Mat, Start, add, gemm};
 use crate::layers::{ENTITY_POSITIONS, FEATURE_POSITIONS, LATENT, Position, TokenLayout};
-use crate::values::with_values;
 use candle_core::Tensor;
+use nn::Result;
+use nn::kernels::{Mat, Start, add, gemm};
+use nn::values::with_values;
 use std::borrow::Cow;
 use std::cell::RefCell;
 

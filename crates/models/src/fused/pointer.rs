@@ -1,8 +1,8 @@
 //! Pointing: the maths of `layers/pointer.rs`, written out forwards and backwards.
 
 use super::{Grads, Pass, slot};
-use crate::kernels::{add, dot};
 use crate::layers::Pointer;
+use nn::kernels::{add, dot};
 
 /// What a pointer says, and what its backward pass needs.
 #[derive(Debug)]

@@ -4,11 +4,12 @@
 use crate::batch::{Batch, Taken};
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, FeatureSpec, Features, Signature, Values};
-use crate::gradients::{Gradients, ParamLayout};
-use crate::model::{LossValues, PolicyModel};
-use crate::rng::Rng;
-use crate::simd::{Level, at_most};
+use crate::model::PolicyModel;
 use candle_core::{Device, Tensor};
+use nn::LossValues;
+use nn::Rng;
+use nn::simd::{Level, at_most};
+use nn::{Gradients, ParamLayout};
 use std::sync::Arc;
 
 /// Moves norms and biases away from their initial 1 and 0, where errors would hide.

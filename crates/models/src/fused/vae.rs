@@ -1,7 +1,7 @@
 //! The VAE encoder of an action chunk, its sample and its KL term.
 
 use super::{Data, Encoder, Grads, Pass, slot};
-use crate::kernels::add;
+use nn::kernels::add;
 
 /// Sizes of the encoder, and its fixed positions.
 #[derive(Debug, Clone, Copy)]

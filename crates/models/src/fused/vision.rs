@@ -6,11 +6,12 @@
 use super::convolution::{framed, input_gradient, weight_gradient};
 use super::keypoints::Keypoints;
 use super::{Grads, Pass, slot};
-use crate::encoders::{BACKBONE, EPS, ImageNorm, KEYPOINT_PROJECTION, PROJECTION, ResNetShape, Size, TokenKind};
-use crate::kernels::{
+use crate::encoders::{BACKBONE, ImageNorm, KEYPOINT_PROJECTION, PROJECTION, ResNetShape, Size, TokenKind};
+use nn::kernels::{
     Conv, Frame, Shortcut, add, group_norm, group_norm_backward, max_pool, max_pool_backward, relu_backward,
     scale_backward, scale_relu,
 };
+use nn::layers::CONV_NORM_EPS as EPS;
 
 fn convolve(pass: &mut Pass<'_>, name: &str, conv: &Conv, x: &[f32]) -> Vec<f32> {
     let mut y = pass.take(conv.made((0, 0)).inside());

@@ -2,12 +2,12 @@
 use super::*;
 use crate::encoders::{ImageEncoder, VisionConfig};
 use crate::fused::{Shape, Workspaces, with_weights};
-use crate::gradients::{Gradients, ParamLayout};
 use crate::layers::Activation;
-use crate::params::Params;
-use crate::rng::Rng;
-use crate::simd::{Level, at_most};
 use candle_core::{Device, Tensor};
+use nn::Params;
+use nn::Rng;
+use nn::simd::{Level, at_most};
+use nn::{Gradients, ParamLayout};
 use std::sync::Arc;
 
 const DIM: usize = 12;

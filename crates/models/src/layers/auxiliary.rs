@@ -7,13 +7,16 @@
 use super::Linear;
 use crate::batch::Batch;
 use crate::checks::check_weight;
-use crate::error::{ModelError, Result};
 use crate::features::Signature;
-use crate::params::Params;
-use crate::rng::Rng;
-use crate::values::with_values;
 use candle_core::Tensor;
+use nn::Params;
+use nn::Rng;
+use nn::ops::{linear, narrow_tokens, term_of};
+use nn::values::with_values;
+use nn::{Context, Term, Value};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// The layer's name.
 pub(crate) const AUXILIARY_HEAD: &str = "auxiliary_head";
@@ -67,6 +70,27 @@ impl Auxiliary {
     /// encoded: (b, M, D), the latent's token first -> (b, K)
     pub(crate) fn forward(&self, encoded: &Tensor) -> Result<Tensor> {
         self.head.forward(&encoded.narrow(1, 0, 1)?.squeeze(1)?.contiguous()?)
+    }
+
+    /// encoded: (b, M, D), the latent's token first -> the squared error of what a batch tells
+    pub(crate) fn term(
+        &self,
+        cx: &mut Context<'_>,
+        encoded: &Value,
+        (model, batch): (&'static str, &Batch),
+    ) -> Result<Term> {
+        let told = Arc::new(self.told(model, batch)?);
+        let first = narrow_tokens(cx, encoded, 0, 1)?;
+        let found = linear(cx, &first, &self.head)?.reshape((batch.rows(), self.head.weight.dim(0)?))?;
+        let by_hand = Arc::clone(&told);
+        let by_hand = move |found: &[f32], grad: Option<(&mut [f32], f64)>| match grad {
+            Some((grad, weight)) => {
+                grad.copy_from_slice(found);
+                by_hand.gradient(grad, weight)
+            }
+            None => by_hand.gradient(&mut found.to_vec(), 0.0),
+        };
+        term_of(cx, &found, by_hand, |found| told.loss(found))
     }
 
     /// What a batch tells.

@@ -8,11 +8,11 @@ use super::tokens::TokenLayout;
 use super::{FeedForward, LayerInit, LayerNorm, Linear, Mode, Shape};
 use crate::batch::Batch;
 use crate::classification::binary_cross_entropy;
-use crate::error::{ModelError, Result};
-use crate::params::{Init, Params};
-use crate::rng::Rng;
-use crate::values::with_values;
 use candle_core::Tensor;
+use nn::Rng;
+use nn::values::with_values;
+use nn::{Init, Params};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// Cells that a convolution reads: a cell and those around it.
@@ -274,7 +274,7 @@ mod tests {
         };
         let layer = GridLayer::new(&mut p, "layer", shape, rng).unwrap();
         let grid = Grid { first: 0, rows: 3, columns: 2 };
-        let x = Tensor::from_vec(rng.normals(6 * 4), (1, 6, 4), &crate::device::HERE).unwrap();
+        let x = Tensor::from_vec(rng.normals(6 * 4), (1, 6, 4), &nn::device::HERE).unwrap();
         let got = layer.forward(grid, &x).unwrap().squeeze(0).unwrap();
         let y = layer.norm1.forward(&x).unwrap().squeeze(0).unwrap();
         for cell in 0..6 {

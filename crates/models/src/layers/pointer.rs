@@ -9,13 +9,16 @@ use super::{Embedding, Linear};
 use crate::batch::Batch;
 use crate::checks::check_weight;
 use crate::classification::{ClassProbability, IGNORE_LABEL, cross_entropy};
-use crate::device::HERE;
-use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Signature};
-use crate::params::Params;
-use crate::rng::Rng;
 use candle_core::{D, DType, Tensor};
+use nn::Params;
+use nn::Rng;
+use nn::device::HERE;
+use nn::ops::{cat_tokens, linear, select_tokens, term_of, weighted_mean};
+use nn::{Context, Term, Value};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// `[policy.pointer]`: ask which entity a demonstration took, and let the actions see the answer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -117,6 +120,25 @@ impl Pointer {
         Ok((Tensor::cat(&[memory, &pointed.token], 1)?, Tensor::cat(&[pos, &own], 1)?))
     }
 
+    /// encoded and tokens: (b, M, D), after and before everything was encoded, pos: (1, M, D) -> what a decoder reads and its
+    /// positions, with the token that is pointed at after them, and the scores, (b, candidates)
+    pub(crate) fn apply(
+        &self,
+        cx: &mut Context<'_>,
+        (encoded, tokens): (&Value, &Value),
+        pos: &Value,
+    ) -> Result<(Value, Value, Value)> {
+        let places: Vec<usize> = self.places.iter().map(|place| *place as usize).collect();
+        let (b, n) = (encoded.dim(0)?, places.len());
+        let candidates = select_tokens(cx, encoded, &places)?;
+        let scores = linear(cx, &candidates, &self.score)?.reshape((b, n))?;
+        let before = select_tokens(cx, tokens, &places)?;
+        let token = weighted_mean(cx, &scores, &before)?;
+        let memory = cat_tokens(cx, b, &[encoded, &token])?;
+        let own = cx.parameter(&self.position.weight)?.reshape((1, 1, pos.width()))?;
+        Ok((memory, cat_tokens(cx, 1, &[pos, &own])?, scores))
+    }
+
     /// What is asked of a batch.
     ///
     /// # Errors
@@ -157,6 +179,15 @@ pub(crate) struct Answers {
 }
 
 impl Asked {
+    /// scores: (b, candidates) -> the loss, and the share of rows that are answered rightly
+    pub(crate) fn term(self, cx: &mut Context<'_>, scores: &Value) -> Result<(Term, f32)> {
+        let right = self.right(&scores.detached())?.to_scalar::<f32>()?;
+        let asked = Arc::new(self);
+        let by_hand = Arc::clone(&asked);
+        let by_hand = move |scores: &[f32], grad: Option<(&mut [f32], f64)>| by_hand.answers(scores, grad).loss;
+        Ok((term_of(cx, scores, by_hand, |scores| asked.loss(scores))?, right))
+    }
+
     /// scores: (b, candidates) -> cross-entropy, a share of the mean over all rows of the batch that are asked.
     pub(crate) fn loss(&self, scores: &Tensor) -> Result<Tensor> {
         let label = |candidate: &Option<usize>| candidate.map_or(IGNORE_LABEL, |at| at as i64);

@@ -2,14 +2,14 @@
 //! map, each through the same dense layer, side by side, or its keypoints through one. Of a history every step is seen.
 
 use crate::encoders::{ImageEncoder, VisionConfig};
-use crate::error::Result;
 use crate::features::{Features, Signature};
 use crate::fused::{Eyes, Grads, Looked, Pass};
 use crate::layers::Cameras;
-use crate::params::Params;
-use crate::rng::Rng;
-use crate::values::with_values;
 use candle_core::{DType, Tensor};
+use nn::Params;
+use nn::Result;
+use nn::Rng;
+use nn::values::with_values;
 
 /// Cameras, and the network that their pictures go through.
 #[derive(Debug)]

@@ -3,12 +3,12 @@
 use super::Sight;
 use crate::batch::Batch;
 use crate::encoders::VisionConfig;
-use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::{Grads, Looked, Pass};
-use crate::params::Params;
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Params;
+use nn::Result;
+use nn::Rng;
 
 /// What a step shows.
 #[derive(Debug)]

@@ -6,12 +6,14 @@
 
 use super::{Embedding, Linear};
 use crate::encoders::{ImageEncoder, ResNetShape, Size, TokenKind, VisionConfig, position_table};
-use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Signature};
 use crate::fused::Eyes;
-use crate::params::Params;
-use crate::rng::Rng;
 use candle_core::{DType, Tensor};
+use nn::Params;
+use nn::Rng;
+use nn::ops::{cat_tokens, linear, select_tokens};
+use nn::{Context, Value};
+use nn::{ModelError, Result};
 
 /// The latent's projection.
 pub(crate) const LATENT: &str = "encoder_latent_input_proj";
@@ -310,6 +312,58 @@ impl InputTokens {
             rows.push(eyes.positions()?);
         }
         Ok(Tensor::cat(&rows, 0)?.unsqueeze(0)?)
+    }
+}
+
+impl InputTokens {
+    /// latent: (b, L), the features of the observation -> (b, M, D)
+    pub(crate) fn apply(&self, cx: &mut Context<'_>, latent: &Value, observation: &Features<Tensor>) -> Result<Value> {
+        let (b, width) = latent.dims2()?;
+        // backwards, so that gradients of a projection that entities share are added in their order
+        let mut tokens = Vec::with_capacity(2 + self.projections.len());
+        for (token, layer) in self.layout.tokens.iter().zip(&self.projections).rev() {
+            let values = observation.require("tokens", &token.feature)?.flatten_from(1)?.unsqueeze(1)?;
+            tokens.push(linear(cx, &Value::from(&values.contiguous()?), layer)?);
+        }
+        tokens.push(linear(cx, &latent.reshape((b, 1, width))?, &self.latent)?);
+        tokens.reverse();
+        if let (Some(eyes), Some(cameras)) = (&self.eyes, &self.layout.cameras) {
+            let pictures = cameras.features.iter().map(|name| Ok(observation.require("tokens", name)?.clone()));
+            tokens.push(eyes.apply(cx, &pictures.collect::<Result<Vec<_>>>()?)?);
+        }
+        cat_tokens(cx, b, &tokens.iter().collect::<Vec<_>>())
+    }
+
+    /// (1, M, D)
+    pub(crate) fn apply_positions(&self, cx: &mut Context<'_>) -> Result<Value> {
+        let (rows, dim) = self.feature_positions.weight.dims2()?;
+        let features = cx.parameter(&self.feature_positions.weight)?.reshape((1, rows, dim))?;
+        if self.layout.len() == self.layout.feature_rows() {
+            return Ok(features);
+        }
+        let entities = match &self.entity_positions {
+            Some(entities) => {
+                let rows = entities.weight.dim(0)?;
+                Some(cx.parameter(&entities.weight)?.reshape((1, rows, dim))?)
+            }
+            None => None,
+        };
+        let nowhere = Value::zeros((1, 1, dim), &cx.device().clone())?;
+        let mut parts = vec![select_tokens(cx, &features, &[0])?];
+        for token in &self.layout.tokens {
+            parts.push(match (token.position, &entities) {
+                (Position::Feature(row), _) => select_tokens(cx, &features, &[row])?,
+                (Position::Entity(row), Some(entities)) => select_tokens(cx, entities, &[row])?,
+                (Position::Entity(_) | Position::Nowhere, _) => nowhere.clone(),
+            });
+        }
+        if let Some(eyes) = &self.eyes {
+            let positions = eyes.positions()?;
+            let (rows, dim) = positions.dims2()?;
+            let positions = if eyes.learns_positions() { cx.parameter(&positions)? } else { Value::from(&positions) };
+            parts.push(positions.reshape((1, rows, dim))?);
+        }
+        cat_tokens(cx, 1, &parts.iter().collect::<Vec<_>>())
     }
 }
 

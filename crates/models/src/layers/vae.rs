@@ -3,10 +3,12 @@
 use super::tokens::TokenLayout;
 use super::{Embedding, Encoder, LayerInit, Linear, Mode, Shape};
 use crate::batch::Batch;
-use crate::error::Result;
-use crate::params::Params;
-use crate::rng::Rng;
 use candle_core::{DType, Tensor};
+use nn::Params;
+use nn::Result;
+use nn::Rng;
+use nn::ops::{cat_tokens, linear};
+use nn::{Context, Value};
 
 /// The part that encodes an action chunk into a latent; training only.
 #[derive(Debug)]
@@ -54,6 +56,22 @@ impl Vae {
         let x = self.encoder.forward(&tokens, &pos.to_device(tokens.device())?, Some(&key_pad), mode)?;
         let out = self.latent_output_proj.forward(&x.narrow(1, 0, 1)?.squeeze(1)?)?;
         Ok((out.narrow(1, 0, latent)?, out.narrow(1, latent, latent)?))
+    }
+}
+
+impl Vae {
+    /// actions: (b, C, A), is_pad: (b, C), pos: (1, C + 2, D) -> mean and log-variance of the latent, (b, 2L)
+    pub(crate) fn apply(&self, cx: &mut Context<'_>, batch: &Batch, pos: &Tensor) -> Result<Value> {
+        let (b, dim) = (batch.rows(), self.cls_embed.weight.dim(1)?);
+        let cls = cx.parameter(&self.cls_embed.weight)?.reshape((1, 1, dim))?;
+        let state = batch.observation.require("latent", &self.state)?.flatten_from(1)?.unsqueeze(1)?;
+        let state = linear(cx, &Value::from(&state.contiguous()?), &self.robot_state_input_proj)?;
+        let actions = linear(cx, &Value::from(&batch.actions), &self.action_input_proj)?;
+        let tokens = cat_tokens(cx, b, &[&cls, &state, &actions])?;
+        let always = Tensor::zeros((b, 2), DType::F32, cx.device())?;
+        let key_pad = Tensor::cat(&[&always, &batch.is_pad], 1)?;
+        let x = self.encoder.apply(cx, &tokens, &Value::from(pos), Some(&key_pad), 1)?;
+        linear(cx, &x.reshape((b, dim))?, &self.latent_output_proj)
     }
 }
 

@@ -8,8 +8,8 @@ mod temporal_ensemble;
 pub use receding_horizon::RecedingHorizon;
 pub use temporal_ensemble::TemporalEnsemble;
 
-use crate::error::{ModelError, Result};
 use crate::features::Observation;
+use nn::{ModelError, Result};
 
 /// Actions for the next steps in raw units, row-major `(action_horizon, action_dim)`.
 #[derive(Debug, Clone, PartialEq)]

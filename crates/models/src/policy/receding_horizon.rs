@@ -1,7 +1,7 @@
 //! Executing the head of each chunk.
 
 use super::{Actor, Observation, Policy};
-use crate::error::{ModelError, Result};
+use nn::{ModelError, Result};
 use std::collections::VecDeque;
 
 /// Executes the first `n_action_steps` of a chunk, then asks again.

@@ -1,7 +1,7 @@
 //! Averaging the overlapping chunks.
 
 use super::{Actor, Observation, Policy};
-use crate::error::{ModelError, Result};
+use nn::{ModelError, Result};
 use std::collections::VecDeque;
 
 /// Asks at every step and averages all predictions made for it, weight `exp(-coefficient * i)` with i = 0 the oldest

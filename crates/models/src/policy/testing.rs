@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use super::{ActionChunk, Observation, Policy};
-use crate::error::Result;
+use nn::Result;
 
 /// Plays back given chunks.
 pub(super) struct Tape {

@@ -59,7 +59,7 @@ pub(super) fn standardise(values: &mut [f32], floor: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rng::Rng;
+    use nn::Rng;
 
     #[test]
     fn advantages_are_their_definitions_sums() {

@@ -1,9 +1,9 @@
 //! What an update minimises, on vectors of one number a step. Every product is of two vectors of the same length:
 //! candle refuses to multiply others, and nothing here broadcasts.
 
-use crate::device::HERE;
-use crate::error::Result;
 use candle_core::{D, Tensor};
+use nn::Result;
+use nn::device::HERE;
 
 /// The steps that an update learns from; each list has one item a step.
 #[derive(Debug, Clone, Default)]

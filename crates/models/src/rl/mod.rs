@@ -42,13 +42,13 @@ mod losses;
 mod tests;
 
 use crate::baselines::WalkerNet;
-use crate::device::HERE;
-use crate::error::{ModelError, Result};
-use crate::rng::Rng;
 use crate::train::{Learner, LearnerMetrics, TrainConfig};
 use advantages::{advantages, standardise};
 use candle_core::{D, Tensor};
 use losses::{Chosen, entropy, log_softmax};
+use nn::Rng;
+use nn::device::HERE;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 

@@ -1,7 +1,7 @@
 //! How a model is trained.
 
-use crate::error::{ModelError, Result};
-use crate::optim::OptimiserConfig;
+use nn::OptimiserConfig;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// What the learning rate does after the warm-up.

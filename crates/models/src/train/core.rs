@@ -2,13 +2,13 @@
 //! this goes on from, to the bit.
 
 use super::config::TrainConfig;
-use crate::error::{ModelError, Result};
-use crate::gradients::{Gradients, ParamLayout};
-use crate::optim::{Optimiser, flat};
-use crate::params::Params;
-use crate::simd::vectorised;
-use crate::values::with_values;
 use candle_core::Tensor;
+use nn::Params;
+use nn::simd::vectorised;
+use nn::values::with_values;
+use nn::{Gradients, ParamLayout};
+use nn::{ModelError, Result};
+use nn::{Optimiser, flat};
 use std::collections::BTreeMap;
 use std::marker::PhantomData;
 use std::sync::Arc;

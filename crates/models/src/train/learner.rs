@@ -4,11 +4,11 @@
 
 use super::config::TrainConfig;
 use super::core::{Core, Double};
-use crate::error::{ModelError, Result};
-use crate::gradients::Gradients;
-use crate::params::Params;
-use crate::simd::sum_of_squares;
 use candle_core::{Tensor, Var};
+use nn::Gradients;
+use nn::Params;
+use nn::simd::sum_of_squares;
+use nn::{ModelError, Result};
 use std::collections::BTreeMap;
 
 /// What a step measured.
@@ -111,8 +111,8 @@ impl Learner {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::params::Init;
-    use crate::rng::Rng;
+    use nn::Init;
+    use nn::Rng;
 
     fn parameters() -> Params {
         let mut params = Params::new();

@@ -6,13 +6,14 @@
 use super::config::TrainConfig;
 use super::core::{Core, Single};
 use crate::batch::Batch;
-use crate::error::{ModelError, Result};
-use crate::gradients::Gradients;
-use crate::model::{LossValues, PolicyModel};
-use crate::rng::Rng;
-use crate::simd::{sum_of_squares, vectorised};
-use crate::values::with_values;
+use crate::model::PolicyModel;
 use candle_core::Tensor;
+use nn::Gradients;
+use nn::LossValues;
+use nn::Rng;
+use nn::simd::{sum_of_squares, vectorised};
+use nn::values::with_values;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 

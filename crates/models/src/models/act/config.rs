@@ -1,9 +1,9 @@
 //! ACT's options.
 
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
 use crate::layers::{Activation, AuxiliaryConfig, PointerConfig, Shape};
-use crate::size::Size;
+use nn::Size;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// ACT's options; defaults are LeRobot's.

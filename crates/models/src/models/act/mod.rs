@@ -22,11 +22,13 @@
 //! Deviations: none in the maths. `feedforward_activation = "glu"` is refused: LeRobot accepts it in its configuration,
 //! but its layer then cannot run (`glu` halves the width that `linear2` expects).
 //!
-//! This file is the model as one reads it, on candle's autograd. Training steps and predictions run the same maths with
-//! hand-written backward passes (`fused.rs`); tests hold the two together.
+//! Exact savings over LeRobot: of the VAE encoder's last layer only the first token is computed, because nothing else is read;
+//! the first decoder layer's queries, keys and values are computed once for the whole batch, because its input is zero for
+//! every sample.
 
 mod config;
-mod fused;
+#[cfg(test)]
+mod tests;
 
 pub use config::Config;
 
@@ -34,48 +36,23 @@ use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation, check_signature};
 use crate::chunk_policy::ChunkPolicy;
 use crate::encoders::VisionConfig;
-use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::flops;
-use crate::fused::Workspaces;
-use crate::gradients::Gradients;
 use crate::layers::{
-    Auxiliary, Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Mode, Pointed,
-    Pointer, TokenLayout, Vae, environment_state, kl_divergence, sample, sinusoid_table,
+    Auxiliary, Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Pointer,
+    TokenLayout, Vae, environment_state, sinusoid_table,
 };
-use crate::losses::absolute;
-use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
-use crate::params::Params;
+use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
-use crate::rng::Rng;
-use candle_core::{DType, Tensor};
-use std::collections::BTreeMap;
+use candle_core::Tensor;
+use nn::ops::{Error, chunk_error, kl_divergence, linear, sample_latent};
+use nn::{Cache, Context, Gradients, Loss, LossParts, LossValues, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
 pub const READS: &[FeatureKind] =
     &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
-
-/// What the training forward pass gives.
-#[derive(Debug)]
-pub struct TrainOutput {
-    /// (b, action_horizon, A)
-    pub actions: Tensor,
-    /// mean and log-variance of the latent, (b, latent_dim) each; `None` without VAE
-    pub latent: Option<(Tensor, Tensor)>,
-    /// what is asked beside them
-    beside: Beside,
-}
-
-/// What is asked beside the actions.
-#[derive(Debug)]
-struct Beside {
-    /// which entity is meant
-    pointed: Option<Pointed>,
-    /// numbers that are not seen, (b, K), from a training forward pass
-    auxiliary: Option<Tensor>,
-}
 
 /// The model.
 #[derive(Debug)]
@@ -83,18 +60,16 @@ pub struct Act {
     config: Config,
     signature: Signature,
     params: Params,
-    pub(crate) vae: Option<Vae>,
-    pub(crate) encoder: Encoder,
-    pub(crate) decoder: Decoder,
-    pub(crate) tokens: InputTokens,
-    pub(crate) action_head: Linear,
+    vae: Option<Vae>,
+    encoder: Encoder,
+    decoder: Decoder,
+    tokens: InputTokens,
+    action_head: Linear,
     pointer: Option<Pointer>,
     auxiliary: Option<Auxiliary>,
-    pub(crate) workspaces: Workspaces,
+    cache: Cache,
     /// (1, action_horizon + 2, D), fixed
-    pub(crate) vae_encoder_pos_enc: Tensor,
-    /// the same as a slice
-    position_table: Vec<f32>,
+    vae_encoder_pos_enc: Tensor,
 }
 
 impl Act {
@@ -143,8 +118,7 @@ impl Act {
             action_head,
             pointer,
             auxiliary,
-            workspaces: Workspaces::default(),
-            position_table: table.flatten_all()?.to_vec1()?,
+            cache: Cache::default(),
             vae_encoder_pos_enc: table,
             params: p,
             config: config.clone(),
@@ -157,96 +131,121 @@ impl Act {
         &self.config
     }
 
-    /// (action_horizon + 2, D)
-    pub(crate) fn position_table(&self) -> &[f32] {
-        &self.position_table
+    /// Mean and log-variance of the latent of a batch's actions, (b, 2L); `None` without VAE.
+    fn encode(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Option<Value>> {
+        self.vae.as_ref().map(|vae| vae.apply(cx, batch, &self.vae_encoder_pos_enc)).transpose()
     }
 
-    /// latent: (b, L), the features of the observation -> (b, C, A), and what is asked beside them
-    fn decode(&self, latent: &Tensor, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<(Tensor, Beside)> {
-        let tokens = self.tokens.forward(latent, observation)?;
-        let mut pos = self.tokens.positions()?;
-        let mut memory = self.encoder.forward(&tokens, &pos, None, mode)?;
-        let pointed = self.pointer.as_ref().map(|pointer| pointer.forward(&memory, &tokens)).transpose()?;
-        if let (Some(pointer), Some(pointed)) = (&self.pointer, &pointed) {
-            (memory, pos) = pointer.beside(&memory, &pos, pointed)?;
+    /// latent: (b, L), the features of the observation -> (b, C, A), the encoder's output, and the pointer's scores
+    fn decode(
+        &self,
+        cx: &mut Context<'_>,
+        latent: &Value,
+        observation: &Features<Tensor>,
+    ) -> Result<(Value, Value, Option<Value>)> {
+        let tokens = self.tokens.apply(cx, latent, observation)?;
+        let mut pos = self.tokens.apply_positions(cx)?;
+        let mut memory = self.encoder.apply(cx, &tokens, &pos, None, tokens.dim(1)?)?;
+        let mut scores = None;
+        if let Some(pointer) = &self.pointer {
+            let found;
+            (memory, pos, found) = pointer.apply(cx, (&memory, &tokens), &pos)?;
+            scores = Some(found);
         }
-        let auxiliary = match mode {
-            Mode::Train(_) => self.auxiliary.as_ref().map(|asked| asked.forward(&memory)).transpose()?,
-            Mode::Eval => None,
-        };
-        let actions = self.action_head.forward(&self.decoder.forward(&memory, &pos, mode)?)?;
-        Ok((actions, Beside { pointed, auxiliary }))
+        let decoded = self.decoder.apply(cx, &memory, &pos)?;
+        Ok((linear(cx, &decoded, &self.action_head)?, memory, scores))
     }
 
-    /// The training forward pass with dropout from `mode` and the latent's noise `eps`: (b, L).
+    /// L1 over valid steps plus weighted KL, with a pointer cross-entropy, and what `auxiliary` asks; noise of the latent's
+    /// sample: (b, L).
+    fn loss_with(&self, cx: &mut Context<'_>, batch: &Batch, noise: &Value) -> Result<Loss> {
+        let latent = self.encode(cx, batch)?;
+        let sample = match &latent {
+            Some(latent) => sample_latent(cx, latent, noise)?,
+            None => Value::zeros(noise.dims(), batch.device())?,
+        };
+        let (actions, memory, scores) = self.decode(cx, &sample, &batch.observation)?;
+
+        let mut loss = Loss::default();
+        let entries = batch.total_valid_steps * self.signature.action_dim;
+        let (l1, _) = chunk_error(cx, (&actions, &batch.actions), &batch.is_pad, Error::Absolute, entries)?;
+        loss.add("l1_loss", l1, 1.0);
+        if let (Some(pointer), Some(scores)) = (&self.pointer, &scores) {
+            let (term, right) = pointer.asked("act", batch)?.term(cx, scores)?;
+            loss.add("pointer_loss", term, pointer.weight);
+            loss.tell("pointer_right", right);
+        }
+        if let Some(auxiliary) = &self.auxiliary {
+            loss.add("auxiliary_loss", auxiliary.term(cx, &memory, ("act", batch))?, auxiliary.weight);
+        }
+        if let Some(latent) = &latent {
+            loss.add("kld_loss", kl_divergence(cx, latent, batch.total_rows)?, self.config.kl_weight);
+        }
+        Ok(loss)
+    }
+
+    /// Loss of a training forward pass with the latent's noise `eps`: (b, L), and its gradients added to `into`.
+    /// Dropout masks are drawn from `rng`; without it nothing is dropped.
     ///
     /// # Errors
     /// Inputs of the wrong shape.
-    pub fn train_forward(&self, batch: &Batch, eps: &Tensor, mode: &mut Mode<'_>) -> Result<TrainOutput> {
-        self.check_batch(batch)?;
-        let observation = self.tokens.look(&batch.observation, None)?;
-        let latent = match &self.vae {
-            Some(vae) => Some(vae.encode(batch, &self.vae_encoder_pos_enc, mode)?),
-            None => None,
-        };
-        let sample = match &latent {
-            Some(latent) => sample(latent, eps)?,
-            None => eps.zeros_like()?,
-        };
-        let (actions, beside) = self.decode(&sample, &observation, mode)?;
-        Ok(TrainOutput { actions, latent, beside })
+    pub fn gradients_with(
+        &self,
+        batch: &Batch,
+        eps: &Tensor,
+        rng: Option<&mut Rng>,
+        into: &mut Gradients,
+    ) -> Result<LossValues> {
+        let batch = &self.looked_at(batch, None)?;
+        self.cache.step(&self.params, rng, into, |cx| self.loss_with(cx, batch, &Value::from(eps)))
     }
 
-    /// L1 over valid steps plus weighted KL, with a pointer cross-entropy, and what `auxiliary` asks, from a training forward
-    /// pass.
-    pub fn loss_of(&self, output: &TrainOutput, batch: &Batch) -> Result<LossParts> {
-        let (b, c, a) = batch.actions.dims3()?;
-        let valid = (1.0 - batch.is_pad.reshape((b, c, 1))?)?;
-        let difference = absolute(&(&output.actions - &batch.actions)?)?;
-        let entries = (batch.total_valid_steps * a).max(1) as f64;
-        let l1 = (difference.broadcast_mul(&valid)?.sum_all()? / entries)?;
-        let mut parts = BTreeMap::from([("l1_loss".to_string(), l1.detach())]);
-        let mut total = l1;
-        if let Some((mu, log_variance)) = &output.latent {
-            let kld = kl_divergence(mu, log_variance, batch.total_rows)?;
-            parts.insert("kld_loss".to_string(), kld.detach());
-            total = (total + (kld * self.config.kl_weight)?)?;
-        }
-        if let (Some(pointer), Some(pointed)) = (&self.pointer, &output.beside.pointed) {
-            let asked = pointer.asked("act", batch)?;
-            let loss = asked.loss(&pointed.scores)?;
-            parts.insert("pointer_loss".to_string(), loss.detach());
-            parts.insert("pointer_right".to_string(), asked.right(&pointed.scores)?);
-            total = (total + (loss * pointer.weight)?)?;
-        }
-        if let (Some(asked), Some(found)) = (&self.auxiliary, &output.beside.auxiliary) {
-            let loss = asked.told("act", batch)?.loss(found)?;
-            parts.insert("auxiliary_loss".to_string(), loss.detach());
-            total = (total + (loss * asked.weight)?)?;
-        }
-        Ok(LossParts { total, parts })
+    /// The same loss on candle's operations, with its graph and without dropout.
+    ///
+    /// # Errors
+    /// Inputs of the wrong shape.
+    pub fn composed_loss_with(&self, batch: &Batch, eps: &Tensor) -> Result<LossParts> {
+        let batch = &self.looked_at(batch, None)?;
+        self.cache.composed_loss(&self.params, None, |cx| self.loss_with(cx, batch, &Value::from(eps)))
     }
 
-    pub(crate) fn check_batch(&self, batch: &Batch) -> Result<()> {
-        check_batch("act", &self.signature, self.config.action_horizon, batch)
+    /// Actions, (b, C, A), and mean and log-variance of the latent, (b, 2L), of a training forward pass without dropout.
+    ///
+    /// # Errors
+    /// Inputs of the wrong shape.
+    pub fn training_output(&self, batch: &Batch, eps: &Tensor) -> Result<(Tensor, Option<Tensor>)> {
+        let batch = &self.looked_at(batch, None)?;
+        self.cache.predict(&self.params, &mut || {}, |cx| {
+            let latent = self.encode(cx, batch)?;
+            let sample = match &latent {
+                Some(latent) => sample_latent(cx, latent, &Value::from(eps))?,
+                None => Value::zeros(eps.dims(), batch.device())?,
+            };
+            let actions = self.decode(cx, &sample, &batch.observation)?.0.detached();
+            Ok((actions, latent.map(|latent| latent.detached())))
+        })
     }
 
-    pub(crate) fn check_inputs(&self, observation: &Features<Tensor>) -> Result<usize> {
-        check_observation("act", &self.signature, observation)
-    }
-
-    /// The prediction on candle's autograd; `predict` runs the same maths faster.
+    /// The prediction on candle's operations; `predict` runs the same statement by hand.
+    ///
+    /// # Errors
+    /// Inputs of the wrong shape.
     pub fn predict_composed(&self, observation: &Features<Tensor>) -> Result<Tensor> {
-        let rows = self.check_inputs(observation)?;
-        let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
-        Ok(self.decode(&latent, &self.tokens.look(observation, None)?, &mut Mode::Eval)?.0)
+        let (latent, observation) = self.mean_latent(observation)?;
+        self.cache.composed_predict(&self.params, |cx| Ok(self.decode(cx, &latent, &observation)?.0.detached()))
     }
 
-    /// The batch with pictures as the network reads them in training.
-    fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
-        self.check_batch(batch)?;
-        Ok(Batch { observation: self.tokens.look(&batch.observation, Some(rng))?, ..batch.clone() })
+    /// Without a sample the latent is its mean under the prior, zero; and pictures as the network reads them.
+    fn mean_latent(&self, observation: &Features<Tensor>) -> Result<(Value, Features<Tensor>)> {
+        let rows = check_observation("act", &self.signature, observation)?;
+        let latent = Value::zeros((rows, self.config.latent_dim), &self.params.device())?;
+        Ok((latent, self.tokens.look(observation, None)?))
+    }
+
+    /// The batch with pictures as the network reads them: random parts in training, with `rng`.
+    fn looked_at(&self, batch: &Batch, rng: Option<&mut Rng>) -> Result<Batch> {
+        check_batch("act", &self.signature, self.config.action_horizon, batch)?;
+        Ok(Batch { observation: self.tokens.look(&batch.observation, rng)?, ..batch.clone() })
     }
 }
 
@@ -260,39 +259,27 @@ impl PolicyModel for Act {
     }
 
     fn composed_because(&self) -> Option<String> {
-        not_by_hand(&self.signature)
+        None
     }
 
-    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
-        let batch = &self.looked_at(batch, rng)?;
-        let shape = (batch.rows(), self.config.latent_dim);
-        let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.device())?;
-        let output = self.train_forward(batch, &eps, &mut Mode::Train(rng))?;
-        self.loss_of(&output, batch)
+    fn cache(&self) -> Option<&Cache> {
+        Some(&self.cache)
     }
 
-    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
-        if self.composed_because().is_some() {
-            return autograd(self, batch, rng, into);
-        }
-        let batch = &self.looked_at(batch, rng)?;
-        let shape = (batch.rows(), self.config.latent_dim);
-        let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.device())?;
-        self.fused_gradients(batch, &eps, Some(rng), into)
+    fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
+        let batch = &self.looked_at(batch, Some(cx.rng()?))?;
+        let noise = cx.normals(&[batch.rows(), self.config.latent_dim])?;
+        self.loss_with(cx, batch, &noise)
     }
 
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
-        match self.composed_because() {
-            Some(_) => self.predict_composed(observation),
-            None => self.fused_predict(observation, &mut || {}),
-        }
+        self.sample_seen(observation, &mut Rng::new(0, "predict"), &mut || {})
     }
 
+    /// Nothing is drawn.
     fn sample_seen(&self, observation: &Features<Tensor>, _: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
-        match self.composed_because() {
-            Some(_) => self.predict_composed(observation),
-            None => self.fused_predict(observation, on_seen),
-        }
+        let (latent, observation) = self.mean_latent(observation)?;
+        self.cache.predict(&self.params, on_seen, |cx| Ok(self.decode(cx, &latent, &observation)?.0.detached()))
     }
 
     fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {

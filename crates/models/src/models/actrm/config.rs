@@ -1,10 +1,10 @@
 //! ACTRM's options.
 
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
 use crate::layers::{Activation, AuxiliaryConfig, GridConfig, PointerConfig, Shape};
 use crate::models::act;
-use crate::size::Size;
+use nn::Size;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 

@@ -2,13 +2,13 @@
 //! its reasoning is tampered with. On candle's autograd: for measurements, not for speed.
 
 use super::{Actrm, Carry, Config, Design, positioned, update};
-use crate::error::{ModelError, Result};
 use crate::features::{Features, Observation};
 use crate::history::History;
 use crate::layers::Mode;
 use crate::policy::{ActionChunk, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::{DType, Tensor};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 

@@ -58,23 +58,24 @@ use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation, check_signature};
 use crate::classification::binary_cross_entropy;
 use crate::encoders::VisionConfig;
-use crate::error::Result;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::flops;
 use crate::fused::Workspaces;
-use crate::gradients::Gradients;
 use crate::layers::{
     Answers, Asked, Auxiliary, Cells, Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, GridLayer,
     InputTokens, LayerInit, LayerNorm, Linear, Mode, MultiHeadAttention, NEIGHBOURS, Pointer, Shape, TokenLayout, Vae,
     Visited, environment_state, kl_divergence, sample, sinusoid_table,
 };
-use crate::losses::absolute;
-use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
-use crate::params::{Init, Params};
+use crate::model::{PolicyModel, autograd, not_by_hand};
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
-use crate::rng::Rng;
 use candle_core::{DType, Tensor};
+use nn::Gradients;
+use nn::Result;
+use nn::Rng;
+use nn::losses::absolute;
+use nn::{Init, Params};
+use nn::{LossParts, LossValues};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

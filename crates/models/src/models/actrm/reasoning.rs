@@ -2,7 +2,6 @@
 
 use super::{Actrm, Carry, Config, Over, ReasoningConfig};
 use crate::checks::check_shape;
-use crate::error::Result;
 use crate::features::{Features, Observation};
 use crate::history::History;
 use crate::layers::Mode;
@@ -10,6 +9,7 @@ use crate::model::PolicyModel;
 use crate::policy::{ActionChunk, Clock, Policy, ThoughtStep};
 use crate::preprocess::Preprocess;
 use candle_core::{DType, Tensor};
+use nn::Result;
 use std::cell::RefCell;
 use std::sync::Arc;
 

@@ -3,7 +3,6 @@ use super::*;
 use crate::batch::Taken;
 use crate::features::{FeatureSpec, Features, Observation, ValuesRef};
 use crate::fused::testing::{assert_the_gradient_is_the_slope, move_parameters, signatures};
-use crate::gradients::ParamLayout;
 use crate::layers::{AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::models::act::{self, Act};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
@@ -12,6 +11,7 @@ use crate::preprocess::Preprocess;
 use crate::registry::PolicyConfig;
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
+use nn::ParamLayout;
 use std::sync::Arc;
 
 fn signature() -> Signature {

@@ -1,8 +1,8 @@
 //! BC's options.
 
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
-use crate::size::Size;
+use nn::Size;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// What is minimised over the steps that are not padding.

@@ -2,17 +2,18 @@
 
 use super::{Bc, Loss};
 use crate::batch::Batch;
-use crate::device::HERE;
-use crate::error::Result;
 use crate::features::Features;
 use crate::fused::{Looked, Pass, with_weights};
-use crate::gradients::Gradients;
-use crate::kernels::{activate, activate_backward};
 use crate::layers::{Activation, Shape, Sight};
-use crate::model::{LossValues, PolicyModel};
-use crate::simd::vectorised;
-use crate::values::with_values;
+use crate::model::PolicyModel;
 use candle_core::Tensor;
+use nn::Gradients;
+use nn::LossValues;
+use nn::Result;
+use nn::device::HERE;
+use nn::kernels::{activate, activate_backward};
+use nn::simd::vectorised;
+use nn::values::with_values;
 use std::collections::BTreeMap;
 
 /// What every layer reads, the first one `first`, and last what they give.

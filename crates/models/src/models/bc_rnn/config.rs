@@ -1,9 +1,9 @@
 //! BC-RNN's options.
 
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
 use crate::layers::Cell;
-use crate::size::Size;
+use nn::Size;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// Options with robomimic's names' meaning and its defaults.

@@ -2,13 +2,14 @@
 
 use super::{BcRnn, beginnings};
 use crate::batch::Batch;
-use crate::error::Result;
 use crate::fused::{Pass, Recurrent, Wanted, likelihood, with_weights};
-use crate::gradients::Gradients;
-use crate::kernels::add;
 use crate::layers::{Activation, Shape};
-use crate::model::{LossValues, PolicyModel};
-use crate::values::with_values;
+use crate::model::PolicyModel;
+use nn::Gradients;
+use nn::LossValues;
+use nn::Result;
+use nn::kernels::add;
+use nn::values::with_values;
 use std::collections::BTreeMap;
 
 /// A shard of sequences, step by step, without the padding that they begin with.

@@ -26,20 +26,21 @@ pub use config::Config;
 
 use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
-use crate::device::HERE;
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
 use crate::features::{FeatureKind, Features, Observation, Signature};
 use crate::fused::Workspaces;
-use crate::gradients::Gradients;
 use crate::layers::{Mixture, MixtureHead, Recurrent, RecurrentState, Steps};
-use crate::losses::absolute;
-use crate::model::{LossParts, LossValues, PolicyModel, autograd, not_by_hand};
-use crate::params::Params;
+use crate::model::{PolicyModel, autograd, not_by_hand};
 use crate::policy::{ActionChunk, Clock, Policy};
 use crate::preprocess::Preprocess;
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Gradients;
+use nn::Params;
+use nn::Rng;
+use nn::device::HERE;
+use nn::losses::absolute;
+use nn::{LossParts, LossValues};
+use nn::{ModelError, Result};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

@@ -1,8 +1,8 @@
 //! BC-Transformer's options.
 
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
-use crate::size::Size;
+use nn::Size;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// Options with robomimic's defaults; the context is as long as `data.n_obs_steps`.

@@ -2,17 +2,18 @@
 
 use super::BcTransformer;
 use crate::batch::Batch;
-use crate::error::Result;
 use crate::fused::{Grads, Norm, Pass, Wanted, Workspace, likelihood, slot, weight_gradient, with_weights};
-use crate::gradients::Gradients;
-use crate::kernels::{
+use crate::layers::{Activation, DropoutMask, Shape};
+use crate::model::PolicyModel;
+use nn::Gradients;
+use nn::LossValues;
+use nn::Result;
+use nn::Rng;
+use nn::kernels::{
     Heads, Mat, Start, activate, activate_backward, add, attend, attend_backward, column_sums, drop_scale, product,
 };
-use crate::layers::{Activation, DropoutMask, Shape};
-use crate::model::{LossValues, PolicyModel};
-use crate::rng::Rng;
-use crate::simd::vectorised;
-use crate::values::with_values;
+use nn::simd::vectorised;
+use nn::values::with_values;
 use std::collections::BTreeMap;
 
 /// A dropout of a whole tensor, in place.

@@ -3,12 +3,12 @@
 use super::values;
 use crate::batch::Batch;
 use crate::encoders::VisionConfig;
-use crate::error::Result;
 use crate::features::{Features, Signature};
 use crate::layers::{Sight, Steps};
-use crate::params::Params;
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Params;
+use nn::Result;
+use nn::Rng;
 
 /// The condition of diffusion, flow matching and MIP.
 #[derive(Debug)]

@@ -3,8 +3,8 @@
 use super::transformer::TransformerConfig;
 use super::unet::NetworkConfig;
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
-use crate::size::Size;
+use nn::Size;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// What the network is trained to give.

@@ -5,19 +5,19 @@
 use super::condition::Told;
 use super::unet::{LAST_GROUPS, NetworkConfig, embedding};
 use super::values;
-use crate::device::HERE;
-use crate::error::Result;
 use crate::fused::{
     Grads, Pass, Workspaces, convolution_gradient, convolve, framed, input_gradient, slot, with_weights,
 };
-use crate::gradients::Gradients;
-use crate::kernels::{
+use crate::layers::{Activation, Shape};
+use candle_core::Tensor;
+use nn::Gradients;
+use nn::Params;
+use nn::Result;
+use nn::device::HERE;
+use nn::kernels::{
     After, Conv, Film, Frame, add, add_bias, column_sums, group_norm, group_norm_backward, mish, mish_backward,
     norm_mish, norm_mish_backward,
 };
-use crate::layers::{Activation, Shape};
-use crate::params::Params;
-use candle_core::Tensor;
 
 /// What the network is apart from its weights, and the buffers of its passes.
 #[derive(Debug)]

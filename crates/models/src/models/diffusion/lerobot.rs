@@ -1,12 +1,12 @@
 //! LeRobot's diffusion files as values: `config.json` and the names of the tensors. Files are read and written in `zoo`.
 
 use super::{Config, Prediction, Sampler, unet::NetworkConfig};
-use crate::error::{ModelError, Result, some_names};
 use crate::features::{FeatureKind, Signature};
 use crate::lerobot::{mode_name, mode_of};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
-use crate::params::Params;
 use candle_core::Tensor;
+use nn::Params;
+use nn::{ModelError, Result, some_names};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;

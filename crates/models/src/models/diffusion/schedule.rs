@@ -3,9 +3,9 @@
 //! `fixed_small` variance) and the DDIM of Song et al. (arXiv 2010.02502, eta 0), timesteps spaced `leading`.
 
 use super::config::{Config, Prediction, Sampler};
-use crate::device::HERE;
-use crate::error::Result;
 use candle_core::Tensor;
+use nn::Result;
+use nn::device::HERE;
 
 /// The share of the actions' variance that is left at each step.
 #[derive(Debug, Clone)]

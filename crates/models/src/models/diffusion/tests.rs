@@ -5,9 +5,9 @@ use crate::encoders::{ImageNorm, TokenKind};
 use crate::fused::testing::{
     assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
 };
-use crate::simd::{Level, at_most};
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
+use nn::simd::{Level, at_most};
 
 fn small() -> Config {
     let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, step_embed_dim: 8, ..NetworkConfig::default() };

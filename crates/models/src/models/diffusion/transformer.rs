@@ -9,13 +9,13 @@
 //! This file is the network as one reads it; training steps and predictions run on `transformer_fused.rs`.
 
 use super::unet::embedding;
-use crate::device::HERE;
-use crate::error::{ModelError, Result};
 use crate::layers::{Activation, DecoderLayer, LayerNorm, Linear, Mode, Shape, mish};
-use crate::params::{Init, Params};
-use crate::rng::Rng;
-use crate::size::Size;
 use candle_core::{DType, Tensor};
+use nn::Rng;
+use nn::Size;
+use nn::device::HERE;
+use nn::{Init, Params};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// What the names of its parameters begin with.

@@ -4,16 +4,16 @@ use super::fused::{Asked, Wanted};
 use super::transformer::{Around, PREFIX, TransformerConfig};
 use super::unet::embedding;
 use super::values;
-use crate::device::HERE;
-use crate::error::Result;
 use crate::fused::{
     DecoderGrads, DecoderLayers, Grads, Memory, Norm, Own, Part, Pass, Workspaces, gather, scatter, slot, with_weights,
 };
-use crate::gradients::Gradients;
-use crate::kernels::{add, column_sums, mish, mish_backward};
-use crate::params::Params;
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Gradients;
+use nn::Params;
+use nn::Result;
+use nn::Rng;
+use nn::device::HERE;
+use nn::kernels::{add, column_sums, mish, mish_backward};
 
 /// What the network is apart from its weights, and the buffers of its passes.
 #[derive(Debug)]

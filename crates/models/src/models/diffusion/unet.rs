@@ -1,13 +1,13 @@
 //! The 1-D UNet over the steps of an action sequence, conditioned by FiLM: LeRobot's `DiffusionConditionalUnet1d` with its
 //! tensor names, steps before channels. Diffusion, flow matching and MIP share it.
 
-use crate::device::HERE;
-use crate::error::{ModelError, Result};
 use crate::layers::{Conv1d, GroupNorm, Linear, Upsample1d, mish};
-use crate::params::Params;
-use crate::rng::Rng;
-use crate::size::Size;
 use candle_core::Tensor;
+use nn::Params;
+use nn::Rng;
+use nn::Size;
+use nn::device::HERE;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// Groups of the last block's norm, whatever the others have.

@@ -9,14 +9,14 @@
 pub use super::READS;
 use super::{Floor, Rule, at_least_one, joined};
 use crate::batch::Batch;
-use crate::device::HERE;
-use crate::error::{ModelError, Result};
 use crate::features::{Features, Signature};
-use crate::params::Params;
-use crate::rng::Rng;
-use crate::size::Size;
-use crate::values::with_values;
 use candle_core::Tensor;
+use nn::Params;
+use nn::Rng;
+use nn::Size;
+use nn::device::HERE;
+use nn::values::with_values;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// Table of the observations, (windows, everything seen).

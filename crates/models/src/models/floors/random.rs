@@ -4,12 +4,12 @@
 
 pub use super::{Config, READS};
 use super::{Floor, Rule};
-use crate::device::HERE;
-use crate::error::Result;
 use crate::features::{Features, Signature};
-use crate::params::Params;
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Params;
+use nn::Result;
+use nn::Rng;
+use nn::device::HERE;
 
 /// The model.
 pub type Random = Floor<Chance>;

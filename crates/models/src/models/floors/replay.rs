@@ -5,13 +5,13 @@
 pub use super::{Config, READS};
 use super::{Floor, Rule};
 use crate::batch::Batch;
-use crate::error::{ModelError, Result};
 use crate::features::{Features, Observation, Signature};
-use crate::params::Params;
 use crate::policy::{ActionChunk, Policy};
 use crate::preprocess::Preprocess;
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Params;
+use nn::Rng;
+use nn::{ModelError, Result};
 use std::sync::Arc;
 
 /// Table of the actions of all demonstrations, (steps, A).

@@ -4,11 +4,11 @@
 
 pub use super::{Config, READS};
 use super::{Floor, Rule};
-use crate::error::Result;
 use crate::features::{Features, Signature};
-use crate::params::Params;
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Params;
+use nn::Result;
+use nn::Rng;
 
 /// The model.
 pub type Zero = Floor<Nothing>;

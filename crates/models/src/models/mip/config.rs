@@ -1,9 +1,9 @@
 //! MIP's options.
 
 use crate::encoders::VisionConfig;
-use crate::error::{ModelError, Result};
 use crate::models::diffusion::unet::NetworkConfig;
-use crate::size::Size;
+use nn::Size;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// Options.

@@ -1,6 +1,6 @@
 //! Sizes and choices of a TRM.
 
-use crate::error::{ModelError, Result};
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
 /// How a layer lets positions see each other.

@@ -34,9 +34,9 @@ pub(crate) use fused::Fused;
 pub use slots::{Example, Release, Slots};
 pub use train::{PuzzleConfig, StepReport, Trainer};
 
-use crate::error::{ModelError, Result};
-use crate::params::Params;
 use candle_core::{D, DType, IndexOp, Tensor};
+use nn::Params;
+use nn::{ModelError, Result};
 use weights::{Mix, Weights};
 
 /// The two states of the recursion, each `(batch, positions, hidden)`.

@@ -1,7 +1,7 @@
 //! The reference's own configuration, as its checkpoints store it.
 
 use super::{Config, Mixing, Positions};
-use crate::error::{ModelError, Result};
+use nn::{ModelError, Result};
 use serde::Deserialize;
 
 /// The fields of `TinyRecursiveReasoningModel_ACTV1Config` that shape the model, with the

@@ -4,10 +4,10 @@
 
 use super::{Carry, Trm, misfit};
 use crate::classification::IGNORE_LABEL;
-use crate::device::HERE;
-use crate::error::Result;
-use crate::rng::Rng;
 use candle_core::Tensor;
+use nn::Result;
+use nn::Rng;
+use nn::device::HERE;
 use serde::{Deserialize, Serialize};
 
 /// One puzzle with its answer.

@@ -1,10 +1,10 @@
 #![allow(clippy::unwrap_used)]
 use super::weights::PUZZLES;
 use super::*;
-use crate::optim::OptimiserConfig;
-use crate::rng::Rng;
 use crate::train::TrainConfig;
 use candle_core::Device;
+use nn::OptimiserConfig;
+use nn::Rng;
 
 fn configs() -> Vec<Config> {
     let base =

@@ -3,11 +3,11 @@
 use super::weights::PUZZLES;
 use super::{Carry, Example, Gradient, Release, Slots, StepOutput, Trm};
 use crate::classification::{ClassProbability, IGNORE_LABEL, binary_cross_entropy, cross_entropy};
-use crate::device::HERE;
-use crate::error::{ModelError, Result};
-use crate::rng::Rng;
 use crate::train::{Learner, TrainConfig};
 use candle_core::{DType, Tensor};
+use nn::Rng;
+use nn::device::HERE;
+use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -278,10 +278,7 @@ impl Trainer {
         }
         let get = |name: &str, shape: &[usize]| -> Result<Tensor> {
             let Some(tensor) = tensors.get(name) else {
-                return Err(ModelError::MissingTensor {
-                    name: name.into(),
-                    given: crate::error::some_names(tensors.keys()),
-                });
+                return Err(ModelError::MissingTensor { name: name.into(), given: nn::some_names(tensors.keys()) });
             };
             if tensor.dims() != shape {
                 let (expected, found) = (shape.to_vec(), tensor.dims().to_vec());

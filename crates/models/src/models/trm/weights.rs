@@ -2,11 +2,11 @@
 
 use super::fused::Fused;
 use super::{Config, Mixing, Positions, Trm};
-use crate::device::HERE;
-use crate::error::{ModelError, Result, some_names};
-use crate::params::{Init, Params};
-use crate::rng::Rng;
 use candle_core::{DType, Tensor};
+use nn::Rng;
+use nn::device::HERE;
+use nn::{Init, Params};
+use nn::{ModelError, Result, some_names};
 use std::collections::BTreeMap;
 
 const H_INIT: &str = "inner.H_init";

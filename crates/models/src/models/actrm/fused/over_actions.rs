@@ -9,9 +9,9 @@ use crate::fused::{
     BlockLayer, Encoder, Grads, Input, Part, Pass, Tokens, add_to_first, ask, gather, keys_and_values,
     keys_and_values_backward, positions_backward, scatter, slot,
 };
-use crate::kernels::add;
 use crate::layers::{Shape, Told};
 use crate::models::actrm::{Actrm, Config};
+use nn::kernels::add;
 
 pub(super) struct OverActions<'m> {
     config: &'m Config,

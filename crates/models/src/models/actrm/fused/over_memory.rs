@@ -2,9 +2,9 @@
 
 use super::{AnswerGrad, Carry, Recursion, Step, mean_over_tokens, shaped};
 use crate::fused::{Decoder, DecoderGrads, Encoder, Grads, Memory, Pass, Tokens, positions_backward, slot};
-use crate::kernels::add;
 use crate::layers::{Shape, TokenLayout};
 use crate::models::actrm::{Actrm, Config, fixed_values};
+use nn::kernels::add;
 
 pub(super) struct OverMemory<'m> {
     config: &'m Config,

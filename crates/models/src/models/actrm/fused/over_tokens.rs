@@ -5,9 +5,9 @@ use crate::fused::{
     Decoder, DecoderGrads, EncoderLayer, Grads, GridLayer, Memory, Norm, Pass, Pointed, PointerGrads, Tokens, cells_of,
     positions_backward, put_cells, slot,
 };
-use crate::kernels::add;
 use crate::layers::{Cells, Pointer, WAY};
 use crate::models::actrm::{Actrm, Config, Design, TokenLayers};
+use nn::kernels::add;
 
 pub(super) struct OverTokens<'m> {
     config: &'m Config,

@@ -8,7 +8,7 @@ use crate::fused::testing::{
 };
 use crate::layers::{Activation, AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::models::actrm::{Config, ReasoningConfig, WarmStart};
-use crate::simd::{Level, at_most};
+use nn::simd::{Level, at_most};
 
 /// Odd sizes in all designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
 fn configs() -> Vec<(Config, Signature, usize)> {

@@ -2,7 +2,7 @@
 //! body for the machine's best instructions and picks one at run time. Sums run over lanes in a
 //! fixed order, so that results do not depend on which was picked more than rounding does.
 
-use crate::simd::vectorised;
+use nn::simd::vectorised;
 
 /// Lanes that sums are kept in: one AVX-512 register, two AVX2 ones.
 const LANES: usize = 16;

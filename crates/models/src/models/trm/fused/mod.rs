@@ -8,9 +8,9 @@ mod plan;
 mod product;
 
 use super::{Carry, Config, Gradient, Mixing};
-use crate::error::Result;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result as CandleResult, Shape, Storage, Tensor};
 use layer::Direction;
+use nn::Result;
 use plan::{Plan, PlanMix};
 use std::sync::{Arc, Mutex};
 

@@ -8,7 +8,7 @@
 //! Plain safe Rust; `pulp` picks AVX-512, AVX2 or scalar code at run time. The order of additions depends on the shape
 //! and the width of the vectors alone.
 
-use crate::simd::dispatch;
+use nn::simd::dispatch;
 use pulp::{Simd, WithSimd};
 
 /// A factor `(k, n)` in panels of two vectors' width, depth first; missing columns are zero.
@@ -369,7 +369,7 @@ fn outer_tile<S: Simd, F: Fn(usize) -> usize + Copy, const MR: usize, const NV: 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rng::Rng;
+    use nn::Rng;
     use proptest::prelude::*;
 
     fn close(got: f32, expected: f64) -> bool {

@@ -1,0 +1,45 @@
+//! Layers shared by the models. The Rust field is the checkpoint key.
+//!
+//! Everything here has a gradient: candle-nn's `LayerNorm` and `softmax_last_dim` drop it in silence and are not used.
+
+mod attention;
+mod conv1d;
+mod dropout;
+mod embedding;
+mod feed_forward;
+mod group_norm;
+mod gru;
+mod layer_norm;
+mod linear;
+mod lstm;
+mod mish;
+mod mixture;
+mod position;
+mod recurrent;
+mod resnet;
+mod spatial_softmax;
+mod transformer;
+
+pub(crate) use attention::UNSEEN;
+pub use attention::{MultiHeadAttention, masked_softmax};
+pub use conv1d::{Conv1d, Upsample1d};
+pub use dropout::{Dropout, DropoutMask, Mode};
+pub use embedding::Embedding;
+pub use feed_forward::{Activation, FeedForward};
+pub use group_norm::GroupNorm;
+pub use gru::Gru;
+pub use layer_norm::LayerNorm;
+pub use linear::Linear;
+pub use lstm::{Lstm, sigmoid, tanh};
+pub use mish::mish;
+pub use mixture::{Mixture, MixtureHead};
+pub use position::sinusoid_table;
+pub use recurrent::{Cell, Recurrent, RecurrentState};
+#[doc(hidden)]
+pub use resnet::CONV_NORM_EPS;
+pub use resnet::{ImageNorm, ResNet, ResNetShape};
+pub(crate) use resnet::{conv2d_composed, max_pool_composed};
+pub use spatial_softmax::SpatialSoftmax;
+#[doc(hidden)]
+pub use spatial_softmax::cell_places;
+pub use transformer::{Decoder, DecoderLayer, Encoder, EncoderLayer, LayerInit, Shape};

@@ -1,0 +1,42 @@
+//! Neural networks on a CPU and on candle: layers, the operations that they are stated in, the tape of a training step,
+//! parameters, gradients, optimisers.
+//!
+//! A model is stated once. Its forward pass runs in a [`Context`] on [`Value`]s: on the CPU every operation of [`ops`] runs a
+//! kernel written by hand, forwards and backwards; elsewhere, and in tests, the same operation is a composition of candle's.
+//!
+//! This crate knows tensors and numbers only. It opens no file, starts no process and prints nothing.
+
+mod context;
+#[doc(hidden)]
+pub mod device;
+mod error;
+mod gradients;
+#[doc(hidden)]
+pub mod kernels;
+pub mod layers;
+mod loss;
+#[doc(hidden)]
+pub mod losses;
+
+pub mod ops;
+mod optim;
+mod params;
+mod rng;
+#[doc(hidden)]
+pub mod simd;
+mod size;
+mod tape;
+mod value;
+#[doc(hidden)]
+pub mod values;
+
+pub use context::{Cache, Context, Workspace, compose};
+pub use error::{ModelError, Result, some_names};
+pub use gradients::{Gradients, ParamLayout};
+pub use loss::{Loss, LossParts, LossValues, Term};
+pub use optim::{Optimiser, OptimiserConfig, flat};
+pub use params::{Init, Params};
+pub use rng::Rng;
+pub use simd::vectors;
+pub use size::Size;
+pub use value::Value;

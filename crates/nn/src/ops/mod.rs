@@ -1,0 +1,58 @@
+//! The operations of a forward pass. On the CPU each runs a kernel by hand and notes its backward pass on the tape; on other
+//! devices, and where a pass asks for it, it is a composition of candle's own operations under the same name.
+
+mod attention;
+mod conv2d;
+mod elementwise;
+mod feed_forward;
+mod latent;
+mod linear;
+mod losses;
+mod norm;
+mod tokens;
+
+pub use attention::{Attention, attention, self_attention};
+pub use conv2d::{ConvNorm, conv2d, max_pool, spatial_softmax};
+pub use elementwise::{activation, add, cat_rows, detached_mean, dropout};
+pub use feed_forward::feed_forward;
+pub use latent::{kl_divergence, sample_latent};
+pub use linear::{linear, linear_rows};
+pub use losses::{Error, chunk_error, term_of};
+pub use norm::{layer_norm, residual};
+pub use tokens::{cat_tokens, narrow_tokens, select_tokens, weighted_mean};
+
+use crate::error::{ModelError, Result};
+use crate::value::Value;
+use candle_core::Tensor;
+
+fn check_width(operation: &'static str, x: &Value, width: usize) -> Result<()> {
+    if x.width() == width {
+        return Ok(());
+    }
+    let mut expected = x.dims().to_vec();
+    if let Some(last) = expected.last_mut() {
+        *last = width;
+    }
+    Err(ModelError::Shape { operation, object: "input", expected, found: x.dims().to_vec() })
+}
+
+/// x: (b or 1, t, D) beside (b, t, D)
+fn check_broadcast(operation: &'static str, x: &Value, whole: &Value) -> Result<()> {
+    let fits = x.dims() == whole.dims() || x.dims().first() == Some(&1) && x.dims()[1..] == whole.dims()[1..];
+    if fits {
+        return Ok(());
+    }
+    let (expected, found) = (whole.dims().to_vec(), x.dims().to_vec());
+    Err(ModelError::Shape { operation, object: "input", expected, found })
+}
+
+fn check_shape(operation: &'static str, object: &'static str, tensor: &Tensor, expected: &[usize]) -> Result<()> {
+    if tensor.dims() == expected {
+        return Ok(());
+    }
+    let (expected, found) = (expected.to_vec(), tensor.dims().to_vec());
+    Err(ModelError::Shape { operation, object, expected, found })
+}
+
+#[cfg(test)]
+mod tests;

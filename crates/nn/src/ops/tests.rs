@@ -1,0 +1,305 @@
+//! Every operation by hand beside its composition of candle's, forwards and backwards, on every instruction set, and the slope of
+//! the loss along the gradient.
+#![allow(clippy::unwrap_used)]
+
+use super::*;
+use crate::context::{Cache, Context};
+use crate::gradients::{Gradients, ParamLayout};
+use crate::layers::{Activation, Dropout, FeedForward, LayerNorm, Linear};
+use crate::loss::Loss;
+use crate::params::{Init, Params};
+use crate::rng::Rng;
+use crate::simd::{Level, at_most};
+use candle_core::Device;
+use std::sync::Arc;
+
+/// Parameters by name, the inputs among them: what is differentiated.
+struct Case {
+    params: Params,
+    rng: Rng,
+}
+
+impl Case {
+    fn new() -> Self {
+        Self { params: Params::new(), rng: Rng::new(1, "case") }
+    }
+
+    fn tensor(&mut self, name: &str, shape: &[usize]) -> Tensor {
+        self.params.create(name, shape, Init::Normal { std: 0.7 }, &mut self.rng).unwrap()
+    }
+
+    fn linear(&mut self, name: &str, input: usize, output: usize) -> Linear {
+        let weight = self.tensor(&format!("{name}.weight"), &[output, input]);
+        Linear { weight, bias: Some(self.tensor(&format!("{name}.bias"), &[output])) }
+    }
+
+    fn norm(&mut self, name: &str, dim: usize) -> LayerNorm {
+        LayerNorm {
+            weight: self.tensor(&format!("{name}.weight"), &[dim]),
+            bias: self.tensor(&format!("{name}.bias"), &[dim]),
+        }
+    }
+
+    /// Compares the weighted sum of what `op` gives, and its gradients.
+    fn check(&self, what: &str, op: impl Fn(&mut Context<'_>) -> Result<Value>) {
+        let loss = |cx: &mut Context<'_>| {
+            let y = op(cx)?;
+            let weights = Rng::new(9, "weights").normals(y.len());
+            let composed = Tensor::from_slice(&weights, y.dims(), &Device::Cpu)?;
+            let by_hand = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
+                if let Some((grad, weight)) = grad {
+                    grad.iter_mut().zip(&weights).for_each(|(grad, w)| *grad = (f64::from(*w) * weight) as f32);
+                }
+                y.iter().zip(&weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
+            };
+            let mut loss = Loss::default();
+            loss.add("sum", term_of(cx, &y, by_hand, |y| Ok(y.mul(&composed)?.sum_all()?))?, 0.8);
+            Ok(loss)
+        };
+        self.check_loss(what, loss);
+    }
+
+    fn check_loss(&self, what: &str, loss: impl Fn(&mut Context<'_>) -> Result<Loss>) {
+        let (cache, rng) = (Cache::default(), || Rng::new(4, "dropout"));
+        let composed = cache.composed_loss(&self.params, Some(&mut rng()), &loss).unwrap();
+        let (want, graph) = (composed.total.to_scalar::<f32>().unwrap(), composed.total.backward().unwrap());
+        let step = || {
+            let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(&self.params)));
+            let values = cache.step(&self.params, Some(&mut rng()), &mut grads, &loss).unwrap();
+            (values.total, grads)
+        };
+        for level in Level::ALL {
+            at_most(level, || {
+                let (got, grads) = step();
+                assert!((got - want).abs() < 1e-4 * want.abs().max(1.0), "{what} {level:?}: {got} {want}");
+                for (name, var) in self.params.iter() {
+                    let want = graph.get(var).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+                    let scale = want.iter().fold(1e-2f32, |m, x| m.max(x.abs()));
+                    for (got, want) in grads.get(name).unwrap().iter().zip(&want) {
+                        assert!((got - want).abs() < 1e-4 * scale, "{what} {level:?} {name}: {got} {want} of {scale}");
+                    }
+                }
+            });
+        }
+        // along its gradient the loss rises by the gradient's square
+        let (_, grads) = step();
+        let square: f64 = grads.values().iter().map(|g| f64::from(*g).powi(2)).sum();
+        let moved = |by: f64| {
+            for (name, var) in self.params.iter() {
+                let grad = Tensor::from_slice(grads.get(name).unwrap(), var.dims(), &Device::Cpu).unwrap();
+                var.set(&(var.as_tensor() + (grad * by).unwrap()).unwrap().detach()).unwrap();
+            }
+            f64::from(step().0)
+        };
+        let h = 1e-3 / square.sqrt();
+        let (up, down) = (moved(h), moved(-2.0 * h));
+        moved(h);
+        let slope = (up - down) / (2.0 * h);
+        assert!((slope - square).abs() < 0.03 * square.max(1e-3), "{what}: slope {slope}, square {square}");
+    }
+}
+
+fn value(cx: &mut Context<'_>, tensor: &Tensor) -> Value {
+    cx.parameter(tensor).unwrap()
+}
+
+#[test]
+fn linear_layers() {
+    for (b, t, input, output) in [(1, 1, 3, 5), (2, 7, 12, 35), (5, 6, 33, 16)] {
+        let mut case = Case::new();
+        let (x, layer) = (case.tensor("x", &[b, t, input]), case.linear("layer", input, output));
+        case.check("linear", |cx| {
+            let x = value(cx, &x);
+            linear(cx, &x, &layer)
+        });
+        let mut case = Case::new();
+        let (x, pos) = (case.tensor("x", &[b, t, input]), case.tensor("pos", &[1, t, input]));
+        let (w, bias) = (case.tensor("w", &[3 * input, input]), case.tensor("bias", &[3 * input]));
+        case.check("rows with positions", |cx| {
+            let (x, pos) = (value(cx, &x), value(cx, &pos));
+            linear_rows(cx, &x, Some(&pos), (&w, &bias), input..3 * input)
+        });
+    }
+}
+
+#[test]
+fn norms_and_residuals() {
+    for (b, t, all, dim, p) in [(1, 1, 1, 5, 0.0), (3, 4, 4, 12, 0.3), (3, 2, 5, 33, 0.2)] {
+        let mut case = Case::new();
+        let (x, norm) = (case.tensor("x", &[b, t, dim]), case.norm("norm", dim));
+        case.check("norm", |cx| {
+            let x = value(cx, &x);
+            layer_norm(cx, &x, &norm)
+        });
+        for own in [b, 1] {
+            let mut case = Case::new();
+            let (x, branch) = (case.tensor("x", &[own, t, dim]), case.tensor("branch", &[b, t, dim]));
+            let norm = case.norm("norm", dim);
+            case.check("residual with its norm", |cx| {
+                let (x, branch) = (value(cx, &x), value(cx, &branch));
+                residual(cx, &x, &branch, (p, all), Some(&norm))
+            });
+            let mut case = Case::new();
+            let (x, branch) = (case.tensor("x", &[own, t, dim]), case.tensor("branch", &[b, t, dim]));
+            case.check("residual", |cx| {
+                let (x, branch) = (value(cx, &x), value(cx, &branch));
+                residual(cx, &x, &branch, (p, all), None)
+            });
+        }
+    }
+}
+
+#[test]
+fn attention_and_self_attention() {
+    for (batch, own, t, queries, dropout, causal) in
+        [(2, 2, 5, 5, 0.0, false), (3, 1, 4, 4, 0.2, false), (2, 2, 6, 1, 0.2, false), (2, 2, 5, 5, 0.1, true)]
+    {
+        let (heads, dim) = (3, 12);
+        let pad: Vec<f32> = (0..batch * t).map(|i| f32::from(u8::from(i % t == 2 && t > 5))).collect();
+        let pad = Tensor::from_vec(pad, (batch, t), &Device::Cpu).unwrap();
+        let how = Attention { heads, batch, all_queries: t, causal, key_pad: Some(&pad), dropout };
+        let mut case = Case::new();
+        let (q, kv) = (case.tensor("q", &[own, queries, dim]), case.tensor("kv", &[batch, t, 2 * dim]));
+        case.check("attention", |cx| {
+            let (q, kv) = (value(cx, &q), value(cx, &kv));
+            attention(cx, &q, &kv, how)
+        });
+        let mut case = Case::new();
+        let (x, pos) = (case.tensor("x", &[own, t, dim]), case.tensor("pos", &[1, t, dim]));
+        let (w, bias) = (case.tensor("w", &[3 * dim, dim]), case.tensor("bias", &[3 * dim]));
+        case.check("self attention", |cx| {
+            let (x, pos) = (value(cx, &x), value(cx, &pos));
+            self_attention(cx, &x, &pos, queries, (&w, &bias), how)
+        });
+    }
+}
+
+#[test]
+fn feed_forward_and_activations() {
+    for (kind, p) in [(Activation::Relu, 0.2), (Activation::Gelu, 0.2), (Activation::Gelu, 0.0)] {
+        let mut case = Case::new();
+        let (b, t, all, dim, hidden) = (3, 2, 4, 12, 19);
+        let x = case.tensor("x", &[b, t, dim]);
+        let (linear1, linear2) = (case.linear("one", dim, hidden), case.linear("two", hidden, dim));
+        let layer = FeedForward { linear1, linear2, activation: kind, dropout: Dropout { p } };
+        case.check("feed forward", |cx| {
+            let x = value(cx, &x);
+            feed_forward(cx, &x, &layer, all)
+        });
+        let mut case = Case::new();
+        let x = case.tensor("x", &[b, t, dim]);
+        case.check("activation and dropout", |cx| {
+            let x = value(cx, &x);
+            let y = activation(cx, &x, kind)?;
+            dropout(cx, &y, p)
+        });
+    }
+}
+
+#[test]
+fn tokens() {
+    let mut case = Case::new();
+    let (a, b, scores) = (case.tensor("a", &[3, 2, 5]), case.tensor("b", &[1, 4, 5]), case.tensor("scores", &[3, 3]));
+    case.check("tokens", |cx| {
+        let (a, b, scores) = (value(cx, &a), value(cx, &b), value(cx, &scores));
+        let all = cat_tokens(cx, 3, &[&a, &b, &a])?;
+        let some = select_tokens(cx, &all, &[6, 0, 3])?;
+        let mean = weighted_mean(cx, &scores, &some)?;
+        let first = narrow_tokens(cx, &all, 1, 2)?;
+        let both = cat_tokens(cx, 3, &[&mean, &first])?;
+        let rows = both.reshape((3, 15))?;
+        cat_rows(cx, &rows, &scores)
+    });
+}
+
+#[test]
+fn a_latent_and_losses() {
+    let mut case = Case::new();
+    let (latent, chunk) = (case.tensor("latent", &[4, 6]), case.tensor("chunk", &[4, 3, 2]));
+    let mut rng = Rng::new(3, "data");
+    let noise = Tensor::from_vec(rng.normals(12), (4, 3), &Device::Cpu).unwrap();
+    let want = Tensor::from_vec(rng.normals(24), (4, 3, 2), &Device::Cpu).unwrap();
+    let pad =
+        Tensor::from_vec((0..12).map(|i| f32::from(u8::from(i % 5 == 0))).collect(), (4, 3), &Device::Cpu).unwrap();
+    case.check("sample", |cx| {
+        let (latent, chunk) = (value(cx, &latent), value(cx, &chunk));
+        let sample = sample_latent(cx, &latent, &Value::from(&noise))?;
+        cat_rows(cx, &sample, &chunk.reshape((4, 6))?)
+    });
+    for error in [Error::Absolute, Error::Squared] {
+        case.check_loss("losses", |cx| {
+            let (latent, chunk) = (value(cx, &latent), value(cx, &chunk));
+            let mut loss = Loss::default();
+            loss.add("error", chunk_error(cx, (&chunk, &want), &pad, error, 19)?.0, 1.5);
+            loss.add("kld", kl_divergence(cx, &latent, 7)?, 10.0);
+            Ok(loss)
+        });
+    }
+}
+
+#[test]
+fn convolutions() {
+    for (size, channels, output, k, stride, frozen) in [
+        ((7, 6), 3, 16, 3, 1, false),
+        ((9, 9), 16, 32, 3, 2, true),
+        ((8, 7), 16, 16, 1, 2, false),
+        ((12, 12), 3, 8, 7, 2, false),
+    ] {
+        let mut case = Case::new();
+        let x = case.tensor("x", &[2, size.0, size.1, channels]);
+        let weight = case.tensor("weight", &[output, channels, k, k]);
+        let made = [2, size.0.div_ceil(stride), size.1.div_ceil(stride), output];
+        let mut vector = |low: f32| {
+            let values = case.rng.normals(output).into_iter().map(|x| low + x.abs()).collect::<Vec<_>>();
+            Tensor::from_vec(values, output, &Device::Cpu).unwrap()
+        };
+        let fixed = [vector(0.5), vector(0.0), vector(0.0), vector(0.5)];
+        let shortcut = case.tensor("shortcut", &made);
+        let norm = match frozen {
+            true => {
+                let [weight, bias, mean, variance] = fixed;
+                ConvNorm::Frozen { weight, bias, mean, variance }
+            }
+            false => {
+                let norm = case.norm("norm", output);
+                ConvNorm::Group { weight: norm.weight, bias: norm.bias, groups: 2 }
+            }
+        };
+        case.check("convolution", |cx| {
+            let (x, shortcut) = (value(cx, &x), value(cx, &shortcut));
+            let y = conv2d(cx, &x, (&weight, stride), &norm, None, false)?;
+            let one = activation(cx, &y, Activation::Gelu)?;
+            let z = conv2d(cx, &x, (&weight, stride), &norm, Some(&shortcut), true)?;
+            cat_tokens(cx, 1, &[&one.reshape((1, one.len(), 1))?, &z.reshape((1, z.len(), 1))?])
+        });
+    }
+    let mut case = Case::new();
+    let x = case.tensor("x", &[2, 5, 6, 3]);
+    case.check("max pool and keypoints", |cx| {
+        let x = value(cx, &x);
+        let positive = activation(cx, &x, Activation::Relu)?;
+        let pooled = max_pool(cx, &positive)?;
+        let &[n, h, w, c] = pooled.dims() else { unreachable!("four dimensions") };
+        spatial_softmax(cx, &pooled.reshape((n, h * w, c))?, (h, w))
+    });
+}
+
+#[test]
+fn what_does_not_fit_is_named() {
+    let mut case = Case::new();
+    let (x, layer) = (case.tensor("x", &[2, 3, 5]), case.linear("layer", 4, 5));
+    let cache = Cache::default();
+    let error = |op: &dyn Fn(&mut Context<'_>) -> Result<Value>| {
+        cache.predict(&case.params, &mut || {}, |cx| op(cx)).map(|_| ()).unwrap_err().to_string()
+    };
+    let wrong = error(&|cx| linear(cx, &Value::from(&x), &layer));
+    assert_eq!(wrong, "linear: input has shape [2, 3, 5], expected [2, 3, 4]");
+    let wide = x.to_dtype(candle_core::DType::F64).unwrap();
+    let wrong = error(&|cx| activation(cx, &Value::from(&wide), Activation::Relu));
+    assert_eq!(wrong, "activation: tensor is of F64, expected of f32");
+    let turned = x.transpose(1, 2).unwrap();
+    let wrong = error(&|cx| activation(cx, &Value::from(&turned), Activation::Relu));
+    assert!(wrong.starts_with("activation: tensor is with strides"), "{wrong}");
+    let wrong = error(&|cx| select_tokens(cx, &Value::from(&x), &[3]));
+    assert_eq!(wrong, "select: token is 3, expected below 3");
+}

@@ -1,0 +1,315 @@
+//! Optimisers whose state can be saved.
+
+use crate::error::{ModelError, Result};
+use crate::gradients::{Gradients, ParamLayout};
+use crate::params::Params;
+use crate::simd::vectorised;
+use candle_core::{CpuStorage, InplaceOp1, Layout, Tensor, Var};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Which optimiser, without its learning rate.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+pub enum OptimiserConfig {
+    /// Loshchilov and Hutter, arXiv 1711.05101, as `torch.optim.AdamW`
+    AdamW {
+        /// decay of the first moment
+        beta1: f64,
+        /// decay of the second moment
+        beta2: f64,
+        /// added to the root of the second moment
+        eps: f64,
+        /// decoupled; every parameter decays
+        weight_decay: f64,
+    },
+    /// Everett et al., arXiv 2407.05872: `lr * atan2(m, sqrt(v))` instead of a quotient with eps, as the official TRM
+    AdamAtan2 {
+        /// decay of the first moment
+        beta1: f64,
+        /// decay of the second moment
+        beta2: f64,
+        /// decoupled; every parameter decays
+        weight_decay: f64,
+    },
+}
+
+impl Default for OptimiserConfig {
+    /// LeRobot's for ACT.
+    fn default() -> Self {
+        Self::AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 1e-4 }
+    }
+}
+
+/// An optimiser and its moments.
+#[derive(Debug)]
+pub struct Optimiser {
+    config: OptimiserConfig,
+    layout: Arc<ParamLayout>,
+    first: Vec<f32>,
+    second: Vec<f32>,
+    step: u64,
+    threads: usize,
+}
+
+/// One step's constants.
+#[derive(Debug, Clone, Copy)]
+struct Update {
+    config: OptimiserConfig,
+    lr: f64,
+    grad_scale: f32,
+    /// 1 - beta^t of both moments
+    corrections: (f64, f64),
+}
+
+impl Update {
+    /// Elementwise, so the order does not matter.
+    fn apply(&self, params: &mut [f32], grads: &[f32], first: &mut [f32], second: &mut [f32]) {
+        let (c1, c2) = (self.corrections.0, self.corrections.1);
+        let s = self.grad_scale;
+        let rows = params.iter_mut().zip(grads).zip(first.iter_mut().zip(second.iter_mut()));
+        match self.config {
+            OptimiserConfig::AdamW { beta1, beta2, eps, weight_decay } => {
+                let decay = (1.0 - self.lr * weight_decay) as f32;
+                let (b1, b2, eps) = (beta1 as f32, beta2 as f32, eps as f32);
+                let (n1, n2) = ((1.0 - beta1) as f32, (1.0 - beta2) as f32);
+                let (rate, root) = ((self.lr / c1) as f32, (1.0 / c2.sqrt()) as f32);
+                vectorised(
+                    #[inline(always)]
+                    || {
+                        for ((p, g), (m, v)) in rows {
+                            let g = g * s;
+                            *m = *m * b1 + g * n1;
+                            *v = *v * b2 + g * g * n2;
+                            *p = *p * decay - rate * *m / (v.sqrt() * root + eps);
+                        }
+                    },
+                );
+            }
+            OptimiserConfig::AdamAtan2 { beta1, beta2, weight_decay } => {
+                let decay = (1.0 - self.lr * weight_decay) as f32;
+                let (b1, b2) = (beta1 as f32, beta2 as f32);
+                let (n1, n2) = ((1.0 - beta1) as f32, (1.0 - beta2) as f32);
+                let (k1, k2, lr) = ((1.0 / c1) as f32, (1.0 / c2) as f32, self.lr as f32);
+                for ((p, g), (m, v)) in rows {
+                    let g = g * s;
+                    *m = *m * b1 + g * n1;
+                    *v = *v * b2 + g * g * n2;
+                    *p = *p * decay - lr * (*m * k1).atan2((*v * k2).sqrt());
+                }
+            }
+        }
+    }
+}
+
+/// One parameter with its slices; candle hands out the storage for the time of the call.
+struct InPlace<'a> {
+    update: Update,
+    grads: &'a [f32],
+    moments: Mutex<(&'a mut [f32], &'a mut [f32])>,
+}
+
+impl InplaceOp1 for InPlace<'_> {
+    fn name(&self) -> &'static str {
+        "optimiser-step"
+    }
+
+    fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> candle_core::Result<()> {
+        let CpuStorage::F32(values) = storage else {
+            candle_core::bail!("a parameter is not f32");
+        };
+        let values = match layout.contiguous_offsets() {
+            Some((from, to)) => &mut values[from..to],
+            None => candle_core::bail!("a parameter is not contiguous"),
+        };
+        let mut moments = self.moments.lock().unwrap_or_else(PoisonError::into_inner);
+        let (first, second) = &mut *moments;
+        self.update.apply(values, self.grads, first, second);
+        Ok(())
+    }
+}
+
+impl Optimiser {
+    /// Moments at zero.
+    pub fn new(config: OptimiserConfig, layout: Arc<ParamLayout>) -> Self {
+        let zeros = || vec![0.0; layout.len()];
+        let (first, second) = (zeros(), zeros());
+        Self { config, layout, first, second, step: 0, threads: rayon::current_num_threads() }
+    }
+
+    /// Steps taken.
+    pub fn steps(&self) -> u64 {
+        self.step
+    }
+
+    /// Runs on at most `threads` threads (unless set: as many as rayon has, at most two). The result is the same.
+    pub fn set_threads(&mut self, threads: usize) {
+        self.threads = threads.max(1);
+    }
+
+    /// One update of `params` with `grads * grad_scale`, each at its own rate relative to `lr`; in place.
+    ///
+    /// # Errors
+    /// If `params` are not those of the layout.
+    pub fn step(&mut self, params: &Params, grads: &Gradients, grad_scale: f32, lr: f64) -> Result<()> {
+        if **grads.layout() != *self.layout || params.iter().count() != self.layout.iter().count() {
+            return Err(ModelError::State {
+                object: "optimiser",
+                detail: "parameters and gradients are not those that it was made for".to_string(),
+            });
+        }
+        self.step += 1;
+        let (OptimiserConfig::AdamW { beta1, beta2, .. } | OptimiserConfig::AdamAtan2 { beta1, beta2, .. }) =
+            self.config;
+        let t = self.step as f64;
+        let corrections = (1.0 - beta1.powf(t), 1.0 - beta2.powf(t));
+        let update = Update { config: self.config, lr, grad_scale, corrections };
+
+        let (mut first, mut second) = (self.first.as_mut_slice(), self.second.as_mut_slice());
+        let mut work: Vec<(&Var, InPlace<'_>)> = Vec::new();
+        for ((name, var), (_, span)) in params.iter().zip(self.layout.iter()) {
+            let update = Update { lr: lr * params.rate(name), ..update };
+            let (m, rest) = first.split_at_mut(span.len());
+            first = rest;
+            let (v, rest) = second.split_at_mut(span.len());
+            second = rest;
+            let grads = &grads.values()[span];
+            work.push((var, InPlace { update, grads, moments: Mutex::new((m, v)) }));
+        }
+        let mut seen = 0;
+        let half = self.layout.len() / 2;
+        let cut = work.iter().take_while(|(var, _)| {
+            seen += var.elem_count();
+            seen <= half
+        });
+        let cut = cut.count();
+        let (left, right) = work.split_at(cut);
+        let run = |part: &[(&Var, InPlace<'_>)]| part.iter().try_for_each(|(var, op)| var.inplace_op1(op));
+        let done = match self.threads {
+            1 => run(left).and_then(|()| run(right)),
+            _ => std::thread::scope(|scope| {
+                let other = scope.spawn(|| run(right));
+                let mine = run(left);
+                mine.and(other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            }),
+        };
+        params.changed();
+        Ok(done?)
+    }
+
+    /// Both moments as tensors named `moment1.<name>` and `moment2.<name>`.
+    pub fn state(&self, params: &Params) -> Result<BTreeMap<String, Tensor>> {
+        let mut tensors = BTreeMap::new();
+        for ((name, var), (_, span)) in params.iter().zip(self.layout.iter()) {
+            for (kind, values) in [("moment1", &self.first), ("moment2", &self.second)] {
+                let tensor = Tensor::from_slice(&values[span.clone()], var.dims(), var.device())?;
+                tensors.insert(format!("{kind}.{name}"), tensor);
+            }
+        }
+        Ok(tensors)
+    }
+
+    /// Takes moments saved by `state`, after `step` steps.
+    ///
+    /// # Errors
+    /// A moment that is missing or of the wrong size.
+    pub fn restore(&mut self, tensors: &BTreeMap<String, Tensor>, step: u64) -> Result<()> {
+        let first = flat(&self.layout, "moment1", tensors)?;
+        let second = flat(&self.layout, "moment2", tensors)?;
+        (self.first, self.second, self.step) = (first, second, step);
+        Ok(())
+    }
+}
+
+/// The tensors `<kind>.<name>` one after the other.
+pub fn flat(layout: &ParamLayout, kind: &str, tensors: &BTreeMap<String, Tensor>) -> Result<Vec<f32>> {
+    let mut values = Vec::with_capacity(layout.len());
+    for (name, span) in layout.iter() {
+        let name = format!("{kind}.{name}");
+        let tensor = tensors.get(&name).ok_or_else(|| ModelError::MissingTensor {
+            name: name.clone(),
+            given: crate::error::some_names(tensors.keys()),
+        })?;
+        if tensor.elem_count() != span.len() {
+            let (expected, found) = (vec![span.len()], tensor.dims().to_vec());
+            return Err(ModelError::MisshapenTensor { name, expected, found });
+        }
+        values.extend(tensor.flatten_all()?.to_vec1::<f32>()?);
+    }
+    Ok(values)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::{Init, Rng};
+    use candle_core::Device;
+
+    fn three_steps(config: OptimiserConfig) -> Vec<f32> {
+        let mut params = Params::new();
+        let start = Tensor::new(&[1f32, -2.0, 0.5], &Device::Cpu).unwrap();
+        params.insert("w", start).unwrap();
+        let layout = Arc::new(ParamLayout::new(&params));
+        let mut optimiser = Optimiser::new(config, layout.clone());
+        let mut grads = Gradients::zeros(layout);
+        for k in 1..=3 {
+            grads.values_mut().copy_from_slice(&[0.1 * k as f32, -0.3, 2.0 / k as f32]);
+            optimiser.step(&params, &grads, 1.0, 0.01).unwrap();
+        }
+        params.get("w").unwrap().to_vec1().unwrap()
+    }
+
+    #[test]
+    fn adamw_is_torchs() {
+        let got = three_steps(OptimiserConfig::AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.1 });
+        // torch.optim.AdamW(lr=0.01, weight_decay=0.1), the same three gradients
+        let (mut p, mut m, mut v) = ([1f64, -2.0, 0.5], [0f64; 3], [0f64; 3]);
+        for k in 1..=3 {
+            let g = [0.1 * f64::from(k), -0.3, 2.0 / f64::from(k)];
+            for i in 0..3 {
+                p[i] *= 1.0 - 0.01 * 0.1;
+                m[i] = 0.9 * m[i] + 0.1 * g[i];
+                v[i] = 0.999 * v[i] + 0.001 * g[i] * g[i];
+                let (mh, vh) = (m[i] / (1.0 - 0.9f64.powi(k)), v[i] / (1.0 - 0.999f64.powi(k)));
+                p[i] -= 0.01 * mh / (vh.sqrt() + 1e-8);
+            }
+        }
+        for (a, b) in got.iter().zip(p) {
+            assert!((f64::from(*a) - b).abs() < 1e-6, "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn adam_atan2_moves_by_the_angle() {
+        let got = three_steps(OptimiserConfig::AdamAtan2 { beta1: 0.9, beta2: 0.95, weight_decay: 0.1 });
+        // the first step moves by lr * pi/4 whatever the size of the gradient; constant gradients go on so
+        let decayed = |p: f64| p * (1.0 - 0.01 * 0.1) + 0.01 * std::f64::consts::FRAC_PI_4;
+        let expected = decayed(decayed(decayed(-2.0)));
+        assert!((f64::from(got[1]) - expected).abs() < 1e-5, "{} {expected}", got[1]);
+    }
+
+    #[test]
+    fn a_restored_optimiser_goes_on_with_the_same_bits() {
+        let mut rng = Rng::new(1, "test");
+        let mut params = Params::new();
+        params.create("a", &[3, 5], Init::XavierUniform, &mut rng).unwrap();
+        params.create("b", &[7], Init::Ones, &mut rng).unwrap();
+        let layout = Arc::new(ParamLayout::new(&params));
+        let mut grads = Gradients::zeros(layout.clone());
+        let mut one = Optimiser::new(OptimiserConfig::default(), layout.clone());
+        grads.values_mut().copy_from_slice(&rng.normals(22));
+        one.step(&params, &grads, 0.5, 0.1).unwrap();
+        let saved = one.state(&params).unwrap();
+        let weights: BTreeMap<_, _> = params.tensors().iter().map(|(k, v)| (k.clone(), v.copy().unwrap())).collect();
+        one.step(&params, &grads, 0.5, 0.1).unwrap();
+        let expected = params.get("a").unwrap().to_vec2::<f32>().unwrap();
+        params.load(&weights).unwrap();
+        let mut two = Optimiser::new(OptimiserConfig::default(), layout);
+        two.restore(&saved, 1).unwrap();
+        two.step(&params, &grads, 0.5, 0.1).unwrap();
+        assert_eq!(params.get("a").unwrap().to_vec2::<f32>().unwrap(), expected);
+        assert!(two.restore(&BTreeMap::new(), 1).is_err());
+    }
+}
