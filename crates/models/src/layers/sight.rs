@@ -10,6 +10,7 @@ use nn::Params;
 use nn::Result;
 use nn::Rng;
 use nn::values::with_values;
+use nn::{Context, Value};
 
 /// Cameras, and the network that their pictures go through.
 #[derive(Debug)]
@@ -130,6 +131,14 @@ impl Sight {
         let pictures = pictures.map(|name| self.unfolded(observation.require("see", name)?));
         let tokens = self.encoder.forward(&pictures.collect::<Result<Vec<_>>>()?)?;
         Ok(tokens.reshape(((), self.width()))?)
+    }
+
+    /// An observation that was looked at -> (b, width)
+    pub(crate) fn apply(&self, cx: &mut Context<'_>, observation: &Features<Tensor>) -> Result<Value> {
+        let pictures = self.cameras.features.iter();
+        let pictures = pictures.map(|name| self.unfolded(observation.require("see", name)?));
+        let tokens = self.encoder.apply(cx, &pictures.collect::<Result<Vec<_>>>()?)?;
+        tokens.reshape((tokens.len() / self.width(), self.width()))
     }
 
     /// Pictures of one step, in order -> (b, numbers of a step)

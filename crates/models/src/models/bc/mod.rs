@@ -9,7 +9,6 @@
 //! keypoints).
 
 mod config;
-mod fused;
 
 pub use config::{Config, Loss};
 
@@ -18,19 +17,13 @@ use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Signature};
-use crate::fused::Workspaces;
-use crate::layers::{Linear, Sight};
+use crate::layers::{Activation, Linear, Sight};
 use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
-use nn::Gradients;
-use nn::Params;
-use nn::Result;
-use nn::Rng;
-use nn::losses::absolute;
-use nn::{LossParts, LossValues};
-use std::collections::BTreeMap;
+use nn::ops::{Error, activation, cat_rows, chunk_error, linear};
+use nn::{Cache, Context, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -46,7 +39,7 @@ pub struct Bc {
     sight: Option<Sight>,
     hidden: Vec<Linear>,
     action_head: Linear,
-    workspaces: Workspaces,
+    cache: Cache,
 }
 
 impl Bc {
@@ -69,8 +62,8 @@ impl Bc {
             width = next;
         }
         let action_head = Linear::new(&mut p, "action_head", width, config.action_horizon * signature.action_dim, rng)?;
-        let (config, signature, workspaces) = (config.clone(), signature.clone(), Workspaces::default());
-        Ok(Self { config, signature, params: p, sight, hidden, action_head, workspaces })
+        let (config, signature, cache) = (config.clone(), signature.clone(), Cache::default());
+        Ok(Self { config, signature, params: p, sight, hidden, action_head, cache })
     }
 
     /// The signature's features that are numbers, (b, …) each -> (b, all of them)
@@ -82,27 +75,32 @@ impl Bc {
         Ok(Tensor::cat(&joined, 1)?)
     }
 
-    /// The signature's features, (b, …) each -> (b, H, A)
-    fn forward(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
-        let mut x = self.numbers(rows, observation)?;
+    /// The signature's features, (b, …) each, pictures as the network reads them -> (b, H, A)
+    fn forward(&self, cx: &mut Context<'_>, rows: usize, observation: &Features<Tensor>) -> Result<Value> {
+        let mut x = Value::from(&self.numbers(rows, observation)?);
         if let Some(sight) = &self.sight {
-            x = Tensor::cat(&[x, sight.forward(&sight.look(observation, None)?)?], 1)?;
+            let seen = sight.apply(cx, observation)?;
+            x = cat_rows(cx, &x, &seen)?;
         }
         for layer in &self.hidden {
-            x = layer.forward(&x)?.relu()?;
+            x = linear(cx, &x, layer)?;
+            x = activation(cx, &x, Activation::Relu)?;
         }
         let shape = (rows, self.config.action_horizon, self.signature.action_dim);
-        Ok(self.action_head.forward(&x)?.reshape(shape)?)
+        linear(cx, &x, &self.action_head)?.reshape(shape)
     }
 
-    /// The batch with pictures as the network reads them in training.
-    fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
-        check_batch("bc", &self.signature, self.config.action_horizon, batch)?;
-        let observation = match &self.sight {
-            Some(sight) => sight.look(&batch.observation, Some(rng))?,
-            None => batch.observation.clone(),
-        };
-        Ok(Batch { observation, ..batch.clone() })
+    /// The observation with pictures as the network reads them: random parts in training, with `rng`.
+    fn look(&self, observation: &Features<Tensor>, rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
+        self.sight.as_ref().map_or_else(|| Ok(observation.clone()), |sight| sight.look(observation, rng))
+    }
+
+    /// The prediction on candle's operations; `predict` runs the same statement by hand.
+    #[cfg(test)]
+    fn predict_composed(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+        let rows = check_observation("bc", &self.signature, observation)?;
+        let observation = self.look(observation, None)?;
+        self.cache.composed_predict(&self.params, |cx| Ok(self.forward(cx, rows, &observation)?.detached()))
     }
 }
 
@@ -119,28 +117,29 @@ impl PolicyModel for Bc {
         None
     }
 
-    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
-        self.fused_gradients(&self.looked_at(batch, rng)?, into)
+    fn cache(&self) -> Option<&Cache> {
+        Some(&self.cache)
     }
 
-    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
-        let batch = &self.looked_at(batch, rng)?;
-        let difference = (self.forward(batch.rows(), &batch.observation)? - &batch.actions)?;
-        let valid = (1.0 - batch.is_pad.unsqueeze(2)?)?;
-        let entries = (batch.total_valid_steps * self.signature.action_dim).max(1) as f64;
-        let mean = |error: Tensor| -> Result<Tensor> { Ok((error.broadcast_mul(&valid)?.sum_all()? / entries)?) };
-        let l1 = mean(absolute(&difference)?)?;
-        // L1 in any case: it is what other policies report
-        let mut parts = BTreeMap::from([("l1_loss".to_string(), l1.detach())]);
-        let total = match self.config.loss {
-            Loss::L1 => l1,
-            Loss::L2 => {
-                let l2 = mean(difference.sqr()?)?;
-                parts.insert("l2_loss".to_string(), l2.detach());
-                l2
-            }
+    fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<nn::Loss> {
+        check_batch("bc", &self.signature, self.config.action_horizon, batch)?;
+        let observation = self.look(&batch.observation, Some(cx.rng()?))?;
+        let actions = self.forward(cx, batch.rows(), &observation)?;
+        let entries = batch.total_valid_steps * self.signature.action_dim;
+        let mut loss = nn::Loss::default();
+        let mut error = |cx: &mut Context<'_>, actions: &Value, error: Error| {
+            Ok::<_, nn::ModelError>(chunk_error(cx, (actions, &batch.actions), &batch.is_pad, error, entries)?.0)
         };
-        Ok(LossParts { total, parts })
+        match self.config.loss {
+            Loss::L1 => loss.add("l1_loss", error(cx, &actions, Error::Absolute)?, 1.0),
+            Loss::L2 => {
+                // L1 in any case: it is what other policies report
+                let l1 = error(cx, &actions.detach(), Error::Absolute)?;
+                loss.tell("l1_loss", l1.value() as f32);
+                loss.add("l2_loss", error(cx, &actions, Error::Squared)?, 1.0);
+            }
+        }
+        Ok(loss)
     }
 
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
@@ -150,10 +149,8 @@ impl PolicyModel for Bc {
     /// Nothing is drawn.
     fn sample_seen(&self, observation: &Features<Tensor>, _rng: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
         let rows = check_observation("bc", &self.signature, observation)?;
-        match &self.sight {
-            Some(sight) => self.fused_predict(sight, rows, observation, on_seen),
-            None => Ok(self.forward(rows, observation)?.detach()),
-        }
+        let observation = self.look(observation, None)?;
+        self.cache.predict(&self.params, on_seen, |cx| Ok(self.forward(cx, rows, &observation)?.detached()))
     }
 
     fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
@@ -206,7 +203,7 @@ mod tests {
                 move_parameters(&model);
                 let batch = batch(signature, 3, 3, 3);
                 assert_the_step_is_the_composed_one(&model, &batch, &format!("{:?}", model.config));
-                let (want, mut seen) = (model.forward(3, &batch.observation).unwrap(), 0);
+                let (want, mut seen) = (model.predict_composed(&batch.observation).unwrap(), 0);
                 let rng = &mut Rng::new(0, "unused");
                 let got = model.sample_seen(&batch.observation, rng, &mut || seen += 1).unwrap();
                 let off = (got - want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
