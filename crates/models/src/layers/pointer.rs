@@ -120,20 +120,23 @@ impl Pointer {
         Ok((Tensor::cat(&[memory, &pointed.token], 1)?, Tensor::cat(&[pos, &own], 1)?))
     }
 
-    /// encoded and tokens: (b, M, D), after and before everything was encoded, pos: (1, M, D) -> what a decoder reads and its
+    /// Of tokens, (b, M, D), those of the candidates, (b, candidates, D).
+    pub(crate) fn candidates(&self, cx: &mut Context<'_>, tokens: &Value) -> Result<Value> {
+        select_tokens(cx, tokens, &self.places.iter().map(|place| *place as usize).collect::<Vec<_>>())
+    }
+
+    /// encoded: (b, M, D), the candidates as they came in, (b, candidates, D), pos: (1, M, D) -> what a decoder reads and its
     /// positions, with the token that is pointed at after them, and the scores, (b, candidates)
     pub(crate) fn apply(
         &self,
         cx: &mut Context<'_>,
-        (encoded, tokens): (&Value, &Value),
+        (encoded, candidates): (&Value, &Value),
         pos: &Value,
     ) -> Result<(Value, Value, Value)> {
-        let places: Vec<usize> = self.places.iter().map(|place| *place as usize).collect();
-        let (b, n) = (encoded.dim(0)?, places.len());
-        let candidates = select_tokens(cx, encoded, &places)?;
-        let scores = linear(cx, &candidates, &self.score)?.reshape((b, n))?;
-        let before = select_tokens(cx, tokens, &places)?;
-        let token = weighted_mean(cx, &scores, &before)?;
+        let (b, n, _) = candidates.dims3()?;
+        let read = self.candidates(cx, encoded)?;
+        let scores = linear(cx, &read, &self.score)?.reshape((b, n))?;
+        let token = weighted_mean(cx, &scores, candidates)?;
         let memory = cat_tokens(cx, b, &[encoded, &token])?;
         let own = cx.parameter(&self.position.weight)?.reshape((1, 1, pos.width()))?;
         Ok((memory, cat_tokens(cx, 1, &[pos, &own])?, scores))

@@ -145,11 +145,12 @@ impl Act {
     ) -> Result<(Value, Value, Option<Value>)> {
         let tokens = self.tokens.apply(cx, latent, observation)?;
         let mut pos = self.tokens.apply_positions(cx)?;
+        let candidates = self.pointer.as_ref().map(|pointer| pointer.candidates(cx, &tokens)).transpose()?;
         let mut memory = self.encoder.apply(cx, &tokens, &pos, None, tokens.dim(1)?)?;
         let mut scores = None;
-        if let Some(pointer) = &self.pointer {
+        if let (Some(pointer), Some(candidates)) = (&self.pointer, &candidates) {
             let found;
-            (memory, pos, found) = pointer.apply(cx, (&memory, &tokens), &pos)?;
+            (memory, pos, found) = pointer.apply(cx, (&memory, candidates), &pos)?;
             scores = Some(found);
         }
         let decoded = self.decoder.apply(cx, &memory, &pos)?;
