@@ -3,7 +3,7 @@
 use crate::context::Workspace;
 use crate::error::{ModelError, Result};
 use crate::gradients::Gradients;
-use crate::kernels::{Pack, Start, add};
+use crate::kernels::add;
 use crate::params::Params;
 use candle_core::{Tensor, TensorId};
 use std::collections::HashMap;
@@ -114,21 +114,5 @@ impl<'a> Backward<'a> {
             }
             empty => *empty = Some(grad),
         }
-    }
-
-    /// Adds a product to the gradient of a result, if it has one: `f` gets the sum so far.
-    pub(crate) fn add_product(
-        &mut self,
-        node: Option<usize>,
-        len: usize,
-        f: impl FnOnce(&mut [f32], Start<'static>, &mut Pack),
-    ) {
-        let Some(node) = node else { return };
-        let (mut sum, start) = match self.slot(node).take() {
-            Some(sum) => (sum, Start::Add),
-            None => (self.space.pool.take(len), Start::Zero),
-        };
-        f(&mut sum, start, &mut self.space.pack);
-        self.grads[node] = Some(sum);
     }
 }

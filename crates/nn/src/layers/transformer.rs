@@ -14,11 +14,17 @@ use candle_core::{DType, Tensor};
 /// What all transformer layers of a model share.
 #[derive(Debug, Clone, Copy)]
 pub struct Shape {
+    /// width
     pub dim: usize,
+    /// attention heads
     pub heads: usize,
+    /// width of the feed-forward part
     pub hidden: usize,
+    /// of the feed-forward part
     pub activation: Activation,
+    /// probability
     pub dropout: f64,
+    /// whether a norm comes before its branch, not after the sum
     pub pre_norm: bool,
 }
 
@@ -37,15 +43,19 @@ impl Shape {
 /// One encoder layer: self-attention and feed-forward, each with a residual.
 #[derive(Debug)]
 pub struct EncoderLayer {
-    pub self_attn: MultiHeadAttention,
-    pub ff: FeedForward,
-    pub norm1: LayerNorm,
-    pub norm2: LayerNorm,
+    self_attn: MultiHeadAttention,
+    ff: FeedForward,
+    norm1: LayerNorm,
+    norm2: LayerNorm,
     dropout: Dropout,
     pre_norm: bool,
 }
 
 impl EncoderLayer {
+    /// Creates the parameters below `prefix`.
+    ///
+    /// # Errors
+    /// If a name is taken.
     pub fn new(params: &mut Params, prefix: &str, shape: Shape, init: LayerInit, rng: &mut Rng) -> Result<Self> {
         let (dim, p) = (shape.dim, shape.dropout);
         let attn = format!("{prefix}.self_attn");
@@ -125,11 +135,15 @@ impl EncoderLayer {
 /// Encoder layers, and a final norm if they are pre-norm.
 #[derive(Debug)]
 pub struct Encoder {
-    pub layers: Vec<EncoderLayer>,
-    pub norm: Option<LayerNorm>,
+    layers: Vec<EncoderLayer>,
+    norm: Option<LayerNorm>,
 }
 
 impl Encoder {
+    /// Creates `n_layers` layers below `prefix`.
+    ///
+    /// # Errors
+    /// If a name is taken.
     pub fn new(
         params: &mut Params,
         prefix: &str,
@@ -189,17 +203,21 @@ impl Encoder {
 /// One decoder layer: self-attention, attention to the encoder's output, feed-forward.
 #[derive(Debug)]
 pub struct DecoderLayer {
-    pub self_attn: MultiHeadAttention,
-    pub multihead_attn: MultiHeadAttention,
-    pub ff: FeedForward,
-    pub norm1: LayerNorm,
-    pub norm2: LayerNorm,
-    pub norm3: LayerNorm,
+    self_attn: MultiHeadAttention,
+    multihead_attn: MultiHeadAttention,
+    ff: FeedForward,
+    norm1: LayerNorm,
+    norm2: LayerNorm,
+    norm3: LayerNorm,
     dropout: Dropout,
     pre_norm: bool,
 }
 
 impl DecoderLayer {
+    /// Creates the parameters below `prefix`.
+    ///
+    /// # Errors
+    /// If a name is taken.
     pub fn new(params: &mut Params, prefix: &str, shape: Shape, rng: &mut Rng) -> Result<Self> {
         let (dim, p, init) = (shape.dim, shape.dropout, LayerInit::Xavier.weight());
         let hidden = (dim, shape.hidden);
@@ -287,9 +305,11 @@ impl DecoderLayer {
 /// Decoder layers over learned queries, and their final norm.
 #[derive(Debug)]
 pub struct Decoder {
+    /// one after the other
     pub layers: Vec<DecoderLayer>,
+    /// of their result
     pub norm: LayerNorm,
-    /// (C, D)
+    /// of the queries, (C, D)
     pub pos_embed: Embedding,
 }
 
@@ -342,6 +362,7 @@ pub enum LayerInit {
 }
 
 impl LayerInit {
+    /// Of the matrices of attention.
     pub fn weight(self) -> Init {
         match self {
             Self::Xavier | Self::Recursive => Init::XavierUniform,
