@@ -203,7 +203,8 @@ impl Encoder {
 /// One decoder layer: self-attention, attention to the encoder's output, feed-forward.
 #[derive(Debug)]
 pub struct DecoderLayer {
-    self_attn: MultiHeadAttention,
+    /// among the tokens
+    pub self_attn: MultiHeadAttention,
     multihead_attn: MultiHeadAttention,
     ff: FeedForward,
     norm1: LayerNorm,

@@ -127,7 +127,7 @@ impl PolicyModel for Bc {
         let actions = self.forward(cx, batch.rows(), &observation)?;
         let entries = batch.total_valid_steps * self.signature.action_dim;
         let mut loss = nn::Loss::default();
-        let mut error = |cx: &mut Context<'_>, actions: &Value, error: Error| {
+        let error = |cx: &mut Context<'_>, actions: &Value, error: Error| {
             Ok::<_, nn::ModelError>(chunk_error(cx, (actions, &batch.actions), &batch.is_pad, error, entries)?.0)
         };
         match self.config.loss {
