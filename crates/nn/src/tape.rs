@@ -9,12 +9,14 @@ use candle_core::{Tensor, TensorId};
 use std::collections::HashMap;
 use std::ops::Range;
 
+type Passes<G> = Box<dyn FnOnce(G, &mut Backward<'_>) -> Result<()>>;
+
 /// What passes a gradient on.
 enum Back {
     /// of a result
-    Result(Box<dyn FnOnce(Vec<f32>, &mut Backward<'_>) -> Result<()>>),
+    Result(Passes<Vec<f32>>),
     /// of a term of the loss, whose gradient is its weight
-    Term(Box<dyn FnOnce(f64, &mut Backward<'_>) -> Result<()>>),
+    Term(Passes<f64>),
 }
 
 /// Backward passes in the order of the operations.

@@ -5,7 +5,7 @@ use nn::kernels::{Conv, Frame, Winograd};
 
 /// A frame with its border of zeros.
 pub(crate) fn framed(pass: &mut Pass<'_>, frame: &Frame) -> Vec<f32> {
-    let mut x = pass.take(frame.len());
+    let mut x = pass.take(frame.buffer_len());
     frame.clear_border(&mut x);
     x
 }

@@ -120,7 +120,7 @@ impl<'a> Net<'a> {
         grad: &[f32],
         grads: &mut Grads<'_>,
     ) -> Vec<f32> {
-        let mut out = pass.take(frame.len());
+        let mut out = pass.take(frame.buffer_len());
         frame.clear_border(&mut out);
         match self.shape.norm {
             ImageNorm::Group => {

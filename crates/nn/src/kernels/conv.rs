@@ -38,7 +38,7 @@ impl Frame {
     }
 
     /// Numbers of all pictures, and some that are never used.
-    pub fn len(&self) -> usize {
+    pub fn buffer_len(&self) -> usize {
         self.pictures * self.picture() + TAIL
     }
 

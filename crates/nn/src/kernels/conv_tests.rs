@@ -39,7 +39,7 @@ fn each(conv: &Conv, mut f: impl FnMut(usize, usize, usize)) {
 }
 
 fn framed(frame: &Frame, values: &[f32]) -> Vec<f32> {
-    let mut x = vec![f32::NAN; frame.len()];
+    let mut x = vec![f32::NAN; frame.buffer_len()];
     frame.clear_border(&mut x);
     let row = frame.width * frame.channels;
     for (r, line) in values.chunks_exact(row).enumerate() {

@@ -58,7 +58,7 @@ impl ConvNorm {
 
 /// x in a frame with its border of zeros.
 fn framed(x: &[f32], frame: &Frame, pool: &mut Pool) -> Vec<f32> {
-    let mut out = pool.take(frame.len());
+    let mut out = pool.take(frame.buffer_len());
     frame.clear_border(&mut out);
     let line = frame.width * frame.channels;
     for (r, row) in x.chunks_exact(line).enumerate() {
@@ -204,7 +204,7 @@ pub fn conv2d(
         }
         let frame = conv.made(conv.grad_border());
         let [scale, _] = norm.scale_and_shift()?;
-        let mut before = back.space.pool.take(frame.len());
+        let mut before = back.space.pool.take(frame.buffer_len());
         frame.clear_border(&mut before);
         match &norm {
             ConvNorm::Group { weight, bias, .. } => {
