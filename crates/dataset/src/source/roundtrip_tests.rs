@@ -119,7 +119,7 @@ proptest! {
             writer.add_demo(demo).unwrap();
         }
         writer.finish().unwrap();
-        let source = Source::open(&path).unwrap();
+        let source = Source::open(&path).unwrap().nonfinite(NonFinite::Keep);
         prop_assert_eq!(&source.root().unwrap(), &root);
         for (i, demo) in demos.iter().enumerate() {
             prop_assert_eq!(&source.read_demo(i).unwrap(), demo);
