@@ -16,26 +16,26 @@ use crate::work::{run, unlocked};
 /// The most samples in a batch.
 const MOST_SAMPLES: usize = 1 << 24;
 
-/// A LeRobotDataset v3.0 folder, written by actrm or by LeRobot, as a map of samples.
+/// A LeRobotDataset v3.0 folder, written by actrm or by LeRobot, as a map-style data set.
 ///
-/// A sample is a dict with LeRobot's keys and shapes: a column of numbers as an array (a column of one number without
-/// an axis), a camera as (3, height, width), depth as (1, height, width). Sample `i` is the `i`-th frame of the chosen episodes. Numbers are float32,
-/// truth values bool, the index columns int64; numeric columns and pictures stay in memory.
+/// Sample `i` is the `i`-th frame of the chosen episodes: a dict with LeRobot's keys and shapes. A numeric column is an
+/// array (a scalar without an axis), a camera (3, height, width), depth (1, height, width). Numbers are float32,
+/// booleans bool and the index columns int64. Numeric columns and images stay in memory.
 ///
 /// Parameters
 /// ----------
 /// path: the folder.
-/// delta_timestamps: by column the frames around the sample's that belong to it, as whole numbers of frames or, where
-///     any of them is a float, in seconds as LeRobot has them. The column then has an axis of frames in front, and
-///     `<column>_is_pad` says which of them lie outside the episode and repeat its first or last frame.
-/// split: take the episodes of this mask only (`train`, `valid`, ...).
-/// episodes: or these.
-/// cameras: cameras whose pictures are read; all of them unless given.
-/// depth: depth that is read; all of it unless given.
-/// depth_output_unit: what depth and its statistics are given in, `mm` or `m`.
-/// return_uint8: pictures as they are stored, 0 to 255, instead of float32 from 0 to 1.
+/// delta_timestamps: for each column the offsets of the frames in a sample. Integers count frames; if any is a float,
+///     all are seconds, as in LeRobot. The column then has a leading axis of frames, and `<column>_is_pad` marks the
+///     frames outside the episode, which repeat its first or last frame.
+/// split: only the episodes of this mask (`train`, `valid`, ...).
+/// episodes: only these episodes, instead of `split`.
+/// cameras: cameras to read; all unless given.
+/// depth: depth columns to read; all unless given.
+/// depth_output_unit: unit of depth and of its statistics, `mm` or `m`.
+/// return_uint8: images as they are stored, 0 to 255, instead of float32 from 0 to 1.
 ///
-/// Pickles (by path), and works in a `torch.utils.data.DataLoader` whose workers are forked or spawned.
+/// It can be pickled (by path), and works in a `torch.utils.data.DataLoader` whose workers are forked or spawned.
 #[pyclass(frozen, module = "actrm", name = "Dataset", subclass)]
 pub(crate) struct PyDataset {
     given: Given,
@@ -109,7 +109,7 @@ impl PyDataset {
         PyList::new(py, indices.into_iter().map(sample).collect::<PyResult<Vec<_>>>()?)
     }
 
-    /// Several samples in one dict, each column with an axis of samples in front.
+    /// Several samples in one dict, each column with a leading axis of samples.
     fn batch<'py>(&self, py: Python<'py>, indices: Vec<isize>) -> PyResult<Bound<'py, PyDict>> {
         let samples: Vec<u32> = indices.into_iter().map(|index| self.sample(index)).collect::<PyResult<_>>()?;
         self.gather(py, &samples, Some(samples.len()))
@@ -117,10 +117,10 @@ impl PyDataset {
 
     /// The samples in batches, one dict of arrays each.
     ///
-    /// Without a seed in their order. With one in the order in which `actrm-zoo train` reads them with this seed: one
-    /// epoch, the `epoch`-th, whose last batch is smaller unless `drop_last`; or, with `steps`, the batches of as many
-    /// training steps from the step `start` on, epochs end to end and all batches of one size. With `threads`, as many
-    /// threads make batches ahead while Python does something else: the same batches in the same order.
+    /// Without a seed the samples keep their order. With one they have the order in which `actrm-zoo train` reads them with
+    /// this seed. That is one epoch, the `epoch`-th, whose last batch is smaller unless `drop_last`. With `steps` it is the
+    /// batches of as many training steps from step `start` on: epochs follow each other, all batches have one size. With
+    /// `threads`, as many threads prepare batches while Python runs: the same batches in the same order.
     #[pyo3(signature = (batch_size, seed=None, *, epoch=0, steps=None, start=0, drop_last=false, threads=0))]
     #[expect(clippy::too_many_arguments, reason = "options by name")]
     fn batches(
@@ -149,7 +149,7 @@ impl PyDataset {
         Batches::new(slf.unbind(), batch_size, order, threads)
     }
 
-    /// Statistics over all episodes, as they are stored, of depth in its output unit: by column `min`, `max`, `mean`,
+    /// Stored statistics over all episodes, of depth in its output unit: for each column `min`, `max`, `mean`,
     /// `std`, quantiles and `count`.
     #[getter]
     fn stats<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -197,7 +197,7 @@ impl PyDataset {
         PyList::new(py, self.chosen.iter().map(row).collect::<PyResult<Vec<_>>>()?)
     }
 
-    /// Type, shape and names of every column, as `meta/info.json` states them.
+    /// Type, shape and dimension names of every column, from `meta/info.json`.
     #[getter]
     fn features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
@@ -223,19 +223,19 @@ impl PyDataset {
         self.dataset.info().fps
     }
 
-    /// Task texts; `task_index` counts them.
+    /// Task texts, in the order of `task_index`.
     #[getter]
     fn tasks(&self) -> Vec<String> {
         self.dataset.tasks().to_vec()
     }
 
-    /// What is not as it should be and was read as LeRobot reads it.
+    /// Faults of the data set that were read as LeRobot reads them.
     #[getter]
     fn notes(&self) -> Vec<String> {
         self.dataset.notes().to_vec()
     }
 
-    /// Names that `split` knows.
+    /// Names of the masks that `split` takes.
     #[getter]
     fn splits(&self) -> Vec<&str> {
         self.dataset.split_names()

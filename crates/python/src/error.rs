@@ -10,7 +10,7 @@ create_exception!(
     actrm,
     Error,
     PyException,
-    "What actrm refuses, in the words of its programs: file, key, what was expected and what was found."
+    "An error of actrm, with the message of its programs: file, key, what was expected and what was found."
 );
 
 /// An error with everything behind it, in one line.

@@ -14,10 +14,10 @@ use crate::error::{raised, words};
 use crate::policy::registry;
 use crate::work::unlocked;
 
-/// What was evaluated in a zoo, ranked: a list of dicts with the columns of `leaderboard.csv`, as `pandas.DataFrame` and
+/// The ranked results of a zoo: a list of dicts with the columns of `leaderboard.csv`, as `pandas.DataFrame` and
 /// `polars.DataFrame` take them. A value that a row does not have is None.
 ///
-/// Results that do not stand (damaged, edited, copied, of an entry that is not there) are left out and named in a
+/// Results that are not valid (damaged, edited, copied, of a missing entry) are left out and named in a
 /// `UserWarning` each, as `actrm-zoo leaderboard` names them.
 ///
 /// Parameters

@@ -24,13 +24,13 @@ const MOST_ROWS: usize = 1 << 16;
 
 /// A trained policy: an entry of a zoo, or a checkpoint of LeRobot's. Made by `load_policy`.
 ///
-/// Observations are dicts with LeRobot's keys, in the units of the data: `observation.state` and the others as arrays
-/// (or what numpy makes arrays of, such as tensors), pictures as 0 to 255 (uint8) or 0 to 1 (float), colours first or
-/// last. Further keys are left alone. With an axis of rows in front they are a batch: each row has the state of an
-/// episode of its own. Actions come back in the units of the data: nothing has to be normalised before or after.
+/// Observations are dicts with LeRobot's keys, in the units of the data. `observation.state` and the others are arrays
+/// or what numpy converts to arrays, such as tensors. Images are 0 to 255 (uint8) or 0 to 1 (float), channels first or
+/// last. Further keys are ignored. A leading axis makes a batch, in which each row is an episode of its own. Actions
+/// are in the units of the data: nothing has to be normalised before or after.
 ///
-/// `select_action` and `predict_action_chunk` each keep an episode of their own: observations that a policy looks back
-/// to, what it thought last. `reset` begins both anew. Safe to be used from several threads, one after the other.
+/// `select_action` and `predict_action_chunk` each keep the state of their own episode: past observations and, with a
+/// warm start, the previous chunk. `reset` clears both. A policy may be used from several threads, one after the other.
 #[pyclass(frozen, module = "actrm", name = "Policy")]
 pub(crate) struct PyPolicy {
     /// What loads it again.
@@ -95,7 +95,7 @@ struct Asked {
 
 #[pymethods]
 impl PyPolicy {
-    /// Begins an episode: forgets the last one. What a policy draws depends on the seed only; row `i` of a batch has
+    /// Begins an episode and clears the last one. Random draws of a policy depend on the seed only; row `i` of a batch has
     /// the seed `seed + i`, or the `i`-th of a list.
     #[pyo3(signature = (seed=None))]
     fn reset(&self, py: Python<'_>, seed: Option<Seeds>) -> PyResult<()> {
@@ -107,7 +107,7 @@ impl PyPolicy {
         })
     }
 
-    /// The action to execute now: (action_dim,), or (rows, action_dim) for a batch. Asks the network when the actions
+    /// The action to execute now: (action_dim,), or (rows, action_dim) for a batch. Queries the network when the actions
     /// that were planned are used up, as the entry's evaluations do.
     fn select_action<'py>(&self, py: Python<'py>, observation: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
         let asked = self.asked(observation)?;
@@ -125,10 +125,10 @@ impl PyPolicy {
         array(py, &shape(asked.batch, &[width]), &actions.concat())
     }
 
-    /// The actions from now on, as the network plans them: (action_horizon, action_dim), or (rows, action_horizon,
-    /// action_dim) for a batch. A policy that looks back (`n_obs_steps`) is to be shown the steps between two calls by
-    /// `observe`. `executed`: how many actions of the last chunk were executed since, for a policy that
-    /// goes on from its last thought; as many as the entry's evaluations execute unless given.
+    /// The predicted actions from now on: (action_horizon, action_dim), or (rows, action_horizon, action_dim) for a batch.
+    /// A policy with past observations (`n_obs_steps`) needs those between two calls by `observe`. `executed`: how many
+    /// actions of the last chunk were executed since, for a policy with a warm start; unless given, as many as the
+    /// entry's evaluations execute.
     #[pyo3(signature = (observation, executed=None))]
     fn predict_action_chunk<'py>(
         &self,
@@ -154,7 +154,7 @@ impl PyPolicy {
         array(py, &shape(asked.batch, &rows), &values)
     }
 
-    /// Shows `predict_action_chunk` a step at which it is not called; `select_action` sees every step.
+    /// Adds the observation of a step at which `predict_action_chunk` is not called; `select_action` needs no such call.
     fn observe(&self, py: Python<'_>, observation: &Bound<'_, PyDict>) -> PyResult<()> {
         let asked = self.asked(observation)?;
         unlocked(py, || {
@@ -183,7 +183,7 @@ impl PyPolicy {
         &self.loaded.entry().meta().task
     }
 
-    /// The kind of policy: `act`, `actrm`, ...
+    /// Type of the policy: `act`, `actrm`, ...
     #[getter]
     fn kind(&self) -> &str {
         &self.loaded.entry().meta().policy
@@ -195,7 +195,7 @@ impl PyPolicy {
         self.loaded.entry().meta().parameters
     }
 
-    /// The features of an observation and their shapes, with LeRobot's keys; pictures have their colours first.
+    /// The features of an observation and their shapes, with LeRobot's keys; images have their channels first.
     #[getter]
     fn input_features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
@@ -226,14 +226,14 @@ impl PyPolicy {
         Ok(all)
     }
 
-    /// Actions in a chunk (LeRobot: `chunk_size`), without those that were due before it.
+    /// Actions in a chunk (LeRobot: `chunk_size`), without those of past observations.
     #[getter]
     fn action_horizon(&self) -> usize {
         let past = self.loaded.experiment().policy.past_actions(self.n_obs_steps());
         self.loaded.model().action_horizon() - past
     }
 
-    /// Actions that are executed before the network is asked again; 1 where predictions are averaged.
+    /// Actions that are executed before the next query of the network; 1 with a temporal ensemble.
     #[getter]
     fn n_action_steps(&self) -> usize {
         match self.execution {
@@ -242,7 +242,7 @@ impl PyPolicy {
         }
     }
 
-    /// Observations that are seen at once: the present one and those before it, which are remembered.
+    /// Number of observations that the policy gets at once: the present one and those before it, which it keeps.
     #[getter]
     fn n_obs_steps(&self) -> usize {
         self.loaded.preprocess().signature().n_obs_steps
@@ -368,7 +368,7 @@ fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>
     Ok((shape, Values::U8(values)))
 }
 
-/// A policy that can be asked: an entry of a zoo, every file of it checked against its hash, or a checkpoint of LeRobot's.
+/// Load a policy: an entry of a zoo, whose files are checked against their hashes, or a checkpoint of LeRobot's.
 ///
 /// Parameters
 /// ----------

@@ -92,8 +92,8 @@ impl Simulator {
         Ok((self.seen(py, &seen)?, info))
     }
 
-    /// Executes an action, clipped to its limits: the observation, the reward, whether the task is done, and in a word
-    /// why it no longer can be, where the environment says so.
+    /// Executes an action, clipped to its limits. Returns the observation, the reward, whether the task is solved, and
+    /// `failure`: a word where the environment reports that the task is lost, else None.
     fn step<'py>(
         &self,
         py: Python<'py>,
@@ -111,7 +111,7 @@ impl Simulator {
         Ok((self.seen(py, &seen)?, rewards.iter().sum(), success, failure))
     }
 
-    /// A picture of the present state: (height, width, 3), uint8.
+    /// An image of the present state: (height, width, 3), uint8.
     #[pyo3(signature = (camera="agentview", height=256, width=256))]
     fn render<'py>(&self, py: Python<'py>, camera: &str, height: usize, width: usize) -> PyResult<Bound<'py, PyAny>> {
         if !(1..=4096).contains(&height) || !(1..=4096).contains(&width) {
@@ -139,7 +139,7 @@ impl Simulator {
         &self.ready.task
     }
 
-    /// The task's cap on an episode, in steps.
+    /// The task's step limit of an episode.
     #[getter]
     fn max_steps(&self) -> usize {
         self.ready.max_steps
@@ -161,7 +161,7 @@ impl Simulator {
         Ok((limit(&self.ready.action_low)?, limit(&self.ready.action_high)?))
     }
 
-    /// The features of an observation with their shapes; those of pictures have three axes.
+    /// The features of an observation with their shapes; those of images have three axes.
     #[getter]
     fn features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
@@ -179,7 +179,7 @@ impl Simulator {
         Ok(all)
     }
 
-    /// Versions of the simulator and of what it stands on.
+    /// Versions of the simulator and of its dependencies.
     #[getter]
     fn versions(&self) -> BTreeMap<String, String> {
         self.ready.versions.clone()

@@ -5,7 +5,7 @@ writes too, makes the policy type `actrm` and the environment type `actrm` known
 
     lerobot-eval --policy.type=actrm --policy.entry=zoo/stack-act --env.type=actrm --env.task=Stack
 
-An entry that sees pictures needs an environment that shows them: `--env.entry=` the same entry.
+An entry with image inputs needs an environment that renders them: `--env.entry=` the same entry.
 `ActrmPolicy.save_pretrained` writes a folder that `--policy.path` takes.
 """
 

@@ -64,30 +64,30 @@ def convert(
 ) -> dict[str, Any]:
     """Convert demonstrations (HDF5 of robomimic's family) into a LeRobotDataset v3.0 folder.
 
-    `dst` appears whole or not at all; Ctrl-C leaves nothing behind. Python runs on meanwhile.
+    `dst` appears whole or not at all; Ctrl-C leaves nothing behind. Other Python threads keep running.
 
     Parameters
     ----------
     src: HDF5 file, or a folder with one file an episode.
     dst: folder to create.
-    progress: True shows a bar, False does not, a function is called with frames done and frames in all; unless given
-        there is a bar where somebody can see it.
+    progress: True shows a bar, False does not. A function is called with frames done and frames in all. Unless given,
+        there is a bar in terminals and notebooks.
     state_keys, env_keys: observation keys of `observation.state` and `observation.environment_state`; those of the
         file's layout unless given.
-    entities: by name the observation keys of `observation.entity.<name>`; parts (`key[0:3]`), differences (`a - b`),
-        what an episode began with (`first(key)`), what was so many control steps before (`before(key:8)`) and
-        axes of a quaternion (`axes(key)`) may stand in the lists.
+    entities: for each name the observation keys of `observation.entity.<name>`. The lists may have slices (`key[0:3]`),
+        differences (`a - b`), the value at the first step (`first(key)`) or 8 control steps earlier (`before(key:8)`),
+        and the axes of a quaternion (`axes(key)`).
     fps: frames a second; the control frequency that the file states unless given.
-    images: how pictures are stored.
+    images: how images are stored.
     depth: make columns of depth, as LeRobot records it; the side folder alone keeps it otherwise.
-    actions: as the controller got them, or absolute poses.
+    actions: as the controller received them (`delta`), or absolute poses.
     rotation: how rotations in actions are written.
     nonfinite: refuse a source with values that are NaN or infinite, naming demo, key and step, or keep them; statistics
         are those of the finite values.
     skip_bad: leave out demos that cannot be converted, instead of refusing the source.
     lossless: keep what the format has no place for in the side folder, from which `actrm-data export` rebuilds the
         source.
-    jobs: threads; one a core for 0.
+    jobs: threads; 0 means one per core.
 
     Returns what was written: `episodes`, `frames`, `tasks`, `files`, `bytes`, `fingerprint`, `layout`, `notes`, and
     `skipped`, the demos left out, each with the reason.
@@ -130,31 +130,31 @@ def evaluate(
     results: Path | None = None,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Evaluate an entry's policy in simulation, one episode a seed, as `actrm-zoo eval` does.
+    """Evaluate an entry's policy in simulation, one episode per seed, as `actrm-zoo eval` does.
 
-    The results are stored where the leaderboard finds them. Finished episodes are not run again: an evaluation that was
-    interrupted goes on where it was, a finished one is returned at once. The outcome of an episode does not depend on
+    The results are stored where the leaderboard finds them. Finished episodes are not run again: an
+    interrupted evaluation resumes, a finished one is returned at once. The outcome of an episode does not depend on
     the number of workers.
 
     Parameters
     ----------
     entry: an entry's folder (`zoo/stack-act`), or its name in `zoo`.
     episodes: how many; their seeds count up from `seed`.
-    workers: simulators at once; one a core unless given.
+    workers: number of simulators at once; one per core unless given.
     progress: as in `convert`, in episodes.
     task: another task than the entry's.
-    max_steps: control steps after which an episode has failed; the entry's or the task's own cap unless given.
-    n_action_steps: actions that are executed before the policy is asked again; the entry's unless given.
-    temporal_ensemble: ask at every step and average all predictions, with this coefficient.
+    max_steps: control steps after which an episode has failed; the entry's or the task's own limit unless given.
+    n_action_steps: actions that are executed before the next query of the policy; the entry's unless given.
+    temporal_ensemble: query at every step and average all predictions, with this coefficient.
     control: control loop inside the simulator.
     python: an interpreter with robosuite; this one where it has robosuite, else `$ACTRM_PYTHON`, `.venv` here or above,
         `python3`.
     env_module: Python module that registers environments.
     zoo: folder of the zoo that names are looked up in.
     results: folder of results; `results` in the entry's zoo unless given.
-    force: evaluate although the demonstrations were recorded in another simulator generation, or with these seeds.
+    force: evaluate even if the demonstrations were recorded in another simulator version or with these seeds.
 
-    Returns columns, a row an episode, ascending by seed: `seed`, `success`, `steps`, `return`, `wall_ms` and
+    Returns columns with one row per episode, ascending by seed: `seed`, `success`, `steps`, `return`, `wall_ms` and
     `inference_ms` (mean of its queries) as arrays, `fingerprint` (of the initial state), `group` and `failure` as
     lists.
     """

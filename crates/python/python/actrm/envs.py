@@ -1,4 +1,4 @@
-"""gymnasium environments over the workers that evaluate: `gymnasium.make("actrm/Stack-v0")` after `import actrm.envs`.
+"""gymnasium environments on the workers of evaluations: `gymnasium.make("actrm/Stack-v0")` after `import actrm.envs`.
 
 An episode is the one that `actrm-zoo eval` runs with its seed. Observations are dicts with LeRobot's keys, so that a
 policy's `select_action` takes them as they are; which features they have is an entry's (`entry=`), or by default the
@@ -47,9 +47,9 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     Parameters
     ----------
     task: the task's name.
-    entry: an entry whose features are to be seen, and whose environment it is to be; its task unless one is named.
-    keys: by feature the observation keys that make it, instead.
-    max_steps: the cap on an episode; the task's own unless given. An episode that reaches it is truncated.
+    entry: an entry whose features and environment to use; also its task unless one is named.
+    keys: instead, for each feature its observation keys.
+    max_steps: the step limit of an episode; the task's own unless given. An episode that reaches it is truncated.
     render_mode: `rgb_array` or none.
     camera, size: what `render` shows.
     control, python, env_module: as in `actrm.evaluate`.
