@@ -62,6 +62,9 @@ fn parts_of_an_experiment_are_chosen_on_the_command_line() {
         chosen(&["act_stack", "train.steps=5"]).unwrap(),
         ("act_stack".to_owned(), vec!["train.steps=5".to_owned()])
     );
-    assert_eq!(chosen(&["policy=act"]).unwrap_err().to_string(), "key `task` is missing");
+    assert_eq!(
+        chosen(&["policy=act"]).unwrap_err().to_string(),
+        "key `task`: expected the task as well: an experiment is policy=... task=... [inputs=...], found none"
+    );
     assert!(chosen(&["act_stak", "inputs=image"]).unwrap_err().to_string().contains("did you mean `act_stack`"));
 }

@@ -126,7 +126,11 @@ impl Library {
             Some(name) => Some(self.parts(name)?.ok_or_else(|| self.unknown(name))?),
             None => None,
         };
-        let missing = |key: &str| ZooError::MissingKey { key: key.to_owned() };
+        let missing = |key: &str| ZooError::InvalidValue {
+            key: key.to_owned(),
+            expected: format!("the {key} as well: an experiment is policy=... task=... [inputs=...]"),
+            found: "none".to_owned(),
+        };
         let [policy, task, inputs] = chosen;
         let parts = Parts {
             policy: policy.or(of_name.as_ref().map(|p| p.policy.clone())).ok_or_else(|| missing("policy"))?,
@@ -240,9 +244,9 @@ impl Library {
         for (what, name, has) in [("task", &parts.task, Some(of_task)), ("policy", &parts.policy, policy.inputs())] {
             if let Some(has) = has.filter(|has| !has.contains(&parts.inputs.as_str())) {
                 return Err(ZooError::InvalidValue {
-                    key: format!("{what} `{name}`"),
-                    expected: format!("inputs {}", has.join(", ")),
-                    found: format!("inputs `{}`", parts.inputs),
+                    key: "inputs".to_owned(),
+                    expected: format!("one of those that {what} `{name}` has ({})", has.join(", ")),
+                    found: format!("`{}`", parts.inputs),
                 });
             }
         }

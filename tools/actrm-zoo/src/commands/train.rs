@@ -6,7 +6,6 @@ use anyhow::{Context, anyhow, bail};
 use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use study::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
 use zoo::ZooError;
-use zoo::config::{Library, nearest_of};
 use zoo::entry::member_name;
 use zoo::run::{COMMAND_FILE, TrainEvent, TrainOutcome, TrainRequest, finished_entry, train};
 use zoo::write_atomic;
@@ -132,12 +131,9 @@ fn in_words(error: ZooError) -> ZooError {
 }
 
 /// What to do about a change of the policy's type, which leaves the other settings of another policy behind.
-fn other_policy(args: &Args, library: &Library) -> Option<String> {
+fn other_policy(args: &Args) -> Option<String> {
     let policy = args.overrides.iter().find_map(|set| set.strip_prefix("policy.type="))?.replace('-', "_");
-    let (_, task) = args.experiment.split_once('_')?;
-    let names = library.names().ok()?;
-    let near = nearest_of(&format!("{policy}_{task}"), &names, 1).pop()?;
-    Some(format!("another policy has other settings; did you mean the experiment `{near}`?"))
+    Some(format!("another policy has other settings; did you mean `policy={policy}`?"))
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
@@ -148,7 +144,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let args = &Args { experiment, overrides, ..args.clone() };
     let load = |overrides: &[String]| {
         AnyExperiment::load(&library, &args.experiment, overrides).map_err(in_words).with_context(
-            || match other_policy(args, &library) {
+            || match other_policy(args) {
                 Some(hint) => format!("experiment `{}`: {hint}", args.experiment),
                 None => format!("experiment `{}`", args.experiment),
             },
