@@ -446,7 +446,7 @@ fn an_edited_set_is_what_conversion_makes_of_the_same_demos() {
     assert_eq!(named.depth_maps(new, 2).unwrap(), all.depth_maps(FRONT_DEPTH, 2).unwrap());
     export(&at("named"), &at("named.hdf5"), &WriteOptions::default(), &mut quiet).unwrap();
     assert!(content(&at("named.hdf5")) == content(&at("all.hdf5")));
-    // metres and millimetres are not joined in silence
+    // metres and millimetres are not joined silently
     copy(&theirs(), &at("mm"));
     let info = at("mm/meta/info.json");
     let text = std::fs::read_to_string(&info).unwrap();

@@ -1,5 +1,5 @@
 //! Recordings that are not as they should be: what is wrong is named with file, demo and key, before anything is written;
-//! nothing is left out in silence.
+//! nothing is left out silently.
 
 #![allow(clippy::unwrap_used)]
 

@@ -106,7 +106,7 @@ impl Cache {
         })
     }
 
-    /// The loss on candle's operations, with its graph: what a step runs where no kernel by hand does, and what the others are
+    /// The loss on candle's operations, with its graph: what a step runs where no hand-written kernel does, and what the others are
     /// tested by.
     ///
     /// # Errors
@@ -213,7 +213,7 @@ impl<'a> Context<'a> {
         self.prepared.is_some()
     }
 
-    /// Whether something is kept for a backward pass by hand.
+    /// Whether something is kept for a hand-written backward pass.
     pub(crate) fn records(&self) -> bool {
         self.tape.is_some()
     }
@@ -305,7 +305,7 @@ impl<'a> Context<'a> {
         Ok(made)
     }
 
-    /// A result of an operation by hand; with a gradient if anything that it depends on has one.
+    /// A result of a hand-written operation; with a gradient if anything that it depends on has one.
     pub(crate) fn result(
         &mut self,
         values: Vec<f32>,

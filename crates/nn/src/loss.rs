@@ -76,7 +76,7 @@ impl Term {
 }
 
 impl Context<'_> {
-    /// A term by hand: its value, and what passes its gradient, the term's weight, back.
+    /// A hand-written term: its value, and what passes its gradient, the term's weight, back.
     pub(crate) fn term(
         &mut self,
         value: f64,

@@ -6,7 +6,7 @@ use candle_core::{DType, Device, Shape, Tensor};
 /// A tensor in a forward pass.
 ///
 /// Operations of [`crate::ops`] take values and give values. Candle's own are out of reach, so that none of them can lose a
-/// gradient in silence: what leaves a pass goes through [`Value::detached`].
+/// gradient silently: what leaves a pass goes through [`Value::detached`].
 #[derive(Debug, Clone)]
 pub struct Value {
     pub(crate) tensor: Tensor,

@@ -281,7 +281,7 @@ pub struct Provenance {
     pub left_out: Vec<String>,
     /// Whether the side folder is there.
     pub lossless: bool,
-    /// sha256 of everything else in it and of `meta/info.json`, so that an edited number does not train other weights in silence.
+    /// sha256 of everything else in it and of `meta/info.json`, so that an edited number does not train other weights silently.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seal: Option<String>,
     /// How pictures were encoded, where they are videos.

@@ -69,7 +69,7 @@ pub struct Check {
 const FILES_CHECK: &str = "files have the hashes recorded";
 
 /// Compares a file or folder of demonstrations with the hash that was recorded when the data set at `root` was made
-/// of it: a change that every reader accepts in silence shows here.
+/// of it: a change that every reader accepts silently is found here.
 pub fn verify_source(root: &Path, source: &Path) -> Result<Check> {
     let (info, _) = parse_info(root)?;
     let Some(provenance) = info.actrm else {

@@ -1,4 +1,4 @@
-//! A long short-term memory (Hochreiter and Schmidhuber 1997) with torch's weights and gates, its cell by hand.
+//! A long short-term memory (Hochreiter and Schmidhuber 1997) with torch's weights and gates and a hand-written cell.
 
 use super::Linear;
 use super::recurrent::{RecurrentState, gate_layers};

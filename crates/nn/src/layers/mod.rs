@@ -1,6 +1,6 @@
 //! Layers shared by the models. The Rust field is the checkpoint key.
 //!
-//! Everything here has a gradient: candle-nn's `LayerNorm` and `softmax_last_dim` drop it in silence and are not used.
+//! Everything here has a gradient: candle-nn's `LayerNorm` and `softmax_last_dim` drop it silently and are not used.
 
 mod attention;
 mod conv1d;

@@ -1,5 +1,5 @@
-//! The operations of a forward pass. On the CPU each runs a kernel by hand and notes its backward pass on the tape; on other
-//! devices, and where a pass asks for it, it is a composition of candle's own operations under the same name.
+//! The operations of a forward pass. On the CPU each runs a hand-written kernel and records its backward pass on the tape.
+//! On other devices, and where a pass asks for it, it is a composition of candle's operations under the same name.
 
 mod attention;
 mod conv2d;

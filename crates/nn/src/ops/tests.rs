@@ -1,4 +1,4 @@
-//! Every operation by hand beside its composition of candle's, forwards and backwards, on every instruction set, and the slope of
+//! Every hand-written operation beside its composition of candle's, forwards and backwards, on every instruction set, and the slope of
 //! the loss along the gradient.
 #![allow(clippy::unwrap_used)]
 

@@ -227,7 +227,7 @@ impl Act {
         })
     }
 
-    /// The prediction on candle's operations; `predict` runs the same statement by hand.
+    /// The prediction on candle's operations; `predict` runs the same statement on hand-written kernels.
     ///
     /// # Errors
     /// Inputs of the wrong shape.

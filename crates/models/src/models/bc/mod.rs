@@ -95,7 +95,7 @@ impl Bc {
         self.sight.as_ref().map_or_else(|| Ok(observation.clone()), |sight| sight.look(observation, rng))
     }
 
-    /// The prediction on candle's operations; `predict` runs the same statement by hand.
+    /// The prediction on candle's operations; `predict` runs the same statement on hand-written kernels.
     #[cfg(test)]
     fn predict_composed(&self, observation: &Features<Tensor>) -> Result<Tensor> {
         let rows = check_observation("bc", &self.signature, observation)?;
