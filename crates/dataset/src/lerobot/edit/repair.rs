@@ -2,9 +2,9 @@
 
 use super::super::check::TIME_TOLERANCE;
 use super::super::export::side_folder_of;
-use super::super::faults::{Area, Tables};
 use super::super::meta::PROVENANCE_FILE;
 use super::super::open::Dataset;
+use super::super::tables::{Area, Tables};
 use super::super::verify::{in_full, not_finite, picture_problem};
 use super::{Destination, EditReport, Input, Progress, Renames, one};
 use crate::error::Result;
