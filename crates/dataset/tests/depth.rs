@@ -2,7 +2,10 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use arrow::array::{Array as _, ArrayRef, BinaryArray, RecordBatch, StructArray};
+use common::copy;
 use dataset::edit::{Destination, Renames, Selection, keep, merge, rename, without};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, DepthUnit, Dtype, FeatureStats, RobomimicWriter, SampleSpec, Source,
@@ -119,18 +122,6 @@ fn with_files(root: &Path, column: &str, change: &dyn Fn(usize, &[u8]) -> Vec<u8
         writer.write(&RecordBatch::try_new(schema.clone(), all).unwrap()).unwrap();
     }
     writer.close().unwrap();
-}
-
-fn copy(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).unwrap();
-    for entry in std::fs::read_dir(from).unwrap() {
-        let path = entry.unwrap().path();
-        let to = to.join(path.file_name().unwrap());
-        match path.is_dir() {
-            true => copy(&path, &to),
-            false => drop(std::fs::copy(&path, &to).unwrap()),
-        }
-    }
 }
 
 fn numbers(episodes: &[usize]) -> Selection {

@@ -2,8 +2,11 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use arrow::array::{ArrayRef, AsArray, Float64Array, RecordBatch};
 use arrow::datatypes::Float64Type;
+use common::files;
 use dataset::edit::{Destination, EditReport, Parts, Renames, Selection, keep, merge, rename, split, without};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, ImageForm, RobomimicWriter, Source, VideoOptions, WriteOptions, convert,
@@ -33,19 +36,6 @@ fn content(path: &Path) -> (Demo, Vec<Demo>) {
     let source = Source::open(path).unwrap();
     let demos = (0..source.plan().demos.len()).map(|i| source.read_demo(i).unwrap()).collect();
     (source.root().unwrap(), demos)
-}
-
-fn files(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    for entry in std::fs::read_dir(root).unwrap() {
-        let path = entry.unwrap().path();
-        let name = PathBuf::from(path.file_name().unwrap());
-        match path.is_dir() {
-            true => found.extend(files(&path).into_iter().map(|(k, v)| (name.join(k), v))),
-            false => drop(found.insert(name, std::fs::read(&path).unwrap())),
-        }
-    }
-    found
 }
 
 fn sound(root: &Path) {

@@ -3,12 +3,15 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use arrow::array::{
     Array as _, ArrayRef, AsArray, BinaryArray, Float32Array, Float64Array, Int64Array, ListBuilder, RecordBatch,
     StringArray, StringBuilder, StructArray,
 };
 use arrow::compute::{cast, concat_batches, take_record_batch};
 use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int64Type};
+use common::{copy, files};
 use dataset::edit::{Destination, Repair, Selection, keep, repair};
 use dataset::{
     Array, Check, ConvertOptions, Dataset, Demo, RobomimicWriter, WriteOptions, convert, verify, verify_within,
@@ -17,9 +20,8 @@ use parquet::arrow::ArrowWriter;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::file::properties::WriterProperties;
 use serde_json::{Value, json};
-use std::collections::BTreeMap;
 use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 const DATA: &str = "data/chunk-000/file-000.parquet";
@@ -82,30 +84,6 @@ fn sound(out: &Path) {
 
 fn numbers(episodes: std::ops::Range<usize>) -> Selection {
     Selection { episodes: episodes.collect(), ..Selection::default() }
-}
-
-fn copy(from: &Path, to: &Path) {
-    std::fs::create_dir(to).unwrap();
-    for entry in std::fs::read_dir(from).unwrap() {
-        let (path, target) = (entry.as_ref().unwrap().path(), to.join(entry.unwrap().file_name()));
-        match path.is_dir() {
-            true => copy(&path, &target),
-            false => drop(std::fs::copy(&path, &target).unwrap()),
-        }
-    }
-}
-
-fn files(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    for entry in std::fs::read_dir(root).unwrap() {
-        let path = entry.unwrap().path();
-        let name = PathBuf::from(path.file_name().unwrap());
-        match path.is_dir() {
-            true => found.extend(files(&path).into_iter().map(|(k, v)| (name.join(k), v))),
-            false => drop(found.insert(name, std::fs::read(&path).unwrap())),
-        }
-    }
-    found
 }
 
 fn edit_json(root: &Path, file: &str, edit: impl Fn(&mut Value)) {

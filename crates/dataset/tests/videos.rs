@@ -2,6 +2,9 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
+use common::{copy, files};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, RobomimicWriter, STATE, Source, VideoOptions, WindowBatch, WindowSpec,
     WriteOptions, convert, export, verify,
@@ -18,35 +21,6 @@ fn lerobot() -> PathBuf {
 }
 
 fn quiet(_: u64, _: u64) {}
-
-/// A folder with all that is in it.
-fn copy(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).unwrap();
-    for entry in std::fs::read_dir(from).unwrap() {
-        let path = entry.unwrap().path();
-        let target = to.join(path.file_name().unwrap());
-        match path.is_dir() {
-            true => copy(&path, &target),
-            false => {
-                std::fs::copy(&path, &target).unwrap();
-            }
-        }
-    }
-}
-
-fn files(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    for entry in std::fs::read_dir(root).unwrap() {
-        let path = entry.unwrap().path();
-        match path.is_dir() {
-            true => {
-                found.extend(files(&path).into_iter().map(|(k, v)| (Path::new(path.file_name().unwrap()).join(k), v)))
-            }
-            false => drop(found.insert(PathBuf::from(path.file_name().unwrap()), std::fs::read(&path).unwrap())),
-        }
-    }
-    found
-}
 
 #[test]
 fn lerobots_pictures_are_lerobots_bytes() {

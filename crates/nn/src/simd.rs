@@ -34,19 +34,25 @@ pub fn dispatch<Op: WithSimd>(op: Op) -> Op::Output {
     Simd::vectorize(Scalar, op)
 }
 
-/// The vectors that arithmetic runs on here, by name. Sums of floats may differ in their last bits between two of these.
-pub fn vectors() -> &'static str {
-    struct Bytes;
-    impl WithSimd for Bytes {
+/// Numbers of 32 bits in the widest vector of this machine.
+pub fn lanes() -> usize {
+    struct Lanes;
+    impl WithSimd for Lanes {
         type Output = usize;
+        #[inline(always)]
         fn with_simd<S: Simd>(self, _: S) -> usize {
-            size_of::<S::f32s>()
+            S::F32_LANES
         }
     }
-    match dispatch(Bytes) {
-        64 => "AVX-512",
-        32 => "AVX2",
-        16 => "NEON",
+    dispatch(Lanes)
+}
+
+/// The vectors that arithmetic runs on here, by name. Sums of floats may differ in their last bits between two of these.
+pub fn vectors() -> &'static str {
+    match lanes() {
+        16 => "AVX-512",
+        8 => "AVX2",
+        4 => "NEON",
         _ => "none",
     }
 }

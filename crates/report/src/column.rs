@@ -46,36 +46,24 @@ pub struct Column<R: 'static> {
     page: Option<&'static str>,
 }
 
-/// A column of words, in no form yet.
-pub const fn text<R>(value: fn(&R) -> String) -> Column<R> {
-    Column {
-        value: Value::Text(value),
-        align: Align::Right,
-        kept: false,
-        more: false,
-        csv: None,
-        table: None,
-        page: None,
-    }
-}
-
-/// A column of numbers, in no form yet: `exact` decimal places in CSV, `shown` in tables for people.
-pub const fn number<R>(value: fn(&R) -> Option<f64>, exact: usize, shown: usize) -> Column<R> {
-    let value = Value::Number(value, exact, shown);
+/// A column in no form yet.
+const fn column<R>(value: Value<R>) -> Column<R> {
     Column { value, align: Align::Right, kept: false, more: false, csv: None, table: None, page: None }
 }
 
-/// A column of whole numbers, in no form yet.
+/// A column of words.
+pub const fn text<R>(value: fn(&R) -> String) -> Column<R> {
+    column(Value::Text(value))
+}
+
+/// A column of numbers: `exact` decimal places in CSV, `shown` in tables for people.
+pub const fn number<R>(value: fn(&R) -> Option<f64>, exact: usize, shown: usize) -> Column<R> {
+    column(Value::Number(value, exact, shown))
+}
+
+/// A column of whole numbers.
 pub const fn count<R>(value: fn(&R) -> Option<u64>) -> Column<R> {
-    Column {
-        value: Value::Count(value),
-        align: Align::Right,
-        kept: false,
-        more: false,
-        csv: None,
-        table: None,
-        page: None,
-    }
+    column(Value::Count(value))
 }
 
 impl<R> Column<R> {

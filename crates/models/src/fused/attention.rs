@@ -1,8 +1,8 @@
 //! The attention branch: projections, positions, attention, output projection.
 
-use super::{Grads, Pass, Workspace, slot, sum_over_sequences, weight_gradient};
+use super::{Grads, Pass, Workspace, slot, weight_gradient};
 use crate::layers::DropoutMask;
-use nn::kernels::{Heads, Mat, Start, attend, attend_backward, column_sums, product};
+use nn::kernels::{Heads, Mat, Start, attend, attend_backward, column_sums, product, sum_over_sequences};
 
 /// What attention's backward pass needs.
 #[derive(Debug)]

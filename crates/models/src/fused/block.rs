@@ -2,8 +2,8 @@
 //! the sum. The context's keys and values come ready, because most of them serve several updates.
 
 use super::feed_forward::FeedForward;
-use super::{Grads, Pass, Residual, Rows, Workspace, slot, sum_over_sequences, weight_gradient};
-use nn::kernels::{Heads, Mat, Start, add, attend, attend_backward, column_sums, product};
+use super::{Grads, Pass, Residual, Rows, Workspace, slot, weight_gradient};
+use nn::kernels::{Heads, Mat, Start, add, attend, attend_backward, column_sums, product, sum_over_sequences};
 use std::ops::Range;
 
 /// What a layer's backward pass needs.

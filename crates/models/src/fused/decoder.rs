@@ -2,9 +2,9 @@
 
 use super::attention::{Attention, Side};
 use super::feed_forward::FeedForward;
-use super::{Entry, Grads, Norm, Pass, Residual, Rows, enter, enter_backward, sum_over_sequences};
+use super::{Entry, Grads, Norm, Pass, Residual, Rows, enter, enter_backward};
 use crate::layers::Shape;
-use nn::kernels::{Heads, Start, add};
+use nn::kernels::{Heads, Start, add, sum_over_sequences};
 
 /// What a decoder layer's backward pass needs.
 #[derive(Debug)]

@@ -299,22 +299,6 @@ pub(crate) fn weight_gradient(
     product((out, input, rows), g, x, Start::Add, into, pack);
 }
 
-/// Sums the first `width` columns of rows `stride` wide over all sequences of `out.len() / width` rows.
-fn sum_over_sequences(out: &mut [f32], x: &[f32], stride: usize, width: usize) {
-    let per = out.len() / width;
-    out.fill(0.0);
-    vectorised(
-        #[inline(always)]
-        || {
-            for sequence in x.chunks_exact(per * stride) {
-                for (out, x) in out.chunks_exact_mut(width).zip(sequence.chunks_exact(stride)) {
-                    out.iter_mut().zip(x).for_each(|(o, x)| *o += x);
-                }
-            }
-        },
-    );
-}
-
 /// What a norm's backward pass needs.
 #[derive(Debug)]
 pub(crate) struct Norm {

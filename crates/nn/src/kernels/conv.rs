@@ -7,7 +7,7 @@
 //! such products. Sums run in an order that depends on the sizes alone.
 
 use super::gemm::{Pack, Start, tile_of};
-use crate::simd::dispatch;
+use crate::simd::{dispatch, lanes};
 use pulp::{Simd, WithSimd};
 
 /// Numbers behind a picture that may be read and are not used.
@@ -344,15 +344,7 @@ impl Conv {
 
 /// Columns of a panel for `n` columns in all: one vector if that is enough, else two.
 pub fn panel_width(n: usize) -> usize {
-    struct Lanes;
-    impl WithSimd for Lanes {
-        type Output = usize;
-        #[inline(always)]
-        fn with_simd<S: Simd>(self, _: S) -> usize {
-            S::F32_LANES
-        }
-    }
-    let lanes = dispatch(Lanes);
+    let lanes = lanes();
     if n <= lanes { lanes } else { 2 * lanes }
 }
 

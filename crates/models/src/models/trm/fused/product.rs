@@ -8,7 +8,7 @@
 //! Plain safe Rust; `pulp` picks AVX-512, AVX2 or scalar code at run time. The order of additions depends on the shape
 //! and the width of the vectors alone.
 
-use nn::simd::dispatch;
+use nn::simd::{dispatch, lanes};
 use pulp::{Simd, WithSimd};
 
 /// A factor `(k, n)` in panels of two vectors' width, depth first; missing columns are zero.
@@ -17,19 +17,6 @@ pub(super) struct Packed {
     panels: Vec<f32>,
     k: usize,
     n: usize,
-}
-
-/// Lanes of a vector on this machine.
-fn lanes() -> usize {
-    struct Lanes;
-    impl WithSimd for Lanes {
-        type Output = usize;
-        #[inline(always)]
-        fn with_simd<S: Simd>(self, _: S) -> usize {
-            S::F32_LANES
-        }
-    }
-    dispatch(Lanes)
 }
 
 impl Packed {
