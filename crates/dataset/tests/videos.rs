@@ -10,7 +10,6 @@ use dataset::{
     WriteOptions, convert, export, verify,
 };
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
