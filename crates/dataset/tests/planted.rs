@@ -396,7 +396,7 @@ const OTHERS: &[Planted] = &[
     (
         "a number that is none",
         |s| edit_list(s, LATER, "action", |i, n| if i == 7 * 43 + 2 { f64::NAN } else { n }),
-        &["action: episode 5, frame 3, dimension 2: NaN"],
+        &["action: episode 5", "frame 3, dimension 2: NaN"],
     ),
     (
         "infinite numbers",

@@ -67,24 +67,31 @@ pub fn notes(root: &Path) -> Result<Vec<String>> {
 }
 
 impl Dataset {
-    /// In words the first value of a column that is NaN or infinite, in some episodes; none of a column that is not in
-    /// memory.
-    pub fn not_finite(&self, column: &str, episodes: &[usize]) -> Option<String> {
-        let values = self.column(column)?;
-        episodes.iter().filter_map(|&episode| self.episodes().get(episode)).find_map(|episode| {
-            let mine = values.data.get(episode.from * values.dim..episode.to * values.dim)?;
-            if mine.iter().fold(true, |all, v| all & v.is_finite()) {
-                return None;
+    /// In words the values of a column that are NaN or infinite: of some episodes, the first of each dimension; nothing of a column
+    /// that is not in memory.
+    pub fn not_finite(&self, name: &str, episodes: &[usize]) -> Vec<String> {
+        let Some(column) = self.column(name) else { return Vec::new() };
+        let mut found = Vec::new();
+        for episode in episodes.iter().filter_map(|&episode| self.episodes().get(episode)) {
+            let values = column.data.get(episode.from * column.dim..episode.to * column.dim).unwrap_or_default();
+            if values.iter().fold(true, |all, v| all & v.is_finite()) {
+                continue;
             }
-            let at = mine.iter().position(|v| !v.is_finite())?;
             let demo = episode.demo.as_ref().map_or_else(String::new, |demo| format!(" ({demo})"));
-            Some(format!(
-                "{column}: episode {}{demo}, frame {}, dimension {}: {}",
-                episode.index,
-                at / values.dim,
-                at % values.dim,
-                mine[at]
-            ))
-        })
+            for dimension in 0..column.dim {
+                let mine = values.iter().skip(dimension).step_by(column.dim).enumerate();
+                let mut bad = mine.filter(|(_, v)| !v.is_finite());
+                let Some((frame, value)) = bad.next() else { continue };
+                let more = match bad.count() {
+                    0 => String::new(),
+                    more => format!(" (and {more} more frames)"),
+                };
+                let episode = episode.index;
+                found.push(format!(
+                    "{name}: episode {episode}{demo}, frame {frame}, dimension {dimension}: {value}{more}"
+                ));
+            }
+        }
+        found
     }
 }

@@ -165,32 +165,10 @@ pub(super) fn in_full(error: &dyn std::error::Error) -> String {
     causes.fold(error.to_string(), |text, cause| format!("{text}: {cause}"))
 }
 
-/// Numbers that are NaN or infinite: the first of each dimension of each episode.
+/// Numbers that are NaN or infinite, in every column.
 pub(super) fn not_finite(dataset: &Dataset) -> Option<String> {
-    let mut found = Vec::new();
-    for name in dataset.column_names() {
-        let column = dataset.column(name)?;
-        for episode in dataset.episodes() {
-            let values = &column.data[episode.from * column.dim..episode.to * column.dim];
-            if values.iter().all(|v| v.is_finite()) {
-                continue;
-            }
-            for dimension in 0..column.dim {
-                let mut bad =
-                    values.iter().skip(dimension).step_by(column.dim).enumerate().filter(|(_, v)| !v.is_finite());
-                let Some((frame, value)) = bad.next() else { continue };
-                let more = match bad.count() {
-                    0 => String::new(),
-                    more => format!(" ({more} more frames of it)"),
-                };
-                found.push(format!(
-                    "{name}: episode {}, frame {frame}, dimension {dimension}: {value}{more}",
-                    episode.index
-                ));
-            }
-        }
-    }
-    listed(&found)
+    let all: Vec<usize> = (0..dataset.episodes().len()).collect();
+    listed(&dataset.column_names().flat_map(|name| dataset.not_finite(name, &all)).collect::<Vec<_>>())
 }
 
 fn split_problem(dataset: &Dataset) -> Option<String> {

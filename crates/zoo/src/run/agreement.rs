@@ -41,7 +41,7 @@ pub(super) fn agree(dataset: &Dataset, path: &Path, experiment: &Experiment, for
         Agreed { dataset: dataset.clone(), experiment: experiment.clone(), names: BTreeMap::new(), notes: Vec::new() };
     let doubt = |notes: &mut Vec<String>, reason: String, remedy: &str| match force {
         true => {
-            notes.push(format!("{reason}; trained all the same (--force)"));
+            notes.push(format!("{reason}; trained anyway (--force)"));
             Ok(())
         }
         false => Err(unfit(format!("{reason}; {remedy}"))),
@@ -93,7 +93,7 @@ pub(super) fn agree(dataset: &Dataset, path: &Path, experiment: &Experiment, for
             Names::Other => {
                 let reason = format!("{feature}: expected {wanted}, found {}", stated.join(", "));
                 let remedy = match feature {
-                    ACTION => "the simulator would be sent other numbers (--force trains all the same)",
+                    ACTION => "the simulator would be sent other numbers (--force trains anyway)",
                     _ => {
                         "name the keys (data.state_keys, data.env_keys), give a task of your own (task.name), or --force"
                     }

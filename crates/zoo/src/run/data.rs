@@ -227,10 +227,11 @@ pub(super) fn prepare(
     }
 
     let observation = observed(dataset, experiment);
+    let used: Vec<usize> = train.iter().chain(&valid).copied().collect();
     for column in observation.iter().map(String::as_str).chain([dataset::ACTION]) {
-        if let Some(found) = dataset.not_finite(column, &train).or_else(|| dataset.not_finite(column, &valid)) {
+        if let Some(found) = dataset.not_finite(column, &used).first() {
             return Err(unfit(format!(
-                "{found}: nothing can be learnt from it (convert --skip-bad leaves such demos out)"
+                "{found}: training needs finite values (convert --skip-bad leaves such demos out)"
             )));
         }
     }

@@ -42,7 +42,7 @@ pub struct TrainRequest {
     pub resume: bool,
     /// The zoo that gets the entry.
     pub zoo: PathBuf,
-    /// Train on demonstrations of another task, or of other names, all the same.
+    /// Train on demonstrations of another task, or of other names, anyway.
     pub force: bool,
     /// Bytes that pictures may take in memory; more are kept in a file and read ahead. `None`: half of what is free.
     pub image_memory: Option<u64>,
