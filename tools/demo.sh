@@ -17,7 +17,6 @@ step() { # step TEXT COMMAND...: say what is done, show the command, do it, say 
     printf '\033[2m%s: %d s\033[0m\n' "$text" $((SECONDS - start))
 }
 
-printf "The demonstration takes about two minutes on two idle cores, after the build.\n"
 begin=$SECONDS
 step "1/9 What is in the demonstrations" "$bin/actrm-data" inspect "$data"
 step "2/9 HDF5 to a LeRobot data set" "$bin/actrm-data" convert "$data" "$out/lift"

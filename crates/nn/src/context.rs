@@ -246,7 +246,7 @@ impl<'a> Context<'a> {
         Value::of(values, shape, &self.device)
     }
 
-    /// Says that pictures have become tokens.
+    /// Says that the images have been encoded.
     pub fn seen(&mut self) {
         if let Some(on_seen) = self.on_seen.take() {
             on_seen();
@@ -257,7 +257,7 @@ impl<'a> Context<'a> {
     ///
     /// # Errors
     /// Those of `f`.
-    pub fn quietly<R>(&mut self, f: impl FnOnce(&mut Self) -> Result<R>) -> Result<R> {
+    pub fn no_grad<R>(&mut self, f: impl FnOnce(&mut Self) -> Result<R>) -> Result<R> {
         let (tape, rng) = (self.tape.take(), self.rng.take());
         let result = f(self);
         (self.tape, self.rng) = (tape, rng);

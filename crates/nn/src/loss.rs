@@ -46,7 +46,7 @@ impl LossValues {
         }
     }
 
-    /// Divides by `n`.
+    /// Multiplies by `factor`.
     pub fn scale(&mut self, factor: f32) {
         self.total *= factor;
         self.parts.values_mut().for_each(|v| *v *= factor);
@@ -88,7 +88,7 @@ impl Context<'_> {
     }
 }
 
-/// The loss of a training pass: weighted terms, and what is told of them.
+/// The loss of a training pass: weighted terms, and what is reported of them.
 #[derive(Debug, Default)]
 pub struct Loss {
     terms: Vec<(Term, f64)>,
@@ -96,19 +96,19 @@ pub struct Loss {
 }
 
 impl Loss {
-    /// Adds `weight` times a term, and tells it by this name.
+    /// Adds `weight` times a term, and reports it under this name.
     pub fn add(&mut self, name: &str, term: Term, weight: f64) {
-        self.tell(name, term.value as f32);
+        self.report(name, term.value as f32);
         self.terms.push((term, weight));
     }
 
-    /// Tells a number that is not minimised.
-    pub fn tell(&mut self, name: &str, value: f32) {
+    /// Reports a number that is not minimised.
+    pub fn report(&mut self, name: &str, value: f32) {
         self.parts.insert(name.to_string(), value);
     }
 
     /// The same, unless the name is taken.
-    pub fn tell_first(&mut self, name: &str, value: f32) {
+    pub fn report_first(&mut self, name: &str, value: f32) {
         self.parts.entry(name.to_string()).or_insert(value);
     }
 

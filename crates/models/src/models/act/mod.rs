@@ -174,7 +174,7 @@ impl Act {
         if let (Some(pointer), Some(scores)) = (&self.pointer, &scores) {
             let (term, right) = pointer.asked("act", batch)?.term(cx, scores)?;
             loss.add("pointer_loss", term, pointer.weight);
-            loss.tell("pointer_right", right);
+            loss.report("pointer_right", right);
         }
         if let Some(auxiliary) = &self.auxiliary {
             loss.add("auxiliary_loss", auxiliary.term(cx, &memory, ("act", batch))?, auxiliary.weight);
