@@ -86,11 +86,16 @@ zoo: build ## every policy on every robot task, three trainings each, and the le
 study-thinking: build ## does thinking help: the studies of robot policies, as far as they have not been run (days)
 	@for study in thinking towers fewer; do RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/$$study.toml --jobs $(or $(JOBS),2); done
 
+.PHONY: check
+check: build ## the tests of one change, in five minutes: unit tests, the rules of the house, the whole line once
+	@$(CARGO) test $(CARGO_FLAGS) --workspace --lib
+	@$(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- architecture:: house:: help:: main_line:: bad_data:: bad_zoo::
+
 .PHONY: test
 test: wheel ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace
 	@if [ -n "$(BROWSER)$${CI:-}" ]; then \
-	    $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test page -- --ignored; \
+	    $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test e2e -- --ignored; \
 	  else echo "not run: the tests of the pages in a browser (no Chromium on the PATH; ACTRM_CHROMIUM names one)"; fi
 	@.venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests
 	@tools/test_wheel.sh
@@ -115,12 +120,17 @@ bench: wheel .venv-peers/.complete ## our speed beside the peers', measured in o
 study-puzzles: build ## the puzzle study, as far as it has not been run (hours), and its page, docs/puzzles.md
 	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study --page docs/puzzles.md
 
-# other files, and more of them: make fuzz MUTATIONS=20000 SEED=7
+# other files, and more of them: make campaign MUTATIONS=20000 SEED=7
 MUTATIONS ?= 2000
 SEED ?= 1
-.PHONY: fuzz
-fuzz: .venv/.complete ## damaged HDF5 files and videos through the reader: data or an error, in time (MUTATIONS=2000 SEED=1)
-	@ACTRM_MUTATIONS=$(MUTATIONS) ACTRM_MUTATION_SEED=$(SEED) $(CARGO) test $(CARGO_FLAGS) --workspace --test hostile --test hostile_videos
+KILLS ?= 50
+FLIPS ?= 100000
+FAULTS ?= all
+.PHONY: campaign
+campaign: build ## hours of damage: mutated files, flipped bits, kills and faults at every call (MUTATIONS= SEED= KILLS= FLIPS= FAULTS=)
+	@ACTRM_MUTATIONS=$(MUTATIONS) ACTRM_MUTATION_SEED=$(SEED) ACTRM_FLIPS=$(FLIPS) ACTRM_FLIP_SEED=$(SEED) \
+	    $(CARGO) test $(CARGO_FLAGS) --workspace --no-fail-fast --test hostile --test hostile_videos --test flips
+	@ACTRM_KILLS=$(KILLS) ACTRM_FAULTS=$(FAULTS) $(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- killed:: faults::
 
 .PHONY: bench-memory
 bench-memory: build ## memory that converting a 3 GB image file takes (needs 6 GB of disk; target/bench/memory.json)

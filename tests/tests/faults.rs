@@ -5,8 +5,6 @@
 //! `ACTRM_FAULTS=all` for every call and every kind of fault, `ACTRM_FAULTS=200` for so many of each command; without it
 //! a few, evenly spread.
 
-#![cfg(all(target_os = "linux", target_arch = "x86_64"))]
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -145,6 +145,14 @@ pub enum ModelError {
         /// what does not fit
         detail: String,
     },
+    /// A policy that runs elsewhere, in Python or on a server, failed or did not answer as it should.
+    #[error("{policy}: {reason}")]
+    External {
+        /// the policy: its class, or the address of its server
+        policy: String,
+        /// what happened
+        reason: String,
+    },
     /// The tensor library refused an operation.
     #[error("tensor operation failed")]
     Tensor(#[from] candle_core::Error),

@@ -1,19 +1,27 @@
 //! Evaluations.
 
-use std::path::PathBuf;
-use std::sync::Arc;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, PoisonError};
 
+use models::{ModelError, Policy};
 use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use rollout::{Control, Pool, PoolOptions, find_python, harness_folder, remembered_greeting};
-use zoo::ZooError;
-use zoo::evaluation::{Environment, EvaluationEnd, EvaluationOptions, Progress, evaluate as run_missing, finished};
+use rollout::{Control, Pool, PoolOptions, Ready, find_python, harness_folder, remembered_greeting};
+use zoo::entry::LoadedEntry;
+use zoo::evaluation::{
+    Environment, EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate as run_missing, finished,
+};
+use zoo::external::{External, Named, reads_images, usual_inputs};
+use zoo::protocols::{Block, Protocols};
 use zoo::results::{Execution, Seeds, StoredEvaluation};
+use zoo::{FeatureKeys, ZooError};
 
 use crate::arrays::{array, flags};
 use crate::error::{Error, raised, words};
+use crate::external::{Failure, Given, PythonPolicy};
 use crate::policy::registry;
 use crate::work::interruptible;
 
@@ -31,18 +39,45 @@ enum End {
     Failed(String),
 }
 
-/// `actrm.evaluate` without its bar: `tell(done, total)` is called as episodes end.
+/// The policy that is asked about.
+enum Asked {
+    Entry(Box<LoadedEntry>),
+    External { external: External, inputs: Option<FeatureKeys>, named: Named, called: Py<PyAny> },
+}
+
+impl Asked {
+    /// What is evaluated in the environment that `ready` describes.
+    fn subject<'a>(&'a self, zoo: &Path, ready: &Ready, failure: &'a Failure) -> Result<Subject<'a>, ZooError> {
+        match self {
+            Self::Entry(loaded) => Ok(loaded.subject()),
+            Self::External { external, inputs, named, called } => {
+                let inputs = inputs.clone().map_or_else(|| usual_inputs(ready), Ok)?;
+                let external = External { inputs, ..external.clone() };
+                let entry = external.entry(zoo, named, ready)?;
+                let (source, signature) = (external.source.clone(), entry.meta().signature.clone());
+                let policy = move || -> Result<Box<dyn Policy>, ModelError> {
+                    Ok(Box::new(PythonPolicy::new(called, &source, &signature, failure)?))
+                };
+                Ok(external.subject(&entry, policy))
+            }
+        }
+    }
+}
+
+/// `actrm.evaluate` without its bar: `tell(done, total)` is called as episodes end. One of `entry` and `external`.
 #[pyfunction]
 #[pyo3(signature = (
-    entry, tell, *, episodes, workers, seed, task, max_steps, n_action_steps, temporal_ensemble, control, python,
-    env_module, zoo, results, force
+    entry, external, tell, *, protocol, episodes, workers, seed, task, max_steps, n_action_steps, temporal_ensemble,
+    control, python, env_module, zoo, results, force
 ))]
 #[expect(clippy::too_many_arguments, reason = "options by name")]
 pub(crate) fn evaluate<'py>(
     py: Python<'py>,
-    entry: PathBuf,
+    entry: Option<PathBuf>,
+    external: Option<Given>,
     tell: &Bound<'py, PyAny>,
-    episodes: u64,
+    protocol: Option<String>,
+    episodes: Option<u64>,
     workers: usize,
     seed: u64,
     task: Option<String>,
@@ -56,18 +91,11 @@ pub(crate) fn evaluate<'py>(
     results: Option<PathBuf>,
     force: bool,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let control: Control = control.parse().map_err(PyValueError::new_err)?;
+    let mut control: Control = control.parse().map_err(PyValueError::new_err)?;
     let invalid = |text: String| Err(PyValueError::new_err(text));
-    if !(1..=1_000_000).contains(&episodes) || seed.checked_add(episodes).is_none() {
-        return invalid(format!("episodes: expected 1 to 1000000 and seeds below 2^64, found {episodes} from {seed}"));
-    }
-    if !(1..=1024).contains(&workers) {
-        return invalid(format!("workers: expected 1 to 1024, found {workers}"));
-    }
-    if max_steps == Some(0) {
-        return invalid("max_steps: expected at least 1, found 0".to_owned());
-    }
-    let execution = match (n_action_steps, temporal_ensemble) {
+    let (mut task, mut max_steps) = (task, max_steps);
+    let mut seeds = Seeds { start: seed, count: episodes.unwrap_or(20) };
+    let mut execution = match (n_action_steps, temporal_ensemble) {
         (Some(_), Some(_)) => {
             return invalid("n_action_steps and temporal_ensemble: expected one of them".to_owned());
         }
@@ -75,37 +103,85 @@ pub(crate) fn evaluate<'py>(
         (None, Some(coefficient)) => Some(Execution::TemporalEnsemble { coefficient }),
         (None, None) => None,
     };
+    if let Some(name) = &protocol {
+        let protocols = Protocols::built_in();
+        let rules = protocols.get(name).map_err(raised)?;
+        let given = [
+            ("task", task.as_ref().is_some_and(|task| *task != rules.task)),
+            ("episodes", episodes.is_some()),
+            ("max_steps", max_steps.is_some()),
+            ("n_action_steps or temporal_ensemble", execution.is_some() && rules.execution.is_some()),
+        ];
+        if let Some((word, _)) = given.iter().find(|(_, given)| *given) {
+            return invalid(format!("{word}: expected as protocol {name} says, found another"));
+        }
+        (task, max_steps, control) = (Some(rules.task.clone()), Some(rules.max_steps), rules.control);
+        (seeds, execution) = (rules.seeds(Block::Test), execution.or(rules.execution));
+    }
+    let (first, count) = (seeds.start, seeds.count);
+    if !(1..=1_000_000).contains(&count) || first.checked_add(count).is_none() {
+        return invalid(format!("episodes: expected 1 to 1000000 and seeds below 2^64, found {count} from {first}"));
+    }
+    if !(1..=1024).contains(&workers) {
+        return invalid(format!("workers: expected 1 to 1024, found {workers}"));
+    }
+    if max_steps == Some(0) {
+        return invalid("max_steps: expected at least 1, found 0".to_owned());
+    }
     let registry = registry(zoo);
+    let failure = Failure::default();
     let end = interruptible(
         py,
         |stop, news| -> Result<End, ZooError> {
-            let entry = registry.locate(&entry.to_string_lossy())?;
-            let zoo = entry.folder().ancestors().nth(2).map(PathBuf::from).unwrap_or_default();
+            let (asked, environment, zoo) = match (entry, external) {
+                (Some(entry), _) => {
+                    let entry = registry.locate(&entry.to_string_lossy())?;
+                    let zoo = entry.folder().ancestors().nth(2).map(PathBuf::from).unwrap_or_default();
+                    let loaded = entry.load()?;
+                    execution.iter().try_for_each(|e| e.check(loaded.experiment().policy.action_horizon()))?;
+                    let environment = Environment::of(entry.meta(), task.as_deref(), env_module.as_deref())?;
+                    (Asked::Entry(Box::new(loaded)), environment, zoo)
+                }
+                (None, Some((called, name, source, declared, inputs, image_size))) => {
+                    let task = task.ok_or_else(|| missing("task", "a task, such as Lift, or a protocol"))?;
+                    let inputs = inputs.map(feature_keys).transpose()?;
+                    let execution = execution.unwrap_or(Execution::RecedingHorizon { n_action_steps: 1 });
+                    let image_size = inputs.as_ref().is_some_and(reads_images).then_some(image_size);
+                    let external = External {
+                        source,
+                        declared,
+                        image_size,
+                        execution,
+                        inputs: inputs.clone().unwrap_or_default(),
+                    };
+                    let environment = Environment::usual(&task, env_module.as_deref(), external.cameras());
+                    let named = Named { name, description: String::new() };
+                    let asked = Asked::External { external, inputs, named, called };
+                    (asked, environment, registry.folder().to_owned())
+                }
+                (None, None) => return Err(missing("policy", "an entry or a policy")),
+            };
             let results = results.unwrap_or_else(|| zoo.join("results"));
-            let loaded = entry.load()?;
-            let environment = Environment::of(entry.meta(), task.as_deref(), env_module.as_deref())?;
-            let mut subject = loaded.subject();
-            subject.max_steps = max_steps.or(subject.max_steps);
-            subject.execution = execution.unwrap_or(subject.execution);
-            subject.execution.check(loaded.experiment().policy.action_horizon())?;
+            let subject_of = |ready: &Ready| -> Result<Subject<'_>, ZooError> {
+                let mut subject = asked.subject(&zoo, ready, &failure)?;
+                subject.max_steps = max_steps.or(subject.max_steps);
+                subject.execution = execution.unwrap_or(subject.execution);
+                Ok(subject)
+            };
             let mut spec = environment.worker(find_python(python.as_deref())?, harness_folder()?);
             spec.control = control;
-            let options = EvaluationOptions {
-                seeds: Seeds { start: seed, count: episodes },
-                shard: None,
-                env_module: environment.env_module.clone(),
-                force,
-            };
+            let options = EvaluationOptions { seeds, shard: None, env_module: environment.env_module.clone(), force };
             if let Some(ready) = remembered_greeting(&spec)
-                && let Some(stored) = finished(&subject, &ready, &results, &options)?
+                && let Some(stored) = finished(&subject_of(&ready)?, &ready, &results, &options)?
             {
                 return Ok(End::Complete(Box::new(stored)));
             }
             let flag = Arc::clone(stop);
-            let asked = move || flag.load(Ordering::SeqCst);
-            let mut pool = Pool::start(PoolOptions { stop: Arc::new(asked), ..PoolOptions::new(spec, workers) })?;
+            let stopped = move || flag.load(Ordering::SeqCst);
+            let mut pool = Pool::start(PoolOptions { stop: Arc::new(stopped), ..PoolOptions::new(spec, workers) })?;
             let note = |text: String| drop(news.send(News::Note(text)));
             pool.fallback().into_iter().for_each(|why| note(why.to_owned()));
+            let subject = subject_of(pool.ready())?;
             let mut at = (0, 0);
             let end = run_missing(&subject, &mut pool, &results, &options, &mut |progress| {
                 at = match progress {
@@ -140,11 +216,36 @@ pub(crate) fn evaluate<'py>(
             }
         },
     )?;
-    match end.map_err(raised)? {
+    let end = end.map_err(|error| {
+        let error = raised(error);
+        // what the policy itself raised
+        error.set_cause(py, failure.lock().unwrap_or_else(PoisonError::into_inner).take());
+        error
+    })?;
+    match end {
         End::Complete(evaluation) => arrays(py, &evaluation),
         End::Stopped => Err(Error::new_err("the evaluation was stopped")),
         End::Failed(text) => Err(Error::new_err(text)),
     }
+}
+
+/// The features that these keys make.
+fn feature_keys(inputs: BTreeMap<String, Vec<String>>) -> Result<FeatureKeys, ZooError> {
+    let mut all = FeatureKeys::default();
+    for (feature, keys) in inputs {
+        let expected = "observation keys, parts of them (key[0:3]) and differences (a - b)".to_owned();
+        all.insert(&feature, &keys).map_err(|found| ZooError::InvalidValue {
+            key: format!("inputs: {feature}"),
+            expected,
+            found,
+        })?;
+    }
+    Ok(all)
+}
+
+/// An argument that is not there, or not as it should be.
+fn missing(key: &str, expected: &str) -> ZooError {
+    ZooError::InvalidValue { key: key.to_owned(), expected: expected.to_owned(), found: "none".to_owned() }
 }
 
 /// The episodes of an evaluation as columns, ascending by seed.

@@ -10,6 +10,7 @@ mod convert;
 mod dataset;
 mod error;
 mod evaluate;
+mod external;
 mod leaderboard;
 mod policy;
 mod simulator;

@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use models::{ENVIRONMENT_STATE, Observation, STATE, Values};
+use models::{Observation, Values};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use rollout::{Control, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder};
 use zoo::evaluation::Environment;
-use zoo::experiment::DataSection;
+use zoo::external::usual_inputs;
 use zoo::{FeatureKeys, Past};
 
 use crate::arrays::{array, filled, read};
@@ -66,7 +66,7 @@ impl Simulator {
             let keys = match (keys, of_entry) {
                 (Some(keys), _) => chosen(keys.into_iter())?,
                 (None, Some(keys)) => keys,
-                (None, None) => usual(pool.ready())?,
+                (None, None) => usual_inputs(pool.ready()).map_err(raised)?,
             };
             for feature in keys.features() {
                 let words = |reason| Error::new_err(format!("task {}: {feature}: {reason}", pool.ready().task));
@@ -247,12 +247,4 @@ fn chosen(keys: impl Iterator<Item = (String, Vec<String>)>) -> PyResult<Feature
         all.insert(&feature, &of).map_err(words)?;
     }
     Ok(all)
-}
-
-/// The features that data sets have by default, as far as the environment has their keys.
-fn usual(ready: &Ready) -> PyResult<FeatureKeys> {
-    let DataSection { state_keys, env_keys, .. } = DataSection::default();
-    let there = |keys: &Vec<String>| keys.iter().all(|key| ready.observations.contains_key(key));
-    let features = [(STATE, state_keys), (ENVIRONMENT_STATE, env_keys)].into_iter();
-    chosen(features.filter(|(_, keys)| there(keys)).map(|(name, keys)| (name.to_owned(), keys)))
 }

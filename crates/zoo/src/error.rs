@@ -391,6 +391,15 @@ pub enum ZooError {
         /// The version that the worker runs.
         running: String,
     },
+    /// A policy of somebody else's, which only its owner can run.
+    #[error(
+        "entry {entry}: its weights are not in this zoo; whoever has the policy runs it, in Python with \
+         actrm.evaluate(policy, name=..., task=...)"
+    )]
+    External {
+        /// The entry.
+        entry: String,
+    },
     /// The entry and the environment do not fit each other.
     #[error("entry {entry} in task {task}: {what}: expected {expected}, found {found}")]
     UnfitEntry {

@@ -12,6 +12,7 @@ pub mod config;
 pub mod entry;
 mod error;
 pub mod experiment;
+pub mod external;
 mod feature_keys;
 mod files;
 pub mod lerobot;

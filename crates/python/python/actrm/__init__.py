@@ -6,6 +6,7 @@
     policy = actrm.load_policy("zoo/stack-act")
     policy.reset(seed=1); policy.select_action(observation)
     episodes = actrm.evaluate("zoo/stack-act", episodes=50, workers=2)
+    episodes = actrm.evaluate(my_policy, name="mine", protocol="lift-v1")
     rows = actrm.leaderboard("zoo")
 
 Keys, shapes and names are LeRobot's. What is refused is an `actrm.Error` with the words of the programs.
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from . import _actrm
 from ._actrm import Dataset, Error, Policy, Simulator, __version__, leaderboard, load_policy
 from ._programs import CONTROL, folder
+from ._policies import Called, source
 from ._progress import Progress, teller
 
 if TYPE_CHECKING:
@@ -113,13 +115,18 @@ def convert(
 
 
 def evaluate(
-    entry: Path,
-    episodes: int = 20,
+    policy: Path | Any,
+    episodes: int | None = None,
     workers: int | None = None,
     progress: Progress = None,
     *,
-    seed: int = 10_000,
+    name: str | None = None,
     task: str | None = None,
+    protocol: str | None = None,
+    inputs: Mapping[str, Sequence[str]] | None = None,
+    image_size: int = 84,
+    declared: str | None = None,
+    seed: int = 10_000,
     max_steps: int | None = None,
     n_action_steps: int | None = None,
     temporal_ensemble: float | None = None,
@@ -130,21 +137,36 @@ def evaluate(
     results: Path | None = None,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Evaluate an entry's policy in simulation, one episode per seed, as `actrm-zoo eval` does.
+    """Evaluate a policy in simulation, one episode per seed, as `actrm-zoo eval` does: an entry, or a policy of yours.
 
     The results are stored where the leaderboard finds them. Finished episodes are not run again: an
     interrupted evaluation resumes, a finished one is returned at once. The outcome of an episode does not depend on
     the number of workers.
 
+    A policy of yours is a function, or an object with `select_action` or `predict_action_chunk`, and `reset` if it
+    remembers anything. It gets a dict of NumPy arrays without a batch axis: float32 numbers, uint8 images (height,
+    width, 3). It returns one action (D,) or a chunk (T, D). It is evaluated under `name`, as a new entry of the zoo
+    that says where it comes from and holds no weights.
+
     Parameters
     ----------
-    entry: an entry's folder (`zoo/stack-act`), or its name in `zoo`.
-    episodes: how many; their seeds count up from `seed`.
-    workers: number of simulators at once; one per core unless given.
+    policy: an entry's folder (`zoo/stack-act`), its name in `zoo`, or a policy of yours.
+    episodes: how many; their seeds count up from `seed`. 20 unless given.
+    workers: number of simulators at once; one per core unless given. Each gets a copy (`copy.deepcopy`) of a policy of
+        yours that has `reset`; others are shared by threads.
     progress: as in `convert`, in episodes.
-    task: another task than the entry's.
+    name: name of your policy's entry.
+    task: another task than the entry's; the task that your policy is evaluated on.
+    protocol: a named protocol, such as `lift-v1`, which says task, seeds, step limit and control loop.
+    inputs: observation keys of each feature that your policy reads, such as `{"observation.state": ["robot0_eef_pos"]}`;
+        an image is `"observation.images.agentview": ["agentview_image"]`. The features that data sets have by default
+        (`observation.state`, `observation.environment_state`) unless given.
+    image_size: side of your policy's images in pixels.
+    declared: what you declare of your policy's weights, such as a hash; another one is another version of the entry.
+    seed: seed of the first episode.
     max_steps: control steps after which an episode has failed; the entry's or the task's own limit unless given.
-    n_action_steps: actions that are executed before the next query of the policy; the entry's unless given.
+    n_action_steps: actions that are executed before the next query of the policy; the entry's unless given. With it, your
+        policy is asked by `predict_action_chunk`; without, by `select_action` at every step.
     temporal_ensemble: query at every step and average all predictions, with this coefficient.
     control: control loop inside the simulator.
     python: an interpreter with robosuite; this one where it has robosuite, else `$ACTRM_PYTHON`, `.venv` here or above,
@@ -158,12 +180,26 @@ def evaluate(
     `inference_ms` (mean of its queries) as arrays, `fingerprint` (of the initial state), `group` and `failure` as
     lists.
     """
+    workers = workers or os.cpu_count() or 1
+    external = None
+    if isinstance(policy, (str, os.PathLike)):
+        given = {"name": name, "inputs": inputs, "declared": declared}
+        if meant := [word for word, value in given.items() if value is not None]:
+            raise ValueError(f"{meant[0]}: expected with a policy of yours, found the entry {os.fspath(policy)!r}")
+    else:
+        if name is None:
+            raise ValueError("name: expected a name for your policy's entry, such as name='mine', found none")
+        called = Called.of(policy, workers=workers, chunks=(n_action_steps or temporal_ensemble) is not None)
+        keys = None if inputs is None else {feature: list(of) for feature, of in inputs.items()}
+        external = (called, name, source(policy), declared, keys, image_size)
     with teller("eval", progress) as tell:
         return _actrm.evaluate(
-            entry,
+            policy if external is None else None,
+            external,
             tell,
+            protocol=protocol,
             episodes=episodes,
-            workers=workers or os.cpu_count() or 1,
+            workers=workers,
             seed=seed,
             task=task,
             max_steps=max_steps,

@@ -5,7 +5,10 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._policies import Called
+
 _Path = str | PathLike[str]
+_External = tuple[Called, str, str, str | None, dict[str, list[str]] | None, int]
 
 __version__: str
 
@@ -154,10 +157,12 @@ def convert(
     jobs: int,
 ) -> dict[str, Any]: ...
 def evaluate(
-    entry: _Path,
+    entry: _Path | None,
+    external: _External | None,
     tell: Callable[[int, int], object],
     *,
-    episodes: int,
+    protocol: str | None,
+    episodes: int | None,
     workers: int,
     seed: int,
     task: str | None,

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use zoo::external::EXTERNAL;
 use zoo::protocols::Block;
 use zoo::results::{EpisodeTiming, EvaluationRecord, Execution, StoredEvaluation};
 
@@ -257,9 +258,11 @@ impl LeaderboardRow {
         self.policy().to_owned() + if self.sees_pictures() { " from images" } else { "" }
     }
 
-    /// Its name, with what it sees in a second line where that is pictures.
+    /// Its name; in further lines that it reads images, and that its weights are elsewhere.
     pub(super) fn name_lines(&self) -> String {
-        self.name() + if self.sees_pictures() { "\nfrom images" } else { "" }
+        let images = if self.sees_pictures() { "\nfrom images" } else { "" };
+        let external = if self.policy() == EXTERNAL { "\nweights not in this zoo" } else { "" };
+        self.name() + images + external
     }
 
     /// Whether it has weights that training found.

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::is_built_in_task;
 use crate::experiment::PICTURE_SUFFIX;
+use crate::external::EXTERNAL;
 use crate::results::Seeds;
 use crate::{FeatureKeys, ZooError, sha256_hex};
 
@@ -236,6 +237,11 @@ impl EntryMeta {
     /// Whether it is a policy for a robot's task.
     pub fn is_robot_policy(&self) -> bool {
         self.kind.is_none() && self.section.is_none()
+    }
+
+    /// Whether its weights are not in the zoo: whoever has the policy runs it.
+    pub fn is_external(&self) -> bool {
+        self.policy == EXTERNAL
     }
 
     /// Its licence, by the name that the Hugging Face Hub knows.

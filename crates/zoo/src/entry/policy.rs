@@ -28,6 +28,9 @@ impl Entry {
     /// # Errors
     /// What does not fit, by name.
     pub fn load(&self) -> Result<LoadedEntry, ZooError> {
+        if self.meta().is_external() {
+            return Err(ZooError::External { entry: self.id().to_string() });
+        }
         if !self.meta().is_robot_policy() {
             return Err(ZooError::UnfitEntry {
                 entry: self.id().to_string(),

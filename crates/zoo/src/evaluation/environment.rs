@@ -37,6 +37,11 @@ impl Environment {
         Ok(Self { task: other.unwrap_or(&meta.task).to_owned(), env_module, env_args, cameras: meta.cameras()? })
     }
 
+    /// A task's usual environment, seen through `cameras`.
+    pub fn usual(task: &str, env_module: Option<&str>, cameras: Option<CamerasMeta>) -> Self {
+        Self { task: task.to_owned(), env_module: env_module.map(str::to_owned), env_args: None, cameras }
+    }
+
     /// What a worker for it is to be.
     pub fn worker(&self, python: Python, harness: PathBuf) -> WorkerSpec {
         let mut spec = WorkerSpec::new(python, harness, &self.task);

@@ -243,6 +243,10 @@ fn open(
     says: &mut Says,
 ) -> anyhow::Result<Option<LoadedEntry>> {
     let entry = registry.entry(&id.to_string())?;
+    if entry.meta().is_external() && (args.all || args.all_versions) {
+        cli::note(&format!("note: {id}: not evaluated: its weights are not in this zoo"));
+        return Ok(None);
+    }
     if entry.meta().is_robot_policy() {
         let task = args.run.task.as_ref().unwrap_or(&entry.meta().task);
         if let Some(protocol) = asked.protocol.filter(|protocol| protocol.task != *task) {

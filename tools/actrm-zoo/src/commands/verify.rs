@@ -88,6 +88,9 @@ fn check(id: &EntryId, entries: &KnownEntries, deep: bool) -> anyhow::Result<(us
 }
 
 fn deep_check(entry: &Entry) -> anyhow::Result<String> {
+    if entry.meta().is_external() {
+        return Ok("; its weights are not in this zoo".to_owned());
+    }
     for name in [MODEL_FILE, NORMALISER_FILE] {
         let path = entry.folder().join(name);
         let (values, _) = tensors::read(&path)?;

@@ -1,0 +1,297 @@
+//! Policies of others: a Python object, a server. Their weights are not in the zoo, so their owner runs them.
+//!
+//! Such a policy has an entry too: its name, where it comes from, what it reads and how its predictions become actions, but
+//! no weights. Its results are sealed and ranked as those of any entry. The same name with other settings is a new version.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use models::{FeatureKind, FeatureSpec, ModelError, Policy, Signature};
+use rollout::Ready;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+
+use crate::config::{Library, from_value};
+use crate::entry::{CamerasMeta, CardWords, Entry, EntryDraft, EntryId, EntryMeta, training_facts};
+use crate::evaluation::Subject;
+use crate::experiment::{DataSection, Experiment, PICTURE_PREFIX, PICTURE_SUFFIX};
+use crate::registry::Registry;
+use crate::results::{EntryIdentity, Execution};
+use crate::{FeatureKeys, ZooError, tensors};
+
+/// The kind of policy that such entries name.
+pub const EXTERNAL: &str = "external";
+
+/// A policy whose weights are not in the zoo: `config.toml` of its entry.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct External {
+    /// Where it comes from: `python package.module.Class`, or the address of a server.
+    pub source: String,
+    /// What its owner declares of its weights, such as a hash; another one is another version of the entry.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub declared: Option<String>,
+    /// Side of the images that it reads, in pixels.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub image_size: Option<usize>,
+    /// How its predictions become actions.
+    pub execution: Execution,
+    /// Observation keys of its features, in order. An image is `observation.images.<camera> = ["<camera>_image"]`.
+    pub inputs: FeatureKeys,
+}
+
+/// The file's own form.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    external: External,
+}
+
+/// What an external policy is ranked as.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Named {
+    /// Name of its entry.
+    pub name: String,
+    /// One sentence on what it is; may be empty.
+    pub description: String,
+}
+
+/// Whether some of these features are images.
+pub fn reads_images(inputs: &FeatureKeys) -> bool {
+    inputs.features().any(|feature| feature.starts_with(PICTURE_PREFIX))
+}
+
+/// The features that experiments on the task of `ready` read by default, as far as the environment has their keys.
+///
+/// # Errors
+/// Keys that cannot be read.
+pub fn usual_inputs(ready: &Ready) -> Result<FeatureKeys, ZooError> {
+    let experiment = Experiment::load(&Library::built_in(), &format!("act_{}", ready.task.to_lowercase()), &[]);
+    let of_task = experiment.ok().filter(|experiment| experiment.task.name == ready.task);
+    let data = of_task.map_or_else(DataSection::default, |experiment| experiment.data);
+    let features = [(models::STATE, data.state_keys), (models::ENVIRONMENT_STATE, data.env_keys)];
+    let mut keys = FeatureKeys::default();
+    for (feature, of) in features {
+        keys.insert(feature, &of).map_err(|found| ZooError::InvalidValue {
+            key: feature.to_owned(),
+            expected: "observation keys".to_owned(),
+            found,
+        })?;
+        if of.is_empty() || keys.width(feature, ready).is_err() {
+            keys.retain(|other| other != feature);
+        }
+    }
+    Ok(keys)
+}
+
+impl External {
+    /// The cameras that it looks through; `None` if it reads no images.
+    pub fn cameras(&self) -> Option<CamerasMeta> {
+        let cameras = self.inputs.features().filter(|feature| feature.starts_with(PICTURE_PREFIX));
+        let name = |feature: &str| {
+            let key = self.inputs.of(feature).concat();
+            key.strip_suffix(PICTURE_SUFFIX).unwrap_or(&key).to_owned()
+        };
+        let names: Vec<String> = cameras.map(name).collect();
+        let size = self.image_size.unwrap_or(0);
+        (!names.is_empty()).then_some(CamerasMeta { names, size, fast_render: false })
+    }
+
+    /// The features of its inputs in the environment that `ready` describes.
+    fn signature(&self, ready: &Ready) -> Result<Signature, ZooError> {
+        let spec = |feature: &str| -> Result<FeatureSpec, ZooError> {
+            if feature.starts_with(PICTURE_PREFIX) {
+                let side = self.image_size.unwrap_or(0);
+                return Ok(FeatureSpec::image(feature, side, side));
+            }
+            let width = self.inputs.width(feature, ready).map_err(|found| ZooError::InvalidValue {
+                key: format!("inputs: {feature}"),
+                expected: format!(
+                    "observation keys of task {}: {}",
+                    ready.task,
+                    ready.observations.keys().cloned().collect::<Vec<_>>().join(", ")
+                ),
+                found,
+            })?;
+            Ok(match feature {
+                models::STATE => FeatureSpec::state(width),
+                models::ENVIRONMENT_STATE => FeatureSpec::environment_state(width),
+                _ => FeatureSpec { name: feature.to_owned(), kind: FeatureKind::Entity, ..FeatureSpec::state(width) },
+            })
+        };
+        let observation = self.inputs.features().map(spec).collect::<Result<_, _>>()?;
+        Ok(Signature { observation, action_dim: ready.action_dim, ..Signature::default() })
+    }
+
+    /// Its entry in `zoo`: the newest version under its name if that says the same, else a new one.
+    ///
+    /// # Errors
+    /// A name that is an entry with weights; keys that the environment does not have; files that cannot be written.
+    pub fn entry(&self, zoo: &Path, named: &Named, ready: &Ready) -> Result<Entry, ZooError> {
+        let (signature, config) = (self.signature(ready)?, self.to_toml());
+        let registry = Registry::open(zoo);
+        let newest = registry.ids()?.into_iter().filter(|id| id.name == named.name).max();
+        if let Some(id) = newest {
+            let entry = registry.entry(&id.to_string())?;
+            let meta = entry.meta();
+            if !meta.is_external() {
+                return Err(ZooError::InvalidValue {
+                    key: "name".to_owned(),
+                    expected: "a name that no entry with weights has".to_owned(),
+                    found: id.to_string(),
+                });
+            }
+            if entry.config_text()? == config && meta.signature == signature && meta.task == ready.task {
+                return Ok(entry);
+            }
+        }
+        let empty = |name: &str| tensors::to_bytes(Path::new(name), &BTreeMap::new(), &json!({"format": 1}));
+        let draft = EntryDraft {
+            meta: EntryMeta {
+                format: 0,
+                name: named.name.clone(),
+                version: 0,
+                description: named.description.clone(),
+                experiment: self.source.clone(),
+                policy: EXTERNAL.to_owned(),
+                task: ready.task.clone(),
+                env_name: Some(ready.env_name.clone()),
+                env_version: None,
+                env_module: None,
+                env_args: None,
+                parameters: 0,
+                signature,
+                keys: self.inputs.clone(),
+                data: None,
+                kind: None,
+                section: None,
+                training: None,
+                parent: None,
+                license: None,
+                versions: crate::versions(),
+                files: BTreeMap::new(),
+            },
+            model: empty(crate::entry::MODEL_FILE)?,
+            config,
+            normaliser: empty(crate::entry::NORMALISER_FILE)?,
+            card: CardWords {
+                rows: vec![("weights".to_owned(), "not in this zoo; the owner runs the policy".to_owned())],
+                usage: "rank it again with `actrm.evaluate(policy, name=..., task=...)` in Python".to_owned(),
+                ..CardWords::default()
+            },
+            metrics: None,
+            command: None,
+            reference: None,
+        };
+        let id: EntryId = draft.seal(zoo)?;
+        Entry::open(zoo, &id)
+    }
+
+    /// What the entry says of its policy; `None` for an entry with weights.
+    ///
+    /// # Errors
+    /// A file that says something else.
+    pub fn of(entry: &Entry) -> Result<Option<Self>, ZooError> {
+        if !entry.meta().is_external() {
+            return Ok(None);
+        }
+        let name = entry.id().to_string();
+        let table: toml::Table = toml::from_str(&entry.config_text()?)
+            .map_err(|source| ZooError::ExperimentSyntax { experiment: name.clone(), source: Box::new(source) })?;
+        let file: File = from_value(&toml::Value::Table(table), &[&name])?;
+        Ok(Some(file.external))
+    }
+
+    fn to_toml(&self) -> String {
+        toml::to_string(&File { external: self.clone() }).expect("texts, numbers and lists become TOML")
+    }
+
+    /// The policy of `entry` as an evaluation takes it; `policy` makes one for each simulator.
+    pub fn subject<'a>(
+        &self,
+        entry: &Entry,
+        policy: impl Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a,
+    ) -> Subject<'a> {
+        let meta = entry.meta();
+        Subject {
+            entry: EntryIdentity { name: meta.name.clone(), version: meta.version, hash: meta.content_sha256() },
+            training: training_facts(meta),
+            task: meta.task.clone(),
+            demonstrations: None,
+            env_version: None,
+            keys: meta.keys.clone(),
+            execution: self.execution,
+            max_steps: None,
+            signature: meta.signature.clone(),
+            time_decides: false,
+            is_scripted: false,
+            fast_render: self.cameras().map(|cameras| cameras.fast_render),
+            perturbation: None,
+            policy: Box::new(policy),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::entry::test_draft;
+
+    /// A greeting with these observations and actions of 7 numbers.
+    fn ready(observations: serde_json::Value) -> Ready {
+        serde_json::from_value(json!({
+            "protocol": 2, "simulator": "robosuite", "versions": {}, "task": "Lift", "env_name": "Lift",
+            "control": "compiled", "control_freq": 20.0, "max_steps": 400, "action_dim": 7,
+            "action_low": vec![-1.0; 7], "action_high": vec![1.0; 7], "observations": observations,
+        }))
+        .unwrap()
+    }
+
+    fn external() -> External {
+        let mut inputs = FeatureKeys::default();
+        inputs.insert(models::STATE, &["robot0_eef_pos".to_owned()]).unwrap();
+        External {
+            source: "python mine.Policy".to_owned(),
+            declared: None,
+            image_size: None,
+            execution: Execution::RecedingHorizon { n_action_steps: 1 },
+            inputs,
+        }
+    }
+
+    #[test]
+    fn the_same_policy_is_the_same_entry_and_another_is_another_version() {
+        let zoo = tempfile::tempdir().unwrap();
+        let named = Named { name: "mine".to_owned(), description: String::new() };
+        let ready = ready(json!({"robot0_eef_pos": [3], "object": [10]}));
+        let one = external().entry(zoo.path(), &named, &ready).unwrap();
+        assert_eq!(external().entry(zoo.path(), &named, &ready).unwrap().id(), one.id());
+        assert_eq!(External::of(&one).unwrap().unwrap(), external());
+        assert_eq!(one.meta().signature, Signature::low_dimensional(3, 0, 7));
+        assert!(one.card().unwrap().contains("not in this zoo"));
+        let declared = External { declared: Some("abc".to_owned()), ..external() };
+        let two = declared.entry(zoo.path(), &named, &ready).unwrap();
+        assert_eq!(two.id().to_string(), "mine@2");
+        assert_ne!(one.meta().content_sha256(), two.meta().content_sha256());
+
+        let error = one.load().err().unwrap().to_string();
+        assert!(error.contains("mine@1") && error.contains("not in this zoo"), "{error}");
+    }
+
+    #[test]
+    fn a_name_with_weights_and_unknown_keys_are_refused() {
+        let zoo = tempfile::tempdir().unwrap();
+        let named = Named { name: "lift-act".to_owned(), description: String::new() };
+        let id = test_draft("lift-act").seal(zoo.path()).unwrap();
+        assert!(External::of(&Entry::open(zoo.path(), &id).unwrap()).unwrap().is_none());
+        let ready = ready(json!({"robot0_eef_pos": [3]}));
+        let error = external().entry(zoo.path(), &named, &ready).unwrap_err().to_string();
+        assert!(error.contains("lift-act@1"), "{error}");
+        let mut other = external();
+        other.inputs.insert(models::STATE, &["robot0_eef_pso".to_owned()]).unwrap();
+        let named = Named { name: "mine".to_owned(), ..named };
+        let error = other.entry(zoo.path(), &named, &ready).unwrap_err().to_string();
+        assert!(error.contains("robot0_eef_pso") && error.contains("robot0_eef_pos"), "{error}");
+    }
+}
