@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from . import _actrm
 from ._actrm import Dataset, Error, Policy, Simulator, __version__, leaderboard, load_policy
-from ._programs import CONTROL, folder
 from ._policies import Called, source
+from ._programs import CONTROL, folder
 from ._progress import Progress, teller
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def convert(
 
 
 def evaluate(
-    policy: Path | Any,
+    policy: Path | object,
     episodes: int | None = None,
     workers: int | None = None,
     progress: Progress = None,
@@ -158,15 +158,15 @@ def evaluate(
     name: name of your policy's entry.
     task: another task than the entry's; the task that your policy is evaluated on.
     protocol: a named protocol, such as `lift-v1`, which says task, seeds, step limit and control loop.
-    inputs: observation keys of each feature that your policy reads, such as `{"observation.state": ["robot0_eef_pos"]}`;
-        an image is `"observation.images.agentview": ["agentview_image"]`. The features that data sets have by default
-        (`observation.state`, `observation.environment_state`) unless given.
+    inputs: observation keys of each feature that your policy reads: `{"observation.state": ["robot0_eef_pos"]}`. An
+        image is `"observation.images.agentview": ["agentview_image"]`. `observation.state` and
+        `observation.environment_state` of the task unless given.
     image_size: side of your policy's images in pixels.
     declared: what you declare of your policy's weights, such as a hash; another one is another version of the entry.
     seed: seed of the first episode.
     max_steps: control steps after which an episode has failed; the entry's or the task's own limit unless given.
-    n_action_steps: actions that are executed before the next query of the policy; the entry's unless given. With it, your
-        policy is asked by `predict_action_chunk`; without, by `select_action` at every step.
+    n_action_steps: actions that are executed before the next query of the policy; the entry's unless given. With it,
+        your policy is asked by `predict_action_chunk`; without, by `select_action` at every step.
     temporal_ensemble: query at every step and average all predictions, with this coefficient.
     control: control loop inside the simulator.
     python: an interpreter with robosuite; this one where it has robosuite, else `$ACTRM_PYTHON`, `.venv` here or above,
@@ -181,11 +181,12 @@ def evaluate(
     lists.
     """
     workers = workers or os.cpu_count() or 1
-    external = None
+    entry, external = None, None
     if isinstance(policy, (str, os.PathLike)):
         given = {"name": name, "inputs": inputs, "declared": declared}
+        entry = str(policy)  # pyright: ignore[reportUnknownArgumentType]
         if meant := [word for word, value in given.items() if value is not None]:
-            raise ValueError(f"{meant[0]}: expected with a policy of yours, found the entry {os.fspath(policy)!r}")
+            raise ValueError(f"{meant[0]}: expected with a policy of yours, found the entry {entry!r}")
     else:
         if name is None:
             raise ValueError("name: expected a name for your policy's entry, such as name='mine', found none")
@@ -194,7 +195,7 @@ def evaluate(
         external = (called, name, source(policy), declared, keys, image_size)
     with teller("eval", progress) as tell:
         return _actrm.evaluate(
-            policy if external is None else None,
+            entry,
             external,
             tell,
             protocol=protocol,

@@ -8,21 +8,24 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+Observation = dict[str, NDArray[Any]]
 
 
 def source(policy: Any) -> str:
     """Where a policy comes from: `python package.module.Class`."""
-    kind = policy if hasattr(policy, "__qualname__") else type(policy)
+    kind: Any = policy if hasattr(policy, "__qualname__") else type(policy)  # pyright: ignore[reportUnknownVariableType]
     return f"python {kind.__module__}.{kind.__qualname__}"
 
 
 class Called:
-    """A policy with its own state of an episode: `reset(seed)`, and `predict(observation)`, which gives actions (T, D)."""
+    """A policy with a state of its own: `reset(seed)`, and `predict(observation)`, which gives actions (T, D)."""
 
     def __init__(self, policy: Any, ask: str | None) -> None:
         self.policy = policy
         self.ask = ask
-        self.predicted: Callable[[dict[str, np.ndarray]], Any] = getattr(policy, ask) if ask else policy
+        self.predicted: Callable[[Observation], Any] = getattr(policy, ask) if ask else policy
         self.takes_seed = False
         if reset := getattr(policy, "reset", None):
             try:
@@ -42,7 +45,9 @@ class Called:
                 f"found {type(policy).__name__}"
             )
         if chunks and asks[:1] == ["select_action"]:
-            raise ValueError("n_action_steps: expected a policy with predict_action_chunk, found one with select_action")
+            raise ValueError(
+                "n_action_steps: expected a policy with predict_action_chunk, found one with select_action"
+            )
         if not chunks and asks[:1] == ["predict_action_chunk"]:
             raise ValueError(
                 "n_action_steps: expected how many actions of a chunk are executed before the next query, found none"
@@ -67,7 +72,7 @@ class Called:
         if hasattr(self.policy, "reset"):
             self.policy.reset(*([seed] if self.takes_seed else []))
 
-    def predict(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+    def predict(self, observation: Observation) -> NDArray[np.float32]:
         """Actions for the next steps, float32 (T, D)."""
         found = self.predicted(observation)
         if hasattr(found, "detach"):

@@ -1,0 +1,162 @@
+"""Policies of the user's own: the outcomes of an entry, what is given, what is refused."""
+
+from __future__ import annotations
+
+import copy
+import json
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import actrm
+import numpy as np
+import pytest
+from conftest import ROOT
+
+LIFT_ACT = ROOT / "zoo/lift-act"
+
+
+class Entry:
+    """An entry, posing as a policy of the user's."""
+
+    def __init__(self) -> None:
+        self.policy = actrm.load_policy(LIFT_ACT)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Entry:
+        return Entry()
+
+    def reset(self, seed: int) -> None:
+        self.policy.reset(seed)
+
+    def select_action(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        return self.policy.select_action(observation)
+
+    def predict_action_chunk(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        return self.policy.predict_action_chunk(observation)
+
+
+def test_an_entry_s_policy_has_the_entry_s_outcomes(zoo: Path, tmp_path: Path) -> None:
+    own = actrm.evaluate(LIFT_ACT, episodes=6, results=tmp_path / "own", progress=False)
+    steps = int(actrm.load_policy(LIFT_ACT).n_action_steps)
+    for workers, options in ((1, {}), (3, {}), (2, {"n_action_steps": steps})):
+        results = tmp_path / f"{workers}"
+        given = {"name": "mine", "task": "Lift", "episodes": 6, "workers": workers, "zoo": zoo, "results": results}
+        ours = actrm.evaluate(Entry(), progress=False, **given, **options)
+        for column in ("seed", "success", "steps", "return", "fingerprint"):
+            assert list(own[column]) == list(ours[column]), (workers, column)
+    # the same settings are the same entry, others a new version
+    assert sorted(path.name for path in (zoo / "mine").iterdir() if path.is_dir()) == ["1", "2"]
+    rows = actrm.leaderboard(zoo, results=tmp_path / "3")
+    assert [(row["entry"], row["policy"], row["successes"]) for row in rows] == [("mine", "external", 6)]
+
+
+def test_the_page_s_policy_is_ranked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "docs/howto_own_policy.md").read_text()
+    lines = text[text.index("    import actrm\n") :].splitlines()
+    end = next(i for i, line in enumerate(lines) if line and not line.startswith("    "))
+    example = textwrap.dedent("\n".join(lines[:end])).strip()
+    assert example.count("\n") < 16
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(example, "howto_own_policy.md", "exec"), names)
+    assert names["episodes"]["success"].mean() > 0.8
+    assert [row["entry"] for row in actrm.leaderboard("zoo")] == ["reach"]
+
+
+def test_images_and_keys_that_are_asked_for_are_given(tmp_path: Path) -> None:
+    seen: list[dict[str, np.ndarray]] = []
+
+    def look(observation: dict[str, np.ndarray]) -> np.ndarray:
+        seen.append(copy.deepcopy(observation))
+        return np.zeros(7)
+
+    inputs = {"observation.images.agentview": ["agentview_image"], "gripper": ["robot0_gripper_qpos"]}
+    actrm.evaluate(
+        look, episodes=1, workers=1, name="look", task="Lift", inputs=inputs, image_size=32, max_steps=2, zoo=tmp_path
+    )
+    assert len(seen) == 2
+    assert {name: (value.shape, value.dtype.name) for name, value in seen[0].items()} == {
+        "observation.images.agentview": ((32, 32, 3), "uint8"),
+        "gripper": ((2,), "float32"),
+    }
+    assert seen[0]["observation.images.agentview"].std() > 10
+    meta = json.loads((tmp_path / "look/1/entry.json").read_text())
+    assert meta["policy"] == "external" and meta["parameters"] == 0
+
+
+def test_a_policy_that_fails_is_no_failed_episode(tmp_path: Path) -> None:
+    asked = []
+
+    def fails(observation: dict[str, np.ndarray]) -> np.ndarray:
+        asked.append(0)
+        if len(asked) > 15:
+            raise KeyError("weights")
+        return np.zeros(7)
+
+    options = {"name": "fails", "task": "Lift", "episodes": 3, "workers": 1, "max_steps": 10, "zoo": tmp_path}
+    with pytest.raises(actrm.Error, match="seed 10001, step 5: querying the policy: .*KeyError") as raised:
+        actrm.evaluate(fails, progress=False, **options)
+    assert isinstance(raised.value.__cause__, KeyError)
+    # the first episode is kept
+    told: list[int] = []
+    asked.clear()
+    with pytest.raises(actrm.Error):
+        actrm.evaluate(fails, progress=lambda done, _: told.append(done), **options)
+    assert told[0] == 1
+
+    for answer, words in (
+        (np.zeros(6), "6 values"),
+        (np.full(7, np.nan), "NaN at index 0"),
+        (np.zeros((2, 2, 2)), r"found \(2, 2, 2\)"),
+        ("no", "could not convert"),
+    ):
+        with pytest.raises(actrm.Error, match=words):
+            actrm.evaluate(lambda _, answer=answer: answer, progress=False, **{**options, "name": "other"})
+
+
+class Chunks:
+    def predict_action_chunk(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        return np.zeros((4, 7))
+
+
+class Uncopied:
+    def __init__(self) -> None:
+        self.file = (one for one in ())
+
+    def reset(self) -> None: ...
+
+    def select_action(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        return np.zeros(7)
+
+
+def test_what_cannot_be_asked_is_refused_by_name(zoo: Path, tmp_path: Path) -> None:
+    for policy, options, words in (
+        (Chunks(), {"task": "Lift"}, "n_action_steps: expected how many"),
+        (Uncopied(), {"task": "Lift", "workers": 2}, "workers: expected 1"),
+        (
+            Uncopied(),
+            {"task": "Lift", "n_action_steps": 2},
+            "n_action_steps: expected a policy with predict_action_chunk",
+        ),
+        (Chunks().predict_action_chunk, {"task": "Stack", "protocol": "lift-v1"}, "task: expected as protocol lift-v1"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            actrm.evaluate(policy, name="mine", zoo=tmp_path, **options)
+    for options, words in (
+        ({}, "`task`: expected a task"),
+        ({"task": "Lift", "name": "lift-act", "zoo": zoo}, "lift-act@"),
+        ({"task": "Lift", "inputs": {"observation.state": ["robot0_eef_pso"]}}, "robot0_eef_pso"),
+        ({"protocol": "lfit-v1"}, "did you mean `lift-v1`"),
+    ):
+        with pytest.raises(actrm.Error, match=words):
+            actrm.evaluate(lambda _: np.zeros(7), **{"name": "mine", "zoo": tmp_path, **options})
+    with pytest.raises(TypeError, match="found int"):
+        actrm.evaluate(3, name="mine", task="Lift")
+    with pytest.raises(ValueError, match="name: expected"):
+        actrm.evaluate(Chunks(), task="Lift")
+    with pytest.raises(ValueError, match="name: expected with a policy of yours"):
+        actrm.evaluate(LIFT_ACT, name="mine")
+    # an entry without weights is not loaded, and says why
+    with pytest.raises(actrm.Error, match="not in this zoo"):
+        actrm.evaluate(lambda _: np.zeros(7), name="here", task="Lift", episodes=1, max_steps=1, zoo=tmp_path)
+        actrm.load_policy("here", zoo=tmp_path)
