@@ -610,7 +610,7 @@ fn a_training_begins_with_an_entry_s_weights() {
     // from a seed it would be another training; from the entry it is the same twice
     let again = request(root.path(), &data, &[&from]);
     assert_eq!(model(&finish(&again)), model(&finish(&again)));
-    for (from, words) in [("nobody", "unknown entry `nobody`"), ("lift-act@7", "lift-act@7")] {
+    for (from, words) in [("nobody", "expected name@version of an entry"), ("lift-act@7", "lift-act/7/entry.json")] {
         let request = request(root.path(), &data, &[&format!("train.from={from}")]);
         let error = train(&request, &|| false, &mut |_| {}).unwrap_err().to_string();
         assert!(error.contains(words), "{error}");

@@ -5,8 +5,7 @@ use std::path::Path;
 
 use candle_core::Tensor;
 
-use crate::entry::{MODEL_FILE, ParentMeta};
-use crate::registry::Registry;
+use crate::entry::{Entry, EntryId, EntryRequest, MODEL_FILE, ParentMeta};
 use crate::{ZooError, tensors};
 
 /// Weights that a training begins with.
@@ -17,12 +16,17 @@ pub(super) struct Beginning {
 }
 
 impl Beginning {
-    /// Those of the entry that `from` means in `zoo`: its name, `name@version`, or its folder.
+    /// Those of the entry `from`, `name@version`, of `zoo`.
     ///
     /// # Errors
     /// An entry that is not there, is damaged, or has no weights.
     pub fn read(zoo: &Path, from: &str) -> Result<Self, ZooError> {
-        let entry = Registry::open(zoo).locate(from)?;
+        let EntryRequest { name, version, .. } = from.parse()?;
+        let Some(version) = version else {
+            let (key, expected) = ("train.from".to_owned(), "name@version of an entry".to_owned());
+            return Err(ZooError::InvalidValue { key, expected, found: from.to_owned() });
+        };
+        let entry = Entry::open(zoo, &EntryId { name, version })?;
         if entry.meta().is_external() {
             return Err(ZooError::External { entry: entry.id().to_string() });
         }

@@ -38,7 +38,8 @@ pub struct TrainSection {
     pub batch_size: usize,
     /// Seed of weights, latents, dropout and batch order.
     pub seed: u64,
-    /// The entry whose weights it begins with, as far as they have its names and shapes; absent: drawn from the seed.
+    /// The entry, `name@version`, whose weights it begins with, as far as names and shapes are the same; absent: drawn from
+    /// the seed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub from: Option<String>,
     /// Highest learning rate.

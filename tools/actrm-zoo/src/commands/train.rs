@@ -147,9 +147,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (experiment, mut overrides) = library.choose(&words)?;
     if let Some(from) = &args.from {
         // of a name, the version that is the newest now
-        let entry = args.zoo.registry().locate(from)?;
-        let is_path = from.contains(std::path::MAIN_SEPARATOR);
-        overrides.push(format!("train.from={}", if is_path { from.clone() } else { entry.id().to_string() }));
+        overrides.push(format!("train.from={}", args.zoo.registry().resolve(from)?));
     }
     let args = &Args { experiment, overrides, from: None, ..args.clone() };
     let load = |overrides: &[String]| {
