@@ -254,50 +254,6 @@ impl Begun {
     }
 }
 
-/// Decoder layers over tokens that every sequence has its own of.
-#[derive(Debug)]
-pub(crate) struct DecoderLayers(Vec<DecoderLayer>);
-
-impl DecoderLayers {
-    /// Layers `{prefix}.0..n`. x: (b, c, D) -> (b, c, D)
-    pub(crate) fn forward(
-        pass: &mut Pass<'_>,
-        (prefix, n): (&str, usize),
-        mut x: Vec<f32>,
-        own: Own<'_>,
-        memory: Memory<'_>,
-    ) -> (Vec<f32>, Self) {
-        let mut layers = Vec::with_capacity(n);
-        for i in 0..n {
-            let (out, layer) = DecoderLayer::forward(pass, format!("{prefix}.{i}"), x, own, memory);
-            x = out;
-            layers.push(layer);
-        }
-        (x, Self(layers))
-    }
-
-    /// grad: that of the output, (b, c, D) -> that of x
-    pub(crate) fn backward(
-        self,
-        pass: &mut Pass<'_>,
-        mut grad: Vec<f32>,
-        own: Own<'_>,
-        memory: Memory<'_>,
-        into: &mut DecoderGrads<'_>,
-        grads: &mut Grads<'_>,
-    ) -> Vec<f32> {
-        for layer in self.0.into_iter().rev() {
-            grad = layer.backward(pass, grad, own.pos, memory, into, grads);
-        }
-        grad
-    }
-
-    /// Gives the buffers back without a backward pass.
-    pub(crate) fn free(self, pass: &mut Pass<'_>) {
-        self.0.into_iter().for_each(|layer| layer.free(pass));
-    }
-}
-
 /// What the backward pass of a decoder over the memory needs.
 #[derive(Debug)]
 pub(crate) struct Decoder {

@@ -28,8 +28,7 @@ mod vision;
 
 pub(crate) use auxiliary::{add_to_first, ask};
 pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_and_values_backward, scatter};
-pub(crate) use convolution::{convolve, framed, input_gradient, weight_gradient as convolution_gradient};
-pub(crate) use decoder::{Decoder, DecoderGrads, DecoderLayers, Memory, Own};
+pub(crate) use decoder::{Decoder, DecoderGrads, Memory};
 pub(crate) use encoder::{Encoder, EncoderLayer};
 pub(crate) use grid::{GridLayer, cells_of, put_cells};
 pub(crate) use loss::AbsoluteError;

@@ -6,6 +6,7 @@ pub mod actrm;
 pub mod bc;
 pub mod bc_rnn;
 pub mod bc_transformer;
+pub mod denoising;
 pub mod diffusion;
 pub mod floors;
 pub mod flow;

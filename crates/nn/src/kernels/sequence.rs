@@ -1,7 +1,6 @@
 //! What stands between convolutions over the steps of sequences: GroupNorm's weights, Mish, FiLM, sums. A sequence lies step
-//! after step with its channels side by side, in a frame of one row.
+//! after step with its channels side by side.
 
-use super::conv::Frame;
 use super::elementwise::exp;
 use crate::simd::vectorised;
 
@@ -75,19 +74,16 @@ pub enum After<'a> {
     Film(Film<'a>),
     /// (n, steps, C), added
     Plain(&'a [f32]),
-    /// the same in a frame
-    Framed(&'a [f32], &'a Frame),
 }
 
-/// `mish(y * weight + bias)`, then `after`, into a frame whose border is not touched. y: (n, steps, C).
-pub fn norm_mish(y: &[f32], (weight, bias): (&[f32], &[f32]), after: After<'_>, frame: &Frame, out: &mut [f32]) {
-    let (c, row) = (frame.channels, frame.width * frame.channels);
+/// `mish(y * weight + bias)`, then `after`. y: (n, steps, C).
+pub fn norm_mish(y: &[f32], (weight, bias): (&[f32], &[f32]), after: After<'_>, steps: usize, out: &mut [f32]) {
+    let c = weight.len();
+    let row = steps * c;
     vectorised(
         #[inline(always)]
         || {
-            for (n, y) in y.chunks_exact(row).enumerate() {
-                let at = frame.at(n, 0);
-                let out = &mut out[at..at + row];
+            for (n, (out, y)) in out.chunks_exact_mut(row).zip(y.chunks_exact(row)).enumerate() {
                 for (out, y) in out.chunks_exact_mut(c).zip(y.chunks_exact(c)) {
                     for (((out, y), w), b) in out.iter_mut().zip(y).zip(weight).zip(bias) {
                         let z = y * w + b;
@@ -106,10 +102,6 @@ pub fn norm_mish(y: &[f32], (weight, bias): (&[f32], &[f32]), after: After<'_>, 
                         }
                     }
                     After::Plain(x) => out.iter_mut().zip(&x[n * row..]).for_each(|(out, x)| *out += x),
-                    After::Framed(x, frame) => {
-                        let at = frame.at(n, 0);
-                        out.iter_mut().zip(&x[at..at + row]).for_each(|(out, x)| *out += x);
-                    }
                 }
             }
         },

@@ -4,7 +4,6 @@
 //! convolution is one product.
 
 use super::Linear;
-use crate::device::HERE;
 use crate::error::Result;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
@@ -17,8 +16,7 @@ pub struct Conv1d {
     pub weight: Tensor,
     /// (out)
     pub bias: Tensor,
-    stride: usize,
-    padding: usize,
+    pub(crate) stride: usize,
 }
 
 /// Both parameters uniform in ±1/sqrt(fan_in), as torch draws them.
@@ -45,32 +43,33 @@ fn unfold(x: &Tensor, (first, stride): (i64, usize), taps: usize, outputs: usize
     let padded = x.pad_with_zeros(1, before, after)?;
     let from = (first + before as i64) as usize;
     let index: Vec<u32> = (0..outputs).flat_map(|i| (0..taps).map(move |k| (from + stride * i + k) as u32)).collect();
-    let index = Tensor::from_vec(index, outputs * taps, &HERE)?;
+    let index = Tensor::from_vec(index, outputs * taps, x.device())?;
     Ok(padded.contiguous()?.index_select(&index, 1)?.reshape((b, outputs, taps * channels))?)
 }
 
 impl Conv1d {
-    /// Creates `{prefix}.weight` and `{prefix}.bias`. `shape` is (in, out, kernel).
+    /// Creates `{prefix}.weight` and `{prefix}.bias`. `shape` is (in, out, kernel); the kernel is odd, and so wide is the
+    /// padding that a stride of 1 gives as many steps.
     pub fn new(
         params: &mut Params,
         prefix: &str,
         (input, output, kernel): (usize, usize, usize),
-        (stride, padding): (usize, usize),
+        stride: usize,
         rng: &mut Rng,
     ) -> Result<Self> {
         let shape = [output, input, kernel];
         let (weight, bias) = parameters(params, prefix, shape, (input * kernel, output), rng)?;
-        Ok(Self { weight, bias, stride, padding })
+        Ok(Self { weight, bias, stride })
     }
 
-    /// x: (b, steps, in) -> (b, (steps + 2 padding - kernel) / stride + 1, out)
+    /// x: (b, steps, in) -> (b, steps / stride, out)
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let (output, input, kernel) = self.weight.dims3()?;
-        let outputs = (x.dim(1)? + 2 * self.padding - kernel) / self.stride + 1;
+        let (outputs, padding) = (x.dim(1)?.div_ceil(self.stride), kernel / 2);
         // the weight as that of a dense layer over the numbers under the kernel
         let weight = self.weight.transpose(1, 2)?.contiguous()?.reshape((output, kernel * input))?;
         let layer = Linear { weight, bias: Some(self.bias.clone()) };
-        layer.forward(&unfold(x, (-(self.padding as i64), self.stride), kernel, outputs)?)
+        layer.forward(&unfold(x, (-(padding as i64), self.stride), kernel, outputs)?)
     }
 }
 
@@ -130,19 +129,14 @@ mod tests {
 
     #[test]
     fn convolutions_are_candles() {
-        for (kernel, stride, padding, steps) in [(5, 1, 2, 8), (3, 2, 1, 8), (3, 2, 1, 7), (1, 1, 0, 4), (5, 1, 2, 2)] {
+        for (kernel, stride, steps) in [(5, 1, 8), (3, 2, 8), (3, 2, 7), (1, 1, 4), (5, 1, 2)] {
             let mut p = Params::new();
             let mut rng = Rng::new(1, "init");
-            let conv = Conv1d::new(&mut p, "c", (3, 4, kernel), (stride, padding), &mut rng).unwrap();
+            let conv = Conv1d::new(&mut p, "c", (3, 4, kernel), stride, &mut rng).unwrap();
             let x = random(&[2, steps, 3], 5);
             let first = x.transpose(1, 2).unwrap().contiguous().unwrap();
-            let theirs = first.conv1d(&conv.weight, padding, stride, 1, 1).unwrap();
-            assert_same(
-                &conv.forward(&x).unwrap(),
-                &theirs,
-                &conv.bias,
-                &format!("{kernel} {stride} {padding} {steps}"),
-            );
+            let theirs = first.conv1d(&conv.weight, kernel / 2, stride, 1, 1).unwrap();
+            assert_same(&conv.forward(&x).unwrap(), &theirs, &conv.bias, &format!("{kernel} {stride} {steps}"));
         }
     }
 

@@ -12,7 +12,7 @@ pub struct GroupNorm {
     pub weight: Tensor,
     /// (channels)
     pub bias: Tensor,
-    groups: usize,
+    pub(crate) groups: usize,
 }
 
 impl GroupNorm {

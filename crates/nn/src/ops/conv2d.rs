@@ -57,7 +57,7 @@ impl ConvNorm {
 }
 
 /// x in a frame with its border of zeros.
-fn framed(x: &[f32], frame: &Frame, pool: &mut Pool) -> Vec<f32> {
+pub(super) fn framed(x: &[f32], frame: &Frame, pool: &mut Pool) -> Vec<f32> {
     let mut out = pool.take(frame.buffer_len());
     frame.clear_border(&mut out);
     let line = frame.width * frame.channels;
@@ -68,33 +68,44 @@ fn framed(x: &[f32], frame: &Frame, pool: &mut Pool) -> Vec<f32> {
     out
 }
 
-/// The convolution in tiles, where that is fewer products. Predictions stay with the plain sum: what an entry does may not
-/// depend on how many pictures it is asked about at once.
-fn forward(cx: &mut Context<'_>, conv: &Conv, w: &[f32], x: &[f32], y: &mut [f32]) -> Result<()> {
-    if cx.prepared.is_some() {
-        // panels are as wide as the vectors of the instruction set that reads them
-        let name = || format!("{} in panels of {}", w.as_ptr().addr(), conv.panel_widths().0);
-        let panels = cx.fixed(name, |_| {
-            let mut panels = vec![0.0; conv.panel_len().0];
-            conv.pack(w, &mut panels);
+/// Calls `run` with panels of a weight; predictions make them once, under a name.
+pub(super) fn with_panels(
+    cx: &mut Context<'_>,
+    (len, name): (usize, &dyn Fn() -> String),
+    pack: impl FnOnce(&mut [f32]),
+    run: impl FnOnce(&[f32]),
+) -> Result<()> {
+    if cx.is_prepared() {
+        let make = |_: &mut Context<'_>| {
+            let mut panels = vec![0.0; len];
+            pack(&mut panels);
             Ok(Arc::new(panels))
-        })?;
-        conv.forward(x, &panels, false, y);
+        };
+        run(cx.fixed(name, make)?.as_slice());
         return Ok(());
     }
-    let pool = &mut cx.space.pool;
-    if let Some(tiles) = Winograd::of(conv) {
+    let mut panels = cx.space.pool.take(len);
+    pack(&mut panels);
+    run(&panels);
+    cx.space.pool.give(panels);
+    Ok(())
+}
+
+/// The convolution in tiles, where that is fewer products; with `add` added to what is there. Predictions stay with the plain
+/// sum: what an entry does may not depend on how many pictures it is asked about at once.
+pub(super) fn forward(cx: &mut Context<'_>, conv: &Conv, w: &[f32], x: &[f32], add: bool, y: &mut [f32]) -> Result<()> {
+    if let Some(tiles) = Winograd::of(conv).filter(|_| !cx.is_prepared()) {
+        let pool = &mut cx.space.pool;
         let (mut panels, mut scratch) = (pool.take(tiles.panel_len().0), pool.take(tiles.scratch()));
         tiles.pack(w, &mut panels);
-        tiles.forward(x, &panels, false, y, &mut scratch);
+        tiles.forward(x, &panels, add, y, &mut scratch);
         [panels, scratch].into_iter().for_each(|buffer| pool.give(buffer));
         return Ok(());
     }
-    let mut panels = pool.take(conv.panel_len().0);
-    conv.pack(w, &mut panels);
-    conv.forward(x, &panels, false, y);
-    pool.give(panels);
-    Ok(())
+    // panels are as wide as the vectors of the instruction set that reads them
+    let name = || format!("{} in panels of {}", w.as_ptr().addr(), conv.panel_widths().0);
+    let run = |panels: &[f32]| conv.forward(x, panels, add, y);
+    with_panels(cx, (conv.panel_len().0, &name), |panels| conv.pack(w, panels), run)
 }
 
 fn input_gradient(back: &mut Backward<'_>, conv: &Conv, w: &[f32], grad: &[f32], add: bool, out: &mut [f32]) {
@@ -112,7 +123,7 @@ fn input_gradient(back: &mut Backward<'_>, conv: &Conv, w: &[f32], grad: &[f32],
     pool.give(panels);
 }
 
-fn weight_gradient(back: &mut Backward<'_>, conv: &Conv, weight: &Tensor, x: &[f32], grad: &[f32]) {
+pub(super) fn weight_gradient(back: &mut Backward<'_>, conv: &Conv, weight: &Tensor, x: &[f32], grad: &[f32]) {
     let pool = &mut back.space.pool;
     let (tiles, mut scratch) = match Winograd::of(conv) {
         Some(tiles) => (Some((tiles, pool.take(tiles.weights()))), pool.take(tiles.scratch())),
@@ -128,6 +139,30 @@ fn weight_gradient(back: &mut Backward<'_>, conv: &Conv, weight: &Tensor, x: &[f
         }
     }
     back.space.pool.give(scratch);
+}
+
+/// Adds the gradients of a convolution's weight and of what it read. grad: that of its output, in a frame of `grad_border`
+pub(super) fn backward(
+    back: &mut Backward<'_>,
+    conv: &Conv,
+    weight: &Tensor,
+    (x, node): (&Tensor, Option<usize>),
+    grad: &[f32],
+) -> Result<()> {
+    read("convolution", [x, weight], |[x, w]| {
+        let framed = framed(x, &conv.input, &mut back.space.pool);
+        weight_gradient(back, conv, weight, &framed, grad);
+        back.space.pool.give(framed);
+        if node.is_some() {
+            let (mut of, sum) = match back.take(node) {
+                Some(sum) => (sum, true),
+                None => (back.space.pool.take(x.len()), false),
+            };
+            input_gradient(back, conv, w, grad, sum, &mut of);
+            back.add(node, of);
+        }
+        Ok(())
+    })
 }
 
 /// `norm(conv(x)) + shortcut`, then ReLU unless it is not wanted; padding is half the kernel. x: (n, h, w, C), weight:
@@ -159,7 +194,7 @@ pub fn conv2d(
     let mut y = cx.space.pool.take(made.inside());
     read("convolution", [&x.tensor, weight], |[x, w]| {
         let framed = framed(x, &conv.input, &mut cx.space.pool);
-        forward(cx, &conv, w, &framed, &mut y)?;
+        forward(cx, &conv, w, &framed, false, &mut y)?;
         cx.space.pool.give(framed);
         Ok(())
     })?;
@@ -219,20 +254,7 @@ pub fn conv2d(
             }
             ConvNorm::Frozen { .. } => scale_backward(&grad, &scale, &frame, &mut before),
         }
-        read("convolution", [&x, &weight], |[x, w]| {
-            let framed = framed(x, &conv.input, &mut back.space.pool);
-            weight_gradient(back, &conv, &weight, &framed, &before);
-            back.space.pool.give(framed);
-            if of_x.is_some() {
-                let (mut of, sum) = match back.take(of_x) {
-                    Some(sum) => (sum, true),
-                    None => (back.space.pool.take(x.len()), false),
-                };
-                input_gradient(back, &conv, w, &before, sum, &mut of);
-                back.add(of_x, of);
-            }
-            Ok(())
-        })?;
+        backward(back, &conv, &weight, (&x, of_x), &before)?;
         [y, inverse, before].into_iter().for_each(|buffer| back.space.pool.give(buffer));
         back.add(of_shortcut, grad);
         Ok(())

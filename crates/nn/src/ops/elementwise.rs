@@ -2,7 +2,7 @@
 
 use crate::context::{Context, read};
 use crate::error::Result;
-use crate::kernels::{Rows, activate, activate_backward};
+use crate::kernels::{Rows, activate, activate_backward, mish_backward};
 use crate::layers::Activation;
 use crate::simd::vectorised;
 use crate::value::Value;
@@ -37,6 +37,42 @@ pub fn activation(cx: &mut Context<'_>, x: &Value, activation: Activation) -> Re
                 #[inline(always)]
                 || activate_backward(&mut grad, x, activation, None, 0),
             );
+            Ok(())
+        })?;
+        back.add(node, grad);
+        Ok(())
+    })
+}
+
+/// The same value; its gradient is added to that of `x` after those of everything that reads `x` later.
+///
+/// # Errors
+/// If the tensor library fails.
+pub fn branch(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
+    if cx.composed() {
+        return Ok(x.clone());
+    }
+    let node = x.node;
+    cx.result_of(x.tensor.clone(), node.is_some(), move |grad, back| {
+        back.add(node, grad);
+        Ok(())
+    })
+}
+
+/// Mish, number by number.
+///
+/// # Errors
+/// If the tensor library fails.
+pub fn mish(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
+    if cx.composed() {
+        return Ok(Value::constant(crate::layers::mish(&x.tensor)?));
+    }
+    let mut out = read("mish", [&x.tensor], |[x]| Ok(x.to_vec()))?;
+    crate::kernels::mish(&mut out);
+    let (node, shape, x) = (x.node, x.dims().to_vec(), x.tensor.clone());
+    cx.result(out, &shape, node.is_some(), move |mut grad, back| {
+        read("mish", [&x], |[x]| {
+            mish_backward(&mut grad, x);
             Ok(())
         })?;
         back.add(node, grad);

@@ -2,6 +2,7 @@
 //! On other devices, and where a pass asks for it, it is a composition of candle's operations under the same name.
 
 mod attention;
+mod conv1d;
 mod conv2d;
 mod elementwise;
 mod feed_forward;
@@ -12,8 +13,9 @@ mod norm;
 mod tokens;
 
 pub use attention::{Attention, attention, self_attention};
+pub use conv1d::{Then, conv1d, conv1d_mish, upsample1d};
 pub use conv2d::{ConvNorm, conv2d, max_pool, spatial_softmax};
-pub use elementwise::{activation, add, cat_rows, detached_mean, dropout};
+pub use elementwise::{activation, add, branch, cat_rows, detached_mean, dropout, mish};
 pub use feed_forward::feed_forward;
 pub use latent::{kl_divergence, sample_latent};
 pub use linear::{linear, linear_rows};

@@ -5,7 +5,7 @@
 use super::*;
 use crate::context::{Cache, Context};
 use crate::gradients::{Gradients, ParamLayout};
-use crate::layers::{Activation, Dropout, FeedForward, LayerNorm, Linear};
+use crate::layers::{Activation, Conv1d, Dropout, FeedForward, GroupNorm, LayerNorm, Linear, Upsample1d};
 use crate::loss::Loss;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
@@ -285,6 +285,34 @@ fn convolutions() {
 }
 
 #[test]
+fn convolutions_of_sequences() {
+    for (steps, input, output, kernel, stride) in
+        [(8, 3, 16, 5, 1), (8, 16, 8, 3, 2), (7, 24, 40, 1, 1), (5, 8, 24, 3, 2)]
+    {
+        let mut case = Case::new();
+        let x = case.tensor("x", &[3, steps, input]);
+        let layer = Conv1d::new(&mut case.params, "conv", (input, output, kernel), stride, &mut case.rng).unwrap();
+        let norm = case.norm("norm", output);
+        let norm = GroupNorm { weight: norm.weight, bias: norm.bias, groups: 4 };
+        let double = Upsample1d::new(&mut case.params, "double", output, &mut case.rng).unwrap();
+        let (scaled, shifted) = (case.tensor("scaled", &[3, 2 * output]), case.tensor("shifted", &[3, output]));
+        case.check("convolution of sequences", |cx| {
+            let (x, scaled, shifted) = (value(cx, &x), value(cx, &scaled), value(cx, &shifted));
+            // read three times: gradients are added
+            let y = conv1d(cx, &x, &layer)?;
+            let kept = branch(cx, &y)?;
+            let a = conv1d_mish(cx, &x, (&layer, &norm), Then::Film(&scaled))?;
+            let b = conv1d_mish(cx, &x, (&layer, &norm), Then::Film(&shifted))?;
+            let c = conv1d_mish(cx, &x, (&layer, &norm), Then::Add(&y))?;
+            let d = conv1d_mish(cx, &x, (&layer, &norm), Then::Nothing)?;
+            let up = upsample1d(cx, &y, &double)?;
+            let up = mish(cx, &up)?;
+            cat_tokens(cx, 3, &[&a, &b, &c, &d, &up, &kept])
+        });
+    }
+}
+
+#[test]
 fn what_does_not_fit_is_named() {
     let mut case = Case::new();
     let (x, layer) = (case.tensor("x", &[2, 3, 5]), case.linear("layer", 4, 5));
@@ -300,6 +328,14 @@ fn what_does_not_fit_is_named() {
     let turned = x.transpose(1, 2).unwrap();
     let wrong = error(&|cx| activation(cx, &Value::from(&turned), Activation::Relu));
     assert!(wrong.starts_with("activation: tensor is with strides"), "{wrong}");
+    let conv = Conv1d::new(&mut Params::new(), "conv", (4, 8, 3), 1, &mut Rng::new(1, "init")).unwrap();
+    let wrong = error(&|cx| conv1d(cx, &Value::from(&x), &conv));
+    assert_eq!(wrong, "convolution: input has shape [2, 3, 5], expected [2, 3, 4]");
+    let fits = Value::from(&x.narrow(2, 0, 4).unwrap().contiguous().unwrap());
+    let weight = Tensor::zeros(8, candle_core::DType::F32, &Device::Cpu).unwrap();
+    let norm = GroupNorm { weight: weight.clone(), bias: weight, groups: 4 };
+    let wrong = error(&|cx| conv1d_mish(cx, &fits, (&conv, &norm), Then::Film(&fits)));
+    assert_eq!(wrong, "convolution: film has shape [2, 3, 4], expected [2, 8]");
     let wrong = error(&|cx| select_tokens(cx, &Value::from(&x), &[3]));
     assert_eq!(wrong, "select: token is 3, expected below 3");
 }

@@ -1,8 +1,7 @@
 //! Diffusion's options.
 
-use super::transformer::TransformerConfig;
-use super::unet::NetworkConfig;
 use crate::encoders::VisionConfig;
+use crate::models::denoising::{NetworkConfig, TransformerConfig};
 use nn::Size;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};

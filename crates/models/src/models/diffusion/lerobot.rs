@@ -1,6 +1,6 @@
 //! LeRobot's diffusion files as values: `config.json` and the names of the tensors. Files are read and written in `zoo`.
 
-use super::{Config, Prediction, Sampler, unet::NetworkConfig};
+use super::{Config, NetworkConfig, Prediction, Sampler};
 use crate::features::{FeatureKind, Signature};
 use crate::lerobot::{mode_name, mode_of};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};

@@ -5,7 +5,6 @@
 use super::config::{Config, Prediction, Sampler};
 use candle_core::Tensor;
 use nn::Result;
-use nn::device::HERE;
 
 /// The share of the actions' variance that is left at each step.
 #[derive(Debug, Clone)]
@@ -59,7 +58,7 @@ impl NoiseSchedule {
     pub fn add_noise(&self, actions: &Tensor, noise: &Tensor, steps: &[u32]) -> Result<Tensor> {
         let column = |of: &dyn Fn(f32) -> f32| {
             let values: Vec<f32> = steps.iter().map(|&t| of(self.alphas_cumprod[t as usize])).collect();
-            Tensor::from_vec(values, (steps.len(), 1, 1), &HERE)
+            Tensor::from_vec(values, (steps.len(), 1, 1), actions.device())
         };
         let (keep, add) = (column(&|a: f32| a.sqrt())?, column(&|a: f32| (1.0 - a).sqrt())?);
         Ok((actions.broadcast_mul(&keep)? + noise.broadcast_mul(&add)?)?)

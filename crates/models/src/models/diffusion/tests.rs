@@ -1,10 +1,11 @@
 #![allow(clippy::unwrap_used)]
-use super::unet::NetworkConfig;
 use super::*;
-use crate::encoders::{ImageNorm, TokenKind};
+use crate::encoders::{ImageNorm, TokenKind, VisionConfig};
+use crate::features::FeatureKind;
 use crate::fused::testing::{
     assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
 };
+use crate::model::PolicyModel;
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
 use nn::simd::{Level, at_most};
@@ -81,18 +82,15 @@ fn answers_by_hand_are_the_composed_ones_also_when_weights_change() {
         for rows in [1, 2, 13] {
             let other = Diffusion::new(&config, &signature, rows as u64).unwrap();
             move_parameters(&other);
-            model.params.load(&other.params.tensors()).unwrap();
+            model.params().load(&other.params().tensors()).unwrap();
             let batch = batch(&signature, 8, rows, 3);
             let steps: Vec<u32> = (0..rows as u32).map(|row| row * 7).collect();
-            let want = values(&model.denoise(&batch.observation, &batch.actions, &steps).unwrap()).unwrap();
+            let values = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            let want = values(model.denoise(&batch.observation, &batch.actions, &steps).unwrap());
             let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
             for level in Level::ALL {
-                let got = at_most(level, || {
-                    let told = model.condition.told(rows, &batch.observation).unwrap();
-                    let cond = model.network.seen(&model.params, rows, told).unwrap();
-                    model.network.answered(&model.params, &batch.actions, &steps, &cond).unwrap()
-                });
-                for (got, want) in values(&got).unwrap().iter().zip(&want) {
+                let got = at_most(level, || model.answered(&batch.observation, &batch.actions, &steps).unwrap());
+                for (got, want) in values(got).iter().zip(&want) {
                     assert!((got - want).abs() < 1e-5 * want.abs().max(1.0), "{got} {want} {level:?} {config:?}");
                 }
             }
@@ -106,7 +104,7 @@ fn shards_add_up_to_the_whole() {
     for mask_padding in [false, true] {
         let model = Diffusion::new(&Config { mask_padding, ..small() }, &signature, 1).unwrap();
         let batch = batch(&signature, 8, 5, 3);
-        let noise = model.noise(5, &mut Rng::new(1, "noise")).unwrap();
+        let noise = normals_like(&batch.actions, &mut Rng::new(1, "noise")).unwrap();
         let steps = [3, 99, 0, 50, 20];
         let number = |loss: Tensor| loss.to_scalar::<f32>().unwrap();
         let whole = number(model.loss_with(&batch, &noise, &steps).unwrap());

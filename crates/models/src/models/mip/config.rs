@@ -1,7 +1,7 @@
 //! MIP's options.
 
 use crate::encoders::VisionConfig;
-use crate::models::diffusion::unet::NetworkConfig;
+use crate::models::denoising::NetworkConfig;
 use nn::Size;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};

@@ -3,9 +3,10 @@ use super::*;
 use crate::fused::testing::{
     assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
 };
-use crate::models::diffusion::unet::NetworkConfig;
+use crate::model::PolicyModel;
+use crate::models::denoising::NetworkConfig;
 use crate::train::{TrainConfig, Trainer};
-use candle_core::Device;
+use candle_core::{DType, Device};
 
 fn small() -> Config {
     let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, step_embed_dim: 8, ..NetworkConfig::default() };
@@ -29,13 +30,8 @@ fn from_pictures_too() {
     move_parameters(&model);
     let batch = batch(&signature, 8, 3, 3);
     assert_the_step_is_the_composed_one(&model, &batch, "pictures");
-    let rows = check_observation("mip", &signature, &batch.observation).unwrap();
-    let seen = model.condition.look(&batch.observation).unwrap();
-    let cond = model.condition.forward(rows, &seen).unwrap();
-    let want =
-        two_steps(&model.nothing(rows).unwrap(), model.config.second_time as f32, |x, t| model.answer(&cond, x, t))
-            .unwrap();
     let got = model.predict(&batch.observation).unwrap();
+    let want = model.predict_composed(&batch.observation).unwrap();
     let off = (got - want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
     assert!(off < 1e-4, "{off}");
 }

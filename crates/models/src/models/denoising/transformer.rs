@@ -5,21 +5,17 @@
 //! Deviations: every action attends to all observations (there, with `causal_attn`, the first ones not to the last ones);
 //! no dropout of tokens (0 in their experiments on low-dimensional observations) and no encoder over the observations
 //! (`n_cond_layers`, 0 there); no pictures.
-//!
-//! This file is the network as one reads it; training steps and predictions run on `transformer_fused.rs`.
 
 use super::unet::embedding;
-use crate::layers::{Activation, DecoderLayer, LayerNorm, Linear, Mode, Shape, mish};
-use candle_core::{DType, Tensor};
-use nn::Rng;
-use nn::Size;
+use crate::layers::{Activation, DecoderLayer, LayerNorm, Linear, Shape};
+use candle_core::Tensor;
 use nn::device::HERE;
-use nn::{Init, Params};
-use nn::{ModelError, Result};
+use nn::ops::{add, cat_tokens, layer_norm, linear, mish};
+use nn::{Context, Init, ModelError, Params, Result, Rng, Size, Value};
 use serde::{Deserialize, Serialize};
 
 /// What the names of its parameters begin with.
-pub(super) const PREFIX: &str = "transformer";
+const PREFIX: &str = "transformer";
 /// Deviation of initial matrices and positions.
 const STD: f64 = 0.02;
 
@@ -80,7 +76,7 @@ impl TransformerConfig {
     }
 
     /// What its layers share.
-    pub(super) fn shape(&self) -> Shape {
+    fn shape(&self) -> Shape {
         Shape {
             dim: self.dim_model,
             heads: self.n_heads,
@@ -161,20 +157,29 @@ impl Transformer {
     /// x: (b, T, A), the step of each row, cond: (b, observations * width) -> (b, T, A)
     ///
     /// # Errors
-    /// If the tensor library fails.
-    pub(super) fn forward(&self, x: &Tensor, steps: &[f32], cond: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let (rows, dim) = (steps.len(), self.dim);
-        let time = Tensor::from_vec(embedding(steps, dim), (rows, 1, dim), &HERE)?;
-        let seen = cond.reshape((rows, self.around.n_obs_steps, self.around.width))?;
-        let told = Tensor::cat(&[&time, &self.cond_obs_emb.forward(&seen)?], 1)?.broadcast_add(&self.cond_pos_emb)?;
+    /// Shapes that do not go together.
+    pub(super) fn apply(&self, cx: &mut Context<'_>, x: &Value, steps: &[f32], cond: &Value) -> Result<Value> {
+        let (rows, dim, device) = (steps.len(), self.dim, cx.device().clone());
+        let Around { horizon, n_obs_steps, width, .. } = self.around;
+        let time = Value::of(embedding(steps, dim), (rows, 1, dim), &device)?;
+        let observed = linear(cx, &cond.reshape((rows, n_obs_steps, width))?, &self.cond_obs_emb)?;
+        let tokens = cat_tokens(cx, rows, &[&time, &observed])?;
+        let positions = cx.parameter(&self.cond_pos_emb)?;
+        let tokens = add(cx, &positions, &tokens)?;
         let [first, second] = &self.encoder;
-        let memory = second.forward(&mish(&first.forward(&told)?)?)?;
+        let hidden = linear(cx, &tokens, first)?;
+        let hidden = mish(cx, &hidden)?;
+        let memory = linear(cx, &hidden, second)?;
         // positions are in the tokens already
-        let none = Tensor::zeros((1, 1, dim), DType::F32, &HERE)?;
-        let mut x = self.input_emb.forward(x)?.broadcast_add(&self.pos_emb)?;
+        let zeros = |tokens: usize| Value::zeros((1, tokens, dim), &device);
+        let (none, none_of_memory) = (zeros(horizon)?, zeros(1 + n_obs_steps)?);
+        let x = linear(cx, x, &self.input_emb)?;
+        let positions = cx.parameter(&self.pos_emb)?;
+        let mut x = add(cx, &positions, &x)?;
         for layer in &self.layers {
-            x = layer.forward(&x, &none, &memory, &none, mode)?;
+            x = layer.apply(cx, &x, &none, &memory, &none_of_memory)?;
         }
-        self.head.forward(&self.ln_f.forward(&x)?)
+        let x = layer_norm(cx, &x, &self.ln_f)?;
+        linear(cx, &x, &self.head)
     }
 }

@@ -1,17 +1,13 @@
 //! The 1-D UNet over the steps of an action sequence, conditioned by FiLM: LeRobot's `DiffusionConditionalUnet1d` with its
 //! tensor names, steps before channels. Diffusion, flow matching and MIP share it.
 
-use crate::layers::{Conv1d, GroupNorm, Linear, Upsample1d, mish};
-use candle_core::Tensor;
-use nn::Params;
-use nn::Rng;
-use nn::Size;
-use nn::device::HERE;
-use nn::{ModelError, Result};
+use crate::layers::{Conv1d, GroupNorm, Linear, Upsample1d};
+use nn::ops::{Then, branch, cat_rows, conv1d, conv1d_mish, linear, mish, upsample1d};
+use nn::{Context, ModelError, Params, Result, Rng, Size, Value};
 use serde::{Deserialize, Serialize};
 
 /// Groups of the last block's norm, whatever the others have.
-pub(super) const LAST_GROUPS: usize = 8;
+const LAST_GROUPS: usize = 8;
 
 /// Options of the network, with LeRobot's names and defaults.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -120,13 +116,13 @@ impl ConvBlock {
         rng: &mut Rng,
     ) -> Result<Self> {
         Ok(Self {
-            conv: Conv1d::new(p, &format!("{prefix}.block.0"), (input, output, kernel), (1, kernel / 2), rng)?,
+            conv: Conv1d::new(p, &format!("{prefix}.block.0"), (input, output, kernel), 1, rng)?,
             norm: GroupNorm::new(p, &format!("{prefix}.block.1"), output, groups, rng)?,
         })
     }
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        mish(&self.norm.forward(&self.conv.forward(x)?)?)
+    fn apply(&self, cx: &mut Context<'_>, x: &Value, then: Then<'_>) -> Result<Value> {
+        conv1d_mish(cx, x, (&self.conv, &self.norm), then)
     }
 }
 
@@ -137,7 +133,6 @@ struct ResidualBlock {
     cond_encoder: Linear,
     conv2: ConvBlock,
     residual_conv: Option<Conv1d>,
-    film_scale: bool,
 }
 
 impl ResidualBlock {
@@ -157,29 +152,20 @@ impl ResidualBlock {
             conv2: ConvBlock::new(p, &format!("{prefix}.conv2"), (output, output, kernel), groups, rng)?,
             residual_conv: match input == output {
                 true => None,
-                false => Some(Conv1d::new(p, &residual, (input, output, 1), (1, 0), rng)?),
+                false => Some(Conv1d::new(p, &residual, (input, output, 1), 1, rng)?),
             },
-            film_scale: config.film_scale,
         })
     }
 
     /// x: (b, T, in), cond: (b, cond) after its activation -> (b, T, out)
-    fn forward(&self, x: &Tensor, cond: &Tensor) -> Result<Tensor> {
-        let out = self.conv1.forward(x)?;
-        let channels = out.dim(2)?;
-        let film = self.cond_encoder.forward(cond)?.unsqueeze(1)?;
-        let out = match self.film_scale {
-            true => {
-                let (scale, shift) = (film.narrow(2, 0, channels)?, film.narrow(2, channels, channels)?);
-                out.broadcast_mul(&scale)?.broadcast_add(&shift)?
-            }
-            false => out.broadcast_add(&film)?,
+    fn apply(&self, cx: &mut Context<'_>, x: &Value, cond: &Value) -> Result<Value> {
+        let film = linear(cx, cond, &self.cond_encoder)?;
+        let around = match &self.residual_conv {
+            Some(conv) => conv1d(cx, x, conv)?,
+            None => x.clone(),
         };
-        let out = self.conv2.forward(&out)?;
-        Ok(match &self.residual_conv {
-            Some(conv) => (out + conv.forward(x)?)?,
-            None => (out + x)?,
-        })
+        let y = self.conv1.apply(cx, x, Then::Film(&film))?;
+        self.conv2.apply(cx, &y, Then::Add(&around))
     }
 }
 
@@ -232,7 +218,7 @@ impl Unet {
         let mut down = Vec::new();
         for (level, (pair, &dim)) in blocks.into_iter().zip(dims).enumerate() {
             let name = format!("{prefix}.down_modules.{level}.2");
-            let halve = (level < last).then(|| Conv1d::new(p, &name, (dim, dim, 3), (2, 1), rng));
+            let halve = (level < last).then(|| Conv1d::new(p, &name, (dim, dim, 3), 2, rng));
             down.push((pair, halve.transpose()?));
         }
         let mut up = Vec::new();
@@ -252,37 +238,48 @@ impl Unet {
             mid,
             up,
             final_block: ConvBlock::new(p, &format!("{name}.0"), (dim, dim, kernel), LAST_GROUPS, rng)?,
-            final_conv: Conv1d::new(p, &format!("{name}.1"), (dim, action_dim, 1), (1, 0), rng)?,
+            final_conv: Conv1d::new(p, &format!("{name}.1"), (dim, action_dim, 1), 1, rng)?,
         })
     }
 
     /// x: (b, T, A), the step of each row, cond: (b, cond) -> (b, T, A)
     ///
     /// # Errors
-    /// If the tensor library fails.
-    pub fn forward(&self, x: &Tensor, steps: &[f32], cond: &Tensor) -> Result<Tensor> {
+    /// Shapes that do not go together.
+    pub fn apply(&self, cx: &mut Context<'_>, x: &Value, steps: &[f32], cond: &Value) -> Result<Value> {
         let [first, second] = &self.step_encoder;
         let width = self.step_embed_dim;
-        let embedded = Tensor::from_vec(embedding(steps, width), (steps.len(), width), &HERE)?;
-        let embedded = second.forward(&mish(&first.forward(&embedded)?)?)?;
+        let embedded = Value::of(embedding(steps, width), (steps.len(), width), &cx.device().clone())?;
+        let embedded = linear(cx, &embedded, first)?;
+        let embedded = mish(cx, &embedded)?;
+        let embedded = linear(cx, &embedded, second)?;
         // every block begins with the same activation of the same condition
-        let cond = mish(&Tensor::cat(&[&embedded, cond], 1)?)?;
-        let through = |pair: &[ResidualBlock; 2], x: &Tensor| pair[1].forward(&pair[0].forward(x, &cond)?, &cond);
+        let cond = cat_rows(cx, &embedded, cond)?;
+        let cond = mish(cx, &cond)?;
+        let through = |cx: &mut Context<'_>, pair: &[ResidualBlock; 2], x: &Value| -> Result<Value> {
+            let x = pair[0].apply(cx, x, &cond)?;
+            pair[1].apply(cx, &x, &cond)
+        };
         let mut x = x.clone();
         let mut skipped = Vec::with_capacity(self.down.len());
         for (pair, halve) in &self.down {
-            x = through(pair, &x)?;
-            skipped.push(x.clone());
+            x = through(cx, pair, &x)?;
+            skipped.push(branch(cx, &x)?);
             if let Some(halve) = halve {
-                x = halve.forward(&x)?;
+                x = conv1d(cx, &x, halve)?;
             }
         }
-        x = through(&self.mid, &x)?;
+        x = through(cx, &self.mid, &x)?;
         for (pair, double) in &self.up {
             let skip = skipped.pop().expect("a level down for every level up");
-            x = double.forward(&through(pair, &Tensor::cat(&[&x, &skip], 2)?)?)?;
+            let (b, steps, channels) = x.dims3()?;
+            let rows = |x: &Value| x.reshape((b * steps, channels));
+            let both = cat_rows(cx, &rows(&x)?, &rows(&skip)?)?.reshape((b, steps, 2 * channels))?;
+            x = through(cx, pair, &both)?;
+            x = upsample1d(cx, &x, double)?;
         }
-        self.final_conv.forward(&self.final_block.forward(&x)?)
+        x = self.final_block.apply(cx, &x, Then::Nothing)?;
+        conv1d(cx, &x, &self.final_conv)
     }
 }
 
