@@ -3,6 +3,8 @@
 
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
 pub mod faults;
+pub mod options;
+pub mod reference;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};

@@ -49,7 +49,7 @@ def main() -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--config-file", str(CONFIG)]
     if subprocess.run(command, check=False, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}).returncode:
         sys.exit(1)
-    sys.stdout.write(f"{ROOT / 'out/site/index.html'}\n")
+    sys.stdout.write("out/site/index.html; searching needs a server: python3 -m http.server --directory out/site\n")
 
 
 if __name__ == "__main__":
