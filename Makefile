@@ -118,7 +118,7 @@ lint: .venv/.complete ## formatting and lints, Rust and Python
 
 .PHONY: reference
 reference: build ## write docs/reference/*.md from the code (tests check that they are current); docs/python.md: tools/python_api.py
-	@ACTRM_REFERENCE=write $(CARGO) test $(CARGO_FLAGS) --workspace --test house --test help -- the_reference_of
+	@ACTRM_REFERENCE=write $(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- the_reference_of
 
 .PHONY: docs
 docs: .venv-docs/.complete ## the documentation as a site that can be searched, in out/site

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use e2e::options::options_page;
 use e2e::reference::assert_current;
+use e2e::results::results_page;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").canonicalize().expect("the repository is there")
@@ -203,4 +204,15 @@ fn the_reference_of_options_is_current() {
         }
     }
     assert!(seen > 1000, "{seen}");
+}
+
+#[test]
+fn the_reference_of_results_is_current() {
+    let (page, of_readme) = results_page();
+    assert_current("docs/results.md", &page);
+    let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
+    let readme = words(&fs::read_to_string(root().join("README.md")).expect("the README"));
+    for said in of_readme {
+        assert!(readme.contains(&words(&said)), "README: expected what the results say:\n{said}");
+    }
 }
