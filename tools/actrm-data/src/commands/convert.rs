@@ -58,7 +58,7 @@ pub struct Args {
     /// How to store images
     #[arg(long, value_enum, default_value_t = Images::Png)]
     images: Images,
-    /// Store pictures as AV1 videos: small, and close to the recording's, not equal; the side folder keeps the exact ones
+    /// Store images as AV1 videos, which are small and not exact; the side folder keeps the exact images
     #[arg(long, conflicts_with = "images")]
     video: bool,
     /// With --video: 1 (large, nearly exact) to 255 (small)
@@ -67,7 +67,7 @@ pub struct Args {
     /// With --video: 0 (slow, small) to 10
     #[arg(long, value_name = "N", default_value_t = VideoOptions::default().speed, requires = "video", value_parser = clap::value_parser!(u8).range(..=10))]
     video_speed: u8,
-    /// With --video: leave the exact pictures out of the side folder: smaller, but the source cannot be rebuilt
+    /// With --video: leave the exact images out of the side folder. It is smaller, but the source cannot be rebuilt
     #[arg(long, requires = "video")]
     no_side_pictures: bool,
     /// Make no columns of depth: the side folder alone keeps it, whatever its values
