@@ -16,6 +16,7 @@ use std::path::Path;
 use rustix::buffer::spare_capacity;
 
 use crate::error::{InputError, Result};
+use crate::lerobot::old_version;
 use crate::plan::{DemoPlan, KeyPlan, Plan};
 use crate::tree::{Array, Demo};
 use local::{Backend, Local};
@@ -315,6 +316,11 @@ impl Source {
 }
 
 fn exists(path: &Path) -> Result<(), InputError> {
+    if let Some(version) = old_version(path) {
+        let reason = "`actrm-data convert` makes a LeRobot v3.0 set of it".to_owned();
+        let (path, object) = (path.to_owned(), format!("a LeRobot {version} folder"));
+        return Err(InputError::Unavailable { path, object, reason });
+    }
     match std::fs::metadata(path) {
         // libhdf5's binding takes text
         Ok(_) if path.to_str().is_none() => {
