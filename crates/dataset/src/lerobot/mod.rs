@@ -36,10 +36,11 @@ pub use convert::{ConvertReport, convert, convert_unless};
 pub use depth::{DepthMaps, DepthUnit};
 pub use export::{ExportReport, export};
 pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, MISTAKE, VideoOptions};
-pub(crate) use images::encode_png;
+pub(crate) use images::{decode as decode_image, encode_png, is_jpeg};
 pub use info::{
     ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm, SkippedDemo, VideoProvenance,
 };
+pub(crate) use meta::python_json;
 pub use notes::notes;
 pub(crate) use notes::{mask_note, shared_notes};
 pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};

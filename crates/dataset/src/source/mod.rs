@@ -4,10 +4,12 @@ mod codec;
 mod dialect;
 pub mod isolation;
 mod local;
+mod rlds;
 mod value;
 mod video;
 mod walk;
 mod writer;
+mod zarr;
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -65,8 +67,8 @@ impl Source {
     /// Opens in this process: for files that are trusted.
     pub fn open(path: &Path) -> Result<Self> {
         exists(path)?;
-        let (local, plan) = Local::open(path, &mut || {})?;
-        Self::with(plan, Box::new(local))
+        let (backend, plan) = open_backend(path, &mut || {})?;
+        Self::with(plan, backend)
     }
 
     /// Opens with all parsing done in a child process with memory and time limits. The program has to have called
@@ -313,6 +315,18 @@ impl Source {
             found: if value.is_finite() { format!("{value:e}, which float32 cannot hold") } else { value.to_string() },
         })
     }
+}
+
+/// Opens a source of any format in this process.
+fn open_backend(path: &Path, beat: &mut dyn FnMut()) -> Result<(Box<dyn Backend>, Plan), InputError> {
+    if let Some((buffer, plan)) = zarr::Buffer::open(path, beat)? {
+        return Ok((Box::new(buffer), plan));
+    }
+    if let Some((set, plan)) = rlds::Rlds::open(path, beat)? {
+        return Ok((Box::new(set), plan));
+    }
+    let (local, plan) = Local::open(path, beat)?;
+    Ok((Box::new(local), plan))
 }
 
 fn exists(path: &Path) -> Result<(), InputError> {

@@ -1,6 +1,8 @@
 //! Sources that are no HDF5 file: values are those of the format's own reader.
 
 mod lerobot_v2;
+mod rlds;
+mod zarr;
 
 use std::path::{Path, PathBuf};
 
