@@ -109,7 +109,7 @@ fn join(
 
 /// Whether the samples of an episode can be moved: they begin with a key frame that says what follows.
 fn moves(set: &Dataset, place: &VideoPlace, episode: usize) -> Result<bool> {
-    match Source::open(&place.path)?.samples(&set.episodes()[episode], place) {
+    match Source::open(&place.path).and_then(|source| source.samples(&set.episodes()[episode], place)) {
         Ok(samples) => Ok(samples.first().is_some_and(Sample::begins)),
         // whoever reads it as it is says what is wrong with it
         Err(DatasetError::Video(_)) => Ok(false),
