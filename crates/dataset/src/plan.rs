@@ -35,6 +35,10 @@ pub enum Dialect {
     D4rl,
     /// ALOHA and ACT: one file per episode.
     Aloha,
+    /// A zarr replay buffer, as Diffusion Policy and UMI record it.
+    Zarr,
+    /// RLDS, as `tensorflow-datasets` stores it.
+    Rlds,
 }
 
 impl Dialect {
@@ -53,12 +57,24 @@ impl Dialect {
             Self::Droid => "DROID",
             Self::D4rl => "D4RL",
             Self::Aloha => "ALOHA",
+            Self::Zarr => "zarr replay buffer",
+            Self::Rlds => "RLDS",
         }
     }
 
     /// Whether it was recorded without a simulator's rewards and ends, which nobody misses in it.
     pub(crate) fn is_a_recording(self) -> bool {
-        matches!(self, Self::Aloha | Self::Robotwin | Self::Droid | Self::Maniskill | Self::IsaacLab | Self::Behavior)
+        matches!(
+            self,
+            Self::Zarr
+                | Self::Rlds
+                | Self::Aloha
+                | Self::Robotwin
+                | Self::Droid
+                | Self::Maniskill
+                | Self::IsaacLab
+                | Self::Behavior
+        )
     }
 
     /// How a recording without observations gets them.
@@ -79,7 +95,17 @@ impl Dialect {
             Self::Aloha | Self::Robotwin => Some(50.0),
             Self::Maniskill => Some(20.0),
             Self::Droid => Some(15.0),
+            Self::Zarr | Self::Rlds => Some(10.0),
             _ => None,
+        }
+    }
+
+    /// The format of its files.
+    pub fn format(self) -> &'static str {
+        match self {
+            Self::Zarr => "zarr",
+            Self::Rlds => "TFRecord",
+            _ => "HDF5",
         }
     }
 }

@@ -5,6 +5,8 @@
 //! `ACTRM_MUTATIONS=2000` sets how many files are made (300 otherwise), `ACTRM_MUTATION_SEED` which ones.
 #![allow(clippy::unwrap_used, clippy::result_large_err)]
 
+mod common;
+
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -12,7 +14,7 @@ use std::time::{Duration, Instant};
 #[path = "common/made.rs"]
 mod made;
 
-use dataset::{DatasetError, Demo, InputError, RobomimicWriter, Source, WriteOptions, isolation};
+use dataset::{DatasetError, Demo, InputError, OldSet, RobomimicWriter, Source, WriteOptions, isolation};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 
@@ -26,6 +28,7 @@ fn main() {
     an_unarmed_path_reports_like_an_armed_one();
     a_reading_process_that_dies_is_an_error();
     mutations();
+    other_formats();
 }
 
 fn fixture(name: &str) -> std::path::PathBuf {
@@ -209,6 +212,50 @@ fn mutations() {
     println!("{count} mutated files, seed {seed}: {tally:#?}");
     println!("slowest {slowest:?}, most memory here and in the reading process {} MB", most >> 20);
     assert!(most < 1 << 30, "{most} bytes");
+}
+
+/// Formats that are read by Rust alone: in this process, so that a panic is seen.
+fn other_formats() {
+    let (count, seed) = (number("ACTRM_MUTATIONS", 500), number("ACTRM_MUTATION_SEED", 1));
+    let dir = tempfile::tempdir().unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    for name in ["zarr/umi.zarr", "zarr/lz4.zarr.zip", "rlds", "lerobot_v21"] {
+        let copied = dir.path().join(name);
+        match fixture(name).is_dir() {
+            true => common::copy(&fixture(name), &copied),
+            false => drop(std::fs::copy(fixture(name), &copied).unwrap()),
+        }
+        let files: Vec<_> = match copied.is_dir() {
+            true => common::files(&copied).into_keys().map(|file| copied.join(file)).collect(),
+            false => vec![copied.clone()],
+        };
+        let (mut read, mut slowest) = (0, Duration::ZERO);
+        for i in 0..count {
+            let file = &files[(i % files.len() as u64) as usize];
+            let original = std::fs::read(file).unwrap();
+            let mut bytes = original.clone();
+            // room for every kind of damage in the smallest file
+            bytes.resize(bytes.len().max(600), b' ');
+            let how = mutate(&mut bytes, &mut rng);
+            std::fs::write(file, &bytes).unwrap();
+            let start = Instant::now();
+            let result = match name {
+                "lerobot_v21" => OldSet::open(&copied).map(drop),
+                _ => Source::open(&copied).and_then(|source| everything(&source)).map(drop),
+            };
+            slowest = slowest.max(start.elapsed());
+            assert!(start.elapsed() < PATIENT_LIMIT, "{name}, file {i} ({how}, seed {seed})");
+            read += u64::from(result.is_ok());
+            if let Err(error) = result {
+                let text = error.to_string();
+                assert!(!text.contains('\n'), "{name}, file {i} ({how}, seed {seed}): one line: {text}");
+            }
+            std::fs::write(file, &original).unwrap();
+        }
+        println!("{count} mutated files of {name}: {read} read, the others refused; slowest {slowest:?}");
+    }
+    let most = children_peak();
+    assert!(most < 2 << 30, "{most} bytes");
 }
 
 /// Peak resident memory of this process and of its children that live, in bytes.

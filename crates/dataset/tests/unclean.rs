@@ -3,6 +3,9 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod common;
+mod sources;
+
 use dataset::{
     Array, ConvertOptions, ConvertReport, Dataset, DatasetError, Demo, NonFinite, RobomimicWriter, Source,
     WriteOptions, convert, edit, export, verify, verify_source,

@@ -37,3 +37,11 @@ pub struct Sample {
     /// Whether it can be decoded without the ones before it.
     pub key: bool,
 }
+
+impl Sample {
+    /// Whether a file of AV1 can begin with it, or go on with it after samples of another encoder.
+    pub fn begins(&self) -> bool {
+        let units = sequence::units(&self.bytes).unwrap_or_default();
+        self.key && units.iter().any(|unit| unit.kind == sequence::SEQUENCE)
+    }
+}

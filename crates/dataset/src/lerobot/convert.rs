@@ -16,6 +16,7 @@ use super::side::{self, SideEncoder, SideOutput, SideWriter};
 use super::skip;
 use super::staging::Staging;
 use super::tally::{Tally, Told};
+use super::v2::OldSet;
 use super::verify::hash_files;
 use super::videos::{self, VideoWriter};
 use super::work;
@@ -77,6 +78,9 @@ pub fn convert_unless(
     options: &ConvertOptions,
     progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
 ) -> Result<ConvertReport> {
+    if let Some(old) = OldSet::open(source)? {
+        return old.convert(out, options, progress);
+    }
     let mut input = Source::open_guarded(source)?.nonfinite(options.nonfinite);
     without_observations(&input)?;
     if !options.depth {

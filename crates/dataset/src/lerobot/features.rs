@@ -14,8 +14,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Default keys of `observation.state`: the first set that is there whole wins. Robots after the first
 /// (`robot1_...`) are added to robomimic's. Where there is none of them, all vectors are taken.
-const STATE_DEFAULTS: [&[&str]; 6] = [
+const STATE_DEFAULTS: [&[&str]; 7] = [
     &["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"],
+    // UMI
+    &["robot0_eef_pos", "robot0_eef_rot_axis_angle", "robot0_gripper_width"],
     // LIBERO, ALOHA and others, D4RL, Isaac Lab, DROID
     &["ee_pos", "ee_ori", "gripper_states"],
     &["qpos"],
@@ -396,12 +398,14 @@ impl Chooser<'_> {
     }
 
     /// Observations of floating-point numbers, a vector or a number a step, in order of their names. What follows from
-    /// others is none: the environment's state, the action before and what Mimic notes for itself.
+    /// others is none: the environment's state, the action before, what Mimic notes for itself and what a text was embedded as.
     fn vectors(&self) -> Vec<String> {
         let fits = |key: &KeyPlan| {
             matches!(key.dtype, Dtype::F32 | Dtype::F64) && matches!(key.shape[..], [_] | [_, 1..=VECTOR])
         };
-        let other = |name: &str| matches!(name, ENV_DEFAULT | "actions") || name.starts_with("datagen_info/");
+        let other = |name: &str| {
+            matches!(name, ENV_DEFAULT | "actions") || name.starts_with("datagen_info/") || name.contains("embedding")
+        };
         let keys = self.first.keys.iter().filter(|(path, key)| fits(key) && self.usual(path));
         let names = keys.filter_map(|(path, _)| path.strip_prefix("obs/"));
         names.filter(|name| !other(name)).map(str::to_owned).collect()

@@ -119,6 +119,11 @@ pub(crate) fn jpeg(row: &[u8]) -> Option<&[u8]> {
     row.starts_with(&JPEG).then(|| &row[..end])
 }
 
+/// Whether a file begins as a JPEG file does.
+pub(crate) fn is_jpeg(file: &[u8]) -> bool {
+    file.starts_with(&JPEG)
+}
+
 /// A JPEG file whose header was read.
 type Jpeg<'a> = JpegDecoder<ZCursor<&'a [u8]>>;
 

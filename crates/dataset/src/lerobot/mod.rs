@@ -25,6 +25,7 @@ mod tables;
 mod tally;
 mod tiff;
 mod to_robomimic;
+mod v2;
 mod values;
 mod verify;
 mod videos;
@@ -35,13 +36,16 @@ pub use convert::{ConvertReport, convert, convert_unless};
 pub use depth::{DepthMaps, DepthUnit};
 pub use export::{ExportReport, export};
 pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, MISTAKE, VideoOptions};
-pub(crate) use images::encode_png;
+pub(crate) use images::{decode as decode_image, encode_png, is_jpeg};
 pub use info::{
     ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm, SkippedDemo, VideoProvenance,
 };
+pub(crate) use meta::python_json;
 pub use notes::notes;
 pub(crate) use notes::{mask_note, shared_notes};
 pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};
 pub use pictures::{CameraFile, PictureFile, PictureStore, Pictures};
 pub use to_robomimic::rewrite;
+pub use v2::OldSet;
+pub(crate) use v2::version as old_version;
 pub use verify::{Check, source_hash, verify, verify_source, verify_within};

@@ -168,6 +168,11 @@ impl Dataset {
         })
     }
 
+    /// Says at what size files of a set that is made of this one are closed, in MiB.
+    pub(super) fn limit_files(&mut self, data: f64, video: f64) {
+        (self.info.data_files_size_in_mb, self.info.video_files_size_in_mb) = (data, video);
+    }
+
     /// Leaves out where it came from: what follows is a set of its own.
     pub(super) fn forget_provenance(&mut self) {
         (self.info.actrm, self.env) = (None, None);
@@ -463,7 +468,7 @@ pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T
     serde_json::from_slice(&read_file(path)?).map_err(|source| DatasetError::Json { path: path.to_path_buf(), source })
 }
 
-fn read_file(path: &Path) -> Result<Vec<u8>> {
+pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>> {
     read::refuse_pointer(path)?;
     std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_path_buf(), operation: "read it", source })
 }
@@ -493,15 +498,16 @@ pub(crate) fn parse_info(root: &Path) -> Result<(Info, Value)> {
         |source| DatasetError::Json { path, source }
     };
     let mut value: Value = serde_json::from_slice(&text).map_err(failed(&path))?;
-    let mut info: Info = serde_json::from_slice(&text).map_err(failed(&path))?;
-    if !info.codebase_version.starts_with("v3.") {
-        return Err(DatasetError::BadDataset {
-            path,
-            object: "codebase_version".to_owned(),
-            expected: "v3.0".to_owned(),
-            found: info.codebase_version,
-        });
+    let version = value.get("codebase_version").and_then(Value::as_str).unwrap_or("v3.0");
+    if !version.starts_with("v3.") {
+        let found = match version.starts_with("v2.") {
+            true => format!("{version}; `actrm-data convert` makes a v3.0 set of it"),
+            false => version.to_owned(),
+        };
+        let (object, expected) = ("codebase_version".to_owned(), "v3.0".to_owned());
+        return Err(DatasetError::BadDataset { path, object, expected, found });
     }
+    let mut info: Info = serde_json::from_slice(&text).map_err(failed(&path))?;
     let beside = root.join(PROVENANCE_FILE);
     if info.actrm.is_none() && beside.exists() {
         let text = read_file(&beside)?;

@@ -13,8 +13,8 @@ use rustix::process::{Resource, Rlimit};
 use serde::{Deserialize, Serialize};
 
 use super::codec::{Taker, put_array, put_demo};
-use super::local::{Backend, Local};
-use super::video;
+use super::local::Backend;
+use super::{open_backend, video};
 use crate::error::InputError;
 use crate::plan::Plan;
 use crate::tree::{Array, Demo};
@@ -115,14 +115,17 @@ pub(super) fn limit_cpu(seconds: u64, maximum: Option<u64>) -> std::io::Result<(
     Ok(rustix::process::setrlimit(Resource::Cpu, Rlimit { current: Some(seconds), maximum })?)
 }
 
-fn source_bytes(path: &Path) -> u64 {
-    let files = super::local::files(path).unwrap_or_default();
-    files.iter().map(|file| std::fs::metadata(file).map_or(0, |m| m.len())).sum()
+/// Bytes of a file, or of everything in a folder.
+fn source_bytes(path: &Path, depth: usize) -> u64 {
+    match std::fs::read_dir(path) {
+        Ok(entries) if depth > 0 => entries.flatten().map(|e| source_bytes(&e.path(), depth - 1)).sum(),
+        _ => std::fs::metadata(path).map_or(0, |m| m.len()),
+    }
 }
 
 fn serve(path: &Path) -> std::io::Result<()> {
     let allowed = |bytes: u64| CPU_SECONDS + bytes / BYTES_PER_CPU_SECOND;
-    let bytes = source_bytes(path);
+    let bytes = source_bytes(path, 4);
     limit_self(allowed(bytes), None)?;
     let mut out = std::io::stdout().lock();
     let _ = rustix::pipe::fcntl_setpipe_size(&out, 1 << 20);
@@ -133,7 +136,7 @@ fn serve(path: &Path) -> std::io::Result<()> {
             // a parent that has gone is noticed when the plan is sent
             let _ = send(&mut beat_out, BEAT, &[]);
         };
-        Local::open(path, &mut beat)
+        open_backend(path, &mut beat)
     };
     out = std::io::stdout().lock();
     let local = match opened {

@@ -4,10 +4,12 @@ mod codec;
 mod dialect;
 pub mod isolation;
 mod local;
+mod rlds;
 mod value;
 mod video;
 mod walk;
 mod writer;
+mod zarr;
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -16,6 +18,7 @@ use std::path::Path;
 use rustix::buffer::spare_capacity;
 
 use crate::error::{InputError, Result};
+use crate::lerobot::old_version;
 use crate::plan::{DemoPlan, KeyPlan, Plan};
 use crate::tree::{Array, Demo};
 use local::{Backend, Local};
@@ -64,8 +67,8 @@ impl Source {
     /// Opens in this process: for files that are trusted.
     pub fn open(path: &Path) -> Result<Self> {
         exists(path)?;
-        let (local, plan) = Local::open(path, &mut || {})?;
-        Self::with(plan, Box::new(local))
+        let (backend, plan) = open_backend(path, &mut || {})?;
+        Self::with(plan, backend)
     }
 
     /// Opens with all parsing done in a child process with memory and time limits. The program has to have called
@@ -314,7 +317,24 @@ impl Source {
     }
 }
 
+/// Opens a source of any format in this process.
+fn open_backend(path: &Path, beat: &mut dyn FnMut()) -> Result<(Box<dyn Backend>, Plan), InputError> {
+    if let Some((buffer, plan)) = zarr::Buffer::open(path, beat)? {
+        return Ok((Box::new(buffer), plan));
+    }
+    if let Some((set, plan)) = rlds::Rlds::open(path, beat)? {
+        return Ok((Box::new(set), plan));
+    }
+    let (local, plan) = Local::open(path, beat)?;
+    Ok((Box::new(local), plan))
+}
+
 fn exists(path: &Path) -> Result<(), InputError> {
+    if let Some(version) = old_version(path) {
+        let reason = "`actrm-data convert` makes a LeRobot v3.0 set of it".to_owned();
+        let (path, object) = (path.to_owned(), format!("a LeRobot {version} folder"));
+        return Err(InputError::Unavailable { path, object, reason });
+    }
     match std::fs::metadata(path) {
         // libhdf5's binding takes text
         Ok(_) if path.to_str().is_none() => {

@@ -70,7 +70,7 @@ def convert(
 
     Parameters
     ----------
-    src: HDF5 file, or a folder with one file an episode.
+    src: what `actrm-data convert` takes: an HDF5 file or a folder of them, a zarr store, an RLDS or LeRobot v2.x folder.
     dst: folder to create.
     progress: True shows a bar, False does not. A function is called with frames done and frames in all. Unless given,
         there is a bar in terminals and notebooks.

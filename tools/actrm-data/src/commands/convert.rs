@@ -20,17 +20,22 @@ use std::time::Instant;
 /// metres or uint16 millimetres, height x width x 1) becomes observation.images.<camera>_depth, a TIFF file a frame, as
 /// LeRobot records it. No file says its unit, and robosuite's own camera_depths, before robomimic makes metres of them,
 /// go from 0 to 1. OUT appears whole or not at all.
+///
+/// Sources: HDF5 files of robomimic's family, ALOHA and D4RL; zarr v2 replay buffers (Diffusion Policy, UMI), as a folder or a zip
+/// file; RLDS data sets of tensorflow-datasets, as the folder with features.json; LeRobot v2.0 and v2.1 folders, whose columns
+/// stay as they are and whose videos are joined (AV1) or copied (H.264), never encoded again.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data convert data/lift.hdf5 lift
   actrm-data convert image.hdf5 set --images ppm --jobs 2
   actrm-data convert image.hdf5 set --video
+  actrm-data convert replay.zarr.zip umi --fps 20
   actrm-data convert can.hdf5 can --state-keys robot0_eef_pos,robot0_gripper_qpos --env-keys object
   actrm-data convert stack.hdf5 stack --entity \"a=cubeA_pos,cubeA_pos - robot0_eef_pos\"
   actrm-data convert square.hdf5 square --actions absolute --rotation 6d
   actrm-data convert recorded recorded.hdf5 --to robomimic")]
 pub struct Args {
-    /// HDF5 file, or a folder with one file an episode or a task
+    /// HDF5 file, or a folder with one file an episode or a task; zarr store, RLDS or LeRobot v2.x folder
     source: PathBuf,
     /// Directory to create, or HDF5 file
     out: PathBuf,

@@ -1,5 +1,5 @@
 use anyhow::Result;
-use dataset::{Dataset, Dtype, NonFinite, Source};
+use dataset::{Dataset, Dtype, NonFinite, OldSet, Source};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ use std::process::ExitCode;
   actrm-data inspect lift --json
   actrm-data inspect image.hdf5 --quick --demos")]
 pub struct Args {
-    /// HDF5 file, folder with one file an episode, or data set directory
+    /// Anything that `convert` takes, or a data set directory
     path: PathBuf,
     /// Do not read the data: no ranges
     #[arg(long)]
@@ -90,8 +90,15 @@ pub(super) fn summary(path: &Path) -> Result<Summary> {
 }
 
 fn of(args: &Args) -> Result<Summary> {
+    if let Some(old) = OldSet::open(&args.path)? {
+        let mut summary = of_dataset(args, old.set())?;
+        summary.layout = format!("LeRobotDataset {}", old.version());
+        summary.notes.push("`actrm-data convert` makes a LeRobotDataset v3.0 of it".to_owned());
+        summary.notes.extend(old.notes().iter().cloned());
+        return Ok(summary);
+    }
     match args.path.join("meta/info.json").exists() {
-        true => of_dataset(args),
+        true => of_dataset(args, &Dataset::open(&args.path)?),
         false => of_source(args),
     }
 }
@@ -194,7 +201,7 @@ fn of_source(args: &Args) -> Result<Summary> {
     let each = plan.demos.iter().map(|d| DemoRow { id: d.id.clone(), length: d.length, task: d.task.clone() });
     Ok(Summary {
         path: cli::lossy(&args.path),
-        layout: format!("{} HDF5", plan.dialect.name()),
+        layout: format!("{} {}", plan.dialect.name(), plan.dialect.format()),
         bytes: plan.files.iter().map(|(_, size)| size).sum(),
         env_name: plan.env_name.clone(),
         env_version: plan.env_version.clone(),
@@ -216,8 +223,7 @@ fn dtype_name(dtype: &Dtype) -> String {
     dtype.to_string()
 }
 
-fn of_dataset(args: &Args) -> Result<Summary> {
-    let set = Dataset::open(&args.path)?;
+fn of_dataset(args: &Args, set: &Dataset) -> Result<Summary> {
     let lengths: Vec<usize> = set.episodes().iter().map(|e| e.length).collect();
     let ranges = |name: &str| {
         let stats = set.stats().get(name)?;
@@ -228,7 +234,7 @@ fn of_dataset(args: &Args) -> Result<Summary> {
     let mut keys = Vec::new();
     for (name, feature) in &set.info().features.0 {
         let video = match feature.dtype.as_str() {
-            "video" => videos(&set, name).map_err(|e| problems.push(format!("{name}: {e}"))).ok(),
+            "video" => videos(set, name).map_err(|e| problems.push(format!("{name}: {e}"))).ok(),
             _ => None,
         };
         keys.push(KeyRow {

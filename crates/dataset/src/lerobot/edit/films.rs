@@ -39,6 +39,9 @@ pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) ->
         let (_, height, width) = set.camera(old)?;
         let mut film = Film::new(set.info().fps, (height, width));
         let mut stretches: Vec<Option<Stretch>> = vec![None; places.len()];
+        if input.joins {
+            join(edit, set, (name, old), &places, &mut film, &mut stretches, &mut copied.files)?;
+        }
         for &episode in taken {
             if stretches[episode].is_some() {
                 continue;
@@ -48,8 +51,7 @@ pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) ->
             let wanted: Vec<usize> = of_file.iter().copied().filter(|e| taken.binary_search(e).is_ok()).collect();
             // what does not fit its set is not made to look as if it did
             wanted.iter().try_for_each(|&e| film.locate(&set.episodes()[e], &places[e]).map(|_| ()))?;
-            let (folder, file) = (copied.files.len() / FILES_PER_FOLDER, copied.files.len() % FILES_PER_FOLDER);
-            let target = Target { edit, relative: format!("videos/{name}/chunk-{folder:03}/file-{file:03}.mp4") };
+            let (target, (folder, file)) = Target::next(edit, name, copied.files.len());
             let (written, spans) = match wanted.len() == of_file.len() {
                 true => target.whole(&places, &wanted)?,
                 false => target.cut(set, old, &places, &wanted)?,
@@ -66,6 +68,55 @@ pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) ->
     Ok(copied)
 }
 
+/// Puts the files of episodes that follow each other into one, up to the size at which a file is closed, as LeRobot does. Those
+/// whose samples cannot be moved are left for later.
+fn join(
+    edit: &Edit<'_>,
+    set: &Dataset,
+    (name, old): (&str, &str),
+    places: &[VideoPlace],
+    film: &mut Film,
+    stretches: &mut [Option<Stretch>],
+    files: &mut Vec<WrittenFile>,
+) -> Result<()> {
+    let limit = (set.info().video_files_size_in_mb * f64::from(1 << 20)) as u64;
+    let bytes = |episode: usize| std::fs::metadata(&places[episode].path).map_or(0, |m| m.len());
+    let mut next = 0;
+    while next < places.len() {
+        let (mut together, mut size) = (Vec::new(), 0);
+        while next < places.len()
+            && (together.is_empty() || size + bytes(next) < limit)
+            && moves(set, &places[next], next)?
+        {
+            film.locate(&set.episodes()[next], &places[next])?;
+            size += bytes(next);
+            together.push(next);
+            next += 1;
+        }
+        if together.len() > 1 {
+            let (target, (folder, file)) = Target::next(edit, name, files.len());
+            let (written, spans) = target.cut(set, old, places, &together)?;
+            files.push(written);
+            for (episode, (from, to)) in together.iter().copied().zip(spans) {
+                stretches[episode] = Some(Stretch { folder, file, from, to });
+            }
+        } else if together.is_empty() {
+            next += 1;
+        }
+    }
+    Ok(())
+}
+
+/// Whether the samples of an episode can be moved: they begin with a key frame that says what follows.
+fn moves(set: &Dataset, place: &VideoPlace, episode: usize) -> Result<bool> {
+    match Source::open(&place.path).and_then(|source| source.samples(&set.episodes()[episode], place)) {
+        Ok(samples) => Ok(samples.first().is_some_and(Sample::begins)),
+        // whoever reads it as it is says what is wrong with it
+        Err(DatasetError::Video(_)) => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
 /// Bytes that are copied at once.
 const COPIED: usize = 1 << 20;
 
@@ -78,7 +129,14 @@ struct Target<'a> {
     relative: String,
 }
 
-impl Target<'_> {
+impl<'a> Target<'a> {
+    /// The file after so many others, with its folder and number.
+    fn next(edit: &'a Edit<'a>, name: &str, others: usize) -> (Self, (usize, usize)) {
+        let (folder, file) = (others / FILES_PER_FOLDER, others % FILES_PER_FOLDER);
+        let relative = format!("videos/{name}/chunk-{folder:03}/file-{file:03}.mp4");
+        (Self { edit, relative }, (folder, file))
+    }
+
     fn create(&self) -> Result<HashingFile> {
         let path = self.edit.root.join(&self.relative);
         create_parent(&path)?;
@@ -118,18 +176,26 @@ impl Target<'_> {
     ) -> Result<(WrittenFile, Spans)> {
         let (_, height, width) = set.camera(name)?;
         let rate = rate(set.info().fps, width, height)?;
-        let source = Source::open(&places[episodes[0]].path)?;
+        let mut open: Option<(&Path, Source)> = None;
+        let mut samples = |episode: usize| {
+            let place = &places[episode];
+            if open.as_ref().is_none_or(|(path, _)| *path != place.path) {
+                open = Some((&place.path, Source::open(&place.path)?));
+            }
+            let (_, source) = open.as_ref().expect("it was opened above");
+            source.samples(&set.episodes()[episode], place)
+        };
         let mut muxer = Muxer::new(width as u16, height as u16, rate);
         let mut spans = Spans::new();
         for &episode in episodes {
             let from = muxer.frames();
-            source.samples(&set.episodes()[episode], &places[episode])?.iter().try_for_each(|s| muxer.push(s))?;
+            samples(episode)?.iter().try_for_each(|s| muxer.push(s))?;
             spans.push((rate.seconds(from), rate.seconds(muxer.frames())));
         }
         let mut to = self.create()?;
         to.write_all(&muxer.header()).map_err(self.failed())?;
         for &episode in episodes {
-            for sample in source.samples(&set.episodes()[episode], &places[episode])? {
+            for sample in samples(episode)? {
                 to.write_all(&sample.bytes).map_err(self.failed())?;
             }
         }

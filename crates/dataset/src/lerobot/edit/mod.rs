@@ -29,6 +29,7 @@ use super::verify::picture_problem;
 use super::videos::{Stretch, VIDEO_PATH};
 use crate::error::{DatasetError, Result};
 use std::collections::BTreeMap;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 /// Where an edited data set goes.
@@ -71,6 +72,8 @@ struct Input {
     set: Dataset,
     /// Of its side folder, whose files have the hashes recorded.
     layout: Option<Layout>,
+    /// Whether its videos, a file an episode, become files of many episodes.
+    joins: bool,
 }
 
 impl Input {
@@ -95,7 +98,7 @@ impl Input {
             },
             _ => None,
         };
-        Ok(Self { set, layout })
+        Ok(Self { set, layout, joins: false })
     }
 }
 
@@ -198,6 +201,25 @@ pub fn merge(sets: &[PathBuf], out: &Path, progress: &mut Progress<'_>) -> Resul
     let taken: Vec<Vec<usize>> = inputs.iter().map(|input| (0..input.set.episodes().len()).collect()).collect();
     let staging = Staging::create(out)?;
     let report = told(&inputs, taken, &Renames::new(), None, staging.path(), progress)?;
+    staging.publish()?;
+    Ok(report)
+}
+
+/// All of `set`, which has a file an episode, in the new directory `out`.
+pub(super) fn gather(
+    set: Dataset,
+    out: &Path,
+    progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
+) -> Result<EditReport> {
+    let staging = Staging::create(out)?;
+    let (root, all) = (set.root().to_path_buf(), (0..set.episodes().len()).collect());
+    let input = Input { set, layout: None, joins: true };
+    let mut stopped = false;
+    let tell = &mut |done, total| stopped |= progress(done, total).is_break();
+    let report = told(&[input], vec![all], &Renames::new(), None, staging.path(), tell)?;
+    if stopped {
+        return Err(DatasetError::Stopped { path: root });
+    }
     staging.publish()?;
     Ok(report)
 }
@@ -330,7 +352,9 @@ impl Edit<'_> {
     /// Task texts that the result has whichever of them its frames do.
     fn tasks(&self) -> Vec<String> {
         let mut tasks: Vec<String> = Vec::new();
-        for text in self.inputs.iter().filter(|_| self.repair.is_some()).flat_map(|input| input.set.tasks()) {
+        for text in
+            self.inputs.iter().filter(|input| self.repair.is_some() || input.joins).flat_map(|input| input.set.tasks())
+        {
             if !tasks.contains(text) {
                 tasks.push(text.clone());
             }

@@ -60,7 +60,7 @@ pub fn repair(set: &Path, to: &Destination, what: Repair, progress: &mut Progres
         false => None,
     };
     let all = (0..derived.episodes().len()).collect();
-    let mut made = one(Input { set: derived, layout }, to, all, &Renames::new(), Some(what), progress)?;
+    let mut made = one(Input { set: derived, layout, joins: false }, to, all, &Renames::new(), Some(what), progress)?;
     made.notes.splice(0..0, notes);
     Ok(RepairReport { corrected, left, made: Some(made) })
 }

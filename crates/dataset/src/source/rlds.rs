@@ -1,0 +1,737 @@
+//! RLDS data sets as `tensorflow-datasets` stores them: TFRecord files with an episode a record, described by `features.json` and
+//! `dataset_info.json`. A record is a `tf.train.Example` in which every list of `steps/...` has the values of all steps in a row.
+//! Read without TensorFlow, after the descriptions of both formats.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::local::Backend;
+use super::value::one_line;
+use crate::error::InputError;
+use crate::lerobot::{decode_image, is_jpeg};
+use crate::plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
+use crate::tree::{Array, Attrs, Demo, Dtype};
+
+/// Bytes of a record, at most.
+const MAX_RECORD: u64 = 320 << 20;
+/// Bytes of an answer, and of an image, at most.
+const MAX_ROWS: usize = 320 << 20;
+const MAX_IMAGE: usize = 64 << 20;
+/// Bytes of a JSON file, at most.
+const MAX_JSON: u64 = 16 << 20;
+/// Steps of an episode, at most.
+const MAX_STEPS: usize = 1 << 24;
+
+/// A data set of episodes.
+pub(super) struct Rlds {
+    path: PathBuf,
+    leaves: Vec<Leaf>,
+    records: Vec<Record>,
+    /// The record that was read last.
+    kept: Mutex<Option<(usize, Arc<Vec<u8>>)>>,
+}
+
+/// A list of `steps` that can be read.
+struct Leaf {
+    /// Its name in records.
+    name: String,
+    key: String,
+    form: Form,
+    /// Of a step.
+    shape: Vec<usize>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum Form {
+    Numbers(Dtype),
+    Text,
+    Images,
+}
+
+struct Record {
+    file: PathBuf,
+    /// Where its content begins.
+    offset: u64,
+    length: usize,
+    id: String,
+    attrs: Attrs,
+    keys: BTreeMap<String, KeyPlan>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Stated {
+    name: String,
+    #[serde(default)]
+    file_format: Option<String>,
+    splits: Vec<Split>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Split {
+    name: String,
+    /// Whole numbers, as texts.
+    #[serde(default)]
+    shard_lengths: Vec<Value>,
+    #[serde(default)]
+    filepath_template: Option<String>,
+}
+
+// ---- TFRecord and protocol buffers ----
+
+/// CRC-32C, rotated and shifted, as TFRecord stores it.
+fn masked_crc(bytes: &[u8]) -> u32 {
+    const TABLE: [u32; 256] = {
+        let mut table = [0; 256];
+        let mut i = 0;
+        while i < 256 {
+            let (mut crc, mut bit) = (i as u32, 0);
+            while bit < 8 {
+                crc = if crc & 1 == 1 { crc >> 1 ^ 0x82f6_3b78 } else { crc >> 1 };
+                bit += 1;
+            }
+            table[i] = crc;
+            i += 1;
+        }
+        table
+    };
+    let crc = !bytes.iter().fold(!0_u32, |crc, &byte| TABLE[usize::from(crc as u8 ^ byte)] ^ crc >> 8);
+    crc.rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+/// A field of a message.
+enum Field<'a> {
+    Number(u64),
+    Bytes(&'a [u8]),
+    Fixed(u32),
+}
+
+const CUT: &str = "a message that is cut off";
+
+fn varint(rest: &mut &[u8]) -> Result<u64, String> {
+    let mut number = 0;
+    for shift in (0..64).step_by(7) {
+        let (&byte, tail) = rest.split_first().ok_or(CUT)?;
+        *rest = tail;
+        number |= u64::from(byte & 127) << shift;
+        if byte < 128 {
+            return Ok(number);
+        }
+    }
+    Err("a number of more than 64 bits".to_owned())
+}
+
+/// Calls `take` with the number and content of every field of a message.
+fn fields<'a>(message: &'a [u8], take: &mut dyn FnMut(u64, Field<'a>) -> Result<(), String>) -> Result<(), String> {
+    let mut rest = message;
+    while !rest.is_empty() {
+        let tag = varint(&mut rest)?;
+        let field = match tag & 7 {
+            0 => Field::Number(varint(&mut rest)?),
+            1 => {
+                rest = rest.get(8..).ok_or(CUT)?;
+                continue;
+            }
+            2 => {
+                let length = usize::try_from(varint(&mut rest)?).map_err(|e| e.to_string())?;
+                let (content, tail) = rest.split_at_checked(length).ok_or(CUT)?;
+                rest = tail;
+                Field::Bytes(content)
+            }
+            5 => {
+                let (four, tail) = rest.split_first_chunk::<4>().ok_or(CUT)?;
+                rest = tail;
+                Field::Fixed(u32::from_le_bytes(*four))
+            }
+            kind => return Err(format!("a field of kind {kind}")),
+        };
+        take(tag >> 3, field)?;
+    }
+    Ok(())
+}
+
+/// The lists of an example by name: kind (1 bytes, 2 floats, 3 whole numbers) and content.
+type Lists<'a> = BTreeMap<&'a str, (u64, &'a [u8])>;
+
+fn lists(record: &[u8]) -> Result<Lists<'_>, String> {
+    let mut found = Lists::new();
+    fields(record, &mut |number, field| match (number, field) {
+        (1, Field::Bytes(features)) => fields(features, &mut |number, entry| {
+            let (1, Field::Bytes(entry)) = (number, entry) else { return Ok(()) };
+            let (mut name, mut list) = ("", None);
+            fields(entry, &mut |number, field| {
+                match (number, field) {
+                    (1, Field::Bytes(text)) => name = std::str::from_utf8(text).map_err(|e| e.to_string())?,
+                    (2, Field::Bytes(feature)) => fields(feature, &mut |kind, field| {
+                        if let Field::Bytes(content) = field {
+                            list = Some((kind, content));
+                        }
+                        Ok(())
+                    })?,
+                    _ => {}
+                }
+                Ok(())
+            })?;
+            found.extend(list.map(|list| (name, list)));
+            Ok(())
+        }),
+        _ => Ok(()),
+    })?;
+    Ok(found)
+}
+
+fn byte_strings(list: &[u8]) -> Result<Vec<&[u8]>, String> {
+    let mut all = Vec::new();
+    fields(list, &mut |_, field| {
+        if let Field::Bytes(one) = field {
+            all.push(one);
+        }
+        Ok(())
+    })?;
+    Ok(all)
+}
+
+/// Calls `take` with every number of a list, as float or as whole number.
+fn numbers(kind: u64, list: &[u8], take: &mut dyn FnMut(f32, i64)) -> Result<(), String> {
+    fields(list, &mut |_, field| {
+        match (kind, field) {
+            (2, Field::Bytes(packed)) => {
+                let (values, rest) = packed.as_chunks::<4>();
+                values.iter().for_each(|&v| take(f32::from_le_bytes(v), 0));
+                if !rest.is_empty() {
+                    return Err(CUT.to_owned());
+                }
+            }
+            (2, Field::Fixed(bits)) => take(f32::from_bits(bits), 0),
+            (3, Field::Bytes(mut packed)) => {
+                while !packed.is_empty() {
+                    take(0.0, varint(&mut packed)? as i64);
+                }
+            }
+            (3, Field::Number(number)) => take(0.0, number as i64),
+            _ => return Err("a list of numbers that holds something else".to_owned()),
+        }
+        Ok(())
+    })
+}
+
+/// Number of elements of a list.
+fn count(kind: u64, list: &[u8]) -> Result<usize, String> {
+    let mut all = 0;
+    match kind {
+        1 => all = byte_strings(list)?.len(),
+        _ => numbers(kind, list, &mut |_, _| all += 1)?,
+    }
+    Ok(all)
+}
+
+/// The numbers of a list in their own type.
+fn elements(kind: u64, list: &[u8], dtype: &Dtype) -> Result<Vec<u8>, String> {
+    let mut out = Vec::new();
+    let whole = kind == 3;
+    let put = &mut |float: f32, number: i64| {
+        let bytes = number.to_le_bytes();
+        match dtype {
+            Dtype::F32 if whole => out.extend_from_slice(&(number as f32).to_le_bytes()),
+            Dtype::F32 => out.extend_from_slice(&float.to_le_bytes()),
+            Dtype::F64 if whole => out.extend_from_slice(&(number as f64).to_le_bytes()),
+            Dtype::F64 => out.extend_from_slice(&f64::from(float).to_le_bytes()),
+            Dtype::Bool => out.push(u8::from(number != 0)),
+            other => out.extend_from_slice(&bytes[..other.size().unwrap_or(8)]),
+        }
+    };
+    if !whole && !matches!(dtype, Dtype::F32 | Dtype::F64) {
+        return Err(format!("floats where {dtype} is stated"));
+    }
+    numbers(kind, list, put)?;
+    Ok(out)
+}
+
+// ---- what features.json states ----
+
+/// Finds the leaves below a feature: name, and what is stated of it.
+fn leaves<'v>(feature: &'v Value, name: &str, depth: usize, found: &mut Vec<(String, &'v Value)>) {
+    let dict = feature.pointer("/featuresDict/features").and_then(Value::as_object);
+    match (dict, feature.pointer("/sequence/feature")) {
+        (Some(dict), _) if depth > 0 => {
+            for (child, feature) in dict {
+                let name = if name.is_empty() { child.clone() } else { format!("{name}/{child}") };
+                leaves(feature, &name, depth - 1, found);
+            }
+        }
+        (None, Some(step)) if name == "steps" && depth > 0 => leaves(step, name, depth - 1, found),
+        _ => found.push((name.to_owned(), feature)),
+    }
+}
+
+/// Form and shape of a leaf; what it is in words where it cannot be read.
+fn form(feature: &Value) -> Result<(Form, Vec<usize>), String> {
+    let what = || {
+        let class = feature.get("pythonClassName").and_then(Value::as_str).unwrap_or("a feature without a class");
+        class.rsplit('.').next().unwrap_or(class).to_owned()
+    };
+    if feature.get("text").is_some() {
+        return Ok((Form::Text, Vec::new()));
+    }
+    if feature.get("classLabel").is_some() {
+        return Ok((Form::Numbers(Dtype::I64), Vec::new()));
+    }
+    let (stated, is_image) = match (feature.get("tensor"), feature.get("image")) {
+        (Some(tensor), _) => (tensor, false),
+        (None, Some(image)) => (image, true),
+        _ => return Err(what()),
+    };
+    let of = |key: &str| stated.get(key).and_then(Value::as_str).unwrap_or("");
+    let dimensions = stated.pointer("/shape/dimensions").and_then(Value::as_array);
+    let extent = |d: &Value| d.as_i64().or_else(|| d.as_str()?.parse().ok());
+    let shape: Option<Vec<i64>> = dimensions.into_iter().flatten().map(extent).collect();
+    let shape = shape.ok_or_else(what)?;
+    if is_image {
+        return match (of("dtype"), shape.last()) {
+            ("uint8" | "", Some(3)) => Ok((Form::Images, Vec::new())),
+            (dtype, channels) => Err(format!("{} of {dtype} with {} channels", what(), channels.unwrap_or(&0))),
+        };
+    }
+    let shape: Vec<usize> = shape
+        .into_iter()
+        .map(|n| usize::try_from(n).ok())
+        .collect::<Option<_>>()
+        .ok_or("an extent that is not stated")?;
+    if !matches!(of("encoding"), "" | "none") {
+        return Err(format!("{} with encoding {}", what(), of("encoding")));
+    }
+    if shape.iter().try_fold(1_usize, |n, &extent| n.checked_mul(extent)).is_none_or(|n| n == 0 || n > MAX_ROWS / 8) {
+        return Err(format!("{} of shape {shape:?}", what()));
+    }
+    let dtype = match of("dtype") {
+        "float32" | "float16" | "bfloat16" => Dtype::F32,
+        "float64" => Dtype::F64,
+        "bool" => Dtype::Bool,
+        "uint8" => Dtype::U8,
+        "int8" => Dtype::I8,
+        "uint16" => Dtype::U16,
+        "int16" => Dtype::I16,
+        "uint32" => Dtype::U32,
+        "int32" => Dtype::I32,
+        "uint64" => Dtype::U64,
+        "int64" => Dtype::I64,
+        "string" if shape.is_empty() => return Ok((Form::Text, shape)),
+        other => return Err(format!("{} of {other}", what())),
+    };
+    Ok((Form::Numbers(dtype), shape))
+}
+
+/// robomimic's names for those of RLDS.
+fn key_of(name: &str) -> String {
+    match name.split_once('/') {
+        None if name == "action" => "actions".to_owned(),
+        None if name == "reward" => "rewards".to_owned(),
+        None if name == "is_terminal" => "dones".to_owned(),
+        Some(("action", rest)) => format!("action_dict/{rest}"),
+        Some(("observation", rest)) => format!("obs/{rest}"),
+        _ => name.to_owned(),
+    }
+}
+
+// ---- the data set ----
+
+impl Rlds {
+    /// Opens a folder with `features.json` and `dataset_info.json`; `None` where the path is none.
+    pub fn open(path: &Path, beat: &mut dyn FnMut()) -> Result<Option<(Self, Plan)>, InputError> {
+        if !path.join("features.json").is_file() || !path.join("dataset_info.json").is_file() {
+            return Ok(None);
+        }
+        let mut set = Self { path: path.to_owned(), leaves: Vec::new(), records: Vec::new(), kept: Mutex::new(None) };
+        let plan = set.plan(beat)?;
+        Ok(Some((set, plan)))
+    }
+
+    fn damaged(&self, path: &Path, object: &str, reason: &str) -> InputError {
+        let (path, object, operation) = (path.to_owned(), object.to_owned(), "read".to_owned());
+        InputError::Damaged { path, object, operation, reason: one_line(reason) }
+    }
+
+    fn json<T: serde::de::DeserializeOwned>(&self, name: &str) -> Result<T, InputError> {
+        let path = self.path.join(name);
+        let failed = |e: &dyn std::fmt::Display| self.damaged(&path, name, &e.to_string());
+        if std::fs::metadata(&path).map_err(|e| failed(&e))?.len() > MAX_JSON {
+            return Err(failed(&format!("more than {MAX_JSON} bytes")));
+        }
+        let text = std::fs::read(&path).map_err(|e| failed(&e))?;
+        serde_json::from_slice(&text).map_err(|e| failed(&e))
+    }
+
+    fn plan(&mut self, beat: &mut dyn FnMut()) -> Result<Plan, InputError> {
+        let info: Stated = self.json("dataset_info.json")?;
+        let features: Value = self.json("features.json")?;
+        let format = info.file_format.as_deref().unwrap_or("tfrecord");
+        if format != "tfrecord" {
+            let (path, object) = (self.path.clone(), "dataset_info.json".to_owned());
+            return Err(InputError::Unsupported {
+                path,
+                object,
+                what: format!("file format {format} (tfrecord is read)"),
+            });
+        }
+        let mut found = Vec::new();
+        leaves(&features, "", 16, &mut found);
+        let mut problems = Vec::new();
+        let mut metadata = Vec::new();
+        for (name, feature) in found {
+            let step = name.strip_prefix("steps/");
+            match (form(feature), step) {
+                (Ok((form, shape)), None) => metadata.push(Leaf { key: name.clone(), name, form, shape }),
+                (Ok((form, shape)), Some(step)) => {
+                    let key = key_of(step);
+                    self.leaves.push(Leaf { name, key, form, shape });
+                }
+                (Err(what), Some(step)) => {
+                    let (path, object) = (self.path.clone(), name.clone());
+                    let error = InputError::Unsupported { path, object, what: one_line(&what) };
+                    problems.push(Problem::new(None, Some(&key_of(step)), true, error));
+                }
+                (Err(_), None) => {}
+            }
+        }
+        if self.leaves.is_empty() {
+            return Err(InputError::UnknownLayout {
+                path: self.path.clone(),
+                expected: "an RLDS data set, whose features.json has steps".to_owned(),
+                found: "features.json without any that can be read".to_owned(),
+            });
+        }
+        let mut files = ["dataset_info.json", "features.json"].map(|name| self.path.join(name)).to_vec();
+        let (mut masks, mut demos) = (BTreeMap::new(), Vec::new());
+        for split in &info.splits {
+            let shards = split.shard_lengths.len();
+            for (shard, stated) in split.shard_lengths.iter().enumerate() {
+                let file = self.shard(&info, split, shard, shards)?;
+                let stated = stated.as_u64().or_else(|| stated.as_str()?.parse().ok());
+                let lost = |problems: &[Problem]| problems.iter().filter(|p| p.demo.is_some()).count();
+                let (whole, before) = (demos.len(), demos.len() + lost(&problems));
+                self.read_shard(&file, &metadata, &mut demos, &mut problems, beat)?;
+                let after = demos.len() + lost(&problems);
+                if stated.is_some_and(|stated| stated != (after - before) as u64) {
+                    let reason = format!(
+                        "dataset_info.json states {} records, there are {}",
+                        stated.unwrap_or(0),
+                        after - before
+                    );
+                    return Err(self.damaged(&file, "its records", &reason));
+                }
+                let ids = demos[whole..].iter().map(|demo: &DemoPlan| demo.id.clone());
+                masks.entry(split.name.clone()).or_insert_with(Vec::new).extend(ids);
+                files.push(file);
+            }
+        }
+        if demos.is_empty() && problems.iter().all(|p| p.demo.is_none()) {
+            return Err(InputError::NoDemos { path: self.path.clone(), found: "no record".to_owned() });
+        }
+        Ok(Plan {
+            path: self.path.clone(),
+            files: files.into_iter().map(|f| (f.clone(), std::fs::metadata(&f).map_or(0, |m| m.len()))).collect(),
+            dialect: Dialect::Rlds,
+            demos,
+            env_args: None,
+            env_name: None,
+            env_version: None,
+            masks,
+            texts: BTreeMap::new(),
+            notes: Vec::new(),
+            problems,
+        })
+    }
+
+    /// The file of a shard.
+    fn shard(&self, info: &Stated, split: &Split, shard: usize, shards: usize) -> Result<PathBuf, InputError> {
+        let template = split.filepath_template.as_deref().unwrap_or("{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}");
+        let name = template
+            .replace("{DATASET}", &info.name)
+            .replace("{SPLIT}", &split.name)
+            .replace("{FILEFORMAT}", "tfrecord")
+            .replace("{SHARD_X_OF_Y}", &format!("{shard:05}-of-{shards:05}"))
+            .replace("{SHARD_INDEX}", &format!("{shard:05}"))
+            .replace("{NUM_SHARDS}", &format!("{shards:05}"));
+        if name.contains(['/', '{', '\0']) || name.starts_with('.') {
+            return Err(self.damaged(&self.path.join("dataset_info.json"), "filepathTemplate", &name));
+        }
+        let file = self.path.join(name);
+        match file.is_file() {
+            true => Ok(file),
+            false => Err(InputError::NotFound { path: file }),
+        }
+    }
+
+    /// Takes note of every record of a file.
+    fn read_shard(
+        &mut self,
+        path: &Path,
+        metadata: &[Leaf],
+        demos: &mut Vec<DemoPlan>,
+        problems: &mut Vec<Problem>,
+        beat: &mut dyn FnMut(),
+    ) -> Result<(), InputError> {
+        let unreadable = |e: std::io::Error| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() };
+        if super::is_lfs_pointer(path) {
+            return Err(InputError::LfsPointer { path: path.to_owned() });
+        }
+        let file = File::open(path).map_err(unreadable)?;
+        let end = file.metadata().map_err(unreadable)?.len();
+        let (mut at, mut number) = (0, 0);
+        while at < end {
+            let object = format!("record {number}");
+            let mut head = [0; 12];
+            if end - at < 16 {
+                return Err(self.damaged(path, &object, "it is cut off"));
+            }
+            file.read_exact_at(&mut head, at).map_err(unreadable)?;
+            let length = u64::from_le_bytes(head[..8].try_into().unwrap_or_default());
+            if masked_crc(&head[..8]) != u32::from_le_bytes(head[8..].try_into().unwrap_or_default()) {
+                return Err(self.damaged(path, &object, "the checksum of its length is wrong"));
+            }
+            if length > end - at - 16 {
+                return Err(self.damaged(
+                    path,
+                    &object,
+                    &format!("it is cut off: {length} bytes are stated, {} are left", end - at - 16),
+                ));
+            }
+            if length > MAX_RECORD {
+                return Err(InputError::TooLarge { path: path.to_owned(), object, bytes: length, limit: MAX_RECORD });
+            }
+            let mut content = vec![0; length as usize + 4];
+            file.read_exact_at(&mut content, at + 12).map_err(unreadable)?;
+            let crc = content.split_off(length as usize);
+            let lost = problems.iter().filter(|p| p.demo.is_some()).count();
+            let position = demos.len() + lost;
+            let id = format!("demo_{position}");
+            let sound = masked_crc(&content) == u32::from_le_bytes(crc[..].try_into().unwrap_or_default());
+            let episode = match sound {
+                true => self.episode(&content, metadata),
+                false => Err("its checksum is wrong".to_owned()),
+            };
+            match episode {
+                Ok((steps, keys, attrs, task)) => {
+                    demos.push(DemoPlan {
+                        id: id.clone(),
+                        number: position as u64,
+                        length: steps,
+                        keys: keys.clone(),
+                        attr_names: attrs.keys().cloned().collect(),
+                        task,
+                    });
+                    let (file, offset) = (path.to_owned(), at + 12);
+                    self.records.push(Record { file, offset, length: content.len(), id, attrs, keys });
+                }
+                Err(reason) => {
+                    problems.push(Problem::new(Some(&id), None, true, self.damaged(path, &object, &reason)));
+                }
+            }
+            at += 16 + length;
+            number += 1;
+            beat();
+        }
+        Ok(())
+    }
+
+    /// Steps, keys, attributes and instruction of a record.
+    #[allow(clippy::type_complexity)]
+    fn episode(
+        &self,
+        record: &[u8],
+        metadata: &[Leaf],
+    ) -> Result<(usize, BTreeMap<String, KeyPlan>, Attrs, Option<String>), String> {
+        let lists = lists(record)?;
+        let mut steps: Option<(usize, &str)> = None;
+        let mut keys = BTreeMap::new();
+        let mut task: Option<(usize, String)> = None;
+        for leaf in &self.leaves {
+            let Some(&(kind, list)) = lists.get(leaf.name.as_str()) else { continue };
+            let (all, width) = (count(kind, list)?, leaf.shape.iter().product::<usize>());
+            let here = all / width.max(1);
+            if here * width != all || here > MAX_STEPS {
+                return Err(format!("{}: {all} elements, which are no steps of {width}", leaf.name));
+            }
+            match steps {
+                Some((there, name)) if there != here => {
+                    return Err(format!("{} has {here} steps, {name} has {there}", leaf.name));
+                }
+                _ => steps = Some((here, &leaf.name)),
+            }
+            let (mut key, mut dtype, mut shape) = (leaf.key.clone(), Dtype::U8, vec![here]);
+            match &leaf.form {
+                Form::Numbers(stated) => {
+                    dtype = stated.clone();
+                    shape.extend(&leaf.shape);
+                }
+                Form::Text => {
+                    let texts = byte_strings(list)?;
+                    // text that is none stays out of the way
+                    if texts.iter().any(|text| std::str::from_utf8(text).is_err()) {
+                        continue;
+                    }
+                    let said = texts.iter().find(|text| !text.is_empty());
+                    if let (true, Some(said)) = (leaf.name.contains("instruction"), said)
+                        && task.as_ref().is_none_or(|(length, _)| leaf.name.len() < *length)
+                    {
+                        task = Some((leaf.name.len(), String::from_utf8_lossy(said).into_owned()));
+                    }
+                    dtype = Dtype::VarStr;
+                }
+                Form::Images => {
+                    let files = byte_strings(list)?;
+                    if files.first().is_some_and(|file| is_jpeg(file)) {
+                        // kept as files: rows as long as the longest
+                        shape.push(files.iter().map(|file| file.len()).max().unwrap_or(0));
+                        key = key.replacen("obs/", "obs/images/", 1);
+                    } else {
+                        let size = files.first().and_then(|file| png_size(file));
+                        let (height, width) = size.ok_or_else(|| format!("{}: neither JPEG nor PNG", leaf.name))?;
+                        shape.extend([height, width, 3]);
+                    }
+                }
+            }
+            let place = Place { file: 0, path: leaf.name.clone(), first_row: 0, offset: None, join: None };
+            keys.insert(key, KeyPlan { dtype, shape, block_rows: 1, place });
+        }
+        let mut attrs = Attrs::new();
+        for leaf in metadata {
+            let Some(&(kind, list)) = lists.get(leaf.name.as_str()) else { continue };
+            let value = match &leaf.form {
+                Form::Numbers(dtype) => {
+                    let bytes = elements(kind, list, dtype)?;
+                    let expected = leaf.shape.iter().product::<usize>() * dtype.size().unwrap_or(0);
+                    (bytes.len() == expected).then(|| Array { dtype: dtype.clone(), shape: leaf.shape.clone(), bytes })
+                }
+                Form::Text => {
+                    let texts = byte_strings(list)?;
+                    texts.first().and_then(|text| std::str::from_utf8(text).ok()).map(Array::from_str)
+                }
+                Form::Images => None,
+            };
+            let name = leaf.name.strip_prefix("episode_metadata/").unwrap_or(&leaf.name);
+            attrs.extend(value.map(|value| (name.to_owned(), value)));
+        }
+        let (steps, _) = steps.ok_or("none of the steps that features.json states")?;
+        Ok((steps, keys, attrs, task.map(|(_, text)| text)))
+    }
+
+    /// A record's content.
+    fn content(&self, index: usize) -> Result<Arc<Vec<u8>>, InputError> {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, content)) = kept.as_ref().filter(|(known, _)| *known == index) {
+            return Ok(Arc::clone(content));
+        }
+        *kept = None;
+        let record = self.record(index)?;
+        let unreadable =
+            |e: std::io::Error| InputError::Unreadable { path: record.file.clone(), reason: e.to_string() };
+        let mut content = vec![0; record.length];
+        let file = File::open(&record.file).map_err(unreadable)?;
+        file.read_exact_at(&mut content, record.offset).map_err(unreadable)?;
+        let content = Arc::new(content);
+        *kept = Some((index, Arc::clone(&content)));
+        Ok(content)
+    }
+
+    fn record(&self, index: usize) -> Result<&Record, InputError> {
+        self.records.get(index).ok_or_else(|| InputError::NoSuch {
+            path: self.path.clone(),
+            wanted: format!("demo at position {index}"),
+            found: format!("{} demos", self.records.len()),
+        })
+    }
+
+    fn rows_of(&self, record: &[u8], leaf: &Leaf, key: &KeyPlan, first: usize, count: usize) -> Result<Array, String> {
+        let lists = lists(record)?;
+        let &(kind, list) = lists.get(leaf.name.as_str()).ok_or("it is not there any more")?;
+        let mut shape = key.shape.clone();
+        shape[0] = count;
+        let row = key.bytes().map_or(0, |bytes| bytes as usize / key.shape[0].max(1));
+        if row.saturating_mul(count) > MAX_ROWS {
+            return Err(format!("{count} rows of {row} bytes at once"));
+        }
+        let bytes = match &leaf.form {
+            Form::Numbers(dtype) => {
+                let all = elements(kind, list, dtype)?;
+                all.get(first * row..(first + count) * row).ok_or(CUT)?.to_vec()
+            }
+            Form::Text => {
+                let texts = byte_strings(list)?;
+                let texts = texts.get(first..first + count).ok_or(CUT)?;
+                let texts: Vec<&str> = texts
+                    .iter()
+                    .map(|text| std::str::from_utf8(text))
+                    .collect::<Result<_, _>>()
+                    .map_err(|e| e.to_string())?;
+                return Ok(Array::from_strings(shape, &texts));
+            }
+            Form::Images => {
+                let files = byte_strings(list)?;
+                let mut out = Vec::new();
+                for (step, file) in files.get(first..first + count).ok_or(CUT)?.iter().enumerate() {
+                    match key.shape[..] {
+                        [_, height, width, _] => decode_image(file, height, width, &mut out)
+                            .map_err(|e| format!("step {}: {e}", first + step))?,
+                        _ if file.len() > row => return Err(CUT.to_owned()),
+                        _ => {
+                            out.extend_from_slice(file);
+                            out.resize(out.len() + row - file.len(), 0);
+                        }
+                    }
+                }
+                out
+            }
+        };
+        Ok(Array { dtype: key.dtype.clone(), shape, bytes })
+    }
+}
+
+/// Height and width of a PNG file.
+fn png_size(file: &[u8]) -> Option<(usize, usize)> {
+    let head = file.strip_prefix(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")?.first_chunk::<8>()?;
+    let number = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]) as usize;
+    let (width, height) = (number(0), number(4));
+    let bytes = width.checked_mul(height)?.checked_mul(3)?;
+    (1..=MAX_IMAGE).contains(&bytes).then_some((height, width))
+}
+
+impl Backend for Rlds {
+    fn root(&self) -> Result<Demo, InputError> {
+        Ok(Demo::default())
+    }
+
+    fn demo(&self, index: usize, keys: &[String]) -> Result<Demo, InputError> {
+        let record = self.record(index)?;
+        let mut demo = Demo { id: record.id.clone(), attrs: record.attrs.clone(), ..Demo::default() };
+        for key in keys {
+            let rows = record.keys.get(key).map_or(0, |plan| plan.shape[0]);
+            demo.datasets.insert(key.clone(), self.rows(index, key, 0, rows)?);
+        }
+        Ok(demo)
+    }
+
+    fn rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array, InputError> {
+        let record = self.record(index)?;
+        let plan = record.keys.get(key);
+        let leaf = plan.and_then(|plan| self.leaves.iter().find(|leaf| leaf.name == plan.place.path));
+        let none = || InputError::NoSuch {
+            path: self.path.clone(),
+            wanted: format!("rows {first} and the {count} after of {key} in {}", record.id),
+            found: record.keys.keys().cloned().collect::<Vec<_>>().join(", "),
+        };
+        let (plan, leaf) = plan.zip(leaf).ok_or_else(none)?;
+        if first.checked_add(count).is_none_or(|end| end > plan.shape[0]) {
+            return Err(none());
+        }
+        let rows = self.rows_of(&self.content(index)?, leaf, plan, first, count);
+        rows.map_err(|reason| self.damaged(&record.file, &format!("{} of {}", leaf.name, record.id), &reason))
+    }
+}

@@ -1,0 +1,129 @@
+//! LeRobot v2.0 and v2.1 folders.
+
+use super::{fixture, quiet};
+use crate::common::copy;
+use arrow::array::AsArray;
+use arrow::datatypes::{Float32Type, Int64Type};
+use dataset::edit::{Destination, Selection, keep};
+use dataset::{ConvertOptions, Dataset, OldSet, Source, VideoFile, convert, verify};
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use std::fs::File;
+use std::path::Path;
+
+const TOP: &str = "observation.images.top";
+
+fn rgb(path: &Path, frames: usize) -> Vec<u8> {
+    let file = VideoFile::open(path).unwrap();
+    let mut all = Vec::new();
+    file.read(0..frames, &mut |_, picture| all.extend_from_slice(picture)).unwrap();
+    all
+}
+
+#[test]
+fn every_frame_is_kept_and_videos_are_joined_without_encoding() {
+    let (dir, old) = (tempfile::tempdir().unwrap(), fixture("lerobot_v21"));
+    let out = dir.path().join("set");
+    let report = convert(&old, &out, &ConvertOptions::default(), &mut quiet).unwrap();
+    assert_eq!((report.dialect, report.episodes, report.frames), ("LeRobot v2.1", 3, 15));
+    let set = Dataset::open(&out).unwrap();
+    assert_eq!(set.tasks(), ["pick the cube", "place the cube"]);
+    assert_eq!(set.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), [5, 4, 6]);
+    assert_eq!(set.notes(), [""; 0]);
+    let actions = set.column("action").unwrap();
+    let mut row = 0;
+    for (episode, meta) in set.episodes().iter().enumerate() {
+        let file = File::open(old.join(format!("data/chunk-000/episode_{episode:06}.parquet"))).unwrap();
+        for batch in ParquetRecordBatchReaderBuilder::try_new(file).unwrap().build().unwrap() {
+            let batch = batch.unwrap();
+            let action = batch.column_by_name("action").unwrap().as_fixed_size_list();
+            let expected = action.values().as_primitive::<Float32Type>().values();
+            assert_eq!(&actions.data[row * 3..(row + batch.num_rows()) * 3], &expected[..]);
+            let task = batch.column_by_name("task_index").unwrap().as_primitive::<Int64Type>().value(0);
+            assert_eq!(meta.tasks, [set.tasks()[task as usize].clone()]);
+            row += batch.num_rows();
+        }
+        let video = old.join(format!("videos/chunk-000/{TOP}/episode_{episode:06}.mp4"));
+        let shown = set.episode_pictures(TOP, episode).unwrap();
+        assert!(shown.data == rgb(&video, meta.length), "episode {episode}");
+    }
+    assert_eq!(set.video_files(TOP).unwrap().len(), 1);
+    // images are looked at, videos keep what was stated of them
+    assert_ne!(set.stats()["observation.images.wrist"].max[0], 0.7);
+    assert!((set.stats()[TOP].max[0] - 0.7).abs() < 1e-9);
+    for check in verify(&out, &mut quiet).unwrap() {
+        assert_eq!(check.problem, None, "{}", check.name);
+    }
+}
+
+#[test]
+fn version_2_0_has_statistics_of_the_whole_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let old = dir.path().join("old");
+    copy(&fixture("lerobot_v21"), &old);
+    std::fs::remove_file(old.join("meta/episodes_stats.jsonl")).unwrap();
+    let stats = format!(r#"{{"{TOP}": {{"min": [[[0.0]]], "max": [[[0.5]]], "mean": [[[0.25]]], "std": [[[NaN]]]}}}}"#);
+    std::fs::write(old.join("meta/stats.json"), stats.replace("NaN", "0.1")).unwrap();
+    let info = std::fs::read_to_string(old.join("meta/info.json")).unwrap();
+    std::fs::write(old.join("meta/info.json"), info.replace("v2.1", "v2.0")).unwrap();
+    let out = dir.path().join("set");
+    assert_eq!(convert(&old, &out, &ConvertOptions::default(), &mut quiet).unwrap().dialect, "LeRobot v2.0");
+    assert_eq!(Dataset::open(&out).unwrap().stats()[TOP].mean, [0.25]);
+}
+
+#[test]
+fn what_is_missing_is_named_as_the_folder_has_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let broken = |name: &str, change: &dyn Fn(&Path)| {
+        let old = dir.path().join(name);
+        copy(&fixture("lerobot_v21"), &old);
+        change(&old);
+        let out = dir.path().join(format!("{name}.out"));
+        let text = convert(&old, &out, &ConvertOptions::default(), &mut quiet).unwrap_err().to_string();
+        assert!(!out.exists() && !text.contains('\n'), "{text}");
+        text
+    };
+    let second = "data/chunk-000/episode_000001.parquet";
+    let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 4000\n";
+    let text = broken("pointer", &|old| std::fs::write(old.join(second), pointer).unwrap());
+    assert!(text.contains(&format!("pointer/{second}: a git-lfs pointer")), "{text}");
+    let text = broken("cut", &|old| std::fs::write(old.join(second), b"PAR1").unwrap());
+    assert!(text.contains(&format!("cut/{second}")), "{text}");
+    let video = format!("videos/chunk-000/{TOP}/episode_000002.mp4");
+    let text = broken("no_video", &|old| std::fs::remove_file(old.join(&video)).unwrap());
+    assert!(text.contains(&format!("no_video/{video}")), "{text}");
+    let text = broken("bad_video", &|old| std::fs::write(old.join(&video), b"nothing").unwrap());
+    assert!(text.contains(&format!("bad_video/{video}")), "{text}");
+    let text = broken("gap", &|old| {
+        let lines = std::fs::read_to_string(old.join("meta/episodes.jsonl")).unwrap();
+        std::fs::write(old.join("meta/episodes.jsonl"), lines.split_inclusive('\n').take(1).collect::<String>() + "{")
+            .unwrap();
+    });
+    assert!(text.contains("gap/meta/episodes.jsonl: line 2"), "{text}");
+    let text = broken("outside", &|old| {
+        let info = std::fs::read_to_string(old.join("meta/info.json")).unwrap();
+        std::fs::write(old.join("meta/info.json"), info.replace("data/chunk-{", "../chunk-{")).unwrap();
+    });
+    assert!(text.contains("data_path"), "{text}");
+}
+
+#[test]
+fn a_count_that_is_wrong_is_noted_and_other_doors_say_what_to_do() {
+    let dir = tempfile::tempdir().unwrap();
+    let old = dir.path().join("old");
+    copy(&fixture("lerobot_v21"), &old);
+    let path = old.join("meta/episodes.jsonl");
+    let lines = std::fs::read_to_string(&path).unwrap().replace("\"length\": 4", "\"length\": 9");
+    std::fs::write(&path, lines).unwrap();
+    let opened = OldSet::open(&old).unwrap().unwrap();
+    assert!(opened.notes()[0].contains("episode 1: expected 4 frames"), "{:?}", opened.notes());
+    assert_eq!(opened.set().frames(), 15);
+    let chosen = Selection { episodes: vec![0], ..Selection::default() };
+    let kept = keep(&old, &Destination::New(dir.path().join("kept")), &chosen, &mut quiet).map(drop);
+    let opened = Dataset::open(&old).map(drop);
+    for text in [kept, opened, Source::open(&old).map(drop)].map(|r| r.unwrap_err().to_string()) {
+        assert!(text.contains("`actrm-data convert` makes a") && !text.contains('\n'), "{text}");
+    }
+    let fps = ConvertOptions { fps: Some(5.0), ..ConvertOptions::default() };
+    let text = convert(&old, &dir.path().join("out"), &fps, &mut quiet).unwrap_err().to_string();
+    assert!(text.contains("--fps is not supported"), "{text}");
+}
