@@ -13,6 +13,10 @@ use std::time::Instant;
 /// folder of task files is one data set), robocasa, D4RL, ALOHA, ManiSkill, RoboTwin, DROID, BEHAVIOR; for `--to robomimic` also a
 /// LeRobot data set. Where observation keys are the recorder's own, observation.state takes all vectors, and a note lists them.
 ///
+/// Other sources are zarr v2 replay buffers, RLDS data sets, and LeRobot v2.0 or v2.1 folders. A zarr store (Diffusion Policy, UMI)
+/// may be a folder or a zip file. An RLDS data set is the folder with features.json that tensorflow-datasets writes. Of a LeRobot
+/// v2.x folder columns stay as they are; its videos are joined (AV1) or copied (H.264), never encoded again.
+///
 /// Columns: observation.state, observation.environment_state, observation.entity.<name>, observation.images.<camera>, action, next.reward,
 /// next.done, next.success, mistake (of a demo that marks its mistakes), and the five index columns. What the format has no place for is kept in the side folder
 /// `actrm/`, from which `actrm-data export` rebuilds the source. So are grey and RGBA images, which LeRobot does not
@@ -20,10 +24,6 @@ use std::time::Instant;
 /// metres or uint16 millimetres, height x width x 1) becomes observation.images.<camera>_depth, a TIFF file a frame, as
 /// LeRobot records it. No file says its unit, and robosuite's own camera_depths, before robomimic makes metres of them,
 /// go from 0 to 1. OUT appears whole or not at all.
-///
-/// Sources: HDF5 files of robomimic's family, ALOHA and D4RL; zarr v2 replay buffers (Diffusion Policy, UMI), as a folder or a zip
-/// file; RLDS data sets of tensorflow-datasets, as the folder with features.json; LeRobot v2.0 and v2.1 folders, whose columns
-/// stay as they are and whose videos are joined (AV1) or copied (H.264), never encoded again.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data convert data/lift.hdf5 lift
