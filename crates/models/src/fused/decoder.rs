@@ -2,7 +2,7 @@
 
 use super::attention::{Attention, Side};
 use super::feed_forward::FeedForward;
-use super::{Entry, Grads, Norm, Pass, Residual, Rows, enter, enter_backward};
+use super::{Entry, Grads, Pass, Residual, Rows, enter, enter_backward};
 use crate::layers::Shape;
 use nn::kernels::{Heads, Start, add, sum_over_sequences};
 
@@ -169,91 +169,6 @@ impl DecoderLayer {
     }
 }
 
-/// What the first layer makes of its input of zeros before it sees the memory: the same for every observation, so
-/// predictions keep it with the packed weights.
-#[derive(Debug)]
-pub(super) struct Begun {
-    /// after the first residual, (c, D)
-    x: Vec<f32>,
-    /// queries to the memory, (c, D)
-    q: Vec<f32>,
-}
-
-impl Begun {
-    fn new(pass: &mut Pass<'_>, prefix: &str, query_pos: &[f32]) -> Self {
-        let Shape { dim, heads, .. } = pass.shape;
-        let queries = query_pos.len() / dim;
-        let (all_queries, keys, shared) = (queries, queries, false);
-        let heads = Heads {
-            batch: 1,
-            heads,
-            queries,
-            all_queries,
-            keys,
-            dim,
-            shared_queries: shared,
-            shared_keys: shared,
-            causal: false,
-        };
-        let rows = Rows { computed: queries, all: queries };
-        let name = |part: &str| format!("{prefix}.{part}");
-        let zeros = pass.space.pool.zeros(query_pos.len());
-        let Entry { y, x, norm } = enter(pass, &name("norm1"), zeros);
-        let side = Side { x: &y, pos: query_pos };
-        let (branch, attention) = Attention::forward(pass, &name("self_attn"), heads, side, side, None);
-        let (out, residual) = Residual::leave(pass, &name("norm1"), norm, x.as_ref().unwrap_or(&y), branch, rows);
-        attention.free(pass);
-        residual.norm.free(pass);
-        x.into_iter().chain([y]).for_each(|buffer| pass.give(buffer));
-        let kept = out.clone();
-        let Entry { y, x, norm } = enter(pass, &name("norm2"), out);
-        let q = Attention::queries(pass, &name("multihead_attn"), Side { x: &y, pos: query_pos });
-        x.into_iter().chain([y]).for_each(|buffer| pass.give(buffer));
-        norm.into_iter().for_each(|norm| norm.free(pass));
-        // copies: the workspace keeps its buffers
-        let begun = Self { x: kept, q: q.clone() };
-        pass.give(q);
-        begun
-    }
-
-    /// The rest of the layer: memory -> (b, c, D)
-    fn finish(&self, pass: &mut Pass<'_>, prefix: &str, memory: Memory<'_>) -> Vec<f32> {
-        let Shape { dim, heads, .. } = pass.shape;
-        let queries = self.x.len() / dim;
-        let (keys, shared_queries) = (memory.pos.len() / dim, true);
-        let heads = Heads {
-            batch: memory.batch,
-            heads,
-            queries,
-            all_queries: queries,
-            keys,
-            dim,
-            shared_queries,
-            shared_keys: false,
-            causal: false,
-        };
-        let rows = Rows { computed: queries, all: queries };
-        let name = |part: &str| format!("{prefix}.{part}");
-        let (q, x) = (pass.space.pool.copy(&self.q), pass.space.pool.copy(&self.x));
-        let key = Side { x: memory.x, pos: memory.pos };
-        let (branch, attention) = Attention::of_queries(pass, &name("multihead_attn"), heads, q, key, None);
-        attention.free(pass);
-        // after the norm of the sum; a norm before the branch has gone into the queries already
-        let Entry { y, x, norm } = enter(pass, &name("norm2"), x);
-        let (x2, residual) = Residual::leave(pass, &name("norm2"), norm, x.as_ref().unwrap_or(&y), branch, rows);
-        residual.norm.free(pass);
-        x.into_iter().chain([y]).for_each(|buffer| pass.give(buffer));
-
-        let Entry { y, x, norm } = enter(pass, &name("norm3"), x2);
-        let (branch, ff) = FeedForward::forward(pass, prefix, &y, rows);
-        let (out, residual) = Residual::leave(pass, &name("norm3"), norm, x.as_ref().unwrap_or(&y), branch, rows);
-        ff.free(pass);
-        residual.norm.free(pass);
-        x.into_iter().chain([y]).for_each(|buffer| pass.give(buffer));
-        out
-    }
-}
-
 /// Decoder layers over tokens that every sequence has its own of.
 #[derive(Debug)]
 pub(crate) struct DecoderLayers(Vec<DecoderLayer>);
@@ -295,61 +210,5 @@ impl DecoderLayers {
     /// Gives the buffers back without a backward pass.
     pub(crate) fn free(self, pass: &mut Pass<'_>) {
         self.0.into_iter().for_each(|layer| layer.free(pass));
-    }
-}
-
-/// What the backward pass of a decoder over the memory needs.
-#[derive(Debug)]
-pub(crate) struct Decoder {
-    layers: Vec<DecoderLayer>,
-    norm: Norm,
-}
-
-impl Decoder {
-    /// Layers `decoder.layers.0..n` over an input of zeros, and `decoder.norm`; query_pos: (c, D) -> (b, c, D). With
-    /// packed weights the first layer leaves nothing for a backward pass.
-    pub(crate) fn forward(pass: &mut Pass<'_>, n: usize, query_pos: &[f32], memory: Memory<'_>) -> (Vec<f32>, Self) {
-        let mut layers = Vec::with_capacity(n);
-        let (mut x, first) = match pass.packed {
-            Some(packed) => {
-                let prefix = "decoder.layers.0";
-                let begun = packed.begun(|| Begun::new(pass, prefix, query_pos));
-                (begun.finish(pass, prefix, memory), 1)
-            }
-            // zero for every sample: one sequence stands for all of them
-            None => (pass.space.pool.zeros(query_pos.len()), 0),
-        };
-        for i in first..n {
-            let own = Own { pos: query_pos, causal: false };
-            let (out, layer) = DecoderLayer::forward(pass, format!("decoder.layers.{i}"), x, own, memory);
-            x = out;
-            layers.push(layer);
-        }
-        let (out, norm) = Norm::forward(pass, "decoder.norm", &x);
-        pass.give(x);
-        (out, Self { layers, norm })
-    }
-
-    /// grad: that of the output, (b, c, D)
-    pub(crate) fn backward(
-        self,
-        pass: &mut Pass<'_>,
-        mut grad: Vec<f32>,
-        query_pos: &[f32],
-        memory: Memory<'_>,
-        into: &mut DecoderGrads<'_>,
-        grads: &mut Grads<'_>,
-    ) {
-        self.norm.backward(pass, "decoder.norm", &mut grad, grads);
-        for layer in self.layers.into_iter().rev() {
-            grad = layer.backward(pass, grad, query_pos, memory, into, grads);
-        }
-        pass.give(grad);
-    }
-
-    /// Gives the buffers back without a backward pass.
-    pub(crate) fn free(self, pass: &mut Pass<'_>) {
-        self.norm.free(pass);
-        self.layers.into_iter().for_each(|layer| layer.free(pass));
     }
 }

@@ -6,38 +6,18 @@
 //! are computed once for the batch: `(x + pos) Wᵀ = x Wᵀ + pos Wᵀ`.
 
 mod attention;
-mod auxiliary;
 mod block;
 mod convolution;
 mod decoder;
-mod encoder;
 mod feed_forward;
-mod grid;
-mod gru;
 mod keypoints;
-mod loss;
-mod lstm;
-mod mixture;
-mod observation;
-mod pointer;
-mod recurrent;
 #[cfg(test)]
 pub(crate) mod testing;
-mod vae;
 mod vision;
 
-pub(crate) use auxiliary::{add_to_first, ask};
-pub(crate) use block::{BlockLayer, Input, Part, gather, keys_and_values, keys_and_values_backward, scatter};
+pub(crate) use block::{Part, gather, scatter};
 pub(crate) use convolution::{convolve, framed, input_gradient, weight_gradient as convolution_gradient};
-pub(crate) use decoder::{Decoder, DecoderGrads, DecoderLayers, Memory, Own};
-pub(crate) use encoder::{Encoder, EncoderLayer};
-pub(crate) use grid::{GridLayer, cells_of, put_cells};
-pub(crate) use loss::AbsoluteError;
-pub(crate) use mixture::{Wanted, likelihood};
-pub(crate) use observation::{Data, Inputs, Tokens, inputs, positions_backward, uncovered};
-pub(crate) use pointer::{Pointed, PointerGrads};
-pub(crate) use recurrent::Recurrent;
-pub(crate) use vae::Vae;
+pub(crate) use decoder::{DecoderGrads, DecoderLayers, Memory, Own};
 pub(crate) use vision::{Eyes, Looked};
 
 use nn::{ModelError, Result};
@@ -51,7 +31,7 @@ use nn::kernels::{
 };
 use nn::simd::vectorised;
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Parameters by name.
 pub(crate) type Weights<'a> = BTreeMap<&'a str, &'a [f32]>;
@@ -99,7 +79,6 @@ pub(crate) struct PackedWeights {
     version: u64,
     /// by the place in memory, which a parameter keeps, and the number of rows
     panels: Mutex<BTreeMap<(usize, usize), Arc<Packed>>>,
-    begun: OnceLock<decoder::Begun>,
     /// what layers make of inputs that are parameters themselves
     fixed: Mutex<BTreeMap<String, Arc<Vec<f32>>>>,
 }
@@ -117,12 +96,6 @@ impl PackedWeights {
         self.fixed.lock().unwrap_or_else(PoisonError::into_inner).get(name).cloned()
     }
 
-    fn keep(&self, name: String, values: &[f32]) {
-        // a copy: the workspace keeps its buffers
-        let values = Arc::new(values.to_vec());
-        self.fixed.lock().unwrap_or_else(PoisonError::into_inner).insert(name, values);
-    }
-
     /// What `make` makes of the weights alone, made once; not copied.
     fn made_once(&self, name: &str, make: impl FnOnce() -> Vec<f32>) -> Arc<Vec<f32>> {
         if let Some(kept) = self.kept(name) {
@@ -131,11 +104,6 @@ impl PackedWeights {
         let values = Arc::new(make());
         self.fixed.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_string(), values.clone());
         values
-    }
-
-    /// The decoder's first layer before the memory, made once.
-    fn begun(&self, make: impl FnOnce() -> decoder::Begun) -> &decoder::Begun {
-        self.begun.get_or_init(make)
     }
 }
 
@@ -203,18 +171,6 @@ impl<'a> Pass<'a> {
 
     pub(crate) fn give(&mut self, buffer: Vec<f32>) {
         self.space.pool.give(buffer);
-    }
-
-    /// What `make` computes from the weights alone; predictions compute it once.
-    pub(crate) fn fixed(&mut self, name: impl Fn() -> String, make: impl FnOnce(&mut Self) -> Vec<f32>) -> Vec<f32> {
-        let Some(packed) = self.packed else { return make(self) };
-        let name = name();
-        if let Some(kept) = packed.kept(&name) {
-            return self.space.pool.copy(&kept);
-        }
-        let values = make(self);
-        packed.keep(name, &values);
-        values
     }
 
     /// x: (rows, in) -> (rows, out), `y = x Wᵀ + b`

@@ -1,7 +1,7 @@
 //! Arithmetic on plain slices, single-threaded: matrix products, layer norm, attention, activations.
 //!
 //! What candle's autograd would do in several passes with a new tensor each is done here in one, into buffers that are
-//! reused. Every function with a backward pass is held against candle's composed operations by the tests of `fused`.
+//! reused. Every function with a backward pass is compared with candle's composed operations by the tests of `ops`.
 
 mod attention;
 mod conv;

@@ -9,7 +9,7 @@ use crate::params::{Init, Params};
 use crate::rng::Rng;
 use crate::size::Size;
 use crate::value::Value;
-use candle_core::{DType, Tensor};
+use candle_core::Tensor;
 
 /// What all transformer layers of a model share.
 #[derive(Debug, Clone, Copy)]
@@ -69,24 +69,6 @@ impl EncoderLayer {
             dropout: Dropout { p },
             pre_norm: shape.pre_norm,
         })
-    }
-
-    /// x: (b, t, D), pos: (1, t, D) -> (b, t, D)
-    pub fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let y = if self.pre_norm { self.norm1.forward(x)? } else { x.clone() };
-        let qk = y.broadcast_add(pos)?;
-        let branch = self.self_attn.forward(&qk, &qk, &y, key_pad, mode)?;
-        let x = (x + self.dropout.forward(&branch, mode)?)?;
-        let (x, y) = if self.pre_norm {
-            let y = self.norm2.forward(&x)?;
-            (x, y)
-        } else {
-            let x = self.norm1.forward(&x)?;
-            (x.clone(), x)
-        };
-        let branch = self.ff.forward(&y, mode)?;
-        let x = (x + self.dropout.forward(&branch, mode)?)?;
-        if self.pre_norm { Ok(x) } else { self.norm2.forward(&x) }
     }
 }
 
@@ -162,20 +144,6 @@ impl Encoder {
         Ok(Self { layers, norm })
     }
 
-    /// x: (b, t, D), pos: (1, t, D) -> (b, t, D)
-    pub fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let mut x = x.clone();
-        for layer in &self.layers {
-            x = layer.forward(&x, pos, key_pad, mode)?;
-        }
-        match &self.norm {
-            Some(norm) => norm.forward(&x),
-            None => Ok(x),
-        }
-    }
-}
-
-impl Encoder {
     /// x: (b, t, D), pos: (1, t, D) -> the first `read` tokens of each sequence, (b, read, D); of the last layer nothing else
     /// is computed.
     ///
@@ -312,19 +280,6 @@ pub struct Decoder {
     pub norm: LayerNorm,
     /// of the queries, (C, D)
     pub pos_embed: Embedding,
-}
-
-impl Decoder {
-    /// memory: (b, M, D), pos: (1, M, D) -> (b, C, D)
-    pub fn forward(&self, memory: &Tensor, pos: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let query_pos = self.pos_embed.weight.unsqueeze(0)?;
-        let (c, dim) = self.pos_embed.weight.dims2()?;
-        let mut x = Tensor::zeros((memory.dim(0)?, c, dim), DType::F32, memory.device())?;
-        for layer in &self.layers {
-            x = layer.forward(&x, &query_pos, memory, pos, mode)?;
-        }
-        self.norm.forward(&x)
-    }
 }
 
 impl Decoder {

@@ -44,6 +44,18 @@ pub fn activation(cx: &mut Context<'_>, x: &Value, activation: Activation) -> Re
     })
 }
 
+/// The same value. Its gradient is summed by itself before it is added to that of x: where the order of sums matters.
+pub fn alias(cx: &mut Context<'_>, x: &Value) -> Value {
+    let of = x.node;
+    let node = cx.tape.as_mut().filter(|_| of.is_some()).map(|tape| {
+        tape.push(move |grad, back| {
+            back.add(of, grad);
+            Ok(())
+        })
+    });
+    Value { tensor: x.tensor.clone(), node }
+}
+
 /// Dropout of a whole tensor.
 ///
 /// # Errors
