@@ -132,9 +132,3 @@ pub(crate) fn autograd<M: PolicyModel + ?Sized>(
     }
     LossValues::from_parts(&loss)
 }
-
-/// Words for a feature that no step by hand covers.
-pub(crate) fn not_by_hand(signature: &Signature) -> Option<String> {
-    let spec = crate::fused::uncovered(signature)?;
-    Some(format!("the step by hand does not cover feature {} of kind {}", spec.name, spec.kind))
-}
