@@ -130,6 +130,7 @@ FAULTS ?= all
 campaign: build ## hours of damage: mutated files, flipped bits, kills and faults at every call (MUTATIONS= SEED= KILLS= FLIPS= FAULTS=)
 	@ACTRM_MUTATIONS=$(MUTATIONS) ACTRM_MUTATION_SEED=$(SEED) ACTRM_FLIPS=$(FLIPS) ACTRM_FLIP_SEED=$(SEED) \
 	    $(CARGO) test $(CARGO_FLAGS) --workspace --no-fail-fast --test hostile --test hostile_videos --test flips
+	@$(CARGO) test $(CARGO_FLAGS) --workspace --test puzzles -- --ignored
 	@ACTRM_KILLS=$(KILLS) ACTRM_FAULTS=$(FAULTS) $(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- killed:: faults::
 
 .PHONY: bench-memory

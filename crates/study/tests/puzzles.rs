@@ -91,6 +91,7 @@ fn short(name: &str, overrides: &[&str]) -> PuzzleEvaluation {
 }
 
 #[test]
+#[ignore = "minutes of training; `make campaign` runs it"]
 fn the_studys_mazes_are_learned_to_their_constant_answers() {
     for (name, steps, most) in [
         ("trm_maze8-original", "train.steps=400", 9_922),
@@ -185,6 +186,7 @@ fn a_short_training_fills_sudoku_it_has_not_seen() {
 }
 
 #[test]
+#[ignore = "minutes of training; `make campaign` runs it"]
 fn a_walker_learns_mazes_with_walls_from_search_and_from_rewards() {
     let searched = short("search_trm_maze5-walls", &["train.steps=250"]);
     // half of them are what random moves reach

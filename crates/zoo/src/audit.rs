@@ -248,14 +248,15 @@ mod tests {
 
     /// Every bit of every file of a result: headers, payload, Parquet, seal.
     #[test]
-    fn every_flipped_bit_of_a_result_is_told() {
+    fn a_flipped_bit_anywhere_in_a_result_is_told() {
         let (_zoo, folder, _) = zoo();
         let mut flips = 0;
         for name in [RECORD, OUTCOMES, "timings.parquet", SEAL_FILE] {
             let path = folder.join(name);
             let original = fs::read(&path).unwrap();
             let mut bytes = original.clone();
-            for bit in 0..8 * original.len() {
+            // `tests/flips.rs` flips others
+            for bit in (0..8 * original.len()).step_by(37) {
                 bytes[bit / 8] ^= 1 << (bit % 8);
                 fs::write(&path, &bytes).unwrap();
                 let read = StoredEvaluation::read(&folder);
@@ -266,17 +267,17 @@ mod tests {
             fs::write(&path, &original).unwrap();
         }
         assert!(StoredEvaluation::read(&folder).unwrap().is_some());
-        assert!(flips > 30_000, "{flips}");
+        assert!(flips > 800, "{flips}");
     }
 
     #[test]
-    fn every_flipped_bit_of_an_entry_leaves_its_results_out_and_names_it() {
+    fn a_flipped_bit_anywhere_in_an_entry_leaves_its_results_out_and_names_it() {
         let (zoo, _, _) = zoo();
         let mut flips = 0;
         for name in ["entry.json", "model.safetensors", "config.toml", "normaliser.safetensors", "README.md"] {
             let path = zoo.path().join("lift-act/1").join(name);
             let original = fs::read(&path).unwrap();
-            for bit in (0..8 * original.len()).step_by(3) {
+            for bit in (0..8 * original.len()).step_by(23) {
                 let mut bytes = original.clone();
                 bytes[bit / 8] ^= 1 << (bit % 8);
                 fs::write(&path, &bytes).unwrap();
@@ -289,7 +290,7 @@ mod tests {
             assert!(reason(zoo.path()).contains("entry: expected lift-act@1 as it was written"));
             fs::write(&path, original).unwrap();
         }
-        assert!(flips > 3_000, "{flips}");
+        assert!(flips > 390, "{flips}");
         assert_eq!(audited(zoo.path()).standing.len(), 1);
     }
 

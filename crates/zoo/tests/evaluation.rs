@@ -188,13 +188,13 @@ fn one_two_and_four_workers_shards_and_resuming_give_the_same_bytes() {
     assert_same(&resumed, &straight);
 }
 
-/// Kills, stops and slows workers at random, and prints into their pipes, while 40 episodes run.
+/// Kills, stops and slows workers at random, and prints into their pipes, while 16 episodes run.
 #[test]
 fn chaos_among_the_workers_does_not_change_a_byte() {
     let _workers = WORKERS.write().unwrap_or_else(PoisonError::into_inner);
     let dir = tempfile::tempdir().unwrap();
     let mut calm = Pool::start(options("Lift", 2)).unwrap();
-    let expected = run(&mut calm, &dir.path().join("calm"), &wanted(40));
+    let expected = run(&mut calm, &dir.path().join("calm"), &wanted(16));
     drop(calm);
 
     // every third start prints into its pipe after a while: not the first ones, which have only three attempts each
@@ -241,7 +241,7 @@ fn chaos_among_the_workers_does_not_change_a_byte() {
             let results = dir.path().join("disturbed");
             // an episode that met three bad workers in a row is reported; asking again runs it again
             loop {
-                match evaluate(&subject(), &mut pool, &results, &wanted(40), &mut |_| {}) {
+                match evaluate(&subject(), &mut pool, &results, &wanted(16), &mut |_| {}) {
                     Ok(EvaluationEnd::Complete(stored)) => break *stored,
                     Ok(EvaluationEnd::Failed { .. }) | Err(ZooError::Rollout(RolloutError::Start { .. })) => {}
                     other => panic!("{other:?}"),

@@ -310,10 +310,8 @@ mod tests {
     #[test]
     fn the_interval_holds_the_truth_as_often_as_it_says() {
         // 300 runs at 95%: two standard errors are 2.5 points
-        // the last two near an edge, where a bootstrap alone often has no width
-        for (trainings, rate, spread) in
-            [(3, 0.7, 0.2), (5, 0.8, 0.15), (8, 0.6, 0.3), (5, 0.5, 0.0), (3, 0.97, 0.02), (5, 0.03, 0.03)]
-        {
+        // the last one near an edge, where a bootstrap alone often has no width
+        for (trainings, rate, spread) in [(3, 0.7, 0.2), (5, 0.5, 0.0), (3, 0.97, 0.02)] {
             let found = coverage(trainings, rate, spread);
             assert!(found >= 0.925, "{trainings} trainings at {rate} +- {spread}: {found}");
         }
@@ -354,14 +352,14 @@ mod tests {
         assert!(found.p_value < 0.05 && found.estimate.low > 0.05, "{found:?}");
         let turned = difference(&low, &high, 1).unwrap();
         assert!((turned.estimate.value + found.estimate.value).abs() < 1e-12);
-        // under no difference, 5% of the tests may say otherwise: two standard errors of 200 are 3.1 points
-        let wrong = (0..200)
+        // under no difference, 5% of the tests may say otherwise: two standard errors of 100 are 4.4 points
+        let wrong = (0..100)
             .filter(|&run| {
                 let [a, b] = sides([0.7, 0.7]);
                 difference(&a, &b, run).unwrap().p_value < 0.05
             })
             .count();
-        assert!(wrong <= 16, "{wrong} of 200");
+        assert!(wrong <= 9, "{wrong} of 100");
         assert_eq!(difference(&high[..1], &low, 1), None);
         let same = difference(&vec![vec![1.0; 4]; 3], &vec![vec![1.0; 4]; 3], 1).unwrap();
         assert_eq!((same.estimate.value, same.p_value), (0.0, 1.0));
