@@ -200,10 +200,6 @@ impl PolicyModel for Fallback {
         self.0.signature()
     }
 
-    fn composed_because(&self) -> Option<String> {
-        None
-    }
-
     fn loss(&self, batch: &Batch, rng: &mut Rng) -> nn::Result<nn::LossParts> {
         self.0.loss(batch, rng)
     }

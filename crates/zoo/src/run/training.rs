@@ -194,9 +194,6 @@ impl PolicyTraining {
         let trainer = Trainer::new(build()?, section.trainer_config(), section.seed)
             .map_err(experiment.model_error("set up the training of"))?;
         let evaluated = build()?;
-        if let Some(reason) = evaluated.composed_because() {
-            on_event(TrainEvent::Note(&format!("training steps run on candle's autograd: {reason}")));
-        }
         if earlier.is_none() {
             let note =
                 RunNote { experiment: request.name.clone(), data: path, fingerprint: dataset.fingerprint().to_owned() };

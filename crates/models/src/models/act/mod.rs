@@ -259,10 +259,6 @@ impl PolicyModel for Act {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        None
-    }
-
     fn cache(&self) -> Option<&Cache> {
         Some(&self.cache)
     }

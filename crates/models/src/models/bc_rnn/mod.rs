@@ -152,10 +152,6 @@ impl PolicyModel for BcRnn {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        None
-    }
-
     fn cache(&self) -> Option<&Cache> {
         Some(&self.cache)
     }

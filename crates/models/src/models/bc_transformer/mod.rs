@@ -191,10 +191,6 @@ impl PolicyModel for BcTransformer {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        None
-    }
-
     fn cache(&self) -> Option<&Cache> {
         Some(&self.cache)
     }
