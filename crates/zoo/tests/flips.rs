@@ -57,6 +57,7 @@ fn trained(root: &Path, zoo: &Path) -> EntryId {
         run: None,
         resume: false,
         zoo: zoo.to_owned(),
+        from_zoo: None,
         force: false,
         image_memory: None,
         command: Some("actrm-zoo train act_lift".to_owned()),

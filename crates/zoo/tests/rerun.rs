@@ -35,6 +35,7 @@ fn trained(folder: &Path, data: &Path) -> Entry {
         run: None,
         resume: false,
         zoo: folder.join("zoo"),
+        from_zoo: None,
         force: false,
         image_memory: None,
         command: None,

@@ -31,6 +31,7 @@ fn request(root: &Path, data: &Path, extra: &[&str]) -> TrainRequest {
         run: None,
         resume: false,
         zoo: root.join("zoo"),
+        from_zoo: None,
         force: false,
         image_memory: None,
         command: None,
@@ -587,6 +588,33 @@ fn a_task_without_a_simulator_has_the_keys_of_its_data_and_a_true_card() {
     assert_eq!(second.meta().content_sha256(), entry.meta().content_sha256());
     let chunk = entry.load().unwrap().policy().predict(&Observation::of_state(vec![0.1; 9], vec![0.1; 10])).unwrap();
     assert_eq!(chunk.action_dim, 7);
+}
+
+#[test]
+fn a_training_begins_with_an_entry_s_weights() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let first = finish(&request(root.path(), &data, &[]));
+    let from = format!("train.from={}", first.id());
+    // a step so small that the weights stay
+    let still =
+        |extra: &[&str]| request(root.path(), &data, &[&[&*from, "train.lr=1e-30", "train.steps=1"], extra].concat());
+    let (notes, second) = noted(&still(&["train.ema_decay=0"]));
+    assert!(notes.contains("tensors begin as in lift-act@1"), "{notes}");
+    assert_eq!(model(&second), model(&first));
+    let parent = second.meta().parent.as_ref().unwrap();
+    assert_eq!((&*parent.entry, &parent.content_sha256), ("lift-act@1", &first.meta().content_sha256()));
+    // what has another shape begins anew, and is named
+    let (notes, _) = noted(&still(&["policy.action_horizon=3", "rollout.n_action_steps=2"]));
+    assert!(notes.contains("; new: ") && notes.contains("; not used: "), "{notes}");
+    // from a seed it would be another training; from the entry it is the same twice
+    let again = request(root.path(), &data, &[&from]);
+    assert_eq!(model(&finish(&again)), model(&finish(&again)));
+    for (from, words) in [("nobody", "expected name@version of an entry"), ("lift-act@7", "lift-act/7/entry.json")] {
+        let request = request(root.path(), &data, &[&format!("train.from={from}")]);
+        let error = train(&request, &|| false, &mut |_| {}).unwrap_err().to_string();
+        assert!(error.contains(words), "{error}");
+    }
 }
 
 #[test]

@@ -79,6 +79,10 @@ pub fn train_puzzles(
     on_event: &mut dyn FnMut(TrainEvent<'_>),
 ) -> Result<TrainOutcome, ZooError> {
     let PuzzleTrainRequest { name, experiment, runs, run, resume, zoo, command } = request.clone();
+    if let Some(found) = &experiment.train.from {
+        let (key, expected) = ("train.from".to_owned(), "none: solvers of puzzles begin from their seed".to_owned());
+        return Err(ZooError::InvalidValue { key, expected, found: found.clone() });
+    }
     let place = Place { name, runs, run, resume, zoo, command };
     zoo::run::run(&place, &experiment, |_, _| PuzzleTraining::new(&experiment), stop, on_event)
 }

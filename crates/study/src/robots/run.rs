@@ -331,6 +331,7 @@ impl Shared<'_> {
                     resume: run.join("config.toml").exists(),
                     run: Some(run),
                     zoo: zoo.clone(),
+                    from_zoo: None,
                     force: false,
                     image_memory: None,
                 };

@@ -132,6 +132,7 @@ impl Rerun {
                     resume: run.join("config.toml").is_file(),
                     run: Some(run.clone()),
                     zoo: zoo.clone(),
+                    from_zoo: self.entry.folder().ancestors().nth(2).map(std::path::Path::to_owned),
                     // what was refused then would have made no entry
                     force: true,
                     image_memory: how.image_memory,

@@ -2,6 +2,7 @@
 
 mod agreement;
 mod auxiliary;
+mod beginning;
 mod checkpoint;
 mod data;
 mod exchange;

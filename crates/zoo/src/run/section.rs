@@ -38,6 +38,10 @@ pub struct TrainSection {
     pub batch_size: usize,
     /// Seed of weights, latents, dropout and batch order.
     pub seed: u64,
+    /// The entry, `name@version`, whose weights it begins with, as far as names and shapes are the same; absent: drawn from
+    /// the seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub from: Option<String>,
     /// Highest learning rate.
     pub lr: f64,
     /// Steps over which the learning rate rises to it.
@@ -76,6 +80,7 @@ impl Default for TrainSection {
             steps: 1000,
             batch_size: 64,
             seed: 1,
+            from: None,
             lr: 1e-3,
             warmup_steps: 50,
             schedule: Schedule::Cosine,

@@ -10,11 +10,12 @@ use dataset::shuffle::Sampler;
 use models::{PolicyModel, Trainer, TrainerState};
 use serde::{Deserialize, Serialize};
 
-use crate::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, ModuleMeta, TrainingMeta, reference};
+use crate::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, ModuleMeta, ParentMeta, TrainingMeta, reference};
 use crate::experiment::Experiment;
 use crate::{ZooError, tensors, write_atomic};
 
 use super::agreement::agree;
+use super::beginning::Beginning;
 use super::checkpoint::Checkpoint;
 use super::data::{self, Demonstrations, PictureMemory};
 use super::feed::Feed;
@@ -42,6 +43,8 @@ pub struct TrainRequest {
     pub resume: bool,
     /// The zoo that gets the entry.
     pub zoo: PathBuf,
+    /// The zoo that the entry of `train.from` is in; `None`: the same.
+    pub from_zoo: Option<PathBuf>,
     /// Train on demonstrations of another task, or of other names, anyway.
     pub force: bool,
     /// Bytes that pictures may take in memory; more are kept in a file and read ahead. `None`: half of what is free.
@@ -138,6 +141,8 @@ struct PolicyTraining {
     trainer: Trainer,
     /// Carries the weights that are validated and sealed: the moving average where there is one.
     evaluated: Box<dyn PolicyModel>,
+    /// The entry whose weights it began with.
+    parent: Option<ParentMeta>,
     feed: Feed,
     /// When the last row of metrics was written, and the samples since.
     rate: (Instant, u64),
@@ -184,16 +189,25 @@ impl PolicyTraining {
             on_event(TrainEvent::Note(note));
         }
         let section = &experiment.train;
+        let from_zoo = request.from_zoo.as_ref().unwrap_or(&request.zoo);
+        let beginning = section.from.as_ref().map(|from| Beginning::read(from_zoo, from)).transpose()?;
         let build = || {
             let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed);
             let model = model.map_err(experiment.model_error("build the policy of"))?;
             super::eyes::open(model.as_ref(), &demonstrations, &experiment)?;
             super::memory::fill(model.as_ref(), &demonstrations, &experiment)?;
+            if let Some(beginning) = &beginning {
+                let taken = model.params().load(&beginning.weights(&model.params().tensors()));
+                taken.map_err(experiment.model_error("take the weights of `train.from` for"))?;
+            }
             Ok::<_, ZooError>(model)
         };
         let trainer = Trainer::new(build()?, section.trainer_config(), section.seed)
             .map_err(experiment.model_error("set up the training of"))?;
         let evaluated = build()?;
+        if let Some(beginning) = &beginning {
+            on_event(TrainEvent::Note(&beginning.note(&evaluated.params().tensors())?));
+        }
         if earlier.is_none() {
             let note =
                 RunNote { experiment: request.name.clone(), data: path, fingerprint: dataset.fingerprint().to_owned() };
@@ -208,6 +222,7 @@ impl PolicyTraining {
             env: dataset.env().cloned(),
             trainer,
             evaluated,
+            parent: beginning.map(|beginning| beginning.parent),
             feed,
             rate: (Instant::now(), 0),
         })
@@ -302,7 +317,7 @@ impl Training for PolicyTraining {
             kind: None,
             section: None,
             training: Some(training),
-            parent: None,
+            parent: self.parent.clone(),
             license: Some(LICENSE.to_owned()),
             versions: crate::versions(),
             files: BTreeMap::new(),

@@ -10,7 +10,7 @@ use zoo::entry::member_name;
 use zoo::run::{COMMAND_FILE, TrainEvent, TrainOutcome, TrainRequest, finished_entry, train};
 use zoo::write_atomic;
 
-use crate::places::{ConfigArgs, ZooArgs, experiment_names};
+use crate::places::{ConfigArgs, ZooArgs, entry_names, experiment_names};
 use crate::training::show;
 
 /// Train an experiment and add the result to the zoo
@@ -34,6 +34,7 @@ use crate::training::show;
   actrm-zoo train act_lift --data demos.hdf5 --zoo my-zoo
   actrm-zoo train act_lift --data aloha task.name=transfer_cube entry=aloha-act
   actrm-zoo train my.toml
+  actrm-zoo train act_lift --from lift-act train.steps=500
   actrm-zoo train act_lift --resume
   actrm-zoo train act_lift --seeds 1..8
   actrm-zoo train trm_dfs10 train.seed=2
@@ -48,6 +49,9 @@ pub struct Args {
     /// Demonstrations: an HDF5 file or a LeRobotDataset folder [default: the experiment's]
     #[arg(long, value_name = "PATH")]
     data: Option<PathBuf>,
+    /// Begin with the weights of this entry, as far as names and shapes are the same (fine-tuning)
+    #[arg(long, value_name = "ENTRY", add = entry_names())]
+    from: Option<String>,
     /// Train even if the demonstrations are of another task or their dimensions have other names
     #[arg(long)]
     force: bool,
@@ -140,8 +144,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let args = &args.named()?;
     let library = args.configs.library()?;
     let words: Vec<String> = [&args.experiment].into_iter().chain(&args.overrides).cloned().collect();
-    let (experiment, overrides) = library.choose(&words)?;
-    let args = &Args { experiment, overrides, ..args.clone() };
+    let (experiment, mut overrides) = library.choose(&words)?;
+    if let Some(from) = &args.from {
+        // of a name, the version that is the newest now
+        overrides.push(format!("train.from={}", args.zoo.registry().resolve(from)?));
+    }
+    let args = &Args { experiment, overrides, from: None, ..args.clone() };
     let load = |overrides: &[String]| {
         AnyExperiment::load(&library, &args.experiment, overrides).map_err(in_words).with_context(
             || match other_policy(args) {
@@ -221,8 +229,9 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
             task = Some(experiment.task.name.clone());
             let data = args.data.clone();
             let (image_memory, force) = (args.image_memory, args.force);
-            let experiment = *experiment;
-            let request = TrainRequest { name, experiment, data, runs, run, resume, zoo, force, image_memory, command };
+            let (experiment, from_zoo) = (*experiment, None);
+            let request =
+                TrainRequest { name, experiment, data, runs, run, resume, zoo, from_zoo, force, image_memory, command };
             train(&request, &stop, &mut on_event)
         }
         AnyExperiment::Puzzle(experiment) => {
