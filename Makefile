@@ -50,6 +50,12 @@ help: ## list the targets
 	@.venv-wheel/bin/python -m $(PIP) -r $<
 	@touch $@
 
+.venv-docs/.complete: tools/site/requirements.lock
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.11, 3.12 or 3.13 with venv found; name one: make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
+	@rm -rf .venv-docs && "$(PYTHON)" -m venv .venv-docs
+	@.venv-docs/bin/python -m $(PIP) -r $<
+	@touch $@
+
 .PHONY: venv
 venv: .venv/.complete ## Python with robosuite, in .venv
 
@@ -110,6 +116,14 @@ lint: .venv/.complete ## formatting and lints, Rust and Python
 	@.venv/bin/python -m basedpyright --project tools/harness --pythonpath .venv/bin/python
 	@.venv/bin/python -m basedpyright --project crates/python --pythonpath .venv/bin/python
 
+.PHONY: reference
+reference: build ## write docs/reference/*.md from the code (tests check that they are current); docs/python.md: tools/python_api.py
+	@ACTRM_REFERENCE=write $(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- the_reference_of
+
+.PHONY: docs
+docs: .venv-docs/.complete ## the documentation as a site that can be searched, in out/site
+	@.venv-docs/bin/python tools/site/build.py
+
 # ---- beside the others ----------------------------------------------------------------------------------------
 
 .PHONY: bench
@@ -147,4 +161,4 @@ references: build .venv-peers/.complete ## LeRobot and robomimic train on our de
 
 .PHONY: clean
 clean: ## remove what was built and installed (target, .venv, .venv-peers, out)
-	@rm -rf target .venv .venv-peers .venv-wheel out
+	@rm -rf target .venv .venv-peers .venv-wheel .venv-docs out

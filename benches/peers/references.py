@@ -46,7 +46,7 @@ class Arm:
     # what our experiments' names begin with, and our study's arm
     experiment: str
     ours: str
-    # robomimic's normalisation, mended
+    # robomimic's normalisation, fixed
     normalise: bool = False
 
 
@@ -54,7 +54,7 @@ ARMS = {
     "lerobot-act": Arm("LeRobot's ACT", "lerobot", "act", "act"),
     "robomimic-bc-rnn": Arm("robomimic's BC-RNN", "robomimic", "bc_rnn", "bc-rnn"),
     "robomimic-bc-rnn-normalised": Arm(
-        "robomimic's BC-RNN, its normalisation mended", "robomimic", "bc_rnn", "bc-rnn", normalise=True
+        "robomimic's BC-RNN, normalisation fixed", "robomimic", "bc_rnn", "bc-rnn", normalise=True
     ),
 }
 

@@ -105,61 +105,49 @@ COLUMNS = (
     "ours, seconds",
 )
 
-HEAD = """# Trained by the references
+HEAD = """# LeRobot's and robomimic's own trainers
 
-Written by `benches/peers/references_page.py` from `docs/references` and `docs/zoo`; `tools/references.sh` trains,
-imports and evaluates what is missing, and writes this page.
+LeRobot's ACT and ours solve as many episodes. robomimic 0.3.0's BC-RNN, as released, solves none of Lift and two
+thirds of PickPlaceCan, because its observations are not normalised. With that fixed it solves as many as ours.
 
-Other people's training code on the same demonstrations, judged by the same harness: LeRobot's ACT and robomimic's
-BC-RNN, each trained by the package that it comes from, become entries by `actrm-zoo import` and play the test block of
-the task's protocol, as our own did ([results.md](results.md)). Demonstrations (200, of which 180 are trained on), sizes
-of networks, batches, steps and learning rates are those of our experiments (`configs/`), read from the same files. Each
-row is one training beside one of ours with the same seed: how much two trainings of one kind differ is in
-[results.md](results.md), not here.
+LeRobot and robomimic train on the same 180 demonstrations with our sizes, batches, steps and learning rates
+(`configs/`). `actrm-zoo import` makes entries of the results, which play the test block of the task's protocol, as
+our own did ([policies and tasks](policies.md)). Each row is one training beside one of ours with the same seed.
 
 {table}
 
-Intervals are of 95%: Wilson's of a share, Newcombe's of the difference, theirs less ours. "Only theirs" counts the
-seeds that theirs solved and ours did not. Seconds are of a machine of two cores that did much other work beside, theirs
-on one thread; processor seconds are what a program had of it, which was not measured of ours. They say what a run costs
-and are no comparison of speed: that is [notes/performance_policies.md](notes/performance_policies.md). Versions:
-{versions}.
+95% intervals: Wilson's of a share, Newcombe's of the difference, theirs minus ours. "Only theirs" counts seeds that
+theirs solved and ours did not. Seconds are of a machine of two cores that also did other work. They are no
+comparison of speed ([speed](notes/performance_policies.md)). Versions: {versions}.
 
-## What is not the same
+## Differences in training
 
-- LeRobot (`lerobot-train`, its own data loader, AdamW, clipping and cosine with warm-up, with our numbers): no moving
-  average of the weights, which ours has on PickPlaceCan. Its statistics are those of the same 180 demonstrations. What
-  its data set gives for a frame is kept and given again (`benches/peers/train_lerobot.py`): time, and nothing else.
-- robomimic (its `train`, data loader and Adam): the learning rate falls in a line to 0 every hundred steps, the nearest
-  that it has to our warm-up and cosine; no clipping of gradients, no moving average; actions raw in -1 to 1, where ours
-  are scaled to their range; sequences as in the head of `crates/models/src/models/bc_rnn/mod.rs`.
-- robomimic's observations go in as they are, ours normalised by mean and deviation. robomimic 0.3.0 has that
-  (`hdf5_normalize_obs`), and with sequences it fails an assertion (`shape mismatch in @normalize obs`); its loop then
-  applies it to batches that the data set has normalised already. The rows "its normalisation mended" are of robomimic
-  with these two places changed (`benches/peers/train_robomimic.py`), and nothing else.
+- **LeRobot** (`lerobot-train`, its data loader, AdamW, clipping and cosine with warm-up): no moving average of the
+  weights, which ours has on PickPlaceCan. Frames of the data set are cached (`benches/peers/train_lerobot.py`),
+  which changes time only.
+- **robomimic** (`train`, data loader and Adam): the learning rate falls to 0 every hundred steps, without clipping
+  and moving average. Actions are raw in -1 to 1; ours are scaled to their range.
+- **Normalisation.** robomimic 0.3.0 has `hdf5_normalize_obs`. With sequences it fails an assertion (`shape mismatch
+  in @normalize obs`), and its loop then normalises batches a second time. The rows "normalisation fixed" change
+  these two places (`benches/peers/train_robomimic.py`), and nothing else.
 
 """
 
-FOUND = """## What came of it
+FOUND = """## Remarks
 
-- LeRobot's ACT and ours solve as many episodes of both tasks. On PickPlaceCan our row is of another collection of
-  demonstrations by the same seeds.
-- robomimic's BC-RNN with its normalisation mended solves what ours does, within each other's interval, on both tasks.
-- robomimic's BC-RNN as it is released solves none of Lift and two thirds of PickPlaceCan, where ours solves all.
-  Nothing but the normalisation of observations is different from the row below it: that is what is missing. In its own
-  log the loss of the last hundred steps on Lift is -18.3 without it and -20.3 with it, on PickPlaceCan -18.6 and -20.2.
-  1,500 and 6,000 steps are few for robomimic, whose default is 200,000; what it reaches then was not tried.
-- What else is not the same (schedule, clipping, moving average, scale of actions, ends of sequences) shows nothing on
-  these two tasks, where hardly anything is left to be gained.
+- On PickPlaceCan our ACT row comes from another collection of demonstrations with the same seeds.
+- In robomimic's own log the loss of the last hundred steps on Lift is -18.3 without normalisation and -20.3 with it;
+  on PickPlaceCan -18.6 and -20.2.
+- 1,500 and 6,000 steps are few for robomimic, whose default is 200,000. More steps were not tried.
 
 ## The commands
 
-    tools/references.sh                                 # collects the demonstrations, too, where they are not there
+    tools/references.sh                          # trains and evaluates what is missing, and writes this page
     tools/references.sh --data FOLDER --only act-on-lift
     actrm-zoo import robomimic MODEL.pth --name lift-theirs --task Lift
     actrm-zoo eval lift-theirs --protocol lift-v1 --block test
 
-Every training's own command stands in `benches/peers/references.py`; its log, checkpoint and times lie in
+Commands of the trainings are in `benches/peers/references.py`; logs, checkpoints and times are in
 `out/references/train`.
 """
 

@@ -4,7 +4,7 @@ The settings name what our experiment files do; what they do not name is robomim
 checkpoint, robomimic's `.pth`, to the settings' `checkpoint`. The loop, the data loader, the optimiser and the file are
 robomimic's.
 
-With `normalise` two lines of robomimic 0.3.0 are mended: its normalisation of observations (`hdf5_normalize_obs`) fails
+With `normalise` two lines of robomimic 0.3.0 are fixed: its normalisation of observations (`hdf5_normalize_obs`) fails
 an assertion for sequences, and where it does not it is applied twice, by the data set and by the loop.
 """
 

@@ -4,6 +4,10 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use e2e::options::options_page;
+use e2e::reference::assert_current;
+use e2e::results::results_page;
+
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").canonicalize().expect("the repository is there")
 }
@@ -165,4 +169,50 @@ fn paths_are_found_in_documents() {
     let folders = ["crates".to_owned()];
     let text = "see `crates/a/b.rs` and `zoo/src/lib.rs`,\n`name@1/x`, `crates/*/src` and `a/b`";
     assert_eq!(paths(text, &folders), [(1, "crates/a/b.rs".to_owned()), (1, "crates/zoo/src/lib.rs".to_owned())]);
+}
+
+#[test]
+fn the_reference_of_options_is_current() {
+    let (text, options) = options_page();
+    assert!(options > 190, "{options}");
+    assert_current("docs/reference/options.md", &text);
+    // what experiments really have is there
+    let mut seen = 0;
+    for config in files(&root().join("zoo"), "toml").iter().filter(|path| path.ends_with("config.toml")) {
+        let mut section = String::new();
+        for line in fs::read_to_string(config).expect("TOML is text").lines() {
+            if let Some(name) = line.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')) {
+                let mut parts: Vec<&str> = name.split('.').collect();
+                if let ["data", "entities" | "grids" | "exchange" | "symmetries" | "mirror", name, ..] =
+                    parts.as_mut_slice()
+                {
+                    *name = "NAME";
+                }
+                section = format!("{}.", parts.join("."));
+                continue;
+            }
+            let Some((key, _)) = line.split_once(" = ").filter(|(key, _)| !key.starts_with([' ', '"'])) else {
+                continue;
+            };
+            let key = match section.as_str() {
+                "data.entities." | "data.symmetries." | "data.mirror." => "NAME",
+                _ => key,
+            };
+            seen += 1;
+            let option = format!("| `{section}{key}` |");
+            assert!(key == "type" || text.contains(&option), "{}: {option} is not on the page", config.display());
+        }
+    }
+    assert!(seen > 1000, "{seen}");
+}
+
+#[test]
+fn the_reference_of_results_is_current() {
+    let (page, of_readme) = results_page();
+    assert_current("docs/results.md", &page);
+    let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
+    let readme = words(&fs::read_to_string(root().join("README.md")).expect("the README"));
+    for said in of_readme {
+        assert!(readme.contains(&words(&said)), "README: expected what the results say:\n{said}");
+    }
 }

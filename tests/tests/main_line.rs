@@ -4,40 +4,37 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use e2e::{data, lift, succeeds, text, zoo};
+use e2e::{data, howto, lift, root, succeeds, text, zoo};
 
-/// Convert, train briefly, evaluate and rank in `folder`; returns the files whose bytes must not depend on the run.
+/// Convert, then the commands of the how-to on one's own file in `folder`, small: a few steps, three episodes. Returns the files
+/// whose bytes must not depend on the run.
 fn line(folder: &Path, workers: &str) -> BTreeMap<String, Vec<u8>> {
     let at = |name: &str| folder.join(name);
-    let (set, entries, runs) = (at("lift"), at("zoo"), at("runs"));
+    let (set, entries, runs) = (at("lift"), at("my-zoo"), at("runs"));
     succeeds(&mut data(["convert", text(&lift()), text(&set)]));
-    succeeds(&mut zoo([
-        "train",
-        "act_lift",
-        "--data",
-        text(&set),
-        "--zoo",
-        text(&entries),
-        "--runs",
-        text(&runs),
-        "train.steps=5",
-    ]));
-    succeeds(&mut zoo([
-        "eval",
-        "lift-act@1",
-        "--episodes",
-        "3",
-        "--max-steps",
-        "40",
-        "--workers",
-        workers,
-        "--zoo",
-        text(&entries),
-    ]));
-    succeeds(&mut zoo(["leaderboard", "--zoo", text(&entries)]));
+    let small = fs::read_to_string(root().join("protocols/lift-v1.toml")).expect("a protocol");
+    let small = small.replace("40000-40199", "40000-40002").replace("max_steps = 400", "max_steps = 40");
+    fs::create_dir_all(at("protocols")).expect("a folder");
+    fs::write(at("protocols/small-v1.toml"), small).expect("a protocol is written");
+    for words in howto("Compare ACT with diffusion") {
+        assert_eq!(words[0], "actrm-zoo");
+        let mut command = zoo([]);
+        command.current_dir(folder).env("ACTRM_PROTOCOLS", at("protocols"));
+        command.args(words[1..].iter().map(|word| match word.as_str() {
+            "mine.hdf5" => text(&set),
+            "lift-v1" => "small-v1",
+            word => word,
+        }));
+        match words[1].as_str() {
+            "train" => command.args(["--runs", text(&runs), "train.steps=5"]),
+            "eval" => command.args(["--workers", workers]),
+            _ => &mut command,
+        };
+        succeeds(&mut command);
+    }
     assert!(entries.join("leaderboard.csv").is_file());
     let report = fs::read_to_string(entries.join("report.html")).expect("a report");
-    assert!(report.contains("lift-act"), "the report names the entry");
+    assert!(report.contains("lift-act") && report.contains("lift-diffusion"), "the report names the entries");
     assert!(!report.contains("http://") && !report.contains("https://"), "the report needs nothing from elsewhere");
     let mut files = BTreeMap::new();
     gather(folder, folder, &mut files);

@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use e2e::{copy, data, lift, listing, refused, root, signal, succeeds, text, zoo};
+use e2e::{copy, data, howto, lift, listing, refused, root, signal, succeeds, text, zoo};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -204,7 +204,12 @@ fn demonstrations_of_the_scripted_expert_are_collected_again() {
     fs::remove_file(&demos).expect("removable");
 
     // nothing is where the experiment says: the seeds in the entry say how to make it
-    let again = told(&mut rerun(folder.path(), &[]), 0);
+    let page = howto("Reproduce a row").remove(0);
+    assert_eq!(page[..2], ["actrm-zoo", "rerun"]);
+    // this small row has no protocol
+    let flags: Vec<&str> =
+        page[3..].iter().map(String::as_str).filter(|w| !["--protocol", "lift-v1"].contains(w)).collect();
+    let again = told(&mut rerun(folder.path(), &flags), 0);
     assert_eq!(outcomes(&again), STEPS.map(|step| (step, "same")), "{again:#}");
     assert!(said(&again, "demonstrations").contains("work/demonstrations.hdf5"), "{again:#}");
 

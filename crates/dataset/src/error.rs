@@ -327,11 +327,13 @@ pub enum InputError {
         found: String,
     },
 
-    /// The file holds states only; observations have to be rendered first.
-    #[error("{path}: a raw robosuite recording without observations: run `actrm-data extract` on it first", path = path.display())]
-    NeedsExtraction {
+    /// The demonstrations have no observations.
+    #[error("{path}: no observations: {advice}", path = path.display())]
+    NoObservations {
         /// The file.
         path: PathBuf,
+        /// How to get them.
+        advice: String,
     },
 
     /// The reading process ended without an answer: the file crashed the library that reads its kind.

@@ -32,10 +32,10 @@ pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset, DepthMaps,
     DepthUnit, ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm,
     Info, MISTAKE, PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, SkippedDemo, TIME_TOLERANCE,
-    VideoOptions, VideoProvenance, convert, convert_unless, edit, export, notes, source_hash, verify, verify_source,
-    verify_within,
+    VideoOptions, VideoProvenance, convert, convert_unless, edit, export, notes, rewrite, source_hash, verify,
+    verify_source, verify_within,
 };
-pub use plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
+pub use plan::{DemoPlan, Dialect, Join, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};
 pub use samples::{SampleColumn, SamplePlace, SampleSpec, Samples};
 pub use sheet::Picture;

@@ -19,8 +19,18 @@ pub enum Dialect {
     Libero,
     /// robocasa.
     Robocasa,
-    /// MimicGen and Isaac Lab Mimic.
+    /// MimicGen.
     Mimicgen,
+    /// Isaac Lab, with Mimic or without.
+    IsaacLab,
+    /// BEHAVIOR and whatever else OmniGibson records.
+    Behavior,
+    /// ManiSkill: `trajectory.h5` with a JSON file beside it.
+    Maniskill,
+    /// RoboTwin: one file per episode.
+    Robotwin,
+    /// DROID as it was recorded: one `trajectory.h5` per episode.
+    Droid,
     /// D4RL: one run of steps, cut into episodes at terminals and timeouts.
     D4rl,
     /// ALOHA and ACT: one file per episode.
@@ -36,14 +46,41 @@ impl Dialect {
             Self::Libero => "LIBERO",
             Self::Robocasa => "robocasa",
             Self::Mimicgen => "MimicGen",
+            Self::IsaacLab => "Isaac Lab",
+            Self::Behavior => "BEHAVIOR",
+            Self::Maniskill => "ManiSkill",
+            Self::Robotwin => "RoboTwin",
+            Self::Droid => "DROID",
             Self::D4rl => "D4RL",
             Self::Aloha => "ALOHA",
         }
     }
 
-    /// Whether observations have to be made by replaying the states first.
-    pub fn needs_extraction(self) -> bool {
-        self == Self::RobosuiteRaw
+    /// Whether it was recorded without a simulator's rewards and ends, which nobody misses in it.
+    pub(crate) fn is_a_recording(self) -> bool {
+        matches!(self, Self::Aloha | Self::Robotwin | Self::Droid | Self::Maniskill | Self::IsaacLab | Self::Behavior)
+    }
+
+    /// How a recording without observations gets them.
+    pub(crate) fn observe(self) -> &'static str {
+        match self {
+            Self::RobosuiteRaw => "this is a raw robosuite recording; run `actrm-data extract` on it first",
+            Self::Behavior => "replay it with OmniGibson's DataPlaybackWrapper, which writes them",
+            Self::Maniskill => {
+                "replay it with `python -m mani_skill.trajectory.replay_trajectory -o state --save-traj`"
+            }
+            _ => "record it again with observations",
+        }
+    }
+
+    /// Frames a second of recordings that do not state them: what the recorder does unless it is told otherwise.
+    pub(crate) fn usual_fps(self) -> Option<f64> {
+        match self {
+            Self::Aloha | Self::Robotwin => Some(50.0),
+            Self::Maniskill => Some(20.0),
+            Self::Droid => Some(15.0),
+            _ => None,
+        }
     }
 }
 
@@ -135,6 +172,17 @@ pub struct KeyPlan {
 }
 
 impl KeyPlan {
+    /// Rows `first .. first + count` of the same dataset.
+    pub(crate) fn part(mut self, first: usize, count: usize) -> Self {
+        let row = self.dtype.size().unwrap_or(0) * self.shape.iter().skip(1).product::<usize>();
+        self.place.first_row += first;
+        self.place.offset = self.place.offset.map(|at| at + (first * row) as u64);
+        if let Some(rows) = self.shape.first_mut() {
+            *rows = count;
+        }
+        self
+    }
+
     /// Bytes once read; `None` where the size is not known beforehand.
     pub fn bytes(&self) -> Option<u64> {
         let size = self.dtype.size()? as u64;
@@ -158,6 +206,18 @@ pub struct Place {
     pub first_row: usize,
     /// Position in the file of the demo's first element, where they lie there as they are in memory.
     pub offset: Option<u64>,
+    /// What is read together with it.
+    #[serde(default)]
+    pub join: Option<Join>,
+}
+
+/// Datasets of the same file that make one with another.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Join {
+    /// The first row is the only one of this dataset; the rows of the other follow.
+    Before(String),
+    /// Each row goes on with that of each of these.
+    Beside(Vec<String>),
 }
 
 impl Problem {

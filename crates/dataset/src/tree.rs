@@ -38,6 +38,8 @@ pub enum Dtype {
     VarStr,
     /// As [`Dtype::VarStr`], marked ASCII in the file.
     VarAscii,
+    /// Bytes, any number of them an element (variable-length uint8); stored as [`Dtype::VarStr`] is.
+    VarBytes,
     /// A type that cannot be carried, in words. Only plans hold it, never an [`Array`].
     Other(String),
 }
@@ -51,13 +53,16 @@ impl Dtype {
             Self::U32 | Self::I32 | Self::F32 => Some(4),
             Self::U64 | Self::I64 | Self::F64 => Some(8),
             Self::FixedStr(n) | Self::FixedUtf8(n) => Some(*n),
-            Self::VarStr | Self::VarAscii | Self::Other(_) => None,
+            Self::VarStr | Self::VarAscii | Self::VarBytes | Self::Other(_) => None,
         }
     }
 
     /// Whether elements are numbers or truth values.
     pub fn is_numeric(&self) -> bool {
-        !matches!(self, Self::FixedStr(_) | Self::FixedUtf8(_) | Self::VarStr | Self::VarAscii | Self::Other(_))
+        !matches!(
+            self,
+            Self::FixedStr(_) | Self::FixedUtf8(_) | Self::VarStr | Self::VarAscii | Self::VarBytes | Self::Other(_)
+        )
     }
 }
 
@@ -79,6 +84,7 @@ impl fmt::Display for Dtype {
             Self::FixedUtf8(n) => write!(f, "utf8[{n}]"),
             Self::VarStr => f.write_str("string"),
             Self::VarAscii => f.write_str("ascii string"),
+            Self::VarBytes => f.write_str("uint8 of any length"),
             Self::Other(text) => f.write_str(text),
         }
     }
@@ -249,13 +255,22 @@ impl Array {
                 .chunks_exact(n.max(1))
                 .map(|b| text(&b[..b.iter().rposition(|&c| c != 0).map_or(0, |last| last + 1)]))
                 .collect(),
-            Dtype::VarStr | Dtype::VarAscii => {
+            Dtype::VarStr | Dtype::VarAscii => self.byte_rows()?.into_iter().map(text).collect(),
+            _ => None,
+        }
+    }
+
+    /// The bytes of each element of any length, or of each row of a table of bytes; `None` of anything else.
+    pub(crate) fn byte_rows(&self) -> Option<Vec<&[u8]>> {
+        match (&self.dtype, self.shape.as_slice()) {
+            (Dtype::U8, &[_, width]) => Some(self.bytes.chunks_exact(width.max(1)).collect()),
+            (Dtype::VarStr | Dtype::VarAscii | Dtype::VarBytes, _) => {
                 let mut rest = self.bytes.as_slice();
                 let mut out = Vec::new();
                 while !rest.is_empty() {
                     let (count, tail) = rest.split_first_chunk::<4>()?;
                     let (one, tail) = tail.split_at_checked(u32::from_le_bytes(*count) as usize)?;
-                    out.push(text(one)?);
+                    out.push(one);
                     rest = tail;
                 }
                 Some(out)

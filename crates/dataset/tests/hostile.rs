@@ -9,6 +9,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+#[path = "common/made.rs"]
+mod made;
+
 use dataset::{DatasetError, Demo, InputError, RobomimicWriter, Source, WriteOptions, isolation};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
@@ -165,6 +168,10 @@ fn mutations() {
             let content = everything(&Source::open(&path).unwrap()).unwrap();
             originals.push((std::fs::read(&path).unwrap(), content));
         }
+    }
+    for path in made::each(&dir.path().join("layouts")) {
+        let content = everything(&Source::open(&path).unwrap()).unwrap();
+        originals.push((std::fs::read(&path).unwrap(), content));
     }
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut tally: BTreeMap<&str, u64> = BTreeMap::new();

@@ -89,7 +89,7 @@ macro_rules! policies {
 policies! {
     /// Action Chunking with Transformers
     "act" => Act: act::Act,
-    /// ACT that reasons recursively
+    /// ACT with a recursive block that refines its actions
     "actrm" => Actrm: actrm::Actrm,
     /// Behaviour cloning with a multi-layer perceptron
     "bc" => Bc: bc::Bc,
@@ -103,13 +103,13 @@ policies! {
     "expert" => Expert: expert::Expert,
     /// Flow matching
     "flow" => Flow: flow::Flow,
-    /// Minimal iterative policy: two steps of regression
+    /// MIP (minimal iterative policy): two steps of regression
     "mip" => Mip: mip::Mip,
-    /// The nearest demonstrations' actions
+    /// Nearest-neighbour lookup of the demonstrations' actions
     "nearest" => Nearest: nearest::Nearest,
-    /// Actions by chance
+    /// Random actions
     "random" => Random: random::Random,
-    /// A held-out demonstration, played back
+    /// Open-loop replay of a held-out demonstration
     "replay" => Replay: replay::Replay,
     /// No action
     "zero" => Zero: zero::Zero,

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 import textwrap
+from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
@@ -29,6 +32,19 @@ def test_readme_s_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert len(names["rows"]) >= 6  # type: ignore[arg-type]
 
 
+def test_the_how_to_for_pytorch_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    section = (ROOT / "docs/howto.md").read_text().split("## Load a data set in PyTorch")[1]
+    example = textwrap.dedent("\n".join(line for line in section.splitlines() if line.startswith("    ")))
+    assert 1 <= example.count("\n") < 5
+    if find_spec("torch") is None:  # then what it is given is looked at
+        monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(from_numpy=lambda array: array))  # type: ignore[arg-type]
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(compile(example, "howto.md", "exec"), names)
+    assert tuple(names["action"].shape[1:]) == (16, 7)  # type: ignore[attr-defined]
+
+
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     notebook = json.loads((ROOT / "examples/quickstart.ipynb").read_text())
     assert len(notebook["cells"]) <= 20
@@ -46,7 +62,6 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 
 def test_the_api_page_is_the_docstrings() -> None:
     import subprocess
-    import sys
 
     command = [sys.executable, str(ROOT / "tools/python_api.py")]
     page = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -28,7 +28,7 @@ pub(crate) const PICTURE_SUFFIX: &str = "_image";
 /// A resolved experiment, as `config.toml` of runs and entries holds it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Experiment {
-    /// Name of the entry that it makes.
+    /// Name of the entry that training makes.
     pub entry: String,
     /// One sentence for the model card.
     pub description: String,
@@ -67,33 +67,33 @@ struct Sections {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskSection {
-    /// The task's name, as the worker knows it.
+    /// The task's name in the simulator.
     pub name: String,
 }
 
-/// `[data.exchange.NAME]`: things that may change places with each other in training, all but the one that was taken.
+/// `[data.exchange.NAME]`: objects that are swapped with each other in training, all but the one that was taken.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExchangeSection {
-    /// Where each thing is from the hand; the nearest one at the end of a demonstration is the one that was taken.
+    /// Position of each object relative to the gripper. The nearest one at the end of a demonstration is the one that was taken.
     pub taken: Vec<String>,
-    /// What is known of each thing, item for item.
+    /// Observation items of each object, in the same order for all.
     pub items: Vec<Vec<String>>,
-    /// Where each thing is, item for item, all moved by one vector to where one was taken in another demonstration.
+    /// Position items of each object. All are moved by one vector, to where an object was taken in another demonstration.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub places: Vec<Vec<String>>,
-    /// At so many observations of a demonstration, the first ones, a pointer is asked which was taken; at all where absent.
+    /// Number of first observations of a demonstration at which the pointer has a loss; absent: all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub asked: Option<usize>,
 }
 
-/// `[data.beginning]`: how often the first windows of an episode are drawn in training.
+/// `[data.beginning]`: how often the first windows of an episode are sampled in training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BeginningSection {
-    /// How many windows of an episode these are.
+    /// Number of first windows of an episode.
     pub steps: usize,
-    /// How often each of them is drawn where another one is drawn once.
+    /// How many times as often each of them is sampled as another window.
     pub times: usize,
 }
 
@@ -101,49 +101,49 @@ pub struct BeginningSection {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DataSection {
-    /// Demonstrations: an HDF5 file or a LeRobotDataset folder, from the current folder or as shipped.
+    /// Demonstrations: an HDF5 file or a LeRobotDataset folder. A relative path starts at the current folder or at the shipped data.
     pub path: String,
     /// Observation keys that make `observation.state`, in order.
     pub state_keys: Vec<String>,
     /// Observation keys that make `observation.environment_state`, in order; may be empty.
     pub env_keys: Vec<String>,
-    /// Observation keys of what is known in training and not seen, in order: `policy.auxiliary` asks for them.
+    /// Observation keys that are known in training only, in order; targets of the auxiliary loss (`policy.auxiliary`).
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub auxiliary_keys: Vec<String>,
-    /// Things that are a token each, by name.
+    /// Objects that get one token each, by name: a list of observation keys, or a table.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub entities: BTreeMap<String, EntitySection>,
-    /// Grids, each cell of which is such a thing, by name.
+    /// Grids by name; every cell gets one token.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub grids: BTreeMap<String, GridSection>,
-    /// Items of the lists above that are permuted alike in training, by the name of the symmetry.
+    /// Items of the lists above that are permuted together in training, by the name of the symmetry.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub symmetries: BTreeMap<String, Vec<String>>,
-    /// Signs that a mirror gives the numbers of every item of the lists above, and of `action`: then half of the samples that are
-    /// trained on are what it shows, pictures too.
+    /// Mirror augmentation: the sign of every dimension of every item of the lists above, and of `action`, in the mirror. Half of the
+    /// training samples are mirrored, images included.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub mirror: BTreeMap<String, Vec<i8>>,
-    /// Things that may change places in training, by a name for them.
+    /// Groups of objects that are swapped in training, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub exchange: BTreeMap<String, ExchangeSection>,
-    /// What is drawn more often in training: the beginnings of episodes, where it is decided what to do.
+    /// Sample the first windows of episodes more often in training.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub beginning: Option<BeginningSection>,
-    /// Learn the actions, too, that the demonstrations mark as mistakes; otherwise what lies between mistakes is learned
-    /// as if each stretch were an episode of its own.
+    /// Also learn actions that the demonstrations mark as mistakes. Otherwise each stretch between mistakes is learned as an episode
+    /// of its own.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub mistakes: bool,
-    /// Observations that the policy sees at once: the present one and those before it.
+    /// Number of observations that the policy gets at once: the current one and those before it.
     #[serde(skip_serializing_if = "is_one")]
     pub n_obs_steps: usize,
-    /// Cameras whose pictures are seen, by the simulator's names.
+    /// Cameras whose images the policy gets, by the simulator's names.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub cameras: Vec<String>,
-    /// Three entities, each a colour, in which all cameras' pictures are seen: the first channel shows how much of the first one's
-    /// colour a pixel has, and so on. Empty: red, green and blue.
+    /// Three entities, each a colour. The first channel of every image is then the amount of the first entity's colour in a pixel, and
+    /// so on. Empty: red, green and blue.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub picture_colours: Vec<String>,
-    /// Mask of the episodes to train on; a data set without masks is trained on whole, and so is any with "" here.
+    /// Mask of the episodes to train on. With "", or in a data set without masks, all episodes.
     pub train_mask: String,
     /// Mask of the episodes to validate on; "" for none.
     pub valid_mask: String,
@@ -356,14 +356,14 @@ impl DataSection {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NormalisationSection {
-    /// Of `observation.state`.
+    /// Normalisation of `observation.state`.
     pub state: NormMode,
-    /// Of `observation.environment_state`.
+    /// Normalisation of `observation.environment_state`.
     pub environment_state: NormMode,
-    /// Of entities.
+    /// Normalisation of entities.
     #[serde(skip_serializing_if = "is_default")]
     pub entities: NormMode,
-    /// Of `action`.
+    /// Normalisation of `action`.
     pub action: NormMode,
 }
 
@@ -396,12 +396,12 @@ fn is_default(mode: &NormMode) -> bool {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RolloutSection {
-    /// Actions of a chunk that are executed before the policy is asked again.
+    /// Number of actions of a chunk that are executed before the policy is queried again.
     pub n_action_steps: usize,
-    /// Ask at every step and average all predictions, with this coefficient (ACT uses 0.01).
+    /// Temporal ensemble: query at every step and average all predictions with this coefficient (ACT: 0.01).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub temporal_ensemble: Option<f64>,
-    /// Steps after which an episode has failed; the task's own cap unless given.
+    /// Steps after which an episode has failed; absent: the task's own limit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_steps: Option<usize>,
 }

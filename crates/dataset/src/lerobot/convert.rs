@@ -78,9 +78,7 @@ pub fn convert_unless(
     progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
 ) -> Result<ConvertReport> {
     let mut input = Source::open_guarded(source)?.nonfinite(options.nonfinite);
-    if input.plan().dialect.needs_extraction() {
-        return Err(InputError::NeedsExtraction { path: source.to_path_buf() }.into());
-    }
+    without_observations(&input)?;
     if !options.depth {
         // the side folder keeps it, whatever its values
         let keys = input.plan().demos.iter().flat_map(|demo| &demo.keys);
@@ -109,6 +107,15 @@ pub fn convert_unless(
     })?;
     staging.publish()?;
     Ok(report)
+}
+
+/// Refuses demonstrations that have no observations, and says how they get them.
+pub(crate) fn without_observations(input: &Source) -> Result<()> {
+    let plan = input.plan();
+    if plan.demos.is_empty() || plan.demos.iter().any(|demo| demo.keys.keys().any(|key| key.starts_with("obs/"))) {
+        return Ok(());
+    }
+    Err(InputError::NoObservations { path: plan.path.clone(), advice: plan.dialect.observe().to_owned() }.into())
 }
 
 /// Task texts in order of first use, and each episode's.

@@ -14,7 +14,8 @@ use crate::source::{NonFinite, Source};
 use crate::stats::FeatureStats;
 use crate::tree::{Array, Demo};
 use arrow::array::{
-    ArrayRef, BinaryArray, BooleanArray, FixedSizeListArray, Float32Array, Int64Array, StringArray, StructArray,
+    ArrayRef, BinaryArray, BooleanArray, FixedSizeListArray, Float32Array, Float64Array, Int64Array, StringArray,
+    StructArray,
 };
 use arrow::buffer::{OffsetBuffer, ScalarBuffer};
 use arrow::datatypes::DataType;
@@ -170,7 +171,10 @@ impl Job<'_> {
                 summary.values = columns
                     .map(|(values, column)| ColumnSummary {
                         stats: values.stats(column.dim()),
-                        digest: values.digest(),
+                        digest: match &column.origin {
+                            Origin::Stored(_) => values.digest_as_read(),
+                            _ => values.digest(),
+                        },
                         values,
                     })
                     .collect();
@@ -279,8 +283,8 @@ impl Job<'_> {
         let array = self.source.read_rows(l.part.episode, key, rows.start, rows.len())?;
         if jpeg {
             let expected = format!("a JPEG file of {height} x {width}");
-            let (row, mut pixels) = (array.bytes.len() / rows.len().max(1), Vec::with_capacity(size));
-            for (frame, bytes) in rows.zip(array.bytes.chunks_exact(row.max(1))) {
+            let mut pixels = Vec::with_capacity(size);
+            for (frame, bytes) in rows.zip(array.byte_rows().unwrap_or_default()) {
                 let bad = |found| self.bad_picture(l, key, frame, &expected, found);
                 let file = images::jpeg(bytes).ok_or_else(|| bad("other bytes".to_owned()))?;
                 pixels.clear();
@@ -356,41 +360,27 @@ fn too_large(path: &Path, key: &str) -> DatasetError {
 /// Concatenates the rows of one column over the parts of a row group.
 fn number_array(column: &Column, index: usize, loaded: &[Loaded]) -> ArrayRef {
     let dim = column.dim();
-    let rows: usize = loaded.iter().map(|l| l.part.rows.len()).sum();
-    let slices = loaded.iter().map(|l| (&l.values[index], l.part.rows.start * dim..l.part.rows.end * dim));
-    match loaded.first().map(|l| &l.values[index]) {
-        Some(Values::I64(_)) => {
-            let mut all = Vec::with_capacity(rows * dim);
-            for (values, range) in slices {
-                if let Values::I64(v) = values {
+    let slices = || loaded.iter().map(|l| (&l.values[index], l.part.rows.start * dim..l.part.rows.end * dim));
+    macro_rules! all {
+        ($kind:ident) => {{
+            let mut all = Vec::with_capacity(slices().map(|(_, range)| range.len()).sum());
+            for (values, range) in slices() {
+                if let Values::$kind(v) = values {
                     all.extend_from_slice(&v[range]);
                 }
             }
-            Arc::new(Int64Array::from(all))
-        }
-        Some(Values::Bool(_)) => {
-            let mut all = Vec::with_capacity(rows * dim);
-            for (values, range) in slices {
-                if let Values::Bool(v) = values {
-                    all.extend_from_slice(&v[range]);
-                }
-            }
-            Arc::new(BooleanArray::from(all))
-        }
-        _ => {
-            let mut all = Vec::with_capacity(rows * dim);
-            for (values, range) in slices {
-                if let Values::F32(v) = values {
-                    all.extend_from_slice(&v[range]);
-                }
-            }
-            let flat = Float32Array::from(all);
-            debug_assert_eq!(flat.len(), rows * dim);
-            match dim {
-                1 => Arc::new(flat),
-                n => Arc::new(FixedSizeListArray::new(element(DataType::Float32), n as i32, Arc::new(flat), None)),
-            }
-        }
+            all
+        }};
+    }
+    let (flat, value): (ArrayRef, DataType) = match loaded.first().map(|l| &l.values[index]) {
+        Some(Values::I64(_)) => (Arc::new(Int64Array::from(all!(I64))), DataType::Int64),
+        Some(Values::F64(_)) => (Arc::new(Float64Array::from(all!(F64))), DataType::Float64),
+        Some(Values::Bool(_)) => (Arc::new(BooleanArray::from(all!(Bool))), DataType::Boolean),
+        _ => (Arc::new(Float32Array::from(all!(F32))), DataType::Float32),
+    };
+    match dim {
+        1 => flat,
+        n => Arc::new(FixedSizeListArray::new(element(value), n as i32, flat, None)),
     }
 }
 

@@ -10,6 +10,7 @@ use super::side::{
     FRAMES, Kind, LAYOUT_FILE, Layout, MANIFEST_FILE, Manifest, NO_EPISODE, OBJECTS, Object, SideColumn,
 };
 use super::tiff;
+use super::to_robomimic;
 use super::verify::hash_file;
 use crate::error::{DatasetError, Result};
 use crate::source::{RobomimicWriter, WriteOptions};
@@ -30,9 +31,12 @@ pub struct ExportReport {
     pub demos: usize,
     /// Steps written.
     pub frames: usize,
+    /// What was left out or is not as it was.
+    pub notes: Vec<String>,
 }
 
-/// Rebuilds the robomimic file of the data set `root` at `out`, which must not exist.
+/// Makes a robomimic file of the data set `root` at `out`, which must not exist: rebuilds the one that it was converted from
+/// where the side folder keeps all of it, and makes one of the columns otherwise.
 ///
 /// The files of the side folder are first compared with their recorded hashes. `progress` is told frames done
 /// and frames in all.
@@ -44,12 +48,9 @@ pub fn export(
 ) -> Result<ExportReport> {
     let info = read_info(root)?;
     let of_side = info.actrm.as_ref().filter(|p| p.lossless);
-    if of_side.and_then(|p| p.video.as_ref()).is_some_and(|v| !v.side_pictures) {
-        return Err(DatasetError::NotInDataset {
-            path: root.to_path_buf(),
-            wanted: "exact pictures to rebuild the file from".to_owned(),
-            found: "video of them only (converted with --no-side-pictures)".to_owned(),
-        });
+    let exact = of_side.is_some_and(|p| p.video.as_ref().is_none_or(|video| video.side_pictures));
+    if !exact {
+        return to_robomimic::from_columns(root, out, options, progress);
     }
     let layout = side_folder(root, &info)?;
     let episodes = read_episodes(root, &info)?;
@@ -101,7 +102,7 @@ pub fn export(
         progress(episode.to as u64, total);
     }
     writer.finish()?;
-    Ok(ExportReport { demos: episodes.len(), frames: info.total_frames })
+    Ok(ExportReport { demos: episodes.len(), frames: info.total_frames, notes: Vec::new() })
 }
 
 /// The layout of the side folder, once its files are known to be those that were written.
@@ -317,7 +318,7 @@ pub(crate) fn picture_pixels(
 }
 
 /// Calls `take` with the file of every picture of a column; what it finds wrong is an error of the column's.
-fn each_file(
+pub(super) fn each_file(
     root: &Path,
     name: &str,
     column: &ArrayRef,

@@ -3,6 +3,7 @@
 use super::depth::{self, DepthKind};
 use super::encoded::may_hold_files;
 use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm};
+use super::to_robomimic::{Stated, stated};
 use crate::error::{DatasetError, InputError, Result};
 use crate::keys::KeyItem;
 use crate::plan::{DemoPlan, KeyPlan, Plan};
@@ -12,12 +13,15 @@ use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Default keys of `observation.state`: the first set that is there whole wins. Robots after the first
-/// (`robot1_...`) are added to robomimic's.
-const STATE_DEFAULTS: [&[&str]; 4] = [
+/// (`robot1_...`) are added to robomimic's. Where there is none of them, all vectors are taken.
+const STATE_DEFAULTS: [&[&str]; 6] = [
     &["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"],
+    // LIBERO, ALOHA and others, D4RL, Isaac Lab, DROID
     &["ee_pos", "ee_ori", "gripper_states"],
     &["qpos"],
     &["flat"],
+    &["eef_pos", "eef_quat", "gripper_pos"],
+    &["joint_positions", "gripper_position"],
 ];
 
 /// What the names of columns of entities begin with.
@@ -28,6 +32,9 @@ pub const MISTAKE: &str = "mistake";
 
 /// Default key of `observation.environment_state`.
 const ENV_DEFAULT: &str = "object";
+
+/// The longest row that is a vector and no image or cloud of points.
+const VECTOR: usize = 4096;
 
 /// Control frequency of robosuite environments whose arguments state none, in Hz.
 const ROBOSUITE_CONTROL_FREQ: f64 = 20.0;
@@ -141,12 +148,12 @@ pub(crate) enum Origin {
     Action { key: String, width: usize, rotation: RotationForm },
     /// `rewards` as float.
     Reward,
-    /// `dones` as truth value.
-    Done,
     /// `rewards` at its maximum of 1: the task is solved at this step.
     Success,
-    /// `mistakes` as truth value.
-    Mistake,
+    /// A dataset of one truth value a step.
+    Flag(String),
+    /// A dataset as it is, in the type of the column.
+    Stored(String),
     /// A dataset of 8-bit images, or of their JPEG files.
     Image { key: String, height: usize, width: usize, jpeg: bool },
     /// A dataset of depth, `dtype` a pixel.
@@ -182,8 +189,7 @@ impl Column {
             }
             Origin::Action { key, .. } => vec![key.clone()],
             Origin::Reward | Origin::Success => vec!["rewards".to_owned()],
-            Origin::Done => vec!["dones".to_owned()],
-            Origin::Mistake => vec!["mistakes".to_owned()],
+            Origin::Flag(key) | Origin::Stored(key) => vec![key.clone()],
             Origin::Image { .. } | Origin::Depth { .. } | Origin::Index(_) => Vec::new(),
         }
     }
@@ -222,7 +228,11 @@ impl Mapping {
         let first = first.ok_or_else(|| InputError::NoDemos { path: plan.path.clone(), found: "none".to_owned() })?;
         let least = if options.skip_bad { plan.demos.len().div_ceil(2) } else { 1 };
         let chooser = Chooser { plan, first, files, least };
-        let state_keys = chooser.state_keys(options)?;
+        if let Some(stated) = chooser.stated(options) {
+            return chooser.as_stated(&stated, options);
+        }
+        let mut notes = Vec::new();
+        let state_keys = chooser.state_keys(options, &mut notes)?;
         let env_keys = chooser.env_keys(options)?;
         let mut columns = Vec::new();
         for (name, keys) in [("observation.state", &state_keys), ("observation.environment_state", &env_keys)] {
@@ -246,7 +256,7 @@ impl Mapping {
         }
         let (mut pictures, mut left_out) = (chooser.images()?, BTreeMap::new());
         chooser.depth(options, &mut pictures, &mut left_out);
-        let mut notes = chooser.pictures_left_out(&pictures, left_out, options);
+        notes.extend(chooser.pictures_left_out(&pictures, left_out, options));
         columns.extend(pictures);
         let (action, provenance) = chooser.action(options)?;
         columns.push(action);
@@ -255,10 +265,7 @@ impl Mapping {
         let fps = chooser.fps(options, &mut notes)?;
         let entities = options.entities.clone();
         let mut mapping = Self { columns, fps, state_keys, env_keys, entities, action: provenance, notes };
-        if let Some(video) = &options.video {
-            chooser.check_films(&mapping.columns)?;
-            mapping.film(video, options.lossless);
-        }
+        chooser.filmed(&mut mapping, options)?;
         Ok(mapping)
     }
 
@@ -338,6 +345,41 @@ struct Chooser<'a> {
 }
 
 impl Chooser<'_> {
+    /// The columns that the file states, unless others are asked for.
+    fn stated(&self, options: &ConvertOptions) -> Option<Stated> {
+        let chosen = options.state_keys.is_some() || options.env_keys.is_some() || !options.entities.is_empty();
+        let chosen = chosen || options.actions != ActionKind::Delta || options.rotation != RotationForm::AxisAngle;
+        if chosen { None } else { stated(self.plan) }
+    }
+
+    fn as_stated(&self, stated: &Stated, options: &ConvertOptions) -> Result<Mapping> {
+        let action =
+            ActionProvenance { key: "actions".to_owned(), kind: ActionKind::Delta, rotation: RotationForm::AxisAngle };
+        let mut mapping = Mapping {
+            columns: Vec::new(),
+            fps: 0.0,
+            state_keys: Vec::new(),
+            env_keys: Vec::new(),
+            entities: BTreeMap::new(),
+            action,
+            notes: Vec::new(),
+        };
+        stated.mapping(self.plan, &mut mapping)?;
+        mapping.columns.extend(index_columns());
+        mapping.fps = options.fps.unwrap_or(mapping.fps);
+        self.filmed(&mut mapping, options)?;
+        Ok(mapping)
+    }
+
+    /// Makes videos of the cameras where they are asked for.
+    fn filmed(&self, mapping: &mut Mapping, options: &ConvertOptions) -> Result<()> {
+        if let Some(video) = &options.video {
+            self.check_films(&mapping.columns)?;
+            mapping.film(video, options.lossless);
+        }
+        Ok(())
+    }
+
     /// Refuses pictures of a size that no video has.
     fn check_films(&self, columns: &[Column]) -> Result<()> {
         for column in columns {
@@ -353,16 +395,33 @@ impl Chooser<'_> {
         Ok(())
     }
 
-    fn state_keys(&self, options: &ConvertOptions) -> Result<Vec<String>> {
+    /// Observations of floating-point numbers, a vector or a number a step, in order of their names. What follows from
+    /// others is none: the environment's state, the action before and what Mimic notes for itself.
+    fn vectors(&self) -> Vec<String> {
+        let fits = |key: &KeyPlan| {
+            matches!(key.dtype, Dtype::F32 | Dtype::F64) && matches!(key.shape[..], [_] | [_, 1..=VECTOR])
+        };
+        let other = |name: &str| matches!(name, ENV_DEFAULT | "actions") || name.starts_with("datagen_info/");
+        let keys = self.first.keys.iter().filter(|(path, key)| fits(key) && self.usual(path));
+        let names = keys.filter_map(|(path, _)| path.strip_prefix("obs/"));
+        names.filter(|name| !other(name)).map(str::to_owned).collect()
+    }
+
+    fn state_keys(&self, options: &ConvertOptions, notes: &mut Vec<String>) -> Result<Vec<String>> {
         if let Some(keys) = &options.state_keys {
             return Ok(keys.clone());
         }
         let has = |key: &str| self.usual(&format!("obs/{key}"));
         let chosen = STATE_DEFAULTS.iter().find(|set| set.iter().all(|key| has(key)));
         let Some(set) = chosen else {
-            // name what robomimic's set lacks, and what there is to choose from
+            // a part of robomimic's set is a file that lost the others
             let lacking = STATE_DEFAULTS[0].iter().find(|key| !has(key)).expect("one is lacking");
-            return Err(self.missing(self.first, &format!("obs/{lacking}")).into());
+            let vectors = if STATE_DEFAULTS[0].iter().any(|key| has(key)) { Vec::new() } else { self.vectors() };
+            if vectors.is_empty() {
+                return Err(self.missing(self.first, &format!("obs/{lacking}")).into());
+            }
+            notes.push(format!("observation.state is made of {} (--state-keys chooses others)", vectors.join(", ")));
+            return Ok(vectors);
         };
         let mut keys: Vec<String> = set.iter().map(|&k| k.to_owned()).collect();
         for robot in 1.. {
@@ -547,8 +606,9 @@ impl Chooser<'_> {
                 ([_, _, 1], Dtype::F32 | Dtype::F64 | Dtype::U16) => "nothing in its name says that it is depth",
                 ([_, _, 1], _) => "LeRobot's depth is float or uint16",
                 ([_, _, 3 | 4], _) => NO_COLOUR,
-                // a row of bytes a step under the name of a camera that is no JPEG file
-                ([_] | [], _) if path.starts_with("obs/images/") => NO_COLOUR,
+                // bytes for each step under the name of a camera that are no JPEG file
+                ([_] | [], _) if path.starts_with("obs/images/") || path.ends_with("_image") => NO_COLOUR,
+                ([], Dtype::VarBytes) => NO_COLOUR,
                 _ => continue,
             };
             let reason = known.get(path).map_or(reason, String::as_str);
@@ -577,14 +637,17 @@ impl Chooser<'_> {
         }
         if self.usual("dones") {
             self.one_a_step("dones")?;
-            columns.push(scalar("next.done", "bool", Origin::Done));
+            columns.push(scalar("next.done", "bool", Origin::Flag("dones".to_owned())));
         }
         if self.usual("rewards") && self.rewards_tell_success() {
             columns.push(scalar("next.success", "bool", Origin::Success));
+        } else if self.usual("success") {
+            self.one_a_step("success")?;
+            columns.push(scalar("next.success", "bool", Origin::Flag("success".to_owned())));
         }
         if self.usual("mistakes") {
             self.one_a_step("mistakes")?;
-            columns.push(scalar(MISTAKE, "bool", Origin::Mistake));
+            columns.push(scalar(MISTAKE, "bool", Origin::Flag("mistakes".to_owned())));
         }
         Ok(columns)
     }
@@ -611,13 +674,21 @@ impl Chooser<'_> {
     fn fps(&self, options: &ConvertOptions, notes: &mut Vec<String>) -> Result<f64> {
         let kwargs = self.plan.env_args.as_ref().and_then(|args| args.get("env_kwargs"));
         let stated = kwargs.and_then(|kwargs| kwargs.get("control_freq")?.as_f64());
+        // Isaac Lab states its steps
+        let sim = self.plan.env_args.as_ref().and_then(|args| args.get("sim_args"));
+        let step = sim.and_then(|sim| Some(sim.get("dt")?.as_f64()? * sim.get("decimation")?.as_f64()?));
+        let stated = stated.or(step.filter(|&step| step > 0.0).map(|step| (1e6 / step).round() / 1e6));
         let mut default = || {
-            self.is_robosuite().then(|| {
+            if self.is_robosuite() {
                 notes.push(format!(
                     "env_args state no control_freq; {ROBOSUITE_CONTROL_FREQ} Hz is taken, robosuite's default (--fps decides)"
                 ));
-                ROBOSUITE_CONTROL_FREQ
-            })
+                return Some(ROBOSUITE_CONTROL_FREQ);
+            }
+            let usual = self.plan.dialect.usual_fps()?;
+            let name = self.plan.dialect.name();
+            notes.push(format!("no rate is stated; {usual} Hz is taken, as is usual of {name} (--fps decides)"));
+            Some(usual)
         };
         let fps = options.fps.or(stated).or_else(&mut default).ok_or_else(|| InputError::BadAttribute {
             path: self.plan.path.clone(),

@@ -29,6 +29,7 @@ fn data_type(feature: &Feature) -> DataType {
     let value = match feature.dtype.as_str() {
         "image" => return DataType::Struct(image_fields()),
         "int64" => DataType::Int64,
+        "float64" => DataType::Float64,
         "bool" => DataType::Boolean,
         _ => DataType::Float32,
     };

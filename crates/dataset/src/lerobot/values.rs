@@ -6,7 +6,7 @@ use crate::error::{DatasetError, InputError, Result};
 use crate::keys::{KeyItem, Moment};
 use crate::rotation;
 use crate::stats::FeatureStats;
-use crate::tree::{Array, Demo};
+use crate::tree::{Array, Demo, Dtype};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -44,6 +44,15 @@ impl Values {
             Self::Pictures => {}
         }
         hash.finalize().into()
+    }
+
+    /// The digest of the values as an opened data set has them: whole numbers and doubles as float32.
+    pub(crate) fn digest_as_read(&self) -> [u8; 32] {
+        match self {
+            Self::F64(v) => Self::F32(v.iter().map(|&v| v as f32).collect()).digest(),
+            Self::I64(v) => Self::F32(v.iter().map(|&v| v as f32).collect()).digest(),
+            _ => self.digest(),
+        }
     }
 
     /// Statistics over rows of `dim` values; `None` for pictures and for no rows.
@@ -112,8 +121,8 @@ pub(crate) fn column_values(path: &Path, column: &Column, demo: &Demo, fps: f64,
             })
         }
         Origin::Reward => Values::F32(single("rewards")?),
-        Origin::Done => Values::Bool(single("dones")?.iter().map(|&v| v != 0.0).collect()),
-        Origin::Mistake => Values::Bool(single("mistakes")?.iter().map(|&v| v != 0.0).collect()),
+        Origin::Stored(key) => stored(path, demo, key, column, length)?,
+        Origin::Flag(key) => Values::Bool(single(key)?.iter().map(|&v| v != 0.0).collect()),
         Origin::Success => Values::Bool(single("rewards")?.iter().map(|&v| v >= 1.0).collect()),
         Origin::Image { .. } | Origin::Depth { .. } => Values::Pictures,
         Origin::Index(index) => index_values(*index, fps, position),
@@ -166,6 +175,23 @@ fn concat(
         offset += row.len();
     }
     Ok(out)
+}
+
+/// The values of a dataset in the type of their column.
+fn stored(path: &Path, demo: &Demo, key: &str, column: &Column, length: usize) -> Result<Values> {
+    let array = demo.datasets.get(key).ok_or_else(|| missing(path, demo, key))?;
+    let wrong = || wrong_shape(path, demo, key, &format!("{length} steps of {} numbers", column.dim()));
+    let doubles = || array.to_f64().filter(|v| v.len() == column.dim() * length).ok_or_else(wrong);
+    Ok(match (column.feature.dtype.as_str(), &array.dtype) {
+        ("int64", Dtype::I64 | Dtype::U64) if array.len() == column.dim() * length => {
+            let (values, _) = array.bytes.as_chunks();
+            Values::I64(values.iter().map(|v| i64::from_le_bytes(*v)).collect())
+        }
+        ("int64", _) => Values::I64(doubles()?.iter().map(|&v| v as i64).collect()),
+        ("bool", _) => Values::Bool(doubles()?.iter().map(|&v| v != 0.0).collect()),
+        ("float64", _) => Values::F64(doubles()?),
+        _ => Values::F32(numbers(path, demo, key, column.dim(), length)?),
+    })
 }
 
 fn numbers(path: &Path, demo: &Demo, key: &str, width: usize, length: usize) -> Result<Vec<f32>> {

@@ -3,6 +3,7 @@
 
 use super::features::Mapping;
 use crate::plan::{DemoPlan, KeyPlan};
+use crate::tree::Dtype;
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::{Condvar, Mutex, mpsc};
@@ -14,6 +15,9 @@ pub(crate) const GROUP_FRAMES: usize = 4096;
 pub(crate) const GROUP_BYTES: u64 = 8 << 20;
 /// A dataset with more bytes a row than this is read by rows, never whole.
 pub(crate) const BULK_ROW_BYTES: u64 = 4096;
+
+/// What an element of bytes of any length is taken for.
+const VAR_BYTES: u64 = 32 << 10;
 
 /// Rows of one episode that go into one row group.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -47,7 +51,11 @@ pub(crate) fn is_bulk(key: &KeyPlan, length: usize) -> bool {
 
 fn row_bytes(key: &KeyPlan) -> u64 {
     let rows = key.shape.first().copied().unwrap_or(1).max(1) as u64;
-    key.bytes().unwrap_or(0) / rows
+    match key.dtype {
+        // files of pictures, whose sizes are known when they are read
+        Dtype::VarBytes => VAR_BYTES,
+        _ => key.bytes().unwrap_or(0) / rows,
+    }
 }
 
 /// Cuts the demos into row groups: small episodes together, as long as they fit a file of `file_bytes`, a large one into

@@ -66,6 +66,7 @@ pub(super) fn code_of(dtype: &Dtype) -> (u8, usize) {
         Dtype::FixedUtf8(n) => (12, *n),
         Dtype::VarStr => (13, 0),
         Dtype::VarAscii => (14, 0),
+        Dtype::VarBytes => (15, 0),
         Dtype::Other(_) => (255, 0),
     }
 }
@@ -87,6 +88,7 @@ fn dtype_of(code: u8, width: usize) -> Option<Dtype> {
         12 => Dtype::FixedUtf8(width),
         13 => Dtype::VarStr,
         14 => Dtype::VarAscii,
+        15 => Dtype::VarBytes,
         _ => return None,
     })
 }

@@ -105,7 +105,7 @@ fn isaac_lab_nests_observations_and_states() {
         floats(&initial.create_group("articulation").unwrap(), "joint_position", &[1, 9]);
         floats(&one.create_group("states").unwrap(), "joint_position", &[3, 9]);
     });
-    assert_eq!(source.plan().dialect, Dialect::Mimicgen);
+    assert_eq!(source.plan().dialect, Dialect::IsaacLab);
     let one = source.read_demo(0).unwrap();
     assert_eq!(one.datasets["obs/datagen_info/object_pose"].shape, [3, 4, 4]);
     assert_eq!(one.datasets["initial_state/articulation/joint_position"].shape, [1, 9]);

@@ -116,11 +116,8 @@ pub(super) fn limit_cpu(seconds: u64, maximum: Option<u64>) -> std::io::Result<(
 }
 
 fn source_bytes(path: &Path) -> u64 {
-    let size = |p: &Path| std::fs::metadata(p).map_or(0, |m| m.len());
-    match std::fs::read_dir(path) {
-        Ok(entries) => entries.flatten().map(|e| size(&e.path())).sum(),
-        Err(_) => size(path),
-    }
+    let files = super::local::files(path).unwrap_or_default();
+    files.iter().map(|file| std::fs::metadata(file).map_or(0, |m| m.len())).sum()
 }
 
 fn serve(path: &Path) -> std::io::Result<()> {

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use super::dialect::{self, DemoDraft, Draft, Survey};
 use super::walk::{Walked, check_signature};
 use crate::error::InputError;
-use crate::plan::{Plan, Problem};
-use crate::tree::{Array, Demo};
+use crate::plan::{Join, Plan, Problem};
+use crate::tree::{Array, Attrs, Demo};
 
 /// What a source can be asked for, in this process or in another.
 pub(super) trait Backend: Send + Sync {
@@ -40,19 +40,26 @@ impl Local {
             match Walked::open(file, keep, beat) {
                 Ok(walked) => files.push(walked),
                 Err(error) if path.is_dir() => {
-                    let id = format!("demo_{}", dialect::number_of(file, index));
-                    lost.push(Problem::new(Some(&id), None, true, error));
+                    lost.push((file, dialect::number_of(file, index), error));
                 }
                 Err(error) => return Err(error),
             }
         }
-        if let (true, Some(problem)) = (files.is_empty(), lost.first()) {
-            return Err(problem.error.clone());
+        if let (true, Some((.., error))) = (files.is_empty(), lost.first()) {
+            return Err(error.clone());
         }
         let survey = Survey { path: path.to_owned(), files };
         let Draft { dialect, demos, env_args, env_name, env_version, masks, texts, notes, problems } =
             dialect::draft(&survey, beat)?;
-        let problems = lost.into_iter().chain(problems).collect();
+        let of_file = |(file, number, error): (&PathBuf, u64, InputError)| {
+            let mut id = format!("demo_{number}");
+            if demos.iter().any(|demo| demo.plan.id == id) {
+                // a file of many demos is no demo itself
+                id = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            }
+            Problem::new(Some(&id), None, true, error)
+        };
+        let problems = lost.into_iter().map(of_file).chain(problems).collect();
         let mut linked: Vec<(PathBuf, u64)> = Vec::new();
         for file in survey.files.iter().flat_map(|f| &f.linked) {
             if !linked.contains(file) && !survey.files.iter().any(|f| f.path == file.0) {
@@ -97,18 +104,19 @@ const EXTENSIONS: [&str; 4] = ["hdf5", "h5", "hdf", "he5"];
 
 /// The HDF5 files of a folder, by the number in their names and then by name, with those that are only called so: an
 /// episode may have been cut off, or be a pointer of git-lfs. Hidden ones are somebody's work in progress.
+/// Where there is none, those of the folders below.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
-    let unreadable = |e: std::io::Error| InputError::Unreadable { path: folder.to_owned(), reason: e.to_string() };
     let mut found = Vec::new();
     let mut others = BTreeSet::new();
-    for entry in std::fs::read_dir(folder).map_err(unreadable)? {
-        let path = entry.map_err(unreadable)?.path();
-        let hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-        let named = path.extension().is_some_and(|e| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known)));
-        if !hidden && path.is_file() && (named || check_signature(&path).is_ok()) {
-            found.push(path);
-        } else if let Some(name) = path.file_name() {
-            others.insert(name.to_string_lossy().into_owned());
+    let mut folders = Vec::new();
+    list_files(folder, &mut found, &mut folders, &mut others)?;
+    // an episode a folder, a folder of tasks, a folder beside instructions and videos
+    for _ in 0..MAX_FOLDERS {
+        if !found.is_empty() {
+            break;
+        }
+        for folder in std::mem::take(&mut folders) {
+            list_files(&folder, &mut found, &mut folders, &mut BTreeSet::new())?;
         }
     }
     if found.is_empty() {
@@ -127,21 +135,62 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
     Ok(found)
 }
 
+/// Folders in folders are looked through so deep: DROID has four.
+const MAX_FOLDERS: usize = 5;
+
+/// Sorts what is in a folder into HDF5 files, folders and the names of everything else.
+fn list_files(
+    folder: &Path,
+    found: &mut Vec<PathBuf>,
+    folders: &mut Vec<PathBuf>,
+    others: &mut BTreeSet<String>,
+) -> Result<(), InputError> {
+    let unreadable = |e: std::io::Error| InputError::Unreadable { path: folder.to_owned(), reason: e.to_string() };
+    for entry in std::fs::read_dir(folder).map_err(unreadable)? {
+        let entry = entry.map_err(unreadable)?;
+        let path = entry.path();
+        let hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
+        let named = path.extension().is_some_and(|e| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known)));
+        if !hidden && path.is_file() && (named || check_signature(&path).is_ok()) {
+            found.push(path);
+            continue;
+        }
+        if let Some(name) = path.file_name() {
+            others.insert(name.to_string_lossy().into_owned());
+        }
+        // links to folders may lead in a circle
+        if !hidden && entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            folders.push(path);
+        }
+    }
+    Ok(())
+}
+
 impl Backend for Local {
     fn root(&self) -> Result<Demo, InputError> {
         let mut root = Demo::default();
-        let Some(file) = self.survey.single() else { return Ok(root) };
+        for (name, text) in &self.plan.texts {
+            if let Some(name) = name.strip_prefix(dialect::BESIDE) {
+                root.attrs.insert(name.to_owned(), Array::from_str(text));
+            }
+        }
+        let Some(file) = self.survey.single() else {
+            if self.drafts.iter().any(|d| d.home.as_ref().is_some_and(|(_, path)| !path.is_empty())) {
+                self.roots(&mut root)?;
+            }
+            return Ok(root);
+        };
         if self.drafts.iter().any(|d| d.home.as_ref().is_some_and(|(_, path)| path.is_empty())) {
             // the file is the demo
             return Ok(root);
         }
-        root.attrs = file.attrs("")?;
+        root.attrs.extend(file.attrs("")?);
         let homes: Vec<String> = self.drafts.iter().filter_map(|d| Some(format!("{}/", d.home.as_ref()?.1))).collect();
         let homes: BTreeSet<&str> = homes.iter().map(String::as_str).collect();
-        // a home is `data/demo_3/`: two levels, so the first two levels of a path decide
+        // a home is `data/demo_3/` or `traj_3/`, so the first two levels of a path decide
         let in_demo = |path: &str| {
-            let end = path.match_indices('/').nth(1).map_or(path.len(), |(at, _)| at);
-            homes.contains(format!("{}/", &path[..end]).as_str())
+            let mut ends = path.match_indices('/').map(|(at, _)| at).chain([path.len()]).take(2);
+            ends.any(|end| homes.contains(format!("{}/", &path[..end]).as_str()))
         };
         let used: BTreeSet<&str> =
             self.plan.demos.iter().flat_map(|d| d.keys.values().map(|k| k.place.path.as_str())).collect();
@@ -191,11 +240,62 @@ impl Backend for Local {
 
     fn rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array, InputError> {
         let place = self.place(index, key)?;
-        self.survey.files[place.file].read(&place.path, Some((place.first_row + first, count)))
+        let file = &self.survey.files[place.file];
+        let from = place.first_row + first;
+        let beside = match &place.join {
+            None => return file.read(&place.path, Some((from, count))),
+            Some(Join::Before(path)) => {
+                let mut array = file.read(path, Some((0, usize::from(from == 0 && count > 0))))?;
+                let rest = file.read(&place.path, Some((from.saturating_sub(1), count - array.shape[0])))?;
+                array.shape[0] += rest.shape[0];
+                array.bytes.extend_from_slice(&rest.bytes);
+                return Ok(array);
+            }
+            Some(Join::Beside(paths)) => paths,
+        };
+        let mut parts = vec![file.read(&place.path, Some((from, count)))?];
+        for path in beside {
+            parts.push(file.read(path, Some((from, count)))?);
+        }
+        let width = |part: &Array| part.shape.iter().skip(1).product::<usize>();
+        let shape = vec![count, parts.iter().map(width).sum()];
+        let mut bytes = Vec::new();
+        for row in 0..count {
+            for part in &parts {
+                let size = part.bytes.len() / count;
+                bytes.extend_from_slice(&part.bytes[row * size..(row + 1) * size]);
+            }
+        }
+        Ok(Array { dtype: parts[0].dtype.clone(), shape, bytes })
     }
 }
 
 impl Local {
+    /// What belongs to no demo in several files of many demos each: the attributes that the group `data` needs, and below
+    /// `files/<name>` everything else of each.
+    fn roots(&self, root: &mut Demo) -> Result<(), InputError> {
+        let mut data = Attrs::from([("total".to_owned(), Array::from_i64(Vec::new(), &[self.plan.frames() as i64]))]);
+        if let Some(env_args) = &self.plan.env_args {
+            data.insert("env_args".to_owned(), Array::from_str(&env_args.to_string()));
+        }
+        root.inner_attrs.insert("data".to_owned(), data);
+        for (name, demos) in &self.plan.masks {
+            root.datasets.insert(format!("mask/{name}"), Array::from_fixed_strings(demos));
+        }
+        for file in &self.survey.files {
+            let name = file.path.file_name().unwrap_or_default().to_string_lossy();
+            let outside = |path: &str| !path.starts_with("data/") && !path.starts_with("mask/");
+            for (path, _) in file.groups.iter().filter(|(path, node)| node.attrs > 0 && outside(path)) {
+                let below = if path.is_empty() { String::new() } else { format!("/{path}") };
+                root.inner_attrs.insert(format!("files/{name}{below}"), file.attrs(path)?);
+            }
+            for path in file.datasets.keys().filter(|path| outside(path)) {
+                root.datasets.insert(format!("files/{name}/{path}"), file.read(path, None)?);
+            }
+        }
+        Ok(())
+    }
+
     fn place(&self, index: usize, key: &str) -> Result<&crate::plan::Place, InputError> {
         let draft = self.draft(index)?;
         draft.plan.keys.get(key).map(|k| &k.place).ok_or_else(|| InputError::MissingKey {

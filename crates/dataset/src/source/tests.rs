@@ -117,7 +117,6 @@ fn names_that_command_a_terminal_are_refused_in_one_plain_line() {
 fn raw_recordings_are_recognised() {
     let source = Source::open(&fixture("lift_raw_3_demos.hdf5")).unwrap();
     assert_eq!(source.plan().dialect, Dialect::RobosuiteRaw);
-    assert!(source.plan().dialect.needs_extraction());
     assert_eq!(source.plan().env_version.as_deref(), Some("1.5.2"));
     let demo = source.read_demo(2).unwrap();
     assert_eq!(demo.datasets["states"].shape, [54, 32]);

@@ -1,6 +1,8 @@
 //! Elements between HDF5 and [`Array`]: which types are carried, and how they are read and written.
 
-use hdf5::types::{FixedAscii, FixedUnicode, FloatSize, H5Type, IntSize, TypeDescriptor, VarLenAscii, VarLenUnicode};
+use hdf5::types::{
+    FixedAscii, FixedUnicode, FloatSize, H5Type, IntSize, TypeDescriptor, VarLenArray, VarLenAscii, VarLenUnicode,
+};
 use hdf5::{Container, Hyperslab, Selection, SliceOrIndex};
 use ndarray::IxDyn;
 
@@ -27,6 +29,7 @@ pub(super) fn dtype_of(descriptor: &TypeDescriptor) -> Dtype {
         TypeDescriptor::FixedUnicode(n) if *n <= MAX_FIXED => Dtype::FixedUtf8(*n),
         TypeDescriptor::VarLenAscii => Dtype::VarAscii,
         TypeDescriptor::VarLenUnicode => Dtype::VarStr,
+        TypeDescriptor::VarLenArray(of) if **of == TypeDescriptor::Unsigned(IntSize::U1) => Dtype::VarBytes,
         other => Dtype::Other(one_line(&other.to_string())),
     }
 }
@@ -49,13 +52,14 @@ pub(super) fn descriptor_of(dtype: &Dtype) -> ValueResult<TypeDescriptor> {
         Dtype::FixedUtf8(n) => TypeDescriptor::FixedUnicode(*n),
         Dtype::VarAscii => TypeDescriptor::VarLenAscii,
         Dtype::VarStr => TypeDescriptor::VarLenUnicode,
+        Dtype::VarBytes => TypeDescriptor::VarLenArray(Box::new(TypeDescriptor::Unsigned(IntSize::U1))),
         Dtype::Other(text) => return Err(format!("elements of type {text}")),
     })
 }
 
 /// Widest fixed-length string that is carried, in bytes. Memory types have their width at compile time, so a
 /// string travels in the next wider of a few widths.
-const MAX_FIXED: usize = 65_536;
+pub(super) const MAX_FIXED: usize = 65_536;
 
 macro_rules! for_width {
     ($n:expr, $kind:ident, $call:ident ( $($arg:expr),* )) => {
@@ -127,6 +131,12 @@ fn fixed<T: FixedText>(from: &Container, part: Part<'_>, width: usize) -> ValueR
     let mut bytes = Vec::with_capacity(values.len() * width);
     for value in &values {
         let text = value.text();
+        // the library ends each string at its first zero byte, so only text comes whole
+        if text.starts_with(&[0xFF, 0xD8, 0xFF]) {
+            return Err(
+                "JPEG files as byte strings are read only from datasets that are neither chunked nor packed".to_owned()
+            );
+        }
         if text.len() > width {
             return Err(format!("a string of {} bytes in a field of {width}", text.len()));
         }
@@ -184,6 +194,13 @@ pub(super) fn read(from: &Container, dtype: &Dtype, part: Part<'_>) -> ValueResu
             }
             bytes
         }
+        Dtype::VarBytes => {
+            let mut bytes = Vec::new();
+            for value in elements::<VarLenArray<u8>>(from, part)? {
+                push_str(&mut bytes, &value);
+            }
+            bytes
+        }
         Dtype::Other(text) => return Err(format!("elements of type {text} are not supported")),
     })
 }
@@ -210,6 +227,7 @@ pub(super) fn check(array: &Array) -> ValueResult<()> {
     let (expected, found) = match array.dtype.size() {
         Some(0) => return Err("strings of no bytes".to_owned()),
         Some(size) => (count * size, array.bytes.len()),
+        None if array.dtype == Dtype::VarBytes => (count, array.byte_rows().ok_or("bytes that are cut off")?.len()),
         None => (count, array.to_strings().ok_or("strings that are cut off or not UTF-8")?.len()),
     };
     if expected == found {
@@ -265,6 +283,10 @@ pub(super) fn write(to: &Container, array: &Array) -> ValueResult<()> {
                 .map(|s| s.parse().map_err(|e| format!("not a string of HDF5: {e}")))
                 .collect::<ValueResult<_>>()?;
             put(to, &values)
+        }
+        Dtype::VarBytes => {
+            let rows = array.byte_rows().ok_or("bytes that are cut off")?;
+            put(to, &rows.into_iter().map(VarLenArray::from_slice).collect::<Vec<_>>())
         }
         Dtype::Other(text) => Err(format!("elements of type {text}")),
     }

@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 
 use hdf5::dataset::Layout;
 use hdf5::filters::Filter;
+use hdf5::types::TypeDescriptor;
 use hdf5::{Dataset, Datatype, Group, IndexType, IterationOrder, LinkType, LocationType};
 
-use super::value::{self, Part, dtype_of, one_line, reason};
+use super::value::{self, MAX_FIXED, Part, dtype_of, one_line, reason};
 use crate::error::InputError;
 use crate::tree::{Array, Attrs, Dtype};
 
@@ -163,6 +164,16 @@ impl Walked {
             walked.file = Some(file);
         }
         Ok(walked)
+    }
+
+    /// Whether the file has these bytes at this place.
+    pub fn begins_with(&self, offset: u64, expected: &[u8]) -> bool {
+        let read = File::open(&self.path).and_then(|mut file| {
+            let mut found = vec![0; expected.len()];
+            file.seek(SeekFrom::Start(offset))?;
+            file.read_exact(&mut found).map(|()| found)
+        });
+        read.is_ok_and(|found| found == expected)
     }
 
     fn file(&self) -> Result<hdf5::File, InputError> {
@@ -339,6 +350,11 @@ impl Walked {
             }
             return Ok((node, native));
         }
+        if matches!(node.dtype, Dtype::FixedStr(width) if width > MAX_FIXED) {
+            let what = format!("the type {} in a dataset that is chunked or packed", node.dtype);
+            node.fault = Some(unsupported(what));
+            return Ok((node, native));
+        }
         let plist = dataset.dcpl().map_err(|e| bad("read the layout of", e))?;
         match plist.layout() {
             Layout::Virtual => node.fault = Some(unsupported("a view of other files".to_owned())),
@@ -512,6 +528,11 @@ impl NativeTypes {
             && let Some((_, dtype)) = self.0.iter().find(|(native, _)| native == file_type)
         {
             return (dtype.clone(), true);
+        }
+        // byte strings as numpy writes them; libhdf5 would end each at its first zero byte
+        let bytes = Datatype::from_descriptor(&TypeDescriptor::FixedAscii(file_type.size()));
+        if bytes.is_ok_and(|bytes| bytes == *file_type) {
+            return (Dtype::FixedStr(file_type.size()), true);
         }
         (carrier(file_type), false)
     }

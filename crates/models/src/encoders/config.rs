@@ -11,10 +11,10 @@ const MOST_BLOCKS: usize = 36;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
 pub enum Architecture {
-    /// 2, 2, 2, 2
+    /// 2, 2, 2 and 2 blocks
     #[default]
     Resnet18,
-    /// 3, 4, 6, 3
+    /// 3, 4, 6 and 3 blocks
     Resnet34,
 }
 
@@ -22,12 +22,12 @@ pub enum Architecture {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
 pub enum Normalisation {
-    /// mean and standard deviation of ImageNet's pictures, a channel
+    /// per channel mean and standard deviation of ImageNet
     #[default]
     Imagenet,
-    /// those of the data set
+    /// per channel mean and standard deviation of the data set
     Dataset,
-    /// nothing: 0 to 1
+    /// none: values from 0 to 1
     Unit,
 }
 
@@ -35,13 +35,12 @@ pub enum Normalisation {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
 pub enum TokenKind {
-    /// a token a cell, with fixed positions, the same for every camera as in LeRobot: nothing but what is seen says which
-    /// camera saw it, and cameras that are taken for each other change no action
+    /// one token per cell of the feature map; positional encodings are shared by all cameras, as in LeRobot
     #[default]
     Map,
-    /// one token a camera: where so many keypoints are
+    /// one token per camera: spatial-softmax coordinates of this many keypoints
     Keypoints {
-        /// keypoints
+        /// number of keypoints
         count: usize,
     },
 }
@@ -50,34 +49,34 @@ pub enum TokenKind {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VisionConfig {
-    /// the network
+    /// architecture
     pub encoder: Architecture,
-    /// blocks of each of its four layers, instead of the network's; the last ones may have none, which leaves a finer map
+    /// blocks of each of the four layers, instead of the architecture's; the last ones may be 0, for a finer feature map
     #[serde(skip_serializing_if = "Option::is_none")]
     pub blocks: Option<[usize; 4]>,
-    /// channels of its first layer
+    /// channels of the first layer
     pub width: usize,
-    /// what follows its convolutions
+    /// normalisation after convolutions
     pub norm: ImageNorm,
-    /// what becomes of its feature map
+    /// how the feature map becomes tokens
     pub tokens: TokenKind,
-    /// side of the square that is cut out of a picture: at random in training, from the middle otherwise
+    /// side of the square crop in pixels: random in training, central otherwise
     #[serde(skip_serializing_if = "Option::is_none")]
     pub crop: Option<usize>,
-    /// pixels by which a picture is moved at random in training, its border repeated
+    /// random shift in training, in pixels; the border is repeated
     pub shift: usize,
-    /// how far brightness, contrast and saturation are changed at random in training: factors from 1 - jitter to 1 + jitter
+    /// random brightness, contrast and saturation in training: factors from 1 - jitter to 1 + jitter
     pub jitter: f64,
-    /// what pictures are normalised by
+    /// normalisation of pixels, after division by 255
     pub normalise: Normalisation,
-    /// file of torchvision's weights to begin with
+    /// file with torchvision's pretrained weights
     #[serde(skip_serializing_if = "Option::is_none")]
     pub weights: Option<String>,
-    /// learning rate of the network relative to the rest; absent: 1, or 0.1 with weights
+    /// learning rate of the encoder relative to the rest; absent: 1, or 0.1 with `weights`
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lr_backbone: Option<f64>,
-    /// numbers that a cell of the map, or a camera's keypoints, become for a model that reads one vector; absent: 32, or 64
-    /// for keypoints
+    /// for policies that take one vector: dimensions per cell of the feature map, or per camera with keypoints; absent: 32, or 64 with
+    /// keypoints
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cell_features: Option<usize>,
 }

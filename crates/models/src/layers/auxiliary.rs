@@ -25,7 +25,7 @@ pub(crate) const AUXILIARY_HEAD: &str = "auxiliary_head";
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct AuxiliaryConfig {
-    /// weight of the squared error of these numbers
+    /// weight of the squared error
     pub weight: f64,
 }
 

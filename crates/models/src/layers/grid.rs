@@ -24,11 +24,11 @@ const WAY: &str = "way.score";
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GridConfig {
-    /// the group of entities that are the cells, row by row in the order of their names
+    /// group of entities that are the cells, row by row in the order of their names
     pub among: String,
-    /// cells of a row
+    /// cells per row
     pub columns: usize,
-    /// weight of the loss on which cells a demonstration still comes by; 0 where that is not asked
+    /// weight of the auxiliary loss on the cells that the demonstration still visits; 0: none
     #[serde(default)]
     pub way: f64,
 }

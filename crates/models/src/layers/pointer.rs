@@ -23,9 +23,9 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PointerConfig {
-    /// the group of entities of which one is taken; those of them that have a position of their own are no candidates
+    /// group of entities of which one is taken; those with a learned position are no candidates
     pub among: String,
-    /// weight of the loss on which was taken
+    /// weight of the loss
     #[serde(default = "default_weight")]
     pub weight: f64,
 }

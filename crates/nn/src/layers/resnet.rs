@@ -20,10 +20,10 @@ pub const CONV_NORM_EPS: f64 = 1e-5;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
 pub enum ImageNorm {
-    /// GroupNorm: for networks that begin with random weights
+    /// GroupNorm, for random initial weights
     #[default]
     Group,
-    /// batch norm whose statistics stay as they came with the weights; normalises nothing without any
+    /// batch norm with the statistics of the pretrained weights
     Frozen,
 }
 

@@ -49,7 +49,7 @@ impl AnyExperiment {
         }
     }
 
-    /// Name of the entry that it makes.
+    /// Name of the entry that training makes.
     pub fn entry(&self) -> &str {
         match self {
             Self::Robot(experiment) => &experiment.entry,
@@ -69,7 +69,7 @@ impl AnyExperiment {
 /// A resolved experiment on puzzles.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PuzzleExperiment {
-    /// Name of the entry that it makes.
+    /// Name of the entry that training makes.
     pub entry: String,
     /// One sentence for the model card.
     pub description: String,
@@ -106,16 +106,15 @@ struct Sections {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PuzzleTask {
-    /// The family: `dfs10`, `sudoku9`, …
+    /// The family, such as `dfs10` or `sudoku9`.
     pub puzzle: String,
     /// Fewest and most givens of a Sudoku to train on; tests have the fewest.
     #[serde(default)]
     pub givens: [usize; 2],
-    /// Number of different puzzles to train on, over and over; 0 for always new ones.
+    /// Number of different training puzzles; 0: always new ones.
     #[serde(default)]
     pub train_puzzles: u64,
-    /// From how many sides puzzles to train on are seen, drawn anew for each: 1, as they are made, up to the 8 of a square;
-    /// of a Sudoku the digits are renamed, too.
+    /// Augmentation: number of symmetries of the square (1 to 8) that are sampled in training; a Sudoku's digits are renamed as well.
     #[serde(default = "one_view", skip_serializing_if = "is_one_view")]
     pub views: u64,
     /// Number of puzzles of the validation split.
@@ -139,7 +138,7 @@ fn default_valid_puzzles() -> u64 {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LearningSection {
-    /// What turns scores into probabilities.
+    /// How scores become probabilities.
     pub probability: ClassProbability,
     /// Weight of the halting loss (TRM).
     pub halt_weight: f64,
@@ -147,12 +146,10 @@ pub struct LearningSection {
     /// official TRM.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub release_solved: Option<f64>,
-    /// Probability per step that a puzzle's states are lost to noise or to another puzzle's states, so that its answer is
-    /// found from anywhere: stable fixed points (TRM).
+    /// Probability per step that a puzzle's states are replaced by noise or by another puzzle's states (TRM).
     #[serde(skip_serializing_if = "is_zero")]
     pub disturbed: f64,
-    /// Standard deviation of the normal noise that is added to all states after every step of training, so that they say
-    /// things that survive it (TRM).
+    /// Standard deviation of the noise that is added to all states after every training step (TRM).
     #[serde(skip_serializing_if = "is_zero")]
     pub state_noise: f64,
 }

@@ -35,15 +35,15 @@ pub struct TrmSection {
     /// Updates of `z_l` per round.
     #[serde(default = "four")]
     pub l_cycles: usize,
-    /// How positions see each other.
+    /// How positions exchange information.
     pub mixing: Mixing,
-    /// How positions are told apart.
+    /// How positions are distinguished.
     #[serde(default = "no_positions")]
     pub positions: Positions,
     /// What the halting head reads.
     #[serde(default = "mean")]
     pub pooling: Pooling,
-    /// Supervision steps after which a puzzle is given up in training.
+    /// Largest number of supervision steps per puzzle in training.
     #[serde(default = "eight")]
     pub halt_max_steps: usize,
     /// Share of puzzles that must take a random minimum of steps in training.
@@ -76,17 +76,17 @@ fn mean() -> Pooling {
 pub enum SolverConfig {
     /// The Tiny Recursive Model.
     Trm(TrmSection),
-    /// The study's own recursion per cell.
+    /// A small recursion per cell.
     SmallTrm(SmallTrmConfig),
     /// Convolutions.
     Cnn(CnnSection),
     /// A Transformer encoder over cells.
     Transformer(TransformerSection),
-    /// Dense layers over the flattened grid, or over what a walker sees.
+    /// Dense layers over the flattened grid, or over a walker's observation.
     Mlp(MlpSection),
-    /// A walker's: the study's recursion of a high and a low state.
+    /// For walkers: a recursion of a high and a low state.
     Hierarchical(HierarchicalSection),
-    /// A walker's: a recursion of one 3x3 convolution over the cells.
+    /// For walkers: a recursion of one 3x3 convolution over the cells.
     Conv(ConvSection),
 }
 
@@ -128,9 +128,9 @@ pub struct HierarchicalSection {
     pub high: usize,
     /// Width of the low state.
     pub low: usize,
-    /// Cycles K.
+    /// Cycles of the recursion.
     pub cycles: usize,
-    /// Whether the previous action is seen.
+    /// Whether the previous action is an input.
     #[serde(default)]
     pub previous_action: bool,
 }

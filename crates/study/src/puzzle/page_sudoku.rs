@@ -11,15 +11,14 @@ use super::study::TestedRow as Row;
 const HEAD: &str = "
 ### 9x9 Sudoku of few givens, and what it costs
 
-`sudoku9-hard` are puzzles of our own rated by search effort: from the grid of the same number in sudoku9 as few cells are given
-as asked, or as few as leave one solution, and thirty times some cells are given and others taken away; what comes of it is kept
-if a search needs no fewer guesses. The search fills in the only digit of a cell and the only cell of a digit and guesses
-where neither is, in a cell with the fewest candidates; all guesses are tried and counted. Where 17 givens are asked, 21 to 26 are
-what a grid came down to. Answers after up to 16 steps, of hard ones 64; *views*: seen from eight sides with digits renamed, up to
-64 steps each, the answers elected.
+`sudoku9-hard` are our own puzzles, rated by search effort. From a solved grid of sudoku9 as few cells are given as asked, or as few as leave
+one solution. Thirty times some cells are then added and others removed; the result is kept if a search needs no fewer guesses. The
+search fills in the only digit of a cell and the only cell of a digit. Otherwise it guesses in a cell with the fewest candidates; all
+guesses are tried and counted. Where 17 givens are asked, grids have 21 to 26.
 
-Right, mean over the trainings; in bold what no other row beats in weights, in processor seconds and in that column at once (ties are
-beaten by the cheaper one).
+Models answer after up to 16 steps, hard puzzles after up to 64. *Views*: eight symmetric views with renamed digits, up to 64 steps each,
+majority vote. The table shows the mean over trainings. Bold: no other row is better in weights, processor seconds and that column at
+once (the cheaper one wins ties).
 
 ";
 

@@ -22,7 +22,7 @@ const BATCH: usize = 100;
 pub struct RlSection {
     /// How the policy is improved.
     pub algorithm: RlKind,
-    /// Episodes an update (mazes an update for `search`).
+    /// Episodes per update (`search`: mazes per update).
     pub episodes: usize,
     /// Discount per step.
     #[serde(default = "default_gamma")]
@@ -39,7 +39,7 @@ pub struct RlSection {
     /// Rewards are multiplied by this.
     #[serde(default = "default_scale")]
     pub reward_scale: f64,
-    /// Least standard deviation that advantages are divided by.
+    /// Smallest standard deviation by which advantages are divided.
     #[serde(default = "default_floor")]
     pub advantage_std_floor: f64,
     /// PPO: how far the ratio of new to old probability may go.
@@ -48,10 +48,10 @@ pub struct RlSection {
     /// PPO: passes over the episodes.
     #[serde(default = "default_epochs")]
     pub epochs: usize,
-    /// PPO: the passes end once the divergence exceeds this.
+    /// PPO: passes end when the KL divergence exceeds this.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub target_kl: Option<f64>,
-    /// PPO: learn from each episode's mirror images too, as far as their mazes are training mazes.
+    /// PPO: also learn from each episode's mirror images, where the mirrored maze is a training maze.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub mirrored: bool,
 }

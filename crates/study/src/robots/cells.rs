@@ -75,10 +75,10 @@ mod tests {
         let later = CellRow { stage: 2, ..row(&["a"], 1, &["z"]) };
         let study = Study {
             title: String::new(),
+            verdict: String::new(),
             introduction: String::new(),
             results: "r".into(),
             page: "p".into(),
-            appendix: None,
             zoo: None,
             data: BTreeMap::new(),
             arms: BTreeMap::new(),

@@ -16,16 +16,16 @@ use zoo::evaluation::Perturbation;
 pub struct Study {
     /// The page's heading.
     pub title: String,
-    /// What the page says before its numbers, in Markdown.
+    /// What the page begins with, beside the answers of its comparisons.
+    #[serde(default)]
+    pub verdict: String,
+    /// How it was done, in Markdown.
     #[serde(default)]
     pub introduction: String,
     /// Folder of results, one file a training and test.
     pub results: PathBuf,
     /// The page.
     pub page: PathBuf,
-    /// A page whose text stands at the end of this one, in Markdown.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub appendix: Option<PathBuf>,
     /// A zoo that gets the entries, named as families are (`stack-act-s1`), and their evaluations; where none is given they stay
     /// in the study's own folder, under the names of its cells.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -112,7 +112,7 @@ impl Data {
         let of_cameras = |cameras: &CamerasMeta| {
             let CamerasMeta { names, size, fast_render } = cameras;
             let drawn = if *fast_render { "" } else { " with reflections" };
-            format!(", pictures of {} ({size} x {size}{drawn})", names.join(" and "))
+            format!(", images of {} ({size} x {size}{drawn})", names.join(" and "))
         };
         format!("{expert}{skill}{}", self.cameras.as_ref().map(of_cameras).unwrap_or_default())
     }
@@ -135,12 +135,12 @@ impl Test {
         let steps = steps.map(|n| format!("{n} step{}", if n == 1 { "" } else { "s" }));
         let halting = match (&steps, halting) {
             (_, None) => None,
-            (Some(_), Some(true)) => Some("at most, halting".to_owned()),
-            (None, Some(true)) => Some("halting".to_owned()),
-            (_, Some(false)) => Some("no halting".to_owned()),
+            (Some(_), Some(true)) => Some("early stopping".to_owned()),
+            (None, Some(true)) => Some("early stopping".to_owned()),
+            (_, Some(false)) => Some("no early stopping".to_owned()),
         };
-        let sure = halt_threshold.map(|threshold| format!("once surer than {threshold}"));
-        let still = change_threshold.map(|threshold| format!("once the chunk changes by less than {threshold}"));
+        let sure = halt_threshold.map(|threshold| format!("halting probability above {threshold}"));
+        let still = change_threshold.map(|threshold| format!("chunk change below {threshold}"));
         let intervene = intervene.map(|intervention| match intervention {
             Intervention::Freeze => "reasoning frozen after the first step".to_owned(),
             Intervention::Shuffle => "reasoning of another episode".to_owned(),

@@ -13,7 +13,7 @@ use report::statistics::{Estimate, difference, hierarchical, holm};
 use zoo::ZooError;
 
 pub use self::charts::robot_charts;
-use self::charts::{by_arm, by_steps, shown};
+use self::charts::{all_arms, by_arm, by_steps, shown};
 use self::probes::probes;
 use super::cells::cells;
 use super::file::{Comparison, Data, Study};
@@ -28,24 +28,28 @@ type Trainings = BTreeMap<u64, CellResult>;
 /// What there is of a study, by test, demonstrations and arm.
 type Results = BTreeMap<(String, String, String), Trainings>;
 
-/// What there is in the folder of `study`, and what is not, by stage. A result of another definition of its demonstrations or
-/// its test, from before the study's file was changed, is none of this study's.
-fn read_results(study: &Study) -> Result<(Results, BTreeMap<u8, Vec<String>>), ZooError> {
+/// What there is in the folder of `study`. A result of another definition of its demonstrations or its test, from before the
+/// study's file was changed, is none of this study's.
+fn read_results(study: &Study) -> Result<Results, ZooError> {
     let mut results = Results::new();
-    let mut missing: BTreeMap<u8, Vec<String>> = BTreeMap::new();
     for cell in cells(study) {
         for test in &cell.tests {
             let found = CellResult::read(&study.results.join(cell.file_name(test)))?;
-            match found.filter(|result| result.answers(study, &cell, test)) {
-                Some(result) => {
-                    let key = (test.clone(), cell.data.clone(), cell.arm.clone());
-                    results.entry(key).or_default().insert(cell.seed, result);
-                }
-                None => missing.entry(cell.stage).or_default().push(format!("{} on {test}", cell.name())),
+            if let Some(result) = found.filter(|result| result.answers(study, &cell, test)) {
+                let key = (test.clone(), cell.data.clone(), cell.arm.clone());
+                results.entry(key).or_default().insert(cell.seed, result);
             }
         }
     }
-    Ok((results, missing))
+    Ok(results)
+}
+
+/// Part of a page that is shown when its title is clicked.
+fn folded(text: &mut String, title: &str, part: &str) {
+    // HTML shows no Markdown
+    let title = title.replace('`', "");
+    let _ =
+        writeln!(text, "<details markdown=\"1\">\n<summary>{title}</summary>\n\n{}\n\n</details>\n", part.trim_end());
 }
 
 /// The page of `study` from the results in its folder, as Markdown.
@@ -53,24 +57,28 @@ fn read_results(study: &Study) -> Result<(Results, BTreeMap<u8, Vec<String>>), Z
 /// # Errors
 /// A result that cannot be read.
 pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
-    let (results, missing) = read_results(study)?;
+    let results = read_results(study)?;
     let charts = by_arm(study, &results);
     let mut text = format!("# {}\n\n", study.title);
-    // a folder without a result may not be there
-    let from = match results.is_empty() {
-        true => "before any result was there".to_owned(),
-        false => format!("from the files in `{}`", study.results.display()),
-    };
-    let _ = writeln!(
-        text,
-        "Written by `actrm-zoo study {} --page-only` {from}; without `--page-only` the same command runs what is missing.\n",
-        file.display()
-    );
+    if !study.verdict.is_empty() {
+        let _ = writeln!(text, "{}\n", study.verdict.trim());
+    }
+    let compared: Vec<Vec<Compared<'_>>> = [1, 2].into_iter().map(|stage| compare(study, &results, stage)).collect();
+    verdict(&mut text, study, &compared);
+    if let Some(chart) = all_arms(study, &results) {
+        let _ = writeln!(text, "{}", shown(study, &chart));
+    }
     if !study.introduction.is_empty() {
         let _ = writeln!(text, "{}\n", study.introduction.trim());
     }
     overview(&mut text, study, &results);
-    for (name, test) in study.tests.iter().filter(|(_, test)| test.is_plain()) {
+    let tests: Vec<_> = study.tests.iter().filter(|(_, test)| test.is_plain()).collect();
+    if !results.is_empty() {
+        text.push_str(
+            "## Trainings\n\nSuccess with its 95% interval over trainings and episodes; below it the successes of each training.\n\n",
+        );
+    }
+    for (name, test) in tests {
         for data in study.data.keys() {
             let of_test: Vec<(&String, &Trainings)> = study
                 .arms
@@ -81,61 +89,46 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
                 continue;
             }
             let source = &study.data[data];
-            let _ = writeln!(
-                text,
-                "## {} after {} demonstrations of {}{}\n\nSeeds {} to {}, {} episodes a training. Success with its 95% \
-                 interval over trainings and episodes; below it each training's.\n",
+            for (_, chart) in charts.iter().filter(|((test, of), _)| test == name && of == data) {
+                let _ = writeln!(text, "{}", shown(study, chart));
+            }
+            let title = format!(
+                "{}: {} demonstrations of {}{}; seeds {} to {}",
                 test.task,
                 source.episodes,
                 source.task,
                 source.words(),
                 test.seed_start,
-                test.seed_start + test.episodes - 1,
-                test.episodes
+                test.seed_start + test.episodes - 1
             );
-            table(&mut text, study, &of_test);
-            for (_, chart) in charts.iter().filter(|((test, of), _)| test == name && of == data) {
-                let _ = writeln!(text, "{}", shown(study, chart));
-            }
+            let mut part = String::new();
+            table(&mut part, study, &of_test);
+            folded(&mut text, &title, &part);
         }
     }
-    for (stage, title) in [(1, "Comparisons"), (2, "Further comparisons, planned later")] {
-        comparisons(&mut text, study, &results, (stage, title));
+    for (found, title) in compared.iter().zip(["Planned comparisons", "Comparisons that were added later"]) {
+        comparisons(&mut text, study, found, title);
     }
-    pictures_changed(&mut text, study, &results);
-    thinking_otherwise(&mut text, study, &results);
+    images_changed(&mut text, study, &results);
+    other_refinement(&mut text, study, &results);
     probes(&mut text, study)?;
     costs(&mut text, study, &results);
     trained_twice(&mut text, &results);
-    if !missing.is_empty() {
-        let _ = writeln!(text, "## Not run\n");
-    }
-    for (stage, cells) in missing {
-        let _ = writeln!(text, "Stage {stage}:\n");
-        cells.iter().for_each(|cell| {
-            let _ = writeln!(text, "- {cell}");
-        });
-        text.push('\n');
-    }
-    if let Some(appendix) = &study.appendix {
-        let page = std::fs::read_to_string(appendix).map_err(ZooError::io("read", appendix))?;
-        text.push_str(&one_level_down(&page));
-    }
+    let from = match results.is_empty() {
+        // a folder without a result may not be there
+        true => String::new(),
+        false => format!(" from the files in `{}`", study.results.display()),
+    };
+    let file = file.display();
+    let _ = writeln!(
+        text,
+        "## How to repeat it\n\n`actrm-zoo study {file} --page-only` writes this page{from}. Without `--page-only` it first runs what \
+         is missing, and `--list` prints which trainings and tests those are.\n"
+    );
     while text.ends_with("\n\n") {
         text.pop();
     }
     Ok(text)
-}
-
-/// A page as a part of another one: its headings a level lower.
-fn one_level_down(page: &str) -> String {
-    let mut code = false;
-    let line = |line: &str| {
-        code ^= line.starts_with("```");
-        let mark = if line.starts_with('#') && !code { "#" } else { "" };
-        format!("{mark}{line}\n")
-    };
-    page.lines().map(line).collect()
 }
 
 /// Arms against demonstrations, where an arm was meant for several: success on the first test of each.
@@ -156,6 +149,7 @@ fn overview(text: &mut String, study: &Study, results: &Results) {
             *seeds = row.seeds.max(*seeds);
         }
     }
+    columns.retain(|(data, test)| results.keys().any(|(of, its, _)| of == test && its == data));
     let several = rows.iter().any(|arm| planned.keys().filter(|(planned, _)| planned == arm).count() > 1);
     if !several {
         return;
@@ -170,16 +164,16 @@ fn overview(text: &mut String, study: &Study, results: &Results) {
     let heads: Vec<String> = columns.iter().map(head).collect();
     let _ = writeln!(
         text,
-        "## All of it\n\nSuccess with its 95% interval over trainings and episodes, and how many trainings; what is planned and has \
-         no result is \"not run\".\n\n| | {} |\n|---|{}",
+        "## Success\n\nSuccess with its 95% interval over trainings and episodes, and the number of trainings.\n\n| | {} |\n|---|{}",
         heads.join(" | "),
         "---|".repeat(heads.len())
     );
-    for arm in rows {
+    let ran = |arm: &&str| results.keys().any(|(_, _, of)| of == arm);
+    for arm in rows.into_iter().filter(ran) {
         let cell = |(data, test): &(&str, &str)| {
             let Some(&seeds) = planned.get(&(arm, *data)) else { return "-".to_owned() };
             let key = ((*test).to_owned(), (*data).to_owned(), arm.to_owned());
-            let Some(trainings) = results.get(&key) else { return "not run".to_owned() };
+            let Some(trainings) = results.get(&key) else { return "-".to_owned() };
             let estimate = hierarchical(&outcomes(trainings, &[]), BOOTSTRAP_SEED);
             let estimate = estimate.as_ref().map_or_else(|| "-".to_owned(), percent);
             match trainings.len() as u64 {
@@ -245,7 +239,7 @@ fn table(text: &mut String, study: &Study, rows: &[(&String, &Trainings)]) {
     if staged {
         let _ = writeln!(
             text,
-            "Progress: the mean share of the task's stages, success the last, that an episode passed in order.\n"
+            "Progress: mean share of the task's stages that an episode passed in order; success is the last stage.\n"
         );
     }
 }
@@ -257,11 +251,11 @@ fn mean_progress(trainings: &Trainings) -> Option<f64> {
     ways.filter(|ways| !ways.is_empty()).map(|ways| ways.iter().sum::<f64>() / ways.len() as f64)
 }
 
-/// An arm, how it thinks in words, and what came of it.
+/// An arm, how it refines in words, and its results.
 type Otherwise<'a> = (&'a str, String, &'a Trainings);
 
-/// What the same weights do where they think otherwise than they were trained to.
-fn thinking_otherwise(text: &mut String, study: &Study, results: &Results) {
+/// What the same weights do with other refinement settings than in training.
+fn other_refinement(text: &mut String, study: &Study, results: &Results) {
     let mut rows: BTreeMap<(&str, &str), Vec<Otherwise<'_>>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results {
         let definition = &study.tests[test];
@@ -273,8 +267,8 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &Results) {
     }
     let _ = writeln!(
         text,
-        "## The same weights, thinking otherwise\n\nNothing is trained again: the policies above with another number of steps, \
-         with or without a way to stop early, with their reasoning frozen or taken from the thought about another episode's beginning.\n"
+        "## Other refinement settings\n\nThe weights of the policies above, tested with another number of refinement steps, with or without \
+         early stopping, or with their latent reasoning frozen or taken from another episode.\n"
     );
     for ((task, data), mut rows) in rows {
         rows.sort_by_key(|(arm, _, trainings)| {
@@ -289,10 +283,10 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &Results) {
         let mut columns: Vec<Option<String>> = vec![None];
         columns.extend(groups.into_iter().map(Some));
         let heads: Vec<String> = columns.iter().map(|c| c.clone().unwrap_or_else(|| "all".to_owned())).collect();
+        let mut part = String::new();
         let _ = writeln!(
-            text,
-            "{task} after {} demonstrations:\n\n| arm | thinks | {} | a query, ms | MFLOP |\n|---|---|{}",
-            study.data[data].episodes,
+            part,
+            "| arm | refinement | {} | query, ms | MFLOP |\n|---|---|{}",
             heads.join(" | "),
             "---|".repeat(heads.len() + 2)
         );
@@ -303,25 +297,24 @@ fn thinking_otherwise(text: &mut String, study: &Study, results: &Results) {
             let halts = of_arm.iter().any(|result| result.test_definition.thinking.halting == Some(true));
             let most = if halts { "at most " } else { "" };
             let _ = writeln!(
-                text,
+                part,
                 "| {label} | {words} | {cells} | {:.2} | {most}{} |",
                 median(&of_arm, |result| result.query_ms),
                 megaflops(&of_arm)
             );
         }
-        text.push('\n');
         for (_, chart) in by_steps(study, results).iter().filter(|((of, its), _)| of == task && its == data) {
             let _ = writeln!(text, "{}", shown(study, chart));
         }
+        folded(text, &format!("{task} after {} demonstrations", study.data[data].episodes), &part);
     }
 }
 
-/// What became of the pictures, in which test, and what came of it.
+/// What was changed in the images, in which test, and its results.
 type Changed<'a> = Vec<(&'a str, &'a str, &'a Trainings)>;
 
-/// What policies lose where their pictures are changed on the way to them: success on the plain test, then on each of the
-/// others of the same task and demonstrations.
-fn pictures_changed(text: &mut String, study: &Study, results: &Results) {
+/// Success with changed images: on the plain test, then on each of the others of the same task and demonstrations.
+fn images_changed(text: &mut String, study: &Study, results: &Results) {
     let mut tables: BTreeMap<&str, BTreeMap<&str, Changed<'_>>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results {
         if let Some(perturb) = &study.tests[test].perturb {
@@ -333,20 +326,20 @@ fn pictures_changed(text: &mut String, study: &Study, results: &Results) {
     }
     let _ = writeln!(
         text,
-        "## Pictures changed on their way to the policy\n\nNothing is trained again: the policies above with their cameras taken for each \
-         other, one of them black, colours turned, less light (`actrm-zoo eval --perturb`). The episodes are the first of those above.\n"
+        "## Changed images\n\nThe weights of the policies above, tested with perturbed images (`actrm-zoo eval --perturb`): cameras \
+         swapped, one camera black, hues rotated, less light. The episodes are the first of those above.\n"
     );
     for (data, arms) in tables {
         let changes: BTreeSet<&str> = arms.values().flatten().map(|(perturb, ..)| *perturb).collect();
         let heads: Vec<&str> = changes.iter().copied().collect();
         let task = &study.data[data].task;
         let _ =
-            writeln!(text, "| {task} | as drawn | {} |\n|---|---|{}", heads.join(" | "), "---|".repeat(heads.len()));
+            writeln!(text, "| {task} | unchanged | {} |\n|---|---|{}", heads.join(" | "), "---|".repeat(heads.len()));
         for (arm, changed) in arms {
             let plain = results.iter().find(|((test, of, its), _)| {
                 study.tests[test].is_plain() && study.tests[test].task == *task && of == data && its == arm
             });
-            let plain = plain.map_or("not run".to_owned(), |(_, trainings)| cell_text(trainings, &[]));
+            let plain = plain.map_or("-".to_owned(), |(_, trainings)| cell_text(trainings, &[]));
             let cells: Vec<String> = changes.iter().map(|change| changed_text(&changed, change)).collect();
             let _ = writeln!(text, "| {} | {plain} | {} |", study.arms[arm].label, cells.join(" | "));
         }
@@ -354,11 +347,11 @@ fn pictures_changed(text: &mut String, study: &Study, results: &Results) {
     }
 }
 
-/// The results under one change of pictures; several tests of it go by their names.
+/// The results under one change of images; several tests of it go by their names.
 fn changed_text(changed: &Changed<'_>, change: &str) -> String {
     let of_change: Vec<_> = changed.iter().filter(|(perturb, ..)| *perturb == change).collect();
     match of_change.as_slice() {
-        [] => "not run".to_owned(),
+        [] => "-".to_owned(),
         [(_, _, trainings)] => cell_text(trainings, &[]),
         several => {
             let cells: Vec<String> =
@@ -380,18 +373,16 @@ fn trained_twice(text: &mut String, results: &Results) {
     if by_training.is_empty() {
         return;
     }
-    let _ = writeln!(
-        text,
-        "## Trained twice\n\nTheir tests are of more than one training with the same settings and the same seed. What is done in the \
-         same order gives the same weights on the same kind of processor; of these it was not written down whether it did.\n"
-    );
+    let mut part = "The tests of these cells come from more than one training with the same settings and seed. Whether the weights are \
+                    identical was not recorded.\n\n"
+        .to_owned();
     for ((data, arm, seed), tests) in by_training {
         let mut entries: BTreeMap<&String, Vec<&str>> = BTreeMap::new();
         tests.iter().for_each(|test| entries.entry(&test.entry.hash).or_default().push(&test.test));
         let groups: Vec<String> = entries.values().map(|tests| tests.join(", ")).collect();
-        let _ = writeln!(text, "- {arm} on {data}, seed {seed}: {}", groups.join("; "));
+        let _ = writeln!(part, "- {arm} on {data}, seed {seed}: {}", groups.join("; "));
     }
-    text.push('\n');
+    folded(text, "Trained twice", &part);
 }
 
 /// The middle value, the upper one of two.
@@ -420,62 +411,102 @@ fn percent(estimate: &Estimate) -> String {
     format!("{:.1}% [{:.0}-{:.0}]", 100.0 * value, 100.0 * low, 100.0 * high)
 }
 
-fn comparisons(text: &mut String, study: &Study, results: &Results, (stage, title): (u8, &str)) {
-    let of_stage: Vec<&Comparison> = study.comparisons.iter().filter(|c| c.stage == stage).collect();
-    if of_stage.is_empty() {
-        return;
+/// A comparison, the number of trainings on each side, the success of each, and the difference with its adjusted p.
+struct Compared<'a> {
+    comparison: &'a Comparison,
+    trainings: (usize, usize),
+    success: [f64; 2],
+    difference: Option<(Estimate, f64)>,
+}
+
+/// The comparisons of a stage whose sides both have results; p after Holm's correction over all of them.
+fn compare<'a>(study: &'a Study, results: &Results, stage: u8) -> Vec<Compared<'a>> {
+    let mut found: Vec<Compared<'_>> = Vec::new();
+    for comparison in study.comparisons.iter().filter(|c| c.stage == stage) {
+        let c = comparison;
+        let side = |arm: &String, data: &String| {
+            results.get(&(c.test.clone(), data.clone(), arm.clone())).map(|trainings| outcomes(trainings, &c.groups))
+        };
+        let second = side(&c.second, c.second_data.as_ref().unwrap_or(&c.data));
+        let Some((a, b)) = side(&c.first, &c.data).zip(second) else { continue };
+        let mean = |side: &[Vec<f64>]| {
+            let all = side.concat();
+            all.iter().sum::<f64>() / all.len().max(1) as f64
+        };
+        let counted = difference(&a, &b, BOOTSTRAP_SEED).map(|d| (d.estimate, d.p_value));
+        let trainings = (a.len(), b.len());
+        found.push(Compared { comparison, trainings, success: [mean(&a), mean(&b)], difference: counted });
     }
-    let _ = writeln!(
-        text,
-        "## {title}\n\nDifference of success, first less second, with its 95% interval (trainings drawn on both \
-         sides, episodes for both alike; Student's t for the number of trainings); p after Holm's correction over the \
-         rows of this table.\n\n| question | first | second | episodes | trainings | difference | p | answer |\n\
-         |---|---|---|---|---|---|---|---|"
-    );
-    let found: Vec<_> = of_stage
-        .into_iter()
-        .map(|c| {
-            let side = |arm: &String, data: &String| {
-                let key = (c.test.clone(), data.clone(), arm.clone());
-                results.get(&key).map(|trainings| outcomes(trainings, &c.groups))
-            };
-            let sides = side(&c.first, &c.data).zip(side(&c.second, c.second_data.as_ref().unwrap_or(&c.data)));
-            let trainings = sides.as_ref().map(|(a, b)| (a.len(), b.len()));
-            (c, trainings, sides.and_then(|(a, b)| difference(&a, &b, BOOTSTRAP_SEED)))
-        })
-        .collect();
-    let p_values: Vec<f64> = found.iter().filter_map(|(_, _, d)| d.as_ref().map(|d| d.p_value)).collect();
+    let p_values: Vec<f64> = found.iter().filter_map(|c| c.difference.as_ref().map(|(_, p)| *p)).collect();
     let mut adjusted = holm(&p_values).into_iter();
-    for (comparison, trainings, counted) in found {
-        let side = |arm: &String, data: &String| match &comparison.second_data {
-            Some(_) => format!("{}, {data}", study.arms[arm].label),
+    for (_, p) in found.iter_mut().filter_map(|c| c.difference.as_mut()) {
+        *p = adjusted.next().unwrap_or(1.0);
+    }
+    found
+}
+
+impl Compared<'_> {
+    /// The names of both sides.
+    fn sides(&self, study: &Study) -> [String; 2] {
+        let c = self.comparison;
+        let side = |arm: &String, data: &String| match &c.second_data {
+            Some(_) => format!("{} ({data})", study.arms[arm].label),
             None => study.arms[arm].label.clone(),
         };
-        let second = comparison.second_data.as_ref().unwrap_or(&comparison.data);
-        let (first, second) = (side(&comparison.first, &comparison.data), side(&comparison.second, second));
-        let episodes = match comparison.groups.is_empty() {
-            true => "all".to_owned(),
-            false => comparison.groups.join(", "),
-        };
-        let rest = match (trainings, counted) {
-            (None, _) => "| not run | - | - | not run".to_owned(),
-            // one training says nothing of how trainings differ
-            (Some((m, n)), None) => format!("| {m}, {n} | - | - | too few trainings"),
-            (Some((m, n)), Some(d)) => {
-                let p = adjusted.next().unwrap_or(1.0);
-                let Estimate { value, low, high } = d.estimate;
-                let answer = match (p < 0.05, value > 0.0) {
-                    (false, _) => "cannot tell",
-                    (true, true) => "the first is better",
-                    (true, false) => "the second is better",
-                };
-                let points = format!("{:+.1} points [{:+.0}, {:+.0}]", 100.0 * value, 100.0 * low, 100.0 * high);
-                format!("| {m}, {n} | {points} | {} | {answer}", p_text(p))
-            }
-        };
-        let _ = writeln!(text, "| {} | {first} | {second} | {episodes} {rest} |", comparison.question);
+        [side(&c.first, &c.data), side(&c.second, c.second_data.as_ref().unwrap_or(&c.data))]
     }
-    text.push('\n');
+
+    fn answer(&self, study: &Study) -> String {
+        let [first, second] = self.sides(study);
+        match &self.difference {
+            // one training says nothing of how trainings differ
+            None => "too few trainings".to_owned(),
+            Some((_, p)) if *p >= 0.05 => "not significant".to_owned(),
+            Some((estimate, _)) if estimate.value > 0.0 => format!("{first} is better"),
+            Some(_) => format!("{second} is better"),
+        }
+    }
+
+    fn points(&self) -> String {
+        let Some((Estimate { value, low, high }, _)) = &self.difference else { return "-".to_owned() };
+        format!("{:+.1} points [{:+.0}, {:+.0}]", 100.0 * value, 100.0 * low, 100.0 * high)
+    }
+}
+
+/// What the comparisons answer, a line each.
+fn verdict(text: &mut String, study: &Study, compared: &[Vec<Compared<'_>>]) {
+    let counted: Vec<&Compared<'_>> = compared.iter().flatten().filter(|c| c.difference.is_some()).collect();
+    for c in &counted {
+        let ([first, second], [a, b]) = (c.sides(study), c.success.map(|share| 100.0 * share));
+        let (question, answer) = (&c.comparison.question, c.answer(study));
+        let _ =
+            writeln!(text, "- {question} **{answer}**: {a:.1}% ({first}) against {b:.1}% ({second}), {}.", c.points());
+    }
+    if !counted.is_empty() {
+        text.push('\n');
+    }
+}
+
+fn comparisons(text: &mut String, study: &Study, compared: &[Compared<'_>], title: &str) {
+    if compared.is_empty() {
+        return;
+    }
+    let mut part = "Difference of success, first minus second, with its 95% interval. Trainings are resampled on both sides, episodes for both \
+                    together; Student's t for the number of trainings. p is Holm-corrected over the rows of this table.\n\n\
+                    | question | first | second | episodes | trainings | difference | p | answer |\n|---|---|---|---|---|---|---|---|\n"
+        .to_owned();
+    for c in compared {
+        let ([first, second], (m, n)) = (c.sides(study), c.trainings);
+        let episodes = match c.comparison.groups.is_empty() {
+            true => "all".to_owned(),
+            false => c.comparison.groups.join(", "),
+        };
+        let p = c.difference.as_ref().map_or("-".to_owned(), |(_, p)| p_text(*p));
+        let (question, points, answer) = (&c.comparison.question, c.points(), c.answer(study));
+        let _ =
+            writeln!(part, "| {question} | {first} | {second} | {episodes} | {m}, {n} | {points} | {p} | {answer} |");
+    }
+    folded(text, title, &part);
 }
 
 fn p_text(p: f64) -> String {
@@ -483,12 +514,10 @@ fn p_text(p: f64) -> String {
 }
 
 fn costs(text: &mut String, study: &Study, results: &Results) {
-    let _ = writeln!(
-        text,
-        "## What each costs\n\nMedians over all trainings of an arm; minutes are of a machine that did other work beside. MFLOP: \
-         millions of floating-point operations in the matrix products of a query that thinks as long as it may.\n\n\
-         | arm | experiment | settings | parameters | steps | minutes | a query, ms | MFLOP |\n|---|---|---|---|---|---|---|---|"
-    );
+    let mut part = "Medians over the trainings of an arm, on a machine that also did other work. MFLOP: millions of floating-point \
+                    operations in the matrix products of a query with the largest number of refinement steps.\n\n\
+                    | arm | experiment | settings | parameters | steps | minutes | query, ms | MFLOP |\n|---|---|---|---|---|---|---|---|\n"
+        .to_owned();
     for (name, arm) in &study.arms {
         let mut data: Vec<&str> = Vec::new();
         for row in study.cells.iter().filter(|row| row.arms.contains(name)) {
@@ -498,11 +527,13 @@ fn costs(text: &mut String, study: &Study, results: &Results) {
             }
         }
         match data.is_empty() {
-            true => cost(text, study, results, (name, None)),
-            false => data.into_iter().for_each(|data| cost(text, study, results, (name, Some(data)))),
+            true => cost(&mut part, study, results, (name, None)),
+            false => data.into_iter().for_each(|data| cost(&mut part, study, results, (name, Some(data)))),
         }
     }
-    text.push('\n');
+    if !results.is_empty() {
+        folded(text, "Settings and costs", &part);
+    }
 }
 
 /// The row of an arm, on some demonstrations or on all.
@@ -517,10 +548,7 @@ fn cost(text: &mut String, study: &Study, results: &Results, (name, data): (&Str
         .filter(|((test, d, a), _)| a == name && data.is_none_or(|data| data == d) && as_trained(test))
         .flat_map(|(_, trainings)| trainings.values())
         .collect();
-    let Some(first) = of_arm.first() else {
-        let _ = writeln!(text, "| {} | `{experiment}` | {settings} | not run | | | | |", arm.label);
-        return;
-    };
+    let Some(first) = of_arm.first() else { return };
     let _ = writeln!(
         text,
         "| {} | `{experiment}` | {settings} | {} | {} | {:.1} | {:.2} | {} |",

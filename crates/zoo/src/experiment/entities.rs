@@ -19,11 +19,11 @@ use serde::{Deserialize, Serialize};
 /// One entity of `[data.entities]`: a list of keys, or a table.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct EntitySection {
-    /// Observation keys that make its vector, in order.
+    /// Observation keys of its vector, in order.
     pub keys: Vec<String>,
-    /// What shares its projection and statistics; derived from its name if absent.
+    /// Group, which shares projection and statistics; absent: the name without the digits at its end.
     pub group: Option<String>,
-    /// Whether it gets a learned position, which tells it from the others of its group.
+    /// Whether it gets a learned position, which distinguishes it from the others of its group.
     pub position: bool,
 }
 

@@ -24,16 +24,16 @@ const MOST_CELLS: usize = 4096;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GridSection {
-    /// Observation keys with a number for each cell.
+    /// Observation keys with one number per cell.
     pub keys: Vec<String>,
     /// Rows of cells.
     pub rows: usize,
-    /// Cells of a row.
+    /// Cells per row.
     pub columns: usize,
     /// Whether every cell gets a learned position of its own.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub position: bool,
-    /// The key of them that is 1 where the hand is, so that a demonstration shows which cells it comes by.
+    /// The key among them that is 1 in the gripper's cell. It gives the cells that a demonstration visits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub visited: Option<String>,
 }

@@ -24,7 +24,7 @@ pub enum OptimiserKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum WeightsFormat {
-    /// Rounded to 16 bits (11 of them significant): half the size. What is evaluated is what is stored.
+    /// Rounded to float16. The stored weights are those that are evaluated.
     F16,
 }
 
@@ -34,7 +34,7 @@ pub enum WeightsFormat {
 pub struct TrainSection {
     /// Optimiser steps.
     pub steps: u64,
-    /// Windows a step.
+    /// Windows per step.
     pub batch_size: usize,
     /// Seed of weights, latents, dropout and batch order.
     pub seed: u64,
@@ -44,26 +44,26 @@ pub struct TrainSection {
     pub from: Option<String>,
     /// Highest learning rate.
     pub lr: f64,
-    /// Steps over which the learning rate rises to it.
+    /// Steps of linear warm-up to `lr`.
     pub warmup_steps: u64,
-    /// What it does after that.
+    /// Learning rate after the warm-up.
     pub schedule: Schedule,
     /// End of the cosine as a share of `lr`.
     pub min_lr_ratio: f64,
     /// The optimiser.
     pub optimiser: OptimiserKind,
-    /// Decays of its first and second moment.
+    /// Decay rates of the first and second moment.
     pub betas: [f64; 2],
-    /// Its decoupled weight decay.
+    /// Decoupled weight decay.
     pub weight_decay: f64,
-    /// Largest norm of the gradient, larger ones are scaled down; 0 for none.
+    /// Largest gradient norm; larger gradients are scaled down. 0: no limit.
     pub grad_clip_norm: f64,
-    /// Parts that a batch is cut into, one after the other, to save memory.
+    /// Gradient accumulation: number of parts of a batch, one after the other, to save memory.
     pub accumulation: usize,
-    /// Decay of the moving average of the weights; absent or 0: no average.
+    /// Decay of the exponential moving average of the weights; absent or 0: no average.
     #[serde(skip_serializing_if = "Option::is_none", deserialize_with = "zero_is_none")]
     pub ema_decay: Option<f64>,
-    /// How an entry stores its weights; absent: as they were trained, in 32 bits.
+    /// How an entry stores its weights; absent: as float32.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub weights: Option<WeightsFormat>,
     /// Steps between rows of metrics.

@@ -1,11 +1,17 @@
-use anyhow::{Result, anyhow};
-use dataset::{ActionKind, ConvertOptions, DatasetError, ImageForm, InputError, NonFinite, RotationForm, VideoOptions};
+use anyhow::{Result, anyhow, bail};
+use dataset::{
+    ActionKind, ConvertOptions, DatasetError, ImageForm, InputError, NonFinite, RotationForm, VideoOptions, WriteOptions,
+};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Instant;
 
-/// Convert demonstrations into a LeRobotDataset v3.0 directory.
+/// Convert demonstrations into a LeRobotDataset v3.0 directory, or into robomimic HDF5.
+///
+/// Layouts, recognised by their content: robomimic, robosuite, MimicGen, Isaac Lab (with observations or states), LIBERO (a
+/// folder of task files is one data set), robocasa, D4RL, ALOHA, ManiSkill, RoboTwin, DROID, BEHAVIOR; for `--to robomimic` also a
+/// LeRobot data set. Where observation keys are the recorder's own, observation.state takes all vectors, and a note lists them.
 ///
 /// Columns: observation.state, observation.environment_state, observation.entity.<name>, observation.images.<camera>, action, next.reward,
 /// next.done, next.success, mistake (of a demo that marks its mistakes), and the five index columns. What the format has no place for is kept in the side folder
@@ -21,12 +27,19 @@ use std::time::Instant;
   actrm-data convert image.hdf5 set --video
   actrm-data convert can.hdf5 can --state-keys robot0_eef_pos,robot0_gripper_qpos --env-keys object
   actrm-data convert stack.hdf5 stack --entity \"a=cubeA_pos,cubeA_pos - robot0_eef_pos\"
-  actrm-data convert square.hdf5 square --actions absolute --rotation 6d")]
+  actrm-data convert square.hdf5 square --actions absolute --rotation 6d
+  actrm-data convert recorded recorded.hdf5 --to robomimic")]
 pub struct Args {
-    /// HDF5 file, or a folder with one file an episode
+    /// HDF5 file, or a folder with one file an episode or a task
     source: PathBuf,
-    /// Directory to create
+    /// Directory to create, or HDF5 file
     out: PathBuf,
+    /// What to write [default: robomimic where OUT ends in .hdf5 or .h5, else lerobot]
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    to: Option<Format>,
+    /// With --to robomimic: compress datasets with gzip of this level
+    #[arg(long, value_parser = clap::value_parser!(u8).range(1..=9), value_name = "LEVEL")]
+    gzip: Option<u8>,
     /// Observation keys of observation.state, in order [default: those of the file's layout]
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     state_keys: Option<Vec<String>>,
@@ -45,7 +58,7 @@ pub struct Args {
     /// How to store images
     #[arg(long, value_enum, default_value_t = Images::Png)]
     images: Images,
-    /// Store pictures as AV1 videos: small, and close to the recording's, not equal; the side folder keeps the exact ones
+    /// Store images as AV1 videos, which are small and not exact; the side folder keeps the exact images
     #[arg(long, conflicts_with = "images")]
     video: bool,
     /// With --video: 1 (large, nearly exact) to 255 (small)
@@ -54,7 +67,7 @@ pub struct Args {
     /// With --video: 0 (slow, small) to 10
     #[arg(long, value_name = "N", default_value_t = VideoOptions::default().speed, requires = "video", value_parser = clap::value_parser!(u8).range(..=10))]
     video_speed: u8,
-    /// With --video: leave the exact pictures out of the side folder: smaller, but the source cannot be rebuilt
+    /// With --video: leave the exact images out of the side folder. It is smaller, but the source cannot be rebuilt
     #[arg(long, requires = "video")]
     no_side_pictures: bool,
     /// Make no columns of depth: the side folder alone keeps it, whatever its values
@@ -89,6 +102,12 @@ pub struct Args {
     /// Report as JSON
     #[arg(long)]
     json: bool,
+}
+
+#[derive(Clone, Copy, PartialEq, clap::ValueEnum)]
+enum Format {
+    Lerobot,
+    Robomimic,
 }
 
 #[derive(Clone, Copy, clap::ValueEnum)]
@@ -134,7 +153,45 @@ fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
+/// Writes a robomimic file, of a LeRobot data set or of demonstrations of any layout.
+fn to_robomimic(args: &Args) -> Result<ExitCode> {
+    let export = super::export::Args {
+        dir: args.source.clone(),
+        out: args.out.clone(),
+        gzip: args.gzip,
+        json: args.json,
+    };
+    if args.source.join("meta/info.json").exists() {
+        return super::export::run(&export);
+    }
+    if args.skip_bad {
+        bail!("--skip-bad is for --to lerobot; a data set that it wrote becomes robomimic HDF5 after it");
+    }
+    let nonfinite = args.nonfinite.into();
+    let mut screen = cli::Screen::new();
+    let options = WriteOptions { gzip: args.gzip };
+    let report = dataset::rewrite(&args.source, &args.out, nonfinite, &options, &mut screen.advance("converting"));
+    screen.clear();
+    super::export::tell(&export, report?)
+}
+
+impl From<Nonfinite> for NonFinite {
+    fn from(choice: Nonfinite) -> Self {
+        match choice {
+            Nonfinite::Refuse => Self::Refuse,
+            Nonfinite::Keep => Self::Keep,
+        }
+    }
+}
+
 pub fn run(args: &Args) -> Result<ExitCode> {
+    let file = args.out.extension().is_some_and(|extension| extension == "hdf5" || extension == "h5");
+    match args.to {
+        Some(Format::Robomimic) => return to_robomimic(args),
+        None if file => return to_robomimic(args),
+        _ if args.gzip.is_some() => bail!("--gzip is for --to robomimic"),
+        _ => {}
+    }
     let options = ConvertOptions {
         state_keys: args.state_keys.as_deref().map(keys),
         env_keys: args.env_keys.as_deref().map(keys),
@@ -159,10 +216,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             side_pictures: !args.no_side_pictures,
             ..VideoOptions::default()
         }),
-        nonfinite: match args.nonfinite {
-            Nonfinite::Refuse => NonFinite::Refuse,
-            Nonfinite::Keep => NonFinite::Keep,
-        },
+        nonfinite: args.nonfinite.into(),
         skip_bad: args.skip_bad,
         lossless: !args.no_lossless,
         jobs: args.jobs,

@@ -1,28 +1,29 @@
 use anyhow::Result;
-use dataset::WriteOptions;
+use dataset::{ExportReport, WriteOptions};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Rebuild the robomimic HDF5 file that a data set was converted from.
+/// Write a data set as robomimic HDF5; the same as `convert DIR OUT --to robomimic`.
 ///
-/// Every group, dataset, type, shape, attribute and value equals the original. Needs the side folder `actrm/`, whose
-/// files are first compared with their recorded hashes.
+/// A data set with the side folder `actrm/` becomes the file that it was converted from: every group, dataset, type, shape,
+/// attribute and value equals the original. The files of the side folder are first compared with their recorded hashes. Any
+/// other data set becomes a file of its columns: an episode is a demo, a camera is obs/<camera>_image.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data export lift lift_again.hdf5
   actrm-data export lift small.hdf5 --gzip 4")]
 pub struct Args {
     /// Data set directory
-    dir: PathBuf,
+    pub(super) dir: PathBuf,
     /// File to create
-    out: PathBuf,
+    pub(super) out: PathBuf,
     /// Compress datasets with gzip of this level
     #[arg(long, value_parser = clap::value_parser!(u8).range(1..=9), value_name = "LEVEL")]
-    gzip: Option<u8>,
+    pub(super) gzip: Option<u8>,
     /// Print the report as JSON
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
@@ -30,9 +31,18 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let options = WriteOptions { gzip: args.gzip };
     let report = dataset::export(&args.dir, &args.out, &options, &mut screen.advance("exporting"));
     screen.clear();
-    let report = report?;
+    tell(args, report?)
+}
+
+/// Says what was written.
+pub(super) fn tell(args: &Args, report: ExportReport) -> Result<ExitCode> {
+    for note in &report.notes {
+        cli::note(&format!("note: {note}"));
+    }
     if args.json {
-        cli::print_json(&json!({"out": cli::lossy(&args.out), "demos": report.demos, "frames": report.frames}))?;
+        cli::print_json(&json!({
+            "out": cli::lossy(&args.out), "demos": report.demos, "frames": report.frames, "notes": report.notes,
+        }))?;
     } else {
         cli::print(&format!(
             "{}: {} demos, {} steps\n",

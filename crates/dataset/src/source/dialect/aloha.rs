@@ -1,11 +1,10 @@
-//! ALOHA and ACT: one file per episode (`episode_<i>.hdf5`) with `/action` and `/observations/{qpos,qvel,images}`;
-//! a folder of them is one data set, a single one is a data set of one demo.
+//! ALOHA and ACT: one file per episode. Names become robomimic's: `action` is `actions`, `observations/qpos` is
+//! `obs/qpos`, a camera `observations/images/top` is `obs/images/top`. Cameras may hold JPEG files: rows of bytes, byte
+//! strings or uint8 of any length.
 
-use std::collections::{BTreeMap, BTreeSet};
-
-use super::{DemoDraft, Draft, Layout, Survey, key_plan, list, number_of};
+use super::{DemoDraft, Draft, Layout, Survey, contents, id_of, stranger, wrong_lengths};
 use crate::error::InputError;
-use crate::plan::{DemoPlan, Dialect, Problem};
+use crate::plan::{DemoPlan, Dialect};
 use crate::source::walk::Walked;
 
 pub(super) struct Aloha;
@@ -20,33 +19,16 @@ impl Layout for Aloha {
     }
 
     fn recognises(&self, survey: &Survey) -> bool {
-        survey.files.iter().any(is_episode)
+        survey.any(is_episode)
     }
 
     fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
-        let mut out = Draft {
-            dialect: Dialect::Aloha,
-            demos: Vec::new(),
-            env_args: None,
-            env_name: None,
-            env_version: None,
-            masks: BTreeMap::new(),
-            texts: BTreeMap::new(),
-            notes: Vec::new(),
-            problems: Vec::new(),
-        };
+        let mut out = Draft::new(Dialect::Aloha);
         for (index, file) in survey.files.iter().enumerate() {
             if is_episode(file) {
                 episode(index, file, &mut out)?;
             } else {
-                let unknown = || InputError::UnknownLayout {
-                    path: file.path.clone(),
-                    expected: "action and observations/qpos as in the other files".to_owned(),
-                    found: list(file.datasets.keys().map(String::as_str)),
-                };
-                let error = file.broken.values().next().cloned().unwrap_or_else(unknown);
-                let id = format!("demo_{}", number_of(&file.path, index));
-                out.problems.push(Problem::new(Some(&id), None, true, error));
+                out.problems.push(stranger(file, index, "action and observations/qpos as in the other files"));
             }
             beat();
         }
@@ -65,50 +47,11 @@ fn name_of(path: &str) -> String {
 
 fn episode(index: usize, file: &Walked, out: &mut Draft) -> Result<(), InputError> {
     let (attr_names, _) = file.some_attrs("/", &[])?;
-    let mut keys = BTreeMap::new();
-    let mut inner = Vec::new();
-    let number = number_of(&file.path, index);
-    let mut id = format!("demo_{number}");
-    if out.demos.iter().any(|d| d.plan.id == id) {
-        id = format!("demo_{number}_{index}");
-    }
+    let (number, id) = id_of(&file.path, index, &out.demos);
+    let found = contents((index, file), "", &id, &name_of, &mut out.problems);
     let length = file.datasets["action"].shape.first().copied().unwrap_or(0);
-    let mut add = |key: &str, error: InputError| out.problems.push(Problem::new(Some(&id), Some(key), true, error));
-    for (path, error) in &file.broken {
-        add(&name_of(path), error.clone());
-    }
-    for (path, node) in &file.datasets {
-        let key = name_of(path);
-        if let Some(fault) = &node.fault {
-            add(&key, fault.clone());
-        } else if (key.starts_with("obs/") || key == "actions") && node.shape.first() != Some(&length) {
-            let error = InputError::WrongLength {
-                path: file.path.clone(),
-                demo: id.clone(),
-                key: key.clone(),
-                expected: format!("{length} (action)"),
-                found: format!("shape {:?}", node.shape),
-            };
-            add(&key, error);
-        }
-        if node.attrs > 0 {
-            inner.push((key.clone(), index, path.clone()));
-        }
-        if let Some(plan) = key_plan(index, file, path) {
-            keys.insert(key, plan);
-        }
-    }
-    let mut groups = BTreeSet::new();
-    for (path, node) in file.groups.iter().filter(|(path, _)| !path.is_empty()) {
-        let key = name_of(path);
-        if node.attrs > 0 {
-            inner.push((key.clone(), index, path.clone()));
-        }
-        if node.empty {
-            groups.insert(key);
-        }
-    }
-    let plan = DemoPlan { id, number, length, keys, attr_names, task: None };
-    out.demos.push(DemoDraft { plan, home: Some((index, String::new())), groups, inner });
+    out.problems.extend(wrong_lengths(file, &id, (length, "action"), &found.keys));
+    let plan = DemoPlan { id, number, length, keys: found.keys, attr_names, task: None };
+    out.demos.push(DemoDraft { plan, home: Some((index, String::new())), groups: found.groups, inner: found.inner });
     Ok(())
 }

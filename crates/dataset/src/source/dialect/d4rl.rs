@@ -61,17 +61,7 @@ impl Layout for D4rl {
                 found: format!("{steps} steps and neither terminal nor timeout"),
             });
         }
-        Ok(Draft {
-            dialect: Dialect::D4rl,
-            demos,
-            env_args: None,
-            env_name: None,
-            env_version: None,
-            masks: BTreeMap::new(),
-            texts,
-            notes,
-            problems,
-        })
+        Ok(Draft { demos, texts, notes, problems, ..Draft::new(Dialect::D4rl) })
     }
 }
 
@@ -107,12 +97,8 @@ fn demo(file: &Walked, number: usize, first: usize, length: usize, steps: usize)
         if node.shape.first() != Some(&steps) || node.dtype == Dtype::VarStr {
             continue;
         }
-        if let Some(mut plan) = key_plan(0, file, path) {
-            let row = plan.dtype.size().unwrap_or(0) * plan.shape[1..].iter().product::<usize>();
-            plan.shape[0] = length;
-            plan.place.first_row = first;
-            plan.place.offset = plan.place.offset.map(|at| at + (first * row) as u64);
-            keys.insert(name_of(path), plan);
+        if let Some(plan) = key_plan(0, file, path) {
+            keys.insert(name_of(path), plan.part(first, length));
         }
     }
     let plan = DemoPlan {

@@ -1,8 +1,8 @@
 //! What robomimic's layout and everything derived from it share: `/data/demo_<k>` and `/mask`.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use super::{DemoDraft, Draft, Survey, key_plan, list, number_after, per_step};
+use super::{DemoDraft, Draft, Survey, behavior, contents, empty, list, number_after, wrong_lengths};
 use crate::error::InputError;
 use crate::lerobot::{mask_note, shared_notes};
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Problem};
@@ -38,6 +38,12 @@ pub(super) fn data_attr_names(file: &Walked) -> Vec<String> {
     file.some_attrs("data", &[]).map(|(names, _)| names).unwrap_or_default()
 }
 
+/// Text of an attribute of `data`.
+pub(super) fn data_attr(file: &Walked, name: &str) -> Option<String> {
+    let (_, attrs) = file.some_attrs("data", &[name]).ok()?;
+    attrs.get(name)?.to_text()
+}
+
 /// `ep_meta` of the first demo, if it is JSON.
 pub(super) fn first_ep_meta(file: &Walked) -> Option<serde_json::Value> {
     let (_, id) = demo_ids(file).into_iter().next()?;
@@ -45,16 +51,73 @@ pub(super) fn first_ep_meta(file: &Walked) -> Option<serde_json::Value> {
     serde_json::from_str(&attrs.get("ep_meta")?.to_text()?).ok()
 }
 
-/// Finds demos, masks and the environment of a file in robomimic's layout.
+/// Finds demos, masks and the environment of a file in robomimic's layout, or of a folder of such files: their demos are
+/// numbered through in the order of the files.
 pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
-    let Some(file) = survey.single() else {
-        return Err(InputError::UnknownLayout {
-            path: survey.path.clone(),
-            expected: "one file".to_owned(),
-            found: survey.contents(),
-        });
+    if let Some(file) = survey.single() {
+        return draft_file((0, file), None, dialect, beat);
+    }
+    let mut out = Draft::new(dialect);
+    let mut first = true;
+    for (index, file) in survey.files.iter().enumerate() {
+        let name = file.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let one = match draft_file((index, file), Some(out.demos.len() as u64), dialect, beat) {
+            Ok(one) => one,
+            Err(error) => {
+                out.problems.push(Problem::new(Some(&name), None, true, error));
+                continue;
+            }
+        };
+        if let (Some(from), Some(to)) = (one.demos.first(), one.demos.last()) {
+            out.notes.push(format!("{} to {} are the demos of {name}", from.plan.id, to.plan.id));
+        }
+        // what all files say is said of the whole
+        if std::mem::take(&mut first) {
+            (out.env_args, out.env_name, out.env_version) = (one.env_args, one.env_name, one.env_version);
+            out.texts = one.texts;
+        } else {
+            out.env_args = out.env_args.zip(one.env_args).and_then(|(a, b)| common(a, &b));
+            out.env_name = out.env_name.filter(|mine| one.env_name.as_ref() == Some(mine));
+            out.env_version = out.env_version.filter(|mine| one.env_version.as_ref() == Some(mine));
+            out.texts.retain(|name, text| one.texts.get(name) == Some(text));
+        }
+        for (name, ids) in one.masks {
+            out.masks.entry(name).or_default().extend(ids);
+        }
+        out.demos.extend(one.demos);
+        out.notes.extend(one.notes);
+        out.problems.extend(one.problems);
+    }
+    match out.problems.first() {
+        Some(problem) if out.demos.is_empty() => Err(problem.error.clone()),
+        _ => Ok(out),
+    }
+}
+
+/// What two JSON values agree in.
+fn common(a: serde_json::Value, b: &serde_json::Value) -> Option<serde_json::Value> {
+    use serde_json::Value;
+    match (a, b) {
+        (Value::Object(a), Value::Object(b)) => {
+            let both = a.into_iter().filter_map(|(key, value)| Some((key.clone(), common(value, b.get(&key)?)?)));
+            Some(Value::Object(both.collect()))
+        }
+        (a, b) => (a == *b).then_some(a),
+    }
+}
+
+/// [`draft`] of one file; where the demos are numbered through, `base` is the number of the first.
+fn draft_file(
+    (index, file): (usize, &Walked),
+    base: Option<u64>,
+    dialect: Dialect,
+    beat: &mut dyn FnMut(),
+) -> Result<Draft, InputError> {
+    let found = demo_ids(file);
+    let ids: Vec<(u64, String, String)> = match base {
+        None => found.into_iter().map(|(number, name)| (number, name.clone(), name)).collect(),
+        Some(base) => (base..).zip(found).map(|(number, (_, name))| (number, format!("demo_{number}"), name)).collect(),
     };
-    let ids = demo_ids(file);
     if ids.is_empty() {
         if let Some(error) = file.broken.values().next() {
             return Err(error.clone());
@@ -67,22 +130,19 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -
             .filter(|p| !p.contains('/'));
         return Err(InputError::NoDemos { path: file.path.clone(), found: list(members) });
     }
-    let mut out = Draft {
-        dialect,
-        demos: Vec::new(),
-        env_args: None,
-        env_name: None,
-        env_version: None,
-        masks: BTreeMap::new(),
-        texts: BTreeMap::new(),
-        notes: Vec::new(),
-        problems: Vec::new(),
-    };
+    let mut out = Draft::new(dialect);
     for (path, error) in &file.broken {
-        let below = path.strip_prefix("data/").unwrap_or_default();
-        let (id, key) = below.split_once('/').map_or((below, None), |(id, key)| (id, Some(key)));
-        let of_demo = number_after(id, "demo_").is_some();
-        out.problems.push(Problem::new(of_demo.then_some(id), key.filter(|_| of_demo), of_demo, error.clone()));
+        let name = path.strip_prefix("data/").unwrap_or_default();
+        // what is broken inside a demo is found with its contents
+        if ids.iter().any(|(.., home)| name.split_once('/').is_some_and(|(first, _)| first == home)) {
+            continue;
+        }
+        let of_demo = number_after(name, "demo_").is_some();
+        let id = match base {
+            None => name.to_owned(),
+            Some(_) => format!("{} {name}", file.path.file_name().unwrap_or_default().to_string_lossy()),
+        };
+        out.problems.push(Problem::new(of_demo.then_some(&id), None, of_demo, error.clone()));
     }
     let data_attrs = file.attrs("data")?;
     for (place, attrs) in [("", file.attrs("")?), ("data/", data_attrs.clone())] {
@@ -94,8 +154,8 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -
     }
     environment(file, &data_attrs, &mut out);
     let language = file_language(&out);
-    for (number, id) in ids {
-        demo(file, number, &id, language.as_deref(), &mut out)?;
+    for (number, id, name) in &ids {
+        demo((index, file), (*number, id, &format!("data/{name}")), language.as_deref(), &mut out)?;
         beat();
     }
     if !file.foreign.is_empty() {
@@ -105,7 +165,7 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -
         ));
     }
     total(file, &data_attrs, &mut out);
-    masks(file, &mut out)?;
+    masks(file, &ids, &mut out)?;
     Ok(out)
 }
 
@@ -118,6 +178,10 @@ fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
     match parsed {
         Ok(json) => {
             let text = |key: &str| json.get(key).and_then(|v| v.as_str()).map(str::to_owned);
+            // a file that was made of a data set without an environment has arguments only because robomimic wants some
+            if stated_elsewhere(out) {
+                return;
+            }
             out.env_name = text("env_name");
             out.env_version = text("env_version");
             out.env_args = Some(json);
@@ -137,6 +201,12 @@ fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
     }
 }
 
+/// Whether the file says that its `env_args` are made up.
+fn stated_elsewhere(out: &Draft) -> bool {
+    let stated = out.texts.get("data/lerobot").and_then(|text| serde_json::from_str::<serde_json::Value>(text).ok());
+    stated.is_some_and(|stated| stated["environment"] == serde_json::Value::Bool(false))
+}
+
 /// An instruction that holds for the whole file.
 fn file_language(out: &Draft) -> Option<String> {
     let env = out.env_args.as_ref()?;
@@ -146,35 +216,17 @@ fn file_language(out: &Draft) -> Option<String> {
         .filter(|t| !t.is_empty())
 }
 
-fn demo(file: &Walked, number: u64, id: &str, language: Option<&str>, out: &mut Draft) -> Result<(), InputError> {
-    let home = format!("data/{id}");
-    let prefix = format!("{home}/");
-    let (attr_names, attrs) = file.some_attrs(&home, &["num_samples", "ep_meta"])?;
-    let mut keys = BTreeMap::new();
-    let mut inner = Vec::new();
-    for (path, node) in file.datasets.range(prefix.clone()..).take_while(|(p, _)| p.starts_with(&prefix)) {
-        let key = path[prefix.len()..].to_owned();
-        if node.attrs > 0 {
-            inner.push((key.clone(), 0, path.clone()));
-        }
-        if let Some(fault) = &node.fault {
-            out.problems.push(Problem::new(Some(id), Some(&key), true, fault.clone()));
-        }
-        if let Some(plan) = key_plan(0, file, path) {
-            keys.insert(key, plan);
-        }
-    }
-    let mut groups = BTreeSet::new();
-    for (path, node) in file.groups.range(prefix.clone()..).take_while(|(p, _)| p.starts_with(&prefix)) {
-        let below = path[prefix.len()..].to_owned();
-        if node.attrs > 0 {
-            inner.push((below.clone(), 0, path.clone()));
-        }
-        if node.empty {
-            groups.insert(below);
-        }
-    }
-    let length = length(file, id, &attrs, &keys, out);
+fn demo(
+    (index, file): (usize, &Walked),
+    (number, id, home): (u64, &str, &str),
+    language: Option<&str>,
+    out: &mut Draft,
+) -> Result<(), InputError> {
+    let (attr_names, attrs) = file.some_attrs(home, &["num_samples", "ep_meta"])?;
+    let behavior = out.dialect == Dialect::Behavior;
+    let named = |path: &str| if behavior { behavior::name_of(path).to_owned() } else { path.to_owned() };
+    let found = contents((index, file), home, id, &named, &mut out.problems);
+    let length = length(file, (id, home), &attrs, &found.keys, out);
     let task = attrs
         .get("ep_meta")
         .and_then(Array::to_text)
@@ -182,14 +234,21 @@ fn demo(file: &Walked, number: u64, id: &str, language: Option<&str>, out: &mut 
         .and_then(|meta| meta.get("lang")?.as_str().map(str::to_owned))
         .filter(|t| !t.is_empty())
         .or_else(|| language.map(str::to_owned));
-    let plan = DemoPlan { id: id.to_owned(), number, length, keys, attr_names, task };
+    let plan = DemoPlan { id: id.to_owned(), number, length, keys: found.keys, attr_names, task };
     check(file, &plan, out);
-    out.demos.push(DemoDraft { plan, home: Some((0, home)), groups, inner });
+    let home = Some((index, home.to_owned()));
+    out.demos.push(DemoDraft { plan, home, groups: found.groups, inner: found.inner });
     Ok(())
 }
 
 /// Steps of a demo: `num_samples` where it is there, else the length of its actions.
-fn length(file: &Walked, id: &str, attrs: &Attrs, keys: &BTreeMap<String, KeyPlan>, out: &mut Draft) -> usize {
+fn length(
+    file: &Walked,
+    (id, home): (&str, &str),
+    attrs: &Attrs,
+    keys: &BTreeMap<String, KeyPlan>,
+    out: &mut Draft,
+) -> usize {
     let rows = keys.get("actions").and_then(|k| k.shape.first().copied()).unwrap_or(0);
     let stated = attrs.get("num_samples");
     match stated.and_then(Array::to_i64).and_then(|n| usize::try_from(n).ok()) {
@@ -198,7 +257,7 @@ fn length(file: &Walked, id: &str, attrs: &Attrs, keys: &BTreeMap<String, KeyPla
             if out.dialect != Dialect::RobosuiteRaw {
                 let error = InputError::BadAttribute {
                     path: file.path.clone(),
-                    object: format!("data/{id}"),
+                    object: home.to_owned(),
                     attribute: "num_samples".to_owned(),
                     expected: "the number of steps".to_owned(),
                     found: match stated {
@@ -220,14 +279,7 @@ fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
     let missing =
         |key: &str| InputError::MissingKey { path: path(), demo: id.to_owned(), key: key.to_owned(), found: found() };
     if plan.length == 0 {
-        let error = InputError::WrongLength {
-            path: path(),
-            demo: id.to_owned(),
-            key: "actions".to_owned(),
-            expected: "at least 1".to_owned(),
-            found: "0: the demo is empty".to_owned(),
-        };
-        return out.problems.push(Problem::new(Some(id), None, true, error));
+        return out.problems.push(empty(file, id, "actions"));
     }
     let known: Vec<String> =
         out.problems.iter().filter(|p| p.demo.as_deref() == Some(id)).filter_map(|p| p.key.clone()).collect();
@@ -252,28 +304,24 @@ fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
             }
         }
     }
-    if out.dialect != Dialect::RobosuiteRaw {
-        if !plan.keys.keys().any(|k| k.starts_with("obs/")) {
-            add("obs", true, missing("obs"));
-        }
+    // what a recording has instead of observations
+    let instead = match out.dialect {
+        Dialect::RobosuiteRaw | Dialect::Behavior => "",
+        Dialect::IsaacLab => "states/",
+        _ => "obs/",
+    };
+    if !plan.keys.keys().any(|key| key.starts_with("obs/") || key.starts_with(instead)) {
+        add("obs", true, missing("obs"));
+    }
+    if out.dialect != Dialect::RobosuiteRaw && !out.dialect.is_a_recording() {
         for key in ["rewards", "dones"] {
             if !plan.keys.contains_key(key) {
                 add(key, false, missing(key));
             }
         }
     }
-    for (key, plan_of_key) in plan.keys.iter().filter(|(key, _)| per_step(key)) {
-        if plan_of_key.shape.first() != Some(&plan.length) {
-            let error = InputError::WrongLength {
-                path: path(),
-                demo: id.to_owned(),
-                key: key.clone(),
-                expected: plan.length.to_string(),
-                found: format!("shape {:?}", plan_of_key.shape),
-            };
-            add(key, true, error);
-        }
-    }
+    let wrong = wrong_lengths(file, id, (plan.length, "its steps"), &plan.keys);
+    out.problems.extend(wrong.into_iter().filter(|p| !known.iter().any(|known| p.key.as_ref() == Some(known))));
 }
 
 fn total(file: &Walked, attrs: &Attrs, out: &mut Draft) {
@@ -291,8 +339,8 @@ fn total(file: &Walked, attrs: &Attrs, out: &mut Draft) {
     }
 }
 
-fn masks(file: &Walked, out: &mut Draft) -> Result<(), InputError> {
-    let known: BTreeSet<String> = out.demos.iter().map(|d| d.plan.id.clone()).collect();
+fn masks(file: &Walked, demos: &[(u64, String, String)], out: &mut Draft) -> Result<(), InputError> {
+    let known: BTreeMap<&str, &str> = demos.iter().map(|(_, id, name)| (name.as_str(), id.as_str())).collect();
     let paths: Vec<&String> = file
         .datasets
         .range("mask/".to_owned()..)
@@ -314,11 +362,13 @@ fn masks(file: &Walked, out: &mut Draft) -> Result<(), InputError> {
             continue;
         };
         // robomimic's own `dataset_states_to_obs --n 3` copies the masks of the whole file
-        let absent: Vec<String> = ids.iter().filter(|id| !known.contains(*id)).map(|id| one_line(id)).collect();
+        let absent: Vec<String> =
+            ids.iter().filter(|id| !known.contains_key(id.as_str())).map(|id| one_line(id)).collect();
         if !absent.is_empty() {
             out.notes.push(mask_note(&name, ids.len(), &absent));
         }
-        out.masks.insert(name, ids);
+        let ids = ids.into_iter().map(|id| known.get(id.as_str()).map_or(id.clone(), |&id| id.to_owned()));
+        out.masks.insert(name, ids.collect());
     }
     out.notes.extend(shared_notes(&out.masks));
     Ok(())

@@ -1,8 +1,12 @@
-//! LIBERO: robomimic's layout with a BDDL problem; the instruction is in `problem_info`.
+//! LIBERO: robomimic's layout with a BDDL problem; the instruction is in `problem_info`. A folder of them, one a task, is one
+//! data set.
+
+use serde_json::Value;
 
 use super::{Draft, Layout, Survey, family};
 use crate::error::InputError;
 use crate::plan::Dialect;
+use crate::source::walk::Walked;
 
 pub(super) struct Libero;
 
@@ -12,7 +16,7 @@ impl Layout for Libero {
     }
 
     fn recognises(&self, survey: &Survey) -> bool {
-        survey.single().is_some_and(|file| {
+        survey.any(|file| {
             file.groups.contains_key("data")
                 && family::data_attr_names(file)
                     .iter()
@@ -22,25 +26,10 @@ impl Layout for Libero {
 
     fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
         let mut draft = family::draft(survey, Dialect::Libero, beat)?;
-        let instruction = draft
-            .texts
-            .get("data/problem_info")
-            .and_then(|text| serde_json::from_str::<serde_json::Value>(text).ok())
-            .and_then(|info| match info.get("language_instruction")? {
-                serde_json::Value::String(text) => Some(text.clone()),
-                // some tasks store the words one by one
-                serde_json::Value::Array(words) => {
-                    let words: Option<Vec<&str>> = words.iter().map(|w| w.as_str()).collect();
-                    Some(words?.join(" "))
-                }
-                _ => None,
-            })
-            .map(|text| text.trim_matches('"').to_owned())
-            .filter(|text| !text.is_empty());
-        if let Some(instruction) = instruction {
-            for demo in &mut draft.demos {
-                demo.plan.task.get_or_insert_with(|| instruction.clone());
-            }
+        let instructions: Vec<Option<String>> = survey.files.iter().map(instruction).collect();
+        for demo in &mut draft.demos {
+            let file = demo.home.as_ref().map_or(0, |(file, _)| *file);
+            demo.plan.task = demo.plan.task.take().or_else(|| instructions[file].clone());
         }
         if draft.env_name.is_none() {
             draft.env_name = draft.texts.get("data/env_name").cloned();
@@ -54,4 +43,16 @@ impl Layout for Libero {
         }
         Ok(draft)
     }
+}
+
+/// What a file's robot is told to do.
+fn instruction(file: &Walked) -> Option<String> {
+    let info: Value = serde_json::from_str(&family::data_attr(file, "problem_info")?).ok()?;
+    let text = match info.get("language_instruction")? {
+        Value::String(text) => text.clone(),
+        // some tasks store the words one by one
+        Value::Array(words) => words.iter().map(Value::as_str).collect::<Option<Vec<&str>>>()?.join(" "),
+        _ => return None,
+    };
+    Some(text.trim_matches('"').to_owned()).filter(|text| !text.is_empty())
 }

@@ -12,7 +12,7 @@ impl Layout for Mimicgen {
     }
 
     fn recognises(&self, survey: &Survey) -> bool {
-        survey.single().is_some_and(|file| {
+        survey.any(|file| {
             ["datagen_info", "obs/datagen_info", "src_demo_inds"].iter().any(|below| family::any_demo_has(file, below))
         })
     }

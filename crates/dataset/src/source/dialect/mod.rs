@@ -1,13 +1,18 @@
 //! The layouts that files of demonstrations come in: each recognised by content, each in a file of its own.
 
 mod aloha;
+mod behavior;
 mod d4rl;
+mod droid;
 mod family;
+mod isaac_lab;
 mod libero;
+mod maniskill;
 mod mimicgen;
 mod robocasa;
 mod robomimic;
 mod robosuite_raw;
+mod robotwin;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -27,6 +32,11 @@ impl Survey {
     /// The file, where the source is one.
     pub fn single(&self) -> Option<&Walked> {
         if self.files.len() == 1 { self.files.first() } else { None }
+    }
+
+    /// Whether any of the files is laid out this way.
+    pub fn any(&self, is: impl Fn(&Walked) -> bool) -> bool {
+        self.files.iter().any(is)
     }
 
     /// What is at the top of the source, in a line.
@@ -65,6 +75,26 @@ pub(super) struct Draft {
     pub problems: Vec<Problem>,
 }
 
+impl Draft {
+    /// Nothing found yet.
+    fn new(dialect: Dialect) -> Self {
+        Self {
+            dialect,
+            demos: Vec::new(),
+            env_args: None,
+            env_name: None,
+            env_version: None,
+            masks: BTreeMap::new(),
+            texts: BTreeMap::new(),
+            notes: Vec::new(),
+            problems: Vec::new(),
+        }
+    }
+}
+
+/// Begins the names of texts that come from a file beside the source: the root keeps them.
+pub(super) const BESIDE: &str = "beside/";
+
 /// A demo, and where the parts of it lie that are no dataset.
 pub(super) struct DemoDraft {
     pub plan: DemoPlan,
@@ -87,14 +117,19 @@ trait Layout {
 }
 
 /// The special ones first: most are robomimic's layout with something more.
-const LAYOUTS: [&dyn Layout; 7] = [
+const LAYOUTS: [&dyn Layout; 12] = [
     &libero::Libero,
     &robocasa::Robocasa,
+    &isaac_lab::IsaacLab,
+    &behavior::Behavior,
     &mimicgen::Mimicgen,
     &robosuite_raw::RobosuiteRaw,
     &robomimic::Robomimic,
     &d4rl::D4rl,
     &aloha::Aloha,
+    &maniskill::Maniskill,
+    &robotwin::Robotwin,
+    &droid::Droid,
 ];
 
 /// Recognises the layout and finds the demos.
@@ -136,7 +171,9 @@ fn ragged(survey: &Survey, out: &mut Draft) {
             let step = k.shape.get(1..).unwrap_or_default();
             *counts.entry(key).or_default() += 1;
             let (first, dtype, shape) = all.entry(key).or_insert((&plan.id, &k.dtype, step));
-            if per_step(key) && (*dtype, *shape) != (&k.dtype, step) {
+            // a row of bytes is as long as the longest file of its demo
+            let files = **dtype == Dtype::U8 && k.dtype == Dtype::U8 && (shape.len(), step.len()) == (1, 1);
+            if per_step(key) && !files && (*dtype, *shape) != (&k.dtype, step) {
                 let error = InputError::WrongShape {
                     path: survey.path.clone(),
                     demo: plan.id.clone(),
@@ -149,7 +186,8 @@ fn ragged(survey: &Survey, out: &mut Draft) {
         }
     }
     // actions, rewards and dones have been asked for already
-    let asked = |key: &str| out.dialect != Dialect::Aloha && matches!(key, "actions" | "rewards" | "dones");
+    let family = !out.dialect.is_a_recording();
+    let asked = |key: &str| family && matches!(key, "actions" | "rewards" | "dones");
     let some = counts.into_iter().filter(|&(key, count)| count < demos.len() && !asked(key));
     let (mut notes, mut missing) = (Vec::new(), Vec::new());
     for (key, count) in some {
@@ -179,16 +217,161 @@ fn ragged(survey: &Survey, out: &mut Draft) {
     out.problems.append(&mut problems);
 }
 
-/// A dataset as a demo's key: all of it; `None` where it cannot be read.
+/// A dataset as a demo's key: all of it; `None` where it cannot be read. Byte strings that hold JPEG files are a row of
+/// bytes each.
 fn key_plan(file: usize, walked: &Walked, path: &str) -> Option<KeyPlan> {
     let node = walked.datasets.get(path).filter(|node| node.fault.is_none())?;
-    Some(KeyPlan {
-        dtype: node.dtype.clone(),
-        shape: node.shape.clone(),
-        block_rows: node.block_rows,
-        place: Place { file, path: path.to_owned(), first_row: 0, offset: node.offset },
-    })
+    let place = Place { file, path: path.to_owned(), first_row: 0, offset: node.offset, join: None };
+    let (mut dtype, mut shape) = (node.dtype.clone(), node.shape.clone());
+    if let (&Dtype::FixedStr(width), [rows], Some(offset)) = (&node.dtype, shape.as_slice(), node.offset)
+        && *rows > 0
+        && walked.begins_with(offset, &JPEG)
+    {
+        (dtype, shape) = (Dtype::U8, vec![*rows, width]);
+    }
+    Some(KeyPlan { dtype, shape, block_rows: node.block_rows, place })
 }
+
+/// What belongs to one demo of a file, by its name here.
+struct Contents {
+    keys: BTreeMap<String, KeyPlan>,
+    groups: BTreeSet<String>,
+    inner: Vec<(String, usize, String)>,
+}
+
+/// Everything below the group `home` of a file, the whole file where that is empty. `named` gives its name here; what
+/// cannot be read is a problem of the demo `id`.
+fn contents(
+    (index, file): (usize, &Walked),
+    home: &str,
+    id: &str,
+    named: &dyn Fn(&str) -> String,
+    problems: &mut Vec<Problem>,
+) -> Contents {
+    let mut out = Contents { keys: BTreeMap::new(), groups: BTreeSet::new(), inner: Vec::new() };
+    let prefix = if home.is_empty() { String::new() } else { format!("{home}/") };
+    let inside = |path: &String| path.starts_with(&prefix);
+    for (path, error) in file.broken.range(prefix.clone()..).take_while(|(path, _)| inside(path)) {
+        problems.push(Problem::new(Some(id), Some(&named(&path[prefix.len()..])), true, error.clone()));
+    }
+    for (path, node) in file.datasets.range(prefix.clone()..).take_while(|(path, _)| inside(path)) {
+        let mut key = named(&path[prefix.len()..]);
+        if out.keys.contains_key(&key) {
+            // two datasets of one name here keep the names that they have there
+            key = path[prefix.len()..].to_owned();
+        }
+        if let Some(fault) = &node.fault {
+            problems.push(Problem::new(Some(id), Some(&key), true, fault.clone()));
+        }
+        if node.attrs > 0 {
+            out.inner.push((key.clone(), index, path.clone()));
+        }
+        if let Some(plan) = key_plan(index, file, path) {
+            out.keys.insert(key, plan);
+        }
+    }
+    let groups = file.groups.range(prefix.clone()..).take_while(|(path, _)| inside(path));
+    for (path, node) in groups.filter(|(path, _)| !path.is_empty()) {
+        let key = named(&path[prefix.len()..]);
+        if node.attrs > 0 {
+            out.inner.push((key.clone(), index, path.clone()));
+        }
+        if node.empty {
+            out.groups.insert(key);
+        }
+    }
+    out
+}
+
+/// A demo that lacks a dataset without which nothing can be made of it.
+fn missing(file: &Walked, id: &str, key: &str, keys: &BTreeMap<String, KeyPlan>) -> Problem {
+    let error = InputError::MissingKey {
+        path: file.path.clone(),
+        demo: id.to_owned(),
+        key: key.to_owned(),
+        found: list(keys.keys().map(String::as_str)),
+    };
+    Problem::new(Some(id), None, true, error)
+}
+
+/// Problems of the datasets that have not one row a step.
+fn wrong_lengths(
+    file: &Walked,
+    id: &str,
+    (length, of): (usize, &str),
+    keys: &BTreeMap<String, KeyPlan>,
+) -> Vec<Problem> {
+    let wrong = keys.iter().filter(|(key, k)| per_step(key) && k.shape.first() != Some(&length));
+    let problem = |(key, k): (&String, &KeyPlan)| {
+        let error = InputError::WrongLength {
+            path: file.path.clone(),
+            demo: id.to_owned(),
+            key: key.clone(),
+            expected: format!("{length} ({of})"),
+            found: format!("shape {:?}", k.shape),
+        };
+        Problem::new(Some(id), Some(key), true, error)
+    };
+    wrong.map(problem).collect()
+}
+
+/// A demo of no steps, which nothing can be made of.
+fn empty(file: &Walked, id: &str, key: &str) -> Problem {
+    let error = InputError::WrongLength {
+        path: file.path.clone(),
+        demo: id.to_owned(),
+        key: key.to_owned(),
+        expected: "at least 1".to_owned(),
+        found: "0: the demo is empty".to_owned(),
+    };
+    Problem::new(Some(id), None, true, error)
+}
+
+/// Takes the rows `first .. first + length` of a dataset that has a row for the state after the last step too, and the rows
+/// one step later as `next_obs`.
+fn observed(keys: &mut BTreeMap<String, KeyPlan>, length: usize) {
+    let later: Vec<(String, KeyPlan)> = keys
+        .iter()
+        .filter(|(key, k)| key.starts_with("obs/") && k.shape.first() == Some(&(length + 1)))
+        .map(|(key, k)| (key.replacen("obs/", "next_obs/", 1), k.clone().part(1, length)))
+        .collect();
+    for (next, plan) in later {
+        if let Some(now) = keys.get_mut(&next.replacen("next_obs/", "obs/", 1)) {
+            *now = now.clone().part(0, length);
+        }
+        keys.insert(next, plan);
+    }
+}
+
+/// The id of the episode that a file is: the number of its name, unless another has it.
+fn id_of(file: &Path, index: usize, demos: &[DemoDraft]) -> (u64, String) {
+    let number = number_of(file, index);
+    let id = format!("demo_{number}");
+    match demos.iter().any(|demo| demo.plan.id == id) {
+        true => (number, format!("demo_{number}_{index}")),
+        false => (number, id),
+    }
+}
+
+/// A file that is no episode as the others of its folder are.
+fn stranger(file: &Walked, index: usize, expected: &str) -> Problem {
+    let unknown = || InputError::UnknownLayout {
+        path: file.path.clone(),
+        expected: expected.to_owned(),
+        found: list(file.datasets.keys().map(String::as_str)),
+    };
+    let error = file.broken.values().next().cloned().unwrap_or_else(unknown);
+    Problem::new(Some(&format!("demo_{}", number_of(&file.path, index))), None, true, error)
+}
+
+/// Text of a small file beside the source; `None` where there is none.
+fn beside(path: &Path) -> Option<String> {
+    const MOST: u64 = 64 << 20;
+    let small = std::fs::metadata(path).is_ok_and(|meta| meta.is_file() && meta.len() <= MOST);
+    if small { std::fs::read_to_string(path).ok() } else { None }
+}
+
+const JPEG: [u8; 3] = [0xFF, 0xD8, 0xFF];
 
 /// The number at the end of a name such as `demo_12` or `episode_3`.
 fn number_after(name: &str, prefix: &str) -> Option<u64> {

@@ -12,7 +12,7 @@ impl Layout for Robocasa {
     }
 
     fn recognises(&self, survey: &Survey) -> bool {
-        survey.single().is_some_and(|file| {
+        survey.any(|file| {
             family::any_demo_has(file, "obs")
                 && family::first_ep_meta(file)
                     .is_some_and(|meta| ["layout_id", "style_id", "fixture_refs"].iter().any(|k| meta.get(k).is_some()))

@@ -12,7 +12,7 @@ impl Layout for Robomimic {
     }
 
     fn recognises(&self, survey: &Survey) -> bool {
-        survey.single().is_some_and(|file| file.groups.contains_key("data"))
+        survey.any(|file| file.groups.contains_key("data"))
     }
 
     fn draft(&self, survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {

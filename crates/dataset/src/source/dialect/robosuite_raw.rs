@@ -13,7 +13,7 @@ impl Layout for RobosuiteRaw {
     }
 
     fn recognises(&self, survey: &Survey) -> bool {
-        survey.single().is_some_and(|file| {
+        survey.any(|file| {
             family::any_demo_has(file, "states")
                 && family::any_demo_has(file, "actions")
                 && !family::any_demo_has(file, "obs")

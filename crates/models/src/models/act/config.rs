@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// actions predicted at once (LeRobot: `chunk_size`)
     pub action_horizon: usize,
-    /// normalise before each branch instead of after it
+    /// layer norm before each branch instead of after it
     pub pre_norm: bool,
     /// width
     pub dim_model: usize,
@@ -26,7 +26,7 @@ pub struct Config {
     pub n_encoder_layers: usize,
     /// decoder layers
     pub n_decoder_layers: usize,
-    /// train with a latent
+    /// train with the VAE's latent
     pub use_vae: bool,
     /// width of the latent
     pub latent_dim: usize,
@@ -36,13 +36,13 @@ pub struct Config {
     pub dropout: f64,
     /// weight of the KL term
     pub kl_weight: f64,
-    /// how pictures are seen, if there are any
+    /// image encoder; absent without cameras
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
-    /// whether the encoder's output is asked which entity is meant
+    /// auxiliary loss on which entity was taken, from the encoder's output
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pointer: Option<PointerConfig>,
-    /// whether training asks for numbers that are not seen
+    /// auxiliary loss on `data.auxiliary_keys`
     #[serde(skip_serializing_if = "Option::is_none")]
     pub auxiliary: Option<AuxiliaryConfig>,
 }

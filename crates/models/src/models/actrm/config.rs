@@ -36,8 +36,7 @@ impl Over {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WarmStart {
-    /// In training half of each batch starts from the answer to the same observation with this
-    /// much normal noise on it (network units).
+    /// Standard deviation of the noise on the previous answer, from which half of each batch starts in training (normalised units).
     #[serde(default = "default_noise")]
     pub noise: f64,
 }
@@ -56,41 +55,40 @@ pub struct ReasoningConfig {
     pub tokens: usize,
     /// layers of the shared block
     pub n_layers: usize,
-    /// hidden width of the shared block's dense part; half of `dim_feedforward` when absent
+    /// hidden width of the shared block's feed-forward part; absent: half of `dim_feedforward`
     pub dim_feedforward: Option<usize>,
     /// rounds per supervision step; the last one has gradients (`over = "tokens"`: 1)
     pub h_cycles: usize,
     /// updates of the reasoning, or of the tokens, per round
     pub l_cycles: usize,
-    /// supervision steps in training (`over = "memory"`: the most that are drawn)
+    /// refinement steps in training, each with a loss (`over = "memory"`: the largest number that is sampled)
     pub supervision_steps: usize,
-    /// most steps at inference; as many as in training when absent
+    /// largest number of refinement steps at inference; absent: as in training
     pub max_steps: Option<usize>,
     /// stop once the halting head's probability exceeds this; 1 never stops
     pub halt_threshold: f64,
-    /// stop once the chunk's mean absolute change falls below this (network units); 0 never stops
+    /// stop once the chunk's mean absolute change falls below this (normalised units); 0 never stops
     pub change_threshold: f64,
-    /// stop once this much time has passed; the caller brings the clock
+    /// stop after this many milliseconds
     pub budget_ms: Option<f64>,
     /// weight of the halting head's loss
     pub halt_weight: f64,
-    /// an error that one more step lowers by less than this share counts as not lowered
+    /// the halting head's target: a step helps if it lowers the error by at least this share
     pub halt_margin: f64,
     /// start from the previous query's answer (`over = "actions"`)
     pub warm_start: Option<WarmStart>,
-    /// a block of its own for every supervision step of the training instead of a shared one (not `over = "memory"`): the same
-    /// depth and work, as many times the weights; steps beyond apply the last block
+    /// a block with its own weights for every refinement step instead of a shared one (not `over = "memory"`); further steps at
+    /// inference apply the last block
     #[serde(skip_serializing_if = "is_default")]
     pub untied: bool,
-    /// in training a thought begins with normal noise of this standard deviation instead of zero, at inference with its
-    /// mean, zero (`over = "actions"`); added to what is observed with `over = "tokens"`
+    /// standard deviation of the noise from which refinement starts in training; at inference it starts from zero
+    /// (`over = "tokens"`: the noise is added to the observation's tokens)
     #[serde(skip_serializing_if = "is_default")]
     pub start_noise: f64,
-    /// whether the answer of every supervision step has a loss; else only the last one's has
+    /// whether every refinement step has a loss; otherwise only the last one has
     #[serde(skip_serializing_if = "is_true")]
     pub deep_supervision: bool,
-    /// the recursion goes over a grid of cells, from neighbour to neighbour, instead of attention among all tokens
-    /// (`over = "tokens"`)
+    /// recursion by 3x3 convolutions over a grid of cells instead of attention among all tokens (`over = "tokens"`)
     #[serde(skip_serializing_if = "Option::is_none")]
     pub grid: Option<GridConfig>,
 }
@@ -180,7 +178,7 @@ pub struct Config {
     pub n_memory_layers: usize,
     /// layers of the decoder (not `over = "actions"`)
     pub n_decoder_layers: usize,
-    /// train with a latent
+    /// train with the VAE's latent
     pub use_vae: bool,
     /// width of the latent
     pub latent_dim: usize,
@@ -192,13 +190,13 @@ pub struct Config {
     pub kl_weight: f64,
     /// the recursion
     pub reasoning: ReasoningConfig,
-    /// how pictures are seen, if there are any
+    /// image encoder; absent without cameras
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
-    /// whether every supervision step is asked which entity is meant (`over = "tokens"`)
+    /// auxiliary loss of every refinement step on which entity was taken (`over = "tokens"`)
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pointer: Option<PointerConfig>,
-    /// whether training asks for numbers that are not seen (`over = "actions"` with a memory that is encoded)
+    /// auxiliary loss on `data.auxiliary_keys` (`over = "actions"` with `n_memory_layers` of 1 or more)
     #[serde(skip_serializing_if = "Option::is_none")]
     pub auxiliary: Option<AuxiliaryConfig>,
 }

@@ -24,9 +24,9 @@ pub struct Config {
     pub action_horizon: usize,
     /// widths of the hidden layers (robomimic: `actor_layer_dims`)
     pub hidden: Vec<usize>,
-    /// what is minimised
+    /// loss
     pub loss: Loss,
-    /// how pictures are seen, if there are any
+    /// image encoder; absent without cameras
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
 }

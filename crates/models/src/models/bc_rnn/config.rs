@@ -10,21 +10,21 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// steps of a sequence in training, and those after which the state begins anew (robomimic: `rnn.horizon` and
-    /// `train.seq_length`); as many as `data.n_obs_steps`
+    /// steps of a training sequence, after which the state is also reset at inference (robomimic: `rnn.horizon` and
+    /// `train.seq_length`); must equal `data.n_obs_steps`
     pub action_horizon: usize,
-    /// numbers in a layer's state (robomimic: `rnn.hidden_dim`)
+    /// dimension of a layer's state (robomimic: `rnn.hidden_dim`)
     pub hidden_dim: usize,
-    /// layers of cells
+    /// recurrent layers
     pub n_layers: usize,
-    /// lstm or gru (robomimic: `rnn.rnn_type`)
+    /// recurrent cell (robomimic: `rnn.rnn_type`)
     #[serde(skip_serializing_if = "is_lstm")]
     pub cell: Cell,
-    /// Gaussians of the mixture
+    /// components of the Gaussian mixture
     pub n_modes: usize,
-    /// least deviation of a Gaussian in training
+    /// smallest standard deviation of a component in training
     pub min_std: f64,
-    /// how pictures are seen, if there are any
+    /// image encoder; absent without cameras
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
 }

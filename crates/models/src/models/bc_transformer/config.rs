@@ -15,15 +15,15 @@ pub struct Config {
     pub dim_model: usize,
     /// attention heads
     pub n_heads: usize,
-    /// blocks
+    /// transformer blocks
     pub n_layers: usize,
-    /// of tokens, attention weights and outputs of blocks alike
+    /// dropout of tokens, attention weights and block outputs
     pub dropout: f64,
-    /// Gaussians of the mixture
+    /// components of the Gaussian mixture
     pub n_modes: usize,
-    /// least deviation of a Gaussian in training
+    /// smallest standard deviation of a component in training
     pub min_std: f64,
-    /// how pictures are seen, if there are any
+    /// image encoder; absent without cameras
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
 }

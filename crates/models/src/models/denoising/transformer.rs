@@ -23,15 +23,15 @@ const STD: f64 = 0.02;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TransformerConfig {
-    /// width of a token (there: `n_emb`)
+    /// width of a token (Chi et al.: `n_emb`)
     pub dim_model: usize,
     /// attention heads
     pub n_heads: usize,
     /// decoder layers
     pub n_layers: usize,
-    /// of attention weights and of branches (there: `p_drop_attn`)
+    /// dropout of attention weights and branches (Chi et al.: `p_drop_attn`)
     pub dropout: f64,
-    /// whether an action attends to itself and earlier ones only (there: `causal_attn`)
+    /// whether an action attends only to itself and earlier ones (Chi et al.: `causal_attn`)
     pub causal: bool,
 }
 

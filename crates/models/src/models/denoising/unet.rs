@@ -13,15 +13,15 @@ const LAST_GROUPS: usize = 8;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkConfig {
-    /// channels of each level; between two levels the number of steps is halved
+    /// channels of each level; each level has half the time steps of the one before
     pub down_dims: Vec<usize>,
-    /// steps under a convolution's kernel; odd
+    /// kernel size of the convolutions; odd
     pub kernel_size: usize,
-    /// groups of the norms
+    /// groups of the group norms
     pub n_groups: usize,
-    /// numbers that say how noisy the actions are; even
+    /// dimension of the time step's embedding; even
     pub step_embed_dim: usize,
-    /// whether the condition scales channels or only shifts them
+    /// whether the condition also scales channels (FiLM), or only shifts them
     pub film_scale: bool,
 }
 

@@ -13,7 +13,7 @@ pub enum Prediction {
     /// the noise that was added
     #[default]
     Epsilon,
-    /// the actions without it
+    /// the actions without noise
     Sample,
 }
 
@@ -21,7 +21,7 @@ pub enum Prediction {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Sampler {
-    /// noise only at the beginning (Song et al.)
+    /// deterministic after the initial noise (Song et al.)
     #[default]
     Ddim,
     /// noise at every step (Ho et al.)
@@ -32,26 +32,26 @@ pub enum Sampler {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// actions in a sequence, beginning with that of the first observation seen (LeRobot: `horizon`)
+    /// actions in a sequence, starting at the first observation of the history (LeRobot: `horizon`)
     pub action_horizon: usize,
     /// the network, a UNet
     pub network: NetworkConfig,
-    /// a transformer in the UNet's place
+    /// a transformer instead of the UNet
     #[serde(skip_serializing_if = "Option::is_none")]
     pub transformer: Option<TransformerConfig>,
-    /// steps of noise in training
+    /// diffusion steps in training
     pub num_train_timesteps: usize,
-    /// what the network gives
+    /// output of the network
     pub prediction: Prediction,
-    /// how actions are drawn
+    /// sampler of actions
     pub sampler: Sampler,
-    /// steps from noise to actions
+    /// denoising steps at inference
     pub inference_steps: usize,
-    /// largest magnitude of a normalised action, between steps too; 0 for any
+    /// largest magnitude of a normalised action, also between steps; 0: no limit
     pub clip_sample: f64,
-    /// whether steps beyond an episode's ends are left out of the loss (LeRobot: `do_mask_loss_for_padding`)
+    /// whether padding beyond an episode's ends is left out of the loss (LeRobot: `do_mask_loss_for_padding`)
     pub mask_padding: bool,
-    /// how pictures are seen, if there are any
+    /// image encoder; absent without cameras
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
 }

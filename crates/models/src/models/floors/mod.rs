@@ -37,7 +37,7 @@ pub const READS: &[FeatureKind] = &[FeatureKind::State, FeatureKind::Environment
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// actions given at once
+    /// actions predicted at once
     pub action_horizon: usize,
 }
 

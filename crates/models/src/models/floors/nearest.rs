@@ -31,9 +31,9 @@ pub type Nearest = Floor<Neighbours>;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// actions given at once
+    /// actions predicted at once
     pub action_horizon: usize,
-    /// neighbours that are averaged
+    /// number of neighbours that are averaged
     pub k: usize,
 }
 

@@ -10,15 +10,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// actions in a sequence, beginning with that of the first observation seen
+    /// actions in a sequence, starting at the first observation of the history
     pub action_horizon: usize,
     /// the network
     pub network: NetworkConfig,
     /// Euler steps from noise to actions
     pub inference_steps: usize,
-    /// whether steps beyond an episode's ends are left out of the loss
+    /// whether padding beyond an episode's ends is left out of the loss
     pub mask_padding: bool,
-    /// how pictures are seen, if there are any
+    /// image encoder; absent without cameras
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<VisionConfig>,
 }

@@ -16,7 +16,7 @@ pub enum Mixing {
     Conv,
 }
 
-/// How positions are told apart.
+/// How positions are distinguished.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Positions {
@@ -25,7 +25,7 @@ pub enum Positions {
     Rope,
     /// A learned vector per position, added to the input embedding.
     Learned,
-    /// Not at all: the mixing knows them.
+    /// None; the mixing depends on positions itself.
     None,
 }
 
@@ -71,7 +71,7 @@ pub struct Config {
     /// Height and width, needed by [`Mixing::Conv`]; their product is `seq_len`.
     #[serde(default)]
     pub grid: Option<[usize; 2]>,
-    /// How positions are told apart.
+    /// How positions are distinguished.
     #[serde(default)]
     pub positions: Positions,
     /// Base of the rotary angles.

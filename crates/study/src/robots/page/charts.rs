@@ -1,16 +1,17 @@
-//! Charts of a study's page, drawn from its committed results: success by group of episodes for every arm, and by how many
-//! steps the same weights think.
+//! Charts of a study's page, drawn from its committed results: success of every arm, by group of episodes, and by the number of
+//! refinement steps.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+use report::statistics::{Estimate, hierarchical};
 use zoo::ZooError;
 
 use super::super::file::Study;
-use super::{Results, Trainings, outcomes, read_results};
+use super::{BOOTSTRAP_SEED, Results, Trainings, outcomes, read_results};
 
-/// Lines of a chart that can be told apart: colours that differ to the colour-blind as well.
+/// Colours of lines, which differ to the colour-blind as well.
 const COLORS: [&str; 8] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a7f00"];
 
 /// Groups of episodes that make a line worth drawing.
@@ -28,9 +29,12 @@ pub(super) struct Chart {
 /// # Errors
 /// A result that cannot be read.
 pub fn robot_charts(study: &Study) -> Result<Vec<(PathBuf, String)>, ZooError> {
-    let (results, _) = read_results(study)?;
+    let results = read_results(study)?;
     let by_arm = by_arm(study, &results).into_iter().map(|(_, chart)| chart);
-    let all = by_arm.chain(by_steps(study, &results).into_iter().map(|(_, chart)| chart));
+    let all = all_arms(study, &results)
+        .into_iter()
+        .chain(by_arm)
+        .chain(by_steps(study, &results).into_iter().map(|(_, chart)| chart));
     Ok(all.map(|chart| (study.results.join(chart.name), chart.svg)).collect())
 }
 
@@ -39,6 +43,24 @@ pub(super) fn shown(study: &Study, chart: &Chart) -> String {
     let beside = study.page.parent().unwrap_or(Path::new(""));
     let folder = study.results.strip_prefix(beside).unwrap_or(&study.results);
     format!("![{}]({})\n", chart.shows, folder.join(&chart.name).display())
+}
+
+/// Success of every arm on every plain test, with its 95% interval: a row each.
+pub(super) fn all_arms(study: &Study, results: &Results) -> Option<Chart> {
+    let mut rows: Vec<(String, Vec<(String, Estimate)>)> = Vec::new();
+    for ((test, data, arm), trainings) in results.iter().filter(|((test, _, _), _)| study.tests[test].is_plain()) {
+        let Some(estimate) = hierarchical(&outcomes(trainings, &[]), BOOTSTRAP_SEED) else { continue };
+        let of = &study.data[data];
+        let expert = of.expert.as_ref().map(|expert| format!(", {expert}")).unwrap_or_default();
+        let skill = if of.skill.is_good() { String::new() } else { format!(", {}", of.skill) };
+        let head = format!("{} ({} demonstrations{expert}{skill})", study.tests[test].task, of.episodes);
+        match rows.last_mut().filter(|(last, _)| *last == head) {
+            Some((_, arms)) => arms.push((study.arms[arm].label.clone(), estimate)),
+            None => rows.push((head, vec![(study.arms[arm].label.clone(), estimate)])),
+        }
+    }
+    let shows = format!("{}: success with 95% intervals", study.title);
+    (!rows.is_empty()).then(|| Chart { name: "success.svg".to_owned(), svg: intervals(&shows, &rows), shows })
 }
 
 /// Success by group, a line an arm, of every plain test and its demonstrations; arms with most trainings where there are
@@ -63,14 +85,14 @@ pub(super) fn by_arm(study: &Study, results: &Results) -> Vec<((String, String),
                 (format!("{} ({})", study.arms[*arm].label, trainings.len()), values)
             })
             .collect();
-        let shows = format!("{} after {}: success by group, mean of so many trainings", study.tests[test].task, data);
+        let shows = format!("{} after {}: success by group (number of trainings)", study.tests[test].task, data);
         let name = format!("{test}_{data}_by-arm.svg");
         charts.push(((test.to_owned(), data.to_owned()), Chart { name, svg: drawn(&shows, &groups, &lines), shows }));
     }
     charts
 }
 
-/// Success by how many steps the same weights think, a line a group, of every arm tested with several numbers of steps.
+/// Success by the number of refinement steps of the same weights, a line a group, of every arm tested with several numbers.
 pub(super) fn by_steps(study: &Study, results: &Results) -> Vec<((String, String), Chart)> {
     let mut arms: BTreeMap<(&str, &str, &str), BTreeMap<usize, &Trainings>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results {
@@ -94,7 +116,7 @@ pub(super) fn by_steps(study: &Study, results: &Results) -> Vec<((String, String
                 (group[0].clone(), by_steps.values().map(|trainings| mean(trainings, group)).collect())
             })
             .collect();
-        let shows = format!("{task}, {}: success by the steps that it thinks in the test", study.arms[arm].label);
+        let shows = format!("{task}, {}: success by number of refinement steps in the test", study.arms[arm].label);
         let name = format!("{arm}_{data}_by-steps.svg");
         charts.push(((task.to_owned(), data.to_owned()), Chart { name, svg: drawn(&shows, &heads, &lines), shows }));
     }
@@ -111,6 +133,51 @@ fn groups<'a>(trainings: impl Iterator<Item = &'a Trainings>) -> Vec<String> {
 fn mean(trainings: &Trainings, groups: &[String]) -> Option<f64> {
     let all: Vec<f64> = outcomes(trainings, groups).concat();
     (!all.is_empty()).then(|| all.iter().sum::<f64>() / all.len() as f64)
+}
+
+/// Points with their intervals, shares of one from left to right, under a head for each group of rows.
+fn intervals(title: &str, groups: &[(String, Vec<(String, Estimate)>)]) -> String {
+    let (left, width, line) = (430.0, 390.0, 19.0);
+    let x = |share: f64| left + width * share;
+    let lines = groups.iter().map(|(_, rows)| rows.len() + 1).sum::<usize>() as f64;
+    let (bottom, title) = (40.0 + line * lines, escaped(title));
+    let height = bottom + 30.0;
+    let mut svg = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 900 {height}\" width=\"900\" height=\"{height}\" role=\"img\" \
+         aria-label=\"{title}\" font-family=\"sans-serif\" font-size=\"13\">\n<rect width=\"900\" height=\"{height}\" \
+         fill=\"#ffffff\"/>\n<text x=\"12\" y=\"20\" font-weight=\"bold\">{title}</text>\n"
+    );
+    for share in [0.0, 0.25, 0.5, 0.75, 1.0] {
+        let (at, below) = (x(share), bottom + 18.0);
+        let _ = writeln!(
+            svg,
+            "<line x1=\"{at}\" x2=\"{at}\" y1=\"30\" y2=\"{bottom}\" stroke=\"#d8d8d8\"/><text x=\"{at}\" y=\"{below}\" \
+             text-anchor=\"middle\">{:.0}%</text>",
+            100.0 * share
+        );
+    }
+    let mut at = 40.0;
+    for (head, rows) in groups {
+        let _ = writeln!(svg, "<text x=\"12\" y=\"{}\" font-weight=\"bold\">{}</text>", at + 4.0, escaped(head));
+        at += line;
+        for (label, Estimate { value, low, high }) in rows {
+            let (color, text) = (COLORS[0], at + 4.0);
+            let _ = writeln!(
+                svg,
+                "<text x=\"28\" y=\"{text}\">{}</text><line x1=\"{:.1}\" x2=\"{:.1}\" y1=\"{at}\" y2=\"{at}\" stroke=\"{color}\" \
+                 stroke-width=\"3\"/><circle cx=\"{:.1}\" cy=\"{at}\" r=\"4.5\" fill=\"{color}\"/><text x=\"886\" y=\"{text}\" \
+                 text-anchor=\"end\">{:.1}%</text>",
+                escaped(label),
+                x(*low),
+                x(*high),
+                x(*value),
+                100.0 * value
+            );
+            at += line;
+        }
+    }
+    svg.push_str("</svg>\n");
+    svg
 }
 
 /// Lines over `heads`, shares of one from bottom to top, with a legend at the right.

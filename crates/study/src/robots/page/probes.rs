@@ -1,4 +1,4 @@
-//! What linear probes read from thoughts, as a part of a study's page.
+//! What linear probes decode from the latent reasoning, as a part of a study's page.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -6,7 +6,8 @@ use std::fmt::Write as _;
 use zoo::ZooError;
 use zoo::probe::{ProbeCell, ProbeResult};
 
-use crate::robots::file::{Study, Test};
+use super::folded;
+use crate::robots::file::Study;
 
 /// The section, from the files `probe_*.json` of the study's results.
 pub(super) fn probes(text: &mut String, study: &Study) -> Result<(), ZooError> {
@@ -21,26 +22,20 @@ pub(super) fn probes(text: &mut String, study: &Study) -> Result<(), ZooError> {
         }
     }
     files.sort();
-    // the probe reads chains off thoughts: a study that asks nothing about thoughts on them misses none
-    let asks = |test: &Test| test.task == "PickChain" && test.thinking_words().is_some();
-    if files.is_empty() && !study.tests.values().any(asks) {
+    if files.is_empty() {
         return Ok(());
     }
     let _ = writeln!(
         text,
-        "## What can be read from a thought\n\nA linear probe (`actrm-zoo probe`): which cube, by its colour, is it after i hops? \
-         Fitted to how demonstrations begin, with their colours renamed at random; read on the beginnings of fresh episodes whose \
-         chains have at least i hops, those as long as demonstrations have them, and (in brackets) longer ones. A guess is right \
-         one time in twelve; what an untrained network shows is what the observation gives away.\n"
+        "## What a probe decodes from the latent reasoning\n\nA linear probe (`actrm-zoo probe`) predicts the colour of the cube after i \
+         hops. It is fitted to the first frames of demonstrations, with colours renamed at random. It is tested on the first frames of new \
+         episodes: those with chains as long as in the demonstrations, and longer ones (in brackets). Guessing is right one time in \
+         twelve. An untrained network shows what the observation alone gives away.\n"
     );
-    if files.is_empty() {
-        let _ = writeln!(text, "Not run.\n");
-    }
     for path in files {
-        let result = ProbeResult::read(&path)?;
-        let _ = writeln!(
-            text,
-            "`{}`, {} demonstrations shown {} times each, fresh episodes of seeds {}:\n",
+        let (result, mut part) = (ProbeResult::read(&path)?, String::new());
+        let title = format!(
+            "`{}`: {} demonstrations, {} renamings of each, new episodes of seeds {}",
             result.entry, result.demonstrations, result.renamings, result.seeds
         );
         for reading in &result.readings {
@@ -48,8 +43,8 @@ pub(super) fn probes(text: &mut String, study: &Study) -> Result<(), ZooError> {
             let head = |cell: &ProbeCell| cell.hops.map_or("the end".to_owned(), |hops| format!("{hops} hops"));
             let of_step = |step: usize| reading.cells.iter().filter(move |cell| cell.step == step);
             let heads: Vec<String> = steps.first().map(|&step| of_step(step).map(head).collect()).unwrap_or_default();
-            let _ = writeln!(text, "| {}, after step | {} |", reading.state, heads.join(" | "));
-            let _ = writeln!(text, "|---|{}", "---|".repeat(heads.len()));
+            let _ = writeln!(part, "| {}, after step | {} |", reading.state, heads.join(" | "));
+            let _ = writeln!(part, "|---|{}", "---|".repeat(heads.len()));
             for step in steps {
                 let cells: Vec<String> = of_step(step)
                     .map(|cell| {
@@ -60,9 +55,9 @@ pub(super) fn probes(text: &mut String, study: &Study) -> Result<(), ZooError> {
                         format!("{} ({})", share(cell.right, cell.of), share(cell.right_beyond, cell.of_beyond))
                     })
                     .collect();
-                let _ = writeln!(text, "| {step} | {} |", cells.join(" | "));
+                let _ = writeln!(part, "| {step} | {} |", cells.join(" | "));
             }
-            text.push('\n');
+            part.push('\n');
         }
         let counts: Vec<String> = result
             .readings
@@ -72,7 +67,8 @@ pub(super) fn probes(text: &mut String, study: &Study) -> Result<(), ZooError> {
             .flatten()
             .map(|cell| format!("{} ({})", cell.of, cell.of_beyond))
             .collect();
-        let _ = writeln!(text, "Episodes behind the columns: {}.\n", counts.join(", "));
+        let _ = writeln!(part, "Episodes per column: {}.\n", counts.join(", "));
+        folded(text, &title, &part);
     }
     Ok(())
 }
