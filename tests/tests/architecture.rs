@@ -39,6 +39,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("rollout", &[]),
     ("nn", &[]),
     ("models", &["nn"]),
+    ("serving", &["models"]),
     ("video", &[]),
     ("dataset", &["puzzles", "video"]),
     ("query", &["dataset"]),
@@ -50,7 +51,10 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("cli", &["rollout", "video"]),
     ("actrm-data", &["cli", "dataset", "puzzles", "recording", "rollout"]),
     ("actrm-query", &["cli", "dataset", "query"]),
-    ("actrm-zoo", &["cli", "dataset", "models", "puzzles", "recording", "report", "rollout", "study", "zoo"]),
+    (
+        "actrm-zoo",
+        &["cli", "dataset", "models", "puzzles", "recording", "report", "rollout", "serving", "study", "zoo"],
+    ),
     ("e2e", &[]),
 ];
 
@@ -89,6 +93,8 @@ fn each_heavy_dependency_has_one_room() {
         ("comfy-table", &["cli"]),
         ("ctrlc", &["cli"]),
         ("pyo3", &["python"]),
+        ("tungstenite", &["serving"]),
+        ("rmp", &["serving"]),
     ];
     for (package, names) in dependencies() {
         for (dependency, allowed) in rooms {

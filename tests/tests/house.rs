@@ -69,6 +69,8 @@ fn models_knows_tensors_and_numbers_only() {
     assert_eq!(said("crates/nn/src", &words, &[]), [""; 0]);
     assert_eq!(said("crates/models/src", &words, &[]), [""; 0]);
     assert_eq!(said("crates/puzzles/src", &words, &[]), [""; 0]);
+    // a message of a stranger opens no file
+    assert_eq!(said("crates/serving/src", FILES, &[]), [""; 0]);
 }
 
 #[test]
@@ -80,7 +82,7 @@ fn a_report_is_a_function_of_results() {
 #[test]
 fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
     let reader = ["crates/dataset/src/source/isolation.rs"];
-    for room in ["dataset", "query", "recording", "video", "zoo", "study", "python"] {
+    for room in ["dataset", "query", "recording", "serving", "video", "zoo", "study", "python"] {
         assert_eq!(said(&format!("crates/{room}/src"), PROCESSES, &reader), [""; 0]);
     }
     assert!(!said("crates/rollout/src", PROCESSES, &[]).is_empty(), "the test finds what it looks for");
@@ -93,7 +95,7 @@ fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
 
 #[test]
 fn only_tools_print_and_read_arguments() {
-    for room in ["dataset", "query", "recording", "rollout", "video", "zoo", "report", "study", "python"] {
+    for room in ["dataset", "query", "recording", "rollout", "serving", "video", "zoo", "report", "study", "python"] {
         // both speak to the program that started them
         let reader = ["crates/dataset/src/source/isolation.rs", "crates/dataset/src/source/video.rs"];
         let words: Vec<&str> = [PRINTING, &["env::args"]].concat();

@@ -21,6 +21,7 @@ mod page;
 mod paths;
 mod pipes;
 mod rerun;
+mod serving;
 mod shipped_zoo;
 mod sizes;
 mod stopping;

@@ -150,6 +150,7 @@ pub(crate) fn evaluate<'py>(
                     let external = External {
                         source,
                         declared,
+                        mapping: None,
                         image_size,
                         execution,
                         inputs: inputs.clone().unwrap_or_default(),

@@ -31,6 +31,9 @@ pub struct External {
     /// What its owner declares of its weights, such as a hash; another one is another version of the entry.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub declared: Option<String>,
+    /// How the observations of a server are made of the features: a preset's name, or the text of the file.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mapping: Option<String>,
     /// Side of the images that it reads, in pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image_size: Option<usize>,
@@ -176,7 +179,10 @@ impl External {
             normaliser: empty(crate::entry::NORMALISER_FILE)?,
             card: CardWords {
                 rows: vec![("weights".to_owned(), "not in this zoo; the owner runs the policy".to_owned())],
-                usage: "rank it again with `actrm.evaluate(policy, name=..., task=...)` in Python".to_owned(),
+                usage: match self.source.starts_with("ws://") {
+                    true => "rank it again with `actrm-zoo eval --policy ws://... --name ... --task ...`".to_owned(),
+                    false => "rank it again with `actrm.evaluate(policy, name=..., task=...)` in Python".to_owned(),
+                },
                 ..CardWords::default()
             },
             metrics: None,
@@ -254,6 +260,7 @@ mod tests {
         External {
             source: "python mine.Policy".to_owned(),
             declared: None,
+            mapping: None,
             image_size: None,
             execution: Execution::RecedingHorizon { n_action_steps: 1 },
             inputs,

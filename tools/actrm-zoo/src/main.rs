@@ -9,6 +9,7 @@ mod commands;
 mod films;
 mod places;
 mod puzzles;
+mod remote;
 mod simulation;
 mod training;
 

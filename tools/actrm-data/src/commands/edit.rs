@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 /// Make a data set of data sets: leave episodes out, split, merge, rename features, repair tables.
 ///
-/// Works on LeRobotDataset v3.0 directories, ours or LeRobot's. Pictures and videos are carried over as they are stored;
+/// Works on LeRobotDataset v3.0 directories, ours or LeRobot's. Images and videos are carried over as they are stored;
 /// numbers, tasks, masks, statistics, fingerprint and the side folder follow from the episodes that the result has, as if it
 /// had been converted. Sources are never touched, and a result appears whole or not at all. Of a video file of which some
 /// episodes are left out, those of the others are cut out without encoding them again: AV1 can be cut, H.264 is refused.

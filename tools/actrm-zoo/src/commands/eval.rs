@@ -21,6 +21,7 @@ use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 use crate::films;
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names, of_entry};
 use crate::puzzles::{PuzzleArgs, evaluate_solver};
+use crate::remote::{Remote, RemoteArgs};
 use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
 
 /// Headings of its help.
@@ -56,10 +57,11 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval lift-act-image --episodes 100 --video-failed 3
   actrm-zoo eval lift-act-image --episodes 100 --perturb black-agentview
   actrm-zoo eval lift-act --episodes 50 --again
-  actrm-zoo eval lift-act --episodes 200 --shard 2/8")]
+  actrm-zoo eval lift-act --episodes 200 --shard 2/8
+  actrm-zoo eval --policy ws://127.0.0.1:8000 --name mine --protocol lift-v1")]
 pub struct Args {
     /// Entries: `name` (its newest version), `name@version`, or a pattern with `*`
-    #[arg(required_unless_present_any = ["all", "all_versions"], add = entry_names())]
+    #[arg(required_unless_present_any = ["all", "all_versions", "policy"], add = entry_names())]
     entries: Vec<String>,
     /// The newest version of every entry of the zoo
     #[arg(long, conflicts_with = "entries")]
@@ -115,6 +117,8 @@ pub struct Args {
     json: bool,
     #[command(flatten, next_help_heading = OUTPUT)]
     results: ResultsArgs,
+    #[command(flatten, next_help_heading = "Policies of others")]
+    remote: RemoteArgs,
     #[command(flatten, next_help_heading = "Puzzle solvers")]
     puzzles: PuzzleArgs,
     #[command(flatten, next_help_heading = OUTPUT)]
@@ -153,6 +157,15 @@ struct Asked<'a> {
     protocol: Option<&'a NamedProtocol>,
 }
 
+impl Asked<'_> {
+    fn check_task(&self, task: &str) -> anyhow::Result<()> {
+        match self.protocol.filter(|protocol| protocol.task != task) {
+            Some(protocol) => bail!("protocol {}: task: expected {}, found {task}", protocol.name, protocol.task),
+            None => Ok(()),
+        }
+    }
+}
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let protocols = args.protocols.protocols()?;
     let protocol = args.protocol.as_deref().map(|name| protocols.get(name)).transpose()?;
@@ -164,6 +177,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     limits::check_seeds(seeds.start, seeds.count)?;
     limits::workers(args.run.simulator.workers)?;
     let registry = args.zoo.registry();
+    let mut says = Says { as_json: args.json, all: Vec::new() };
+    let task = args.run.task.as_deref();
+    if let Some(remote) = args.remote.policy(task.or(protocol.map(|protocol| protocol.task.as_str())))? {
+        let stop = Stop::install(GOES_ON)?;
+        evaluate_remote(args, &asked, &remote, &stop, &mut says)?;
+        if says.as_json {
+            cli::print_json(&says.all)?;
+        }
+        return Ok(if stop.asked() { ExitCode::from(INTERRUPTED) } else { ExitCode::SUCCESS });
+    }
     let ids: Vec<EntryId> = match (args.all_versions, args.all) {
         (true, _) => registry.ids()?,
         (false, true) => registry.newest()?,
@@ -176,7 +199,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         bail!("no entries in {}; make one with: actrm-zoo train act_lift", shown(&args.zoo.zoo));
     }
     let stop = Stop::install(GOES_ON)?;
-    let mut says = Says { as_json: args.json, all: Vec::new() };
     // one bad entry must not keep the others from being evaluated
     let mut failures: Vec<anyhow::Error> = Vec::new();
     // one set of simulators serves all entries of an environment
@@ -248,10 +270,7 @@ fn open(
         return Ok(None);
     }
     if entry.meta().is_robot_policy() {
-        let task = args.run.task.as_ref().unwrap_or(&entry.meta().task);
-        if let Some(protocol) = asked.protocol.filter(|protocol| protocol.task != *task) {
-            bail!("protocol {}: task: expected {}, found {task}", protocol.name, protocol.task);
-        }
+        asked.check_task(args.run.task.as_ref().unwrap_or(&entry.meta().task))?;
         return Ok(Some(entry.load()?));
     }
     // what says how robots are run; with --all it is meant for the others
@@ -334,7 +353,17 @@ fn evaluate_on(
 
 /// The entry as the command line wants it to act.
 fn subject(args: &Args, asked: &Asked<'_>, loaded: &LoadedEntry) -> anyhow::Result<Subject<'static>> {
-    let mut subject = loaded.subject();
+    adjusted(args, asked, loaded.subject(), Some(loaded.experiment().policy.action_horizon()))
+}
+
+/// The same of what has chunks of `action_horizon` actions, where that is known.
+fn adjusted<'a>(
+    args: &Args,
+    asked: &Asked<'_>,
+    mut subject: Subject<'a>,
+    action_horizon: Option<usize>,
+) -> anyhow::Result<Subject<'a>> {
+    let action_horizon = action_horizon.unwrap_or(usize::MAX);
     subject.perturbation.clone_from(&args.perturb);
     if let Some(protocol) = asked.protocol {
         subject.max_steps = Some(protocol.max_steps);
@@ -345,11 +374,11 @@ fn subject(args: &Args, asked: &Asked<'_>, loaded: &LoadedEntry) -> anyhow::Resu
     }
     if let Some(n_action_steps) = args.n_action_steps {
         subject.execution = Execution::RecedingHorizon { n_action_steps: usize::try_from(n_action_steps)? };
-        subject.execution.check(loaded.experiment().policy.action_horizon()).context("--n-action-steps")?;
+        subject.execution.check(action_horizon).context("--n-action-steps")?;
     }
     if let Some(coefficient) = args.temporal_ensemble {
         subject.execution = Execution::TemporalEnsemble { coefficient };
-        subject.execution.check(loaded.experiment().policy.action_horizon()).context("--temporal-ensemble")?;
+        subject.execution.check(action_horizon).context("--temporal-ensemble")?;
     }
     if let Some((protocol, fixed)) = asked.protocol.and_then(|protocol| Some((protocol, protocol.execution?)))
         && fixed != subject.execution
@@ -357,6 +386,34 @@ fn subject(args: &Args, asked: &Asked<'_>, loaded: &LoadedEntry) -> anyhow::Resu
         bail!("protocol {}: execution: expected {fixed:?}, found {:?}", protocol.name, subject.execution);
     }
     Ok(subject)
+}
+
+/// Evaluates the policy of a server.
+fn evaluate_remote(
+    args: &Args,
+    asked: &Asked<'_>,
+    remote: &Remote,
+    stop: &Stop,
+    says: &mut Says,
+) -> anyhow::Result<()> {
+    asked.check_task(&remote.task)?;
+    let environment = Environment::usual(&remote.task, args.run.simulator.env_module.as_deref(), remote.cameras()?);
+    let spec =
+        limited_worker(&environment, &args.run, asked.protocol.map_or(args.run.control, |protocol| protocol.control))?;
+    let (results, options) = (args.results.folder(&args.zoo), options(args, asked, &environment));
+    let subject = |ready: &Ready| adjusted(args, asked, remote.subject(&args.zoo.zoo, ready)?, None);
+    let remembered =
+        (!args.again && args.video == 0 && args.video_failed == 0).then(|| remembered_greeting(&spec)).flatten();
+    if let Some(ready) = remembered
+        && let Some(evaluation) = finished(&subject(&ready)?, &ready, &results, &options)?
+    {
+        return says.evaluation(&evaluation, true);
+    }
+    let Some(mut pool) = args.run.simulator.start(spec, args.run.worker_logs.clone(), stop)? else { return Ok(()) };
+    let subject = subject(pool.ready())?;
+    let ended = evaluate_entry((args, asked), &options, &subject, &mut pool, stop, says);
+    cli::close(pool);
+    ended
 }
 
 fn options(args: &Args, asked: &Asked<'_>, environment: &Environment) -> EvaluationOptions {

@@ -5,6 +5,7 @@ cli::commands! {
     "Evaluate": eval, merge, rerun, verify;
     "Compare": leaderboard, compare, diff;
     "Analyse": trace, saliency, depth, probe;
+    "Use": serve;
     "Manage entries": list, show, alias, remove, import, export;
     "Shell": completions;
 }

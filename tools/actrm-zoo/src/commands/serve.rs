@@ -1,0 +1,107 @@
+use std::process::ExitCode;
+
+use anyhow::bail;
+use cli::Stop;
+use serde_json::Value as Json;
+use serving::{Limits, Server, Service, Value};
+use zoo::entry::LoadedEntry;
+
+use crate::places::{ZooArgs, entry_names};
+
+/// Serve an entry to robots and scripts: openpi's protocol, for `openpi-client` and others
+///
+/// Clients send observations with the entry's features under LeRobot's names, and get chunks of actions in the units of the
+/// data. The first message describes the policy. Each client has an episode of its own. `GET /healthz` and `GET /metrics` are
+/// on the same port. Ctrl-C ends it.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  actrm-zoo serve lift-act
+  actrm-zoo serve lift-act@1 --port 8001
+  ACTRM_TOKEN=secret actrm-zoo serve lift-act --host 0.0.0.0")]
+pub struct Args {
+    /// Entry: `name` (its newest version), `name@version`, or its folder
+    #[arg(add = entry_names())]
+    entry: String,
+    /// Address to listen on; one that other machines reach needs a token
+    #[arg(long, value_name = "HOST", default_value = "127.0.0.1")]
+    host: String,
+    /// Port to listen on; 0 takes a free one
+    #[arg(long, value_name = "PORT", default_value_t = 8000)]
+    port: u16,
+    /// Token that clients have to send as `Authorization: Api-Key TOKEN`
+    #[arg(long, value_name = "TOKEN", env = "ACTRM_TOKEN", hide_env_values = true)]
+    token: Option<String>,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let loaded = args.zoo.registry().locate(&args.entry)?.load()?;
+    let id = loaded.entry().id();
+    if loaded.subject().is_scripted {
+        bail!("entry {id}: its expert acts inside the simulator and cannot be served");
+    }
+    let stop = Stop::install("stopped")?;
+    let server = Server::bind(&args.host, args.port, args.token.clone(), service(loaded), Limits::default())?;
+    cli::print(&format!("{id} on ws://{}\n", server.address()))?;
+    server.run(&|| stop.asked());
+    let queries = server.queries();
+    cli::note(&format!("stopped after {queries} {}", if queries == 1 { "query" } else { "queries" }));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// An entry's policy with what the entry records of its conventions.
+fn service(loaded: LoadedEntry) -> Service {
+    let (meta, experiment) = (loaded.entry().meta().clone(), loaded.experiment());
+    let signature = loaded.preprocess().signature().clone();
+    let past = experiment.policy.past_actions(signature.n_obs_steps);
+    let action_horizon = loaded.model().action_horizon() - past;
+    let keys = meta.keys.features().map(|feature| {
+        let keys = meta.keys.of(feature).iter().map(|key| Value::text(key.clone())).collect();
+        (feature.to_owned(), Value::List(keys))
+    });
+    let mut facts = vec![
+        ("entry", Value::text(meta.id().to_string())),
+        ("policy", Value::text(meta.policy.clone())),
+        ("task", Value::text(meta.task.clone())),
+        ("observation_keys", Value::map(keys)),
+    ];
+    if let Some(version) = &meta.env_version {
+        facts.push(("env_version", Value::text(version.clone())));
+    }
+    if let Some(environment) = &meta.env_args {
+        if let Some(rate) = environment.pointer("/env_kwargs/control_freq") {
+            facts.push(("control_freq", value(rate)));
+        }
+        facts.push(("env_args", value(environment)));
+    }
+    let n_action_steps = match experiment.rollout.temporal_ensemble {
+        Some(coefficient) => {
+            facts.push(("temporal_ensemble", Value::Float(coefficient)));
+            1
+        }
+        None => experiment.rollout.n_action_steps,
+    };
+    Service {
+        signature,
+        action_horizon,
+        n_action_steps,
+        facts: facts.into_iter().map(|(key, value)| (key.to_owned(), value)).collect(),
+        policy: Box::new(move || loaded.policy()),
+    }
+}
+
+/// JSON as a message has it.
+fn value(json: &Json) -> Value<'static> {
+    match json {
+        Json::Null => Value::Nil,
+        Json::Bool(yes) => Value::Bool(*yes),
+        Json::Number(number) => match number.as_i128() {
+            Some(integer) => Value::Integer(integer),
+            None => Value::Float(number.as_f64().unwrap_or(f64::NAN)),
+        },
+        Json::String(text) => Value::text(text.clone()),
+        Json::Array(values) => Value::List(values.iter().map(value).collect()),
+        Json::Object(pairs) => Value::map(pairs.iter().map(|(key, json)| (key.clone(), value(json)))),
+    }
+}

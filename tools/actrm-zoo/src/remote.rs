@@ -1,0 +1,164 @@
+//! A policy that a server runs, as an evaluation takes it.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use cli::shown;
+use models::{ModelError, Policy};
+use rollout::Ready;
+use serving::{Facts, Mapping, RemotePolicy};
+use zoo::entry::CamerasMeta;
+use zoo::evaluation::Subject;
+use zoo::external::{External, Named, usual_inputs};
+use zoo::results::Execution;
+use zoo::{FeatureKeys, ZooError};
+
+/// Where a policy of others is, and what it is ranked as.
+#[derive(Args)]
+pub struct RemoteArgs {
+    /// Evaluate the policy of this server, which speaks openpi's protocol; needs --name, and --task or --protocol
+    #[arg(long, value_name = "ws://HOST:PORT", requires = "name", conflicts_with_all = ["entries", "all", "all_versions"])]
+    policy: Option<String>,
+    /// Name that the policy of --policy is ranked under
+    #[arg(long, value_name = "NAME", requires = "policy")]
+    name: Option<String>,
+    /// What the server is sent: `actrm` (features under LeRobot's names), `openpi-libero`, or a TOML file
+    #[arg(long, value_name = "PRESET|FILE", default_value = "actrm", requires = "policy")]
+    mapping: String,
+    /// Hash or version of the server's weights; another one is another version of the entry [default: what the server says]
+    #[arg(long, value_name = "TEXT", requires = "policy")]
+    declared: Option<String>,
+    /// Token of the server, sent as `Authorization: Api-Key TOKEN`
+    #[arg(long, value_name = "TOKEN", env = "ACTRM_TOKEN", hide_env_values = true)]
+    token: Option<String>,
+}
+
+impl RemoteArgs {
+    /// The policy that was asked about, if it is a server's; the server is asked what it is.
+    ///
+    /// # Errors
+    /// A mapping that cannot be read, a server that cannot be used.
+    pub fn policy(&self, task: Option<&str>) -> anyhow::Result<Option<Remote>> {
+        let (Some(address), Some(name)) = (&self.policy, &self.name) else { return Ok(None) };
+        let Some(task) = task else { bail!("--policy: expected --task or --protocol beside it") };
+        let (mapping, text) = mapping(&self.mapping)?;
+        let mapping = mapping.of_task(task);
+        let facts = Facts::ask(address, self.token.as_deref(), &mapping)?;
+        Ok(Some(Remote {
+            address: address.clone(),
+            token: self.token.clone(),
+            task: task.to_owned(),
+            named: Named { name: name.clone(), description: format!("The policy that a server runs, on {task}.") },
+            declared: self.declared.clone().or_else(|| facts.entry.clone()),
+            mapping,
+            text,
+            facts,
+        }))
+    }
+}
+
+/// A mapping and its file's text; none of one that changes nothing.
+fn mapping(name: &str) -> anyhow::Result<(Mapping, Option<String>)> {
+    if let Some(mapping) = Mapping::preset(name) {
+        let text = (mapping != Mapping::default()).then(|| format!("preset {name}"));
+        return Ok((mapping, text));
+    }
+    let presets: Vec<&str> = Mapping::presets().collect();
+    let text = std::fs::read_to_string(PathBuf::from(name))
+        .with_context(|| format!("--mapping {}: expected {}, or a file", shown(Path::new(name)), presets.join(", ")))?;
+    Ok((Mapping::parse(name, &text)?, Some(text)))
+}
+
+/// A server's policy.
+pub struct Remote {
+    address: String,
+    token: Option<String>,
+    /// The task that it is evaluated on.
+    pub task: String,
+    named: Named,
+    declared: Option<String>,
+    mapping: Mapping,
+    text: Option<String>,
+    facts: Facts,
+}
+
+/// How features of images are named.
+const IMAGES: &str = "observation.images.";
+
+impl Remote {
+    fn external(&self, inputs: FeatureKeys) -> External {
+        let steps = self.mapping.n_action_steps.or(self.facts.n_action_steps).unwrap_or(1);
+        let execution = match self.facts.temporal_ensemble.filter(|_| self.mapping.n_action_steps.is_none()) {
+            Some(coefficient) => Execution::TemporalEnsemble { coefficient },
+            None => Execution::RecedingHorizon { n_action_steps: steps },
+        };
+        let (source, declared, mapping) = (self.address.clone(), self.declared.clone(), self.text.clone());
+        let images = inputs.features().any(|feature| feature.starts_with(IMAGES));
+        External { source, declared, mapping, image_size: images.then(|| self.image_size()), execution, inputs }
+    }
+
+    /// Side of the images: as the server says of its own, else as the mapping says.
+    fn image_size(&self) -> usize {
+        let own = self.facts.shapes.iter().find(|(key, _)| key.starts_with(IMAGES));
+        own.and_then(|(_, shape)| shape.first().copied()).unwrap_or(self.mapping.image_size)
+    }
+
+    /// The features and their keys, as far as server and mapping say them; `None` of a feature with its usual keys.
+    fn features(&self) -> Vec<(String, Option<Vec<String>>)> {
+        if self.mapping.observation.is_empty() {
+            return self.facts.observation_keys.iter().map(|(name, keys)| (name.clone(), Some(keys.clone()))).collect();
+        }
+        let keys = |feature: &str| Some(vec![format!("{}_image", feature.strip_prefix(IMAGES)?)]);
+        self.mapping.observation.iter().map(|item| (item.feature.clone(), keys(&item.feature))).collect()
+    }
+
+    /// The cameras that it looks through.
+    ///
+    /// # Errors
+    /// Keys that cannot be read.
+    pub fn cameras(&self) -> anyhow::Result<Option<CamerasMeta>> {
+        let mut inputs = FeatureKeys::default();
+        for (feature, keys) in self.features() {
+            if let Some(keys) = keys.filter(|_| feature.starts_with(IMAGES)) {
+                insert(&mut inputs, &feature, &keys)?;
+            }
+        }
+        Ok(self.external(inputs).cameras())
+    }
+
+    /// Its entry in `zoo`, and what is evaluated in the environment that `ready` describes.
+    ///
+    /// # Errors
+    /// Keys that the environment does not have; a name that is an entry with weights.
+    pub fn subject(&self, zoo: &Path, ready: &Ready) -> anyhow::Result<Subject<'_>> {
+        let usual = usual_inputs(ready)?;
+        let mut inputs = FeatureKeys::default();
+        for (feature, keys) in self.features() {
+            let keys = keys.unwrap_or_else(|| usual.of(&feature));
+            insert(&mut inputs, &feature, &keys)?;
+        }
+        if inputs.features().next().is_none() {
+            inputs = usual;
+        }
+        let external = self.external(inputs);
+        let entry = external.entry(zoo, &self.named, ready)?;
+        let signature = entry.meta().signature.clone();
+        // what does not fit is said before an episode begins
+        self.connect(&signature)?;
+        Ok(external.subject(&entry, move || self.connect(&signature)))
+    }
+
+    fn connect(&self, signature: &models::Signature) -> Result<Box<dyn Policy>, ModelError> {
+        let policy = RemotePolicy::connect(&self.address, self.token.as_deref(), signature, &self.mapping);
+        policy.map(|policy| Box::new(policy) as Box<dyn Policy>).map_err(ModelError::from)
+    }
+}
+
+fn insert(inputs: &mut FeatureKeys, feature: &str, keys: &[String]) -> Result<(), ZooError> {
+    inputs.insert(feature, keys).map_err(|found| ZooError::InvalidValue {
+        key: feature.to_owned(),
+        expected: "observation keys".to_owned(),
+        found,
+    })
+}
