@@ -301,6 +301,7 @@ impl Actrm {
     }
 
     /// What is asked of a batch beside the actions: its name in the loss, and its weight.
+    #[allow(clippy::type_complexity)] // name, question, weight
     fn question(&self, batch: &Batch) -> Result<Option<(&'static str, Arc<dyn Question>, f64)>> {
         let Design::Tokens(design) = &self.design else { return Ok(None) };
         Ok(match (&design.pointer, &design.layers) {
