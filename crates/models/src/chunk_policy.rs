@@ -122,9 +122,6 @@ mod tests {
         fn signature(&self) -> &Signature {
             self.0.signature()
         }
-        fn composed_because(&self) -> Option<String> {
-            self.0.composed_because()
-        }
         fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
             self.0.loss(batch, rng)
         }

@@ -13,7 +13,6 @@ pub mod classification;
 pub mod encoders;
 mod features;
 mod flops;
-mod fused;
 mod history;
 pub mod layers;
 pub mod lerobot;
@@ -27,6 +26,8 @@ pub mod rl;
 pub mod robomimic;
 #[cfg(test)]
 mod size;
+#[cfg(test)]
+mod testing;
 mod train;
 
 pub use batch::{Batch, Taken};

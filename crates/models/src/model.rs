@@ -17,9 +17,6 @@ pub trait PolicyModel: Send + Sync {
     /// What it is fed and what it gives.
     fn signature(&self) -> &Signature;
 
-    /// Why its training step runs on candle's autograd; `None` where a step by hand covers it.
-    fn composed_because(&self) -> Option<String>;
-
     /// Buffers of its passes and weights prepared for predictions, of a model that states its loss as [`Self::forward_loss`].
     fn cache(&self) -> Option<&Cache> {
         None
@@ -131,10 +128,4 @@ pub(crate) fn autograd<M: PolicyModel + ?Sized>(
         into.add_tensor(name, grad)?;
     }
     LossValues::from_parts(&loss)
-}
-
-/// Words for a feature that no step by hand covers.
-pub(crate) fn not_by_hand(signature: &Signature) -> Option<String> {
-    let spec = crate::fused::uncovered(signature)?;
-    Some(format!("the step by hand does not cover feature {} of kind {}", spec.name, spec.kind))
 }

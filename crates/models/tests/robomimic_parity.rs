@@ -5,7 +5,7 @@
 mod common;
 
 use candle_core::{DType, Device, Tensor};
-use models::layers::{Mixture, Mode};
+use models::layers::Mixture;
 use models::{
     ACTION, Batch, Clock, ENVIRONMENT_STATE, Features, NormMode, Normaliser, Observation, PolicyConfig, PolicyModel,
     Preprocess, Rng, STATE, Signature, bc_rnn::BcRnn, bc_transformer::BcTransformer,
@@ -107,7 +107,7 @@ impl Model {
     fn mixtures(&self, batch: &Batch) -> Mixture {
         match self {
             Self::Rnn(model) => model.mixtures(&batch.observation).unwrap(),
-            Self::Transformer(model) => model.mixtures(&batch.observation, &mut Mode::Eval).unwrap(),
+            Self::Transformer(model) => model.mixtures(&batch.observation).unwrap(),
         }
     }
 }

@@ -4,8 +4,11 @@
 #![allow(unsafe_code)] // an allocator is an unsafe trait; this one counts and passes on
 
 use candle_core::{Device, Tensor};
+use models::actrm::{self, Actrm, Over, ReasoningConfig};
 use models::trm::{Config, Gradient, Mixing, Positions, Trm};
+use models::{Batch, Features, Gradients, ParamLayout, PolicyModel, Rng, Signature};
 use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
 
 struct Counting;
@@ -52,6 +55,23 @@ fn peak(config: &Config, composed: bool) -> usize {
     PEAK.load(SeqCst) - before
 }
 
+/// The same of a training step of ACTRM.
+fn peak_of_actrm(over: Over, (h_cycles, l_cycles): (usize, usize)) -> usize {
+    let reasoning = ReasoningConfig { over, h_cycles, l_cycles, supervision_steps: 1, ..ReasoningConfig::default() };
+    let config = actrm::Config { dim_model: 16, n_heads: 2, action_horizon: 4, reasoning, ..Default::default() };
+    let (signature, rows) = (Signature::low_dimensional(3, 2, 2), 8);
+    let model = Actrm::new(&config, &signature, 0).unwrap();
+    let mut rng = Rng::new(1, "data");
+    let (state, environment, actions) = (rng.normals(rows * 3), rng.normals(rows * 2), rng.normals(rows * 4 * 2));
+    let observation = Features::of_slices(&state, &environment);
+    let batch = Batch::from_slices(&signature, 4, &observation, &actions, &vec![false; rows * 4]).unwrap();
+    let mut gradients = Gradients::zeros(Arc::new(ParamLayout::new(model.params())));
+    let before = LIVE.load(SeqCst);
+    PEAK.store(before, SeqCst);
+    model.accumulate_gradients(&batch, &mut rng, &mut gradients).unwrap();
+    PEAK.load(SeqCst) - before
+}
+
 // one test: the counters are the process's
 #[test]
 fn memory_is_flat_in_the_rounds_without_gradient() {
@@ -77,5 +97,11 @@ fn memory_is_flat_in_the_rounds_without_gradient() {
             let deep = peak(&config(2, 12), composed);
             assert!(deep as f64 > 1.5 * short as f64, "{what}; {deep} with four times the cycles with gradient");
         }
+    }
+    for over in [Over::Actions, Over::Memory] {
+        let least = |cycles| (0..4).map(|_| peak_of_actrm(over, cycles)).min().unwrap();
+        let (short, long, deep) = (least((2, 2)), least((12, 2)), least((2, 12)));
+        assert!(long as f64 <= 1.02 * short as f64, "{over:?}: {short} bytes with 2 rounds, {long} with 12");
+        assert!(deep as f64 > 1.3 * short as f64, "{over:?}: {short} bytes, {deep} with six times the cycles");
     }
 }

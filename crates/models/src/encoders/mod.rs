@@ -2,8 +2,7 @@
 //!
 //! An encoder reads pictures that are normalised already, (b, H, W, 3), and gives every camera either one token a cell of
 //! its feature map (ACT, LeRobot) or one token of keypoints. All cameras go through the same network. Convolutions and
-//! their tensors are torchvision's and LeRobot's by name and order. This is the readable form on candle's autograd;
-//! `fused/vision.rs` runs the same maths on slices.
+//! their tensors are torchvision's and LeRobot's by name and order.
 
 mod config;
 mod look;
@@ -291,3 +290,6 @@ impl ImageEncoder {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -67,11 +67,6 @@ impl Auxiliary {
         Ok(Self { head: Linear::new(p, AUXILIARY_HEAD, dim, signature.auxiliary_dim, rng)?, weight: config.weight })
     }
 
-    /// encoded: (b, M, D), the latent's token first -> (b, K)
-    pub(crate) fn forward(&self, encoded: &Tensor) -> Result<Tensor> {
-        self.head.forward(&encoded.narrow(1, 0, 1)?.squeeze(1)?.contiguous()?)
-    }
-
     /// encoded: (b, M, D), the latent's token first -> the squared error of what a batch tells
     pub(crate) fn term(
         &self,
@@ -97,7 +92,7 @@ impl Auxiliary {
     ///
     /// # Errors
     /// A batch that tells nothing, or something else.
-    pub(crate) fn told(&self, model: &'static str, batch: &Batch) -> Result<Told> {
+    fn told(&self, model: &'static str, batch: &Batch) -> Result<Told> {
         let expected = [batch.rows(), self.head.weight.dim(0)?];
         match &batch.auxiliary {
             Some(told) if told.dims() == expected => {
@@ -116,7 +111,7 @@ impl Auxiliary {
 
 /// What a shard tells.
 #[derive(Debug)]
-pub(crate) struct Told {
+struct Told {
     /// (b, K), normalised
     values: Vec<f32>,
     /// numbers that the whole batch tells
@@ -125,13 +120,13 @@ pub(crate) struct Told {
 
 impl Told {
     /// found: (b, K) -> the squared error, a share of the mean over the whole batch
-    pub(crate) fn loss(&self, found: &Tensor) -> Result<Tensor> {
+    fn loss(&self, found: &Tensor) -> Result<Tensor> {
         let told = Tensor::from_slice(&self.values, found.dims(), found.device())?;
         Ok(((found - told)?.sqr()?.sum_all()? / self.entries as f64)?)
     }
 
     /// The same on a slice; what was found becomes `weight` times the gradient of the loss.
-    pub(crate) fn gradient(&self, found: &mut [f32], weight: f64) -> f64 {
+    fn gradient(&self, found: &mut [f32], weight: f64) -> f64 {
         let (mut loss, share) = (0.0, weight * 2.0 / self.entries as f64);
         for (found, told) in found.iter_mut().zip(&self.values) {
             let off = f64::from(*found) - f64::from(*told);

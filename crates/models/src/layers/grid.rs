@@ -3,20 +3,22 @@
 //! Attention would have to learn which thing lies beside which; a convolution knows. As in `trm`, whose mazes and Sudoku
 //! it serves, it is what passes something on from cell to cell, one cell at each application.
 
-use super::pointer::Answers;
+use super::pointer::{Answers, Question};
 use super::tokens::TokenLayout;
-use super::{FeedForward, LayerInit, LayerNorm, Linear, Mode, Shape};
+use super::{FeedForward, LayerInit, LayerNorm, Linear, Shape};
 use crate::batch::Batch;
 use crate::classification::binary_cross_entropy;
 use candle_core::Tensor;
-use nn::Rng;
+use nn::ops::{cat_tokens, feed_forward, grid_convolution, layer_norm, linear, narrow_tokens, residual};
 use nn::values::with_values;
-use nn::{Init, Params};
-use nn::{ModelError, Result};
+use nn::{Context, Init, ModelError, Params, Result, Rng, Value};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Cells that a convolution reads: a cell and those around it.
 pub(crate) const NEIGHBOURS: usize = 9;
+/// The way's parameters.
+const WAY: &str = "way.score";
 
 /// `[policy.reasoning.grid]`: the tokens of a group of entities are cells of a grid, and the recursion goes over them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -77,16 +79,6 @@ impl Grid {
     pub(crate) fn cells(self) -> usize {
         self.rows * self.columns
     }
-
-    /// The cells that a convolution reads at `cell`, by tap, row by row; `None` beyond the edge.
-    pub(crate) fn neighbours(self, cell: usize) -> impl Iterator<Item = Option<usize>> {
-        let (row, column) = (cell / self.columns, cell % self.columns);
-        (0..NEIGHBOURS).map(move |tap| {
-            let (down, right) = (row + tap / 3, column + tap % 3);
-            let inside = (1..=self.rows).contains(&down) && (1..=self.columns).contains(&right);
-            inside.then(|| (down - 1) * self.columns + right - 1)
-        })
-    }
 }
 
 /// A layer over the cells: a zero-padded 3x3 convolution and a dense part, each after a norm and with a residual.
@@ -114,15 +106,14 @@ impl GridLayer {
     }
 
     /// x: (b, cells, D) -> (b, cells, D)
-    pub(crate) fn forward(&self, grid: Grid, x: &Tensor) -> Result<Tensor> {
-        let (batch, cells, dim) = x.dims3()?;
-        let (rows, columns) = (grid.rows, grid.columns);
-        let y = self.norm1.forward(x)?.reshape((batch, rows, columns, dim))?;
-        let padded = y.pad_with_zeros(1, 1, 1)?.pad_with_zeros(2, 1, 1)?;
-        let tap = |tap: usize| padded.narrow(1, tap / 3, rows)?.narrow(2, tap % 3, columns);
-        let patches = Tensor::cat(&(0..NEIGHBOURS).map(tap).collect::<candle_core::Result<Vec<_>>>()?, 3)?;
-        let x = (x + self.conv.forward(&patches.reshape((batch, cells, NEIGHBOURS * dim))?)?)?;
-        Ok((&x + self.ff.forward(&self.norm2.forward(&x)?, &mut Mode::Eval)?)?)
+    pub(crate) fn apply(&self, cx: &mut Context<'_>, grid: Grid, x: &Value) -> Result<Value> {
+        let cells = grid.cells();
+        let y = layer_norm(cx, x, &self.norm1)?;
+        let branch = grid_convolution(cx, &y, (grid.rows, grid.columns), &self.conv)?;
+        let x = residual(cx, x, &branch, (0.0, cells), None)?;
+        let y = layer_norm(cx, &x, &self.norm2)?;
+        let branch = feed_forward(cx, &y, &self.ff, cells)?;
+        residual(cx, &x, &branch, (0.0, cells), None)
     }
 }
 
@@ -149,32 +140,35 @@ impl Cells {
     }
 
     /// Of all tokens, (b, M, D), the cells, (b, cells, D).
-    pub(crate) fn of(&self, tokens: &Tensor) -> Result<Tensor> {
-        Ok(tokens.narrow(1, self.grid.first, self.grid.cells())?.contiguous()?)
+    pub(crate) fn of(&self, cx: &mut Context<'_>, tokens: &Value) -> Result<Value> {
+        narrow_tokens(cx, tokens, self.grid.first, self.grid.cells())
     }
 
     /// All tokens with these cells in their places.
-    pub(crate) fn put(&self, tokens: &Tensor, cells: &Tensor) -> Result<Tensor> {
+    pub(crate) fn put(&self, cx: &mut Context<'_>, tokens: &Value, cells: &Value) -> Result<Value> {
+        let (b, all, _) = tokens.dims3()?;
         let (first, after) = (self.grid.first, self.grid.first + self.grid.cells());
-        let rest = tokens.dim(1)? - after;
-        let mut parts = vec![tokens.narrow(1, 0, first)?, cells.clone()];
-        if rest > 0 {
-            parts.push(tokens.narrow(1, after, rest)?);
+        let before = narrow_tokens(cx, tokens, 0, first)?;
+        if after == all {
+            return cat_tokens(cx, b, &[&before, cells]);
         }
-        Ok(Tensor::cat(&parts, 1)?)
+        let rest = narrow_tokens(cx, tokens, after, all - after)?;
+        cat_tokens(cx, b, &[&before, cells, &rest])
     }
 
     /// tokens: (b, M, D) -> (b, cells), positive where the way is thought to go on; `None` where that is not asked
-    pub(crate) fn way(&self, tokens: &Tensor) -> Result<Option<Tensor>> {
-        let score = |way: &Linear| -> Result<Tensor> { Ok(way.forward(&self.of(tokens)?)?.squeeze(2)?) };
-        self.way.as_ref().map(score).transpose()
+    pub(crate) fn way(&self, cx: &mut Context<'_>, tokens: &Value) -> Result<Option<Value>> {
+        let Some(way) = &self.way else { return Ok(None) };
+        let cells = self.of(cx, tokens)?;
+        let (b, n, _) = cells.dims3()?;
+        Ok(Some(linear(cx, &cells, way)?.reshape((b, n))?))
     }
 
     /// What is asked of a batch; `None` if nothing is.
     ///
     /// # Errors
     /// A batch that does not say which cells are come by.
-    pub(crate) fn asked(&self, model: &'static str, batch: &Batch) -> Result<Option<Visited>> {
+    pub(crate) fn asked(&self, model: &'static str, batch: &Batch) -> Result<Option<Arc<dyn Question>>> {
         if self.way.is_none() {
             return Ok(None);
         }
@@ -188,16 +182,13 @@ impl Cells {
             return Err(refuse(format!("{:?}", visited.dims())));
         }
         let values = with_values(visited, <[f32]>::to_vec)?;
-        Ok(Some(Visited { values, cells, total: (batch.total_rows * cells).max(1) }))
+        Ok(Some(Arc::new(Visited { values, cells, total: (batch.total_rows * cells).max(1) })))
     }
 }
 
-/// The way's parameters.
-pub(crate) const WAY: &str = "way.score";
-
 /// What is asked of a shard: of each row the cells that its demonstration still comes by.
 #[derive(Debug)]
-pub(crate) struct Visited {
+struct Visited {
     /// (b, cells) of 0 and 1
     values: Vec<f32>,
     cells: usize,
@@ -205,16 +196,16 @@ pub(crate) struct Visited {
     total: usize,
 }
 
-impl Visited {
+impl Question for Visited {
     /// scores: (b, cells) -> binary cross-entropy, a share of the mean over all cells of the batch.
-    pub(crate) fn loss(&self, scores: &Tensor) -> Result<Tensor> {
+    fn loss(&self, scores: &Tensor) -> Result<Tensor> {
         let targets = Tensor::from_slice(&self.values, scores.shape(), scores.device())?;
         Ok((binary_cross_entropy(scores, &targets)?.sum_all()? / self.total as f64)?)
     }
 
     /// The same on a slice; writes `weight` times the gradient of the loss into `grad`, (b, cells). Right is a row of which
     /// every cell is.
-    pub(crate) fn answers(&self, scores: &[f32], grad: Option<(&mut [f32], f64)>) -> Answers {
+    fn answers(&self, scores: &[f32], grad: Option<(&mut [f32], f64)>) -> Answers {
         let cells = || scores.iter().zip(&self.values).map(|(&score, &target)| (f64::from(score), f64::from(target)));
         let loss: f64 = cells().map(|(x, target)| x.max(0.0) - x * target + (-x.abs()).exp().ln_1p()).sum();
         let is_right = |(score, target): (&f32, &f32)| (*score > 0.0) == (*target > 0.5);
@@ -250,8 +241,6 @@ mod tests {
         let grid = Grid::new("test", &config(2), &layout(&names)).unwrap();
         // after latent, state and environment state
         assert_eq!(grid, Grid { first: 3, rows: 2, columns: 2 });
-        let around: Vec<_> = grid.neighbours(1).collect();
-        assert_eq!(around, [None, None, None, Some(0), Some(1), None, Some(2), Some(3), None]);
         let error = |columns, names: &[(&str, &str)]| {
             Grid::new("test", &config(columns), &layout(names)).unwrap_err().to_string()
         };
@@ -275,19 +264,23 @@ mod tests {
         let layer = GridLayer::new(&mut p, "layer", shape, rng).unwrap();
         let grid = Grid { first: 0, rows: 3, columns: 2 };
         let x = Tensor::from_vec(rng.normals(6 * 4), (1, 6, 4), &nn::device::HERE).unwrap();
-        let got = layer.forward(grid, &x).unwrap().squeeze(0).unwrap();
+        let cache = nn::Cache::default();
+        let got = cache.predict(&p, &mut || {}, |cx| layer.apply(cx, grid, &Value::from(&x))).unwrap();
+        let got = got.detached().squeeze(0).unwrap();
         let y = layer.norm1.forward(&x).unwrap().squeeze(0).unwrap();
         for cell in 0..6 {
             let mut sum = layer.conv.bias.as_ref().unwrap().clone();
-            for (tap, at) in grid.neighbours(cell).enumerate() {
-                if let Some(at) = at {
+            for tap in 0..NEIGHBOURS {
+                let (down, right) = (cell / 2 + tap / 3, cell % 2 + tap % 3);
+                if (1..=3).contains(&down) && (1..=2).contains(&right) {
+                    let at = (down - 1) * 2 + right - 1;
                     let w = layer.conv.weight.narrow(1, tap * 4, 4).unwrap();
                     sum = (sum + w.matmul(&y.narrow(0, at, 1).unwrap().t().unwrap()).unwrap().squeeze(1).unwrap())
                         .unwrap();
                 }
             }
             let after = (x.squeeze(0).unwrap().narrow(0, cell, 1).unwrap() + sum.unsqueeze(0).unwrap()).unwrap();
-            let dense = layer.ff.forward(&layer.norm2.forward(&after).unwrap(), &mut Mode::Eval).unwrap();
+            let dense = layer.ff.forward(&layer.norm2.forward(&after).unwrap(), &mut super::super::Mode::Eval).unwrap();
             let off = ((&after + dense).unwrap() - got.narrow(0, cell, 1).unwrap()).unwrap();
             assert!(off.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-5);
         }

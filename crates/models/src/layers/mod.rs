@@ -9,15 +9,13 @@ mod tokens;
 mod vae;
 
 pub use auxiliary::AuxiliaryConfig;
-pub(crate) use auxiliary::{AUXILIARY_HEAD, Auxiliary, Told};
+pub(crate) use auxiliary::{AUXILIARY_HEAD, Auxiliary};
 pub use grid::GridConfig;
-pub(crate) use grid::{Cells, Grid, GridLayer, NEIGHBOURS, Visited, WAY};
+pub(crate) use grid::{Cells, GridLayer, NEIGHBOURS};
 pub use nn::layers::*;
 pub use pointer::PointerConfig;
-pub(crate) use pointer::{Answers, Asked, Pointer};
+pub(crate) use pointer::{Pointer, Question, ask};
 pub(crate) use sight::Sight;
 pub(crate) use steps::Steps;
-pub(crate) use tokens::{
-    Cameras, ENTITY_POSITIONS, FEATURE_POSITIONS, InputTokens, LATENT, Position, TokenLayout, environment_state,
-};
-pub(crate) use vae::{Vae, kl_divergence, sample};
+pub(crate) use tokens::{Cameras, InputTokens, TokenLayout, environment_state};
+pub(crate) use vae::Vae;

@@ -10,10 +10,9 @@ use crate::batch::Batch;
 use crate::checks::check_weight;
 use crate::classification::{ClassProbability, IGNORE_LABEL, cross_entropy};
 use crate::features::{FeatureKind, Signature};
-use candle_core::{D, DType, Tensor};
+use candle_core::{DType, Tensor};
 use nn::Params;
 use nn::Rng;
-use nn::device::HERE;
 use nn::ops::{cat_tokens, linear, select_tokens, term_of, weighted_mean};
 use nn::{Context, Term, Value};
 use nn::{ModelError, Result};
@@ -57,19 +56,10 @@ pub(crate) struct Pointer {
     /// (1, D), of the token that is read
     position: Embedding,
     /// places of the candidates among the tokens
-    pub(crate) places: Vec<u32>,
+    places: Vec<u32>,
     /// and of their features in the signature
     features: Vec<usize>,
     pub(crate) weight: f64,
-}
-
-/// What a pointer says.
-#[derive(Debug)]
-pub(crate) struct Pointed {
-    /// (b, candidates)
-    pub(crate) scores: Tensor,
-    /// (b, 1, D)
-    pub(crate) token: Tensor,
 }
 
 impl Pointer {
@@ -104,22 +94,6 @@ impl Pointer {
         })
     }
 
-    /// encoded and tokens: (b, M, D), after and before everything was encoded
-    pub(crate) fn forward(&self, encoded: &Tensor, tokens: &Tensor) -> Result<Pointed> {
-        let places = Tensor::new(self.places.as_slice(), &HERE)?;
-        let scores = self.score.forward(&encoded.index_select(&places, 1)?)?.squeeze(2)?;
-        let shares = scores.broadcast_sub(&scores.max_keepdim(D::Minus1)?.detach())?.exp()?;
-        let shares = shares.broadcast_div(&shares.sum_keepdim(D::Minus1)?)?;
-        let token = shares.unsqueeze(1)?.matmul(&tokens.index_select(&places, 1)?.contiguous()?)?;
-        Ok(Pointed { scores, token })
-    }
-
-    /// What a decoder reads, (b, M, D), and its positions, (1, M, D), with the token that is pointed at after them.
-    pub(crate) fn beside(&self, memory: &Tensor, pos: &Tensor, pointed: &Pointed) -> Result<(Tensor, Tensor)> {
-        let own = self.position.weight.unsqueeze(0)?;
-        Ok((Tensor::cat(&[memory, &pointed.token], 1)?, Tensor::cat(&[pos, &own], 1)?))
-    }
-
     /// Of tokens, (b, M, D), those of the candidates, (b, candidates, D).
     pub(crate) fn candidates(&self, cx: &mut Context<'_>, tokens: &Value) -> Result<Value> {
         select_tokens(cx, tokens, &self.places.iter().map(|place| *place as usize).collect::<Vec<_>>())
@@ -146,7 +120,7 @@ impl Pointer {
     ///
     /// # Errors
     /// A batch that does not say what was taken, or names something else than the candidates.
-    pub(crate) fn asked(&self, model: &'static str, batch: &Batch) -> Result<Asked> {
+    pub(crate) fn asked(&self, model: &'static str, batch: &Batch) -> Result<Arc<dyn Question>> {
         let refuse = |found: String| {
             let expected = "one of the candidates of `pointer.among` for each row".to_string();
             ModelError::Input { operation: model, object: "what was taken", found, expected }
@@ -160,39 +134,47 @@ impl Pointer {
             at.ok_or_else(|| refuse(format!("feature {feature}")))
         };
         let candidates = taken.features.iter().map(|feature| feature.map(candidate).transpose());
-        Ok(Asked { candidates: candidates.collect::<Result<_>>()?, total: taken.total.max(1) })
+        Ok(Arc::new(Asked { candidates: candidates.collect::<Result<_>>()?, total: taken.total.max(1) }))
     }
 }
 
 /// What a pointer is asked of a shard: of each row the candidate that was taken, where it is asked.
 #[derive(Debug)]
-pub(crate) struct Asked {
+struct Asked {
     candidates: Vec<Option<usize>>,
     /// rows of the whole batch that are asked
     total: usize,
 }
 
-/// How a pointer answers.
+/// How a question is answered.
 #[derive(Debug)]
 pub(crate) struct Answers {
-    /// cross-entropy, a share of the mean over all rows of the batch that are asked
+    /// cross-entropy, a share of the mean over all of the batch that is asked
     pub(crate) loss: f64,
-    /// rows whose highest score is that of what was taken, a share likewise
+    /// rows that are answered rightly, a share likewise
     pub(crate) right: f32,
 }
 
-impl Asked {
-    /// scores: (b, candidates) -> the loss, and the share of rows that are answered rightly
-    pub(crate) fn term(self, cx: &mut Context<'_>, scores: &Value) -> Result<(Term, f32)> {
-        let right = self.right(&scores.detached())?.to_scalar::<f32>()?;
-        let asked = Arc::new(self);
-        let by_hand = Arc::clone(&asked);
-        let by_hand = move |scores: &[f32], grad: Option<(&mut [f32], f64)>| by_hand.answers(scores, grad).loss;
-        Ok((term_of(cx, scores, by_hand, |scores| asked.loss(scores))?, right))
-    }
+/// What scores are asked about.
+pub(crate) trait Question {
+    /// The answers that scores give; writes `weight` times the gradient of their loss beside them.
+    fn answers(&self, scores: &[f32], grad: Option<(&mut [f32], f64)>) -> Answers;
 
+    /// Their loss on candle's graph.
+    fn loss(&self, scores: &Tensor) -> Result<Tensor>;
+}
+
+/// The loss of these scores, and the share of rows that are answered rightly.
+pub(crate) fn ask(cx: &mut Context<'_>, question: &Arc<dyn Question>, scores: &Value) -> Result<(Term, f32)> {
+    let values = scores.detached().flatten_all()?.to_vec1::<f32>()?;
+    let (right, by_hand) = (question.answers(&values, None).right, Arc::clone(question));
+    let by_hand = move |scores: &[f32], grad: Option<(&mut [f32], f64)>| by_hand.answers(scores, grad).loss;
+    Ok((term_of(cx, scores, by_hand, |scores| question.loss(scores))?, right))
+}
+
+impl Question for Asked {
     /// scores: (b, candidates) -> cross-entropy, a share of the mean over all rows of the batch that are asked.
-    pub(crate) fn loss(&self, scores: &Tensor) -> Result<Tensor> {
+    fn loss(&self, scores: &Tensor) -> Result<Tensor> {
         let label = |candidate: &Option<usize>| candidate.map_or(IGNORE_LABEL, |at| at as i64);
         let labels: Vec<i64> = self.candidates.iter().map(label).collect();
         let each = cross_entropy(scores, &labels, ClassProbability::Softmax)?.to_dtype(DType::F32)?;
@@ -200,7 +182,7 @@ impl Asked {
     }
 
     /// The same on a slice; writes `weight` times the gradient of the loss into `grad`, (b, candidates).
-    pub(crate) fn answers(&self, scores: &[f32], grad: Option<(&mut [f32], f64)>) -> Answers {
+    fn answers(&self, scores: &[f32], grad: Option<(&mut [f32], f64)>) -> Answers {
         let width = scores.len() / self.candidates.len();
         let rows = || self.candidates.iter().zip(scores.chunks_exact(width));
         let asked = || rows().filter_map(|(taken, scores)| taken.map(|taken| (taken, scores)));
@@ -217,11 +199,5 @@ impl Asked {
             }
         }
         Answers { loss: loss / self.total as f64, right: right as f32 / self.total as f32 }
-    }
-
-    /// Rows whose highest score is that of what was taken, a share of all rows of the batch that are asked.
-    pub(crate) fn right(&self, scores: &Tensor) -> Result<Tensor> {
-        let values = scores.detach().flatten_all()?.to_vec1::<f32>()?;
-        Ok(Tensor::new(self.answers(&values, None).right, scores.device())?)
     }
 }

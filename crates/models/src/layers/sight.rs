@@ -3,13 +3,11 @@
 
 use crate::encoders::{ImageEncoder, VisionConfig};
 use crate::features::{Features, Signature};
-use crate::fused::{Eyes, Grads, Looked, Pass};
 use crate::layers::Cameras;
 use candle_core::{DType, Tensor};
 use nn::Params;
 use nn::Result;
 use nn::Rng;
-use nn::values::with_values;
 use nn::{Context, Value};
 
 /// Cameras, and the network that their pictures go through.
@@ -44,64 +42,22 @@ impl Sight {
         &self.cameras
     }
 
-    /// The same by hand: its tokens are those of all cameras, of every step.
-    pub(crate) fn eyes(&self) -> Eyes<'_> {
-        self.cameras.eyes()
-    }
-
-    /// By hand: numbers, and behind them what the cameras see, in so many `lines` (one a row, or one a step of a row), and what
-    /// the backward pass needs.
-    pub(crate) fn beside(
-        &self,
-        pass: &mut Pass<'_>,
-        lines: usize,
-        numbers: &[f32],
-        pictures: &[Vec<f32>],
-    ) -> (Vec<f32>, Looked) {
-        let first = pictures.first().map_or(0, Vec::len);
-        let (height, width) = self.cameras.seen[0];
-        let rows = first / (height * width * 3 * self.steps);
-        let mut x = pass.take(rows * self.width());
-        let looked = self.of_cells(pass, |pass| self.eyes().forward(pass, pictures, &mut x, (0, self.cameras.tokens)));
-        let both = pass.beside(lines, numbers, &x);
-        pass.give(x);
-        (both, looked)
-    }
-
-    /// Adds the gradients of the cameras' network, given that of such lines of `width` numbers.
-    pub(crate) fn learn(
-        &self,
-        pass: &mut Pass<'_>,
-        looked: Looked,
-        (grad, width): (&[f32], usize),
-        own: usize,
-        grads: &mut Grads<'_>,
-    ) {
-        let mut of_seen = pass.take(grad.len() / width * own);
-        for (to, from) in of_seen.chunks_exact_mut(own).zip(grad.chunks_exact(width)) {
-            to.copy_from_slice(&from[width - own..]);
-        }
-        self.of_cells(pass, |pass| self.eyes().backward(pass, looked, &of_seen, (0, self.cameras.tokens), grads));
-        pass.give(of_seen);
-    }
-
-    /// Calls `f` with the width of a cell for that of the layers.
-    fn of_cells<R>(&self, pass: &mut Pass<'_>, f: impl FnOnce(&mut Pass<'_>) -> R) -> R {
-        let layers = pass.shape;
-        pass.shape.dim = self.config().cell_features();
-        let result = f(pass);
-        pass.shape = layers;
-        result
-    }
-
     /// Numbers of a row: those of all cells, or keypoints, of all cameras, step after step.
     pub(crate) fn width(&self) -> usize {
         self.steps * self.cameras.tokens * self.config().cell_features()
     }
 
-    /// The same cameras and network, of one step.
-    pub(crate) fn one_step(&self) -> OneStep<'_> {
-        OneStep(self)
+    /// Of a single step, whatever the history is: pictures as the data has them, (b, H, W, 3) or (b, 1, H, W, 3) a camera
+    /// -> (b, numbers of a step)
+    pub(crate) fn apply_to_step(&self, cx: &mut Context<'_>, observation: &Features<Tensor>) -> Result<Value> {
+        let mut looked = Vec::with_capacity(self.cameras.features.len());
+        for (i, name) in self.cameras.features.iter().enumerate() {
+            let pictures = observation.require("see", name)?;
+            let pictures = if pictures.rank() == 5 { pictures.squeeze(1)? } else { pictures.clone() };
+            looked.push(self.encoder.look(i, &pictures, None)?);
+        }
+        let tokens = self.encoder.apply(cx, &looked)?;
+        tokens.reshape((tokens.dim(0)?, self.width() / self.steps))
     }
 
     /// A camera's pictures one after the other, (b, …) or (b, steps, …) -> (b*steps, …)
@@ -125,46 +81,11 @@ impl Sight {
         Ok(seen)
     }
 
-    /// An observation that was looked at -> (b, width), with a gradient
-    pub(crate) fn forward(&self, observation: &Features<Tensor>) -> Result<Tensor> {
-        let pictures = self.cameras.features.iter();
-        let pictures = pictures.map(|name| self.unfolded(observation.require("see", name)?));
-        let tokens = self.encoder.forward(&pictures.collect::<Result<Vec<_>>>()?)?;
-        Ok(tokens.reshape(((), self.width()))?)
-    }
-
     /// An observation that was looked at -> (b, width)
     pub(crate) fn apply(&self, cx: &mut Context<'_>, observation: &Features<Tensor>) -> Result<Value> {
         let pictures = self.cameras.features.iter();
         let pictures = pictures.map(|name| self.unfolded(observation.require("see", name)?));
         let tokens = self.encoder.apply(cx, &pictures.collect::<Result<Vec<_>>>()?)?;
         tokens.reshape((tokens.len() / self.width(), self.width()))
-    }
-
-    /// Pictures of one step, in order -> (b, numbers of a step)
-    fn tokens(&self, pictures: &[Tensor]) -> Result<Tensor> {
-        Ok(self.encoder.forward(pictures)?.reshape(((), self.width() / self.steps))?)
-    }
-
-    /// The pictures of an observation that was looked at as slices, (b*steps, H, W, 3) a camera.
-    pub(crate) fn pictures(&self, observation: &Features<Tensor>) -> Result<Vec<Vec<f32>>> {
-        let names = self.cameras.features.iter();
-        names.map(|name| with_values(observation.require("see", name)?, <[f32]>::to_vec)).collect()
-    }
-}
-
-/// Cameras that see a single step, whatever the history is.
-pub(crate) struct OneStep<'a>(&'a Sight);
-
-impl OneStep<'_> {
-    /// Pictures as the data has them, (b, H, W, 3) or (b, 1, H, W, 3) a camera -> (b, numbers of a step)
-    pub(crate) fn forward(&self, observation: &Features<Tensor>) -> Result<Tensor> {
-        let mut looked = Vec::with_capacity(self.0.cameras.features.len());
-        for (i, name) in self.0.cameras.features.iter().enumerate() {
-            let pictures = observation.require("see", name)?;
-            let pictures = if pictures.rank() == 5 { pictures.squeeze(1)? } else { pictures.clone() };
-            looked.push(self.0.encoder.look(i, &pictures, None)?);
-        }
-        self.0.tokens(&looked)
     }
 }

@@ -4,11 +4,9 @@ use super::Sight;
 use crate::batch::Batch;
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Signature};
-use crate::fused::{Grads, Looked, Pass};
 use candle_core::Tensor;
-use nn::Params;
-use nn::Result;
-use nn::Rng;
+use nn::ops::cat_rows;
+use nn::{Context, Params, Result, Rng, Value};
 
 /// What a step shows.
 #[derive(Debug)]
@@ -80,57 +78,29 @@ impl Steps {
         Ok(Tensor::cat(&joined, 2)?)
     }
 
-    /// The signature's features, (b, T, …) each -> (b, T, width), with a gradient
-    pub(crate) fn forward(&self, rows: usize, observation: &Features<Tensor>) -> Result<Tensor> {
-        let numbers = self.numbers(rows, observation)?;
+    /// The signature's features, (b, T, …) each, pictures as the network reads them -> (b, T, width)
+    pub(crate) fn apply(&self, cx: &mut Context<'_>, rows: usize, observation: &Features<Tensor>) -> Result<Value> {
+        let numbers = Value::from(&self.numbers(rows, observation)?);
         let Some(sight) = &self.sight else { return Ok(numbers) };
-        let seen = sight.forward(&sight.look(observation, None)?)?;
-        Ok(Tensor::cat(&[numbers, seen.reshape((rows, self.signature.n_obs_steps, ()))?], 2)?)
+        let seen = sight.apply(cx, observation)?;
+        let lines = rows * self.signature.n_obs_steps;
+        let seen = seen.reshape((lines, self.of_cameras()))?;
+        let both = cat_rows(cx, &numbers.reshape((lines, numbers.width()))?, &seen)?;
+        both.reshape((rows, self.signature.n_obs_steps, self.width()))
     }
 
-    /// The last step alone, of one row: (1, 1, width). Of a camera's pictures the last one is seen only.
-    pub(crate) fn last(&self, observation: &Features<Tensor>) -> Result<Tensor> {
+    /// The last step alone, of one row: (1, 1, width). Of a camera's pictures, as the data has them, the last one is seen only.
+    pub(crate) fn apply_to_last(&self, cx: &mut Context<'_>, observation: &Features<Tensor>) -> Result<Value> {
         let steps = self.signature.n_obs_steps;
-        let numbers = self.numbers(1, observation)?.narrow(1, steps - 1, 1)?;
-        let Some(sight) = &self.sight else { return Ok(numbers) };
+        let numbers = self.numbers(1, observation)?.narrow(1, steps - 1, 1)?.contiguous()?;
+        let Some(sight) = &self.sight else { return Ok(Value::from(&numbers)) };
         let mut last = Features::new();
         for camera in &sight.cameras().features {
             let pictures = observation.require(self.model, camera)?;
             // a history of one step has no axis of its own
             last.insert(camera, if steps > 1 { pictures.narrow(1, steps - 1, 1)? } else { pictures.clone() });
         }
-        let seen = sight.one_step().forward(&last)?;
-        Ok(Tensor::cat(&[numbers, seen.unsqueeze(1)?], 2)?)
-    }
-
-    /// Its pictures as slices, which were looked at; `None` without any.
-    pub(crate) fn pictures(&self, observation: &Features<Tensor>) -> Result<Option<Vec<Vec<f32>>>> {
-        self.sight.as_ref().map(|sight| sight.pictures(observation)).transpose()
-    }
-
-    /// By hand: numbers, (b*T, numbers), and pictures -> (b*T, width), and what the backward pass needs.
-    pub(crate) fn see(
-        &self,
-        pass: &mut Pass<'_>,
-        rows: usize,
-        numbers: &[f32],
-        pictures: Option<&[Vec<f32>]>,
-    ) -> (Vec<f32>, Option<Looked>) {
-        let (Some(sight), Some(pictures)) = (&self.sight, pictures) else {
-            return (pass.space.pool.copy(numbers), None);
-        };
-        let (both, looked) = sight.beside(pass, rows * self.signature.n_obs_steps, numbers, pictures);
-        (both, Some(looked))
-    }
-
-    /// Whether a gradient goes on below what `see` gave.
-    pub(crate) fn learns(&self) -> bool {
-        self.sight.is_some()
-    }
-
-    /// Adds the gradients of the cameras' network, given that of what `see` gave, (b*T, width).
-    pub(crate) fn learn(&self, pass: &mut Pass<'_>, looked: Option<Looked>, grad: &[f32], grads: &mut Grads<'_>) {
-        let (Some(sight), Some(looked)) = (&self.sight, looked) else { return };
-        sight.learn(pass, looked, (grad, self.width()), self.of_cameras(), grads);
+        let seen = sight.apply_to_step(cx, &last)?;
+        cat_rows(cx, &Value::from(&numbers.squeeze(1)?), &seen)?.reshape((1, 1, self.width()))
     }
 }

@@ -7,7 +7,6 @@
 use super::{Embedding, Linear};
 use crate::encoders::{ImageEncoder, ResNetShape, Size, TokenKind, VisionConfig, position_table};
 use crate::features::{FeatureKind, Features, Signature};
-use crate::fused::Eyes;
 use candle_core::{DType, Tensor};
 use nn::Params;
 use nn::Rng;
@@ -16,11 +15,11 @@ use nn::{Context, Value};
 use nn::{ModelError, Result};
 
 /// The latent's projection.
-pub(crate) const LATENT: &str = "encoder_latent_input_proj";
+const LATENT: &str = "encoder_latent_input_proj";
 /// Positions of latent, state and environment state.
-pub(crate) const FEATURE_POSITIONS: &str = "encoder_1d_feature_pos_embed";
+const FEATURE_POSITIONS: &str = "encoder_1d_feature_pos_embed";
 /// Positions of the entities that have one.
-pub(crate) const ENTITY_POSITIONS: &str = "encoder_entity_pos_embed";
+const ENTITY_POSITIONS: &str = "encoder_entity_pos_embed";
 
 /// Where a token's position comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -97,11 +96,6 @@ impl Cameras {
         }
         let features = specs.iter().map(|spec| spec.name.clone()).collect();
         Ok(Some(Self { config: config.clone(), shape, features, given, seen, tokens, positions }))
-    }
-
-    /// What their pictures go through, by hand.
-    pub(crate) fn eyes(&self) -> Eyes<'_> {
-        Eyes { shape: &self.shape, sizes: &self.seen, tokens: self.config.tokens }
     }
 
     /// The same with the default encoder where nothing is said; to say something where nothing is seen is an error.
@@ -280,43 +274,6 @@ impl InputTokens {
     }
 
     /// latent: (b, L), the features of the observation -> (b, M, D)
-    pub(crate) fn forward(&self, latent: &Tensor, observation: &Features<Tensor>) -> Result<Tensor> {
-        let mut tokens = vec![self.latent.forward(latent)?.unsqueeze(1)?];
-        for (token, layer) in self.layout.tokens.iter().zip(&self.projections) {
-            let values = observation.require("tokens", &token.feature)?.flatten_from(1)?;
-            tokens.push(layer.forward(&values)?.unsqueeze(1)?);
-        }
-        if let (Some(eyes), Some(cameras)) = (&self.eyes, &self.layout.cameras) {
-            let pictures = cameras.features.iter().map(|name| Ok(observation.require("tokens", name)?.clone()));
-            tokens.push(eyes.forward(&pictures.collect::<Result<Vec<_>>>()?)?);
-        }
-        Ok(Tensor::cat(&tokens, 1)?)
-    }
-
-    /// (1, M, D)
-    pub(crate) fn positions(&self) -> Result<Tensor> {
-        let features = &self.feature_positions.weight;
-        if self.layout.len() == self.layout.feature_rows() {
-            return Ok(features.unsqueeze(0)?);
-        }
-        let (_, dim) = features.dims2()?;
-        let mut rows = vec![features.narrow(0, 0, 1)?];
-        for token in &self.layout.tokens {
-            rows.push(match (token.position, &self.entity_positions) {
-                (Position::Feature(row), _) => features.narrow(0, row, 1)?,
-                (Position::Entity(row), Some(entities)) => entities.weight.narrow(0, row, 1)?,
-                (Position::Entity(_) | Position::Nowhere, _) => Tensor::zeros((1, dim), DType::F32, features.device())?,
-            });
-        }
-        if let Some(eyes) = &self.eyes {
-            rows.push(eyes.positions()?);
-        }
-        Ok(Tensor::cat(&rows, 0)?.unsqueeze(0)?)
-    }
-}
-
-impl InputTokens {
-    /// latent: (b, L), the features of the observation -> (b, M, D)
     pub(crate) fn apply(&self, cx: &mut Context<'_>, latent: &Value, observation: &Features<Tensor>) -> Result<Value> {
         let (b, width) = latent.dims2()?;
         // backwards, so that gradients of a projection that entities share are added in their order
@@ -403,7 +360,8 @@ mod tests {
         let (mut p, rng) = (Params::new(), &mut Rng::new(1, "init"));
         let env_state = environment_state(&mut p, &layout, 8, rng).unwrap();
         let tokens = InputTokens::new(&mut p, layout, 3, 8, env_state, rng).unwrap();
-        let positions = tokens.positions().unwrap().squeeze(0).unwrap().to_vec2::<f32>().unwrap();
+        let positions = nn::compose(&nn::device::HERE, |cx| tokens.apply_positions(cx)).unwrap().detached();
+        let positions = positions.squeeze(0).unwrap().to_vec2::<f32>().unwrap();
         let rows = |name: &str| p.get(name).unwrap().to_vec2::<f32>().unwrap();
         let (features, entities) =
             (rows("encoder_1d_feature_pos_embed.weight"), rows("encoder_entity_pos_embed.weight"));

@@ -1,7 +1,7 @@
-//! The VAE encoder of an action chunk, a sample of its latent and its KL term.
+//! The VAE encoder of an action chunk.
 
 use super::tokens::TokenLayout;
-use super::{Embedding, Encoder, LayerInit, Linear, Mode, Shape};
+use super::{Embedding, Encoder, LayerInit, Linear, Shape};
 use crate::batch::Batch;
 use candle_core::{DType, Tensor};
 use nn::Params;
@@ -15,11 +15,11 @@ use nn::{Context, Value};
 pub(crate) struct Vae {
     /// the feature that it reads
     state: String,
-    pub(crate) encoder: Encoder,
-    pub(crate) cls_embed: Embedding,
-    pub(crate) robot_state_input_proj: Linear,
-    pub(crate) action_input_proj: Linear,
-    pub(crate) latent_output_proj: Linear,
+    encoder: Encoder,
+    cls_embed: Embedding,
+    robot_state_input_proj: Linear,
+    action_input_proj: Linear,
+    latent_output_proj: Linear,
 }
 
 impl Vae {
@@ -42,24 +42,6 @@ impl Vae {
         })
     }
 
-    /// actions: (b, C, A), is_pad: (b, C), pos: (1, C + 2, D) -> mean and log-variance of the latent, (b, L) each
-    pub(crate) fn encode(&self, batch: &Batch, pos: &Tensor, mode: &mut Mode<'_>) -> Result<(Tensor, Tensor)> {
-        let (b, dim) = (batch.rows(), self.cls_embed.weight.dim(1)?);
-        let latent = self.latent_output_proj.weight.dim(0)? / 2;
-        let cls = self.cls_embed.weight.reshape((1, 1, dim))?.broadcast_as((b, 1, dim))?;
-        let state = batch.observation.require("latent", &self.state)?.flatten_from(1)?;
-        let state = self.robot_state_input_proj.forward(&state)?.unsqueeze(1)?;
-        let actions = self.action_input_proj.forward(&batch.actions)?;
-        let tokens = Tensor::cat(&[&cls.contiguous()?, &state, &actions], 1)?;
-        let always = Tensor::zeros((b, 2), DType::F32, tokens.device())?;
-        let key_pad = Tensor::cat(&[&always, &batch.is_pad], 1)?;
-        let x = self.encoder.forward(&tokens, &pos.to_device(tokens.device())?, Some(&key_pad), mode)?;
-        let out = self.latent_output_proj.forward(&x.narrow(1, 0, 1)?.squeeze(1)?)?;
-        Ok((out.narrow(1, 0, latent)?, out.narrow(1, latent, latent)?))
-    }
-}
-
-impl Vae {
     /// actions: (b, C, A), is_pad: (b, C), pos: (1, C + 2, D) -> mean and log-variance of the latent, (b, 2L)
     pub(crate) fn apply(&self, cx: &mut Context<'_>, batch: &Batch, pos: &Tensor) -> Result<Value> {
         let (b, dim) = (batch.rows(), self.cls_embed.weight.dim(1)?);
@@ -73,15 +55,4 @@ impl Vae {
         let x = self.encoder.apply(cx, &tokens, &Value::from(pos), Some(&key_pad), 1)?;
         linear(cx, &x.reshape((b, dim))?, &self.latent_output_proj)
     }
-}
-
-/// A sample of the latent with noise `eps`: (b, L)
-pub(crate) fn sample((mu, log_variance): &(Tensor, Tensor), eps: &Tensor) -> Result<Tensor> {
-    Ok((mu + (log_variance / 2.0)?.exp()?.mul(eps)?)?)
-}
-
-/// KL(latent ‖ N(0, 1)), summed over the latent and averaged over `total_rows`.
-pub(crate) fn kl_divergence(mu: &Tensor, log_variance: &Tensor, total_rows: usize) -> Result<Tensor> {
-    let terms = ((log_variance + 1.0)? - mu.sqr()? - log_variance.exp()?)?;
-    Ok((terms.sum_all()? * (-0.5 / total_rows.max(1) as f64))?)
 }

@@ -1,5 +1,4 @@
-//! One model, one folder: `mod.rs` is the model as one reads it, `config.rs` its options, `fused` its training step by hand
-//! where it has one.
+//! One model, one folder: `mod.rs` is the model as one reads it, `config.rs` its options.
 
 pub mod act;
 pub mod actrm;

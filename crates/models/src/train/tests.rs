@@ -187,3 +187,84 @@ fn the_schedule_rises_then_falls() {
     assert_eq!(flat.lr_at(99), 1.0);
     assert!(TrainConfig { accumulation: 0, ..Default::default() }.validate().is_err());
 }
+
+/// A model whose training steps run on candle's operations, as on a device without kernels of its own.
+struct Fallback(Box<dyn PolicyModel>);
+
+impl PolicyModel for Fallback {
+    fn params(&self) -> &nn::Params {
+        self.0.params()
+    }
+
+    fn signature(&self) -> &Signature {
+        self.0.signature()
+    }
+
+    fn loss(&self, batch: &Batch, rng: &mut Rng) -> nn::Result<nn::LossParts> {
+        self.0.loss(batch, rng)
+    }
+
+    fn predict(&self, observation: &Features<Tensor>) -> nn::Result<Tensor> {
+        self.0.predict(observation)
+    }
+
+    fn policy(
+        self: std::sync::Arc<Self>,
+        _: std::sync::Arc<crate::Preprocess>,
+        _: Box<dyn crate::Clock>,
+    ) -> Box<dyn crate::Policy> {
+        unreachable!("it trains")
+    }
+
+    fn action_horizon(&self) -> usize {
+        self.0.action_horizon()
+    }
+}
+
+/// Policies on hand-written kernels and on candle's operations: 50 steps of training end with the same losses.
+#[test]
+fn the_fallback_trains_to_the_same_losses() {
+    use serde_json::json;
+    let of = crate::testing::signatures();
+    let act = json!({"action_horizon": 5, "dim_model": 12, "n_heads": 3, "dim_feedforward": 19, "latent_dim": 3});
+    let actrm = |reasoning| {
+        let mut config = act.clone();
+        config["reasoning"] = reasoning;
+        config
+    };
+    let pointer = json!({"among": "cube", "weight": 0.7});
+    let mut pointing = actrm(json!({"over": "tokens"}));
+    pointing["pointer"] = pointer.clone();
+    let grid = json!({"over": "tokens", "grid": {"among": "cell", "columns": 3, "way": 0.5}});
+    let memory = json!({"over": "memory", "n_layers": 1, "h_cycles": 2, "l_cycles": 2, "supervision_steps": 2});
+    let rnn = |cell| json!({"action_horizon": 3, "hidden_dim": 9, "n_modes": 2, "min_std": 0.05, "cell": cell});
+    let transformer = json!({"dim_model": 12, "n_heads": 2, "n_layers": 2, "n_modes": 2, "min_std": 0.05});
+    for (kind, mut policy, signature) in [
+        ("act", act.clone(), &of.plain),
+        ("bc", json!({"action_horizon": 3, "hidden": [11, 7]}), &of.plain),
+        ("actrm", actrm(json!({"h_cycles": 2, "l_cycles": 2})), &of.entities),
+        ("actrm", actrm(json!({"warm_start": {"noise": 0.1}})), &of.plain),
+        ("actrm", pointing, &of.entities),
+        ("actrm", actrm(grid), &of.grid),
+        ("actrm", actrm(memory), &of.plain),
+        ("bc_rnn", rnn("lstm"), &of.history),
+        ("bc_rnn", rnn("gru"), &of.history),
+        ("bc_transformer", transformer, &of.history),
+    ] {
+        policy["type"] = kind.into();
+        let policy: PolicyConfig = serde_json::from_value(policy).unwrap();
+        let losses = |fallback: bool| {
+            let model = policy.build(signature, 1).unwrap();
+            let model = if fallback { Box::new(Fallback(model)) as Box<dyn PolicyModel> } else { model };
+            let config = TrainConfig { steps: 50, lr: 1e-3, warmup_steps: 5, ..Default::default() };
+            let mut trainer = Trainer::new(model, config, 5).unwrap();
+            let batch = crate::testing::batch(signature, policy.action_horizon(), 4, 3);
+            (0..50).map(|_| trainer.step(&batch).unwrap().loss).collect::<Vec<_>>()
+        };
+        let (fast, fallback) = (losses(false), losses(true));
+        for (step, (a, b)) in fast.iter().zip(&fallback).enumerate() {
+            assert!((a - b).abs() < 1e-3 * b.abs().max(1.0), "{policy:?}, step {step}: {a} and {b}");
+        }
+        assert!(fast[49] < fast[0], "{policy:?}: {} and {}", fast[0], fast[49]);
+    }
+}

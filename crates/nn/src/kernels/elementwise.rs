@@ -106,6 +106,21 @@ pub fn exp(x: f32) -> f32 {
     y * f32::from_bits((shifted.to_bits() << 23).wrapping_add(127 << 23))
 }
 
+/// From one exponential that cannot overflow.
+#[inline(always)]
+pub fn sigmoid(x: f32) -> f32 {
+    let w = exp(-x.abs());
+    if x < 0.0 { w / (1.0 + w) } else { 1.0 / (1.0 + w) }
+}
+
+/// Likewise.
+#[inline(always)]
+pub fn tanh(x: f32) -> f32 {
+    let w = exp(-2.0 * x.abs());
+    let t = (1.0 - w) / (1.0 + w);
+    if x < 0.0 { -t } else { t }
+}
+
 /// The sum in a fixed order that vectorises.
 #[inline(always)]
 pub fn sum(x: &[f32]) -> f32 {

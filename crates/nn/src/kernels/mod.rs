@@ -1,14 +1,13 @@
 //! Arithmetic on plain slices, single-threaded: matrix products, layer norm, attention, activations.
 //!
 //! What candle's autograd would do in several passes with a new tensor each is done here in one, into buffers that are
-//! reused. Every function with a backward pass is held against candle's composed operations by the tests of `fused`.
+//! reused. Every function with a backward pass is compared with candle's composed operations by the tests of `ops`.
 
 mod attention;
 mod conv;
 pub mod elementwise;
 mod gemm;
 mod image;
-mod norm;
 mod pool;
 mod residual;
 mod sequence;
@@ -21,7 +20,6 @@ pub use gemm::{Mat, Pack, Packed, Start, gemm, gemm_with, product};
 pub use image::{
     Shortcut, group_norm, group_norm_backward, max_pool, max_pool_backward, relu_backward, scale_backward, scale_relu,
 };
-pub use norm::{layer_norm, layer_norm_backward};
 pub use pool::Pool;
 pub use residual::{Rows, Summed, dropped, sum_over_sequences};
 pub use sequence::{After, Film, add_bias, mish, mish_backward, mish_parts, norm_mish, norm_mish_backward};

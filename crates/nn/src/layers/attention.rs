@@ -116,7 +116,7 @@ impl MultiHeadAttention {
     /// # Errors
     /// Shapes that do not go together.
     pub fn queries(&self, cx: &mut Context<'_>, x: &Value, positions: Option<&Value>) -> Result<Value> {
-        linear_rows(cx, x, positions, (&self.in_proj_weight, &self.in_proj_bias), 0..x.width())
+        linear_rows(cx, x, positions, (&self.in_proj_weight, Some(&self.in_proj_bias)), 0..x.width())
     }
 
     /// Keys and values of x, (b or 1, s, 2D); values have no positions.
@@ -125,7 +125,7 @@ impl MultiHeadAttention {
     /// Shapes that do not go together.
     pub fn keys_and_values(&self, cx: &mut Context<'_>, x: &Value, positions: Option<&Value>) -> Result<Value> {
         let dim = x.width();
-        linear_rows(cx, x, positions, (&self.in_proj_weight, &self.in_proj_bias), dim..3 * dim)
+        linear_rows(cx, x, positions, (&self.in_proj_weight, Some(&self.in_proj_bias)), dim..3 * dim)
     }
 
     /// Attention of queries, (b or 1, t, D), to keys and values, (b or 1, s, 2D) -> (b, t, D)

@@ -1,10 +1,12 @@
 //! A mixture of Gaussians over actions, as robomimic's GMM heads have it.
 
 use super::Linear;
-use crate::device::HERE;
+use crate::context::Context;
 use crate::error::Result;
+use crate::ops::linear;
 use crate::params::Params;
 use crate::rng::Rng;
+use crate::value::Value;
 use candle_core::{D, Tensor};
 
 /// Deviation of a component at test time (robomimic: `low_noise_eval`).
@@ -50,19 +52,48 @@ impl MixtureHead {
         })
     }
 
-    /// x: (n, in) -> n mixtures
+    /// x: (n, in) -> n mixtures as its layers give them
+    ///
+    /// # Errors
+    /// An input of another width.
+    pub fn apply(&self, cx: &mut Context<'_>, x: &Value) -> Result<MixtureParts> {
+        // backwards, so that the gradient of x is that of the means, then of the scales, then of the logits
+        let logits = linear(cx, x, &self.logits)?;
+        let scales = linear(cx, x, &self.scale)?;
+        let means = linear(cx, x, &self.mean)?;
+        Ok(MixtureParts { means, scales, logits, min_std: self.min_std, action_dim: self.action_dim })
+    }
+}
+
+/// n mixtures of M Gaussians with A numbers each as a [`MixtureHead`]'s layers give them.
+#[derive(Debug)]
+pub struct MixtureParts {
+    /// (n, M * A), before tanh
+    pub means: Value,
+    /// (n, M * A), before softplus
+    pub scales: Value,
+    /// (n, M)
+    pub logits: Value,
+    /// what is added to scales
+    pub min_std: f64,
+    /// A
+    pub action_dim: usize,
+}
+
+impl MixtureParts {
+    /// The mixtures, on candle's operations.
     ///
     /// # Errors
     /// If the tensor library fails.
-    pub fn forward(&self, x: &Tensor) -> Result<Mixture> {
-        let apart = |y: Tensor| y.reshape((x.dim(0)?, (), self.action_dim));
-        let scale = apart(self.scale.forward(x)?)?;
+    pub fn mixture(&self) -> Result<Mixture> {
+        let apart = |y: &Tensor| y.reshape((y.dim(0)?, (), self.action_dim));
+        let scale = apart(&self.scales.tensor)?;
         // softplus, which cannot overflow so
         let scales = (scale.relu()? + (scale.abs()?.neg()?.exp()? + 1.0)?.log()?)?;
         Ok(Mixture {
-            means: apart(self.mean.forward(x)?)?.tanh()?,
+            means: apart(&self.means.tensor)?.tanh()?,
             scales: (scales + self.min_std)?,
-            logits: self.logits.forward(x)?,
+            logits: self.logits.tensor.clone(),
         })
     }
 }
@@ -116,7 +147,7 @@ impl Mixture {
         };
         let modes: Vec<usize> = rows.iter().map(draw).collect();
         let means = self.of_modes(&modes)?;
-        let noise = Tensor::from_vec(rng.normals(means.elem_count()), means.shape(), &HERE)?;
+        let noise = Tensor::from_vec(rng.normals(means.elem_count()), means.shape(), means.device())?;
         Ok((means + (noise * f64::from(LOW_NOISE))?)?)
     }
 
@@ -124,7 +155,7 @@ impl Mixture {
     fn of_modes(&self, modes: &[usize]) -> Result<Tensor> {
         let (n, count, width) = self.means.dims3()?;
         let rows: Vec<u32> = modes.iter().enumerate().map(|(row, mode)| (row * count + mode) as u32).collect();
-        Ok(self.means.reshape((n * count, width))?.index_select(&Tensor::from_vec(rows, n, &HERE)?, 0)?)
+        Ok(self.means.reshape((n * count, width))?.index_select(&Tensor::from_vec(rows, n, self.means.device())?, 0)?)
     }
 }
 

@@ -1,11 +1,14 @@
-//! Layers that carry a state from step to step, of either cell.
+//! Layers that carry a state from step to step, of either cell, with torch's weights and gates and without dropout: long
+//! short-term memory (Hochreiter and Schmidhuber 1997) and gated recurrent units (Cho et al. 2014).
 
-use super::{Gru, Linear, Lstm};
-use crate::device::HERE;
+use super::Linear;
+use crate::context::Context;
 use crate::error::Result;
+use crate::ops::{gru, lstm};
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use candle_core::{DType, Tensor};
+use crate::value::Value;
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// The cell of a recurrent network, with torch's weights and gates (robomimic: `rnn.rnn_type`).
@@ -27,13 +30,6 @@ impl Cell {
             Self::Gru => 3,
         }
     }
-
-    fn states(self) -> usize {
-        match self {
-            Self::Lstm => 2,
-            Self::Gru => 1,
-        }
-    }
 }
 
 /// Of each layer the tensors that go from step to step, (b, hidden) each: an LSTM's h and c, a GRU's h.
@@ -42,16 +38,9 @@ pub type RecurrentState = Vec<Vec<Tensor>>;
 /// Layers of one kind of cell.
 #[derive(Debug, Clone)]
 pub struct Recurrent {
-    layers: Layers,
+    /// from what comes from below, (gates * hidden, in), and from the state, (gates * hidden, hidden)
+    layers: Vec<(Linear, Linear)>,
     cell: Cell,
-    hidden: usize,
-    count: usize,
-}
-
-#[derive(Debug, Clone)]
-enum Layers {
-    Lstm(Lstm),
-    Gru(Gru),
 }
 
 impl Recurrent {
@@ -63,50 +52,40 @@ impl Recurrent {
         params: &mut Params,
         prefix: &str,
         cell: Cell,
-        sizes: (usize, usize, usize),
+        (input, hidden, layers): (usize, usize, usize),
         rng: &mut Rng,
     ) -> Result<Self> {
-        let layers = match cell {
-            Cell::Lstm => Layers::Lstm(Lstm::new(params, prefix, sizes, rng)?),
-            Cell::Gru => Layers::Gru(Gru::new(params, prefix, sizes, rng)?),
+        let init = Init::Uniform { bound: 1.0 / (hidden as f64).sqrt() };
+        let wide = cell.gates() * hidden;
+        let mut linear = |side: &str, layer: usize, input: usize| -> Result<Linear> {
+            let weight = params.create(&format!("{prefix}.weight_{side}_l{layer}"), &[wide, input], init, rng)?;
+            let bias = params.create(&format!("{prefix}.bias_{side}_l{layer}"), &[wide], init, rng)?;
+            Ok(Linear { weight, bias: Some(bias) })
         };
-        Ok(Self { layers, cell, hidden: sizes.1, count: sizes.2 })
+        let layers =
+            (0..layers).map(|l| Ok((linear("ih", l, if l == 0 { input } else { hidden })?, linear("hh", l, hidden)?)));
+        Ok(Self { layers: layers.collect::<Result<_>>()?, cell })
     }
 
-    /// The state before the first step of `rows` sequences.
+    /// x: (steps, b, in) -> (steps, b, hidden). A prediction may go on from a state, which becomes that after the last step;
+    /// without one it begins at zero.
     ///
     /// # Errors
-    /// If the tensor library fails.
-    pub fn zero_state(&self, rows: usize) -> Result<RecurrentState> {
-        let zeros = || Tensor::zeros((rows, self.hidden), DType::F32, &HERE);
-        (0..self.count).map(|_| (0..self.cell.states()).map(|_| Ok(zeros()?)).collect()).collect()
-    }
-
-    /// x: (b, steps, in) -> (b, steps, hidden); `state` becomes that after the last step.
-    ///
-    /// # Errors
-    /// If the tensor library fails.
-    pub fn forward(&self, x: &Tensor, state: &mut RecurrentState) -> Result<Tensor> {
-        match &self.layers {
-            Layers::Lstm(layers) => layers.forward(x, state),
-            Layers::Gru(layers) => layers.forward(x, state),
+    /// Shapes that do not go together, a state in a pass that trains.
+    pub fn apply(&self, cx: &mut Context<'_>, x: &Value, mut state: Option<&mut RecurrentState>) -> Result<Value> {
+        let (mut x, mut after) = (x.clone(), Vec::with_capacity(self.layers.len()));
+        for (i, layer) in self.layers.iter().enumerate() {
+            let before = state.as_ref().and_then(|state| state.get(i)).map(Vec::as_slice);
+            let (out, last) = match self.cell {
+                Cell::Lstm => lstm(cx, &x, (&layer.0, &layer.1), before)?,
+                Cell::Gru => gru(cx, &x, (&layer.0, &layer.1), before)?,
+            };
+            x = out;
+            after.push(last);
         }
+        if let Some(state) = &mut state {
+            **state = after;
+        }
+        Ok(x)
     }
-}
-
-/// The weights of layers with so many gates: from what comes from below and from the state.
-pub fn gate_layers(
-    params: &mut Params,
-    prefix: &str,
-    (input, hidden, layers): (usize, usize, usize),
-    gates: usize,
-    rng: &mut Rng,
-) -> Result<Vec<(Linear, Linear)>> {
-    let init = Init::Uniform { bound: 1.0 / (hidden as f64).sqrt() };
-    let mut linear = |side: &str, layer: usize, input: usize| -> Result<Linear> {
-        let weight = params.create(&format!("{prefix}.weight_{side}_l{layer}"), &[gates * hidden, input], init, rng)?;
-        let bias = params.create(&format!("{prefix}.bias_{side}_l{layer}"), &[gates * hidden], init, rng)?;
-        Ok(Linear { weight, bias: Some(bias) })
-    };
-    (0..layers).map(|l| Ok((linear("ih", l, if l == 0 { input } else { hidden })?, linear("hh", l, hidden)?))).collect()
 }

@@ -1,7 +1,7 @@
 //! Transformer encoder and decoder as ACT has them: positions are added to queries and keys, and a norm stands before or
 //! after each branch.
 
-use super::{Activation, Dropout, Embedding, FeedForward, LayerNorm, Mode, MultiHeadAttention};
+use super::{Activation, Dropout, Embedding, FeedForward, LayerNorm, MultiHeadAttention};
 use crate::context::Context;
 use crate::error::Result;
 use crate::ops::{feed_forward, layer_norm, narrow_tokens, residual};
@@ -9,7 +9,7 @@ use crate::params::{Init, Params};
 use crate::rng::Rng;
 use crate::size::Size;
 use crate::value::Value;
-use candle_core::{DType, Tensor};
+use candle_core::Tensor;
 
 /// What all transformer layers of a model share.
 #[derive(Debug, Clone, Copy)]
@@ -69,24 +69,6 @@ impl EncoderLayer {
             dropout: Dropout { p },
             pre_norm: shape.pre_norm,
         })
-    }
-
-    /// x: (b, t, D), pos: (1, t, D) -> (b, t, D)
-    pub fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let y = if self.pre_norm { self.norm1.forward(x)? } else { x.clone() };
-        let qk = y.broadcast_add(pos)?;
-        let branch = self.self_attn.forward(&qk, &qk, &y, key_pad, mode)?;
-        let x = (x + self.dropout.forward(&branch, mode)?)?;
-        let (x, y) = if self.pre_norm {
-            let y = self.norm2.forward(&x)?;
-            (x, y)
-        } else {
-            let x = self.norm1.forward(&x)?;
-            (x.clone(), x)
-        };
-        let branch = self.ff.forward(&y, mode)?;
-        let x = (x + self.dropout.forward(&branch, mode)?)?;
-        if self.pre_norm { Ok(x) } else { self.norm2.forward(&x) }
     }
 }
 
@@ -162,20 +144,6 @@ impl Encoder {
         Ok(Self { layers, norm })
     }
 
-    /// x: (b, t, D), pos: (1, t, D) -> (b, t, D)
-    pub fn forward(&self, x: &Tensor, pos: &Tensor, key_pad: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let mut x = x.clone();
-        for layer in &self.layers {
-            x = layer.forward(&x, pos, key_pad, mode)?;
-        }
-        match &self.norm {
-            Some(norm) => norm.forward(&x),
-            None => Ok(x),
-        }
-    }
-}
-
-impl Encoder {
     /// x: (b, t, D), pos: (1, t, D) -> the first `read` tokens of each sequence, (b, read, D); of the last layer nothing else
     /// is computed.
     ///
@@ -233,35 +201,6 @@ impl DecoderLayer {
         Ok(Self { self_attn, multihead_attn, ff, norm1, norm2, norm3, dropout, pre_norm: shape.pre_norm })
     }
 
-    /// x: (b, c, D), query_pos: (1, c, D), memory: (b, m, D), memory_pos: (1, m, D) -> (b, c, D)
-    pub fn forward(
-        &self,
-        x: &Tensor,
-        query_pos: &Tensor,
-        memory: &Tensor,
-        memory_pos: &Tensor,
-        mode: &mut Mode<'_>,
-    ) -> Result<Tensor> {
-        // a branch reads norm(x) when pre-norm; otherwise the norm comes after the residual
-        let before = |norm: &LayerNorm, x: &Tensor| if self.pre_norm { norm.forward(x) } else { Ok(x.clone()) };
-        let after = |norm: &LayerNorm, x: Tensor| if self.pre_norm { Ok(x) } else { norm.forward(&x) };
-
-        let y = before(&self.norm1, x)?;
-        let qk = y.broadcast_add(query_pos)?;
-        let branch = self.self_attn.forward(&qk, &qk, &y, None, mode)?;
-        let x = after(&self.norm1, (x + self.dropout.forward(&branch, mode)?)?)?;
-
-        let q = before(&self.norm2, &x)?.broadcast_add(query_pos)?;
-        let k = memory.broadcast_add(memory_pos)?;
-        let branch = self.multihead_attn.forward(&q, &k, memory, None, mode)?;
-        let x = after(&self.norm2, (x + self.dropout.forward(&branch, mode)?)?)?;
-
-        let branch = self.ff.forward(&before(&self.norm3, &x)?, mode)?;
-        after(&self.norm3, (&x + self.dropout.forward(&branch, mode)?)?)
-    }
-}
-
-impl DecoderLayer {
     /// What the layer makes of its tokens before it reads the memory: their sum, and queries. x: (b or 1, c, D); attention of
     /// one sequence stands for `batch` where dropout makes them differ.
     fn begin(&self, cx: &mut Context<'_>, x: &Value, query_pos: &Value, batch: usize) -> Result<(Value, Value)> {
@@ -312,19 +251,6 @@ pub struct Decoder {
     pub norm: LayerNorm,
     /// of the queries, (C, D)
     pub pos_embed: Embedding,
-}
-
-impl Decoder {
-    /// memory: (b, M, D), pos: (1, M, D) -> (b, C, D)
-    pub fn forward(&self, memory: &Tensor, pos: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let query_pos = self.pos_embed.weight.unsqueeze(0)?;
-        let (c, dim) = self.pos_embed.weight.dims2()?;
-        let mut x = Tensor::zeros((memory.dim(0)?, c, dim), DType::F32, memory.device())?;
-        for layer in &self.layers {
-            x = layer.forward(&x, &query_pos, memory, pos, mode)?;
-        }
-        self.norm.forward(&x)
-    }
 }
 
 impl Decoder {

@@ -120,9 +120,9 @@ pub fn self_attention(
 ) -> Result<Value> {
     let (x_batch, keys, dim) = x.dims3()?;
     if cx.composed() {
-        let kv = linear_rows(cx, x, Some(positions), (weight, bias), dim..3 * dim)?;
+        let kv = linear_rows(cx, x, Some(positions), (weight, Some(bias)), dim..3 * dim)?;
         let (first, first_positions) = (narrow_tokens(cx, x, 0, queries)?, narrow_tokens(cx, positions, 0, queries)?);
-        let q = linear_rows(cx, &first, Some(&first_positions), (weight, bias), 0..dim)?;
+        let q = linear_rows(cx, &first, Some(&first_positions), (weight, Some(bias)), 0..dim)?;
         return attention(cx, &q, &kv, how);
     }
     let Attention { heads, batch, all_queries, causal, key_pad, dropout } = how;

@@ -44,19 +44,16 @@ pub fn activation(cx: &mut Context<'_>, x: &Value, activation: Activation) -> Re
     })
 }
 
-/// The same value; its gradient is added to that of `x` after those of everything that reads `x` later.
-///
-/// # Errors
-/// If the tensor library fails.
-pub fn branch(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
-    if cx.composed() {
-        return Ok(x.clone());
-    }
-    let node = x.node;
-    cx.result_of(x.tensor.clone(), node.is_some(), move |grad, back| {
-        back.add(node, grad);
-        Ok(())
-    })
+/// The same value. Its gradient is summed by itself before it is added to that of x: where the order of sums matters.
+pub fn alias(cx: &mut Context<'_>, x: &Value) -> Value {
+    let of = x.node;
+    let node = cx.tape.as_mut().filter(|_| of.is_some()).map(|tape| {
+        tape.push(move |grad, back| {
+            back.add(of, grad);
+            Ok(())
+        })
+    });
+    Value { tensor: x.tensor.clone(), node }
 }
 
 /// Mish, number by number.

@@ -22,11 +22,11 @@ pub fn linear(cx: &mut Context<'_>, x: &Value, layer: &Linear) -> Result<Value> 
         return Ok(Value::constant(layer.forward(&x.tensor)?));
     }
     let rows = 0..layer.weight.dim(0)?;
-    by_rows(cx, x, None, (&layer.weight, layer.bias.as_ref()), rows)
+    by_rows(cx, x, None, (&layer.weight, layer.bias.as_ref()), rows, false)
 }
 
-/// x: (b, t, D) by these rows of a weight (n, D); positions, (1, t, D), go through the first D of the rows and are added. With
-/// the bias.
+/// x: (b, t, D) by these rows of a weight (n, D), and of its bias; positions, (1, t, D), go through the first D of the rows and are
+/// added. Without positions the gradient of x is added in place to what later operations made of it.
 ///
 /// # Errors
 /// An input of another width.
@@ -34,14 +34,14 @@ pub fn linear_rows(
     cx: &mut Context<'_>,
     x: &Value,
     positions: Option<&Value>,
-    (weight, bias): (&Tensor, &Tensor),
+    (weight, bias): (&Tensor, Option<&Tensor>),
     rows: Range<usize>,
 ) -> Result<Value> {
     let dim = x.width();
     if cx.composed() {
         let part = |rows: &Range<usize>| -> Result<Linear> {
             let weight = weight.narrow(0, rows.start, rows.len())?;
-            Ok(Linear { weight, bias: Some(bias.narrow(0, rows.start, rows.len())?) })
+            Ok(Linear { weight, bias: bias.map(|bias| bias.narrow(0, rows.start, rows.len())).transpose()? })
         };
         let y = part(&rows)?.forward(&x.tensor)?;
         let Some(positions) = positions else { return Ok(Value::constant(y)) };
@@ -49,11 +49,10 @@ pub fn linear_rows(
         let first = first.forward(&positions.tensor)?.pad_with_zeros(D::Minus1, 0, rows.len() - dim)?;
         return Ok(Value::constant(y.broadcast_add(&first)?));
     }
-    let positions = match positions {
-        Some(positions) => Some(by_rows(cx, positions, None, (weight, None), rows.start..rows.start + dim)?),
-        None => None,
-    };
-    by_rows(cx, x, positions.as_ref(), (weight, Some(bias)), rows)
+    let first = rows.start..rows.start + dim;
+    let positions =
+        positions.map(|positions| by_rows(cx, positions, None, (weight, None), first, false)).transpose()?;
+    by_rows(cx, x, positions.as_ref(), (weight, bias), rows, positions.is_none())
 }
 
 /// `y = start + x wᵀ`, w: (out, in), and rows of `first`, (t, D), over and over, added to the first D columns.
@@ -85,6 +84,7 @@ fn by_rows(
     first: Option<&Value>,
     (weight, bias): (&Tensor, Option<&Tensor>),
     rows: Range<usize>,
+    in_place: bool,
 ) -> Result<Value> {
     let (out, input) = (rows.len(), weight.elem_count() / weight.dim(0)?);
     super::check_width("linear", x, input)?;
@@ -123,9 +123,12 @@ fn by_rows(
                 column_sums(&mut into[rows], &grad);
             }
             if of_x.is_some() {
-                let mut of = back.space.pool.take(n * input);
+                let (mut of, start) = match if in_place { back.take(of_x) } else { None } {
+                    Some(sum) => (sum, Start::Add),
+                    None => (back.space.pool.take(n * input), Start::Zero),
+                };
                 let (g, w) = (Mat::rows(&grad, out), Mat::rows(&w[part], input));
-                product((n, input, out), g, w, Start::Zero, &mut of, &mut back.space.pack);
+                product((n, input, out), g, w, start, &mut of, &mut back.space.pack);
                 back.add(of_x, of);
             }
             Ok(())

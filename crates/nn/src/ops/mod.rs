@@ -6,21 +6,27 @@ mod conv1d;
 mod conv2d;
 mod elementwise;
 mod feed_forward;
+mod grid;
 mod latent;
 mod linear;
 mod losses;
+mod mixture;
 mod norm;
+mod recurrent;
 mod tokens;
 
 pub use attention::{Attention, attention, self_attention};
 pub use conv1d::{Then, conv1d, conv1d_mish, upsample1d};
 pub use conv2d::{ConvNorm, conv2d, max_pool, spatial_softmax};
-pub use elementwise::{activation, add, branch, cat_rows, detached_mean, dropout, mish};
+pub use elementwise::{activation, add, alias, cat_rows, detached_mean, dropout, mish};
 pub use feed_forward::feed_forward;
+pub use grid::grid_convolution;
 pub use latent::{kl_divergence, sample_latent};
 pub use linear::{linear, linear_rows};
 pub use losses::{Error, chunk_error, term_of};
+pub use mixture::mixture_likelihood;
 pub use norm::{layer_norm, residual};
+pub use recurrent::{gru, lstm};
 pub use tokens::{cat_tokens, narrow_tokens, select_tokens, weighted_mean};
 
 use crate::error::{ModelError, Result};

@@ -2,7 +2,7 @@
 
 use crate::context::{Context, read};
 use crate::error::Result;
-use crate::kernels::{Rows, Summed, dropped, sum_over_sequences};
+use crate::kernels::{Rows, Summed, dropped};
 use crate::layers::{DropoutMask, LayerNorm};
 use crate::value::Value;
 use candle_core::Tensor;
@@ -113,8 +113,8 @@ fn sum(
         }
         if shared && node.is_some() {
             // x stands for every sequence: so does its gradient
-            let mut sums = back.space.pool.take(x_len);
-            sum_over_sequences(&mut sums, &grad, width, width);
+            let mut sums = back.take(node).unwrap_or_else(|| back.space.pool.zeros(x_len));
+            grad.chunks_exact(x_len).for_each(|sequence| crate::kernels::add(&mut sums, sequence));
             back.space.pool.give(std::mem::replace(&mut grad, sums));
         }
         back.add(node, grad);

@@ -5,7 +5,9 @@
 use super::*;
 use crate::context::{Cache, Context};
 use crate::gradients::{Gradients, ParamLayout};
-use crate::layers::{Activation, Conv1d, Dropout, FeedForward, GroupNorm, LayerNorm, Linear, Upsample1d};
+use crate::layers::{
+    Activation, Cell, Conv1d, Dropout, FeedForward, GroupNorm, LayerNorm, Linear, MixtureHead, Recurrent, Upsample1d,
+};
 use crate::loss::Loss;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
@@ -117,7 +119,18 @@ fn linear_layers() {
         let (w, bias) = (case.tensor("w", &[3 * input, input]), case.tensor("bias", &[3 * input]));
         case.check("rows with positions", |cx| {
             let (x, pos) = (value(cx, &x), value(cx, &pos));
-            linear_rows(cx, &x, Some(&pos), (&w, &bias), input..3 * input)
+            linear_rows(cx, &x, Some(&pos), (&w, Some(&bias)), input..3 * input)
+        });
+        let mut case = Case::new();
+        let (x, w) = (case.tensor("x", &[b, t, input]), case.tensor("w", &[3 * input, input]));
+        case.check("rows added in place, and an alias", |cx| {
+            let x = value(cx, &x);
+            let own = alias(cx, &x);
+            let kv = linear_rows(cx, &x, None, (&w, None), input..3 * input)?;
+            let q = linear_rows(cx, &own, None, (&w, None), 0..input)?;
+            let sum = add(cx, &own, &x)?;
+            let sum = add(cx, &sum, &q)?;
+            cat_tokens(cx, b, &[&kv.reshape((b, 2 * t, input))?, &sum])
         });
     }
 }
@@ -300,7 +313,7 @@ fn convolutions_of_sequences() {
             let (x, scaled, shifted) = (value(cx, &x), value(cx, &scaled), value(cx, &shifted));
             // read three times: gradients are added
             let y = conv1d(cx, &x, &layer)?;
-            let kept = branch(cx, &y)?;
+            let kept = alias(cx, &y);
             let a = conv1d_mish(cx, &x, (&layer, &norm), Then::Film(&scaled))?;
             let b = conv1d_mish(cx, &x, (&layer, &norm), Then::Film(&shifted))?;
             let c = conv1d_mish(cx, &x, (&layer, &norm), Then::Add(&y))?;
@@ -308,6 +321,78 @@ fn convolutions_of_sequences() {
             let up = upsample1d(cx, &y, &double)?;
             let up = mish(cx, &up)?;
             cat_tokens(cx, 3, &[&a, &b, &c, &d, &up, &kept])
+        });
+    }
+}
+
+#[test]
+fn convolutions_over_a_grid() {
+    for (b, rows, columns, dim, output) in [(1, 1, 1, 3, 3), (2, 3, 2, 5, 7), (3, 4, 5, 16, 16)] {
+        let mut case = Case::new();
+        let (x, layer) = (case.tensor("x", &[b, rows * columns, dim]), case.linear("layer", 9 * dim, output));
+        case.check("grid convolution", |cx| {
+            let x = value(cx, &x);
+            grid_convolution(cx, &x, (rows, columns), &layer)
+        });
+    }
+}
+
+#[test]
+fn recurrent_layers() {
+    for (steps, rows, input, hidden) in [(1, 3, 4, 5), (4, 1, 3, 6), (3, 7, 12, 17)] {
+        for cell in [Cell::Lstm, Cell::Gru] {
+            let mut case = Case::new();
+            let x = case.tensor("x", &[steps, rows, input]);
+            let sizes = (input, hidden, 2);
+            let layers = Recurrent::new(&mut case.params, "rnn", cell, sizes, &mut case.rng).unwrap();
+            if steps > 1 {
+                case.check("recurrent layers", |cx| {
+                    let x = value(cx, &x);
+                    layers.apply(cx, &x, None)
+                });
+            }
+            // a prediction step by step, and one of all steps, by hand and on candle's operations
+            let (cache, x) = (Cache::default(), Value::from(&x));
+            let flat = |x: &Value| x.detached().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            let whole = |cx: &mut Context<'_>| Ok(flat(&layers.apply(cx, &x, None)?));
+            let by_step = |cx: &mut Context<'_>| {
+                let (mut state, mut out) = (Vec::new(), Vec::new());
+                for step in 0..steps {
+                    let x = Value::from(&x.detached().narrow(0, step, 1)?.contiguous()?);
+                    out.extend(flat(&layers.apply(cx, &x, Some(&mut state))?));
+                }
+                Ok(out)
+            };
+            let want = cache.composed_predict(&case.params, whole).unwrap();
+            for got in [
+                cache.predict(&case.params, &mut || {}, whole).unwrap(),
+                cache.predict(&case.params, &mut || {}, by_step).unwrap(),
+                cache.composed_predict(&case.params, by_step).unwrap(),
+            ] {
+                assert!(got.iter().zip(&want).all(|(a, b)| (a - b).abs() < 1e-5), "{cell:?}: {got:?} {want:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn likelihoods_of_mixtures() {
+    for (n, input, modes, action_dim) in [(1, 4, 1, 2), (5, 7, 3, 2)] {
+        let mut case = Case::new();
+        let x = case.tensor("x", &[n, input]);
+        let head = MixtureHead::new(&mut case.params, "head", (input, modes, action_dim), 0.05, &mut case.rng).unwrap();
+        let mut rng = Rng::new(3, "data");
+        let actions = Tensor::from_vec(rng.normals(n * action_dim), (n, action_dim), &Device::Cpu).unwrap();
+        let real = (0..n).map(|row| f32::from(u8::from(row % 3 != 2))).collect::<Vec<_>>();
+        let real = Tensor::from_vec(real, n, &Device::Cpu).unwrap();
+        case.check_loss("likelihood", |cx| {
+            let x = value(cx, &x);
+            let parts = head.apply(cx, &x)?;
+            let (nll, l1) = mixture_likelihood(cx, &parts, (&actions, &real), n + 2)?;
+            let mut loss = Loss::default();
+            loss.add("nll", nll, 0.8);
+            loss.report("l1_loss", l1);
+            Ok(loss)
         });
     }
 }
@@ -336,6 +421,10 @@ fn what_does_not_fit_is_named() {
     let norm = GroupNorm { weight: weight.clone(), bias: weight, groups: 4 };
     let wrong = error(&|cx| conv1d_mish(cx, &fits, (&conv, &norm), Then::Film(&fits)));
     assert_eq!(wrong, "convolution: film has shape [2, 3, 4], expected [2, 8]");
+    let wrong = error(&|cx| grid_convolution(cx, &Value::from(&x), (2, 2), &layer));
+    assert_eq!(wrong, "grid convolution: cells has shape [2, 3, 5], expected [2, 4, 0]");
+    let wrong = error(&|cx| Ok(lstm(cx, &Value::from(&x), (&layer, &layer), None)?.0));
+    assert_eq!(wrong, "lstm: weight of the input has shape [5, 4], expected [16, 5]");
     let wrong = error(&|cx| select_tokens(cx, &Value::from(&x), &[3]));
     assert_eq!(wrong, "select: token is 3, expected below 3");
 }

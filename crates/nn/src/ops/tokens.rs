@@ -51,14 +51,21 @@ pub fn cat_tokens(cx: &mut Context<'_>, batch: usize, parts: &[&Value]) -> Resul
             if node.is_none() {
                 continue;
             }
-            let of = if shared {
-                let mut of = back.space.pool.zeros(len);
-                rows.for_each(|row| add(&mut of, row));
-                of
-            } else {
-                let mut of = back.space.pool.take(batch * len);
-                of.chunks_exact_mut(len).zip(rows).for_each(|(of, row)| of.copy_from_slice(row));
-                of
+            let of = match (back.take(node), shared) {
+                (Some(mut of), false) => {
+                    of.chunks_exact_mut(len).zip(rows).for_each(|(of, row)| add(of, row));
+                    of
+                }
+                (None, false) => {
+                    let mut of = back.space.pool.take(batch * len);
+                    of.chunks_exact_mut(len).zip(rows).for_each(|(of, row)| of.copy_from_slice(row));
+                    of
+                }
+                (sum, true) => {
+                    let mut of = sum.unwrap_or_else(|| back.space.pool.zeros(len));
+                    rows.for_each(|row| add(&mut of, row));
+                    of
+                }
             };
             back.add(node, of);
         }
@@ -109,7 +116,7 @@ pub fn select_tokens(cx: &mut Context<'_>, x: &Value, tokens: &[usize]) -> Resul
     })?;
     let (node, tokens) = (x.node, tokens.to_vec());
     cx.result(out, &[b, n, dim], node.is_some(), move |grad, back| {
-        let mut of = back.space.pool.zeros(b * t * dim);
+        let mut of = back.take(node).unwrap_or_else(|| back.space.pool.zeros(b * t * dim));
         for (of, grad) in of.chunks_exact_mut(t * dim).zip(grad.chunks_exact(n * dim)) {
             for (token, grad) in tokens.iter().zip(grad.chunks_exact(dim)) {
                 add(&mut of[token * dim..(token + 1) * dim], grad);

@@ -208,9 +208,6 @@ impl PolicyTraining {
         if let Some(beginning) = &beginning {
             on_event(TrainEvent::Note(&beginning.note(&evaluated.params().tensors())?));
         }
-        if let Some(reason) = evaluated.composed_because() {
-            on_event(TrainEvent::Note(&format!("training steps run on candle's autograd: {reason}")));
-        }
         if earlier.is_none() {
             let note =
                 RunNote { experiment: request.name.clone(), data: path, fingerprint: dataset.fingerprint().to_owned() };

@@ -40,7 +40,7 @@ use crate::features::{FeatureKind, Features, Signature};
 use crate::flops;
 use crate::layers::{
     Auxiliary, Decoder, DecoderLayer, Embedding, Encoder, InputTokens, LayerInit, LayerNorm, Linear, Pointer,
-    TokenLayout, Vae, environment_state, sinusoid_table,
+    TokenLayout, Vae, ask, environment_state, sinusoid_table,
 };
 use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
@@ -172,7 +172,7 @@ impl Act {
         let (l1, _) = chunk_error(cx, (&actions, &batch.actions), &batch.is_pad, Error::Absolute, entries)?;
         loss.add("l1_loss", l1, 1.0);
         if let (Some(pointer), Some(scores)) = (&self.pointer, &scores) {
-            let (term, right) = pointer.asked("act", batch)?.term(cx, scores)?;
+            let (term, right) = ask(cx, &pointer.asked("act", batch)?, scores)?;
             loss.add("pointer_loss", term, pointer.weight);
             loss.report("pointer_right", right);
         }
@@ -257,10 +257,6 @@ impl PolicyModel for Act {
 
     fn signature(&self) -> &Signature {
         &self.signature
-    }
-
-    fn composed_because(&self) -> Option<String> {
-        None
     }
 
     fn cache(&self) -> Option<&Cache> {

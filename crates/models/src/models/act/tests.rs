@@ -2,12 +2,12 @@
 use super::*;
 use crate::encoders::{ImageNorm, TokenKind, VisionConfig};
 use crate::features::{FeatureSpec, Signature};
-use crate::fused::testing::{
+use crate::layers::{Activation, AuxiliaryConfig, PointerConfig};
+use crate::models::act::Config;
+use crate::testing::{
     Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
-use crate::layers::{Activation, AuxiliaryConfig, PointerConfig};
-use crate::models::act::Config;
 use nn::ParamLayout;
 use nn::device::HERE;
 use nn::simd::{Level, at_most};

@@ -1,14 +1,13 @@
 //! Looking into a thought: its states after every step, what its action tokens attend to, and what becomes of it where
-//! its reasoning is tampered with. On candle's autograd: for measurements, not for speed.
+//! its reasoning is tampered with.
 
-use super::{Actrm, Carry, Config, Design, positioned, update};
+use super::{Actrm, Carry, Config, Design, Observed, OverActions};
 use crate::features::{Features, Observation};
 use crate::history::History;
-use crate::layers::Mode;
 use crate::policy::{ActionChunk, Policy};
 use crate::preprocess::Preprocess;
-use candle_core::{DType, Tensor};
-use nn::{ModelError, Result};
+use candle_core::Tensor;
+use nn::{Context, ModelError, Result, Value};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -137,68 +136,94 @@ impl Actrm {
             Some(Intervention::Shuffle) => Some(self.examine(observation, steps, None)?),
             _ => None,
         };
-        let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
-        let memory = self.memory(&latent, &self.tokens.look(observation, None)?, &mut Mode::Eval)?.detach();
-        let mut carry = self.start(rows, &memory)?;
-        let mut done: Vec<ExaminedStep> = Vec::with_capacity(steps);
-        for at in 0..steps {
-            let Design::Actions(design) = &self.design else {
+        let observation = self.tokens.look(observation, None)?;
+        self.cache.predict(&self.params, &mut || {}, |cx| {
+            let latent = Value::zeros((rows, self.config.latent_dim), &cx.device().clone())?;
+            let memory = self.memory(cx, &latent, &observation)?;
+            let (observed, mut carry) = (self.observe(cx, memory)?, Carry::default());
+            let mut done: Vec<ExaminedStep> = Vec::with_capacity(steps);
+            for at in 0..steps {
                 let others = others.as_ref().map(|others| &others[at].reasoning);
-                done.push(self.examine_tokens(&memory, &mut carry, (at, intervene), done.first(), others)?);
-                continue;
-            };
-            let layers = &design.layers[self.config.reasoning.layers_of(at)];
-            let mut attention = None;
-            for _ in 0..self.config.reasoning.h_cycles {
-                let y = positioned(&carry.answer, &design.action_pos)?;
-                for _ in 0..self.config.reasoning.l_cycles {
-                    let z = positioned(&carry.reasoning, &design.latent_pos)?;
-                    carry.reasoning = update(layers, &z, &[&z, &y, &memory])?.detach();
-                }
-                match (intervene, &others) {
-                    (Some(Intervention::Freeze), _) if at > 0 => carry.reasoning = done[0].reasoning.clone(),
-                    (Some(Intervention::Shuffle), Some(others)) => carry.reasoning = rolled(&others[at].reasoning)?,
-                    _ => {}
-                }
-                let z = positioned(&carry.reasoning, &design.latent_pos)?;
-                let context = Tensor::cat(&[&z, &y, &memory], 1)?;
-                attention = Some(layers[0].attn.weights(&y, &context, None)?.mean(1)?.detach());
-                carry.answer = update(layers, &y, &[&z, &y, &memory])?.detach();
+                let instead = match (intervene, done.first(), others) {
+                    (Some(Intervention::Freeze), Some(first), _) => Some(Value::from(&first.reasoning)),
+                    (Some(Intervention::Shuffle), _, Some(others)) => Some(Value::from(&rolled(others)?)),
+                    _ => None,
+                };
+                let step = match &self.design {
+                    Design::Actions(design) => {
+                        self.examine_actions(cx, design, &observed, (&mut carry, at), instead)?
+                    }
+                    _ => self.examine_tokens(cx, &observed, (&mut carry, at), instead)?,
+                };
+                done.push(step);
             }
-            done.push(ExaminedStep {
-                chunk: self.action_head.forward(&carry.answer)?.detach(),
-                answer: carry.answer.clone(),
-                reasoning: carry.reasoning.clone(),
-                attention,
-                scores: None,
-            });
-        }
-        Ok(done)
+            Ok(done)
+        })
     }
 
-    /// A step over tokens. Where they are tampered with, the answer is decoded from what they became, and what is pointed at is
-    /// read from its own observation.
+    /// A step over actions, of whose reasoning another may take the place before the answer reads it.
+    fn examine_actions(
+        &self,
+        cx: &mut Context<'_>,
+        design: &OverActions,
+        observed: &Observed,
+        (carry, at): (&mut Carry, usize),
+        instead: Option<Value>,
+    ) -> Result<ExaminedStep> {
+        let (rows, memory) = (observed.memory.dim(0)?, observed.memory.detached());
+        let attn = &design.layers[self.config.reasoning.layers_of(at).start].attn;
+        let mut attention = None;
+        for _ in 0..self.config.reasoning.h_cycles {
+            let positions = design.action_pos.weight.detach().unsqueeze(0)?;
+            let y = match &carry.answer {
+                Some(answer) => answer.detached().broadcast_add(&positions)?,
+                None => positions.repeat((rows, 1, 1))?,
+            };
+            let mut between = |reasoning: &mut Value| {
+                if let Some(instead) = &instead {
+                    *reasoning = instead.clone();
+                }
+                let z = reasoning.detached().broadcast_add(&design.latent_pos.weight.detach().unsqueeze(0)?)?;
+                let context = Tensor::cat(&[&z, &y, &memory], 1)?;
+                attention = Some(attn.weights(&y, &context, None)?.mean(1)?.detach());
+                Ok(())
+            };
+            *carry = design.round(cx, &self.config, observed, (carry, at), &mut between)?;
+        }
+        let step = self.answer(cx, observed, carry.clone(), None)?;
+        let reasoning = carry.reasoning.as_ref().expect("a round leaves a reasoning").detached();
+        Ok(ExaminedStep {
+            chunk: step.chunk.detached(),
+            answer: step.decoded.detached(),
+            reasoning,
+            attention,
+            scores: None,
+        })
+    }
+
+    /// A step over tokens. Where others take their place, the answer is decoded from these, and what is pointed at is read from its
+    /// own observation.
     fn examine_tokens(
         &self,
-        memory: &Tensor,
-        carry: &mut Carry,
-        (at, intervene): (usize, Option<Intervention>),
-        first: Option<&ExaminedStep>,
-        others: Option<&Tensor>,
+        cx: &mut Context<'_>,
+        observed: &Observed,
+        (carry, at): (&mut Carry, usize),
+        instead: Option<Value>,
     ) -> Result<ExaminedStep> {
-        let mode = &mut Mode::Eval;
-        *carry = self.round(memory, carry, at, false)?.detach();
-        match (intervene, first, others) {
-            (Some(Intervention::Freeze), Some(first), _) => carry.answer = first.reasoning.clone(),
-            (Some(Intervention::Shuffle), _, Some(others)) => carry.answer = rolled(others)?,
-            _ => {}
+        *carry = self.rounds(cx, observed, carry, (at, None))?;
+        if instead.is_some() {
+            carry.answer = instead;
         }
-        let step = self.answer(memory, carry.clone(), mode)?;
-        let (chunk, answer) = (step.chunk.detach(), step.decoded.detach());
+        let step = self.answer(cx, observed, carry.clone(), None)?;
         // over a grid what goes on is under a norm; what is seen is as it was left
-        let left = std::mem::replace(carry, step.carry.detach());
-        let scores = step.scores.map(|scores| scores.detach());
-        Ok(ExaminedStep { chunk, answer, reasoning: left.answer, attention: None, scores })
+        let left = std::mem::replace(carry, step.carry).answer.expect("a round leaves an answer");
+        Ok(ExaminedStep {
+            chunk: step.chunk.detached(),
+            answer: step.decoded.detached(),
+            reasoning: left.detached(),
+            attention: None,
+            scores: step.scores.map(|scores| scores.detached()),
+        })
     }
 
     /// What the columns of [`ExaminedStep::attention`] stand for: the reasoning's tokens, the actions', the latent, features

@@ -39,13 +39,14 @@
 //! Halting: a head reads the reasoning after each step and is trained on whether one more step
 //! would still lower this sample's chunk error. For the last step's target one more step runs
 //! without gradient.
-//!
-//! This file is the model as one reads it, on candle's autograd. Training steps and thoughts run the same maths with
-//! hand-written backward passes (`fused/`); tests hold the two together.
 
+#[cfg(test)]
+mod by_hand_tests;
 mod config;
 mod examine;
-mod fused;
+mod over_actions;
+mod over_memory;
+mod over_tokens;
 mod reasoning;
 #[cfg(test)]
 mod tests;
@@ -60,101 +61,26 @@ use crate::classification::binary_cross_entropy;
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Signature};
 use crate::flops;
-use crate::fused::Workspaces;
 use crate::layers::{
-    Answers, Asked, Auxiliary, Cells, Decoder, DecoderLayer, Embedding, Encoder, EncoderLayer, FeedForward, GridLayer,
-    InputTokens, LayerInit, LayerNorm, Linear, Mode, MultiHeadAttention, NEIGHBOURS, Pointer, Shape, TokenLayout, Vae,
-    Visited, environment_state, kl_divergence, sample, sinusoid_table,
+    Auxiliary, Decoder, DecoderLayer, Embedding, InputTokens, LayerNorm, Linear, NEIGHBOURS, Question, Shape,
+    TokenLayout, Vae, ask, environment_state, sinusoid_table,
 };
-use crate::model::{PolicyModel, autograd, not_by_hand};
+use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
-use candle_core::{DType, Tensor};
-use nn::Gradients;
-use nn::Result;
-use nn::Rng;
-use nn::losses::absolute;
-use nn::{Init, Params};
-use nn::{LossParts, LossValues};
-use std::collections::BTreeMap;
+use candle_core::Tensor;
+use nn::ops::{
+    Error, add, alias, cat_tokens, chunk_error, detached_mean, kl_divergence, linear, residual, sample_latent, term_of,
+};
+use nn::{Cache, Context, Loss, Params, Result, Rng, Term, Value};
+use over_actions::{OverActions, Read};
+use over_memory::OverMemory;
+use over_tokens::{OverTokens, TokenLayers};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
 pub const READS: &[FeatureKind] =
     &[FeatureKind::State, FeatureKind::EnvironmentState, FeatureKind::Entity, FeatureKind::Image];
-
-/// The shared layer of `over = "actions"`: attention to a context, then a dense part.
-#[derive(Debug)]
-struct BlockLayer {
-    attn: MultiHeadAttention,
-    ff: FeedForward,
-    norm1: LayerNorm,
-    norm2: LayerNorm,
-}
-
-impl BlockLayer {
-    fn new(params: &mut Params, prefix: &str, config: &Config, rng: &mut Rng) -> Result<Self> {
-        let dim = config.dim_model;
-        let init = LayerInit::Xavier.weight();
-        let hidden = (dim, config.block_feedforward());
-        let act = config.feedforward_activation;
-        Ok(Self {
-            attn: MultiHeadAttention::new(params, &format!("{prefix}.attn"), dim, config.n_heads, 0.0, init, rng)?,
-            ff: FeedForward::new(params, &format!("{prefix}."), hidden, act, 0.0, init, rng)?,
-            norm1: LayerNorm::new(params, &format!("{prefix}.norm1"), dim, rng)?,
-            norm2: LayerNorm::new(params, &format!("{prefix}.norm2"), dim, rng)?,
-        })
-    }
-
-    /// x: (b, t, D), context: (b, s, D) -> (b, t, D)
-    fn forward(&self, x: &Tensor, context: &Tensor) -> Result<Tensor> {
-        let mode = &mut Mode::Eval;
-        let seen = self.attn.forward(x, context, context, None, mode)?;
-        let x = self.norm1.forward(&(x + seen)?)?;
-        self.norm2.forward(&(&x + self.ff.forward(&x, mode)?)?)
-    }
-}
-
-/// The recursion over actions.
-#[derive(Debug)]
-struct OverActions {
-    memory_encoder: Option<Encoder>,
-    /// (R, D), added to z before every update
-    latent_pos: Embedding,
-    /// (H, D), added to y before every update
-    action_pos: Embedding,
-    /// of the shared block, or of every supervision step's block one after the other
-    layers: Vec<BlockLayer>,
-}
-
-/// The recursion over the memory, and ACT's decoder.
-#[derive(Debug)]
-struct OverMemory {
-    block: Encoder,
-    z_init: [Vec<f32>; 2],
-    decoder: Decoder,
-}
-
-/// The recursion over the observation's tokens, and ACT's decoder.
-#[derive(Debug)]
-struct OverTokens {
-    /// of the tokens before the first step
-    first_norm: LayerNorm,
-    layers: TokenLayers,
-    /// before tokens are read
-    norm: LayerNorm,
-    decoder: Decoder,
-    pointer: Option<Pointer>,
-}
-
-/// Pre-norm; of the shared block, or of every supervision step's block one after the other.
-#[derive(Debug)]
-enum TokenLayers {
-    /// among all tokens
-    Attention(Vec<EncoderLayer>),
-    /// from cell to cell of a grid
-    Grid(Cells, Vec<GridLayer>),
-}
 
 #[derive(Debug)]
 enum Design {
@@ -163,70 +89,42 @@ enum Design {
     Tokens(OverTokens),
 }
 
-/// The recursion's states: `(y, z)` over actions, `(z_h, z_l)` over the memory, the tokens twice over tokens.
-#[derive(Debug, Clone)]
+/// The recursion's states, `(y, z)` over actions, `(z_h, z_l)` over the memory, the tokens over tokens; `None` is what a thought
+/// begins with.
+#[derive(Debug, Clone, Default)]
 struct Carry {
-    answer: Tensor,
-    reasoning: Tensor,
+    answer: Option<Value>,
+    reasoning: Option<Value>,
 }
 
 impl Carry {
     fn detach(&self) -> Self {
-        Self { answer: self.answer.detach(), reasoning: self.reasoning.detach() }
+        let detached = |state: &Option<Value>| state.as_ref().map(Value::detach);
+        Self { answer: detached(&self.answer), reasoning: detached(&self.reasoning) }
     }
 }
 
-/// What a supervision step is asked beside the actions.
-#[derive(Debug)]
-enum Question {
-    /// which entity a demonstration took
-    Taken(Asked),
-    /// which cells it still comes by
-    Visited(Visited),
-}
-
-impl Question {
-    /// What its parts of the loss begin with.
-    fn name(&self) -> &'static str {
-        match self {
-            Self::Taken(_) => "pointer",
-            Self::Visited(_) => "way",
-        }
-    }
-
-    fn loss(&self, scores: &Tensor) -> Result<Tensor> {
-        match self {
-            Self::Taken(asked) => asked.loss(scores),
-            Self::Visited(visited) => visited.loss(scores),
-        }
-    }
-
-    /// The loss on a slice, and `weight` times its gradient.
-    fn answers(&self, scores: &[f32], grad: Option<(&mut [f32], f64)>) -> Answers {
-        match self {
-            Self::Taken(asked) => asked.answers(scores, grad),
-            Self::Visited(visited) => visited.answers(scores, grad),
-        }
-    }
-
-    /// Rows that are answered rightly, a share of all rows of the batch that are asked.
-    fn right(&self, scores: &Tensor) -> Result<Tensor> {
-        let values = scores.detach().flatten_all()?.to_vec1::<f32>()?;
-        Ok(Tensor::new(self.answers(&values, None).right, scores.device())?)
-    }
+/// What the recursion reads, made once per observation.
+struct Observed {
+    /// (b, M, D)
+    memory: Value,
+    /// what a thought over tokens begins with
+    begun: Value,
+    /// over actions
+    read: Option<Read>,
 }
 
 /// What a supervision step gives.
 struct Step {
     carry: Carry,
     /// (b, H, A)
-    chunk: Tensor,
-    /// (b,)
-    halt_logit: Tensor,
+    chunk: Value,
+    /// what the halting head reads, (b, D)
+    mean: Value,
     /// what the chunk is read from, (b, H, D)
-    decoded: Tensor,
+    decoded: Value,
     /// of every candidate whether it is the entity that is meant, or of every cell whether the way goes there, if that is asked
-    scores: Option<Tensor>,
+    scores: Option<Value>,
 }
 
 /// The model.
@@ -238,14 +136,12 @@ pub struct Actrm {
     vae: Option<Vae>,
     /// (1, H + 2, D), fixed
     vae_pos_enc: Tensor,
-    /// the same as a slice
-    vae_positions: Vec<f32>,
     tokens: InputTokens,
     design: Design,
     action_head: Linear,
     halt_head: Linear,
     auxiliary: Option<Auxiliary>,
-    workspaces: Workspaces,
+    cache: Cache,
 }
 
 impl Actrm {
@@ -259,7 +155,7 @@ impl Actrm {
         let layout = TokenLayout::new(signature, config.vision.as_ref(), config.dim_model)?;
         let rng = &mut Rng::new(seed, "init");
         let mut p = Params::new();
-        let (dim, shape, r) = (config.dim_model, config.shape(), &config.reasoning);
+        let (dim, shape) = (config.dim_model, config.shape());
         let vae = match config.use_vae {
             true => {
                 let (of_vae, io) = ((config.n_vae_encoder_layers, config.latent_dim), (&layout, signature.action_dim));
@@ -268,59 +164,14 @@ impl Actrm {
             false => None,
         };
         let env_state = environment_state(&mut p, &layout, dim, rng)?;
-        let positions = sinusoid_table(config.action_horizon + 2, dim)?;
-        let design = match r.over {
-            Over::Actions => Design::Actions(OverActions {
-                memory_encoder: match config.n_memory_layers {
-                    0 => None,
-                    n => Some(Encoder::new(&mut p, "encoder", n, shape, LayerInit::Xavier, rng)?),
-                },
-                latent_pos: Embedding::new(&mut p, "reasoning.latent_pos_embed", r.tokens, dim, rng)?,
-                action_pos: Embedding::new(&mut p, "reasoning.action_pos_embed", config.action_horizon, dim, rng)?,
-                layers: (0..r.blocks() * r.n_layers)
-                    .map(|i| BlockLayer::new(&mut p, &format!("reasoning.layers.{i}"), config, rng))
-                    .collect::<Result<_>>()?,
-            }),
-            Over::Memory => {
-                // no dropout inside the recursion
-                let quiet = Shape { dropout: 0.0, ..shape };
-                Design::Memory(OverMemory {
-                    block: Encoder::new(&mut p, "reasoning", r.n_layers, quiet, LayerInit::Xavier, rng)?,
-                    z_init: fixed_values(dim),
-                    decoder: decoder(&mut p, config, rng)?,
-                })
-            }
-            Over::Tokens => {
-                let block = config.block_shape();
-                let layer = |i: usize| format!("reasoning.layers.{i}");
-                let blocks = 0..r.blocks() * r.n_layers;
-                Design::Tokens(OverTokens {
-                    first_norm: LayerNorm::new(&mut p, "reasoning.first_norm", dim, rng)?,
-                    // a step begins as a small change of what tokens say: after six large ones nothing of it was left
-                    layers: match &r.grid {
-                        None => TokenLayers::Attention(
-                            blocks
-                                .map(|i| EncoderLayer::new(&mut p, &layer(i), block, LayerInit::Recursive, rng))
-                                .collect::<Result<_>>()?,
-                        ),
-                        Some(grid) => TokenLayers::Grid(
-                            Cells::new(&mut p, grid, ("actrm", &layout), dim, rng)?,
-                            blocks.map(|i| GridLayer::new(&mut p, &layer(i), block, rng)).collect::<Result<_>>()?,
-                        ),
-                    },
-                    norm: LayerNorm::new(&mut p, "reasoning.norm", dim, rng)?,
-                    decoder: decoder(&mut p, config, rng)?,
-                    pointer: match &config.pointer {
-                        Some(pointer) => Some(Pointer::new(&mut p, pointer, ("actrm", signature, &layout), dim, rng)?),
-                        None => None,
-                    },
-                })
-            }
+        let design = match config.reasoning.over {
+            Over::Actions => Design::Actions(OverActions::new(&mut p, config, shape, rng)?),
+            Over::Memory => Design::Memory(OverMemory::new(&mut p, config, shape, rng)?),
+            Over::Tokens => Design::Tokens(OverTokens::new(&mut p, config, (signature, &layout), rng)?),
         };
         Ok(Self {
             vae,
-            vae_positions: positions.flatten_all()?.to_vec1()?,
-            vae_pos_enc: positions,
+            vae_pos_enc: sinusoid_table(config.action_horizon + 2, dim)?,
             tokens: InputTokens::new(&mut p, layout, config.latent_dim, dim, env_state, rng)?,
             design,
             action_head: Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?,
@@ -329,7 +180,7 @@ impl Actrm {
                 Some(asked) => Some(Auxiliary::new(&mut p, asked, ("actrm", signature), dim, rng)?),
                 None => None,
             },
-            workspaces: Workspaces::default(),
+            cache: Cache::default(),
             params: p,
             config: config.clone(),
             signature: signature.clone(),
@@ -341,136 +192,90 @@ impl Actrm {
         &self.config
     }
 
-    /// What the recursion reads, made once per observation: (b, M, D).
-    fn memory(&self, latent: &Tensor, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let tokens = self.tokens.forward(latent, observation)?;
-        let pos = self.tokens.positions()?;
+    /// The observation encoded: latent: (b, L), pictures as the network reads them -> (b, M, D)
+    fn memory(&self, cx: &mut Context<'_>, latent: &Value, observation: &Features<Tensor>) -> Result<Value> {
+        let tokens = self.tokens.apply(cx, latent, observation)?;
+        let all = tokens.dim(1)?;
         match &self.design {
-            Design::Actions(OverActions { memory_encoder: Some(encoder), .. }) => {
-                let memory = encoder.forward(&tokens, &pos, None, mode)?;
-                Ok(memory.broadcast_add(&pos)?)
+            Design::Actions(design) => {
+                let pos = self.tokens.apply_positions(cx)?;
+                let memory = match &design.memory_encoder {
+                    Some(encoder) => encoder.apply(cx, &tokens, &pos, None, all)?,
+                    None => tokens,
+                };
+                add(cx, &pos, &memory)
             }
-            Design::Actions(_) => Ok(tokens.broadcast_add(&pos)?),
-            Design::Tokens(design) => design.first_norm.forward(&tokens.broadcast_add(&pos)?),
+            Design::Tokens(design) => {
+                let pos = self.tokens.apply_positions(cx)?;
+                residual(cx, &pos, &tokens, (0.0, all), Some(&design.first_norm))
+            }
             Design::Memory(_) => Ok(tokens),
         }
     }
 
-    /// The states before the first step.
-    fn start(&self, batch: usize, memory: &Tensor) -> Result<Carry> {
-        let dim = self.config.dim_model;
-        let zeros = |n: usize| Tensor::zeros((batch, n, dim), DType::F32, memory.device());
-        Ok(match &self.design {
-            Design::Actions(_) => {
-                Carry { answer: zeros(self.config.action_horizon)?, reasoning: zeros(self.config.reasoning.tokens)? }
-            }
-            Design::Memory(design) => {
-                let [h, l] = &design.z_init;
-                let all = |z: &[f32]| Tensor::from_slice(z, z.len(), memory.device())?.broadcast_as(memory.shape());
-                Carry { answer: all(h)?.contiguous()?, reasoning: all(l)?.contiguous()? }
-            }
-            Design::Tokens(_) => Carry { answer: memory.clone(), reasoning: memory.clone() },
-        })
-    }
-
-    /// Supervision step number `at`, from 0. Earlier rounds than the last are detached call by call, so that their graphs
-    /// are freed as they go.
-    fn step(&self, memory: &Tensor, carry: &Carry, at: usize, mode: &mut Mode<'_>) -> Result<Step> {
-        let mut carry = carry.clone();
-        for round in 1..=self.config.reasoning.h_cycles {
-            carry = match round == self.config.reasoning.h_cycles {
-                true => self.round(memory, &carry, at, false)?,
-                false => self.round(&memory.detach(), &carry.detach(), at, true)?,
-            };
-        }
-        self.answer(memory, carry, mode)
-    }
-
-    /// What a carry says.
-    fn answer(&self, memory: &Tensor, carry: Carry, mode: &mut Mode<'_>) -> Result<Step> {
-        let (mut scores, mut read, mut carry) = (None, carry.answer.clone(), carry);
-        let decoded = match &self.design {
-            Design::Actions(_) => {
-                read = carry.reasoning.clone();
-                carry.answer.clone()
-            }
-            Design::Memory(design) => {
-                let pos = self.tokens.positions()?;
-                design.decoder.forward(&carry.answer, &pos, mode)?
-            }
-            Design::Tokens(design) => {
-                read = design.norm.forward(&carry.answer)?;
-                if let TokenLayers::Grid(cells, _) = &design.layers {
-                    scores = cells.way(&read)?;
-                    carry = Carry { answer: read.clone(), reasoning: read.clone() };
-                }
-                // tokens have brought their positions along
-                let nowhere = self.tokens.positions()?.zeros_like()?;
-                match &design.pointer {
-                    Some(pointer) => {
-                        let which = pointer.forward(&read, memory)?;
-                        let (beside, pos) = pointer.beside(&read, &nowhere, &which)?;
-                        scores = Some(which.scores);
-                        design.decoder.forward(&beside, &pos, mode)?
-                    }
-                    None => design.decoder.forward(&read, &nowhere, mode)?,
-                }
-            }
+    /// memory: (b, M, D)
+    fn observe(&self, cx: &mut Context<'_>, memory: Value) -> Result<Observed> {
+        let read = match &self.design {
+            Design::Actions(design) => Some(design.read(cx, &memory)?),
+            Design::Memory(_) | Design::Tokens(_) => None,
         };
-        let chunk = self.action_head.forward(&decoded)?;
-        // the head judges the reasoning and must not bend it
-        let halt_logit = self.halt_head.forward(&read.detach().mean(1)?)?.squeeze(1)?;
-        Ok(Step { carry, chunk, halt_logit, decoded, scores })
+        Ok(Observed { begun: alias(cx, &memory), memory, read })
     }
 
-    /// `l_cycles` updates of the reasoning, one of the answer.
-    fn round(&self, memory: &Tensor, carry: &Carry, at: usize, quiet: bool) -> Result<Carry> {
-        let Carry { mut answer, mut reasoning } = carry.clone();
-        let settle = |x: Tensor| if quiet { x.detach() } else { x };
-        match &self.design {
-            Design::Actions(design) => {
-                let layers = &design.layers[self.config.reasoning.layers_of(at)];
-                let y = positioned(&answer, &design.action_pos)?;
-                for _ in 0..self.config.reasoning.l_cycles {
-                    let z = positioned(&reasoning, &design.latent_pos)?;
-                    reasoning = settle(update(layers, &z, &[&z, &y, memory])?);
-                }
-                let z = positioned(&reasoning, &design.latent_pos)?;
-                answer = settle(update(layers, &y, &[&z, &y, memory])?);
+    /// Supervision step number `at`, from 0.
+    fn step(&self, cx: &mut Context<'_>, observed: &Observed, carry: &Carry, at: usize) -> Result<Step> {
+        // positions of what is observed, over the memory
+        let pos = match &self.design {
+            Design::Memory(_) => Some(self.tokens.apply_positions(cx)?),
+            Design::Actions(_) | Design::Tokens(_) => None,
+        };
+        let carry = self.rounds(cx, observed, carry, (at, pos.as_ref()))?;
+        self.answer(cx, observed, carry, pos.as_ref())
+    }
+
+    /// The rounds of a step; earlier ones than the last are without gradient.
+    fn rounds(
+        &self,
+        cx: &mut Context<'_>,
+        observed: &Observed,
+        carry: &Carry,
+        (at, pos): (usize, Option<&Value>),
+    ) -> Result<Carry> {
+        let round = |cx: &mut Context<'_>, carry: &Carry| match (&self.design, pos) {
+            (Design::Actions(design), _) => design.round(cx, &self.config, observed, (carry, at), &mut |_| Ok(())),
+            (Design::Memory(design), Some(pos)) => design.round(cx, &self.config, observed, carry, pos),
+            (Design::Memory(design), None) => {
+                let pos = self.tokens.apply_positions(cx)?;
+                design.round(cx, &self.config, observed, carry, &pos)
             }
-            Design::Memory(design) => {
-                let pos = self.tokens.positions()?;
-                let update = |x: &Tensor| design.block.forward(x, &pos, None, &mut Mode::Eval);
-                let injected = (&answer + memory)?;
-                for _ in 0..self.config.reasoning.l_cycles {
-                    reasoning = settle(update(&(&reasoning + &injected)?)?);
-                }
-                answer = settle(update(&(&answer + &reasoning)?)?);
-            }
-            Design::Tokens(design) => {
-                let of_step = self.config.reasoning.layers_of(at);
-                match &design.layers {
-                    TokenLayers::Attention(layers) => {
-                        let nowhere = self.tokens.positions()?.zeros_like()?;
-                        for layer in (0..self.config.reasoning.l_cycles).flat_map(|_| &layers[of_step.clone()]) {
-                            answer = layer.forward(&answer, &nowhere, None, &mut Mode::Eval)?;
-                        }
-                    }
-                    TokenLayers::Grid(cells, layers) => {
-                        if at > 0 {
-                            answer = (answer + memory)?;
-                        }
-                        let mut x = cells.of(&answer)?;
-                        for layer in (0..self.config.reasoning.l_cycles).flat_map(|_| &layers[of_step.clone()]) {
-                            x = layer.forward(cells.grid, &x)?;
-                        }
-                        answer = cells.put(&answer, &x)?;
-                    }
-                }
-                reasoning = answer.clone();
-            }
+            (Design::Tokens(design), _) => design.round(cx, &self.config, observed, (carry, at)),
+        };
+        let mut carry = carry.clone();
+        for _ in 1..self.config.reasoning.h_cycles {
+            carry = cx.no_grad(|cx| round(cx, &carry))?.detach();
         }
-        Ok(Carry { answer, reasoning })
+        round(cx, &carry)
+    }
+
+    /// What a carry says; pos: (1, M, D) over the memory.
+    fn answer(&self, cx: &mut Context<'_>, observed: &Observed, carry: Carry, pos: Option<&Value>) -> Result<Step> {
+        let states = (carry.answer.clone(), carry.reasoning.clone());
+        let (Some(answer), reasoning) = states else { unreachable!("a round leaves an answer") };
+        let (carry, read, decoded, scores) = match (&self.design, reasoning, pos) {
+            (Design::Actions(_), Some(reasoning), _) => (carry, reasoning, answer, None),
+            (Design::Memory(design), _, Some(pos)) => {
+                let decoded = design.decoder.apply(cx, &answer, pos)?;
+                (carry, answer, decoded, None)
+            }
+            (Design::Tokens(design), ..) => {
+                let (on, read, decoded, scores) = design.answer(cx, observed, &answer)?;
+                (Carry { answer: Some(on), reasoning: None }, read, decoded, scores)
+            }
+            _ => unreachable!("a round over actions leaves a reasoning, a step over the memory has positions"),
+        };
+        // the head judges the reasoning and must not bend it
+        let mean = detached_mean(cx, &read)?;
+        Ok(Step { carry, chunk: linear(cx, &decoded, &self.action_head)?, mean, decoded, scores })
     }
 
     /// Supervision steps for this batch.
@@ -495,13 +300,14 @@ impl Actrm {
         (0..steps).map(|i| weight(i) / total).collect()
     }
 
-    /// What is asked of a batch beside the actions, and the weight of the loss on it.
-    fn question(&self, batch: &Batch) -> Result<Option<(Question, f64)>> {
+    /// What is asked of a batch beside the actions: its name in the loss, and its weight.
+    #[allow(clippy::type_complexity)] // name, question, weight
+    fn question(&self, batch: &Batch) -> Result<Option<(&'static str, Arc<dyn Question>, f64)>> {
         let Design::Tokens(design) = &self.design else { return Ok(None) };
         Ok(match (&design.pointer, &design.layers) {
-            (Some(pointer), _) => Some((Question::Taken(pointer.asked("actrm", batch)?), pointer.weight)),
+            (Some(pointer), _) => Some(("pointer", pointer.asked("actrm", batch)?, pointer.weight)),
             (None, TokenLayers::Grid(cells, _)) => {
-                cells.asked("actrm", batch)?.map(|visited| (Question::Visited(visited), cells.weight))
+                cells.asked("actrm", batch)?.map(|visited| ("way", visited, cells.weight))
             }
             _ => None,
         })
@@ -511,39 +317,92 @@ impl Actrm {
         check_observation("actrm", &self.signature, observation)
     }
 
-    fn check_batch(&self, batch: &Batch) -> Result<()> {
-        check_batch("actrm", &self.signature, self.config.action_horizon, batch)
-    }
-
-    /// The batch with pictures as the network reads them in training.
-    fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
-        self.check_batch(batch)?;
-        Ok(Batch { observation: self.tokens.look(&batch.observation, Some(rng))?, ..batch.clone() })
-    }
-
-    /// With warm starts in use, the answer that half of the rows begin with: the model's own, to
-    /// the same observation under noise.
-    fn warm_answers(&self, batch: &Batch, warm: WarmStart, carry: &Carry, rng: &mut Rng) -> Result<Tensor> {
-        let mut noisy = |x: &Tensor| -> Result<Tensor> {
-            let noise = Tensor::from_vec(rng.normals(x.elem_count()), x.shape(), x.device())?;
-            Ok((x + (noise * warm.noise)?)?)
+    /// What the first step begins with: with warm starts in use, the answer that half of the rows begin with, the model's own to the
+    /// same observation under noise; with `start_noise` noise.
+    fn start(&self, cx: &mut Context<'_>, batch: &Batch, observed: &mut Observed) -> Result<Carry> {
+        let (rows, r) = (batch.rows(), &self.config.reasoning);
+        if let Some(warm) = r.warm_start {
+            return Ok(Carry { answer: Some(self.warm_answers(cx, batch, warm)?), reasoning: None });
+        }
+        if r.start_noise == 0.0 {
+            return Ok(Carry::default());
+        }
+        let mut noise = |shape: &[usize]| -> Result<Value> {
+            let drawn = cx.rng()?.normals(shape.iter().product());
+            let drawn = drawn.into_iter().map(|noise| noise * r.start_noise as f32).collect();
+            Value::of(drawn, shape, batch.device())
         };
+        if r.over == Over::Tokens {
+            let shape = observed.memory.dims().to_vec();
+            let drawn = noise(&shape)?;
+            // a second state's, which nothing reads
+            noise(&shape)?;
+            observed.begun = add(cx, &observed.memory, &drawn)?;
+            return Ok(Carry::default());
+        }
+        let dim = self.config.dim_model;
+        let answer = noise(&[rows, self.config.action_horizon, dim])?;
+        Ok(Carry { answer: Some(answer), reasoning: Some(noise(&[rows, r.tokens, dim])?) })
+    }
+
+    fn warm_answers(&self, cx: &mut Context<'_>, batch: &Batch, warm: WarmStart) -> Result<Value> {
         let mut observation = Features::new();
         for token in &self.tokens.layout().tokens {
-            observation.insert(&token.feature, noisy(batch.observation.require("warm start", &token.feature)?)?);
+            let x = batch.observation.require("warm start", &token.feature)?;
+            let noise = Tensor::from_vec(cx.rng()?.normals(x.elem_count()), x.shape(), x.device())?;
+            observation.insert(&token.feature, (x + (noise * warm.noise)?)?);
         }
         for camera in self.tokens.layout().cameras.iter().flat_map(|cameras| &cameras.features) {
             observation.insert(camera, batch.observation.require("warm start", camera)?.clone());
         }
-        let latent = Tensor::zeros((batch.rows(), self.config.latent_dim), DType::F32, batch.device())?;
-        let memory = self.memory(&latent, &observation, &mut Mode::Eval)?.detach();
-        let mut thought = carry.clone();
-        for at in 0..self.config.reasoning.supervision_steps {
-            thought = self.step(&memory, &thought, at, &mut Mode::Eval)?.carry.detach();
+        let answer = cx.no_grad(|cx| {
+            let latent = Value::zeros((batch.rows(), self.config.latent_dim), batch.device())?;
+            let memory = self.memory(cx, &latent, &observation)?;
+            let (observed, mut carry) = (self.observe(cx, memory)?, Carry::default());
+            for at in 0..self.config.reasoning.supervision_steps {
+                carry = self.rounds(cx, &observed, &carry, (at, None))?.detach();
+            }
+            Ok(carry.answer.expect("a round leaves an answer").detached())
+        })?;
+        let mut values = answer.flatten_all()?.to_vec1::<f32>()?;
+        let per_row = values.len() / batch.rows();
+        for row in values.chunks_exact_mut(per_row) {
+            if cx.rng()?.uniform() >= 0.5 {
+                row.fill(0.0);
+            }
         }
-        let warm: Vec<f32> = (0..batch.rows()).map(|_| if rng.uniform() < 0.5 { 1.0 } else { 0.0 }).collect();
-        let warm = Tensor::from_vec(warm, (batch.rows(), 1, 1), batch.device())?;
-        Ok(thought.answer.broadcast_mul(&warm)?)
+        Value::of(values, answer.dims(), batch.device())
+    }
+
+    /// The halting head's loss: it is asked of each step, errors: (b), whether the next would lower them no more.
+    fn halting(&self, cx: &mut Context<'_>, batch: &Batch, steps: &[Step], errors: &[Vec<f64>]) -> Result<Term> {
+        let rows = batch.rows();
+        // backwards, so that gradients are added in the order of the steps
+        let logits = steps.iter().rev().map(|step| linear(cx, &step.mean, &self.halt_head)?.reshape((1, rows, 1)));
+        let mut logits = logits.collect::<Result<Vec<_>>>()?;
+        logits.reverse();
+        let logits = cat_tokens(cx, 1, &logits.iter().collect::<Vec<_>>())?;
+        let still = 1.0 - self.config.reasoning.halt_margin;
+        let halted = errors.windows(2).flat_map(|pair| pair[0].iter().zip(&pair[1]));
+        let targets: Vec<f64> = halted.map(|(here, next)| f64::from(u8::from(*next >= here * still))).collect();
+        let total = (batch.total_rows.max(1) * steps.len()) as f64;
+        let share = 1.0 / total;
+        let asked: Arc<[f64]> = targets.into();
+        let by_hand = Arc::clone(&asked);
+        let by_hand = move |logits: &[f32], grad: Option<(&mut [f32], f64)>| {
+            let each = || logits.iter().zip(&*by_hand).map(|(logit, target)| (f64::from(*logit), *target));
+            if let Some((grad, weight)) = grad {
+                for (grad, (x, target)) in grad.iter_mut().zip(each()) {
+                    *grad = ((1.0 / (1.0 + (-x).exp()) - target) * share * weight) as f32;
+                }
+            }
+            each().fold(0.0, |sum, (x, target)| sum + (x.max(0.0) - x * target + (-x.abs()).exp().ln_1p()) * share)
+        };
+        term_of(cx, &logits, by_hand, |logits| {
+            let targets = asked.iter().map(|target| *target as f32).collect::<Vec<_>>();
+            let targets = Tensor::from_vec(targets, logits.shape(), logits.device())?;
+            Ok((binary_cross_entropy(logits, &targets)?.sum_all()? / total)?)
+        })
     }
 }
 
@@ -559,28 +418,6 @@ fn decoder(p: &mut Params, config: &Config, rng: &mut Rng) -> Result<Decoder> {
     })
 }
 
-/// x: (b, t, D), positions of the t tokens -> their sum
-fn positioned(x: &Tensor, positions: &Embedding) -> Result<Tensor> {
-    Ok(x.broadcast_add(&positions.weight.unsqueeze(0)?)?)
-}
-
-/// A block's layers on x: (b, t, D), context: tokens to attend to -> (b, t, D)
-fn update(layers: &[BlockLayer], x: &Tensor, context: &[&Tensor]) -> Result<Tensor> {
-    let context = Tensor::cat(context, 1)?;
-    let mut x = x.clone();
-    for layer in layers {
-        x = layer.forward(&x, &context)?;
-    }
-    Ok(x)
-}
-
-/// The fixed values that `z_h` and `z_l` begin with, (D) each: a pure function of the width, so that nothing untrained
-/// needs storing.
-fn fixed_values(dim: usize) -> [Vec<f32>; 2] {
-    let init = Init::TruncatedNormal { std: 1.0 };
-    ["actrm z_h", "actrm z_l"].map(|name| init.values(&[dim], &mut Rng::new(0, name)))
-}
-
 impl PolicyModel for Actrm {
     fn params(&self) -> &Params {
         &self.params
@@ -590,113 +427,66 @@ impl PolicyModel for Actrm {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        not_by_hand(&self.signature)
+    fn cache(&self) -> Option<&Cache> {
+        Some(&self.cache)
     }
 
-    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
-        let batch = &self.looked_at(batch, rng)?;
-        let rows = batch.rows();
-        let shape = (rows, self.config.latent_dim);
-        let latent = match &self.vae {
-            Some(vae) => Some(vae.encode(batch, &self.vae_pos_enc, &mut Mode::Train(rng))?),
-            None => None,
-        };
+    fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
+        check_batch("actrm", &self.signature, self.config.action_horizon, batch)?;
+        let observation = self.tokens.look(&batch.observation, Some(cx.rng()?))?;
+        let batch = &Batch { observation, ..batch.clone() };
+        let (rows, config) = (batch.rows(), &self.config);
+        let latent = self.vae.as_ref().map(|vae| vae.apply(cx, batch, &self.vae_pos_enc)).transpose()?;
         let sample = match &latent {
             Some(latent) => {
-                let eps = Tensor::from_vec(rng.normals(shape.0 * shape.1), shape, batch.device())?;
-                sample(latent, &eps)?
+                let noise = cx.normals(&[rows, config.latent_dim])?;
+                sample_latent(cx, latent, &noise)?
             }
-            None => Tensor::zeros(shape, DType::F32, batch.device())?,
+            None => Value::zeros((rows, config.latent_dim), batch.device())?,
         };
-        let memory = self.memory(&sample, &batch.observation, &mut Mode::Train(rng))?;
-        let mut carry = self.start(rows, &memory)?;
-        if let Some(warm) = self.config.reasoning.warm_start {
-            carry.answer = self.warm_answers(batch, warm, &carry, rng)?;
-        }
-        let noise = self.config.reasoning.start_noise;
-        if noise > 0.0 {
-            for state in [&mut carry.answer, &mut carry.reasoning] {
-                let drawn = Tensor::from_vec(rng.normals(state.elem_count()), state.shape(), batch.device())?;
-                *state = match self.config.reasoning.over {
-                    Over::Tokens => (&*state + (drawn * noise)?)?,
-                    _ => (drawn * noise)?,
-                };
-            }
-        }
-
-        let steps = self.steps_of(batch);
-        let (mut chunks, mut halts, mut scores) = (Vec::new(), Vec::new(), Vec::new());
-        for at in 0..steps {
-            let step = self.step(&memory, &carry, at, &mut Mode::Train(rng))?;
-            carry = match self.config.reasoning.over {
-                Over::Actions | Over::Tokens => step.carry,
-                Over::Memory => step.carry.detach(),
-            };
-            chunks.push(step.chunk);
-            halts.push(step.halt_logit);
-            scores.extend(step.scores);
+        let memory = self.memory(cx, &sample, &batch.observation)?;
+        let auxiliary = match &self.auxiliary {
+            Some(auxiliary) => Some((auxiliary.term(cx, &memory, ("actrm", batch))?, auxiliary.weight)),
+            None => None,
+        };
+        let mut observed = self.observe(cx, memory)?;
+        let mut carry = self.start(cx, batch, &mut observed)?;
+        let mut steps: Vec<Step> = Vec::new();
+        for at in 0..self.steps_of(batch) {
+            let step = self.step(cx, &observed, &carry, at)?;
+            carry = step.carry.clone();
+            steps.push(step);
         }
         // one step more, so that the last depth has a halting target as well
-        let beyond = self.step(&memory.detach(), &carry.detach(), steps, &mut Mode::Eval)?.chunk.detach();
+        let beyond = cx.no_grad(|cx| self.step(cx, &observed, &carry, steps.len()))?.chunk.detach();
 
-        let (b, c, a) = batch.actions.dims3()?;
-        let valid = (1.0 - batch.is_pad.reshape((b, c, 1))?)?;
-        let errors =
-            |chunk: &Tensor| -> Result<Tensor> { Ok(absolute(&(chunk - &batch.actions)?)?.broadcast_mul(&valid)?) };
-        let entries = (batch.total_valid_steps * a).max(1) as f64;
-        let mut parts = BTreeMap::new();
-        let mut total = Tensor::zeros((), DType::F32, batch.device())?;
-        let mut row_errors = Vec::with_capacity(steps + 1);
-        for (chunk, weight) in chunks.iter().zip(self.step_weights(steps)) {
-            let error = errors(chunk)?;
-            let l1 = (error.sum_all()? / entries)?;
+        let entries = batch.total_valid_steps * self.signature.action_dim;
+        let error = |cx: &mut Context<'_>, chunk: &Value| {
+            chunk_error(cx, (chunk, &batch.actions), &batch.is_pad, Error::Absolute, entries)
+        };
+        let (question, mut loss, mut errors) = (self.question(batch)?, Loss::default(), Vec::new());
+        for (step, weight) in steps.iter().zip(self.step_weights(steps.len())) {
+            let (l1, of_rows) = error(cx, &step.chunk)?;
             // the last step's is the one comparable with ACT's
-            parts.insert("l1_loss".to_string(), l1.detach());
-            parts.entry("l1_loss_first".to_string()).or_insert_with(|| l1.detach());
-            row_errors.push(error.detach().sum((1, 2))?);
-            total = (total + (l1 * weight)?)?;
-        }
-        row_errors.push(errors(&beyond)?.sum((1, 2))?);
-
-        if let Some((question, share)) = self.question(batch)? {
-            let name = question.name();
-            for (scores, weight) in scores.iter().zip(self.step_weights(steps)) {
-                let (loss, right) = (question.loss(scores)?, question.right(scores)?);
-                parts.insert(format!("{name}_loss"), loss.detach());
-                parts.entry(format!("{name}_right_first")).or_insert_with(|| right.clone());
-                parts.insert(format!("{name}_right"), right);
-                total = (total + (loss * (weight * share))?)?;
+            loss.report_first("l1_loss_first", l1.value() as f32);
+            loss.add("l1_loss", l1, weight);
+            errors.push(of_rows);
+            if let (Some((name, question, share)), Some(scores)) = (&question, &step.scores) {
+                let (term, right) = ask(cx, question, scores)?;
+                loss.report_first(&format!("{name}_right_first"), right);
+                loss.report(&format!("{name}_right"), right);
+                loss.add(&format!("{name}_loss"), term, weight * share);
             }
         }
-
-        if let Some(asked) = &self.auxiliary {
-            let loss = asked.told("actrm", batch)?.loss(&asked.forward(&memory)?)?;
-            parts.insert("auxiliary_loss".to_string(), loss.detach());
-            total = (total + (loss * asked.weight)?)?;
+        errors.push(error(cx, &beyond)?.1);
+        loss.add("halt_loss", self.halting(cx, batch, &steps, &errors)?, config.reasoning.halt_weight);
+        if let Some((term, weight)) = auxiliary {
+            loss.add("auxiliary_loss", term, weight);
         }
-        let mut halt = Tensor::zeros((), DType::F32, batch.device())?;
-        let still = 1.0 - self.config.reasoning.halt_margin;
-        for (i, logit) in halts.iter().enumerate() {
-            let target = row_errors[i + 1].ge(&(&row_errors[i] * still)?)?.to_dtype(DType::F32)?;
-            halt = (halt + binary_cross_entropy(logit, &target)?.sum_all()?)?;
+        if let Some(latent) = &latent {
+            loss.add("kld_loss", kl_divergence(cx, latent, batch.total_rows)?, config.kl_weight);
         }
-        let halt = (halt / (batch.total_rows.max(1) * steps) as f64)?;
-        parts.insert("halt_loss".to_string(), halt.detach());
-        total = (total + (halt * self.config.reasoning.halt_weight)?)?;
-        if let Some((mu, log_variance)) = &latent {
-            let kld = kl_divergence(mu, log_variance, batch.total_rows)?;
-            parts.insert("kld_loss".to_string(), kld.detach());
-            total = (total + (kld * self.config.kl_weight)?)?;
-        }
-        Ok(LossParts { total, parts })
-    }
-
-    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
-        match self.composed_because() {
-            Some(_) => autograd(self, batch, rng, into),
-            None => self.fused_gradients(batch, rng, into),
-        }
+        Ok(loss)
     }
 
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {

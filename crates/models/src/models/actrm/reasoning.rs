@@ -4,12 +4,11 @@ use super::{Actrm, Carry, Config, Over, ReasoningConfig};
 use crate::checks::check_shape;
 use crate::features::{Features, Observation};
 use crate::history::History;
-use crate::layers::Mode;
-use crate::model::PolicyModel;
 use crate::policy::{ActionChunk, Clock, Policy, ThoughtStep};
 use crate::preprocess::Preprocess;
-use candle_core::{DType, Tensor};
-use nn::Result;
+use candle_core::Tensor;
+use nn::ops::linear;
+use nn::{Context, ModelError, Result, Value};
 use std::cell::RefCell;
 use std::sync::Arc;
 
@@ -64,40 +63,46 @@ impl Actrm {
         on_seen: &mut dyn FnMut(),
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
-        if self.composed_because().is_some() {
-            return self.reason_composed(observation, start, should_stop);
-        }
         let rows = self.check_thought(observation, start)?;
-        let mut thought = Thought::new(&self.config.reasoning, rows, should_stop);
-        let answer =
-            self.think(observation, rows, start, on_seen, &mut |chunk, logits| thought.step(chunk, &logits))?;
-        thought.end(answer)
+        let observation = self.tokens.look(observation, None)?;
+        let thought = Thought::new(&self.config.reasoning, rows, should_stop);
+        self.cache.predict(&self.params, on_seen, |cx| self.think(cx, rows, &observation, start, thought))
     }
 
-    /// The thought on candle's autograd; `reason` runs the same maths faster.
-    ///
-    /// # Errors
-    /// Inputs of the wrong shape.
-    pub fn reason_composed(
+    /// The thought on candle's operations; `reason` runs the same statement on hand-written kernels.
+    #[cfg(test)]
+    pub(super) fn reason_composed(
         &self,
         observation: &Features<Tensor>,
         start: Option<&Tensor>,
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
         let rows = self.check_thought(observation, start)?;
-        let latent = Tensor::zeros((rows, self.config.latent_dim), DType::F32, self.action_head.weight.device())?;
         let observation = self.tokens.look(observation, None)?;
-        let memory = self.memory(&latent, &observation, &mut Mode::Eval)?.detach();
-        let mut carry = self.start(rows, &memory)?;
-        if let Some(start) = start {
-            carry.answer = start.clone();
-        }
-        let mut thought = Thought::new(&self.config.reasoning, rows, should_stop);
+        let thought = Thought::new(&self.config.reasoning, rows, should_stop);
+        self.cache.composed_predict(&self.params, |cx| self.think(cx, rows, &observation, start, thought))
+    }
+
+    /// Pictures are as the network reads them.
+    fn think(
+        &self,
+        cx: &mut Context<'_>,
+        rows: usize,
+        observation: &Features<Tensor>,
+        start: Option<&Tensor>,
+        mut thought: Thought<'_>,
+    ) -> Result<Reasoning> {
+        let latent = Value::zeros((rows, self.config.latent_dim), &cx.device().clone())?;
+        let memory = self.memory(cx, &latent, observation)?;
+        let observed = self.observe(cx, memory)?;
+        let answer = start.map(|start| Ok::<_, ModelError>(Value::from(&start.contiguous()?))).transpose()?;
+        let mut carry = Carry { answer, reasoning: None };
         loop {
-            let step = self.step(&memory, &carry, thought.steps.len(), &mut Mode::Eval)?;
-            carry = Carry::detach(&step.carry);
-            if thought.step(step.chunk.detach(), &step.halt_logit.to_vec1()?)? {
-                return thought.end(carry.answer);
+            let step = self.step(cx, &observed, &carry, thought.steps.len())?;
+            let logits = linear(cx, &step.mean, &self.halt_head)?.detached().flatten_all()?.to_vec1()?;
+            carry = step.carry.detach();
+            if thought.step(step.chunk.detached(), &logits)? {
+                return thought.end(carry.answer.expect("a step leaves an answer").detached());
             }
         }
     }

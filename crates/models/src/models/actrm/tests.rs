@@ -2,16 +2,18 @@
 use super::*;
 use crate::batch::Taken;
 use crate::features::{FeatureSpec, Features, Observation, ValuesRef};
-use crate::fused::testing::{assert_the_gradient_is_the_slope, move_parameters, signatures};
 use crate::layers::{AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::models::act::{self, Act};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::policy::Policy;
 use crate::preprocess::Preprocess;
 use crate::registry::PolicyConfig;
+use crate::testing::{assert_the_gradient_is_the_slope, move_parameters, signatures};
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
+use nn::Gradients;
 use nn::ParamLayout;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 fn signature() -> Signature {
@@ -358,9 +360,9 @@ fn a_thought_over_a_grid_looked_into_is_the_thought() {
     let base = ReasoningConfig { over: Over::Tokens, grid, max_steps: Some(5), ..ReasoningConfig::default() };
     let reasoning = ReasoningConfig { l_cycles: 2, halt_threshold: 1.0, change_threshold: 0.0, ..base };
     let config = small(reasoning);
-    let signature = crate::fused::testing::signatures().grid;
+    let signature = crate::testing::signatures().grid;
     let model = Actrm::new(&config, &signature, 5).unwrap();
-    let batch = crate::fused::testing::batch(&signature, config.action_horizon, 3, 1);
+    let batch = crate::testing::batch(&signature, config.action_horizon, 3, 1);
     let off = |a: &Tensor, b: &Tensor| value(&(a - b).unwrap().abs().unwrap().max_all().unwrap());
     let thought = model.reason(&batch.observation, None, &mut |_| false).unwrap();
     let steps = model.examine(&batch.observation, 5, None).unwrap();
@@ -555,7 +557,7 @@ fn pointing(change: &dyn Fn(&mut Config)) -> (Actrm, Batch) {
     let signature = signatures().entities;
     let model = Actrm::new(&config, &signature, 1).unwrap();
     move_parameters(&model);
-    let mut batch = crate::fused::testing::batch(&signature, config.action_horizon, 6, 3);
+    let mut batch = crate::testing::batch(&signature, config.action_horizon, 6, 3);
     let cubes: Vec<u32> = (0..signature.observation.len() as u32)
         .filter(|&i| signature.observation[i as usize].group() == "cube")
         .collect();

@@ -113,10 +113,6 @@ impl PolicyModel for Bc {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        None
-    }
-
     fn cache(&self) -> Option<&Cache> {
         Some(&self.cache)
     }
@@ -170,7 +166,7 @@ impl PolicyModel for Bc {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::fused::testing::{
+    use crate::testing::{
         assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
     };
     use crate::train::{TrainConfig, Trainer};

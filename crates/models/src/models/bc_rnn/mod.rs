@@ -13,14 +13,9 @@
 //! loss either way. Pictures become the cells of `[policy.vision]`'s feature map behind a step's numbers (robomimic: keypoints). No goals, no open loop. The means lie in -1 to 1, so that actions have to be normalised by their
 //! range (`normalisation.action = "min_max"`).
 //!
-//! What it costs: one product a step and layer for the recurrence, one a layer for all that comes from below; the cell is by
-//! hand (`layers/lstm.rs`; `layers/gru.rs` is composed).
-//!
-//! This file is the model as one reads it, on candle's autograd. Training steps run the same maths with hand-written backward
-//! passes (`fused.rs`); tests hold the two together.
+//! What it costs: one product a step and layer for the recurrence, one a layer for all that comes from below.
 
 mod config;
-mod fused;
 
 pub use config::Config;
 
@@ -28,20 +23,13 @@ use crate::batch::Batch;
 use crate::checks::{check_batch, check_observation};
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Observation, Signature};
-use crate::fused::Workspaces;
-use crate::layers::{Mixture, MixtureHead, Recurrent, RecurrentState, Steps};
-use crate::model::{PolicyModel, autograd, not_by_hand};
+use crate::layers::{Mixture, MixtureHead, MixtureParts, Recurrent, RecurrentState, Steps};
+use crate::model::PolicyModel;
 use crate::policy::{ActionChunk, Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
-use nn::Gradients;
-use nn::Params;
-use nn::Rng;
-use nn::device::HERE;
-use nn::losses::absolute;
-use nn::{LossParts, LossValues};
-use nn::{ModelError, Result};
-use std::collections::BTreeMap;
+use nn::ops::{mixture_likelihood, select_tokens};
+use nn::{Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -57,7 +45,7 @@ pub struct BcRnn {
     steps: Steps,
     rnn: Recurrent,
     head: MixtureHead,
-    workspaces: Workspaces,
+    cache: Cache,
 }
 
 impl BcRnn {
@@ -87,15 +75,30 @@ impl BcRnn {
             steps,
             rnn,
             head,
-            workspaces: Workspaces::default(),
+            cache: Cache::default(),
         })
     }
 
-    /// x: (b, T, D), from the state before it -> b*T mixtures
-    fn forward(&self, x: &Tensor, state: &mut RecurrentState) -> Result<Mixture> {
-        let (b, steps, _) = x.dims3()?;
-        let y = self.rnn.forward(x, state)?;
-        self.head.forward(&y.reshape((b * steps, self.config.hidden_dim))?)
+    /// x: (T, b, D), step by step -> T*b mixtures. A prediction may go on from a state.
+    fn forward(&self, cx: &mut Context<'_>, x: &Value, state: Option<&mut RecurrentState>) -> Result<MixtureParts> {
+        let (steps, b, _) = x.dims3()?;
+        let y = self.rnn.apply(cx, x, state)?;
+        self.head.apply(cx, &y.reshape((steps * b, self.config.hidden_dim))?)
+    }
+
+    /// The signature's features, (b, T, …) each, pictures as the network reads them, in this order of all steps of all rows -> as
+    /// many mixtures. The order is step by step.
+    fn in_order(
+        &self,
+        cx: &mut Context<'_>,
+        rows: usize,
+        observation: &Features<Tensor>,
+        order: &[usize],
+    ) -> Result<MixtureParts> {
+        let (steps, width) = (self.config.action_horizon, self.steps.width());
+        let x = self.steps.apply(cx, rows, observation)?.reshape((1, rows * steps, width))?;
+        let x = select_tokens(cx, &x, order)?.reshape((steps, rows, width))?;
+        self.forward(cx, &x, None)
     }
 
     /// The mixtures of the signature's features, (b, T, …) each -> b*T mixtures
@@ -104,7 +107,23 @@ impl BcRnn {
     /// An observation that does not fit.
     pub fn mixtures(&self, observation: &Features<Tensor>) -> Result<Mixture> {
         let rows = check_observation("bc_rnn", &self.signature, observation)?;
-        self.forward(&self.steps.forward(rows, observation)?, &mut self.rnn.zero_state(rows)?)
+        let observation = self.steps.look(observation, None)?;
+        let steps = self.config.action_horizon;
+        let by_step: Vec<usize> = (0..steps).flat_map(|step| (0..rows).map(move |row| row * steps + step)).collect();
+        let mixtures = self
+            .cache
+            .predict(&self.params, &mut || {}, |cx| self.in_order(cx, rows, &observation, &by_step)?.mixture())?;
+        // row by row again
+        let by_row = |x: &Tensor| -> Result<Tensor> {
+            let rest = x.dims()[1..].to_vec();
+            let (apart, together) = ([&[steps, rows], &rest[..]].concat(), [&[rows * steps], &rest[..]].concat());
+            Ok(x.reshape(apart)?.transpose(0, 1)?.contiguous()?.reshape(together)?)
+        };
+        Ok(Mixture {
+            means: by_row(&mixtures.means)?,
+            scales: by_row(&mixtures.scales)?,
+            logits: by_row(&mixtures.logits)?,
+        })
     }
 }
 
@@ -116,20 +135,12 @@ fn beginnings(is_pad: &[f32], step: usize) -> (usize, f32) {
     (at, if step + before < is_pad.len() { 1.0 - is_pad[at] } else { 0.0 })
 }
 
-/// For every step of every row the one that takes its place once the padding that a row begins with is moved to its end,
-/// and 1 if it is real, else 0. is_pad: (b, T) -> b*T indices, b*T weights
-fn real_first(is_pad: &Tensor) -> Result<(Tensor, Tensor)> {
-    let (rows, steps) = is_pad.dims2()?;
-    let (mut from, mut real) = (Vec::with_capacity(rows * steps), Vec::with_capacity(rows * steps));
-    for (row, pad) in is_pad.to_vec2::<f32>()?.iter().enumerate() {
-        for step in 0..steps {
-            let (at, is_real) = beginnings(pad, step);
-            from.push((row * steps + at) as u32);
-            real.push(is_real);
-        }
-    }
-    let count = rows * steps;
-    Ok((Tensor::from_vec(from, count, &HERE)?, Tensor::from_vec(real, count, &HERE)?))
+/// For every step of every row, step by step, the one that takes its place once the padding that a row begins with is moved to its
+/// end, counted row by row, and 1 if it is real, else 0. is_pad: (b, T)
+fn real_first(is_pad: &Tensor) -> Result<(Vec<usize>, Vec<f32>)> {
+    let (pads, steps) = (is_pad.to_vec2::<f32>()?, is_pad.dim(1)?);
+    let each = (0..steps).flat_map(|step| pads.iter().enumerate().map(move |(row, pad)| (row, beginnings(pad, step))));
+    Ok(each.map(|(row, (at, real))| (row * steps + at, real)).unzip())
 }
 
 impl PolicyModel for BcRnn {
@@ -141,47 +152,35 @@ impl PolicyModel for BcRnn {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        not_by_hand(&self.signature)
+    fn cache(&self) -> Option<&Cache> {
+        Some(&self.cache)
     }
 
-    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+    fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch("bc_rnn", &self.signature, self.config.action_horizon, batch)?;
-        match self.composed_because() {
-            Some(_) => autograd(self, batch, rng, into),
-            None => self.fused_gradients(&self.steps.looked_at(batch, rng)?, into),
-        }
-    }
-
-    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
-        check_batch("bc_rnn", &self.signature, self.config.action_horizon, batch)?;
-        let batch = &self.steps.looked_at(batch, rng)?;
-        let (rows, steps) = (batch.rows(), self.config.action_horizon);
+        let observation = self.steps.look(&batch.observation, Some(cx.rng()?))?;
         let (from, real) = real_first(&batch.is_pad)?;
-        let moved = |x: &Tensor| -> Result<Tensor> {
-            let width = x.dim(2)?;
-            Ok(x.reshape((rows * steps, width))?.index_select(&from, 0)?)
-        };
-        let x = moved(&self.steps.forward(rows, &batch.observation)?)?;
-        let actions = moved(&batch.actions)?;
-        let mixtures = self.forward(&x.reshape((rows, steps, ()))?, &mut self.rnn.zero_state(rows)?)?;
-        let valid = batch.total_valid_steps.max(1) as f64;
-        let total = ((mixtures.log_prob(&actions)?.mul(&real)?.sum_all()? / valid)? * -1.0)?;
-        // of the likeliest Gaussian's mean, beside what other policies report
-        let away = absolute(&(mixtures.likeliest()?.detach() - &actions)?)?.broadcast_mul(&real.unsqueeze(1)?)?;
-        let l1 = (away.sum_all()? / (valid * self.signature.action_dim as f64))?;
-        let parts = BTreeMap::from([("nll".to_string(), total.detach()), ("l1_loss".to_string(), l1)]);
-        Ok(LossParts { total, parts })
+        let mixtures = self.in_order(cx, batch.rows(), &observation, &from)?;
+        let count = from.len();
+        let from = from.into_iter().map(|at| at as u32).collect::<Vec<_>>();
+        let from = Tensor::from_vec(from, count, batch.device())?;
+        let actions = batch.actions.flatten(0, 1)?.index_select(&from, 0)?;
+        let real = Tensor::from_vec(real, count, batch.device())?;
+        let (nll, l1) = mixture_likelihood(cx, &mixtures, (&actions, &real), batch.total_valid_steps)?;
+        let mut loss = Loss::default();
+        loss.add("nll", nll, 1.0);
+        loss.report("l1_loss", l1);
+        Ok(loss)
     }
 
     /// The mean of the likeliest Gaussian at every step.
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
-        let actions = self.mixtures(observation)?.likeliest()?.detach();
+        let actions = self.mixtures(observation)?.likeliest()?;
         Ok(actions.reshape(((), self.config.action_horizon, self.signature.action_dim))?)
     }
 
     fn sample(&self, observation: &Features<Tensor>, rng: &mut Rng) -> Result<Tensor> {
-        let actions = self.mixtures(observation)?.sample(rng)?.detach();
+        let actions = self.mixtures(observation)?.sample(rng)?;
         Ok(actions.reshape(((), self.config.action_horizon, self.signature.action_dim))?)
     }
 
@@ -217,19 +216,21 @@ fn generator(seed: u64) -> Rng {
 impl Policy for Carrying {
     /// One action.
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
-        let (model, begun) = (&self.model, self.clock.milliseconds());
+        let (model, clock) = (&self.model, &mut self.clock);
+        let (begun, mut encoding) = (clock.milliseconds(), None);
         let seen = self.preprocess.observation(std::slice::from_ref(observation))?;
-        // the same observation as often as a history is long: its last
-        let now = model.steps.last(&seen)?;
-        self.encoding = model.vision().map(|_| self.clock.milliseconds() - begun);
         let mut state = match self.state.take() {
             Some(state) if !self.steps.is_multiple_of(model.config.action_horizon) => state,
-            _ => model.rnn.zero_state(1)?,
+            _ => RecurrentState::new(),
         };
-        let mixture = model.forward(&now, &mut state)?;
-        state.iter_mut().flatten().for_each(|tensor| *tensor = tensor.detach());
-        (self.state, self.steps) = (Some(state), self.steps + 1);
-        self.preprocess.chunk(&mixture.sample(&mut self.rng)?.detach().unsqueeze(1)?)
+        let mut on_seen = || encoding = Some(clock.milliseconds() - begun);
+        let mixture = model.cache.predict(&model.params, &mut on_seen, |cx| {
+            // the same observation as often as a history is long: its last
+            let now = model.steps.apply_to_last(cx, &seen)?;
+            model.forward(cx, &now, Some(&mut state))?.mixture()
+        })?;
+        (self.state, self.steps, self.encoding) = (Some(state), self.steps + 1, encoding);
+        self.preprocess.chunk(&mixture.sample(&mut self.rng)?.unsqueeze(1)?)
     }
 
     fn encoding(&self) -> Option<f64> {

@@ -1,14 +1,14 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
 use crate::features::Values;
-use crate::fused::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients, move_parameters,
-    signatures,
-};
 use crate::layers::Cell;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
+use crate::testing::{
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+};
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
+use std::collections::BTreeMap;
 
 fn small() -> Config {
     Config { action_horizon: 3, hidden_dim: 9, n_modes: 2, min_std: 0.05, ..Config::default() }
@@ -50,7 +50,6 @@ fn the_step_by_hand_is_the_composed_one() {
     let gru = |config: Config| Config { cell: Cell::Gru, ..config };
     for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }, gru(small()), gru(other.clone()), other] {
         let model = BcRnn::new(&config, &signature, 1).unwrap();
-        assert!(model.composed_because().is_none());
         for rows in [1, 5] {
             assert_the_step_is_the_composed_one(&model, &padded_before(&signature, rows), &format!("{config:?}"));
         }
@@ -111,33 +110,18 @@ fn from_pictures_the_policy_sees_one_step_at_a_time() {
 }
 
 #[test]
-fn steps_need_no_more_memory_than_the_first() {
-    let signature = signatures().history;
-    for cell in [Cell::Lstm, Cell::Gru] {
-        let model = BcRnn::new(&Config { cell, ..small() }, &signature, 1).unwrap();
-        let batch = padded_before(&signature, 4);
-        let held = || {
-            gradients(&model, &batch);
-            model.workspaces.with(|space| space.pool.numbers())
-        };
-        let first = held();
-        for _ in 0..3 {
-            assert_eq!(held(), first);
-        }
-    }
-}
-
-#[test]
 fn a_row_that_begins_with_padding_is_a_shorter_sequence() {
     let signature = signatures().history;
     let model = BcRnn::new(&small(), &signature, 1).unwrap();
     let batch = padded_before(&signature, 3);
     let (mut sum, mut count) = (0.0, 0);
-    let x = model.steps.forward(3, &batch.observation).unwrap();
+    let x = model.steps.numbers(3, &batch.observation).unwrap();
     for row in 0..3 {
         // rows with 0, 1 and 2 steps of padding
-        let own = x.narrow(0, row, 1).unwrap().narrow(1, row, 3 - row).unwrap();
-        let mixtures = model.forward(&own, &mut model.rnn.zero_state(1).unwrap()).unwrap();
+        let own = x.get(row).unwrap().narrow(0, row, 3 - row).unwrap().unsqueeze(1).unwrap();
+        let own = Value::from(&own.contiguous().unwrap());
+        let forward = |cx: &mut Context<'_>| model.forward(cx, &own, None)?.mixture();
+        let mixtures = model.cache.predict(&model.params, &mut || {}, forward).unwrap();
         let actions = batch.actions.get(row).unwrap().narrow(0, row, 3 - row).unwrap();
         let log_prob = mixtures.log_prob(&actions).unwrap().to_vec1::<f32>().unwrap();
         sum += log_prob.iter().sum::<f32>();

@@ -11,11 +11,9 @@
 //! in -1 to 1, so that actions have to be normalised by their range (`normalisation.action = "min_max"`).
 //!
 //! What it costs: of the last block only the last step is computed beyond keys and values, because nothing else is read
-//! (robomimic computes all of it). This file is the readable form; training steps run on `fused.rs`, the same maths written
-//! out, which `bench_policies` puts beside robomimic's.
+//! (robomimic computes all of it).
 
 mod config;
-mod fused;
 
 pub use config::Config;
 
@@ -24,20 +22,16 @@ use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Signature};
-use crate::fused::Workspaces;
-use crate::layers::{Dropout, LayerNorm, Linear, Mixture, MixtureHead, Mode, Steps, masked_softmax};
+use crate::layers::{Activation, Dropout, FeedForward, LayerNorm, Linear, Mixture, MixtureHead, MixtureParts, Steps};
 use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
-use candle_core::Tensor;
-use nn::Gradients;
-use nn::Result;
-use nn::Rng;
-use nn::device::HERE;
-use nn::losses::absolute;
-use nn::{Init, Params};
-use nn::{LossParts, LossValues};
-use std::collections::BTreeMap;
+use candle_core::{DType, Tensor};
+use nn::ops::{
+    Attention, attention, dropout, feed_forward, layer_norm, linear, linear_rows, mixture_likelihood, narrow_tokens,
+    residual,
+};
+use nn::{Cache, Context, Init, Loss, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -58,8 +52,7 @@ pub struct BcTransformer {
     blocks: Vec<Block>,
     output_ln: LayerNorm,
     head: MixtureHead,
-    dropout: Dropout,
-    workspaces: Workspaces,
+    cache: Cache,
 }
 
 /// Attention to what was before, then two dense layers; each after a norm and added to what it came from.
@@ -69,9 +62,9 @@ struct Block {
     qkv: Linear,
     output: Linear,
     ln2: LayerNorm,
-    mlp: [Linear; 2],
+    mlp: FeedForward,
     n_heads: usize,
-    dropout: Dropout,
+    dropout: f64,
 }
 
 impl Block {
@@ -82,10 +75,12 @@ impl Block {
         };
         let qkv = linear(p, "attention.nets.qkv", (dim, 3 * dim), None)?;
         let output = linear(p, "attention.nets.output", (dim, dim), Some(Init::Zeros))?;
-        let mlp = [
-            linear(p, "mlp.0", (dim, 4 * dim), Some(Init::Zeros))?,
-            linear(p, "mlp.2", (4 * dim, dim), Some(Init::Zeros))?,
-        ];
+        let mlp = FeedForward {
+            linear1: linear(p, "mlp.0", (dim, 4 * dim), Some(Init::Zeros))?,
+            linear2: linear(p, "mlp.2", (4 * dim, dim), Some(Init::Zeros))?,
+            activation: Activation::Gelu,
+            dropout: Dropout { p: 0.0 },
+        };
         Ok(Self {
             ln1: LayerNorm::new(p, &format!("{prefix}.ln1"), dim, rng)?,
             qkv,
@@ -93,33 +88,27 @@ impl Block {
             ln2: LayerNorm::new(p, &format!("{prefix}.ln2"), dim, rng)?,
             mlp,
             n_heads: config.n_heads,
-            dropout: Dropout { p: config.dropout },
+            dropout: config.dropout,
         })
     }
 
-    /// x: (b, T, D), mask: (T, T), 0 where a step may look and very negative elsewhere -> (b, T, D), or (b, 1, D) without
-    /// a mask: the last step alone, which may look everywhere
-    fn forward(&self, x: &Tensor, mask: Option<&Tensor>, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let (b, steps, dim) = x.dims3()?;
-        let head = dim / self.n_heads;
-        let qkv = self.qkv.forward(&self.ln1.forward(x)?)?;
-        let part = |i: usize, of: &Tensor| -> Result<Tensor> {
-            let part = of.narrow(2, i * dim, dim)?.reshape((b, (), self.n_heads, head))?;
-            Ok(part.transpose(1, 2)?.contiguous()?)
-        };
-        let computed = if mask.is_some() { steps } else { 1 };
-        let last = |x: &Tensor| -> Result<Tensor> { Ok(x.narrow(1, steps - computed, computed)?) };
-        let (q, k, v) = (part(0, &last(&qkv)?)?, part(1, &qkv)?, part(2, &qkv)?);
-        let mut scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (head as f64).sqrt()))?;
-        if let Some(mask) = mask {
-            scores = scores.broadcast_add(mask)?;
-        }
-        let weights = self.dropout.forward(&masked_softmax(&scores, None)?, mode)?;
-        let mixed = weights.matmul(&v)?.transpose(1, 2)?.reshape((b, computed, dim))?;
-        let x = (last(x)? + self.dropout.forward(&self.output.forward(&mixed)?, mode)?)?;
-        let inner = self.mlp[0].forward(&self.ln2.forward(&x)?)?.gelu_erf()?;
-        let outer = self.dropout.forward(&self.mlp[1].forward(&inner)?, mode)?;
-        Ok((x + outer)?)
+    /// x: (b, T, D) -> (b, T, D), each step after those before it, or (b, 1, D): the last step alone, which sees all of them
+    fn apply(&self, cx: &mut Context<'_>, x: &Value, all: bool) -> Result<Value> {
+        let (batch, steps, dim) = x.dims3()?;
+        let computed = if all { steps } else { 1 };
+        let y = layer_norm(cx, x, &self.ln1)?;
+        let asking = narrow_tokens(cx, &y, steps - computed, computed)?;
+        let q = linear_rows(cx, &asking, None, (&self.qkv.weight, None), 0..dim)?;
+        let kv = linear_rows(cx, &y, None, (&self.qkv.weight, None), dim..3 * dim)?;
+        let (heads, dropout) = (self.n_heads, self.dropout);
+        let how = Attention { heads, batch, all_queries: computed, causal: all, key_pad: None, dropout };
+        let mixed = attention(cx, &q, &kv, how)?;
+        let branch = linear(cx, &mixed, &self.output)?;
+        let x = narrow_tokens(cx, x, steps - computed, computed)?;
+        let x = residual(cx, &x, &branch, (dropout, computed), None)?;
+        let z = layer_norm(cx, &x, &self.ln2)?;
+        let branch = feed_forward(cx, &z, &self.mlp, computed)?;
+        residual(cx, &x, &branch, (dropout, computed), None)
     }
 }
 
@@ -145,7 +134,6 @@ impl BcTransformer {
         let output_ln = LayerNorm::new(&mut p, "output_ln", dim, rng)?;
         let sizes = (dim, config.n_modes, signature.action_dim);
         let head = MixtureHead::new(&mut p, "decoder", sizes, config.min_std, rng)?;
-        let dropout = Dropout { p: config.dropout };
         let (config, signature) = (config.clone(), signature.clone());
         Ok(Self {
             config,
@@ -158,46 +146,39 @@ impl BcTransformer {
             blocks,
             output_ln,
             head,
-            dropout,
-            workspaces: Workspaces::default(),
+            cache: Cache::default(),
         })
     }
 
-    /// The signature's features, (b, T, …) each -> b mixtures, of the last step
+    /// The signature's features, (b, T, …) each, pictures as the network reads them -> b mixtures, of the last step
+    fn forward(&self, cx: &mut Context<'_>, rows: usize, observation: &Features<Tensor>) -> Result<MixtureParts> {
+        let (steps, dim) = (self.signature.n_obs_steps, self.config.dim_model);
+        let seen = self.steps.apply(cx, rows, observation)?;
+        let x = linear(cx, &seen, &self.embed_encoder)?;
+        let positions = cx.parameter(&self.embed_timestep)?;
+        let x = residual(cx, &positions, &x, (0.0, steps), Some(&self.embed_ln))?;
+        let mut x = dropout(cx, &x, self.config.dropout)?;
+        for (i, block) in self.blocks.iter().enumerate() {
+            x = block.apply(cx, &x, i + 1 < self.blocks.len())?;
+        }
+        let read = layer_norm(cx, &x, &self.output_ln)?;
+        self.head.apply(cx, &read.reshape((rows, dim))?)
+    }
+
+    /// The signature's features, (b, T, …) each -> b mixtures, of the last step; `on_seen` is called when pictures have been
+    /// encoded.
+    fn mixtures_seen(&self, observation: &Features<Tensor>, on_seen: &mut dyn FnMut()) -> Result<Mixture> {
+        let rows = check_observation("bc_transformer", &self.signature, observation)?;
+        let observation = self.steps.look(observation, None)?;
+        self.cache.predict(&self.params, on_seen, |cx| self.forward(cx, rows, &observation)?.mixture())
+    }
+
+    /// The same without being told.
     ///
     /// # Errors
     /// An observation that does not fit.
-    pub fn mixtures(&self, observation: &Features<Tensor>, mode: &mut Mode<'_>) -> Result<Mixture> {
-        let rows = check_observation("bc_transformer", &self.signature, observation)?;
-        self.mixtures_of(&self.steps.forward(rows, observation)?, mode)
-    }
-
-    /// The same of sequences, (b, T, everything of a step)
-    fn mixtures_of(&self, seen: &Tensor, mode: &mut Mode<'_>) -> Result<Mixture> {
-        let steps = self.signature.n_obs_steps;
-        let x = self.embed_encoder.forward(seen)?.broadcast_add(&self.embed_timestep)?;
-        let mut x = self.dropout.forward(&self.embed_ln.forward(&x)?, mode)?;
-        let mask: Vec<f32> = (0..steps * steps).map(|i| if i % steps > i / steps { -1e30 } else { 0.0 }).collect();
-        let mask = Tensor::from_vec(mask, (steps, steps), &HERE)?;
-        for (i, block) in self.blocks.iter().enumerate() {
-            x = block.forward(&x, Some(&mask).filter(|_| i + 1 < self.blocks.len()), mode)?;
-        }
-        self.head.forward(&self.output_ln.forward(&x.squeeze(1)?)?)
-    }
-
-    /// The loss of these mixtures, one a row of the batch.
-    ///
-    /// # Errors
-    /// If the tensor library fails.
-    pub fn loss_of(&self, mixtures: &Mixture, batch: &Batch) -> Result<LossParts> {
-        let actions = batch.actions.squeeze(1)?;
-        let rows = batch.total_rows.max(1) as f64;
-        let total = ((mixtures.log_prob(&actions)?.sum_all()? / rows)? * -1.0)?;
-        // of the likeliest Gaussian's mean, beside what other policies report
-        let away = absolute(&(mixtures.likeliest()?.detach() - &actions)?)?;
-        let l1 = (away.sum_all()? / (rows * self.signature.action_dim as f64))?;
-        let parts = BTreeMap::from([("nll".to_string(), total.detach()), ("l1_loss".to_string(), l1)]);
-        Ok(LossParts { total, parts })
+    pub fn mixtures(&self, observation: &Features<Tensor>) -> Result<Mixture> {
+        self.mixtures_seen(observation, &mut || {})
     }
 }
 
@@ -210,24 +191,25 @@ impl PolicyModel for BcTransformer {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        None
+    fn cache(&self) -> Option<&Cache> {
+        Some(&self.cache)
     }
 
-    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+    fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch("bc_transformer", &self.signature, self.config.action_horizon, batch)?;
-        self.fused_gradients(&self.steps.looked_at(batch, rng)?, rng, into)
-    }
-
-    fn loss(&self, batch: &Batch, rng: &mut Rng) -> Result<LossParts> {
-        check_batch("bc_transformer", &self.signature, self.config.action_horizon, batch)?;
-        let batch = &self.steps.looked_at(batch, rng)?;
-        self.loss_of(&self.mixtures(&batch.observation, &mut Mode::Train(rng))?, batch)
+        let observation = self.steps.look(&batch.observation, Some(cx.rng()?))?;
+        let mixtures = self.forward(cx, batch.rows(), &observation)?;
+        let real = Tensor::ones(batch.rows(), DType::F32, batch.device())?;
+        let (nll, l1) = mixture_likelihood(cx, &mixtures, (&batch.actions.squeeze(1)?, &real), batch.total_rows)?;
+        let mut loss = Loss::default();
+        loss.add("nll", nll, 1.0);
+        loss.report("l1_loss", l1);
+        Ok(loss)
     }
 
     /// The mean of the likeliest Gaussian.
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
-        Ok(self.mixtures(observation, &mut Mode::Eval)?.likeliest()?.detach().unsqueeze(1)?)
+        Ok(self.mixtures(observation)?.likeliest()?.unsqueeze(1)?)
     }
 
     fn sample(&self, observation: &Features<Tensor>, rng: &mut Rng) -> Result<Tensor> {
@@ -235,12 +217,7 @@ impl PolicyModel for BcTransformer {
     }
 
     fn sample_seen(&self, observation: &Features<Tensor>, rng: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
-        let rows = check_observation("bc_transformer", &self.signature, observation)?;
-        let seen = self.steps.forward(rows, observation)?;
-        if self.steps.learns() {
-            on_seen();
-        }
-        Ok(self.mixtures_of(&seen, &mut Mode::Eval)?.sample(rng)?.detach().unsqueeze(1)?)
+        Ok(self.mixtures_seen(observation, on_seen)?.sample(rng)?.unsqueeze(1)?)
     }
 
     fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
@@ -260,7 +237,7 @@ impl PolicyModel for BcTransformer {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::fused::testing::{
+    use crate::testing::{
         assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
     };
     use crate::train::{TrainConfig, Trainer};

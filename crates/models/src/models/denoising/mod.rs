@@ -249,10 +249,6 @@ impl<M: Method> PolicyModel for Denoising<M> {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        None
-    }
-
     fn cache(&self) -> Option<&Cache> {
         Some(&self.cache)
     }

@@ -2,7 +2,7 @@
 //! tensor names, steps before channels. Diffusion, flow matching and MIP share it.
 
 use crate::layers::{Conv1d, GroupNorm, Linear, Upsample1d};
-use nn::ops::{Then, branch, cat_rows, conv1d, conv1d_mish, linear, mish, upsample1d};
+use nn::ops::{Then, alias, cat_rows, conv1d, conv1d_mish, linear, mish, upsample1d};
 use nn::{Context, ModelError, Params, Result, Rng, Size, Value};
 use serde::{Deserialize, Serialize};
 
@@ -264,7 +264,7 @@ impl Unet {
         let mut skipped = Vec::with_capacity(self.down.len());
         for (pair, halve) in &self.down {
             x = through(cx, pair, &x)?;
-            skipped.push(branch(cx, &x)?);
+            skipped.push(alias(cx, &x));
             if let Some(halve) = halve {
                 x = conv1d(cx, &x, halve)?;
             }

@@ -2,10 +2,10 @@
 use super::*;
 use crate::encoders::{ImageNorm, TokenKind, VisionConfig};
 use crate::features::FeatureKind;
-use crate::fused::testing::{
+use crate::model::PolicyModel;
+use crate::testing::{
     assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
 };
-use crate::model::PolicyModel;
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
 use nn::simd::{Level, at_most};

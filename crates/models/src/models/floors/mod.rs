@@ -155,10 +155,6 @@ impl<R: Rule> PolicyModel for Floor<R> {
         &self.signature
     }
 
-    fn composed_because(&self) -> Option<String> {
-        None
-    }
-
     /// How far the demonstrations are from what it does; there is nothing to minimise.
     fn loss(&self, batch: &Batch, _rng: &mut Rng) -> Result<LossParts> {
         check_batch(R::NAME, &self.signature, self.action_horizon(), batch)?;

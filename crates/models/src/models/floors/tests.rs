@@ -5,9 +5,9 @@ use super::replay::Replay;
 use super::zero::Zero;
 use super::*;
 use crate::features::Observation;
-use crate::fused::testing::{batch, signatures};
 use crate::normaliser::{ACTION, NormMode, Normaliser, STATE};
 use crate::policy::{Actor, RecedingHorizon};
+use crate::testing::{batch, signatures};
 use crate::train::{TrainConfig, Trainer};
 
 struct NoClock;

@@ -1,10 +1,10 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::fused::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
-};
 use crate::model::PolicyModel;
 use crate::models::denoising::NetworkConfig;
+use crate::testing::{
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+};
 use crate::train::{TrainConfig, Trainer};
 use candle_core::{DType, Device};
 

@@ -1,4 +1,4 @@
-//! What the tests of fused models share: the composed model and finite differences as oracles.
+//! What the tests of models share: the same model on candle's operations and finite differences as oracles.
 #![allow(clippy::unwrap_used)]
 
 use crate::batch::{Batch, Taken};

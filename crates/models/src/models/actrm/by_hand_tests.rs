@@ -1,13 +1,14 @@
+//! Steps and thoughts on hand-written kernels beside those on candle's operations, in all designs.
 #![allow(clippy::unwrap_used)]
 use super::*;
 use crate::encoders::{TokenKind, VisionConfig};
 use crate::features::Signature;
-use crate::fused::testing::{
+use crate::layers::{Activation, AuxiliaryConfig, GridConfig, PointerConfig};
+use crate::testing::{
     Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
     move_parameters, signatures,
 };
-use crate::layers::{Activation, AuxiliaryConfig, GridConfig, PointerConfig};
-use crate::models::actrm::{Config, ReasoningConfig, WarmStart};
+use candle_core::Tensor;
 use nn::simd::{Level, at_most};
 
 /// Odd sizes in all designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
@@ -106,7 +107,7 @@ fn seeing() -> Vec<(Config, Signature, usize)> {
 }
 
 #[test]
-fn the_fused_step_is_the_composed_one_with_dropout() {
+fn the_step_by_hand_is_the_composed_one_with_dropout() {
     assert_eq!(seeing().len(), 6);
     for (config, signature, rows) in configs().into_iter().chain(seeing()) {
         let model = model(&config, &signature);
@@ -118,7 +119,7 @@ fn the_fused_step_is_the_composed_one_with_dropout() {
 }
 
 #[test]
-fn the_fused_thought_is_the_composed_one() {
+fn the_thought_by_hand_is_the_composed_one() {
     for (mut config, signature, rows) in configs().into_iter().chain(seeing()) {
         config.reasoning.max_steps = Some(4);
         config.reasoning.change_threshold = 0.05;
@@ -148,7 +149,7 @@ fn the_fused_thought_is_the_composed_one() {
 }
 
 #[test]
-fn the_fused_gradient_is_the_slope_of_the_loss() {
+fn the_gradient_is_the_slope_of_the_loss() {
     for (mut config, signature, rows) in configs() {
         // what the reference leaves without gradient on purpose: earlier rounds, earlier carries over the memory, what
         // the halting head reads, and warm answers
@@ -170,34 +171,5 @@ fn the_same_seed_gives_the_same_bits_in_any_workspace() {
         let (first, second) = (gradients(&model, &batch), gradients(&model, &batch));
         assert_eq!(first.0, second.0);
         assert!(first.1.values().iter().zip(second.1.values()).all(|(a, b)| a.to_bits() == b.to_bits()));
-    }
-}
-
-#[test]
-fn rounds_without_gradient_need_no_memory() {
-    let buffers = |h_cycles: usize| {
-        let (mut config, signature, rows) = configs().remove(0);
-        config.reasoning.h_cycles = h_cycles;
-        let (model, batch) = (model(&config, &signature), batch(&signature, config.action_horizon, rows, 3));
-        gradients(&model, &batch);
-        model.workspaces.with(|space| space.pool.numbers())
-    };
-    assert_eq!(buffers(2), buffers(40));
-}
-
-#[test]
-fn steps_need_no_more_memory_than_the_first() {
-    for (config, signature, rows) in configs() {
-        let model = model(&config, &signature);
-        let batch = batch(&signature, config.action_horizon, rows, 3);
-        let held = || {
-            gradients(&model, &batch);
-            model.reason(&batch.observation, None, &mut |_| false).unwrap();
-            model.workspaces.with(|space| space.pool.numbers())
-        };
-        let first = held();
-        for _ in 0..3 {
-            assert_eq!(held(), first, "{config:?}");
-        }
     }
 }
