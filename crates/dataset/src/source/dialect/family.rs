@@ -320,7 +320,7 @@ fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
             }
         }
     }
-    let wrong = wrong_lengths(file, id, (plan.length, "its steps"), &plan.keys);
+    let wrong = wrong_lengths(file, id, (plan.length, ""), &plan.keys);
     out.problems.extend(wrong.into_iter().filter(|p| !known.iter().any(|known| p.key.as_ref() == Some(known))));
 }
 

@@ -294,7 +294,7 @@ fn missing(file: &Walked, id: &str, key: &str, keys: &BTreeMap<String, KeyPlan>)
     Problem::new(Some(id), None, true, error)
 }
 
-/// Problems of the datasets that have not one row a step.
+/// Problems of the datasets that have not one row a step; `of` says where the length was found, if not in the demo.
 fn wrong_lengths(
     file: &Walked,
     id: &str,
@@ -307,7 +307,7 @@ fn wrong_lengths(
             path: file.path.clone(),
             demo: id.to_owned(),
             key: key.clone(),
-            expected: format!("{length} ({of})"),
+            expected: if of.is_empty() { length.to_string() } else { format!("{length} ({of})") },
             found: format!("shape {:?}", k.shape),
         };
         Problem::new(Some(id), Some(key), true, error)
