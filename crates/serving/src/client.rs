@@ -108,7 +108,7 @@ impl Facts {
         };
         Ok(Self {
             entry: metadata.get("entry").and_then(text),
-            observation_keys: lists(metadata.get("observation_keys"), |value| Some(value), text),
+            observation_keys: lists(metadata.get("observation_keys"), Some, text),
             shapes: lists(
                 metadata.get("observation"),
                 |value| value.get("shape"),
