@@ -62,6 +62,20 @@ impl Dialect {
         }
     }
 
+    /// Whether a layout of this name has robomimic's tree: `data/demo_<k>` with what it needs.
+    pub(crate) fn is_robomimics(name: &str) -> bool {
+        let tree = [
+            Self::Robomimic,
+            Self::RobosuiteRaw,
+            Self::Libero,
+            Self::Robocasa,
+            Self::Mimicgen,
+            Self::IsaacLab,
+            Self::Behavior,
+        ];
+        tree.iter().any(|dialect| dialect.name() == name)
+    }
+
     /// Whether it was recorded without a simulator's rewards and ends, which nobody misses in it.
     pub(crate) fn is_a_recording(self) -> bool {
         matches!(

@@ -362,6 +362,28 @@ fn a_data_set_becomes_robomimic_and_comes_back_frame_by_frame() {
     assert_eq!(first.fingerprint(), again.fingerprint());
 }
 
+/// A set of every layout becomes a file that passes every check as a robomimic one and converts again to the same actions.
+#[test]
+fn every_layout_goes_through_robomimic() {
+    let dir = tempfile::tempdir().unwrap();
+    for file in made::each(dir.path()) {
+        let name = file.file_stem().unwrap().to_string_lossy().into_owned();
+        if name.starts_with("behavior") {
+            continue;
+        }
+        let at = |end: &str| dir.path().join(format!("{name}{end}"));
+        let (first, _) = converted(&file, &at(""));
+        export(&at(""), &at(".hdf5"), &WriteOptions::default(), &mut quiet).unwrap();
+        let plan = Source::open(&at(".hdf5")).unwrap().plan().clone();
+        assert_eq!(plan.problems, [], "{name}");
+        let (second, _) = converted(&at(".hdf5"), &at("-again"));
+        assert_eq!(column(&first, "action"), column(&second, "action"), "{name}");
+        assert_eq!(column(&first, "observation.state"), column(&second, "observation.state"), "{name}");
+        assert_eq!((first.tasks(), first.info().fps), (second.tasks(), second.info().fps), "{name}");
+        assert!(first.cameras().eq(second.cameras()), "{name}");
+    }
+}
+
 /// Every layout without one dataset, and with one cut short, is told by file and key.
 #[test]
 fn a_dataset_that_is_missing_or_too_short_is_named() {

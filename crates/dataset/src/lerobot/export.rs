@@ -13,6 +13,7 @@ use super::tiff;
 use super::to_robomimic;
 use super::verify::hash_file;
 use crate::error::{DatasetError, Result};
+use crate::plan::Dialect;
 use crate::source::{RobomimicWriter, WriteOptions};
 use crate::tree::{Array, Attrs, Demo, Dtype};
 use arrow::array::{
@@ -70,7 +71,13 @@ pub fn export(
     };
     let mut pictures: BTreeMap<String, Rows> = BTreeMap::new();
     let mut writer = RobomimicWriter::create(out, options)?;
-    writer.set_root(&rest(root, objects.of(NO_EPISODE)?)?)?;
+    let mut outside = rest(root, objects.of(NO_EPISODE)?)?;
+    // a recording of another layout lacks what robomimic needs
+    let foreign = info.actrm.as_ref().is_some_and(|p| !Dialect::is_robomimics(&p.dialect));
+    if foreign {
+        to_robomimic::complete_root(&mut outside, &info);
+    }
+    writer.set_root(&outside)?;
     let total = info.total_frames as u64;
     progress(0, total);
     for (episode, id) in episodes.iter().zip(demos) {
@@ -97,6 +104,9 @@ pub fn export(
         for object in shifted {
             let array = unshift(root, &demo, &object)?;
             demo.datasets.insert(object.path, array);
+        }
+        if foreign {
+            to_robomimic::complete(&mut demo, episode.length, episode.tasks.first().map(String::as_str));
         }
         writer.add_demo(&demo)?;
         progress(episode.to as u64, total);

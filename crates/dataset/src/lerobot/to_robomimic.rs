@@ -200,8 +200,23 @@ fn with_kind(args: &mut Value) {
     }
 }
 
+/// Adds what robomimic expects of the group `data` and a recording of another layout lacks.
+pub(super) fn complete_root(root: &mut Demo, info: &Info) {
+    let known = info.actrm.as_ref().and_then(|p| p.env_args.clone());
+    let name = info.actrm.as_ref().and_then(|p| p.env_name.clone().or(Some(p.dialect.clone())));
+    let mut args = known.unwrap_or_else(|| json!({"env_name": name}));
+    with_kind(&mut args);
+    if let Some(kwargs) = args.get_mut("env_kwargs").and_then(Value::as_object_mut) {
+        kwargs.entry("control_freq").or_insert(json!(info.fps));
+    }
+    let data = root.inner_attrs.entry("data".to_owned()).or_default();
+    let total = || Array::from_i64(Vec::new(), &[info.total_frames as i64]);
+    data.entry("total".to_owned()).or_insert_with(total);
+    data.entry("env_args".to_owned()).or_insert_with(|| Array::from_str(&args.to_string()));
+}
+
 /// Adds what robomimic expects of every demo and this one lacks.
-fn complete(demo: &mut Demo, length: usize, task: Option<&str>) {
+pub(super) fn complete(demo: &mut Demo, length: usize, task: Option<&str>) {
     let count = || Array::from_i64(Vec::new(), &[length as i64]);
     demo.attrs.entry("num_samples".to_owned()).or_insert_with(count);
     if let Some(task) = task {
