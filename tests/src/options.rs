@@ -79,11 +79,12 @@ fn items(file: &Path, text: &str) -> Vec<Item> {
                     attributes,
                     ..Part::default()
                 });
-            } else if depth == 8 && open.is_enum {
-                if let (Some(last), Some((name, holds))) = (open.parts.last_mut(), code.split_once(": ")) {
-                    let (name, holds) = (name.to_owned(), holds.trim_end_matches(',').to_owned());
-                    last.fields.push(Part { name, holds, doc, attributes, ..Part::default() });
-                }
+            } else if depth == 8
+                && open.is_enum
+                && let (Some(last), Some((name, holds))) = (open.parts.last_mut(), code.split_once(": "))
+            {
+                let (name, holds) = (name.to_owned(), holds.trim_end_matches(',').to_owned());
+                last.fields.push(Part { name, holds, doc, attributes, ..Part::default() });
             }
         } else {
             let code = trimmed.trim_start_matches("pub(super) ").trim_start_matches("pub ");
@@ -432,8 +433,8 @@ pub fn options_page() -> (String, usize) {
         let places = [format!("{module}/config.rs"), format!("{module}.rs"), "floors/mod.rs".to_owned()];
         let config = places.iter().find_map(|place| {
             sources.items.iter().find(|item| {
-                item.name == "Config" && item.file.ends_with(format!("src/models/{place}"))
-                    || item.name == "Config" && item.file.ends_with(format!("floors/{place}"))
+                let ours = ["src/models", "floors"].map(|folder| item.file.ends_with(format!("{folder}/{place}")));
+                item.name == "Config" && ours.contains(&true)
             })
         });
         let config = config.unwrap_or_else(|| panic!("the options of `{name}`"));

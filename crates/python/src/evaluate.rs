@@ -42,7 +42,7 @@ enum End {
 /// The policy that is asked about.
 enum Asked {
     Entry(Box<LoadedEntry>),
-    External { external: External, inputs: Option<FeatureKeys>, named: Named, called: Py<PyAny> },
+    External { external: Box<External>, inputs: Option<FeatureKeys>, named: Named, called: Py<PyAny> },
 }
 
 impl Asked {
@@ -52,7 +52,7 @@ impl Asked {
             Self::Entry(loaded) => Ok(loaded.subject()),
             Self::External { external, inputs, named, called } => {
                 let inputs = inputs.clone().map_or_else(|| usual_inputs(ready), Ok)?;
-                let external = External { inputs, ..external.clone() };
+                let external = External { inputs, ..(**external).clone() };
                 let entry = external.entry(zoo, named, ready)?;
                 let (source, signature) = (external.source.clone(), entry.meta().signature.clone());
                 let policy = move || -> Result<Box<dyn Policy>, ModelError> {
@@ -157,7 +157,7 @@ pub(crate) fn evaluate<'py>(
                     };
                     let environment = Environment::usual(&task, env_module.as_deref(), external.cameras());
                     let named = Named { name, description: String::new() };
-                    let asked = Asked::External { external, inputs, named, called };
+                    let asked = Asked::External { external: Box::new(external), inputs, named, called };
                     (asked, environment, registry.folder().to_owned())
                 }
                 (None, None) => return Err(missing("policy", "an entry or a policy")),

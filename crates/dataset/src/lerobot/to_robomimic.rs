@@ -364,7 +364,7 @@ impl Stated {
         let column = self.columns.iter().find(|column| column.key == key);
         let demo = plan.demos.iter().find(|demo| {
             let rows = |k: &crate::plan::KeyPlan| k.shape.iter().skip(1).product::<usize>();
-            !demo.keys.get(key).is_some_and(|k| column.is_some_and(|c| rows(k) == c.feature.dim()))
+            demo.keys.get(key).is_none_or(|k| column.is_none_or(|c| rows(k) != c.feature.dim()))
         });
         let demo = demo.or(plan.demos.first());
         InputError::WrongShape {

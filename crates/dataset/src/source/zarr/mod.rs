@@ -296,11 +296,12 @@ impl ZArray {
         }
         // lines along the last axis, at their place in the chunk and in the step
         let mut lines: Vec<(usize, usize)> = vec![(0, 0)];
-        for axis in 1..inner {
-            let begin = place[axis] * self.chunks[axis];
-            let count = self.chunks[axis].min(self.shape[axis] - begin);
+        let axes = place.iter().zip(&self.chunks).zip(&self.shape).take(inner).skip(1);
+        for ((&place, &chunk), &whole) in axes {
+            let begin = place * chunk;
+            let count = chunk.min(whole - begin);
             let of_line = |&(here, there): &(usize, usize)| {
-                (0..count).map(move |i| (here * self.chunks[axis] + i, there * self.shape[axis] + begin + i))
+                (0..count).map(move |i| (here * chunk + i, there * whole + begin + i))
             };
             lines = lines.iter().flat_map(of_line).collect();
         }
