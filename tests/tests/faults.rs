@@ -267,7 +267,7 @@ fn the_page_of_a_study_survives_a_fault_at_any_call() {
     let whole = run(&mut study(), &out, None);
     assert!(whole.status.success(), "{}", whole.stderr);
     let expected = page();
-    assert!(expected.as_ref().is_some_and(|page| page.contains("Does thinking help?")));
+    assert!(expected.as_ref().is_some_and(|page| page.contains("# Does recursion help?")));
     let faults = faults(&whole.calls, 8);
     for fault in &faults {
         fs::write(out.join("page.md"), "old").expect("writable");
