@@ -9,9 +9,10 @@ use std::time::Instant;
 
 /// Convert demonstrations into a LeRobotDataset v3.0 directory, or into robomimic HDF5.
 ///
-/// Layouts, recognised by their content: robomimic, robosuite, MimicGen, Isaac Lab (with observations or states), LIBERO (a
-/// folder of task files is one data set), robocasa, D4RL, ALOHA, ManiSkill, RoboTwin, DROID, BEHAVIOR; for `--to robomimic` also a
-/// LeRobot data set. Where observation keys are the recorder's own, observation.state takes all vectors, and a note lists them.
+/// The layout is recognised by its content. robomimic, robosuite, MimicGen, Isaac Lab, LIBERO, robocasa and D4RL have many demos
+/// in a file. ALOHA, RoboTwin and DROID have a folder of episodes, ManiSkill a file with JSON beside it. A folder of LIBERO files
+/// becomes one data set. Isaac Lab without observations gets them from its states. BEHAVIOR without observations is refused.
+/// Where observation keys are the recorder's own, observation.state takes all vectors, and a note lists them.
 ///
 /// Other sources are zarr v2 replay buffers, RLDS data sets, and LeRobot v2.0 or v2.1 folders. A zarr store (Diffusion Policy, UMI)
 /// may be a folder or a zip file. An RLDS data set is the folder with features.json that tensorflow-datasets writes. Of a LeRobot
