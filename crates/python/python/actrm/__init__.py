@@ -70,7 +70,8 @@ def convert(
 
     Parameters
     ----------
-    src: what `actrm-data convert` takes: an HDF5 file or a folder of them, a zarr store, an RLDS or LeRobot v2.x folder.
+    src: what `actrm-data convert` takes: an HDF5 file or a folder of them, a zarr store, an RLDS or a LeRobot v2.x
+        folder.
     dst: folder to create.
     progress: True shows a bar, False does not. A function is called with frames done and frames in all. Unless given,
         there is a bar in terminals and notebooks.

@@ -1,6 +1,7 @@
 use anyhow::{Result, anyhow, bail};
 use dataset::{
-    ActionKind, ConvertOptions, DatasetError, ImageForm, InputError, NonFinite, RotationForm, VideoOptions, WriteOptions,
+    ActionKind, ConvertOptions, DatasetError, ImageForm, InputError, NonFinite, RotationForm, VideoOptions,
+    WriteOptions,
 };
 use serde_json::json;
 use std::path::PathBuf;
@@ -161,12 +162,8 @@ fn positive(text: &str) -> Result<f64, String> {
 
 /// Writes a robomimic file, of a LeRobot data set or of demonstrations of any layout.
 fn to_robomimic(args: &Args) -> Result<ExitCode> {
-    let export = super::export::Args {
-        dir: args.source.clone(),
-        out: args.out.clone(),
-        gzip: args.gzip,
-        json: args.json,
-    };
+    let export =
+        super::export::Args { dir: args.source.clone(), out: args.out.clone(), gzip: args.gzip, json: args.json };
     if args.source.join("meta/info.json").exists() {
         return super::export::run(&export);
     }
