@@ -51,7 +51,7 @@ fn a_study_as_an_array_of_cells() {
     succeeds(&mut command);
     let said = fs::read_to_string(&jobs).expect("jobs were queued");
     assert!(said.contains("--array=1-2") && said.contains("--dependency=afterok:4711"), "{said}");
-    let results = ["act-on-lift-seed1_lift.json", "act-on-lift-seed2_lift.json"];
+    let results = ["act-on-lift-seed1_lift.json", "act-on-lift-seed2_lift.json", "success.svg"];
     assert_eq!(listing(&folder.path().join("results")), results);
     // entries are a family, and their evaluations lie where the leaderboard looks
     assert_eq!(listing(&folder.path().join("zoo")), ["lift-act-s1", "lift-act-s2", "results"]);

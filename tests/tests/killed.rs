@@ -143,7 +143,7 @@ fn studied(folder: &Path) -> (Vec<u8>, Vec<u8>, serde_json::Value) {
     let work = folder.join("work/small");
     let entries: Vec<String> = listing(&work.join("zoo")).into_iter().filter(|name| name.starts_with("act")).collect();
     assert_eq!(entries.len(), 1, "{entries:?}");
-    assert_eq!(listing(&folder.join("results")), ["act-on-lift-seed1_lift.json"]);
+    assert_eq!(listing(&folder.join("results")), ["act-on-lift-seed1_lift.json", "success.svg"]);
     let result = read(folder.join("results/act-on-lift-seed1_lift.json"));
     let mut result: serde_json::Value = serde_json::from_slice(&result).expect("JSON");
     result["query_ms"] = 0.into();
