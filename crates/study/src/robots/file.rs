@@ -133,12 +133,7 @@ impl Test {
     pub fn thinking_words(&self) -> Option<String> {
         let Thinking { steps, halting, halt_threshold, change_threshold, intervene } = self.thinking;
         let steps = steps.map(|n| format!("{n} step{}", if n == 1 { "" } else { "s" }));
-        let halting = match (&steps, halting) {
-            (_, None) => None,
-            (Some(_), Some(true)) => Some("early stopping".to_owned()),
-            (None, Some(true)) => Some("early stopping".to_owned()),
-            (_, Some(false)) => Some("no early stopping".to_owned()),
-        };
+        let halting = halting.map(|halting| if halting { "early stopping" } else { "no early stopping" }.to_owned());
         let sure = halt_threshold.map(|threshold| format!("halting probability above {threshold}"));
         let still = change_threshold.map(|threshold| format!("chunk change below {threshold}"));
         let intervene = intervene.map(|intervention| match intervention {
@@ -361,11 +356,11 @@ mod tests {
         let words = |thinking: &str| open(&with(thinking)).unwrap().tests["lift"].thinking_words();
         assert_eq!(open(TEXT).unwrap().tests["lift"].thinking_words(), None);
         assert_eq!(words("{ steps = 1 }").unwrap(), "1 step");
-        assert_eq!(words("{ steps = 8, halting = true }").unwrap(), "8 steps, at most, halting");
-        assert_eq!(words("{ halting = false }").unwrap(), "no halting");
+        assert_eq!(words("{ steps = 8, halting = true }").unwrap(), "8 steps, early stopping");
+        assert_eq!(words("{ halting = false }").unwrap(), "no early stopping");
         assert_eq!(
             words("{ halting = true, halt_threshold = 0.9, change_threshold = 0.005 }").unwrap(),
-            "halting, once surer than 0.9, once the chunk changes by less than 0.005"
+            "early stopping, halting probability above 0.9, chunk change below 0.005"
         );
         assert_eq!(words("{ steps = 6, intervene = \"shuffle\" }").unwrap(), "6 steps, reasoning of another episode");
         assert!(open(&with("{ step = 1 }")).unwrap_err().contains("step"));
@@ -380,7 +375,7 @@ mod tests {
         let study = open(&TEXT.replace("episodes = 10", cameras)).unwrap();
         let data = &study.data["lift"];
         assert_eq!(data.file_name(), "lift-seen84-10-seed1.hdf5");
-        assert_eq!(data.words(), ", pictures of agentview and robot0_eye_in_hand (84 x 84)");
+        assert_eq!(data.words(), ", images of agentview and robot0_eye_in_hand (84 x 84)");
         assert_eq!(open(TEXT).unwrap().data["lift"].file_name(), "lift-10-seed1.hdf5");
         let with =
             |perturb: &str| TEXT.replace("seed_start = 40000", &format!("seed_start = 40000\nperturb = \"{perturb}\""));

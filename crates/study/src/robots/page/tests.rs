@@ -123,7 +123,10 @@ fn arms_of_several_tasks_stand_in_one_table() {
         .replace("task = \"Lift\"\nepisodes = 200", "task = \"PickChain\"\nepisodes = 25");
     std::fs::write(&file, fewer).unwrap();
     let page = robot_page(&Study::open(&file).unwrap(), &file).unwrap();
-    assert!(!page.contains("25"), "results of other demonstrations: {page}");
+    assert!(
+        !page.contains("PickChain, 25") && !page.contains(" 25 demonstrations"),
+        "results of other demonstrations: {page}"
+    );
     let page = robot_page(&ran(), &file).unwrap();
     assert!(page.contains("| | PickChain, 200 | PickChain, 25 |\n"), "{page}");
     // and who showed them
@@ -144,7 +147,8 @@ fn arms_of_several_tasks_stand_in_one_table() {
     let error = format!("{:?}", Study::open(&file).unwrap_err());
     assert!(error.contains("careless"), "{error}");
     std::fs::write(&file, shown).unwrap();
-    assert!(page.contains("| Better? | one step (lift) | one step (chain) | all | 2, 2 | +0.0 points"), "{page}");
+    // one of its sides has no result of that test
+    assert!(!page.contains("Better?"), "{page}");
 }
 
 #[test]
