@@ -5,12 +5,13 @@ from __future__ import annotations
 import copy
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-Observation = dict[str, NDArray[Any]]
+    Observation = dict[str, NDArray[Any]]
 
 
 def source(policy: Any) -> str:
@@ -74,6 +75,8 @@ class Called:
 
     def predict(self, observation: Observation) -> NDArray[np.float32]:
         """Actions for the next steps, float32 (T, D)."""
+        import numpy as np
+
         found = self.predicted(observation)
         if hasattr(found, "detach"):
             found = found.detach().cpu()
