@@ -5,12 +5,14 @@ The wheels are unpacked beside the peers' packages, where `run.py` finds them.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +149,20 @@ def found_by_lerobot(entry: Path, task: str, folder: Path) -> str:
     before, after = make_pre_post_processors(loaded, pretrained_path=str(folder / "saved"))
     assert np.array_equal(after(again.select_action(before(dict(seen)))).numpy(), wanted)
     return f"{ours.id}, from its type and from what was saved"
+
+
+def how_to(folder: Path) -> str:
+    """The example of docs/howto.md gives tensors of PyTorch."""
+    section = (ROOT / "docs/howto.md").read_text().split("## Load a data set in PyTorch")[1]
+    example = textwrap.dedent("\n".join(line for line in section.splitlines() if line.startswith("    ")))
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "data").symlink_to(ROOT / "data")
+    names: dict[str, Any] = {}
+    with contextlib.chdir(folder):
+        exec(compile(example, "howto.md", "exec"), names)
+    action = names["action"]
+    assert isinstance(action, torch.Tensor) and tuple(action.shape[1:]) == (HORIZON, 7), action
+    return f"{tuple(action.shape)}"
 
 
 def lerobot_eval(entry: Path, task: str, folder: Path, episodes: int, expected: float | None) -> str:

@@ -6,9 +6,7 @@ import json
 import shutil
 import sys
 import textwrap
-from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
@@ -30,19 +28,6 @@ def test_readme_s_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert names["action"].shape == (7,)  # type: ignore[attr-defined]
     assert names["episodes"]["success"].mean() > 0.9  # type: ignore[index]
     assert len(names["rows"]) >= 6  # type: ignore[arg-type]
-
-
-def test_the_how_to_for_pytorch_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    section = (ROOT / "docs/howto.md").read_text().split("## Load a data set in PyTorch")[1]
-    example = textwrap.dedent("\n".join(line for line in section.splitlines() if line.startswith("    ")))
-    assert 1 <= example.count("\n") < 5
-    if find_spec("torch") is None:  # then what it is given is looked at
-        monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(from_numpy=lambda array: array))  # type: ignore[arg-type]
-    (tmp_path / "data").symlink_to(ROOT / "data")
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
-    exec(compile(example, "howto.md", "exec"), names)
-    assert tuple(names["action"].shape[1:]) == (16, 7)  # type: ignore[attr-defined]
 
 
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,17 +20,17 @@ use crate::session::{EPISODE_KEYS, EXECUTED, RESET, SEED, integer};
 const MOST_ANSWER: usize = 64 << 20;
 /// Actions of a chunk.
 const MOST_HORIZON: usize = 100_000;
-/// Times that a lost connection is made again, before each a pause that is twice as long as the one before.
+/// Reconnection attempts; the pause before each doubles.
 const ATTEMPTS: u32 = 3;
 
 /// A policy that a server runs, for one environment, over a connection of its own.
 ///
-/// Where the server keeps the state of an episode, a connection that was lost is made again and the episode's queries are
-/// repeated, so that the outcome does not depend on it.
+/// After a lost connection it reconnects. If the server keeps state within an episode, the episode's queries are sent again, so
+/// that the outcome stays the same.
 #[derive(Debug)]
 pub struct RemotePolicy {
     address: Address,
-    /// before a lost connection is made again
+    /// before the first reconnection
     pub(crate) pause: Duration,
     prompt: Option<String>,
     items: Vec<Mapped>,

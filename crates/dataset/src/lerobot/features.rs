@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Default keys of `observation.state`: the first set that is there whole wins. Robots after the first
-/// (`robot1_...`) are added to robomimic's. Where there is none of them, all vectors are taken.
+/// (`robot1_...`) are added to robomimic's. If a file has none of these keys, all its vectors are used.
 const STATE_DEFAULTS: [&[&str]; 7] = [
     &["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"],
     // UMI

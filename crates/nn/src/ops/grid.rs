@@ -75,7 +75,7 @@ pub fn grid_convolution(
     cx.result(out, &[b, cells, out_dim], true, move |grad, back| {
         let n = b * cells;
         read("grid convolution", [&x, &weight], |[x, w]| {
-            // made again rather than kept: nine times as large as what they are made of
+            // recomputed, not stored: the columns are nine times as large as the input
             let mut patches = patches(&mut back.space.pool, (rows, columns), dim, x);
             if let Some((into, space)) = back.parameter(&weight) {
                 let (g, x) = (Mat::rows(&grad, out_dim).t(), Mat::rows(&patches, width));

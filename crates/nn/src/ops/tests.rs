@@ -351,7 +351,7 @@ fn recurrent_layers() {
                     layers.apply(cx, &x, None)
                 });
             }
-            // a prediction step by step, and one of all steps, by hand and on candle's operations
+            // prediction one step at a time and over all steps, on kernels and on candle's operations
             let (cache, x) = (Cache::default(), Value::from(&x));
             let flat = |x: &Value| x.detached().flatten_all().unwrap().to_vec1::<f32>().unwrap();
             let whole = |cx: &mut Context<'_>| Ok(flat(&layers.apply(cx, &x, None)?));
