@@ -80,8 +80,9 @@ demo-cost:
 	@echo "make demo takes about 12 minutes on two idle cores the first time (9 to compile, 3 to run), then 3, and 4 GB of disk."
 
 .PHONY: wheel
-wheel: build .venv-wheel/.complete ## the Python package, with the programs in it, in target/wheels
-	@.venv-wheel/bin/python tools/wheel.py
+wheel: .venv/.complete .venv-wheel/.complete ## the Python package, with the programs in it, in target/wheels
+	@$(CARGO) build $(CARGO_FLAGS) -p actrm-data -p actrm-zoo -p control -p python
+	@.venv-wheel/bin/python tools/build_wheel.py
 
 .PHONY: zoo
 zoo: build ## every policy on every robot task, three trainings each, and the leaderboard (hours; goes on where it was)
@@ -98,7 +99,7 @@ check: build ## the tests of one change, in five minutes: unit tests, the rules 
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- architecture:: house:: help:: main_line:: bad_data:: bad_zoo::
 
 .PHONY: test
-test: wheel ## every test: Rust, Python and end to end
+test: build wheel ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace
 	@if [ -n "$(BROWSER)$${CI:-}" ]; then \
 	    $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test e2e -- --ignored; \
@@ -127,7 +128,7 @@ docs: .venv-docs/.complete ## the documentation as a site that can be searched, 
 # ---- beside the others ----------------------------------------------------------------------------------------
 
 .PHONY: bench
-bench: wheel .venv-peers/.complete ## our speed beside the peers', measured in one run (table, target/bench/*.json)
+bench: build wheel .venv-peers/.complete ## our speed beside the peers', measured in one run (table, target/bench/*.json)
 	@tools/bench.sh
 
 .PHONY: study-puzzles
@@ -152,7 +153,7 @@ bench-memory: build ## memory that converting a 3 GB image file takes (needs 6 G
 	@target/release/examples/bench_memory
 
 .PHONY: interop
-interop: wheel .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round; Ray runs shards
+interop: build wheel .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round; Ray runs shards
 	@.venv-peers/bin/python tests/interop/run.py
 
 .PHONY: references

@@ -1,16 +1,19 @@
 """The Python package actrm and LeRobot's plugin as wheels in target/wheels, made of what cargo has built.
 
-    .venv-wheel/bin/python tools/wheel.py
+    .venv-wheel/bin/python tools/build_wheel.py
 
-Nothing is compiled: the extension is `lib_actrm.so`, and both programs and the compiled control loop go along. maturin
-would select the one crate, which has other features than the workspace, and compile nearly everything a second time.
-The tag is the one that auditwheel finds.
+The extension is `lib_actrm.so`; both programs and the compiled control loop go along. maturin would select the one
+crate, which has other features than the workspace, and compile nearly everything a second time. auditwheel finds the
+tag.
+
+This is also the build backend of `pip install .` (PEP 517, see pyproject.toml). pip shows cargo's output with `-v`.
 """
 
 import base64
 import hashlib
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -23,6 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CRATE = ROOT / "crates/python"
 TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 PLUGIN = CRATE / "lerobot_policy_actrm"
+PACKED = ("actrm-data", "actrm-zoo", "control", "python")
 PROGRAMS = ("actrm-data", "actrm-zoo", "libcontrol.so")
 # so that the same files make the same wheel
 EPOCH = (2020, 1, 1, 0, 0, 0)
@@ -102,30 +106,50 @@ def platform(files: dict[str, bytes], info: str) -> str:
     return found[1]
 
 
-def package(version: str) -> Path:
-    """The wheel of the package, under the tag that fits what it holds."""
-    project = tomllib.loads((CRATE / "pyproject.toml").read_text())["project"]
+def package(version: str, out: Path) -> Path:
+    """The wheel of the package in the folder `out`, under the tag that fits what it holds."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     info = f"actrm-{version}.dist-info"
     folder = CRATE / "python"
     sources = sorted(path for path in (folder / "actrm").glob("*") if path.suffix in {".py", ".pyi", ".typed"})
     files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in sources}
     files["actrm/_actrm.abi3.so"] = stripped(TARGET / "release/lib_actrm.so")
     files |= {f"actrm/bin/{name}": stripped(TARGET / "release" / name) for name in PROGRAMS}
-    files |= metadata(project, version, (CRATE / "README.md").read_text())
+    files |= metadata(project, version, (ROOT / project["readme"]).read_text())
     tag = f"cp311-abi3-{platform(files, info)}"
-    path = TARGET / "wheels" / f"actrm-{version}-{tag}.whl"
+    path = out / f"actrm-{version}-{tag}.whl"
     write(path, files | tag_file(info, tag, False), info)
     return path
 
 
+def workspace_version() -> str:
+    """The version of every crate, which is the package's."""
+    return tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
+
+
+def build_wheel(wheel_directory: str, config_settings: object = None, metadata_directory: object = None) -> str:
+    """PEP 517: compile what the wheel holds and write it to `wheel_directory`; the file's name."""
+    del config_settings, metadata_directory
+    if shutil.which("cargo") is None:
+        raise SystemExit("error: no cargo on the PATH; install Rust from https://rustup.rs, then run pip again")
+    packages = [word for name in PACKED for word in ("-p", name)]
+    subprocess.run(["cargo", "build", "--release", "--locked", *packages], cwd=ROOT, check=True)
+    return package(workspace_version(), Path(wheel_directory)).name
+
+
+def build_sdist(sdist_directory: str, config_settings: object = None) -> str:
+    """PEP 517: not offered, since a clone is the source."""
+    raise SystemExit("error: actrm is built from a clone of its repository: pip install <clone>")
+
+
 def main() -> None:
     """Write both wheels in the place of older ones."""
-    version = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
+    version = workspace_version()
     out = TARGET / "wheels"
     out.mkdir(parents=True, exist_ok=True)
     for old in out.glob("*.whl"):
         old.unlink()
-    for path in (package(version), plugin(version)):
+    for path in (package(version, out), plugin(version)):
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
