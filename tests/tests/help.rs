@@ -122,7 +122,7 @@ const COINED: &[&str] = &[
     "thinks",
     "thinking",
     "a thought",
-    "pictures",
+    "picture",
     "the eyes",
     "in silence",
     "what is fed",
@@ -149,6 +149,83 @@ fn prose(text: &str) -> String {
     // no paths and no options
     let words = plain.split_whitespace().filter(|word| !word.contains('/') && !word.starts_with("--"));
     words.collect::<Vec<_>>().join(" ").to_lowercase()
+}
+
+/// String literals of Rust code, without its comments; a line that ends in a backslash goes on in the next.
+fn literals(code: &str) -> Vec<String> {
+    let (mut found, mut rest) = (Vec::new(), code);
+    while let Some(at) = rest.find(['"', '/', '\'']) {
+        let (before, from) = rest.split_at(at);
+        rest = &from[1..];
+        if from.starts_with("//") {
+            rest = from.split_once('\n').map_or("", |(_, next)| next);
+        } else if from.starts_with("'\"'") || from.starts_with("'\\\"'") || from.starts_with("'/'") {
+            rest = &from[3..];
+        } else if from.starts_with('"') {
+            let raw = before.ends_with('r');
+            let hashes = before.len() - before.trim_end_matches('#').len();
+            let end = if raw || before.trim_end_matches('#').ends_with('r') {
+                rest.find(&format!("\"{}", "#".repeat(hashes)))
+            } else {
+                let mut escaped = false;
+                rest.find(|c| {
+                    let end = c == '"' && !escaped;
+                    escaped = c == '\\' && !escaped;
+                    end
+                })
+            };
+            let text = &rest[..end.unwrap_or(rest.len())];
+            rest = &rest[text.len().min(rest.len() - 1) + 1..];
+            found.push(text.split("\\\n").map(str::trim_start).collect::<String>());
+        }
+    }
+    found
+}
+
+/// What the crates and programs can say: their string literals of three words and more, each with its file.
+fn messages() -> Vec<(String, String)> {
+    let mut found = Vec::new();
+    let mut folders = vec![root().join("crates"), root().join("tools")];
+    while let Some(folder) = folders.pop() {
+        for path in fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("an entry").path()) {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            match path.extension() {
+                None if path.is_dir() && !["tests", "examples", "benches"].contains(&name.as_str()) => {
+                    folders.push(path)
+                }
+                Some(ending) if ending == "rs" && !name.ends_with("tests.rs") && name != "testing.rs" => {
+                    let code = fs::read_to_string(&path).expect("a source file");
+                    let code = code.split("#[cfg(test)]\nmod").next().unwrap_or_default();
+                    let shown = path.strip_prefix(root()).expect("below the root").display().to_string();
+                    let texts = literals(code).into_iter().filter(|text| text.split_whitespace().count() > 2);
+                    found.extend(texts.filter(|text| !text.contains('<')).map(|text| (shown.clone(), text)));
+                }
+                _ => {}
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn messages_are_plain() {
+    let said = messages();
+    assert!(said.len() > 1500, "{}", said.len());
+    let mut found = Vec::new();
+    for (file, text) in said {
+        let plain = prose(&text.replace("\\n", " "));
+        found.extend(COINED.iter().filter(|word| plain.contains(**word)).map(|word| format!("{file}: {word}: {text}")));
+        // lists of examples are not sentences
+        let sentences: Vec<String> = text.split(['\n', ';']).map(str::to_owned).collect();
+        found.extend(long(&sentences, SENTENCE).iter().map(|sentence| format!("{file}: long: {sentence}")));
+    }
+    assert_eq!(found, [""; 0]);
+}
+
+#[test]
+fn literals_are_found() {
+    let code = "say(\"one \\\"two\\\" \\\n   three\"); // \"four\"\nlet c = '\"'; r#\"five \"six\"\"#; \"seven\"";
+    assert_eq!(literals(code), ["one \\\"two\\\" three", "five \"six\"", "seven"]);
 }
 
 #[test]

@@ -239,7 +239,7 @@ impl Bench {
             let cost = measure(|| cameras.iter().try_for_each(|camera| set.pictures(camera).map(drop)))?;
             let work = format!("{form} 84 x 84 into memory, CPU");
             rows.push(row(&work, "pictures/s", both / cost.cpu, None, None, bar));
-            let work = format!("windows with 2 pictures ({form}), batch 64, CPU");
+            let work = format!("windows with 2 images ({form}), batch 64, CPU");
             let ours = windows(&set)?;
             let peer = match &self.peers {
                 None => None,

@@ -498,7 +498,7 @@ fn damaged_frames_are_named_wherever_they_are_read() {
         ("cut", &|file| file[..file.len() - 9].to_vec(), "a broken TIFF file"),
         ("empty", &|_| Vec::new(), "no TIFF file"),
         ("png", &|_| b"\x89PNG\r\n".to_vec(), "no TIFF file"),
-        ("wide", &|file| [&file[..18], &[15_u8], &file[19..]].concat(), "a picture of 10 x 15 instead of 10 x 14"),
+        ("wide", &|file| [&file[..18], &[15_u8], &file[19..]].concat(), "an image of 10 x 15 instead of 10 x 14"),
     ];
     for (name, change, what) in cases {
         let root = broken(name, change);

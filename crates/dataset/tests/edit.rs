@@ -555,7 +555,7 @@ fn what_cannot_be_done_is_told_and_leaves_nothing() {
     std::fs::copy(two.join(data), one.join(data)).unwrap();
     told(
         keep(&one, &new(), &numbers(&[0]), &mut quiet),
-        &["one: pictures: expected the content that was recorded", "fingerprint"],
+        &["one: images: expected the content that was recorded", "fingerprint"],
     );
     // what was changed since it was written is not carried on
     let path = set.join("actrm/layout.json");

@@ -132,7 +132,7 @@ fn mutations(originals: &[PathBuf], contents: &[Vec<u8>]) {
         assert!(took < LIMIT, "file {i} ({how}, seed {seed}): {took:?}");
         let kind = match &result {
             Ok(same) if *same == contents[which] => "read, nothing of it changed",
-            Ok(_) => "read, other pictures",
+            Ok(_) => "read, other images",
             Err(InputError::ReaderDied { .. }) => "the decoder crashed or ran out, alone",
             Err(InputError::ReaderSilent { .. }) => "the decoder hung, alone",
             Err(InputError::Video { .. }) => "refused with a reason",

@@ -124,7 +124,7 @@ fn a_file_that_is_broken_or_of_another_size_is_named() {
         error
     };
     assert!(error("cut", good[..good.len() / 2].to_vec()).contains("broken JPEG"));
-    assert!(error("other", b"no picture".to_vec()).contains("other bytes"));
+    assert!(error("other", b"no image".to_vec()).contains("other bytes"));
     let mut wide = good.clone();
     // width in the start of frame, behind its marker, length, precision and height
     let frame = wide.windows(2).position(|pair| pair == [0xFF, 0xC0]).unwrap();

@@ -395,7 +395,7 @@ fn pictures_that_are_not_colour_stay_beside_and_are_named() {
     for (name, what, why) in [
         ("obs/depth", "int32 [4, 4, 1]", "LeRobot's depth is float or uint16"),
         ("obs/heat", "float32 [4, 4, 1]", "nothing in its name says that it is depth"),
-        ("obs/grey", "uint8 [4, 4, 1]", "LeRobot records no grey pictures"),
+        ("obs/grey", "uint8 [4, 4, 1]", "LeRobot records no grey images"),
         ("obs/rgba", "uint8 [4, 4, 4]", "LeRobot records no fourth channel"),
         ("obs/images/cam_high", "encoded images, uint8 [5]", "only uint8 [height, width, 3] and JPEG files do"),
     ] {

@@ -82,7 +82,7 @@ fn a_camera_that_is_not_as_the_set_says_is_told() {
     let text = edited("\"fps\": 20,", "\"fps\": 21,");
     assert!(text.contains("21") || text.contains("frame 1 of episode 0: expected a frame within 0.0001 s"), "{text}");
     let text = edited("                84,\n                84,", "                84,\n                96,");
-    assert!(text.contains("pictures: expected 84 x 96, as info.json says, found 84 x 84"), "{text}");
+    assert!(text.contains("images: expected 84 x 96, as info.json says, found 84 x 84"), "{text}");
     let text = edited("videos/{video_key}/chunk", "../{video_key}/chunk");
     assert!(text.contains("video_path: expected a path inside the data set"), "{text}");
 }
@@ -168,7 +168,7 @@ fn videos_are_written_read_and_checked_and_the_source_comes_back() {
             assert_eq!(one, all.frame(frame), "frame {frame}");
         }
         let beyond = file.read(20, &mut one).unwrap_err().to_string();
-        assert!(beyond.contains(&dir.path().display().to_string()) && beyond.contains("decoded pictures"), "{beyond}");
+        assert!(beyond.contains(&dir.path().display().to_string()) && beyond.contains("decoded images"), "{beyond}");
         let second = set.episode_pictures(CAMERA, 1).unwrap();
         assert_eq!(second.data, all.data[7 * one.len()..19 * one.len()]);
         let some = set.pictures_of(CAMERA, 1, &mut |frame| [3, 11].contains(&frame)).unwrap();

@@ -211,7 +211,7 @@ impl Signature {
                 return refuse("observation", found, format!("{:?}, as {}", other.shape, other.name));
             }
             if let Some(fault) = self.fault_of_colours(spec) {
-                return refuse("colours", fault, "three features of 3 numbers each, of a picture".to_string());
+                return refuse("colours", fault, "three features of 3 numbers each, of an image".to_string());
             }
         }
         Ok(())
@@ -531,7 +531,7 @@ mod tests {
         for (error, expected) in faults {
             let error = error.unwrap();
             assert!(error.contains(expected), "{error}");
-            assert!(error.contains("three features of 3 numbers each, of a picture"), "{error}");
+            assert!(error.contains("three features of 3 numbers each, of an image"), "{error}");
         }
     }
 

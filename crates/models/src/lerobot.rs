@@ -192,7 +192,8 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
                 return Err(refuse("input_features", format!("{name} of shape {shape:?}"), "one dimension"));
             }
             (kind, _, _) => {
-                let expected = "observation.state of type STATE, observation.environment_state of type ENV, pictures of type VISUAL";
+                let expected =
+                    "observation.state of type STATE, observation.environment_state of type ENV, images of type VISUAL";
                 return Err(refuse("input_features", format!("{name} of type {kind}"), expected));
             }
         }

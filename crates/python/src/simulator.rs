@@ -115,9 +115,7 @@ impl Simulator {
     #[pyo3(signature = (camera="agentview", height=256, width=256))]
     fn render<'py>(&self, py: Python<'py>, camera: &str, height: usize, width: usize) -> PyResult<Bound<'py, PyAny>> {
         if !(1..=4096).contains(&height) || !(1..=4096).contains(&width) {
-            return Err(PyValueError::new_err(format!(
-                "picture: expected a side of 1 to 4096, found {height}x{width}"
-            )));
+            return Err(PyValueError::new_err(format!("image: expected a side of 1 to 4096, found {height}x{width}")));
         }
         let image = unlocked(py, || self.worker(|worker| worker.render(camera, height, width).map_err(raised)))?;
         filled(py, &[height, width, 3], |out| out.copy_from_slice(&image.rgb))

@@ -40,7 +40,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         rates.sort_by(f64::total_cmp);
         let name = file.file_name().unwrap_or_default().to_string_lossy();
         println!(
-            "read  {name}: {} x {}, {}, {:.0} pictures/s (least {:.0}, most {:.0} of 5 s)",
+            "read  {name}: {} x {}, {}, {:.0} images/s (least {:.0}, most {:.0} of 5 s)",
             info.width,
             info.height,
             info.codec.name(),
@@ -63,7 +63,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 }
                 let count = (rounds * pictures.len()) as f64;
                 println!(
-                    "write {name}: quantizer {quantizer}: {:.0} pictures/s, {:.0} bytes each",
+                    "write {name}: quantizer {quantizer}: {:.0} images/s, {:.0} bytes each",
                     count / (cpu_seconds()? - start),
                     bytes as f64 / count
                 );

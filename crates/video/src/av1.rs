@@ -49,7 +49,7 @@ impl Av1 {
                 Ok(picture) => {
                     shown += 1;
                     if shown > 1 {
-                        return Err("it shows more than one picture".to_owned());
+                        return Err("it shows more than one image".to_owned());
                     }
                     self.take(&picture, out)?;
                 }
@@ -60,7 +60,7 @@ impl Av1 {
         }
         match (sent, shown) {
             (Ok(()), 1) => Ok(()),
-            (Ok(()), _) => Err("it shows no picture".to_owned()),
+            (Ok(()), _) => Err("it shows no image".to_owned()),
             (Err(e), _) => Err(e.to_string()),
         }
     }
@@ -68,10 +68,10 @@ impl Av1 {
     fn take(&self, picture: &Picture, out: &mut [u8]) -> Result<(), String> {
         let size = (picture.width(), picture.height());
         if size != (self.sequence.width, self.sequence.height) {
-            return Err(format!("a picture of {} x {}", size.0, size.1));
+            return Err(format!("an image of {} x {}", size.0, size.1));
         }
         if picture.pixel_layout() != PixelLayout::I420 || picture.bit_depth() != 8 {
-            return Err(format!("a picture of {:?} with {} bits", picture.pixel_layout(), picture.bit_depth()));
+            return Err(format!("an image of {:?} with {} bits", picture.pixel_layout(), picture.bit_depth()));
         }
         let planes = [PlanarImageComponent::Y, PlanarImageComponent::U, PlanarImageComponent::V];
         let strides = (picture.stride(planes[0]) as usize, picture.stride(planes[1]) as usize);

@@ -227,7 +227,7 @@ const OTHERS: [(&[Kind], &str); 9] = [
     (&[*b"mp4v"], "MPEG-4 part 2"),
     (&[*b"avc2", *b"avc3", *b"avc4"], "H.264 with parameters inside the stream"),
     (&[*b"mjpa", *b"mjpb", *b"jpeg", *b"mjp2"], "Motion JPEG"),
-    (&[*b"png ", *b"raw "], "pictures without a video codec"),
+    (&[*b"png ", *b"raw "], "images without a video codec"),
     (&[*b"apcn", *b"apch", *b"apcs", *b"apco", *b"ap4h"], "ProRes"),
     (&[*b"encv"], "encrypted video"),
 ];

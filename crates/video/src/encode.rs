@@ -44,7 +44,7 @@ pub struct Encoder {
 /// An odd height, sides that are not 16 to 8192 pixels.
 pub fn check_size(width: usize, height: usize) -> std::result::Result<(), &'static str> {
     if height % 2 == 1 {
-        return Err("the height is odd, and readers of 4:2:0 disagree about such pictures");
+        return Err("the height is odd, and readers of 4:2:0 disagree about such images");
     }
     if !(16..=8192).contains(&width) || !(16..=8192).contains(&height) {
         return Err("sides are 16 to 8192 pixels");

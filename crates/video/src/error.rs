@@ -107,7 +107,7 @@ pub enum VideoError {
     },
 
     /// Pictures that cannot be encoded.
-    #[error("pictures of {width} x {height} at {fps} frames a second cannot be encoded: {reason}")]
+    #[error("images of {width} x {height} at {fps} frames a second cannot be encoded: {reason}")]
     Encode {
         /// Pixels in a row.
         width: usize,

@@ -97,10 +97,10 @@ impl H264 {
         let frame = guarded(|| self.picture(sample))?;
         self.broken = false;
         if (frame.width, frame.height) != self.size {
-            return Err(format!("a picture of {} x {}", frame.width, frame.height));
+            return Err(format!("an image of {} x {}", frame.width, frame.height));
         }
         if frame.chroma_format != ChromaFormat::Yuv420 || frame.bit_depth != 8 {
-            return Err(format!("a picture of {:?} with {} bits", frame.chroma_format, frame.bit_depth));
+            return Err(format!("an image of {:?} with {} bits", frame.chroma_format, frame.bit_depth));
         }
         let strides = (frame.width as usize, frame.chroma_width() as usize);
         let planes = Planes { y: &frame.y, u: &frame.u, v: &frame.v, strides };
@@ -125,13 +125,13 @@ impl H264 {
             }
             // the decoder gives a picture when the next one begins: here that would be one too many
             if self.decoder.decode_nal(&nal).map_err(|e| e.to_string())?.is_some() {
-                return Err("it holds more than one picture".to_owned());
+                return Err("it holds more than one image".to_owned());
             }
         }
         if slices == 0 {
-            return Err("it holds no picture".to_owned());
+            return Err("it holds no image".to_owned());
         }
-        self.decoder.flush().ok_or_else(|| "it holds no whole picture".to_owned())
+        self.decoder.flush().ok_or_else(|| "it holds no whole image".to_owned())
     }
 }
 

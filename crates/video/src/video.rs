@@ -227,7 +227,7 @@ impl<'v> Frames<'v> {
         let video = self.video;
         let expected = video.info.picture_bytes();
         if out.len() != expected {
-            return Err(video.none(format!("picture of {} bytes", out.len())));
+            return Err(video.none(format!("image of {} bytes", out.len())));
         }
         let wanted = video.order[index] as usize;
         if let Some(picture) = self.waiting.remove(&wanted) {

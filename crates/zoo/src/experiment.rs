@@ -310,7 +310,7 @@ impl DataSection {
         }
         if !self.exchange.is_empty() && !self.cameras.is_empty() {
             let names: Vec<&str> = self.exchange.keys().map(String::as_str).collect();
-            let expected = "none with data.cameras, whose pictures show what was exchanged where it was";
+            let expected = "none with data.cameras, whose images show what was exchanged where it was";
             return invalid("data.exchange".to_owned(), expected, names.join(", "));
         }
         self.check_mirror(&known)?;

@@ -226,7 +226,7 @@ pub fn probe(
     };
     let config = entry.experiment().policy.reasoner();
     let (Some(model), Some(config)) = (entry.reasoner()?, config) else {
-        return Err(unfit("policy", "one that thinks step by step", entry.experiment().policy_type()));
+        return Err(unfit("policy", "one that reasons step by step", entry.experiment().policy_type()));
     };
     let keys = &entry.entry().meta().keys;
     let chain = Chain::find(keys, ready).map_err(|expected| unfit("task", &expected, "none".to_owned()))?;

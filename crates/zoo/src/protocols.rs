@@ -191,7 +191,7 @@ impl Protocols {
         self.0.iter().find(|protocol| protocol.name == name).ok_or_else(|| {
             let names: Vec<String> = self.0.iter().map(|protocol| protocol.name.clone()).collect();
             let hint = nearest(name, &names).map_or(String::new(), |near| format!(" (did you mean `{near}`?)"));
-            let reason = format!("there is none of that name{hint}; protocols: {}", names.join(", "));
+            let reason = format!("not found{hint}; protocols: {}", names.join(", "));
             ZooError::Protocol { name: name.to_owned(), reason }
         })
     }

@@ -127,7 +127,7 @@ fn pictures_that_are_drawn_otherwise_than_the_demonstrations_are_refused() {
         };
         evaluated(drawn, &mut pool).unwrap();
         let error = evaluated(!drawn, &mut pool).unwrap_err();
-        assert!(error.contains("grasper@1") && error.contains("pictures drawn"), "{error}");
+        assert!(error.contains("grasper@1") && error.contains("images drawn"), "{error}");
     }
 }
 

@@ -203,7 +203,7 @@ impl Job<'_> {
                     // as it was recorded
                     Some(file) => files.extend_from_slice(file),
                     None => images::encode(self.images, height, width, pixels, &mut files)
-                        .map_err(|e| self.bad_picture(l, key, frame, "a picture that can be encoded", e.to_string()))?,
+                        .map_err(|e| self.bad_picture(l, key, frame, "an image that can be encoded", e.to_string()))?,
                 }
                 offsets.push(i32::try_from(files.len()).ok().ok_or_else(|| too_large(self.path, key))?);
                 names.push(format!("frame-{frame:06}.{extension}"));
@@ -334,7 +334,7 @@ impl<'a> Stored<'a> {
     fn of(column: &'a Column) -> Self {
         match &column.origin {
             &Origin::Image { ref key, height, width, jpeg } => Self { key, height, width, jpeg },
-            _ => unreachable!("asked of columns of pictures alone"),
+            _ => unreachable!("asked of columns of images alone"),
         }
     }
 }

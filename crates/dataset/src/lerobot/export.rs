@@ -338,7 +338,7 @@ pub(super) fn each_file(
     let bad = |found: String| DatasetError::BadDataset {
         path: root.join("data"),
         object: format!("column {name}"),
-        expected: format!("{height} x {width} pictures"),
+        expected: format!("{height} x {width} images"),
         found,
     };
     let files = image_files(root, column).map_err(bad)?;

@@ -299,7 +299,7 @@ impl Mapping {
                 false => "the exact ones are left out (--no-lossless)",
             };
             let note =
-                format!("{} is AV1 video: its pictures are close to the recording's, not equal; {fate}", column.name);
+                format!("{} is AV1 video: its images are close to the recording's, not equal; {fate}", column.name);
             self.notes.push(note);
         }
     }
@@ -390,7 +390,7 @@ impl Chooser<'_> {
                 path: self.plan.path.clone(),
                 demo: self.first.id.clone(),
                 key: key.clone(),
-                expected: "pictures that can become a video (without --video every size can be converted)".to_owned(),
+                expected: "images that can become a video (without --video every size can be converted)".to_owned(),
                 found: format!("{height} x {width}: {reason}"),
             })?;
         }
@@ -604,7 +604,7 @@ impl Chooser<'_> {
                 _ if !path.starts_with("obs/") || self.files.contains_key(path) => continue,
                 _ if columns.iter().any(is_column) => continue,
                 ([_, _, 3], _) if key.is_image() => continue,
-                ([_, _, 1], Dtype::U8) => "LeRobot records no grey pictures, and its ACT takes three channels",
+                ([_, _, 1], Dtype::U8) => "LeRobot records no grey images, and its ACT takes three channels",
                 ([_, _, 4], Dtype::U8) => "LeRobot records no fourth channel, and its ACT takes three",
                 _ if depth::size(path, key).is_some() => "not every demo has this depth",
                 ([_, _, 1], Dtype::F32 | Dtype::F64 | Dtype::U16) => "nothing in its name says that it is depth",

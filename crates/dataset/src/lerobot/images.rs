@@ -63,7 +63,7 @@ pub(crate) fn decode(file: &[u8], height: usize, width: usize, out: &mut Vec<u8>
         _ => return Err("neither a PNG nor a PPM nor a JPEG file".to_owned()),
     };
     if found != (height, width) {
-        return Err(format!("a picture of {} x {} instead of {height} x {width}", found.0, found.1));
+        return Err(format!("an image of {} x {} instead of {height} x {width}", found.0, found.1));
     }
     Ok(())
 }

@@ -73,7 +73,7 @@ impl PictureFile {
         let at = (frame * self.height * self.width * 3) as u64;
         self.file
             .read_exact_at(out, at)
-            .map_err(failed(&self.folder, "read decoded pictures from a temporary file in it"))
+            .map_err(failed(&self.folder, "read decoded images from a temporary file in it"))
     }
 }
 
@@ -204,7 +204,7 @@ impl Dataset {
     /// As [`Dataset::pictures`]; a file that cannot be written.
     pub fn picture_file(&self, name: &str, folder: &Path) -> Result<PictureFile> {
         let (_, height, width) = self.camera(name)?;
-        let write = "write decoded pictures to a temporary file in it";
+        let write = "write decoded images to a temporary file in it";
         let file = tempfile::tempfile_in(folder).map_err(failed(folder, "create a temporary file in it"))?;
         let mut out = BufWriter::new(file);
         self.decode(name, 0..self.episodes().len(), BLOCK, &mut |block| {
@@ -293,7 +293,7 @@ impl Dataset {
                 path: self.root().join("meta/info.json"),
                 object: name.to_owned(),
                 expected: format!(
-                    "pictures of shape [height, width, 3], or [3, height, width] where its names say so, up to {MAX_SIDE} on a side \
+                    "images of shape [height, width, 3], or [3, height, width] where its names say so, up to {MAX_SIDE} on a side \
                      and {MAX_PIXELS} pixels"
                 ),
                 found: format!("shape {:?}, names {}", feature.shape, feature.names),
@@ -376,7 +376,7 @@ impl Dataset {
         DatasetError::BadDataset {
             path: self.root().join("data"),
             object: format!("column {name}, {what}"),
-            expected: "PNG, PPM or JPEG pictures of the size that info.json says".to_owned(),
+            expected: "PNG, PPM or JPEG images of the size that info.json says".to_owned(),
             found,
         }
     }
@@ -547,7 +547,7 @@ impl Film {
         let (height, width) = self.size;
         if (info.height, info.width) != self.size {
             let found = format!("{} x {}", info.height, info.width);
-            return Err(bad("pictures".to_owned(), format!("{height} x {width}, as info.json says"), found));
+            return Err(bad("images".to_owned(), format!("{height} x {width}, as info.json says"), found));
         }
         if episode.length == 0 {
             return Ok(0);

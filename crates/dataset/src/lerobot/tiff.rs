@@ -46,7 +46,7 @@ pub(crate) fn decode(file: &[u8], height: usize, width: usize, out: &mut Vec<u8>
     let entries = Entries::open(file)?;
     let found = (entries.one(tag::HEIGHT, None)? as usize, entries.one(tag::WIDTH, None)? as usize);
     if found != (height, width) {
-        return Err(format!("a picture of {} x {} instead of {height} x {width}", found.0, found.1));
+        return Err(format!("an image of {} x {} instead of {height} x {width}", found.0, found.1));
     }
     let (channels, photometric) = (entries.one(tag::CHANNELS, Some(1))?, entries.one(tag::PHOTOMETRIC, None)?);
     if (channels, photometric) != (1, BLACK_IS_ZERO) {
@@ -224,7 +224,7 @@ mod tests {
         assert!(told(&good[..20]).starts_with("a broken TIFF file: "));
         // the values of the entries begin at 10, twelve bytes each, eight bytes into them
         let entry = |i: usize, value: u8| changed(10 + ENTRY * i + 8, value);
-        assert_eq!(entry(0, 8), "a picture of 5 x 8 instead of 5 x 7");
+        assert_eq!(entry(0, 8), "an image of 5 x 8 instead of 5 x 7");
         assert_eq!(entry(2, 64), "64 bits of format 3 instead of float32 or uint16");
         assert_eq!(entry(3, 5), "a TIFF file of compression 5, where LeRobot has none");
         assert_eq!(entry(4, 0), "1 channels of photometric kind 0 instead of one of depth");

@@ -134,7 +134,7 @@ pub fn verify_within(root: &Path, tolerance: f64, progress: &mut dyn FnMut(u64, 
         }
         note("splits name episodes", split_problem(&set));
         if set.has_pictures() {
-            note("pictures decode and have the content recorded", picture_problem(&set, progress)?);
+            note("images decode and have the content recorded", picture_problem(&set, progress)?);
         } else if set.provenance().is_some() {
             // opening compared it
             note("content has the fingerprint recorded", None);
@@ -191,7 +191,7 @@ pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u
     let mut cursors = BTreeMap::new();
     for (name, feature) in info.features.0.iter().filter(|(_, f)| f.dtype == "image" && !f.is_depth()) {
         let Some((height, width)) = feature.picture_size() else {
-            return Ok(Some(format!("{name}: pictures of shape {:?} are not read", feature.shape)));
+            return Ok(Some(format!("{name}: images of shape {:?} are not read", feature.shape)));
         };
         cursors.insert(name.as_str(), (Rows::open(root, "data", Some(name), 32)?, height, width));
     }

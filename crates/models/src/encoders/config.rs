@@ -181,7 +181,7 @@ impl VisionConfig {
                 model: "vision",
                 field: "shift",
                 found: self.shift.to_string(),
-                expected: format!("less than the picture's side, {}", h.min(w)),
+                expected: format!("less than the image's side, {}", h.min(w)),
             });
         }
         match self.crop {
@@ -191,7 +191,7 @@ impl VisionConfig {
                 model: "vision",
                 field: "crop",
                 found: side.to_string(),
-                expected: format!("at most the picture's side, {}", h.min(w)),
+                expected: format!("at most the image's side, {}", h.min(w)),
             }),
         }
     }

@@ -119,17 +119,17 @@ impl ImageEncoder {
         let rows = pictures.dims().first().copied().unwrap_or(0);
         if pictures.dims() != [rows, size.0, size.1, 3] {
             let (expected, found) = (vec![rows, size.0, size.1, 3], pictures.dims().to_vec());
-            return Err(ModelError::Shape { operation: "see", object: "picture", expected, found });
+            return Err(ModelError::Shape { operation: "see", object: "image", expected, found });
         }
         if pictures.dtype() != DType::U8 {
             let (found, expected) = (format!("{:?}", pictures.dtype()), "bytes".to_string());
-            return Err(ModelError::Input { operation: "see", object: "picture", found, expected });
+            return Err(ModelError::Input { operation: "see", object: "image", found, expected });
         }
         let bytes = pictures.contiguous()?;
         let (storage, layout) = bytes.storage_and_layout();
         let candle_core::Storage::Cpu(storage) = &*storage else {
             let (found, expected) = ("on another device".to_string(), "on the CPU".to_string());
-            return Err(ModelError::Input { operation: "see", object: "picture", found, expected });
+            return Err(ModelError::Input { operation: "see", object: "image", found, expected });
         };
         let from = layout.start_offset();
         let bytes = &storage.as_slice::<u8>()?[from..from + layout.shape().elem_count()];

@@ -132,7 +132,7 @@ impl ImageEncoder {
                     model: "vision",
                     field: "tokens",
                     found: "keypoints in maps of one cell, which are always in the same place".to_string(),
-                    expected: "map, fewer blocks or larger pictures".to_string(),
+                    expected: "map, fewer blocks or larger images".to_string(),
                 });
             }
             TokenKind::Keypoints { count } => Head::Keypoints {
@@ -284,7 +284,7 @@ impl ImageEncoder {
         for (x, &(h, w)) in pictures.iter().zip(&self.sizes) {
             if x.dims() != [b, h, w, 3] {
                 let (expected, found) = (vec![b, h, w, 3], x.dims().to_vec());
-                return Err(ModelError::Shape { operation: "see", object: "picture", expected, found });
+                return Err(ModelError::Shape { operation: "see", object: "image", expected, found });
             }
         }
         Ok(())

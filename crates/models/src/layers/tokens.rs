@@ -123,7 +123,7 @@ impl TokenLayout {
     pub(crate) fn new(signature: &Signature, vision: Option<&VisionConfig>, dim: usize) -> Result<Self> {
         let cameras = Cameras::asked(signature, vision, dim)?;
         if cameras.is_some() && signature.n_obs_steps != 1 {
-            let (found, expected) = (signature.n_obs_steps.to_string(), "1 with pictures".to_string());
+            let (found, expected) = (signature.n_obs_steps.to_string(), "1 with images".to_string());
             return Err(ModelError::Config { model: "vision", field: "n_obs_steps", found, expected });
         }
         let mut specs: Vec<_> = signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image).collect();

@@ -219,7 +219,7 @@ impl EntryMeta {
             return Err(ZooError::UnfitEntry {
                 entry: self.id().to_string(),
                 task: self.task.clone(),
-                what: "pictures".to_owned(),
+                what: "images".to_owned(),
                 expected: "square and all of one size".to_owned(),
                 found: format!("{sizes:?}"),
             });

@@ -96,7 +96,7 @@ impl LoadedEntry {
     /// # Errors
     /// A policy that cannot think so.
     pub fn thinking(&self, thinking: &Thinking) -> Result<Self, ZooError> {
-        let failed = |source| self.failed("change the thinking of", source);
+        let failed = |source| self.failed("change the refinement steps of", source);
         let policy = self.experiment.policy.thinking(thinking).map_err(failed)?;
         let model = policy.build(&self.entry.meta().signature, 0).map_err(failed)?;
         model.params().load(&self.model.params().tensors()).map_err(failed)?;

@@ -142,7 +142,7 @@ pub fn saliency(
     let Some((outcome, asked)) = episode(subject, pool, seed)? else { return Ok(None) };
     let chosen = evenly(asked.len(), queries);
     let failed =
-        |source| ZooError::Model { operation: "look at the pictures of", name: subject.entry.to_string(), source };
+        |source| ZooError::Model { operation: "look at the images of", name: subject.entry.to_string(), source };
     let mut looked = Vec::with_capacity(chosen.len());
     for (done, &at) in chosen.iter().enumerate() {
         progress(done as u64, chosen.len() as u64);

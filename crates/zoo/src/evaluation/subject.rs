@@ -106,7 +106,7 @@ impl Subject<'_> {
         let way = |fast: bool| if fast { "without reflections" } else { "with reflections" }.to_owned();
         let drawn = self
             .fast_render
-            .map(|fast| ("pictures drawn".to_owned(), way(fast), way(CamerasMeta::draws_fast(&ready.env_args))));
+            .map(|fast| ("images drawn".to_owned(), way(fast), way(CamerasMeta::draws_fast(&ready.env_args))));
         let action =
             ("length of an action".to_owned(), self.signature.action_dim.to_string(), ready.action_dim.to_string());
         for (what, expected, found) in features.chain(drawn).chain([action]) {

@@ -49,7 +49,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     if options.fast_render && signature.of_kind(FeatureKind::Image).next().is_none() {
         return Err(ZooError::InvalidValue {
             key: "fast rendering".to_owned(),
-            expected: "a policy that sees pictures".to_owned(),
+            expected: "a policy that sees images".to_owned(),
             found: "one that sees none".to_owned(),
         });
     }
@@ -209,7 +209,7 @@ fn cameras(signature: &Signature) -> Result<Vec<String>, ModelError> {
         Some(camera) => Ok(camera.to_owned()),
         None => Err(ModelError::Input {
             operation: "import",
-            object: "picture",
+            object: "image",
             found: spec.name.clone(),
             expected: format!("{PICTURE_PREFIX}<camera>"),
         }),

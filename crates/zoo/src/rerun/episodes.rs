@@ -19,8 +19,10 @@ impl Rerun {
         let by_clock = self.stored.record.time_decides;
         if by_clock {
             for step in [RULES, EPISODES] {
-                report
-                    .not_compared(step, "it thinks by the clock: its episodes may end otherwise each time".to_owned());
+                report.not_compared(
+                    step,
+                    "it refines by the clock, so its episodes can end differently each time".to_owned(),
+                );
             }
         }
         by_clock

@@ -278,7 +278,7 @@ pub(super) fn prepare(
     if !fits {
         let (bytes, budget) = (gigabytes(bytes), gigabytes(memory.budget));
         notes.push(format!(
-            "pictures take {bytes}, {budget} are for them: kept in a file in the run's folder, read ahead"
+            "images take {bytes}, {budget} are for them: kept in a file in the run's folder, read ahead"
         ));
     }
     for name in cameras {

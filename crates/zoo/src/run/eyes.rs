@@ -25,12 +25,12 @@ pub(super) fn open(
     if vision.normalise == Normalisation::Dataset {
         let statistics = demonstrations.picture_statistics.as_ref().ok_or_else(|| ZooError::InvalidValue {
             key: "policy.vision.normalise".to_owned(),
-            expected: "imagenet or unit: the data set has no statistics of its pictures".to_owned(),
+            expected: "imagenet or unit: the data set has no statistics of its images".to_owned(),
             found: "dataset".to_owned(),
         })?;
         let (mean, std) = scales(statistics);
         ImageEncoder::set_statistics(model.params(), &mean, &std)
-            .map_err(experiment.model_error("take the statistics of pictures for"))?;
+            .map_err(experiment.model_error("take the statistics of images for"))?;
     }
     if let Some(path) = &vision.weights {
         let weights = tensors::read_weights(&locate(Path::new(path))?)?;

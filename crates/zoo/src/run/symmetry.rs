@@ -137,7 +137,7 @@ mod tests {
                 assert_eq!((&b[..3], &b[3..]), (&order[..], &moved(3.0)[..]));
                 let pixels = |camera: usize| &batch.pictures[camera].1[(window * 2 + step) * 6..][..6];
                 assert!(pixels(0).iter().map(|x| f32::from(*x)).eq(order.iter().copied().chain(moved(3.0))));
-                assert!(pixels(1).iter().copied().eq(6..12), "pictures that are not named stay");
+                assert!(pixels(1).iter().copied().eq(6..12), "images that are not named stay");
             }
             seen.insert(order.iter().map(|x| *x as u32).collect::<Vec<_>>());
         }

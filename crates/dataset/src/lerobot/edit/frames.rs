@@ -355,7 +355,7 @@ impl<'a> Seen<'a> {
                 object: format!("column {name}, frame {} of episode {}", first + row, self.episode),
                 expected: match feature.is_depth() {
                     true => format!("a TIFF file with {height} x {width} of finite depth"),
-                    false => format!("a PNG or PPM picture of {height} x {width}"),
+                    false => format!("a PNG or PPM image of {height} x {width}"),
                 },
                 found,
             })?;

@@ -90,7 +90,7 @@ impl Input {
                 Some(found) => {
                     return Err(DatasetError::BadDataset {
                         path: root.to_path_buf(),
-                        object: "pictures".to_owned(),
+                        object: "images".to_owned(),
                         expected: "the content that was recorded when it was made".to_owned(),
                         found,
                     });

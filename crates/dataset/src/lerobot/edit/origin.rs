@@ -73,7 +73,7 @@ pub(super) fn of(edit: &Edit<'_>, fingerprint: &str, notes: &mut Vec<String>) ->
     if !lossless && all.iter().any(|p| p.lossless) {
         let why = match (same_args, exact) {
             (false, _) => "one file has one env_args",
-            (_, false) => "some have no exact pictures",
+            (_, false) => "some have no exact images",
             _ => "some have none",
         };
         notes.push(format!("the side folders are left out ({why}): no HDF5 file can be rebuilt from the result"));

@@ -139,14 +139,14 @@ fn features_that_act_cannot_read_are_refused_by_name() {
     signature.observation[2] = FeatureSpec::image(front, 8, 8);
     let with = |vision: VisionConfig| Config { vision: Some(vision), ..config.clone() };
     let small = Act::new(&with(VisionConfig { crop: Some(9), ..eyes() }), &signature, 1).unwrap_err().to_string();
-    assert_eq!(small, "config of vision: crop is 9, expected at most the picture's side, 8");
+    assert_eq!(small, "config of vision: crop is 9, expected at most the image's side, 8");
     for blocks in [[0, 2, 2, 2], [2, 0, 2, 2], [0; 4]] {
         let vision = VisionConfig { blocks: Some(blocks), crop: None, ..eyes() };
         let refused = Act::new(&with(vision), &signature, 1).unwrap_err().to_string();
         assert!(refused.starts_with(&format!("config of vision: blocks is {blocks:?}, expected")), "{refused}");
     }
     signature.n_obs_steps = 2;
-    assert!(error(signature.clone()).contains("n_obs_steps is 2, expected 1 with pictures"));
+    assert!(error(signature.clone()).contains("n_obs_steps is 2, expected 1 with images"));
     signature.n_obs_steps = 1;
     signature.observation = vec![FeatureSpec::environment_state(2)];
     let expected =

@@ -125,7 +125,7 @@ impl Actrm {
     ) -> Result<Vec<ExaminedStep>> {
         let rows = self.check_inputs(observation)?;
         if let Design::Memory(_) = &self.design {
-            let (found, expected) = ("memory".to_string(), "actions or tokens, to look into a thought".to_string());
+            let (found, expected) = ("memory".to_string(), "actions or tokens, to look into the reasoning".to_string());
             return Err(ModelError::Config { model: "actrm", field: "reasoning.over", found, expected });
         }
         let others = match intervene {

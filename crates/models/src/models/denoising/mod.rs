@@ -122,7 +122,7 @@ impl<M: Method> Denoising<M> {
         let refuse = |field, found, expected| Err(ModelError::Config { model: M::NAME, field, found, expected });
         let pictures: Vec<&str> = signature.of_kind(FeatureKind::Image).map(|spec| spec.name.as_str()).collect();
         if setup.transformer.is_some() && !pictures.is_empty() {
-            let expected = "none where there are pictures, which it does not see".to_string();
+            let expected = "none where there are images, which it does not see".to_string();
             return refuse("transformer", format!("one beside {}", pictures.join(", ")), expected);
         }
         let (horizon, n_obs_steps, action_dim) = (setup.action_horizon, signature.n_obs_steps, signature.action_dim);

@@ -95,11 +95,7 @@ impl Config {
             None => self.network.validate("diffusion", self.action_horizon)?,
         }
         if self.transformer.is_some() && self.vision.is_some() {
-            return refuse(
-                "vision",
-                "given".to_string(),
-                "none with a transformer, which sees no pictures".to_string(),
-            );
+            return refuse("vision", "given".to_string(), "none with a transformer, which sees no images".to_string());
         }
         if self.num_train_timesteps == 0 {
             return refuse("num_train_timesteps", "0".to_string(), "at least 1".to_string());

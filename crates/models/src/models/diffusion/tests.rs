@@ -203,7 +203,7 @@ fn impossible_configurations_name_the_field() {
     assert!(error(both).contains("vision is given, expected none with a transformer"));
     // a signature with pictures brings an encoder of its own
     let unseen = Diffusion::new(&attending(tokens()), &of.pictures, 0).unwrap_err().to_string();
-    assert!(unseen.contains("transformer is one beside a, b, c, expected none where there are pictures"), "{unseen}");
+    assert!(unseen.contains("transformer is one beside a, b, c, expected none where there are images"), "{unseen}");
     let sees = |vision| {
         let config = Config { vision: Some(vision), ..small() };
         Diffusion::new(&config, &of.pictures, 0).unwrap_err().to_string()
