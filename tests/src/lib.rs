@@ -149,6 +149,27 @@ pub fn copied_zoo() -> (TempDir, PathBuf) {
     (folder, to)
 }
 
+/// A zoo of these shipped entries and their results that a test may change, and the temporary folder that it lies in.
+///
+/// # Panics
+/// If it cannot be made, or there is no such entry.
+pub fn shipped(names: &[&str]) -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (from, to) = (root().join("zoo"), folder.path().join("zoo"));
+    std::fs::create_dir_all(to.join("results")).expect("creatable");
+    for name in names {
+        copy(&from.join(name), &to.join(name));
+        let results =
+            listing(&from.join("results")).into_iter().filter(|result| result.starts_with(&format!("{name}@")));
+        results.for_each(|result| copy(&from.join("results").join(&result), &to.join("results").join(&result)));
+    }
+    (folder, to)
+}
+
+/// The entry of each task that one training of ACT made.
+pub const SHIPPED_ACT: [&str; 6] =
+    ["door-act", "lift-act", "nutassemblysquare-act", "pickplacecan-act", "stack-act", "stackthreecubes-act"];
+
 /// Copy a folder with everything in it.
 ///
 /// # Panics

@@ -6,7 +6,7 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use e2e::{copied_zoo, listing, refused, root, succeeds, text, trained, zoo};
+use e2e::{SHIPPED_ACT, copied_zoo, listing, refused, shipped, succeeds, text, trained, zoo};
 use serde_json::Value;
 
 fn said(command: &mut Command) -> String {
@@ -64,14 +64,6 @@ fn several_seeds_make_a_family_that_is_one_row() {
     );
 }
 
-/// The shipped zoo, copied.
-fn shipped() -> (tempfile::TempDir, std::path::PathBuf) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let to = folder.path().join("zoo");
-    e2e::copy(&root().join("zoo"), &to);
-    (folder, to)
-}
-
 #[test]
 fn entries_are_compared_seed_by_seed() {
     let (_folder, entries) = copied_zoo();
@@ -101,14 +93,15 @@ fn entries_are_compared_seed_by_seed() {
 
 #[test]
 fn what_was_not_run_under_the_same_rules_is_not_compared() {
-    let (_folder, entries) = shipped();
+    let (_folder, entries) = shipped(&["lift-act", "stack-act"]);
     let arguments = ["compare", "lift-act", "stack-act", "--zoo", text(&entries)];
     refused(&mut zoo(arguments), &["lift-act@1", "stack-act@1", "same protocol"]);
 }
 
 #[test]
 fn rows_of_a_protocol_stand_under_its_name() {
-    let (_folder, entries) = shipped();
+    let (_folder, entries) =
+        shipped(&[&SHIPPED_ACT[..], &["lift-act-s1", "lift-act-s2", "lift-actrm-s1", "lift-expert-s1"]].concat());
     let board = json(&mut zoo(["leaderboard", "--json", "--zoo", text(&entries)]));
     let rows = board["rows"].as_array().expect("rows");
     assert!(rows.iter().all(|row| row["named_protocol"].as_str().is_some_and(|name| name.ends_with("-v1"))));
@@ -138,7 +131,7 @@ fn rows_of_a_protocol_stand_under_its_name() {
 
 #[test]
 fn aliases_point_and_what_something_stands_on_stays() {
-    let (_folder, entries) = shipped();
+    let (_folder, entries) = shipped(&["lift-act"]);
     let command = |name: &str, arguments: &[&str]| {
         let mut command = zoo([name]);
         command.args(arguments).args(["--zoo", text(&entries)]);
@@ -163,7 +156,7 @@ fn aliases_point_and_what_something_stands_on_stays() {
 
 #[test]
 fn entries_differ_in_what_they_say() {
-    let (_folder, entries) = shipped();
+    let (_folder, entries) = shipped(&[&SHIPPED_ACT[..], &["lift-act-s1", "lift-act-s2"]].concat());
     let command = |arguments: &[&str]| {
         let mut command = zoo([]);
         command.args(arguments).args(["--zoo", text(&entries)]);

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use e2e::{copied_zoo, copy, data, lift, listing, root, succeeds, text, trained, zoo};
+use e2e::{copied_zoo, data, lift, listing, shipped, succeeds, text, trained, zoo};
 
 fn kills() -> u64 {
     std::env::var("ACTRM_KILLS").ok().map_or(3, |text| text.parse().expect("a number"))
@@ -82,7 +82,7 @@ fn a_killed_training_goes_on_to_the_same_bytes() {
         assert_eq!(listing(&folder.join("zoo")), ["lift-act-s1", "lift-act-s2"]);
         fs::remove_dir_all(folder).expect("removable");
     }
-    println!("train: {died} of {} killed", 3 * kills());
+    assert!(died > 0, "none was killed in time");
 }
 
 #[test]
@@ -111,7 +111,7 @@ fn a_killed_evaluation_goes_on_to_the_same_bytes() {
         succeeds(&mut zoo(["verify", "--zoo", text(&entries), "--results", text(&results)]));
         fs::remove_dir_all(results).expect("removable");
     }
-    println!("eval: {died} of {} killed", 2 * kills());
+    assert!(died > 0, "none was killed in time");
 }
 
 /// A study of one small policy: five demonstrations from the expert, a training, three episodes; with `demonstrations`
@@ -167,13 +167,12 @@ fn a_killed_study_goes_on_to_the_same_bytes() {
     let trained = at("trained");
     let takes = [whole, timed(&mut study(&trained, Some(&demonstrations)))];
     assert_eq!(studied(&trained), studied(&straight));
-    let (mut died, mut begun) = (0, 0);
+    let mut died = 0;
     for k in 0..kills().div_ceil(3) {
         let folder = at(&format!("killed-{k}"));
         // every other one begins with the training
         let demonstrations = (k % 2 == 1).then_some(&*demonstrations);
         for again in 0..3 {
-            begun += 1;
             let takes = takes[(k % 2) as usize];
             died += u32::from(killed(&mut study(&folder, demonstrations), takes, spread(3 * k + again)));
             succeeds(&mut zoo(["verify", "--zoo", text(&folder.join("work/small/zoo"))]));
@@ -182,14 +181,13 @@ fn a_killed_study_goes_on_to_the_same_bytes() {
         assert_eq!(studied(&folder), studied(&straight), "after {died} kills");
         fs::remove_dir_all(folder).expect("removable");
     }
-    println!("study: {died} of {begun} killed");
+    assert!(died > 0, "none was killed in time");
 }
 
 #[test]
 fn a_killed_leaderboard_leaves_whole_files() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let (entries, out) = (folder.path().join("zoo"), folder.path().join("out"));
-    copy(&root().join("zoo"), &entries);
+    let (folder, entries) = shipped(&["door-act"]);
+    let out = folder.path().join("out");
     let board = || {
         let mut command = zoo(["leaderboard", "--zoo", text(&entries), "--out", text(&out)]);
         command.stdout(Stdio::null());
@@ -211,7 +209,7 @@ fn a_killed_leaderboard_leaves_whole_files() {
         succeeds(&mut board());
         assert_eq!(files(), whole);
     }
-    println!("leaderboard: {died} of {} killed", 2 * kills());
+    assert!(died > 0, "none was killed in time");
 }
 
 #[test]
@@ -241,4 +239,5 @@ fn a_killed_edit_in_place_leaves_the_old_set_or_the_new() {
     // the next one takes away what the killed ones left
     succeeds(&mut rename(names[0], names[1]));
     assert_eq!(listing(folder.path()), ["set"], "after {died} kills");
+    assert!(died > 0, "none was killed in time");
 }

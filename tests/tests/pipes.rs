@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-use e2e::{copied_zoo, data, lift, listing, root, succeeds, text, trained, zoo};
+use e2e::{copied_zoo, data, lift, listing, succeeds, text, trained, zoo};
 
 /// Ends by itself and does not panic.
 fn ran(command: &mut Command) -> Output {
@@ -89,8 +89,7 @@ fn a_full_disk_is_an_error_in_one_line() {
 
 #[test]
 fn files_are_written_whoever_reads_the_table() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let shipped = root().join("zoo");
+    let (folder, shipped) = e2e::shipped(&["door-act", "lift-act-s1", "lift-act-s2"]);
     // families and tasks decide which files there are: a reader who stays sees as many
     let read = folder.path().join("read");
     assert!(ran(&mut zoo(["leaderboard", "--zoo", text(&shipped), "--out", text(&read)])).status.success());

@@ -2,7 +2,6 @@
 
 use std::fs;
 use std::process::Command;
-use std::time::Instant;
 
 use e2e::{copied_zoo, data, listing, refused, succeeds, text, zoo};
 
@@ -14,7 +13,8 @@ fn absurd_sizes_are_refused_beforehand() {
         command.args(arguments);
         command
     };
-    let begin = Instant::now();
+    // a simulator that would be started is not there, which would be another message
+    let nowhere = ("ACTRM_PYTHON", "no/python");
     for (arguments, words) in [
         (&["--workers", "100000"][..], &["--workers 100000", "memory", "free"][..]),
         (&["--workers", "0"], &["--workers 0"]),
@@ -26,7 +26,7 @@ fn absurd_sizes_are_refused_beforehand() {
         (&["--temporal-ensemble", "-1e308"], &["--temporal-ensemble", "finite"]),
         (&["--temporal-ensemble", "nan"], &["--temporal-ensemble", "finite"]),
     ] {
-        refused(&mut eval(arguments), words);
+        refused(eval(arguments).env(nowhere.0, nowhere.1), words);
     }
     let out = folder.path().join("x.hdf5");
     for (arguments, words) in [
@@ -35,10 +35,8 @@ fn absurd_sizes_are_refused_beforehand() {
     ] {
         let mut command = data(["collect", "--task", "Lift", "--out", text(&out)]);
         command.args(arguments);
-        refused(&mut command, &words);
+        refused(command.env(nowhere.0, nowhere.1), &words);
     }
-    // no simulator was started for any of them
-    assert!(begin.elapsed().as_secs() < 60, "{:?}", begin.elapsed());
     assert_eq!(listing(folder.path()), ["zoo"]);
     assert!(!entries.join("results").exists());
 }

@@ -4,16 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
-use e2e::{copy, listing, root, succeeds, text, zoo};
-use tempfile::TempDir;
-
-/// A copy of the entries that come with the repository, with their results.
-fn shipped() -> (TempDir, PathBuf) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let to = folder.path().join("zoo");
-    copy(&root().join("zoo"), &to);
-    (folder, to)
-}
+use e2e::{SHIPPED_ACT, listing, root, shipped, succeeds, text, zoo};
 
 /// A leaderboard that leaves something out: exit code 1. What it said on standard error, and its CSV.
 fn leaves_out(entries: &Path) -> (String, String) {
@@ -68,7 +59,7 @@ fn an_entry_says_where_it_comes_from_and_answers_as_when_it_was_sealed() {
 
 #[test]
 fn bad_files_stop_nothing_and_are_named() {
-    let (_folder, entries) = shipped();
+    let (_folder, entries) = shipped(&SHIPPED_ACT);
     succeeds(&mut zoo(["leaderboard", "--zoo", text(&entries)]));
     let all = fs::read_to_string(entries.join("leaderboard.csv")).expect("a leaderboard");
     let rows = |text: &str, entry: &str| text.lines().filter(|row| row.starts_with(entry)).count();
@@ -119,7 +110,7 @@ fn bad_files_stop_nothing_and_are_named() {
 
 #[test]
 fn a_result_of_an_entry_that_is_not_in_the_zoo_has_no_row() {
-    let (_folder, entries) = shipped();
+    let (_folder, entries) = shipped(&SHIPPED_ACT);
     fs::remove_dir_all(entries.join("lift-act")).expect("removed");
     let (said, board) = leaves_out(&entries);
     assert_eq!(said.matches("found lift-act@1").count(), 2, "{said}");
@@ -128,7 +119,7 @@ fn a_result_of_an_entry_that_is_not_in_the_zoo_has_no_row() {
 
 #[test]
 fn a_report_that_cannot_be_written_leaves_the_table_as_it_was() {
-    let (_folder, entries) = shipped();
+    let (_folder, entries) = shipped(&["door-act"]);
     fs::create_dir(entries.join("report.html")).expect("creatable");
     fs::write(entries.join("leaderboard.csv"), "old").expect("writable");
     let output = zoo(["leaderboard", "--zoo", text(&entries)]).output().expect("the program starts");

@@ -156,15 +156,10 @@ def test_the_programs_are_there() -> None:
         assert said == f"{name} {actrm.__version__}\n"
 
 
-def test_importing_is_quick_and_brings_no_more_than_itself() -> None:
-    script = (
-        "import sys, time; t = time.perf_counter(); import actrm; print(time.perf_counter() - t); print(*sys.modules)"
-    )
+def test_importing_brings_no_more_than_itself() -> None:
+    script = "import sys, actrm; print(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    seconds, modules = said.splitlines()
-    assert not {"numpy", "torch", "gymnasium"} & set(modules.split())
-    # the bar is 0.1 s on a machine with nothing else to do
-    assert float(seconds) < 1.0
+    assert not {"numpy", "torch", "gymnasium"} & set(said.split())
 
 
 def test_everything_public_says_what_it_is() -> None:

@@ -491,7 +491,6 @@ fn provenance(row: &LeaderboardRow, beside: &Beside) -> String {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use std::time::Instant;
 
     use super::*;
     use crate::testing::{finished, sample};
@@ -582,13 +581,10 @@ mod tests {
                 other
             })
             .collect();
-        let begin = Instant::now();
         let rows = rank(&all, &Reading::default());
         let html = to_html(&rows, &Beside::default());
-        let took = begin.elapsed();
         assert_eq!(rows.len(), 10_000);
         assert!(html.len() < 12_000_000, "{} bytes", html.len());
-        assert!(took.as_secs_f64() < 15.0, "{took:?}");
         // what a browser has to build, however many rows there are
         let elements = |html: &str| html.split('<').skip(1).filter(|tag| tag.starts_with(char::is_alphabetic)).count();
         let all = elements(&html);

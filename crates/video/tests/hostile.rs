@@ -115,9 +115,7 @@ fn tables_that_state_too_much_are_refused_at_once() {
     let changed = |at: usize, value: u32| {
         let mut bytes = original.clone();
         bytes[at..at + 4].copy_from_slice(&value.to_be_bytes());
-        let start = Instant::now();
         let result = Video::from_bytes("f", bytes).map(|v| v.info().frames).map_err(|e| e.to_string());
-        assert!(start.elapsed() < Duration::from_secs(1));
         result.unwrap_err()
     };
     let (stsz, stts, stsc, stco) = (find(b"stsz"), find(b"stts"), find(b"stsc"), find(b"stco"));
