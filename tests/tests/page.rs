@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use e2e::{data, lift, listing, refused, root, succeeds, text, zoo};
+use e2e::{data, lift, listing, refused, root, shipped, succeeds, text, zoo};
 
 /// The browser.
 fn browser() -> String {
@@ -17,12 +17,13 @@ fn browser() -> String {
         .expect("Chromium is on the PATH, or ACTRM_CHROMIUM names one")
 }
 
-/// The page after it has loaded, and what was said on its console.
-fn rendered(browser: &str, page: &Path) -> (String, Vec<String>) {
+/// The page after it has loaded, and what was said on its console, with further options of the browser.
+fn rendered(browser: &str, page: &Path, options: &[&str]) -> (String, Vec<String>) {
     let profile = tempfile::tempdir().expect("a temporary folder");
     let output = Command::new(browser)
         .args(["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--enable-logging=stderr"])
         .args(["--window-size=1280,900", "--dump-dom"])
+        .args(options)
         .arg(format!("--user-data-dir={}", profile.path().display()))
         .arg(format!("file://{}", page.display()))
         .output()
@@ -56,9 +57,9 @@ addEventListener("DOMContentLoaded", async () => {
 </script>"##;
 
 /// What a reader was told by a page.
-fn visited(browser: &str, page: &Path, reader: &str) -> serde_json::Value {
+fn visited(browser: &str, page: &Path, reader: &str, options: &[&str]) -> serde_json::Value {
     let html = fs::read_to_string(page).expect("a page");
-    let (_, console) = rendered(browser, page);
+    let (_, console) = rendered(browser, page, options);
     assert!(console.is_empty(), "{console:#?}");
     let quoted = serde_json::to_string(&html).expect("text").replace("</", "<\\/").replace("<!--", "<\\!--");
     let copy = page.with_extension("visited.html");
@@ -66,7 +67,7 @@ fn visited(browser: &str, page: &Path, reader: &str) -> serde_json::Value {
     let (before, after) = html.rsplit_once("</body>").expect("a body");
     let visit = VISIT.replace("READER", reader).replace("PAGE", &quoted);
     fs::write(&copy, format!("{before}{visit}</body>{after}")).expect("writable");
-    let (dom, console) = rendered(browser, &copy);
+    let (dom, console) = rendered(browser, &copy, options);
     assert!(console.is_empty(), "{console:#?}");
     let (_, told) = dom.split_once("<pre id=\"told\">").expect("the reader came to an end");
     serde_json::from_str(told.split("</pre>").next().unwrap_or("")).expect("JSON")
@@ -149,7 +150,7 @@ fn the_report_works_in_a_browser() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     succeeds(&mut zoo(["leaderboard", "--zoo", text(&root().join("zoo")), "--out", text(folder.path())]));
     let page = folder.path().join("report.html");
-    let told = visited(&browser, &page, READER);
+    let told = visited(&browser, &page, READER, &[]);
     let numbers = |key: &str| -> Vec<f64> {
         told[key].as_array().expect("a list").iter().map(|x| x.as_f64().expect("a number")).collect()
     };
@@ -233,6 +234,39 @@ const VIEWER: &str = r##"async (page) => {
   return told;
 }"##;
 
+/// axe-core's findings of a page whose parts are all open: rule, impact and the first place.
+const AXE: &str = r##"async () => {
+  document.querySelectorAll("details").forEach((details) => { details.open = true; });
+  const found = await axe.run(document, { resultTypes: ["violations"], iframes: false });
+  return found.violations.map((rule) => [rule.id, rule.impact, rule.nodes[0].html.slice(0, 200)]);
+}"##;
+
+#[test]
+#[ignore = "needs Chromium; `make test` runs it where there is one"]
+fn pages_are_accessible_in_light_and_dark() {
+    let browser = browser();
+    let (folder, entries) = shipped(&["lift-act-s1", "lift-act-s2", "lift-actrm-s1", "lift-actrm-s2", "door-act-s1"]);
+    succeeds(&mut zoo(["leaderboard", "--zoo", text(&entries), "--out", text(folder.path())]));
+    viewed(folder.path());
+    let packages = fs::read_dir(root().join(".venv/lib")).expect("`make venv` makes it");
+    let python = packages.map(|entry| entry.expect("an entry").path()).find(|path| path.join("site-packages").is_dir());
+    let axe = python.expect("a Python").join("site-packages/axe_playwright_python/axe.min.js");
+    let axe = fs::read_to_string(axe).expect("axe-core");
+    for name in ["report.html", "films.html", "file.html"] {
+        let page = folder.path().join(name);
+        let html = fs::read_to_string(&page).expect("a page");
+        let (head, body) = html.split_once("</head>").expect("a head");
+        let script = axe.replace("</script", "<\\/script");
+        fs::write(&page, format!("{head}<script>{script}</script></head>{body}")).expect("writable");
+        // 0 is dark
+        for scheme in ["0", "1"] {
+            let scheme = format!("--blink-settings=preferredColorScheme={scheme}");
+            let found = visited(&browser, &page, AXE, &[&scheme]);
+            assert_eq!(found, serde_json::json!([]), "{name} {scheme}");
+        }
+    }
+}
+
 fn films() -> PathBuf {
     root().join("crates/dataset/tests/fixtures/lerobot_video_av1")
 }
@@ -270,7 +304,7 @@ fn a_data_set_is_viewed_in_a_browser() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let at = |name: &str| folder.path().join(name);
     viewed(folder.path());
-    let told = visited(&browser, &at("films.html"), VIEWER);
+    let told = visited(&browser, &at("films.html"), VIEWER, &[]);
     assert_eq!((&told["episodes"], &told["all"]), (&3.into(), &5.into()), "{told}");
     // two cameras, three frames each, of an episode of 12 steps
     assert_eq!(told["pictures"], serde_json::json!([84, 84, 84, 84, 84, 84]), "{told}");
@@ -289,7 +323,7 @@ fn a_data_set_is_viewed_in_a_browser() {
         numbers("points")
     };
     assert_eq!(check(&told).len(), 2);
-    let told = visited(&browser, &at("file.html"), VIEWER);
+    let told = visited(&browser, &at("file.html"), VIEWER, &[]);
     assert_eq!(told["episodes"], 50);
     // seven actions, every second of an episode's 41 to 80 steps, or every one of fewer
     let points = check(&told);

@@ -356,7 +356,7 @@ fn task(rows: &[&LeaderboardRow], beside: &Beside, open: bool, palette: &Palette
 
 fn card(title: &str, content: &str) -> String {
     format!(
-        "<div class=\"card\" role=\"region\" aria-label=\"{0}\" tabindex=\"0\">\n<h4>{0}</h4>\n{content}</div>",
+        "<div class=\"card\" role=\"group\" aria-label=\"{0}\" tabindex=\"0\">\n<h4>{0}</h4>\n{content}</div>",
         escape(title)
     )
 }
