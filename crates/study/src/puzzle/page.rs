@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
+use report::statistics::{Estimate, hierarchical};
 use report::wilson_interval;
 use zoo::ZooError;
 use zoo::config::Library;
@@ -13,6 +14,10 @@ use zoo::config::Library;
 use super::evaluation::{Judge, PuzzleEvaluation, TEST_SEED};
 use super::grade::{Baseline, Counts};
 use super::study::{Bar, STUDY_PUZZLES, StudyRow, StudyTest, TestedRow as Row, study_results};
+use crate::charts::{BOOTSTRAP_SEED, intervals};
+
+/// A question, and the success of each model that answers it.
+type Compared = (String, Vec<(String, Estimate)>);
 
 const HEAD: &str = "# Puzzles: what a small recursion can and cannot do
 
@@ -95,26 +100,31 @@ start, and all 200 with two or three more. So it was tested once more with two m
 
 ";
 
-/// The page for the results stored in `results`.
+/// The page for the results stored in `results`, and the chart that it shows as `puzzles/success.svg`. A row without results
+/// is left out.
 ///
 /// # Errors
 /// A result that cannot be read, an experiment that `library` lacks.
-pub fn study_page(library: &Library, results: &Path) -> Result<String, ZooError> {
-    let (rated, rest): (Vec<Row>, Vec<Row>) =
-        study_results(library, results)?.into_iter().partition(|(_, test, _)| test.is_rated());
+pub fn study_page(library: &Library, results: &Path) -> Result<(String, String), ZooError> {
+    let planned = study_results(library, results)?;
+    let trained =
+        |(_, test, _): &&Row| test.task.is_none() && test.givens.is_none() && !test.is_rated() && !test.is_further();
+    let wanted: u64 = planned.iter().filter(trained).map(|(row, ..)| row.seeds).sum();
+    let runs: usize = planned.iter().filter(trained).map(|(.., results)| results.len()).sum();
+    let found = planned.into_iter().filter(|(.., results)| !results.is_empty());
+    let (rated, rest): (Vec<Row>, Vec<Row>) = found.partition(|(_, test, _)| test.is_rated());
     let (further, rows): (Vec<Row>, Vec<Row>) = rest.into_iter().partition(|(_, test, _)| test.is_further());
     let of = |names: &[&str]| -> Vec<&Row> {
         rows.iter().filter(|(row, ..)| names.iter().any(|name| row.experiment.ends_with(name))).collect()
     };
     let mut page = String::from(HEAD);
-    let runs: usize =
-        rows.iter().filter(|(_, test, _)| test.task.is_none() && test.givens.is_none()).map(|r| r.2.len()).sum();
-    let wanted: u64 =
-        rows.iter().filter(|(_, test, _)| test.task.is_none() && test.givens.is_none()).map(|r| r.0.seeds).sum();
-    page.push_str(&thesis(&rows));
+    let (verdicts, compared) = thesis(&rows);
+    page.push_str(&verdicts);
+    let title = "Puzzles solved, recursion beside none, with 95% intervals";
+    let _ = write!(page, "\n![{title}](puzzles/success.svg)\n");
     let _ = writeln!(
         page,
-        "\n## How it was measured\n\nThe tables have {runs} of {wanted} planned trainings. Every number is over {STUDY_PUZZLES} held-out \
+        "\n## How it was measured\n\nThe tables have {runs} of {wanted} planned trainings; `actrm-zoo study --list` names the others. Every number is over {STUDY_PUZZLES} held-out \
          test puzzles (or walks) a seed; \"worst\" is the worst seed, with its 95% Wilson interval. *Right*: any shortest path, the \
          solution, or the goal reached. *Exact*: cell by cell the stored answer (for walkers: reached in the fewest moves). *CPU s*: \
          processor seconds of training, all threads, without validation, mean over the seeds. Settings were chosen on validation \
@@ -143,7 +153,7 @@ pub fn study_page(library: &Library, results: &Path) -> Result<String, ZooError>
     page.push_str(&curves(&of(&["maze5-walls"])));
     page.push_str("\n## Bars\n\n");
     page.push_str(&bars(&rows));
-    Ok(page)
+    Ok((page, intervals(title, &compared)))
 }
 
 pub(super) fn percent(share: f64) -> String {
@@ -180,10 +190,6 @@ pub(super) fn model(row: &StudyRow) -> &'static str {
     row.experiment.rsplit_once('_').map_or(row.experiment, |(model, _)| model)
 }
 
-fn not_run(cells: usize) -> String {
-    " not run |".to_owned() + &" |".repeat(cells - 1)
-}
-
 /// Models that mark cells.
 fn marking(rows: &[&Row]) -> String {
     let mut text = String::from(
@@ -194,11 +200,7 @@ fn marking(rows: &[&Row]) -> String {
     for (row, test, results) in rows {
         let task = tested_on(row, test, results);
         let _ = write!(text, "| {task} | {} |", model(row));
-        let Some(first) = results.first() else {
-            text.push_str(&not_run(9));
-            text.push('\n');
-            continue;
-        };
+        let first = &results[0];
         let cells = best(&first.baselines, |c| (c.cells_right, c.cells));
         let _ = writeln!(
             text,
@@ -260,11 +262,7 @@ fn walking(rows: &[&Row]) -> String {
     for (row, test, results) in rows {
         let task = tested_on(row, test, results);
         let _ = write!(text, "| {task} | {} |", model(row));
-        let Some(first) = results.first() else {
-            text.push_str(&not_run(8));
-            text.push('\n');
-            continue;
-        };
+        let first = &results[0];
         random = random.or(first.baselines.get(&Baseline::Random).map(|counts| (task, *counts)));
         let last = |r: &PuzzleEvaluation| r.progress.last().and_then(|point| point.sampled);
         let recent: Vec<f64> = results.iter().filter_map(last).collect();
@@ -341,11 +339,6 @@ fn further_tests(rows: &[Row]) -> String {
             how.push("weighed by cells".to_owned());
         }
         let _ = write!(text, "| {} | {} | {} |", tested_on(row, test, results), model(row), how.join(", "));
-        if results.is_empty() {
-            text.push_str(&not_run(8));
-            text.push('\n');
-            continue;
-        }
         let at = |depth: usize| {
             let at: Vec<f64> =
                 results.iter().filter_map(|r| r.by_depth.get(&depth)).map(|c| c.share(c.valid)).collect();
@@ -382,10 +375,7 @@ fn curves(rows: &[&Row]) -> String {
     );
     for (row, _, results) in rows.iter().filter(|(row, ..)| !row.experiment.starts_with("search")) {
         let _ = write!(text, "| {} |", model(row));
-        if results.is_empty() {
-            text.push_str(&not_run(EPISODES.len() + 1));
-        }
-        for episodes in EPISODES.iter().filter(|_| !results.is_empty()) {
+        for episodes in &EPISODES {
             let at: Vec<f64> = results
                 .iter()
                 .filter_map(|r| r.progress.iter().rfind(|point| point.seen <= *episodes))
@@ -424,10 +414,6 @@ fn bars(rows: &[Row]) -> String {
     for (row, test, results) in rows {
         let Some(bar) = test.bar else { continue };
         let _ = write!(text, "| {} | {} | {} |", tested_on(row, test, results), model(row), asked(&bar));
-        if results.is_empty() {
-            text.push_str(" | not run |\n");
-            continue;
-        }
         let least = |of: fn(&PuzzleEvaluation) -> f64| results.iter().map(of).fold(f64::INFINITY, f64::min);
         let most = |of: fn(&PuzzleEvaluation) -> f64| results.iter().map(of).fold(0.0, f64::max);
         let right = least(|r| r.answers.share(r.answers.valid));
@@ -463,7 +449,8 @@ fn asked(bar: &Bar) -> String {
 }
 
 /// Sentences that follow from the numbers, or say which are missing.
-fn thesis(rows: &[Row]) -> String {
+/// What the results answer, and the success of the models that answer it.
+fn thesis(rows: &[Row]) -> (String, Vec<Compared>) {
     let found = |name: &str| {
         let row =
             rows.iter().find(|(row, test, _)| row.experiment == name && test.task.is_none() && test.givens.is_none());
@@ -475,7 +462,16 @@ fn thesis(rows: &[Row]) -> String {
     };
     let best =
         |results: &[PuzzleEvaluation]| results.iter().map(|r| r.answers.share(r.answers.valid)).fold(0.0, f64::max);
+    // each puzzle or walk of each seed, solved or not
+    let estimate = |results: &[PuzzleEvaluation]| {
+        let solved = |r: &PuzzleEvaluation| {
+            let (valid, all) = (r.answers.valid as usize, r.answers.puzzles as usize);
+            [vec![1.0; valid], vec![0.0; all.saturating_sub(valid)]].concat()
+        };
+        hierarchical(&results.iter().map(solved).collect::<Vec<_>>(), BOOTSTRAP_SEED)
+    };
     let mut text = String::new();
+    let mut compared: Vec<Compared> = Vec::new();
     let mut compare = |task: &str, what: &str, recursive: &str, other: &str| {
         let line = match (found(recursive), found(other)) {
             (Some(one), Some(two)) => {
@@ -499,6 +495,8 @@ fn thesis(rows: &[Row]) -> String {
             _ => return,
         };
         let _ = writeln!(text, "- {line}");
+        let both = [recursive, other].map(|name| Some((name.to_owned(), estimate(found(name)?)?)));
+        compared.push((format!("{task}, {what}"), both.into_iter().flatten().collect()));
     };
     compare("Empty 5x5 maze", "REINFORCE, greedy", "reinforce_trm5_maze5-rl", "reinforce_mlp_maze5-rl");
     compare("5x5 mazes with walls", "PPO, greedy", "ppo_trm_maze5-walls", "ppo_mlp_maze5-walls");
@@ -512,7 +510,7 @@ fn thesis(rows: &[Row]) -> String {
          applied twice instead of eight times, so the two differ in recursion only. `small-trm`, `cnn`, `transformer` and `mlp` keep \
          the study's sizes and its short trainings. Where CPU seconds differ, a line also compares training recipes.\n",
     );
-    text
+    (text, compared)
 }
 
 #[cfg(test)]
@@ -521,11 +519,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn without_results_everything_is_not_run() {
+    fn rows_without_results_are_left_out() {
         let folder = tempfile::tempdir().unwrap();
-        let page = study_page(&Library::built_in(), folder.path()).unwrap();
-        assert!(page.contains("0 of ") && page.contains("| dfs10 | trm | not run |"), "{page}");
-        assert!(page.contains("| dfs16 | trm | right 90.0% | | not run |"));
+        let (page, _) = study_page(&Library::built_in(), folder.path()).unwrap();
+        assert!(page.contains("0 of ") && !page.contains("not run |") && !page.contains("| dfs10 |"), "{page}");
         assert!(!page.contains("`ppo_trm_maze5-walls`"), "what has no result answers nothing");
         // every table has as many cells in each row as in its head
         let mut width = 0;

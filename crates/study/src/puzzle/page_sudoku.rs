@@ -91,15 +91,12 @@ fn prices(names: &[&'static str], all: &[&Row]) -> String {
     text.push('\n');
     let priced: Vec<Priced> = names.iter().filter_map(|name| price(name, all)).collect();
     for name in names {
-        let Some(its) = priced.iter().find(|its| its.name == *name) else {
-            let _ = writeln!(text, "| {} | not run |{}", short(name), " |".repeat(ASKED.len() + 2));
-            continue;
-        };
+        let Some(its) = priced.iter().find(|its| its.name == *name) else { continue };
         let _ = write!(text, "| {} | {} | {} | {:.0} |", short(name), its.parameters, its.trainings, its.cpu);
         for (column, right) in its.right.iter().enumerate() {
             let text = &mut text;
             let _ = match right {
-                None => write!(text, " not run |"),
+                None => write!(text, " – |"),
                 Some(right) if priced.iter().any(|other| other.beats(its, column)) => {
                     write!(text, " {} |", percent(*right))
                 }
@@ -157,10 +154,6 @@ fn efforts(rated: &[Row]) -> String {
             givens => format!("{} givens", givens.unwrap_or_default()),
         };
         let _ = write!(text, "| {} | hard, {givens}{views} |", model(row));
-        if results.is_empty() {
-            let _ = writeln!(text, " not run |{}", " |".repeat(from.len() + 2));
-            continue;
-        }
         let bands = || results.iter().flat_map(|r| &r.by_effort);
         let (cells, puzzles) = bands().fold((0, 0), |(g, n), band| (g + band.givens, n + band.puzzles));
         let _ = write!(text, " {} | {:.1} |", results.len(), cells as f64 / puzzles.max(1) as f64);

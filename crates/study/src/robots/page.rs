@@ -18,9 +18,7 @@ use self::probes::probes;
 use super::cells::cells;
 use super::file::{Comparison, Data, Study};
 use super::result::CellResult;
-
-/// Seed of the bootstrap: the same results give the same page.
-const BOOTSTRAP_SEED: u64 = 1;
+use crate::charts::BOOTSTRAP_SEED;
 
 /// Results of one arm on one test, by the training's seed.
 type Trainings = BTreeMap<u64, CellResult>;

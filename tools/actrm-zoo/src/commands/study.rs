@@ -116,7 +116,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         printed?;
     }
     if let Some(path) = &args.page {
-        write_atomic(path, study_page(&args.configs.library()?, &args.results)?.as_bytes())?;
+        let (page, chart) = study_page(&args.configs.library()?, &args.results)?;
+        write_atomic(&args.results.join("success.svg"), chart.as_bytes())?;
+        write_atomic(path, page.as_bytes())?;
         cli::print(&(shown(path) + "\n"))?;
     }
     if !whole {

@@ -9,10 +9,8 @@ use report::statistics::{Estimate, hierarchical};
 use zoo::ZooError;
 
 use super::super::file::Study;
-use super::{BOOTSTRAP_SEED, Results, Trainings, outcomes, read_results};
-
-/// Colours of lines, which differ to the colour-blind as well.
-const COLORS: [&str; 8] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a7f00"];
+use super::{Results, Trainings, outcomes, read_results};
+use crate::charts::{BOOTSTRAP_SEED, COLORS, escaped, intervals};
 
 /// Groups of episodes that make a line worth drawing.
 const FEWEST_GROUPS: usize = 4;
@@ -135,51 +133,6 @@ fn mean(trainings: &Trainings, groups: &[String]) -> Option<f64> {
     (!all.is_empty()).then(|| all.iter().sum::<f64>() / all.len() as f64)
 }
 
-/// Points with their intervals, shares of one from left to right, under a head for each group of rows.
-fn intervals(title: &str, groups: &[(String, Vec<(String, Estimate)>)]) -> String {
-    let (left, width, line) = (430.0, 390.0, 19.0);
-    let x = |share: f64| left + width * share;
-    let lines = groups.iter().map(|(_, rows)| rows.len() + 1).sum::<usize>() as f64;
-    let (bottom, title) = (40.0 + line * lines, escaped(title));
-    let height = bottom + 30.0;
-    let mut svg = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 900 {height}\" width=\"900\" height=\"{height}\" role=\"img\" \
-         aria-label=\"{title}\" font-family=\"sans-serif\" font-size=\"13\">\n<rect width=\"900\" height=\"{height}\" \
-         fill=\"#ffffff\"/>\n<text x=\"12\" y=\"20\" font-weight=\"bold\">{title}</text>\n"
-    );
-    for share in [0.0, 0.25, 0.5, 0.75, 1.0] {
-        let (at, below) = (x(share), bottom + 18.0);
-        let _ = writeln!(
-            svg,
-            "<line x1=\"{at}\" x2=\"{at}\" y1=\"30\" y2=\"{bottom}\" stroke=\"#d8d8d8\"/><text x=\"{at}\" y=\"{below}\" \
-             text-anchor=\"middle\">{:.0}%</text>",
-            100.0 * share
-        );
-    }
-    let mut at = 40.0;
-    for (head, rows) in groups {
-        let _ = writeln!(svg, "<text x=\"12\" y=\"{}\" font-weight=\"bold\">{}</text>", at + 4.0, escaped(head));
-        at += line;
-        for (label, Estimate { value, low, high }) in rows {
-            let (color, text) = (COLORS[0], at + 4.0);
-            let _ = writeln!(
-                svg,
-                "<text x=\"28\" y=\"{text}\">{}</text><line x1=\"{:.1}\" x2=\"{:.1}\" y1=\"{at}\" y2=\"{at}\" stroke=\"{color}\" \
-                 stroke-width=\"3\"/><circle cx=\"{:.1}\" cy=\"{at}\" r=\"4.5\" fill=\"{color}\"/><text x=\"886\" y=\"{text}\" \
-                 text-anchor=\"end\">{:.1}%</text>",
-                escaped(label),
-                x(*low),
-                x(*high),
-                x(*value),
-                100.0 * value
-            );
-            at += line;
-        }
-    }
-    svg.push_str("</svg>\n");
-    svg
-}
-
 /// Lines over `heads`, shares of one from bottom to top, with a legend at the right.
 fn drawn(title: &str, heads: &[String], lines: &[(String, Vec<Option<f64>>)]) -> String {
     let (left, top, width, height) = (52.0, 34.0, 560.0, 240.0);
@@ -229,10 +182,6 @@ fn drawn(title: &str, heads: &[String], lines: &[(String, Vec<Option<f64>>)]) ->
     }
     svg.push_str("</svg>\n");
     svg
-}
-
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 #[cfg(test)]
