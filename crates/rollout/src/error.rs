@@ -40,7 +40,7 @@ pub enum RolloutError {
     },
     /// The interpreter cannot run the harness.
     #[error(
-        "python {} (from {origin}): {problem}; run `make venv` in the repository, or name a Python with robosuite 1.5.2 and mujoco 3.3.7 by --python or ACTRM_PYTHON",
+        "python {} (from {origin}): {problem}; run `make venv` in the repository, or name another by --python or ACTRM_PYTHON",
         path.display()
     )]
     PythonUnusable {

@@ -17,8 +17,8 @@ const FILES: &[(&str, &[u8])] = &include!(concat!(env!("OUT_DIR"), "/harness_fil
 /// The name of the Python package.
 const PACKAGE: &str = "actrm_harness";
 
-/// What the interpreter must be able to import.
-const NEEDED: [&str; 4] = ["numpy", "mujoco", "robosuite", "numba"];
+/// What the worker itself must be able to import; what a simulator needs is asked there.
+const NEEDED: [&str; 1] = ["numpy"];
 
 /// The folder that goes on `PYTHONPATH`: `$ACTRM_HARNESS` where it is set, else the sources in this
 /// binary, unpacked once into the cache.
@@ -263,14 +263,14 @@ mod tests {
     }
 
     #[test]
-    fn a_python_without_robosuite_is_one_clear_line() {
+    fn a_python_without_numpy_is_one_clear_line() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("python");
-        fs::write(&path, "#!/bin/sh\necho 3.12\necho mujoco,robosuite\n").unwrap();
+        fs::write(&path, "#!/bin/sh\necho 3.12\necho numpy\n").unwrap();
         fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
         let python = Python { path: path.clone(), origin: "--python".into() };
         let error = python.problem().unwrap().to_string();
-        assert!(error.contains("it has no mujoco, robosuite"), "{error}");
+        assert!(error.contains("it has no numpy"), "{error}");
         assert!(error.contains("make venv") && !error.contains('\n'), "{error}");
         fs::write(&path, "#!/bin/sh\necho 3.9\necho\n").unwrap();
         let error = python.problem().unwrap().to_string();

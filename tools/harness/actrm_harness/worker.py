@@ -13,6 +13,7 @@ import os
 import platform
 import sys
 import traceback
+from collections.abc import Callable
 from typing import Any, BinaryIO, NoReturn, cast
 
 import numpy as np
@@ -55,8 +56,17 @@ def settle() -> None:
 def run(requests: BinaryIO, replies: BinaryIO) -> int:
     """Start and serve; the exit code."""
     args = arguments()
+
+    def move(simulator: str) -> None:
+        """Start again in the interpreter that the simulator needs, with the same pipes, if that is another."""
+        if python := simulators.interpreter(simulator):
+            os.dup2(requests.fileno(), 0)
+            os.dup2(replies.fileno(), 1)
+            os.environ[simulators.MOVED] = simulator
+            os.execv(python, [python, *sys.orig_argv[1:]])
+
     try:
-        simulation = start(args)
+        simulation = start(args, move)
         wire.write_frame(replies, protocol.ready_message(describe(args, simulation)))
     except RequestError as error:
         wire.write_frame(replies, error_message(error.kind, str(error)))
@@ -96,8 +106,10 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def start(args: argparse.Namespace) -> Simulation:
+def start(args: argparse.Namespace, move: Callable[[str], None]) -> Simulation:
     """Import the simulator and make the environment."""
+    if not args.env_module:
+        move(tasks.row(args.task).simulator)
     simulators.prepare(tasks.row(args.task).simulator)
     if args.env_module:
         try:
@@ -106,6 +118,8 @@ def start(args: argparse.Namespace) -> Simulation:
             raise RequestError(
                 "env_module", f"cannot import environment module {args.env_module!r}: {error}"
             ) from error
+        # the module may have named another
+        move(tasks.row(args.task).simulator)
     cameras = tuple(name for name in args.cameras.split(",") if name)
     return simulators.start(
         simulators.Options(

@@ -1,12 +1,15 @@
 """What the worker asks of a simulator: other robots, and another simulator altogether."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import Client, WorkerError, walk
+
+from actrm_harness import wire
 
 HERE = Path(__file__).resolve().parent
 PATHS = {"PYTHONPATH": f"{HERE}:{HERE.parent}"}
@@ -223,3 +226,33 @@ def test_what_was_imported_is_summed(lift: Client, tmp_path: Path) -> None:
     assert sums() == first, "where it lies does not matter"
     (tmp_path / "toy_simulator.py").write_text(text.replace("< 0.1)", "< 0.2)"))
     assert sums()["toy_simulator"] != first["toy_simulator"]
+
+
+HOUSED = """
+from odd_simulator import start
+from actrm_harness.simulators import Requirements
+from actrm_harness.tasks import Task, register
+REQUIREMENTS = Requirements(("only_there",), ".venv-housed", "make housed")
+register(Task("HOUSED", simulator="housed"))
+"""
+
+
+def test_a_simulator_runs_in_the_interpreter_that_has_its_packages(tmp_path: Path) -> None:
+    (tmp_path / "housed.py").write_text(HOUSED)
+    (tmp_path / "packages").mkdir()
+    (tmp_path / "packages/only_there.py").write_text("")
+    paths = f"{tmp_path}:{PATHS['PYTHONPATH']}"
+    arguments = ("--task", "HOUSED", "--env-module", "housed")
+    client = Client(*arguments, env={"PYTHONPATH": paths}, ready=False)
+    frame = wire.read_frame(client.replies)
+    assert frame is not None and client.close() == 1
+    assert frame[0]["kind"] == "missing_module"
+    for word in ("only_there", "simulator housed", "`make housed`", "ACTRM_PYTHON_HOUSED"):
+        assert word in frame[0]["message"]
+    other = tmp_path / "python"
+    other.write_text(f'#!/bin/sh\nPYTHONPATH={tmp_path}/packages:$PYTHONPATH exec "{sys.executable}" "$@"\n')
+    other.chmod(0o755)
+    client = Client(*arguments, env={"PYTHONPATH": paths, "ACTRM_PYTHON_HOUSED": str(other)})
+    assert client.ready["task"] == "HOUSED"
+    assert client.ask("reset", seed=1)[0]["type"] == "reset"
+    assert client.close() == 0

@@ -2,12 +2,16 @@
 
 A row of `tasks` names its simulator: a module of this package, or any other module that Python finds, with a
 function `start(options: Options) -> Simulation`. Importing that module must not import the simulator: `start` does. A
-function `prepare()`, if there is one, sets what has to be set before anybody imports the simulator.
+function `prepare()`, if there is one, sets what has to be set before anybody imports the simulator. `REQUIREMENTS`, if
+there are any, name the packages that it needs and the virtual environment that has them.
 """
 
 import importlib
 import importlib.util
+import os
+import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -15,6 +19,18 @@ import numpy as np
 from actrm_harness.protocol import RequestError
 from actrm_harness.tasks import Task
 from actrm_harness.wire import Array, Tensors
+
+
+@dataclass(frozen=True, slots=True)
+class Requirements:
+    """What a simulator runs in."""
+
+    packages: tuple[str, ...]
+    """Modules that must be found."""
+    venv: str = ".venv"
+    """Name of the virtual environment that has them; it lies beside the one that the worker was started in."""
+    install: str = ""
+    """The command that makes it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +170,29 @@ def finite(what: str, values: Array) -> Array:
         step = int(np.flatnonzero(~np.isfinite(values))[0])
         raise RequestError("environment", f"the environment's {what} is {float(values.flat[step])} (step {step + 1})")
     return values
+
+
+# Set in a worker that was started again in a simulator's own interpreter: there is no second time.
+MOVED = "ACTRM_WORKER_MOVED"
+
+
+def interpreter(simulator: str) -> str | None:
+    """The interpreter that this simulator needs where the present one lacks its packages.
+
+    It is the one that `ACTRM_PYTHON_<SIMULATOR>` names, else the one of the simulator's virtual environment.
+    RequestError("missing_module") if there is none, or it is the present one.
+    """
+    needs: Requirements | None = getattr(_module(simulator), "REQUIREMENTS", None)
+    missing = [name for name in needs.packages if importlib.util.find_spec(name) is None] if needs else []
+    if needs is None or not missing:
+        return None
+    variable = f"ACTRM_PYTHON_{simulator.rsplit('.', 1)[-1].upper()}"
+    python = os.environ.get(variable) or str(Path(sys.prefix).parent / needs.venv / "bin/python")
+    if os.access(python, os.X_OK) and MOVED not in os.environ:
+        return python
+    text = f"{sys.executable} has no {', '.join(missing)}, which simulator {simulator} needs"
+    install = f"run `{needs.install}` in the repository, or " if needs.install else ""
+    raise RequestError("missing_module", f"{text}; {install}name a Python that has them by {variable}")
 
 
 def start(options: Options) -> Simulation:

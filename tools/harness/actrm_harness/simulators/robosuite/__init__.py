@@ -5,7 +5,9 @@ expert does and looks at stored states; `control*` is the compiled control loop'
 `lean` and `lift_cube` make resets cheap; `simulation` is what the worker speaks to.
 """
 
-from actrm_harness.simulators import Options, Simulation
+from actrm_harness.simulators import Options, Requirements, Simulation
+
+REQUIREMENTS = Requirements(("mujoco", "robosuite", "numba"), install="make venv")
 
 
 def prepare() -> None:
