@@ -106,16 +106,21 @@ def platform(files: dict[str, bytes], info: str) -> str:
     return found[1]
 
 
+def described(version: str) -> tuple[str, dict[str, bytes]]:
+    """The folder of the package's metadata, and the files in it but for the tag's."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return f"actrm-{version}.dist-info", metadata(project, version, (ROOT / project["readme"]).read_text())
+
+
 def package(version: str, out: Path) -> Path:
     """The wheel of the package in the folder `out`, under the tag that fits what it holds."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    info = f"actrm-{version}.dist-info"
+    info, about = described(version)
     folder = CRATE / "python"
     sources = sorted(path for path in (folder / "actrm").glob("*") if path.suffix in {".py", ".pyi", ".typed"})
     files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in sources}
     files["actrm/_actrm.abi3.so"] = stripped(TARGET / "release/lib_actrm.so")
     files |= {f"actrm/bin/{name}": stripped(TARGET / "release" / name) for name in PROGRAMS}
-    files |= metadata(project, version, (ROOT / project["readme"]).read_text())
+    files |= about
     tag = f"cp311-abi3-{platform(files, info)}"
     path = out / f"actrm-{version}-{tag}.whl"
     write(path, files | tag_file(info, tag, False), info)
@@ -135,6 +140,17 @@ def build_wheel(wheel_directory: str, config_settings: object = None, metadata_d
     packages = [word for name in PACKED for word in ("-p", name)]
     subprocess.run(["cargo", "build", "--release", "--locked", *packages], cwd=ROOT, check=True)
     return package(workspace_version(), Path(wheel_directory)).name
+
+
+def prepare_metadata_for_build_wheel(metadata_directory: str, config_settings: object = None) -> str:
+    """PEP 517: what the package is, without compiling it."""
+    del config_settings
+    info, files = described(workspace_version())
+    for name, content in files.items():
+        path = Path(metadata_directory) / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    return info
 
 
 def build_sdist(sdist_directory: str, config_settings: object = None) -> str:
