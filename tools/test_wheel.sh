@@ -17,9 +17,14 @@ for version in 3.11 3.12 3.13; do
             -r crates/python/tests/requirements.lock
         touch "$venv/.complete"
     fi
-    "$venv/bin/python" -m pip install --disable-pip-version-check --quiet --no-index --no-deps --force-reinstall "$wheel"
-    tests=(test_readme.py::test_readme_s_example_runs)
-    [[ -n $tested ]] || tests=(.)
+    if [[ -z $tested ]]; then
+        # as `pip install .` in a clone: what cargo has built is there
+        "$venv/bin/python" -m pip install --disable-pip-version-check --quiet --no-deps --force-reinstall .
+        tests=(.)
+    else
+        "$venv/bin/python" -m pip install --disable-pip-version-check --quiet --no-index --no-deps --force-reinstall "$wheel"
+        tests=(test_readme.py::test_readme_s_example_runs)
+    fi
     echo "Python $version: ${tests[*]}"
     # from the tests' folder, so that nothing of the repository is imported by accident
     (cd crates/python/tests && "$venv/bin/python" -m pytest -q -p no:cacheprovider "${tests[@]}" --rootdir .)
