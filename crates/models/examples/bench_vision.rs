@@ -8,7 +8,7 @@
 
 use models::encoders::{ImageNorm, VisionConfig};
 use models::{
-    Batch, FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, PolicyModel, Preprocess, Rng, Signature,
+    Backend, Batch, FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, PolicyModel, Preprocess, Rng, Signature,
     TrainConfig, Trainer, ValuesRef, act,
 };
 use serde_json::json;
@@ -50,14 +50,19 @@ impl Size {
         let Self { dim_model, dim_feedforward, action_horizon, .. } = *self;
         let vision = Some(self.vision.clone());
         let config = act::Config { dim_model, dim_feedforward, action_horizon, vision, ..Default::default() };
-        PolicyConfig::Act(config).build(&signature(), 1).unwrap()
+        PolicyConfig::Act(config).build(&signature(), 1, &Backend::CPU).unwrap()
     }
 
     fn batch(&self, rows: usize) -> Batch {
         let mut rng = Rng::new(1, "bench");
         let modes = [("observation.state", NormMode::Identity), ("action", NormMode::Identity)];
         let modes = modes.map(|(name, mode)| (name.to_string(), mode)).into();
-        let preprocess = Preprocess::new(signature(), Normaliser::new(&modes, &Default::default()).unwrap()).unwrap();
+        let preprocess = Preprocess::new(
+            signature(),
+            Normaliser::new(&modes, &Default::default()).unwrap(),
+            &candle_core::Device::Cpu,
+        )
+        .unwrap();
         let state = rng.normals(rows * 9);
         let pictures = CAMERAS.map(|_| (0..rows * SIDE * SIDE * 3).map(|_| rng.below(256) as u8).collect::<Vec<u8>>());
         let mut seen = Features::new();

@@ -6,7 +6,7 @@ use crate::features::{FeatureKind, FeatureSpec, Signature};
 use crate::layers::{AUXILIARY_HEAD, Activation, sinusoid_table};
 use crate::models::act::Config;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
-use candle_core::{DType, Tensor};
+use candle_core::{DType, Device, Tensor};
 use nn::Params;
 use nn::{ModelError, Result, some_names};
 use serde::de::Error as _;
@@ -380,7 +380,7 @@ pub fn load_tensors(params: &Params, config: &Config, tensors: &BTreeMap<String,
         let table = own
             .remove(POSITION_BUFFER)
             .ok_or_else(|| ModelError::MissingTensor { name: name.clone(), given: some_names(tensors.keys()) })?;
-        let expected = sinusoid_table(config.action_horizon + 2, config.dim_model)?;
+        let expected = sinusoid_table(config.action_horizon + 2, config.dim_model, &Device::Cpu)?;
         if table.dims() != expected.dims() {
             let (expected, found) = (expected.dims().to_vec(), table.dims().to_vec());
             return Err(ModelError::MisshapenTensor { name, expected, found });
@@ -461,7 +461,7 @@ pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, 
     let named = named.map(|(name, t)| (format!("{PREFIX}{name}"), t));
     let mut tensors: BTreeMap<String, Tensor> = named.collect();
     if config.use_vae {
-        let table = sinusoid_table(config.action_horizon + 2, config.dim_model)?;
+        let table = sinusoid_table(config.action_horizon + 2, config.dim_model, &Device::Cpu)?;
         tensors.insert(format!("{PREFIX}{POSITION_BUFFER}"), table);
     }
     Ok(tensors)
@@ -501,7 +501,7 @@ mod tests {
     fn config_and_tensors_come_back() {
         let one = example();
         assert_eq!(read_config(&write_config(&one).unwrap()).unwrap(), one);
-        let [a, b] = [1, 2].map(|seed| Act::new(&one.config, &one.signature, seed).unwrap());
+        let [a, b] = [1, 2].map(|seed| Act::new(&one.config, &one.signature, seed, &nn::Backend::CPU).unwrap());
         let tensors = tensors_out(a.params(), &one.config).unwrap();
         let load_into_b = |tensors: &BTreeMap<String, Tensor>| load_tensors(b.params(), &one.config, tensors);
         load_into_b(&tensors).unwrap();
@@ -527,10 +527,13 @@ mod tests {
         let one = example();
         let told = Config { auxiliary: Some(AuxiliaryConfig::default()), ..one.config.clone() };
         let signature = Signature { auxiliary_dim: 3, ..one.signature.clone() };
-        let act = Act::new(&told, &signature, 1).unwrap();
+        let act = Act::new(&told, &signature, 1, &nn::Backend::CPU).unwrap();
         let names = |act: &Act, config| tensors_out(act.params(), config).unwrap().into_keys().collect::<Vec<_>>();
         assert!(act.params().get("auxiliary_head.weight").is_some());
-        assert_eq!(names(&act, &told), names(&Act::new(&one.config, &one.signature, 1).unwrap(), &one.config));
+        assert_eq!(
+            names(&act, &told),
+            names(&Act::new(&one.config, &one.signature, 1, &nn::Backend::CPU).unwrap(), &one.config)
+        );
     }
 
     #[test]

@@ -8,25 +8,26 @@ use crate::batch::{Batch, tensor};
 use crate::features::{FeatureKind, FeatureSpec, Features, Observation, Signature, Values, ValuesRef};
 use crate::normaliser::{ACTION, Normaliser};
 use crate::policy::ActionChunk;
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use nn::{ModelError, Result};
 
-/// A signature and the statistics of its features and of the actions.
-#[derive(Debug, Clone, PartialEq)]
+/// A signature, the statistics of its features and of the actions, and the device on which a network reads them.
+#[derive(Debug, Clone)]
 pub struct Preprocess {
     signature: Signature,
     normaliser: Normaliser,
+    device: Device,
 }
 
 impl Preprocess {
     /// # Errors
     /// A feature without statistics, or with statistics of another length, by name.
-    pub fn new(signature: Signature, normaliser: Normaliser) -> Result<Self> {
+    pub fn new(signature: Signature, normaliser: Normaliser, device: &Device) -> Result<Self> {
         for spec in signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image) {
             normaliser.normalise(&spec.name, &mut vec![0.0; spec.width()])?;
         }
         normaliser.normalise(ACTION, &mut vec![0.0; signature.action_dim])?;
-        Ok(Self { signature, normaliser })
+        Ok(Self { signature, normaliser, device: device.clone() })
     }
 
     /// What it reads and gives.
@@ -58,7 +59,7 @@ impl Preprocess {
         let seen = self.read(raw)?;
         let mut actions = actions.to_vec();
         self.normaliser.normalise(ACTION, &mut actions)?;
-        Batch::new(&self.signature, action_horizon, seen, actions, is_pad)
+        Batch::new(&self.signature, action_horizon, seen, actions, is_pad, &self.device)
     }
 
     /// What a network reads at the last of `history`, the observations of an episode so far, oldest first; of more than
@@ -96,7 +97,7 @@ impl Preprocess {
         let mut tensors = Features::new();
         for spec in &self.signature.observation {
             let values = read.take("predict", &spec.name)?;
-            tensors.insert(&spec.name, tensor(&spec.name, values, &self.signature.batch_shape(spec, 1))?);
+            tensors.insert(&spec.name, tensor(&spec.name, values, &self.signature.batch_shape(spec, 1), &self.device)?);
         }
         Ok(tensors)
     }
@@ -212,7 +213,6 @@ mod tests {
     use super::*;
     use crate::features::ENTITY_PREFIX;
     use crate::normaliser::{ENVIRONMENT_STATE, NormMode, STATE};
-    use candle_core::Device;
     use proptest::prelude::*;
     use std::collections::BTreeMap;
 
@@ -233,7 +233,7 @@ mod tests {
                 tensors.insert(format!("{name}.{statistic}"), tensor.to_dtype(candle_core::DType::F32).unwrap());
             }
         }
-        Preprocess::new(signature, Normaliser::new(&modes, &tensors).unwrap()).unwrap()
+        Preprocess::new(signature, Normaliser::new(&modes, &tensors).unwrap(), &Device::Cpu).unwrap()
     }
 
     fn seen(values: &[f32]) -> Observation {
@@ -296,7 +296,8 @@ mod tests {
         let signature = Signature { observation, n_obs_steps: 2, action_dim: 1, ..Signature::default() };
         let modes = [STATE, ACTION].into_iter().chain(names.iter().map(String::as_str));
         let modes = modes.map(|name| (name.to_string(), NormMode::Identity)).collect();
-        let preprocess = Preprocess::new(signature, Normaliser::new(&modes, &BTreeMap::new()).unwrap()).unwrap();
+        let preprocess =
+            Preprocess::new(signature, Normaliser::new(&modes, &BTreeMap::new()).unwrap(), &Device::Cpu).unwrap();
         let step = |colours: [[f32; 3]; 3], pixels: [u8; 6]| {
             let mut step = Observation::of_state(vec![0.0; 2], vec![]);
             names.iter().zip(colours).for_each(|(name, colour)| step.insert(name, colour.to_vec().into()));
@@ -359,7 +360,7 @@ mod tests {
         more.insert(ENVIRONMENT_STATE, vec![0.0; 3].into());
         assert_eq!(preprocess.observation(&[more]).unwrap().len(), 3);
         let wide = Signature::low_dimensional(3, 0, 1);
-        let error = Preprocess::new(wide, preprocess.normaliser().clone()).unwrap_err().to_string();
+        let error = Preprocess::new(wide, preprocess.normaliser().clone(), &Device::Cpu).unwrap_err().to_string();
         assert!(error.contains("observation.state with 3 values"), "{error}");
     }
 }

@@ -35,7 +35,7 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
     }
     let a = rng.normals(rows * horizon * signature.action_dim);
     let pad: Vec<bool> = (0..rows * horizon).map(|i| i / horizon % 2 == 1 && i % horizon > horizon / 2).collect();
-    let mut batch = Batch::new(signature, horizon, observation, a, &pad).unwrap();
+    let mut batch = Batch::new(signature, horizon, observation, a, &pad, &candle_core::Device::Cpu).unwrap();
     batch.seed = seed;
     // of a pointer: of every third row it is not asked
     let cubes = signature.observation.iter().enumerate().filter(|(_, spec)| spec.group() == "cube");

@@ -5,7 +5,8 @@
 use candle_core::Tensor;
 use models::encoders::{ImageNorm, TokenKind, VisionConfig};
 use models::{
-    FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, Preprocess, Rng, Signature, ValuesRef, act, actrm,
+    Backend, FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, Preprocess, Rng, Signature, ValuesRef, act,
+    actrm,
 };
 
 const CAMERAS: [&str; 2] = ["observation.images.agentview", "observation.images.robot0_eye_in_hand"];
@@ -21,7 +22,9 @@ fn signature() -> Signature {
 fn observation(horizon: usize, pictures: [&[u8]; 2]) -> Features<Tensor> {
     let modes = [("observation.state", NormMode::Identity), ("action", NormMode::Identity)];
     let modes = modes.map(|(name, mode)| (name.to_string(), mode)).into();
-    let preprocess = Preprocess::new(signature(), Normaliser::new(&modes, &Default::default()).unwrap()).unwrap();
+    let preprocess =
+        Preprocess::new(signature(), Normaliser::new(&modes, &Default::default()).unwrap(), &candle_core::Device::Cpu)
+            .unwrap();
     let state = Rng::new(1, "state").normals(9);
     let mut seen = Features::new();
     seen.insert("observation.state", ValuesRef::F32(&state));
@@ -33,7 +36,7 @@ fn observation(horizon: usize, pictures: [&[u8]; 2]) -> Features<Tensor> {
 
 /// How far apart actions are when both cameras are taken for each other, of the largest action.
 fn difference(config: &PolicyConfig) -> f32 {
-    let model = config.build(&signature(), 3).unwrap();
+    let model = config.build(&signature(), 3, &Backend::CPU).unwrap();
     let mut rng = Rng::new(2, "pictures");
     let [one, other] = [(); 2].map(|()| (0..SIDE * SIDE * 3).map(|_| rng.below(256) as u8).collect::<Vec<u8>>());
     let [usual, swapped] = [[&one[..], &other[..]], [&other[..], &one[..]]].map(|pictures| {

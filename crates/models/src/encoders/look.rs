@@ -4,13 +4,14 @@ use super::config::{Normalisation, VisionConfig};
 use super::{ImageEncoder, Size};
 use candle_core::{DType, Tensor};
 use nn::Rng;
-use nn::device::HERE;
 use nn::{ModelError, Result};
 
 /// ImageNet's mean and standard deviation of red, green and blue, of numbers from 0 to 1.
 const IMAGENET: ([f32; 3], [f32; 3]) = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]);
 /// Added to standard deviations, LeRobot's.
 const EPS: f32 = 1e-8;
+/// Shares of red, green and blue in grey.
+const GREY: [f32; 3] = [0.299, 0.587, 0.114];
 
 /// What pictures are normalised by before anything else is known: mean and standard deviation.
 pub(crate) fn statistics(normalise: Normalisation) -> ([f32; 3], [f32; 3]) {
@@ -96,7 +97,7 @@ impl Look {
     /// Brightness, contrast, saturation, in this order and as torchvision defines them; numbers from 0 to 1.
     fn recolour(&self, x: &mut [f32]) {
         let [brightness, contrast, saturation] = self.colour;
-        let grey = |p: &[f32]| 0.299 * p[0] + 0.587 * p[1] + 0.114 * p[2];
+        let grey = |p: &[f32]| GREY[0] * p[0] + GREY[1] * p[1] + GREY[2] * p[2];
         x.iter_mut().for_each(|x| *x = (*x * brightness).clamp(0.0, 1.0));
         let pixels = (x.len() / 3).max(1) as f64;
         let mean = (x.chunks_exact(3).map(|p| f64::from(grey(p))).sum::<f64>() / pixels) as f32;
@@ -125,6 +126,14 @@ impl ImageEncoder {
             let (found, expected) = (format!("{:?}", pictures.dtype()), "bytes".to_string());
             return Err(ModelError::Input { operation: "see", object: "image", found, expected });
         }
+        let mut rng = rng.filter(|_| Look::is_random(&self.config));
+        let looks = (0..rows).map(|_| match &mut rng {
+            Some(rng) => Look::draw(&self.config, size, seen, rng),
+            None => Look::centre(size, seen),
+        });
+        if self.composed {
+            return self.composed_look(camera, pictures, &looks.collect::<Vec<_>>());
+        }
         let bytes = pictures.contiguous()?;
         let (storage, layout) = bytes.storage_and_layout();
         let candle_core::Storage::Cpu(storage) = &*storage else {
@@ -138,16 +147,44 @@ impl ImageEncoder {
             Ok([row[0], row[1], row[2]])
         };
         let of_camera = (row_of(&self.mean)?, row_of(&self.std)?);
-        let mut rng = rng.filter(|_| Look::is_random(&self.config));
         let mut out = vec![0.0; rows * seen.0 * seen.1 * 3];
-        for (picture, out) in bytes.chunks_exact(size.0 * size.1 * 3).zip(out.chunks_exact_mut(seen.0 * seen.1 * 3)) {
-            let look = match &mut rng {
-                Some(rng) => Look::draw(&self.config, size, seen, rng),
-                None => Look::centre(size, seen),
-            };
+        let each = bytes.chunks_exact(size.0 * size.1 * 3).zip(out.chunks_exact_mut(seen.0 * seen.1 * 3));
+        for ((picture, out), look) in each.zip(looks) {
             look.take(picture, size, seen, of_camera, out);
         }
-        Ok(Tensor::from_vec(out, (rows, seen.0, seen.1, 3), &HERE)?)
+        Ok(Tensor::from_vec(out, (rows, seen.0, seen.1, 3), pictures.device())?)
+    }
+
+    /// The same on candle's operations.
+    fn composed_look(&self, camera: usize, pictures: &Tensor, looks: &[Look]) -> Result<Tensor> {
+        let ((h, w), (seen_h, seen_w), device) = (self.given[camera], self.sizes[camera], pictures.device());
+        let places = |from: isize, count: usize, all: usize| {
+            let places = (0..count).map(|i| (from + i as isize).clamp(0, all as isize - 1) as u32);
+            Tensor::from_iter(places, device)
+        };
+        let pictures = (pictures.to_dtype(DType::F32)? / 255.0)?;
+        let part = |(row, look): (usize, &Look)| {
+            let part = pictures.get(row)?.index_select(&places(look.top, seen_h, h)?, 0)?;
+            part.index_select(&places(look.left, seen_w, w)?, 1)
+        };
+        let parts = looks.iter().enumerate().map(part).collect::<candle_core::Result<Vec<_>>>()?;
+        let mut x = Tensor::stack(&parts, 0)?;
+        if looks.iter().any(|look| look.colour != [1.0; 3]) {
+            let factor = |at: usize| {
+                let factors = looks.iter().map(|look| look.colour[at]).collect::<Vec<_>>();
+                Tensor::from_vec(factors, (looks.len(), 1, 1, 1), device)
+            };
+            let weights = Tensor::new(&GREY, device)?;
+            let grey = |x: &Tensor| x.broadcast_mul(&weights)?.sum_keepdim(3);
+            let towards = |from: &Tensor, x: &Tensor, factor: &Tensor| {
+                x.broadcast_sub(from)?.broadcast_mul(factor)?.broadcast_add(from)?.clamp(0f32, 1f32)
+            };
+            x = x.broadcast_mul(&factor(0)?)?.clamp(0f32, 1f32)?;
+            x = towards(&grey(&x)?.mean_keepdim((1, 2))?, &x, &factor(1)?)?;
+            x = towards(&grey(&x)?, &x, &factor(2)?)?;
+        }
+        let (mean, std) = (self.mean.get(camera)?, (self.std.get(camera)? + f64::from(EPS))?);
+        Ok(x.broadcast_sub(&mean)?.broadcast_div(&std)?.detach())
     }
 }
 
@@ -156,6 +193,8 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::encoders::{ImageEncoder, TokenKind};
+    use candle_core::Device;
+    use nn::Backend;
     use nn::Params;
 
     fn picture((h, w): Size) -> Vec<u8> {
@@ -207,11 +246,27 @@ mod tests {
         let keypoints = |size| {
             let config = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..VisionConfig::default() };
             let mut rng = Rng::new(1, "init");
-            ImageEncoder::without_positions(&mut Params::new(), &config, &[size, (5, 3)], 8, &mut rng)
+            ImageEncoder::without_positions(&mut Params::new(&Backend::CPU), &config, &[size, (5, 3)], 8, &mut rng)
         };
         assert!(keypoints((33, 33)).is_ok());
         let blind = keypoints((32, 32)).map(|_| ()).unwrap_err().to_string();
         assert!(blind.contains("tokens is keypoints in maps of one cell"), "{blind}");
+    }
+
+    #[test]
+    fn the_composed_images_are_the_same() {
+        let bytes = Tensor::from_vec([picture((8, 9)), picture((8, 9))].concat(), (2, 8, 9, 3), &Device::Cpu).unwrap();
+        for jitter in [0.0, 0.3] {
+            let config = VisionConfig { crop: Some(6), shift: 2, jitter, width: 8, ..VisionConfig::default() };
+            let [fast, composed] = [Backend::CPU, Backend::composed(Device::Cpu)].map(|backend| {
+                let (params, mut rng) = (&mut Params::new(&backend), Rng::new(1, "init"));
+                let encoder = ImageEncoder::without_positions(params, &config, &[(8, 9)], 8, &mut rng).unwrap();
+                let drawn = encoder.look(0, &bytes, Some(&mut rng)).unwrap();
+                let both = Tensor::cat(&[drawn, encoder.look(0, &bytes, None).unwrap()], 0).unwrap();
+                both.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+            });
+            assert!(fast.iter().zip(&composed).all(|(a, b)| (a - b).abs() < 1e-5), "{fast:?} {composed:?}");
+        }
     }
 
     #[test]

@@ -16,7 +16,6 @@ pub use position::position_table;
 use crate::layers::Linear;
 use candle_core::{DType, Tensor};
 use nn::Rng;
-use nn::device::HERE;
 use nn::ops::{cat_tokens, linear, narrow_tokens};
 use nn::{Context, Value, compose};
 use nn::{Init, Params};
@@ -63,6 +62,7 @@ pub struct ImageEncoder {
     /// (cameras, 3)
     mean: Tensor,
     std: Tensor,
+    composed: bool,
 }
 
 impl ImageEncoder {
@@ -102,8 +102,9 @@ impl ImageEncoder {
         }
         let sizes = given.iter().map(|&size| config.seen(size)).collect::<Result<Vec<_>>>()?;
         let (mean, std) = look::statistics(config.normalise);
+        let device = params.device().clone();
         let mut buffer = |name: &str, values: [f32; 3]| {
-            let values = Tensor::from_vec(values.repeat(given.len()), (given.len(), 3), &HERE)?;
+            let values = Tensor::from_vec(values.repeat(given.len()), (given.len(), 3), &device)?;
             params.insert_buffer(name, values)
         };
         let (mean, std) = (buffer(PICTURE_MEAN, mean)?, buffer(PICTURE_STD, std)?);
@@ -123,7 +124,7 @@ impl ImageEncoder {
                 let bias = params.create(&format!("{PROJECTION}.bias"), &[dim], uniform, rng)?;
                 let table = |&size: &Size| {
                     let (h, w) = shape.map_size(size);
-                    Ok(Tensor::from_vec(position_table(dim, (h, w)), (h * w, dim), &HERE)?)
+                    Ok(Tensor::from_vec(position_table(dim, (h, w)), (h * w, dim), &device)?)
                 };
                 Head::Map { weight, bias, tables: sizes.iter().map(table).collect::<Result<_>>()? }
             }
@@ -142,7 +143,8 @@ impl ImageEncoder {
             },
         };
         params.set_rate(&format!("{BACKBONE}."), config.backbone_rate());
-        Ok(Self { config: config.clone(), backbone, head, given: given.to_vec(), sizes, mean, std })
+        let (config, given, composed) = (config.clone(), given.to_vec(), params.backend().is_composed());
+        Ok(Self { config, backbone, head, given, sizes, mean, std, composed })
     }
 
     /// The network in front of the tokens.
@@ -161,7 +163,7 @@ impl ImageEncoder {
     /// Another number of cameras, or parameters without cameras.
     pub fn set_statistics(params: &Params, mean: &[[f32; 3]], std: &[[f32; 3]]) -> Result<()> {
         for (name, rows) in [(PICTURE_MEAN, mean), (PICTURE_STD, std)] {
-            let values = Tensor::from_vec(rows.concat(), (rows.len(), 3), &HERE)?;
+            let values = Tensor::from_vec(rows.concat(), (rows.len(), 3), params.device())?;
             params.set_buffer(name, &values)?;
         }
         params.changed();
@@ -225,7 +227,7 @@ impl ImageEncoder {
     /// # Errors
     /// Another number of cameras or another size of picture.
     pub fn forward(&self, pictures: &[Tensor]) -> Result<Tensor> {
-        compose(&HERE, |cx| Ok(self.apply(cx, pictures)?.into_graph()))
+        compose(self.mean.device(), |cx| Ok(self.apply(cx, pictures)?.into_graph()))
     }
 
     /// pictures: one (b, H, W, 3) a camera, normalised -> (b, T, D). Cameras of one size go through the network as one batch.

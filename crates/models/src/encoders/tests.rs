@@ -1,6 +1,8 @@
 //! Image encoders by hand beside the same on candle's operations.
 #![allow(clippy::unwrap_used)]
 use super::*;
+use candle_core::Device;
+use nn::Backend;
 use nn::ops::term_of;
 use nn::simd::{Level, at_most};
 use nn::{Cache, Gradients, Loss, ParamLayout, Value};
@@ -24,21 +26,22 @@ fn tokens_and_gradients_are_the_composed_ones() {
         (8, ImageNorm::Frozen, vec![(40, 33)], 2, map, Some([1, 2, 0, 0])),
     ] {
         let config = VisionConfig { width, norm, tokens, blocks, ..VisionConfig::default() };
-        let (mut params, mut rng, cache) = (Params::new(), Rng::new(5, "init"), Cache::default());
+        let (mut params, mut rng, cache) = (Params::new(&Backend::CPU), Rng::new(5, "init"), Cache::default());
         let encoder = ImageEncoder::without_positions(&mut params, &config, &sizes, DIM, &mut rng).unwrap();
         for (name, var) in params.all() {
             // away from 1 and 0; variances stay positive
-            let noise = Tensor::from_vec(rng.normals(var.elem_count()), var.dims(), &HERE).unwrap();
+            let noise = Tensor::from_vec(rng.normals(var.elem_count()), var.dims(), &Device::Cpu).unwrap();
             let noise = if name.ends_with("var") { noise.abs().unwrap() } else { noise };
             let scale = if var.dims().len() == 1 { 0.1 } else { 0.0 };
             var.set(&(var.as_tensor() + (noise * scale).unwrap()).unwrap()).unwrap();
         }
-        let mut picture = |&(h, w): &Size| Tensor::from_vec(rng.normals(rows * h * w * 3), (rows, h, w, 3), &HERE);
+        let mut picture =
+            |&(h, w): &Size| Tensor::from_vec(rng.normals(rows * h * w * 3), (rows, h, w, 3), &Device::Cpu);
         let pictures: Vec<Tensor> = sizes.iter().map(|size| picture(size).unwrap()).collect();
         let loss = |cx: &mut Context<'_>| {
             let y = encoder.apply(cx, &pictures)?;
             let weights = Rng::new(9, "weights").normals(y.len());
-            let composed = Tensor::from_slice(&weights, y.dims(), &HERE)?;
+            let composed = Tensor::from_slice(&weights, y.dims(), &Device::Cpu)?;
             let by_hand = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
                 if let Some((grad, _)) = grad {
                     grad.copy_from_slice(&weights);

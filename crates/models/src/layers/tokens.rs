@@ -357,10 +357,10 @@ mod tests {
         assert_eq!((layout.len(), layout.feature_rows(), layout.entity_rows()), (7, 3, 2));
         assert_eq!(layout.state().feature, "observation.state");
 
-        let (mut p, rng) = (Params::new(), &mut Rng::new(1, "init"));
+        let (mut p, rng) = (Params::new(&nn::Backend::CPU), &mut Rng::new(1, "init"));
         let env_state = environment_state(&mut p, &layout, 8, rng).unwrap();
         let tokens = InputTokens::new(&mut p, layout, 3, 8, env_state, rng).unwrap();
-        let positions = nn::compose(&nn::device::HERE, |cx| tokens.apply_positions(cx)).unwrap().detached();
+        let positions = nn::compose(&candle_core::Device::Cpu, |cx| tokens.apply_positions(cx)).unwrap().detached();
         let positions = positions.squeeze(0).unwrap().to_vec2::<f32>().unwrap();
         let rows = |name: &str| p.get(name).unwrap().to_vec2::<f32>().unwrap();
         let (features, entities) =

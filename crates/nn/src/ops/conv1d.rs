@@ -28,7 +28,7 @@ fn along((pictures, width, channels): (usize, usize, usize), output: usize, kern
 }
 
 fn convolution(x: &Value, layer: &Conv1d) -> Result<Conv> {
-    let (n, steps, channels) = x.dims3()?;
+    let [n, steps, channels] = super::sizes("convolution", &x.tensor)?;
     let (output, input, kernel) = layer.weight.dims3()?;
     super::check_width("convolution", x, input)?;
     Ok(along((n, steps, channels), output, kernel, layer.stride))
@@ -57,10 +57,10 @@ fn of_bias(back: &mut Backward<'_>, layer: &Conv1d, rows: &[f32]) {
 /// # Errors
 /// An input of another width.
 pub fn conv1d(cx: &mut Context<'_>, x: &Value, layer: &Conv1d) -> Result<Value> {
-    if cx.composed() {
+    let conv = convolution(x, layer)?;
+    if cx.composed("convolution", [&x.tensor, &layer.weight, &layer.bias])? {
         return Ok(Value::constant(layer.forward(&x.tensor)?));
     }
-    let conv = convolution(x, layer)?;
     let made = conv.made((0, 0));
     let mut y = vec![0.0; made.inside()];
     with_bias(cx, &conv, layer, x, &mut y)?;
@@ -96,7 +96,11 @@ pub fn conv1d_mish(
         Then::Add(x) => super::check_shape("convolution", "sum", &x.tensor, &shape).map(|()| false)?,
         Then::Nothing => false,
     };
-    if cx.composed() {
+    let other = match then {
+        Then::Film(other) | Then::Add(other) => Some(&other.tensor),
+        Then::Nothing => None,
+    };
+    if cx.composed("convolution", [&x.tensor, &layer.weight, &layer.bias].into_iter().chain(other))? {
         let y = crate::layers::mish(&norm.forward(&layer.forward(&x.tensor)?)?)?;
         return Ok(Value::constant(match then {
             Then::Nothing => y,
@@ -175,15 +179,15 @@ pub fn conv1d_mish(
 /// # Errors
 /// An input of another width.
 pub fn upsample1d(cx: &mut Context<'_>, x: &Value, layer: &Upsample1d) -> Result<Value> {
-    if cx.composed() {
-        return Ok(Value::constant(layer.forward(&x.tensor)?));
-    }
-    let (n, steps, _) = x.dims3()?;
+    let [n, steps, _] = super::sizes("upsample", &x.tensor)?;
     let (input, output, kernel) = layer.weight.dims3()?;
     super::check_width("upsample", x, input)?;
     if kernel != 4 {
         let (expected, found) = (vec![input, output, 4], layer.weight.dims().to_vec());
         return Err(ModelError::Shape { operation: "upsample", object: "weight", expected, found });
+    }
+    if cx.composed("upsample", [&x.tensor, &layer.weight, &layer.bias])? {
+        return Ok(Value::constant(layer.forward(&x.tensor)?));
     }
     // the way back of a convolution that halves the steps
     let conv = along((n, 2 * steps, output), input, kernel, 2);

@@ -178,15 +178,20 @@ pub fn conv2d(
     shortcut: Option<&Value>,
     relu: bool,
 ) -> Result<Value> {
-    if cx.composed() {
+    let [n, h, w, c] = super::sizes("convolution", &x.tensor)?;
+    let (output, _, k, _) = weight.dims4()?;
+    super::check_shape("convolution", "weight", weight, &[output, c, k, k])?;
+    if let Some(shortcut) = shortcut {
+        let made = [n, h.div_ceil(stride), w.div_ceil(stride), output];
+        super::check_shape("convolution", "shortcut", &shortcut.tensor, &made)?;
+    }
+    let tensors = [&x.tensor, weight].into_iter().chain(shortcut.map(|shortcut| &shortcut.tensor));
+    if cx.composed("convolution", tensors)? {
         let y = crate::layers::conv2d_composed(&x.tensor.permute((0, 3, 1, 2))?, weight, stride)?;
         let y = norm.composed(&y)?.permute((0, 2, 3, 1))?;
         let y = shortcut.map_or(Ok(y.clone()), |shortcut| &y + &shortcut.tensor)?;
         return Ok(Value::constant(if relu { y.relu()? } else { y }.contiguous()?));
     }
-    let (n, h, w, c) = x.tensor.dims4()?;
-    let (output, _, k, _) = weight.dims4()?;
-    super::check_shape("convolution", "weight", weight, &[output, c, k, k])?;
     let input = Frame { pictures: n, height: h, width: w, channels: c, border: (k / 2, k / 2) };
     let conv = Conv { input, output, kernel: (k, k), stride: (stride, stride) };
     let made = conv.made((0, 0));
@@ -266,11 +271,11 @@ pub fn conv2d(
 /// # Errors
 /// Something that is no batch of pictures.
 pub fn max_pool(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
-    if cx.composed() {
+    let [n, h, w, c] = super::sizes("max pool", &x.tensor)?;
+    if cx.composed("max pool", [&x.tensor])? {
         let y = max_pool_composed(&x.tensor.permute((0, 3, 1, 2))?.contiguous()?)?;
         return Ok(Value::constant(y.permute((0, 2, 3, 1))?.contiguous()?));
     }
-    let (n, h, w, c) = x.tensor.dims4()?;
     let from = Frame { pictures: n, height: h, width: w, channels: c, border: (1, 1) };
     let to = Frame { height: h.div_ceil(2), width: w.div_ceil(2), border: (0, 0), ..from };
     let (mut out, mut winner) = (vec![0.0; to.inside()], cx.space.pool.take(to.inside()));
@@ -307,10 +312,10 @@ pub fn max_pool(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
 /// # Errors
 /// Another number of cells.
 pub fn spatial_softmax(cx: &mut Context<'_>, scores: &Value, (h, w): (usize, usize)) -> Result<Value> {
-    let (n, cells, k) = scores.dims3()?;
+    let [n, cells, k] = super::sizes("spatial softmax", &scores.tensor)?;
     super::check_shape("spatial softmax", "scores", &scores.tensor, &[n, h * w, k])?;
     let places = cell_places((h, w));
-    if cx.composed() {
+    if cx.composed("spatial softmax", [&scores.tensor])? {
         let scores = scores.tensor.transpose(1, 2)?.contiguous()?;
         let shifted = scores.broadcast_sub(&scores.max_keepdim(2)?.detach())?.exp()?;
         let share = shifted.broadcast_div(&shifted.sum_keepdim(2)?)?;

@@ -28,11 +28,11 @@ pub fn chunk_error(
     error: Error,
     entries: usize,
 ) -> Result<(Term, Vec<f64>)> {
-    let (b, h, a) = got.dims3()?;
+    let [b, h, a] = super::sizes("loss", &got.tensor)?;
     super::check_shape("loss", "actions", want, &[b, h, a])?;
     super::check_shape("loss", "padding", is_pad, &[b, h])?;
     let entries = entries.max(1) as f64;
-    if cx.composed() {
+    if cx.composed("loss", [&got.tensor, want, is_pad])? {
         let valid = (1.0 - is_pad.reshape((b, h, 1))?)?;
         let difference = (&got.tensor - want)?;
         let each = match error {
@@ -97,7 +97,7 @@ pub fn term_of(
     by_hand: impl Fn(&[f32], Option<(&mut [f32], f64)>) -> f64 + 'static,
     composed: impl FnOnce(&Tensor) -> Result<Tensor>,
 ) -> Result<Term> {
-    if cx.composed() {
+    if cx.composed("loss", [&x.tensor])? {
         return Term::composed(composed(&x.tensor)?);
     }
     let value = read("loss", [&x.tensor], |[x]| Ok(by_hand(x, None)))?;

@@ -47,7 +47,7 @@ use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::{Error, chunk_error, kl_divergence, linear, sample_latent};
-use nn::{Cache, Context, Gradients, Loss, LossParts, LossValues, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Gradients, Loss, LossParts, LossValues, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -78,12 +78,12 @@ impl Act {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         check_signature("act", signature, READS)?;
         let layout = TokenLayout::new(signature, config.vision.as_ref(), config.dim_model)?;
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let (dim, shape) = (config.dim_model, config.shape());
         let vae = match config.use_vae {
             true => {
@@ -101,7 +101,7 @@ impl Act {
         let norm = LayerNorm::new(&mut p, "decoder.norm", dim, rng)?;
         let tokens = InputTokens::new(&mut p, layout, config.latent_dim, dim, env_state, rng)?;
         let pos_embed = Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?;
-        let table = sinusoid_table(config.action_horizon + 2, dim)?;
+        let table = sinusoid_table(config.action_horizon + 2, dim, backend.device())?;
         let action_head = Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?;
         let layout = tokens.layout();
         let pointer = config.pointer.as_ref();
@@ -239,7 +239,7 @@ impl Act {
     /// Without a sample the latent is its mean under the prior, zero; and pictures as the network reads them.
     fn mean_latent(&self, observation: &Features<Tensor>) -> Result<(Value, Features<Tensor>)> {
         let rows = check_observation("act", &self.signature, observation)?;
-        let latent = Value::zeros((rows, self.config.latent_dim), &self.params.device())?;
+        let latent = Value::zeros((rows, self.config.latent_dim), self.params.device())?;
         Ok((latent, self.tokens.look(observation, None)?))
     }
 

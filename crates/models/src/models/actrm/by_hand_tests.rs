@@ -90,7 +90,7 @@ fn configs() -> Vec<(Config, Signature, usize)> {
 }
 
 fn model(config: &Config, signature: &Signature) -> Actrm {
-    let model = Actrm::new(config, signature, 1).unwrap();
+    let model = Actrm::new(config, signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     model
 }

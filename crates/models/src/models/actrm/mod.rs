@@ -72,7 +72,7 @@ use candle_core::Tensor;
 use nn::ops::{
     Error, add, alias, cat_tokens, chunk_error, detached_mean, kl_divergence, linear, residual, sample_latent, term_of,
 };
-use nn::{Cache, Context, Loss, Params, Result, Rng, Term, Value};
+use nn::{Backend, Cache, Context, Loss, Params, Result, Rng, Term, Value};
 use over_actions::{OverActions, Read};
 use over_memory::OverMemory;
 use over_tokens::{OverTokens, TokenLayers};
@@ -149,12 +149,12 @@ impl Actrm {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         check_signature("actrm", signature, READS)?;
         let layout = TokenLayout::new(signature, config.vision.as_ref(), config.dim_model)?;
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let (dim, shape) = (config.dim_model, config.shape());
         let vae = match config.use_vae {
             true => {
@@ -171,7 +171,7 @@ impl Actrm {
         };
         Ok(Self {
             vae,
-            vae_pos_enc: sinusoid_table(config.action_horizon + 2, dim)?,
+            vae_pos_enc: sinusoid_table(config.action_horizon + 2, dim, backend.device())?,
             tokens: InputTokens::new(&mut p, layout, config.latent_dim, dim, env_state, rng)?,
             design,
             action_head: Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?,

@@ -23,7 +23,7 @@ use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::{Error, activation, cat_rows, chunk_error, linear};
-use nn::{Cache, Context, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -47,11 +47,11 @@ impl Bc {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         signature.check("bc", READS)?;
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let sight = Sight::new(&mut p, signature, config.vision.as_ref(), rng)?;
         let numbers = signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image);
         let numbers: usize = numbers.map(|spec| spec.width() * signature.n_obs_steps).sum();
@@ -182,7 +182,7 @@ mod tests {
         let of = signatures();
         for signature in [&of.plain, &of.entities, &of.history] {
             for config in configs() {
-                let model = Bc::new(&config, signature, 1).unwrap();
+                let model = Bc::new(&config, signature, 1, &Backend::CPU).unwrap();
                 move_parameters(&model);
                 let batch = batch(signature, config.action_horizon, 7, 3);
                 assert_the_step_is_the_composed_one(&model, &batch, &format!("{config:?}"));
@@ -195,7 +195,7 @@ mod tests {
         let of = signatures();
         for signature in [&of.pictures, &of.film] {
             for config in configs() {
-                let model = Bc::new(&Config { vision: Some(eyes()), ..config }, signature, 1).unwrap();
+                let model = Bc::new(&Config { vision: Some(eyes()), ..config }, signature, 1, &Backend::CPU).unwrap();
                 move_parameters(&model);
                 let batch = batch(signature, 3, 3, 3);
                 assert_the_step_is_the_composed_one(&model, &batch, &format!("{:?}", model.config));
@@ -213,7 +213,7 @@ mod tests {
         let of = signatures();
         for signature in [&of.plain, &of.no_env, &of.entities, &of.history] {
             for config in configs() {
-                let model = Bc::new(&config, signature, 1).unwrap();
+                let model = Bc::new(&config, signature, 1, &Backend::CPU).unwrap();
                 let batch = batch(signature, config.action_horizon, 4, 3);
                 assert_the_gradient_is_the_slope(&model, &batch, &format!("{config:?}"));
             }
@@ -224,7 +224,7 @@ mod tests {
     fn the_loss_is_the_mean_over_steps_that_are_not_padding() {
         let signature = signatures().plain;
         for config in configs() {
-            let model = Bc::new(&config, &signature, 1).unwrap();
+            let model = Bc::new(&config, &signature, 1, &Backend::CPU).unwrap();
             let batch = batch(&signature, 3, 4, 3);
             let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
             let (predicted, actions) = (flat(&model.predict(&batch.observation).unwrap()), flat(&batch.actions));
@@ -246,7 +246,7 @@ mod tests {
         let signature = signatures().entities;
         let run = || {
             let config = Config { action_horizon: 2, hidden: vec![32, 32], ..Default::default() };
-            let model = Box::new(Bc::new(&config, &signature, 1).unwrap());
+            let model = Box::new(Bc::new(&config, &signature, 1, &Backend::CPU).unwrap());
             let settings = TrainConfig { steps: 80, lr: 3e-3, warmup_steps: 3, ..Default::default() };
             let mut trainer = Trainer::new(model, settings, 5).unwrap();
             let batch = batch(&signature, 2, 8, 0);
@@ -260,7 +260,7 @@ mod tests {
 
     #[test]
     fn impossible_configurations_name_the_field() {
-        let error = |config: Config| Bc::new(&config, &signatures().plain, 0).unwrap_err().to_string();
+        let error = |config: Config| Bc::new(&config, &signatures().plain, 0, &Backend::CPU).unwrap_err().to_string();
         assert!(error(Config { action_horizon: 0, ..Default::default() }).contains("action_horizon"));
         assert!(error(Config { hidden: vec![8, 0], ..Default::default() }).contains("hidden"));
     }

@@ -29,7 +29,7 @@ use crate::policy::{ActionChunk, Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::{mixture_likelihood, select_tokens};
-use nn::{Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -53,7 +53,7 @@ impl BcRnn {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         signature.check("bc_rnn", READS)?;
         if config.action_horizon != signature.n_obs_steps {
@@ -62,7 +62,7 @@ impl BcRnn {
             return Err(ModelError::Config { model: "bc_rnn", field: "action_horizon", found, expected });
         }
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let steps = Steps::new(&mut p, "bc_rnn", signature, config.vision.as_ref(), rng)?;
         let sizes = (steps.width(), config.hidden_dim, config.n_layers);
         let rnn = Recurrent::new(&mut p, "rnn", config.cell, sizes, rng)?;

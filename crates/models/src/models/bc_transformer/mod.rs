@@ -31,7 +31,7 @@ use nn::ops::{
     Attention, attention, dropout, feed_forward, layer_norm, linear, linear_rows, mixture_likelihood, narrow_tokens,
     residual,
 };
-use nn::{Cache, Context, Init, Loss, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Init, Loss, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -117,11 +117,11 @@ impl BcTransformer {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         signature.check("bc_transformer", READS)?;
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let dim = config.dim_model;
         let steps = Steps::new(&mut p, "bc_transformer", signature, config.vision.as_ref(), rng)?;
         let embed_encoder = Linear::new(&mut p, "embed_encoder", steps.width(), dim, rng)?;
@@ -253,7 +253,7 @@ mod tests {
             [(&of.history, 1, 0.0), (&of.history, 3, 0.2), (&of.plain, 2, 0.2), (&of.entities, 2, 0.0)]
         {
             let config = Config { n_layers, dropout, dim_model: 24, ..small() };
-            let model = BcTransformer::new(&config, signature, 1).unwrap();
+            let model = BcTransformer::new(&config, signature, 1, &Backend::CPU).unwrap();
             move_parameters(&model);
             let what = format!("{n_layers} layers, dropout {dropout}");
             assert_the_step_is_the_composed_one(&model, &batch(signature, 1, 7, 3), &what);
@@ -265,7 +265,7 @@ mod tests {
         let of = signatures();
         for signature in [&of.pictures, &of.film] {
             let config = Config { vision: Some(eyes()), dropout: 0.2, ..small() };
-            let model = BcTransformer::new(&config, signature, 1).unwrap();
+            let model = BcTransformer::new(&config, signature, 1, &Backend::CPU).unwrap();
             move_parameters(&model);
             let batch = batch(signature, 1, 3, 3);
             assert_the_step_is_the_composed_one(&model, &batch, &format!("{} steps", signature.n_obs_steps));
@@ -281,7 +281,7 @@ mod tests {
     fn the_gradient_is_the_slope_of_the_loss() {
         let of = signatures();
         for (signature, dropout) in [(&of.history, 0.0), (&of.plain, 0.0), (&of.history, 0.2)] {
-            let model = BcTransformer::new(&Config { dropout, ..small() }, signature, 1).unwrap();
+            let model = BcTransformer::new(&Config { dropout, ..small() }, signature, 1, &Backend::CPU).unwrap();
             move_parameters(&model);
             assert_the_gradient_is_the_slope(&model, &batch(signature, 1, 4, 3), &format!("dropout {dropout}"));
         }
@@ -291,7 +291,7 @@ mod tests {
     fn training_lowers_the_loss_with_the_same_bits_every_time() {
         let signature = signatures().history;
         let run = || {
-            let model = Box::new(BcTransformer::new(&small(), &signature, 1).unwrap());
+            let model = Box::new(BcTransformer::new(&small(), &signature, 1, &Backend::CPU).unwrap());
             let settings = TrainConfig { steps: 60, lr: 5e-3, warmup_steps: 3, ..Default::default() };
             let mut trainer = Trainer::new(model, settings, 5).unwrap();
             let batch = batch(&signature, 1, 8, 0);
@@ -305,7 +305,9 @@ mod tests {
 
     #[test]
     fn impossible_configurations_name_the_field() {
-        let error = |config: Config| BcTransformer::new(&config, &signatures().history, 0).unwrap_err().to_string();
+        let error = |config: Config| {
+            BcTransformer::new(&config, &signatures().history, 0, &Backend::CPU).unwrap_err().to_string()
+        };
         assert!(error(Config { action_horizon: 2, ..small() }).contains("action_horizon is 2, expected 1"));
         assert!(error(Config { n_heads: 5, ..small() }).contains("n_heads is 5, expected a divisor of dim_model, 12"));
         assert!(error(Config { dropout: 1.0, ..small() }).contains("dropout"));

@@ -21,7 +21,7 @@ use crate::preprocess::Preprocess;
 use candle_core::{DType, Tensor};
 use condition::Condition;
 use nn::ops::{Error, chunk_error};
-use nn::{Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
 use std::fmt::Debug;
 use std::sync::Arc;
 use transformer::{Around, Transformer};
@@ -117,7 +117,13 @@ pub struct Denoising<M> {
 
 impl<M: Method> Denoising<M> {
     /// Initial weights are torch's defaults; the configuration was validated.
-    pub(crate) fn build(method: M, setup: &Setup<'_>, signature: &Signature, seed: u64) -> Result<Self> {
+    pub(crate) fn build(
+        method: M,
+        setup: &Setup<'_>,
+        signature: &Signature,
+        seed: u64,
+        backend: &Backend,
+    ) -> Result<Self> {
         signature.check(M::NAME, READS)?;
         let refuse = |field, found, expected| Err(ModelError::Config { model: M::NAME, field, found, expected });
         let pictures: Vec<&str> = signature.of_kind(FeatureKind::Image).map(|spec| spec.name.as_str()).collect();
@@ -129,7 +135,7 @@ impl<M: Method> Denoising<M> {
         if horizon < n_obs_steps {
             return refuse("action_horizon", horizon.to_string(), format!("at least n_obs_steps, {n_obs_steps}"));
         }
-        let (mut p, rng) = (Params::new(), &mut Rng::new(seed, "init"));
+        let (mut p, rng) = (Params::new(backend), &mut Rng::new(seed, "init"));
         let condition = Condition::new(&mut p, M::NAME, signature, setup.vision, rng)?;
         let network = match setup.transformer {
             Some(transformer) => {
@@ -215,7 +221,7 @@ impl<M: Method> Denoising<M> {
         noise: &mut dyn FnMut(&Tensor) -> Result<Tensor>,
     ) -> Result<Tensor> {
         let shape = (rows, self.action_horizon, self.signature.action_dim);
-        let zeros = Tensor::zeros(shape, DType::F32, &self.params.device())?;
+        let zeros = Tensor::zeros(shape, DType::F32, self.params.device())?;
         let cond = self.condition.apply(cx, rows, observation)?;
         let mut answer = |x: &Tensor, step: f32| Ok(self.answer(cx, x, &vec![step; rows], &cond)?.detached());
         self.method.sample(&zeros, &mut || noise(&zeros), &mut answer)

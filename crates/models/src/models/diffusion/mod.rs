@@ -28,7 +28,7 @@ use super::denoising::{Denoising, Method, Setup, Target, normals_like};
 use crate::batch::Batch;
 use crate::features::{Features, Signature};
 use candle_core::Tensor;
-use nn::{Result, Rng};
+use nn::{Backend, Result, Rng};
 
 /// The model.
 pub type Diffusion = Denoising<Noising>;
@@ -83,7 +83,7 @@ impl Diffusion {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         let setup = Setup {
             action_horizon: config.action_horizon,
@@ -93,7 +93,7 @@ impl Diffusion {
             vision: config.vision.as_ref(),
         };
         let schedule = NoiseSchedule::new(config.num_train_timesteps);
-        Self::build(Noising { config: config.clone(), schedule }, &setup, signature, seed)
+        Self::build(Noising { config: config.clone(), schedule }, &setup, signature, seed, backend)
     }
 
     /// The same model drawing its actions otherwise.

@@ -56,7 +56,7 @@ fn cases() -> Vec<(Signature, Config)> {
 #[test]
 fn the_gradient_is_the_slope_of_the_loss() {
     for (signature, config) in cases().into_iter().filter(|(_, config)| config.network.down_dims.len() == 2) {
-        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         let batch = batch(&signature, 8, 3, 3);
         assert_the_gradient_is_the_slope(&model, &batch, &format!("{config:?}"));
@@ -66,7 +66,7 @@ fn the_gradient_is_the_slope_of_the_loss() {
 #[test]
 fn the_step_by_hand_is_the_composed_one() {
     for (signature, config) in cases().into_iter().chain(seeing()) {
-        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         for rows in if config.vision.is_some() { [1, 3] } else { [1, 13] } {
             let batch = batch(&signature, 8, rows, 3);
@@ -78,9 +78,9 @@ fn the_step_by_hand_is_the_composed_one() {
 #[test]
 fn answers_by_hand_are_the_composed_ones_also_when_weights_change() {
     for (signature, config) in cases().into_iter().chain(seeing()) {
-        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         for rows in [1, 2, 13] {
-            let other = Diffusion::new(&config, &signature, rows as u64).unwrap();
+            let other = Diffusion::new(&config, &signature, rows as u64, &Backend::CPU).unwrap();
             move_parameters(&other);
             model.params().load(&other.params().tensors()).unwrap();
             let batch = batch(&signature, 8, rows, 3);
@@ -102,7 +102,7 @@ fn answers_by_hand_are_the_composed_ones_also_when_weights_change() {
 fn shards_add_up_to_the_whole() {
     let signature = signatures().history;
     for mask_padding in [false, true] {
-        let model = Diffusion::new(&Config { mask_padding, ..small() }, &signature, 1).unwrap();
+        let model = Diffusion::new(&Config { mask_padding, ..small() }, &signature, 1, &Backend::CPU).unwrap();
         let batch = batch(&signature, 8, 5, 3);
         let noise = normals_like(&batch.actions, &mut Rng::new(1, "noise")).unwrap();
         let steps = [3, 99, 0, 50, 20];
@@ -144,7 +144,7 @@ fn ddpm_with_a_network_that_knows_the_noise_comes_back_to_the_actions() {
 fn training_lowers_the_loss_with_the_same_bits_every_time() {
     let signature = signatures().history;
     let run = || {
-        let model = Box::new(Diffusion::new(&small(), &signature, 1).unwrap());
+        let model = Box::new(Diffusion::new(&small(), &signature, 1, &Backend::CPU).unwrap());
         let settings = TrainConfig { steps: 60, lr: 3e-3, warmup_steps: 3, ..Default::default() };
         let mut trainer = Trainer::new(model, settings, 5).unwrap();
         let batch = batch(&signature, 8, 16, 0);
@@ -160,7 +160,7 @@ fn training_lowers_the_loss_with_the_same_bits_every_time() {
 #[test]
 fn what_is_drawn_depends_on_the_generator_and_stays_in_range() {
     let signature = signatures().history;
-    let model = Diffusion::new(&small(), &signature, 1).unwrap();
+    let model = Diffusion::new(&small(), &signature, 1, &Backend::CPU).unwrap();
     let batch = batch(&signature, 8, 4, 3);
     let flat = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     let draw = |seed| flat(model.sample(&batch.observation, &mut Rng::new(seed, "policy")).unwrap());
@@ -173,7 +173,7 @@ fn what_is_drawn_depends_on_the_generator_and_stays_in_range() {
 #[test]
 fn impossible_configurations_name_the_field() {
     let of = signatures();
-    let error = |config: Config| Diffusion::new(&config, &of.plain, 0).unwrap_err().to_string();
+    let error = |config: Config| Diffusion::new(&config, &of.plain, 0, &Backend::CPU).unwrap_err().to_string();
     let network = |change: fn(&mut NetworkConfig)| {
         let mut config = small();
         change(&mut config.network);
@@ -202,11 +202,11 @@ fn impossible_configurations_name_the_field() {
     let both = Config { vision: Some(eyes()), ..attending(tokens()) };
     assert!(error(both).contains("vision is given, expected none with a transformer"));
     // a signature with pictures brings an encoder of its own
-    let unseen = Diffusion::new(&attending(tokens()), &of.pictures, 0).unwrap_err().to_string();
+    let unseen = Diffusion::new(&attending(tokens()), &of.pictures, 0, &Backend::CPU).unwrap_err().to_string();
     assert!(unseen.contains("transformer is one beside a, b, c, expected none where there are images"), "{unseen}");
     let sees = |vision| {
         let config = Config { vision: Some(vision), ..small() };
-        Diffusion::new(&config, &of.pictures, 0).unwrap_err().to_string()
+        Diffusion::new(&config, &of.pictures, 0, &Backend::CPU).unwrap_err().to_string()
     };
     assert!(
         sees(VisionConfig { cell_features: Some(6), ..eyes() }).contains("cell_features is 6, expected a multiple")
@@ -214,14 +214,14 @@ fn impossible_configurations_name_the_field() {
     let blind = error(Config { vision: Some(eyes()), ..small() });
     assert!(blind.contains("expected a feature of kind image"), "{blind}");
     let long = Signature { n_obs_steps: 9, ..of.plain.clone() };
-    let error = Diffusion::new(&small(), &long, 0).unwrap_err().to_string();
+    let error = Diffusion::new(&small(), &long, 0, &Backend::CPU).unwrap_err().to_string();
     assert!(error.contains("action_horizon is 8, expected at least n_obs_steps, 9"), "{error}");
 }
 
 #[test]
 fn what_a_camera_sees_decides_and_is_told_before_anything_is_drawn() {
     for (signature, config) in seeing() {
-        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         assert_eq!(model.vision(), config.vision.as_ref());
         let one = batch(&signature, 8, 1, 3).observation;

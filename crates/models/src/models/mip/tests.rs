@@ -17,7 +17,7 @@ fn small() -> Config {
 fn the_step_by_hand_is_the_composed_one() {
     let of = signatures();
     for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
-        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1).unwrap();
+        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         assert_the_step_is_the_composed_one(&model, &batch(signature, 8, 5, 3), &format!("{mask_padding}"));
     }
@@ -26,7 +26,7 @@ fn the_step_by_hand_is_the_composed_one() {
 #[test]
 fn from_pictures_too() {
     let signature = signatures().film;
-    let model = Mip::new(&Config { vision: Some(eyes()), ..small() }, &signature, 1).unwrap();
+    let model = Mip::new(&Config { vision: Some(eyes()), ..small() }, &signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     let batch = batch(&signature, 8, 3, 3);
     assert_the_step_is_the_composed_one(&model, &batch, "pictures");
@@ -40,7 +40,7 @@ fn from_pictures_too() {
 fn the_gradient_is_the_slope_of_the_loss() {
     let of = signatures();
     for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
-        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1).unwrap();
+        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
         assert_the_gradient_is_the_slope(&model, &batch(signature, 8, 3, 3), &format!("{mask_padding}"));
     }
 }
@@ -64,7 +64,7 @@ fn the_two_steps_are_the_oracle_s() {
 fn training_lowers_both_parts_of_the_loss_with_the_same_bits_every_time() {
     let signature = signatures().history;
     let run = || {
-        let model = Box::new(Mip::new(&small(), &signature, 1).unwrap());
+        let model = Box::new(Mip::new(&small(), &signature, 1, &Backend::CPU).unwrap());
         let settings = TrainConfig { steps: 80, lr: 3e-3, warmup_steps: 3, ..Default::default() };
         let mut trainer = Trainer::new(model, settings, 5).unwrap();
         let batch = batch(&signature, 8, 8, 0);
@@ -81,7 +81,9 @@ fn training_lowers_both_parts_of_the_loss_with_the_same_bits_every_time() {
 #[test]
 fn impossible_configurations_name_the_field() {
     for second_time in [0.0, 1.0, f64::NAN] {
-        let error = Mip::new(&Config { second_time, ..small() }, &signatures().plain, 0).unwrap_err().to_string();
+        let error = Mip::new(&Config { second_time, ..small() }, &signatures().plain, 0, &Backend::CPU)
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("config of mip: second_time is"), "{error}");
     }
 }
