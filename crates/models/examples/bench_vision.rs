@@ -2,7 +2,7 @@
 //!
 //!     target/release/examples/bench_vision [--peer PYTHON] [--rounds N] [--only WORD]
 //!
-//! prints a table and writes `target/bench/vision.json`. One thread; CPU time, the least of all rounds. Pictures come as
+//! prints a table and writes `target/bench/vision.json`. One thread; CPU time, the least of all rounds. Images come as
 //! bytes on our side and as normalised floats on theirs. Without `--peer` only ours is timed.
 #![allow(clippy::unwrap_used)]
 
@@ -40,8 +40,8 @@ fn size(name: &str) -> Size {
 }
 
 fn signature() -> Signature {
-    let pictures = CAMERAS.map(|name| FeatureSpec::image(name, SIDE, SIDE));
-    let observation = std::iter::once(FeatureSpec::state(9)).chain(pictures).collect();
+    let images = CAMERAS.map(|name| FeatureSpec::image(name, SIDE, SIDE));
+    let observation = std::iter::once(FeatureSpec::state(9)).chain(images).collect();
     Signature { observation, action_dim: 7, ..Signature::default() }
 }
 
@@ -64,10 +64,10 @@ impl Size {
         )
         .unwrap();
         let state = rng.normals(rows * 9);
-        let pictures = CAMERAS.map(|_| (0..rows * SIDE * SIDE * 3).map(|_| rng.below(256) as u8).collect::<Vec<u8>>());
+        let images = CAMERAS.map(|_| (0..rows * SIDE * SIDE * 3).map(|_| rng.below(256) as u8).collect::<Vec<u8>>());
         let mut seen = Features::new();
         seen.insert("observation.state", ValuesRef::F32(&state));
-        for (name, bytes) in CAMERAS.iter().zip(&pictures) {
+        for (name, bytes) in CAMERAS.iter().zip(&images) {
             seen.insert(name, ValuesRef::U8(bytes));
         }
         let actions = rng.normals(rows * self.action_horizon * 7);

@@ -7,7 +7,7 @@ use nn::{ModelError, Result};
 /// Windows as tensors.
 #[derive(Debug, Clone)]
 pub struct Batch {
-    /// (b, …) each as [`Signature::batch_shape`] says; f32, pictures u8
+    /// (b, …) each as [`Signature::batch_shape`] says; f32, images u8
     pub observation: Features<Tensor>,
     /// (b, H, A)
     pub actions: Tensor,

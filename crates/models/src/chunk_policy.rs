@@ -35,7 +35,7 @@ impl ChunkPolicy {
         Self { past, ..self }
     }
 
-    /// The same with a clock, by which it tells what its pictures took.
+    /// The same with a clock, by which it tells what its images took.
     #[must_use]
     pub fn with_clock(mut self, clock: Box<dyn Clock>) -> Self {
         self.clock = Some(clock);

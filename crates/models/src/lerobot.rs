@@ -1,7 +1,7 @@
 //! LeRobot's ACT files as values: its `config.json`, its tensor names, its names of normalisation modes. This is the one
 //! place that knows them; files are read and written in `zoo`.
 
-use crate::encoders::{Architecture, ImageEncoder, ImageNorm, PICTURE_MEAN, PICTURE_STD, TokenKind, VisionConfig};
+use crate::encoders::{Architecture, IMAGE_MEAN, IMAGE_STD, ImageEncoder, ImageNorm, TokenKind, VisionConfig};
 use crate::features::{FeatureKind, FeatureSpec, Signature};
 use crate::layers::{AUXILIARY_HEAD, Activation, sinusoid_table};
 use crate::models::act::Config;
@@ -19,7 +19,7 @@ const PREFIX: &str = "model.";
 /// Channels of the first layer of torchvision's networks.
 const LEROBOTS_WIDTH: usize = 64;
 /// Buffers of ours that stand among LeRobot's statistics, not among its weights.
-const OF_PICTURES: [&str; 2] = [PICTURE_MEAN, PICTURE_STD];
+const OF_IMAGES: [&str; 2] = [IMAGE_MEAN, IMAGE_STD];
 /// LeRobot saves this fixed table with the weights.
 const POSITION_BUFFER: &str = "vae_encoder_pos_enc";
 /// How far its sines and cosines may be off: bf16 rounds numbers below 1 to 1/512.
@@ -179,12 +179,12 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
     if keys.n_obs_steps != 1 {
         return Err(refuse("n_obs_steps", keys.n_obs_steps.to_string(), "1"));
     }
-    let (mut state, mut env, mut pictures) = (0, 0, Vec::new());
+    let (mut state, mut env, mut images) = (0, 0, Vec::new());
     for (name, feature) in &keys.input_features {
         match (feature.kind.as_str(), name.as_str(), &feature.shape[..]) {
             ("STATE", STATE, &[n]) => state = n,
             ("ENV", ENVIRONMENT_STATE, &[n]) => env = n,
-            ("VISUAL", name, &[3, height, width]) => pictures.push(FeatureSpec::image(name, height, width)),
+            ("VISUAL", name, &[3, height, width]) => images.push(FeatureSpec::image(name, height, width)),
             ("VISUAL", name, shape) => {
                 return Err(refuse("input_features", format!("{name} of shape {shape:?}"), "3 colours, height, width"));
             }
@@ -235,13 +235,13 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
         n_vae_encoder_layers: keys.n_vae_encoder_layers,
         dropout: keys.dropout,
         kl_weight: keys.kl_weight,
-        vision: if pictures.is_empty() { None } else { Some(vision(&keys)?) },
+        vision: if images.is_empty() { None } else { Some(vision(&keys)?) },
         pointer: None,
         auxiliary: None,
     };
     config.validate()?;
     let mut signature = Signature::low_dimensional(state, env, action);
-    signature.observation.extend(pictures);
+    signature.observation.extend(images);
     Ok(LerobotAct {
         config,
         signature,
@@ -268,7 +268,7 @@ fn vision(keys: &Keys) -> Result<VisionConfig> {
         return Err(refuse("replace_final_stride_with_dilation", "true", "false: basic blocks are not dilated"));
     }
     let norm = ImageNorm::Frozen;
-    // what normalises pictures comes with the statistics
+    // what normalises images comes with the statistics
     Ok(VisionConfig { encoder, width, norm, lr_backbone: Some(1.0), ..VisionConfig::default() })
 }
 
@@ -395,14 +395,14 @@ pub fn load_tensors(params: &Params, config: &Config, tensors: &BTreeMap<String,
             });
         }
     }
-    // what normalises pictures is not among LeRobot's weights; `load_statistics` takes it
-    for (name, buffer) in params.buffers().filter(|(name, _)| OF_PICTURES.contains(name)) {
+    // what normalises images is not among LeRobot's weights; `load_statistics` takes it
+    for (name, buffer) in params.buffers().filter(|(name, _)| OF_IMAGES.contains(name)) {
         own.insert(name.to_string(), buffer.as_detached_tensor());
     }
     params.load(&own)
 }
 
-/// Takes what normalises pictures from LeRobot's statistics, `<feature>.mean` and `.std` of shape (3, 1, 1) each; pictures
+/// Takes what normalises images from LeRobot's statistics, `<feature>.mean` and `.std` of shape (3, 1, 1) each; images
 /// without statistics pass as they are, as they do there.
 ///
 /// # Errors
@@ -434,13 +434,13 @@ pub fn load_statistics(
     if means.is_empty() { Ok(()) } else { ImageEncoder::set_statistics(params, &means, &stds) }
 }
 
-/// What normalises pictures, as LeRobot's statistics: `<feature>.mean` and `.std`, (3, 1, 1) each.
+/// What normalises images, as LeRobot's statistics: `<feature>.mean` and `.std`, (3, 1, 1) each.
 ///
 /// # Errors
 /// If the tensor library fails.
 pub fn statistics_out(params: &Params, signature: &Signature) -> Result<BTreeMap<String, Tensor>> {
     let mut statistics = BTreeMap::new();
-    for (buffer, statistic) in OF_PICTURES.iter().zip(["mean", "std"]) {
+    for (buffer, statistic) in OF_IMAGES.iter().zip(["mean", "std"]) {
         let Some((_, values)) = params.buffers().find(|(name, _)| name == buffer) else { continue };
         for (i, spec) in signature.of_kind(FeatureKind::Image).enumerate() {
             let row = values.as_tensor().get(i)?.copy()?.reshape((3, 1, 1))?;
@@ -456,7 +456,7 @@ pub fn statistics_out(params: &Params, signature: &Signature) -> Result<BTreeMap
 /// If the tensor library fails.
 pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, Tensor>> {
     // what only training reads is of no use there
-    let theirs = |name: &str| !OF_PICTURES.contains(&name) && !name.starts_with(AUXILIARY_HEAD);
+    let theirs = |name: &str| !OF_IMAGES.contains(&name) && !name.starts_with(AUXILIARY_HEAD);
     let named = params.tensors().into_iter().filter(|(name, _)| theirs(name));
     let named = named.map(|(name, t)| (format!("{PREFIX}{name}"), t));
     let mut tensors: BTreeMap<String, Tensor> = named.collect();

@@ -1,8 +1,8 @@
 //! Raw values to what a network reads, and actions back: the one place, for training, validation, evaluation and
 //! reasoning.
 //!
-//! Numbers are normalised per feature. Pictures stay bytes: they are scaled where they are encoded, after they have
-//! travelled. A picture in the colours of other features is painted in them here.
+//! Numbers are normalised per feature. Images stay bytes: they are scaled where they are encoded, after they have
+//! travelled. An image in the colours of other features is painted in them here.
 
 use crate::batch::{Batch, tensor};
 use crate::features::{FeatureKind, FeatureSpec, Features, Observation, Signature, Values, ValuesRef};
@@ -105,10 +105,10 @@ impl Preprocess {
     /// Raw values of every feature, of any number of steps -> what a network reads.
     fn read(&self, mut raw: Features<Values>) -> Result<Features<Values>> {
         for spec in self.signature.observation.iter().filter(|spec| !spec.colours.is_empty()) {
-            let Values::U8(mut pictures) = raw.require("see", &spec.name)?.clone() else {
+            let Values::U8(mut images) = raw.require("see", &spec.name)?.clone() else {
                 return Err(wrong_type(spec, "numbers", "bytes"));
             };
-            for (step, picture) in pictures.chunks_exact_mut(spec.width()).enumerate() {
+            for (step, image) in images.chunks_exact_mut(spec.width()).enumerate() {
                 let mut colours = [[0.0; 3]; 3];
                 for (name, colour) in spec.colours.iter().zip(&mut colours) {
                     let numbers = raw.require("see", name)?.numbers().unwrap_or_default();
@@ -125,9 +125,9 @@ impl Preprocess {
                         }
                     }
                 }
-                paint(picture, colours);
+                paint(image, colours);
             }
-            raw.insert(&spec.name, Values::U8(pictures));
+            raw.insert(&spec.name, Values::U8(images));
         }
         let mut read = Features::new();
         for spec in &self.signature.observation {
@@ -171,12 +171,12 @@ impl Preprocess {
 
 /// Channel k of every pixel becomes how much of `colours[k]` it has: its product with that colour, over the colour's sum, so
 /// that grey stays as it is and red, green and blue as colours are those channels. A colour of zeros has none.
-fn paint(picture: &mut [u8], colours: [[f32; 3]; 3]) {
+fn paint(image: &mut [u8], colours: [[f32; 3]; 3]) {
     let shares = colours.map(|colour| {
         let sum: f32 = colour.iter().map(|part| part.abs()).sum();
         colour.map(|part| if sum > 0.0 { part / sum } else { 0.0 })
     });
-    for pixel in picture.chunks_exact_mut(3) {
+    for pixel in image.chunks_exact_mut(3) {
         let seen = [0, 1, 2].map(|c| f32::from(pixel[c]));
         for (channel, share) in pixel.iter_mut().zip(&shares) {
             let product: f32 = share.iter().zip(&seen).map(|(share, seen)| share * seen).sum();
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_are_painted_in_the_colours_of_other_features() {
+    fn images_are_painted_in_the_colours_of_other_features() {
         let names = ["a", "b", "c"].map(|name| format!("{ENTITY_PREFIX}{name}"));
         let observation = vec![
             FeatureSpec::state(2),
@@ -328,7 +328,7 @@ mod tests {
         let rows = Features::from_iter(rows);
         let batch = preprocess.batch(1, &rows.map(|_, values| values.as_ref()), &[0.0], &[false]).unwrap();
         assert_eq!(batch.observation.get("front").unwrap().flatten_all().unwrap().to_vec1::<u8>().unwrap(), bytes);
-        // without them there is no picture
+        // without them there is no image
         let mut blind = history[1].clone();
         blind.take("test", &names[1]).unwrap();
         let error = preprocess.observation(&[blind]).unwrap_err().to_string();

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 const DIM: usize = 12;
 
-/// Both norms, one and two sizes of picture, odd ones among them.
+/// Both norms, one and two sizes of image, odd ones among them.
 #[test]
 fn tokens_and_gradients_are_the_composed_ones() {
     let (map, five) = (TokenKind::Map, TokenKind::Keypoints { count: 5 });
@@ -35,21 +35,20 @@ fn tokens_and_gradients_are_the_composed_ones() {
             let scale = if var.dims().len() == 1 { 0.1 } else { 0.0 };
             var.set(&(var.as_tensor() + (noise * scale).unwrap()).unwrap()).unwrap();
         }
-        let mut picture =
-            |&(h, w): &Size| Tensor::from_vec(rng.normals(rows * h * w * 3), (rows, h, w, 3), &Device::Cpu);
-        let pictures: Vec<Tensor> = sizes.iter().map(|size| picture(size).unwrap()).collect();
+        let mut image = |&(h, w): &Size| Tensor::from_vec(rng.normals(rows * h * w * 3), (rows, h, w, 3), &Device::Cpu);
+        let images: Vec<Tensor> = sizes.iter().map(|size| image(size).unwrap()).collect();
         let loss = |cx: &mut Context<'_>| {
-            let y = encoder.apply(cx, &pictures)?;
+            let y = encoder.apply(cx, &images)?;
             let weights = Rng::new(9, "weights").normals(y.len());
             let composed = Tensor::from_slice(&weights, y.dims(), &Device::Cpu)?;
-            let by_hand = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
+            let on_slices = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
                 if let Some((grad, _)) = grad {
                     grad.copy_from_slice(&weights);
                 }
                 y.iter().zip(&weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
             };
             let mut loss = Loss::default();
-            loss.add("sum", term_of(cx, &y, by_hand, |y| Ok(y.mul(&composed)?.sum_all()?))?, 1.0);
+            loss.add("sum", term_of(cx, &y, on_slices, |y| Ok(y.mul(&composed)?.sum_all()?))?, 1.0);
             Ok(loss)
         };
         let graph = cache.composed_loss(&params, None, loss).unwrap().total.backward().unwrap();
@@ -61,7 +60,7 @@ fn tokens_and_gradients_are_the_composed_ones() {
                 assert!((g - w).abs() <= tolerance * scale, "{what} {sizes:?}: {g} {w} (largest {scale})");
             }
         };
-        let want = flat(&encoder.forward(&pictures).unwrap());
+        let want = flat(&encoder.forward(&images).unwrap());
         for level in Level::ALL {
             at_most(level, || {
                 let step = || {
@@ -78,7 +77,7 @@ fn tokens_and_gradients_are_the_composed_ones() {
                 // predictions keep their panels
                 for _ in 0..2 {
                     let tokens =
-                        |cx: &mut Context<'_>| Ok::<_, ModelError>(Value::detached(&encoder.apply(cx, &pictures)?));
+                        |cx: &mut Context<'_>| Ok::<_, ModelError>(Value::detached(&encoder.apply(cx, &images)?));
                     let got = cache.predict(&params, &mut || {}, tokens).unwrap();
                     close(&flat(&got), &want, 1e-5, &format!("tokens {level:?}"));
                 }

@@ -231,7 +231,7 @@ impl ResNet {
     /// (b, H, W, 3) -> (b, ceil(H / 32), ceil(W / 32), 8 width)
     ///
     /// # Errors
-    /// Something that is no batch of pictures.
+    /// Something that is no batch of images.
     pub fn forward(&self, cx: &mut Context<'_>, x: &Value) -> Result<Value> {
         let x = conv2d(cx, x, self.conv1.parts(), &self.bn1, None, true)?;
         let mut x = max_pool(cx, &x)?;

@@ -1,4 +1,4 @@
-//! Convolutions over the steps of sequences, (b, T, C). For their kernels a sequence is a picture of one row.
+//! Convolutions over the steps of sequences, (b, T, C). For their kernels a sequence is an image of one row.
 
 use super::conv2d::{backward, forward, framed, weight_gradient, with_panels};
 use crate::context::{Context, read};
@@ -22,8 +22,8 @@ pub enum Then<'a> {
     Add(&'a Value),
 }
 
-fn along((pictures, width, channels): (usize, usize, usize), output: usize, kernel: usize, stride: usize) -> Conv {
-    let input = Frame { pictures, height: 1, width, channels, border: (0, (kernel - 1) / 2) };
+fn along((images, width, channels): (usize, usize, usize), output: usize, kernel: usize, stride: usize) -> Conv {
+    let input = Frame { images, height: 1, width, channels, border: (0, (kernel - 1) / 2) };
     Conv { input, output, kernel: (1, kernel), stride: (1, stride) }
 }
 
@@ -65,7 +65,7 @@ pub fn conv1d(cx: &mut Context<'_>, x: &Value, layer: &Conv1d) -> Result<Value> 
     let mut y = vec![0.0; made.inside()];
     with_bias(cx, &conv, layer, x, &mut y)?;
     let (x, layer, node) = (x.tensor.clone(), layer.clone(), x.node);
-    cx.result(y, &[made.pictures, made.width, made.channels], true, move |grad, back| {
+    cx.result(y, &[made.images, made.width, made.channels], true, move |grad, back| {
         of_bias(back, &layer, &grad);
         let framed = framed(&grad, &conv.made(conv.grad_border()), &mut back.space.pool);
         backward(back, &conv, &layer.weight, (&x, node), &framed)?;
@@ -86,7 +86,7 @@ pub fn conv1d_mish(
 ) -> Result<Value> {
     let conv = convolution(x, layer)?;
     let (made, output) = (conv.made((0, 0)), conv.output);
-    let shape = [made.pictures, made.width, output];
+    let shape = [made.images, made.width, output];
     super::check_shape("convolution", "norm", &norm.weight, &[output])?;
     let scales = match then {
         Then::Film(film) if film.dims() == [shape[0], 2 * output] => true,
@@ -112,7 +112,7 @@ pub fn conv1d_mish(
             Then::Add(x) => (y + &x.tensor)?,
         }));
     }
-    let (mut y, mut inverse) = (cx.space.pool.take(made.inside()), cx.space.pool.take(made.pictures * norm.groups));
+    let (mut y, mut inverse) = (cx.space.pool.take(made.inside()), cx.space.pool.take(made.images * norm.groups));
     with_bias(cx, &conv, layer, x, &mut y)?;
     group_norm(&mut y, &made, norm.groups, &mut inverse);
     let mut out = vec![0.0; made.inside()];
@@ -164,7 +164,7 @@ pub fn conv1d_mish(
             }
             back.space.pool.give(grad);
         }
-        of_bias(back, &layer, &before[..frame.pictures * frame.picture()]);
+        of_bias(back, &layer, &before[..frame.images * frame.image()]);
         backward(back, &conv, &layer.weight, (&x, of_x), &before)?;
         [y, inverse, before, grad].into_iter().for_each(|buffer| back.space.pool.give(buffer));
         if let Some(whole) = whole {

@@ -50,14 +50,14 @@ impl Case {
             let y = op(cx)?;
             let weights = Rng::new(9, "weights").normals(y.len());
             let composed = Tensor::from_slice(&weights, y.dims(), &Device::Cpu)?;
-            let by_hand = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
+            let on_slices = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
                 if let Some((grad, weight)) = grad {
                     grad.iter_mut().zip(&weights).for_each(|(grad, w)| *grad = (f64::from(*w) * weight) as f32);
                 }
                 y.iter().zip(&weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
             };
             let mut loss = Loss::default();
-            loss.add("sum", term_of(cx, &y, by_hand, |y| Ok(y.mul(&composed)?.sum_all()?))?, 0.8);
+            loss.add("sum", term_of(cx, &y, on_slices, |y| Ok(y.mul(&composed)?.sum_all()?))?, 0.8);
             Ok(loss)
         };
         self.check_loss(what, loss);

@@ -5,8 +5,8 @@ use crate::features::{FeatureSpec, Signature};
 use crate::layers::{Activation, AuxiliaryConfig, PointerConfig};
 use crate::models::act::Config;
 use crate::testing::{
-    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
-    move_parameters, signatures,
+    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients,
+    move_parameters, signatures, vision_config,
 };
 use candle_core::Device;
 use nn::ParamLayout;
@@ -26,7 +26,7 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         dropout: 0.2,
         ..Default::default()
     };
-    let Signatures { plain, no_env, entities, history, told, .. } = signatures();
+    let Signatures { plain, no_env, entities, history, with_auxiliary, .. } = signatures();
     let auxiliary = Some(AuxiliaryConfig { weight: 0.6 });
     let pointer = Some(PointerConfig { among: "cube".to_string(), weight: 0.7 });
     let gelu = Config { feedforward_activation: Activation::Gelu, ..base.clone() };
@@ -38,8 +38,8 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         (Config { pointer: pointer.clone(), ..base.clone() }, entities.clone(), 4),
         (Config { pointer, pre_norm: true, use_vae: false, ..base.clone() }, entities, 1),
         (base.clone(), history, 4),
-        (Config { auxiliary: auxiliary.clone(), ..base.clone() }, told.clone(), 3),
-        (Config { auxiliary, pre_norm: true, use_vae: false, ..base.clone() }, told, 2),
+        (Config { auxiliary: auxiliary.clone(), ..base.clone() }, with_auxiliary.clone(), 3),
+        (Config { auxiliary, pre_norm: true, use_vae: false, ..base.clone() }, with_auxiliary, 2),
         (Config { n_decoder_layers: 3, action_horizon: 17, n_vae_encoder_layers: 1, ..gelu.clone() }, no_env, 2),
         (Config { pre_norm: true, use_vae: false, ..gelu }, plain.clone(), 1),
         (Config { dim_model: 35, n_heads: 1, dim_feedforward: 70, action_horizon: 1, dropout: 0.0, ..base }, plain, 5),
@@ -54,15 +54,15 @@ fn cases() -> impl Iterator<Item = (Act, Batch, String)> {
     })
 }
 
-/// With pictures, whose network has too many kinks for slopes.
+/// With images, whose network has too many kinks for slopes.
 fn seeing() -> impl Iterator<Item = (Act, Batch, String)> {
     let (first, _, _) = configs().swap_remove(0);
-    let frozen = VisionConfig { norm: ImageNorm::Frozen, crop: None, ..eyes() };
-    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..eyes() };
-    let finer = VisionConfig { blocks: Some([2, 2, 1, 0]), ..eyes() };
-    [eyes(), frozen, keypoints, finer].into_iter().map(move |vision| {
+    let frozen = VisionConfig { norm: ImageNorm::Frozen, crop: None, ..vision_config() };
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..vision_config() };
+    let finer = VisionConfig { blocks: Some([2, 2, 1, 0]), ..vision_config() };
+    [vision_config(), frozen, keypoints, finer].into_iter().map(move |vision| {
         let config = Config { vision: Some(vision), ..first.clone() };
-        let signature = signatures().pictures;
+        let signature = signatures().images;
         let act = Act::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&act);
         (act, batch(&signature, config.action_horizon, 3, 3), format!("{config:?}"))
@@ -70,7 +70,7 @@ fn seeing() -> impl Iterator<Item = (Act, Batch, String)> {
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one_with_dropout() {
+fn the_step_on_kernels_is_the_composed_one_with_dropout() {
     for (act, batch, what) in cases().chain(seeing()) {
         assert_the_step_is_the_composed_one(&act, &batch, &what);
     }
@@ -138,12 +138,12 @@ fn features_that_act_cannot_read_are_refused_by_name() {
     assert_eq!(error(signature.clone()), format!("config of vision: observation is {expected}"));
     signature.observation[2] = FeatureSpec::image(front, 8, 8);
     let with = |vision: VisionConfig| Config { vision: Some(vision), ..config.clone() };
-    let small = Act::new(&with(VisionConfig { crop: Some(9), ..eyes() }), &signature, 1, &Backend::CPU)
+    let small = Act::new(&with(VisionConfig { crop: Some(9), ..vision_config() }), &signature, 1, &Backend::CPU)
         .unwrap_err()
         .to_string();
     assert_eq!(small, "config of vision: crop is 9, expected at most the image's side, 8");
     for blocks in [[0, 2, 2, 2], [2, 0, 2, 2], [0; 4]] {
-        let vision = VisionConfig { blocks: Some(blocks), crop: None, ..eyes() };
+        let vision = VisionConfig { blocks: Some(blocks), crop: None, ..vision_config() };
         let refused = Act::new(&with(vision), &signature, 1, &Backend::CPU).unwrap_err().to_string();
         assert!(refused.starts_with(&format!("config of vision: blocks is {blocks:?}, expected")), "{refused}");
     }

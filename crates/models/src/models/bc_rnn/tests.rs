@@ -4,7 +4,8 @@ use crate::features::Values;
 use crate::layers::Cell;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+    vision_config,
 };
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
@@ -44,7 +45,7 @@ fn the_gradient_is_the_slope_of_the_loss() {
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one() {
+fn the_step_on_kernels_is_the_composed_one() {
     let signature = signatures().history;
     let other = Config { n_layers: 3, hidden_dim: 17, n_modes: 5, ..small() };
     let gru = |config: Config| Config { cell: Cell::Gru, ..config };
@@ -63,37 +64,40 @@ fn the_step_by_hand_is_the_composed_one() {
     }
 }
 
-/// What it sees of two cameras' pictures, a step after another.
-fn film() -> Signature {
-    Signature { n_obs_steps: 3, ..signatures().film }
+/// What it sees of two cameras' images, a step after another.
+fn image_history() -> Signature {
+    Signature { n_obs_steps: 3, ..signatures().image_history }
 }
 
 #[test]
-fn from_pictures_the_step_by_hand_is_the_composed_one() {
+fn from_images_the_step_on_kernels_is_the_composed_one() {
     for rows in [1, 4] {
-        let model = BcRnn::new(&Config { vision: Some(eyes()), ..small() }, &film(), 1, &Backend::CPU).unwrap();
+        let model =
+            BcRnn::new(&Config { vision: Some(vision_config()), ..small() }, &image_history(), 1, &Backend::CPU)
+                .unwrap();
         move_parameters(&model);
-        assert_the_step_is_the_composed_one(&model, &padded_before(&film(), rows), &format!("{rows} rows"));
+        assert_the_step_is_the_composed_one(&model, &padded_before(&image_history(), rows), &format!("{rows} rows"));
     }
-    let (signature, config) = (signatures().pictures, Config { action_horizon: 1, vision: Some(eyes()), ..small() });
+    let (signature, config) =
+        (signatures().images, Config { action_horizon: 1, vision: Some(vision_config()), ..small() });
     let model = BcRnn::new(&config, &signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     assert_the_step_is_the_composed_one(&model, &batch(&signature, 1, 2, 3), "one step");
 }
 
 #[test]
-fn from_pictures_the_policy_sees_one_step_at_a_time() {
-    let signature = film();
+fn from_images_the_policy_sees_one_step_at_a_time() {
+    let signature = image_history();
     let modes = [STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
     let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
     let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser, &Device::Cpu).unwrap());
-    let config = Config { n_modes: 1, vision: Some(eyes()), ..small() };
+    let config = Config { n_modes: 1, vision: Some(vision_config()), ..small() };
     let model = Arc::new(BcRnn::new(&config, &signature, 1, &Backend::CPU).unwrap());
     let mut policy = Arc::clone(&model).policy(Arc::clone(&preprocess), Box::new(Ticks(0.0)));
     let seen = |k: usize| {
-        let picture: Vec<u8> = (0..36 * 40 * 3).map(|i| ((i * 7 + k * 31) % 251) as u8).collect();
+        let image: Vec<u8> = (0..36 * 40 * 3).map(|i| ((i * 7 + k * 31) % 251) as u8).collect();
         let mut observation = Observation::of_state(vec![k as f32 * 0.3, 1.0, -0.5], Vec::new());
-        observation.insert("a", Values::U8(picture));
+        observation.insert("a", Values::U8(image));
         observation
     };
     policy.reset(7);

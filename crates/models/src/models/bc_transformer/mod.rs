@@ -6,7 +6,7 @@
 //! Before an episode has as many steps as the context, the first observation is repeated, there and here.
 //!
 //! Deviations: one dropout for tokens, attention and outputs; a window ends with its frame in the loss, where robomimic's may
-//! end with repeats of an episode's last one. Pictures become the cells of `[policy.vision]`'s feature map behind a step's
+//! end with repeats of an episode's last one. Images become the cells of `[policy.vision]`'s feature map behind a step's
 //! numbers (robomimic: keypoints). No goals, no supervision of all steps, no sinusoidal positions. The means lie
 //! in -1 to 1, so that actions have to be normalised by their range (`normalisation.action = "min_max"`).
 //!
@@ -150,7 +150,7 @@ impl BcTransformer {
         })
     }
 
-    /// The signature's features, (b, T, …) each, pictures as the network reads them -> b mixtures, of the last step
+    /// The signature's features, (b, T, …) each, images as the network reads them -> b mixtures, of the last step
     fn forward(&self, cx: &mut Context<'_>, rows: usize, observation: &Features<Tensor>) -> Result<MixtureParts> {
         let (steps, dim) = (self.signature.n_obs_steps, self.config.dim_model);
         let seen = self.steps.apply(cx, rows, observation)?;
@@ -165,11 +165,11 @@ impl BcTransformer {
         self.head.apply(cx, &read.reshape((rows, dim))?)
     }
 
-    /// The signature's features, (b, T, …) each -> b mixtures, of the last step; `on_seen` is called when pictures have been
+    /// The signature's features, (b, T, …) each -> b mixtures, of the last step; `on_seen` is called when images have been
     /// encoded.
     fn mixtures_seen(&self, observation: &Features<Tensor>, on_seen: &mut dyn FnMut()) -> Result<Mixture> {
         let rows = check_observation("bc_transformer", &self.signature, observation)?;
-        let observation = self.steps.look(observation, None)?;
+        let observation = self.steps.prepare(observation, None)?;
         self.cache.predict(&self.params, on_seen, |cx| self.forward(cx, rows, &observation)?.mixture())
     }
 
@@ -197,7 +197,7 @@ impl PolicyModel for BcTransformer {
 
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch("bc_transformer", &self.signature, self.config.action_horizon, batch)?;
-        let observation = self.steps.look(&batch.observation, Some(cx.rng()?))?;
+        let observation = self.steps.prepare(&batch.observation, Some(cx.rng()?))?;
         let mixtures = self.forward(cx, batch.rows(), &observation)?;
         let real = Tensor::ones(batch.rows(), DType::F32, batch.device())?;
         let (nll, l1) = mixture_likelihood(cx, &mixtures, (&batch.actions.squeeze(1)?, &real), batch.total_rows)?;
@@ -238,7 +238,8 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::testing::{
-        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+        vision_config,
     };
     use crate::train::{TrainConfig, Trainer};
 
@@ -247,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn the_step_by_hand_is_the_composed_one() {
+    fn the_step_on_kernels_is_the_composed_one() {
         let of = signatures();
         for (signature, n_layers, dropout) in
             [(&of.history, 1, 0.0), (&of.history, 3, 0.2), (&of.plain, 2, 0.2), (&of.entities, 2, 0.0)]
@@ -261,10 +262,10 @@ mod tests {
     }
 
     #[test]
-    fn from_pictures_the_step_by_hand_is_the_composed_one() {
+    fn from_images_the_step_on_kernels_is_the_composed_one() {
         let of = signatures();
-        for signature in [&of.pictures, &of.film] {
-            let config = Config { vision: Some(eyes()), dropout: 0.2, ..small() };
+        for signature in [&of.images, &of.image_history] {
+            let config = Config { vision: Some(vision_config()), dropout: 0.2, ..small() };
             let model = BcTransformer::new(&config, signature, 1, &Backend::CPU).unwrap();
             move_parameters(&model);
             let batch = batch(signature, 1, 3, 3);

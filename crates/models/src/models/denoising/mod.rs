@@ -126,10 +126,10 @@ impl<M: Method> Denoising<M> {
     ) -> Result<Self> {
         signature.check(M::NAME, READS)?;
         let refuse = |field, found, expected| Err(ModelError::Config { model: M::NAME, field, found, expected });
-        let pictures: Vec<&str> = signature.of_kind(FeatureKind::Image).map(|spec| spec.name.as_str()).collect();
-        if setup.transformer.is_some() && !pictures.is_empty() {
+        let images: Vec<&str> = signature.of_kind(FeatureKind::Image).map(|spec| spec.name.as_str()).collect();
+        if setup.transformer.is_some() && !images.is_empty() {
             let expected = "none where there are images, which it does not see".to_string();
-            return refuse("transformer", format!("one beside {}", pictures.join(", ")), expected);
+            return refuse("transformer", format!("one beside {}", images.join(", ")), expected);
         }
         let (horizon, n_obs_steps, action_dim) = (setup.action_horizon, signature.n_obs_steps, signature.action_dim);
         if horizon < n_obs_steps {
@@ -178,7 +178,7 @@ impl<M: Method> Denoising<M> {
         })
     }
 
-    /// The mean squared errors of a batch whose pictures are as the network reads them. With `mask_padding` steps beyond an
+    /// The mean squared errors of a batch whose images are as the network reads them. With `mask_padding` steps beyond an
     /// episode's ends do not count.
     fn loss_of(&self, cx: &mut Context<'_>, batch: &Batch, targets: &[Target]) -> Result<Loss> {
         let (rows, horizon, width) = batch.actions.dims3()?;
@@ -202,7 +202,7 @@ impl<M: Method> Denoising<M> {
         Ok(self.cache.composed_loss(&self.params, None, |cx| self.loss_of(cx, batch, targets))?.total)
     }
 
-    /// Actions, (b, H, A), with this noise; `on_seen` is called when the pictures were seen.
+    /// Actions, (b, H, A), with this noise; `on_seen` is called when the images were seen.
     pub(crate) fn drawn_with(
         &self,
         observation: &Features<Tensor>,
@@ -261,7 +261,7 @@ impl<M: Method> PolicyModel for Denoising<M> {
 
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch(M::NAME, &self.signature, self.action_horizon, batch)?;
-        let batch = &self.condition.looked_at(batch, cx.rng()?)?;
+        let batch = &self.condition.with_images(batch, cx.rng()?)?;
         let targets = self.method.targets(cx.rng()?, &batch.actions)?;
         self.loss_of(cx, batch, &targets)
     }

@@ -4,7 +4,7 @@
 //!
 //! Deviations: every action attends to all observations (there, with `causal_attn`, the first ones not to the last ones);
 //! no dropout of tokens (0 in their experiments on low-dimensional observations) and no encoder over the observations
-//! (`n_cond_layers`, 0 there); no pictures.
+//! (`n_cond_layers`, 0 there); no images.
 
 use super::unet::embedding;
 use crate::layers::{Activation, DecoderLayer, LayerNorm, Linear, Shape};

@@ -4,7 +4,7 @@
 //! implementation: LeRobot 0.6.1's `DiffusionPolicy`, of which this has the tensors' names and, on fixtures made with it, the
 //! outputs, the loss and the gradients.
 //!
-//! Deviations: numbers are joined in the signature's order, entities among them, and before what the cameras see; pictures go
+//! Deviations: numbers are joined in the signature's order, entities among them, and before what the cameras see; images go
 //! through `[policy.vision]`'s network and become its map's cells (Chi et al. and LeRobot: keypoints), of every step seen;
 //! betas are those of the squared cosine only; actions are drawn with DDIM in 10 steps unless the configuration says otherwise (LeRobot: DDPM
 //! in as many as were trained); every frame starts a window (LeRobot leaves out the last 7 of an episode). The moving average

@@ -4,7 +4,8 @@ use crate::encoders::{ImageNorm, TokenKind, VisionConfig};
 use crate::features::FeatureKind;
 use crate::model::PolicyModel;
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+    vision_config,
 };
 use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
@@ -23,16 +24,16 @@ fn attending(transformer: TransformerConfig) -> Config {
     Config { transformer: Some(transformer), ..small() }
 }
 
-/// With pictures, whose network has too many kinks for slopes; of one step and of two.
+/// With images, whose network has too many kinks for slopes; of one step and of two.
 fn seeing() -> Vec<(Signature, Config)> {
     let of = signatures();
-    let frozen = VisionConfig { norm: ImageNorm::Frozen, cell_features: Some(4), ..eyes() };
+    let frozen = VisionConfig { norm: ImageNorm::Frozen, cell_features: Some(4), ..vision_config() };
     let masked = Config { mask_padding: true, vision: Some(frozen), ..small() };
-    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 5 }, ..eyes() };
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 5 }, ..vision_config() };
     vec![
-        (of.pictures, Config { vision: Some(eyes()), ..small() }),
-        (of.film.clone(), masked),
-        (of.film, Config { vision: Some(keypoints), ..small() }),
+        (of.images, Config { vision: Some(vision_config()), ..small() }),
+        (of.image_history.clone(), masked),
+        (of.image_history, Config { vision: Some(keypoints), ..small() }),
     ]
 }
 
@@ -64,7 +65,7 @@ fn the_gradient_is_the_slope_of_the_loss() {
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one() {
+fn the_step_on_kernels_is_the_composed_one() {
     for (signature, config) in cases().into_iter().chain(seeing()) {
         let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
@@ -199,19 +200,20 @@ fn impossible_configurations_name_the_field() {
     assert!(attends(|t| t.dim_model = 9).contains("transformer.dim_model is 9"));
     assert!(attends(|t| t.n_layers = 0).contains("transformer.n_layers is 0"));
     assert!(attends(|t| t.dropout = 1.0).contains("transformer.dropout is 1"));
-    let both = Config { vision: Some(eyes()), ..attending(tokens()) };
+    let both = Config { vision: Some(vision_config()), ..attending(tokens()) };
     assert!(error(both).contains("vision is given, expected none with a transformer"));
-    // a signature with pictures brings an encoder of its own
-    let unseen = Diffusion::new(&attending(tokens()), &of.pictures, 0, &Backend::CPU).unwrap_err().to_string();
+    // a signature with images brings an encoder of its own
+    let unseen = Diffusion::new(&attending(tokens()), &of.images, 0, &Backend::CPU).unwrap_err().to_string();
     assert!(unseen.contains("transformer is one beside a, b, c, expected none where there are images"), "{unseen}");
     let sees = |vision| {
         let config = Config { vision: Some(vision), ..small() };
-        Diffusion::new(&config, &of.pictures, 0, &Backend::CPU).unwrap_err().to_string()
+        Diffusion::new(&config, &of.images, 0, &Backend::CPU).unwrap_err().to_string()
     };
     assert!(
-        sees(VisionConfig { cell_features: Some(6), ..eyes() }).contains("cell_features is 6, expected a multiple")
+        sees(VisionConfig { cell_features: Some(6), ..vision_config() })
+            .contains("cell_features is 6, expected a multiple")
     );
-    let blind = error(Config { vision: Some(eyes()), ..small() });
+    let blind = error(Config { vision: Some(vision_config()), ..small() });
     assert!(blind.contains("expected a feature of kind image"), "{blind}");
     let long = Signature { n_obs_steps: 9, ..of.plain.clone() };
     let error = Diffusion::new(&small(), &long, 0, &Backend::CPU).unwrap_err().to_string();
@@ -233,11 +235,11 @@ fn what_a_camera_sees_decides_and_is_told_before_anything_is_drawn() {
         // every camera, and of a history every step
         for spec in signature.of_kind(FeatureKind::Image) {
             for step in 0..signature.n_obs_steps {
-                let picture = one.get(&spec.name).unwrap();
-                let mut bytes = picture.flatten_all().unwrap().to_vec1::<u8>().unwrap();
+                let image = one.get(&spec.name).unwrap();
+                let mut bytes = image.flatten_all().unwrap().to_vec1::<u8>().unwrap();
                 bytes[step * spec.width()..][..spec.width()].iter_mut().for_each(|byte| *byte = 255 - *byte);
                 let mut other = one.clone();
-                other.insert(&spec.name, Tensor::from_vec(bytes, picture.shape(), &Device::Cpu).unwrap());
+                other.insert(&spec.name, Tensor::from_vec(bytes, image.shape(), &Device::Cpu).unwrap());
                 let then = flat(model.sample(&other, &mut Rng::new(1, "policy")).unwrap());
                 assert_ne!(then, first, "{} step {step}", spec.name);
             }

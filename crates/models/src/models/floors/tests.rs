@@ -161,7 +161,7 @@ fn what_cannot_be_is_named() {
     );
     let none = nearest::Config { k: 0, ..Default::default() };
     assert!(error(Nearest::new(&none, &signature, 0, &Backend::CPU).unwrap_err()).contains("k is 0"));
-    let sees = signatures().pictures;
+    let sees = signatures().images;
     assert!(
         error(Replay::new(&Config::default(), &sees, 0, &Backend::CPU).unwrap_err())
             .contains("replay cannot read feature a")

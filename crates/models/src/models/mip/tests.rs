@@ -3,7 +3,8 @@ use super::*;
 use crate::model::PolicyModel;
 use crate::models::denoising::NetworkConfig;
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
+    vision_config,
 };
 use crate::train::{TrainConfig, Trainer};
 use candle_core::{DType, Device};
@@ -14,7 +15,7 @@ fn small() -> Config {
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one() {
+fn the_step_on_kernels_is_the_composed_one() {
     let of = signatures();
     for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
         let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
@@ -24,12 +25,12 @@ fn the_step_by_hand_is_the_composed_one() {
 }
 
 #[test]
-fn from_pictures_too() {
-    let signature = signatures().film;
-    let model = Mip::new(&Config { vision: Some(eyes()), ..small() }, &signature, 1, &Backend::CPU).unwrap();
+fn from_images_too() {
+    let signature = signatures().image_history;
+    let model = Mip::new(&Config { vision: Some(vision_config()), ..small() }, &signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     let batch = batch(&signature, 8, 3, 3);
-    assert_the_step_is_the_composed_one(&model, &batch, "pictures");
+    assert_the_step_is_the_composed_one(&model, &batch, "images");
     let got = model.predict(&batch.observation).unwrap();
     let want = model.predict_composed(&batch.observation).unwrap();
     let off = (got - want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
