@@ -5,11 +5,10 @@ use crate::batch::{Batch, Taken};
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, FeatureSpec, Features, Signature, Values};
 use crate::model::PolicyModel;
+use crate::train::{StepMetrics, TrainConfig, Trainer};
 use candle_core::{Device, Tensor};
-use nn::LossValues;
-use nn::Rng;
 use nn::simd::{Level, at_most};
-use nn::{Gradients, ParamLayout};
+use nn::{Gradients, LossValues, ParamLayout, Result, Rng};
 use std::sync::Arc;
 
 /// Moves norms and biases away from their initial 1 and 0, where errors would hide.
@@ -89,6 +88,22 @@ pub(crate) fn signatures() -> Signatures {
     image_history.observation.push(FeatureSpec::image("a", 36, 40));
     let with_auxiliary = Signature { auxiliary_dim: 3, ..plain.clone() };
     Signatures { plain, no_env, entities, grid, history, images, image_history, with_auxiliary }
+}
+
+/// The losses of a training on one batch, after making sure that it gives the same bits twice.
+pub(crate) fn losses_of_training<M: PolicyModel + 'static>(
+    build: impl Fn() -> Result<M>,
+    batch: &Batch,
+    (steps, lr): (u64, f64),
+) -> Vec<StepMetrics> {
+    let run = || {
+        let config = TrainConfig { steps, lr, warmup_steps: 3, ..Default::default() };
+        let mut trainer = Trainer::new(Box::new(build().unwrap()), config, 5).unwrap();
+        (0..steps).map(|_| trainer.step(batch).unwrap()).collect::<Vec<_>>()
+    };
+    let losses = run();
+    assert_eq!(run(), losses);
+    losses
 }
 
 /// Loss and gradients as the trainer gets them.

@@ -5,7 +5,7 @@
 //! counts agree: CNN 74,850, Transformer 616,514, small TRM 9,922 and 28,258. Initial weights
 //! come from our own generator.
 
-use crate::layers::{Activation, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention};
+use crate::layers::{Activation, FeedForward, LayerNorm, Linear, MultiHeadAttention};
 use candle_core::Tensor;
 use nn::Backend;
 use nn::Rng;
@@ -219,9 +219,9 @@ impl GridModel for Transformer {
         let cells = channels_last(grid)?.reshape((batch, self.dims.cells(), ()))?;
         let mut x = self.input.forward(&cells)?.broadcast_add(&self.positions)?;
         for layer in &self.layers {
-            let mixed = layer.attention.forward(&x, &x, &x, None, &mut Mode::Eval)?;
+            let mixed = layer.attention.forward(&x)?;
             x = layer.norm1.forward(&(x + mixed)?)?;
-            let fed = layer.feed_forward.forward(&x, &mut Mode::Eval)?;
+            let fed = layer.feed_forward.forward(&x)?;
             x = layer.norm2.forward(&(x + fed)?)?;
         }
         let x = self.hidden.forward(&x)?.relu()?;

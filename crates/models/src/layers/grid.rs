@@ -280,7 +280,7 @@ mod tests {
                 }
             }
             let after = (x.squeeze(0).unwrap().narrow(0, cell, 1).unwrap() + sum.unsqueeze(0).unwrap()).unwrap();
-            let dense = layer.ff.forward(&layer.norm2.forward(&after).unwrap(), &mut super::super::Mode::Eval).unwrap();
+            let dense = layer.ff.forward(&layer.norm2.forward(&after).unwrap()).unwrap();
             let off = ((&after + dense).unwrap() - got.narrow(0, cell, 1).unwrap()).unwrap();
             assert!(off.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-5);
         }

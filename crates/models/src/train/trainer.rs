@@ -95,11 +95,6 @@ impl Trainer {
         self.model.as_ref()
     }
 
-    /// Gives the model back.
-    pub fn into_model(self) -> Box<dyn PolicyModel> {
-        self.model
-    }
-
     /// Steps taken.
     pub fn step_count(&self) -> u64 {
         self.core.steps()

@@ -13,7 +13,7 @@ use crate::value::Value;
 /// # Errors
 /// An input of another width, layers without a bias.
 pub fn feed_forward(cx: &mut Context<'_>, x: &Value, layer: &FeedForward, all: usize) -> Result<Value> {
-    let mask = cx.dropout(layer.dropout.p);
+    let mask = cx.dropout(layer.dropout);
     let [b, t, dim] = super::sizes("feed forward", &x.tensor)?;
     let activation = layer.activation;
     let (one, two) = (&layer.linear1, &layer.linear2);

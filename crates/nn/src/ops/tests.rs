@@ -7,7 +7,7 @@ use crate::backend::Backend;
 use crate::context::{Cache, Context};
 use crate::gradients::{Gradients, ParamLayout};
 use crate::layers::{
-    Activation, Cell, Conv1d, Dropout, FeedForward, GroupNorm, LayerNorm, Linear, MixtureHead, MixtureParts, Recurrent,
+    Activation, Cell, Conv1d, FeedForward, GroupNorm, LayerNorm, Linear, MixtureHead, MixtureParts, Recurrent,
     Upsample1d,
 };
 use crate::loss::Loss;
@@ -196,7 +196,7 @@ fn feed_forward_and_activations() {
         let (b, t, all, dim, hidden) = (3, 2, 4, 12, 19);
         let x = case.tensor("x", &[b, t, dim]);
         let (linear1, linear2) = (case.linear("one", dim, hidden), case.linear("two", hidden, dim));
-        let layer = FeedForward { linear1, linear2, activation: kind, dropout: Dropout { p } };
+        let layer = FeedForward { linear1, linear2, activation: kind, dropout: p };
         case.check("feed forward", |cx| {
             let x = value(cx, &x);
             feed_forward(cx, &x, &layer, all)
@@ -408,7 +408,7 @@ fn every_operation_names_what_it_refuses() {
     let mut case = Case::new();
     let (layer, norm, wide) = (case.linear("layer", 4, 4), case.norm("norm", 4), case.linear("wide", 36, 4));
     let (one, two) = (case.linear("one", 4, 8), case.linear("two", 8, 4));
-    let ff = FeedForward { linear1: one, linear2: two, activation: Activation::Relu, dropout: Dropout { p: 0.0 } };
+    let ff = FeedForward { linear1: one, linear2: two, activation: Activation::Relu, dropout: 0.0 };
     let (inner, bias) = (case.tensor("inner", &[12, 4]), case.tensor("bias", &[12]));
     let conv = Conv1d::new(&mut case.params, "conv", (4, 8, 3), 1, &mut case.rng).unwrap();
     let double = Upsample1d::new(&mut case.params, "double", 4, &mut case.rng).unwrap();

@@ -185,7 +185,7 @@ impl Actrm {
                 }
                 let z = reasoning.detached().broadcast_add(&design.latent_pos.weight.detach().unsqueeze(0)?)?;
                 let context = Tensor::cat(&[&z, &y, &memory], 1)?;
-                attention = Some(attn.weights(&y, &context, None)?.mean(1)?.detach());
+                attention = Some(attn.weights(&y, &context)?.mean(1)?.detach());
                 Ok(())
             };
             *carry = design.round(cx, &self.config, observed, (carry, at), &mut between)?;

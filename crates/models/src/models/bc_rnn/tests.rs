@@ -4,10 +4,9 @@ use crate::features::Values;
 use crate::layers::Cell;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
-    vision_config,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training, move_parameters,
+    signatures, vision_config,
 };
-use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
 use std::collections::BTreeMap;
 
@@ -180,18 +179,9 @@ fn the_policy_carries_its_state_and_begins_anew_after_its_horizon() {
 #[test]
 fn training_lowers_the_loss_with_the_same_bits_every_time() {
     let signature = signatures().history;
-    let run = || {
-        let config = Config { hidden_dim: 24, ..small() };
-        let model = Box::new(BcRnn::new(&config, &signature, 1, &Backend::CPU).unwrap());
-        let settings = TrainConfig { steps: 60, lr: 1e-2, warmup_steps: 3, ..Default::default() };
-        let mut trainer = Trainer::new(model, settings, 5).unwrap();
-        let batch = padded_before(&signature, 8);
-        let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
-        (losses[0], losses[59])
-    };
-    let (first, last) = run();
-    assert!(last < first - 0.5, "{first} {last}");
-    assert_eq!(run(), (first, last));
+    let build = || BcRnn::new(&Config { hidden_dim: 24, ..small() }, &signature, 1, &Backend::CPU);
+    let losses = losses_of_training(build, &padded_before(&signature, 8), (60, 1e-2));
+    assert!(losses[59].loss < losses[0].loss - 0.5, "{losses:?}");
 }
 
 #[test]

@@ -4,10 +4,9 @@ use crate::encoders::{ImageNorm, TokenKind, VisionConfig};
 use crate::features::FeatureKind;
 use crate::model::PolicyModel;
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, move_parameters, signatures,
-    vision_config,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training, move_parameters,
+    signatures, vision_config,
 };
-use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
 use nn::simd::{Level, at_most};
 
@@ -144,18 +143,10 @@ fn ddpm_with_a_network_that_knows_the_noise_comes_back_to_the_actions() {
 #[test]
 fn training_lowers_the_loss_with_the_same_bits_every_time() {
     let signature = signatures().history;
-    let run = || {
-        let model = Box::new(Diffusion::new(&small(), &signature, 1, &Backend::CPU).unwrap());
-        let settings = TrainConfig { steps: 60, lr: 3e-3, warmup_steps: 3, ..Default::default() };
-        let mut trainer = Trainer::new(model, settings, 5).unwrap();
-        let batch = batch(&signature, 8, 16, 0);
-        let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
-        let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
-        (mean(&losses[..10]), mean(&losses[50..]))
-    };
-    let (first, last) = run();
-    assert!(last < 0.9 * first, "{first} {last}");
-    assert_eq!(run(), (first, last));
+    let build = || Diffusion::new(&small(), &signature, 1, &Backend::CPU);
+    let losses = losses_of_training(build, &batch(&signature, 8, 16, 0), (60, 3e-3));
+    let ten = |from: usize| losses[from..from + 10].iter().map(|step| step.loss).sum::<f32>();
+    assert!(ten(50) < 0.9 * ten(0), "{losses:?}");
 }
 
 #[test]
