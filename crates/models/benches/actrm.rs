@@ -7,7 +7,7 @@
 use candle_core::{Device, Tensor};
 use models::act::{self, Act};
 use models::actrm::{self, Actrm};
-use models::{Features, PolicyModel, Signature};
+use models::{Backend, Features, PolicyModel, Signature};
 use std::time::Instant;
 
 fn main() {
@@ -23,8 +23,10 @@ fn main() {
         // every step runs: the worst case of the default depth
         ours.reasoning.halt_threshold = 1.0;
         ours.reasoning.change_threshold = 0.0;
-        let models: [Box<dyn PolicyModel>; 2] =
-            [Box::new(Act::new(&act, &signature, 0).unwrap()), Box::new(Actrm::new(&ours, &signature, 0).unwrap())];
+        let models: [Box<dyn PolicyModel>; 2] = [
+            Box::new(Act::new(&act, &signature, 0, &Backend::CPU).unwrap()),
+            Box::new(Actrm::new(&ours, &signature, 0, &Backend::CPU).unwrap()),
+        ];
         let mut seconds = [Vec::new(), Vec::new()];
         for _ in 0..repeats {
             for (model, seconds) in models.iter().zip(&mut seconds) {

@@ -9,7 +9,9 @@
 #![allow(clippy::unwrap_used)]
 
 use models::actrm::{Actrm, Over, ReasoningConfig};
-use models::{Batch, Features, LossParts, PolicyConfig, PolicyModel, Rng, Signature, TrainConfig, Trainer, act, actrm};
+use models::{
+    Backend, Batch, Features, LossParts, PolicyConfig, PolicyModel, Rng, Signature, TrainConfig, Trainer, act, actrm,
+};
 use serde_json::json;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
@@ -71,7 +73,8 @@ fn batch(size: &str) -> Batch {
 }
 
 fn trainer(config: &PolicyConfig, threads: usize) -> Trainer {
-    let mut trainer = Trainer::new(config.build(&signature(), 1).unwrap(), TrainConfig::default(), 1).unwrap();
+    let mut trainer =
+        Trainer::new(config.build(&signature(), 1, &Backend::CPU).unwrap(), TrainConfig::default(), 1).unwrap();
     trainer.set_threads(threads);
     trainer
 }
@@ -211,7 +214,7 @@ impl Bench {
         }
         let name = format!("ACT predict {size}, batch 1");
         if self.wants(&name) {
-            let model = act_config(size).build(&signature(), 1).unwrap();
+            let model = act_config(size).build(&signature(), 1, &Backend::CPU).unwrap();
             let mut peer = self.python.as_deref().map(Peer::start);
             let theirs = peer.as_mut().map(|peer| || peer.timed("predict", size, 1, repeats(size)));
             self.in_turns(&name, Some(0.6), false, || predictions(model.as_ref(), size, repeats(size)), theirs);
@@ -222,9 +225,9 @@ impl Bench {
     /// ACTRM's predictions beside ACT's and the original's plan.
     fn actrm(&mut self, size: &str) {
         let name = format!("ACTRM predict {size} (peer: our ACT)");
-        let ours = PolicyConfig::Actrm(actrm_config(size, full_depth())).build(&signature(), 1).unwrap();
+        let ours = PolicyConfig::Actrm(actrm_config(size, full_depth())).build(&signature(), 1, &Backend::CPU).unwrap();
         if self.wants(&name) {
-            let act = act_config(size).build(&signature(), 1).unwrap();
+            let act = act_config(size).build(&signature(), 1, &Backend::CPU).unwrap();
             let theirs = Some(|| predictions(act.as_ref(), size, repeats(size)));
             self.in_turns(&name, Some(2.0), false, || predictions(ours.as_ref(), size, repeats(size)), theirs);
         }
@@ -238,7 +241,8 @@ impl Bench {
         // on our own layers the plan is as fast as it can be made: what remains is what the design saves
         let name = format!("ACTRM predict {size} (peer: {ORIGINAL_CALLS} calls of our encoder)");
         if self.wants(&name) {
-            let plan = PolicyConfig::Actrm(actrm_config(size, original_plan())).build(&signature(), 1).unwrap();
+            let plan =
+                PolicyConfig::Actrm(actrm_config(size, original_plan())).build(&signature(), 1, &Backend::CPU).unwrap();
             let theirs = Some(|| predictions(plan.as_ref(), size, 1));
             self.in_turns(&name, None, false, || predictions(ours.as_ref(), size, repeats(size)), theirs);
         }
@@ -265,7 +269,7 @@ impl Bench {
             return;
         }
         let config = actrm_config(size, reasoning);
-        let composed = Actrm::new(&config, &signature(), 1).unwrap();
+        let composed = Actrm::new(&config, &signature(), 1, &Backend::CPU).unwrap();
         let (batch, mut trainer) = (batch(size), trainer(&PolicyConfig::Actrm(config), 1));
         let ours = || timed(1, &mut || drop(trainer.step(&batch).unwrap()));
         // the composed model's gradients only: what the optimiser costs is in ours

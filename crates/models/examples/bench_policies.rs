@@ -8,7 +8,7 @@
 //! part of a row's name.
 #![allow(clippy::unwrap_used)]
 
-use models::{Batch, Features, PolicyConfig, Rng, Signature, TrainConfig, Trainer};
+use models::{Backend, Batch, Features, PolicyConfig, Rng, Signature, TrainConfig, Trainer};
 use serde_json::json;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
@@ -101,9 +101,10 @@ fn main() {
         let a: Vec<f32> = (0..BATCH * horizon * 7).map(|_| 2.0 * rng.uniform() - 1.0).collect();
         let pad = vec![false; BATCH * horizon];
         let batch = Batch::from_slices(&signature, horizon, &Features::of_slices(&s, &e), &a, &pad).unwrap();
-        let mut trainer = Trainer::new(config.build(&signature, 1).unwrap(), TrainConfig::default(), 1).unwrap();
+        let mut trainer =
+            Trainer::new(config.build(&signature, 1, &Backend::CPU).unwrap(), TrainConfig::default(), 1).unwrap();
         trainer.set_threads(1);
-        let model = config.build(&signature, 1).unwrap();
+        let model = config.build(&signature, 1, &Backend::CPU).unwrap();
         let one = batch.observation.map(|_, t| t.narrow(0, 0, 1).unwrap().contiguous().unwrap());
         for (work, times, bar) in works {
             let name =

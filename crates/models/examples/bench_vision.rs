@@ -2,13 +2,13 @@
 //!
 //!     target/release/examples/bench_vision [--peer PYTHON] [--rounds N] [--only WORD]
 //!
-//! prints a table and writes `target/bench/vision.json`. One thread; CPU time, the least of all rounds. Pictures come as
+//! prints a table and writes `target/bench/vision.json`. One thread; CPU time, the least of all rounds. Images come as
 //! bytes on our side and as normalised floats on theirs. Without `--peer` only ours is timed.
 #![allow(clippy::unwrap_used)]
 
 use models::encoders::{ImageNorm, VisionConfig};
 use models::{
-    Batch, FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, PolicyModel, Preprocess, Rng, Signature,
+    Backend, Batch, FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, PolicyModel, Preprocess, Rng, Signature,
     TrainConfig, Trainer, ValuesRef, act,
 };
 use serde_json::json;
@@ -40,8 +40,8 @@ fn size(name: &str) -> Size {
 }
 
 fn signature() -> Signature {
-    let pictures = CAMERAS.map(|name| FeatureSpec::image(name, SIDE, SIDE));
-    let observation = std::iter::once(FeatureSpec::state(9)).chain(pictures).collect();
+    let images = CAMERAS.map(|name| FeatureSpec::image(name, SIDE, SIDE));
+    let observation = std::iter::once(FeatureSpec::state(9)).chain(images).collect();
     Signature { observation, action_dim: 7, ..Signature::default() }
 }
 
@@ -50,19 +50,24 @@ impl Size {
         let Self { dim_model, dim_feedforward, action_horizon, .. } = *self;
         let vision = Some(self.vision.clone());
         let config = act::Config { dim_model, dim_feedforward, action_horizon, vision, ..Default::default() };
-        PolicyConfig::Act(config).build(&signature(), 1).unwrap()
+        PolicyConfig::Act(config).build(&signature(), 1, &Backend::CPU).unwrap()
     }
 
     fn batch(&self, rows: usize) -> Batch {
         let mut rng = Rng::new(1, "bench");
         let modes = [("observation.state", NormMode::Identity), ("action", NormMode::Identity)];
         let modes = modes.map(|(name, mode)| (name.to_string(), mode)).into();
-        let preprocess = Preprocess::new(signature(), Normaliser::new(&modes, &Default::default()).unwrap()).unwrap();
+        let preprocess = Preprocess::new(
+            signature(),
+            Normaliser::new(&modes, &Default::default()).unwrap(),
+            &candle_core::Device::Cpu,
+        )
+        .unwrap();
         let state = rng.normals(rows * 9);
-        let pictures = CAMERAS.map(|_| (0..rows * SIDE * SIDE * 3).map(|_| rng.below(256) as u8).collect::<Vec<u8>>());
+        let images = CAMERAS.map(|_| (0..rows * SIDE * SIDE * 3).map(|_| rng.below(256) as u8).collect::<Vec<u8>>());
         let mut seen = Features::new();
         seen.insert("observation.state", ValuesRef::F32(&state));
-        for (name, bytes) in CAMERAS.iter().zip(&pictures) {
+        for (name, bytes) in CAMERAS.iter().zip(&images) {
             seen.insert(name, ValuesRef::U8(bytes));
         }
         let actions = rng.normals(rows * self.action_horizon * 7);

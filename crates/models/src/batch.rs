@@ -2,13 +2,12 @@
 
 use crate::features::{Features, Signature, Values, ValuesRef};
 use candle_core::{Device, Tensor};
-use nn::device::HERE;
 use nn::{ModelError, Result};
 
 /// Windows as tensors.
 #[derive(Debug, Clone)]
 pub struct Batch {
-    /// (b, …) each as [`Signature::batch_shape`] says; f32, pictures u8
+    /// (b, …) each as [`Signature::batch_shape`] says; f32, images u8
     pub observation: Features<Tensor>,
     /// (b, H, A)
     pub actions: Tensor,
@@ -46,7 +45,7 @@ impl Taken {
 }
 
 impl Batch {
-    /// From row-major values: those of the signature's features, `actions` n*H*A, `is_pad` n*H.
+    /// On a device, from row-major values: those of the signature's features, `actions` n*H*A, `is_pad` n*H.
     ///
     /// # Errors
     /// Values of the wrong length, by name, or an empty batch.
@@ -56,6 +55,7 @@ impl Batch {
         mut observation: Features<Values>,
         actions: Vec<f32>,
         is_pad: &[bool],
+        device: &Device,
     ) -> Result<Self> {
         let n = is_pad.len() / action_horizon.max(1);
         check("is_pad", is_pad.len(), &[n, action_horizon])?;
@@ -66,14 +66,13 @@ impl Batch {
         let mut tensors = Features::new();
         for spec in &signature.observation {
             let values = observation.take("batch", &spec.name)?;
-            tensors.insert(&spec.name, tensor(&spec.name, values, &signature.batch_shape(spec, n))?);
+            tensors.insert(&spec.name, tensor(&spec.name, values, &signature.batch_shape(spec, n), device)?);
         }
-        let dev = &HERE;
         let pad: Vec<f32> = is_pad.iter().map(|&p| if p { 1.0 } else { 0.0 }).collect();
         Ok(Self {
             observation: tensors,
-            actions: Tensor::from_vec(actions, (n, action_horizon, signature.action_dim), dev)?,
-            is_pad: Tensor::from_vec(pad, (n, action_horizon), dev)?,
+            actions: Tensor::from_vec(actions, (n, action_horizon, signature.action_dim), device)?,
+            is_pad: Tensor::from_vec(pad, (n, action_horizon), device)?,
             taken: None,
             visited: None,
             auxiliary: None,
@@ -83,7 +82,7 @@ impl Batch {
         })
     }
 
-    /// The same from borrowed values.
+    /// The same on the CPU, from borrowed values.
     ///
     /// # Errors
     /// As [`Batch::new`].
@@ -95,7 +94,7 @@ impl Batch {
         is_pad: &[bool],
     ) -> Result<Self> {
         let owned = observation.map(|_, values| values.to_values());
-        Self::new(signature, action_horizon, owned, actions.to_vec(), is_pad)
+        Self::new(signature, action_horizon, owned, actions.to_vec(), is_pad, &Device::Cpu)
     }
 
     /// Rows in this shard.
@@ -142,11 +141,11 @@ fn check(name: &str, found: usize, expected: &[usize]) -> Result<()> {
 }
 
 /// Values of feature `name` as a tensor of this shape.
-pub(crate) fn tensor(name: &str, values: Values, shape: &[usize]) -> Result<Tensor> {
+pub(crate) fn tensor(name: &str, values: Values, shape: &[usize], device: &Device) -> Result<Tensor> {
     check(name, values.as_ref().len(), shape)?;
     Ok(match values {
-        Values::F32(values) => Tensor::from_vec(values, shape, &HERE)?,
-        Values::U8(values) => Tensor::from_vec(values, shape, &HERE)?,
+        Values::F32(values) => Tensor::from_vec(values, shape, device)?,
+        Values::U8(values) => Tensor::from_vec(values, shape, device)?,
     })
 }
 

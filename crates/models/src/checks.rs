@@ -61,7 +61,7 @@ pub(crate) fn check_observation(
     let rows = observation.iter().next().and_then(|(_, tensor)| tensor.dims().first().copied()).unwrap_or(0).max(1);
     for spec in &signature.observation {
         let tensor = observation.require(operation, &spec.name)?;
-        // what was looked at already has the size of what is seen
+        // what was prepared already has the size of what is seen
         if spec.kind == FeatureKind::Image && tensor.dtype() == DType::F32 && tensor.dims().first() == Some(&rows) {
             continue;
         }

@@ -35,7 +35,7 @@ impl ChunkPolicy {
         Self { past, ..self }
     }
 
-    /// The same with a clock, by which it tells what its pictures took.
+    /// The same with a clock, by which it tells what its images took.
     #[must_use]
     pub fn with_clock(mut self, clock: Box<dyn Clock>) -> Self {
         self.clock = Some(clock);
@@ -96,7 +96,7 @@ mod tests {
         let signature = Signature { n_obs_steps, ..Signature::low_dimensional(2, 0, 1) };
         let modes = [STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
         let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
-        Arc::new(Preprocess::new(signature, normaliser).unwrap())
+        Arc::new(Preprocess::new(signature, normaliser, &Device::Cpu).unwrap())
     }
 
     fn act(preprocess: &Preprocess) -> Act {
@@ -109,7 +109,7 @@ mod tests {
             n_encoder_layers: 1,
             ..Default::default()
         };
-        Act::new(&config, preprocess.signature(), 3).unwrap()
+        Act::new(&config, preprocess.signature(), 3, &nn::Backend::CPU).unwrap()
     }
 
     /// ACT with noise on its chunks.

@@ -19,7 +19,7 @@ pub enum FeatureKind {
     EnvironmentState,
     /// one thing of the world as a vector; things of one group are read alike
     Entity,
-    /// a picture, 8-bit, height x width x channels
+    /// an image, 8-bit, height x width x channels
     Image,
 }
 
@@ -57,8 +57,8 @@ pub struct FeatureSpec {
     /// of an entity: whether it gets a learned position of its own, which tells it from the others of its group
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub position: bool,
-    /// of a picture: three features, each a colour, that take the place of red, green and blue: a channel shows how much of
-    /// its colour a pixel has. Empty for a picture as it is.
+    /// of an image: three features, each a colour, that take the place of red, green and blue: a channel shows how much of
+    /// its colour a pixel has. Empty for an image as it is.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub colours: Vec<String>,
 }
@@ -83,12 +83,12 @@ impl FeatureSpec {
         Self { group: Some(group.to_string()), position, ..plain }
     }
 
-    /// A picture of `height` by `width` pixels of three colours, under its whole name.
+    /// An image of `height` by `width` pixels of three colours, under its whole name.
     pub fn image(name: &str, height: usize, width: usize) -> Self {
         Self::plain(name, FeatureKind::Image, vec![height, width, 3])
     }
 
-    /// The same picture in the colours that these features are.
+    /// The same image in the colours that these features are.
     #[must_use]
     pub fn in_colours(self, colours: Vec<String>) -> Self {
         Self { colours, ..self }
@@ -350,12 +350,12 @@ impl<T> FromIterator<(String, T)> for Features<T> {
     }
 }
 
-/// Raw values of a feature: numbers in the units of the data, or the bytes of a picture.
+/// Raw values of a feature: numbers in the units of the data, or the bytes of an image.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Values {
     /// numbers
     F32(Vec<f32>),
-    /// bytes of a picture
+    /// bytes of an image
     U8(Vec<u8>),
 }
 
@@ -364,12 +364,12 @@ pub enum Values {
 pub enum ValuesRef<'a> {
     /// numbers
     F32(&'a [f32]),
-    /// bytes of a picture
+    /// bytes of an image
     U8(&'a [u8]),
 }
 
 impl Values {
-    /// The numbers; `None` for a picture.
+    /// The numbers; `None` for an image.
     pub fn numbers(&self) -> Option<&[f32]> {
         match self {
             Self::F32(values) => Some(values),
@@ -511,7 +511,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_of_a_picture_are_three_features_of_three_numbers() {
+    fn colours_of_a_image_are_three_features_of_three_numbers() {
         let error = |width: usize, colours: &[&str], of: usize| {
             let colours = colours.iter().map(|name| format!("{ENTITY_PREFIX}{name}")).collect();
             let mut observation = vec![FeatureSpec::state(2), FeatureSpec::image("front", 8, 8)];

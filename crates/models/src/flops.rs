@@ -8,7 +8,7 @@ pub(crate) fn linear(rows: usize, from: usize, to: usize) -> f64 {
     2.0 * (rows * from * to) as f64
 }
 
-/// What tokens and latent cost on their way to the width of `shape`; pictures are not counted.
+/// What tokens and latent cost on their way to the width of `shape`; images are not counted.
 pub(crate) fn tokens(layout: &TokenLayout, latent: usize, dim: usize) -> f64 {
     let widths: usize = layout.tokens.iter().map(|token| token.width).sum();
     linear(1, latent + widths, dim)

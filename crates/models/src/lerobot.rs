@@ -1,12 +1,12 @@
 //! LeRobot's ACT files as values: its `config.json`, its tensor names, its names of normalisation modes. This is the one
 //! place that knows them; files are read and written in `zoo`.
 
-use crate::encoders::{Architecture, ImageEncoder, ImageNorm, PICTURE_MEAN, PICTURE_STD, TokenKind, VisionConfig};
+use crate::encoders::{Architecture, IMAGE_MEAN, IMAGE_STD, ImageEncoder, ImageNorm, TokenKind, VisionConfig};
 use crate::features::{FeatureKind, FeatureSpec, Signature};
 use crate::layers::{AUXILIARY_HEAD, Activation, sinusoid_table};
 use crate::models::act::Config;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
-use candle_core::{DType, Tensor};
+use candle_core::{DType, Device, Tensor};
 use nn::Params;
 use nn::{ModelError, Result, some_names};
 use serde::de::Error as _;
@@ -19,7 +19,7 @@ const PREFIX: &str = "model.";
 /// Channels of the first layer of torchvision's networks.
 const LEROBOTS_WIDTH: usize = 64;
 /// Buffers of ours that stand among LeRobot's statistics, not among its weights.
-const OF_PICTURES: [&str; 2] = [PICTURE_MEAN, PICTURE_STD];
+const OF_IMAGES: [&str; 2] = [IMAGE_MEAN, IMAGE_STD];
 /// LeRobot saves this fixed table with the weights.
 const POSITION_BUFFER: &str = "vae_encoder_pos_enc";
 /// How far its sines and cosines may be off: bf16 rounds numbers below 1 to 1/512.
@@ -179,12 +179,12 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
     if keys.n_obs_steps != 1 {
         return Err(refuse("n_obs_steps", keys.n_obs_steps.to_string(), "1"));
     }
-    let (mut state, mut env, mut pictures) = (0, 0, Vec::new());
+    let (mut state, mut env, mut images) = (0, 0, Vec::new());
     for (name, feature) in &keys.input_features {
         match (feature.kind.as_str(), name.as_str(), &feature.shape[..]) {
             ("STATE", STATE, &[n]) => state = n,
             ("ENV", ENVIRONMENT_STATE, &[n]) => env = n,
-            ("VISUAL", name, &[3, height, width]) => pictures.push(FeatureSpec::image(name, height, width)),
+            ("VISUAL", name, &[3, height, width]) => images.push(FeatureSpec::image(name, height, width)),
             ("VISUAL", name, shape) => {
                 return Err(refuse("input_features", format!("{name} of shape {shape:?}"), "3 colours, height, width"));
             }
@@ -235,13 +235,13 @@ pub fn read_config(config: &Value) -> Result<LerobotAct> {
         n_vae_encoder_layers: keys.n_vae_encoder_layers,
         dropout: keys.dropout,
         kl_weight: keys.kl_weight,
-        vision: if pictures.is_empty() { None } else { Some(vision(&keys)?) },
+        vision: if images.is_empty() { None } else { Some(vision(&keys)?) },
         pointer: None,
         auxiliary: None,
     };
     config.validate()?;
     let mut signature = Signature::low_dimensional(state, env, action);
-    signature.observation.extend(pictures);
+    signature.observation.extend(images);
     Ok(LerobotAct {
         config,
         signature,
@@ -268,7 +268,7 @@ fn vision(keys: &Keys) -> Result<VisionConfig> {
         return Err(refuse("replace_final_stride_with_dilation", "true", "false: basic blocks are not dilated"));
     }
     let norm = ImageNorm::Frozen;
-    // what normalises pictures comes with the statistics
+    // what normalises images comes with the statistics
     Ok(VisionConfig { encoder, width, norm, lr_backbone: Some(1.0), ..VisionConfig::default() })
 }
 
@@ -380,7 +380,7 @@ pub fn load_tensors(params: &Params, config: &Config, tensors: &BTreeMap<String,
         let table = own
             .remove(POSITION_BUFFER)
             .ok_or_else(|| ModelError::MissingTensor { name: name.clone(), given: some_names(tensors.keys()) })?;
-        let expected = sinusoid_table(config.action_horizon + 2, config.dim_model)?;
+        let expected = sinusoid_table(config.action_horizon + 2, config.dim_model, &Device::Cpu)?;
         if table.dims() != expected.dims() {
             let (expected, found) = (expected.dims().to_vec(), table.dims().to_vec());
             return Err(ModelError::MisshapenTensor { name, expected, found });
@@ -395,14 +395,14 @@ pub fn load_tensors(params: &Params, config: &Config, tensors: &BTreeMap<String,
             });
         }
     }
-    // what normalises pictures is not among LeRobot's weights; `load_statistics` takes it
-    for (name, buffer) in params.buffers().filter(|(name, _)| OF_PICTURES.contains(name)) {
+    // what normalises images is not among LeRobot's weights; `load_statistics` takes it
+    for (name, buffer) in params.buffers().filter(|(name, _)| OF_IMAGES.contains(name)) {
         own.insert(name.to_string(), buffer.as_detached_tensor());
     }
     params.load(&own)
 }
 
-/// Takes what normalises pictures from LeRobot's statistics, `<feature>.mean` and `.std` of shape (3, 1, 1) each; pictures
+/// Takes what normalises images from LeRobot's statistics, `<feature>.mean` and `.std` of shape (3, 1, 1) each; images
 /// without statistics pass as they are, as they do there.
 ///
 /// # Errors
@@ -434,13 +434,13 @@ pub fn load_statistics(
     if means.is_empty() { Ok(()) } else { ImageEncoder::set_statistics(params, &means, &stds) }
 }
 
-/// What normalises pictures, as LeRobot's statistics: `<feature>.mean` and `.std`, (3, 1, 1) each.
+/// What normalises images, as LeRobot's statistics: `<feature>.mean` and `.std`, (3, 1, 1) each.
 ///
 /// # Errors
 /// If the tensor library fails.
 pub fn statistics_out(params: &Params, signature: &Signature) -> Result<BTreeMap<String, Tensor>> {
     let mut statistics = BTreeMap::new();
-    for (buffer, statistic) in OF_PICTURES.iter().zip(["mean", "std"]) {
+    for (buffer, statistic) in OF_IMAGES.iter().zip(["mean", "std"]) {
         let Some((_, values)) = params.buffers().find(|(name, _)| name == buffer) else { continue };
         for (i, spec) in signature.of_kind(FeatureKind::Image).enumerate() {
             let row = values.as_tensor().get(i)?.copy()?.reshape((3, 1, 1))?;
@@ -456,12 +456,12 @@ pub fn statistics_out(params: &Params, signature: &Signature) -> Result<BTreeMap
 /// If the tensor library fails.
 pub fn tensors_out(params: &Params, config: &Config) -> Result<BTreeMap<String, Tensor>> {
     // what only training reads is of no use there
-    let theirs = |name: &str| !OF_PICTURES.contains(&name) && !name.starts_with(AUXILIARY_HEAD);
+    let theirs = |name: &str| !OF_IMAGES.contains(&name) && !name.starts_with(AUXILIARY_HEAD);
     let named = params.tensors().into_iter().filter(|(name, _)| theirs(name));
     let named = named.map(|(name, t)| (format!("{PREFIX}{name}"), t));
     let mut tensors: BTreeMap<String, Tensor> = named.collect();
     if config.use_vae {
-        let table = sinusoid_table(config.action_horizon + 2, config.dim_model)?;
+        let table = sinusoid_table(config.action_horizon + 2, config.dim_model, &Device::Cpu)?;
         tensors.insert(format!("{PREFIX}{POSITION_BUFFER}"), table);
     }
     Ok(tensors)
@@ -501,7 +501,7 @@ mod tests {
     fn config_and_tensors_come_back() {
         let one = example();
         assert_eq!(read_config(&write_config(&one).unwrap()).unwrap(), one);
-        let [a, b] = [1, 2].map(|seed| Act::new(&one.config, &one.signature, seed).unwrap());
+        let [a, b] = [1, 2].map(|seed| Act::new(&one.config, &one.signature, seed, &nn::Backend::CPU).unwrap());
         let tensors = tensors_out(a.params(), &one.config).unwrap();
         let load_into_b = |tensors: &BTreeMap<String, Tensor>| load_tensors(b.params(), &one.config, tensors);
         load_into_b(&tensors).unwrap();
@@ -527,10 +527,13 @@ mod tests {
         let one = example();
         let told = Config { auxiliary: Some(AuxiliaryConfig::default()), ..one.config.clone() };
         let signature = Signature { auxiliary_dim: 3, ..one.signature.clone() };
-        let act = Act::new(&told, &signature, 1).unwrap();
+        let act = Act::new(&told, &signature, 1, &nn::Backend::CPU).unwrap();
         let names = |act: &Act, config| tensors_out(act.params(), config).unwrap().into_keys().collect::<Vec<_>>();
         assert!(act.params().get("auxiliary_head.weight").is_some());
-        assert_eq!(names(&act, &told), names(&Act::new(&one.config, &one.signature, 1).unwrap(), &one.config));
+        assert_eq!(
+            names(&act, &told),
+            names(&Act::new(&one.config, &one.signature, 1, &nn::Backend::CPU).unwrap(), &one.config)
+        );
     }
 
     #[test]

@@ -37,8 +37,8 @@ pub use history::History;
 pub use model::{Memory, PolicyModel};
 pub use models::*;
 pub use nn::{
-    Context, Gradients, Init, Loss, LossParts, LossValues, ModelError, Optimiser, OptimiserConfig, ParamLayout, Params,
-    Result, Rng, Size, Value, vectors,
+    Backend, Context, Gradients, Init, Loss, LossParts, LossValues, ModelError, Optimiser, OptimiserConfig,
+    ParamLayout, Params, Result, Rng, Size, Value, vectors,
 };
 pub use normaliser::{ACTION, ENVIRONMENT_STATE, Guarded, NormMode, Normaliser, STATE};
 pub use policy::{ActionChunk, Actor, Clock, Policy, RecedingHorizon, TemporalEnsemble, ThoughtStep};

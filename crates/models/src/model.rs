@@ -64,7 +64,7 @@ pub trait PolicyModel: Send + Sync {
         self.predict(observation)
     }
 
-    /// [`Self::sample`], and `on_seen` is called when pictures have become tokens, by a model that can tell.
+    /// [`Self::sample`], and `on_seen` is called when images have become tokens, by a model that can tell.
     ///
     /// # Errors
     /// As [`Self::predict`].
@@ -99,7 +99,7 @@ pub trait PolicyModel: Send + Sync {
         false
     }
 
-    /// How it sees pictures, if it does.
+    /// How it sees images, if it does.
     fn vision(&self) -> Option<&VisionConfig> {
         None
     }

@@ -1,7 +1,6 @@
 //! Raw units to network units and back, per feature, with LeRobot's formulas and names.
 
-use candle_core::{DType, Tensor};
-use nn::device::HERE;
+use candle_core::{DType, Device, Tensor};
 use nn::{ModelError, Result, some_names};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -133,12 +132,12 @@ impl Normaliser {
         self.features.iter().map(|(k, f)| (k.clone(), f.mode)).collect()
     }
 
-    /// The statistics under LeRobot's names.
+    /// The statistics under LeRobot's names, on the CPU, as they are stored.
     pub fn tensors(&self) -> Result<BTreeMap<String, Tensor>> {
         let mut tensors = BTreeMap::new();
         for (name, feature) in &self.features {
             for (statistic, values) in feature.mode.statistics().iter().zip([&feature.a, &feature.b]) {
-                let tensor = Tensor::from_slice(values, values.len(), &HERE)?;
+                let tensor = Tensor::from_slice(values, values.len(), &Device::Cpu)?;
                 tensors.insert(format!("{name}.{statistic}"), tensor);
             }
         }
@@ -208,7 +207,6 @@ impl Feature {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use candle_core::Device;
     use proptest::prelude::*;
 
     fn normaliser(mode: NormMode, a: &[f32], b: &[f32]) -> Normaliser {

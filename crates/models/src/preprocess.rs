@@ -1,32 +1,33 @@
 //! Raw values to what a network reads, and actions back: the one place, for training, validation, evaluation and
 //! reasoning.
 //!
-//! Numbers are normalised per feature. Pictures stay bytes: they are scaled where they are encoded, after they have
-//! travelled. A picture in the colours of other features is painted in them here.
+//! Numbers are normalised per feature. Images stay bytes: they are scaled where they are encoded, after they have
+//! travelled. An image in the colours of other features is painted in them here.
 
 use crate::batch::{Batch, tensor};
 use crate::features::{FeatureKind, FeatureSpec, Features, Observation, Signature, Values, ValuesRef};
 use crate::normaliser::{ACTION, Normaliser};
 use crate::policy::ActionChunk;
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use nn::{ModelError, Result};
 
-/// A signature and the statistics of its features and of the actions.
-#[derive(Debug, Clone, PartialEq)]
+/// A signature, the statistics of its features and of the actions, and the device on which a network reads them.
+#[derive(Debug, Clone)]
 pub struct Preprocess {
     signature: Signature,
     normaliser: Normaliser,
+    device: Device,
 }
 
 impl Preprocess {
     /// # Errors
     /// A feature without statistics, or with statistics of another length, by name.
-    pub fn new(signature: Signature, normaliser: Normaliser) -> Result<Self> {
+    pub fn new(signature: Signature, normaliser: Normaliser, device: &Device) -> Result<Self> {
         for spec in signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image) {
             normaliser.normalise(&spec.name, &mut vec![0.0; spec.width()])?;
         }
         normaliser.normalise(ACTION, &mut vec![0.0; signature.action_dim])?;
-        Ok(Self { signature, normaliser })
+        Ok(Self { signature, normaliser, device: device.clone() })
     }
 
     /// What it reads and gives.
@@ -58,7 +59,7 @@ impl Preprocess {
         let seen = self.read(raw)?;
         let mut actions = actions.to_vec();
         self.normaliser.normalise(ACTION, &mut actions)?;
-        Batch::new(&self.signature, action_horizon, seen, actions, is_pad)
+        Batch::new(&self.signature, action_horizon, seen, actions, is_pad, &self.device)
     }
 
     /// What a network reads at the last of `history`, the observations of an episode so far, oldest first; of more than
@@ -96,7 +97,7 @@ impl Preprocess {
         let mut tensors = Features::new();
         for spec in &self.signature.observation {
             let values = read.take("predict", &spec.name)?;
-            tensors.insert(&spec.name, tensor(&spec.name, values, &self.signature.batch_shape(spec, 1))?);
+            tensors.insert(&spec.name, tensor(&spec.name, values, &self.signature.batch_shape(spec, 1), &self.device)?);
         }
         Ok(tensors)
     }
@@ -104,10 +105,10 @@ impl Preprocess {
     /// Raw values of every feature, of any number of steps -> what a network reads.
     fn read(&self, mut raw: Features<Values>) -> Result<Features<Values>> {
         for spec in self.signature.observation.iter().filter(|spec| !spec.colours.is_empty()) {
-            let Values::U8(mut pictures) = raw.require("see", &spec.name)?.clone() else {
+            let Values::U8(mut images) = raw.require("see", &spec.name)?.clone() else {
                 return Err(wrong_type(spec, "numbers", "bytes"));
             };
-            for (step, picture) in pictures.chunks_exact_mut(spec.width()).enumerate() {
+            for (step, image) in images.chunks_exact_mut(spec.width()).enumerate() {
                 let mut colours = [[0.0; 3]; 3];
                 for (name, colour) in spec.colours.iter().zip(&mut colours) {
                     let numbers = raw.require("see", name)?.numbers().unwrap_or_default();
@@ -124,9 +125,9 @@ impl Preprocess {
                         }
                     }
                 }
-                paint(picture, colours);
+                paint(image, colours);
             }
-            raw.insert(&spec.name, Values::U8(pictures));
+            raw.insert(&spec.name, Values::U8(images));
         }
         let mut read = Features::new();
         for spec in &self.signature.observation {
@@ -170,12 +171,12 @@ impl Preprocess {
 
 /// Channel k of every pixel becomes how much of `colours[k]` it has: its product with that colour, over the colour's sum, so
 /// that grey stays as it is and red, green and blue as colours are those channels. A colour of zeros has none.
-fn paint(picture: &mut [u8], colours: [[f32; 3]; 3]) {
+fn paint(image: &mut [u8], colours: [[f32; 3]; 3]) {
     let shares = colours.map(|colour| {
         let sum: f32 = colour.iter().map(|part| part.abs()).sum();
         colour.map(|part| if sum > 0.0 { part / sum } else { 0.0 })
     });
-    for pixel in picture.chunks_exact_mut(3) {
+    for pixel in image.chunks_exact_mut(3) {
         let seen = [0, 1, 2].map(|c| f32::from(pixel[c]));
         for (channel, share) in pixel.iter_mut().zip(&shares) {
             let product: f32 = share.iter().zip(&seen).map(|(share, seen)| share * seen).sum();
@@ -212,7 +213,6 @@ mod tests {
     use super::*;
     use crate::features::ENTITY_PREFIX;
     use crate::normaliser::{ENVIRONMENT_STATE, NormMode, STATE};
-    use candle_core::Device;
     use proptest::prelude::*;
     use std::collections::BTreeMap;
 
@@ -233,7 +233,7 @@ mod tests {
                 tensors.insert(format!("{name}.{statistic}"), tensor.to_dtype(candle_core::DType::F32).unwrap());
             }
         }
-        Preprocess::new(signature, Normaliser::new(&modes, &tensors).unwrap()).unwrap()
+        Preprocess::new(signature, Normaliser::new(&modes, &tensors).unwrap(), &Device::Cpu).unwrap()
     }
 
     fn seen(values: &[f32]) -> Observation {
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_are_painted_in_the_colours_of_other_features() {
+    fn images_are_painted_in_the_colours_of_other_features() {
         let names = ["a", "b", "c"].map(|name| format!("{ENTITY_PREFIX}{name}"));
         let observation = vec![
             FeatureSpec::state(2),
@@ -296,7 +296,8 @@ mod tests {
         let signature = Signature { observation, n_obs_steps: 2, action_dim: 1, ..Signature::default() };
         let modes = [STATE, ACTION].into_iter().chain(names.iter().map(String::as_str));
         let modes = modes.map(|name| (name.to_string(), NormMode::Identity)).collect();
-        let preprocess = Preprocess::new(signature, Normaliser::new(&modes, &BTreeMap::new()).unwrap()).unwrap();
+        let preprocess =
+            Preprocess::new(signature, Normaliser::new(&modes, &BTreeMap::new()).unwrap(), &Device::Cpu).unwrap();
         let step = |colours: [[f32; 3]; 3], pixels: [u8; 6]| {
             let mut step = Observation::of_state(vec![0.0; 2], vec![]);
             names.iter().zip(colours).for_each(|(name, colour)| step.insert(name, colour.to_vec().into()));
@@ -327,7 +328,7 @@ mod tests {
         let rows = Features::from_iter(rows);
         let batch = preprocess.batch(1, &rows.map(|_, values| values.as_ref()), &[0.0], &[false]).unwrap();
         assert_eq!(batch.observation.get("front").unwrap().flatten_all().unwrap().to_vec1::<u8>().unwrap(), bytes);
-        // without them there is no picture
+        // without them there is no image
         let mut blind = history[1].clone();
         blind.take("test", &names[1]).unwrap();
         let error = preprocess.observation(&[blind]).unwrap_err().to_string();
@@ -359,7 +360,7 @@ mod tests {
         more.insert(ENVIRONMENT_STATE, vec![0.0; 3].into());
         assert_eq!(preprocess.observation(&[more]).unwrap().len(), 3);
         let wide = Signature::low_dimensional(3, 0, 1);
-        let error = Preprocess::new(wide, preprocess.normaliser().clone()).unwrap_err().to_string();
+        let error = Preprocess::new(wide, preprocess.normaliser().clone(), &Device::Cpu).unwrap_err().to_string();
         assert!(error.contains("observation.state with 3 values"), "{error}");
     }
 }

@@ -5,8 +5,7 @@ use crate::layers::{AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::model::PolicyModel;
 use crate::models::floors::{expert, nearest, random, replay, zero};
 use crate::models::{act, actrm, bc, bc_rnn, bc_transformer, diffusion, flow, mip};
-use nn::Size;
-use nn::{ModelError, Result};
+use nn::{Backend, ModelError, Result, Size};
 use serde::de::{DeserializeSeed, Deserializer};
 use serde::{Deserialize, Serialize};
 
@@ -38,13 +37,13 @@ macro_rules! policies {
                 }
             }
 
-            /// A model with initial weights drawn from `seed`.
+            /// A model on a device, with initial weights drawn from `seed`.
             ///
             /// # Errors
             /// A configuration that describes no possible model, or a feature that it cannot read.
-            pub fn build(&self, signature: &Signature, seed: u64) -> Result<Box<dyn PolicyModel>> {
+            pub fn build(&self, signature: &Signature, seed: u64, backend: &Backend) -> Result<Box<dyn PolicyModel>> {
                 match self {
-                    $(Self::$variant(config) => Ok(Box::new($module::$model::new(config, signature, seed)?)),)+
+                    $(Self::$variant(config) => Ok(Box::new($module::$model::new(config, signature, seed, backend)?)),)+
                 }
             }
 

@@ -36,7 +36,7 @@ mod tests {
             for keys in tried {
                 let config = config(kind, keys.clone());
                 let told = config.size().weights;
-                let real = config.build(&signature, 1).unwrap().params().count() as f64;
+                let real = config.build(&signature, 1, &nn::Backend::CPU).unwrap().params().count() as f64;
                 assert!(0.5 * real <= told && told <= real, "{kind} {keys}: {told} of {real}");
             }
         }

@@ -5,11 +5,10 @@ use crate::batch::{Batch, Taken};
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, FeatureSpec, Features, Signature, Values};
 use crate::model::PolicyModel;
+use crate::train::{StepMetrics, TrainConfig, Trainer};
 use candle_core::{Device, Tensor};
-use nn::LossValues;
-use nn::Rng;
 use nn::simd::{Level, at_most};
-use nn::{Gradients, ParamLayout};
+use nn::{Gradients, LossValues, ParamLayout, Result, Rng};
 use std::sync::Arc;
 
 /// Moves norms and biases away from their initial 1 and 0, where errors would hide.
@@ -35,7 +34,7 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
     }
     let a = rng.normals(rows * horizon * signature.action_dim);
     let pad: Vec<bool> = (0..rows * horizon).map(|i| i / horizon % 2 == 1 && i % horizon > horizon / 2).collect();
-    let mut batch = Batch::new(signature, horizon, observation, a, &pad).unwrap();
+    let mut batch = Batch::new(signature, horizon, observation, a, &pad, &candle_core::Device::Cpu).unwrap();
     batch.seed = seed;
     // of a pointer: of every third row it is not asked
     let cubes = signature.observation.iter().enumerate().filter(|(_, spec)| spec.group() == "cube");
@@ -45,28 +44,28 @@ pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u6
     let cells = signature.observation.iter().filter(|spec| spec.group() == "cell").count();
     let visited = (0..rows * cells).map(|_| rng.below(2) as f32).collect();
     batch.visited = (cells > 0).then(|| Tensor::from_vec(visited, (rows, cells), &Device::Cpu).unwrap());
-    let told = (rows, signature.auxiliary_dim);
-    let values = rng.normals(told.0 * told.1);
-    batch.auxiliary = (told.1 > 0).then(|| Tensor::from_vec(values, told, &Device::Cpu).unwrap());
+    let shape = (rows, signature.auxiliary_dim);
+    let values = rng.normals(shape.0 * shape.1);
+    batch.auxiliary = (shape.1 > 0).then(|| Tensor::from_vec(values, shape, &Device::Cpu).unwrap());
     batch
 }
 
 /// What models are tried on: with and without an environment state, with a history, with entities in two groups, of which
-/// one has positions, with a grid of cells and a thing beside it, with pictures of three cameras, and with a history of two pictures.
+/// one has positions, with a grid of cells and a thing beside it, with images of three cameras, and with a history of two images.
 pub(crate) struct Signatures {
     pub(crate) plain: Signature,
     pub(crate) no_env: Signature,
     pub(crate) entities: Signature,
     pub(crate) grid: Signature,
     pub(crate) history: Signature,
-    pub(crate) pictures: Signature,
-    pub(crate) film: Signature,
-    /// `plain`, with three numbers that training alone is told
-    pub(crate) told: Signature,
+    pub(crate) images: Signature,
+    pub(crate) image_history: Signature,
+    /// `plain`, with three numbers of auxiliary supervision
+    pub(crate) with_auxiliary: Signature,
 }
 
-/// Eyes for the pictures: parts at random, colours changed, tokens of all maps.
-pub(crate) fn eyes() -> VisionConfig {
+/// Eyes for the images: parts at random, colours changed, tokens of all maps.
+pub(crate) fn vision_config() -> VisionConfig {
     VisionConfig { width: 8, crop: Some(33), shift: 1, jitter: 0.2, ..VisionConfig::default() }
 }
 
@@ -81,14 +80,30 @@ pub(crate) fn signatures() -> Signatures {
     grid.observation.push(FeatureSpec::entity("peg", 3, "peg", false));
     let mut history = Signature { n_obs_steps: 3, ..plain.clone() };
     history.observation.extend([cube("cube0"), cube("cube1")]);
-    let mut pictures = plain.clone();
-    pictures.observation.extend(["a", "b"].map(|name| FeatureSpec::image(name, 40, 36)));
-    pictures.observation.push(FeatureSpec::image("c", 34, 34));
-    pictures.observation.push(cube("cube0"));
-    let mut film = Signature { n_obs_steps: 2, ..no_env.clone() };
-    film.observation.push(FeatureSpec::image("a", 36, 40));
-    let told = Signature { auxiliary_dim: 3, ..plain.clone() };
-    Signatures { plain, no_env, entities, grid, history, pictures, film, told }
+    let mut images = plain.clone();
+    images.observation.extend(["a", "b"].map(|name| FeatureSpec::image(name, 40, 36)));
+    images.observation.push(FeatureSpec::image("c", 34, 34));
+    images.observation.push(cube("cube0"));
+    let mut image_history = Signature { n_obs_steps: 2, ..no_env.clone() };
+    image_history.observation.push(FeatureSpec::image("a", 36, 40));
+    let with_auxiliary = Signature { auxiliary_dim: 3, ..plain.clone() };
+    Signatures { plain, no_env, entities, grid, history, images, image_history, with_auxiliary }
+}
+
+/// The losses of a training on one batch, after making sure that it gives the same bits twice.
+pub(crate) fn losses_of_training<M: PolicyModel + 'static>(
+    build: impl Fn() -> Result<M>,
+    batch: &Batch,
+    (steps, lr): (u64, f64),
+) -> Vec<StepMetrics> {
+    let run = || {
+        let config = TrainConfig { steps, lr, warmup_steps: 3, ..Default::default() };
+        let mut trainer = Trainer::new(Box::new(build().unwrap()), config, 5).unwrap();
+        (0..steps).map(|_| trainer.step(batch).unwrap()).collect::<Vec<_>>()
+    };
+    let losses = run();
+    assert_eq!(run(), losses);
+    losses
 }
 
 /// Loss and gradients as the trainer gets them.

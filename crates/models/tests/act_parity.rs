@@ -6,7 +6,7 @@ mod common;
 
 use candle_core::{DType, Device, Tensor};
 use models::act::{Act, Config};
-use models::{Batch, Features, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
+use models::{Backend, Batch, Features, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -25,7 +25,7 @@ struct Fixture {
 fn read(folder: &Path) -> Fixture {
     let config = std::fs::read_to_string(folder.join("config.json")).unwrap();
     let lerobot = lerobot::read_config(&serde_json::from_str(&config).unwrap()).unwrap();
-    let act = Act::new(&lerobot.config, &lerobot.signature, 0).unwrap();
+    let act = Act::new(&lerobot.config, &lerobot.signature, 0, &Backend::CPU).unwrap();
     let load = |file: &str| candle_core::safetensors::load(folder.join(file), &Device::Cpu).unwrap();
     let tensors: BTreeMap<_, _> = load("model.safetensors").into_iter().collect();
     lerobot::load_tensors(act.params(), &lerobot.config, &tensors).unwrap();

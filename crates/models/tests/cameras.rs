@@ -5,27 +5,30 @@
 use candle_core::Tensor;
 use models::encoders::{ImageNorm, TokenKind, VisionConfig};
 use models::{
-    FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, Preprocess, Rng, Signature, ValuesRef, act, actrm,
+    Backend, FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, Preprocess, Rng, Signature, ValuesRef, act,
+    actrm,
 };
 
 const CAMERAS: [&str; 2] = ["observation.images.agentview", "observation.images.robot0_eye_in_hand"];
 const SIDE: usize = 84;
 
 fn signature() -> Signature {
-    let pictures = CAMERAS.map(|name| FeatureSpec::image(name, SIDE, SIDE));
-    let observation = std::iter::once(FeatureSpec::state(9)).chain(pictures).collect();
+    let images = CAMERAS.map(|name| FeatureSpec::image(name, SIDE, SIDE));
+    let observation = std::iter::once(FeatureSpec::state(9)).chain(images).collect();
     Signature { observation, action_dim: 7, ..Signature::default() }
 }
 
-/// One observation, with its pictures in this order.
-fn observation(horizon: usize, pictures: [&[u8]; 2]) -> Features<Tensor> {
+/// One observation, with its images in this order.
+fn observation(horizon: usize, images: [&[u8]; 2]) -> Features<Tensor> {
     let modes = [("observation.state", NormMode::Identity), ("action", NormMode::Identity)];
     let modes = modes.map(|(name, mode)| (name.to_string(), mode)).into();
-    let preprocess = Preprocess::new(signature(), Normaliser::new(&modes, &Default::default()).unwrap()).unwrap();
+    let preprocess =
+        Preprocess::new(signature(), Normaliser::new(&modes, &Default::default()).unwrap(), &candle_core::Device::Cpu)
+            .unwrap();
     let state = Rng::new(1, "state").normals(9);
     let mut seen = Features::new();
     seen.insert("observation.state", ValuesRef::F32(&state));
-    for (name, bytes) in CAMERAS.iter().zip(pictures) {
+    for (name, bytes) in CAMERAS.iter().zip(images) {
         seen.insert(name, ValuesRef::U8(bytes));
     }
     preprocess.batch(horizon, &seen, &vec![0.0; horizon * 7], &vec![false; horizon]).unwrap().observation
@@ -33,11 +36,11 @@ fn observation(horizon: usize, pictures: [&[u8]; 2]) -> Features<Tensor> {
 
 /// How far apart actions are when both cameras are taken for each other, of the largest action.
 fn difference(config: &PolicyConfig) -> f32 {
-    let model = config.build(&signature(), 3).unwrap();
+    let model = config.build(&signature(), 3, &Backend::CPU).unwrap();
     let mut rng = Rng::new(2, "pictures");
     let [one, other] = [(); 2].map(|()| (0..SIDE * SIDE * 3).map(|_| rng.below(256) as u8).collect::<Vec<u8>>());
-    let [usual, swapped] = [[&one[..], &other[..]], [&other[..], &one[..]]].map(|pictures| {
-        let actions = model.predict(&observation(model.action_horizon(), pictures)).unwrap();
+    let [usual, swapped] = [[&one[..], &other[..]], [&other[..], &one[..]]].map(|images| {
+        let actions = model.predict(&observation(model.action_horizon(), images)).unwrap();
         actions.flatten_all().unwrap().to_vec1::<f32>().unwrap()
     });
     let scale = usual.iter().fold(1e-3f32, |m, x| m.max(x.abs()));

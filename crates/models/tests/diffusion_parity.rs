@@ -7,7 +7,7 @@ mod common;
 
 use candle_core::{DType, Device, Tensor};
 use models::diffusion::{Config, Diffusion, Sampler, TransformerConfig, lerobot};
-use models::{Batch, Features, PolicyModel, Rng, Signature};
+use models::{Backend, Batch, Features, PolicyModel, Rng, Signature};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -27,7 +27,7 @@ impl Fixture {
     fn model(&self) -> Diffusion {
         let config = std::fs::read_to_string(self.folder.join("config.json")).unwrap();
         let lerobot = lerobot::read_config(&serde_json::from_str(&config).unwrap()).unwrap();
-        let model = Diffusion::new(&lerobot.config, &lerobot.signature, 0).unwrap();
+        let model = Diffusion::new(&lerobot.config, &lerobot.signature, 0, &Backend::CPU).unwrap();
         lerobot::load_tensors(model.params(), &tensors(&self.folder, "model.safetensors")).unwrap();
         model
     }
@@ -165,7 +165,7 @@ fn the_transformer_its_error_and_its_gradients_are_chi_et_als() {
         let sizes = Signature::low_dimensional(width("state"), width("env"), width("eps"));
         let signature = Signature { n_obs_steps: number("n_obs_steps"), ..sizes };
         let config = Config { action_horizon: number("horizon"), transformer: Some(transformer), ..Config::default() };
-        let model = Diffusion::new(&config, &signature, 0).unwrap();
+        let model = Diffusion::new(&config, &signature, 0, &Backend::CPU).unwrap();
         let prefixed = |file: &str| -> BTreeMap<String, Tensor> {
             tensors(&f.folder, file).into_iter().map(|(name, t)| (format!("transformer.{name}"), t)).collect()
         };

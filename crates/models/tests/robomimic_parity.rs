@@ -7,8 +7,8 @@ mod common;
 use candle_core::{DType, Device, Tensor};
 use models::layers::Mixture;
 use models::{
-    ACTION, Batch, Clock, ENVIRONMENT_STATE, Features, NormMode, Normaliser, Observation, PolicyConfig, PolicyModel,
-    Preprocess, Rng, STATE, Signature, bc_rnn::BcRnn, bc_transformer::BcTransformer,
+    ACTION, Backend, Batch, Clock, ENVIRONMENT_STATE, Features, NormMode, Normaliser, Observation, PolicyConfig,
+    PolicyModel, Preprocess, Rng, STATE, Signature, bc_rnn::BcRnn, bc_transformer::BcTransformer,
 };
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -61,9 +61,11 @@ impl Fixture {
     fn model(&self) -> Model {
         let text = std::fs::read_to_string(self.folder.join("config.json")).unwrap();
         let model = match serde_json::from_str(&text).unwrap() {
-            PolicyConfig::BcRnn(config) => Model::Rnn(BcRnn::new(&config, &self.signature(), 0).unwrap()),
+            PolicyConfig::BcRnn(config) => {
+                Model::Rnn(BcRnn::new(&config, &self.signature(), 0, &Backend::CPU).unwrap())
+            }
             PolicyConfig::BcTransformer(config) => {
-                Model::Transformer(BcTransformer::new(&config, &self.signature(), 0).unwrap())
+                Model::Transformer(BcTransformer::new(&config, &self.signature(), 0, &Backend::CPU).unwrap())
             }
             other => panic!("{other:?}"),
         };
@@ -155,7 +157,7 @@ fn a_state_is_carried_and_begun_anew_as_robomimics() {
     for f in fixtures().into_iter().filter(|f| f.io.contains_key("carried")) {
         let modes = [STATE, ENVIRONMENT_STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
         let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
-        let preprocess = Arc::new(Preprocess::new(f.signature(), normaliser).unwrap());
+        let preprocess = Arc::new(Preprocess::new(f.signature(), normaliser, &candle_core::Device::Cpu).unwrap());
         let Model::Rnn(model) = f.model() else { panic!("{}", f.name) };
         let model = Arc::new(model);
         let (state, env) = (f.get("state").to_vec3::<f32>().unwrap(), f.get("env").to_vec3::<f32>().unwrap());

@@ -6,7 +6,7 @@
 use candle_core::{Device, Tensor};
 use models::actrm::{self, Actrm, Over, ReasoningConfig};
 use models::trm::{Config, Gradient, Mixing, Positions, Trm};
-use models::{Batch, Features, Gradients, ParamLayout, PolicyModel, Rng, Signature};
+use models::{Backend, Batch, Features, Gradients, ParamLayout, PolicyModel, Rng, Signature};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
@@ -60,7 +60,7 @@ fn peak_of_actrm(over: Over, (h_cycles, l_cycles): (usize, usize)) -> usize {
     let reasoning = ReasoningConfig { over, h_cycles, l_cycles, supervision_steps: 1, ..ReasoningConfig::default() };
     let config = actrm::Config { dim_model: 16, n_heads: 2, action_horizon: 4, reasoning, ..Default::default() };
     let (signature, rows) = (Signature::low_dimensional(3, 2, 2), 8);
-    let model = Actrm::new(&config, &signature, 0).unwrap();
+    let model = Actrm::new(&config, &signature, 0, &Backend::CPU).unwrap();
     let mut rng = Rng::new(1, "data");
     let (state, environment, actions) = (rng.normals(rows * 3), rng.normals(rows * 2), rng.normals(rows * 4 * 2));
     let observation = Features::of_slices(&state, &environment);

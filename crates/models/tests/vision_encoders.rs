@@ -8,7 +8,7 @@ use candle_core::{Device, Tensor, Var};
 use common::npz::{self, Array};
 use common::recipe::{self, assert_probes};
 use models::encoders::{ImageNorm, ResNet, ResNetShape, SpatialSoftmax, position_table};
-use models::{Params, Rng};
+use models::{Backend, Params, Rng};
 use nn::{Value, compose};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -52,7 +52,7 @@ fn check(name: &str, params: &Params, forward: impl Fn(&Tensor) -> Tensor) {
 
 #[test]
 fn a_narrow_resnet_with_group_norm_is_torchs() {
-    let mut params = Params::new();
+    let mut params = Params::new(&Backend::CPU);
     let shape = ResNetShape { blocks: [2, 2, 2, 2], width: 16, norm: ImageNorm::Group };
     let net = ResNet::new(&mut params, "", &shape, &mut Rng::new(0, "init")).unwrap();
     fill(&params);
@@ -66,7 +66,7 @@ fn a_narrow_resnet_with_group_norm_is_torchs() {
 
 #[test]
 fn keypoints_are_robomimics() {
-    let mut params = Params::new();
+    let mut params = Params::new(&Backend::CPU);
     let rng = &mut Rng::new(0, "init");
     let softmax = SpatialSoftmax::new(&mut params, "pool", 32, 16, rng).unwrap();
     let mut create = |name: &str, shape: &[usize]| params.create(name, shape, models::Init::Zeros, rng).unwrap();

@@ -11,7 +11,7 @@ use common::recipe::{self, assert_probes};
 use models::act::Act;
 use models::lerobot::{self, LerobotAct};
 use models::{
-    Batch, FeatureKind, Features, Gradients, LossValues, OptimiserConfig, ParamLayout, PolicyModel, Schedule,
+    Backend, Batch, FeatureKind, Features, Gradients, LossValues, OptimiserConfig, ParamLayout, PolicyModel, Schedule,
     TrainConfig,
 };
 use std::collections::BTreeMap;
@@ -56,7 +56,7 @@ fn folders() -> Vec<PathBuf> {
 
 fn read(folder: &Path) -> Fixture {
     let lerobot = lerobot::read_config(&json(&folder.join("config.json"))).unwrap();
-    let act = Act::new(&lerobot.config, &lerobot.signature, 0).unwrap();
+    let act = Act::new(&lerobot.config, &lerobot.signature, 0, &Backend::CPU).unwrap();
     let weights = folder.join("model.safetensors");
     match weights.exists() {
         true => lerobot::load_tensors(act.params(), &lerobot.config, &safetensors(&weights)).unwrap(),
@@ -185,7 +185,7 @@ fn three_steps_with_two_rates_are_lerobots() {
         let mut f = read(&folder);
         let mut config = f.lerobot.config.clone();
         config.vision.as_mut().unwrap().lr_backbone = Some(0.1);
-        let act = Act::new(&config, &f.lerobot.signature, 0).unwrap();
+        let act = Act::new(&config, &f.lerobot.signature, 0, &Backend::CPU).unwrap();
         act.params().load(&f.act.params().tensors()).unwrap();
         f.act = act;
         let steps = json(&folder.join("train_steps.json"));

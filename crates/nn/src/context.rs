@@ -1,5 +1,6 @@
 //! A forward pass: what operations share.
 
+use crate::backend::{Backend, require_device};
 use crate::error::{ModelError, Result};
 use crate::gradients::Gradients;
 use crate::kernels::{Mat, Pack, Packed, Pool};
@@ -9,7 +10,7 @@ use crate::params::Params;
 use crate::rng::Rng;
 use crate::tape::{Backward, Tape};
 use crate::value::Value;
-use candle_core::{Device, Storage, Tensor};
+use candle_core::{DType, Device, Storage, Tensor};
 use std::any::Any;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -84,8 +85,7 @@ impl Cache {
         into: &mut Gradients,
         forward: impl FnOnce(&mut Context<'_>) -> Result<Loss>,
     ) -> Result<LossValues> {
-        let device = params.device();
-        if !device.is_cpu() {
+        if params.backend().is_composed() {
             let loss = self.composed_loss(params, rng, forward)?;
             let grads = loss.total.backward()?;
             for (name, var) in params.iter() {
@@ -95,7 +95,7 @@ impl Cache {
             return LossValues::from_parts(&loss);
         }
         self.with(|space| {
-            let mut cx = Context { tape: Some(Tape::default()), rng, ..Context::new(space, device) };
+            let mut cx = Context { tape: Some(Tape::default()), rng, ..Context::new(space, params.backend()) };
             let loss = forward(&mut cx)?;
             if let Some(tape) = cx.tape.take() {
                 let mut backward = Backward::new(params, into, cx.space)?;
@@ -118,7 +118,7 @@ impl Cache {
         forward: impl FnOnce(&mut Context<'_>) -> Result<Loss>,
     ) -> Result<LossParts> {
         self.with(|space| {
-            let mut cx = Context { composed: true, rng, ..Context::new(space, params.device()) };
+            let mut cx = Context { composed: true, rng, ..Context::new(space, params.backend()) };
             forward(&mut cx)?.composed(cx.device())
         })
     }
@@ -134,10 +134,8 @@ impl Cache {
         forward: impl FnOnce(&mut Context<'_>) -> Result<R>,
     ) -> Result<R> {
         self.with(|space| {
-            let device = params.device();
-            let prepared = device.is_cpu().then(|| self.prepared(params));
-            let composed = !device.is_cpu();
-            let mut cx = Context { prepared, composed, on_seen: Some(on_seen), ..Context::new(space, device) };
+            let prepared = (!params.backend().is_composed()).then(|| self.prepared(params));
+            let mut cx = Context { prepared, on_seen: Some(on_seen), ..Context::new(space, params.backend()) };
             forward(&mut cx)
         })
     }
@@ -151,7 +149,7 @@ impl Cache {
         params: &Params,
         forward: impl FnOnce(&mut Context<'_>) -> Result<R>,
     ) -> Result<R> {
-        self.with(|space| forward(&mut Context { composed: true, ..Context::new(space, params.device()) }))
+        self.with(|space| forward(&mut Context { composed: true, ..Context::new(space, params.backend()) }))
     }
 }
 
@@ -161,7 +159,7 @@ impl Cache {
 /// Those of `f`.
 #[doc(hidden)]
 pub fn compose<R>(device: &Device, f: impl FnOnce(&mut Context<'_>) -> Result<R>) -> Result<R> {
-    f(&mut Context { composed: true, ..Context::new(&mut Workspace::default(), device.clone()) })
+    f(&mut Context::new(&mut Workspace::default(), &Backend::composed(device.clone())))
 }
 
 /// glibc gives blocks back to the system until one of up to 32 MiB was freed; from then on it keeps blocks of that size, and
@@ -194,13 +192,28 @@ impl std::fmt::Debug for Context<'_> {
 }
 
 impl<'a> Context<'a> {
-    fn new(space: &'a mut Workspace, device: Device) -> Self {
-        Self { space, tape: None, composed: false, prepared: None, rng: None, on_seen: None, device }
+    fn new(space: &'a mut Workspace, backend: &Backend) -> Self {
+        let (composed, device) = (backend.is_composed(), backend.device().clone());
+        Self { space, tape: None, composed, prepared: None, rng: None, on_seen: None, device }
     }
 
-    /// Whether operations are candle's.
-    pub fn composed(&self) -> bool {
-        self.composed
+    /// Whether an operation is candle's, after a look at its inputs: every operation begins with it.
+    ///
+    /// # Errors
+    /// A tensor that is not f32, or on another device.
+    pub(crate) fn composed<'t>(
+        &self,
+        operation: &'static str,
+        tensors: impl IntoIterator<Item = &'t Tensor>,
+    ) -> Result<bool> {
+        for tensor in tensors {
+            require_device(operation, tensor.device(), &self.device)?;
+            if tensor.dtype() != DType::F32 {
+                let (found, expected) = (format!("of {:?}", tensor.dtype()), "of F32".to_string());
+                return Err(ModelError::Input { operation, object: "tensor", found, expected });
+            }
+        }
+        Ok(self.composed)
     }
 
     /// Where tensors are made.
@@ -344,7 +357,7 @@ pub(crate) fn read<const N: usize, R>(
             return refuse("on another device".to_string(), "on the CPU");
         };
         let Ok(values) = storage.as_slice::<f32>() else {
-            return refuse(format!("of {:?}", candle_core::backend::BackendStorage::dtype(storage)), "of f32");
+            return refuse(format!("of {:?}", candle_core::backend::BackendStorage::dtype(storage)), "of F32");
         };
         let Some((from, to)) = layout.contiguous_offsets() else {
             return refuse(format!("with strides {:?}", layout.stride()), "contiguous");

@@ -6,9 +6,8 @@
 //!
 //! This crate knows tensors and numbers only. It opens no file, starts no process and prints nothing.
 
+mod backend;
 mod context;
-#[doc(hidden)]
-pub mod device;
 mod error;
 mod gradients;
 #[doc(hidden)]
@@ -21,6 +20,7 @@ pub mod losses;
 pub mod ops;
 mod optim;
 mod params;
+mod per_parameter;
 mod rng;
 #[doc(hidden)]
 pub mod simd;
@@ -30,12 +30,14 @@ mod value;
 #[doc(hidden)]
 pub mod values;
 
+pub use backend::Backend;
 pub use context::{Cache, Context, Workspace, compose};
 pub use error::{ModelError, Result, some_names};
 pub use gradients::{Gradients, ParamLayout};
 pub use loss::{Loss, LossParts, LossValues, Term};
-pub use optim::{Optimiser, OptimiserConfig, flat};
+pub use optim::{Optimiser, OptimiserConfig};
 pub use params::{Init, Params};
+pub use per_parameter::PerParameter;
 pub use rng::Rng;
 pub use simd::vectors;
 pub use size::Size;

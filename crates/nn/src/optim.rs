@@ -3,6 +3,7 @@
 use crate::error::{ModelError, Result};
 use crate::gradients::{Gradients, ParamLayout};
 use crate::params::Params;
+use crate::per_parameter::PerParameter;
 use crate::simd::vectorised;
 use candle_core::{CpuStorage, InplaceOp1, Layout, Tensor, Var};
 use serde::{Deserialize, Serialize};
@@ -47,8 +48,7 @@ impl Default for OptimiserConfig {
 pub struct Optimiser {
     config: OptimiserConfig,
     layout: Arc<ParamLayout>,
-    first: Vec<f32>,
-    second: Vec<f32>,
+    moments: [PerParameter; 2],
     step: u64,
     threads: usize,
 }
@@ -63,7 +63,54 @@ struct Update {
     corrections: (f64, f64),
 }
 
+impl OptimiserConfig {
+    fn betas(self) -> [f64; 2] {
+        match self {
+            Self::AdamW { beta1, beta2, .. } | Self::AdamAtan2 { beta1, beta2, .. } => [beta1, beta2],
+        }
+    }
+}
+
+/// `atan2(y, x)` for x from 0 on, of candle's operations: four times the angle of a quarter, by its series.
+fn atan2(y: &Tensor, x: &Tensor) -> candle_core::Result<Tensor> {
+    let scale = (y.abs()?.maximum(x)? + 1e-30)?;
+    let (y, x) = ((y / &scale)?, (x / &scale)?);
+    let half = (&y / ((&x + (x.sqr()? + y.sqr()?)?.sqrt()?)? + 1e-30)?)?;
+    let quarter = (&half / ((half.sqr()? + 1.0)?.sqrt()? + 1.0)?)?;
+    let square = quarter.sqr()?;
+    let mut series = square.zeros_like()?;
+    for k in (0..10).rev() {
+        let term = if k % 2 == 0 { 1.0 } else { -1.0 } / f64::from(2 * k + 1);
+        series = ((series * &square)? + term)?;
+    }
+    (series * quarter)? * 4.0
+}
+
 impl Update {
+    /// The same on candle's operations.
+    fn apply_composed(
+        &self,
+        var: &Var,
+        grad: Option<&Tensor>,
+        [first, second]: [&mut Option<Tensor>; 2],
+    ) -> candle_core::Result<()> {
+        let value = var.as_detached_tensor();
+        let grad = grad.map_or_else(|| value.zeros_like(), |grad| grad * f64::from(self.grad_scale))?;
+        let [beta1, beta2] = self.config.betas();
+        let blend = |mean: &mut Option<Tensor>, keep: f64, now: &Tensor| {
+            let now = (now * (1.0 - keep))?;
+            let sum = mean.take().map_or(Ok(now.clone()), |mean| (mean * keep)? + now)?;
+            candle_core::Result::Ok(mean.insert(sum).clone())
+        };
+        let m = (blend(first, beta1, &grad)? / self.corrections.0)?;
+        let root = (blend(second, beta2, &grad.sqr()?)? / self.corrections.1)?.sqrt()?;
+        let (direction, weight_decay) = match self.config {
+            OptimiserConfig::AdamW { eps, weight_decay, .. } => ((m / (root + eps)?)?, weight_decay),
+            OptimiserConfig::AdamAtan2 { weight_decay, .. } => (atan2(&m, &root)?, weight_decay),
+        };
+        var.set(&((value * (1.0 - self.lr * weight_decay))? - (direction * self.lr)?)?)
+    }
+
     /// Elementwise, so the order does not matter.
     fn apply(&self, params: &mut [f32], grads: &[f32], first: &mut [f32], second: &mut [f32]) {
         let (c1, c2) = (self.corrections.0, self.corrections.1);
@@ -133,9 +180,8 @@ impl InplaceOp1 for InPlace<'_> {
 impl Optimiser {
     /// Moments at zero.
     pub fn new(config: OptimiserConfig, layout: Arc<ParamLayout>) -> Self {
-        let zeros = || vec![0.0; layout.len()];
-        let (first, second) = (zeros(), zeros());
-        Self { config, layout, first, second, step: 0, threads: rayon::current_num_threads() }
+        let moments = [PerParameter::zeros(&layout), PerParameter::zeros(&layout)];
+        Self { config, layout, moments, step: 0, threads: rayon::current_num_threads() }
     }
 
     /// Steps taken.
@@ -160,13 +206,24 @@ impl Optimiser {
             });
         }
         self.step += 1;
-        let (OptimiserConfig::AdamW { beta1, beta2, .. } | OptimiserConfig::AdamAtan2 { beta1, beta2, .. }) =
-            self.config;
+        let [beta1, beta2] = self.config.betas();
         let t = self.step as f64;
         let corrections = (1.0 - beta1.powf(t), 1.0 - beta2.powf(t));
         let update = Update { config: self.config, lr, grad_scale, corrections };
-
-        let (mut first, mut second) = (self.first.as_mut_slice(), self.second.as_mut_slice());
+        let [first, second] = &mut self.moments;
+        let (mut first, mut second) = match (first, second, grads.stored()) {
+            (PerParameter::Flat(first), PerParameter::Flat(second), _) => (first.as_mut_slice(), second.as_mut_slice()),
+            (PerParameter::Tensors(first), PerParameter::Tensors(second), PerParameter::Tensors(grads)) => {
+                let moments = first.iter_mut().zip(second);
+                for (((name, var), grad), (m, v)) in params.iter().zip(grads).zip(moments) {
+                    let update = Update { lr: lr * params.rate(name), ..update };
+                    update.apply_composed(var, grad.as_ref(), [m, v])?;
+                }
+                params.changed();
+                return Ok(());
+            }
+            _ => unreachable!("gradients and moments have the same layout"),
+        };
         let mut work: Vec<(&Var, InPlace<'_>)> = Vec::new();
         for ((name, var), (_, span)) in params.iter().zip(self.layout.iter()) {
             let update = Update { lr: lr * params.rate(name), ..update };
@@ -201,61 +258,56 @@ impl Optimiser {
     /// Both moments as tensors named `moment1.<name>` and `moment2.<name>`.
     pub fn state(&self, params: &Params) -> Result<BTreeMap<String, Tensor>> {
         let mut tensors = BTreeMap::new();
-        for ((name, var), (_, span)) in params.iter().zip(self.layout.iter()) {
-            for (kind, values) in [("moment1", &self.first), ("moment2", &self.second)] {
-                let tensor = Tensor::from_slice(&values[span.clone()], var.dims(), var.device())?;
-                tensors.insert(format!("{kind}.{name}"), tensor);
-            }
+        for (kind, values) in MOMENTS.into_iter().zip(&self.moments) {
+            let named = values.named(params, &self.layout)?.into_iter();
+            tensors.extend(named.map(|(name, tensor)| (format!("{kind}.{name}"), tensor)));
         }
         Ok(tensors)
     }
 
-    /// Takes moments saved by `state`, after `step` steps.
+    /// Moments saved by `state`, for [`Self::restore`].
     ///
     /// # Errors
     /// A moment that is missing or of the wrong size.
-    pub fn restore(&mut self, tensors: &BTreeMap<String, Tensor>, step: u64) -> Result<()> {
-        let first = flat(&self.layout, "moment1", tensors)?;
-        let second = flat(&self.layout, "moment2", tensors)?;
-        (self.first, self.second, self.step) = (first, second, step);
-        Ok(())
+    pub fn saved(&self, params: &Params, tensors: &BTreeMap<String, Tensor>) -> Result<[PerParameter; 2]> {
+        let restored = |kind: &str| PerParameter::restored(params, &self.layout, kind, tensors);
+        let [first, second] = MOMENTS;
+        Ok([restored(first)?, restored(second)?])
+    }
+
+    /// Takes saved moments, after `step` steps.
+    pub fn restore(&mut self, moments: [PerParameter; 2], step: u64) {
+        (self.moments, self.step) = (moments, step);
     }
 }
 
-/// The tensors `<kind>.<name>` one after the other.
-pub fn flat(layout: &ParamLayout, kind: &str, tensors: &BTreeMap<String, Tensor>) -> Result<Vec<f32>> {
-    let mut values = Vec::with_capacity(layout.len());
-    for (name, span) in layout.iter() {
-        let name = format!("{kind}.{name}");
-        let tensor = tensors.get(&name).ok_or_else(|| ModelError::MissingTensor {
-            name: name.clone(),
-            given: crate::error::some_names(tensors.keys()),
-        })?;
-        if tensor.elem_count() != span.len() {
-            let (expected, found) = (vec![span.len()], tensor.dims().to_vec());
-            return Err(ModelError::MisshapenTensor { name, expected, found });
-        }
-        values.extend(tensor.flatten_all()?.to_vec1::<f32>()?);
-    }
-    Ok(values)
-}
+/// Prefixes of the moments' names.
+const MOMENTS: [&str; 2] = ["moment1", "moment2"];
 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::{Init, Rng};
+    use crate::{Backend, Init, Rng};
     use candle_core::Device;
 
     fn three_steps(config: OptimiserConfig) -> Vec<f32> {
-        let mut params = Params::new();
+        let [fast, composed] = [Backend::CPU, Backend::composed(Device::Cpu)].map(|backend| steps_on(&backend, config));
+        assert!(fast.iter().zip(&composed).all(|(a, b)| (a - b).abs() < 1e-6), "{fast:?} {composed:?}");
+        fast
+    }
+
+    fn steps_on(backend: &Backend, config: OptimiserConfig) -> Vec<f32> {
+        let mut params = Params::new(backend);
         let start = Tensor::new(&[1f32, -2.0, 0.5], &Device::Cpu).unwrap();
         params.insert("w", start).unwrap();
         let layout = Arc::new(ParamLayout::new(&params));
         let mut optimiser = Optimiser::new(config, layout.clone());
         let mut grads = Gradients::zeros(layout);
         for k in 1..=3 {
-            grads.values_mut().copy_from_slice(&[0.1 * k as f32, -0.3, 2.0 / k as f32]);
+            let grad = Tensor::new(&[0.1 * k as f32, -0.3, 2.0 / k as f32], &Device::Cpu).unwrap();
+            grads.clear();
+            grads.add_tensor("w", &grad).unwrap();
             optimiser.step(&params, &grads, 1.0, 0.01).unwrap();
         }
         params.get("w").unwrap().to_vec1().unwrap()
@@ -291,9 +343,21 @@ mod tests {
     }
 
     #[test]
+    fn the_composed_angle_is_atan2() {
+        let values = [0.0f32, 1e-30, 3e-12, 1e-3, 0.7, 1.0, 55.0, 1e20];
+        for y in values.into_iter().flat_map(|y| [y, -y]) {
+            let x = Tensor::new(&values, &Device::Cpu).unwrap();
+            let got = atan2(&Tensor::full(y, values.len(), &Device::Cpu).unwrap(), &x).unwrap();
+            for (got, x) in got.to_vec1::<f32>().unwrap().into_iter().zip(values) {
+                assert!((got - y.atan2(x)).abs() < 1e-6 || y.abs() <= 1e-30, "atan2({y}, {x}): {got}");
+            }
+        }
+    }
+
+    #[test]
     fn a_restored_optimiser_goes_on_with_the_same_bits() {
         let mut rng = Rng::new(1, "test");
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         params.create("a", &[3, 5], Init::XavierUniform, &mut rng).unwrap();
         params.create("b", &[7], Init::Ones, &mut rng).unwrap();
         let layout = Arc::new(ParamLayout::new(&params));
@@ -307,9 +371,9 @@ mod tests {
         let expected = params.get("a").unwrap().to_vec2::<f32>().unwrap();
         params.load(&weights).unwrap();
         let mut two = Optimiser::new(OptimiserConfig::default(), layout);
-        two.restore(&saved, 1).unwrap();
+        two.restore(two.saved(&params, &saved).unwrap(), 1);
         two.step(&params, &grads, 0.5, 0.1).unwrap();
         assert_eq!(params.get("a").unwrap().to_vec2::<f32>().unwrap(), expected);
-        assert!(two.restore(&BTreeMap::new(), 1).is_err());
+        assert!(two.saved(&params, &BTreeMap::new()).is_err());
     }
 }

@@ -1,6 +1,6 @@
 //! Named parameters of a model: created from our own generator, iterated in the order of their names.
 
-use crate::device::HERE;
+use crate::backend::Backend;
 use crate::error::{ModelError, Result, some_names};
 use crate::rng::Rng;
 use candle_core::{DType, Device, Tensor, Var};
@@ -82,9 +82,10 @@ struct Table {
 }
 
 /// A model's parameters by name, its buffers, numbers that belong to the weights and are never trained, and its tables,
-/// rows kept of the demonstrations themselves. Cloning shares the storage.
-#[derive(Debug, Clone, Default)]
+/// rows kept of the demonstrations themselves: all on one device. Cloning shares the storage.
+#[derive(Debug, Clone)]
 pub struct Params {
+    backend: Backend,
     vars: BTreeMap<String, Var>,
     buffers: BTreeMap<String, Var>,
     tables: Arc<Mutex<BTreeMap<String, Table>>>,
@@ -94,9 +95,16 @@ pub struct Params {
 }
 
 impl Params {
-    /// No parameters yet.
-    pub fn new() -> Self {
-        Self::default()
+    /// No parameters yet; they will be on the backend's device.
+    pub fn new(backend: &Backend) -> Self {
+        Self {
+            backend: backend.clone(),
+            vars: BTreeMap::new(),
+            buffers: BTreeMap::new(),
+            tables: Arc::default(),
+            rates: BTreeMap::new(),
+            version: Arc::default(),
+        }
     }
 
     /// Creates `name` and returns its tensor, which shares the storage: later updates are seen through it.
@@ -104,7 +112,7 @@ impl Params {
     /// # Errors
     /// If the name is taken, or the tensor library fails.
     pub fn create(&mut self, name: &str, shape: &[usize], init: Init, rng: &mut Rng) -> Result<Tensor> {
-        self.insert(name, Tensor::from_vec(init.values(shape, rng), shape, &HERE)?)
+        self.insert(name, Tensor::from_vec(init.values(shape, rng), shape, self.device())?)
     }
 
     /// Adds `name` with the given values.
@@ -131,7 +139,7 @@ impl Params {
 
     fn new_var(&self, name: &str, values: &Tensor) -> Result<Var> {
         self.check_new(name)?;
-        Ok(Var::from_tensor(&values.contiguous()?)?)
+        Ok(Var::from_tensor(&values.to_device(self.device())?.contiguous()?)?)
     }
 
     fn check_new(&self, name: &str) -> Result<()> {
@@ -164,7 +172,7 @@ impl Params {
         let given = some_names(tables.keys());
         let table = tables.get_mut(name).ok_or_else(|| ModelError::MissingTensor { name: name.to_string(), given })?;
         table.check(name, rows)?;
-        table.rows = Some(rows.to_dtype(DType::F32)?.contiguous()?);
+        table.rows = Some(self.placed(rows)?);
         drop(tables);
         self.changed();
         Ok(())
@@ -208,7 +216,7 @@ impl Params {
             let (name, expected, found) = (name.to_string(), buffer.dims().to_vec(), values.dims().to_vec());
             return Err(ModelError::MisshapenTensor { name, expected, found });
         }
-        buffer.set(&values.to_dtype(DType::F32)?.contiguous()?)?;
+        buffer.set(&self.placed(values)?)?;
         self.changed();
         Ok(())
     }
@@ -256,9 +264,19 @@ impl Params {
         Self { vars, ..self.clone() }
     }
 
-    /// Where they are; the CPU if there are none.
-    pub fn device(&self) -> Device {
-        self.vars.values().next().map_or(Device::Cpu, |var| var.device().clone())
+    /// Where they are, and which operations run on them.
+    pub fn backend(&self) -> &Backend {
+        &self.backend
+    }
+
+    /// Where they are.
+    pub fn device(&self) -> &Device {
+        self.backend.device()
+    }
+
+    /// Given values as those of parameters are.
+    fn placed(&self, values: &Tensor) -> Result<Tensor> {
+        Ok(values.to_device(self.device())?.to_dtype(DType::F32)?.contiguous()?)
     }
 
     /// Number of scalar parameters, without buffers.
@@ -304,10 +322,10 @@ impl Params {
         }
         for (name, var) in self.all() {
             // copied, because a variable cannot be set to itself
-            var.set(&tensors[name].to_dtype(DType::F32)?.copy()?)?;
+            var.set(&self.placed(&tensors[name])?.copy()?)?;
         }
         for (name, table) in &mut *tables {
-            table.rows = Some(tensors[name].to_dtype(DType::F32)?.contiguous()?);
+            table.rows = Some(self.placed(&tensors[name])?);
         }
         drop(tables);
         self.changed();
@@ -335,7 +353,7 @@ mod tests {
 
     fn two() -> Params {
         let mut rng = Rng::new(0, "init");
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         params.create("b", &[3], Init::Ones, &mut rng).unwrap();
         params.create("a", &[2, 3], Init::XavierUniform, &mut rng).unwrap();
         params
@@ -410,7 +428,7 @@ mod tests {
     #[test]
     fn an_update_is_seen_through_the_layers_tensor() {
         let mut rng = Rng::new(0, "init");
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let held = params.create("w", &[2], Init::Zeros, &mut rng).unwrap();
         params.get("w").unwrap().set(&Tensor::new(&[1f32, 2.0], &Device::Cpu).unwrap()).unwrap();
         assert_eq!(held.to_vec1::<f32>().unwrap(), [1.0, 2.0]);

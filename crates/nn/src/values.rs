@@ -1,22 +1,11 @@
 //! Tensors as slices.
 
-use crate::error::{ModelError, Result};
-use candle_core::{DType, Tensor};
+use crate::context::read;
+use crate::error::Result;
+use candle_core::{DType, Device, Tensor};
 
-/// Calls `f` with the values of a contiguous f32 tensor, without a copy.
+/// Calls `f` with the values of a tensor: without a copy where it is contiguous f32 on the CPU.
 pub fn with_values<R>(tensor: &Tensor, f: impl FnOnce(&[f32]) -> R) -> Result<R> {
-    let tensor = tensor.to_dtype(DType::F32)?.contiguous()?;
-    let (storage, layout) = tensor.storage_and_layout();
-    let candle_core::Storage::Cpu(storage) = &*storage else {
-        let found = "on another device".to_string();
-        return Err(ModelError::Input {
-            operation: "read",
-            object: "tensor",
-            found,
-            expected: "on the CPU".to_string(),
-        });
-    };
-    let values = storage.as_slice::<f32>()?;
-    let from = layout.start_offset();
-    Ok(f(&values[from..from + layout.shape().elem_count()]))
+    let tensor = tensor.to_device(&Device::Cpu)?.to_dtype(DType::F32)?.contiguous()?;
+    read("values", [&tensor], |[values]| Ok(f(values)))
 }

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use candle_core::{D, DType, Device, Tensor};
 use dataset::WindowBatch;
 use models::actrm::Actrm;
-use models::{ModelError, ValuesRef};
+use models::{Backend, ModelError, ValuesRef};
 use rollout::Ready;
 use serde::{Deserialize, Serialize};
 
@@ -231,7 +231,7 @@ pub fn probe(
     let keys = &entry.entry().meta().keys;
     let chain = Chain::find(keys, ready).map_err(|expected| unfit("task", &expected, "none".to_owned()))?;
     let failed = |source| entry.failed("examine", source);
-    let untrained = Actrm::new(config, entry.preprocess().signature(), 1).map_err(failed)?;
+    let untrained = Actrm::new(config, entry.preprocess().signature(), 1, &Backend::CPU).map_err(failed)?;
 
     let data = locate(&request.data)?;
     let (windows, symmetries, firsts) = first_windows(&data, &request.work, entry.experiment())?;

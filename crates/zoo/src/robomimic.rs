@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use candle_core::Tensor;
-use models::{NormMode, Normaliser, PolicyConfig, Preprocess, robomimic};
+use models::{Backend, NormMode, Normaliser, PolicyConfig, Preprocess, robomimic};
 use rollout::Python;
 use serde_json::{Value, json};
 
@@ -73,10 +73,11 @@ pub fn import(path: &Path, options: &ImportOptions, python: &Python, zoo: &Path)
 
     // before a model of these sizes is built
     let weights = checkpoint.weights(&given).map_err(misfit)?;
-    let model = experiment.policy.build(signature, 0).map_err(experiment.model_error("build the policy of"))?;
+    let model =
+        experiment.policy.build(signature, 0, &Backend::CPU).map_err(experiment.model_error("build the policy of"))?;
     model.params().load(&weights).map_err(misfit)?;
     let preprocess = Normaliser::new(&experiment.normalisation.modes(signature), &checkpoint.statistics)
-        .and_then(|normaliser| Preprocess::new(signature.clone(), normaliser))
+        .and_then(|normaliser| Preprocess::new(signature.clone(), normaliser, model.params().device()))
         .map_err(experiment.model_error("take the statistics of"))?;
 
     let statistics = preprocess.normaliser().tensors().map_err(experiment.model_error("store the normaliser of"))?;

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use common::options;
 use models::actrm::{Config, ReasoningConfig, WarmStart};
 use models::{
-    ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, PolicyConfig, PolicyModel, Preprocess, STATE, Signature,
+    ACTION, Backend, ENVIRONMENT_STATE, NormMode, Normaliser, PolicyConfig, PolicyModel, Preprocess, STATE, Signature,
 };
 use rollout::Pool;
 use zoo::FeatureKeys;
@@ -29,10 +29,10 @@ fn subject(reasoning: ReasoningConfig) -> Subject<'static> {
         reasoning,
         ..Config::default()
     });
-    let model: Arc<dyn PolicyModel> = config.build(&signature, 3).unwrap().into();
+    let model: Arc<dyn PolicyModel> = config.build(&signature, 3, &Backend::CPU).unwrap().into();
     let modes = [STATE, ENVIRONMENT_STATE, ACTION].map(|name| (name.to_owned(), NormMode::Identity));
     let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
-    let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser).unwrap());
+    let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser, &candle_core::Device::Cpu).unwrap());
     let mut keys = FeatureKeys::default();
     keys.insert(STATE, &["robot0_eef_pos", "robot0_gripper_qpos"].map(str::to_owned)).unwrap();
     keys.insert(ENVIRONMENT_STATE, &["object".to_owned()]).unwrap();

@@ -5,8 +5,9 @@
 //! counts agree: CNN 74,850, Transformer 616,514, small TRM 9,922 and 28,258. Initial weights
 //! come from our own generator.
 
-use crate::layers::{Activation, FeedForward, LayerNorm, Linear, Mode, MultiHeadAttention};
+use crate::layers::{Activation, FeedForward, LayerNorm, Linear, MultiHeadAttention};
 use candle_core::Tensor;
+use nn::Backend;
 use nn::Rng;
 use nn::{Init, Params};
 use nn::{ModelError, Result};
@@ -116,7 +117,7 @@ pub(super) struct Cnn {
 
 impl Cnn {
     pub(super) fn new(dims: GridDims, channels: &[usize], rng: &mut Rng) -> Result<Self> {
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let mut width = dims.channels;
         let mut convolutions = Vec::new();
         for (i, &next) in channels.iter().enumerate() {
@@ -171,7 +172,7 @@ impl Transformer {
         (dim, heads, layers, feedforward): (usize, usize, usize, usize),
         rng: &mut Rng,
     ) -> Result<Self> {
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let input = Linear::new(&mut params, "input", dims.channels, dim, rng)?;
         let normal = Init::Normal { std: 0.02 };
         let positions = params.create("positions", &[dims.cells(), dim], normal, rng)?;
@@ -218,9 +219,9 @@ impl GridModel for Transformer {
         let cells = channels_last(grid)?.reshape((batch, self.dims.cells(), ()))?;
         let mut x = self.input.forward(&cells)?.broadcast_add(&self.positions)?;
         for layer in &self.layers {
-            let mixed = layer.attention.forward(&x, &x, &x, None, &mut Mode::Eval)?;
+            let mixed = layer.attention.forward(&x)?;
             x = layer.norm1.forward(&(x + mixed)?)?;
-            let fed = layer.feed_forward.forward(&x, &mut Mode::Eval)?;
+            let fed = layer.feed_forward.forward(&x)?;
             x = layer.norm2.forward(&(x + fed)?)?;
         }
         let x = self.hidden.forward(&x)?.relu()?;
@@ -237,7 +238,7 @@ pub(super) struct Mlp {
 
 impl Mlp {
     pub(super) fn new(dims: GridDims, hidden: &[usize], rng: &mut Rng) -> Result<Self> {
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let mut width = dims.channels * dims.cells();
         let mut layers = Vec::new();
         for (i, &next) in hidden.iter().chain([&(dims.cells() * dims.classes)]).enumerate() {
@@ -332,7 +333,7 @@ mod tests {
     fn a_convolution_is_the_naive_sum() {
         let mut rng = Rng::new(3, "conv");
         let (h, w, input, output) = (4, 5, 3, 2);
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let conv = Conv3x3::new(&mut params, "conv", (input, output), &mut rng).unwrap();
         let x = rng.normals(h * w * input);
         let t = Tensor::from_slice(&x, (1, h, w, input), &Device::Cpu).unwrap();

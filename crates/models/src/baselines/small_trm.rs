@@ -8,10 +8,10 @@
 
 use super::grids::{Conv3x3, GridDims, GridModel, channels_last};
 use crate::layers::Linear;
-use candle_core::{D, DType, Tensor};
+use candle_core::{D, DType, Device, Tensor};
+use nn::Backend;
 use nn::Result;
 use nn::Rng;
-use nn::device::HERE;
 use nn::{Init, Params};
 use serde::{Deserialize, Serialize};
 
@@ -102,7 +102,7 @@ impl SmallTrm {
     /// # Errors
     /// When a tensor operation fails.
     pub fn new(dims: GridDims, config: SmallTrmConfig, rng: &mut Rng) -> Result<Self> {
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let p = &mut params;
         let SmallTrmConfig { features, latent, answer, hidden, head, .. } = config;
         let stem = match config.stem {
@@ -143,7 +143,7 @@ impl GridModel for SmallTrm {
         let (cells, classes) = (self.dims.cells(), self.dims.classes);
         let x = self.features(grid)?.reshape((batch, cells, self.config.features))?;
         let mut z = self.z_init.broadcast_as((batch, cells, self.config.latent))?.contiguous()?;
-        let uniform = Tensor::full(1.0 / classes as f32, (batch * cells, classes), &HERE)?;
+        let uniform = Tensor::full(1.0 / classes as f32, (batch * cells, classes), &Device::Cpu)?;
         let mut belief = uniform.to_dtype(DType::F32)?;
         let mut outputs = Vec::new();
         for step in 0..self.config.supervision_steps {

@@ -9,6 +9,7 @@ use super::grids::dense;
 use crate::layers::{LayerNorm, Linear};
 use crate::models::trm::{self, Fused};
 use candle_core::{D, Tensor};
+use nn::Backend;
 use nn::Rng;
 use nn::{Init, Params};
 use nn::{ModelError, Result};
@@ -149,7 +150,7 @@ pub struct MlpWalker {
 
 impl MlpWalker {
     fn new(observation: usize, actions: usize, hidden: &[usize], with_value: bool, rng: &mut Rng) -> Result<Self> {
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let mut width = observation;
         let mut layers = Vec::new();
         for (i, &next) in hidden.iter().enumerate() {
@@ -247,7 +248,7 @@ impl TrmWalker {
                 expected: "at least 2".into(),
             });
         }
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let p = &mut params;
         let previous = if previous_action {
             let table = p.create("previous.embed", &[actions, high], Init::Normal { std: 1.0 }, rng)?;
@@ -358,7 +359,7 @@ impl ConvWalker {
             ..trm::Config::new(1, height * width, hidden)
         };
         config.check()?;
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let p = &mut params;
         let weight = |params: &mut Params, name: &str, input: usize, output: usize, rng: &mut Rng| {
             let init = Init::TruncatedNormal { std: 1.0 / (input as f64).sqrt() };

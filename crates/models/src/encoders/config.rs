@@ -1,4 +1,4 @@
-//! `[policy.vision]`: how pictures are seen.
+//! `[policy.vision]`: how images are seen.
 
 use super::{ImageNorm, ResNetShape};
 use nn::{ModelError, Result};
@@ -18,7 +18,7 @@ pub enum Architecture {
     Resnet34,
 }
 
-/// What pictures are normalised by, after division by 255.
+/// What images are normalised by, after division by 255.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
 pub enum Normalisation {
@@ -171,10 +171,10 @@ impl VisionConfig {
         ResNetShape { blocks, width: self.width, norm: self.norm }
     }
 
-    /// Size of what the network sees of a picture.
+    /// Size of what the network sees of an image.
     ///
     /// # Errors
-    /// A crop that is larger than the picture, a shift that would move it out of sight.
+    /// A crop that is larger than the image, a shift that would move it outside.
     pub fn seen(&self, (h, w): (usize, usize)) -> Result<(usize, usize)> {
         if self.shift > 0 && self.shift >= h.min(w) {
             return Err(ModelError::Config {

@@ -1,22 +1,21 @@
-//! From a picture to tokens: what ACT and its relatives see with.
+//! From an image to tokens: what ACT and its relatives see with.
 //!
-//! An encoder reads pictures that are normalised already, (b, H, W, 3), and gives every camera either one token a cell of
+//! An encoder reads images that are normalised already, (b, H, W, 3), and gives every camera either one token a cell of
 //! its feature map (ACT, LeRobot) or one token of keypoints. All cameras go through the same network. Convolutions and
 //! their tensors are torchvision's and LeRobot's by name and order.
 
+mod augmentation;
 mod config;
-mod look;
 mod position;
 
+pub use augmentation::Augmentation;
 pub use config::{Architecture, Normalisation, TokenKind, VisionConfig};
-pub use look::Look;
 pub use nn::layers::{ImageNorm, ResNet, ResNetShape, SpatialSoftmax};
 pub use position::position_table;
 
 use crate::layers::Linear;
 use candle_core::{DType, Tensor};
 use nn::Rng;
-use nn::device::HERE;
 use nn::ops::{cat_tokens, linear, narrow_tokens};
 use nn::{Context, Value, compose};
 use nn::{Init, Params};
@@ -31,14 +30,14 @@ pub const PROJECTION: &str = "encoder_img_feat_input_proj";
 pub const KEYPOINTS: &str = "encoder_img_keypoints";
 /// Prefix of the layer between keypoints and token.
 pub const KEYPOINT_PROJECTION: &str = "encoder_img_keypoint_input_proj";
-/// Mean of the pictures of each camera, (cameras, 3), on the scale from 0 to 1: a buffer.
-pub const PICTURE_MEAN: &str = "encoder_img_mean";
+/// Mean of the images of each camera, (cameras, 3), on the scale from 0 to 1: a buffer.
+pub const IMAGE_MEAN: &str = "encoder_img_mean";
 /// Standard deviation of the same.
-pub const PICTURE_STD: &str = "encoder_img_std";
+pub const IMAGE_STD: &str = "encoder_img_std";
 /// Name of the positions of keypoint tokens, one a camera.
 pub const CAMERA_EMBED: &str = "encoder_img_camera_embed";
 
-/// Height and width of a picture as the network gets it.
+/// Height and width of an image as the network gets it.
 pub type Size = (usize, usize);
 
 /// What is made of a feature map.
@@ -56,17 +55,18 @@ pub struct ImageEncoder {
     config: VisionConfig,
     backbone: ResNet,
     head: Head,
-    /// of the cameras' pictures
+    /// of the cameras' images
     given: Vec<Size>,
     /// of what is seen of them
     sizes: Vec<Size>,
     /// (cameras, 3)
     mean: Tensor,
     std: Tensor,
+    composed: bool,
 }
 
 impl ImageEncoder {
-    /// For cameras whose pictures have these sizes, in order, and tokens of width `dim`.
+    /// For cameras whose images have these sizes, in order, and tokens of width `dim`.
     ///
     /// # Errors
     /// A configuration or a size that describes no possible network.
@@ -101,12 +101,13 @@ impl ImageEncoder {
             });
         }
         let sizes = given.iter().map(|&size| config.seen(size)).collect::<Result<Vec<_>>>()?;
-        let (mean, std) = look::statistics(config.normalise);
+        let (mean, std) = augmentation::statistics(config.normalise);
+        let device = params.device().clone();
         let mut buffer = |name: &str, values: [f32; 3]| {
-            let values = Tensor::from_vec(values.repeat(given.len()), (given.len(), 3), &HERE)?;
+            let values = Tensor::from_vec(values.repeat(given.len()), (given.len(), 3), &device)?;
             params.insert_buffer(name, values)
         };
-        let (mean, std) = (buffer(PICTURE_MEAN, mean)?, buffer(PICTURE_STD, std)?);
+        let (mean, std) = (buffer(IMAGE_MEAN, mean)?, buffer(IMAGE_STD, std)?);
         let shape = config.shape();
         let backbone = ResNet::new(params, &format!("{BACKBONE}."), &shape, rng)?;
         let channels = shape.channels_out();
@@ -123,7 +124,7 @@ impl ImageEncoder {
                 let bias = params.create(&format!("{PROJECTION}.bias"), &[dim], uniform, rng)?;
                 let table = |&size: &Size| {
                     let (h, w) = shape.map_size(size);
-                    Ok(Tensor::from_vec(position_table(dim, (h, w)), (h * w, dim), &HERE)?)
+                    Ok(Tensor::from_vec(position_table(dim, (h, w)), (h * w, dim), &device)?)
                 };
                 Head::Map { weight, bias, tables: sizes.iter().map(table).collect::<Result<_>>()? }
             }
@@ -142,7 +143,8 @@ impl ImageEncoder {
             },
         };
         params.set_rate(&format!("{BACKBONE}."), config.backbone_rate());
-        Ok(Self { config: config.clone(), backbone, head, given: given.to_vec(), sizes, mean, std })
+        let (config, given, composed) = (config.clone(), given.to_vec(), params.backend().is_composed());
+        Ok(Self { config, backbone, head, given, sizes, mean, std, composed })
     }
 
     /// The network in front of the tokens.
@@ -150,18 +152,18 @@ impl ImageEncoder {
         &self.backbone
     }
 
-    /// Sizes of what is seen of the cameras' pictures.
+    /// Sizes of what is seen of the cameras' images.
     pub fn sizes(&self) -> &[Size] {
         &self.sizes
     }
 
-    /// Sets what the pictures of each camera are normalised by, on the scale from 0 to 1.
+    /// Sets what the images of each camera are normalised by, on the scale from 0 to 1.
     ///
     /// # Errors
     /// Another number of cameras, or parameters without cameras.
     pub fn set_statistics(params: &Params, mean: &[[f32; 3]], std: &[[f32; 3]]) -> Result<()> {
-        for (name, rows) in [(PICTURE_MEAN, mean), (PICTURE_STD, std)] {
-            let values = Tensor::from_vec(rows.concat(), (rows.len(), 3), &HERE)?;
+        for (name, rows) in [(IMAGE_MEAN, mean), (IMAGE_STD, std)] {
+            let values = Tensor::from_vec(rows.concat(), (rows.len(), 3), params.device())?;
             params.set_buffer(name, &values)?;
         }
         params.changed();
@@ -220,30 +222,30 @@ impl ImageEncoder {
         }
     }
 
-    /// pictures: one (b, H, W, 3) a camera, normalised -> (b, T, D), with candle's graph
+    /// images: one (b, H, W, 3) a camera, normalised -> (b, T, D), with candle's graph
     ///
     /// # Errors
-    /// Another number of cameras or another size of picture.
-    pub fn forward(&self, pictures: &[Tensor]) -> Result<Tensor> {
-        compose(&HERE, |cx| Ok(self.apply(cx, pictures)?.into_graph()))
+    /// Another number of cameras or another size of image.
+    pub fn forward(&self, images: &[Tensor]) -> Result<Tensor> {
+        compose(self.mean.device(), |cx| Ok(self.apply(cx, images)?.into_graph()))
     }
 
-    /// pictures: one (b, H, W, 3) a camera, normalised -> (b, T, D). Cameras of one size go through the network as one batch.
+    /// images: one (b, H, W, 3) a camera, normalised -> (b, T, D). Cameras of one size go through the network as one batch.
     ///
     /// # Errors
-    /// Another number of cameras or another size of picture.
-    pub fn apply(&self, cx: &mut Context<'_>, pictures: &[Tensor]) -> Result<Value> {
-        self.check(pictures)?;
-        let b = pictures[0].dim(0)?;
-        let mut tokens: Vec<Option<Value>> = vec![None; pictures.len()];
+    /// Another number of cameras or another size of image.
+    pub fn apply(&self, cx: &mut Context<'_>, images: &[Tensor]) -> Result<Value> {
+        self.check(images)?;
+        let b = images[0].dim(0)?;
+        let mut tokens: Vec<Option<Value>> = vec![None; images.len()];
         // backwards, so that gradients are added in the order of the cameras
-        for first in (0..pictures.len()).rev() {
-            let alike: Vec<usize> = (0..pictures.len()).filter(|&i| self.sizes[i] == self.sizes[first]).collect();
+        for first in (0..images.len()).rev() {
+            let alike: Vec<usize> = (0..images.len()).filter(|&i| self.sizes[i] == self.sizes[first]).collect();
             if alike[0] != first {
                 continue;
             }
             let of_size =
-                alike.iter().map(|&i| pictures[i].to_dtype(DType::F32)).collect::<candle_core::Result<Vec<_>>>()?;
+                alike.iter().map(|&i| images[i].to_dtype(DType::F32)).collect::<candle_core::Result<Vec<_>>>()?;
             let map = self.backbone.forward(cx, &Value::from(&Tensor::cat(&of_size, 0)?))?;
             let all = match &self.head {
                 Head::Map { weight, bias, .. } => {
@@ -257,7 +259,7 @@ impl ImageEncoder {
                     linear(cx, &places.reshape((n, 1, width))?, project)?
                 }
             };
-            // one picture after the other, camera by camera: as one sequence its parts are the cameras'
+            // one image after the other, camera by camera: as one sequence its parts are the cameras'
             let (n, t, dim) = all.dims3()?;
             let all = all.reshape((1, n * t, dim))?;
             for (at, &i) in alike.iter().enumerate() {
@@ -274,14 +276,14 @@ impl ImageEncoder {
         matches!(self.head, Head::Keypoints { .. })
     }
 
-    /// Checks number and sizes of the pictures.
-    pub(crate) fn check(&self, pictures: &[Tensor]) -> Result<()> {
-        if pictures.len() != self.sizes.len() {
-            let (found, expected) = (pictures.len().to_string(), self.sizes.len().to_string());
+    /// Checks number and sizes of the images.
+    pub(crate) fn check(&self, images: &[Tensor]) -> Result<()> {
+        if images.len() != self.sizes.len() {
+            let (found, expected) = (images.len().to_string(), self.sizes.len().to_string());
             return Err(ModelError::Input { operation: "see", object: "number of cameras", found, expected });
         }
-        let b = pictures.first().map_or(Ok(0), |x| x.dim(0))?;
-        for (x, &(h, w)) in pictures.iter().zip(&self.sizes) {
+        let b = images.first().map_or(Ok(0), |x| x.dim(0))?;
+        for (x, &(h, w)) in images.iter().zip(&self.sizes) {
             if x.dims() != [b, h, w, 3] {
                 let (expected, found) = (vec![b, h, w, 3], x.dims().to_vec());
                 return Err(ModelError::Shape { operation: "see", object: "image", expected, found });

@@ -1,6 +1,8 @@
 //! Image encoders by hand beside the same on candle's operations.
 #![allow(clippy::unwrap_used)]
 use super::*;
+use candle_core::Device;
+use nn::Backend;
 use nn::ops::term_of;
 use nn::simd::{Level, at_most};
 use nn::{Cache, Gradients, Loss, ParamLayout, Value};
@@ -8,7 +10,7 @@ use std::sync::Arc;
 
 const DIM: usize = 12;
 
-/// Both norms, one and two sizes of picture, odd ones among them.
+/// Both norms, one and two sizes of image, odd ones among them.
 #[test]
 fn tokens_and_gradients_are_the_composed_ones() {
     let (map, five) = (TokenKind::Map, TokenKind::Keypoints { count: 5 });
@@ -24,29 +26,29 @@ fn tokens_and_gradients_are_the_composed_ones() {
         (8, ImageNorm::Frozen, vec![(40, 33)], 2, map, Some([1, 2, 0, 0])),
     ] {
         let config = VisionConfig { width, norm, tokens, blocks, ..VisionConfig::default() };
-        let (mut params, mut rng, cache) = (Params::new(), Rng::new(5, "init"), Cache::default());
+        let (mut params, mut rng, cache) = (Params::new(&Backend::CPU), Rng::new(5, "init"), Cache::default());
         let encoder = ImageEncoder::without_positions(&mut params, &config, &sizes, DIM, &mut rng).unwrap();
         for (name, var) in params.all() {
             // away from 1 and 0; variances stay positive
-            let noise = Tensor::from_vec(rng.normals(var.elem_count()), var.dims(), &HERE).unwrap();
+            let noise = Tensor::from_vec(rng.normals(var.elem_count()), var.dims(), &Device::Cpu).unwrap();
             let noise = if name.ends_with("var") { noise.abs().unwrap() } else { noise };
             let scale = if var.dims().len() == 1 { 0.1 } else { 0.0 };
             var.set(&(var.as_tensor() + (noise * scale).unwrap()).unwrap()).unwrap();
         }
-        let mut picture = |&(h, w): &Size| Tensor::from_vec(rng.normals(rows * h * w * 3), (rows, h, w, 3), &HERE);
-        let pictures: Vec<Tensor> = sizes.iter().map(|size| picture(size).unwrap()).collect();
+        let mut image = |&(h, w): &Size| Tensor::from_vec(rng.normals(rows * h * w * 3), (rows, h, w, 3), &Device::Cpu);
+        let images: Vec<Tensor> = sizes.iter().map(|size| image(size).unwrap()).collect();
         let loss = |cx: &mut Context<'_>| {
-            let y = encoder.apply(cx, &pictures)?;
+            let y = encoder.apply(cx, &images)?;
             let weights = Rng::new(9, "weights").normals(y.len());
-            let composed = Tensor::from_slice(&weights, y.dims(), &HERE)?;
-            let by_hand = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
+            let composed = Tensor::from_slice(&weights, y.dims(), &Device::Cpu)?;
+            let on_slices = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
                 if let Some((grad, _)) = grad {
                     grad.copy_from_slice(&weights);
                 }
                 y.iter().zip(&weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
             };
             let mut loss = Loss::default();
-            loss.add("sum", term_of(cx, &y, by_hand, |y| Ok(y.mul(&composed)?.sum_all()?))?, 1.0);
+            loss.add("sum", term_of(cx, &y, on_slices, |y| Ok(y.mul(&composed)?.sum_all()?))?, 1.0);
             Ok(loss)
         };
         let graph = cache.composed_loss(&params, None, loss).unwrap().total.backward().unwrap();
@@ -58,7 +60,7 @@ fn tokens_and_gradients_are_the_composed_ones() {
                 assert!((g - w).abs() <= tolerance * scale, "{what} {sizes:?}: {g} {w} (largest {scale})");
             }
         };
-        let want = flat(&encoder.forward(&pictures).unwrap());
+        let want = flat(&encoder.forward(&images).unwrap());
         for level in Level::ALL {
             at_most(level, || {
                 let step = || {
@@ -75,7 +77,7 @@ fn tokens_and_gradients_are_the_composed_ones() {
                 // predictions keep their panels
                 for _ in 0..2 {
                     let tokens =
-                        |cx: &mut Context<'_>| Ok::<_, ModelError>(Value::detached(&encoder.apply(cx, &pictures)?));
+                        |cx: &mut Context<'_>| Ok::<_, ModelError>(Value::detached(&encoder.apply(cx, &images)?));
                     let got = cache.predict(&params, &mut || {}, tokens).unwrap();
                     close(&flat(&got), &want, 1e-5, &format!("tokens {level:?}"));
                 }

@@ -1,6 +1,6 @@
-//! Told in training, unseen afterwards: numbers that demonstrations know and the policy must find in what it sees.
+//! Auxiliary supervision: numbers that demonstrations know and the policy must find in what it sees.
 //!
-//! A policy that sees pictures learns where things are only by what its actions have to do with it, from few demonstrations
+//! A policy that sees images learns where things are only by what its actions have to do with it, from few demonstrations
 //! slowly. So the encoder's output at the latent's token, the first one, is asked for those numbers as well, and the squared error is a part of the loss (Levine et al., "End-to-End Training of Deep Visuomotor Policies",
 //! arXiv 1504.00702, begin their convolutions so). When it acts a policy neither gets these numbers nor is asked for them.
 
@@ -74,62 +74,62 @@ impl Auxiliary {
         encoded: &Value,
         (model, batch): (&'static str, &Batch),
     ) -> Result<Term> {
-        let told = Arc::new(self.told(model, batch)?);
+        let targets = Arc::new(self.targets(model, batch)?);
         let first = narrow_tokens(cx, encoded, 0, 1)?;
         let found = linear(cx, &first, &self.head)?.reshape((batch.rows(), self.head.weight.dim(0)?))?;
-        let by_hand = Arc::clone(&told);
-        let by_hand = move |found: &[f32], grad: Option<(&mut [f32], f64)>| match grad {
+        let on_slices = Arc::clone(&targets);
+        let on_slices = move |found: &[f32], grad: Option<(&mut [f32], f64)>| match grad {
             Some((grad, weight)) => {
                 grad.copy_from_slice(found);
-                by_hand.gradient(grad, weight)
+                on_slices.gradient(grad, weight)
             }
-            None => by_hand.gradient(&mut found.to_vec(), 0.0),
+            None => on_slices.gradient(&mut found.to_vec(), 0.0),
         };
-        term_of(cx, &found, by_hand, |found| told.loss(found))
+        term_of(cx, &found, on_slices, |found| targets.loss(found))
     }
 
-    /// What a batch tells.
+    /// Targets of a batch.
     ///
     /// # Errors
     /// A batch that tells nothing, or something else.
-    fn told(&self, model: &'static str, batch: &Batch) -> Result<Told> {
+    fn targets(&self, model: &'static str, batch: &Batch) -> Result<AuxiliaryTargets> {
         let expected = [batch.rows(), self.head.weight.dim(0)?];
         match &batch.auxiliary {
-            Some(told) if told.dims() == expected => {
-                let values = with_values(told, <[f32]>::to_vec)?;
-                Ok(Told { values, entries: (batch.total_rows * expected[1]).max(1) })
+            Some(targets) if targets.dims() == expected => {
+                let values = with_values(targets, <[f32]>::to_vec)?;
+                Ok(AuxiliaryTargets { values, entries: (batch.total_rows * expected[1]).max(1) })
             }
             other => Err(ModelError::Input {
                 operation: model,
                 object: "auxiliary numbers",
-                found: other.as_ref().map_or_else(|| "nothing".to_string(), |told| format!("{:?}", told.dims())),
+                found: other.as_ref().map_or_else(|| "nothing".to_string(), |targets| format!("{:?}", targets.dims())),
                 expected: format!("{expected:?}"),
             }),
         }
     }
 }
 
-/// What a shard tells.
+/// Targets of a shard.
 #[derive(Debug)]
-struct Told {
+struct AuxiliaryTargets {
     /// (b, K), normalised
     values: Vec<f32>,
     /// numbers that the whole batch tells
     entries: usize,
 }
 
-impl Told {
+impl AuxiliaryTargets {
     /// found: (b, K) -> the squared error, a share of the mean over the whole batch
     fn loss(&self, found: &Tensor) -> Result<Tensor> {
-        let told = Tensor::from_slice(&self.values, found.dims(), found.device())?;
-        Ok(((found - told)?.sqr()?.sum_all()? / self.entries as f64)?)
+        let targets = Tensor::from_slice(&self.values, found.dims(), found.device())?;
+        Ok(((found - targets)?.sqr()?.sum_all()? / self.entries as f64)?)
     }
 
     /// The same on a slice; what was found becomes `weight` times the gradient of the loss.
     fn gradient(&self, found: &mut [f32], weight: f64) -> f64 {
         let (mut loss, share) = (0.0, weight * 2.0 / self.entries as f64);
-        for (found, told) in found.iter_mut().zip(&self.values) {
-            let off = f64::from(*found) - f64::from(*told);
+        for (found, targets) in found.iter_mut().zip(&self.values) {
+            let off = f64::from(*found) - f64::from(*targets);
             loss += off * off;
             *found = (off * share) as f32;
         }

@@ -252,7 +252,7 @@ mod tests {
 
     #[test]
     fn a_layer_is_the_sum_over_the_neighbours() {
-        let (mut p, rng) = (Params::new(), &mut Rng::new(1, "init"));
+        let (mut p, rng) = (Params::new(&nn::Backend::CPU), &mut Rng::new(1, "init"));
         let shape = Shape {
             dim: 4,
             heads: 1,
@@ -263,7 +263,7 @@ mod tests {
         };
         let layer = GridLayer::new(&mut p, "layer", shape, rng).unwrap();
         let grid = Grid { first: 0, rows: 3, columns: 2 };
-        let x = Tensor::from_vec(rng.normals(6 * 4), (1, 6, 4), &nn::device::HERE).unwrap();
+        let x = Tensor::from_vec(rng.normals(6 * 4), (1, 6, 4), &candle_core::Device::Cpu).unwrap();
         let cache = nn::Cache::default();
         let got = cache.predict(&p, &mut || {}, |cx| layer.apply(cx, grid, &Value::from(&x))).unwrap();
         let got = got.detached().squeeze(0).unwrap();
@@ -280,7 +280,7 @@ mod tests {
                 }
             }
             let after = (x.squeeze(0).unwrap().narrow(0, cell, 1).unwrap() + sum.unsqueeze(0).unwrap()).unwrap();
-            let dense = layer.ff.forward(&layer.norm2.forward(&after).unwrap(), &mut super::super::Mode::Eval).unwrap();
+            let dense = layer.ff.forward(&layer.norm2.forward(&after).unwrap()).unwrap();
             let off = ((&after + dense).unwrap() - got.narrow(0, cell, 1).unwrap()).unwrap();
             assert!(off.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-5);
         }

@@ -2,8 +2,8 @@
 
 mod auxiliary;
 mod grid;
+mod image_features;
 mod pointer;
-mod sight;
 mod steps;
 mod tokens;
 mod vae;
@@ -12,10 +12,10 @@ pub use auxiliary::AuxiliaryConfig;
 pub(crate) use auxiliary::{AUXILIARY_HEAD, Auxiliary};
 pub use grid::GridConfig;
 pub(crate) use grid::{Cells, GridLayer, NEIGHBOURS};
+pub(crate) use image_features::ImageFeatures;
 pub use nn::layers::*;
 pub use pointer::PointerConfig;
 pub(crate) use pointer::{Pointer, Question, ask};
-pub(crate) use sight::Sight;
 pub(crate) use steps::Steps;
 pub(crate) use tokens::{Cameras, InputTokens, TokenLayout, environment_state};
 pub(crate) use vae::Vae;

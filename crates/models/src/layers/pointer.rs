@@ -167,9 +167,9 @@ pub(crate) trait Question {
 /// The loss of these scores, and the share of rows that are answered rightly.
 pub(crate) fn ask(cx: &mut Context<'_>, question: &Arc<dyn Question>, scores: &Value) -> Result<(Term, f32)> {
     let values = scores.detached().flatten_all()?.to_vec1::<f32>()?;
-    let (right, by_hand) = (question.answers(&values, None).right, Arc::clone(question));
-    let by_hand = move |scores: &[f32], grad: Option<(&mut [f32], f64)>| by_hand.answers(scores, grad).loss;
-    Ok((term_of(cx, scores, by_hand, |scores| question.loss(scores))?, right))
+    let (right, on_slices) = (question.answers(&values, None).right, Arc::clone(question));
+    let on_slices = move |scores: &[f32], grad: Option<(&mut [f32], f64)>| on_slices.answers(scores, grad).loss;
+    Ok((term_of(cx, scores, on_slices, |scores| question.loss(scores))?, right))
 }
 
 impl Question for Asked {

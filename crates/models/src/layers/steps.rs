@@ -1,6 +1,6 @@
 //! Observations step by step, for models that read a sequence: all numbers of a step, then what the cameras see of it.
 
-use super::Sight;
+use super::ImageFeatures;
 use crate::batch::Batch;
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Signature};
@@ -13,11 +13,11 @@ use nn::{Context, Params, Result, Rng, Value};
 pub(crate) struct Steps {
     model: &'static str,
     signature: Signature,
-    sight: Option<Sight>,
+    image_features: Option<ImageFeatures>,
 }
 
 impl Steps {
-    /// Of a signature that was checked. Without pictures nothing is drawn from `rng`.
+    /// Of a signature that was checked. Without images nothing is drawn from `rng`.
     pub(crate) fn new(
         p: &mut Params,
         model: &'static str,
@@ -25,23 +25,23 @@ impl Steps {
         vision: Option<&VisionConfig>,
         rng: &mut Rng,
     ) -> Result<Self> {
-        let sight = Sight::new(p, signature, vision, rng)?;
-        Ok(Self { model, signature: signature.clone(), sight })
+        let image_features = ImageFeatures::new(p, signature, vision, rng)?;
+        Ok(Self { model, signature: signature.clone(), image_features })
     }
 
     /// The cameras, if there are any.
-    pub(crate) fn sight(&self) -> Option<&Sight> {
-        self.sight.as_ref()
+    pub(crate) fn image_features(&self) -> Option<&ImageFeatures> {
+        self.image_features.as_ref()
     }
 
-    /// How pictures are seen, if there are any.
+    /// How images are seen, if there are any.
     pub(crate) fn vision(&self) -> Option<&VisionConfig> {
-        self.sight.as_ref().map(Sight::config)
+        self.image_features.as_ref().map(ImageFeatures::config)
     }
 
     /// Numbers of a step that cameras make.
     fn of_cameras(&self) -> usize {
-        self.sight.as_ref().map_or(0, |sight| sight.width() / self.signature.n_obs_steps)
+        self.image_features.as_ref().map_or(0, |image_features| image_features.width() / self.signature.n_obs_steps)
     }
 
     /// Steps of an observation.
@@ -55,17 +55,17 @@ impl Steps {
         numbers.map(|spec| spec.width()).sum::<usize>() + self.of_cameras()
     }
 
-    /// The observation with pictures as the network reads them; random parts in training, with `rng`.
-    pub(crate) fn look(&self, observation: &Features<Tensor>, rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
-        match &self.sight {
-            Some(sight) => sight.look(observation, rng),
+    /// The observation with images as the network reads them; random parts in training, with `rng`.
+    pub(crate) fn prepare(&self, observation: &Features<Tensor>, rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
+        match &self.image_features {
+            Some(image_features) => image_features.prepare(observation, rng),
             None => Ok(observation.clone()),
         }
     }
 
-    /// The batch with pictures as the network reads them in training.
-    pub(crate) fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
-        Ok(Batch { observation: self.look(&batch.observation, Some(rng))?, ..batch.clone() })
+    /// The batch with images as the network reads them in training.
+    pub(crate) fn with_images(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
+        Ok(Batch { observation: self.prepare(&batch.observation, Some(rng))?, ..batch.clone() })
     }
 
     /// The features that are numbers, (b, T, …) each -> (b, T, numbers)
@@ -78,29 +78,29 @@ impl Steps {
         Ok(Tensor::cat(&joined, 2)?)
     }
 
-    /// The signature's features, (b, T, …) each, pictures as the network reads them -> (b, T, width)
+    /// The signature's features, (b, T, …) each, images as the network reads them -> (b, T, width)
     pub(crate) fn apply(&self, cx: &mut Context<'_>, rows: usize, observation: &Features<Tensor>) -> Result<Value> {
         let numbers = Value::from(&self.numbers(rows, observation)?);
-        let Some(sight) = &self.sight else { return Ok(numbers) };
-        let seen = sight.apply(cx, observation)?;
+        let Some(image_features) = &self.image_features else { return Ok(numbers) };
+        let seen = image_features.apply(cx, observation)?;
         let lines = rows * self.signature.n_obs_steps;
         let seen = seen.reshape((lines, self.of_cameras()))?;
         let both = cat_rows(cx, &numbers.reshape((lines, numbers.width()))?, &seen)?;
         both.reshape((rows, self.signature.n_obs_steps, self.width()))
     }
 
-    /// The last step alone, of one row: (1, 1, width). Of a camera's pictures, as the data has them, the last one is seen only.
+    /// The last step alone, of one row: (1, 1, width). Of a camera's images, as the data has them, the last one is seen only.
     pub(crate) fn apply_to_last(&self, cx: &mut Context<'_>, observation: &Features<Tensor>) -> Result<Value> {
         let steps = self.signature.n_obs_steps;
         let numbers = self.numbers(1, observation)?.narrow(1, steps - 1, 1)?.contiguous()?;
-        let Some(sight) = &self.sight else { return Ok(Value::from(&numbers)) };
+        let Some(image_features) = &self.image_features else { return Ok(Value::from(&numbers)) };
         let mut last = Features::new();
-        for camera in &sight.cameras().features {
-            let pictures = observation.require(self.model, camera)?;
+        for camera in &image_features.cameras().features {
+            let images = observation.require(self.model, camera)?;
             // a history of one step has no axis of its own
-            last.insert(camera, if steps > 1 { pictures.narrow(1, steps - 1, 1)? } else { pictures.clone() });
+            last.insert(camera, if steps > 1 { images.narrow(1, steps - 1, 1)? } else { images.clone() });
         }
-        let seen = sight.apply_to_step(cx, &last)?;
+        let seen = image_features.apply_to_step(cx, &last)?;
         cat_rows(cx, &Value::from(&numbers.squeeze(1)?), &seen)?.reshape((1, 1, self.width()))
     }
 }

@@ -47,7 +47,7 @@ pub(crate) struct TokenSpec {
     pub(crate) position: Position,
 }
 
-/// The cameras of a signature, and the tokens that their pictures become.
+/// The cameras of a signature, and the tokens that their images become.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Cameras {
     pub(crate) config: VisionConfig,
@@ -55,7 +55,7 @@ pub(crate) struct Cameras {
     pub(crate) shape: ResNetShape,
     /// names of the features
     pub(crate) features: Vec<String>,
-    /// sizes of their pictures
+    /// sizes of their images
     pub(crate) given: Vec<Size>,
     /// sizes of what is seen of them
     pub(crate) seen: Vec<Size>,
@@ -110,7 +110,7 @@ impl Cameras {
     }
 }
 
-/// The tokens after the latent's: state, environment state, entities, then pictures.
+/// The tokens after the latent's: state, environment state, entities, then images.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TokenLayout {
     /// one token a feature
@@ -119,7 +119,7 @@ pub(crate) struct TokenLayout {
 }
 
 impl TokenLayout {
-    /// Of a signature that was checked, for tokens of width `dim`; pictures are seen as `vision` says.
+    /// Of a signature that was checked, for tokens of width `dim`; images are seen as `vision` says.
     pub(crate) fn new(signature: &Signature, vision: Option<&VisionConfig>, dim: usize) -> Result<Self> {
         let cameras = Cameras::asked(signature, vision, dim)?;
         if cameras.is_some() && signature.n_obs_steps != 1 {
@@ -152,7 +152,7 @@ impl TokenLayout {
         Ok(Self { tokens: tokens.collect(), cameras })
     }
 
-    /// Tokens with the latent's, without those of pictures.
+    /// Tokens with the latent's, without those of images.
     pub(crate) fn vectors(&self) -> usize {
         1 + self.tokens.len()
     }
@@ -206,7 +206,7 @@ pub(crate) struct InputTokens {
     projections: Vec<Linear>,
     feature_positions: Embedding,
     entity_positions: Option<Embedding>,
-    eyes: Option<ImageEncoder>,
+    image_encoder: Option<ImageEncoder>,
 }
 
 impl InputTokens {
@@ -241,29 +241,33 @@ impl InputTokens {
         let projections = layout.tokens.iter();
         let projections = projections.map(|token| layer(&token.prefix).expect("one was made for every token"));
         let projections = projections.collect();
-        let eyes = match &layout.cameras {
+        let image_encoder = match &layout.cameras {
             Some(cameras) => Some(ImageEncoder::new(p, &cameras.config, &cameras.given, dim, rng)?),
             None => None,
         };
-        Ok(Self { layout, latent, projections, feature_positions, entity_positions, eyes })
+        Ok(Self { layout, latent, projections, feature_positions, entity_positions, image_encoder })
     }
 
-    /// The observation with pictures as the network reads them: random parts in training, with `rng`. What was looked at
-    /// already stays.
-    pub(crate) fn look(&self, observation: &Features<Tensor>, mut rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
+    /// The observation with images as the network reads them: random parts in training, with `rng`. Images that
+    /// are prepared already stay.
+    pub(crate) fn prepare(
+        &self,
+        observation: &Features<Tensor>,
+        mut rng: Option<&mut Rng>,
+    ) -> Result<Features<Tensor>> {
         let mut seen = observation.clone();
-        if let (Some(eyes), Some(cameras)) = (&self.eyes, &self.layout.cameras) {
+        if let (Some(image_encoder), Some(cameras)) = (&self.image_encoder, &self.layout.cameras) {
             for (i, name) in cameras.features.iter().enumerate() {
-                let pictures = observation.require("see", name)?;
-                if pictures.dtype() == DType::U8 {
-                    seen.insert(name, eyes.look(i, pictures, rng.as_deref_mut())?);
+                let images = observation.require("see", name)?;
+                if images.dtype() == DType::U8 {
+                    seen.insert(name, image_encoder.prepare(i, images, rng.as_deref_mut())?);
                 }
             }
         }
         Ok(seen)
     }
 
-    /// How pictures are seen, if there are any.
+    /// How images are seen, if there are any.
     pub(crate) fn vision(&self) -> Option<&VisionConfig> {
         self.layout.cameras.as_ref().map(|cameras| &cameras.config)
     }
@@ -284,9 +288,9 @@ impl InputTokens {
         }
         tokens.push(linear(cx, &latent.reshape((b, 1, width))?, &self.latent)?);
         tokens.reverse();
-        if let (Some(eyes), Some(cameras)) = (&self.eyes, &self.layout.cameras) {
-            let pictures = cameras.features.iter().map(|name| Ok(observation.require("tokens", name)?.clone()));
-            tokens.push(eyes.apply(cx, &pictures.collect::<Result<Vec<_>>>()?)?);
+        if let (Some(image_encoder), Some(cameras)) = (&self.image_encoder, &self.layout.cameras) {
+            let images = cameras.features.iter().map(|name| Ok(observation.require("tokens", name)?.clone()));
+            tokens.push(image_encoder.apply(cx, &images.collect::<Result<Vec<_>>>()?)?);
         }
         cat_tokens(cx, b, &tokens.iter().collect::<Vec<_>>())
     }
@@ -314,10 +318,11 @@ impl InputTokens {
                 (Position::Entity(_) | Position::Nowhere, _) => nowhere.clone(),
             });
         }
-        if let Some(eyes) = &self.eyes {
-            let positions = eyes.positions()?;
+        if let Some(image_encoder) = &self.image_encoder {
+            let positions = image_encoder.positions()?;
             let (rows, dim) = positions.dims2()?;
-            let positions = if eyes.learns_positions() { cx.parameter(&positions)? } else { Value::from(&positions) };
+            let positions =
+                if image_encoder.learns_positions() { cx.parameter(&positions)? } else { Value::from(&positions) };
             parts.push(positions.reshape((1, rows, dim))?);
         }
         cat_tokens(cx, 1, &parts.iter().collect::<Vec<_>>())
@@ -357,10 +362,10 @@ mod tests {
         assert_eq!((layout.len(), layout.feature_rows(), layout.entity_rows()), (7, 3, 2));
         assert_eq!(layout.state().feature, "observation.state");
 
-        let (mut p, rng) = (Params::new(), &mut Rng::new(1, "init"));
+        let (mut p, rng) = (Params::new(&nn::Backend::CPU), &mut Rng::new(1, "init"));
         let env_state = environment_state(&mut p, &layout, 8, rng).unwrap();
         let tokens = InputTokens::new(&mut p, layout, 3, 8, env_state, rng).unwrap();
-        let positions = nn::compose(&nn::device::HERE, |cx| tokens.apply_positions(cx)).unwrap().detached();
+        let positions = nn::compose(&candle_core::Device::Cpu, |cx| tokens.apply_positions(cx)).unwrap().detached();
         let positions = positions.squeeze(0).unwrap().to_vec2::<f32>().unwrap();
         let rows = |name: &str| p.get(name).unwrap().to_vec2::<f32>().unwrap();
         let (features, entities) =

@@ -81,7 +81,7 @@ pub trait Policy: Send {
     /// Tells it that so many actions of its last chunk are on their way.
     fn executed(&mut self, _actions: usize) {}
 
-    /// Milliseconds from the last query's beginning until its pictures were tokens; `None` if it sees none, or cannot tell.
+    /// Milliseconds from the last query's beginning until its images were tokens; `None` if it sees none, or cannot tell.
     fn encoding(&self) -> Option<f64> {
         None
     }

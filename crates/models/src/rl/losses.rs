@@ -1,9 +1,8 @@
 //! What an update minimises, on vectors of one number a step. Every product is of two vectors of the same length:
 //! candle refuses to multiply others, and nothing here broadcasts.
 
-use candle_core::{D, Tensor};
+use candle_core::{D, Device, Tensor};
 use nn::Result;
-use nn::device::HERE;
 
 /// The steps that an update learns from; each list has one item a step.
 #[derive(Debug, Clone, Default)]
@@ -48,14 +47,14 @@ impl Chosen {
     }
 
     fn vector(list: &[f32]) -> Result<Tensor> {
-        Ok(Tensor::from_slice(list, list.len(), &HERE)?)
+        Ok(Tensor::from_slice(list, list.len(), &Device::Cpu)?)
     }
 
     /// `-mean(log p(a) A)`, or with `clip` PPO's `-mean(min(r A, clamp(r, 1 - clip, 1 + clip) A))`, `r` the ratio of the
     /// action's probability to that when it was drawn.
     pub(super) fn policy_loss(&self, log_policy: &Tensor, clip: Option<f64>) -> Result<PolicyLoss> {
         let n = self.actions.len();
-        let index = Tensor::from_slice(&self.actions, (n, 1), &HERE)?;
+        let index = Tensor::from_slice(&self.actions, (n, 1), &Device::Cpu)?;
         let log_probs = log_policy.gather(&index, 1)?.squeeze(1)?;
         let advantages = Self::vector(&self.advantages)?;
         let log_ratio = (&log_probs - Self::vector(&self.log_probs)?)?;

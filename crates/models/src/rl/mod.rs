@@ -44,10 +44,9 @@ mod tests;
 use crate::baselines::WalkerNet;
 use crate::train::{Learner, LearnerMetrics, TrainConfig};
 use advantages::{advantages, standardise};
-use candle_core::{D, Tensor};
+use candle_core::{D, Device, Tensor};
 use losses::{Chosen, entropy, log_softmax};
 use nn::Rng;
-use nn::device::HERE;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -324,6 +323,7 @@ impl Agent {
     /// # Errors
     /// A configuration out of range; a value head with REINFORCE, or none with the others.
     pub fn new(net: Box<dyn WalkerNet>, config: RlConfig, train: TrainConfig, seed: u64) -> Result<Self> {
+        net.params().backend().require_cpu("reinforcement learning")?;
         config.check()?;
         let (wants, has) = (!matches!(config.algorithm, Algorithm::Reinforce), net.sizes().2);
         if wants != has {
@@ -408,7 +408,7 @@ impl Agent {
 
     /// One optimiser step on the steps `batch`; adds to `metrics` and returns the divergence.
     fn improve(&mut self, steps: &Steps, batch: &[u32], metrics: &mut RlMetrics) -> Result<f64> {
-        let index = Tensor::from_slice(batch, batch.len(), &HERE)?;
+        let index = Tensor::from_slice(batch, batch.len(), &Device::Cpu)?;
         let observations = steps.observations.index_select(&index, 0)?;
         let previous = steps.previous.index_select(&index, 0)?;
         let chosen = steps.chosen.select(batch);
@@ -472,8 +472,8 @@ impl Agent {
         let std = standardise(&mut chosen.advantages, self.config.advantage_std_floor);
         let count = previous.len();
         let steps = Steps {
-            observations: Tensor::from_vec(observations, (count, self.sizes.observation), &HERE)?,
-            previous: Tensor::from_vec(previous, count, &HERE)?,
+            observations: Tensor::from_vec(observations, (count, self.sizes.observation), &Device::Cpu)?,
+            previous: Tensor::from_vec(previous, count, &Device::Cpu)?,
             chosen,
         };
         Ok((steps, std))
@@ -503,7 +503,7 @@ impl Agent {
                 });
             }
         }
-        let targets = Tensor::from_slice(targets, (rows, actions), &HERE)?;
+        let targets = Tensor::from_slice(targets, (rows, actions), &Device::Cpu)?;
         let log_policy = log_softmax(&self.net.forward(&observations, Some(&previous))?.logits)?;
         let loss = ((log_policy * targets)?.sum_all()? * (-1.0 / rows as f64))?;
         self.learner.step(&loss)
@@ -568,8 +568,8 @@ fn inputs(net: &dyn WalkerNet, observations: &[f32], previous: &[u32]) -> Result
             expected: format!("below {actions}"),
         });
     }
-    let observations = Tensor::from_slice(observations, (n, width), &HERE)?;
-    Ok((observations, Tensor::from_slice(previous, n, &HERE)?))
+    let observations = Tensor::from_slice(observations, (n, width), &Device::Cpu)?;
+    Ok((observations, Tensor::from_slice(previous, n, &Device::Cpu)?))
 }
 
 /// Decisions of any policy network: drawn with `rng`, or the most probable ones without.

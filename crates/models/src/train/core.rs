@@ -3,12 +3,9 @@
 
 use super::config::TrainConfig;
 use candle_core::Tensor;
-use nn::Params;
 use nn::simd::vectorised;
 use nn::values::with_values;
-use nn::{Gradients, ParamLayout};
-use nn::{ModelError, Result};
-use nn::{Optimiser, flat};
+use nn::{Gradients, ModelError, Optimiser, ParamLayout, Params, PerParameter, Result};
 use std::collections::BTreeMap;
 use std::marker::PhantomData;
 use std::sync::Arc;
@@ -53,8 +50,7 @@ pub(super) struct Core<P> {
     config: TrainConfig,
     layout: Arc<ParamLayout>,
     optimiser: Optimiser,
-    /// all parameters one after the other
-    ema: Option<Vec<f32>>,
+    ema: Option<PerParameter>,
     precision: PhantomData<P>,
 }
 
@@ -63,16 +59,7 @@ impl<P: Precision> Core<P> {
     pub(super) fn new(params: &Params, config: TrainConfig) -> Result<Self> {
         config.validate()?;
         let layout = Arc::new(ParamLayout::new(params));
-        let ema = match config.ema_decay {
-            Some(_) => {
-                let mut values = Vec::with_capacity(layout.len());
-                for (_, var) in params.iter() {
-                    with_values(var.as_tensor(), |v| values.extend_from_slice(v))?;
-                }
-                Some(values)
-            }
-            None => None,
-        };
+        let ema = config.ema_decay.map(|_| PerParameter::copy_of(params, &layout)).transpose()?;
         let optimiser = Optimiser::new(config.optimiser, layout.clone());
         Ok(Self { params: params.clone(), config, layout, optimiser, ema, precision: PhantomData })
     }
@@ -105,13 +92,22 @@ impl<P: Precision> Core<P> {
         // torch.nn.utils.clip_grad_norm_'s factor
         let scale = if clip > 0.0 { (clip / (grad_norm + 1e-6)).min(1.0) } else { 1.0 };
         self.optimiser.step(&self.params, gradients, scale as f32, lr)?;
-        if let (Some(ema), Some(decay)) = (&mut self.ema, self.config.ema_decay) {
-            let mut rest = ema.as_mut_slice();
-            for (_, var) in self.params.iter() {
-                let (mean, tail) = rest.split_at_mut(var.elem_count());
-                rest = tail;
-                with_values(var.as_tensor(), |now| P::blend(decay, mean, now))?;
+        match (&mut self.ema, self.config.ema_decay) {
+            (Some(PerParameter::Flat(ema)), Some(decay)) => {
+                let mut rest = ema.as_mut_slice();
+                for (_, var) in self.params.iter() {
+                    let (mean, tail) = rest.split_at_mut(var.elem_count());
+                    rest = tail;
+                    with_values(var.as_tensor(), |now| P::blend(decay, mean, now))?;
+                }
             }
+            (Some(PerParameter::Tensors(ema)), Some(decay)) => {
+                for ((_, var), mean) in self.params.iter().zip(ema) {
+                    let now = (var.as_detached_tensor() * (1.0 - decay))?;
+                    *mean = Some(mean.take().map_or_else(|| Ok(now.clone()), |mean| (mean * decay)? + &now)?);
+                }
+            }
+            _ => {}
         }
         Ok(lr)
     }
@@ -122,25 +118,23 @@ impl<P: Precision> Core<P> {
     }
 
     /// The first parameter whose gradient is not finite, as an error.
-    pub(super) fn gradient_at_fault(&self, gradients: &Gradients) -> Option<ModelError> {
-        self.layout.iter().find_map(|(name, span)| {
-            let value = gradients.values()[span].iter().copied().find(|x| !x.is_finite())?;
-            Some(self.not_finite(format!("gradient of {name}"), value))
-        })
+    pub(super) fn gradient_at_fault(&self, gradients: &Gradients) -> Result<Option<ModelError>> {
+        let found = gradients.not_finite()?;
+        Ok(found.map(|(name, value)| self.not_finite(format!("gradient of {name}"), value)))
     }
 
     /// The weights to evaluate: the moving average if there is one. Copies.
     pub(super) fn eval_params(&self) -> Result<BTreeMap<String, Tensor>> {
-        let mut tensors = BTreeMap::new();
-        for ((name, var), (_, span)) in self.params.iter().zip(self.layout.iter()) {
-            let tensor = match &self.ema {
-                Some(ema) => Tensor::from_slice(&ema[span], var.dims(), var.device())?,
-                None => var.as_detached_tensor().copy()?,
-            };
-            tensors.insert(name.to_string(), tensor);
-        }
-        for (name, var) in self.params.buffers() {
-            tensors.insert(name.to_string(), var.as_detached_tensor().copy()?);
+        let averaged = match &self.ema {
+            Some(ema) => ema.named(&self.params, &self.layout)?,
+            None => Vec::new(),
+        };
+        let mut tensors: BTreeMap<_, _> =
+            averaged.into_iter().map(|(name, tensor)| (name.to_string(), tensor)).collect();
+        for (name, var) in self.params.all() {
+            if !tensors.contains_key(name) {
+                tensors.insert(name.to_string(), var.as_detached_tensor().copy()?);
+            }
         }
         tensors.extend(self.params.tables());
         Ok(tensors)
@@ -173,19 +167,15 @@ impl<P: Precision> Core<P> {
 
     /// Goes on from [`Self::state`] after `steps` steps. Nothing is changed unless everything fits.
     pub(super) fn restore(&mut self, tensors: &BTreeMap<String, Tensor>, steps: u64) -> Result<()> {
-        let ema = match self.ema {
-            Some(_) => Some(flat(&self.layout, "ema", tensors)?),
-            None => None,
-        };
         // all checks come before the first change
-        flat(&self.layout, "moment2", tensors)?;
-        flat(&self.layout, "moment1", tensors)?;
+        let ema = self.ema.as_ref().map(|_| PerParameter::restored(&self.params, &self.layout, "ema", tensors));
+        let (ema, moments) = (ema.transpose()?, self.optimiser.saved(&self.params, tensors)?);
         let with_prefix = |(name, tensor): (&String, &Tensor)| {
             let name = name.strip_prefix("param.")?;
             Some((name.to_string(), tensor.clone()))
         };
         self.params.load(&tensors.iter().filter_map(with_prefix).collect())?;
-        self.optimiser.restore(tensors, steps)?;
+        self.optimiser.restore(moments, steps);
         self.ema = ema;
         Ok(())
     }

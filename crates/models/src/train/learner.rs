@@ -7,7 +7,6 @@ use super::core::{Core, Double};
 use candle_core::{Tensor, Var};
 use nn::Gradients;
 use nn::Params;
-use nn::simd::sum_of_squares;
 use nn::{ModelError, Result};
 use std::collections::BTreeMap;
 
@@ -71,9 +70,9 @@ impl Learner {
             let grad = grads.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() })?;
             self.gradients.add_tensor(name, grad)?;
         }
-        let grad_norm = sum_of_squares(self.gradients.values()).sqrt();
+        let grad_norm = self.gradients.norm()?;
         if !grad_norm.is_finite() {
-            let fault = self.core.gradient_at_fault(&self.gradients);
+            let fault = self.core.gradient_at_fault(&self.gradients)?;
             return Err(fault.unwrap_or_else(|| self.core.not_finite("gradient norm".into(), grad_norm as f32)));
         }
         let lr = self.core.step(&self.gradients, grad_norm)?;
@@ -111,11 +110,12 @@ impl Learner {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use nn::Backend;
     use nn::Init;
     use nn::Rng;
 
     fn parameters() -> Params {
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         params.create("a", &[3], Init::Normal { std: 1.0 }, &mut Rng::new(1, "a")).unwrap();
         params
     }

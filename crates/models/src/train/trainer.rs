@@ -11,7 +11,6 @@ use candle_core::Tensor;
 use nn::Gradients;
 use nn::LossValues;
 use nn::Rng;
-use nn::simd::{sum_of_squares, vectorised};
 use nn::values::with_values;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
@@ -96,11 +95,6 @@ impl Trainer {
         self.model.as_ref()
     }
 
-    /// Gives the model back.
-    pub fn into_model(self) -> Box<dyn PolicyModel> {
-        self.model
-    }
-
     /// Steps taken.
     pub fn step_count(&self) -> u64 {
         self.core.steps()
@@ -156,14 +150,8 @@ impl Trainer {
             }
         }
         let (first, others) = self.gradients.split_at_mut(1);
-        let sum = first[0].values_mut();
-        for other in others {
-            vectorised(
-                #[inline(always)]
-                || sum.iter_mut().zip(other.values()).for_each(|(a, b)| *a += b),
-            );
-        }
-        let norm = sum_of_squares(sum).sqrt();
+        others.iter().try_for_each(|other| first[0].add(other))?;
+        let norm = first[0].norm()?;
         if !loss.total.is_finite() || !norm.is_finite() {
             return Err(self.not_finite(&batch, &loss)?);
         }
@@ -189,7 +177,7 @@ impl Trainer {
                 return Ok(found(format!("loss part {name}"), value));
             }
         }
-        let fault = self.core.gradient_at_fault(&self.gradients[0]);
+        let fault = self.core.gradient_at_fault(&self.gradients[0])?;
         Ok(fault.unwrap_or_else(|| found("loss".to_string(), loss.total)))
     }
 

@@ -20,12 +20,12 @@ pub const TRANSFORMER: [&str; 3] = ["config.json", "model.safetensors", "transfo
 /// A folder is a fixture of robomimic's if it holds these files.
 pub const ROBOMIMIC: [&str; 3] = ["config.json", "model.safetensors", "robomimic.npz"];
 
-/// A folder is a fixture of LeRobot's ACT with cameras if it holds these files and its configuration has pictures.
+/// A folder is a fixture of LeRobot's ACT with cameras if it holds these files and its configuration has images.
 pub const SEEING_ACT: [&str; 2] = ["config.json", "io.npz"];
 /// A folder is a fixture of an image encoder alone if it holds these files.
 pub const ENCODER: [&str; 3] = ["note.txt", "model.safetensors", "io.npz"];
 
-/// Whether a LeRobot configuration reads pictures.
+/// Whether a LeRobot configuration reads images.
 fn sees(config: &str) -> bool {
     config.contains(r#""type": "VISUAL""#)
 }
@@ -48,7 +48,7 @@ fn walk(folder: &Path, kind: &[&str], found: &mut Vec<PathBuf>) {
     let mut entries: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
     entries.sort();
     let holds = |files: &[&str]| files.iter().all(|file| folder.join(file).is_file());
-    // the same files with pictures are the business of `vision_parity.rs`
+    // the same files with images are the business of `vision_parity.rs`
     let sees = std::fs::read_to_string(folder.join("config.json")).is_ok_and(|text| sees(&text));
     if holds(kind) && sees == (kind == SEEING_ACT) {
         found.push(folder.to_path_buf());

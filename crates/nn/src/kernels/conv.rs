@@ -1,7 +1,7 @@
 //! Convolutions as products over windows, without copies of the windows.
 //!
-//! Pictures lie pixel after pixel with all channels of a pixel side by side, in a frame of zeros as wide as the padding; a
-//! sequence is a picture of one row, convolved by kernels of one row, and upsampling is the way back of a convolution.
+//! Images lie pixel after pixel with all channels of a pixel side by side, in a frame of zeros as wide as the padding; a
+//! sequence is an image of one row, convolved by kernels of one row, and upsampling is the way back of a convolution.
 //! A window is then a few stretches of memory that follow each other at equal distances, and a product can read the
 //! stretches of a dozen windows where they are. Forward pass, gradient of the input and gradient of the weights are all
 //! such products. Sums run in an order that depends on the sizes alone.
@@ -10,15 +10,15 @@ use super::gemm::{Pack, Start, tile_of};
 use crate::simd::{dispatch, lanes};
 use pulp::{Simd, WithSimd};
 
-/// Numbers behind a picture that may be read and are not used.
+/// Numbers behind an image that may be read and are not used.
 pub const TAIL: usize = 64;
 /// Windows of a block: what it reads stays in the second-level cache while all outputs are made of it.
 const BLOCK: usize = 240;
 
-/// Pictures in frames of zeros.
+/// Images in frames of zeros.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Frame {
-    pub pictures: usize,
+    pub images: usize,
     pub height: usize,
     pub width: usize,
     pub channels: usize,
@@ -32,41 +32,41 @@ impl Frame {
         (self.width + 2 * self.border.1) * self.channels
     }
 
-    /// Numbers of a picture with its borders.
-    pub fn picture(&self) -> usize {
+    /// Numbers of an image with its borders.
+    pub fn image(&self) -> usize {
         (self.height + 2 * self.border.0) * self.row()
     }
 
-    /// Numbers of all pictures, and some that are never used.
+    /// Numbers of all images, and some that are never used.
     pub fn buffer_len(&self) -> usize {
-        self.pictures * self.picture() + TAIL
+        self.images * self.image() + TAIL
     }
 
-    /// Numbers of all pictures without borders.
+    /// Numbers of all images without borders.
     pub fn inside(&self) -> usize {
         self.pixels() * self.channels
     }
 
-    /// Pixels of all pictures.
+    /// Pixels of all images.
     pub fn pixels(&self) -> usize {
-        self.pictures * self.height * self.width
+        self.images * self.height * self.width
     }
 
-    /// Where row `y` of picture `n` begins inside the border.
+    /// Where row `y` of image `n` begins inside the border.
     #[inline(always)]
     pub fn at(&self, n: usize, y: usize) -> usize {
-        n * self.picture() + (y + self.border.0) * self.row() + self.border.1 * self.channels
+        n * self.image() + (y + self.border.0) * self.row() + self.border.1 * self.channels
     }
 
     /// Writes the zeros of the border and of the tail.
     pub fn clear_border(&self, x: &mut [f32]) {
         let (row, side) = (self.row(), self.border.1 * self.channels);
-        let end = self.pictures * self.picture();
-        for picture in x[..end].chunks_exact_mut(self.picture().max(1)) {
-            picture[..self.border.0 * row].fill(0.0);
+        let end = self.images * self.image();
+        for image in x[..end].chunks_exact_mut(self.image().max(1)) {
+            image[..self.border.0 * row].fill(0.0);
             let below = (self.border.0 + self.height) * row;
-            picture[below..].fill(0.0);
-            for line in picture[self.border.0 * row..below].chunks_exact_mut(row) {
+            image[below..].fill(0.0);
+            for line in image[self.border.0 * row..below].chunks_exact_mut(row) {
                 line[..side].fill(0.0);
                 line[row - side..].fill(0.0);
             }
@@ -88,11 +88,11 @@ pub struct Conv {
     pub stride: (usize, usize),
 }
 
-/// Places of a grid of windows: `start + picture * n + row * y + column * x`.
+/// Places of a grid of windows: `start + image * n + row * y + column * x`.
 #[derive(Debug, Clone, Copy)]
 struct Places {
     start: usize,
-    picture: usize,
+    image: usize,
     row: usize,
     column: usize,
 }
@@ -100,7 +100,7 @@ struct Places {
 /// A product over windows: where they are, what they are made of, where results go.
 #[derive(Debug, Clone, Copy)]
 struct Grid {
-    pictures: usize,
+    images: usize,
     rows: usize,
     columns: usize,
     from: Places,
@@ -116,7 +116,7 @@ type Block = [(usize, usize); BLOCK];
 
 impl Grid {
     fn windows(&self) -> usize {
-        self.pictures * self.rows * self.columns
+        self.images * self.rows * self.columns
     }
 
     fn depth(&self) -> usize {
@@ -130,7 +130,7 @@ impl Grid {
         let (mut x, rest) = (first % self.columns, first / self.columns);
         let (mut y, mut n) = (rest % self.rows, rest / self.rows);
         for place in &mut block[..count] {
-            let at = |p: &Places| p.start + p.picture * n + p.row * y + p.column * x;
+            let at = |p: &Places| p.start + p.image * n + p.row * y + p.column * x;
             *place = (at(&self.from), at(&self.to));
             x += 1;
             if x == self.columns {
@@ -156,9 +156,9 @@ impl Conv {
 
     /// What it makes, in a frame of `border`.
     pub fn made(&self, border: (usize, usize)) -> Frame {
-        let Frame { pictures, height, width, .. } = self.input;
+        let Frame { images, height, width, .. } = self.input;
         let (height, width) = (height.div_ceil(self.stride.0), width.div_ceil(self.stride.1));
-        Frame { pictures, height, width, channels: self.output, border }
+        Frame { images, height, width, channels: self.output, border }
     }
 
     /// Numbers of its weights.
@@ -172,16 +172,16 @@ impl Conv {
         let c = x.channels;
         let pad = self.padding();
         Grid {
-            pictures: x.pictures,
+            images: x.images,
             rows: made.height,
             columns: made.width,
             from: Places {
                 start: (x.border.0 - pad.0) * x.row() + (x.border.1 - pad.1) * c,
-                picture: x.picture(),
+                image: x.image(),
                 row: self.stride.0 * x.row(),
                 column: self.stride.1 * c,
             },
-            to: Places { start: 0, picture: made.picture(), row: made.row(), column: made.channels },
+            to: Places { start: 0, image: made.image(), row: made.row(), column: made.channels },
             stretches: self.kernel.0,
             apart: x.row(),
             length: self.kernel.1 * c,
@@ -211,18 +211,18 @@ impl Conv {
                     continue;
                 }
                 let grid = Grid {
-                    pictures: x.pictures,
+                    images: x.images,
                     rows: (x.height - py).div_ceil(s.0),
                     columns: (x.width - px).div_ceil(s.1),
                     from: Places {
                         start: y0 * g.row() + x0 * g.channels,
-                        picture: g.picture(),
+                        image: g.image(),
                         row: g.row(),
                         column: g.channels,
                     },
                     to: Places {
                         start: (py * x.width + px) * x.channels,
-                        picture: x.height * x.width * x.channels,
+                        image: x.height * x.width * x.channels,
                         row: s.0 * x.width * x.channels,
                         column: s.1 * x.channels,
                     },
@@ -330,7 +330,7 @@ impl Conv {
     pub fn weight_gradient(&self, x: &[f32], grad: &[f32], turned: &mut [f32], into: &mut [f32], pack: &mut Pack) {
         let mut grid = self.forward_grid();
         let g = self.made(self.grad_border());
-        grid.to = Places { start: g.at(0, 0), picture: g.picture(), row: g.row(), column: g.channels };
+        grid.to = Places { start: g.at(0, 0), image: g.image(), row: g.row(), column: g.channels };
         turned.fill(0.0);
         dispatch(WeightGradient { grid, x, grad, output: self.output, into: turned, pack });
         let (c, per) = (self.input.channels, self.taps());
@@ -351,9 +351,9 @@ pub fn panel_width(n: usize) -> usize {
 impl Grid {
     /// Rows of a matrix, one after the other, and of what is made of them.
     fn rows(count: usize, depth: usize, output: usize) -> Self {
-        let places = |column: usize| Places { start: 0, picture: 0, row: 0, column };
+        let places = |column: usize| Places { start: 0, image: 0, row: 0, column };
         let (from, to) = (places(depth), places(output));
-        Self { pictures: 1, rows: 1, columns: count, from, to, stretches: 1, apart: 0, length: depth }
+        Self { images: 1, rows: 1, columns: count, from, to, stretches: 1, apart: 0, length: depth }
     }
 }
 

@@ -16,7 +16,7 @@ fn naive(conv: &Conv, x: &[f32], w: &[f32]) -> Vec<f64> {
 /// Calls `f(output, input, weight)` for every product of the definition.
 fn each(conv: &Conv, mut f: impl FnMut(usize, usize, usize)) {
     let (x, made, k) = (conv.input, conv.made((0, 0)), conv.kernel);
-    for n in 0..x.pictures {
+    for n in 0..x.images {
         for oy in 0..made.height {
             for ox in 0..made.width {
                 for (ky, kx) in (0..k.0 * k.1).map(|t| (t / k.1, t % k.1)) {
@@ -57,10 +57,10 @@ fn close(got: &[f32], want: &[f64], what: &str) {
     }
 }
 
-/// Odd and even sizes, channels above and below a vector, pictures smaller than the kernel.
+/// Odd and even sizes, channels above and below a vector, images smaller than the kernel.
 fn cases() -> Vec<Conv> {
     let mut all = Vec::new();
-    for (pictures, height, width, channels, output, kernel, stride) in [
+    for (images, height, width, channels, output, kernel, stride) in [
         (2, 9, 7, 3, 5, 7, 2),
         (1, 12, 12, 3, 16, 7, 2),
         (3, 5, 6, 4, 7, 3, 1),
@@ -73,12 +73,12 @@ fn cases() -> Vec<Conv> {
         (1, 18, 17, 2, 40, 3, 2),
     ] {
         for border in [kernel / 2, 3] {
-            let input = Frame { pictures, height, width, channels, border: (border, border) };
+            let input = Frame { images, height, width, channels, border: (border, border) };
             all.push(Conv { input, output, kernel: (kernel, kernel), stride: (stride, stride) });
         }
     }
     // sequences: those of a UNet, one step alone, and the way back of an upsampling
-    for (pictures, width, channels, output, kernel, stride) in [
+    for (images, width, channels, output, kernel, stride) in [
         (3, 8, 7, 20, 5, 1),
         (1, 1, 16, 33, 5, 1),
         (2, 8, 17, 5, 3, 2),
@@ -87,7 +87,7 @@ fn cases() -> Vec<Conv> {
         (4, 5, 6, 3, 1, 1),
     ] {
         for border in [(0, kernel / 2), (1, 2)] {
-            let input = Frame { pictures, height: 1, width, channels, border };
+            let input = Frame { images, height: 1, width, channels, border };
             all.push(Conv { input, output, kernel: (1, kernel), stride: (1, stride) });
         }
     }
@@ -143,9 +143,9 @@ fn all_three_products_are_those_of_the_definition() {
 fn tiled() -> Vec<Conv> {
     let sizes = [(1, 21, 21, 32, 48), (3, 11, 10, 48, 32), (8, 6, 6, 64, 32), (40, 3, 3, 32, 64), (4, 9, 7, 32, 32)];
     let mut all = Vec::new();
-    for (pictures, height, width, channels, output) in sizes {
+    for (images, height, width, channels, output) in sizes {
         for border in [(1, 1), (2, 3)] {
-            let input = Frame { pictures, height, width, channels, border };
+            let input = Frame { images, height, width, channels, border };
             all.push(Conv { input, output, kernel: (3, 3), stride: (1, 1) });
         }
     }
@@ -195,9 +195,9 @@ fn products_in_tiles_are_those_of_the_definition() {
 }
 
 #[test]
-fn tiles_are_for_many_pictures_and_channels_only() {
-    let conv = |pictures, height, channels, output, kernel, stride| {
-        let input = Frame { pictures, height, width: height, channels, border: (1, 1) };
+fn tiles_are_for_many_images_and_channels_only() {
+    let conv = |images, height, channels, output, kernel, stride| {
+        let input = Frame { images, height, width: height, channels, border: (1, 1) };
         Conv { input, output, kernel: (kernel, kernel), stride: (stride, stride) }
     };
     assert!(Winograd::of(&conv(8, 21, 64, 64, 3, 1)).is_some());

@@ -1,4 +1,4 @@
-//! What stands between convolutions: GroupNorm or a fixed scale, ReLU, sums, maximum over windows. Pictures lie pixel after
+//! What stands between convolutions: GroupNorm or a fixed scale, ReLU, sums, maximum over windows. Images lie pixel after
 //! pixel; convolutions read them from frames of zeros and write them without.
 
 use super::conv::Frame;
@@ -7,7 +7,7 @@ use crate::simd::vectorised;
 /// Added to variances, torch's.
 const EPS: f64 = 1e-5;
 
-/// y: (n, pixels, C), made to have mean 0 and variance 1 in every group of channels of every picture; `inverse` takes
+/// y: (n, pixels, C), made to have mean 0 and variance 1 in every group of channels of every image; `inverse` takes
 /// 1/std, (n, groups).
 pub fn group_norm(y: &mut [f32], frame: &Frame, groups: usize, inverse: &mut [f32]) {
     let (c, pixels) = (frame.channels, frame.height * frame.width);
@@ -17,19 +17,19 @@ pub fn group_norm(y: &mut [f32], frame: &Frame, groups: usize, inverse: &mut [f3
     vectorised(
         #[inline(always)]
         || {
-            for (picture, inverse) in y.chunks_exact_mut(pixels * c).zip(inverse.chunks_exact_mut(groups)) {
+            for (image, inverse) in y.chunks_exact_mut(pixels * c).zip(inverse.chunks_exact_mut(groups)) {
                 let spread = |sums: &mut [f32], of: &mut dyn FnMut(f64) -> f32| {
                     for group in sums.chunks_exact_mut(each) {
                         let value = of(group.iter().map(|&x| f64::from(x)).sum::<f64>() / count);
                         group.fill(value);
                     }
                 };
-                channel_sums(picture, &mut sums, |x, _| x);
+                channel_sums(image, &mut sums, |x, _| x);
                 spread(&mut sums, &mut |mean| mean as f32);
-                for pixel in picture.chunks_exact_mut(c) {
+                for pixel in image.chunks_exact_mut(c) {
                     pixel.iter_mut().zip(&sums).for_each(|(x, mean)| *x -= mean);
                 }
-                channel_sums(picture, &mut sums, |x, _| x * x);
+                channel_sums(image, &mut sums, |x, _| x * x);
                 let mut at = inverse.iter_mut();
                 spread(&mut sums, &mut |variance| {
                     let value = (1.0 / (variance + EPS).sqrt()) as f32;
@@ -38,7 +38,7 @@ pub fn group_norm(y: &mut [f32], frame: &Frame, groups: usize, inverse: &mut [f3
                     }
                     value
                 });
-                for pixel in picture.chunks_exact_mut(c) {
+                for pixel in image.chunks_exact_mut(c) {
                     pixel.iter_mut().zip(&sums).for_each(|(x, inverse)| *x *= inverse);
                 }
             }
@@ -46,15 +46,15 @@ pub fn group_norm(y: &mut [f32], frame: &Frame, groups: usize, inverse: &mut [f3
     );
 }
 
-/// Sums of `of(x, channel)` over the pixels of a picture, a channel, in a fixed order.
+/// Sums of `of(x, channel)` over the pixels of an image, a channel, in a fixed order.
 #[inline(always)]
-fn channel_sums(picture: &[f32], sums: &mut [f32], of: impl Fn(f32, usize) -> f32) {
+fn channel_sums(image: &[f32], sums: &mut [f32], of: impl Fn(f32, usize) -> f32) {
     sums.fill(0.0);
     let c = sums.len();
     if c == 16 {
         // the narrowest layers have the most pixels: sums that stay in a register
         let mut few = [0f32; 16];
-        for pixel in picture.chunks_exact(16) {
+        for pixel in image.chunks_exact(16) {
             for i in 0..16 {
                 few[i] += of(pixel[i], i);
             }
@@ -62,7 +62,7 @@ fn channel_sums(picture: &[f32], sums: &mut [f32], of: impl Fn(f32, usize) -> f3
         sums.copy_from_slice(&few);
         return;
     }
-    for pixel in picture.chunks_exact(c) {
+    for pixel in image.chunks_exact(c) {
         for (i, (sum, &x)) in sums.iter_mut().zip(pixel).enumerate() {
             *sum += of(x, i);
         }
@@ -145,7 +145,7 @@ pub fn group_norm_backward(
     out: &mut [f32],
 ) {
     let (c, pixels, row) = (frame.channels, frame.height * frame.width, frame.width * frame.channels);
-    let groups = inverse.len() / frame.pictures;
+    let groups = inverse.len() / frame.images;
     let each = c / groups;
     let count = (pixels * each) as f64;
     // sums of the gradient and of gradient times normed, then what is subtracted
@@ -153,7 +153,7 @@ pub fn group_norm_backward(
     vectorised(
         #[inline(always)]
         || {
-            for n in 0..frame.pictures {
+            for n in 0..frame.images {
                 let part = n * pixels * c..(n + 1) * pixels * c;
                 let (grad, normed) = (&grad[part.clone()], &normed[part]);
                 channel_sums(grad, &mut plain, |x, _| x);
@@ -242,7 +242,7 @@ pub fn max_pool(x: &[f32], from: &Frame, to: &Frame, out: &mut [f32], winner: &m
                 let (n, y) = (r / to.height, r % to.height);
                 let at = to.at(n, y);
                 // the frame's border takes part: zeros lose against every positive number
-                let first = n * from.picture() + (2 * y + from.border.0 - 1) * from.row() + (from.border.1 - 1) * c;
+                let first = n * from.image() + (2 * y + from.border.0 - 1) * from.row() + (from.border.1 - 1) * c;
                 let lines = out[at..at + to.width * c].chunks_exact_mut(c).zip(winners.chunks_exact_mut(c));
                 for (column, (out, winner)) in lines.enumerate() {
                     for tap in 0..9 {

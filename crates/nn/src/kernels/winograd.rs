@@ -4,7 +4,7 @@
 //! five points a direction (0, 1, -1, 2 and infinity): 25 products instead of 81, and sums over channels are taken at each
 //! point alone, as matrix products. Forward pass, gradient of the input and gradient of the weights are all of this kind.
 //! Rounding grows to about three times that of the plain sum. Predictions stay with the plain sum (`conv.rs`); with many
-//! pictures, as in training, what is saved is far more than what the transformations cost.
+//! images, as in training, what is saved is far more than what the transformations cost.
 
 use super::conv::{Conv, Frame, TAIL, add_products, multiply, panel_width};
 use super::gemm::Pack;
@@ -31,14 +31,14 @@ const TOGETHER: usize = 4;
 #[derive(Debug, Clone, Copy)]
 pub struct Winograd {
     conv: Conv,
-    /// rows and columns of tiles, a picture
+    /// rows and columns of tiles, an image
     grid: (usize, usize),
 }
 
 impl Winograd {
     /// The convolution in tiles; `None` where that is impossible or saves too little.
     pub fn of(conv: &Conv) -> Option<Self> {
-        let Frame { pictures, height, width, channels, border } = conv.input;
+        let Frame { images, height, width, channels, border } = conv.input;
         let grid = (height.div_ceil(MADE), width.div_ceil(MADE));
         let possible = conv.kernel == (3, 3)
             && conv.stride == (1, 1)
@@ -48,13 +48,13 @@ impl Winograd {
             && conv.output.is_multiple_of(16);
         // few channels leave the products short beside the transformations, few tiles the weights'
         let wide = channels.min(conv.output) >= 32;
-        let many = pictures * grid.0 * grid.1 >= 32;
+        let many = images * grid.0 * grid.1 >= 32;
         let saves = 9 * height * width >= 40 * grid.0 * grid.1;
         (possible && wide && many && saves).then_some(Self { conv: *conv, grid })
     }
 
     fn tiles(&self) -> usize {
-        self.conv.input.pictures * self.grid.0 * self.grid.1
+        self.conv.input.images * self.grid.0 * self.grid.1
     }
 
     /// Tiles at a time. The weights are read once for them, so there are more of them where weights are many.
@@ -157,7 +157,7 @@ impl Winograd {
         dispatch(WeightsMade { from: points, into });
     }
 
-    /// Picture, row and column of a tile's first output.
+    /// Image, row and column of a tile's first output.
     #[inline(always)]
     fn place(&self, tile: usize) -> (usize, usize, usize) {
         let (x, rest) = (tile % self.grid.1, tile / self.grid.1);
@@ -269,12 +269,12 @@ impl<const F: usize> Seen<'_, F> {
         let first = (frame.border.0 - before, frame.border.1 - before);
         let all = (frame.height + 2 * frame.border.0, frame.width + 2 * frame.border.1);
         for t in 0..block.1 {
-            let (picture, row, column) = tiles.place(block.0 + t);
+            let (image, row, column) = tiles.place(block.0 + t);
             let mut pixels = [[&zeros[..]; F]; F];
             for (k, pixel) in pixels.as_flattened_mut().iter_mut().enumerate() {
                 let (row, column) = (row + first.0 + k / F, column + first.1 + k % F);
                 if row < all.0 && column < all.1 {
-                    *pixel = &x[picture * frame.picture() + row * frame.row() + column * c..][..c];
+                    *pixel = &x[image * frame.image() + row * frame.row() + column * c..][..c];
                 }
             }
             at_points::<S, O, F>(simd, pixels.as_flattened(), (&mut *into, t));
@@ -363,12 +363,12 @@ impl WithSimd for Made<'_> {
         let (from, _) = S::as_simd_f32s(from);
         let apart = from.len() / POINTS;
         for t in 0..block.1 {
-            let (picture, row, column) = tiles.place(block.0 + t);
+            let (image, row, column) = tiles.place(block.0 + t);
             let here = (MADE.min(height - row), MADE.min(width - column));
             for l in 0..vectors {
                 let whole = both::<S, Results, SEEN, MADE>(simd, products::<S>(simd, from, apart, t * vectors + l));
                 for y in 0..here.0 {
-                    let at = ((picture * height + row + y) * width + column) * output;
+                    let at = ((image * height + row + y) * width + column) * output;
                     let (line, _) = S::as_mut_simd_f32s(&mut out[at..at + here.1 * output]);
                     for x in 0..here.1 {
                         let to = &mut line[x * vectors + l];

@@ -1,6 +1,6 @@
 //! Multi-head attention with torch's tensor names.
 
-use super::{Dropout, Linear, Mode};
+use super::Linear;
 use crate::context::Context;
 use crate::error::{ModelError, Result};
 use crate::ops::{self, Attention, linear, linear_rows};
@@ -26,7 +26,7 @@ pub struct MultiHeadAttention {
     /// number of heads
     pub n_heads: usize,
     /// of the attention weights
-    pub dropout: Dropout,
+    pub dropout: f64,
     /// a query sees the keys of its own step and of those before
     pub causal: bool,
 }
@@ -60,28 +60,20 @@ impl MultiHeadAttention {
             in_proj_bias: params.create(&bias, &[3 * dim], Init::Zeros, rng)?,
             out_proj: Linear::with_init(params, &name, (dim, dim), out_proj, Some(Init::Zeros), rng)?,
             n_heads,
-            dropout: Dropout { p },
+            dropout: p,
             causal: false,
         })
     }
 
-    /// q: (b, t, D), k and v: (b, s, D), key_pad: (b, s) of 0/1 in f32, 1 = not attended to -> (b, t, D)
-    pub fn forward(
-        &self,
-        q: &Tensor,
-        k: &Tensor,
-        v: &Tensor,
-        key_pad: Option<&Tensor>,
-        mode: &mut Mode<'_>,
-    ) -> Result<Tensor> {
-        let (b, t, dim) = q.dims3()?;
-        let weights = self.dropout.forward(&self.weights(q, k, key_pad)?, mode)?;
-        let mixed = weights.matmul(&self.project(v, 2)?)?.transpose(1, 2)?.reshape((b, t, dim))?;
-        self.out_proj.forward(&mixed)
+    /// x: (b, t, D) -> (b, t, D), on candle's operations, without dropout
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let (b, t, dim) = x.dims3()?;
+        let mixed = self.weights(x, x)?.matmul(&self.project(x, 2)?)?;
+        self.out_proj.forward(&mixed.transpose(1, 2)?.reshape((b, t, dim))?)
     }
 
     /// How much each query attends to each key, without dropout: q: (b, t, D), k: (b, s, D) -> (b, n_heads, t, s)
-    pub fn weights(&self, q: &Tensor, k: &Tensor, key_pad: Option<&Tensor>) -> Result<Tensor> {
+    pub fn weights(&self, q: &Tensor, k: &Tensor) -> Result<Tensor> {
         let (q, k) = (self.project(q, 0)?, self.project(k, 1)?);
         let head = q.dim(D::Minus1)? as f64;
         let mut scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / head.sqrt()))?;
@@ -90,7 +82,7 @@ impl MultiHeadAttention {
             let later = (0..t * s).map(|i| if i % s > i / s { UNSEEN } else { 0.0 }).collect::<Vec<f32>>();
             scores = scores.broadcast_add(&Tensor::from_vec(later, (1, 1, t, s), scores.device())?)?;
         }
-        masked_softmax(&scores, key_pad)
+        masked_softmax(&scores, None)
     }
 
     /// x: (b, n, D) -> queries, keys or values (parts 0, 1, 2) by head, (b, n_heads, n, D / n_heads)
@@ -107,7 +99,7 @@ impl MultiHeadAttention {
 
 impl MultiHeadAttention {
     fn how<'a>(&self, batch: usize, all_queries: usize, key_pad: Option<&'a Tensor>) -> Attention<'a> {
-        let (heads, causal, dropout) = (self.n_heads, self.causal, self.dropout.p);
+        let (heads, causal, dropout) = (self.n_heads, self.causal, self.dropout);
         Attention { heads, batch, all_queries, causal, key_pad, dropout }
     }
 

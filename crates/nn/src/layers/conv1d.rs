@@ -112,6 +112,7 @@ impl Upsample1d {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::Backend;
     use candle_core::Device;
 
     fn random(shape: &[usize], seed: u64) -> Tensor {
@@ -130,7 +131,7 @@ mod tests {
     #[test]
     fn convolutions_are_candles() {
         for (kernel, stride, steps) in [(5, 1, 8), (3, 2, 8), (3, 2, 7), (1, 1, 4), (5, 1, 2)] {
-            let mut p = Params::new();
+            let mut p = Params::new(&Backend::CPU);
             let mut rng = Rng::new(1, "init");
             let conv = Conv1d::new(&mut p, "c", (3, 4, kernel), stride, &mut rng).unwrap();
             let x = random(&[2, steps, 3], 5);
@@ -143,7 +144,7 @@ mod tests {
     #[test]
     fn upsampling_is_candles_transposed_convolution() {
         for steps in [1, 2, 5] {
-            let mut p = Params::new();
+            let mut p = Params::new(&Backend::CPU);
             let up = Upsample1d::new(&mut p, "u", 3, &mut Rng::new(1, "init")).unwrap();
             let x = random(&[2, steps, 3], 6);
             let first = x.transpose(1, 2).unwrap().contiguous().unwrap();

@@ -6,15 +6,6 @@ use crate::error::Result;
 use crate::rng::Rng;
 use candle_core::{Device, Tensor};
 
-/// Whether a forward pass trains (and draws dropout masks) or predicts.
-#[derive(Debug)]
-pub enum Mode<'a> {
-    /// no dropout
-    Eval,
-    /// dropout drawn from this generator
-    Train(&'a mut Rng),
-}
-
 /// One drawn mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DropoutMask {
@@ -50,31 +41,6 @@ impl DropoutMask {
         let values: Vec<f32> =
             (0..shape.iter().product::<usize>()).map(|i| if self.keeps(i as u32) { scale } else { 0.0 }).collect();
         Ok(Tensor::from_vec(values, shape, device)?)
-    }
-}
-
-/// Inverted dropout.
-#[derive(Debug, Clone, Copy)]
-pub struct Dropout {
-    /// probability that an element is dropped
-    pub p: f64,
-}
-
-impl Dropout {
-    /// A mask when training with p > 0.
-    pub fn mask(&self, mode: &mut Mode<'_>) -> Option<DropoutMask> {
-        match mode {
-            Mode::Train(rng) if self.p > 0.0 => Some(DropoutMask::draw(self.p, rng)),
-            _ => None,
-        }
-    }
-
-    /// x: any shape -> the same
-    pub fn forward(&self, x: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
-        match self.mask(mode) {
-            Some(mask) => Ok(x.mul(&mask.tensor(x.dims(), x.device())?)?),
-            None => Ok(x.clone()),
-        }
     }
 }
 

@@ -1,6 +1,6 @@
 //! Two dense layers with an activation between them.
 
-use super::{Dropout, Linear, Mode};
+use super::Linear;
 use crate::error::Result;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
@@ -46,7 +46,7 @@ pub struct FeedForward {
     /// between the two
     pub activation: Activation,
     /// after the activation
-    pub dropout: Dropout,
+    pub dropout: f64,
 }
 
 impl FeedForward {
@@ -68,13 +68,12 @@ impl FeedForward {
             linear1: layer("linear1", dim, hidden)?,
             linear2: layer("linear2", hidden, dim)?,
             activation,
-            dropout: Dropout { p },
+            dropout: p,
         })
     }
 
-    /// x: (…, dim) -> (…, dim)
-    pub fn forward(&self, x: &Tensor, mode: &mut Mode<'_>) -> Result<Tensor> {
-        let h = self.activation.forward(&self.linear1.forward(x)?)?;
-        self.linear2.forward(&self.dropout.forward(&h, mode)?)
+    /// x: (…, dim) -> (…, dim), on candle's operations, without dropout
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        self.linear2.forward(&self.activation.forward(&self.linear1.forward(x)?)?)
     }
 }

@@ -21,7 +21,7 @@ mod transformer;
 pub(crate) use attention::UNSEEN;
 pub use attention::{MultiHeadAttention, masked_softmax};
 pub use conv1d::{Conv1d, Upsample1d};
-pub use dropout::{Dropout, DropoutMask, Mode};
+pub use dropout::DropoutMask;
 pub use embedding::Embedding;
 pub use feed_forward::{Activation, FeedForward};
 pub use group_norm::GroupNorm;

@@ -1,12 +1,11 @@
 //! Fixed sinusoidal positions.
 
-use crate::device::HERE;
 use crate::error::Result;
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 
 /// () -> (1, positions, dim): angle `pos / 10000^(2⌊i/2⌋/dim)`, sine on even and cosine on odd dimensions
 /// (as LeRobot's `create_sinusoidal_pos_embedding`, computed in f64).
-pub fn sinusoid_table(positions: usize, dim: usize) -> Result<Tensor> {
+pub fn sinusoid_table(positions: usize, dim: usize, device: &Device) -> Result<Tensor> {
     let mut values = Vec::with_capacity(positions * dim);
     for pos in 0..positions {
         for i in 0..dim {
@@ -14,5 +13,5 @@ pub fn sinusoid_table(positions: usize, dim: usize) -> Result<Tensor> {
             values.push(if i % 2 == 0 { angle.sin() } else { angle.cos() } as f32);
         }
     }
-    Ok(Tensor::from_vec(values, (1, positions, dim), &HERE)?)
+    Ok(Tensor::from_vec(values, (1, positions, dim), device)?)
 }

@@ -6,7 +6,6 @@
 //! `max(1, channels / 16)` groups, as Diffusion Policy and R3PL have it, under the names of the batch norms.
 
 use crate::context::Context;
-use crate::device::HERE;
 use crate::ops::{ConvNorm, conv2d, max_pool};
 use crate::value::Value;
 use crate::{Init, Params, Result, Rng};
@@ -127,8 +126,10 @@ impl ConvNorm {
                 groups: ResNetShape::groups(channels),
             },
             ImageNorm::Frozen => {
-                let mut buffer =
-                    |last: &str, value: f32| params.insert_buffer(&named(last), Tensor::full(value, channels, &HERE)?);
+                let mut buffer = |last: &str, value: f32| {
+                    let values = Tensor::full(value, channels, params.device())?;
+                    params.insert_buffer(&named(last), values)
+                };
                 Self::Frozen {
                     weight: buffer("weight", 1.0)?,
                     bias: buffer("bias", 0.0)?,
@@ -230,7 +231,7 @@ impl ResNet {
     /// (b, H, W, 3) -> (b, ceil(H / 32), ceil(W / 32), 8 width)
     ///
     /// # Errors
-    /// Something that is no batch of pictures.
+    /// Something that is no batch of images.
     pub fn forward(&self, cx: &mut Context<'_>, x: &Value) -> Result<Value> {
         let x = conv2d(cx, x, self.conv1.parts(), &self.bn1, None, true)?;
         let mut x = max_pool(cx, &x)?;

@@ -1,7 +1,7 @@
 //! Transformer encoder and decoder as ACT has them: positions are added to queries and keys, and a norm stands before or
 //! after each branch.
 
-use super::{Activation, Dropout, Embedding, FeedForward, LayerNorm, MultiHeadAttention};
+use super::{Activation, Embedding, FeedForward, LayerNorm, MultiHeadAttention};
 use crate::context::Context;
 use crate::error::Result;
 use crate::ops::{feed_forward, layer_norm, narrow_tokens, residual};
@@ -47,7 +47,7 @@ pub struct EncoderLayer {
     ff: FeedForward,
     norm1: LayerNorm,
     norm2: LayerNorm,
-    dropout: Dropout,
+    dropout: f64,
     pre_norm: bool,
 }
 
@@ -66,7 +66,7 @@ impl EncoderLayer {
             ff: FeedForward::new(params, &format!("{prefix}."), hidden, ff, p, init.dense(), rng)?,
             norm1: LayerNorm::new(params, &format!("{prefix}.norm1"), dim, rng)?,
             norm2: LayerNorm::new(params, &format!("{prefix}.norm2"), dim, rng)?,
-            dropout: Dropout { p },
+            dropout: p,
             pre_norm: shape.pre_norm,
         })
     }
@@ -103,7 +103,7 @@ impl EncoderLayer {
         read: usize,
     ) -> Result<Value> {
         let all = x.dim(1)?;
-        let (dropout, pre_norm) = ((self.dropout.p, all), self.pre_norm);
+        let (dropout, pre_norm) = ((self.dropout, all), self.pre_norm);
         let y = enter(cx, x, &self.norm1, pre_norm)?;
         let branch = self.self_attn.self_attention(cx, &y, pos, x.dim(0)?, read, key_pad)?;
         let x = narrow_tokens(cx, if pre_norm { x } else { &y }, 0, read)?;
@@ -178,7 +178,7 @@ pub struct DecoderLayer {
     norm1: LayerNorm,
     norm2: LayerNorm,
     norm3: LayerNorm,
-    dropout: Dropout,
+    dropout: f64,
     pre_norm: bool,
 }
 
@@ -197,8 +197,7 @@ impl DecoderLayer {
         let ff = FeedForward::new(params, &format!("{prefix}."), hidden, act, p, init, rng)?;
         let mut norm = |name: &str| LayerNorm::new(params, &format!("{prefix}.{name}"), dim, rng);
         let (norm1, norm2, norm3) = (norm("norm1")?, norm("norm2")?, norm("norm3")?);
-        let dropout = Dropout { p };
-        Ok(Self { self_attn, multihead_attn, ff, norm1, norm2, norm3, dropout, pre_norm: shape.pre_norm })
+        Ok(Self { self_attn, multihead_attn, ff, norm1, norm2, norm3, dropout: p, pre_norm: shape.pre_norm })
     }
 
     /// What the layer makes of its tokens before it reads the memory: their sum, and queries. x: (b or 1, c, D); attention of
@@ -207,7 +206,7 @@ impl DecoderLayer {
         let (c, pre_norm) = (x.dim(1)?, self.pre_norm);
         let y = enter(cx, x, &self.norm1, pre_norm)?;
         let branch = self.self_attn.self_attention(cx, &y, query_pos, batch, c, None)?;
-        let x = leave(cx, x, &branch, (self.dropout.p, c), &self.norm1, pre_norm)?;
+        let x = leave(cx, x, &branch, (self.dropout, c), &self.norm1, pre_norm)?;
         let y = enter(cx, &x, &self.norm2, pre_norm)?;
         let q = self.multihead_attn.queries(cx, &y, Some(query_pos))?;
         Ok((x, q))
@@ -216,7 +215,7 @@ impl DecoderLayer {
     /// The rest of it: memory: (b, m, D), its positions: (1, m, D) -> (b, c, D)
     fn finish(&self, cx: &mut Context<'_>, (x, q): (Value, Value), memory: (&Value, &Value)) -> Result<Value> {
         let (batch, c, pre_norm) = (memory.0.dim(0)?, x.dim(1)?, self.pre_norm);
-        let dropout = (self.dropout.p, c);
+        let dropout = (self.dropout, c);
         let kv = self.multihead_attn.keys_and_values(cx, memory.0, Some(memory.1))?;
         let branch = self.multihead_attn.attend(cx, &q, &kv, batch)?;
         let x = leave(cx, &x, &branch, dropout, &self.norm2, pre_norm)?;

@@ -26,6 +26,10 @@ pub struct Attention<'a> {
     pub dropout: f64,
 }
 
+fn check_pad(pad: Option<&Tensor>, batch: usize, keys: usize) -> Result<()> {
+    pad.map_or(Ok(()), |pad| super::check_shape("attention", "padding", pad, &[batch, keys]))
+}
+
 fn with_pad<R>(pad: Option<&Tensor>, f: impl FnOnce(Option<&[f32]>) -> Result<R>) -> Result<R> {
     match pad {
         Some(pad) => read("attention", [pad], |[pad]| f(Some(pad))),
@@ -39,15 +43,17 @@ fn with_pad<R>(pad: Option<&Tensor>, f: impl FnOnce(Option<&[f32]>) -> Result<R>
 /// Shapes that do not go together.
 pub fn attention(cx: &mut Context<'_>, q: &Value, kv: &Value, how: Attention<'_>) -> Result<Value> {
     let mask = cx.dropout(how.dropout);
-    if cx.composed() {
-        return composed(cx, q, kv, how, mask);
-    }
-    let ((q_batch, queries, dim), (kv_batch, keys, width)) = (q.dims3()?, kv.dims3()?);
+    let [q_batch, queries, dim] = super::sizes("attention", &q.tensor)?;
+    let [kv_batch, keys, width] = super::sizes("attention", &kv.tensor)?;
     let Attention { heads, batch, all_queries, causal, key_pad, .. } = how;
     let fits = |n: usize| n == batch || n == 1;
     if width != 2 * dim || !fits(q_batch) || !fits(kv_batch) || !dim.is_multiple_of(heads) {
         let (found, expected) = (kv.dims().to_vec(), vec![batch, keys, 2 * dim]);
         return Err(ModelError::Shape { operation: "attention", object: "keys and values", expected, found });
+    }
+    check_pad(key_pad, batch, keys)?;
+    if cx.composed("attention", [&q.tensor, &kv.tensor].into_iter().chain(key_pad))? {
+        return composed(cx, q, kv, how, mask);
     }
     let (shared_queries, shared_keys) = (q_batch != batch, kv_batch != batch);
     let heads = Heads { batch, heads, queries, all_queries, keys, dim, shared_queries, shared_keys, causal };
@@ -118,18 +124,20 @@ pub fn self_attention(
     (weight, bias): (&Tensor, &Tensor),
     how: Attention<'_>,
 ) -> Result<Value> {
-    let (x_batch, keys, dim) = x.dims3()?;
-    if cx.composed() {
-        let kv = linear_rows(cx, x, Some(positions), (weight, Some(bias)), dim..3 * dim)?;
-        let (first, first_positions) = (narrow_tokens(cx, x, 0, queries)?, narrow_tokens(cx, positions, 0, queries)?);
-        let q = linear_rows(cx, &first, Some(&first_positions), (weight, Some(bias)), 0..dim)?;
-        return attention(cx, &q, &kv, how);
-    }
+    let [x_batch, keys, dim] = super::sizes("self attention", &x.tensor)?;
     let Attention { heads, batch, all_queries, causal, key_pad, dropout } = how;
     super::check_width("self attention", x, weight.dim(1)?)?;
     if positions.len() != keys * dim || !dim.is_multiple_of(heads) || (x_batch != batch && x_batch != 1) {
         let (found, expected) = (positions.dims().to_vec(), vec![1, keys, dim]);
         return Err(ModelError::Shape { operation: "self attention", object: "positions", expected, found });
+    }
+    check_pad(key_pad, batch, keys)?;
+    let tensors = [&x.tensor, &positions.tensor, weight, bias].into_iter().chain(key_pad);
+    if cx.composed("self attention", tensors)? {
+        let kv = linear_rows(cx, x, Some(positions), (weight, Some(bias)), dim..3 * dim)?;
+        let (first, first_positions) = (narrow_tokens(cx, x, 0, queries)?, narrow_tokens(cx, positions, 0, queries)?);
+        let q = linear_rows(cx, &first, Some(&first_positions), (weight, Some(bias)), 0..dim)?;
+        return attention(cx, &q, &kv, how);
     }
     let shared = x_batch != batch;
     let heads =

@@ -1,4 +1,4 @@
-//! Convolutions over the steps of sequences, (b, T, C). For their kernels a sequence is a picture of one row.
+//! Convolutions over the steps of sequences, (b, T, C). For their kernels a sequence is an image of one row.
 
 use super::conv2d::{backward, forward, framed, weight_gradient, with_panels};
 use crate::context::{Context, read};
@@ -22,13 +22,13 @@ pub enum Then<'a> {
     Add(&'a Value),
 }
 
-fn along((pictures, width, channels): (usize, usize, usize), output: usize, kernel: usize, stride: usize) -> Conv {
-    let input = Frame { pictures, height: 1, width, channels, border: (0, (kernel - 1) / 2) };
+fn along((images, width, channels): (usize, usize, usize), output: usize, kernel: usize, stride: usize) -> Conv {
+    let input = Frame { images, height: 1, width, channels, border: (0, (kernel - 1) / 2) };
     Conv { input, output, kernel: (1, kernel), stride: (1, stride) }
 }
 
 fn convolution(x: &Value, layer: &Conv1d) -> Result<Conv> {
-    let (n, steps, channels) = x.dims3()?;
+    let [n, steps, channels] = super::sizes("convolution", &x.tensor)?;
     let (output, input, kernel) = layer.weight.dims3()?;
     super::check_width("convolution", x, input)?;
     Ok(along((n, steps, channels), output, kernel, layer.stride))
@@ -57,15 +57,15 @@ fn of_bias(back: &mut Backward<'_>, layer: &Conv1d, rows: &[f32]) {
 /// # Errors
 /// An input of another width.
 pub fn conv1d(cx: &mut Context<'_>, x: &Value, layer: &Conv1d) -> Result<Value> {
-    if cx.composed() {
+    let conv = convolution(x, layer)?;
+    if cx.composed("convolution", [&x.tensor, &layer.weight, &layer.bias])? {
         return Ok(Value::constant(layer.forward(&x.tensor)?));
     }
-    let conv = convolution(x, layer)?;
     let made = conv.made((0, 0));
     let mut y = vec![0.0; made.inside()];
     with_bias(cx, &conv, layer, x, &mut y)?;
     let (x, layer, node) = (x.tensor.clone(), layer.clone(), x.node);
-    cx.result(y, &[made.pictures, made.width, made.channels], true, move |grad, back| {
+    cx.result(y, &[made.images, made.width, made.channels], true, move |grad, back| {
         of_bias(back, &layer, &grad);
         let framed = framed(&grad, &conv.made(conv.grad_border()), &mut back.space.pool);
         backward(back, &conv, &layer.weight, (&x, node), &framed)?;
@@ -86,7 +86,7 @@ pub fn conv1d_mish(
 ) -> Result<Value> {
     let conv = convolution(x, layer)?;
     let (made, output) = (conv.made((0, 0)), conv.output);
-    let shape = [made.pictures, made.width, output];
+    let shape = [made.images, made.width, output];
     super::check_shape("convolution", "norm", &norm.weight, &[output])?;
     let scales = match then {
         Then::Film(film) if film.dims() == [shape[0], 2 * output] => true,
@@ -96,7 +96,11 @@ pub fn conv1d_mish(
         Then::Add(x) => super::check_shape("convolution", "sum", &x.tensor, &shape).map(|()| false)?,
         Then::Nothing => false,
     };
-    if cx.composed() {
+    let other = match then {
+        Then::Film(other) | Then::Add(other) => Some(&other.tensor),
+        Then::Nothing => None,
+    };
+    if cx.composed("convolution", [&x.tensor, &layer.weight, &layer.bias].into_iter().chain(other))? {
         let y = crate::layers::mish(&norm.forward(&layer.forward(&x.tensor)?)?)?;
         return Ok(Value::constant(match then {
             Then::Nothing => y,
@@ -108,7 +112,7 @@ pub fn conv1d_mish(
             Then::Add(x) => (y + &x.tensor)?,
         }));
     }
-    let (mut y, mut inverse) = (cx.space.pool.take(made.inside()), cx.space.pool.take(made.pictures * norm.groups));
+    let (mut y, mut inverse) = (cx.space.pool.take(made.inside()), cx.space.pool.take(made.images * norm.groups));
     with_bias(cx, &conv, layer, x, &mut y)?;
     group_norm(&mut y, &made, norm.groups, &mut inverse);
     let mut out = vec![0.0; made.inside()];
@@ -160,7 +164,7 @@ pub fn conv1d_mish(
             }
             back.space.pool.give(grad);
         }
-        of_bias(back, &layer, &before[..frame.pictures * frame.picture()]);
+        of_bias(back, &layer, &before[..frame.images * frame.image()]);
         backward(back, &conv, &layer.weight, (&x, of_x), &before)?;
         [y, inverse, before, grad].into_iter().for_each(|buffer| back.space.pool.give(buffer));
         if let Some(whole) = whole {
@@ -175,15 +179,15 @@ pub fn conv1d_mish(
 /// # Errors
 /// An input of another width.
 pub fn upsample1d(cx: &mut Context<'_>, x: &Value, layer: &Upsample1d) -> Result<Value> {
-    if cx.composed() {
-        return Ok(Value::constant(layer.forward(&x.tensor)?));
-    }
-    let (n, steps, _) = x.dims3()?;
+    let [n, steps, _] = super::sizes("upsample", &x.tensor)?;
     let (input, output, kernel) = layer.weight.dims3()?;
     super::check_width("upsample", x, input)?;
     if kernel != 4 {
         let (expected, found) = (vec![input, output, 4], layer.weight.dims().to_vec());
         return Err(ModelError::Shape { operation: "upsample", object: "weight", expected, found });
+    }
+    if cx.composed("upsample", [&x.tensor, &layer.weight, &layer.bias])? {
+        return Ok(Value::constant(layer.forward(&x.tensor)?));
     }
     // the way back of a convolution that halves the steps
     let conv = along((n, 2 * steps, output), input, kernel, 2);

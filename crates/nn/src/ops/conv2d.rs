@@ -1,4 +1,4 @@
-//! Convolutions of pictures, (n, h, w, C): rows after rows, as they come. Frames of zeros and panels are the operations' own.
+//! Convolutions of images, (n, h, w, C): rows after rows, as they come. Frames of zeros and panels are the operations' own.
 
 use crate::context::{Context, read};
 use crate::error::Result;
@@ -92,7 +92,7 @@ pub(super) fn with_panels(
 }
 
 /// The convolution in tiles, where that is fewer products; with `add` added to what is there. Predictions stay with the plain
-/// sum: what an entry does may not depend on how many pictures it is asked about at once.
+/// sum: what an entry does may not depend on how many images it is asked about at once.
 pub(super) fn forward(cx: &mut Context<'_>, conv: &Conv, w: &[f32], x: &[f32], add: bool, y: &mut [f32]) -> Result<()> {
     if let Some(tiles) = Winograd::of(conv).filter(|_| !cx.is_prepared()) {
         let pool = &mut cx.space.pool;
@@ -178,19 +178,24 @@ pub fn conv2d(
     shortcut: Option<&Value>,
     relu: bool,
 ) -> Result<Value> {
-    if cx.composed() {
+    let [n, h, w, c] = super::sizes("convolution", &x.tensor)?;
+    let (output, _, k, _) = weight.dims4()?;
+    super::check_shape("convolution", "weight", weight, &[output, c, k, k])?;
+    if let Some(shortcut) = shortcut {
+        let made = [n, h.div_ceil(stride), w.div_ceil(stride), output];
+        super::check_shape("convolution", "shortcut", &shortcut.tensor, &made)?;
+    }
+    let tensors = [&x.tensor, weight].into_iter().chain(shortcut.map(|shortcut| &shortcut.tensor));
+    if cx.composed("convolution", tensors)? {
         let y = crate::layers::conv2d_composed(&x.tensor.permute((0, 3, 1, 2))?, weight, stride)?;
         let y = norm.composed(&y)?.permute((0, 2, 3, 1))?;
         let y = shortcut.map_or(Ok(y.clone()), |shortcut| &y + &shortcut.tensor)?;
         return Ok(Value::constant(if relu { y.relu()? } else { y }.contiguous()?));
     }
-    let (n, h, w, c) = x.tensor.dims4()?;
-    let (output, _, k, _) = weight.dims4()?;
-    super::check_shape("convolution", "weight", weight, &[output, c, k, k])?;
-    let input = Frame { pictures: n, height: h, width: w, channels: c, border: (k / 2, k / 2) };
+    let input = Frame { images: n, height: h, width: w, channels: c, border: (k / 2, k / 2) };
     let conv = Conv { input, output, kernel: (k, k), stride: (stride, stride) };
     let made = conv.made((0, 0));
-    let shape = [made.pictures, made.height, made.width, made.channels];
+    let shape = [made.images, made.height, made.width, made.channels];
     let mut y = cx.space.pool.take(made.inside());
     read("convolution", [&x.tensor, weight], |[x, w]| {
         let framed = framed(x, &conv.input, &mut cx.space.pool);
@@ -200,7 +205,7 @@ pub fn conv2d(
     })?;
     let mut inverse = Vec::new();
     if let ConvNorm::Group { groups, .. } = norm {
-        inverse = cx.space.pool.take(made.pictures * groups);
+        inverse = cx.space.pool.take(made.images * groups);
         group_norm(&mut y, &made, *groups, &mut inverse);
     }
     let [scale, shift] = norm.scale_and_shift()?;
@@ -264,14 +269,14 @@ pub fn conv2d(
 /// The maximum over windows of 3x3, stride 2, padding 1, of numbers that are not negative.
 ///
 /// # Errors
-/// Something that is no batch of pictures.
+/// Something that is no batch of images.
 pub fn max_pool(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
-    if cx.composed() {
+    let [n, h, w, c] = super::sizes("max pool", &x.tensor)?;
+    if cx.composed("max pool", [&x.tensor])? {
         let y = max_pool_composed(&x.tensor.permute((0, 3, 1, 2))?.contiguous()?)?;
         return Ok(Value::constant(y.permute((0, 2, 3, 1))?.contiguous()?));
     }
-    let (n, h, w, c) = x.tensor.dims4()?;
-    let from = Frame { pictures: n, height: h, width: w, channels: c, border: (1, 1) };
+    let from = Frame { images: n, height: h, width: w, channels: c, border: (1, 1) };
     let to = Frame { height: h.div_ceil(2), width: w.div_ceil(2), border: (0, 0), ..from };
     let (mut out, mut winner) = (vec![0.0; to.inside()], cx.space.pool.take(to.inside()));
     read("max pool", [&x.tensor], |[x]| {
@@ -307,10 +312,10 @@ pub fn max_pool(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
 /// # Errors
 /// Another number of cells.
 pub fn spatial_softmax(cx: &mut Context<'_>, scores: &Value, (h, w): (usize, usize)) -> Result<Value> {
-    let (n, cells, k) = scores.dims3()?;
+    let [n, cells, k] = super::sizes("spatial softmax", &scores.tensor)?;
     super::check_shape("spatial softmax", "scores", &scores.tensor, &[n, h * w, k])?;
     let places = cell_places((h, w));
-    if cx.composed() {
+    if cx.composed("spatial softmax", [&scores.tensor])? {
         let scores = scores.tensor.transpose(1, 2)?.contiguous()?;
         let shifted = scores.broadcast_sub(&scores.max_keepdim(2)?.detach())?.exp()?;
         let share = shifted.broadcast_div(&shifted.sum_keepdim(2)?)?;

@@ -12,7 +12,7 @@ use crate::value::Value;
 /// # Errors
 /// Shapes that do not go together.
 pub fn add(cx: &mut Context<'_>, a: &Value, b: &Value) -> Result<Value> {
-    let all = b.dim(1)?;
+    let [_, all, _] = super::sizes("add", &b.tensor)?;
     super::residual(cx, a, b, (0.0, all), None)
 }
 
@@ -21,7 +21,7 @@ pub fn add(cx: &mut Context<'_>, a: &Value, b: &Value) -> Result<Value> {
 /// # Errors
 /// If the tensor library fails.
 pub fn activation(cx: &mut Context<'_>, x: &Value, activation: Activation) -> Result<Value> {
-    if cx.composed() {
+    if cx.composed("activation", [&x.tensor])? {
         return Ok(Value::constant(activation.forward(&x.tensor)?));
     }
     let mut out = read("activation", [&x.tensor], |[x]| Ok(x.to_vec()))?;
@@ -61,7 +61,7 @@ pub fn alias(cx: &mut Context<'_>, x: &Value) -> Value {
 /// # Errors
 /// If the tensor library fails.
 pub fn mish(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
-    if cx.composed() {
+    if cx.composed("mish", [&x.tensor])? {
         return Ok(Value::constant(crate::layers::mish(&x.tensor)?));
     }
     let mut out = read("mish", [&x.tensor], |[x]| Ok(x.to_vec()))?;
@@ -83,7 +83,7 @@ pub fn mish(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
 /// If the tensor library fails.
 pub fn dropout(cx: &mut Context<'_>, x: &Value, p: f64) -> Result<Value> {
     let Some(mask) = cx.dropout(p) else { return Ok(x.clone()) };
-    if cx.composed() {
+    if cx.composed("dropout", [&x.tensor])? {
         return Ok(Value::constant(x.tensor.mul(&mask.tensor(x.dims(), cx.device())?)?));
     }
     let rows = Rows { computed: 1, all: 1 };
@@ -108,7 +108,9 @@ pub fn dropout(cx: &mut Context<'_>, x: &Value, p: f64) -> Result<Value> {
 /// # Errors
 /// Another number of rows.
 pub fn cat_rows(cx: &mut Context<'_>, a: &Value, b: &Value) -> Result<Value> {
-    let ((n, wide_a), (_, wide_b)) = (a.dims2()?, b.dims2()?);
+    let [n, wide_a] = super::sizes("cat rows", &a.tensor)?;
+    let [_, wide_b] = super::sizes("cat rows", &b.tensor)?;
+    super::check_shape("cat rows", "input", &b.tensor, &[n, wide_b])?;
     // a row of numbers is a sequence of tokens that are one wide
     let (a, b) = (a.reshape((n, wide_a, 1))?, b.reshape((n, wide_b, 1))?);
     super::cat_tokens(cx, n, &[&a, &b])?.reshape((n, wide_a + wide_b))
@@ -119,8 +121,8 @@ pub fn cat_rows(cx: &mut Context<'_>, a: &Value, b: &Value) -> Result<Value> {
 /// # Errors
 /// If the tensor library fails.
 pub fn detached_mean(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
-    let (b, t, dim) = x.dims3()?;
-    if cx.composed() {
+    let [b, t, dim] = super::sizes("mean", &x.tensor)?;
+    if cx.composed("mean", [&x.tensor])? {
         return Ok(Value::constant(x.tensor.detach().mean(1)?));
     }
     let mut out = vec![0.0; b * dim];

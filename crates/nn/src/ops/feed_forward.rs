@@ -13,10 +13,12 @@ use crate::value::Value;
 /// # Errors
 /// An input of another width, layers without a bias.
 pub fn feed_forward(cx: &mut Context<'_>, x: &Value, layer: &FeedForward, all: usize) -> Result<Value> {
-    let mask = cx.dropout(layer.dropout.p);
-    let (b, t, dim) = x.dims3()?;
+    let mask = cx.dropout(layer.dropout);
+    let [b, t, dim] = super::sizes("feed forward", &x.tensor)?;
     let activation = layer.activation;
-    if cx.composed() {
+    let (one, two) = (&layer.linear1, &layer.linear2);
+    super::check_width("feed forward", x, one.weight.dim(1)?)?;
+    if cx.composed("feed forward", [&x.tensor, &one.weight, &two.weight])? {
         let hidden = activation.forward(&layer.linear1.forward(&x.tensor)?)?;
         let hidden = match mask {
             Some(mask) => {
@@ -27,8 +29,6 @@ pub fn feed_forward(cx: &mut Context<'_>, x: &Value, layer: &FeedForward, all: u
         };
         return Ok(Value::constant(layer.linear2.forward(&hidden)?));
     }
-    super::check_width("feed forward", x, layer.linear1.weight.dim(1)?)?;
-    let (one, two) = (&layer.linear1, &layer.linear2);
     let (Some(b1), Some(b2)) = (&one.bias, &two.bias) else {
         let (found, expected) = ("without a bias".to_string(), "with one".to_string());
         return Err(ModelError::Input { operation: "feed forward", object: "layer", found, expected });

@@ -49,12 +49,13 @@ pub fn grid_convolution(
     (rows, columns): (usize, usize),
     layer: &Linear,
 ) -> Result<Value> {
-    let ((b, cells, dim), (out_dim, width)) = (x.dims3()?, layer.weight.dims2()?);
+    let [b, cells, dim] = super::sizes("grid convolution", &x.tensor)?;
+    let (out_dim, width) = layer.weight.dims2()?;
     if cells != rows * columns || width != NEIGHBOURS * dim {
         let (expected, found) = (vec![b, rows * columns, width / NEIGHBOURS], x.dims().to_vec());
         return Err(ModelError::Shape { operation: "grid convolution", object: "cells", expected, found });
     }
-    if cx.composed() {
+    if cx.composed("grid convolution", [&x.tensor, &layer.weight])? {
         let padded = x.tensor.reshape((b, rows, columns, dim))?.pad_with_zeros(1, 1, 1)?.pad_with_zeros(2, 1, 1)?;
         let tap = |tap: usize| padded.narrow(1, tap / 3, rows)?.narrow(2, tap % 3, columns);
         let patches = Tensor::cat(&(0..NEIGHBOURS).map(tap).collect::<candle_core::Result<Vec<_>>>()?, 3)?;

@@ -16,13 +16,19 @@ fn parts(latent: &Tensor) -> Result<(Tensor, Tensor)> {
 /// # Errors
 /// Noise of another shape.
 pub fn sample_latent(cx: &mut Context<'_>, latent: &Value, noise: &Value) -> Result<Value> {
-    if cx.composed() {
+    let width = noise.width();
+    super::check_width("sample", latent, 2 * width)?;
+    super::check_shape(
+        "sample",
+        "noise",
+        &noise.tensor,
+        &[&latent.dims()[..latent.dims().len() - 1], &[width]].concat(),
+    )?;
+    if cx.composed("sample", [&latent.tensor, &noise.tensor])? {
         let (mean, log_variance) = parts(&latent.tensor)?;
         let spread = (log_variance / 2.0)?.exp()?.mul(&noise.tensor)?;
         return Ok(Value::constant((mean + spread)?));
     }
-    let width = noise.width();
-    super::check_width("sample", latent, 2 * width)?;
     let mut out = Vec::with_capacity(noise.len());
     read("sample", [&latent.tensor, &noise.tensor], |[latent, noise]| {
         for (latent, noise) in latent.chunks_exact(2 * width).zip(noise.chunks_exact(width)) {
@@ -59,7 +65,8 @@ pub fn sample_latent(cx: &mut Context<'_>, latent: &Value, noise: &Value) -> Res
 /// If the tensor library fails.
 pub fn kl_divergence(cx: &mut Context<'_>, latent: &Value, total_rows: usize) -> Result<Term> {
     let total = total_rows.max(1);
-    if cx.composed() {
+    super::check_width("KL divergence", latent, latent.width() / 2 * 2)?;
+    if cx.composed("KL divergence", [&latent.tensor])? {
         let (mean, log_variance) = parts(&latent.tensor)?;
         let terms = ((&log_variance + 1.0)? - mean.sqr()? - log_variance.exp()?)?;
         return Term::composed((terms.sum_all()? * (-0.5 / total as f64))?);

@@ -16,12 +16,13 @@ pub(super) const UNPACKED_ROWS: usize = 4;
 /// # Errors
 /// An input of another width.
 pub fn linear(cx: &mut Context<'_>, x: &Value, layer: &Linear) -> Result<Value> {
-    if cx.composed() {
+    let rows = 0..layer.weight.dim(0)?;
+    super::check_width("linear", x, layer.weight.elem_count() / rows.len().max(1))?;
+    if cx.composed("linear", [&x.tensor, &layer.weight].into_iter().chain(&layer.bias))? {
         // a convolution of one pixel is a dense layer
         let layer = Linear { weight: layer.weight.flatten_from(1)?, bias: layer.bias.clone() };
         return Ok(Value::constant(layer.forward(&x.tensor)?));
     }
-    let rows = 0..layer.weight.dim(0)?;
     by_rows(cx, x, None, (&layer.weight, layer.bias.as_ref()), rows, false)
 }
 
@@ -38,7 +39,12 @@ pub fn linear_rows(
     rows: Range<usize>,
 ) -> Result<Value> {
     let dim = x.width();
-    if cx.composed() {
+    super::check_width("linear", x, weight.elem_count() / weight.dim(0)?.max(1))?;
+    if let Some(positions) = positions {
+        super::check_width("linear", positions, dim)?;
+    }
+    let tensors = [&x.tensor, weight].into_iter().chain(bias).chain(positions.map(|positions| &positions.tensor));
+    if cx.composed("linear", tensors)? {
         let part = |rows: &Range<usize>| -> Result<Linear> {
             let weight = weight.narrow(0, rows.start, rows.len())?;
             Ok(Linear { weight, bias: bias.map(|bias| bias.narrow(0, rows.start, rows.len())).transpose()? })
@@ -87,7 +93,6 @@ fn by_rows(
     in_place: bool,
 ) -> Result<Value> {
     let (out, input) = (rows.len(), weight.elem_count() / weight.dim(0)?);
-    super::check_width("linear", x, input)?;
     let (n, part) = (x.len() / input, rows.start * input..rows.end * input);
     let mut y = vec![0.0; n * out];
     read("linear", [&x.tensor, weight], |[x, w]| {

@@ -28,11 +28,11 @@ pub fn chunk_error(
     error: Error,
     entries: usize,
 ) -> Result<(Term, Vec<f64>)> {
-    let (b, h, a) = got.dims3()?;
+    let [b, h, a] = super::sizes("loss", &got.tensor)?;
     super::check_shape("loss", "actions", want, &[b, h, a])?;
     super::check_shape("loss", "padding", is_pad, &[b, h])?;
     let entries = entries.max(1) as f64;
-    if cx.composed() {
+    if cx.composed("loss", [&got.tensor, want, is_pad])? {
         let valid = (1.0 - is_pad.reshape((b, h, 1))?)?;
         let difference = (&got.tensor - want)?;
         let each = match error {
@@ -86,7 +86,7 @@ pub fn chunk_error(
     Ok((term, rows))
 }
 
-/// A term by a function on numbers: `by_hand` gives its value and, where it is asked, writes so many times its gradient;
+/// A term by a function on numbers: `on_slices` gives its value and, where it is asked, writes so many times its gradient;
 /// `composed` gives the same on candle's graph.
 ///
 /// # Errors
@@ -94,18 +94,18 @@ pub fn chunk_error(
 pub fn term_of(
     cx: &mut Context<'_>,
     x: &Value,
-    by_hand: impl Fn(&[f32], Option<(&mut [f32], f64)>) -> f64 + 'static,
+    on_slices: impl Fn(&[f32], Option<(&mut [f32], f64)>) -> f64 + 'static,
     composed: impl FnOnce(&Tensor) -> Result<Tensor>,
 ) -> Result<Term> {
-    if cx.composed() {
+    if cx.composed("loss", [&x.tensor])? {
         return Term::composed(composed(&x.tensor)?);
     }
-    let value = read("loss", [&x.tensor], |[x]| Ok(by_hand(x, None)))?;
+    let value = read("loss", [&x.tensor], |[x]| Ok(on_slices(x, None)))?;
     let (node, x) = (x.node, x.tensor.clone());
     Ok(cx.term(value, node.is_some(), move |weight, back| {
         let mut of = back.space.pool.take(x.elem_count());
         read("loss", [&x], |[x]| {
-            by_hand(x, Some((&mut of, weight)));
+            on_slices(x, Some((&mut of, weight)));
             Ok(())
         })?;
         back.add(node, of);

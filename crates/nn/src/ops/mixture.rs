@@ -23,7 +23,7 @@ pub fn mixture_likelihood(
     (actions, real): (&Tensor, &Tensor),
     total: usize,
 ) -> Result<(Term, f32)> {
-    let (n, modes) = parts.logits.dims2()?;
+    let [n, modes] = super::sizes("likelihood", &parts.logits.tensor)?;
     let (width, total) = (parts.action_dim, total.max(1));
     super::check_shape("likelihood", "actions", actions, &[n, width])?;
     super::check_shape("likelihood", "rows that count", real, &[n])?;
@@ -34,7 +34,8 @@ pub fn mixture_likelihood(
         }
     }
     let min_std = parts.min_std;
-    if cx.composed() {
+    let tensors = [&parts.means.tensor, &parts.scales.tensor, &parts.logits.tensor, actions, real];
+    if cx.composed("likelihood", tensors)? {
         let mixtures = parts.mixture()?;
         let nll = ((mixtures.log_prob(actions)?.mul(real)?.sum_all()? / total as f64)? * -1.0)?;
         let away = absolute(&(mixtures.likeliest()?.detach() - actions)?)?.broadcast_mul(&real.unsqueeze(1)?)?;
@@ -44,7 +45,6 @@ pub fn mixture_likelihood(
     let (mut nll, mut l1, share) = (0.0, 0.0, 1.0 / total as f64);
     let pool = &mut cx.space.pool;
     let mut grads = [pool.take(n * modes * width), pool.take(n * modes * width), pool.take(n * modes)];
-    let tensors = [&parts.means.tensor, &parts.scales.tensor, &parts.logits.tensor, actions, real];
     read("likelihood", tensors, |[means, scales, logits, actions, real]| {
         let mut of_mode = vec![0.0; modes];
         let [of_means, of_scales, of_logits] = &mut grads;

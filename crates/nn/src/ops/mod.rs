@@ -33,6 +33,14 @@ use crate::error::{ModelError, Result};
 use crate::value::Value;
 use candle_core::Tensor;
 
+/// The sizes of a tensor of `N` dimensions.
+fn sizes<const N: usize>(operation: &'static str, x: &Tensor) -> Result<[usize; N]> {
+    x.dims().try_into().map_err(|_| {
+        let (found, expected) = (format!("of shape {:?}", x.dims()), format!("of {N} dimensions"));
+        ModelError::Input { operation, object: "input", found, expected }
+    })
+}
+
 fn check_width(operation: &'static str, x: &Value, width: usize) -> Result<()> {
     if x.width() == width {
         return Ok(());

@@ -12,7 +12,8 @@ use candle_core::Tensor;
 /// # Errors
 /// An input of another width.
 pub fn layer_norm(cx: &mut Context<'_>, x: &Value, norm: &LayerNorm) -> Result<Value> {
-    if cx.composed() {
+    super::check_width("norm", x, norm.weight.elem_count())?;
+    if cx.composed("norm", [&x.tensor, &norm.weight, &norm.bias])? {
         return Ok(Value::constant(norm.forward(&x.tensor)?));
     }
     let n = x.len() / x.width().max(1);
@@ -32,8 +33,13 @@ pub fn residual(
     norm: Option<&LayerNorm>,
 ) -> Result<Value> {
     let mask = cx.dropout(p);
-    let (b, computed, dim) = branch.dims3()?;
-    if cx.composed() {
+    let [b, computed, dim] = super::sizes("residual", &branch.tensor)?;
+    super::check_broadcast("residual", x, branch)?;
+    if let Some(norm) = norm {
+        super::check_width("norm", x, norm.weight.elem_count())?;
+    }
+    let of_norm = norm.into_iter().flat_map(|norm| [&norm.weight, &norm.bias]);
+    if cx.composed("residual", [&x.tensor, &branch.tensor].into_iter().chain(of_norm))? {
         let branch = match mask {
             Some(mask) => branch.tensor.mul(&mask.tensor(&[b, all, dim], cx.device())?.narrow(1, 0, computed)?)?,
             None => branch.tensor.clone(),
@@ -41,7 +47,6 @@ pub fn residual(
         let sum = branch.broadcast_add(&x.tensor)?;
         return Ok(Value::constant(norm.map_or(Ok(sum.clone()), |norm| norm.forward(&sum))?));
     }
-    super::check_broadcast("residual", x, branch)?;
     sum(cx, (x, Some(branch)), mask, Rows { computed, all }, norm)
 }
 
@@ -68,7 +73,6 @@ fn sum(
             Ok(())
         }
         Some(norm) => {
-            super::check_width("norm", x, norm.weight.elem_count())?;
             stats = cx.space.pool.take(2 * out.len() / width);
             read("norm", [&norm.weight, &norm.bias], |[w, b]| {
                 sum.norm(w, b, &mut out, &mut stats);

@@ -35,7 +35,7 @@ impl<'a> Sizes<'a> {
         states: usize,
         before: Option<&[Tensor]>,
     ) -> Result<Self> {
-        let ((steps, rows, width), hidden) = (x.dims3()?, recurrent.weight.dim(1)?);
+        let ([steps, rows, width], hidden) = (super::sizes(operation, &x.tensor)?, recurrent.weight.dim(1)?);
         super::check_shape(operation, "weight of the input", &input.weight, &[gates * hidden, width])?;
         super::check_shape(operation, "weight of the state", &recurrent.weight, &[gates * hidden, hidden])?;
         let refuse = |object: &'static str, found: &str, expected: &str| ModelError::Input {
@@ -93,7 +93,7 @@ pub fn lstm(
     before: Option<&[Tensor]>,
 ) -> Result<(Value, Vec<Tensor>)> {
     let sizes = Sizes::of(cx, "lstm", x, layer, 4, 2, before)?;
-    if cx.composed() {
+    if cx.composed("lstm", [&x.tensor, &layer.0.weight].into_iter().chain(before.into_iter().flatten()))? {
         return lstm_composed(cx, &sizes, x, layer, before);
     }
     let (input, recurrent) = layer;
@@ -261,7 +261,7 @@ pub fn gru(
     before: Option<&[Tensor]>,
 ) -> Result<(Value, Vec<Tensor>)> {
     let sizes = Sizes::of(cx, "gru", x, layer, 3, 1, before)?;
-    if cx.composed() {
+    if cx.composed("gru", [&x.tensor, &layer.0.weight].into_iter().chain(before.into_iter().flatten()))? {
         return gru_composed(cx, &sizes, x, layer, before);
     }
     let (input, recurrent) = layer;

@@ -3,16 +3,18 @@
 #![allow(clippy::unwrap_used)]
 
 use super::*;
+use crate::backend::Backend;
 use crate::context::{Cache, Context};
 use crate::gradients::{Gradients, ParamLayout};
 use crate::layers::{
-    Activation, Cell, Conv1d, Dropout, FeedForward, GroupNorm, LayerNorm, Linear, MixtureHead, Recurrent, Upsample1d,
+    Activation, Cell, Conv1d, FeedForward, GroupNorm, LayerNorm, Linear, MixtureHead, MixtureParts, Recurrent,
+    Upsample1d,
 };
 use crate::loss::Loss;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
 use crate::simd::{Level, at_most};
-use candle_core::Device;
+use candle_core::{DType, Device};
 use std::sync::Arc;
 
 /// Parameters by name, the inputs among them: what is differentiated.
@@ -23,7 +25,7 @@ struct Case {
 
 impl Case {
     fn new() -> Self {
-        Self { params: Params::new(), rng: Rng::new(1, "case") }
+        Self { params: Params::new(&Backend::CPU), rng: Rng::new(1, "case") }
     }
 
     fn tensor(&mut self, name: &str, shape: &[usize]) -> Tensor {
@@ -48,14 +50,14 @@ impl Case {
             let y = op(cx)?;
             let weights = Rng::new(9, "weights").normals(y.len());
             let composed = Tensor::from_slice(&weights, y.dims(), &Device::Cpu)?;
-            let by_hand = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
+            let on_slices = move |y: &[f32], grad: Option<(&mut [f32], f64)>| {
                 if let Some((grad, weight)) = grad {
                     grad.iter_mut().zip(&weights).for_each(|(grad, w)| *grad = (f64::from(*w) * weight) as f32);
                 }
                 y.iter().zip(&weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
             };
             let mut loss = Loss::default();
-            loss.add("sum", term_of(cx, &y, by_hand, |y| Ok(y.mul(&composed)?.sum_all()?))?, 0.8);
+            loss.add("sum", term_of(cx, &y, on_slices, |y| Ok(y.mul(&composed)?.sum_all()?))?, 0.8);
             Ok(loss)
         };
         self.check_loss(what, loss);
@@ -194,7 +196,7 @@ fn feed_forward_and_activations() {
         let (b, t, all, dim, hidden) = (3, 2, 4, 12, 19);
         let x = case.tensor("x", &[b, t, dim]);
         let (linear1, linear2) = (case.linear("one", dim, hidden), case.linear("two", hidden, dim));
-        let layer = FeedForward { linear1, linear2, activation: kind, dropout: Dropout { p } };
+        let layer = FeedForward { linear1, linear2, activation: kind, dropout: p };
         case.check("feed forward", |cx| {
             let x = value(cx, &x);
             feed_forward(cx, &x, &layer, all)
@@ -397,6 +399,165 @@ fn likelihoods_of_mixtures() {
     }
 }
 
+/// A call of an operation with these inputs.
+type Call<'a> = Box<dyn Fn(&mut Context<'_>, &[Value]) -> Result<()> + 'a>;
+
+/// Every operation refuses by its name inputs of another type and shape, on kernels and on candle's operations.
+#[test]
+fn every_operation_names_what_it_refuses() {
+    let mut case = Case::new();
+    let (layer, norm, wide) = (case.linear("layer", 4, 4), case.norm("norm", 4), case.linear("wide", 36, 4));
+    let (one, two) = (case.linear("one", 4, 8), case.linear("two", 8, 4));
+    let ff = FeedForward { linear1: one, linear2: two, activation: Activation::Relu, dropout: 0.0 };
+    let (inner, bias) = (case.tensor("inner", &[12, 4]), case.tensor("bias", &[12]));
+    let conv = Conv1d::new(&mut case.params, "conv", (4, 8, 3), 1, &mut case.rng).unwrap();
+    let double = Upsample1d::new(&mut case.params, "double", 4, &mut case.rng).unwrap();
+    let of_conv = case.norm("of_conv", 8);
+    let of_conv = GroupNorm { weight: of_conv.weight, bias: of_conv.bias, groups: 4 };
+    let (weight, of_map) = (case.tensor("weight", &[4, 4, 3, 3]), case.norm("of_map", 4));
+    let of_map = ConvNorm::Group { weight: of_map.weight, bias: of_map.bias, groups: 2 };
+    let gates =
+        |case: &mut Case, n: usize| (case.linear(&format!("{n} in"), 4, 4 * n), case.linear(&format!("{n}"), 4, 4 * n));
+    let (of_lstm, of_gru) = (gates(&mut case, 4), gates(&mut case, 3));
+    let how = Attention { heads: 2, batch: 2, all_queries: 3, causal: false, key_pad: None, dropout: 0.0 };
+    let likelihood = |means: &Value, scales: &Value, logits: &Value| MixtureParts {
+        means: means.clone(),
+        scales: scales.clone(),
+        logits: logits.clone(),
+        min_std: 0.1,
+        action_dim: 2,
+    };
+    let seq: &[usize] = &[2, 3, 4];
+    // name, shapes that fit, the input to change and a shape that does not fit, the call
+    let table: Vec<(&str, Vec<&[usize]>, (usize, &[usize]), Call<'_>)> = vec![
+        ("linear", vec![seq], (0, &[2, 3, 5]), Box::new(|cx, x| linear(cx, &x[0], &layer).map(drop))),
+        (
+            "linear",
+            vec![seq, &[1, 3, 4]],
+            (1, &[1, 3, 5]),
+            Box::new(|cx, x| linear_rows(cx, &x[0], Some(&x[1]), (&inner, Some(&bias)), 4..12).map(drop)),
+        ),
+        ("norm", vec![seq], (0, &[2, 3, 5]), Box::new(|cx, x| layer_norm(cx, &x[0], &norm).map(drop))),
+        (
+            "residual",
+            vec![seq, seq],
+            (0, &[2, 2, 4]),
+            Box::new(|cx, x| residual(cx, &x[0], &x[1], (0.0, 3), Some(&norm)).map(drop)),
+        ),
+        ("residual", vec![seq, seq], (0, &[3, 3, 4]), Box::new(|cx, x| add(cx, &x[0], &x[1]).map(drop))),
+        (
+            "attention",
+            vec![seq, &[2, 5, 8]],
+            (1, &[2, 5, 7]),
+            Box::new(|cx, x| attention(cx, &x[0], &x[1], how).map(drop)),
+        ),
+        (
+            "attention",
+            vec![seq, &[2, 5, 8], &[2, 5]],
+            (2, &[2, 4]),
+            Box::new(|cx, x| attention(cx, &x[0], &x[1], Attention { key_pad: Some(&x[2].tensor), ..how }).map(drop)),
+        ),
+        (
+            "self attention",
+            vec![seq, &[1, 3, 4]],
+            (1, &[1, 2, 4]),
+            Box::new(|cx, x| self_attention(cx, &x[0], &x[1], 3, (&inner, &bias), how).map(drop)),
+        ),
+        ("feed forward", vec![seq], (0, &[2, 3, 5]), Box::new(|cx, x| feed_forward(cx, &x[0], &ff, 3).map(drop))),
+        ("activation", vec![seq], (0, seq), Box::new(|cx, x| activation(cx, &x[0], Activation::Gelu).map(drop))),
+        ("mish", vec![seq], (0, seq), Box::new(|cx, x| mish(cx, &x[0]).map(drop))),
+        ("mean", vec![seq], (0, &[2, 3]), Box::new(|cx, x| detached_mean(cx, &x[0]).map(drop))),
+        ("cat", vec![seq, &[2, 1, 4]], (1, &[2, 1, 5]), Box::new(|cx, x| cat_tokens(cx, 2, &[&x[0], &x[1]]).map(drop))),
+        ("cat rows", vec![&[2, 3], &[2, 4]], (1, &[3, 4]), Box::new(|cx, x| cat_rows(cx, &x[0], &x[1]).map(drop))),
+        ("narrow", vec![seq], (0, &[2, 2, 4]), Box::new(|cx, x| narrow_tokens(cx, &x[0], 1, 2).map(drop))),
+        ("select", vec![seq], (0, &[2, 2, 4]), Box::new(|cx, x| select_tokens(cx, &x[0], &[2, 0]).map(drop))),
+        (
+            "weighted mean",
+            vec![&[2, 3], seq],
+            (0, &[2, 2]),
+            Box::new(|cx, x| weighted_mean(cx, &x[0], &x[1]).map(drop)),
+        ),
+        ("sample", vec![&[2, 6], &[2, 3]], (1, &[3, 3]), Box::new(|cx, x| sample_latent(cx, &x[0], &x[1]).map(drop))),
+        ("KL divergence", vec![&[2, 6]], (0, &[2, 5]), Box::new(|cx, x| kl_divergence(cx, &x[0], 2).map(drop))),
+        (
+            "loss",
+            vec![seq, seq, &[2, 3]],
+            (2, &[2, 4]),
+            Box::new(|cx, x| chunk_error(cx, (&x[0], &x[1].tensor), &x[2].tensor, Error::Squared, 6).map(drop)),
+        ),
+        (
+            "likelihood",
+            vec![&[2, 6], &[2, 6], &[2, 3], &[2, 2], &[2]],
+            (1, &[2, 5]),
+            Box::new(|cx, x| {
+                let parts = likelihood(&x[0], &x[1], &x[2]);
+                mixture_likelihood(cx, &parts, (&x[3].tensor, &x[4].tensor), 2).map(drop)
+            }),
+        ),
+        ("convolution", vec![seq], (0, &[2, 3, 5]), Box::new(|cx, x| conv1d(cx, &x[0], &conv).map(drop))),
+        (
+            "convolution",
+            vec![seq, &[2, 16]],
+            (1, &[2, 9]),
+            Box::new(|cx, x| conv1d_mish(cx, &x[0], (&conv, &of_conv), Then::Film(&x[1])).map(drop)),
+        ),
+        ("upsample", vec![seq], (0, &[2, 3, 5]), Box::new(|cx, x| upsample1d(cx, &x[0], &double).map(drop))),
+        (
+            "convolution",
+            vec![&[2, 5, 6, 4], &[2, 3, 3, 4]],
+            (1, &[2, 3, 4, 4]),
+            Box::new(|cx, x| conv2d(cx, &x[0], (&weight, 2), &of_map, Some(&x[1]), true).map(drop)),
+        ),
+        ("max pool", vec![&[2, 5, 6, 4]], (0, seq), Box::new(|cx, x| max_pool(cx, &x[0]).map(drop))),
+        (
+            "spatial softmax",
+            vec![&[2, 6, 4]],
+            (0, &[2, 5, 4]),
+            Box::new(|cx, x| spatial_softmax(cx, &x[0], (2, 3)).map(drop)),
+        ),
+        (
+            "grid convolution",
+            vec![&[2, 6, 4]],
+            (0, &[2, 5, 4]),
+            Box::new(|cx, x| grid_convolution(cx, &x[0], (2, 3), &wide).map(drop)),
+        ),
+        (
+            "lstm",
+            vec![seq],
+            (0, &[2, 3, 5]),
+            Box::new(|cx, x| lstm(cx, &x[0], (&of_lstm.0, &of_lstm.1), None).map(drop)),
+        ),
+        ("gru", vec![seq], (0, &[2, 3]), Box::new(|cx, x| gru(cx, &x[0], (&of_gru.0, &of_gru.1), None).map(drop))),
+    ];
+    let cache = Cache::default();
+    for (name, shapes, (changed, misfit), call) in &table {
+        let zeros = |shape: &[usize], dtype| Value::constant(Tensor::zeros(shape, dtype, &Device::Cpu).unwrap());
+        let fitting: Vec<Value> = shapes.iter().map(|shape| zeros(shape, DType::F32)).collect();
+        let both = |inputs: &[Value]| {
+            let fast = cache.predict(&case.params, &mut || {}, |cx| call(cx, inputs));
+            [fast, cache.composed_predict(&case.params, |cx| call(cx, inputs))]
+        };
+        for result in both(&fitting) {
+            result.unwrap_or_else(|error| panic!("{name}: {error}"));
+        }
+        let mut cases: Vec<(usize, Value)> = (0..fitting.len()).map(|i| (i, zeros(shapes[i], DType::F64))).collect();
+        if misfit != &shapes[*changed] {
+            cases.push((*changed, zeros(misfit, DType::F32)));
+        }
+        for (at, wrong) in cases {
+            let mut inputs = fitting.clone();
+            inputs[at] = wrong;
+            for result in both(&inputs) {
+                let error = result.expect_err(name).to_string();
+                // an operation made of others may fail in one of them
+                let named =
+                    error.starts_with(&format!("{name}: ")) || (*name == "cat rows" && error.starts_with("cat: "));
+                assert!(named, "{name}, input {at}: {error}");
+            }
+        }
+    }
+}
+
 #[test]
 fn what_does_not_fit_is_named() {
     let mut case = Case::new();
@@ -407,17 +568,17 @@ fn what_does_not_fit_is_named() {
     };
     let wrong = error(&|cx| linear(cx, &Value::from(&x), &layer));
     assert_eq!(wrong, "linear: input has shape [2, 3, 5], expected [2, 3, 4]");
-    let wide = x.to_dtype(candle_core::DType::F64).unwrap();
+    let wide = x.to_dtype(DType::F64).unwrap();
     let wrong = error(&|cx| activation(cx, &Value::from(&wide), Activation::Relu));
-    assert_eq!(wrong, "activation: tensor is of F64, expected of f32");
+    assert_eq!(wrong, "activation: tensor is of F64, expected of F32");
     let turned = x.transpose(1, 2).unwrap();
     let wrong = error(&|cx| activation(cx, &Value::from(&turned), Activation::Relu));
     assert!(wrong.starts_with("activation: tensor is with strides"), "{wrong}");
-    let conv = Conv1d::new(&mut Params::new(), "conv", (4, 8, 3), 1, &mut Rng::new(1, "init")).unwrap();
+    let conv = Conv1d::new(&mut Params::new(&Backend::CPU), "conv", (4, 8, 3), 1, &mut Rng::new(1, "init")).unwrap();
     let wrong = error(&|cx| conv1d(cx, &Value::from(&x), &conv));
     assert_eq!(wrong, "convolution: input has shape [2, 3, 5], expected [2, 3, 4]");
     let fits = Value::from(&x.narrow(2, 0, 4).unwrap().contiguous().unwrap());
-    let weight = Tensor::zeros(8, candle_core::DType::F32, &Device::Cpu).unwrap();
+    let weight = Tensor::zeros(8, DType::F32, &Device::Cpu).unwrap();
     let norm = GroupNorm { weight: weight.clone(), bias: weight, groups: 4 };
     let wrong = error(&|cx| conv1d_mish(cx, &fits, (&conv, &norm), Then::Film(&fits)));
     assert_eq!(wrong, "convolution: film has shape [2, 3, 4], expected [2, 8]");

@@ -11,22 +11,20 @@ use candle_core::{D, Tensor};
 /// # Errors
 /// Parts of different widths.
 pub fn cat_tokens(cx: &mut Context<'_>, batch: usize, parts: &[&Value]) -> Result<Value> {
-    if cx.composed() {
-        let whole = |part: &&Value| -> Result<Tensor> {
-            let (_, t, dim) = part.dims3()?;
-            Ok(part.tensor.broadcast_as((batch, t, dim))?.contiguous()?)
-        };
-        return Ok(Value::constant(Tensor::cat(&parts.iter().map(whole).collect::<Result<Vec<_>>>()?, 1)?));
-    }
     let dim = parts.first().map_or(0, |part| part.width());
     let mut nodes = Vec::with_capacity(parts.len());
     for part in parts {
-        let (b, t, width) = part.dims3()?;
+        let [b, t, width] = super::sizes("cat", &part.tensor)?;
         if width != dim || (b != batch && b != 1) {
             let (expected, found) = (vec![batch, t, dim], part.dims().to_vec());
             return Err(ModelError::Shape { operation: "cat", object: "tokens", expected, found });
         }
         nodes.push((part.node, t * dim, b != batch));
+    }
+    if cx.composed("cat", parts.iter().map(|part| &part.tensor))? {
+        let whole = |part: &&Value| part.tensor.broadcast_as((batch, part.dims()[1], dim))?.contiguous();
+        let parts = parts.iter().map(whole).collect::<candle_core::Result<Vec<_>>>()?;
+        return Ok(Value::constant(Tensor::cat(&parts, 1)?));
     }
     let all: usize = nodes.iter().map(|(_, len, _)| len).sum();
     let mut out = vec![0.0; batch * all];
@@ -79,11 +77,15 @@ pub fn cat_tokens(cx: &mut Context<'_>, batch: usize, parts: &[&Value]) -> Resul
 /// # Errors
 /// Fewer tokens.
 pub fn narrow_tokens(cx: &mut Context<'_>, x: &Value, first: usize, count: usize) -> Result<Value> {
-    let (_, t, _) = x.dims3()?;
+    let [_, t, _] = super::sizes("narrow", &x.tensor)?;
     if first == 0 && count == t {
         return Ok(x.clone());
     }
-    if cx.composed() {
+    if first + count > t {
+        let (found, expected) = (format!("{first} to {}", first + count), format!("up to {t}"));
+        return Err(ModelError::Input { operation: "narrow", object: "tokens", found, expected });
+    }
+    if cx.composed("narrow", [&x.tensor])? {
         return Ok(Value::constant(x.tensor.narrow(1, first, count)?.contiguous()?));
     }
     select_tokens(cx, x, &(first..first + count).collect::<Vec<_>>())
@@ -94,12 +96,12 @@ pub fn narrow_tokens(cx: &mut Context<'_>, x: &Value, first: usize, count: usize
 /// # Errors
 /// A token that is not there.
 pub fn select_tokens(cx: &mut Context<'_>, x: &Value, tokens: &[usize]) -> Result<Value> {
-    let (b, t, dim) = x.dims3()?;
+    let [b, t, dim] = super::sizes("select", &x.tensor)?;
     if let Some(token) = tokens.iter().find(|token| **token >= t) {
         let (found, expected) = (token.to_string(), format!("below {t}"));
         return Err(ModelError::Input { operation: "select", object: "token", found, expected });
     }
-    if cx.composed() {
+    if cx.composed("select", [&x.tensor])? {
         let tokens: Vec<u32> = tokens.iter().map(|token| *token as u32).collect();
         let tokens = Tensor::new(tokens, cx.device())?;
         return Ok(Value::constant(x.tensor.index_select(&tokens, 1)?.contiguous()?));
@@ -133,12 +135,9 @@ pub fn select_tokens(cx: &mut Context<'_>, x: &Value, tokens: &[usize]) -> Resul
 /// # Errors
 /// Another number of scores.
 pub fn weighted_mean(cx: &mut Context<'_>, scores: &Value, tokens: &Value) -> Result<Value> {
-    let (b, n, dim) = tokens.dims3()?;
-    if scores.dims() != [b, n] {
-        let (expected, found) = (vec![b, n], scores.dims().to_vec());
-        return Err(ModelError::Shape { operation: "weighted mean", object: "scores", expected, found });
-    }
-    if cx.composed() {
+    let [b, n, dim] = super::sizes("weighted mean", &tokens.tensor)?;
+    super::check_shape("weighted mean", "scores", &scores.tensor, &[b, n])?;
+    if cx.composed("weighted mean", [&scores.tensor, &tokens.tensor])? {
         let shares = scores.tensor.broadcast_sub(&scores.tensor.max_keepdim(D::Minus1)?.detach())?.exp()?;
         let shares = shares.broadcast_div(&shares.sum_keepdim(D::Minus1)?)?;
         return Ok(Value::constant(shares.unsqueeze(1)?.matmul(&tokens.tensor.contiguous()?)?));

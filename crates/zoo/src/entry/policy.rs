@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use candle_core::Tensor;
 use models::actrm::{Actrm, Thinking};
-use models::{ModelError, Normaliser, Policy, PolicyModel, Preprocess, Signature};
+use models::{Backend, ModelError, Normaliser, Policy, PolicyModel, Preprocess, Signature};
 
 use crate::evaluation::WallClock;
 use crate::experiment::Experiment;
@@ -61,11 +61,11 @@ pub(super) fn assemble(
     statistics: &BTreeMap<String, Tensor>,
 ) -> Result<(Arc<dyn PolicyModel>, Arc<Preprocess>), ZooError> {
     let failed = |operation| move |source| ZooError::Model { operation, name: id.to_string(), source };
-    let model = experiment.policy.build(signature, 0).map_err(failed("build the policy of"))?;
+    let model = experiment.policy.build(signature, 0, &Backend::CPU).map_err(failed("build the policy of"))?;
     model.params().load(weights).map_err(failed("load the weights of"))?;
     let modes = experiment.normalisation.modes(signature);
     let preprocess = Normaliser::new(&modes, statistics)
-        .and_then(|normaliser| Preprocess::new(signature.clone(), normaliser))
+        .and_then(|normaliser| Preprocess::new(signature.clone(), normaliser, model.params().device()))
         .map_err(failed("load the normaliser of"))?;
     Ok((model.into(), Arc::new(preprocess)))
 }
@@ -98,7 +98,7 @@ impl LoadedEntry {
     pub fn thinking(&self, thinking: &Thinking) -> Result<Self, ZooError> {
         let failed = |source| self.failed("change the refinement steps of", source);
         let policy = self.experiment.policy.thinking(thinking).map_err(failed)?;
-        let model = policy.build(&self.entry.meta().signature, 0).map_err(failed)?;
+        let model = policy.build(&self.entry.meta().signature, 0, self.model.params().backend()).map_err(failed)?;
         model.params().load(&self.model.params().tensors()).map_err(failed)?;
         let experiment = Experiment { policy, ..self.experiment.clone() };
         Ok(Self { experiment, model: model.into(), ..self.clone() })
@@ -111,7 +111,8 @@ impl LoadedEntry {
     pub fn reasoner(&self) -> Result<Option<Arc<Actrm>>, ZooError> {
         let Some(config) = self.experiment.policy.reasoner() else { return Ok(None) };
         let failed = |source| self.failed("build the policy of", source);
-        let model = Actrm::new(config, &self.entry.meta().signature, 0).map_err(failed)?;
+        let model =
+            Actrm::new(config, &self.entry.meta().signature, 0, self.model.params().backend()).map_err(failed)?;
         model.params().load(&self.model.params().tensors()).map_err(failed)?;
         Ok(Some(Arc::new(model)))
     }

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use candle_core::Tensor;
 use models::{
-    ACTION, ENVIRONMENT_STATE, FeatureKind, FeatureSpec, ModelError, NormMode, Normaliser, PolicyConfig, Preprocess,
-    Signature, lerobot,
+    ACTION, Backend, ENVIRONMENT_STATE, FeatureKind, FeatureSpec, ModelError, NormMode, Normaliser, PolicyConfig,
+    Preprocess, Signature, lerobot,
 };
 use serde_json::Value;
 
@@ -109,13 +109,14 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     };
     experiment.check()?;
 
-    let model = experiment.policy.build(signature, 0).map_err(experiment.model_error("build the policy of"))?;
+    let model =
+        experiment.policy.build(signature, 0, &Backend::CPU).map_err(experiment.model_error("build the policy of"))?;
     checkpoint
         .load(model.params(), &weights, &before.config.norm_map, &before.statistics)
         .map_err(config::misfit(&model_path))?;
     let modes = experiment.normalisation.modes(signature);
     let preprocess = Normaliser::new(&modes, &statistics)
-        .and_then(|normaliser| Preprocess::new(signature.clone(), normaliser))
+        .and_then(|normaliser| Preprocess::new(signature.clone(), normaliser, model.params().device()))
         .map_err(experiment.model_error("take the statistics of"))?;
 
     let statistics = preprocess.normaliser().tensors().map_err(experiment.model_error("store the normaliser of"))?;

@@ -303,8 +303,8 @@ pub(super) fn prepare(
     }
     let exchanges = Exchanges::new(experiment, dataset, &train, &signature, path)?;
     let ways = Ways::new(experiment, dataset, &train, path)?;
-    let preprocess =
-        Preprocess::new(signature, normaliser).map_err(experiment.model_error("take the statistics for"))?;
+    let preprocess = Preprocess::new(signature, normaliser, &Device::Cpu)
+        .map_err(experiment.model_error("take the statistics for"))?;
     let symmetries = Symmetries::new(experiment, dataset, path)?;
     let mirror = Mirror::new(experiment, dataset, &train, path)?;
     let picture_statistics = picture_statistics.into_iter().collect();

@@ -7,7 +7,7 @@ use std::time::Instant;
 use candle_core::Tensor;
 use dataset::EnvMeta;
 use dataset::shuffle::Sampler;
-use models::{PolicyModel, Trainer, TrainerState};
+use models::{Backend, PolicyModel, Trainer, TrainerState};
 use serde::{Deserialize, Serialize};
 
 use crate::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, ModuleMeta, ParentMeta, TrainingMeta, reference};
@@ -192,7 +192,7 @@ impl PolicyTraining {
         let from_zoo = request.from_zoo.as_ref().unwrap_or(&request.zoo);
         let beginning = section.from.as_ref().map(|from| Beginning::read(from_zoo, from)).transpose()?;
         let build = || {
-            let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed);
+            let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed, &Backend::CPU);
             let model = model.map_err(experiment.model_error("build the policy of"))?;
             super::eyes::open(model.as_ref(), &demonstrations, &experiment)?;
             super::memory::fill(model.as_ref(), &demonstrations, &experiment)?;

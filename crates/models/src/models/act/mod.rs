@@ -5,14 +5,14 @@
 //! `model.`, which belongs to its file format.
 //!
 //! Training: the VAE encoder reads `[cls, state, actions…]` and gives the mean and log-variance of a latent. The encoder
-//! reads `[latent, state, environment state, entities…, pictures…]`; the decoder's queries are learned positions, one per action of the chunk.
+//! reads `[latent, state, environment state, entities…, images…]`; the decoder's queries are learned positions, one per action of the chunk.
 //! Loss: L1 over the steps that are not padding, plus `kl_weight` times KL(latent ‖ N(0, 1)). Inference: latent = 0.
 //!
 //! Entities are ours: a token each, through a projection that entities of one group share, without a position unless one
 //! was asked for; without positions the chunk does not depend on the order of a group. Of a history (`n_obs_steps`) each
 //! token reads all steps side by side.
 //!
-//! Pictures are tokens after all others, one a cell of a feature map (`encoders`), in the order of the cameras; as in
+//! Images are tokens after all others, one a cell of a feature map (`encoders`), in the order of the cameras; as in
 //! LeRobot nothing tells cameras apart.
 //!
 //! With `pointer` (ours) the encoder's output is asked which entity a demonstration took, and the decoder reads that entity's
@@ -47,7 +47,7 @@ use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::{Error, chunk_error, kl_divergence, linear, sample_latent};
-use nn::{Cache, Context, Gradients, Loss, LossParts, LossValues, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Gradients, Loss, LossParts, LossValues, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -78,12 +78,12 @@ impl Act {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         check_signature("act", signature, READS)?;
         let layout = TokenLayout::new(signature, config.vision.as_ref(), config.dim_model)?;
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let (dim, shape) = (config.dim_model, config.shape());
         let vae = match config.use_vae {
             true => {
@@ -101,7 +101,7 @@ impl Act {
         let norm = LayerNorm::new(&mut p, "decoder.norm", dim, rng)?;
         let tokens = InputTokens::new(&mut p, layout, config.latent_dim, dim, env_state, rng)?;
         let pos_embed = Embedding::new(&mut p, "decoder_pos_embed", config.action_horizon, dim, rng)?;
-        let table = sinusoid_table(config.action_horizon + 2, dim)?;
+        let table = sinusoid_table(config.action_horizon + 2, dim, backend.device())?;
         let action_head = Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?;
         let layout = tokens.layout();
         let pointer = config.pointer.as_ref();
@@ -197,7 +197,7 @@ impl Act {
         rng: Option<&mut Rng>,
         into: &mut Gradients,
     ) -> Result<LossValues> {
-        let batch = &self.looked_at(batch, None)?;
+        let batch = &self.with_images(batch, None)?;
         self.cache.step(&self.params, rng, into, |cx| self.loss_with(cx, batch, &Value::from(eps)))
     }
 
@@ -206,7 +206,7 @@ impl Act {
     /// # Errors
     /// Inputs of the wrong shape.
     pub fn composed_loss_with(&self, batch: &Batch, eps: &Tensor) -> Result<LossParts> {
-        let batch = &self.looked_at(batch, None)?;
+        let batch = &self.with_images(batch, None)?;
         self.cache.composed_loss(&self.params, None, |cx| self.loss_with(cx, batch, &Value::from(eps)))
     }
 
@@ -215,7 +215,7 @@ impl Act {
     /// # Errors
     /// Inputs of the wrong shape.
     pub fn training_output(&self, batch: &Batch, eps: &Tensor) -> Result<(Tensor, Option<Tensor>)> {
-        let batch = &self.looked_at(batch, None)?;
+        let batch = &self.with_images(batch, None)?;
         self.cache.predict(&self.params, &mut || {}, |cx| {
             let latent = self.encode(cx, batch)?;
             let sample = match &latent {
@@ -236,17 +236,17 @@ impl Act {
         self.cache.composed_predict(&self.params, |cx| Ok(self.decode(cx, &latent, &observation)?.0.detached()))
     }
 
-    /// Without a sample the latent is its mean under the prior, zero; and pictures as the network reads them.
+    /// Without a sample the latent is its mean under the prior, zero; and images as the network reads them.
     fn mean_latent(&self, observation: &Features<Tensor>) -> Result<(Value, Features<Tensor>)> {
         let rows = check_observation("act", &self.signature, observation)?;
-        let latent = Value::zeros((rows, self.config.latent_dim), &self.params.device())?;
-        Ok((latent, self.tokens.look(observation, None)?))
+        let latent = Value::zeros((rows, self.config.latent_dim), self.params.device())?;
+        Ok((latent, self.tokens.prepare(observation, None)?))
     }
 
-    /// The batch with pictures as the network reads them: random parts in training, with `rng`.
-    fn looked_at(&self, batch: &Batch, rng: Option<&mut Rng>) -> Result<Batch> {
+    /// The batch with images as the network reads them: random parts in training, with `rng`.
+    fn with_images(&self, batch: &Batch, rng: Option<&mut Rng>) -> Result<Batch> {
         check_batch("act", &self.signature, self.config.action_horizon, batch)?;
-        Ok(Batch { observation: self.tokens.look(&batch.observation, rng)?, ..batch.clone() })
+        Ok(Batch { observation: self.tokens.prepare(&batch.observation, rng)?, ..batch.clone() })
     }
 }
 
@@ -264,7 +264,7 @@ impl PolicyModel for Act {
     }
 
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
-        let batch = &self.looked_at(batch, Some(cx.rng()?))?;
+        let batch = &self.with_images(batch, Some(cx.rng()?))?;
         let noise = cx.normals(&[batch.rows(), self.config.latent_dim])?;
         self.loss_with(cx, batch, &noise)
     }

@@ -5,11 +5,11 @@ use crate::features::{FeatureSpec, Signature};
 use crate::layers::{Activation, AuxiliaryConfig, PointerConfig};
 use crate::models::act::Config;
 use crate::testing::{
-    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
-    move_parameters, signatures,
+    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients,
+    move_parameters, signatures, vision_config,
 };
+use candle_core::Device;
 use nn::ParamLayout;
-use nn::device::HERE;
 use nn::simd::{Level, at_most};
 use std::sync::Arc;
 
@@ -26,7 +26,7 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         dropout: 0.2,
         ..Default::default()
     };
-    let Signatures { plain, no_env, entities, history, told, .. } = signatures();
+    let Signatures { plain, no_env, entities, history, with_auxiliary, .. } = signatures();
     let auxiliary = Some(AuxiliaryConfig { weight: 0.6 });
     let pointer = Some(PointerConfig { among: "cube".to_string(), weight: 0.7 });
     let gelu = Config { feedforward_activation: Activation::Gelu, ..base.clone() };
@@ -38,8 +38,8 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         (Config { pointer: pointer.clone(), ..base.clone() }, entities.clone(), 4),
         (Config { pointer, pre_norm: true, use_vae: false, ..base.clone() }, entities, 1),
         (base.clone(), history, 4),
-        (Config { auxiliary: auxiliary.clone(), ..base.clone() }, told.clone(), 3),
-        (Config { auxiliary, pre_norm: true, use_vae: false, ..base.clone() }, told, 2),
+        (Config { auxiliary: auxiliary.clone(), ..base.clone() }, with_auxiliary.clone(), 3),
+        (Config { auxiliary, pre_norm: true, use_vae: false, ..base.clone() }, with_auxiliary, 2),
         (Config { n_decoder_layers: 3, action_horizon: 17, n_vae_encoder_layers: 1, ..gelu.clone() }, no_env, 2),
         (Config { pre_norm: true, use_vae: false, ..gelu }, plain.clone(), 1),
         (Config { dim_model: 35, n_heads: 1, dim_feedforward: 70, action_horizon: 1, dropout: 0.0, ..base }, plain, 5),
@@ -48,29 +48,29 @@ fn configs() -> Vec<(Config, Signature, usize)> {
 
 fn cases() -> impl Iterator<Item = (Act, Batch, String)> {
     configs().into_iter().map(|(config, signature, rows)| {
-        let act = Act::new(&config, &signature, 1).unwrap();
+        let act = Act::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&act);
         (act, batch(&signature, config.action_horizon, rows, 3), format!("{config:?}"))
     })
 }
 
-/// With pictures, whose network has too many kinks for slopes.
+/// With images, whose network has too many kinks for slopes.
 fn seeing() -> impl Iterator<Item = (Act, Batch, String)> {
     let (first, _, _) = configs().swap_remove(0);
-    let frozen = VisionConfig { norm: ImageNorm::Frozen, crop: None, ..eyes() };
-    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..eyes() };
-    let finer = VisionConfig { blocks: Some([2, 2, 1, 0]), ..eyes() };
-    [eyes(), frozen, keypoints, finer].into_iter().map(move |vision| {
+    let frozen = VisionConfig { norm: ImageNorm::Frozen, crop: None, ..vision_config() };
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..vision_config() };
+    let finer = VisionConfig { blocks: Some([2, 2, 1, 0]), ..vision_config() };
+    [vision_config(), frozen, keypoints, finer].into_iter().map(move |vision| {
         let config = Config { vision: Some(vision), ..first.clone() };
-        let signature = signatures().pictures;
-        let act = Act::new(&config, &signature, 1).unwrap();
+        let signature = signatures().images;
+        let act = Act::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&act);
         (act, batch(&signature, config.action_horizon, 3, 3), format!("{config:?}"))
     })
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one_with_dropout() {
+fn the_step_on_kernels_is_the_composed_one_with_dropout() {
     for (act, batch, what) in cases().chain(seeing()) {
         assert_the_step_is_the_composed_one(&act, &batch, &what);
     }
@@ -109,7 +109,7 @@ fn the_same_seed_gives_the_same_bits_in_any_workspace() {
 fn the_chunk_does_not_depend_on_the_order_of_a_group() {
     let (config, signature, rows) =
         configs().into_iter().find(|(_, s, _)| s.get("observation.entity.goal0").is_some()).unwrap();
-    let act = Act::new(&config, &signature, 1).unwrap();
+    let act = Act::new(&config, &signature, 1, &Backend::CPU).unwrap();
     move_parameters(&act);
     let batch = batch(&signature, config.action_horizon, rows, 3);
     let chunk = |swapped: Option<[&str; 2]>| {
@@ -130,7 +130,7 @@ fn the_chunk_does_not_depend_on_the_order_of_a_group() {
 #[test]
 fn features_that_act_cannot_read_are_refused_by_name() {
     let config = configs().remove(0).0;
-    let error = |signature: Signature| Act::new(&config, &signature, 1).unwrap_err().to_string();
+    let error = |signature: Signature| Act::new(&config, &signature, 1, &Backend::CPU).unwrap_err().to_string();
     let mut signature = Signature::low_dimensional(3, 2, 2);
     let front = "observation.images.front";
     signature.observation.push(FeatureSpec { shape: vec![8, 8, 4], ..FeatureSpec::image(front, 8, 8) });
@@ -138,11 +138,13 @@ fn features_that_act_cannot_read_are_refused_by_name() {
     assert_eq!(error(signature.clone()), format!("config of vision: observation is {expected}"));
     signature.observation[2] = FeatureSpec::image(front, 8, 8);
     let with = |vision: VisionConfig| Config { vision: Some(vision), ..config.clone() };
-    let small = Act::new(&with(VisionConfig { crop: Some(9), ..eyes() }), &signature, 1).unwrap_err().to_string();
+    let small = Act::new(&with(VisionConfig { crop: Some(9), ..vision_config() }), &signature, 1, &Backend::CPU)
+        .unwrap_err()
+        .to_string();
     assert_eq!(small, "config of vision: crop is 9, expected at most the image's side, 8");
     for blocks in [[0, 2, 2, 2], [2, 0, 2, 2], [0; 4]] {
-        let vision = VisionConfig { blocks: Some(blocks), crop: None, ..eyes() };
-        let refused = Act::new(&with(vision), &signature, 1).unwrap_err().to_string();
+        let vision = VisionConfig { blocks: Some(blocks), crop: None, ..vision_config() };
+        let refused = Act::new(&with(vision), &signature, 1, &Backend::CPU).unwrap_err().to_string();
         assert!(refused.starts_with(&format!("config of vision: blocks is {blocks:?}, expected")), "{refused}");
     }
     signature.n_obs_steps = 2;
@@ -159,7 +161,7 @@ fn a_pointer_needs_candidates_and_a_weight() {
     let (base, signature, _) = configs().swap_remove(2);
     let error = |among: &str, weight: f64| {
         let pointer = Some(PointerConfig { among: among.to_string(), weight });
-        Act::new(&Config { pointer, ..base.clone() }, &signature, 1).unwrap_err().to_string()
+        Act::new(&Config { pointer, ..base.clone() }, &signature, 1, &Backend::CPU).unwrap_err().to_string()
     };
     // the goals have positions
     assert!(error("goal", 1.0).contains("pointer.among is 0 of group goal"), "{}", error("goal", 1.0));
@@ -170,10 +172,10 @@ fn a_pointer_needs_candidates_and_a_weight() {
 #[test]
 fn what_is_told_in_training_alone_is_asked_there_alone() {
     let (config, signature, rows) = configs().into_iter().find(|(config, ..)| config.auxiliary.is_some()).unwrap();
-    let act = Act::new(&config, &signature, 1).unwrap();
+    let act = Act::new(&config, &signature, 1, &Backend::CPU).unwrap();
     let batch = batch(&signature, config.action_horizon, rows, 3);
     let loss = |batch: &Batch| {
-        let eps = Tensor::zeros((batch.rows(), config.latent_dim), candle_core::DType::F32, &HERE).unwrap();
+        let eps = Tensor::zeros((batch.rows(), config.latent_dim), candle_core::DType::F32, &Device::Cpu).unwrap();
         let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(act.params())));
         act.gradients_with(batch, &eps, None, &mut grads).map(|loss| loss.parts["auxiliary_loss"])
     };
@@ -182,7 +184,7 @@ fn what_is_told_in_training_alone_is_asked_there_alone() {
     assert!(whole > 0.1 && (whole - shards).abs() < 1e-5, "{whole} {shards}");
     let error = |auxiliary| loss(&Batch { auxiliary, ..batch.clone() }).unwrap_err().to_string();
     assert!(error(None).contains("auxiliary numbers") && error(None).contains("nothing"), "{}", error(None));
-    let narrow = Tensor::zeros((rows, 2), candle_core::DType::F32, &HERE).unwrap();
+    let narrow = Tensor::zeros((rows, 2), candle_core::DType::F32, &Device::Cpu).unwrap();
     assert!(error(Some(narrow)).contains("[3, 2], expected [3, 3]"));
 
     let head = |params: &nn::Params| {
@@ -195,7 +197,8 @@ fn what_is_told_in_training_alone_is_asked_there_alone() {
     let after = act.predict(&batch.observation).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
     assert_eq!(before, after);
 
-    let refused = |config: &Config, signature: &Signature| Act::new(config, signature, 1).unwrap_err().to_string();
+    let refused =
+        |config: &Config, signature: &Signature| Act::new(config, signature, 1, &Backend::CPU).unwrap_err().to_string();
     let silent = Signature { auxiliary_dim: 0, ..signature.clone() };
     assert!(refused(&config, &silent).contains("auxiliary_dim is 0"), "{}", refused(&config, &silent));
     let heavy = Config { auxiliary: Some(AuxiliaryConfig { weight: f64::INFINITY }), ..config };

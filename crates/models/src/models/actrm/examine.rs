@@ -136,7 +136,7 @@ impl Actrm {
             Some(Intervention::Shuffle) => Some(self.examine(observation, steps, None)?),
             _ => None,
         };
-        let observation = self.tokens.look(observation, None)?;
+        let observation = self.tokens.prepare(observation, None)?;
         self.cache.predict(&self.params, &mut || {}, |cx| {
             let latent = Value::zeros((rows, self.config.latent_dim), &cx.device().clone())?;
             let memory = self.memory(cx, &latent, &observation)?;
@@ -185,7 +185,7 @@ impl Actrm {
                 }
                 let z = reasoning.detached().broadcast_add(&design.latent_pos.weight.detach().unsqueeze(0)?)?;
                 let context = Tensor::cat(&[&z, &y, &memory], 1)?;
-                attention = Some(attn.weights(&y, &context, None)?.mean(1)?.detach());
+                attention = Some(attn.weights(&y, &context)?.mean(1)?.detach());
                 Ok(())
             };
             *carry = design.round(cx, &self.config, observed, (carry, at), &mut between)?;
@@ -227,7 +227,7 @@ impl Actrm {
     }
 
     /// What the columns of [`ExaminedStep::attention`] stand for: the reasoning's tokens, the actions', the latent, features
-    /// by name, places of pictures.
+    /// by name, places of images.
     pub fn context_names(&self) -> Vec<String> {
         let layout = self.tokens.layout();
         let states = (0..self.config.reasoning.tokens).map(|i| format!("z{i}"));

@@ -6,7 +6,7 @@
 //!
 //! **`reasoning.over = "actions"`** (default, our own): `y`, one token per action of the chunk,
 //! is the answer; `z`, a few latent tokens, is the reasoning. The memory (latent, robot state,
-//! environment state, entities, pictures) is encoded once per observation. One small block, shared by everything,
+//! environment state, entities, images) is encoded once per observation. One small block, shared by everything,
 //! updates `z` (`l_cycles` times) and then `y`, each by attending to `[z, y, memory]`. A
 //! supervision step is `h_cycles` such rounds; after it `y` is decoded into a chunk by one dense
 //! layer, so every depth has an answer and the policy can stop at any of them.
@@ -40,10 +40,10 @@
 //! would still lower this sample's chunk error. For the last step's target one more step runs
 //! without gradient.
 
-#[cfg(test)]
-mod by_hand_tests;
 mod config;
 mod examine;
+#[cfg(test)]
+mod kernel_tests;
 mod over_actions;
 mod over_memory;
 mod over_tokens;
@@ -72,7 +72,7 @@ use candle_core::Tensor;
 use nn::ops::{
     Error, add, alias, cat_tokens, chunk_error, detached_mean, kl_divergence, linear, residual, sample_latent, term_of,
 };
-use nn::{Cache, Context, Loss, Params, Result, Rng, Term, Value};
+use nn::{Backend, Cache, Context, Loss, Params, Result, Rng, Term, Value};
 use over_actions::{OverActions, Read};
 use over_memory::OverMemory;
 use over_tokens::{OverTokens, TokenLayers};
@@ -149,12 +149,12 @@ impl Actrm {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         check_signature("actrm", signature, READS)?;
         let layout = TokenLayout::new(signature, config.vision.as_ref(), config.dim_model)?;
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let (dim, shape) = (config.dim_model, config.shape());
         let vae = match config.use_vae {
             true => {
@@ -171,7 +171,7 @@ impl Actrm {
         };
         Ok(Self {
             vae,
-            vae_pos_enc: sinusoid_table(config.action_horizon + 2, dim)?,
+            vae_pos_enc: sinusoid_table(config.action_horizon + 2, dim, backend.device())?,
             tokens: InputTokens::new(&mut p, layout, config.latent_dim, dim, env_state, rng)?,
             design,
             action_head: Linear::new(&mut p, "action_head", dim, signature.action_dim, rng)?,
@@ -192,7 +192,7 @@ impl Actrm {
         &self.config
     }
 
-    /// The observation encoded: latent: (b, L), pictures as the network reads them -> (b, M, D)
+    /// The observation encoded: latent: (b, L), images as the network reads them -> (b, M, D)
     fn memory(&self, cx: &mut Context<'_>, latent: &Value, observation: &Features<Tensor>) -> Result<Value> {
         let tokens = self.tokens.apply(cx, latent, observation)?;
         let all = tokens.dim(1)?;
@@ -388,9 +388,9 @@ impl Actrm {
         let total = (batch.total_rows.max(1) * steps.len()) as f64;
         let share = 1.0 / total;
         let asked: Arc<[f64]> = targets.into();
-        let by_hand = Arc::clone(&asked);
-        let by_hand = move |logits: &[f32], grad: Option<(&mut [f32], f64)>| {
-            let each = || logits.iter().zip(&*by_hand).map(|(logit, target)| (f64::from(*logit), *target));
+        let on_slices = Arc::clone(&asked);
+        let on_slices = move |logits: &[f32], grad: Option<(&mut [f32], f64)>| {
+            let each = || logits.iter().zip(&*on_slices).map(|(logit, target)| (f64::from(*logit), *target));
             if let Some((grad, weight)) = grad {
                 for (grad, (x, target)) in grad.iter_mut().zip(each()) {
                     *grad = ((1.0 / (1.0 + (-x).exp()) - target) * share * weight) as f32;
@@ -398,7 +398,7 @@ impl Actrm {
             }
             each().fold(0.0, |sum, (x, target)| sum + (x.max(0.0) - x * target + (-x.abs()).exp().ln_1p()) * share)
         };
-        term_of(cx, &logits, by_hand, |logits| {
+        term_of(cx, &logits, on_slices, |logits| {
             let targets = asked.iter().map(|target| *target as f32).collect::<Vec<_>>();
             let targets = Tensor::from_vec(targets, logits.shape(), logits.device())?;
             Ok((binary_cross_entropy(logits, &targets)?.sum_all()? / total)?)
@@ -433,7 +433,7 @@ impl PolicyModel for Actrm {
 
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch("actrm", &self.signature, self.config.action_horizon, batch)?;
-        let observation = self.tokens.look(&batch.observation, Some(cx.rng()?))?;
+        let observation = self.tokens.prepare(&batch.observation, Some(cx.rng()?))?;
         let batch = &Batch { observation, ..batch.clone() };
         let (rows, config) = (batch.rows(), &self.config);
         let latent = self.vae.as_ref().map(|vae| vae.apply(cx, batch, &self.vae_pos_enc)).transpose()?;

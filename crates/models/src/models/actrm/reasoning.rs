@@ -55,7 +55,7 @@ impl Actrm {
         self.reason_seen(observation, start, &mut || {}, should_stop)
     }
 
-    /// The same, and `on_seen` is called when pictures have become tokens.
+    /// The same, and `on_seen` is called when images have become tokens.
     fn reason_seen(
         &self,
         observation: &Features<Tensor>,
@@ -64,7 +64,7 @@ impl Actrm {
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
         let rows = self.check_thought(observation, start)?;
-        let observation = self.tokens.look(observation, None)?;
+        let observation = self.tokens.prepare(observation, None)?;
         let thought = Thought::new(&self.config.reasoning, rows, should_stop);
         self.cache.predict(&self.params, on_seen, |cx| self.think(cx, rows, &observation, start, thought))
     }
@@ -78,12 +78,12 @@ impl Actrm {
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
         let rows = self.check_thought(observation, start)?;
-        let observation = self.tokens.look(observation, None)?;
+        let observation = self.tokens.prepare(observation, None)?;
         let thought = Thought::new(&self.config.reasoning, rows, should_stop);
         self.cache.composed_predict(&self.params, |cx| self.think(cx, rows, &observation, start, thought))
     }
 
-    /// Pictures are as the network reads them.
+    /// Images are as the network reads them.
     fn think(
         &self,
         cx: &mut Context<'_>,
@@ -182,7 +182,7 @@ pub struct ReasoningPolicy {
     executed: usize,
     /// of the last thought's steps, in milliseconds
     times: Vec<f64>,
-    /// until the last query's pictures were tokens, in milliseconds
+    /// until the last query's images were tokens, in milliseconds
     encoding: Option<f64>,
 }
 

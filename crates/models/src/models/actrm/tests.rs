@@ -69,8 +69,8 @@ fn it_has_at_most_half_of_acts_parameters() {
     for (dim_model, dim_feedforward, action_horizon) in sizes {
         let act = act::Config { dim_model, dim_feedforward, action_horizon, ..act::Config::default() };
         let ours = Config { dim_model, dim_feedforward, action_horizon, ..Config::default() };
-        let act = Act::new(&act, &signature(), 0).unwrap().params().count();
-        let ours = Actrm::new(&ours, &signature(), 0).unwrap().params().count();
+        let act = Act::new(&act, &signature(), 0, &Backend::CPU).unwrap().params().count();
+        let ours = Actrm::new(&ours, &signature(), 0, &Backend::CPU).unwrap().params().count();
         assert!(2 * ours <= act, "{ours} against {act} at width {dim_model}");
     }
 }
@@ -78,7 +78,7 @@ fn it_has_at_most_half_of_acts_parameters() {
 #[test]
 fn every_parameter_gets_a_gradient() {
     for config in designs() {
-        let model = Actrm::new(&config, &signature(), 1).unwrap();
+        let model = Actrm::new(&config, &signature(), 1, &Backend::CPU).unwrap();
         // off the zeros that biases start from, which hide gradients behind them
         let mut rng = Rng::new(7, "noise");
         for (_, var) in model.params().iter() {
@@ -105,7 +105,7 @@ fn every_parameter_gets_a_gradient() {
 fn shards_add_up_to_the_batch() {
     for config in designs() {
         let config = Config { use_vae: false, ..config };
-        let model = Actrm::new(&config, &signature(), 1).unwrap();
+        let model = Actrm::new(&config, &signature(), 1, &Backend::CPU).unwrap();
         let batch = batch(&config, 7, 3);
         let whole = value(&model.loss(&batch, &mut Rng::new(0, "loss")).unwrap().total);
         let shards = batch.shards(3).unwrap();
@@ -122,7 +122,7 @@ fn training_lowers_the_error_on_new_observations_and_depth_helps() {
         let held_out = batch(&config, 64, 99);
         // the error at each depth, against that of always answering zero
         let errors = |model: &dyn PolicyModel, weights: &BTreeMap<String, Tensor>| -> Vec<f32> {
-            let trained = Actrm::new(&config, &signature(), 1).unwrap();
+            let trained = Actrm::new(&config, &signature(), 1, &Backend::CPU).unwrap();
             assert_eq!(model.params().count(), trained.params().count());
             trained.params().load(weights).unwrap();
             let thought = trained.reason(&held_out.observation, None, &mut |_| false).unwrap();
@@ -131,7 +131,7 @@ fn training_lowers_the_error_on_new_observations_and_depth_helps() {
             thought.steps.iter().map(|s| mean(&(&s.chunk - &held_out.actions).unwrap()) / zero).collect()
         };
         let settings = TrainConfig { steps: 500, lr: 5e-3, ema_decay: Some(0.98), ..TrainConfig::default() };
-        let model = Box::new(Actrm::new(&config, &signature(), 1).unwrap());
+        let model = Box::new(Actrm::new(&config, &signature(), 1, &Backend::CPU).unwrap());
         let mut trainer = Trainer::new(model, settings, 1).unwrap();
         for step in 0..500 {
             trainer.step(&batch(&config, 32, step)).unwrap();
@@ -153,7 +153,7 @@ fn a_rows_thought_does_not_depend_on_its_neighbours() {
         config.reasoning.max_steps = Some(6);
         config.reasoning.change_threshold = 0.05;
         config.reasoning.halt_threshold = 0.7;
-        let model = Actrm::new(&config, &signature(), 5).unwrap();
+        let model = Actrm::new(&config, &signature(), 5, &Backend::CPU).unwrap();
         let batch = batch(&config, 5, 1);
         let all = model.reason(&batch.observation, None, &mut |_| false).unwrap();
         for row in 0..5 {
@@ -175,7 +175,7 @@ fn every_rule_stops_the_thought() {
             config.reasoning.change_threshold = change;
             config.reasoning.halt_threshold = halt;
             config.reasoning.max_steps = Some(max);
-            let model = Actrm::new(&config, &signature(), 5).unwrap();
+            let model = Actrm::new(&config, &signature(), 5, &Backend::CPU).unwrap();
             let batch = batch(&config, 2, 1);
             model.reason(&batch.observation, None, &mut |done| done >= stop_at).unwrap()
         };
@@ -196,7 +196,7 @@ fn every_rule_stops_the_thought() {
 fn identity() -> Arc<Preprocess> {
     let modes = [STATE, ENVIRONMENT_STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
     let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
-    Arc::new(Preprocess::new(signature(), normaliser).unwrap())
+    Arc::new(Preprocess::new(signature(), normaliser, &Device::Cpu).unwrap())
 }
 
 fn observation(seed: u64) -> Observation {
@@ -221,7 +221,7 @@ fn ticking() -> Box<dyn Clock> {
 #[test]
 fn without_warm_start_and_budget_the_policy_predicts() {
     for config in designs() {
-        let model = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
+        let model = Arc::new(Actrm::new(&config, &signature(), 5, &Backend::CPU).unwrap());
         assert!(!model.depends_on_time());
         let mut policy = Arc::clone(&model).policy(identity(), ticking());
         for seed in 0..3 {
@@ -242,7 +242,7 @@ fn the_policy_keeps_to_its_budget_and_starts_warm() {
     config.reasoning.change_threshold = 0.0;
     config.reasoning.budget_ms = Some(3.0);
     config.reasoning.warm_start = Some(WarmStart { noise: 0.1 });
-    let model = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
+    let model = Arc::new(Actrm::new(&config, &signature(), 5, &Backend::CPU).unwrap());
     assert!(model.depends_on_time());
     let mut policy = ReasoningPolicy::new(Arc::clone(&model), identity(), ticking());
     assert!(policy.thought().unwrap().is_empty());
@@ -269,7 +269,7 @@ fn the_policy_keeps_to_its_budget_and_starts_warm() {
     assert_eq!(policy.predict(&observation(1)).unwrap(), first);
     // more time, another answer
     config.reasoning.budget_ms = Some(6.0);
-    let patient = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
+    let patient = Arc::new(Actrm::new(&config, &signature(), 5, &Backend::CPU).unwrap());
     let longer = patient.policy(identity(), ticking()).predict(&observation(1)).unwrap();
     assert_ne!(longer, first);
     // and the model trains with warm starts
@@ -294,7 +294,7 @@ fn settings_that_change_nothing_are_not_written() {
 fn untied_steps_have_blocks_of_their_own_and_the_shared_one_is_the_first() {
     let tied = small(ReasoningConfig::default());
     let untied = small(ReasoningConfig { untied: true, ..ReasoningConfig::default() });
-    let model = |config: &Config| Actrm::new(config, &signature(), 1).unwrap();
+    let model = |config: &Config| Actrm::new(config, &signature(), 1, &Backend::CPU).unwrap();
     let (tied, free) = (model(&tied), model(&untied));
     let of_block = |model: &Actrm| -> usize {
         model
@@ -331,7 +331,7 @@ fn untied_steps_have_blocks_of_their_own_and_the_shared_one_is_the_first() {
 fn without_deep_supervision_only_the_last_answer_counts() {
     let config = small(ReasoningConfig { deep_supervision: false, halt_weight: 0.0, ..ReasoningConfig::default() });
     let config = Config { use_vae: false, ..config };
-    let model = Actrm::new(&config, &signature(), 1).unwrap();
+    let model = Actrm::new(&config, &signature(), 1, &Backend::CPU).unwrap();
     let loss = model.loss(&batch(&config, 4, 0), &mut Rng::new(0, "loss")).unwrap();
     assert!((value(&loss.total) - value(&loss.parts["l1_loss"])).abs() < 1e-6);
     assert!((value(&loss.total) - value(&loss.parts["l1_loss_first"])).abs() > 1e-4);
@@ -342,13 +342,13 @@ fn thoughts_begin_with_noise_in_training_only() {
     let with = |start_noise: f64| small(ReasoningConfig { start_noise, ..ReasoningConfig::default() });
     let (plain, noisy) = (with(0.0), with(1.0));
     let loss = |config: &Config, seed: u64| {
-        let model = Actrm::new(&Config { use_vae: false, ..config.clone() }, &signature(), 1).unwrap();
+        let model = Actrm::new(&Config { use_vae: false, ..config.clone() }, &signature(), 1, &Backend::CPU).unwrap();
         value(&model.loss(&batch(config, 4, 0), &mut Rng::new(seed, "loss")).unwrap().total)
     };
     assert_eq!(loss(&plain, 0), loss(&plain, 1));
     assert_ne!(loss(&noisy, 0), loss(&noisy, 1));
     let predict = |config: &Config| {
-        let model = Actrm::new(config, &signature(), 1).unwrap();
+        let model = Actrm::new(config, &signature(), 1, &Backend::CPU).unwrap();
         model.predict(&batch(config, 4, 0).observation).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap()
     };
     assert_eq!(predict(&plain), predict(&noisy));
@@ -361,7 +361,7 @@ fn a_thought_over_a_grid_looked_into_is_the_thought() {
     let reasoning = ReasoningConfig { l_cycles: 2, halt_threshold: 1.0, change_threshold: 0.0, ..base };
     let config = small(reasoning);
     let signature = crate::testing::signatures().grid;
-    let model = Actrm::new(&config, &signature, 5).unwrap();
+    let model = Actrm::new(&config, &signature, 5, &Backend::CPU).unwrap();
     let batch = crate::testing::batch(&signature, config.action_horizon, 3, 1);
     let off = |a: &Tensor, b: &Tensor| value(&(a - b).unwrap().abs().unwrap().max_all().unwrap());
     let thought = model.reason(&batch.observation, None, &mut |_| false).unwrap();
@@ -383,7 +383,7 @@ fn a_thought_over_a_grid_looked_into_is_the_thought() {
     // two rows of three cells: the far corner is two columns away, which two applications reach
     assert!(off(&of(&other[0], 5), &of(&steps[0], 5)) > 0.0);
     let one = ReasoningConfig { l_cycles: 1, ..config.reasoning.clone() };
-    let near = Actrm::new(&small(one), &signature, 5).unwrap();
+    let near = Actrm::new(&small(one), &signature, 5, &Backend::CPU).unwrap();
     let (before, after) = (near.examine(&batch.observation, 2, None).unwrap(), near.examine(&moved, 2, None).unwrap());
     assert_eq!(off(&of(&after[0], 5), &of(&before[0], 5)), 0.0);
     assert!(off(&of(&after[0], 4), &of(&before[0], 4)) > 0.0);
@@ -397,7 +397,7 @@ fn a_thought_looked_into_is_the_thought() {
     let tokens = ReasoningConfig { over: Over::Tokens, ..still.clone() };
     for config in [small(still), small(deep), small(tokens)] {
         let config = Config { reasoning: ReasoningConfig { max_steps: Some(5), ..config.reasoning.clone() }, ..config };
-        let model = Actrm::new(&config, &signature(), 5).unwrap();
+        let model = Actrm::new(&config, &signature(), 5, &Backend::CPU).unwrap();
         let batch = batch(&config, 3, 1);
         let thought = model.reason(&batch.observation, None, &mut |_| false).unwrap();
         let steps = model.examine(&batch.observation, 5, None).unwrap();
@@ -426,7 +426,7 @@ fn a_thought_looked_into_is_the_thought() {
         let one = batch.observation.map(|_, values| values.narrow(0, 0, 1).unwrap());
         assert!(model.examine(&one, 2, Some(Intervention::Shuffle)).unwrap_err().to_string().contains("2 to shuffle"));
     }
-    let memory = Actrm::new(&designs()[2], &signature(), 5).unwrap();
+    let memory = Actrm::new(&designs()[2], &signature(), 5, &Backend::CPU).unwrap();
     let error = memory.examine(&batch(&designs()[2], 2, 1).observation, 2, None).unwrap_err().to_string();
     assert!(error.contains("reasoning.over"), "{error}");
 }
@@ -467,7 +467,7 @@ fn a_trained_policy_can_be_asked_to_think_otherwise() {
 fn a_disturbed_policy_depends_on_the_episode_only() {
     let config =
         small(ReasoningConfig::default()).thinking(&Thinking { steps: Some(4), ..Thinking::default() }).unwrap();
-    let model = Arc::new(Actrm::new(&config, &signature(), 5).unwrap());
+    let model = Arc::new(Actrm::new(&config, &signature(), 5, &Backend::CPU).unwrap());
     let others = Arc::new((10..13).map(observation).collect::<Vec<_>>());
     let make =
         |intervene| DisturbedPolicy::new(Arc::clone(&model), identity(), intervene, Arc::clone(&others)).unwrap();
@@ -488,8 +488,9 @@ fn a_disturbed_policy_depends_on_the_episode_only() {
 
 #[test]
 fn untied_steps_and_more_steps_cost_what_they_are() {
-    let flops =
-        |reasoning: ReasoningConfig| Actrm::new(&small(reasoning), &signature(), 1).unwrap().query_flops().unwrap();
+    let flops = |reasoning: ReasoningConfig| {
+        Actrm::new(&small(reasoning), &signature(), 1, &Backend::CPU).unwrap().query_flops().unwrap()
+    };
     let of = |supervision_steps: usize, untied: bool| {
         flops(ReasoningConfig { supervision_steps, untied, ..ReasoningConfig::default() })
     };
@@ -505,7 +506,7 @@ fn impossible_configurations_name_the_field() {
     let with = |change: &dyn Fn(&mut Config)| {
         let mut config = small(ReasoningConfig::default());
         change(&mut config);
-        Actrm::new(&config, &signature(), 0).unwrap_err().to_string()
+        Actrm::new(&config, &signature(), 0, &Backend::CPU).unwrap_err().to_string()
     };
     for (error, field) in [
         (with(&|c| c.n_heads = 3), "n_heads"),
@@ -555,7 +556,7 @@ fn pointing(change: &dyn Fn(&mut Config)) -> (Actrm, Batch) {
     let mut config = Config { pointer: Some(among("cube")), use_vae: false, ..small(tokens) };
     change(&mut config);
     let signature = signatures().entities;
-    let model = Actrm::new(&config, &signature, 1).unwrap();
+    let model = Actrm::new(&config, &signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     let mut batch = crate::testing::batch(&signature, config.action_horizon, 6, 3);
     let cubes: Vec<u32> = (0..signature.observation.len() as u32)
@@ -666,7 +667,7 @@ fn a_pointer_learns_to_follow_a_relation_and_the_actions_go_there() {
     let error = |pointer: Option<PointerConfig>| {
         let config = Config { pointer, ..base.clone() };
         let settings = TrainConfig { steps: 700, lr: 3e-3, ..TrainConfig::default() };
-        let model = Box::new(Actrm::new(&config, &signature, 1).unwrap());
+        let model = Box::new(Actrm::new(&config, &signature, 1, &Backend::CPU).unwrap());
         let mut trainer = Trainer::new(model, settings, 1).unwrap();
         for step in 0..700 {
             trainer.step(&one_hop(&config, &signature, 48, step)).unwrap();

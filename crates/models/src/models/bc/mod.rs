@@ -5,7 +5,7 @@
 //!
 //! Deviations: actions may be predicted as a chunk; robomimic predicts one. Its outputs go through `tanh`, because its
 //! actions lie in -1 to 1; ours are normalised and do not. Its history goes through an LSTM (`BC-RNN`); here the steps of a
-//! history lie side by side. Pictures become the cells of `[policy.vision]`'s feature map behind the numbers (robomimic:
+//! history lie side by side. Images become the cells of `[policy.vision]`'s feature map behind the numbers (robomimic:
 //! keypoints).
 
 mod config;
@@ -17,13 +17,13 @@ use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Signature};
-use crate::layers::{Activation, Linear, Sight};
+use crate::layers::{Activation, ImageFeatures, Linear};
 use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::{Error, activation, cat_rows, chunk_error, linear};
-use nn::{Cache, Context, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -36,7 +36,7 @@ pub struct Bc {
     config: Config,
     signature: Signature,
     params: Params,
-    sight: Option<Sight>,
+    image_features: Option<ImageFeatures>,
     hidden: Vec<Linear>,
     action_head: Linear,
     cache: Cache,
@@ -47,15 +47,15 @@ impl Bc {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         signature.check("bc", READS)?;
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
-        let sight = Sight::new(&mut p, signature, config.vision.as_ref(), rng)?;
+        let mut p = Params::new(backend);
+        let image_features = ImageFeatures::new(&mut p, signature, config.vision.as_ref(), rng)?;
         let numbers = signature.observation.iter().filter(|spec| spec.kind != FeatureKind::Image);
         let numbers: usize = numbers.map(|spec| spec.width() * signature.n_obs_steps).sum();
-        let mut width = numbers + sight.as_ref().map_or(0, Sight::width);
+        let mut width = numbers + image_features.as_ref().map_or(0, ImageFeatures::width);
         let mut hidden = Vec::with_capacity(config.hidden.len());
         for (i, &next) in config.hidden.iter().enumerate() {
             hidden.push(Linear::new(&mut p, &format!("hidden.{i}"), width, next, rng)?);
@@ -63,7 +63,7 @@ impl Bc {
         }
         let action_head = Linear::new(&mut p, "action_head", width, config.action_horizon * signature.action_dim, rng)?;
         let (config, signature, cache) = (config.clone(), signature.clone(), Cache::default());
-        Ok(Self { config, signature, params: p, sight, hidden, action_head, cache })
+        Ok(Self { config, signature, params: p, image_features, hidden, action_head, cache })
     }
 
     /// The signature's features that are numbers, (b, …) each -> (b, all of them)
@@ -75,11 +75,11 @@ impl Bc {
         Ok(Tensor::cat(&joined, 1)?)
     }
 
-    /// The signature's features, (b, …) each, pictures as the network reads them -> (b, H, A)
+    /// The signature's features, (b, …) each, images as the network reads them -> (b, H, A)
     fn forward(&self, cx: &mut Context<'_>, rows: usize, observation: &Features<Tensor>) -> Result<Value> {
         let mut x = Value::from(&self.numbers(rows, observation)?);
-        if let Some(sight) = &self.sight {
-            let seen = sight.apply(cx, observation)?;
+        if let Some(image_features) = &self.image_features {
+            let seen = image_features.apply(cx, observation)?;
             x = cat_rows(cx, &x, &seen)?;
         }
         for layer in &self.hidden {
@@ -90,16 +90,18 @@ impl Bc {
         linear(cx, &x, &self.action_head)?.reshape(shape)
     }
 
-    /// The observation with pictures as the network reads them: random parts in training, with `rng`.
-    fn look(&self, observation: &Features<Tensor>, rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
-        self.sight.as_ref().map_or_else(|| Ok(observation.clone()), |sight| sight.look(observation, rng))
+    /// The observation with images as the network reads them: random parts in training, with `rng`.
+    fn prepare(&self, observation: &Features<Tensor>, rng: Option<&mut Rng>) -> Result<Features<Tensor>> {
+        self.image_features
+            .as_ref()
+            .map_or_else(|| Ok(observation.clone()), |image_features| image_features.prepare(observation, rng))
     }
 
     /// The prediction on candle's operations; `predict` runs the same statement on hand-written kernels.
     #[cfg(test)]
     fn predict_composed(&self, observation: &Features<Tensor>) -> Result<Tensor> {
         let rows = check_observation("bc", &self.signature, observation)?;
-        let observation = self.look(observation, None)?;
+        let observation = self.prepare(observation, None)?;
         self.cache.composed_predict(&self.params, |cx| Ok(self.forward(cx, rows, &observation)?.detached()))
     }
 }
@@ -119,7 +121,7 @@ impl PolicyModel for Bc {
 
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<nn::Loss> {
         check_batch("bc", &self.signature, self.config.action_horizon, batch)?;
-        let observation = self.look(&batch.observation, Some(cx.rng()?))?;
+        let observation = self.prepare(&batch.observation, Some(cx.rng()?))?;
         let actions = self.forward(cx, batch.rows(), &observation)?;
         let entries = batch.total_valid_steps * self.signature.action_dim;
         let mut loss = nn::Loss::default();
@@ -145,7 +147,7 @@ impl PolicyModel for Bc {
     /// Nothing is drawn.
     fn sample_seen(&self, observation: &Features<Tensor>, _rng: &mut Rng, on_seen: &mut dyn FnMut()) -> Result<Tensor> {
         let rows = check_observation("bc", &self.signature, observation)?;
-        let observation = self.look(observation, None)?;
+        let observation = self.prepare(observation, None)?;
         self.cache.predict(&self.params, on_seen, |cx| Ok(self.forward(cx, rows, &observation)?.detached()))
     }
 
@@ -154,7 +156,7 @@ impl PolicyModel for Bc {
     }
 
     fn vision(&self) -> Option<&VisionConfig> {
-        self.sight.as_ref().map(Sight::config)
+        self.image_features.as_ref().map(ImageFeatures::config)
     }
 
     fn action_horizon(&self) -> usize {
@@ -167,9 +169,9 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::testing::{
-        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training,
+        move_parameters, signatures, vision_config,
     };
-    use crate::train::{TrainConfig, Trainer};
 
     fn configs() -> Vec<Config> {
         [(Loss::L2, vec![11, 7]), (Loss::L1, vec![9]), (Loss::L2, vec![])]
@@ -178,11 +180,11 @@ mod tests {
     }
 
     #[test]
-    fn the_step_by_hand_is_the_composed_one() {
+    fn the_step_on_kernels_is_the_composed_one() {
         let of = signatures();
         for signature in [&of.plain, &of.entities, &of.history] {
             for config in configs() {
-                let model = Bc::new(&config, signature, 1).unwrap();
+                let model = Bc::new(&config, signature, 1, &Backend::CPU).unwrap();
                 move_parameters(&model);
                 let batch = batch(signature, config.action_horizon, 7, 3);
                 assert_the_step_is_the_composed_one(&model, &batch, &format!("{config:?}"));
@@ -191,11 +193,12 @@ mod tests {
     }
 
     #[test]
-    fn from_pictures_step_and_prediction_are_the_composed_ones() {
+    fn from_images_step_and_prediction_are_the_composed_ones() {
         let of = signatures();
-        for signature in [&of.pictures, &of.film] {
+        for signature in [&of.images, &of.image_history] {
             for config in configs() {
-                let model = Bc::new(&Config { vision: Some(eyes()), ..config }, signature, 1).unwrap();
+                let model =
+                    Bc::new(&Config { vision: Some(vision_config()), ..config }, signature, 1, &Backend::CPU).unwrap();
                 move_parameters(&model);
                 let batch = batch(signature, 3, 3, 3);
                 assert_the_step_is_the_composed_one(&model, &batch, &format!("{:?}", model.config));
@@ -213,7 +216,7 @@ mod tests {
         let of = signatures();
         for signature in [&of.plain, &of.no_env, &of.entities, &of.history] {
             for config in configs() {
-                let model = Bc::new(&config, signature, 1).unwrap();
+                let model = Bc::new(&config, signature, 1, &Backend::CPU).unwrap();
                 let batch = batch(signature, config.action_horizon, 4, 3);
                 assert_the_gradient_is_the_slope(&model, &batch, &format!("{config:?}"));
             }
@@ -224,7 +227,7 @@ mod tests {
     fn the_loss_is_the_mean_over_steps_that_are_not_padding() {
         let signature = signatures().plain;
         for config in configs() {
-            let model = Bc::new(&config, &signature, 1).unwrap();
+            let model = Bc::new(&config, &signature, 1, &Backend::CPU).unwrap();
             let batch = batch(&signature, 3, 4, 3);
             let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
             let (predicted, actions) = (flat(&model.predict(&batch.observation).unwrap()), flat(&batch.actions));
@@ -244,23 +247,15 @@ mod tests {
     #[test]
     fn training_lowers_the_loss_with_the_same_bits_every_time() {
         let signature = signatures().entities;
-        let run = || {
-            let config = Config { action_horizon: 2, hidden: vec![32, 32], ..Default::default() };
-            let model = Box::new(Bc::new(&config, &signature, 1).unwrap());
-            let settings = TrainConfig { steps: 80, lr: 3e-3, warmup_steps: 3, ..Default::default() };
-            let mut trainer = Trainer::new(model, settings, 5).unwrap();
-            let batch = batch(&signature, 2, 8, 0);
-            let losses: Vec<f32> = (0..80).map(|_| trainer.step(&batch).unwrap().loss).collect();
-            (losses[0], losses[79])
-        };
-        let (first, last) = run();
-        assert!(last < 0.2 * first, "{first} {last}");
-        assert_eq!(run(), (first, last));
+        let config = Config { action_horizon: 2, hidden: vec![32, 32], ..Default::default() };
+        let build = || Bc::new(&config, &signature, 1, &Backend::CPU);
+        let losses = losses_of_training(build, &batch(&signature, 2, 8, 0), (80, 3e-3));
+        assert!(losses[79].loss < 0.2 * losses[0].loss, "{losses:?}");
     }
 
     #[test]
     fn impossible_configurations_name_the_field() {
-        let error = |config: Config| Bc::new(&config, &signatures().plain, 0).unwrap_err().to_string();
+        let error = |config: Config| Bc::new(&config, &signatures().plain, 0, &Backend::CPU).unwrap_err().to_string();
         assert!(error(Config { action_horizon: 0, ..Default::default() }).contains("action_horizon"));
         assert!(error(Config { hidden: vec![8, 0], ..Default::default() }).contains("hidden"));
     }

@@ -10,7 +10,7 @@
 //!
 //! Deviations: a sequence of training ends with a window's frame and is shorter at the beginning of an episode, where
 //! robomimic's begins with a frame and repeats the last of the episode, both in the loss; a step has the same share in the
-//! loss either way. Pictures become the cells of `[policy.vision]`'s feature map behind a step's numbers (robomimic: keypoints). No goals, no open loop. The means lie in -1 to 1, so that actions have to be normalised by their
+//! loss either way. Images become the cells of `[policy.vision]`'s feature map behind a step's numbers (robomimic: keypoints). No goals, no open loop. The means lie in -1 to 1, so that actions have to be normalised by their
 //! range (`normalisation.action = "min_max"`).
 //!
 //! What it costs: one product a step and layer for the recurrence, one a layer for all that comes from below.
@@ -29,7 +29,7 @@ use crate::policy::{ActionChunk, Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::{mixture_likelihood, select_tokens};
-use nn::{Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -53,7 +53,7 @@ impl BcRnn {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         signature.check("bc_rnn", READS)?;
         if config.action_horizon != signature.n_obs_steps {
@@ -62,7 +62,7 @@ impl BcRnn {
             return Err(ModelError::Config { model: "bc_rnn", field: "action_horizon", found, expected });
         }
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let steps = Steps::new(&mut p, "bc_rnn", signature, config.vision.as_ref(), rng)?;
         let sizes = (steps.width(), config.hidden_dim, config.n_layers);
         let rnn = Recurrent::new(&mut p, "rnn", config.cell, sizes, rng)?;
@@ -86,7 +86,7 @@ impl BcRnn {
         self.head.apply(cx, &y.reshape((steps * b, self.config.hidden_dim))?)
     }
 
-    /// The signature's features, (b, T, …) each, pictures as the network reads them, in this order of all steps of all rows -> as
+    /// The signature's features, (b, T, …) each, images as the network reads them, in this order of all steps of all rows -> as
     /// many mixtures. The order is step by step.
     fn in_order(
         &self,
@@ -107,7 +107,7 @@ impl BcRnn {
     /// An observation that does not fit.
     pub fn mixtures(&self, observation: &Features<Tensor>) -> Result<Mixture> {
         let rows = check_observation("bc_rnn", &self.signature, observation)?;
-        let observation = self.steps.look(observation, None)?;
+        let observation = self.steps.prepare(observation, None)?;
         let steps = self.config.action_horizon;
         let by_step: Vec<usize> = (0..steps).flat_map(|step| (0..rows).map(move |row| row * steps + step)).collect();
         let mixtures = self
@@ -158,7 +158,7 @@ impl PolicyModel for BcRnn {
 
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch("bc_rnn", &self.signature, self.config.action_horizon, batch)?;
-        let observation = self.steps.look(&batch.observation, Some(cx.rng()?))?;
+        let observation = self.steps.prepare(&batch.observation, Some(cx.rng()?))?;
         let (from, real) = real_first(&batch.is_pad)?;
         let mixtures = self.in_order(cx, batch.rows(), &observation, &from)?;
         let count = from.len();
@@ -205,7 +205,7 @@ struct Carrying {
     steps: usize,
     rng: Rng,
     clock: Box<dyn Clock>,
-    /// until the last query's pictures were numbers, in milliseconds
+    /// until the last query's images were numbers, in milliseconds
     encoding: Option<f64>,
 }
 

@@ -4,9 +4,9 @@ use crate::features::Values;
 use crate::layers::Cell;
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training, move_parameters,
+    signatures, vision_config,
 };
-use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
 use std::collections::BTreeMap;
 
@@ -38,18 +38,18 @@ fn the_gradient_is_the_slope_of_the_loss() {
     let signature = signatures().history;
     let gru = Config { cell: Cell::Gru, ..small() };
     for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }, gru] {
-        let model = BcRnn::new(&config, &signature, 1).unwrap();
+        let model = BcRnn::new(&config, &signature, 1, &Backend::CPU).unwrap();
         assert_the_gradient_is_the_slope(&model, &padded_before(&signature, 4), &format!("{config:?}"));
     }
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one() {
+fn the_step_on_kernels_is_the_composed_one() {
     let signature = signatures().history;
     let other = Config { n_layers: 3, hidden_dim: 17, n_modes: 5, ..small() };
     let gru = |config: Config| Config { cell: Cell::Gru, ..config };
     for config in [small(), Config { n_layers: 1, n_modes: 1, ..small() }, gru(small()), gru(other.clone()), other] {
-        let model = BcRnn::new(&config, &signature, 1).unwrap();
+        let model = BcRnn::new(&config, &signature, 1, &Backend::CPU).unwrap();
         for rows in [1, 5] {
             assert_the_step_is_the_composed_one(&model, &padded_before(&signature, rows), &format!("{config:?}"));
         }
@@ -58,42 +58,45 @@ fn the_step_by_hand_is_the_composed_one() {
     let signature = Signature { n_obs_steps: 1, ..signature };
     for cell in [Cell::Lstm, Cell::Gru] {
         let config = Config { action_horizon: 1, cell, ..small() };
-        let model = BcRnn::new(&config, &signature, 1).unwrap();
+        let model = BcRnn::new(&config, &signature, 1, &Backend::CPU).unwrap();
         assert_the_step_is_the_composed_one(&model, &batch(&signature, 1, 4, 3), "one step");
     }
 }
 
-/// What it sees of two cameras' pictures, a step after another.
-fn film() -> Signature {
-    Signature { n_obs_steps: 3, ..signatures().film }
+/// What it sees of two cameras' images, a step after another.
+fn image_history() -> Signature {
+    Signature { n_obs_steps: 3, ..signatures().image_history }
 }
 
 #[test]
-fn from_pictures_the_step_by_hand_is_the_composed_one() {
+fn from_images_the_step_on_kernels_is_the_composed_one() {
     for rows in [1, 4] {
-        let model = BcRnn::new(&Config { vision: Some(eyes()), ..small() }, &film(), 1).unwrap();
+        let model =
+            BcRnn::new(&Config { vision: Some(vision_config()), ..small() }, &image_history(), 1, &Backend::CPU)
+                .unwrap();
         move_parameters(&model);
-        assert_the_step_is_the_composed_one(&model, &padded_before(&film(), rows), &format!("{rows} rows"));
+        assert_the_step_is_the_composed_one(&model, &padded_before(&image_history(), rows), &format!("{rows} rows"));
     }
-    let (signature, config) = (signatures().pictures, Config { action_horizon: 1, vision: Some(eyes()), ..small() });
-    let model = BcRnn::new(&config, &signature, 1).unwrap();
+    let (signature, config) =
+        (signatures().images, Config { action_horizon: 1, vision: Some(vision_config()), ..small() });
+    let model = BcRnn::new(&config, &signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     assert_the_step_is_the_composed_one(&model, &batch(&signature, 1, 2, 3), "one step");
 }
 
 #[test]
-fn from_pictures_the_policy_sees_one_step_at_a_time() {
-    let signature = film();
+fn from_images_the_policy_sees_one_step_at_a_time() {
+    let signature = image_history();
     let modes = [STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
     let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
-    let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser).unwrap());
-    let config = Config { n_modes: 1, vision: Some(eyes()), ..small() };
-    let model = Arc::new(BcRnn::new(&config, &signature, 1).unwrap());
+    let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser, &Device::Cpu).unwrap());
+    let config = Config { n_modes: 1, vision: Some(vision_config()), ..small() };
+    let model = Arc::new(BcRnn::new(&config, &signature, 1, &Backend::CPU).unwrap());
     let mut policy = Arc::clone(&model).policy(Arc::clone(&preprocess), Box::new(Ticks(0.0)));
     let seen = |k: usize| {
-        let picture: Vec<u8> = (0..36 * 40 * 3).map(|i| ((i * 7 + k * 31) % 251) as u8).collect();
+        let image: Vec<u8> = (0..36 * 40 * 3).map(|i| ((i * 7 + k * 31) % 251) as u8).collect();
         let mut observation = Observation::of_state(vec![k as f32 * 0.3, 1.0, -0.5], Vec::new());
-        observation.insert("a", Values::U8(picture));
+        observation.insert("a", Values::U8(image));
         observation
     };
     policy.reset(7);
@@ -112,7 +115,7 @@ fn from_pictures_the_policy_sees_one_step_at_a_time() {
 #[test]
 fn a_row_that_begins_with_padding_is_a_shorter_sequence() {
     let signature = signatures().history;
-    let model = BcRnn::new(&small(), &signature, 1).unwrap();
+    let model = BcRnn::new(&small(), &signature, 1, &Backend::CPU).unwrap();
     let batch = padded_before(&signature, 3);
     let (mut sum, mut count) = (0.0, 0);
     let x = model.steps.numbers(3, &batch.observation).unwrap();
@@ -137,8 +140,8 @@ fn the_policy_carries_its_state_and_begins_anew_after_its_horizon() {
     let signature = Signature { n_obs_steps: 3, ..signatures().plain };
     let modes = [STATE, ENVIRONMENT_STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
     let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
-    let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser).unwrap());
-    let model = Arc::new(BcRnn::new(&Config { n_modes: 1, ..small() }, &signature, 1).unwrap());
+    let preprocess = Arc::new(Preprocess::new(signature.clone(), normaliser, &Device::Cpu).unwrap());
+    let model = Arc::new(BcRnn::new(&Config { n_modes: 1, ..small() }, &signature, 1, &Backend::CPU).unwrap());
     let mut policy = Carrying {
         model: Arc::clone(&model),
         preprocess: Arc::clone(&preprocess),
@@ -176,24 +179,15 @@ fn the_policy_carries_its_state_and_begins_anew_after_its_horizon() {
 #[test]
 fn training_lowers_the_loss_with_the_same_bits_every_time() {
     let signature = signatures().history;
-    let run = || {
-        let config = Config { hidden_dim: 24, ..small() };
-        let model = Box::new(BcRnn::new(&config, &signature, 1).unwrap());
-        let settings = TrainConfig { steps: 60, lr: 1e-2, warmup_steps: 3, ..Default::default() };
-        let mut trainer = Trainer::new(model, settings, 5).unwrap();
-        let batch = padded_before(&signature, 8);
-        let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
-        (losses[0], losses[59])
-    };
-    let (first, last) = run();
-    assert!(last < first - 0.5, "{first} {last}");
-    assert_eq!(run(), (first, last));
+    let build = || BcRnn::new(&Config { hidden_dim: 24, ..small() }, &signature, 1, &Backend::CPU);
+    let losses = losses_of_training(build, &padded_before(&signature, 8), (60, 1e-2));
+    assert!(losses[59].loss < losses[0].loss - 0.5, "{losses:?}");
 }
 
 #[test]
 fn impossible_configurations_name_the_field() {
     let signature = signatures().history;
-    let error = |config: Config| BcRnn::new(&config, &signature, 0).unwrap_err().to_string();
+    let error = |config: Config| BcRnn::new(&config, &signature, 0, &Backend::CPU).unwrap_err().to_string();
     assert!(error(Config { action_horizon: 4, ..small() }).contains("action_horizon is 4, expected n_obs_steps, 3"));
     assert!(error(Config { hidden_dim: 0, ..small() }).contains("hidden_dim"));
     assert!(error(Config { min_std: 0.0, ..small() }).contains("min_std"));

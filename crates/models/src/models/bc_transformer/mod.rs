@@ -6,7 +6,7 @@
 //! Before an episode has as many steps as the context, the first observation is repeated, there and here.
 //!
 //! Deviations: one dropout for tokens, attention and outputs; a window ends with its frame in the loss, where robomimic's may
-//! end with repeats of an episode's last one. Pictures become the cells of `[policy.vision]`'s feature map behind a step's
+//! end with repeats of an episode's last one. Images become the cells of `[policy.vision]`'s feature map behind a step's
 //! numbers (robomimic: keypoints). No goals, no supervision of all steps, no sinusoidal positions. The means lie
 //! in -1 to 1, so that actions have to be normalised by their range (`normalisation.action = "min_max"`).
 //!
@@ -22,7 +22,7 @@ use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Signature};
-use crate::layers::{Activation, Dropout, FeedForward, LayerNorm, Linear, Mixture, MixtureHead, MixtureParts, Steps};
+use crate::layers::{Activation, FeedForward, LayerNorm, Linear, Mixture, MixtureHead, MixtureParts, Steps};
 use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
@@ -31,7 +31,7 @@ use nn::ops::{
     Attention, attention, dropout, feed_forward, layer_norm, linear, linear_rows, mixture_likelihood, narrow_tokens,
     residual,
 };
-use nn::{Cache, Context, Init, Loss, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Init, Loss, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -79,7 +79,7 @@ impl Block {
             linear1: linear(p, "mlp.0", (dim, 4 * dim), Some(Init::Zeros))?,
             linear2: linear(p, "mlp.2", (4 * dim, dim), Some(Init::Zeros))?,
             activation: Activation::Gelu,
-            dropout: Dropout { p: 0.0 },
+            dropout: 0.0,
         };
         Ok(Self {
             ln1: LayerNorm::new(p, &format!("{prefix}.ln1"), dim, rng)?,
@@ -117,11 +117,11 @@ impl BcTransformer {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         signature.check("bc_transformer", READS)?;
         let rng = &mut Rng::new(seed, "init");
-        let mut p = Params::new();
+        let mut p = Params::new(backend);
         let dim = config.dim_model;
         let steps = Steps::new(&mut p, "bc_transformer", signature, config.vision.as_ref(), rng)?;
         let embed_encoder = Linear::new(&mut p, "embed_encoder", steps.width(), dim, rng)?;
@@ -150,7 +150,7 @@ impl BcTransformer {
         })
     }
 
-    /// The signature's features, (b, T, …) each, pictures as the network reads them -> b mixtures, of the last step
+    /// The signature's features, (b, T, …) each, images as the network reads them -> b mixtures, of the last step
     fn forward(&self, cx: &mut Context<'_>, rows: usize, observation: &Features<Tensor>) -> Result<MixtureParts> {
         let (steps, dim) = (self.signature.n_obs_steps, self.config.dim_model);
         let seen = self.steps.apply(cx, rows, observation)?;
@@ -165,11 +165,11 @@ impl BcTransformer {
         self.head.apply(cx, &read.reshape((rows, dim))?)
     }
 
-    /// The signature's features, (b, T, …) each -> b mixtures, of the last step; `on_seen` is called when pictures have been
+    /// The signature's features, (b, T, …) each -> b mixtures, of the last step; `on_seen` is called when images have been
     /// encoded.
     fn mixtures_seen(&self, observation: &Features<Tensor>, on_seen: &mut dyn FnMut()) -> Result<Mixture> {
         let rows = check_observation("bc_transformer", &self.signature, observation)?;
-        let observation = self.steps.look(observation, None)?;
+        let observation = self.steps.prepare(observation, None)?;
         self.cache.predict(&self.params, on_seen, |cx| self.forward(cx, rows, &observation)?.mixture())
     }
 
@@ -197,7 +197,7 @@ impl PolicyModel for BcTransformer {
 
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch("bc_transformer", &self.signature, self.config.action_horizon, batch)?;
-        let observation = self.steps.look(&batch.observation, Some(cx.rng()?))?;
+        let observation = self.steps.prepare(&batch.observation, Some(cx.rng()?))?;
         let mixtures = self.forward(cx, batch.rows(), &observation)?;
         let real = Tensor::ones(batch.rows(), DType::F32, batch.device())?;
         let (nll, l1) = mixture_likelihood(cx, &mixtures, (&batch.actions.squeeze(1)?, &real), batch.total_rows)?;
@@ -238,22 +238,22 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::testing::{
-        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+        assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training,
+        move_parameters, signatures, vision_config,
     };
-    use crate::train::{TrainConfig, Trainer};
 
     fn small() -> Config {
         Config { dim_model: 12, n_heads: 2, n_layers: 2, n_modes: 2, min_std: 0.05, ..Config::default() }
     }
 
     #[test]
-    fn the_step_by_hand_is_the_composed_one() {
+    fn the_step_on_kernels_is_the_composed_one() {
         let of = signatures();
         for (signature, n_layers, dropout) in
             [(&of.history, 1, 0.0), (&of.history, 3, 0.2), (&of.plain, 2, 0.2), (&of.entities, 2, 0.0)]
         {
             let config = Config { n_layers, dropout, dim_model: 24, ..small() };
-            let model = BcTransformer::new(&config, signature, 1).unwrap();
+            let model = BcTransformer::new(&config, signature, 1, &Backend::CPU).unwrap();
             move_parameters(&model);
             let what = format!("{n_layers} layers, dropout {dropout}");
             assert_the_step_is_the_composed_one(&model, &batch(signature, 1, 7, 3), &what);
@@ -261,11 +261,11 @@ mod tests {
     }
 
     #[test]
-    fn from_pictures_the_step_by_hand_is_the_composed_one() {
+    fn from_images_the_step_on_kernels_is_the_composed_one() {
         let of = signatures();
-        for signature in [&of.pictures, &of.film] {
-            let config = Config { vision: Some(eyes()), dropout: 0.2, ..small() };
-            let model = BcTransformer::new(&config, signature, 1).unwrap();
+        for signature in [&of.images, &of.image_history] {
+            let config = Config { vision: Some(vision_config()), dropout: 0.2, ..small() };
+            let model = BcTransformer::new(&config, signature, 1, &Backend::CPU).unwrap();
             move_parameters(&model);
             let batch = batch(signature, 1, 3, 3);
             assert_the_step_is_the_composed_one(&model, &batch, &format!("{} steps", signature.n_obs_steps));
@@ -281,7 +281,7 @@ mod tests {
     fn the_gradient_is_the_slope_of_the_loss() {
         let of = signatures();
         for (signature, dropout) in [(&of.history, 0.0), (&of.plain, 0.0), (&of.history, 0.2)] {
-            let model = BcTransformer::new(&Config { dropout, ..small() }, signature, 1).unwrap();
+            let model = BcTransformer::new(&Config { dropout, ..small() }, signature, 1, &Backend::CPU).unwrap();
             move_parameters(&model);
             assert_the_gradient_is_the_slope(&model, &batch(signature, 1, 4, 3), &format!("dropout {dropout}"));
         }
@@ -290,22 +290,16 @@ mod tests {
     #[test]
     fn training_lowers_the_loss_with_the_same_bits_every_time() {
         let signature = signatures().history;
-        let run = || {
-            let model = Box::new(BcTransformer::new(&small(), &signature, 1).unwrap());
-            let settings = TrainConfig { steps: 60, lr: 5e-3, warmup_steps: 3, ..Default::default() };
-            let mut trainer = Trainer::new(model, settings, 5).unwrap();
-            let batch = batch(&signature, 1, 8, 0);
-            let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
-            (losses[0], losses[59])
-        };
-        let (first, last) = run();
-        assert!(last < first - 0.5, "{first} {last}");
-        assert_eq!(run(), (first, last));
+        let build = || BcTransformer::new(&small(), &signature, 1, &Backend::CPU);
+        let losses = losses_of_training(build, &batch(&signature, 1, 8, 0), (60, 5e-3));
+        assert!(losses[59].loss < losses[0].loss - 0.5, "{losses:?}");
     }
 
     #[test]
     fn impossible_configurations_name_the_field() {
-        let error = |config: Config| BcTransformer::new(&config, &signatures().history, 0).unwrap_err().to_string();
+        let error = |config: Config| {
+            BcTransformer::new(&config, &signatures().history, 0, &Backend::CPU).unwrap_err().to_string()
+        };
         assert!(error(Config { action_horizon: 2, ..small() }).contains("action_horizon is 2, expected 1"));
         assert!(error(Config { n_heads: 5, ..small() }).contains("n_heads is 5, expected a divisor of dim_model, 12"));
         assert!(error(Config { dropout: 1.0, ..small() }).contains("dropout"));

@@ -13,7 +13,7 @@ use nn::{Context, Params, Result, Rng, Value};
 pub(crate) struct Condition(Steps);
 
 impl Condition {
-    /// Of a signature that was checked. Without pictures nothing is drawn from `rng`.
+    /// Of a signature that was checked. Without images nothing is drawn from `rng`.
     pub(crate) fn new(
         p: &mut Params,
         model: &'static str,
@@ -29,21 +29,21 @@ impl Condition {
         self.0.width() * self.0.count()
     }
 
-    /// How pictures are seen, if there are any.
+    /// How images are seen, if there are any.
     pub(crate) fn vision(&self) -> Option<&VisionConfig> {
         self.0.vision()
     }
 
-    /// The batch with pictures as the network reads them in training.
-    pub(crate) fn looked_at(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
-        self.0.looked_at(batch, rng)
+    /// The batch with images as the network reads them in training.
+    pub(crate) fn with_images(&self, batch: &Batch, rng: &mut Rng) -> Result<Batch> {
+        self.0.with_images(batch, rng)
     }
 
     /// The signature's features, (b, …) each -> (b, width): the features of a step side by side, steps one after another
     pub(crate) fn apply(&self, cx: &mut Context<'_>, rows: usize, observation: &Features<Tensor>) -> Result<Value> {
         let numbers = Value::from(&self.0.numbers(rows, observation)?.reshape((rows, ()))?.contiguous()?);
-        let Some(sight) = self.0.sight() else { return Ok(numbers) };
-        let seen = sight.apply(cx, &sight.look(observation, None)?)?;
+        let Some(image_features) = self.0.image_features() else { return Ok(numbers) };
+        let seen = image_features.apply(cx, &image_features.prepare(observation, None)?)?;
         cat_rows(cx, &numbers, &seen)
     }
 }

@@ -21,7 +21,7 @@ use crate::preprocess::Preprocess;
 use candle_core::{DType, Tensor};
 use condition::Condition;
 use nn::ops::{Error, chunk_error};
-use nn::{Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
 use std::fmt::Debug;
 use std::sync::Arc;
 use transformer::{Around, Transformer};
@@ -117,19 +117,25 @@ pub struct Denoising<M> {
 
 impl<M: Method> Denoising<M> {
     /// Initial weights are torch's defaults; the configuration was validated.
-    pub(crate) fn build(method: M, setup: &Setup<'_>, signature: &Signature, seed: u64) -> Result<Self> {
+    pub(crate) fn build(
+        method: M,
+        setup: &Setup<'_>,
+        signature: &Signature,
+        seed: u64,
+        backend: &Backend,
+    ) -> Result<Self> {
         signature.check(M::NAME, READS)?;
         let refuse = |field, found, expected| Err(ModelError::Config { model: M::NAME, field, found, expected });
-        let pictures: Vec<&str> = signature.of_kind(FeatureKind::Image).map(|spec| spec.name.as_str()).collect();
-        if setup.transformer.is_some() && !pictures.is_empty() {
+        let images: Vec<&str> = signature.of_kind(FeatureKind::Image).map(|spec| spec.name.as_str()).collect();
+        if setup.transformer.is_some() && !images.is_empty() {
             let expected = "none where there are images, which it does not see".to_string();
-            return refuse("transformer", format!("one beside {}", pictures.join(", ")), expected);
+            return refuse("transformer", format!("one beside {}", images.join(", ")), expected);
         }
         let (horizon, n_obs_steps, action_dim) = (setup.action_horizon, signature.n_obs_steps, signature.action_dim);
         if horizon < n_obs_steps {
             return refuse("action_horizon", horizon.to_string(), format!("at least n_obs_steps, {n_obs_steps}"));
         }
-        let (mut p, rng) = (Params::new(), &mut Rng::new(seed, "init"));
+        let (mut p, rng) = (Params::new(backend), &mut Rng::new(seed, "init"));
         let condition = Condition::new(&mut p, M::NAME, signature, setup.vision, rng)?;
         let network = match setup.transformer {
             Some(transformer) => {
@@ -172,7 +178,7 @@ impl<M: Method> Denoising<M> {
         })
     }
 
-    /// The mean squared errors of a batch whose pictures are as the network reads them. With `mask_padding` steps beyond an
+    /// The mean squared errors of a batch whose images are as the network reads them. With `mask_padding` steps beyond an
     /// episode's ends do not count.
     fn loss_of(&self, cx: &mut Context<'_>, batch: &Batch, targets: &[Target]) -> Result<Loss> {
         let (rows, horizon, width) = batch.actions.dims3()?;
@@ -196,7 +202,7 @@ impl<M: Method> Denoising<M> {
         Ok(self.cache.composed_loss(&self.params, None, |cx| self.loss_of(cx, batch, targets))?.total)
     }
 
-    /// Actions, (b, H, A), with this noise; `on_seen` is called when the pictures were seen.
+    /// Actions, (b, H, A), with this noise; `on_seen` is called when the images were seen.
     pub(crate) fn drawn_with(
         &self,
         observation: &Features<Tensor>,
@@ -215,7 +221,7 @@ impl<M: Method> Denoising<M> {
         noise: &mut dyn FnMut(&Tensor) -> Result<Tensor>,
     ) -> Result<Tensor> {
         let shape = (rows, self.action_horizon, self.signature.action_dim);
-        let zeros = Tensor::zeros(shape, DType::F32, &self.params.device())?;
+        let zeros = Tensor::zeros(shape, DType::F32, self.params.device())?;
         let cond = self.condition.apply(cx, rows, observation)?;
         let mut answer = |x: &Tensor, step: f32| Ok(self.answer(cx, x, &vec![step; rows], &cond)?.detached());
         self.method.sample(&zeros, &mut || noise(&zeros), &mut answer)
@@ -255,7 +261,7 @@ impl<M: Method> PolicyModel for Denoising<M> {
 
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch(M::NAME, &self.signature, self.action_horizon, batch)?;
-        let batch = &self.condition.looked_at(batch, cx.rng()?)?;
+        let batch = &self.condition.with_images(batch, cx.rng()?)?;
         let targets = self.method.targets(cx.rng()?, &batch.actions)?;
         self.loss_of(cx, batch, &targets)
     }

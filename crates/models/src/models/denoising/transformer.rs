@@ -4,12 +4,11 @@
 //!
 //! Deviations: every action attends to all observations (there, with `causal_attn`, the first ones not to the last ones);
 //! no dropout of tokens (0 in their experiments on low-dimensional observations) and no encoder over the observations
-//! (`n_cond_layers`, 0 there); no pictures.
+//! (`n_cond_layers`, 0 there); no images.
 
 use super::unet::embedding;
 use crate::layers::{Activation, DecoderLayer, LayerNorm, Linear, Shape};
 use candle_core::Tensor;
-use nn::device::HERE;
 use nn::ops::{add, cat_tokens, layer_norm, linear, mish};
 use nn::{Context, Init, ModelError, Params, Result, Rng, Size, Value};
 use serde::{Deserialize, Serialize};
@@ -138,7 +137,7 @@ impl Transformer {
         // the layers' matrices begin as everything else
         let of_layers = name("decoder.");
         for (_, var) in p.iter().filter(|(name, var)| name.starts_with(&of_layers) && var.dims().len() == 2) {
-            var.set(&Tensor::from_vec(normal.values(var.dims(), rng), var.dims(), &HERE)?)?;
+            var.set(&Tensor::from_vec(normal.values(var.dims(), rng), var.dims(), var.device())?)?;
         }
         Ok(Self {
             dim,

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 /// The prefix of every tensor in LeRobot's files.
 const PREFIX: &str = "diffusion.";
 
-/// Keys that LeRobot knows and that do not matter to a policy at rest that sees no pictures.
+/// Keys that LeRobot knows and that do not matter to a policy at rest that sees no images.
 const OF_NO_MATTER: [&str; 35] = [
     "type",
     "device",
@@ -134,7 +134,7 @@ fn refuse(field: &'static str, found: impl Into<String>, expected: &str) -> Mode
 /// Reads a `config.json`.
 ///
 /// # Errors
-/// Another type of policy, pictures, another schedule of noise, a missing feature, or a configuration that is impossible.
+/// Another type of policy, images, another schedule of noise, a missing feature, or a configuration that is impossible.
 pub fn read_config(config: &Value) -> Result<LerobotDiffusion> {
     let kind = config.get("type").and_then(Value::as_str).unwrap_or("absent");
     if kind != "diffusion" {

@@ -4,7 +4,7 @@
 //! implementation: LeRobot 0.6.1's `DiffusionPolicy`, of which this has the tensors' names and, on fixtures made with it, the
 //! outputs, the loss and the gradients.
 //!
-//! Deviations: numbers are joined in the signature's order, entities among them, and before what the cameras see; pictures go
+//! Deviations: numbers are joined in the signature's order, entities among them, and before what the cameras see; images go
 //! through `[policy.vision]`'s network and become its map's cells (Chi et al. and LeRobot: keypoints), of every step seen;
 //! betas are those of the squared cosine only; actions are drawn with DDIM in 10 steps unless the configuration says otherwise (LeRobot: DDPM
 //! in as many as were trained); every frame starts a window (LeRobot leaves out the last 7 of an episode). The moving average
@@ -28,7 +28,7 @@ use super::denoising::{Denoising, Method, Setup, Target, normals_like};
 use crate::batch::Batch;
 use crate::features::{Features, Signature};
 use candle_core::Tensor;
-use nn::{Result, Rng};
+use nn::{Backend, Result, Rng};
 
 /// The model.
 pub type Diffusion = Denoising<Noising>;
@@ -83,7 +83,7 @@ impl Diffusion {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         let setup = Setup {
             action_horizon: config.action_horizon,
@@ -93,7 +93,7 @@ impl Diffusion {
             vision: config.vision.as_ref(),
         };
         let schedule = NoiseSchedule::new(config.num_train_timesteps);
-        Self::build(Noising { config: config.clone(), schedule }, &setup, signature, seed)
+        Self::build(Noising { config: config.clone(), schedule }, &setup, signature, seed, backend)
     }
 
     /// The same model drawing its actions otherwise.

@@ -4,9 +4,9 @@ use crate::encoders::{ImageNorm, TokenKind, VisionConfig};
 use crate::features::FeatureKind;
 use crate::model::PolicyModel;
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training, move_parameters,
+    signatures, vision_config,
 };
-use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
 use nn::simd::{Level, at_most};
 
@@ -23,16 +23,16 @@ fn attending(transformer: TransformerConfig) -> Config {
     Config { transformer: Some(transformer), ..small() }
 }
 
-/// With pictures, whose network has too many kinks for slopes; of one step and of two.
+/// With images, whose network has too many kinks for slopes; of one step and of two.
 fn seeing() -> Vec<(Signature, Config)> {
     let of = signatures();
-    let frozen = VisionConfig { norm: ImageNorm::Frozen, cell_features: Some(4), ..eyes() };
+    let frozen = VisionConfig { norm: ImageNorm::Frozen, cell_features: Some(4), ..vision_config() };
     let masked = Config { mask_padding: true, vision: Some(frozen), ..small() };
-    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 5 }, ..eyes() };
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 5 }, ..vision_config() };
     vec![
-        (of.pictures, Config { vision: Some(eyes()), ..small() }),
-        (of.film.clone(), masked),
-        (of.film, Config { vision: Some(keypoints), ..small() }),
+        (of.images, Config { vision: Some(vision_config()), ..small() }),
+        (of.image_history.clone(), masked),
+        (of.image_history, Config { vision: Some(keypoints), ..small() }),
     ]
 }
 
@@ -56,7 +56,7 @@ fn cases() -> Vec<(Signature, Config)> {
 #[test]
 fn the_gradient_is_the_slope_of_the_loss() {
     for (signature, config) in cases().into_iter().filter(|(_, config)| config.network.down_dims.len() == 2) {
-        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         let batch = batch(&signature, 8, 3, 3);
         assert_the_gradient_is_the_slope(&model, &batch, &format!("{config:?}"));
@@ -64,9 +64,9 @@ fn the_gradient_is_the_slope_of_the_loss() {
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one() {
+fn the_step_on_kernels_is_the_composed_one() {
     for (signature, config) in cases().into_iter().chain(seeing()) {
-        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         for rows in if config.vision.is_some() { [1, 3] } else { [1, 13] } {
             let batch = batch(&signature, 8, rows, 3);
@@ -78,9 +78,9 @@ fn the_step_by_hand_is_the_composed_one() {
 #[test]
 fn answers_by_hand_are_the_composed_ones_also_when_weights_change() {
     for (signature, config) in cases().into_iter().chain(seeing()) {
-        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         for rows in [1, 2, 13] {
-            let other = Diffusion::new(&config, &signature, rows as u64).unwrap();
+            let other = Diffusion::new(&config, &signature, rows as u64, &Backend::CPU).unwrap();
             move_parameters(&other);
             model.params().load(&other.params().tensors()).unwrap();
             let batch = batch(&signature, 8, rows, 3);
@@ -102,7 +102,7 @@ fn answers_by_hand_are_the_composed_ones_also_when_weights_change() {
 fn shards_add_up_to_the_whole() {
     let signature = signatures().history;
     for mask_padding in [false, true] {
-        let model = Diffusion::new(&Config { mask_padding, ..small() }, &signature, 1).unwrap();
+        let model = Diffusion::new(&Config { mask_padding, ..small() }, &signature, 1, &Backend::CPU).unwrap();
         let batch = batch(&signature, 8, 5, 3);
         let noise = normals_like(&batch.actions, &mut Rng::new(1, "noise")).unwrap();
         let steps = [3, 99, 0, 50, 20];
@@ -143,24 +143,16 @@ fn ddpm_with_a_network_that_knows_the_noise_comes_back_to_the_actions() {
 #[test]
 fn training_lowers_the_loss_with_the_same_bits_every_time() {
     let signature = signatures().history;
-    let run = || {
-        let model = Box::new(Diffusion::new(&small(), &signature, 1).unwrap());
-        let settings = TrainConfig { steps: 60, lr: 3e-3, warmup_steps: 3, ..Default::default() };
-        let mut trainer = Trainer::new(model, settings, 5).unwrap();
-        let batch = batch(&signature, 8, 16, 0);
-        let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
-        let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
-        (mean(&losses[..10]), mean(&losses[50..]))
-    };
-    let (first, last) = run();
-    assert!(last < 0.9 * first, "{first} {last}");
-    assert_eq!(run(), (first, last));
+    let build = || Diffusion::new(&small(), &signature, 1, &Backend::CPU);
+    let losses = losses_of_training(build, &batch(&signature, 8, 16, 0), (60, 3e-3));
+    let ten = |from: usize| losses[from..from + 10].iter().map(|step| step.loss).sum::<f32>();
+    assert!(ten(50) < 0.9 * ten(0), "{losses:?}");
 }
 
 #[test]
 fn what_is_drawn_depends_on_the_generator_and_stays_in_range() {
     let signature = signatures().history;
-    let model = Diffusion::new(&small(), &signature, 1).unwrap();
+    let model = Diffusion::new(&small(), &signature, 1, &Backend::CPU).unwrap();
     let batch = batch(&signature, 8, 4, 3);
     let flat = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     let draw = |seed| flat(model.sample(&batch.observation, &mut Rng::new(seed, "policy")).unwrap());
@@ -173,7 +165,7 @@ fn what_is_drawn_depends_on_the_generator_and_stays_in_range() {
 #[test]
 fn impossible_configurations_name_the_field() {
     let of = signatures();
-    let error = |config: Config| Diffusion::new(&config, &of.plain, 0).unwrap_err().to_string();
+    let error = |config: Config| Diffusion::new(&config, &of.plain, 0, &Backend::CPU).unwrap_err().to_string();
     let network = |change: fn(&mut NetworkConfig)| {
         let mut config = small();
         change(&mut config.network);
@@ -199,29 +191,30 @@ fn impossible_configurations_name_the_field() {
     assert!(attends(|t| t.dim_model = 9).contains("transformer.dim_model is 9"));
     assert!(attends(|t| t.n_layers = 0).contains("transformer.n_layers is 0"));
     assert!(attends(|t| t.dropout = 1.0).contains("transformer.dropout is 1"));
-    let both = Config { vision: Some(eyes()), ..attending(tokens()) };
+    let both = Config { vision: Some(vision_config()), ..attending(tokens()) };
     assert!(error(both).contains("vision is given, expected none with a transformer"));
-    // a signature with pictures brings an encoder of its own
-    let unseen = Diffusion::new(&attending(tokens()), &of.pictures, 0).unwrap_err().to_string();
+    // a signature with images brings an encoder of its own
+    let unseen = Diffusion::new(&attending(tokens()), &of.images, 0, &Backend::CPU).unwrap_err().to_string();
     assert!(unseen.contains("transformer is one beside a, b, c, expected none where there are images"), "{unseen}");
     let sees = |vision| {
         let config = Config { vision: Some(vision), ..small() };
-        Diffusion::new(&config, &of.pictures, 0).unwrap_err().to_string()
+        Diffusion::new(&config, &of.images, 0, &Backend::CPU).unwrap_err().to_string()
     };
     assert!(
-        sees(VisionConfig { cell_features: Some(6), ..eyes() }).contains("cell_features is 6, expected a multiple")
+        sees(VisionConfig { cell_features: Some(6), ..vision_config() })
+            .contains("cell_features is 6, expected a multiple")
     );
-    let blind = error(Config { vision: Some(eyes()), ..small() });
+    let blind = error(Config { vision: Some(vision_config()), ..small() });
     assert!(blind.contains("expected a feature of kind image"), "{blind}");
     let long = Signature { n_obs_steps: 9, ..of.plain.clone() };
-    let error = Diffusion::new(&small(), &long, 0).unwrap_err().to_string();
+    let error = Diffusion::new(&small(), &long, 0, &Backend::CPU).unwrap_err().to_string();
     assert!(error.contains("action_horizon is 8, expected at least n_obs_steps, 9"), "{error}");
 }
 
 #[test]
 fn what_a_camera_sees_decides_and_is_told_before_anything_is_drawn() {
     for (signature, config) in seeing() {
-        let model = Diffusion::new(&config, &signature, 1).unwrap();
+        let model = Diffusion::new(&config, &signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         assert_eq!(model.vision(), config.vision.as_ref());
         let one = batch(&signature, 8, 1, 3).observation;
@@ -233,11 +226,11 @@ fn what_a_camera_sees_decides_and_is_told_before_anything_is_drawn() {
         // every camera, and of a history every step
         for spec in signature.of_kind(FeatureKind::Image) {
             for step in 0..signature.n_obs_steps {
-                let picture = one.get(&spec.name).unwrap();
-                let mut bytes = picture.flatten_all().unwrap().to_vec1::<u8>().unwrap();
+                let image = one.get(&spec.name).unwrap();
+                let mut bytes = image.flatten_all().unwrap().to_vec1::<u8>().unwrap();
                 bytes[step * spec.width()..][..spec.width()].iter_mut().for_each(|byte| *byte = 255 - *byte);
                 let mut other = one.clone();
-                other.insert(&spec.name, Tensor::from_vec(bytes, picture.shape(), &Device::Cpu).unwrap());
+                other.insert(&spec.name, Tensor::from_vec(bytes, image.shape(), &Device::Cpu).unwrap());
                 let then = flat(model.sample(&other, &mut Rng::new(1, "policy")).unwrap());
                 assert_ne!(then, first, "{} step {step}", spec.name);
             }

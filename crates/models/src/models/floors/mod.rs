@@ -18,11 +18,11 @@ use crate::model::{Memory, PolicyModel};
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
+use nn::Backend;
 use nn::Gradients;
 use nn::Params;
 use nn::Rng;
 use nn::Size;
-use nn::device::HERE;
 use nn::losses::absolute;
 use nn::{LossParts, LossValues};
 use nn::{ModelError, Result};
@@ -125,9 +125,9 @@ pub struct Floor<R> {
 impl<R: Rule> Floor<R> {
     /// # Errors
     /// A configuration or a signature that describes no possible policy.
-    pub fn new(config: &R::Config, signature: &Signature, _seed: u64) -> Result<Self> {
+    pub fn new(config: &R::Config, signature: &Signature, _seed: u64, backend: &Backend) -> Result<Self> {
         signature.check(R::NAME, READS)?;
-        let mut params = Params::new();
+        let mut params = Params::new(backend);
         let rule = R::new(config, signature, &mut params)?;
         Ok(Self { rule, signature: signature.clone(), params })
     }
@@ -135,7 +135,7 @@ impl<R: Rule> Floor<R> {
     /// Chunks of one action repeated. action: rows*A values -> (rows, H, A)
     fn repeated(&self, rows: usize, action: Vec<f32>) -> Result<Tensor> {
         let (horizon, width) = (self.rule.action_horizon(), self.signature.action_dim);
-        let action = Tensor::from_vec(action, (rows, 1, width), &HERE)?;
+        let action = Tensor::from_vec(action, (rows, 1, width), self.params.device())?;
         Ok(action.broadcast_as((rows, horizon, width))?.contiguous()?)
     }
 }

@@ -14,7 +14,6 @@ use candle_core::Tensor;
 use nn::Params;
 use nn::Rng;
 use nn::Size;
-use nn::device::HERE;
 use nn::values::with_values;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
@@ -103,7 +102,7 @@ impl Rule for Neighbours {
             })
         })???;
         let shape = (rows, self.config.action_horizon, model.signature.action_dim);
-        Ok(Tensor::from_vec(chunks, shape, &HERE)?)
+        Ok(Tensor::from_vec(chunks, shape, model.params.device())?)
     }
 
     fn remember(&self, model: &Floor<Self>, train: &[Batch], _held_out: &[Batch]) -> Result<()> {

@@ -9,7 +9,6 @@ use candle_core::Tensor;
 use nn::Params;
 use nn::Result;
 use nn::Rng;
-use nn::device::HERE;
 
 /// The model.
 pub type Random = Floor<Chance>;
@@ -38,6 +37,6 @@ impl Rule for Chance {
         let Some(rng) = rng else { return model.repeated(rows, vec![0.0; rows * width]) };
         let horizon = self.config.action_horizon;
         let drawn: Vec<f32> = (0..rows * horizon * width).map(|_| 2.0 * rng.uniform() - 1.0).collect();
-        Ok(Tensor::from_vec(drawn, (rows, horizon, width), &HERE)?)
+        Ok(Tensor::from_vec(drawn, (rows, horizon, width), model.params.device())?)
     }
 }

@@ -22,7 +22,7 @@ impl Clock for NoClock {
 fn plain() -> Arc<Preprocess> {
     let modes = [STATE, ACTION].map(|name| (name.to_string(), NormMode::Identity));
     let normaliser = Normaliser::new(&BTreeMap::from(modes), &BTreeMap::new()).unwrap();
-    Arc::new(Preprocess::new(Signature::low_dimensional(1, 0, 1), normaliser).unwrap())
+    Arc::new(Preprocess::new(Signature::low_dimensional(1, 0, 1), normaliser, &candle_core::Device::Cpu).unwrap())
 }
 
 /// A demonstration: what was seen and done, windows of `horizon`.
@@ -44,12 +44,12 @@ fn zero_does_nothing_and_chance_fills_the_range() {
     let config = Config { action_horizon: 3 };
     let batch = batch(&signature, 3, 200, 1);
     let flat = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    let zero = Zero::new(&config, &signature, 0).unwrap();
+    let zero = Zero::new(&config, &signature, 0, &Backend::CPU).unwrap();
     let sample =
         |model: &dyn PolicyModel, seed| model.sample(&batch.observation, &mut Rng::new(seed, "policy")).unwrap();
     assert_eq!(sample(&zero, 1).dims(), [200, 3, 2]);
     assert!(flat(sample(&zero, 1)).iter().all(|x| *x == 0.0));
-    let random = Random::new(&config, &signature, 0).unwrap();
+    let random = Random::new(&config, &signature, 0, &Backend::CPU).unwrap();
     let drawn = flat(sample(&random, 1));
     assert_eq!(drawn, flat(sample(&random, 1)));
     assert_ne!(drawn, flat(sample(&random, 2)));
@@ -63,7 +63,7 @@ fn the_nearest_are_those_of_a_search_through_all() {
     let signature = signatures().entities;
     for k in [1, 3, 40] {
         let config = nearest::Config { action_horizon: 2, k };
-        let model = Nearest::new(&config, &signature, 0).unwrap();
+        let model = Nearest::new(&config, &signature, 0, &Backend::CPU).unwrap();
         let episodes = [batch(&signature, 2, 17, 3), batch(&signature, 2, 23, 4)];
         model.memory().unwrap().remember(&episodes, &[]).unwrap();
         let asked = batch(&signature, 2, 5, 9);
@@ -87,8 +87,13 @@ fn the_nearest_are_those_of_a_search_through_all() {
             }
         }
     }
-    let model =
-        Nearest::new(&nearest::Config { action_horizon: 1, k: 4 }, &Signature::low_dimensional(1, 0, 1), 0).unwrap();
+    let model = Nearest::new(
+        &nearest::Config { action_horizon: 1, k: 4 },
+        &Signature::low_dimensional(1, 0, 1),
+        0,
+        &Backend::CPU,
+    )
+    .unwrap();
     let few = demonstration(&[(0.0, 1.0), (1.0, 2.0)], 1);
     let error = model.memory().unwrap().remember(&[few], &[]).unwrap_err().to_string();
     assert!(error.contains("k is 4, expected at most the number of windows, 2"), "{error}");
@@ -100,7 +105,7 @@ fn a_demonstration_is_played_to_its_end_and_its_seed_says_which() {
     let held_out =
         [demonstration(&[(0.0, 1.0), (0.0, 2.0), (0.0, 3.0)], 2), demonstration(&[(0.0, -1.0), (0.0, -2.0)], 2)];
     for (horizon, executed) in [(1, 1), (2, 2), (4, 3)] {
-        let model = Replay::new(&Config { action_horizon: horizon }, preprocess.signature(), 0).unwrap();
+        let model = Replay::new(&Config { action_horizon: horizon }, preprocess.signature(), 0, &Backend::CPU).unwrap();
         let error = model.memory().unwrap().remember(&held_out, &[]).unwrap_err().to_string();
         assert!(error.contains("held-out demonstrations is none"), "{error}");
         model.memory().unwrap().remember(&[], &held_out).unwrap();
@@ -127,7 +132,7 @@ fn a_training_leaves_what_was_remembered_and_restores_it() {
     let preprocess = plain();
     let episode = demonstration(&[(0.0, 1.0), (1.0, 2.0), (5.0, 3.0)], 1);
     let make = || {
-        let model = Nearest::new(&nearest::Config::default(), preprocess.signature(), 0).unwrap();
+        let model = Nearest::new(&nearest::Config::default(), preprocess.signature(), 0, &Backend::CPU).unwrap();
         model.memory().unwrap().remember(std::slice::from_ref(&episode), &[]).unwrap();
         Trainer::new(Box::new(model), TrainConfig { steps: 1, ..TrainConfig::default() }, 1).unwrap()
     };
@@ -138,7 +143,7 @@ fn a_training_leaves_what_was_remembered_and_restores_it() {
     other.restore(&trainer.state().unwrap()).unwrap();
     assert_eq!(other.step_count(), 1);
     // an entry is built empty and takes what was saved
-    let entry = Nearest::new(&nearest::Config::default(), preprocess.signature(), 0).unwrap();
+    let entry = Nearest::new(&nearest::Config::default(), preprocess.signature(), 0, &Backend::CPU).unwrap();
     assert!(entry.predict(&episode.observation).unwrap_err().to_string().contains("tensor seen is missing"));
     entry.params().load(&other.eval_params().unwrap()).unwrap();
     let mut policy = Arc::new(entry).policy(preprocess, Box::new(NoClock));
@@ -151,10 +156,14 @@ fn what_cannot_be_is_named() {
     let signature = signatures().plain;
     let error = |error: ModelError| error.to_string();
     assert!(
-        error(Zero::new(&Config { action_horizon: 0 }, &signature, 0).unwrap_err()).contains("action_horizon is 0")
+        error(Zero::new(&Config { action_horizon: 0 }, &signature, 0, &Backend::CPU).unwrap_err())
+            .contains("action_horizon is 0")
     );
     let none = nearest::Config { k: 0, ..Default::default() };
-    assert!(error(Nearest::new(&none, &signature, 0).unwrap_err()).contains("k is 0"));
-    let sees = signatures().pictures;
-    assert!(error(Replay::new(&Config::default(), &sees, 0).unwrap_err()).contains("replay cannot read feature a"));
+    assert!(error(Nearest::new(&none, &signature, 0, &Backend::CPU).unwrap_err()).contains("k is 0"));
+    let sees = signatures().images;
+    assert!(
+        error(Replay::new(&Config::default(), &sees, 0, &Backend::CPU).unwrap_err())
+            .contains("replay cannot read feature a")
+    );
 }

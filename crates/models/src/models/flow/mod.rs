@@ -17,7 +17,7 @@ pub use config::Config;
 use super::denoising::{Denoising, Method, Setup, Target, between, normals_like};
 use crate::features::Signature;
 use candle_core::Tensor;
-use nn::{Result, Rng};
+use nn::{Backend, Result, Rng};
 
 /// What the network is shown at time 1.
 const LAST_STEP: f32 = 100.0;
@@ -67,7 +67,7 @@ impl Flow {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         let setup = Setup {
             action_horizon: config.action_horizon,
@@ -76,7 +76,7 @@ impl Flow {
             mask_padding: config.mask_padding,
             vision: config.vision.as_ref(),
         };
-        Self::build(Velocity { inference_steps: config.inference_steps }, &setup, signature, seed)
+        Self::build(Velocity { inference_steps: config.inference_steps }, &setup, signature, seed, backend)
     }
 }
 

@@ -3,9 +3,9 @@ use super::*;
 use crate::model::PolicyModel;
 use crate::models::denoising::NetworkConfig;
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training, move_parameters,
+    signatures, vision_config,
 };
-use crate::train::{TrainConfig, Trainer};
 use candle_core::Device;
 
 fn small() -> Config {
@@ -14,22 +14,22 @@ fn small() -> Config {
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one() {
+fn the_step_on_kernels_is_the_composed_one() {
     let of = signatures();
     for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
-        let model = Flow::new(&Config { mask_padding, ..small() }, signature, 1).unwrap();
+        let model = Flow::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         assert_the_step_is_the_composed_one(&model, &batch(signature, 8, 5, 3), &format!("{mask_padding}"));
     }
 }
 
 #[test]
-fn from_pictures_too() {
-    let signature = signatures().film;
-    let model = Flow::new(&Config { vision: Some(eyes()), ..small() }, &signature, 1).unwrap();
+fn from_images_too() {
+    let signature = signatures().image_history;
+    let model = Flow::new(&Config { vision: Some(vision_config()), ..small() }, &signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     let batch = batch(&signature, 8, 3, 3);
-    assert_the_step_is_the_composed_one(&model, &batch, "pictures");
+    assert_the_step_is_the_composed_one(&model, &batch, "images");
     let got = model.predict(&batch.observation).unwrap();
     let want = model.predict_composed(&batch.observation).unwrap();
     let off = (got - want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
@@ -40,7 +40,7 @@ fn from_pictures_too() {
 fn the_gradient_is_the_slope_of_the_loss() {
     let of = signatures();
     for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
-        let model = Flow::new(&Config { mask_padding, ..small() }, signature, 1).unwrap();
+        let model = Flow::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
         assert_the_gradient_is_the_slope(&model, &batch(signature, 8, 3, 3), &format!("{mask_padding}"));
     }
 }
@@ -78,22 +78,16 @@ fn on_the_way_there_is_noise_first_and_actions_last() {
 #[test]
 fn training_lowers_the_loss_with_the_same_bits_every_time() {
     let signature = signatures().history;
-    let run = || {
-        let model = Box::new(Flow::new(&small(), &signature, 1).unwrap());
-        let settings = TrainConfig { steps: 60, lr: 3e-3, warmup_steps: 3, ..Default::default() };
-        let mut trainer = Trainer::new(model, settings, 5).unwrap();
-        let batch = batch(&signature, 8, 16, 0);
-        let losses: Vec<f32> = (0..60).map(|_| trainer.step(&batch).unwrap().loss).collect();
-        let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
-        (mean(&losses[..10]), mean(&losses[50..]))
-    };
-    let (first, last) = run();
-    assert!(last < 0.9 * first, "{first} {last}");
-    assert_eq!(run(), (first, last));
+    let build = || Flow::new(&small(), &signature, 1, &Backend::CPU);
+    let losses = losses_of_training(build, &batch(&signature, 8, 16, 0), (60, 3e-3));
+    let ten = |from: usize| losses[from..from + 10].iter().map(|step| step.loss).sum::<f32>();
+    assert!(ten(50) < 0.9 * ten(0), "{losses:?}");
 }
 
 #[test]
 fn impossible_configurations_name_the_field() {
-    let error = Flow::new(&Config { inference_steps: 0, ..small() }, &signatures().plain, 0).unwrap_err().to_string();
+    let error = Flow::new(&Config { inference_steps: 0, ..small() }, &signatures().plain, 0, &Backend::CPU)
+        .unwrap_err()
+        .to_string();
     assert!(error.contains("config of flow: inference_steps is 0"), "{error}");
 }

@@ -16,7 +16,7 @@ pub use config::Config;
 use super::denoising::{Denoising, Method, Setup, Target, between, normals_like};
 use crate::features::Signature;
 use candle_core::Tensor;
-use nn::{Result, Rng};
+use nn::{Backend, Result, Rng};
 
 /// What the network is shown at time 1.
 const LAST_STEP: f32 = 100.0;
@@ -70,7 +70,7 @@ impl Mip {
     ///
     /// # Errors
     /// A configuration or a signature that describes no possible model.
-    pub fn new(config: &Config, signature: &Signature, seed: u64) -> Result<Self> {
+    pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
         let setup = Setup {
             action_horizon: config.action_horizon,
@@ -79,7 +79,7 @@ impl Mip {
             mask_padding: config.mask_padding,
             vision: config.vision.as_ref(),
         };
-        Self::build(TwoSteps { second_time: config.second_time as f32 }, &setup, signature, seed)
+        Self::build(TwoSteps { second_time: config.second_time as f32 }, &setup, signature, seed, backend)
     }
 }
 

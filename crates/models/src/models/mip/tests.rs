@@ -3,9 +3,9 @@ use super::*;
 use crate::model::PolicyModel;
 use crate::models::denoising::NetworkConfig;
 use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, move_parameters, signatures,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training, move_parameters,
+    signatures, vision_config,
 };
-use crate::train::{TrainConfig, Trainer};
 use candle_core::{DType, Device};
 
 fn small() -> Config {
@@ -14,22 +14,22 @@ fn small() -> Config {
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one() {
+fn the_step_on_kernels_is_the_composed_one() {
     let of = signatures();
     for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
-        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1).unwrap();
+        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
         move_parameters(&model);
         assert_the_step_is_the_composed_one(&model, &batch(signature, 8, 5, 3), &format!("{mask_padding}"));
     }
 }
 
 #[test]
-fn from_pictures_too() {
-    let signature = signatures().film;
-    let model = Mip::new(&Config { vision: Some(eyes()), ..small() }, &signature, 1).unwrap();
+fn from_images_too() {
+    let signature = signatures().image_history;
+    let model = Mip::new(&Config { vision: Some(vision_config()), ..small() }, &signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     let batch = batch(&signature, 8, 3, 3);
-    assert_the_step_is_the_composed_one(&model, &batch, "pictures");
+    assert_the_step_is_the_composed_one(&model, &batch, "images");
     let got = model.predict(&batch.observation).unwrap();
     let want = model.predict_composed(&batch.observation).unwrap();
     let off = (got - want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
@@ -40,7 +40,7 @@ fn from_pictures_too() {
 fn the_gradient_is_the_slope_of_the_loss() {
     let of = signatures();
     for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
-        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1).unwrap();
+        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
         assert_the_gradient_is_the_slope(&model, &batch(signature, 8, 3, 3), &format!("{mask_padding}"));
     }
 }
@@ -63,25 +63,19 @@ fn the_two_steps_are_the_oracle_s() {
 #[test]
 fn training_lowers_both_parts_of_the_loss_with_the_same_bits_every_time() {
     let signature = signatures().history;
-    let run = || {
-        let model = Box::new(Mip::new(&small(), &signature, 1).unwrap());
-        let settings = TrainConfig { steps: 80, lr: 3e-3, warmup_steps: 3, ..Default::default() };
-        let mut trainer = Trainer::new(model, settings, 5).unwrap();
-        let batch = batch(&signature, 8, 8, 0);
-        let parts: Vec<_> = (0..80).map(|_| trainer.step(&batch).unwrap().parts).collect();
-        (parts[0].clone(), parts[79].clone())
-    };
-    let (first, last) = run();
+    let build = || Mip::new(&small(), &signature, 1, &Backend::CPU);
+    let losses = losses_of_training(build, &batch(&signature, 8, 8, 0), (80, 3e-3));
     for (part, share) in [("first_l2_loss", 0.9), ("second_l2_loss", 0.7)] {
-        assert!(last[part] < share * first[part], "{part}: {first:?} {last:?}");
+        assert!(losses[79].parts[part] < share * losses[0].parts[part], "{part}: {losses:?}");
     }
-    assert_eq!(run(), (first, last));
 }
 
 #[test]
 fn impossible_configurations_name_the_field() {
     for second_time in [0.0, 1.0, f64::NAN] {
-        let error = Mip::new(&Config { second_time, ..small() }, &signatures().plain, 0).unwrap_err().to_string();
+        let error = Mip::new(&Config { second_time, ..small() }, &signatures().plain, 0, &Backend::CPU)
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("config of mip: second_time is"), "{error}");
     }
 }

@@ -4,10 +4,9 @@
 
 use super::{Carry, Trm, misfit};
 use crate::classification::IGNORE_LABEL;
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use nn::Result;
 use nn::Rng;
-use nn::device::HERE;
 use serde::{Deserialize, Serialize};
 
 /// One puzzle with its answer.
@@ -112,7 +111,7 @@ impl Slots {
             }
             let initial = model.initial_carry(self.batch())?;
             let shape = initial.z_h.shape().clone();
-            let reset = Tensor::from_vec(reset, (self.batch(), 1, 1), &HERE)?.broadcast_as(shape)?;
+            let reset = Tensor::from_vec(reset, (self.batch(), 1, 1), &Device::Cpu)?.broadcast_as(shape)?;
             self.carry = Carry {
                 z_h: reset.where_cond(&initial.z_h, &self.carry.z_h)?,
                 z_l: reset.where_cond(&initial.z_l, &self.carry.z_l)?,
@@ -124,12 +123,12 @@ impl Slots {
     /// The puzzles' tokens, `(batch, seq_len)`.
     pub(super) fn input_tensor(&self) -> Result<Tensor> {
         let len = self.inputs.len() / self.batch();
-        Ok(Tensor::from_slice(&self.inputs, (self.batch(), len), &HERE)?)
+        Ok(Tensor::from_slice(&self.inputs, (self.batch(), len), &Device::Cpu)?)
     }
 
     /// The puzzles' rows in the embedding table, `(batch,)`.
     pub(super) fn identifier_tensor(&self) -> Result<Tensor> {
-        Ok(Tensor::from_slice(&self.identifiers, self.batch(), &HERE)?)
+        Ok(Tensor::from_slice(&self.identifiers, self.batch(), &Device::Cpu)?)
     }
 
     /// Takes the states of a finished step and decides which slots halt.
@@ -188,7 +187,7 @@ impl Slots {
                 }
             }
         }
-        let [z_h, z_l] = states.map(|state| Tensor::from_vec(state, shape.clone(), &HERE));
+        let [z_h, z_l] = states.map(|state| Tensor::from_vec(state, shape.clone(), &Device::Cpu));
         self.carry = Carry { z_h: z_h?, z_l: z_l? };
         Ok(())
     }
@@ -201,7 +200,7 @@ impl Slots {
     /// When a tensor operation fails.
     pub(super) fn blur(&mut self, deviation: f64, rng: &mut Rng) -> Result<()> {
         let mut blurred = |state: &Tensor| -> Result<Tensor> {
-            let noise = Tensor::from_vec(rng.normals(state.elem_count()), state.shape(), &HERE)?;
+            let noise = Tensor::from_vec(rng.normals(state.elem_count()), state.shape(), &Device::Cpu)?;
             Ok((state + (noise * deviation)?)?)
         };
         self.carry = Carry { z_h: blurred(&self.carry.z_h)?, z_l: blurred(&self.carry.z_l)? };

@@ -4,9 +4,8 @@ use super::weights::PUZZLES;
 use super::{Carry, Example, Gradient, Release, Slots, StepOutput, Trm};
 use crate::classification::{ClassProbability, IGNORE_LABEL, binary_cross_entropy, cross_entropy};
 use crate::train::{Learner, TrainConfig};
-use candle_core::{DType, Tensor};
+use candle_core::{DType, Device, Tensor};
 use nn::Rng;
-use nn::device::HERE;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -156,7 +155,7 @@ impl Trainer {
         let solved: Vec<bool> = grades.iter().map(|(right, all)| right == all).collect();
         let class_loss = self.class_loss(&out, &grades)?;
         let targets: Vec<f32> = solved.iter().map(|&s| f32::from(u8::from(s))).collect();
-        let targets = Tensor::from_vec(targets, batch, &HERE)?;
+        let targets = Tensor::from_vec(targets, batch, &Device::Cpu)?;
         let halt_loss = (binary_cross_entropy(&out.q_halt, &targets)?.sum_all()? / batch as f64)?;
         let loss = (&class_loss + (halt_loss.to_dtype(DType::F64)? * self.config.halt_weight)?)?;
 
@@ -203,7 +202,7 @@ impl Trainer {
         let losses = cross_entropy(&flat, &self.slots.labels, self.config.probability)?;
         let per_puzzle = losses.reshape((batch, len))?.sum(1)?;
         let weights: Vec<f64> = grades.iter().map(|(_, all)| 1.0 / ((*all).max(1) * batch) as f64).collect();
-        Ok((per_puzzle * Tensor::from_vec(weights, batch, &HERE)?)?.sum_all()?)
+        Ok((per_puzzle * Tensor::from_vec(weights, batch, &Device::Cpu)?)?.sum_all()?)
     }
 
     /// Sign descent with decoupled decay on the rows that the batch used.
@@ -252,8 +251,8 @@ impl Trainer {
         let saved = |tensor: &Tensor| tensor.copy();
         tensors.insert("carry.z_h".into(), saved(&slots.carry.z_h)?);
         tensors.insert("carry.z_l".into(), saved(&slots.carry.z_l)?);
-        tensors.insert("carry.inputs".into(), Tensor::from_slice(&slots.inputs, (batch, len), &HERE)?);
-        tensors.insert("carry.labels".into(), Tensor::from_slice(&slots.labels, (batch, len), &HERE)?);
+        tensors.insert("carry.inputs".into(), Tensor::from_slice(&slots.inputs, (batch, len), &Device::Cpu)?);
+        tensors.insert("carry.labels".into(), Tensor::from_slice(&slots.labels, (batch, len), &Device::Cpu)?);
         let meta = Meta {
             step,
             rng: self.rng.state(),

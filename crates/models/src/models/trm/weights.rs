@@ -2,9 +2,9 @@
 
 use super::fused::Fused;
 use super::{Config, Mixing, Positions, Trm};
-use candle_core::{DType, Tensor};
+use candle_core::{DType, Device, Tensor};
+use nn::Backend;
 use nn::Rng;
-use nn::device::HERE;
 use nn::{Init, Params};
 use nn::{ModelError, Result, some_names};
 use std::collections::BTreeMap;
@@ -100,7 +100,7 @@ fn rotary_table(positions: usize, size: usize, theta: f64) -> Result<(Tensor, Te
             angles.push(position as f32 * (1.0 / (theta as f32).powf(exponent)));
         }
     }
-    let angles = Tensor::from_vec(angles, (positions, size), &HERE)?;
+    let angles = Tensor::from_vec(angles, (positions, size), &Device::Cpu)?;
     Ok((angles.cos()?, angles.sin()?))
 }
 
@@ -112,7 +112,7 @@ impl Trm {
     pub fn new(config: Config, seed: u64) -> Result<Self> {
         config.check()?;
         let mut rng = Rng::new(seed, "trm");
-        let mut params = Params::new();
+        let mut params = Params::new(&Backend::CPU);
         let d = config.hidden_size;
         let mut matrix = |name: &str, shape: &[usize], fan_in: usize| {
             let std = 1.0 / (fan_in as f64).sqrt() / TRUNCATED_DEVIATION;
@@ -146,13 +146,13 @@ impl Trm {
         let q = config.q_outputs;
         params.create("inner.q_head.weight", &[q, d], Init::Zeros, &mut rng)?;
         // near-certain "do not halt" at first, as in the reference
-        params.insert("inner.q_head.bias", Tensor::full(-5f32, q, &HERE)?)?;
+        params.insert("inner.q_head.bias", Tensor::full(-5f32, q, &Device::Cpu)?)?;
         if config.puzzle_emb_ndim > 0 {
             let shape = [config.num_puzzle_identifiers, config.puzzle_emb_ndim];
             params.create(PUZZLES, &shape, Init::Zeros, &mut rng)?;
         }
         let mut initial = || -> Result<Tensor> {
-            let mut draw = Params::new();
+            let mut draw = Params::new(&Backend::CPU);
             let std = 1.0 / TRUNCATED_DEVIATION;
             Ok(draw.create("state", &[d], Init::TruncatedNormal { std }, &mut rng)?.detach())
         };
@@ -163,6 +163,7 @@ impl Trm {
 
 impl Trm {
     fn from_params(config: Config, params: Params, h_init: Tensor, l_init: Tensor) -> Result<Self> {
+        params.backend().require_cpu("trm")?;
         let get = |name: &str| {
             let var = params.get(name).expect("created above for this configuration");
             Ok::<_, ModelError>(var.as_tensor().clone())

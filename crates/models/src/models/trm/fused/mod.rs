@@ -110,7 +110,11 @@ fn with_slices<R>(a: &Tensor, b: &Tensor, f: impl FnOnce(&[f32], &[f32]) -> R) -
     let (b_storage, b_layout) = b.storage_and_layout();
     match (&*a_storage, &*b_storage) {
         (Storage::Cpu(a), Storage::Cpu(b)) => Ok(f(slice(a, a_layout)?, slice(b, b_layout)?)),
-        _ => candle_core::bail!("trm: the fused network runs on the CPU only"),
+        _ => candle_core::bail!(
+            "trm: the recursion runs on the CPU only; its weights are on {:?}, its input on {:?}",
+            a.device().location(),
+            b.device().location()
+        ),
     }
 }
 

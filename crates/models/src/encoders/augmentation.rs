@@ -1,18 +1,19 @@
-//! From bytes to what the network reads: a part of the picture, its colours changed a little in training, normalised.
+//! From bytes to what the network reads: a part of the image, its colours changed a little in training, normalised.
 
 use super::config::{Normalisation, VisionConfig};
 use super::{ImageEncoder, Size};
 use candle_core::{DType, Tensor};
 use nn::Rng;
-use nn::device::HERE;
 use nn::{ModelError, Result};
 
 /// ImageNet's mean and standard deviation of red, green and blue, of numbers from 0 to 1.
 const IMAGENET: ([f32; 3], [f32; 3]) = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]);
 /// Added to standard deviations, LeRobot's.
 const EPS: f32 = 1e-8;
+/// Shares of red, green and blue in grey.
+const GREY: [f32; 3] = [0.299, 0.587, 0.114];
 
-/// What pictures are normalised by before anything else is known: mean and standard deviation.
+/// What images are normalised by before anything else is known: mean and standard deviation.
 pub(crate) fn statistics(normalise: Normalisation) -> ([f32; 3], [f32; 3]) {
     match normalise {
         Normalisation::Imagenet | Normalisation::Dataset => IMAGENET,
@@ -20,24 +21,24 @@ pub(crate) fn statistics(normalise: Normalisation) -> ([f32; 3], [f32; 3]) {
     }
 }
 
-/// How one picture is looked at.
+/// Which part of an image is read, and how its colours change.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Look {
-    /// row of the picture that becomes the first; may lie outside
+pub struct Augmentation {
+    /// row of the image that becomes the first; may lie outside
     pub top: isize,
-    /// column of the picture that becomes the first; may lie outside
+    /// column of the image that becomes the first; may lie outside
     pub left: isize,
     /// factors of brightness, contrast and saturation
     pub colour: [f32; 3],
 }
 
-impl Look {
-    /// The middle of the picture, as it is.
+impl Augmentation {
+    /// The middle of the image, as it is.
     pub fn centre((h, w): Size, (seen_h, seen_w): Size) -> Self {
         Self { top: ((h - seen_h) / 2) as isize, left: ((w - seen_w) / 2) as isize, colour: [1.0; 3] }
     }
 
-    /// A random part of the picture in random colours.
+    /// A random part of the image in random colours.
     pub fn draw(config: &VisionConfig, (h, w): Size, (seen_h, seen_w): Size, rng: &mut Rng) -> Self {
         let mut place = |room: usize| match room + 2 * config.shift {
             0 => 0,
@@ -51,15 +52,15 @@ impl Look {
         Self { top, left, colour: [factor(), factor(), factor()] }
     }
 
-    /// Whether training looks differently each time.
+    /// Whether training draws another augmentation each time.
     pub fn is_random(config: &VisionConfig) -> bool {
         config.crop.is_some() || config.shift > 0 || config.jitter > 0.0
     }
 
-    /// picture: (h, w, 3) -> out: (seen_h, seen_w, 3), normalised. Beyond the picture its border is repeated.
+    /// image: (h, w, 3) -> out: (seen_h, seen_w, 3), normalised. Beyond the image its border is repeated.
     pub fn take(
         &self,
-        picture: &[u8],
+        image: &[u8],
         (h, w): Size,
         (_, seen_w): Size,
         (mean, std): ([f32; 3], [f32; 3]),
@@ -75,7 +76,7 @@ impl Look {
             .collect();
         for (y, line) in out.chunks_exact_mut(seen_w * 3).enumerate() {
             let row = (self.top + y as isize).clamp(0, h as isize - 1) as usize;
-            let row = &picture[row * w * 3..(row + 1) * w * 3];
+            let row = &image[row * w * 3..(row + 1) * w * 3];
             for (x, pixel) in line.chunks_exact_mut(3).enumerate() {
                 let column = (self.left + x as isize).clamp(0, w as isize - 1) as usize;
                 for c in 0..3 {
@@ -96,7 +97,7 @@ impl Look {
     /// Brightness, contrast, saturation, in this order and as torchvision defines them; numbers from 0 to 1.
     fn recolour(&self, x: &mut [f32]) {
         let [brightness, contrast, saturation] = self.colour;
-        let grey = |p: &[f32]| 0.299 * p[0] + 0.587 * p[1] + 0.114 * p[2];
+        let grey = |p: &[f32]| GREY[0] * p[0] + GREY[1] * p[1] + GREY[2] * p[2];
         x.iter_mut().for_each(|x| *x = (*x * brightness).clamp(0.0, 1.0));
         let pixels = (x.len() / 3).max(1) as f64;
         let mean = (x.chunks_exact(3).map(|p| f64::from(grey(p))).sum::<f64>() / pixels) as f32;
@@ -109,23 +110,31 @@ impl Look {
 }
 
 impl ImageEncoder {
-    /// What the network reads of one camera's pictures, (b, H, W, 3) of bytes: random parts drawn from `rng`, or without
+    /// What the network reads of one camera's images, (b, H, W, 3) of bytes: random parts drawn from `rng`, or without
     /// it their middle -> (b, H', W', 3).
     ///
     /// # Errors
-    /// Another size of picture, or no bytes.
-    pub fn look(&self, camera: usize, pictures: &Tensor, rng: Option<&mut Rng>) -> Result<Tensor> {
+    /// Another size of image, or no bytes.
+    pub fn prepare(&self, camera: usize, images: &Tensor, rng: Option<&mut Rng>) -> Result<Tensor> {
         let (size, seen) = (self.given[camera], self.sizes[camera]);
-        let rows = pictures.dims().first().copied().unwrap_or(0);
-        if pictures.dims() != [rows, size.0, size.1, 3] {
-            let (expected, found) = (vec![rows, size.0, size.1, 3], pictures.dims().to_vec());
+        let rows = images.dims().first().copied().unwrap_or(0);
+        if images.dims() != [rows, size.0, size.1, 3] {
+            let (expected, found) = (vec![rows, size.0, size.1, 3], images.dims().to_vec());
             return Err(ModelError::Shape { operation: "see", object: "image", expected, found });
         }
-        if pictures.dtype() != DType::U8 {
-            let (found, expected) = (format!("{:?}", pictures.dtype()), "bytes".to_string());
+        if images.dtype() != DType::U8 {
+            let (found, expected) = (format!("{:?}", images.dtype()), "bytes".to_string());
             return Err(ModelError::Input { operation: "see", object: "image", found, expected });
         }
-        let bytes = pictures.contiguous()?;
+        let mut rng = rng.filter(|_| Augmentation::is_random(&self.config));
+        let augmentations = (0..rows).map(|_| match &mut rng {
+            Some(rng) => Augmentation::draw(&self.config, size, seen, rng),
+            None => Augmentation::centre(size, seen),
+        });
+        if self.composed {
+            return self.prepare_composed(camera, images, &augmentations.collect::<Vec<_>>());
+        }
+        let bytes = images.contiguous()?;
         let (storage, layout) = bytes.storage_and_layout();
         let candle_core::Storage::Cpu(storage) = &*storage else {
             let (found, expected) = ("on another device".to_string(), "on the CPU".to_string());
@@ -138,16 +147,44 @@ impl ImageEncoder {
             Ok([row[0], row[1], row[2]])
         };
         let of_camera = (row_of(&self.mean)?, row_of(&self.std)?);
-        let mut rng = rng.filter(|_| Look::is_random(&self.config));
         let mut out = vec![0.0; rows * seen.0 * seen.1 * 3];
-        for (picture, out) in bytes.chunks_exact(size.0 * size.1 * 3).zip(out.chunks_exact_mut(seen.0 * seen.1 * 3)) {
-            let look = match &mut rng {
-                Some(rng) => Look::draw(&self.config, size, seen, rng),
-                None => Look::centre(size, seen),
-            };
-            look.take(picture, size, seen, of_camera, out);
+        let each = bytes.chunks_exact(size.0 * size.1 * 3).zip(out.chunks_exact_mut(seen.0 * seen.1 * 3));
+        for ((image, out), augmentation) in each.zip(augmentations) {
+            augmentation.take(image, size, seen, of_camera, out);
         }
-        Ok(Tensor::from_vec(out, (rows, seen.0, seen.1, 3), &HERE)?)
+        Ok(Tensor::from_vec(out, (rows, seen.0, seen.1, 3), images.device())?)
+    }
+
+    /// The same on candle's operations.
+    fn prepare_composed(&self, camera: usize, images: &Tensor, augmentations: &[Augmentation]) -> Result<Tensor> {
+        let ((h, w), (seen_h, seen_w), device) = (self.given[camera], self.sizes[camera], images.device());
+        let places = |from: isize, count: usize, all: usize| {
+            let places = (0..count).map(|i| (from + i as isize).clamp(0, all as isize - 1) as u32);
+            Tensor::from_iter(places, device)
+        };
+        let images = (images.to_dtype(DType::F32)? / 255.0)?;
+        let part = |(row, augmentation): (usize, &Augmentation)| {
+            let part = images.get(row)?.index_select(&places(augmentation.top, seen_h, h)?, 0)?;
+            part.index_select(&places(augmentation.left, seen_w, w)?, 1)
+        };
+        let parts = augmentations.iter().enumerate().map(part).collect::<candle_core::Result<Vec<_>>>()?;
+        let mut x = Tensor::stack(&parts, 0)?;
+        if augmentations.iter().any(|augmentation| augmentation.colour != [1.0; 3]) {
+            let factor = |at: usize| {
+                let factors = augmentations.iter().map(|augmentation| augmentation.colour[at]).collect::<Vec<_>>();
+                Tensor::from_vec(factors, (augmentations.len(), 1, 1, 1), device)
+            };
+            let weights = Tensor::new(&GREY, device)?;
+            let grey = |x: &Tensor| x.broadcast_mul(&weights)?.sum_keepdim(3);
+            let towards = |from: &Tensor, x: &Tensor, factor: &Tensor| {
+                x.broadcast_sub(from)?.broadcast_mul(factor)?.broadcast_add(from)?.clamp(0f32, 1f32)
+            };
+            x = x.broadcast_mul(&factor(0)?)?.clamp(0f32, 1f32)?;
+            x = towards(&grey(&x)?.mean_keepdim((1, 2))?, &x, &factor(1)?)?;
+            x = towards(&grey(&x)?, &x, &factor(2)?)?;
+        }
+        let (mean, std) = (self.mean.get(camera)?, (self.std.get(camera)? + f64::from(EPS))?);
+        Ok(x.broadcast_sub(&mean)?.broadcast_div(&std)?.detach())
     }
 }
 
@@ -156,20 +193,22 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::encoders::{ImageEncoder, TokenKind};
+    use candle_core::Device;
+    use nn::Backend;
     use nn::Params;
 
-    fn picture((h, w): Size) -> Vec<u8> {
+    fn image((h, w): Size) -> Vec<u8> {
         (0..h * w * 3).map(|i| (i * 7 % 251) as u8).collect()
     }
 
     #[test]
     fn the_middle_is_robomimics_and_normalised_as_lerobot_does() {
         let (size, seen) = ((84, 84), (76, 76));
-        let look = Look::centre(size, seen);
-        assert_eq!((look.top, look.left), (4, 4));
-        let bytes = picture(size);
+        let augmentation = Augmentation::centre(size, seen);
+        assert_eq!((augmentation.top, augmentation.left), (4, 4));
+        let bytes = image(size);
         let mut out = vec![0.0; 76 * 76 * 3];
-        look.take(&bytes, size, seen, IMAGENET, &mut out);
+        augmentation.take(&bytes, size, seen, IMAGENET, &mut out);
         let x = f32::from(bytes[((4 + 10) * 84 + 4 + 20) * 3 + 1]) / 255.0;
         assert_eq!(out[(10 * 76 + 20) * 3 + 1], (x - 0.456) / (0.224 + 1e-8));
     }
@@ -179,19 +218,19 @@ mod tests {
         let config = VisionConfig { crop: Some(6), shift: 1, jitter: 0.2, ..VisionConfig::default() };
         let draw = |seed| {
             let mut rng = Rng::new(seed, "look");
-            (0..500).map(|_| Look::draw(&config, (8, 9), (6, 6), &mut rng)).collect::<Vec<_>>()
+            (0..500).map(|_| Augmentation::draw(&config, (8, 9), (6, 6), &mut rng)).collect::<Vec<_>>()
         };
-        let looks = draw(1);
-        assert_eq!(looks, draw(1));
-        assert_ne!(looks, draw(2));
-        let (tops, lefts): (Vec<isize>, Vec<isize>) = looks.iter().map(|l| (l.top, l.left)).unzip();
+        let augmentations = draw(1);
+        assert_eq!(augmentations, draw(1));
+        assert_ne!(augmentations, draw(2));
+        let (tops, lefts): (Vec<isize>, Vec<isize>) = augmentations.iter().map(|l| (l.top, l.left)).unzip();
         assert_eq!((tops.iter().min(), tops.iter().max()), (Some(&-1), Some(&3)));
         assert_eq!((lefts.iter().min(), lefts.iter().max()), (Some(&-1), Some(&4)));
-        assert!(looks.iter().flat_map(|l| l.colour).all(|f| (0.8..=1.2).contains(&f)));
+        assert!(augmentations.iter().flat_map(|l| l.colour).all(|f| (0.8..=1.2).contains(&f)));
         // the border is repeated
-        let (bytes, mut out) = (picture((8, 9)), vec![0.0; 36 * 3]);
-        let look = Look { top: -1, left: 0, colour: [1.0; 3] };
-        look.take(&bytes, (8, 9), (6, 6), ([0.0; 3], [1.0; 3]), &mut out);
+        let (bytes, mut out) = (image((8, 9)), vec![0.0; 36 * 3]);
+        let augmentation = Augmentation { top: -1, left: 0, colour: [1.0; 3] };
+        augmentation.take(&bytes, (8, 9), (6, 6), ([0.0; 3], [1.0; 3]), &mut out);
         assert_eq!(out[..18], out[18..36]);
     }
 
@@ -207,7 +246,7 @@ mod tests {
         let keypoints = |size| {
             let config = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..VisionConfig::default() };
             let mut rng = Rng::new(1, "init");
-            ImageEncoder::without_positions(&mut Params::new(), &config, &[size, (5, 3)], 8, &mut rng)
+            ImageEncoder::without_positions(&mut Params::new(&Backend::CPU), &config, &[size, (5, 3)], 8, &mut rng)
         };
         assert!(keypoints((33, 33)).is_ok());
         let blind = keypoints((32, 32)).map(|_| ()).unwrap_err().to_string();
@@ -215,14 +254,30 @@ mod tests {
     }
 
     #[test]
+    fn the_composed_images_are_the_same() {
+        let bytes = Tensor::from_vec([image((8, 9)), image((8, 9))].concat(), (2, 8, 9, 3), &Device::Cpu).unwrap();
+        for jitter in [0.0, 0.3] {
+            let config = VisionConfig { crop: Some(6), shift: 2, jitter, width: 8, ..VisionConfig::default() };
+            let [fast, composed] = [Backend::CPU, Backend::composed(Device::Cpu)].map(|backend| {
+                let (params, mut rng) = (&mut Params::new(&backend), Rng::new(1, "init"));
+                let encoder = ImageEncoder::without_positions(params, &config, &[(8, 9)], 8, &mut rng).unwrap();
+                let drawn = encoder.prepare(0, &bytes, Some(&mut rng)).unwrap();
+                let both = Tensor::cat(&[drawn, encoder.prepare(0, &bytes, None).unwrap()], 0).unwrap();
+                both.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+            });
+            assert!(fast.iter().zip(&composed).all(|(a, b)| (a - b).abs() < 1e-5), "{fast:?} {composed:?}");
+        }
+    }
+
+    #[test]
     fn colours_change_and_stay_colours() {
         let mut x = vec![0.2, 0.5, 0.9, 0.0, 1.0, 0.3];
         let grey = |p: &[f32]| 0.299 * p[0] + 0.587 * p[1] + 0.114 * p[2];
-        Look { top: 0, left: 0, colour: [1.0, 1.0, 0.0] }.recolour(&mut x);
+        Augmentation { top: 0, left: 0, colour: [1.0, 1.0, 0.0] }.recolour(&mut x);
         let expected = [grey(&[0.2, 0.5, 0.9]); 3];
         assert!(x[..3].iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{x:?}");
         let mut x = vec![0.2, 0.5, 0.9];
-        Look { top: 0, left: 0, colour: [2.0, 1.0, 1.0] }.recolour(&mut x);
+        Augmentation { top: 0, left: 0, colour: [2.0, 1.0, 1.0] }.recolour(&mut x);
         assert!(x.iter().zip([0.4, 1.0, 1.0]).all(|(a, b)| (a - b).abs() < 1e-6), "{x:?}");
     }
 }

@@ -5,15 +5,15 @@ use crate::encoders::{TokenKind, VisionConfig};
 use crate::features::Signature;
 use crate::layers::{Activation, AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::testing::{
-    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, eyes, gradients,
-    move_parameters, signatures,
+    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients,
+    move_parameters, signatures, vision_config,
 };
 use candle_core::Tensor;
 use nn::simd::{Level, at_most};
 
 /// Odd sizes in all designs: no width is a multiple of a vector, more and fewer tokens than a register tile has rows.
 fn configs() -> Vec<(Config, Signature, usize)> {
-    let Signatures { plain, no_env, entities, history, grid, told, .. } = signatures();
+    let Signatures { plain, no_env, entities, history, grid, with_auxiliary, .. } = signatures();
     let auxiliary = Some(AuxiliaryConfig { weight: 0.6 });
     let cells = |way| Some(GridConfig { among: "cell".to_string(), columns: 3, way });
     let base = Config {
@@ -53,7 +53,7 @@ fn configs() -> Vec<(Config, Signature, usize)> {
         (reasoning(&|_| ()), plain.clone(), 3),
         (reasoning(&|r| r.warm_start = warm), entities.clone(), 3),
         (reasoning(&|_| ()), history.clone(), 2),
-        (Config { auxiliary, n_memory_layers: 2, ..reasoning(&|r| r.h_cycles = 2) }, told, 3),
+        (Config { auxiliary, n_memory_layers: 2, ..reasoning(&|r| r.h_cycles = 2) }, with_auxiliary, 3),
         (reasoning(&|r| (r.untied, r.n_layers, r.h_cycles, r.l_cycles) = (true, 2, 2, 2)), entities.clone(), 3),
         (reasoning(&|r| (r.start_noise, r.deep_supervision) = (0.7, false)), plain.clone(), 3),
         (tokens(true, &|_| ()), entities.clone(), 4),
@@ -90,24 +90,24 @@ fn configs() -> Vec<(Config, Signature, usize)> {
 }
 
 fn model(config: &Config, signature: &Signature) -> Actrm {
-    let model = Actrm::new(config, signature, 1).unwrap();
+    let model = Actrm::new(config, signature, 1, &Backend::CPU).unwrap();
     move_parameters(&model);
     model
 }
 
-/// With pictures, in all designs; their network has too many kinks for slopes.
+/// With images, in all designs; their network has too many kinks for slopes.
 fn seeing() -> Vec<(Config, Signature, usize)> {
     let all = configs();
     let plain = |config: &Config| config.use_vae && config.pointer.is_none() && config.reasoning.grid.is_none();
     let of = |over: Over| all.iter().find(|(config, ..)| config.reasoning.over == over && plain(config));
     let designs = [Over::Actions, Over::Memory, Over::Tokens].into_iter().filter_map(of);
-    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..eyes() };
-    let sees = |config: &Config, vision| (Config { vision: Some(vision), ..config.clone() }, signatures().pictures, 2);
-    designs.flat_map(|(config, ..)| [sees(config, eyes()), sees(config, keypoints.clone())]).collect()
+    let keypoints = VisionConfig { tokens: TokenKind::Keypoints { count: 3 }, ..vision_config() };
+    let sees = |config: &Config, vision| (Config { vision: Some(vision), ..config.clone() }, signatures().images, 2);
+    designs.flat_map(|(config, ..)| [sees(config, vision_config()), sees(config, keypoints.clone())]).collect()
 }
 
 #[test]
-fn the_step_by_hand_is_the_composed_one_with_dropout() {
+fn the_step_on_kernels_is_the_composed_one_with_dropout() {
     assert_eq!(seeing().len(), 6);
     for (config, signature, rows) in configs().into_iter().chain(seeing()) {
         let model = model(&config, &signature);
@@ -119,7 +119,7 @@ fn the_step_by_hand_is_the_composed_one_with_dropout() {
 }
 
 #[test]
-fn the_thought_by_hand_is_the_composed_one() {
+fn the_reasoning_on_kernels_is_the_composed_one() {
     for (mut config, signature, rows) in configs().into_iter().chain(seeing()) {
         config.reasoning.max_steps = Some(4);
         config.reasoning.change_threshold = 0.05;
@@ -132,7 +132,7 @@ fn the_thought_by_hand_is_the_composed_one() {
                 let got = at_most(level, || model.reason(&batch.observation, start, &mut |_| false).unwrap());
                 let same = |a: &Tensor, b: &Tensor| {
                     let off = (a - b).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
-                    // through a network for pictures and four rounds of thought
+                    // through a network for images and four rounds of thought
                     let tolerance = if config.vision.is_some() { 3e-5 } else { 1e-5 };
                     assert!(off < tolerance, "{off} {level:?} {config:?}");
                 };
