@@ -82,7 +82,7 @@ fn a_report_is_a_function_of_results() {
 #[test]
 fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
     let reader = ["crates/dataset/src/source/isolation.rs"];
-    for room in ["dataset", "query", "recording", "serving", "video", "zoo", "study", "python"] {
+    for room in ["analysis", "dataset", "query", "recording", "serving", "video", "zoo", "study", "python"] {
         assert_eq!(said(&format!("crates/{room}/src"), PROCESSES, &reader), [""; 0]);
     }
     assert!(!said("crates/rollout/src", PROCESSES, &[]).is_empty(), "the test finds what it looks for");
@@ -95,7 +95,20 @@ fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
 
 #[test]
 fn only_tools_print_and_read_arguments() {
-    for room in ["dataset", "query", "recording", "rollout", "serving", "video", "zoo", "report", "study", "python"] {
+    let rooms = [
+        "analysis",
+        "dataset",
+        "query",
+        "recording",
+        "rollout",
+        "serving",
+        "video",
+        "zoo",
+        "report",
+        "study",
+        "python",
+    ];
+    for room in rooms {
         // both speak to the program that started them
         let reader = ["crates/dataset/src/source/isolation.rs", "crates/dataset/src/source/video.rs"];
         let words: Vec<&str> = [PRINTING, &["env::args"]].concat();

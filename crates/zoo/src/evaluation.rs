@@ -8,11 +8,7 @@ mod agent;
 mod clock;
 mod environment;
 mod perturbation;
-mod saliency;
 mod subject;
-mod thinking;
-mod trace;
-mod way;
 
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -26,10 +22,7 @@ pub use self::agent::{PolicyAgent, QueryTime, QueryTimes};
 pub use self::clock::WallClock;
 pub use self::environment::Environment;
 pub use self::perturbation::Perturbation;
-pub use self::saliency::{Saliency, SalientCamera, SalientQuery, saliency};
-pub use self::subject::{Subject, acting};
-pub use self::thinking::{Start, starts, thinking_subject};
-pub use self::trace::{Examiner, PolicyTrace, TracedQuery, TracedThought, trace};
+pub use self::subject::{Subject, acting, image};
 use crate::ZooError;
 use crate::results::{EpisodeRecord, EpisodeTiming, OtherSimulator, ResultsFolder, Seeds, Shard, StoredEvaluation};
 

@@ -19,11 +19,11 @@ use crate::run::TrainSection;
 use crate::{FeatureKeys, ZooError};
 
 /// What the name of a camera's feature begins with, LeRobot's.
-pub(crate) const PICTURE_PREFIX: &str = "observation.images.";
+pub const IMAGE_PREFIX: &str = "observation.images.";
 /// What the column of what is told in training alone is called, among the entities.
 pub(crate) const AUXILIARY: &str = "auxiliary";
 /// What a camera's observation key ends in, robomimic's.
-pub(crate) const PICTURE_SUFFIX: &str = "_image";
+pub(crate) const IMAGE_SUFFIX: &str = "_image";
 
 /// A resolved experiment, as `config.toml` of runs and entries holds it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -195,11 +195,7 @@ impl DataSection {
             add(format!("data.entities.{name}"), &format!("{ENTITY_PREFIX}{name}"), &entity.keys)?;
         }
         for camera in &self.cameras {
-            add(
-                "data.cameras".to_owned(),
-                &format!("{PICTURE_PREFIX}{camera}"),
-                &[format!("{camera}{PICTURE_SUFFIX}")],
-            )?;
+            add("data.cameras".to_owned(), &format!("{IMAGE_PREFIX}{camera}"), &[format!("{camera}{IMAGE_SUFFIX}")])?;
         }
         Ok(keys)
     }
@@ -220,7 +216,7 @@ impl DataSection {
 
     /// The camera whose pictures an item stands for, if it does.
     pub(crate) fn camera_of(&self, item: &str) -> Option<&str> {
-        let camera = item.strip_suffix(PICTURE_SUFFIX)?;
+        let camera = item.strip_suffix(IMAGE_SUFFIX)?;
         self.cameras.iter().find(|known| *known == camera).map(String::as_str)
     }
 

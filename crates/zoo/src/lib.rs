@@ -16,7 +16,6 @@ pub mod external;
 mod feature_keys;
 mod files;
 pub mod lerobot;
-pub mod probe;
 pub mod registry;
 pub mod robomimic;
 pub mod run;

@@ -6,7 +6,7 @@ use models::{FeatureKind, Signature};
 use serde::{Deserialize, Serialize};
 
 use crate::config::is_built_in_task;
-use crate::experiment::PICTURE_SUFFIX;
+use crate::experiment::IMAGE_SUFFIX;
 use crate::external::EXTERNAL;
 use crate::results::Seeds;
 use crate::{FeatureKeys, ZooError, sha256_hex};
@@ -201,7 +201,7 @@ impl EntryMeta {
     pub fn camera_names(&self) -> Vec<String> {
         let name = |feature: &str| {
             let key = self.keys.of(feature).concat();
-            key.strip_suffix(PICTURE_SUFFIX).unwrap_or(&key).to_owned()
+            key.strip_suffix(IMAGE_SUFFIX).unwrap_or(&key).to_owned()
         };
         self.signature.of_kind(FeatureKind::Image).map(|spec| name(&spec.name)).collect()
     }

@@ -116,7 +116,8 @@ impl LoadedEntry {
         Ok(Some(Arc::new(model)))
     }
 
-    pub(crate) fn failed(&self, operation: &'static str, source: ModelError) -> ZooError {
+    /// An error of the model, with the entry's name.
+    pub fn failed(&self, operation: &'static str, source: ModelError) -> ZooError {
         ZooError::Model { operation, name: self.entry.id().to_string(), source }
     }
 

@@ -7,7 +7,7 @@ use dataset::Dataset;
 use models::{ACTION, ENTITY_PREFIX, ENVIRONMENT_STATE, STATE};
 
 use crate::config::is_built_in_task;
-use crate::experiment::{AUXILIARY, DataSection, Experiment, PICTURE_PREFIX};
+use crate::experiment::{AUXILIARY, DataSection, Experiment, IMAGE_PREFIX};
 use crate::{FeatureKeys, ZooError};
 
 use super::data::columns;
@@ -59,7 +59,7 @@ pub(super) fn agree(dataset: &Dataset, path: &Path, experiment: &Experiment, for
     let keys = agreed.experiment.data.told_and_feature_keys()?;
     check_keys(dataset, &agreed.experiment, &keys).map_err(unfit)?;
     let features: Vec<String> =
-        keys.features().filter(|feature| !feature.starts_with(PICTURE_PREFIX)).map(str::to_owned).collect();
+        keys.features().filter(|feature| !feature.starts_with(IMAGE_PREFIX)).map(str::to_owned).collect();
     for feature in features.iter().map(String::as_str).chain([ACTION]) {
         let Some(column) = dataset.column(feature) else {
             if feature == ENVIRONMENT_STATE {

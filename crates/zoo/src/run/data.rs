@@ -14,7 +14,7 @@ use models::{
 
 use crate::ZooError;
 use crate::entry::DataMeta;
-use crate::experiment::{AUXILIARY, DataSection, EntitySection, Experiment, PICTURE_PREFIX};
+use crate::experiment::{AUXILIARY, DataSection, EntitySection, Experiment, IMAGE_PREFIX};
 
 use super::agreement::{Agreed, agree, takes_keys};
 use super::auxiliary::{Told, is_told};
@@ -271,8 +271,7 @@ pub(super) fn prepare(
         false => Some(windows(valid)?),
     };
     let mut picture_statistics = Vec::new();
-    let cameras: Vec<String> =
-        experiment.data.cameras.iter().map(|camera| format!("{PICTURE_PREFIX}{camera}")).collect();
+    let cameras: Vec<String> = experiment.data.cameras.iter().map(|camera| format!("{IMAGE_PREFIX}{camera}")).collect();
     let bytes = cameras.iter().map(|name| dataset.decoded_bytes(name)).sum::<Result<u64, _>>().map_err(failed)?;
     let fits = bytes <= memory.budget;
     if !fits {
@@ -328,7 +327,7 @@ pub(super) fn prepare(
 ///
 /// # Errors
 /// What a training would refuse.
-pub(crate) fn first_windows(
+pub fn first_windows(
     path: &Path,
     work: &Path,
     experiment: &Experiment,

@@ -27,13 +27,14 @@ mod way;
 
 pub(crate) use agreement::is_whole;
 pub use checkpoint::Checkpoint;
-pub use data::locate;
-pub(crate) use data::{demonstrations, first_windows};
+pub(crate) use data::demonstrations;
+pub use data::{first_windows, locate};
 pub use folder::{COMMAND_FILE, RunFolder};
 pub use list::{FoundRun, RunState, list_runs};
 pub(crate) use loop_parts::same_settings;
 pub use metrics::{Metrics, MetricsRow};
 pub use section::{OptimiserKind, TrainSection, WeightsFormat};
 pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, finished_entry, run};
+pub use symmetry::Symmetries;
 pub use tensorboard::EventWriter;
 pub use training::{TrainRequest, train};

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use dataset::{Dataset, KeyItem, WindowBatch};
 
 use crate::ZooError;
-use crate::experiment::{Experiment, PICTURE_PREFIX};
+use crate::experiment::{Experiment, IMAGE_PREFIX};
 
 /// Where an item stands: the feature that holds it, where its numbers begin there and how many they are.
 #[derive(Debug, Clone, PartialEq)]
@@ -52,7 +52,7 @@ impl Places {
     pub fn new(experiment: &Experiment, dataset: &Dataset, path: &Path, section: &str) -> Result<Self, ZooError> {
         let keys = experiment.data.told_and_feature_keys()?;
         let mut spans = Vec::new();
-        for feature in keys.features().filter(|feature| !feature.starts_with(PICTURE_PREFIX)) {
+        for feature in keys.features().filter(|feature| !feature.starts_with(IMAGE_PREFIX)) {
             let items = keys.items(feature);
             let widths = KeyItem::widths(items, &dataset.names(feature)).ok_or_else(|| ZooError::UnfitData {
                 path: path.to_owned(),

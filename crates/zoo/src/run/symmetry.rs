@@ -16,7 +16,7 @@ use dataset::shuffle::SplitMix64;
 use dataset::{Dataset, WindowBatch};
 
 use crate::ZooError;
-use crate::experiment::{Experiment, PICTURE_PREFIX};
+use crate::experiment::{Experiment, IMAGE_PREFIX};
 
 use super::places::{Place, Places};
 
@@ -24,7 +24,7 @@ use super::places::{Place, Places};
 const PURPOSE: u64 = 0x5359_4d4d_4554_5259;
 
 /// The symmetries of a run.
-pub(crate) struct Symmetries {
+pub struct Symmetries {
     seed: u64,
     all: Vec<Symmetry>,
 }
@@ -46,7 +46,7 @@ impl Symmetries {
     ///
     /// # Errors
     /// An item that stands nowhere, items of unequal lengths, by name.
-    pub fn new(experiment: &Experiment, dataset: &Dataset, path: &Path) -> Result<Self, ZooError> {
+    pub(super) fn new(experiment: &Experiment, dataset: &Dataset, path: &Path) -> Result<Self, ZooError> {
         let mut all = Vec::new();
         if !experiment.data.symmetries.is_empty() {
             let spans = Places::new(experiment, dataset, path, "data.symmetries")?;
@@ -65,7 +65,7 @@ impl Symmetries {
                 all.push(Symmetry {
                     width,
                     places,
-                    pictures: pictures.map(|c| format!("{PICTURE_PREFIX}{c}")).collect(),
+                    pictures: pictures.map(|c| format!("{IMAGE_PREFIX}{c}")).collect(),
                 });
             }
         }

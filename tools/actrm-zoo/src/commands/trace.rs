@@ -6,7 +6,7 @@ use cli::{INTERRUPTED, SimulatorArgs, Stop, shown};
 use rollout::Control;
 use study::puzzle::{SolverEntry, trace};
 use zoo::entry::Entry;
-use zoo::evaluation::{self, FIRST_SEED};
+use zoo::evaluation::FIRST_SEED;
 use zoo::write_atomic;
 
 use crate::places::{ZooArgs, entry_names};
@@ -90,7 +90,7 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     ];
     refuse(entry, "a robot policy of which one episode is shown", &of_puzzles)?;
     let loaded = entry.load()?;
-    let (subject, examiner) = (loaded.subject(), evaluation::Examiner::of(&loaded)?);
+    let (subject, examiner) = (loaded.subject(), analysis::Examiner::of(&loaded)?);
     if args.svg.is_some() && examiner.is_none() {
         bail!(
             "--svg means nothing for {}: it does not think step by step about its actions from one start, nor over a grid",
@@ -103,7 +103,7 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     let one = SimulatorArgs { workers: Some(1), env_module: env_module.clone(), python: python.clone() };
     let spec = worker(&environment, &one, args.control)?;
     let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
-    let traced = evaluation::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED), examiner.as_ref());
+    let traced = analysis::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED), examiner.as_ref());
     cli::close(pool);
     let Some(traced) = traced.with_context(|| format!("entry {}", entry.id()))? else {
         return Ok(ExitCode::from(INTERRUPTED));

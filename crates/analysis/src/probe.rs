@@ -14,12 +14,12 @@ use models::actrm::Actrm;
 use models::{ModelError, ValuesRef};
 use rollout::Ready;
 use serde::{Deserialize, Serialize};
+use zoo::entry::LoadedEntry;
+use zoo::results::{EntryIdentity, Seeds, TrainingFacts};
+use zoo::run::{first_windows, locate};
+use zoo::{FeatureKeys, ZooError, write_atomic};
 
-use crate::entry::LoadedEntry;
-use crate::evaluation::Start;
-use crate::results::{EntryIdentity, Seeds, TrainingFacts};
-use crate::run::{first_windows, locate};
-use crate::{FeatureKeys, ZooError, write_atomic};
+use crate::depth::Start;
 
 /// The longest chain that the demonstrations of PickChain have.
 const DEMONSTRATED: usize = 4;
