@@ -1,4 +1,4 @@
-//! What an image encoder begins with: the data set's colours, weights that the experiment names.
+//! What an image encoder starts with: the data set's colour statistics, weights that the experiment names.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ const LEAST_SPREAD: f32 = 1e-6;
 ///
 /// # Errors
 /// A data set without statistics of its pictures, a file of weights that does not fit.
-pub(super) fn open(
+pub(super) fn initialise(
     model: &dyn PolicyModel,
     demonstrations: &Demonstrations,
     experiment: &Experiment,
