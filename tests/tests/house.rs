@@ -123,12 +123,22 @@ fn parts_of_a_crate_know_only_what_is_below_them() {
         ("crates/zoo/src/config", &["crate::run", "crate::entry", "crate::experiment", "crate::evaluation"][..]),
         ("crates/zoo/src/results", &["crate::run", "crate::entry", "crate::experiment", "crate::evaluation"]),
         ("crates/zoo/src/run", &["crate::evaluation", "crate::results", "crate::registry"]),
+        ("crates/zoo/src/transforms", &["crate::run", "crate::evaluation", "crate::entry", "crate::results"]),
         ("crates/models/src/layers", &["crate::models", "crate::registry", "crate::train"]),
         ("crates/nn/src/kernels", &["crate::ops", "crate::context", "crate::tape"]),
         ("crates/rollout/src", &["models::", "candle"]),
     ] {
         assert_eq!(said(folder, above, &[]), [""; 0]);
     }
+}
+
+#[test]
+fn puzzles_are_behind_one_door() {
+    let tool = ["tools/actrm-zoo/src/puzzles.rs"];
+    let words = ["SolverEntry", "PuzzleExperiment", "is_solver", "train_puzzles"];
+    assert_eq!(said("tools/actrm-zoo/src", &words, &tool), [""; 0]);
+    assert_eq!(said("crates/zoo/src", &["is_policy()", "kind.is_none()"], &["crates/zoo/src/entry/kind.rs"]), [""; 0]);
+    assert_eq!(said("crates/study/src", &["Kind::Robot"], &["crates/study/src/puzzle/door.rs"]), [""; 0]);
 }
 
 /// Paths in `text`, with the line they stand in: what is written as code and begins with one of `folders`, or with the

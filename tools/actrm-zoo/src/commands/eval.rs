@@ -20,7 +20,7 @@ use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
 use crate::films;
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names, of_entry};
-use crate::puzzles::{PuzzleArgs, evaluate_solver};
+use crate::puzzles::{self, PuzzleArgs};
 use crate::remote::{Remote, RemoteArgs};
 use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
 
@@ -269,10 +269,6 @@ fn open(
         cli::note(&format!("note: {id}: not evaluated: its weights are not in this zoo"));
         return Ok(None);
     }
-    if entry.meta().is_robot_policy() {
-        asked.check_task(args.run.task.as_ref().unwrap_or(&entry.meta().task))?;
-        return Ok(Some(entry.load()?));
-    }
     // what says how robots are run; with --all it is meant for the others
     let named = !args.all && !args.all_versions;
     let of_robots = [
@@ -286,17 +282,17 @@ fn open(
         ("--video-failed", args.video_failed > 0),
         ("--perturb", args.perturb.is_some()),
     ];
-    if let Some((option, _)) = of_robots.iter().find(|(_, given)| *given && named) {
-        bail!(
-            "{option}: expected a robot policy, found a solver of puzzles, which takes --puzzles, --depth, --givens, --seed-start and --again"
-        );
-    }
+    let of_robots = of_robots.into_iter().find(|(_, given)| *given && named).map(|(option, _)| option);
     let (task, results) = (args.run.task.as_deref(), args.results.folder(&args.zoo));
     // seeds of episodes are no seeds of puzzles where both kinds are evaluated
     let seed = args.seed.filter(|_| named);
-    let (line, value) = evaluate_solver(&entry, task, &args.puzzles, seed, args.again, &results)?;
-    says.say(&(line + "\n"), value)?;
-    Ok(None)
+    if let Some((line, value)) = puzzles::evaluate(&entry, of_robots, task, &args.puzzles, seed, args.again, &results)?
+    {
+        says.say(&(line + "\n"), value)?;
+        return Ok(None);
+    }
+    asked.check_task(task.unwrap_or(&entry.meta().task))?;
+    Ok(Some(entry.load()?))
 }
 
 /// Evaluates the entries of an environment on one set of simulators.
