@@ -213,12 +213,12 @@ pub fn run_episodes(
 }
 
 /// Episodes with an image of the start and of every step each; the images of one episode are kept at a time by each
-/// worker, and handed to `deliver` with the episode's seed and success. [`View::Seen`] of a policy without pictures gives
+/// worker, and handed to `deliver` with the episode's seed and success. [`View::Seen`] of a policy without cameras gives
 /// no images.
 ///
 /// # Errors
 /// As for an evaluation; a machine that cannot render.
-pub fn film(
+pub fn record_videos(
     subject: &Subject<'_>,
     pool: &mut Pool,
     seeds: &[u64],
@@ -271,7 +271,7 @@ fn unhelpable(task: &str, fault: WorkerFault) -> JobError {
     }
 }
 
-/// What is filmed.
+/// What a video shows.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum View {
     /// What a camera sees.

@@ -16,7 +16,7 @@ use crate::experiment::{DataSection, EntitySection, Experiment, IMAGE_PREFIX};
 use crate::transforms::{self, Source, Stage, Transforms, is_auxiliary};
 
 use super::agreement::{Agreed, agree, takes_keys};
-use super::preflight::picture_budget;
+use super::preflight::image_budget;
 
 /// Folder of the run that a converted HDF5 file goes to.
 pub(super) const CONVERTED: &str = "data";
@@ -139,7 +139,7 @@ pub(crate) fn demonstrations(
 }
 
 /// What pictures may take, and where those go that would take more.
-pub(super) struct PictureMemory<'a> {
+pub(super) struct ImageMemory<'a> {
     pub budget: u64,
     pub folder: &'a Path,
 }
@@ -155,7 +155,7 @@ pub(super) struct Demonstrations {
     pub preprocess: Preprocess,
     pub transforms: Transforms,
     /// Mean and standard deviation of each camera's colours, on the scale from 0 to 1, where the data set has them.
-    pub picture_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
+    pub image_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
     pub meta: DataMeta,
     /// What a user should know: a missing mask, constant dimensions.
     pub notes: Vec<String>,
@@ -168,7 +168,7 @@ pub(super) fn prepare(
     path: &Path,
     name: &str,
     agreed: &Agreed,
-    memory: &PictureMemory<'_>,
+    memory: &ImageMemory<'_>,
 ) -> Result<Demonstrations, ZooError> {
     let Agreed { dataset, experiment, .. } = agreed;
     let unfit = |reason: String| ZooError::UnfitData { path: path.to_owned(), reason };
@@ -260,7 +260,7 @@ pub(super) fn prepare(
         true => None,
         false => Some(windows(valid)?),
     };
-    let mut picture_statistics = Vec::new();
+    let mut image_statistics = Vec::new();
     let cameras: Vec<String> = experiment.data.cameras.iter().map(|camera| format!("{IMAGE_PREFIX}{camera}")).collect();
     let bytes = cameras.iter().map(|name| dataset.decoded_bytes(name)).sum::<Result<u64, _>>().map_err(failed)?;
     let fits = bytes <= memory.budget;
@@ -277,7 +277,7 @@ pub(super) fn prepare(
         };
         train = train.with_pictures(&name, pictures.clone());
         valid = valid.map(|valid| valid.with_pictures(&name, pictures));
-        picture_statistics.push(dataset.stats().get(&name).and_then(colours));
+        image_statistics.push(dataset.stats().get(&name).and_then(colours));
     }
     let signature = signature(&train, experiment);
     let modes = experiment.normalisation.modes(&signature);
@@ -294,8 +294,8 @@ pub(super) fn prepare(
     let signature = preprocess.signature();
     let source = Source { experiment, dataset, path, windows: &train, statistics: &statistics, signature };
     let transforms = Transforms::fit(&source)?;
-    let picture_statistics = picture_statistics.into_iter().collect();
-    Ok(Demonstrations { train, valid, preprocess, transforms, picture_statistics, meta, notes })
+    let image_statistics = image_statistics.into_iter().collect();
+    Ok(Demonstrations { train, valid, preprocess, transforms, image_statistics, meta, notes })
 }
 
 impl Demonstrations {
@@ -334,7 +334,7 @@ pub fn first_windows(
     let episodes: Vec<usize> = dataset.split(&experiment.data.train_mask).unwrap_or_else(all);
     let lengths = episodes.iter().map(|&episode| dataset.episodes()[episode].length as u32);
     let firsts = lengths.scan(0, |next, length| Some(std::mem::replace(next, *next + length))).collect();
-    let memory = PictureMemory { budget: picture_budget(), folder: work };
+    let memory = ImageMemory { budget: image_budget(), folder: work };
     // what an entry was trained on is not asked again
     let agreed = agree(&dataset, path, experiment, true)?;
     let demonstrations = prepare(&dataset, path, &path.display().to_string(), &agreed, &memory)?;

@@ -23,7 +23,7 @@ pub(super) fn initialise(
 ) -> Result<(), ZooError> {
     let Some(vision) = model.vision() else { return Ok(()) };
     if vision.normalise == Normalisation::Dataset {
-        let statistics = demonstrations.picture_statistics.as_ref().ok_or_else(|| ZooError::InvalidValue {
+        let statistics = demonstrations.image_statistics.as_ref().ok_or_else(|| ZooError::InvalidValue {
             key: "policy.vision.normalise".to_owned(),
             expected: "imagenet or unit: the data set has no statistics of its images".to_owned(),
             found: "dataset".to_owned(),

@@ -17,12 +17,12 @@ use crate::{ZooError, tensors, write_atomic};
 
 use super::agreement::agree;
 use super::checkpoint::Checkpoint;
-use super::data::{self, Demonstrations, PictureMemory};
+use super::data::{self, Demonstrations, ImageMemory};
 use super::feed::Feed;
 use super::folder::RunFolder;
 use super::initial_weights::InitialWeights;
 use super::metrics::MetricsRow;
-use super::preflight::picture_budget;
+use super::preflight::image_budget;
 use super::section::TrainSection;
 use super::session::{self, Place, Settings, TrainEvent, TrainOutcome, Training};
 use super::validation::validation_loss;
@@ -171,8 +171,8 @@ impl PolicyTraining {
             Some(provenance) => provenance.source.clone(),
             None => path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
         };
-        let budget = request.image_memory.unwrap_or_else(picture_budget);
-        let memory = PictureMemory { budget, folder: folder.path() };
+        let budget = request.image_memory.unwrap_or_else(image_budget);
+        let memory = ImageMemory { budget, folder: folder.path() };
         if let Some(note) = &earlier
             && note.fingerprint != dataset.fingerprint()
         {

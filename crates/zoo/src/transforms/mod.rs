@@ -321,4 +321,33 @@ mod tests {
             assert!(error.contains(&format!("`data.{}`", transform.name())) && !error.contains("unknown"), "{error}");
         }
     }
+
+    /// Appends the step as a digit to the first action, also for probes where it says so.
+    struct Appends {
+        probed: bool,
+    }
+
+    impl Fitted for Appends {
+        fn applies(&self, stage: Stage) -> bool {
+            matches!(stage, Stage::Training(_)) || self.probed && matches!(stage, Stage::Probe(_))
+        }
+
+        fn apply(&self, step: u64, windows: &mut WindowBatch) {
+            windows.actions[0] = windows.actions[0] * 10.0 + step as f32;
+        }
+    }
+
+    #[test]
+    fn transforms_are_applied_in_order_where_they_belong() {
+        let transforms = Transforms(vec![Box::new(Appends { probed: false }), Box::new(Appends { probed: true })]);
+        let after = |stage: Stage| {
+            let mut windows = WindowBatch { actions: vec![1.0], ..WindowBatch::default() };
+            transforms.apply(stage, &mut windows);
+            windows.actions[0]
+        };
+        assert_eq!(after(Stage::Training(3)), 133.0);
+        assert_eq!(after(Stage::Probe(5)), 15.0);
+        assert_eq!(after(Stage::Validation), 1.0, "as it was recorded");
+        assert_eq!(transforms.draws(&[0..3]), None);
+    }
 }

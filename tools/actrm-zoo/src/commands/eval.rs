@@ -12,17 +12,17 @@ use rollout::{Pool, Ready, remembered_greeting};
 use serde_json::{Value, json};
 use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
 use zoo::evaluation::{
-    Environment, EvaluationOptions, FIRST_SEED, Perturbation, Subject, View, evaluate_again, film, finished,
+    Environment, EvaluationOptions, FIRST_SEED, Perturbation, Subject, View, evaluate_again, finished, record_videos,
 };
 use zoo::protocols::NamedProtocol;
 use zoo::registry::Registry;
 use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
-use crate::films;
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names, of_entry};
 use crate::puzzles::{self, PuzzleArgs};
 use crate::remote::{Remote, RemoteArgs};
 use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
+use crate::videos;
 
 /// Headings of its help.
 const EPISODES: &str = "Episodes";
@@ -421,7 +421,7 @@ fn options(args: &Args, asked: &Asked<'_>, environment: &Environment) -> Evaluat
     }
 }
 
-/// Evaluates one entry and films it, as far as nobody asks to stop.
+/// Evaluates one entry and records videos of it, as far as nobody asks to stop.
 fn evaluate_entry(
     (args, asked): (&Args, &Asked<'_>),
     options: &EvaluationOptions,
@@ -526,7 +526,7 @@ fn again(
     Ok(false)
 }
 
-/// Films episodes; the path of each video is printed.
+/// Records videos of episodes; the path of each video is printed.
 fn videos(
     (args, options): (&Args, &EvaluationOptions),
     seeds: &[u64],
@@ -534,20 +534,20 @@ fn videos(
     subject: &Subject<'_>,
     pool: &mut Pool,
 ) -> anyhow::Result<()> {
-    let folder = films::folder(&args.zoo.zoo, &subject.entry);
+    let folder = videos::folder(&args.zoo.zoo, &subject.entry);
     let conditions = subject.record(pool.ready(), options)?.conditions();
     fs::create_dir_all(&folder).with_context(|| format!("creating {}", shown(&folder)))?;
     let rate = pool.ready().control_freq;
     let task = pool.ready().task.clone();
     let seen = matches!(view, View::Seen { .. });
     let mut screen = Screen::new();
-    screen.begin("film", seeds.len() as u64);
+    screen.begin("video", seeds.len() as u64);
     let mut failure: Option<anyhow::Error> = None;
-    film(subject, pool, seeds, view, &mut |seed, images, success| {
-        let path = folder.join(films::name(&task, seed, success, seen, &conditions));
+    record_videos(subject, pool, seeds, view, &mut |seed, images, success| {
+        let path = folder.join(videos::name(&task, seed, success, seen, &conditions));
         screen.step();
         let line = shown(&path);
-        let written = cli::film(&path, &images, rate).and_then(|()| match args.json {
+        let written = cli::write_video(&path, &images, rate).and_then(|()| match args.json {
             // JSON alone is on standard output
             true => {
                 screen.note(&line);
