@@ -122,10 +122,15 @@ impl AnyExperiment {
         }
     }
 
+    /// Whether it is trained on demonstrations that can be named.
+    pub fn takes_data(&self) -> bool {
+        matches!(self.0, Kind::Robot(_))
+    }
+
     /// Trains it, or resumes its training.
     ///
     /// # Errors
-    /// Demonstrations for an experiment on puzzles; as [`train`] and [`train_puzzles`] otherwise.
+    /// As [`train`] and [`train_puzzles`].
     pub fn train(
         self,
         options: TrainOptions,
@@ -134,8 +139,8 @@ impl AnyExperiment {
     ) -> Result<TrainOutcome, ZooError> {
         let TrainOptions { place, data, force, image_memory } = options;
         let Place { name, runs, run, resume, zoo, command } = place;
-        match (self.0, data) {
-            (Kind::Robot(experiment), data) => {
+        match self.0 {
+            Kind::Robot(experiment) => {
                 let (experiment, from_zoo) = (*experiment, None);
                 let request = TrainRequest {
                     name,
@@ -152,16 +157,11 @@ impl AnyExperiment {
                 };
                 train(&request, stop, on_event)
             }
-            (Kind::Puzzle(experiment), None) => {
+            Kind::Puzzle(experiment) => {
                 let experiment = *experiment;
                 let request = PuzzleTrainRequest { name, experiment, runs, run, resume, zoo, command };
                 train_puzzles(&request, stop, on_event)
             }
-            (Kind::Puzzle(_), Some(data)) => Err(ZooError::InvalidValue {
-                key: "--data".to_owned(),
-                expected: format!("none: experiment `{name}` draws its own puzzles"),
-                found: data.display().to_string(),
-            }),
         }
     }
 }

@@ -219,6 +219,9 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
         zoo: args.zoo.zoo.clone(),
         command: Some(command_line(&trains(args, &one.own))),
     };
+    if args.data.is_some() && !experiment.takes_data() {
+        bail!("--data: experiment `{}` draws its own puzzles", args.experiment);
+    }
     let (data, force, image_memory) = (args.data.clone(), args.force, args.image_memory);
     let options = TrainOptions { place, data, force, image_memory };
     // the error of a file that is for people only must not end a training
