@@ -82,7 +82,7 @@ fn a_report_is_a_function_of_results() {
 #[test]
 fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
     let reader = ["crates/dataset/src/source/isolation.rs"];
-    for room in ["dataset", "query", "recording", "serving", "video", "zoo", "study", "python"] {
+    for room in ["analysis", "dataset", "query", "recording", "serving", "video", "zoo", "study", "python"] {
         assert_eq!(said(&format!("crates/{room}/src"), PROCESSES, &reader), [""; 0]);
     }
     assert!(!said("crates/rollout/src", PROCESSES, &[]).is_empty(), "the test finds what it looks for");
@@ -95,7 +95,20 @@ fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
 
 #[test]
 fn only_tools_print_and_read_arguments() {
-    for room in ["dataset", "query", "recording", "rollout", "serving", "video", "zoo", "report", "study", "python"] {
+    let rooms = [
+        "analysis",
+        "dataset",
+        "query",
+        "recording",
+        "rollout",
+        "serving",
+        "video",
+        "zoo",
+        "report",
+        "study",
+        "python",
+    ];
+    for room in rooms {
         // both speak to the program that started them
         let reader = ["crates/dataset/src/source/isolation.rs", "crates/dataset/src/source/video.rs"];
         let words: Vec<&str> = [PRINTING, &["env::args"]].concat();
@@ -110,12 +123,22 @@ fn parts_of_a_crate_know_only_what_is_below_them() {
         ("crates/zoo/src/config", &["crate::run", "crate::entry", "crate::experiment", "crate::evaluation"][..]),
         ("crates/zoo/src/results", &["crate::run", "crate::entry", "crate::experiment", "crate::evaluation"]),
         ("crates/zoo/src/run", &["crate::evaluation", "crate::results", "crate::registry"]),
+        ("crates/zoo/src/transforms", &["crate::run", "crate::evaluation", "crate::entry", "crate::results"]),
         ("crates/models/src/layers", &["crate::models", "crate::registry", "crate::train"]),
         ("crates/nn/src/kernels", &["crate::ops", "crate::context", "crate::tape"]),
         ("crates/rollout/src", &["models::", "candle"]),
     ] {
         assert_eq!(said(folder, above, &[]), [""; 0]);
     }
+}
+
+#[test]
+fn puzzles_are_behind_one_door() {
+    let tool = ["tools/actrm-zoo/src/puzzles.rs"];
+    let words = ["SolverEntry", "PuzzleExperiment", "PuzzleTrainRequest", "is_solver"];
+    assert_eq!(said("tools/actrm-zoo/src", &words, &tool), [""; 0]);
+    assert_eq!(said("crates/zoo/src", &["is_policy()", "kind.is_none()"], &["crates/zoo/src/entry/kind.rs"]), [""; 0]);
+    assert_eq!(said("crates/study/src", &["Kind::Robot"], &["crates/study/src/puzzle/door.rs"]), [""; 0]);
 }
 
 /// Paths in `text`, with the line they stand in: what is written as code and begins with one of `folders`, or with the

@@ -22,12 +22,10 @@ use zoo::run::TrainOutcome;
 
 fn request(root: &Path, name: &str, overrides: &[&str]) -> PuzzleTrainRequest {
     let overrides: Vec<String> = overrides.iter().map(|o| (*o).to_owned()).collect();
-    let AnyExperiment::Puzzle(experiment) = AnyExperiment::load(&Library::built_in(), name, &overrides).unwrap() else {
-        panic!("{name} is no puzzle experiment")
-    };
+    let experiment = AnyExperiment::load(&Library::built_in(), name, &overrides).unwrap();
     PuzzleTrainRequest {
         name: name.to_owned(),
-        experiment: *experiment,
+        experiment: experiment.puzzle().expect("an experiment on puzzles"),
         runs: root.join("runs"),
         run: None,
         resume: false,

@@ -122,8 +122,7 @@ fn difference(meta: &EntryMeta, found: &TrainingFacts) -> Option<(&'static str, 
     // a number that went through JSON twice may differ in its last bit
     let minutes = (expected.minutes - found.minutes).abs() <= 1e-9 * expected.minutes.abs();
     let text = |value: &Option<String>| value.clone().unwrap_or_else(|| "none".to_owned());
-    // entries of other kinds have no data set of that name
-    let data_set = if meta.is_robot_policy() { found.data_set.clone() } else { expected.data_set.clone() };
+    let data_set = meta.data_set_of(&expected, found).to_owned();
     let facts = [
         ("policy", expected.policy, found.policy.clone()),
         ("parameters", expected.parameters.to_string(), found.parameters.to_string()),

@@ -8,11 +8,7 @@ mod agent;
 mod clock;
 mod environment;
 mod perturbation;
-mod saliency;
 mod subject;
-mod thinking;
-mod trace;
-mod way;
 
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -26,10 +22,7 @@ pub use self::agent::{PolicyAgent, QueryTime, QueryTimes};
 pub use self::clock::WallClock;
 pub use self::environment::Environment;
 pub use self::perturbation::Perturbation;
-pub use self::saliency::{Saliency, SalientCamera, SalientQuery, saliency};
-pub use self::subject::{Subject, acting};
-pub use self::thinking::{Start, starts, thinking_subject};
-pub use self::trace::{Examiner, PolicyTrace, TracedQuery, TracedThought, trace};
+pub use self::subject::{Subject, acting, image};
 use crate::ZooError;
 use crate::results::{EpisodeRecord, EpisodeTiming, OtherSimulator, ResultsFolder, Seeds, Shard, StoredEvaluation};
 
@@ -220,12 +213,12 @@ pub fn run_episodes(
 }
 
 /// Episodes with an image of the start and of every step each; the images of one episode are kept at a time by each
-/// worker, and handed to `deliver` with the episode's seed and success. [`View::Seen`] of a policy without pictures gives
+/// worker, and handed to `deliver` with the episode's seed and success. [`View::Seen`] of a policy without cameras gives
 /// no images.
 ///
 /// # Errors
 /// As for an evaluation; a machine that cannot render.
-pub fn film(
+pub fn record_videos(
     subject: &Subject<'_>,
     pool: &mut Pool,
     seeds: &[u64],
@@ -278,7 +271,7 @@ fn unhelpable(task: &str, fault: WorkerFault) -> JobError {
     }
 }
 
-/// What is filmed.
+/// What a video shows.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum View {
     /// What a camera sees.

@@ -3,7 +3,7 @@
 mod entities;
 mod grids;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use models::{
     ACTION, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureKind, ModelError, NormMode, PolicyConfig, PolicyType, STATE,
@@ -16,14 +16,13 @@ pub use self::entities::EntitySection;
 pub use self::grids::GridSection;
 use crate::config::{Library, apply_overrides, from_value, from_value_as};
 use crate::run::TrainSection;
+pub use crate::transforms::{BeginningSection, DataSection, SwapSection};
 use crate::{FeatureKeys, ZooError};
 
 /// What the name of a camera's feature begins with, LeRobot's.
-pub(crate) const PICTURE_PREFIX: &str = "observation.images.";
-/// What the column of what is told in training alone is called, among the entities.
-pub(crate) const AUXILIARY: &str = "auxiliary";
+pub const IMAGE_PREFIX: &str = "observation.images.";
 /// What a camera's observation key ends in, robomimic's.
-pub(crate) const PICTURE_SUFFIX: &str = "_image";
+pub(crate) const IMAGE_SUFFIX: &str = "_image";
 
 /// A resolved experiment, as `config.toml` of runs and entries holds it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -71,108 +70,6 @@ pub struct TaskSection {
     pub name: String,
 }
 
-/// `[data.exchange.NAME]`: objects that are swapped with each other in training, all but the one that was taken.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ExchangeSection {
-    /// Position of each object relative to the gripper. The nearest one at the end of a demonstration is the one that was taken.
-    pub taken: Vec<String>,
-    /// Observation items of each object, in the same order for all.
-    pub items: Vec<Vec<String>>,
-    /// Position items of each object. All are moved by one vector, to where an object was taken in another demonstration.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub places: Vec<Vec<String>>,
-    /// Number of first observations of a demonstration at which the pointer has a loss; absent: all.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub asked: Option<usize>,
-}
-
-/// `[data.beginning]`: how often the first windows of an episode are sampled in training.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct BeginningSection {
-    /// Number of first windows of an episode.
-    pub steps: usize,
-    /// How many times as often each of them is sampled as another window.
-    pub times: usize,
-}
-
-/// `[data]`
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct DataSection {
-    /// Demonstrations: an HDF5 file or a LeRobotDataset folder. A relative path starts at the current folder or at the shipped data.
-    pub path: String,
-    /// Observation keys that make `observation.state`, in order.
-    pub state_keys: Vec<String>,
-    /// Observation keys that make `observation.environment_state`, in order; may be empty.
-    pub env_keys: Vec<String>,
-    /// Observation keys that are known in training only, in order; targets of the auxiliary loss (`policy.auxiliary`).
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub auxiliary_keys: Vec<String>,
-    /// Objects that get one token each, by name: a list of observation keys, or a table.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub entities: BTreeMap<String, EntitySection>,
-    /// Grids by name; every cell gets one token.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub grids: BTreeMap<String, GridSection>,
-    /// Items of the lists above that are permuted together in training, by the name of the symmetry.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub symmetries: BTreeMap<String, Vec<String>>,
-    /// Mirror augmentation: the sign of every dimension of every item of the lists above, and of `action`, in the mirror. Half of the
-    /// training samples are mirrored, images included.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub mirror: BTreeMap<String, Vec<i8>>,
-    /// Groups of objects that are swapped in training, by name.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub exchange: BTreeMap<String, ExchangeSection>,
-    /// Sample the first windows of episodes more often in training.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub beginning: Option<BeginningSection>,
-    /// Also learn actions that the demonstrations mark as mistakes. Otherwise each stretch between mistakes is learned as an episode
-    /// of its own.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub mistakes: bool,
-    /// Number of observations that the policy gets at once: the current one and those before it.
-    #[serde(skip_serializing_if = "is_one")]
-    pub n_obs_steps: usize,
-    /// Cameras whose images the policy gets, by the simulator's names.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub cameras: Vec<String>,
-    /// Three entities, each a colour. The first channel of every image is then the amount of the first entity's colour in a pixel, and
-    /// so on. Empty: red, green and blue.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub picture_colours: Vec<String>,
-    /// Mask of the episodes to train on. With "", or in a data set without masks, all episodes.
-    pub train_mask: String,
-    /// Mask of the episodes to validate on; "" for none.
-    pub valid_mask: String,
-}
-
-impl Default for DataSection {
-    fn default() -> Self {
-        let owned = |keys: &[&str]| keys.iter().map(|k| (*k).to_owned()).collect();
-        Self {
-            path: String::new(),
-            state_keys: owned(&["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]),
-            env_keys: owned(&["object"]),
-            auxiliary_keys: Vec::new(),
-            entities: BTreeMap::new(),
-            grids: BTreeMap::new(),
-            symmetries: BTreeMap::new(),
-            mirror: BTreeMap::new(),
-            exchange: BTreeMap::new(),
-            beginning: None,
-            mistakes: false,
-            n_obs_steps: 1,
-            cameras: Vec::new(),
-            picture_colours: Vec::new(),
-            train_mask: "train".to_owned(),
-            valid_mask: "valid".to_owned(),
-        }
-    }
-}
-
 /// The longest history.
 const MOST_OBS_STEPS: usize = 1000;
 
@@ -195,32 +92,14 @@ impl DataSection {
             add(format!("data.entities.{name}"), &format!("{ENTITY_PREFIX}{name}"), &entity.keys)?;
         }
         for camera in &self.cameras {
-            add(
-                "data.cameras".to_owned(),
-                &format!("{PICTURE_PREFIX}{camera}"),
-                &[format!("{camera}{PICTURE_SUFFIX}")],
-            )?;
-        }
-        Ok(keys)
-    }
-
-    /// The same, and what training alone is told, under [`AUXILIARY`] as an entity would be.
-    ///
-    /// # Errors
-    /// As [`Self::feature_keys`].
-    pub(crate) fn told_and_feature_keys(&self) -> Result<FeatureKeys, ZooError> {
-        let mut keys = self.feature_keys()?;
-        if !self.auxiliary_keys.is_empty() {
-            let expected = "observation keys, parts of them (key[0:3]) and differences (a - b)".to_owned();
-            keys.insert(&format!("{ENTITY_PREFIX}{AUXILIARY}"), &self.auxiliary_keys)
-                .map_err(|found| ZooError::InvalidValue { key: "data.auxiliary_keys".to_owned(), expected, found })?;
+            add("data.cameras".to_owned(), &format!("{IMAGE_PREFIX}{camera}"), &[format!("{camera}{IMAGE_SUFFIX}")])?;
         }
         Ok(keys)
     }
 
     /// The camera whose pictures an item stands for, if it does.
     pub(crate) fn camera_of(&self, item: &str) -> Option<&str> {
-        let camera = item.strip_suffix(PICTURE_SUFFIX)?;
+        let camera = item.strip_suffix(IMAGE_SUFFIX)?;
         self.cameras.iter().find(|known| *known == camera).map(String::as_str)
     }
 
@@ -277,76 +156,7 @@ impl DataSection {
             let expected = format!("none without data.cameras, or three of the entities: {}", names.join(", "));
             return invalid("data.picture_colours".to_owned(), &expected, colours.join(", "));
         }
-        let keys = self.told_and_feature_keys()?;
-        let known: Vec<String> = keys.features().flat_map(|feature| keys.of(feature)).collect();
-        let symmetries = self.symmetries.iter().map(|(name, items)| (format!("data.symmetries.{name}"), items));
-        let exchanged = self.exchange.iter().flat_map(|(name, exchange)| {
-            let items = exchange.items.iter().map(move |items| (format!("data.exchange.{name}.items"), items));
-            let places = exchange.places.iter().map(move |items| (format!("data.exchange.{name}.places"), items));
-            items.chain(places).chain([(format!("data.exchange.{name}.taken"), &exchange.taken)])
-        });
-        for (key, items) in symmetries.chain(exchanged) {
-            if items.is_empty() {
-                return invalid(key, "at least one item", "none".to_owned());
-            }
-            if let Some(item) = items.iter().find(|item| !known.contains(item)) {
-                return invalid(key, &format!("items of the lists of keys: {}", known.join(", ")), format!("`{item}`"));
-            }
-        }
-        for (name, exchange) in &self.exchange {
-            let things = exchange.taken.len();
-            if exchange.asked == Some(0) {
-                return invalid(format!("data.exchange.{name}.asked"), "1 or more", "0".to_owned());
-            }
-            for (key, lists) in [("items", &exchange.items), ("places", &exchange.places)] {
-                let here = format!("data.exchange.{name}.{key}");
-                if lists.len() != things && !(key == "places" && lists.is_empty()) {
-                    return invalid(here, &format!("{things} lists, one for each of `taken`"), lists.len().to_string());
-                }
-                if let Some(other) = lists.iter().find(|items| items.len() != lists[0].len()) {
-                    return invalid(here, &format!("lists of {} items", lists[0].len()), other.join(", "));
-                }
-            }
-        }
-        if !self.exchange.is_empty() && !self.cameras.is_empty() {
-            let names: Vec<&str> = self.exchange.keys().map(String::as_str).collect();
-            let expected = "none with data.cameras, whose images show what was exchanged where it was";
-            return invalid("data.exchange".to_owned(), expected, names.join(", "));
-        }
-        self.check_mirror(&known)?;
-        if let Some(beginning) = self.beginning.filter(|beginning| beginning.steps == 0 || beginning.times == 0) {
-            let BeginningSection { steps, times } = beginning;
-            return invalid("data.beginning".to_owned(), "1 or more", format!("steps {steps}, times {times}"));
-        }
         Ok(())
-    }
-
-    /// A mirror says of every number whether it changes it: of `known` items but pictures, and of actions.
-    fn check_mirror(&self, known: &[String]) -> Result<(), ZooError> {
-        if self.mirror.is_empty() {
-            return Ok(());
-        }
-        let invalid = |expected: String, found: String| {
-            Err(ZooError::InvalidValue { key: "data.mirror".to_owned(), expected, found })
-        };
-        if !self.exchange.is_empty() || !self.grids.is_empty() {
-            let found = self.mirror.keys().cloned().collect::<Vec<_>>().join(", ");
-            return invalid("none with data.exchange or data.grids".to_owned(), found);
-        }
-        let numbers = known.iter().filter(|item| self.camera_of(item).is_none()).map(String::as_str);
-        let wanted: BTreeSet<&str> = numbers.chain([ACTION]).collect();
-        let given: BTreeSet<&str> = self.mirror.keys().map(String::as_str).collect();
-        if let Some(item) = given.difference(&wanted).next() {
-            let wanted: Vec<&str> = wanted.iter().copied().collect();
-            return invalid(format!("items of the lists of keys: {}", wanted.join(", ")), format!("`{item}`"));
-        }
-        if let Some(item) = wanted.difference(&given).next() {
-            return invalid("signs of every item and of action".to_owned(), format!("none of `{item}`"));
-        }
-        match self.mirror.iter().find(|(_, signs)| signs.is_empty() || signs.iter().any(|sign| sign.abs() != 1)) {
-            Some((item, signs)) => invalid("1 or -1 for each number".to_owned(), format!("{signs:?} of `{item}`")),
-            None => Ok(()),
-        }
     }
 }
 
@@ -382,10 +192,6 @@ impl NormalisationSection {
         }
         modes
     }
-}
-
-fn is_one(count: &usize) -> bool {
-    *count == 1
 }
 
 fn is_default(mode: &NormMode) -> bool {
@@ -490,86 +296,8 @@ impl Experiment {
         }
         self.policy.validate().map_err(self.model_error("build the policy of"))?;
         self.data.check(self.policy.reads())?;
-        self.check_auxiliary()?;
-        self.check_pointer()?;
-        self.check_grid()?;
+        crate::transforms::check(self)?;
         self.train.check()
-    }
-
-    /// What is asked for is told, and nothing else.
-    fn check_auxiliary(&self) -> Result<(), ZooError> {
-        let (keys, asked) = (&self.data.auxiliary_keys, self.policy.auxiliary().is_some());
-        let invalid = |expected: &str| {
-            let (key, found) = ("data.auxiliary_keys".to_owned(), keys.join(", "));
-            let found = if found.is_empty() { "none".to_owned() } else { found };
-            Err(ZooError::InvalidValue { key, expected: expected.to_owned(), found })
-        };
-        match (keys.is_empty(), asked) {
-            (true, true) => return invalid("observation keys, for policy.auxiliary asks for them"),
-            (false, false) => return invalid("none without policy.auxiliary"),
-            (true, false) => return Ok(()),
-            (false, true) => {}
-        }
-        let mut parsed = FeatureKeys::default();
-        if let Err(found) = parsed.insert(AUXILIARY, keys) {
-            return invalid(&format!("observation keys, parts of them (key[0:3]) and differences (a - b): {found}"));
-        }
-        // they would have to change with what is seen; a symmetry can name them
-        if !self.data.exchange.is_empty() {
-            return invalid("none with data.exchange");
-        }
-        match self.data.entities.contains_key(AUXILIARY) {
-            true => invalid("none beside an entity of this name"),
-            false => Ok(()),
-        }
-    }
-
-    /// The exchange that says which of the entities was taken that the policy's pointer is about: the one whose items lie in
-    /// them.
-    pub(crate) fn pointed_exchange(&self) -> Option<&str> {
-        let group = &self.policy.pointer()?.among;
-        let held = |item: &String| {
-            let mut entities = self.data.entities.iter();
-            entities.any(|(name, e)| e.keys.contains(item) && e.group_of(name) == *group && !e.position)
-        };
-        let about = self.data.exchange.iter().find(|(_, exchange)| exchange.taken.iter().all(held));
-        about.map(|(name, _)| name.as_str())
-    }
-
-    /// A pointer is trained on what demonstrations took.
-    fn check_pointer(&self) -> Result<(), ZooError> {
-        match self.policy.pointer() {
-            Some(pointer) if self.pointed_exchange().is_none() => Err(ZooError::InvalidValue {
-                key: "policy.pointer.among".to_owned(),
-                expected: "a group of entities of which a data.exchange says which was `taken`".to_owned(),
-                found: format!("`{}`", pointer.among),
-            }),
-            _ => Ok(()),
-        }
-    }
-
-    /// The grid whose cells the policy is asked about, by name, and the key that says where the hand is.
-    pub(crate) fn asked_grid(&self) -> Option<(&str, &GridSection, &str)> {
-        let asked = self.policy.grid().filter(|grid| grid.way > 0.0)?;
-        let (name, grid) = self.data.grids.get_key_value(&asked.among)?;
-        Some((name, grid, grid.visited.as_deref()?))
-    }
-
-    /// A grid's rows are those of the data, and what is asked of it is there.
-    fn check_grid(&self) -> Result<(), ZooError> {
-        let Some(asked) = self.policy.grid() else { return Ok(()) };
-        let invalid = |key: &str, expected: String, found: String| {
-            Err(ZooError::InvalidValue { key: format!("policy.reasoning.grid.{key}"), expected, found })
-        };
-        if let Some(grid) = self.data.grids.get(&asked.among).filter(|grid| grid.columns != asked.columns) {
-            let expected = format!("{}, as data.grids.{}", grid.columns, asked.among);
-            return invalid("columns", expected, asked.columns.to_string());
-        }
-        if asked.way > 0.0 && self.asked_grid().is_none() {
-            let expected = "a grid of data.grids with the key `visited`".to_owned();
-            return invalid("among", expected, format!("`{}`", asked.among));
-        }
-        Ok(())
     }
 
     /// Kind of policy, as the config names it.
@@ -758,7 +486,6 @@ mod tests {
         let taken = "data.exchange.things={ taken = ['cube0', 'cube1'], items = [['cube0'], ['cube1']] }";
         let pointing = "policy.pointer={ among = 'thing' }";
         let experiment = load(&[things[0], things[1], taken, pointing]).unwrap();
-        assert_eq!(experiment.pointed_exchange(), Some("things"));
         assert_eq!(Experiment::from_toml("x", &experiment.to_toml()).unwrap(), experiment);
         let refused = load(&[things[0], things[1], pointing]).unwrap_err();
         assert!(refused.starts_with("key `policy.pointer.among`: expected a group of entities of which"), "{refused}");

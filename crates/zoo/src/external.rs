@@ -14,7 +14,7 @@ use serde_json::json;
 use crate::config::{Library, from_value};
 use crate::entry::{CamerasMeta, CardWords, Entry, EntryDraft, EntryId, EntryMeta, training_facts};
 use crate::evaluation::Subject;
-use crate::experiment::{DataSection, Experiment, PICTURE_PREFIX, PICTURE_SUFFIX};
+use crate::experiment::{DataSection, Experiment, IMAGE_PREFIX, IMAGE_SUFFIX};
 use crate::registry::Registry;
 use crate::results::{EntryIdentity, Execution};
 use crate::{FeatureKeys, ZooError, tensors};
@@ -61,7 +61,7 @@ pub struct Named {
 
 /// Whether some of these features are images.
 pub fn reads_images(inputs: &FeatureKeys) -> bool {
-    inputs.features().any(|feature| feature.starts_with(PICTURE_PREFIX))
+    inputs.features().any(|feature| feature.starts_with(IMAGE_PREFIX))
 }
 
 /// The features that experiments on the task of `ready` read by default, as far as the environment has their keys.
@@ -90,10 +90,10 @@ pub fn usual_inputs(ready: &Ready) -> Result<FeatureKeys, ZooError> {
 impl External {
     /// The cameras that it looks through; `None` if it reads no images.
     pub fn cameras(&self) -> Option<CamerasMeta> {
-        let cameras = self.inputs.features().filter(|feature| feature.starts_with(PICTURE_PREFIX));
+        let cameras = self.inputs.features().filter(|feature| feature.starts_with(IMAGE_PREFIX));
         let name = |feature: &str| {
             let key = self.inputs.of(feature).concat();
-            key.strip_suffix(PICTURE_SUFFIX).unwrap_or(&key).to_owned()
+            key.strip_suffix(IMAGE_SUFFIX).unwrap_or(&key).to_owned()
         };
         let names: Vec<String> = cameras.map(name).collect();
         let size = self.image_size.unwrap_or(0);
@@ -103,7 +103,7 @@ impl External {
     /// The features of its inputs in the environment that `ready` describes.
     fn signature(&self, ready: &Ready) -> Result<Signature, ZooError> {
         let spec = |feature: &str| -> Result<FeatureSpec, ZooError> {
-            if feature.starts_with(PICTURE_PREFIX) {
+            if feature.starts_with(IMAGE_PREFIX) {
                 let side = self.image_size.unwrap_or(0);
                 return Ok(FeatureSpec::image(feature, side, side));
             }

@@ -16,11 +16,11 @@ pub mod external;
 mod feature_keys;
 mod files;
 pub mod lerobot;
-pub mod probe;
 pub mod registry;
 pub mod robomimic;
 pub mod run;
 pub mod tensors;
+mod transforms;
 
 // evaluations
 pub mod audit;
@@ -32,6 +32,7 @@ pub mod results;
 pub use error::ZooError;
 pub use feature_keys::{FeatureKeys, Past};
 pub use files::{sha256_file, sha256_hex, write_atomic, write_together};
+pub use transforms::{Stage, Transforms};
 
 /// What makes entries, by name: the software's versions, the compiler, what it compiled for, and the vectors of this
 /// machine. The same weights come out where all of these are the same.

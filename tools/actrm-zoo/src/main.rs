@@ -6,12 +6,12 @@
 
 mod card;
 mod commands;
-mod films;
 mod places;
 mod puzzles;
 mod remote;
 mod simulation;
 mod training;
+mod videos;
 
 use std::process::ExitCode;
 

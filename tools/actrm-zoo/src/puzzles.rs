@@ -1,17 +1,19 @@
-//! Puzzles on the command line: their families, and what `eval` does with an entry that solves them.
+//! Puzzles on the command line: their families, and what commands do with an entry that solves them.
 
 use std::path::Path;
 
 use anyhow::bail;
 use clap::{Args, ValueEnum};
+use cli::shown;
 use puzzles::Task;
 use report::wilson_interval;
 use serde_json::{Value, json};
 use study::puzzle::{
     EvaluatedPuzzles, Judge, MOST_VIEWS, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, Starts, TEST_SEED,
-    evaluate_puzzles, evaluate_puzzles_again,
+    evaluate_puzzles, evaluate_puzzles_again, is_solver,
 };
 use zoo::entry::Entry;
+use zoo::write_atomic;
 
 /// How solvers are evaluated.
 #[derive(Args)]
@@ -68,16 +70,26 @@ pub fn family(name: &str) -> anyhow::Result<Task> {
     }
 }
 
-/// Evaluates a solver, or `again` compares with what is stored; the line to show and the same as data. `seed` is another
-/// than that of the puzzles that every solver answers.
-pub fn evaluate_solver(
+/// Evaluates a solver, or `again` compares with what is stored; the line to show and the same as data, `None` of an entry that is
+/// no solver. `of_robots` is an option that a solver does not take. `seed` is another than that of the puzzles that every
+/// solver answers.
+pub fn evaluate(
     entry: &Entry,
+    of_robots: Option<&str>,
     task: Option<&str>,
     args: &PuzzleArgs,
     seed: Option<u64>,
     again: bool,
     results: &Path,
-) -> anyhow::Result<(String, Value)> {
+) -> anyhow::Result<Option<(String, Value)>> {
+    if !is_solver(entry) {
+        return Ok(None);
+    }
+    if let Some(option) = of_robots {
+        bail!(
+            "{option}: expected a robot policy, found a solver of puzzles, which takes --puzzles, --depth, --givens, --seed-start and --again"
+        );
+    }
     if !(args.noise.is_finite() && args.noise >= 0.0) {
         bail!("--noise: expected a number from 0, found {}", args.noise);
     }
@@ -96,7 +108,7 @@ pub fn evaluate_solver(
     if again {
         let puzzles = evaluate_puzzles_again(&solver, results, &options)?.record.answers.puzzles;
         let line = format!("{}: {puzzles} puzzles answered again, every answer the same", entry.id());
-        return Ok((line, json!({"entry": entry.id().to_string(), "run_again": puzzles, "different": 0})));
+        return Ok(Some((line, json!({"entry": entry.id().to_string(), "run_again": puzzles, "different": 0}))));
     }
     let EvaluatedPuzzles { folder, record, was_there } = evaluate_puzzles(&solver, results, &options)?;
     let counts = &record.answers;
@@ -122,5 +134,53 @@ pub fn evaluate_solver(
     let mut value = report::json::object(PUZZLE_COLUMNS, &record);
     value.insert("evaluated_before".to_owned(), was_there.into());
     value.insert("folder".to_owned(), cli::lossy(&folder).into());
-    Ok((text, value.into()))
+    Ok(Some((text, value.into())))
+}
+
+/// What is shown of a solver.
+pub struct TraceOptions<'a> {
+    pub index: Option<u64>,
+    pub depth: Option<u64>,
+    pub task: Option<&'a str>,
+    pub givens: Option<usize>,
+    pub json: bool,
+    pub svg: Option<&'a Path>,
+}
+
+/// Shows the steps of a solver on a puzzle; `false` of an entry that is no solver. `of_robots` is an option that a solver does
+/// not take.
+pub fn trace(entry: &Entry, options: &TraceOptions<'_>, of_robots: Option<&str>) -> anyhow::Result<bool> {
+    if !is_solver(entry) {
+        return Ok(false);
+    }
+    if let Some(option) = of_robots {
+        bail!("{option} means nothing for {}, a puzzle solver", entry.id());
+    }
+    let other = options.task.map(family).transpose()?;
+    let solver = SolverEntry::load(entry, other)?;
+    let task = match other {
+        Some(task) => task,
+        None => solver.experiment().task.family()?,
+    };
+    let givens = options.givens.unwrap_or(solver.experiment().task.givens().0);
+    let depth = usize::try_from(options.depth.unwrap_or(8))?;
+    let trace = study::puzzle::trace(&solver, task, givens, options.index.unwrap_or(0), depth)?;
+    match options.svg {
+        Some(path) => {
+            cli::make_parent(path)?;
+            write_atomic(path, trace.to_svg().as_bytes())?;
+            cli::print(&(shown(path) + "\n"))?;
+        }
+        None if options.json => cli::print_json(&trace)?,
+        None => cli::print(&trace.to_text())?,
+    }
+    Ok(true)
+}
+
+/// Builds a solver's network with its weights; `false` of an entry that is none.
+pub fn deep_check(entry: &Entry) -> anyhow::Result<bool> {
+    if is_solver(entry) {
+        SolverEntry::load(entry, None)?;
+    }
+    Ok(is_solver(entry))
 }

@@ -1,4 +1,4 @@
-//! Experiments on puzzles: which task, which model, how it learns. `[task] puzzle = "dfs10"` tells them from a robot's.
+//! Experiments on puzzles: which task, which model, how it learns.
 
 use std::collections::BTreeMap;
 
@@ -9,62 +9,13 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use zoo::ZooError;
-use zoo::config::{Library, apply_overrides, from_value};
-use zoo::experiment::{Experiment, flatten};
+use zoo::config::from_value;
+use zoo::experiment::flatten;
 use zoo::run::TrainSection;
 
 use super::model::SolverConfig;
 use super::solver::Solver;
 use super::walk::{RlKind, RlSection};
-
-/// An experiment of any kind.
-#[derive(Debug, Clone, PartialEq)]
-pub enum AnyExperiment {
-    /// A robot policy from demonstrations.
-    Robot(Box<Experiment>),
-    /// A puzzle solver from puzzles with their answers.
-    Puzzle(Box<PuzzleExperiment>),
-}
-
-impl AnyExperiment {
-    /// Resolves experiment `name` of `library` with dotted `overrides` laid over it.
-    ///
-    /// # Errors
-    /// Unknown experiments, keys and values; combinations that cannot work.
-    pub fn load(library: &Library, name: &str, overrides: &[String]) -> Result<Self, ZooError> {
-        let mut table = library.resolve(name)?;
-        apply_overrides(&mut table, overrides)?;
-        let is_puzzle = table.get("task").and_then(|task| task.get("puzzle")).is_some();
-        Ok(match is_puzzle {
-            true => Self::Puzzle(Box::new(PuzzleExperiment::from_table(table)?)),
-            false => Self::Robot(Box::new(Experiment::load(library, name, overrides)?)),
-        })
-    }
-
-    /// The resolved experiment as TOML.
-    pub fn to_toml(&self) -> String {
-        match self {
-            Self::Robot(experiment) => experiment.to_toml(),
-            Self::Puzzle(experiment) => experiment.to_toml(),
-        }
-    }
-
-    /// Name of the entry that training makes.
-    pub fn entry(&self) -> &str {
-        match self {
-            Self::Robot(experiment) => &experiment.entry,
-            Self::Puzzle(experiment) => &experiment.entry,
-        }
-    }
-
-    /// One sentence on it.
-    pub fn description(&self) -> &str {
-        match self {
-            Self::Robot(experiment) => &experiment.description,
-            Self::Puzzle(experiment) => &experiment.description,
-        }
-    }
-}
 
 /// A resolved experiment on puzzles.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -215,7 +166,7 @@ impl PuzzleExperiment {
     /// Reads the text of a saved `config.toml`.
     ///
     /// # Errors
-    /// As [`AnyExperiment::load`].
+    /// As [`super::AnyExperiment::load`].
     pub fn from_toml(name: &str, text: &str) -> Result<Self, ZooError> {
         let table = toml::from_str(text)
             .map_err(|source| ZooError::ExperimentSyntax { experiment: name.to_owned(), source: Box::new(source) })?;

@@ -7,6 +7,7 @@
 
 mod board;
 mod cpu;
+mod door;
 mod entry;
 mod evaluation;
 mod experiment;
@@ -23,12 +24,13 @@ mod walk;
 
 pub use board::{PUZZLE_COLUMNS, puzzle_section, rank_puzzles};
 pub use cpu::cpu_seconds;
+pub use door::{AnyExperiment, Summary, TrainOptions, is_solver};
 pub use entry::{ProgressPoint, PuzzleMeta, SOLVER, SolverEntry};
 pub use evaluation::{
     DEPTHS, EvaluatedPuzzles, Judge, MOST_VIEWS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, Starts,
     TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again, list_puzzle_evaluations,
 };
-pub use experiment::{AnyExperiment, LearningSection, PuzzleExperiment, PuzzleTask};
+pub use experiment::{LearningSection, PuzzleExperiment, PuzzleTask};
 pub use grade::{Baseline, Counts, EffortBand};
 pub use model::{
     CnnSection, ConvSection, HierarchicalSection, MlpSection, SolverConfig, TransformerSection, TrmSection,

@@ -14,9 +14,10 @@ use zoo::registry::Registry;
 use zoo::run::{TrainEvent, TrainOutcome};
 use zoo::{ZooError, sha256_hex};
 
+use super::door::AnyExperiment;
 use super::entry::SolverEntry;
 use super::evaluation::{Judge, PuzzleEvaluation, PuzzleEvaluationOptions, Starts, TEST_SEED, evaluate_puzzles};
-use super::experiment::{AnyExperiment, PuzzleExperiment};
+use super::experiment::PuzzleExperiment;
 use super::training::{PuzzleTrainRequest, train_puzzles};
 
 /// Test puzzles a row.
@@ -306,14 +307,12 @@ pub fn run_study(
 
 /// The experiment of a row with its seed.
 fn experiment(library: &Library, name: &str, seed: u64) -> Result<PuzzleExperiment, ZooError> {
-    match AnyExperiment::load(library, name, &[format!("train.seed={seed}")])? {
-        AnyExperiment::Puzzle(experiment) => Ok(*experiment),
-        AnyExperiment::Robot(_) => Err(ZooError::InvalidValue {
-            key: "task".to_owned(),
-            expected: "a puzzle experiment".to_owned(),
-            found: name.to_owned(),
-        }),
-    }
+    let experiment = AnyExperiment::load(library, name, &[format!("train.seed={seed}")])?;
+    experiment.puzzle().ok_or_else(|| ZooError::InvalidValue {
+        key: "task".to_owned(),
+        expected: "a puzzle experiment".to_owned(),
+        found: name.to_owned(),
+    })
 }
 
 /// The result of `test` in `results` if this very experiment made it.

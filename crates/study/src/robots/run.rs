@@ -5,11 +5,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use analysis::depth::thinking_subject;
 use recording::{CollectEnd, CollectOptions, collect};
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, harness_folder};
 use zoo::config::Library;
 use zoo::entry::{Entry, LoadedEntry, member_name};
-use zoo::evaluation::{Environment, EvaluationEnd, EvaluationOptions, evaluate, thinking_subject};
+use zoo::evaluation::{Environment, EvaluationEnd, EvaluationOptions, evaluate};
 use zoo::experiment::Experiment;
 use zoo::registry::Registry;
 use zoo::results::Seeds;

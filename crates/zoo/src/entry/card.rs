@@ -36,13 +36,11 @@ fn render_into(meta: &EntryMeta, words: &CardWords, card: &mut String) -> std::f
     row("task", meta.task.clone())?;
     row("experiment", meta.experiment.clone())?;
     row("parameters", grouped(meta.parameters))?;
-    if meta.is_robot_policy() {
-        for spec in &meta.signature.observation {
-            row(&spec.name, feature(meta, &spec.name))?;
-        }
-        if let Some(names) = meta.data.as_ref().and_then(|data| data.names.get(ACTION)) {
-            row(ACTION, format!("{} numbers, {}", meta.signature.action_dim, called(names)))?;
-        }
+    for spec in &meta.signature.observation {
+        row(&spec.name, feature(meta, &spec.name))?;
+    }
+    if let Some(names) = meta.data.as_ref().and_then(|data| data.names.get(ACTION)) {
+        row(ACTION, format!("{} numbers, {}", meta.signature.action_dim, called(names)))?;
     }
     for (what, value) in &words.rows {
         row(what, value.clone())?;

@@ -21,13 +21,7 @@ pub(super) fn metadata(meta: &EntryMeta) -> String {
     let mut text = format!("library_name: actrm\nlicense: {}\n", meta.license());
     // the Hub's own tags and ours, each once
     let mut tags: BTreeSet<&str> = ["actrm", &meta.policy, &meta.task].into();
-    if meta.is_robot_policy() {
-        text.push_str("pipeline_tag: robotics\n");
-        tags.insert("robotics");
-    }
-    if meta.is_robot_policy() && meta.data.is_some() {
-        tags.insert("imitation-learning");
-    }
+    text.push_str(meta.hub_task(&mut tags));
     text.push_str("tags:\n");
     for tag in tags.into_iter().filter(|tag| !tag.is_empty()) {
         writeln!(text, "- {}", serde_json::Value::from(tag)).expect("writing into a String cannot fail");

@@ -6,7 +6,7 @@ use models::{FeatureKind, Signature};
 use serde::{Deserialize, Serialize};
 
 use crate::config::is_built_in_task;
-use crate::experiment::PICTURE_SUFFIX;
+use crate::experiment::IMAGE_SUFFIX;
 use crate::external::EXTERNAL;
 use crate::results::Seeds;
 use crate::{FeatureKeys, ZooError, sha256_hex};
@@ -201,7 +201,7 @@ impl EntryMeta {
     pub fn camera_names(&self) -> Vec<String> {
         let name = |feature: &str| {
             let key = self.keys.of(feature).concat();
-            key.strip_suffix(PICTURE_SUFFIX).unwrap_or(&key).to_owned()
+            key.strip_suffix(IMAGE_SUFFIX).unwrap_or(&key).to_owned()
         };
         self.signature.of_kind(FeatureKind::Image).map(|spec| name(&spec.name)).collect()
     }
@@ -230,13 +230,8 @@ impl EntryMeta {
 
     /// Whether no simulator is known to have its task: it was trained here on demonstrations that name no environment.
     pub fn is_of_data_alone(&self) -> bool {
-        let trained_on_data = self.is_robot_policy() && self.training.is_some() && self.data.is_some();
+        let trained_on_data = self.training.is_some() && self.data.is_some();
         trained_on_data && self.env_name.is_none() && !is_built_in_task(&self.task)
-    }
-
-    /// Whether it is a policy for a robot's task.
-    pub fn is_robot_policy(&self) -> bool {
-        self.kind.is_none() && self.section.is_none()
     }
 
     /// Whether its weights are not in the zoo: whoever has the policy runs it.

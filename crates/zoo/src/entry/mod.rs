@@ -14,6 +14,7 @@ mod family;
 mod format;
 mod hub;
 mod id;
+mod kind;
 mod meta;
 mod open;
 mod policy;

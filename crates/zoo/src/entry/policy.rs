@@ -31,15 +31,7 @@ impl Entry {
         if self.meta().is_external() {
             return Err(ZooError::External { entry: self.id().to_string() });
         }
-        if !self.meta().is_robot_policy() {
-            return Err(ZooError::UnfitEntry {
-                entry: self.id().to_string(),
-                task: self.meta().task.clone(),
-                what: "kind of entry".to_owned(),
-                expected: "a robot policy".to_owned(),
-                found: self.meta().kind.clone().unwrap_or_else(|| "another kind".to_owned()),
-            });
-        }
+        self.meta().require_policy("a robot policy")?;
         let experiment = Experiment::from_toml(&self.id().to_string(), &self.config_text()?)?;
         let (weights, _) = tensors::read(&self.folder().join(MODEL_FILE))?;
         let (statistics, _) = tensors::read(&self.folder().join(NORMALISER_FILE))?;
@@ -117,7 +109,8 @@ impl LoadedEntry {
         Ok(Some(Arc::new(model)))
     }
 
-    pub(crate) fn failed(&self, operation: &'static str, source: ModelError) -> ZooError {
+    /// An error of the model, with the entry's name.
+    pub fn failed(&self, operation: &'static str, source: ModelError) -> ZooError {
         ZooError::Model { operation, name: self.entry.id().to_string(), source }
     }
 

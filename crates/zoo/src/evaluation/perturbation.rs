@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use models::{FeatureKind, Observation, Signature, Values};
 
-use crate::experiment::PICTURE_PREFIX;
+use crate::experiment::IMAGE_PREFIX;
 
 /// What becomes of a policy's pictures in an evaluation.
 #[derive(Debug, Clone, PartialEq)]
@@ -103,7 +103,7 @@ impl Perturbation {
 
 /// A camera's feature by the simulator's name of the camera.
 fn short(feature: &str) -> &str {
-    feature.strip_prefix(PICTURE_PREFIX).unwrap_or(feature)
+    feature.strip_prefix(IMAGE_PREFIX).unwrap_or(feature)
 }
 
 fn pixels(seen: &mut Observation, camera: &str, change: impl Fn([u8; 3]) -> [u8; 3]) {
@@ -147,7 +147,7 @@ mod tests {
 
     fn signature(cameras: &[(&str, usize)]) -> Signature {
         let pictures =
-            cameras.iter().map(|(name, side)| FeatureSpec::image(&format!("{PICTURE_PREFIX}{name}"), *side, *side));
+            cameras.iter().map(|(name, side)| FeatureSpec::image(&format!("{IMAGE_PREFIX}{name}"), *side, *side));
         let observation = std::iter::once(FeatureSpec::state(2)).chain(pictures).collect();
         Signature { observation, action_dim: 1, ..Signature::default() }
     }

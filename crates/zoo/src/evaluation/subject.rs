@@ -131,7 +131,7 @@ impl Subject<'_> {
             perturbation.apply(&self.signature, &mut seen);
         }
         let cameras = self.signature.of_kind(FeatureKind::Image);
-        let pictures: Vec<Picture> = cameras.filter_map(|camera| picture(camera, &seen)).collect();
+        let pictures: Vec<Picture> = cameras.filter_map(|camera| image(camera, &seen)).collect();
         if pictures.is_empty() {
             return None;
         }
@@ -139,9 +139,11 @@ impl Subject<'_> {
         Some(Image { height, width, rgb })
     }
 
+    /// Refuses a subject whose queries cannot be observed.
+    ///
     /// # Errors
     /// [`RolloutError::Refused`] of what acts inside the simulator, by itself from the first step to the last.
-    pub(super) fn check_watched(&self) -> Result<(), RolloutError> {
+    pub fn check_watched(&self) -> Result<(), RolloutError> {
         if !self.is_scripted {
             return Ok(());
         }
@@ -165,7 +167,10 @@ impl Subject<'_> {
     }
 
     /// `policy` acting as the execution says.
-    pub(super) fn acting(&self, policy: impl Policy + 'static) -> Result<PolicyAgent, ModelError> {
+    ///
+    /// # Errors
+    /// An execution that cannot be.
+    pub fn acting(&self, policy: impl Policy + 'static) -> Result<PolicyAgent, ModelError> {
         let steps = match self.execution {
             // a policy that looks back itself is shown the last steps of a plan one by one
             Execution::RecedingHorizon { n_action_steps } if policy.n_obs_steps() == 1 => n_action_steps,
@@ -177,7 +182,7 @@ impl Subject<'_> {
 }
 
 /// What a camera shows in an observation.
-pub(super) fn picture(camera: &FeatureSpec, seen: &Observation) -> Option<Picture> {
+pub fn image(camera: &FeatureSpec, seen: &Observation) -> Option<Picture> {
     match (seen.get(&camera.name)?, camera.shape.as_slice()) {
         (Values::U8(rgb), &[height, width, _]) => Some(Picture { height, width, rgb: rgb.clone() }),
         _ => None,

@@ -11,7 +11,7 @@ use models::{
 use serde_json::Value;
 
 use crate::entry::{CamerasMeta, CardWords, EntryDraft, EntryId, EntryMeta, ParentMeta, reference};
-use crate::experiment::{DataSection, Experiment, NormalisationSection, PICTURE_PREFIX, RolloutSection, TaskSection};
+use crate::experiment::{DataSection, Experiment, IMAGE_PREFIX, NormalisationSection, RolloutSection, TaskSection};
 use crate::run::TrainSection;
 use crate::{ZooError, tensors};
 
@@ -206,13 +206,13 @@ fn name_of(policy: &PolicyConfig) -> &'static str {
 
 /// The simulator's names of the cameras: what their features are called after LeRobot's prefix.
 fn cameras(signature: &Signature) -> Result<Vec<String>, ModelError> {
-    let name = |spec: &FeatureSpec| match spec.name.strip_prefix(PICTURE_PREFIX) {
+    let name = |spec: &FeatureSpec| match spec.name.strip_prefix(IMAGE_PREFIX) {
         Some(camera) => Ok(camera.to_owned()),
         None => Err(ModelError::Input {
             operation: "import",
             object: "image",
             found: spec.name.clone(),
-            expected: format!("{PICTURE_PREFIX}<camera>"),
+            expected: format!("{IMAGE_PREFIX}<camera>"),
         }),
     };
     signature.of_kind(FeatureKind::Image).map(name).collect()

@@ -53,15 +53,7 @@ impl Rerun {
             report.stop("the entry is not as it was sealed");
             return Ok(None);
         };
-        if !entry.meta().is_robot_policy() {
-            return Err(ZooError::UnfitEntry {
-                entry: entry.id().to_string(),
-                task: entry.meta().task.clone(),
-                what: "kind of entry".to_owned(),
-                expected: "a robot policy (solvers of puzzles: eval --again)".to_owned(),
-                found: entry.meta().kind.clone().unwrap_or_else(|| "another kind".to_owned()),
-            });
-        }
+        entry.meta().require_policy("a robot policy (solvers of puzzles: eval --again)")?;
         report.same(ENTRY, format!("{}: {} files as they were sealed", entry.id(), entry.meta().files.len() + 1));
         let stored = match standing(&row.folder, &known) {
             Ok(Some(stored)) => stored,

@@ -22,7 +22,7 @@ pub use record::{
     EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Execution, Protocol, Seeds, Shard, TrainingFacts,
 };
 pub use seal::{SEAL_FILE, Seal};
-pub(crate) use tables::write_table;
+pub use tables::write_table;
 
 /// What tests elsewhere in this crate build on.
 #[cfg(test)]

@@ -27,7 +27,10 @@ fn table_error<E: std::error::Error + Send + Sync + 'static>(
 }
 
 /// Writes whole columns as a table; those with values missing may have none.
-pub(crate) fn write_table(path: &Path, columns: Vec<(&str, ArrayRef)>) -> Result<(), ZooError> {
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn write_table(path: &Path, columns: Vec<(&str, ArrayRef)>) -> Result<(), ZooError> {
     let columns = columns.into_iter().map(|(name, array)| {
         let nullable = array.null_count() > 0;
         (name, array, nullable)

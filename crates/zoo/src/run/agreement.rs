@@ -7,10 +7,9 @@ use dataset::Dataset;
 use models::{ACTION, ENTITY_PREFIX, ENVIRONMENT_STATE, STATE};
 
 use crate::config::is_built_in_task;
-use crate::experiment::{AUXILIARY, DataSection, Experiment, PICTURE_PREFIX};
+use crate::experiment::{DataSection, Experiment, IMAGE_PREFIX};
 use crate::{FeatureKeys, ZooError};
 
-use super::data::columns;
 use super::names::{self, Names};
 
 /// A data set and an experiment that say the same.
@@ -56,10 +55,10 @@ pub(super) fn agree(dataset: &Dataset, path: &Path, experiment: &Experiment, for
     if free {
         take_keys(&mut agreed);
     }
-    let keys = agreed.experiment.data.told_and_feature_keys()?;
+    let keys = agreed.experiment.data.all_keys()?;
     check_keys(dataset, &agreed.experiment, &keys).map_err(unfit)?;
     let features: Vec<String> =
-        keys.features().filter(|feature| !feature.starts_with(PICTURE_PREFIX)).map(str::to_owned).collect();
+        keys.features().filter(|feature| !feature.starts_with(IMAGE_PREFIX)).map(str::to_owned).collect();
     for feature in features.iter().map(String::as_str).chain([ACTION]) {
         let Some(column) = dataset.column(feature) else {
             if feature == ENVIRONMENT_STATE {
@@ -174,10 +173,8 @@ fn check_keys(dataset: &Dataset, experiment: &Experiment, keys: &FeatureKeys) ->
         ("data.state_keys".to_owned(), STATE.to_owned(), &data.state_keys, &provenance.state_keys),
         ("data.env_keys".to_owned(), ENVIRONMENT_STATE.to_owned(), &data.env_keys, &provenance.env_keys),
     ];
-    let entities = columns(experiment).map(|(name, keys)| {
+    let entities = data.columns().map(|(setting, name, keys)| {
         let found = provenance.entities.get(name).unwrap_or(&none);
-        let setting =
-            if name == AUXILIARY { "data.auxiliary_keys".to_owned() } else { format!("data.entities.{name}") };
         (setting, format!("{ENTITY_PREFIX}{name}"), keys, found)
     });
     for (setting, feature, expected, found) in named.into_iter().chain(entities) {

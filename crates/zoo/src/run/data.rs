@@ -5,24 +5,18 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
-use dataset::{
-    ConvertOptions, Dataset, DatasetError, FeatureStats, PictureStore, Source, WindowBatch, WindowSpec, Windows,
-};
+use dataset::{ConvertOptions, Dataset, FeatureStats, PictureStore, WindowBatch, WindowSpec, Windows};
 use models::{
     Batch, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureSpec, Normaliser, Preprocess, STATE, Signature, ValuesRef,
 };
 
 use crate::ZooError;
 use crate::entry::DataMeta;
-use crate::experiment::{AUXILIARY, DataSection, EntitySection, Experiment, PICTURE_PREFIX};
+use crate::experiment::{DataSection, EntitySection, Experiment, IMAGE_PREFIX};
+use crate::transforms::{self, Source, Stage, Transforms, is_auxiliary};
 
 use super::agreement::{Agreed, agree, takes_keys};
-use super::auxiliary::{Told, is_told};
-use super::exchange::Exchanges;
-use super::mirror::Mirror;
-use super::preflight::picture_budget;
-use super::symmetry::Symmetries;
-use super::way::Ways;
+use super::preflight::image_budget;
 
 /// Folder of the run that a converted HDF5 file goes to.
 pub(super) const CONVERTED: &str = "data";
@@ -100,7 +94,7 @@ pub(super) fn open(
     let options = ConvertOptions {
         state_keys,
         env_keys,
-        entities: columns(experiment).map(|(name, keys)| (name.to_owned(), keys.clone())).collect(),
+        entities: experiment.data.columns().map(|(_, name, keys)| (name.to_owned(), keys.clone())).collect(),
         // no policy reads it
         depth: false,
         ..ConvertOptions::default()
@@ -116,7 +110,7 @@ fn lacks_usual_keys(path: &Path, experiment: &Experiment) -> bool {
     if !takes_keys(experiment) || data.state_keys != usual.state_keys {
         return false;
     }
-    let Ok(source) = Source::open(path) else { return false };
+    let Ok(source) = dataset::Source::open(path) else { return false };
     let Some(demo) = source.plan().demos.first() else { return false };
     usual.state_keys.iter().any(|key| !demo.keys.contains_key(&format!("obs/{key}")))
 }
@@ -145,7 +139,7 @@ pub(crate) fn demonstrations(
 }
 
 /// What pictures may take, and where those go that would take more.
-pub(super) struct PictureMemory<'a> {
+pub(super) struct ImageMemory<'a> {
     pub budget: u64,
     pub folder: &'a Path,
 }
@@ -159,14 +153,9 @@ pub(super) struct Demonstrations {
     pub train: Windows,
     pub valid: Option<Windows>,
     pub preprocess: Preprocess,
-    pub symmetries: Symmetries,
-    pub mirror: Mirror,
-    pub exchanges: Exchanges,
-    pub ways: Ways,
-    /// What training alone is told.
-    pub told: Told,
+    pub transforms: Transforms,
     /// Mean and standard deviation of each camera's colours, on the scale from 0 to 1, where the data set has them.
-    pub picture_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
+    pub image_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
     pub meta: DataMeta,
     /// What a user should know: a missing mask, constant dimensions.
     pub notes: Vec<String>,
@@ -179,7 +168,7 @@ pub(super) fn prepare(
     path: &Path,
     name: &str,
     agreed: &Agreed,
-    memory: &PictureMemory<'_>,
+    memory: &ImageMemory<'_>,
 ) -> Result<Demonstrations, ZooError> {
     let Agreed { dataset, experiment, .. } = agreed;
     let unfit = |reason: String| ZooError::UnfitData { path: path.to_owned(), reason };
@@ -243,13 +232,14 @@ pub(super) fn prepare(
     let statistics = tensors(&statistics).map_err(|e| unfit(e.to_string()))?;
     let action_horizon = experiment.policy.action_horizon();
     let windows = |episodes: Vec<usize>| {
-        let spec = WindowSpec {
+        let mut spec = WindowSpec {
             observation: observation.clone(),
             n_obs_steps: experiment.data.n_obs_steps,
             action_horizon,
             episodes,
-            mistakes: experiment.data.mistakes,
+            mistakes: false,
         };
+        transforms::select(&experiment.data, &mut spec);
         let past = experiment.policy.past_actions(experiment.data.n_obs_steps);
         dataset.windows(&spec).map(|windows| windows.with_past_actions(past)).map_err(failed)
     };
@@ -270,9 +260,8 @@ pub(super) fn prepare(
         true => None,
         false => Some(windows(valid)?),
     };
-    let mut picture_statistics = Vec::new();
-    let cameras: Vec<String> =
-        experiment.data.cameras.iter().map(|camera| format!("{PICTURE_PREFIX}{camera}")).collect();
+    let mut image_statistics = Vec::new();
+    let cameras: Vec<String> = experiment.data.cameras.iter().map(|camera| format!("{IMAGE_PREFIX}{camera}")).collect();
     let bytes = cameras.iter().map(|name| dataset.decoded_bytes(name)).sum::<Result<u64, _>>().map_err(failed)?;
     let fits = bytes <= memory.budget;
     if !fits {
@@ -288,9 +277,8 @@ pub(super) fn prepare(
         };
         train = train.with_pictures(&name, pictures.clone());
         valid = valid.map(|valid| valid.with_pictures(&name, pictures));
-        picture_statistics.push(dataset.stats().get(&name).and_then(colours));
+        image_statistics.push(dataset.stats().get(&name).and_then(colours));
     }
-    let told = Told::new(experiment, &train, &statistics).map_err(experiment.model_error("take the statistics for"))?;
     let signature = signature(&train, experiment);
     let modes = experiment.normalisation.modes(&signature);
     let mut normaliser =
@@ -301,49 +289,56 @@ pub(super) fn prepare(
             guarded.feature, guarded.dim, guarded.spread
         ));
     }
-    let exchanges = Exchanges::new(experiment, dataset, &train, &signature, path)?;
-    let ways = Ways::new(experiment, dataset, &train, path)?;
     let preprocess = Preprocess::new(signature, normaliser, &Device::Cpu)
         .map_err(experiment.model_error("take the statistics for"))?;
-    let symmetries = Symmetries::new(experiment, dataset, path)?;
-    let mirror = Mirror::new(experiment, dataset, &train, path)?;
-    let picture_statistics = picture_statistics.into_iter().collect();
-    Ok(Demonstrations {
-        train,
-        valid,
-        preprocess,
-        symmetries,
-        mirror,
-        exchanges,
-        ways,
-        told,
-        picture_statistics,
-        meta,
-        notes,
-    })
+    let signature = preprocess.signature();
+    let source = Source { experiment, dataset, path, windows: &train, statistics: &statistics, signature };
+    let transforms = Transforms::fit(&source)?;
+    let image_statistics = image_statistics.into_iter().collect();
+    Ok(Demonstrations { train, valid, preprocess, transforms, image_statistics, meta, notes })
 }
 
-/// The windows of the episodes that a training of `experiment` learns from, its symmetries, and the number of each episode's
+impl Demonstrations {
+    /// Windows as a batch in network units, with the data transforms of the stage. The windows are changed.
+    ///
+    /// # Errors
+    /// When a tensor cannot be made.
+    pub fn batch(&self, stage: Stage, windows: &mut WindowBatch, experiment: &Experiment) -> Result<Batch, ZooError> {
+        self.transforms.apply(stage, windows);
+        let numbers = windows.observation.iter().map(|(name, values)| (name.clone(), ValuesRef::F32(values)));
+        let images = windows.pictures.iter().map(|(name, values)| (name.clone(), ValuesRef::U8(values)));
+        let observation = numbers.chain(images).collect();
+        let action_horizon = experiment.policy.action_horizon();
+        let made = self.preprocess.batch(action_horizon, &observation, &windows.actions, &windows.is_pad);
+        let made = made.and_then(|mut batch| {
+            self.transforms.targets(stage, windows, &mut batch)?;
+            Ok(batch)
+        });
+        made.map_err(experiment.model_error("make a batch for"))
+    }
+}
+
+/// The windows of the episodes that a training of `experiment` learns from, its data transforms, and the number of each episode's
 /// first window. An HDF5 file is converted into `work`.
 ///
 /// # Errors
 /// What a training would refuse.
-pub(crate) fn first_windows(
+pub fn first_windows(
     path: &Path,
     work: &Path,
     experiment: &Experiment,
-) -> Result<(Windows, Symmetries, Vec<u32>), ZooError> {
+) -> Result<(Windows, Transforms, Vec<u32>), ZooError> {
     std::fs::create_dir_all(work).map_err(ZooError::io("create folder", work))?;
     let (dataset, _) = open(path, work, experiment, &mut |_, _| {})?;
     let all = || (0..dataset.episodes().len()).collect();
     let episodes: Vec<usize> = dataset.split(&experiment.data.train_mask).unwrap_or_else(all);
     let lengths = episodes.iter().map(|&episode| dataset.episodes()[episode].length as u32);
     let firsts = lengths.scan(0, |next, length| Some(std::mem::replace(next, *next + length))).collect();
-    let memory = PictureMemory { budget: picture_budget(), folder: work };
+    let memory = ImageMemory { budget: image_budget(), folder: work };
     // what an entry was trained on is not asked again
     let agreed = agree(&dataset, path, experiment, true)?;
     let demonstrations = prepare(&dataset, path, &path.display().to_string(), &agreed, &memory)?;
-    Ok((demonstrations.train, demonstrations.symmetries, firsts))
+    Ok((demonstrations.train, demonstrations.transforms, firsts))
 }
 
 /// Mean and standard deviation of three colours.
@@ -362,15 +357,8 @@ fn observed(dataset: &Dataset, experiment: &Experiment) -> Vec<String> {
     if !experiment.data.env_keys.is_empty() && dataset.column(ENVIRONMENT_STATE).is_some() {
         columns.push(ENVIRONMENT_STATE.to_owned());
     }
-    columns.extend(self::columns(experiment).map(|(name, _)| format!("{ENTITY_PREFIX}{name}")));
+    columns.extend(experiment.data.columns().map(|(_, name, _)| format!("{ENTITY_PREFIX}{name}")));
     columns
-}
-
-/// The columns beside those that every data set has, by the names of entities, and their keys.
-pub(super) fn columns(experiment: &Experiment) -> impl Iterator<Item = (&str, &Vec<String>)> {
-    let data = &experiment.data;
-    let told = (!data.auxiliary_keys.is_empty()).then_some((AUXILIARY, &data.auxiliary_keys));
-    data.entities.iter().map(|(name, entity)| (name.as_str(), &entity.keys)).chain(told)
 }
 
 /// The columns of each group of entities.
@@ -397,32 +385,10 @@ fn signature(windows: &Windows, experiment: &Experiment) -> Signature {
     let colours: Vec<String> = colours.collect();
     let pictures = windows.pictures();
     let pictures = pictures.map(|(camera, (h, w))| FeatureSpec::image(camera, h, w).in_colours(colours.clone()));
-    let (told, seen): (Vec<_>, Vec<_>) = windows.observation().partition(|(column, _)| is_told(column));
+    let (told, seen): (Vec<_>, Vec<_>) = windows.observation().partition(|(column, _)| is_auxiliary(column));
     let observation = seen.into_iter().map(spec).chain(pictures).collect();
     let auxiliary_dim = told.iter().map(|(_, width)| width).sum();
     Signature { observation, n_obs_steps: windows.n_obs_steps(), action_dim: windows.action_dim(), auxiliary_dim }
-}
-
-/// Turns gathered windows into a batch in network units.
-pub(super) fn batch(
-    windows: &WindowBatch,
-    demonstrations: &Demonstrations,
-    experiment: &Experiment,
-) -> Result<Batch, ZooError> {
-    let numbers = windows.observation.iter().map(|(name, values)| (name.clone(), ValuesRef::F32(values)));
-    let pictures = windows.pictures.iter().map(|(name, values)| (name.clone(), ValuesRef::U8(values)));
-    let observation = numbers.chain(pictures).collect();
-    let (told, preprocess) = (&demonstrations.told, &demonstrations.preprocess);
-    let action_horizon = experiment.policy.action_horizon();
-    let made = preprocess.batch(action_horizon, &observation, &windows.actions, &windows.is_pad);
-    made.and_then(|batch| Ok(Batch { auxiliary: told.of(windows)?, ..batch }))
-        .map_err(experiment.model_error("make a batch for"))
-}
-
-/// Pictures of a data set that could be decoded and cannot be read any more.
-pub(super) fn unreadable(name: &str) -> impl FnOnce(DatasetError) -> ZooError + use<> {
-    let path = PathBuf::from(name);
-    move |source| ZooError::Dataset { path, source: Box::new(source) }
 }
 
 /// A mask that was asked for and is not there.

@@ -1,14 +1,11 @@
 //! The batches of a training, in order: gathered when they are needed, or, where pictures are read from a file, one step
 //! ahead by a thread of their own while the step before is computed. Which windows make a batch is the sampler's.
 
-use std::ops::Range;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
 use dataset::shuffle::Sampler;
 use dataset::{DatasetError, WindowBatch, Windows};
-
-use crate::experiment::BeginningSection;
 
 /// A batch under way.
 type Coming = JoinHandle<Result<WindowBatch, DatasetError>>;
@@ -16,10 +13,8 @@ type Coming = JoinHandle<Result<WindowBatch, DatasetError>>;
 /// Gathers the windows of each step.
 pub(super) struct Feed {
     sampler: Sampler,
-    /// What is drawn more often than the rest.
-    beginning: Option<BeginningSection>,
-    /// The windows that are drawn once an epoch, by number, as often as they stand here; all of them where empty.
-    drawn: Vec<u32>,
+    /// The windows of an epoch by number, each as often as it is drawn; absent: every window once.
+    drawn: Option<Vec<u32>>,
     /// Steps that there will be.
     steps: u64,
     batch: WindowBatch,
@@ -30,8 +25,8 @@ pub(super) struct Feed {
 }
 
 impl Feed {
-    pub fn new(sampler: Sampler, beginning: Option<BeginningSection>, steps: u64) -> Self {
-        Self { sampler, beginning, drawn: Vec::new(), steps, batch: WindowBatch::default(), shared: None, ahead: None }
+    pub fn new(sampler: Sampler, drawn: Option<Vec<u32>>, steps: u64) -> Self {
+        Self { sampler, drawn, steps, batch: WindowBatch::default(), shared: None, ahead: None }
     }
 
     /// The windows of step `step`, counted from 0. `windows` are always the same.
@@ -63,28 +58,9 @@ impl Feed {
 
     /// Which windows step `step` has.
     fn indices(&mut self, windows: &Windows, step: u64) -> Vec<u32> {
-        let Some(beginning) = self.beginning else { return self.sampler.batch(windows.len(), step) };
-        if self.drawn.is_empty() {
-            self.drawn = with_beginnings(&windows.episodes(), beginning);
+        match &self.drawn {
+            Some(drawn) => self.sampler.batch(drawn.len(), step).iter().map(|&at| drawn[at as usize]).collect(),
+            None => self.sampler.batch(windows.len(), step),
         }
-        self.sampler.batch(self.drawn.len(), step).iter().map(|&at| self.drawn[at as usize]).collect()
-    }
-}
-
-/// The windows of all episodes, the first ones of each as often as asked.
-fn with_beginnings(episodes: &[Range<u32>], beginning: BeginningSection) -> Vec<u32> {
-    let times = |at: usize| if at < beginning.steps { beginning.times } else { 1 };
-    let windows = episodes.iter().flat_map(|episode| episode.clone().enumerate());
-    windows.flat_map(|(at, window)| std::iter::repeat_n(window, times(at))).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_first_windows_of_an_episode_are_there_as_often_as_asked() {
-        let windows = with_beginnings(&[0..3, 3..4, 4..8], BeginningSection { steps: 2, times: 3 });
-        assert_eq!(windows, [0, 0, 0, 1, 1, 1, 2, 3, 3, 3, 4, 4, 4, 5, 5, 5, 6, 7]);
     }
 }

@@ -3,9 +3,10 @@
 use dataset::{WindowBatch, Windows};
 use models::{Batch, PolicyModel};
 
-use super::data::{self, Demonstrations};
+use super::data::Demonstrations;
 use crate::ZooError;
 use crate::experiment::Experiment;
+use crate::transforms::{Stage, unreadable};
 
 /// Shows a model that was just built every episode, if it remembers any.
 ///
@@ -22,8 +23,8 @@ pub(super) fn fill(
         let mut batches = Vec::new();
         for episode in windows.episodes() {
             let indices: Vec<u32> = episode.collect();
-            windows.try_gather(&indices, &mut gathered).map_err(data::unreadable(&demonstrations.meta.name))?;
-            batches.push(data::batch(&gathered, demonstrations, experiment)?);
+            windows.try_gather(&indices, &mut gathered).map_err(unreadable(&demonstrations.meta.name))?;
+            batches.push(demonstrations.batch(Stage::Validation, &mut gathered, experiment)?);
         }
         Ok(batches)
     };

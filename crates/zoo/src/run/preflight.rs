@@ -49,7 +49,7 @@ fn bytes(count: f64) -> String {
 }
 
 /// Bytes that pictures may take unless it is said: half of what is free.
-pub(super) fn picture_budget() -> u64 {
+pub(super) fn image_budget() -> u64 {
     available_memory().map_or(u64::MAX, |bytes| (bytes / 2.0) as u64)
 }
 

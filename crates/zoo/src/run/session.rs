@@ -3,18 +3,17 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Instant, SystemTime};
 
 use candle_core::{DType, Tensor};
 use models::ModelError;
 use serde::{Deserialize, Serialize};
 
-use crate::entry::{ENTRY_FILE, Entry, EntryDraft, EntryId, TRAIN_FILE, TrainingMeta};
+use crate::entry::{CurvePoint, ENTRY_FILE, Entry, EntryDraft, EntryId, TRAIN_FILE, TrainingMeta, thinned};
 use crate::{ZooError, sha256_file, write_atomic};
 
 use super::checkpoint::Checkpoint;
 use super::folder::RunFolder;
-use super::loop_parts::{curve, open_folder, same_settings, wall_time};
 use super::metrics::{Metrics, MetricsRow};
 use super::preflight;
 use super::section::TrainSection;
@@ -160,7 +159,12 @@ pub fn run<E: Settings, T: Training>(
     on_event: &mut dyn FnMut(TrainEvent<'_>),
 ) -> Result<TrainOutcome, ZooError> {
     preflight::check(place, experiment)?;
-    let folder = open_folder(&place.name, &place.runs, place.run.as_deref(), place.resume)?;
+    let folder = match (&place.run, place.resume) {
+        (Some(path), true) => RunFolder::resume(path)?,
+        (Some(path), false) => RunFolder::fresh(path)?,
+        (None, true) => RunFolder::resume_latest(&place.runs, &place.name)?,
+        (None, false) => RunFolder::next(&place.runs, &place.name)?,
+    };
     let outcome = run_in(&folder, place, experiment, make, stop, on_event);
     if outcome.is_err() && !folder.config_path().exists() {
         // refused before it began: as if it had never been asked for
@@ -381,6 +385,38 @@ fn machine() -> Option<String> {
     let cores = text.lines().filter(|line| line.starts_with("processor")).count();
     let kernel = std::fs::read_to_string("/proc/sys/kernel/osrelease").ok()?;
     Some(format!("{name}, {cores} cores, Linux {}", kernel.trim()))
+}
+
+/// Refuses to resume with other settings than the run began with; names the first that differs.
+pub(crate) fn same_settings(
+    folder: &Path,
+    saved: &BTreeMap<String, String>,
+    asked: &BTreeMap<String, String>,
+) -> Result<(), ZooError> {
+    let absent = || "nothing".to_owned();
+    for key in saved.keys().chain(asked.keys()) {
+        let (expected, found) = (saved.get(key), asked.get(key));
+        if expected != found {
+            return Err(ZooError::ResumeMismatch {
+                folder: folder.to_owned(),
+                what: key.clone(),
+                expected: expected.cloned().unwrap_or_else(absent),
+                found: found.cloned().unwrap_or_else(absent),
+            });
+        }
+    }
+    Ok(())
+}
+
+/// The loss curve, thinned.
+fn curve(rows: &[MetricsRow]) -> Vec<CurvePoint> {
+    let value = |row: &MetricsRow, name: &str| row.values.get(name).copied();
+    thinned(rows.iter().map(|row| (row.step, value(row, "loss"), value(row, "valid_loss"))))
+}
+
+/// Seconds since 1970.
+fn wall_time() -> f64 {
+    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
 }
 
 /// The first tensor with a value that no training recovers from.

@@ -12,16 +12,17 @@ use serde::{Deserialize, Serialize};
 
 use crate::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, ModuleMeta, ParentMeta, TrainingMeta, reference};
 use crate::experiment::Experiment;
+use crate::transforms::{Stage, unreadable};
 use crate::{ZooError, tensors, write_atomic};
 
 use super::agreement::agree;
-use super::beginning::Beginning;
 use super::checkpoint::Checkpoint;
-use super::data::{self, Demonstrations, PictureMemory};
+use super::data::{self, Demonstrations, ImageMemory};
 use super::feed::Feed;
 use super::folder::RunFolder;
+use super::initial_weights::InitialWeights;
 use super::metrics::MetricsRow;
-use super::preflight::picture_budget;
+use super::preflight::image_budget;
 use super::section::TrainSection;
 use super::session::{self, Place, Settings, TrainEvent, TrainOutcome, Training};
 use super::validation::validation_loss;
@@ -170,8 +171,8 @@ impl PolicyTraining {
             Some(provenance) => provenance.source.clone(),
             None => path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
         };
-        let budget = request.image_memory.unwrap_or_else(picture_budget);
-        let memory = PictureMemory { budget, folder: folder.path() };
+        let budget = request.image_memory.unwrap_or_else(image_budget);
+        let memory = ImageMemory { budget, folder: folder.path() };
         if let Some(note) = &earlier
             && note.fingerprint != dataset.fingerprint()
         {
@@ -190,14 +191,14 @@ impl PolicyTraining {
         }
         let section = &experiment.train;
         let from_zoo = request.from_zoo.as_ref().unwrap_or(&request.zoo);
-        let beginning = section.from.as_ref().map(|from| Beginning::read(from_zoo, from)).transpose()?;
+        let initial = section.from.as_ref().map(|from| InitialWeights::read(from_zoo, from)).transpose()?;
         let build = || {
             let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed, &Backend::CPU);
             let model = model.map_err(experiment.model_error("build the policy of"))?;
-            super::eyes::open(model.as_ref(), &demonstrations, &experiment)?;
+            super::image_encoder::initialise(model.as_ref(), &demonstrations, &experiment)?;
             super::memory::fill(model.as_ref(), &demonstrations, &experiment)?;
-            if let Some(beginning) = &beginning {
-                let taken = model.params().load(&beginning.weights(&model.params().tensors()));
+            if let Some(initial) = &initial {
+                let taken = model.params().load(&initial.weights(&model.params().tensors()));
                 taken.map_err(experiment.model_error("take the weights of `train.from` for"))?;
             }
             Ok::<_, ZooError>(model)
@@ -205,8 +206,8 @@ impl PolicyTraining {
         let trainer = Trainer::new(build()?, section.trainer_config(), section.seed)
             .map_err(experiment.model_error("set up the training of"))?;
         let evaluated = build()?;
-        if let Some(beginning) = &beginning {
-            on_event(TrainEvent::Note(&beginning.note(&evaluated.params().tensors())?));
+        if let Some(initial) = &initial {
+            on_event(TrainEvent::Note(&initial.note(&evaluated.params().tensors())?));
         }
         if earlier.is_none() {
             let note =
@@ -215,14 +216,15 @@ impl PolicyTraining {
             write_atomic(&note_path, text.as_bytes())?;
         }
         let sampler = Sampler::new(section.seed, section.batch_size);
-        let feed = Feed::new(sampler, experiment.data.beginning, section.steps);
+        let drawn = demonstrations.transforms.draws(&demonstrations.train.episodes());
+        let feed = Feed::new(sampler, drawn, section.steps);
         Ok(Self {
             experiment,
             demonstrations,
             env: dataset.env().cloned(),
             trainer,
             evaluated,
-            parent: beginning.map(|beginning| beginning.parent),
+            parent: initial.map(|initial| initial.parent),
             feed,
             rate: (Instant::now(), 0),
         })
@@ -248,15 +250,10 @@ impl Training for PolicyTraining {
     }
 
     fn step(&mut self, step: u64) -> Result<BTreeMap<String, f64>, ZooError> {
-        let unreadable = data::unreadable(&self.demonstrations.meta.name);
+        let unreadable = unreadable(&self.demonstrations.meta.name);
         let windows = self.feed.take(&self.demonstrations.train, step).map_err(unreadable)?;
-        self.demonstrations.symmetries.apply(step, windows);
-        self.demonstrations.mirror.apply(step, windows);
-        self.demonstrations.exchanges.apply(step, windows);
-        let (mut batch, rows) = (data::batch(windows, &self.demonstrations, &self.experiment)?, windows.n);
-        batch.taken = self.demonstrations.exchanges.taken(windows);
-        let unfit = |source: candle_core::Error| self.experiment.model_error("train")(source.into());
-        batch.visited = self.demonstrations.ways.of(windows).map_err(unfit)?;
+        let rows = windows.n;
+        let batch = self.demonstrations.batch(Stage::Training(step), windows, &self.experiment)?;
         let done = self.trainer.step(&batch).map_err(self.experiment.model_error("train"))?;
         self.rate.1 += rows as u64;
         let mut values = BTreeMap::from([

@@ -6,8 +6,9 @@ use models::{Batch, ModelError, PolicyModel};
 
 use crate::ZooError;
 use crate::experiment::Experiment;
+use crate::transforms::{Stage, unreadable};
 
-use super::data::{self, Demonstrations};
+use super::data::Demonstrations;
 
 /// Windows used, evenly spread; more would cost time and tell the same.
 const MOST_WINDOWS: usize = 512;
@@ -31,8 +32,8 @@ pub(super) fn validation_loss(
     let pixels: usize = windows.pictures().map(|(_, (height, width))| height * width).sum();
     let at_once = (PIXELS / (pixels * windows.n_obs_steps()).max(1)).clamp(1, BATCH);
     for chunk in indices.chunks(at_once) {
-        windows.try_gather(chunk, &mut gathered).map_err(data::unreadable(&demonstrations.meta.name))?;
-        let batch = data::batch(&gathered, demonstrations, experiment)?;
+        windows.try_gather(chunk, &mut gathered).map_err(unreadable(&demonstrations.meta.name))?;
+        let batch = demonstrations.batch(Stage::Validation, &mut gathered, experiment)?;
         let (error, entries) = absolute_error(model, &batch).map_err(experiment.model_error("validate"))?;
         sum += error;
         count += entries;

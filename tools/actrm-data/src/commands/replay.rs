@@ -1,5 +1,5 @@
 use anyhow::{Context, Result, bail};
-use cli::{Film, INTERRUPTED, Screen, SimulatorArgs, Stop};
+use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, VideoWriter};
 use dataset::{Demo, Source, WriteOptions};
 use recording::Recording;
 use rollout::{FrameTensor, Image, RecordedEpisode, RunEnd, Worker};
@@ -68,7 +68,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     };
     let size = (usize::from(args.size), usize::from(args.size));
     let rate = pool.ready().control_freq;
-    let mut film = Film::begin(&args.video, size, rate)?;
+    let mut video = VideoWriter::begin(&args.video, size, rate)?;
     let mut screen = Screen::new();
     screen.begin(format!("drawing {id}"), steps as u64);
     let parts = steps.div_ceil(PART);
@@ -85,7 +85,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let drawn = result.map_err(anyhow::Error::from).and_then(|episode| {
             success |= episode.success;
             let drawn = pictures(&args.camera, size, &episode, last)?;
-            drawn.iter().try_for_each(|image| film.push(image))?;
+            drawn.iter().try_for_each(|image| video.push(image))?;
             images += drawn.len();
             Ok(())
         });
@@ -108,7 +108,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         cli::note(&format!("stopped after {images} of {} images; nothing was written", steps + 1));
         return Ok(ExitCode::from(INTERRUPTED));
     }
-    film.finish()?;
+    video.finish()?;
     if args.json {
         cli::print_json(&json!({
             "video": cli::lossy(&args.video), "task": task, "demo": id, "images": images, "rate": rate, "success": success,

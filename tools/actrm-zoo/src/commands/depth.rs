@@ -2,6 +2,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use analysis::depth::thinking_subject;
 use anyhow::Context;
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits};
 use models::actrm::{Intervention, Thinking};
@@ -10,7 +11,7 @@ use report::statistics::wilson_interval;
 use serde::Serialize;
 use zoo::ZooError;
 use zoo::audit::{KnownEntries, LeftOut, audit};
-use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, evaluate, thinking_subject};
+use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, evaluate};
 use zoo::results::{Seeds, StoredEvaluation};
 
 use crate::places::{ZooArgs, entry_names};

@@ -12,17 +12,17 @@ use rollout::{Pool, Ready, remembered_greeting};
 use serde_json::{Value, json};
 use zoo::entry::{EntryId, EntryMeta, LoadedEntry};
 use zoo::evaluation::{
-    Environment, EvaluationOptions, FIRST_SEED, Perturbation, Subject, View, evaluate_again, film, finished,
+    Environment, EvaluationOptions, FIRST_SEED, Perturbation, Subject, View, evaluate_again, finished, record_videos,
 };
 use zoo::protocols::NamedProtocol;
 use zoo::registry::Registry;
 use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 
-use crate::films;
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names, of_entry};
-use crate::puzzles::{PuzzleArgs, evaluate_solver};
+use crate::puzzles::{self, PuzzleArgs};
 use crate::remote::{Remote, RemoteArgs};
 use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
+use crate::videos;
 
 /// Headings of its help.
 const EPISODES: &str = "Episodes";
@@ -269,10 +269,6 @@ fn open(
         cli::note(&format!("note: {id}: not evaluated: its weights are not in this zoo"));
         return Ok(None);
     }
-    if entry.meta().is_robot_policy() {
-        asked.check_task(args.run.task.as_ref().unwrap_or(&entry.meta().task))?;
-        return Ok(Some(entry.load()?));
-    }
     // what says how robots are run; with --all it is meant for the others
     let named = !args.all && !args.all_versions;
     let of_robots = [
@@ -286,17 +282,17 @@ fn open(
         ("--video-failed", args.video_failed > 0),
         ("--perturb", args.perturb.is_some()),
     ];
-    if let Some((option, _)) = of_robots.iter().find(|(_, given)| *given && named) {
-        bail!(
-            "{option}: expected a robot policy, found a solver of puzzles, which takes --puzzles, --depth, --givens, --seed-start and --again"
-        );
-    }
+    let of_robots = of_robots.into_iter().find(|(_, given)| *given && named).map(|(option, _)| option);
     let (task, results) = (args.run.task.as_deref(), args.results.folder(&args.zoo));
     // seeds of episodes are no seeds of puzzles where both kinds are evaluated
     let seed = args.seed.filter(|_| named);
-    let (line, value) = evaluate_solver(&entry, task, &args.puzzles, seed, args.again, &results)?;
-    says.say(&(line + "\n"), value)?;
-    Ok(None)
+    if let Some((line, value)) = puzzles::evaluate(&entry, of_robots, task, &args.puzzles, seed, args.again, &results)?
+    {
+        says.say(&(line + "\n"), value)?;
+        return Ok(None);
+    }
+    asked.check_task(task.unwrap_or(&entry.meta().task))?;
+    Ok(Some(entry.load()?))
 }
 
 /// Evaluates the entries of an environment on one set of simulators.
@@ -425,7 +421,7 @@ fn options(args: &Args, asked: &Asked<'_>, environment: &Environment) -> Evaluat
     }
 }
 
-/// Evaluates one entry and films it, as far as nobody asks to stop.
+/// Evaluates one entry and records videos of it, as far as nobody asks to stop.
 fn evaluate_entry(
     (args, asked): (&Args, &Asked<'_>),
     options: &EvaluationOptions,
@@ -530,7 +526,7 @@ fn again(
     Ok(false)
 }
 
-/// Films episodes; the path of each video is printed.
+/// Records videos of episodes; the path of each video is printed.
 fn videos(
     (args, options): (&Args, &EvaluationOptions),
     seeds: &[u64],
@@ -538,20 +534,20 @@ fn videos(
     subject: &Subject<'_>,
     pool: &mut Pool,
 ) -> anyhow::Result<()> {
-    let folder = films::folder(&args.zoo.zoo, &subject.entry);
+    let folder = videos::folder(&args.zoo.zoo, &subject.entry);
     let conditions = subject.record(pool.ready(), options)?.conditions();
     fs::create_dir_all(&folder).with_context(|| format!("creating {}", shown(&folder)))?;
     let rate = pool.ready().control_freq;
     let task = pool.ready().task.clone();
     let seen = matches!(view, View::Seen { .. });
     let mut screen = Screen::new();
-    screen.begin("film", seeds.len() as u64);
+    screen.begin("video", seeds.len() as u64);
     let mut failure: Option<anyhow::Error> = None;
-    film(subject, pool, seeds, view, &mut |seed, images, success| {
-        let path = folder.join(films::name(&task, seed, success, seen, &conditions));
+    record_videos(subject, pool, seeds, view, &mut |seed, images, success| {
+        let path = folder.join(videos::name(&task, seed, success, seen, &conditions));
         screen.step();
         let line = shown(&path);
-        let written = cli::film(&path, &images, rate).and_then(|()| match args.json {
+        let written = cli::write_video(&path, &images, rate).and_then(|()| match args.json {
             // JSON alone is on standard output
             true => {
                 screen.note(&line);

@@ -15,8 +15,8 @@ use zoo::entry::Entry;
 use zoo::{ZooError, write_together};
 
 use super::depth::{WORK, depths};
-use crate::films;
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs};
+use crate::videos;
 
 /// Rank all evaluations on screen, as leaderboard.csv and as report.html in the zoo
 ///
@@ -104,7 +104,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         section: puzzle_section(&puzzles),
         entries: entries.good().map(facts).collect(),
         depths,
-        films: films::of_episodes(&rows, &args.zoo.zoo),
+        films: videos::of_episodes(&rows, &args.zoo.zoo),
         places: Places { zoo: args.zoo.named(), results: args.results.named(), protocols: args.protocols.named() },
     };
     let page = to_html(&rows, &beside);

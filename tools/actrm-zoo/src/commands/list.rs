@@ -3,7 +3,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use cli::{Column, Table, shown};
 use serde_json::Value;
-use study::puzzle::{AnyExperiment, PuzzleMeta};
+use study::puzzle::{AnyExperiment, PuzzleMeta, Summary};
 use zoo::entry::Entry;
 
 use crate::places::{ConfigArgs, ZooArgs};
@@ -51,18 +51,8 @@ fn experiments(args: &Args) -> anyhow::Result<ExitCode> {
     let mut table = Table::new(["experiment", "policy", "task", "inputs"].map(Column::new).to_vec());
     let (mut names, mut failures) = (Vec::new(), Vec::new());
     for name in library.names()? {
-        let (policy, task, inputs) = match AnyExperiment::load(&library, &name, &[]) {
-            Ok(AnyExperiment::Robot(one)) => {
-                let data = &one.data;
-                let things = !data.entities.is_empty() || !data.grids.is_empty();
-                let kinds = [(!data.cameras.is_empty(), "images"), (things, "objects"), (true, "state")];
-                let inputs: Vec<&str> = kinds.into_iter().filter(|(given, _)| *given).map(|(_, kind)| kind).collect();
-                (one.policy.policy_type().to_string(), one.task.name.clone(), inputs.join(", "))
-            }
-            Ok(AnyExperiment::Puzzle(one)) => {
-                let policy = name.split('_').next().unwrap_or_default().to_owned();
-                (policy, one.task.puzzle.clone(), "puzzle".to_owned())
-            }
+        let Summary { policy, task, inputs } = match AnyExperiment::load(&library, &name, &[]) {
+            Ok(experiment) => experiment.summary(&name),
             // one bad file must not hide the others
             Err(error) => {
                 failures.push(anyhow::Error::new(error).context(format!("experiment {name}")));

@@ -1,9 +1,9 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use analysis::depth::starts;
+use analysis::probe::{ProbeCell, ProbeRequest, ProbeResult, probe};
 use cli::{INTERRUPTED, SimulatorArgs, Stop, limits, shown};
-use zoo::evaluation::starts;
-use zoo::probe::{ProbeCell, ProbeRequest, ProbeResult, probe};
 use zoo::results::Seeds;
 
 use crate::places::{ZooArgs, entry_names};

@@ -1,11 +1,12 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use analysis::Saliency;
 use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, shown};
 use models::FeatureKind;
 use rollout::Control;
-use zoo::evaluation::{self, FIRST_SEED, Saliency};
+use zoo::evaluation::FIRST_SEED;
 use zoo::write_atomic;
 
 use crate::places::{ZooArgs, entry_names};
@@ -67,7 +68,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
     let mut screen = Screen::new();
     let queries = usize::from(args.queries);
-    let looked = evaluation::saliency(&loaded, &subject, &mut pool, args.seed, queries, &mut screen.advance("looking"));
+    let looked = analysis::saliency(&loaded, &subject, &mut pool, args.seed, queries, &mut screen.advance("looking"));
     drop(screen);
     cli::close(pool);
     let Some(looked) = looked.with_context(|| format!("entry {id}"))? else {

@@ -4,13 +4,12 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use cli::{INTERRUPTED, SimulatorArgs, Stop, shown};
 use rollout::Control;
-use study::puzzle::{SolverEntry, trace};
 use zoo::entry::Entry;
-use zoo::evaluation::{self, FIRST_SEED};
+use zoo::evaluation::FIRST_SEED;
 use zoo::write_atomic;
 
 use crate::places::{ZooArgs, entry_names};
-use crate::puzzles::family;
+use crate::puzzles::{self, TraceOptions};
 use crate::simulation::{drawn, worker};
 
 /// Show the refinement steps of a puzzle solver on a puzzle, or of a robot policy in an episode
@@ -67,18 +66,30 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let entry = args.zoo.registry().entry(&args.entry)?;
-    match entry.meta().is_robot_policy() {
-        true => trace_policy(args, &entry),
-        false => trace_solver(args, &entry),
+    let of_episodes = [
+        ("--seed", args.seed.is_some()),
+        ("--parquet", args.parquet.is_some()),
+        ("--control", args.control != Control::Compiled),
+        ("--workers", args.simulator.workers.is_some()),
+        ("--env-module", args.simulator.env_module.is_some()),
+    ];
+    let options = TraceOptions {
+        index: args.index,
+        depth: args.depth,
+        task: args.task.as_deref(),
+        givens: args.givens,
+        json: args.json,
+        svg: args.svg.as_deref(),
+    };
+    match puzzles::trace(&entry, &options, given(&of_episodes))? {
+        true => Ok(ExitCode::SUCCESS),
+        false => trace_policy(args, &entry),
     }
 }
 
-/// Options that mean nothing for this kind of entry are not passed over.
-fn refuse(entry: &Entry, kind: &str, options: &[(&str, bool)]) -> anyhow::Result<()> {
-    match options.iter().find(|(_, given)| *given) {
-        Some((option, _)) => bail!("{option} means nothing for {}, {kind}", entry.id()),
-        None => Ok(()),
-    }
+/// The first of the options that is given.
+fn given<'o>(options: &[(&'o str, bool)]) -> Option<&'o str> {
+    options.iter().find(|(_, given)| *given).map(|(option, _)| *option)
 }
 
 fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
@@ -88,9 +99,11 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
         ("--givens", args.givens.is_some()),
         ("--workers", args.simulator.workers.is_some()),
     ];
-    refuse(entry, "a robot policy of which one episode is shown", &of_puzzles)?;
+    if let Some(option) = given(&of_puzzles) {
+        bail!("{option} means nothing for {}, a robot policy of which one episode is shown", entry.id());
+    }
     let loaded = entry.load()?;
-    let (subject, examiner) = (loaded.subject(), evaluation::Examiner::of(&loaded)?);
+    let (subject, examiner) = (loaded.subject(), analysis::Examiner::of(&loaded)?);
     if args.svg.is_some() && examiner.is_none() {
         bail!(
             "--svg means nothing for {}: it does not think step by step about its actions from one start, nor over a grid",
@@ -103,7 +116,7 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     let one = SimulatorArgs { workers: Some(1), env_module: env_module.clone(), python: python.clone() };
     let spec = worker(&environment, &one, args.control)?;
     let Some(mut pool) = one.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
-    let traced = evaluation::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED), examiner.as_ref());
+    let traced = analysis::trace(&subject, &mut pool, args.seed.unwrap_or(FIRST_SEED), examiner.as_ref());
     cli::close(pool);
     let Some(traced) = traced.with_context(|| format!("entry {}", entry.id()))? else {
         return Ok(ExitCode::from(INTERRUPTED));
@@ -119,36 +132,6 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     match args.json {
         true => cli::print_json(&traced)?,
         false => cli::print(&traced.to_text())?,
-    }
-    Ok(ExitCode::SUCCESS)
-}
-
-fn trace_solver(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
-    let of_episodes = [
-        ("--seed", args.seed.is_some()),
-        ("--parquet", args.parquet.is_some()),
-        ("--control", args.control != Control::Compiled),
-        ("--workers", args.simulator.workers.is_some()),
-        ("--env-module", args.simulator.env_module.is_some()),
-    ];
-    refuse(entry, "a puzzle solver", &of_episodes)?;
-    let other = args.task.as_deref().map(family).transpose()?;
-    let solver = SolverEntry::load(entry, other)?;
-    let task = match other {
-        Some(task) => task,
-        None => solver.experiment().task.family()?,
-    };
-    let givens = args.givens.unwrap_or(solver.experiment().task.givens().0);
-    let depth = usize::try_from(args.depth.unwrap_or(8))?;
-    let trace = trace(&solver, task, givens, args.index.unwrap_or(0), depth)?;
-    match &args.svg {
-        Some(path) => {
-            cli::make_parent(path)?;
-            write_atomic(path, trace.to_svg().as_bytes())?;
-            cli::print(&(shown(path) + "\n"))?;
-        }
-        None if args.json => cli::print_json(&trace)?,
-        None => cli::print(&trace.to_text())?,
     }
     Ok(ExitCode::SUCCESS)
 }

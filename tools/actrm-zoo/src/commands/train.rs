@@ -4,10 +4,10 @@ use std::process::ExitCode;
 
 use anyhow::{Context, anyhow, bail};
 use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
-use study::puzzle::{AnyExperiment, PuzzleTrainRequest, train_puzzles};
+use study::puzzle::{AnyExperiment, TrainOptions};
 use zoo::ZooError;
 use zoo::entry::member_name;
-use zoo::run::{COMMAND_FILE, TrainEvent, TrainOutcome, TrainRequest, finished_entry, train};
+use zoo::run::{COMMAND_FILE, Place, TrainEvent, TrainOutcome, finished_entry};
 use zoo::write_atomic;
 
 use crate::places::{ConfigArgs, ZooArgs, entry_names, experiment_names};
@@ -211,9 +211,19 @@ struct One {
 fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) -> anyhow::Result<ExitCode> {
     let mut screen = Screen::new();
     let stop = || asked.asked();
-    let (name, runs, run) = (args.experiment.clone(), args.runs.clone(), one.run.clone());
-    let (resume, zoo) = (one.resume, args.zoo.zoo.clone());
-    let command = Some(command_line(&trains(args, &one.own)));
+    let place = Place {
+        name: args.experiment.clone(),
+        runs: args.runs.clone(),
+        run: one.run.clone(),
+        resume: one.resume,
+        zoo: args.zoo.zoo.clone(),
+        command: Some(command_line(&trains(args, &one.own))),
+    };
+    if args.data.is_some() && !experiment.takes_data() {
+        bail!("--data: experiment `{}` draws its own puzzles", args.experiment);
+    }
+    let (data, force, image_memory) = (args.data.clone(), args.force, args.image_memory);
+    let options = TrainOptions { place, data, force, image_memory };
     // the error of a file that is for people only must not end a training
     let mut unwritten = None;
     let mut on_event = |event: TrainEvent<'_>| {
@@ -223,30 +233,12 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
         }
         show(&event, &mut screen, asked);
     };
-    let mut task = None;
-    let outcome = match experiment {
-        AnyExperiment::Robot(experiment) => {
-            task = Some(experiment.task.name.clone());
-            let data = args.data.clone();
-            let (image_memory, force) = (args.image_memory, args.force);
-            let (experiment, from_zoo) = (*experiment, None);
-            let request =
-                TrainRequest { name, experiment, data, runs, run, resume, zoo, from_zoo, force, image_memory, command };
-            train(&request, &stop, &mut on_event)
-        }
-        AnyExperiment::Puzzle(experiment) => {
-            if args.data.is_some() {
-                bail!("--data: experiment `{name}` draws its own puzzles");
-            }
-            let request = PuzzleTrainRequest { name, experiment: *experiment, runs, run, resume, zoo, command };
-            train_puzzles(&request, &stop, &mut on_event)
-        }
-    };
+    let task = experiment.summary(&args.experiment).task;
+    let outcome = experiment.train(options, &stop, &mut on_event);
     drop(screen);
     if let Some(error) = unwritten {
         cli::note(&format!("note: {error}"));
     }
-    let task = task.unwrap_or_default();
     let outcome = outcome.map_err(|error| match error {
         ZooError::DataNotFound { path, .. } => anyhow!(
             "no demonstrations at {}: name yours with --data PATH, or record some with `actrm-data collect --task {task} \

@@ -2,12 +2,13 @@ use std::collections::BTreeMap;
 use std::process::ExitCode;
 
 use cli::shown;
-use study::puzzle::{SolverEntry, audit_puzzles};
+use study::puzzle::audit_puzzles;
 use zoo::audit::{KnownEntries, LeftOut, audit};
 use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE, Repeats};
 use zoo::tensors;
 
 use crate::places::{ResultsArgs, ZooArgs, entry_names, of_entry};
+use crate::puzzles;
 
 /// Check the hashes and seals of entries and results, and with --deep every tensor and predicted action
 ///
@@ -97,8 +98,7 @@ fn deep_check(entry: &Entry) -> anyhow::Result<String> {
         tensors::check_finite(&path, &values)?;
     }
     // names and shapes are compared where the network is built
-    if !entry.meta().is_robot_policy() {
-        SolverEntry::load(entry, None)?;
+    if puzzles::deep_check(entry)? {
         return Ok(String::new());
     }
     Ok(match entry.load()?.repeats()? {

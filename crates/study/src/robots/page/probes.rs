@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
+use analysis::probe::{ProbeCell, ProbeResult};
 use zoo::ZooError;
-use zoo::probe::{ProbeCell, ProbeResult};
 
 use super::folded;
 use crate::robots::file::Study;

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 use super::super::cells::Cell;
 use super::*;
-use zoo::probe::{ProbeCell, ProbeResult, Reading};
+use analysis::probe::{ProbeCell, ProbeResult, Reading};
 
 const STUDY: &str = r#"
         title = "T"

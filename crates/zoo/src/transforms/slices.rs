@@ -1,28 +1,28 @@
-//! Where the items of an experiment's lists of keys stand in the columns of a data set.
+//! Where the items of an experiment's lists of keys are in the columns of a data set.
 
 use std::path::{Path, PathBuf};
 
 use dataset::{Dataset, KeyItem, WindowBatch};
 
 use crate::ZooError;
-use crate::experiment::{Experiment, PICTURE_PREFIX};
+use crate::experiment::{Experiment, IMAGE_PREFIX};
 
-/// Where an item stands: the feature that holds it, where its numbers begin there and how many they are.
+/// Where an item is: its feature, the index of its first dimension there, and its number of dimensions.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Place {
+pub(super) struct Slice {
     pub feature: String,
     pub from: usize,
     pub width: usize,
 }
 
-impl Place {
-    /// The item's numbers in an observation of a window; none where the windows lack the feature.
+impl Slice {
+    /// The item's values in an observation of a window; none where the windows lack the feature.
     pub fn of<'w>(&self, windows: &'w WindowBatch, row: usize, observation: usize) -> &'w [f32] {
         let values = windows.column(&self.feature).unwrap_or_default();
         values.get(self.span(values.len(), windows, row, observation)).unwrap_or_default()
     }
 
-    /// [`Place::of`], to be changed.
+    /// [`Slice::of`], to be changed.
     pub fn of_mut<'w>(&self, windows: &'w mut WindowBatch, row: usize, observation: usize) -> &'w mut [f32] {
         let Some(at) = windows.observation.iter().position(|(name, _)| *name == self.feature) else {
             return &mut [];
@@ -38,21 +38,21 @@ impl Place {
     }
 }
 
-/// Every item with its place.
-pub(super) struct Places {
+/// The slices of all items.
+pub(super) struct Slices {
     path: PathBuf,
-    spans: Vec<(String, Place)>,
+    spans: Vec<(String, Slice)>,
 }
 
-impl Places {
+impl Slices {
     /// Reads them off `dataset`; `section` is the experiment's that needs them, for messages.
     ///
     /// # Errors
     /// A column whose names do not say which keys it holds.
     pub fn new(experiment: &Experiment, dataset: &Dataset, path: &Path, section: &str) -> Result<Self, ZooError> {
-        let keys = experiment.data.told_and_feature_keys()?;
+        let keys = experiment.data.all_keys()?;
         let mut spans = Vec::new();
-        for feature in keys.features().filter(|feature| !feature.starts_with(PICTURE_PREFIX)) {
+        for feature in keys.features().filter(|feature| !feature.starts_with(IMAGE_PREFIX)) {
             let items = keys.items(feature);
             let widths = KeyItem::widths(items, &dataset.names(feature)).ok_or_else(|| ZooError::UnfitData {
                 path: path.to_owned(),
@@ -60,34 +60,34 @@ impl Places {
             })?;
             let mut from = 0;
             for (item, width) in items.iter().zip(widths) {
-                spans.push((item.to_string(), Place { feature: feature.to_owned(), from, width }));
+                spans.push((item.to_string(), Slice { feature: feature.to_owned(), from, width }));
                 from += width;
             }
         }
         Ok(Self { path: path.to_owned(), spans })
     }
 
-    /// The places of `items`, all of them equally long, in their order; an item of several features stands in each.
+    /// The slices of `items`, all of them equally long, in their order; an item of several features stands in each.
     ///
     /// # Errors
     /// An item that stands nowhere, items of unequal lengths, by name and under `key`.
-    pub fn alike(&self, key: &str, items: &[String]) -> Result<Vec<Place>, ZooError> {
+    pub fn alike(&self, key: &str, items: &[String]) -> Result<Vec<Slice>, ZooError> {
         let unfit =
             |reason: String| ZooError::UnfitData { path: self.path.clone(), reason: format!("{key}: {reason}") };
-        let mut places: Vec<Place> = Vec::new();
+        let mut slices: Vec<Slice> = Vec::new();
         for item in items {
-            let here: Vec<&Place> =
-                self.spans.iter().filter(|(text, _)| text == item).map(|(_, place)| place).collect();
+            let here: Vec<&Slice> =
+                self.spans.iter().filter(|(text, _)| text == item).map(|(_, slice)| slice).collect();
             if here.is_empty() {
                 return Err(unfit(format!("{item} is an item of no feature")));
             }
-            for place in here {
-                if let Some(first) = places.first().filter(|first| first.width != place.width) {
-                    return Err(unfit(format!("{item} has {} numbers, {} has {}", place.width, items[0], first.width)));
+            for slice in here {
+                if let Some(first) = slices.first().filter(|first| first.width != slice.width) {
+                    return Err(unfit(format!("{item} has {} numbers, {} has {}", slice.width, items[0], first.width)));
                 }
-                places.push(place.clone());
+                slices.push(slice.clone());
             }
         }
-        Ok(places)
+        Ok(slices)
     }
 }

@@ -1,6 +1,6 @@
-//! Films of episodes in a zoo: `videos/ENTRY/TASK-SEED-failure-CONDITIONS.mp4`, with `-seen` after the outcome where they
+//! Videos of episodes in a zoo: `videos/ENTRY/TASK-SEED-failure-CONDITIONS.mp4`, with `-seen` after the outcome where they
 //! show what the policy saw. The conditions are those of the result that an episode is of
-//! ([`zoo::results::EvaluationRecord::conditions`]); older films name none.
+//! ([`zoo::results::EvaluationRecord::conditions`]); older videos name none.
 
 use std::path::{Path, PathBuf};
 
@@ -8,12 +8,12 @@ use cli::shown;
 use report::{Film, LeaderboardRow, MOST_FILM_BYTES};
 use zoo::results::{EntryIdentity, StoredEvaluation};
 
-/// Where an entry's films lie.
+/// The folder of an entry's videos.
 pub fn folder(zoo: &Path, entry: &EntryIdentity) -> PathBuf {
     zoo.join("videos").join(entry.to_string())
 }
 
-/// A film's file.
+/// The file of a video.
 pub fn name(task: &str, seed: u64, success: bool, seen: bool, conditions: &str) -> String {
     format!("{}-{conditions}.mp4", stem(task, seed, success, seen))
 }
@@ -23,13 +23,13 @@ fn stem(task: &str, seed: u64, success: bool, seen: bool) -> String {
     format!("{task}-{seed}-{word}{}", if seen { "-seen" } else { "" })
 }
 
-/// The films of episodes of these rows, in the rows' order, those of failures first. As many are read as a page takes, the
+/// The videos of episodes of these rows, in the rows' order, those of failures first. As many are read as a page takes, the
 /// others are named.
 ///
-/// A film without conditions counts where it can be of one result only.
+/// A video without conditions counts where it can be of one result only.
 pub fn of_episodes(rows: &[LeaderboardRow], zoo: &Path) -> Vec<Film> {
     let all: Vec<&StoredEvaluation> = rows.iter().flat_map(LeaderboardRow::evaluations).collect();
-    let mut films = Vec::new();
+    let mut found = Vec::new();
     let mut room = MOST_FILM_BYTES;
     for one in &all {
         let (entry, task) = (&one.record.entry, &one.record.protocol.task);
@@ -58,9 +58,9 @@ pub fn of_episodes(rows: &[LeaderboardRow], zoo: &Path) -> Vec<Film> {
                     path.metadata().map_or(usize::MAX, |meta| usize::try_from(meta.len()).unwrap_or(usize::MAX));
                 let video = (length <= room).then(|| std::fs::read(&path).ok()).flatten();
                 room -= video.as_ref().map_or(0, Vec::len).min(room);
-                films.push(Film { result: result.to_owned(), seed, path: shown(&path), video });
+                found.push(Film { result: result.to_owned(), seed, path: shown(&path), video });
             }
         }
     }
-    films
+    found
 }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::trace::PolicyTrace;
+use crate::PolicyTrace;
 
 /// Side of a cell, and the space between grids.
 const CELL: usize = 9;
@@ -64,8 +64,8 @@ impl PolicyTrace {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::trace::{TracedQuery, TracedThought};
     use super::*;
+    use crate::{TracedQuery, TracedThought};
 
     #[test]
     fn a_grid_a_step_is_drawn_with_walls_goal_and_hand() {

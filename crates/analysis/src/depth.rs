@@ -9,11 +9,9 @@ use std::sync::Arc;
 use models::Observation;
 use models::actrm::{DisturbedPolicy, Intervention, Thinking};
 use rollout::{Pool, RolloutError, Worker};
-
-use crate::entry::LoadedEntry;
-use crate::{FeatureKeys, Past, ZooError};
-
-use super::Subject;
+use zoo::entry::LoadedEntry;
+use zoo::evaluation::Subject;
+use zoo::{FeatureKeys, Past, ZooError};
 
 /// The first observation of an episode.
 #[derive(Debug, Clone, PartialEq)]

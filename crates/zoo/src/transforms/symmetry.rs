@@ -1,94 +1,97 @@
-//! `[data.symmetries]`: numbers of an observation that mean the same in any order, permuted at random in every training
-//! sample, alike wherever they stand. Validation sees the observations as they are.
+//! `[data.symmetries]`: values of an observation that mean the same in any order. They are permuted at random in every training
+//! sample, in the same way wherever they are.
 //!
 //! ```toml
 //! [data.symmetries]
 //! colour = ["cube0_rgb", "cube1_rgb", "goal_rgb[0:3]", "goal_rgb[3:6]"]
 //! ```
 //!
-//! One order of the three channels is drawn for a sample, and all four vectors are put into it. The key of a camera's pictures
-//! (`agentview_image`) stands for the colour of every pixel. A batch depends on the seed and the step alone, so that a resumed
-//! run needs no state of this.
+//! One order of the three channels is drawn for a sample, and all four vectors are put into it. The key of a camera's images
+//! (`agentview_image`) stands for the colour of every pixel.
 
-use std::path::Path;
-
+use dataset::WindowBatch;
 use dataset::shuffle::SplitMix64;
-use dataset::{Dataset, WindowBatch};
 
+use super::slices::Slice;
+use super::{DataSection, Fitted, Source, Stage, Transform};
 use crate::ZooError;
-use crate::experiment::{Experiment, PICTURE_PREFIX};
-
-use super::places::{Place, Places};
+use crate::experiment::IMAGE_PREFIX;
 
 /// Keeps the draws apart from those of the batches' order, which have the same seed.
 const PURPOSE: u64 = 0x5359_4d4d_4554_5259;
-
-/// The symmetries of a run.
-pub(crate) struct Symmetries {
-    seed: u64,
-    all: Vec<Symmetry>,
-}
-
-/// Vectors that are permuted alike.
-#[derive(Debug, PartialEq)]
-struct Symmetry {
-    width: usize,
-    places: Vec<Place>,
-    /// cameras of whose pictures every pixel is
-    pictures: Vec<String>,
-}
-
-/// Numbers of a pixel.
+/// Values of a pixel.
 const CHANNELS: usize = 3;
 
-impl Symmetries {
-    /// Finds where the vectors of the experiment's symmetries stand in the columns of `dataset`.
-    ///
-    /// # Errors
-    /// An item that stands nowhere, items of unequal lengths, by name.
-    pub fn new(experiment: &Experiment, dataset: &Dataset, path: &Path) -> Result<Self, ZooError> {
-        let mut all = Vec::new();
-        if !experiment.data.symmetries.is_empty() {
-            let spans = Places::new(experiment, dataset, path, "data.symmetries")?;
-            for (name, items) in &experiment.data.symmetries {
-                let key = format!("data.symmetries.{name}");
-                let (pictures, items): (Vec<_>, Vec<_>) =
-                    items.iter().partition(|item| experiment.data.camera_of(item).is_some());
-                let items: Vec<String> = items.into_iter().cloned().collect();
-                let places = spans.alike(&key, &items)?;
-                let width = places.first().map_or(CHANNELS, |place| place.width);
-                if width != CHANNELS && !pictures.is_empty() {
-                    let reason = format!("{key}: {} has {width} numbers, a pixel has {CHANNELS}", items[0]);
-                    return Err(ZooError::UnfitData { path: path.to_owned(), reason });
-                }
-                let pictures = pictures.into_iter().filter_map(|item| experiment.data.camera_of(item));
-                all.push(Symmetry {
-                    width,
-                    places,
-                    pictures: pictures.map(|c| format!("{PICTURE_PREFIX}{c}")).collect(),
-                });
-            }
-        }
-        Ok(Self { seed: experiment.train.seed ^ PURPOSE, all })
+pub(super) struct Symmetry;
+
+impl Transform for Symmetry {
+    fn name(&self) -> &'static str {
+        "symmetries"
     }
 
-    /// Permutes the windows of step `step`, each by itself.
-    pub fn apply(&self, step: u64, windows: &mut WindowBatch) {
+    fn items<'d>(&self, data: &'d DataSection) -> Vec<(String, &'d Vec<String>)> {
+        data.symmetries.iter().map(|(name, items)| (format!("data.symmetries.{name}"), items)).collect()
+    }
+
+    fn fit(&self, source: &Source<'_>) -> Result<Option<Box<dyn Fitted>>, ZooError> {
+        let data = &source.experiment.data;
+        if data.symmetries.is_empty() {
+            return Ok(None);
+        }
+        let slices = source.slices(self.name())?;
+        let mut all = Vec::new();
+        for (key, items) in self.items(data) {
+            let (images, items): (Vec<_>, Vec<_>) = items.iter().partition(|item| data.camera_of(item).is_some());
+            let items: Vec<String> = items.into_iter().cloned().collect();
+            let vectors = slices.alike(&key, &items)?;
+            let width = vectors.first().map_or(CHANNELS, |slice| slice.width);
+            if width != CHANNELS && !images.is_empty() {
+                let reason = format!("{key}: {} has {width} numbers, a pixel has {CHANNELS}", items[0]);
+                return Err(ZooError::UnfitData { path: source.path.to_owned(), reason });
+            }
+            let cameras = images.into_iter().filter_map(|item| data.camera_of(item));
+            all.push(Permuted { width, vectors, cameras: cameras.map(|c| format!("{IMAGE_PREFIX}{c}")).collect() });
+        }
+        Ok(Some(Box::new(Symmetries { seed: source.experiment.train.seed ^ PURPOSE, all })))
+    }
+}
+
+/// The symmetries of a run.
+struct Symmetries {
+    seed: u64,
+    all: Vec<Permuted>,
+}
+
+/// Vectors that are permuted in the same way.
+#[derive(Debug, PartialEq)]
+struct Permuted {
+    width: usize,
+    vectors: Vec<Slice>,
+    /// cameras of which every pixel is permuted
+    cameras: Vec<String>,
+}
+
+impl Fitted for Symmetries {
+    fn applies(&self, stage: Stage) -> bool {
+        stage != Stage::Validation
+    }
+
+    fn apply(&self, step: u64, windows: &mut WindowBatch) {
         let mut rng = SplitMix64::new(self.seed, step);
         let mut before = Vec::new();
         for symmetry in &self.all {
             for row in 0..windows.n {
                 let mut order: Vec<usize> = (0..symmetry.width).collect();
                 rng.shuffle(&mut order);
-                for place in &symmetry.places {
+                for slice in &symmetry.vectors {
                     for observation in 0..windows.n_obs_steps {
-                        let vector = place.of_mut(windows, row, observation);
+                        let vector = slice.of_mut(windows, row, observation);
                         before.clear();
                         before.extend_from_slice(vector);
                         vector.iter_mut().zip(&order).for_each(|(value, &at)| *value = before[at]);
                     }
                 }
-                for (_, bytes) in windows.pictures.iter_mut().filter(|(name, _)| symmetry.pictures.contains(name)) {
+                for (_, bytes) in windows.pictures.iter_mut().filter(|(name, _)| symmetry.cameras.contains(name)) {
                     let share = bytes.len() / windows.n;
                     for pixel in bytes[row * share..(row + 1) * share].chunks_exact_mut(CHANNELS) {
                         let before = [pixel[0], pixel[1], pixel[2]];
@@ -108,9 +111,9 @@ mod tests {
     use super::*;
 
     fn symmetries(seed: u64) -> Symmetries {
-        let place = |feature: &str, from| Place { feature: feature.to_owned(), from, width: 3 };
-        let places = vec![place("a", 1), place("b", 0), place("b", 3)];
-        Symmetries { seed, all: vec![Symmetry { width: 3, places, pictures: vec!["front".to_owned()] }] }
+        let slice = |feature: &str, from| Slice { feature: feature.to_owned(), from, width: 3 };
+        let vectors = vec![slice("a", 1), slice("b", 0), slice("b", 3)];
+        Symmetries { seed, all: vec![Permuted { width: 3, vectors, cameras: vec!["front".to_owned()] }] }
     }
 
     fn windows(n: usize, n_obs_steps: usize) -> WindowBatch {

@@ -14,12 +14,12 @@ use models::actrm::Actrm;
 use models::{Backend, ModelError, ValuesRef};
 use rollout::Ready;
 use serde::{Deserialize, Serialize};
+use zoo::entry::LoadedEntry;
+use zoo::results::{EntryIdentity, Seeds, TrainingFacts};
+use zoo::run::{first_windows, locate};
+use zoo::{FeatureKeys, Stage, ZooError, write_atomic};
 
-use crate::entry::LoadedEntry;
-use crate::evaluation::Start;
-use crate::results::{EntryIdentity, Seeds, TrainingFacts};
-use crate::run::{first_windows, locate};
-use crate::{FeatureKeys, ZooError, write_atomic};
+use crate::depth::Start;
 
 /// The longest chain that the demonstrations of PickChain have.
 const DEMONSTRATED: usize = 4;
@@ -234,14 +234,15 @@ pub fn probe(
     let untrained = Actrm::new(config, entry.preprocess().signature(), 1, &Backend::CPU).map_err(failed)?;
 
     let data = locate(&request.data)?;
-    let (windows, symmetries, firsts) = first_windows(&data, &request.work, entry.experiment())?;
+    let (windows, transforms, firsts) = first_windows(&data, &request.work, entry.experiment())?;
     let mut fitted = [Samples::default(), Samples::default()];
     let mut gathered = WindowBatch::default();
     for renaming in 0..request.renamings {
         for chunk in firsts.chunks(BATCH) {
             windows.gather(chunk, &mut gathered);
             // far from the steps of any training
-            symmetries.apply(u64::MAX - renaming * firsts.len() as u64 - u64::from(chunk[0]), &mut gathered);
+            let step = u64::MAX - renaming * firsts.len() as u64 - u64::from(chunk[0]);
+            transforms.apply(Stage::Probe(step), &mut gathered);
             let chains = (0..chunk.len()).map(|row| {
                 chain.follow(&|span| {
                     let column = gathered.column(&span.feature).unwrap_or(&[]);

@@ -2,11 +2,13 @@
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "../../rollout/tests/common/mod.rs"]
 mod common;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use analysis::{PolicyTrace, TracedQuery, trace};
 use common::options;
 use models::actrm::{Config, ReasoningConfig, WarmStart};
 use models::{
@@ -14,7 +16,7 @@ use models::{
 };
 use rollout::Pool;
 use zoo::FeatureKeys;
-use zoo::evaluation::{EvaluationOptions, PolicyTrace, Subject, WallClock, trace};
+use zoo::evaluation::{EvaluationOptions, Subject, WallClock};
 use zoo::results::{EntryIdentity, Execution, Seeds, TrainingFacts};
 
 /// The same weights, whatever the rest of its options.
@@ -71,7 +73,7 @@ fn five() -> ReasoningConfig {
 
 /// The actions that went to the environment, in order.
 fn executed(trace: &PolicyTrace) -> Vec<Vec<f32>> {
-    let last = |query: &zoo::evaluation::TracedQuery| query.thought.last().unwrap().actions[..query.executed].to_vec();
+    let last = |query: &TracedQuery| query.thought.last().unwrap().actions[..query.executed].to_vec();
     trace.queries.iter().flat_map(last).collect()
 }
 

@@ -1,4 +1,4 @@
-//! `train.from`: a training that begins with the weights of an entry.
+//! `train.from`: a training that starts from the weights of an entry.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -9,13 +9,13 @@ use crate::entry::{Entry, EntryId, EntryRequest, MODEL_FILE, ParentMeta};
 use crate::{ZooError, tensors};
 
 /// Weights that a training begins with.
-pub(super) struct Beginning {
+pub(super) struct InitialWeights {
     /// The entry that they are of.
     pub parent: ParentMeta,
     weights: BTreeMap<String, Tensor>,
 }
 
-impl Beginning {
+impl InitialWeights {
     /// Those of the entry `from`, `name@version`, of `zoo`.
     ///
     /// # Errors

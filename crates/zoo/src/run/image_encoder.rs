@@ -1,4 +1,4 @@
-//! What an image encoder begins with: the data set's colours, weights that the experiment names.
+//! What an image encoder starts with: the data set's colour statistics, weights that the experiment names.
 
 use std::path::Path;
 
@@ -16,14 +16,14 @@ const LEAST_SPREAD: f32 = 1e-6;
 ///
 /// # Errors
 /// A data set without statistics of its pictures, a file of weights that does not fit.
-pub(super) fn open(
+pub(super) fn initialise(
     model: &dyn PolicyModel,
     demonstrations: &Demonstrations,
     experiment: &Experiment,
 ) -> Result<(), ZooError> {
     let Some(vision) = model.vision() else { return Ok(()) };
     if vision.normalise == Normalisation::Dataset {
-        let statistics = demonstrations.picture_statistics.as_ref().ok_or_else(|| ZooError::InvalidValue {
+        let statistics = demonstrations.image_statistics.as_ref().ok_or_else(|| ZooError::InvalidValue {
             key: "policy.vision.normalise".to_owned(),
             expected: "imagenet or unit: the data set has no statistics of its images".to_owned(),
             found: "dataset".to_owned(),

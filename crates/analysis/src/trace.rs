@@ -1,22 +1,21 @@
 //! What a policy did and thought in one episode, query by query: as text, as JSON and as a Parquet table.
 
 use std::fmt::Write as _;
-use std::ops::ControlFlow;
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Instant;
 
 use arrow::array::{ArrayRef, BooleanArray, Float64Array, Float64Builder, ListBuilder, UInt32Array, UInt64Array};
 use models::actrm::{Actrm, Config, Over};
 use models::{ActionChunk, ModelError, Observation, Policy, Preprocess, ThoughtStep, Values};
-use rollout::{EpisodePlan, Outcome, Pool, RolloutError, Worker};
+use rollout::{Pool, RolloutError};
 use serde::Serialize;
+use zoo::ZooError;
+use zoo::entry::LoadedEntry;
+use zoo::evaluation::Subject;
+use zoo::results::write_table;
 
-use super::Subject;
-use super::agent::PolicyAgent;
-use crate::ZooError;
-use crate::entry::LoadedEntry;
-use crate::results::write_table;
+use crate::episode::{Log, record};
 
 /// One episode of a policy.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -141,13 +140,10 @@ pub struct TracedThought {
     pub way: Vec<f32>,
 }
 
-/// The queries of an episode under way, shared with the policy that fills them.
-type Queries = Arc<Mutex<Vec<TracedQuery>>>;
-
 /// A policy whose queries are kept.
 struct Traced {
     policy: Box<dyn Policy>,
-    queries: Queries,
+    queries: Log<TracedQuery>,
     step: usize,
     examiner: Option<Examiner>,
     /// the observations that the policy sees at once, oldest first
@@ -187,7 +183,7 @@ impl Policy for Traced {
         }
         let cells = self.examiner.as_ref().map(|examiner| examiner.cells(observation)).unwrap_or_default();
         let query = TracedQuery { step: self.step, executed: 0, milliseconds, cells, thought };
-        self.queries.lock().unwrap_or_else(PoisonError::into_inner).push(query);
+        self.queries.push(query);
         Ok(chunk)
     }
 
@@ -202,16 +198,14 @@ impl Policy for Traced {
 
     fn executed(&mut self, actions: usize) {
         self.step += actions;
-        if let Some(query) = self.queries.lock().unwrap_or_else(PoisonError::into_inner).last_mut() {
-            query.executed += actions;
-        }
+        self.queries.with_last(|query| query.executed += actions);
         self.policy.executed(actions);
     }
 
     fn reset(&mut self, seed: u64) {
         self.step = 0;
         self.seen.clear();
-        self.queries.lock().unwrap_or_else(PoisonError::into_inner).clear();
+        self.queries.take();
         self.policy.reset(seed);
     }
 
@@ -231,31 +225,9 @@ pub fn trace(
     seed: u64,
     examiner: Option<&Examiner>,
 ) -> Result<Option<PolicyTrace>, RolloutError> {
-    subject.check_watched()?;
-    let (task, max_steps) = (pool.ready().task.clone(), subject.max_steps.unwrap_or(pool.ready().max_steps));
-    let plan = EpisodePlan::new(pool.ready(), subject.keys.keys(), max_steps)?;
-    let state = || {
-        let queries = Queries::default();
-        let (queries_of, examiner) = (Arc::clone(&queries), examiner.cloned());
-        let traced = |policy| Traced { policy, queries: queries_of, step: 0, examiner, seen: Vec::new() };
-        let made = (subject.policy)().and_then(|policy| subject.acting(traced(policy)));
-        let operation = "building the policy";
-        let made =
-            made.map_err(|source| RolloutError::Policy { seed, step: 0, operation, source: Box::new(source) })?;
-        Ok((made, queries))
-    };
-    let work = |(agent, queries): &mut (PolicyAgent, Queries), worker: &mut Worker, _| {
-        let outcome = plan.run(worker, agent, seed, None)?;
-        let queries = std::mem::take(&mut *queries.lock().unwrap_or_else(PoisonError::into_inner));
-        Ok((outcome, queries))
-    };
-    let mut ended: Option<Result<(Outcome, Vec<TracedQuery>), RolloutError>> = None;
-    pool.run(0..1, &|_| seed, &state, &work, &mut |_, result| {
-        ended = Some(result);
-        ControlFlow::Continue(())
-    })?;
-    let Some(ended) = ended else { return Ok(None) };
-    let (outcome, mut queries) = ended?;
+    let task = pool.ready().task.clone();
+    let traced = |policy, queries| Traced { policy, queries, step: 0, examiner: examiner.cloned(), seen: Vec::new() };
+    let Some((outcome, mut queries)) = record(subject, pool, seed, &traced)? else { return Ok(None) };
     for query in &mut queries {
         // the last of what was planned ahead is not executed where the episode ends before
         query.executed = query.executed.min(outcome.steps.saturating_sub(query.step));

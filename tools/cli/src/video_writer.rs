@@ -1,4 +1,4 @@
-//! Pictures of a simulator to a video that browsers play: AV1 in MP4.
+//! Images of a simulator to a video that browsers play: AV1 in MP4.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -10,16 +10,16 @@ use video::{EncodeOptions, Encoder, Muxer, Rate};
 /// For people who look, not for training: fewer key frames than data sets have, finer pictures.
 const OPTIONS: EncodeOptions = EncodeOptions { speed: 10, quantizer: 60, key_interval: 20 };
 
-/// A video under way, for pictures that come one after the other.
-pub struct Film {
+/// A video under way, for images that come one after the other.
+pub struct VideoWriter {
     path: PathBuf,
     size: (usize, usize),
     rate: Rate,
     encoder: Encoder,
 }
 
-impl Film {
-    /// Begins a video at `path` with pictures of `size` (rows, columns), `rate` of them a second.
+impl VideoWriter {
+    /// Starts a video at `path` with images of `size` (rows, columns), `rate` of them a second.
     ///
     /// # Errors
     /// A size or a rate that no video has.
@@ -75,15 +75,15 @@ impl Film {
     }
 }
 
-/// Writes pictures of one size as a video, `rate` of them a second.
+/// Writes images of one size as a video, `rate` of them a second.
 ///
 /// # Errors
-/// As [`Film`].
-pub fn film(path: &Path, images: &[Image], rate: f64) -> Result<()> {
+/// As [`VideoWriter`].
+pub fn write_video(path: &Path, images: &[Image], rate: f64) -> Result<()> {
     let Some(first) = images.first() else { bail!("video {}: no images", crate::shown(path)) };
-    let mut film = Film::begin(path, (first.height, first.width), rate)?;
-    images.iter().try_for_each(|image| film.push(image))?;
-    film.finish()
+    let mut video = VideoWriter::begin(path, (first.height, first.width), rate)?;
+    images.iter().try_for_each(|image| video.push(image))?;
+    video.finish()
 }
 
 #[cfg(test)]
@@ -93,21 +93,21 @@ mod tests {
     use video::{Codec, Video};
 
     #[test]
-    fn a_film_is_av1_that_our_reader_opens() {
+    fn a_video_is_av1_that_our_reader_opens() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.mp4");
         let image = |k: u8| Image { height: 32, width: 48, rgb: [k * 20, 100, 200 - k * 20].repeat(32 * 48) };
         let images: Vec<Image> = (0..5).map(image).collect();
-        film(&path, &images, 20.0).unwrap();
+        write_video(&path, &images, 20.0).unwrap();
         let video = Video::open(&path).unwrap();
         let info = video.info();
         assert_eq!((info.codec, info.width, info.height, info.frames), (Codec::Av1, 48, 32, 5));
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
         let error = |result: Result<()>| format!("{:#}", result.unwrap_err());
-        assert!(error(film(&path, &[], 20.0)).contains("no images"));
+        assert!(error(write_video(&path, &[], 20.0)).contains("no images"));
         let other = Image { height: 16, width: 16, rgb: vec![0; 768] };
-        assert!(error(film(&path, &[image(0), other], 20.0)).contains("expected images of 32x48"));
+        assert!(error(write_video(&path, &[image(0), other], 20.0)).contains("expected images of 32x48"));
         let odd = Image { height: 33, width: 48, rgb: vec![0; 33 * 48 * 3] };
-        assert!(error(film(&path, &[odd], 20.0)).contains("odd"));
+        assert!(error(write_video(&path, &[odd], 20.0)).contains("odd"));
     }
 }

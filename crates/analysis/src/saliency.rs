@@ -4,21 +4,17 @@
 //! mean colour moves over it; how far the predicted actions move away from those of the whole picture, in the network's
 //! units, is what the place under it meant to the policy. It needs nothing of the model but predictions.
 
-use std::ops::ControlFlow;
-use std::sync::{Arc, Mutex, PoisonError};
-
 use candle_core::{Device, Tensor};
 use dataset::Picture;
 use models::{ActionChunk, FeatureKind, FeatureSpec, Features, ModelError, Observation, Policy, ThoughtStep};
-use rollout::{EpisodePlan, Outcome, Pool, RolloutError, Worker};
+use rollout::{Outcome, Pool};
 use serde::Serialize;
+use zoo::ZooError;
+use zoo::entry::LoadedEntry;
+use zoo::evaluation::{Subject, image};
+use zoo::experiment::IMAGE_PREFIX;
 
-use super::Subject;
-use super::agent::PolicyAgent;
-use super::subject::picture;
-use crate::ZooError;
-use crate::entry::LoadedEntry;
-use crate::experiment::PICTURE_PREFIX;
+use crate::episode::{Log, record};
 
 /// Covered squares that are predicted at once.
 const ROWS: usize = 32;
@@ -70,15 +66,11 @@ pub struct SalientCamera {
     pub heat: Vec<f32>,
 }
 
-/// The observations that a policy was asked about, with the control steps before each.
-type Queries = Vec<(usize, Vec<Observation>)>;
-/// The same while the policy fills it.
-type Asked = Arc<Mutex<Queries>>;
-
 /// A policy whose queries' observations are kept.
 struct Watched {
     policy: Box<dyn Policy>,
-    asked: Asked,
+    /// control steps before each query, and the observations of it
+    queries: Log<(usize, Vec<Observation>)>,
     history: Vec<Observation>,
     step: usize,
 }
@@ -95,7 +87,7 @@ impl Watched {
 impl Policy for Watched {
     fn predict(&mut self, observation: &Observation) -> Result<ActionChunk, ModelError> {
         self.show(observation);
-        self.asked.lock().unwrap_or_else(PoisonError::into_inner).push((self.step, self.history.clone()));
+        self.queries.push((self.step, self.history.clone()));
         self.policy.predict(observation)
     }
 
@@ -116,7 +108,7 @@ impl Policy for Watched {
     fn reset(&mut self, seed: u64) {
         self.step = 0;
         self.history.clear();
-        self.asked.lock().unwrap_or_else(PoisonError::into_inner).clear();
+        self.queries.take();
         self.policy.reset(seed);
     }
 
@@ -139,52 +131,27 @@ pub fn saliency(
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Option<Saliency>, ZooError> {
     let task = pool.ready().task.clone();
-    let Some((outcome, asked)) = episode(subject, pool, seed)? else { return Ok(None) };
-    let chosen = evenly(asked.len(), queries);
+    let watched = |policy, queries| Watched { policy, queries, history: Vec::new(), step: 0 };
+    let Some((outcome, observed)) = record(subject, pool, seed, &watched)? else { return Ok(None) };
+    let chosen = evenly(observed.len(), queries);
     let failed =
         |source| ZooError::Model { operation: "look at the images of", name: subject.entry.to_string(), source };
     let mut looked = Vec::with_capacity(chosen.len());
     for (done, &at) in chosen.iter().enumerate() {
         progress(done as u64, chosen.len() as u64);
-        let (step, history) = &asked[at];
+        let (step, history) = &observed[at];
         let seen = loaded.preprocess().observation(history).map_err(failed)?;
         let last = history.last().expect("a query has an observation");
         let cameras = subject.signature.of_kind(FeatureKind::Image);
-        let cameras = cameras.filter_map(|camera| Some((camera, picture(camera, last)?)));
+        let cameras = cameras.filter_map(|camera| Some((camera, image(camera, last)?)));
         let cameras = cameras
-            .map(|(camera, picture)| covered(&|x: &Features<Tensor>| loaded.model().predict(x), &seen, camera, picture))
+            .map(|(camera, image)| covered(&|x: &Features<Tensor>| loaded.model().predict(x), &seen, camera, image))
             .collect::<Result<Vec<_>, _>>()
             .map_err(failed)?;
         looked.push(SalientQuery { step: *step, cameras });
     }
     let Outcome { success, steps, .. } = outcome;
     Ok(Some(Saliency { entry: subject.entry.to_string(), task, seed, success, steps, queries: looked }))
-}
-
-/// The episode's outcome and what its policy was asked about.
-fn episode(subject: &Subject<'_>, pool: &mut Pool, seed: u64) -> Result<Option<(Outcome, Queries)>, ZooError> {
-    subject.check_watched()?;
-    let plan =
-        EpisodePlan::new(pool.ready(), subject.keys.keys(), subject.max_steps.unwrap_or(pool.ready().max_steps))?;
-    let state = || {
-        let asked = Asked::default();
-        let watched = |policy| Watched { policy, asked: Arc::clone(&asked), history: Vec::new(), step: 0 };
-        let made = (subject.policy)().and_then(|policy| subject.acting(watched(policy)));
-        let operation = "building the policy";
-        let made =
-            made.map_err(|source| RolloutError::Policy { seed, step: 0, operation, source: Box::new(source) })?;
-        Ok((made, asked))
-    };
-    let work = |(agent, asked): &mut (PolicyAgent, Asked), worker: &mut Worker, _| {
-        let outcome = plan.run(worker, agent, seed, None)?;
-        Ok((outcome, std::mem::take(&mut *asked.lock().unwrap_or_else(PoisonError::into_inner))))
-    };
-    let mut ended = None;
-    pool.run(0..1, &|_| seed, &state, &work, &mut |_, result| {
-        ended = Some(result);
-        ControlFlow::Continue(())
-    })?;
-    Ok(ended.transpose()?)
 }
 
 /// Up to `most` of `count` places, evenly spread, the first among them.
@@ -256,7 +223,7 @@ fn covered(
     let best = (0..values.len()).max_by(|&a, &b| values[a].total_cmp(&values[b])).unwrap_or(0);
     let (rows, columns) = clipped(squares[best]);
     let place = ((rows.start + rows.end) / 2, (columns.start + columns.end) / 2);
-    let name = camera.name.strip_prefix(PICTURE_PREFIX).unwrap_or(&camera.name).to_owned();
+    let name = camera.name.strip_prefix(IMAGE_PREFIX).unwrap_or(&camera.name).to_owned();
     Ok(SalientCamera { camera: name, whole, most: values[best], place, picture, heat })
 }
 
