@@ -9,6 +9,7 @@
 //! neither reads the command line nor prints (`tools`).
 
 pub mod config;
+pub mod conventions;
 pub mod entry;
 mod error;
 pub mod experiment;
