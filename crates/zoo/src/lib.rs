@@ -17,6 +17,7 @@ pub mod external;
 mod feature_keys;
 mod files;
 pub mod lerobot;
+pub mod onnx;
 pub mod probe;
 pub mod registry;
 pub mod robomimic;

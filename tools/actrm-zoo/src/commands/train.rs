@@ -216,8 +216,8 @@ fn extend_run(args: &Args, run: &Path) -> anyhow::Result<ExitCode> {
     let Extended { name, experiment, folder, command } = extend(run, steps)?;
     let stop = Stop::install("stopped without a new checkpoint; the new run's folder says how to resume")?;
     let resume = command.as_ref().map(|command| {
-        let words =
-            ["--zoo".into(), args.zoo.zoo.clone().into(), "--run".into(), folder.clone().into(), "--resume".into()];
+        let mut words: Vec<OsString> = vec!["--zoo".into(), args.zoo.zoo.clone().into()];
+        words.extend(["--run".into(), folder.clone().into(), "--resume".into()]);
         format!("{command} {}\n", command_line(&words))
     });
     if let Some(text) = &resume {
