@@ -98,6 +98,47 @@ fn what_was_not_run_under_the_same_rules_is_not_compared() {
     refused(&mut zoo(arguments), &["lift-act@1", "stack-act@1", "same protocol"]);
 }
 
+/// LeRobot's and other files stand beside sealed rows, are told from them, and are paired by seeds alone.
+#[test]
+fn results_of_other_programs_are_compared() {
+    let (_folder, entries) = shipped();
+    let file = |name: &str, text: &str| {
+        let path = entries.join(name);
+        fs::write(&path, text).expect("writable");
+        path
+    };
+    let mut lines = "task,policy,seed,success\n".to_owned();
+    for seed in 40_000..40_200 {
+        lines.push_str(&format!("Lift,mine,{seed},{}\nLift,theirs,{seed},true\n", seed >= 40_010));
+    }
+    let csv = file("results.csv", &lines);
+    let outcomes: Vec<bool> = (0..50).map(|place| place < 40).collect();
+    let info =
+        serde_json::json!({"per_task": [{"task_group": "lift", "task_id": 0, "metrics": {"successes": outcomes}}]});
+    let info = file("eval_info.json", &info.to_string());
+    let compare = |first: &str, second: &str, more: &[&str]| {
+        let mut command = zoo(["compare", first, second, "--zoo", text(&entries)]);
+        command.args(more);
+        command
+    };
+    let (mine, theirs) = (format!("{}:mine", text(&csv)), format!("{}:theirs", text(&csv)));
+    let both = json(&mut compare(&mine, &theirs, &["--json"]));
+    assert_eq!(
+        (&both[0]["test"], &both[0]["flips"]["second_only"].as_array().map(Vec::len)),
+        (&"McNemar".into(), &Some(10))
+    );
+    let told = said(&mut compare("lift-act", &mine, &[]));
+    assert!(told.contains("sealed") && told.contains("results.csv, not sealed"), "{told}");
+    let unpaired = said(&mut compare("lift-act", text(&info), &["--task", "Lift"]));
+    for words in ["0 episodes from the same initial state", "40 of 50", "Barnard p", "N-SCORE p", "SAVI p"] {
+        assert!(unpaired.contains(words), "{unpaired}");
+    }
+    refused(&mut compare("lift-act", text(&info), &[]), &["no task that both have", "Lift", "lift", "--task"]);
+    refused(&mut compare(text(&csv), "lift-act", &[]), &["expected one policy, found mine, theirs", ":POLICY"]);
+    refused(&mut compare(&mine, &theirs, &["--until-decided"]), &["--until-decided", "file of results"]);
+    refused(&mut compare("nothing.csv", "lift-act", &[]), &["nothing.csv"]);
+}
+
 #[test]
 fn rows_of_a_protocol_stand_under_its_name() {
     let (_folder, entries) =

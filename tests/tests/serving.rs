@@ -6,6 +6,8 @@ use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Child, Stdio};
 
+use serde_json::Value;
+
 use e2e::{copied_zoo, listing, refused, root, signal, succeeds, text, zoo};
 
 /// One message of a server's, shorter than 64 KiB.
@@ -62,6 +64,20 @@ fn a_served_policy_is_evaluated_as_its_entry_is() {
     let config = fs::read_to_string(entries.join("mine/1/config.toml")).expect("an entry");
     assert!(config.contains(&url) && config.contains("declared = \"lift-act@1\""), "{config}");
 
+    // what its entry's policy is trained by, as the server says it
+    assert!(config.contains("[external.conventions]") && config.contains("horizon = \"16\""), "{config}");
+    let results = entries.join("served");
+    let rerun = |more: &[&str]| {
+        let mut command = zoo(["rerun", "mine", "--workers", "1", "--json", "--zoo", text(&entries)]);
+        command.args(["--results", text(&results), "--work", text(&entries.join("work"))]).args(more);
+        command.env_remove("ACTRM_TOKEN");
+        command
+    };
+    let again: Value = serde_json::from_slice(&succeeds(&mut rerun(&[])).stdout).expect("JSON");
+    assert_eq!((&again["same"], &again["reasons"]), (&true.into(), &Value::Array(Vec::new())), "{again}");
+    let told = again["steps"].as_array().expect("steps").iter().map(|step| step["told"].to_string());
+    assert!(told.collect::<String>().contains("3 of 3 outcomes the same"), "{again}");
+
     let mapping = entries.join("mapping.toml");
     let one_key = "[[observation]]\nkey = 'observation.state'\nfeature = 'observation.state'\n";
     fs::write(&mapping, one_key).expect("writable");
@@ -76,6 +92,7 @@ fn a_served_policy_is_evaluated_as_its_entry_is() {
     server.kill().expect("it is ended");
     server.wait().expect("it has ended");
     refused(&mut eval(&[&mine[..], &["--again"]].concat(), "served"), &["policy server", &address, "refused"]);
+    refused(&mut rerun(&["--policy", "ws://127.0.0.1:1"]), &["policy server", "ws://127.0.0.1:1"]);
 }
 
 #[test]

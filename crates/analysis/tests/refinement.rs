@@ -57,6 +57,7 @@ fn subject(reasoning: ReasoningConfig) -> Subject<'static> {
         keys,
         execution: Execution::RecedingHorizon { n_action_steps: 4 },
         time_decides: model.depends_on_time(),
+        conventions: zoo::conventions::Conventions::default(),
         is_scripted: false,
         fast_render: None,
         perturbation: None,

@@ -10,6 +10,7 @@ use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rollout::{Control, Pool, PoolOptions, Ready, find_python, harness_folder, remembered_greeting};
+use zoo::conventions::Conventions;
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::{
     Environment, EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate as run_missing, finished,
@@ -142,7 +143,7 @@ pub(crate) fn evaluate<'py>(
                     let environment = Environment::of(entry.meta(), task.as_deref(), env_module.as_deref())?;
                     (Asked::Entry(Box::new(loaded)), environment, zoo)
                 }
-                (None, Some((called, name, source, declared, inputs, image_size))) => {
+                (None, Some((called, name, source, declared, inputs, image_size, conventions))) => {
                     let task = task.ok_or_else(|| missing("task", "a task, such as Lift, or a protocol"))?;
                     let inputs = inputs.map(feature_keys).transpose()?;
                     let execution = execution.unwrap_or(Execution::RecedingHorizon { n_action_steps: 1 });
@@ -154,6 +155,11 @@ pub(crate) fn evaluate<'py>(
                         image_size,
                         execution,
                         inputs: inputs.clone().unwrap_or_default(),
+                        conventions: Conventions::try_from(conventions).map_err(|found| ZooError::InvalidValue {
+                            key: "conventions".to_owned(),
+                            expected: "names of conventions".to_owned(),
+                            found,
+                        })?,
                     };
                     let environment = Environment::usual(&task, env_module.as_deref(), external.cameras());
                     let named = Named { name, description: String::new() };

@@ -9,8 +9,11 @@ use pyo3::types::PyDict;
 
 use crate::arrays::{array, read};
 
-/// A policy, name of its entry, its source, what its owner declares, keys of its features, side of its images.
-pub(crate) type Given = (Py<PyAny>, String, String, Option<String>, Option<BTreeMap<String, Vec<String>>>, usize);
+/// Names and lists of keys, or other texts.
+type Named<T> = BTreeMap<String, T>;
+
+/// A policy, name of its entry, its source, what its owner declares, keys of its features, side of its images, conventions.
+pub(crate) type Given = (Py<PyAny>, String, String, Option<String>, Option<Named<Vec<String>>>, usize, Named<String>);
 
 /// The first exception that the policy raised.
 pub(crate) type Failure = Arc<Mutex<Option<PyErr>>>;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ gymnasium = pytest.importorskip("gymnasium")
 
 import actrm
 import actrm.envs
+from conftest import ROOT
 
 
 @pytest.mark.filterwarnings("ignore:.*Box .* precision lowered.*", "ignore:.*infinity.*")
@@ -26,6 +28,18 @@ def test_gymnasium_s_checker_has_nothing_to_say() -> None:
 def test_every_task_is_known() -> None:
     known = {name for name in gymnasium.registry if name.startswith("actrm/")}
     assert known == {f"actrm/{task}-v0" for task in actrm.envs.TASKS}
+    text = (ROOT / "tools/harness/actrm_harness/tasks.py").read_text()
+    assert set(actrm.envs.TASKS) == set(re.findall(r'Task\(\s*"(\w+)"', text))
+
+
+def test_both_arms_are_seen() -> None:
+    env = gymnasium.make("actrm/TwoArmPegInHole-v0")
+    shapes = {name: space.shape for name, space in env.observation_space.items()}
+    one = gymnasium.make("actrm/Lift-v0").observation_space["observation.state"].shape
+    observation, _ = env.reset(seed=3)
+    assert shapes["observation.state"][0] > one[0]
+    assert observation["observation.state"].shape == shapes["observation.state"]
+    env.close()
 
 
 def test_an_episode_is_the_evaluation_s(zoo: Path) -> None:

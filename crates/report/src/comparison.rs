@@ -129,6 +129,17 @@ fn compare_outcomes(first: &[Outcomes], second: &[Outcomes]) -> Comparison {
     Comparison { difference: sum / (first.len() * second.len()) as f64, interval, p_value, test, shared }
 }
 
+/// Compares outcomes by episode; `paired` where the same number means the same initial state on both sides.
+pub fn compare_runs(first: &BTreeMap<u64, bool>, second: &BTreeMap<u64, bool>, paired: bool) -> Comparison {
+    let list = |run: &BTreeMap<u64, bool>, from: Option<u64>| -> Outcomes {
+        let episodes = run.iter().zip(from.unwrap_or_default()..);
+        episodes.map(|((&number, &success), place)| (from.map_or(number, |_| place), success)).collect()
+    };
+    let start = (!paired).then_some(0);
+    let after = (!paired).then_some(first.len() as u64);
+    compare_outcomes(&[list(first, start)], &[list(second, after)])
+}
+
 /// How much further the first comes on its way than the second, on the seeds that both were run on: two single trainings by
 /// Student's t on paired differences, two families by the bootstrap that [`compare`] uses. `None` where not every episode
 /// says how far it came, where a family stands beside a single training, and below [`FEWEST_SHARED`] seeds.
@@ -298,6 +309,17 @@ mod tests {
         let found = compare_outcomes(&[first(0, 90, 100)], &[first(0, 20, 30)]);
         assert_eq!((found.test, found.shared), (Test::McNemar, 30));
         assert!((found.difference - 1.0 / 3.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn runs_of_others_are_paired_only_where_numbers_mean_the_same() {
+        let (one, two): (BTreeMap<_, _>, BTreeMap<_, _>) =
+            (first(0, 30, 40).into_iter().collect(), first(0, 20, 40).into_iter().collect());
+        let found = compare_runs(&one, &two, true);
+        assert_eq!((found.test, found.shared), (Test::McNemar, 40));
+        let found = compare_runs(&one, &two, false);
+        assert_eq!((found.test, found.shared), (Test::Barnard, 0));
+        assert!((found.p_value - barnard((30, 40), (20, 40))).abs() < 1e-12);
     }
 
     #[test]

@@ -16,6 +16,7 @@ pub mod html;
 pub mod json;
 mod leaderboard;
 pub mod markdown;
+pub mod others;
 mod page;
 pub mod statistics;
 #[cfg(test)]

@@ -40,6 +40,8 @@ pub struct EntryFacts {
     pub task: String,
     /// Control steps a second of its environment.
     pub hertz: f64,
+    /// How its numbers are meant: names and values.
+    pub conventions: Vec<(String, String)>,
 }
 
 /// What a page shows beside its rows. Nothing of it has to be there.
@@ -452,6 +454,9 @@ fn provenance(row: &LeaderboardRow, beside: &Beside) -> String {
         || "It has a time budget, so its episodes may end differently next time.".to_owned(),
         |line| command(&line),
     );
+    let said = beside.entry(row).map_or(&[][..], |entry| &entry.conventions);
+    let said: Vec<String> = said.iter().map(|(name, value)| escape(&format!("{name}: {value}"))).collect();
+    let conventions = if said.is_empty() { "unknown".to_owned() } else { said.join("<br>") };
     let facts = [
         ("entry hash", format!("<code>{}</code>", escape(&row.record().entry.hash))),
         (
@@ -473,6 +478,7 @@ fn provenance(row: &LeaderboardRow, beside: &Beside) -> String {
                 false => "not trained".to_owned(),
             },
         ),
+        ("conventions", conventions),
         ("execution", escape(&row.execution_text())),
         ("rules", format!("<code>{}</code>", escape(&row.record().protocol.id()))),
         ("seeds", escape(&row.seeds_text())),
@@ -505,7 +511,9 @@ mod tests {
         stack.protocol.task = "Stack".into();
         finished(dir.path(), &stack);
         let points = (0..=500).step_by(10).map(|step| (step, 2.0 * (-(step as f64) / 120.0).exp() + 0.03)).collect();
-        let facts = EntryFacts { task: "Lift".into(), hertz: 20.0 };
+        let conventions = [("control_freq", "20"), ("gripper", "-1 opens, 1 closes")];
+        let conventions = conventions.map(|(name, value)| (name.to_owned(), value.to_owned())).into();
+        let facts = EntryFacts { task: "Lift".into(), hertz: 20.0, conventions };
         let beside = Beside {
             curves: vec![Curve { entry: "lift-act@1".into(), points }],
             entries: [("lift-act@1".to_owned(), facts)].into(),

@@ -9,6 +9,15 @@ use std::time::Duration;
 use crate::harness::{Python, cache_folder};
 use crate::message::Control;
 
+/// robomimic's `env_args` of a task's environment with these robots, each with its usual controller.
+pub fn robots_of(task: &str, robots: &[String]) -> serde_json::Value {
+    let robots = match robots {
+        [one] => serde_json::json!(one),
+        several => serde_json::json!(several),
+    };
+    serde_json::json!({"type": 1, "env_name": task, "env_kwargs": {"robots": robots}})
+}
+
 /// Runs a module of the harness, having asked Linux (`prctl(PR_SET_PDEATHSIG, SIGKILL)`) to kill it with us: a
 /// worker that hangs or is stopped would not see its pipe close.
 pub(super) fn boot(module: &str) -> String {

@@ -63,6 +63,10 @@ pub struct Facts {
     pub n_action_steps: Option<usize>,
     /// Coefficient of the temporal ensemble that its actions are executed with.
     pub temporal_ensemble: Option<f64>,
+    /// Conventions of the policy, by name.
+    pub conventions: std::collections::BTreeMap<String, String>,
+    /// Actions of a chunk.
+    pub action_horizon: Option<usize>,
     /// Observations that the policy reads at once.
     n_obs_steps: usize,
     /// Whether the server keeps the state of an episode, and is told of its beginning.
@@ -120,6 +124,13 @@ impl Facts {
                 Some(Value::Float(coefficient)) => Some(*coefficient),
                 _ => None,
             },
+            conventions: match metadata.get("conventions") {
+                Some(Value::Map(pairs)) => {
+                    pairs.iter().filter_map(|(name, value)| Some((name.to_string(), text(value)?))).collect()
+                }
+                _ => std::collections::BTreeMap::new(),
+            },
+            action_horizon: count("action_horizon")?,
             n_obs_steps,
             keeps_episodes: [RESET, SEED, EXECUTED].iter().all(|key| keys.contains(&Value::text(*key))),
             max_message: count("max_message_bytes")?,

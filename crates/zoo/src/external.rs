@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::config::{Library, from_value};
+use crate::conventions::Conventions;
 use crate::entry::{CamerasMeta, CardWords, Entry, EntryDraft, EntryId, EntryMeta, training_facts};
 use crate::evaluation::Subject;
 use crate::experiment::{DataSection, Experiment, IMAGE_PREFIX, IMAGE_SUFFIX};
@@ -41,6 +42,9 @@ pub struct External {
     pub execution: Execution,
     /// Observation keys of its features, in order. An image is `observation.images.<camera> = ["<camera>_image"]`.
     pub inputs: FeatureKeys,
+    /// What its owner, or its server, says of its conventions.
+    #[serde(default, skip_serializing_if = "Conventions::is_empty")]
+    pub conventions: Conventions,
 }
 
 /// The file's own form.
@@ -71,7 +75,12 @@ pub fn reads_images(inputs: &FeatureKeys) -> bool {
 pub fn usual_inputs(ready: &Ready) -> Result<FeatureKeys, ZooError> {
     let experiment = Experiment::load(&Library::built_in(), &format!("act_{}", ready.task.to_lowercase()), &[]);
     let of_task = experiment.ok().filter(|experiment| experiment.task.name == ready.task);
-    let data = of_task.map_or_else(DataSection::default, |experiment| experiment.data);
+    let mut data = of_task.map_or_else(DataSection::default, |experiment| experiment.data);
+    // a second robot shows what the first one does
+    let first = data.state_keys.clone();
+    let second = first.iter().map(|key| key.replace("robot0_", "robot1_"));
+    let new = second.filter(|key| !first.contains(key) && ready.observations.contains_key(key));
+    data.state_keys.extend(new);
     let features = [(models::STATE, data.state_keys), (models::ENVIRONMENT_STATE, data.env_keys)];
     let mut keys = FeatureKeys::default();
     for (feature, of) in features {
@@ -98,6 +107,34 @@ impl External {
         let names: Vec<String> = cameras.map(name).collect();
         let size = self.image_size.unwrap_or(0);
         (!names.is_empty()).then_some(CamerasMeta { names, size, fast_render: false })
+    }
+
+    /// Its conventions: what is said of them, and what follows from how it is asked.
+    pub fn said(&self) -> Conventions {
+        self.conventions.clone().or(self.asked())
+    }
+
+    /// Compares what is said of its conventions with how it is asked.
+    fn check_said(&self, named: &Named, ready: &Ready) -> Result<(), ZooError> {
+        let mut asked = self.asked();
+        if let (Some(horizon), Execution::RecedingHorizon { n_action_steps }) =
+            (self.conventions.get("horizon").and_then(|text| text.parse::<usize>().ok()), self.execution)
+            && n_action_steps > horizon
+        {
+            asked.set("horizon", format!("at least {n_action_steps} for n_action_steps"));
+        }
+        self.conventions.check(&asked, "this evaluation", &named.name, &ready.task)
+    }
+
+    /// What follows from how it is asked.
+    fn asked(&self) -> Conventions {
+        let mut known = Conventions::default();
+        known.set_state(&self.inputs);
+        known.set_execution(self.execution);
+        if let Some(side) = self.image_size {
+            known.set("image_size", format!("{side} x {side}"));
+        }
+        known
     }
 
     /// The features of its inputs in the environment that `ready` describes.
@@ -131,6 +168,7 @@ impl External {
     /// # Errors
     /// A name that is an entry with weights; keys that the environment does not have; files that cannot be written.
     pub fn entry(&self, zoo: &Path, named: &Named, ready: &Ready) -> Result<Entry, ZooError> {
+        self.check_said(named, ready)?;
         let (signature, config) = (self.signature(ready)?, self.to_toml());
         let registry = Registry::open(zoo);
         let newest = registry.ids()?.into_iter().filter(|id| id.name == named.name).max();
@@ -231,6 +269,7 @@ impl External {
             signature: meta.signature.clone(),
             time_decides: false,
             is_scripted: false,
+            conventions: self.said(),
             fast_render: self.cameras().map(|cameras| cameras.fast_render),
             perturbation: None,
             policy: Box::new(policy),
@@ -264,7 +303,24 @@ mod tests {
             image_size: None,
             execution: Execution::RecedingHorizon { n_action_steps: 1 },
             inputs,
+            conventions: Conventions::default(),
         }
+    }
+
+    #[test]
+    fn both_robots_are_seen() {
+        let pose = |robot: u8| [format!("robot{robot}_eef_pos"), format!("robot{robot}_eef_quat")];
+        let mut keys = json!({"object": [10]});
+        for (robot, [position, rotation]) in [(0, pose(0)), (1, pose(1))] {
+            (keys[position], keys[rotation]) = (json!([3]), json!([4]));
+            keys[format!("robot{robot}_gripper_qpos")] = json!([2]);
+        }
+        let two = Ready { task: "TwoArmUnknown".to_owned(), ..ready(keys.clone()) };
+        let seen = usual_inputs(&two).unwrap().of(models::STATE);
+        assert_eq!(seen.len(), 6);
+        assert_eq!(seen[3..], ["robot1_eef_pos", "robot1_eef_quat", "robot1_gripper_qpos"]);
+        keys.as_object_mut().unwrap().retain(|key, _| !key.starts_with("robot1"));
+        assert_eq!(usual_inputs(&ready(keys)).unwrap().of(models::STATE).len(), 3);
     }
 
     #[test]
@@ -284,6 +340,43 @@ mod tests {
 
         let error = one.load().err().unwrap().to_string();
         assert!(error.contains("mine@1") && error.contains("not in this zoo"), "{error}");
+    }
+
+    #[test]
+    fn conventions_that_do_not_hold_here_are_refused_by_name() {
+        let zoo = tempfile::tempdir().unwrap();
+        let named = Named { name: "mine".to_owned(), description: String::new() };
+        let ready = ready(json!({"robot0_eef_pos": [3]}));
+        let mut usual = external();
+        usual.conventions.set("quaternion", "x, y, z, w");
+        usual.conventions.set("horizon", 16);
+        let entry = usual.entry(zoo.path(), &named, &ready).unwrap();
+        assert_eq!(External::of(&entry).unwrap().unwrap(), usual);
+        assert_eq!(entry.conventions().unwrap().get("executed"), Some("1"));
+        for (name, value) in [
+            ("executed", "8"),
+            ("state", "observation.state: robot0_eef_quat"),
+            ("image_size", "224 x 224"),
+            ("horizon", "0"),
+        ] {
+            let mut other = External { image_size: Some(84), ..usual.clone() };
+            other.conventions.set(name, value);
+            let error = other.entry(zoo.path(), &named, &ready).unwrap_err().to_string();
+            assert!(error.contains(&format!("convention {name}: expected {value}, found")), "{error}");
+        }
+        // and what the simulator says otherwise, before an episode begins
+        let mut other = usual;
+        other.conventions.set("control_freq", 10);
+        let entry = other.entry(zoo.path(), &named, &ready).unwrap();
+        let subject = other.subject(&entry, || unreachable!());
+        let options = crate::evaluation::EvaluationOptions {
+            seeds: crate::results::Seeds { start: 0, count: 1 },
+            shard: None,
+            env_module: None,
+            force: true,
+        };
+        let error = subject.record(&ready, &options).unwrap_err().to_string();
+        assert_eq!(error, "entry mine@2 in task Lift: convention control_freq: expected 10, found 20 in robosuite");
     }
 
     #[test]

@@ -9,6 +9,7 @@
 //! neither reads the command line nor prints (`tools`).
 
 pub mod config;
+pub mod conventions;
 pub mod entry;
 mod error;
 pub mod experiment;
@@ -16,6 +17,7 @@ pub mod external;
 mod feature_keys;
 mod files;
 pub mod lerobot;
+pub mod onnx;
 pub mod registry;
 pub mod robomimic;
 pub mod run;

@@ -82,6 +82,7 @@ fn subject() -> Subject<'static> {
         time_decides: false,
         max_steps: Some(45),
         signature: Signature::low_dimensional(5, 10, 7),
+        conventions: zoo::conventions::Conventions::default(),
         is_scripted: false,
         fast_render: None,
         perturbation: None,

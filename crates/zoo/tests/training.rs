@@ -9,14 +9,14 @@ use std::fs;
 use std::path::Path;
 
 use common::{SMALL, demonstrations};
-use dataset::{ConvertOptions, RobomimicWriter, Source, WriteOptions};
+use dataset::{ConvertOptions, Dataset, RobomimicWriter, Source, WriteOptions};
 use models::{FeatureKind, FeatureSpec, Observation, Policy, Values};
 use zoo::ZooError;
 use zoo::config::Library;
-use zoo::entry::Entry;
+use zoo::entry::{Entry, LoadedEntry};
 use zoo::experiment::Experiment;
 use zoo::registry::Registry;
-use zoo::run::{Checkpoint, TrainEvent, TrainOutcome, TrainRequest, train};
+use zoo::run::{Checkpoint, ScoreRequest, TrainEvent, TrainOutcome, TrainRequest, extend, score, score_folder, train};
 
 /// Besides, so that a training that was stopped has something to go on from.
 const LONGER: [&str; 3] = ["train.warmup_steps=2", "train.checkpoint_every=3", "train.ema_decay=0.9"];
@@ -588,6 +588,132 @@ fn a_task_without_a_simulator_has_the_keys_of_its_data_and_a_true_card() {
     assert_eq!(second.meta().content_sha256(), entry.meta().content_sha256());
     let chunk = entry.load().unwrap().policy().predict(&Observation::of_state(vec![0.1; 9], vec![0.1; 10])).unwrap();
     assert_eq!(chunk.action_dim, 7);
+}
+
+#[test]
+fn a_finished_run_goes_on_to_the_bytes_of_a_longer_one() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let whole = finish(&request(root.path(), &data, &["train.schedule=constant"]));
+    let short = request(root.path(), &data, &["train.schedule=constant", "train.steps=5"]);
+    let run = root.path().join("runs/act_lift/002");
+    let first = finish(&short);
+    for (steps, words) in [(5, "train.steps: expected more than the 5 of the finished run"), (0, "found 0")] {
+        let error = extend(&run, steps).err().unwrap().to_string();
+        assert!(error.contains(words), "{error}");
+    }
+    let extended = extend(&run, 12).unwrap();
+    assert!(extended.folder.ends_with("act_lift/003"));
+    let request = TrainRequest {
+        name: extended.name,
+        experiment: extended.experiment,
+        data: None,
+        run: Some(extended.folder),
+        resume: true,
+        ..request(root.path(), &data, &[])
+    };
+    let longer = finish(&request);
+    assert!(model(&longer) == model(&whole) && model(&longer) != model(&first));
+    assert_eq!(longer.config_text().unwrap(), whole.config_text().unwrap());
+    assert_eq!(longer.meta().training.as_ref().unwrap().steps, 12);
+    // rates that depend on the number of steps
+    finish(&TrainRequest { resume: false, ..request_of_cosine(root.path(), &data) });
+    let error = extend(&root.path().join("runs/act_lift/004"), 50).err().unwrap().to_string();
+    assert!(error.contains("train.schedule: expected constant") && error.contains("--from lift-act@4"), "{error}");
+    let error = extend(&root.path().join("runs"), 50).err().unwrap().to_string();
+    assert!(error.contains("not finished"), "{error}");
+}
+
+fn request_of_cosine(root: &Path, data: &Path) -> TrainRequest {
+    request(root, data, &["train.steps=2"])
+}
+
+/// What an entry's actions are wrong by, on episodes that it was not trained on.
+#[test]
+fn an_entry_is_scored_on_held_out_episodes() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let entry = finish(&request(root.path(), &data, &[])).load().unwrap();
+    let work = root.path().join("work");
+    let scored = |entry: &LoadedEntry, data: &Path, mask: Option<&str>, most: usize| {
+        let work = score_folder(&work, data)?;
+        score(&ScoreRequest { entry, data, work: &work, mask, most, force: false })
+    };
+    let held_out = scored(&entry, &data, None, 1000).unwrap();
+    assert_eq!((held_out.mask.as_deref(), held_out.episodes), (Some("valid"), 1));
+    assert_eq!((held_out.names.len(), held_out.errors.len(), held_out.errors[0].len()), (7, 16, 7));
+    // at the last steps of an episode a chunk is longer than it
+    assert_eq!(held_out.counts[0], held_out.queries);
+    assert_eq!(held_out.counts[15], held_out.queries - 15);
+    assert!(held_out.mean > 0.0 && held_out.mean < 2.0 && held_out.notes.is_empty(), "{held_out:?}");
+    let of_dimensions = held_out.of_dimensions();
+    assert!((of_dimensions.iter().sum::<f64>() / 7.0 - held_out.mean).abs() < 1e-9);
+    assert_eq!(held_out.of_steps().len(), 16);
+    // by hand, at one step
+    let one = scored(&entry, &data, Some("train"), 1).unwrap();
+    assert_eq!((one.queries, one.notes.len()), (1, 1), "{:?}", one.notes);
+    let folder = score_folder(&work, &data).unwrap().join("data");
+    let set = Dataset::open(&folder).unwrap();
+    let first = set.split("train").unwrap()[0];
+    let from = set.episodes()[..first].iter().map(|episode| episode.length).sum::<usize>();
+    let row = |name: &str| {
+        let column = set.column(name).unwrap();
+        column.data[from * column.dim..][..column.dim].to_vec()
+    };
+    let mut policy = entry.policy();
+    policy.reset(0);
+    let seen = Observation::of_state(row("observation.state"), row("observation.environment_state"));
+    let predicted = policy.predict(&seen).unwrap();
+    for (dim, shown) in row("action").iter().enumerate() {
+        let expected = f64::from((predicted.actions[dim] - shown).abs());
+        assert!((one.errors[0][dim] - expected).abs() < 1e-6, "{dim}: {} {expected}", one.errors[0][dim]);
+    }
+    let error = scored(&entry, &data, Some("tset"), 1).unwrap_err().to_string();
+    assert!(error.contains("tset"), "{error}");
+}
+
+/// Demonstrations that were recorded at another rate, or by another controller.
+#[test]
+fn other_conventions_of_the_data_are_refused_by_name() {
+    let root = tempfile::tempdir().unwrap();
+    let data = demonstrations(root.path());
+    let entry = finish(&request(root.path(), &data, &[]));
+    let other = root.path().join("other.hdf5");
+    let flip = |place: &str, key: &str, value: serde_json::Value| {
+        let source = Source::open(&data).unwrap();
+        let mut writer = RobomimicWriter::create(&other, &WriteOptions::default()).unwrap();
+        let mut root = source.root().unwrap();
+        let mut args = source.plan().env_args.clone().unwrap();
+        args.pointer_mut(place).unwrap()[key] = value;
+        let attrs = root.inner_attrs.get_mut("data").unwrap();
+        attrs.insert("env_args".to_owned(), dataset::Array::from_str(&args.to_string()));
+        writer.set_root(&root).unwrap();
+        for index in 0..source.plan().demos.len() {
+            writer.add_demo(&source.read_demo(index).unwrap()).unwrap();
+        }
+        writer.finish().unwrap();
+    };
+    let loaded = entry.load().unwrap();
+    let arm = "/env_kwargs/controller_configs/body_parts/right";
+    for (place, key, value, name) in [
+        ("/env_kwargs", "control_freq", 10.into(), "control_freq"),
+        (arm, "input_max", 2.into(), "action_range"),
+        (arm, "input_type", "absolute".into(), "action_space"),
+        (arm, "input_ref_frame", "world".into(), "action_frame"),
+    ] {
+        let _ = fs::remove_file(&other);
+        flip(place, key, value);
+        let request = TrainRequest {
+            data: Some(other.clone()),
+            ..request(root.path(), &data, &[&format!("train.from={}", entry.id())])
+        };
+        let error = train(&request, &|| false, &mut |_| {}).unwrap_err().to_string();
+        assert!(error.contains(&format!("entry lift-act@1 in task Lift: convention {name}: expected")), "{error}");
+        let work = score_folder(&root.path().join("work"), &other).unwrap();
+        let request = ScoreRequest { entry: &loaded, data: &other, work: &work, mask: Some(""), most: 1, force: false };
+        let error = score(&request).unwrap_err().to_string();
+        assert!(error.contains(&format!("convention {name}: expected")), "{error}");
+    }
 }
 
 #[test]

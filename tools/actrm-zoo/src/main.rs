@@ -6,6 +6,7 @@
 
 mod card;
 mod commands;
+mod compared;
 mod places;
 mod puzzles;
 mod remote;

@@ -8,7 +8,8 @@ use cli::shown;
 use models::{ModelError, Policy};
 use rollout::Ready;
 use serving::{Facts, Mapping, RemotePolicy};
-use zoo::entry::CamerasMeta;
+use zoo::conventions::Conventions;
+use zoo::entry::{CamerasMeta, Entry};
 use zoo::evaluation::Subject;
 use zoo::external::{External, Named, usual_inputs};
 use zoo::results::Execution;
@@ -45,6 +46,7 @@ impl RemoteArgs {
         let (mapping, text) = mapping(&self.mapping)?;
         let mapping = mapping.of_task(task);
         let facts = Facts::ask(address, self.token.as_deref(), &mapping)?;
+        let conventions = conventions(address, &facts, &mapping)?;
         Ok(Some(Remote {
             address: address.clone(),
             token: self.token.clone(),
@@ -54,8 +56,87 @@ impl RemoteArgs {
             mapping,
             text,
             facts,
+            conventions,
         }))
     }
+}
+
+/// What a server says of its conventions, as far as `mapping` leaves it as it is.
+fn conventions(address: &str, facts: &Facts, mapping: &Mapping) -> anyhow::Result<Conventions> {
+    let said = Conventions::try_from(facts.conventions.clone()).map_err(anyhow::Error::msg);
+    let mut said = said.with_context(|| format!("policy server {address}"))?;
+    if let Some(horizon) = facts.action_horizon {
+        said.set("horizon", horizon);
+    }
+    if mapping.n_action_steps.is_some() {
+        said = said.without(&["executed"]);
+    }
+    if !mapping.observation.is_empty() {
+        said = said.without(&["state", "quaternion", "image_size", "image_flip", "image_channels"]);
+    }
+    Ok(said)
+}
+
+/// The policy of an external entry behind a server, which is asked for it again.
+pub struct Served {
+    external: External,
+    address: String,
+    token: Option<String>,
+    mapping: Mapping,
+    /// What the server says that it runs.
+    pub declared: Option<String>,
+}
+
+impl Served {
+    /// Asks the server at `address`, or the one that the entry names, whether it is as it was.
+    ///
+    /// # Errors
+    /// An entry whose policy is no server's; a server that cannot be used; other conventions, by name.
+    pub fn of(entry: &Entry, address: Option<&str>, token: Option<&str>) -> anyhow::Result<Option<Self>> {
+        let Some(external) = External::of(entry)? else { return Ok(None) };
+        let id = entry.id();
+        let own = Some(external.source.as_str()).filter(|source| source.starts_with("ws://"));
+        let Some(address) = address.or(own).map(str::to_owned) else {
+            bail!(
+                "entry {id}: {} runs in Python: evaluate it again with actrm.evaluate, or name its server with --policy",
+                external.source
+            );
+        };
+        let mapping = match external.mapping.as_deref() {
+            None => Mapping::default(),
+            Some(text) => match text.strip_prefix("preset ").and_then(Mapping::preset) {
+                Some(mapping) => mapping,
+                None => Mapping::parse("of the entry", text)?,
+            },
+        };
+        let mapping = mapping.of_task(&entry.meta().task);
+        let facts = Facts::ask(&address, token, &mapping)?;
+        let now = conventions(&address, &facts, &mapping)?;
+        external.conventions.check(&now, &address, &id.to_string(), &entry.meta().task)?;
+        let token = token.map(str::to_owned);
+        Ok(Some(Self { external, address, token, mapping, declared: facts.entry }))
+    }
+
+    /// What its owner declared of the weights when the row was measured.
+    pub fn declared_then(&self) -> Option<&str> {
+        self.external.declared.as_deref()
+    }
+
+    /// What is evaluated.
+    pub fn subject(&self, entry: &Entry) -> Subject<'_> {
+        let signature = entry.meta().signature.clone();
+        self.external.subject(entry, move || connect(&self.address, self.token.as_deref(), &signature, &self.mapping))
+    }
+}
+
+fn connect(
+    address: &str,
+    token: Option<&str>,
+    signature: &models::Signature,
+    mapping: &Mapping,
+) -> Result<Box<dyn Policy>, ModelError> {
+    let policy = RemotePolicy::connect(address, token, signature, mapping);
+    policy.map(|policy| Box::new(policy) as Box<dyn Policy>).map_err(ModelError::from)
 }
 
 /// A mapping and its file's text; none of one that changes nothing.
@@ -81,6 +162,8 @@ pub struct Remote {
     mapping: Mapping,
     text: Option<String>,
     facts: Facts,
+    /// What the server says of its conventions, as far as the mapping leaves it as it is.
+    conventions: Conventions,
 }
 
 /// How features of images are named.
@@ -95,7 +178,8 @@ impl Remote {
         };
         let (source, declared, mapping) = (self.address.clone(), self.declared.clone(), self.text.clone());
         let images = inputs.features().any(|feature| feature.starts_with(IMAGES));
-        External { source, declared, mapping, image_size: images.then(|| self.image_size()), execution, inputs }
+        let (image_size, conventions) = (images.then(|| self.image_size()), self.conventions.clone());
+        External { source, declared, mapping, image_size, execution, inputs, conventions }
     }
 
     /// Side of the images: as the server says of its own, else as the mapping says.
@@ -150,8 +234,7 @@ impl Remote {
     }
 
     fn connect(&self, signature: &models::Signature) -> Result<Box<dyn Policy>, ModelError> {
-        let policy = RemotePolicy::connect(&self.address, self.token.as_deref(), signature, &self.mapping);
-        policy.map(|policy| Box::new(policy) as Box<dyn Policy>).map_err(ModelError::from)
+        connect(&self.address, self.token.as_deref(), signature, &self.mapping)
     }
 }
 

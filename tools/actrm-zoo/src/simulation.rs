@@ -25,6 +25,9 @@ pub struct RunArgs {
     /// Task, if not the entry's
     #[arg(long)]
     pub task: Option<String>,
+    /// Robot in place of the task's own, with its usual controller, such as UR5e; two names with a comma for two arms
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    pub robots: Vec<String>,
     /// Control loop inside the simulator: `compiled` or `robosuite`
     #[arg(long, default_value_t = Control::Compiled)]
     pub control: Control,
@@ -47,7 +50,8 @@ pub struct RunArgs {
 /// # Errors
 /// As [`Environment::of`].
 pub fn environment(args: &RunArgs, meta: &EntryMeta) -> Result<Environment, ZooError> {
-    drawn(&args.simulator, args.task.as_deref(), meta)
+    let environment = drawn(&args.simulator, args.task.as_deref(), meta)?;
+    Ok(if args.robots.is_empty() { environment } else { environment.with_robots(&args.robots) })
 }
 
 /// The same for commands that show one episode: as its demonstrations, drawn as they were.

@@ -470,3 +470,12 @@ def test_an_expert_passes_every_stage_before_success_and_who_does_nothing_none(t
         assert envs.state(session.env).tobytes() == envs.state(unseen.env).tobytes()
     session.env.close()
     unseen.env.close()
+
+
+def test_an_expert_moves_another_robot_with_its_usual_controller() -> None:
+    session = envs.make("Lift", env_args={"env_kwargs": {"robots": "UR5e"}})
+    assert session.unusual is not None and episodes.expert_episode(session, 5).success
+    recorded = envs.make("Lift", env_args=session.env_args)
+    assert (recorded.unusual, recorded.task.expert) == (session.unusual, session.task.expert)
+    other = envs.make("Lift", env_args={"env_kwargs": {"robots": "UR5e", "control_freq": 10}})
+    assert other.task.expert is None

@@ -127,6 +127,7 @@ def evaluate(
     inputs: Mapping[str, Sequence[str]] | None = None,
     image_size: int = 84,
     declared: str | None = None,
+    conventions: Mapping[str, str] | None = None,
     seed: int = 10_000,
     max_steps: int | None = None,
     n_action_steps: int | None = None,
@@ -164,6 +165,8 @@ def evaluate(
         `observation.environment_state` of the task unless given.
     image_size: side of your policy's images in pixels.
     declared: what you declare of your policy's weights, such as a hash; another one is another version of the entry.
+    conventions: what your policy expects, such as `{"control_freq": "20", "gripper": "-1 opens, 1 closes"}`.
+        A simulator that differs is refused. Names and values: `actrm-zoo show ENTRY --conventions`.
     seed: seed of the first episode.
     max_steps: control steps after which an episode has failed; the entry's or the task's own limit unless given.
     n_action_steps: actions that are executed before the next query of the policy; the entry's unless given. With it,
@@ -184,7 +187,7 @@ def evaluate(
     workers = workers or os.cpu_count() or 1
     entry, external = None, None
     if isinstance(policy, (str, os.PathLike)):
-        given = {"name": name, "inputs": inputs, "declared": declared}
+        given = {"name": name, "inputs": inputs, "declared": declared, "conventions": conventions}
         entry = str(policy)  # pyright: ignore[reportUnknownArgumentType]
         if meant := [word for word, value in given.items() if value is not None]:
             raise ValueError(f"{meant[0]}: expected with a policy of yours, found the entry {entry!r}")
@@ -193,7 +196,7 @@ def evaluate(
             raise ValueError("name: expected a name for your policy's entry, such as name='mine', found none")
         called = Called.of(policy, workers=workers, chunks=(n_action_steps or temporal_ensemble) is not None)
         keys = None if inputs is None else {feature: list(of) for feature, of in inputs.items()}
-        external = (called, name, source(policy), declared, keys, image_size)
+        external = (called, name, source(policy), declared, keys, image_size, dict(conventions or {}))
     with teller("eval", progress) as tell:
         return _actrm.evaluate(
             entry,

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ._policies import Called
 
 _Path = str | PathLike[str]
-_External = tuple[Called, str, str, str | None, dict[str, list[str]] | None, int]
+_External = tuple[Called, str, str, str | None, dict[str, list[str]] | None, int, dict[str, str]]
 
 __version__: str
 

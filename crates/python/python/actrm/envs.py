@@ -19,6 +19,7 @@ from . import Simulator, simulator_python
 TASKS = (
     "Door",
     "Lift",
+    "NutAssembly",
     "NutAssemblyRound",
     "NutAssemblySquare",
     "PickAny",
@@ -30,12 +31,18 @@ TASKS = (
     "PickPlaceMilk",
     "Recall",
     "RecallHeld",
+    "RoundPillar",
     "Stack",
     "StackColor",
     "StackThreeCubes",
     "TableMaze",
     "TableMaze10",
     "ToolHang",
+    "TwoArmHandover",
+    "TwoArmLift",
+    "TwoArmPegInHole",
+    "TwoArmTransport",
+    "Wipe",
 )
 
 Observation = dict[str, NDArray[Any]]

@@ -10,7 +10,7 @@ mod sequential;
 pub use bootstrap::{Difference, Estimate, difference, hierarchical, interquartile, mean_difference, mean_interval};
 pub use multiple::{Distinct, holm, pairs};
 pub use paired::{Paired, barnard};
-pub use sequential::EProcess;
+pub use sequential::{Bet, EProcess, Unpaired};
 
 /// 97.5% quantile of the standard normal distribution.
 const Z: f64 = 1.959_963_984_540_054;

@@ -42,6 +42,7 @@ impl LoadedEntry {
             max_steps: rollout.max_steps,
             signature: meta.signature.clone(),
             time_decides: self.model().depends_on_time(),
+            conventions: self.conventions(),
             is_scripted: self.model().is_scripted(),
             fast_render: meta
                 .signature

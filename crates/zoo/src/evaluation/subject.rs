@@ -9,6 +9,7 @@ use rollout::{EpisodePlan, Image, Observations, Ready, RolloutError};
 
 use super::agent::{PolicyAgent, QueryTimes, Timed};
 use super::{EvaluationOptions, Perturbation};
+use crate::conventions::Conventions;
 use crate::entry::CamerasMeta;
 use crate::results::{EntryIdentity, EvaluationRecord, Execution, Protocol, Seeds, TrainingFacts};
 use crate::{FeatureKeys, Past, ZooError};
@@ -37,6 +38,8 @@ pub struct Subject<'a> {
     pub time_decides: bool,
     /// Whether the task's scripted expert acts in its place, inside the simulator.
     pub is_scripted: bool,
+    /// How its numbers are meant, as far as that is known.
+    pub conventions: Conventions,
     /// Of a policy that sees pictures: whether those it learned from were drawn without reflections and multisampling.
     pub fast_render: Option<bool>,
     /// What becomes of its pictures on their way to it.
@@ -99,6 +102,8 @@ impl Subject<'_> {
                 expected,
             })?;
         }
+        let simulator = Conventions::of_simulator(ready).without(&["image_size"]);
+        self.conventions.check(&simulator, &ready.simulator, &self.entry.to_string(), &ready.task)?;
         let features = self.signature.observation.iter().map(|spec| {
             let found = self.keys.width(&spec.name, ready).map_or_else(|reason| reason, |width| width.to_string());
             (format!("length of {}", spec.name), spec.width().to_string(), found)

@@ -42,8 +42,15 @@ impl Rerun {
     /// # Errors
     /// An entry that cannot be loaded, a perturbation that is not known.
     pub fn subject(&self, entry: &Entry) -> Result<Subject<'static>, ZooError> {
+        self.as_measured(entry.load()?.subject())
+    }
+
+    /// `subject` acting as the row's policy did.
+    ///
+    /// # Errors
+    /// A perturbation that is not known.
+    pub fn as_measured<'a>(&self, mut subject: Subject<'a>) -> Result<Subject<'a>, ZooError> {
         let record = &self.stored.record;
-        let mut subject = entry.load()?.subject();
         subject.execution = record.execution;
         subject.max_steps = Some(record.protocol.max_steps);
         let known = record.protocol.perturbation.as_deref().map(str::parse::<Perturbation>).transpose();
@@ -78,6 +85,13 @@ impl Rerun {
             // what was recorded is run, whatever it needed then; other versions are told
             force: true,
         })
+    }
+
+    /// Holds what the owner of a policy declares of it now against what was declared when the row was measured.
+    pub fn compare_declared(&self, then: Option<&str>, now: Option<&str>, report: &mut Report) {
+        if let Some(now) = now {
+            report.add_versions([("policy".to_owned(), then.map(str::to_owned), now.to_owned())]);
+        }
     }
 
     /// Where outcomes of `entry` go: beside the retrained entry, or in a folder for the stored one's.

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use candle_core::Tensor;
 
+use crate::conventions::Conventions;
 use crate::entry::{Entry, EntryId, EntryRequest, MODEL_FILE, ParentMeta};
 use crate::{ZooError, tensors};
 
@@ -12,6 +13,7 @@ use crate::{ZooError, tensors};
 pub(super) struct InitialWeights {
     /// The entry that they are of.
     pub parent: ParentMeta,
+    conventions: Conventions,
     weights: BTreeMap<String, Tensor>,
 }
 
@@ -34,7 +36,16 @@ impl InitialWeights {
         let (weights, _) = tensors::read(&path)?;
         let weights = tensors::in_f32(&path, weights)?;
         let parent = ParentMeta { entry: entry.id().to_string(), content_sha256: entry.meta().content_sha256() };
-        Ok(Self { parent, weights })
+        Ok(Self { parent, conventions: entry.conventions()?, weights })
+    }
+
+    /// Compares the conventions that the weights were trained by with those of demonstrations called `name`.
+    ///
+    /// # Errors
+    /// [`ZooError::UnfitEntry`] with the first that differs.
+    pub fn check(&self, demonstrations: &Conventions, name: &str, task: &str) -> Result<(), ZooError> {
+        let said = demonstrations.clone().without(&["image_size"]);
+        self.conventions.check(&said, &format!("{name} (--force trains anyway)"), &self.parent.entry, task)
     }
 
     /// The tensor that begins as `name`, which has the shape of `own`.

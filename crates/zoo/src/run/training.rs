@@ -10,6 +10,7 @@ use dataset::shuffle::Sampler;
 use models::{Backend, PolicyModel, Trainer, TrainerState};
 use serde::{Deserialize, Serialize};
 
+use crate::conventions::Conventions;
 use crate::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, ModuleMeta, ParentMeta, TrainingMeta, reference};
 use crate::experiment::Experiment;
 use crate::transforms::{Stage, unreadable};
@@ -192,6 +193,9 @@ impl PolicyTraining {
         let section = &experiment.train;
         let from_zoo = request.from_zoo.as_ref().unwrap_or(&request.zoo);
         let initial = section.from.as_ref().map(|from| InitialWeights::read(from_zoo, from)).transpose()?;
+        if let (Some(initial), Some(env)) = (&initial, dataset.env().filter(|_| !request.force)) {
+            initial.check(&Conventions::of_env_args(&env.env_args), &name, &experiment.task.name)?;
+        }
         let build = || {
             let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed, &Backend::CPU);
             let model = model.map_err(experiment.model_error("build the policy of"))?;

@@ -24,6 +24,7 @@ const GOES_ON: &str = "stopped; run the same command again to resume";
   actrm-data collect --task Stack --episodes 200 --seed 7 --workers 4 --out stack.hdf5
   actrm-data collect --task StackColor --episodes 200 --expert recoveries --out stackcolor.hdf5
   actrm-data collect --task PickPlaceCan --episodes 200 --skill mixed --out can_mixed.hdf5
+  actrm-data collect --task Lift --episodes 50 --robots UR5e --out lift_ur5e.hdf5
   actrm-data collect --task Lift --episodes 20 --cameras agentview,robot0_eye_in_hand --out lift_image.hdf5")]
 pub struct Args {
     /// Task, as robosuite or the environment module names it
@@ -44,6 +45,10 @@ pub struct Args {
     /// `mixed`: each episode draws good, middling or poor, and the demo's attribute `skill` records it
     #[arg(long, default_value_t = Skill::Good)]
     skill: Skill,
+    /// Robot in place of the task's own, with its usual controller, such as UR5e; two names with a comma for two arms. The experts
+    /// are made for the task's own robot: fewer attempts may succeed
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    robots: Vec<String>,
     /// File to create
     #[arg(long, short)]
     out: PathBuf,
@@ -68,6 +73,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     cli::make_parent(&args.out)?;
     let stop = Stop::install(GOES_ON)?;
     let mut spec = args.simulator.spec(&args.task)?;
+    if !args.robots.is_empty() {
+        spec.env_args = Some(rollout::robots_of(&args.task, &args.robots));
+    }
     args.cameras.set(&mut spec);
     let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
         cli::note(GOES_ON);

@@ -5,7 +5,7 @@ use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Stop, limits, shown};
 use report::comparison::{ALPHA, Comparison, Flips, compare, compare_progress};
 use report::statistics::{Difference, Estimate};
-use report::{Counts, LeaderboardRow, Reading, percent, rank};
+use report::{LeaderboardRow, Reading, rank};
 use rollout::Pool;
 use serde_json::{Value, json};
 use zoo::audit::{KnownEntries, audit};
@@ -13,6 +13,7 @@ use zoo::entry::{EntryId, LoadedEntry};
 use zoo::evaluation::{Environment, EvaluationOptions, FIRST_SEED, Subject};
 use zoo::results::{EvaluationRecord, Seeds, StoredEvaluation};
 
+use crate::compared::{self, Compared, Side, counts, flips_json, list, p_text, sequential_text};
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 use crate::simulation::{RunArgs, environment, limited_worker, run_missing};
 
@@ -25,17 +26,24 @@ const GOES_ON: &str = "stopped; run the same command again to resume";
 /// of both until the sequential test is significant at 5% or --max-episodes is reached. Results must be valid, as for
 /// `actrm-zoo leaderboard`. An entry can be compared with itself where it was evaluated in several ways, for example with two
 /// versions of the simulator.
+///
+/// A side can be a file that another program wrote: LeRobot's `eval_info.json`, a result file of vla-eval, or a CSV with the
+/// columns task, policy, success, and seed or episode. Equal seeds are paired; otherwise the tests are Barnard's and, in the
+/// order of the episodes, N-SCORE and SAVI. Such results have no seal and are not ranked.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo compare lift-act lift-actrm
   actrm-zoo compare 'lift-act-s*' 'lift-actrm-s*'
   actrm-zoo compare stack-act@1 stack-act@2 --until-decided --max-episodes 500
-  actrm-zoo compare lift-act lift-act --json")]
+  actrm-zoo compare lift-act lift-act --json
+  actrm-zoo compare lift-act outputs/eval_info.json --task Lift
+  actrm-zoo compare results.csv:mine results.csv:theirs")]
 pub struct Args {
-    /// First entry: `name` (its newest version), `name@version`, or a pattern with `*` for the trainings of a family
+    /// First entry: `name` (its newest version), `name@version`, or a pattern with `*` for the trainings of a family; or a
+    /// file of results, `FILE` or `FILE:POLICY`
     #[arg(add = entry_names())]
     first: String,
-    /// Second entry or family, named like the first
+    /// Second entry, family or file, named like the first
     #[arg(add = entry_names())]
     second: String,
     /// Run episodes of both on equal seeds until the difference is significant
@@ -63,25 +71,16 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let registry = args.zoo.registry();
+    let files = [&args.first, &args.second].map(|side| compared::is_file(side));
+    if files.contains(&true) {
+        return with_files(args, files);
+    }
     let sides = [registry.matching(&args.first)?, registry.matching(&args.second)?];
     if args.until_decided {
         return until_decided(args, &sides);
     }
-    let entries = KnownEntries::open(&registry)?;
     let results = args.results.folder(&args.zoo);
-    let audit = audit(&results, &entries)?;
-    for left in &audit.left_out {
-        cli::note(&format!("note: left out: {}: {}", shown(&left.folder), left.reason));
-    }
-    let reading = Reading::of(&entries, args.protocols.protocols()?);
-    let rows = |ids: &[EntryId]| {
-        let of = |one: &&StoredEvaluation| {
-            ids.iter().any(|id| id.name == one.record.entry.name && id.version == one.record.entry.version)
-        };
-        let own: Vec<StoredEvaluation> = audit.standing.iter().filter(of).cloned().collect();
-        rank(&own, &reading)
-    };
-    let [first, second] = [rows(&sides[0]), rows(&sides[1])];
+    let [first, second] = rows(args, [&sides[0], &sides[1]])?;
     let found = pairs(&first, &second, sides[0] == sides[1]);
     if found.is_empty() {
         let ids = |ids: &[EntryId]| ids.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
@@ -96,6 +95,52 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     match args.json {
         true => cli::print_json(&told.iter().map(Told::json).collect::<Vec<_>>())?,
         false => cli::print(&told.iter().map(Told::text).collect::<Vec<_>>().join("\n"))?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The sealed rows of two lists of entries.
+fn rows(args: &Args, sides: [&[EntryId]; 2]) -> anyhow::Result<[Vec<LeaderboardRow>; 2]> {
+    let entries = KnownEntries::open(&args.zoo.registry())?;
+    let audit = audit(&args.results.folder(&args.zoo), &entries)?;
+    for left in &audit.left_out {
+        cli::note(&format!("note: left out: {}: {}", shown(&left.folder), left.reason));
+    }
+    let reading = Reading::of(&entries, args.protocols.protocols()?);
+    Ok(sides.map(|ids| {
+        let of = |one: &&StoredEvaluation| {
+            ids.iter().any(|id| id.name == one.record.entry.name && id.version == one.record.entry.version)
+        };
+        let own: Vec<StoredEvaluation> = audit.standing.iter().filter(of).cloned().collect();
+        rank(&own, &reading)
+    }))
+}
+
+/// Compares where a side is a file.
+fn with_files(args: &Args, files: [bool; 2]) -> anyhow::Result<ExitCode> {
+    if args.until_decided {
+        bail!("--until-decided: expected two entries, found a file of results");
+    }
+    let registry = args.zoo.registry();
+    let side = |text: &str, is_file: bool| -> anyhow::Result<Vec<Side>> {
+        if is_file {
+            return Side::of_file(text);
+        }
+        let ids = registry.matching(text)?;
+        let [rows, _] = rows(args, [&ids, &[]])?;
+        if rows.is_empty() {
+            bail!(
+                "{text}: no evaluations in {}; make some with: actrm-zoo eval",
+                shown(&args.results.folder(&args.zoo))
+            );
+        }
+        rows.iter().map(Side::of_row).collect()
+    };
+    let (first, second) = (side(&args.first, files[0])?, side(&args.second, files[1])?);
+    let found = compared::matched(first, second, args.run.task.as_deref())?;
+    match args.json {
+        true => cli::print_json(&found.iter().map(Compared::json).collect::<Vec<_>>())?,
+        false => cli::print(&found.iter().map(Compared::text).collect::<Vec<_>>().join("\n"))?,
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -247,56 +292,19 @@ impl<'a> Told<'a> {
     }
 }
 
-fn flips_json(flips: &Flips) -> Value {
-    json!({
-        "both": flips.counts.both, "neither": flips.counts.neither, "first_only": flips.first_only,
-        "second_only": flips.second_only, "e_value": flips.sequential.e_value(),
-        "sequential_p_value": flips.sequential.p_value(), "decided_after": flips.decided_after,
-        "decided_for_first": flips.first_is_better,
-    })
-}
-
 /// Successes of the only training by seed.
 fn outcomes(row: &LeaderboardRow) -> BTreeMap<u64, bool> {
     row.evaluations().flat_map(|one| &one.episodes).map(|episode| (episode.seed, episode.success)).collect()
 }
 
-/// `95 of 100 (95.0%)`
-fn counts(Counts { successes, episodes }: Counts) -> String {
-    format!("{successes} of {episodes} ({}%)", percent(successes, episodes, 1))
-}
-
-fn p_text(p: f64) -> String {
-    if p < 1e-4 { format!("{p:.1e}") } else { format!("{p:.4}") }
-}
-
-fn sequential_text(flips: &Flips, first: &str, second: &str) -> String {
-    let p = format!("p {} at any time", p_text(flips.sequential.p_value()));
-    match flips.decided_after {
-        Some(seeds) => {
-            let better = if flips.first_is_better == Some(true) { first } else { second };
-            format!("sequential: decided after {seeds} seeds, {better} is better ({p})")
-        }
-        None => format!("sequential: not decided ({p})"),
-    }
-}
-
-/// The first seeds, and how many more.
-fn list(seeds: &[u64]) -> String {
-    const SHOWN: usize = 20;
-    let shown: Vec<String> = seeds.iter().take(SHOWN).map(u64::to_string).collect();
-    let more = seeds.len().saturating_sub(SHOWN);
-    shown.join(" ") + &if more > 0 { format!(" and {more} more") } else { String::new() }
-}
-
 /// One of the two entries that are run.
-struct Side {
+struct Running {
     subject: Subject<'static>,
     /// Outcomes of the first seeds without a gap, ascending.
     outcomes: BTreeMap<u64, bool>,
 }
 
-impl Side {
+impl Running {
     fn new(subject: Subject<'static>) -> Self {
         Self { subject, outcomes: BTreeMap::new() }
     }
@@ -377,7 +385,7 @@ fn until_decided(args: &Args, sides: &[Vec<EntryId>; 2]) -> anyhow::Result<ExitC
                 subject.entry
             );
         }
-        let mut side = Side::new(subject);
+        let mut side = Running::new(subject);
         side.take_stored(pools[of_pool[k]].ready(), &standing, &options(args.most, k))?;
         both.push(side);
     }
@@ -393,7 +401,7 @@ fn until_decided(args: &Args, sides: &[Vec<EntryId>; 2]) -> anyhow::Result<ExitC
     }
     let mut run = both.iter().map(|side| side.outcomes.len() as u64).min().unwrap_or_default().min(args.most);
     loop {
-        let upto = |side: &Side| side.outcomes.range(..args.seed_start + run).map(|(s, o)| (*s, *o)).collect();
+        let upto = |side: &Running| side.outcomes.range(..args.seed_start + run).map(|(s, o)| (*s, *o)).collect();
         let flips = Flips::of(&upto(&both[0]), &upto(&both[1]));
         let names = [first.to_string(), second.to_string()];
         let told = format!(

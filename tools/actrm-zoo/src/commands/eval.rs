@@ -57,6 +57,7 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval lift-act-image --episodes 100 --video-failed 3
   actrm-zoo eval lift-act-image --episodes 100 --perturb black-agentview
   actrm-zoo eval lift-act --episodes 50 --again
+  actrm-zoo eval lift-act --episodes 50 --robots Sawyer
   actrm-zoo eval lift-act --episodes 200 --shard 2/8
   actrm-zoo eval --policy ws://127.0.0.1:8000 --name mine --protocol lift-v1")]
 pub struct Args {
@@ -393,7 +394,10 @@ fn evaluate_remote(
     says: &mut Says,
 ) -> anyhow::Result<()> {
     asked.check_task(&remote.task)?;
-    let environment = Environment::usual(&remote.task, args.run.simulator.env_module.as_deref(), remote.cameras()?);
+    let mut environment = Environment::usual(&remote.task, args.run.simulator.env_module.as_deref(), remote.cameras()?);
+    if !args.run.robots.is_empty() {
+        environment = environment.with_robots(&args.run.robots);
+    }
     let spec =
         limited_worker(&environment, &args.run, asked.protocol.map_or(args.run.control, |protocol| protocol.control))?;
     let (results, options) = (args.results.folder(&args.zoo), options(args, asked, &environment));

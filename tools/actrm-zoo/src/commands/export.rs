@@ -4,14 +4,16 @@ use std::process::ExitCode;
 use cli::shown;
 use zoo::entry::export_hub;
 use zoo::lerobot::export;
+use zoo::onnx;
 
 use crate::card::model_index_of;
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
-/// Export an entry to LeRobot or as a folder for the Hugging Face Hub
+/// Export an entry to LeRobot, to ONNX or as a folder for the Hugging Face Hub
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo export lerobot lift-act@1 lift-act-lerobot
+  actrm-zoo export onnx lift-act@1 lift-act.onnx
   actrm-zoo export hub lift-act@1 lift-act-hub")]
 pub struct Args {
     #[command(subcommand)]
@@ -21,6 +23,7 @@ pub struct Args {
 #[derive(clap::Subcommand)]
 enum To {
     Lerobot(LerobotArgs),
+    Onnx(OnnxArgs),
     Hub(HubArgs),
 }
 
@@ -55,6 +58,22 @@ struct LerobotArgs {
     zoo: ZooArgs,
 }
 
+/// Write ACT or BC as an ONNX model, with its weights and its normalisation
+///
+/// Inputs are the entry's features under their names, (batch, width); the output is `action`, (batch, horizon, width). All are in
+/// the units of the data. Policies of images, of several observations and of other types are refused. The entry's name and its
+/// conventions are the model's metadata.
+#[derive(clap::Args)]
+struct OnnxArgs {
+    /// Entry: `name` (its newest version) or `name@version`
+    #[arg(add = entry_names())]
+    entry: String,
+    /// File to create
+    file: PathBuf,
+    #[command(flatten)]
+    zoo: ZooArgs,
+}
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (entry, folder) = match &args.to {
         To::Lerobot(args) => {
@@ -62,6 +81,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             cli::make_parent(&args.folder)?;
             export(&entry, &args.folder)?;
             (entry, &args.folder)
+        }
+        To::Onnx(args) => {
+            let entry = args.zoo.registry().entry(&args.entry)?;
+            cli::make_parent(&args.file)?;
+            onnx::export(&entry.load()?, &args.file)?;
+            (entry, &args.file)
         }
         To::Hub(args) => {
             let entry = args.zoo.registry().entry(&args.entry)?;

@@ -192,7 +192,10 @@ fn facts(entry: &Entry) -> (String, EntryFacts) {
     let meta = entry.meta();
     let stated = meta.env_args.as_ref().and_then(|args| args.get("env_kwargs")?.get("control_freq")?.as_f64());
     let hertz = stated.filter(|hertz| hertz.is_finite() && *hertz > 0.0).unwrap_or(USUAL);
-    (entry.id().to_string(), EntryFacts { task: meta.task.clone(), hertz })
+    // what cannot be read is named elsewhere
+    let said = entry.conventions().unwrap_or_default();
+    let conventions = said.iter().map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
+    (entry.id().to_string(), EntryFacts { task: meta.task.clone(), hertz, conventions })
 }
 
 /// What says most stays longest where the terminal is narrow; nothing without rows.

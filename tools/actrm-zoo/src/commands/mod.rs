@@ -2,7 +2,7 @@
 
 cli::commands! {
     "Train": train, runs, curves, study;
-    "Evaluate": eval, merge, rerun, verify;
+    "Evaluate": eval, score, merge, rerun, verify;
     "Compare": leaderboard, compare, diff;
     "Analyse": trace, saliency, depth, probe;
     "Use": serve;

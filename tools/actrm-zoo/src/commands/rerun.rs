@@ -1,17 +1,18 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use cli::{Column, INTERRUPTED, Screen, SimulatorArgs, Stop, Table, limits, shown};
 use recording::{CollectEnd, CollectOptions, CollectProgress, collect};
 use rollout::{Control, Skill};
 use serde_json::json;
 use zoo::entry::Entry;
-use zoo::evaluation::Environment;
+use zoo::evaluation::{Environment, Subject};
 use zoo::rerun::{EPISODES, Report, Rerun, Retrained, Retraining, find_row};
 use zoo::results::EvaluationRecord;
 
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
+use crate::remote::Served;
 use crate::simulation::{run_missing, worker};
 use crate::training::show;
 
@@ -28,13 +29,16 @@ const DEMONSTRATIONS: &str = "demonstrations.hdf5";
 /// weights byte by byte, episodes outcome by outcome. Where something differs, versions that changed are named. The zoo and its
 /// results are not changed. The work is done in its own folder, where an interrupted rerun resumes. The exit code is 0 if every
 /// requested step is the same, and 1 otherwise. For puzzle solvers use `eval --again`.
+///
+/// Of a policy that a server runs, the episodes are run again against the server: the one that the entry names, or --policy.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo rerun lift-act-s1 --protocol lift-v1 --collect
   actrm-zoo rerun lift-act@1 --protocol lift-v1 --block dev --skip-training --episodes 10
   actrm-zoo rerun stack-act@1_Stack_40000-40199_c839488e
   actrm-zoo rerun stack-act-s1 --protocol stack-v1 --data stack.hdf5
-  actrm-zoo rerun my-act --work /tmp/again --json")]
+  actrm-zoo rerun my-act --work /tmp/again --json
+  actrm-zoo rerun pi0 --policy ws://gpu:8000")]
 pub struct Args {
     /// Result folder by name, or entry (`name`, `name@version`) whose only or chosen result is meant
     #[arg(add = entry_names())]
@@ -65,6 +69,12 @@ pub struct Args {
     /// Do not train; run the episodes with the stored weights
     #[arg(long, conflicts_with_all = ["data", "image_memory"])]
     skip_training: bool,
+    /// Server of a policy whose weights are not in the zoo [default: the address that its entry records]
+    #[arg(long, value_name = "ws://HOST:PORT", conflicts_with_all = ["data", "collect"])]
+    policy: Option<String>,
+    /// Token of the server, sent as `Authorization: Api-Key TOKEN`
+    #[arg(long, value_name = "TOKEN", env = "ACTRM_TOKEN", hide_env_values = true)]
+    token: Option<String>,
     /// Memory for images, such as 2G or 500M; the rest is kept in a file [default: half of the free memory]
     #[arg(long, value_name = "SIZE", value_parser = limits::bytes)]
     image_memory: Option<u64>,
@@ -105,6 +115,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 /// Trains and runs; whether it came to its end.
 fn again(args: &Args, rerun: &Rerun, stop: &Stop, report: &mut Report) -> anyhow::Result<bool> {
+    if let Some(served) = Served::of(rerun.entry(), args.policy.as_deref(), args.token.as_deref())? {
+        report.skip_training("its weights are not in this zoo: its server acts");
+        rerun.compare_declared(served.declared_then(), served.declared.as_deref(), report);
+        let subject = rerun.as_measured(served.subject(rerun.entry()))?;
+        return episodes(args, rerun, (rerun.entry(), &subject), stop, report);
+    }
+    if args.policy.is_some() {
+        bail!("--policy: expected an entry whose weights are not in the zoo, found {}", rerun.entry().id());
+    }
     let entry = match args.skip_training {
         true => {
             report.skip_training("--skip-training: the stored weights act");
@@ -127,7 +146,7 @@ fn again(args: &Args, rerun: &Rerun, stop: &Stop, report: &mut Report) -> anyhow
     }
     match rerun.time_decides(report) {
         true => Ok(true),
-        false => episodes(args, rerun, &entry, stop, report),
+        false => episodes(args, rerun, (&entry, &rerun.subject(&entry)?), stop, report),
     }
 }
 
@@ -138,7 +157,7 @@ fn retrained(args: &Args, rerun: &Rerun, stop: &Stop, report: &mut Report) -> an
         None if usual && !args.collect => None,
         None => match collected(args, rerun, stop)? {
             Collection::There(path) => Some(path),
-            Collection::Unknown if args.collect => anyhow::bail!(
+            Collection::Unknown if args.collect => bail!(
                 "--collect: {}: its demonstrations are not known to be a scripted expert's; --data names them",
                 rerun.entry().id()
             ),
@@ -208,11 +227,17 @@ fn collected(args: &Args, rerun: &Rerun, stop: &Stop) -> anyhow::Result<Collecti
     }
 }
 
-fn episodes(args: &Args, rerun: &Rerun, entry: &Entry, stop: &Stop, report: &mut Report) -> anyhow::Result<bool> {
-    let (subject, options) = (rerun.subject(entry)?, rerun.options(args.episodes)?);
+fn episodes(
+    args: &Args,
+    rerun: &Rerun,
+    (entry, subject): (&Entry, &Subject<'_>),
+    stop: &Stop,
+    report: &mut Report,
+) -> anyhow::Result<bool> {
+    let options = rerun.options(args.episodes)?;
     let spec = worker(&rerun.environment()?, &args.simulator, rerun.stored().record.protocol.control)?;
     let Some(mut pool) = args.simulator.start(spec, None, stop)? else { return Ok(false) };
-    let done = run_missing(&subject, &mut pool, &rerun.results(entry), &options);
+    let done = run_missing(subject, &mut pool, &rerun.results(entry), &options);
     cli::close(pool);
     let Some(done) = done? else { return Ok(false) };
     if done.was_there {

@@ -60,11 +60,14 @@ fn service(loaded: LoadedEntry) -> Service {
         let keys = meta.keys.of(feature).iter().map(|key| Value::text(key.clone())).collect();
         (feature.to_owned(), Value::List(keys))
     });
+    let conventions = loaded.conventions();
+    let conventions = conventions.iter().map(|(name, said)| (name.to_owned(), Value::text(said.to_owned())));
     let mut facts = vec![
         ("entry", Value::text(meta.id().to_string())),
         ("policy", Value::text(meta.policy.clone())),
         ("task", Value::text(meta.task.clone())),
         ("observation_keys", Value::map(keys)),
+        ("conventions", Value::map(conventions)),
     ];
     if let Some(version) = &meta.env_version {
         facts.push(("env_version", Value::text(version.clone())));

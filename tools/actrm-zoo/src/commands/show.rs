@@ -1,14 +1,17 @@
 use std::process::ExitCode;
 
+use zoo::conventions::NAMES;
+
 use crate::card::model_index_of;
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 
-/// Verify an entry and print its model card, experiment or provenance
+/// Verify an entry and print its model card, experiment, conventions or provenance
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo show lift-act
   actrm-zoo show lift-act@1 --card
   actrm-zoo show lift-act@1 --config
+  actrm-zoo show lift-act@1 --conventions
   actrm-zoo show lift-act@1 --json")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
@@ -20,7 +23,10 @@ pub struct Args {
     /// Print the resolved experiment
     #[arg(long, conflicts_with = "json")]
     config: bool,
-    /// Print the provenance and the hashes of all files
+    /// Print how its numbers are meant: control rate, action space, order of the state
+    #[arg(long, conflicts_with_all = ["card", "config"])]
+    conventions: bool,
+    /// Print the provenance and the hashes of all files; with --conventions, those
     #[arg(long)]
     json: bool,
     #[command(flatten)]
@@ -33,7 +39,15 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let entry = args.zoo.registry().entry(&args.entry)?;
-    if args.json {
+    if args.conventions {
+        let said = entry.conventions()?;
+        let lines =
+            NAMES.iter().filter_map(|(name, what)| Some(format!("{name:14}  {:36}  {what}\n", said.get(name)?)));
+        match args.json {
+            true => cli::print_json(&said)?,
+            false => cli::print(&lines.collect::<String>())?,
+        }
+    } else if args.json {
         cli::print_json(entry.meta())?;
     } else if args.config {
         cli::print(&entry.config_text()?)?;

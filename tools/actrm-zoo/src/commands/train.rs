@@ -7,7 +7,7 @@ use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use study::puzzle::{AnyExperiment, TrainOptions};
 use zoo::ZooError;
 use zoo::entry::member_name;
-use zoo::run::{COMMAND_FILE, Place, TrainEvent, TrainOutcome, finished_entry};
+use zoo::run::{COMMAND_FILE, Extended, Place, TrainEvent, TrainOutcome, extend, finished_entry};
 use zoo::write_atomic;
 
 use crate::places::{ConfigArgs, ZooArgs, entry_names, experiment_names};
@@ -35,13 +35,14 @@ use crate::training::show;
   actrm-zoo train act_lift --data aloha task.name=transfer_cube entry=aloha-act
   actrm-zoo train my.toml
   actrm-zoo train act_lift --from lift-act train.steps=500
+  actrm-zoo train --extend runs/act_lift/001 train.steps=5000
   actrm-zoo train act_lift --resume
   actrm-zoo train act_lift --seeds 1..8
   actrm-zoo train trm_dfs10 train.seed=2
   actrm-zoo train act_lift --print-config")]
 pub struct Args {
     /// Experiment: a name of `actrm-zoo list --experiments`, the path of a TOML file, or parts such as `policy=act`
-    #[arg(add = experiment_names())]
+    #[arg(required_unless_present = "extend", default_value = "", hide_default_value = true, add = experiment_names())]
     experiment: String,
     /// Settings to override, such as `train.steps=5000` or `inputs=image`; `--print-config` shows all
     #[arg(value_name = "KEY=VALUE")]
@@ -52,6 +53,9 @@ pub struct Args {
     /// Begin with the weights of this entry, as far as names and shapes are the same (fine-tuning)
     #[arg(long, value_name = "ENTRY", add = entry_names())]
     from: Option<String>,
+    /// Continue the finished run in this folder, in a new folder, to `train.steps=N`; its schedule must be constant
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["run", "resume", "seeds", "data", "from", "configs", "runs"])]
+    extend: Option<PathBuf>,
     /// Train even if the demonstrations are of another task or their dimensions have other names
     #[arg(long)]
     force: bool,
@@ -141,6 +145,9 @@ fn other_policy(args: &Args) -> Option<String> {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if let Some(run) = &args.extend {
+        return extend_run(args, run);
+    }
     let args = &args.named()?;
     let library = args.configs.library()?;
     let words: Vec<String> = [&args.experiment].into_iter().chain(&args.overrides).cloned().collect();
@@ -197,6 +204,53 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Goes on with a finished run.
+fn extend_run(args: &Args, run: &Path) -> anyhow::Result<ExitCode> {
+    let mut set = std::iter::once(&args.experiment).chain(&args.overrides).filter(|word| !word.is_empty());
+    let steps = set.next().and_then(|word| word.strip_prefix("train.steps=")?.parse::<u64>().ok());
+    let (Some(steps), None) = (steps, set.next()) else {
+        bail!("--extend: expected train.steps=N and no other setting beside it");
+    };
+    let Extended { name, experiment, folder, command } = extend(run, steps)?;
+    let stop = Stop::install("stopped without a new checkpoint; the new run's folder says how to resume")?;
+    let resume = command.as_ref().map(|command| {
+        let mut words: Vec<OsString> = vec!["--zoo".into(), args.zoo.zoo.clone().into()];
+        words.extend(["--run".into(), folder.clone().into(), "--resume".into()]);
+        format!("{command} {}\n", command_line(&words))
+    });
+    if let Some(text) = &resume {
+        write_atomic(&folder.join(COMMAND_FILE), text.as_bytes())?;
+    }
+    let mut screen = Screen::new();
+    let request = TrainRequest {
+        name,
+        experiment,
+        data: None,
+        runs: PathBuf::new(),
+        run: Some(folder),
+        resume: true,
+        zoo: args.zoo.zoo.clone(),
+        from_zoo: None,
+        force: args.force,
+        image_memory: args.image_memory,
+        command: None,
+    };
+    let outcome = train(&request, &|| stop.asked(), &mut |event| show(&event, &mut screen, &stop));
+    drop(screen);
+    match outcome? {
+        TrainOutcome::Finished { entry, run, minutes } => {
+            let (zoo, run) = (shown(&args.zoo.zoo), shown(&run));
+            cli::print(&format!("{entry} is in {zoo} after {minutes:.1} minutes of training (run {run})\n"))?;
+            Ok(ExitCode::SUCCESS)
+        }
+        TrainOutcome::Stopped { step, .. } => {
+            let how = resume.map_or_else(String::new, |text| format!("; resume with: {}", text.trim_end()));
+            cli::note(&format!("stopped after step {step}{how}"));
+            Ok(ExitCode::from(INTERRUPTED))
+        }
+    }
 }
 
 /// One training: where it takes place, and whether it is one of several.

@@ -67,6 +67,10 @@ class Style:
         return replace(self, speed=self.speed * demonstrator.speed, hover=self.hover * demonstrator.height)
 
 
+PADS_MEET = 0.0126
+"""Metres between the middles of the pads of a closed Robotiq gripper."""
+
+
 class Scene:
     """What an expert may look at: gripper, fingers and named bodies, in world coordinates.
 
@@ -81,6 +85,10 @@ class Scene:
         self._site = int(self._robot.eef_site_id["right"])
         self._fingers: list[int] = list(self._robot._ref_gripper_joint_pos_indexes["right"] or [])
         self._finger_speeds: list[int] = list(self._robot._ref_gripper_joint_vel_indexes["right"] or [])
+        # of a gripper whose fingers turn, the distance is that of their pads
+        gripper = self._robot.gripper["right"] if len(self._fingers) > 2 else None
+        geoms: dict[str, list[str]] = gripper.important_geoms if gripper else {}
+        self._pads = [geoms.get(f"{side}_fingerpad", []) for side in ("left", "right")]
 
     @property
     def task(self) -> Any:
@@ -110,14 +118,27 @@ class Scene:
     @property
     def gap(self) -> float:
         """Distance between the finger tips in metres (0.08 when open)."""
+        if len(self._fingers) != 2:
+            left, right = (self._pad(side)[0] for side in self._pads)
+            return max(0.0, float(np.linalg.norm(left - right)) - PADS_MEET)
         left, right = self.env.sim.data.qpos[self._fingers]
         return float(left - right)
 
     @property
     def gap_speed(self) -> float:
         """How fast the fingers open (positive) or close, in metres a second."""
+        if len(self._fingers) != 2:
+            (left, left_speed), (right, right_speed) = (self._pad(side) for side in self._pads)
+            apart = left - right
+            return float((left_speed - right_speed) @ apart / max(1e-9, float(np.linalg.norm(apart))))
         left, right = self.env.sim.data.qvel[self._finger_speeds]
         return float(left - right)
+
+    def _pad(self, geoms: list[str]) -> tuple[Array, Array]:
+        """Position and velocity of a finger's pad."""
+        model, data = self.env.sim.model, self.env.sim.data
+        places = [data.geom_xpos[model.geom_name2id(name)] for name in geoms]
+        return np.mean(places, axis=0), np.mean([data.get_geom_xvelp(name) for name in geoms], axis=0)
 
     def body(self, name: str) -> Array:
         """Position of a body."""

@@ -125,8 +125,10 @@ def make(
     unusual = None
     if kwargs != usual:
         unusual = hashlib.sha256(json.dumps(kwargs, sort_keys=True).encode()).hexdigest()
-        # what keeping the model leaves in place, and what an expert can do, is known of the usual robot only
-        task = replace(task, soft_reset=False, expert=None)
+        # what keeping the model leaves in place is known of the usual robot only; an expert moves the hand of any robot
+        # with its usual controller
+        other_robot = kwargs == arguments(task, {"robots": kwargs["robots"]})
+        task = replace(task, soft_reset=False, expert=task.expert if other_robot else None)
     # in robomimic's order
     kwargs |= {
         "has_renderer": False,
