@@ -146,18 +146,19 @@ pub fn extract(
     let jobs = plan.demos.len() as u64;
     pool.run(0..jobs, &|job| job, &|| Ok(()), &work, &mut |job, result| {
         let id = &plan.demos[job as usize].id;
-        let outcome = result.map_err(|error| replay_error(&options.raw, id, &ready, error)).and_then(|(recorded, episode)| {
-            steps += episode.steps as u64;
-            let mut made = demo(id, episode, options.next_obs)?;
-            // what was recorded stays as it was recorded
-            for (name, value) in recorded.attrs {
-                made.attrs.entry(name).or_insert(value);
-            }
-            made.datasets.extend(recorded.datasets);
-            writer.add_demo(&made)?;
-            done += 1;
-            Ok(())
-        });
+        let outcome =
+            result.map_err(|error| replay_error(&options.raw, id, &ready, error)).and_then(|(recorded, episode)| {
+                steps += episode.steps as u64;
+                let mut made = demo(id, episode, options.next_obs)?;
+                // what was recorded stays as it was recorded
+                for (name, value) in recorded.attrs {
+                    made.attrs.entry(name).or_insert(value);
+                }
+                made.datasets.extend(recorded.datasets);
+                writer.add_demo(&made)?;
+                done += 1;
+                Ok(())
+            });
         progress(done as u64);
         match outcome {
             Ok(()) => ControlFlow::Continue(()),
