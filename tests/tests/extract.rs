@@ -99,3 +99,26 @@ fn cameras_give_pictures_that_convert() {
     refused(&mut data(["extract", text(&made), text(&made)]), &["image.hdf5", "exists"]);
     assert_eq!(listing(folder.path()), ["demo.hdf5", "image.hdf5", "set"]);
 }
+
+#[test]
+fn a_model_that_does_not_load_is_one_line_with_file_and_demo() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (raw, out) = (short(folder.path(), 2), folder.path().join("out.hdf5"));
+    let file = hdf5::File::open_rw(&raw).expect("opens");
+    let demo = file.group("data/demo_1").expect("there");
+    let model = demo.attr("model_file").expect("there");
+    let xml = model.read_scalar::<hdf5::types::VarLenUnicode>().expect("text");
+    demo.delete_attr("model_file").expect("there");
+    // robosuite 1.4 names the mount otherwise; nothing in the file says which version recorded it
+    let old: hdf5::types::VarLenUnicode = xml.as_str().replace("fixed_mount0", "mount0").parse().expect("text");
+    let attr = demo.new_attr::<hdf5::types::VarLenUnicode>().create("model_file").expect("created");
+    attr.write_scalar(&old).expect("written");
+    file.close().expect("closes");
+    let film = folder.path().join("film.mp4");
+    let replay = ["replay", text(&raw), "--demo", "1", "--video", text(&film)];
+    for mut command in [data(["extract", text(&raw), text(&out), "--workers", "1"]), data(replay)] {
+        let said = refused(&mut command, &["demo.hdf5: demo_1: robosuite 1.5", "model_file does not load", "--python"]);
+        assert!(said.trim_end().lines().count() == 1 && said.len() < 700, "{} bytes: {said}", said.len());
+    }
+    assert_eq!(listing(folder.path()), ["demo.hdf5"]);
+}

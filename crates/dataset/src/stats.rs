@@ -43,6 +43,28 @@ pub trait Sample: Copy {
     fn to_f64(self) -> f64;
     /// Total order; NaN sorts last.
     fn order(&self, other: &Self) -> Ordering;
+    /// Bytes of a value.
+    const BYTES: usize;
+    /// Appends the bytes of the value.
+    fn put(self, bytes: &mut Vec<u8>);
+    /// The value of [`Sample::BYTES`] bytes.
+    fn from_bytes(bytes: &[u8]) -> Self;
+    /// A number of [`Sample::BYTES`] bytes that is in the same order.
+    fn key(self) -> u64;
+    /// The value with this key.
+    fn from_key(key: u64) -> Self;
+}
+
+macro_rules! bytes_of {
+    ($t:ty) => {
+        const BYTES: usize = size_of::<$t>();
+        fn put(self, bytes: &mut Vec<u8>) {
+            bytes.extend_from_slice(&self.to_le_bytes());
+        }
+        fn from_bytes(bytes: &[u8]) -> Self {
+            bytes.first_chunk().map_or(<$t>::default(), |b| <$t>::from_le_bytes(*b))
+        }
+    };
 }
 
 impl Sample for f32 {
@@ -51,6 +73,15 @@ impl Sample for f32 {
     }
     fn order(&self, other: &Self) -> Ordering {
         self.total_cmp(other)
+    }
+    bytes_of!(f32);
+    fn key(self) -> u64 {
+        let bits = self.to_bits();
+        u64::from(if bits >> 31 == 0 { bits | 1 << 31 } else { !bits })
+    }
+    fn from_key(key: u64) -> Self {
+        let key = key as u32;
+        Self::from_bits(if key >> 31 == 1 { key & !(1 << 31) } else { !key })
     }
 }
 
@@ -61,6 +92,14 @@ impl Sample for f64 {
     fn order(&self, other: &Self) -> Ordering {
         self.total_cmp(other)
     }
+    bytes_of!(f64);
+    fn key(self) -> u64 {
+        let bits = self.to_bits();
+        if bits >> 63 == 0 { bits | 1 << 63 } else { !bits }
+    }
+    fn from_key(key: u64) -> Self {
+        Self::from_bits(if key >> 63 == 1 { key & !(1 << 63) } else { !key })
+    }
 }
 
 impl Sample for i64 {
@@ -69,6 +108,96 @@ impl Sample for i64 {
     }
     fn order(&self, other: &Self) -> Ordering {
         self.cmp(other)
+    }
+    bytes_of!(i64);
+    fn key(self) -> u64 {
+        self as u64 ^ 1 << 63
+    }
+    fn from_key(key: u64) -> Self {
+        (key ^ 1 << 63) as i64
+    }
+}
+
+/// Takes the next values of a dimension.
+pub(crate) type Streamed<'f, T> = dyn FnMut(&[T]) + 'f;
+
+/// Order statistics of values that pass several times: each pass counts 16 more bits of those that may be wanted.
+struct Radix {
+    /// The ranks wanted, ascending; what is left of each below the bits that are known.
+    ranks: Vec<u64>,
+    /// The bits of each that are known.
+    prefixes: Vec<u64>,
+    /// Different prefixes, and the values of the next 16 bits that begin with each.
+    counts: Vec<(u64, Vec<u64>)>,
+    /// Where the counts of a prefix are, by its last 16 bits: one more, 0 for nowhere.
+    places: Vec<u8>,
+    bits: usize,
+    shift: usize,
+}
+
+impl Radix {
+    const DIGIT: usize = 16;
+    const VALUES: usize = 1 << Self::DIGIT;
+
+    /// For keys of so many bytes, of which the highest digit was counted.
+    fn new(bytes: usize, ranks: &[usize], first: Vec<u64>) -> Self {
+        let mut radix = Self {
+            ranks: ranks.iter().map(|&rank| rank as u64).collect(),
+            prefixes: vec![0; ranks.len()],
+            counts: vec![(0, first)],
+            places: vec![0; Self::VALUES],
+            bits: 8 * bytes,
+            shift: 8 * bytes - Self::DIGIT,
+        };
+        radix.descend();
+        radix
+    }
+
+    /// Whether all bits are known.
+    fn is_done(&self) -> bool {
+        self.shift == self.bits
+    }
+
+    fn count(&mut self, key: u64) {
+        let prefix = key >> (self.shift + Self::DIGIT);
+        let place = self.places[prefix as usize & (Self::VALUES - 1)];
+        if place == 0 {
+            return;
+        }
+        // prefixes that end alike are few
+        if let Some((_, counts)) = self.counts[usize::from(place) - 1..].iter_mut().find(|(known, _)| *known == prefix)
+        {
+            counts[(key >> self.shift) as usize & (Self::VALUES - 1)] += 1;
+        }
+    }
+
+    /// Takes the next digit of every value wanted from the counts.
+    fn descend(&mut self) {
+        for (rank, prefix) in self.ranks.iter_mut().zip(&mut self.prefixes) {
+            let Some((_, counts)) = self.counts.iter().find(|(known, _)| known == prefix) else { continue };
+            let mut below = 0;
+            let digit = counts.iter().position(|&count| {
+                below += count;
+                below > *rank
+            });
+            let digit = digit.unwrap_or(Self::VALUES - 1);
+            *rank -= below - counts[digit];
+            *prefix = *prefix << Self::DIGIT | digit as u64;
+        }
+        if self.shift == 0 {
+            self.shift = self.bits;
+            return;
+        }
+        self.shift -= Self::DIGIT;
+        let mut known = self.prefixes.clone();
+        // those that end alike beside each other
+        known.sort_unstable_by_key(|prefix| (prefix & (Self::VALUES as u64 - 1), *prefix));
+        known.dedup();
+        self.places.fill(0);
+        for (at, prefix) in known.iter().enumerate().rev() {
+            self.places[*prefix as usize & (Self::VALUES - 1)] = at as u8 + 1;
+        }
+        self.counts = known.into_iter().map(|prefix| (prefix, vec![0; Self::VALUES])).collect();
     }
 }
 
@@ -99,6 +228,60 @@ impl FeatureStats {
             stats.push_dimension(&mut scratch);
         }
         Some(stats)
+    }
+
+    /// The same, bit for bit, of values that are not in memory: `each` gives those of a dimension, in order, as often as it is
+    /// asked.
+    pub(crate) fn streamed<T: Sample, E>(
+        dim: usize,
+        each: &mut dyn FnMut(usize, &mut Streamed<'_, T>) -> Result<(), E>,
+    ) -> Result<Option<Self>, E> {
+        let mut stats = Self::with_capacity(dim, 0);
+        for d in 0..dim {
+            let mut first = vec![0_u64; Radix::VALUES];
+            let (mut rows, mut n, mut sum) = (0_u64, 0_usize, std::iter::empty::<f64>().sum::<f64>());
+            let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+            each(d, &mut |values| {
+                rows += values.len() as u64;
+                for &value in values {
+                    let v = value.to_f64();
+                    if v.is_finite() {
+                        (n, sum, low, high) = (n + 1, sum + v, low.min(v), high.max(v));
+                        first[(value.key() >> (8 * T::BYTES - Radix::DIGIT)) as usize] += 1;
+                    }
+                }
+            })?;
+            stats.count = rows;
+            if rows == 0 {
+                return Ok(None);
+            }
+            if n == 0 {
+                stats.vectors_mut().into_iter().for_each(|vector| vector.push(0.0));
+                continue;
+            }
+            let mean = (sum / n as f64).max(low).min(high);
+            let wanted = ranks_wanted(n);
+            let mut radix = Radix::new(T::BYTES, &wanted, first);
+            let mut squares = Some(std::iter::empty::<f64>().sum::<f64>());
+            let mut variance = 0.0;
+            while !radix.is_done() {
+                each(d, &mut |values| {
+                    for &value in values {
+                        let v = value.to_f64();
+                        if v.is_finite() {
+                            squares = squares.map(|sum| sum + (v - mean).powi(2));
+                            radix.count(value.key());
+                        }
+                    }
+                })?;
+                variance = squares.take().map_or(variance, |sum| sum / n as f64);
+                radix.descend();
+            }
+            let found: Vec<f64> = radix.prefixes.iter().map(|&key| T::from_key(key).to_f64()).collect();
+            let at = |rank: usize| found[wanted.partition_point(|&known| known < rank)];
+            stats.push_summary(n, [low, high, mean, variance.sqrt()], at);
+        }
+        Ok(Some(stats))
     }
 
     /// Statistics of an image channel from its histogram over `0..=255`, scaled to `[0, 1]`.
@@ -185,6 +368,17 @@ impl FeatureStats {
         [&self.q01, &self.q10, &self.q50, &self.q90, &self.q99]
     }
 
+    /// All vectors, in the order of [`FeatureStats::from_vectors`].
+    pub(crate) fn vectors(&self) -> [&[f64]; 9] {
+        let Self { min, max, mean, std, count: _, q01, q10, q50, q90, q99 } = self;
+        [min, max, mean, std, q01, q10, q50, q90, q99]
+    }
+
+    pub(crate) fn from_vectors(count: u64, vectors: [Vec<f64>; 9]) -> Self {
+        let [min, max, mean, std, q01, q10, q50, q90, q99] = vectors;
+        Self { min, max, mean, std, count, q01, q10, q50, q90, q99 }
+    }
+
     fn vectors_mut(&mut self) -> [&mut Vec<f64>; 9] {
         let Self { min, max, mean, std, count: _, q01, q10, q50, q90, q99 } = self;
         [min, max, mean, std, q01, q10, q50, q90, q99]
@@ -209,27 +403,33 @@ impl FeatureStats {
         // rounding must not push the mean of a constant column beside its only value
         let mean = (sum / n).max(low).min(high);
         let variance = values.iter().map(|v| (v.to_f64() - mean).powi(2)).sum::<f64>() / n;
-        let mut wanted = Vec::with_capacity(2 * QUANTILES.len());
-        for (_, q) in QUANTILES {
-            let (low, high, _) = ranks(values.len(), q);
-            wanted.extend([low, high]);
-        }
-        wanted.sort_unstable();
-        wanted.dedup();
+        let wanted = ranks_wanted(values.len());
         // index columns, rewards and dones mostly are in order already
         if !values.is_sorted_by(|a, b| a.order(b).is_le()) {
             select_ranks(values, 0, &wanted);
         }
-        let at = |rank: usize| values[rank].to_f64();
+        self.push_summary(values.len(), [low, high, mean, variance.sqrt()], |rank| values[rank].to_f64());
+    }
+
+    /// Appends a dimension of `n` values, of which `at` gives order statistics.
+    fn push_summary(&mut self, n: usize, [low, high, mean, std]: [f64; 4], at: impl Fn(usize) -> f64) {
         self.min.push(low);
         self.max.push(high);
         self.mean.push(mean);
-        self.std.push(variance.sqrt());
+        self.std.push(std);
         for (out, (_, q)) in self.quantiles_mut().into_iter().zip(QUANTILES) {
-            let (low, high, t) = ranks(values.len(), q);
+            let (low, high, t) = ranks(n, q);
             out.push(lerp(at(low), at(high), t));
         }
     }
+}
+
+/// The order statistics that quantiles of `n` values are made of, ascending.
+fn ranks_wanted(n: usize) -> Vec<usize> {
+    let mut wanted: Vec<usize> = QUANTILES.into_iter().map(|(_, q)| ranks(n, q)).flat_map(|(a, b, _)| [a, b]).collect();
+    wanted.sort_unstable();
+    wanted.dedup();
+    wanted
 }
 
 /// The two order statistics around quantile `q` of `n` values, and the weight of the second.

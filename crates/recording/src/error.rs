@@ -15,6 +15,22 @@ pub enum RecordingError {
     /// The simulator could not do its part.
     #[error(transparent)]
     Rollout(#[from] rollout::RolloutError),
+    /// A demo of a recording could not be replayed.
+    #[error(
+        "{}: {demo}: {simulator} cannot replay it: {reason} (where another version of the simulator recorded it, --python \
+         names a Python that has that one)",
+        path.display()
+    )]
+    Replay {
+        /// The file.
+        path: PathBuf,
+        /// The demo.
+        demo: String,
+        /// The simulator that runs, with its version.
+        simulator: String,
+        /// What it says.
+        reason: String,
+    },
     /// The expert fails too often.
     #[error(
         "the expert succeeded in {successes} of {attempts} attempts at {task}: too few for {wanted} demos; nothing was written"

@@ -8,7 +8,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use dataset::{Array, RobomimicWriter, Source, WriteOptions};
-use rollout::{Pool, RolloutError, Worker};
+use rollout::{FaultKind, Pool, Ready, RolloutError, Worker};
 use serde_json::Value;
 
 use crate::demo::{Recording, demo};
@@ -93,6 +93,24 @@ fn same_generation(raw: &Path, recorded: Option<&str>, simulator: &str, running:
     }
 }
 
+/// What is said of a demo that a worker could not replay.
+pub fn replay_error(path: &Path, demo: &str, ready: &Ready, error: RolloutError) -> RecordingError {
+    let fault = match error {
+        RolloutError::Episode { fault, .. } => fault,
+        other => return other.into(),
+    };
+    let version = ready.simulator_version().map_or(String::new(), |version| format!(" {version}"));
+    RecordingError::Replay {
+        path: path.to_owned(),
+        demo: demo.to_owned(),
+        simulator: format!("{}{version}", ready.simulator),
+        reason: match fault.kind {
+            FaultKind::Reported { message, .. } => message,
+            _ => fault.to_string(),
+        },
+    }
+}
+
 /// Replays all demos of `source` with the workers of `pool`; `progress` is told how many are done.
 ///
 /// # Errors
@@ -107,7 +125,7 @@ pub fn extract(
     if let Some((_, error)) = plan.lost().next() {
         return Err(dataset::DatasetError::from(error.clone()).into());
     }
-    let ready = pool.ready();
+    let ready = pool.ready().clone();
     same_generation(&options.raw, plan.env_version.as_deref(), &ready.simulator, ready.simulator_version())?;
     let mut writer = RobomimicWriter::create(&options.out, &WriteOptions { gzip: options.gzip })?;
     let env_args = env_args(plan.env_args.as_ref(), &pool.ready().env_args);
@@ -128,18 +146,19 @@ pub fn extract(
     let jobs = plan.demos.len() as u64;
     pool.run(0..jobs, &|job| job, &|| Ok(()), &work, &mut |job, result| {
         let id = &plan.demos[job as usize].id;
-        let outcome = result.map_err(RecordingError::from).and_then(|(recorded, episode)| {
-            steps += episode.steps as u64;
-            let mut made = demo(id, episode, options.next_obs)?;
-            // what was recorded stays as it was recorded
-            for (name, value) in recorded.attrs {
-                made.attrs.entry(name).or_insert(value);
-            }
-            made.datasets.extend(recorded.datasets);
-            writer.add_demo(&made)?;
-            done += 1;
-            Ok(())
-        });
+        let outcome =
+            result.map_err(|error| replay_error(&options.raw, id, &ready, error)).and_then(|(recorded, episode)| {
+                steps += episode.steps as u64;
+                let mut made = demo(id, episode, options.next_obs)?;
+                // what was recorded stays as it was recorded
+                for (name, value) in recorded.attrs {
+                    made.attrs.entry(name).or_insert(value);
+                }
+                made.datasets.extend(recorded.datasets);
+                writer.add_demo(&made)?;
+                done += 1;
+                Ok(())
+            });
         progress(done as u64);
         match outcome {
             Ok(()) => ControlFlow::Continue(()),

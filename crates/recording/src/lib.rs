@@ -12,4 +12,4 @@ mod extract;
 pub use collect::{CollectEnd, CollectOptions, CollectProgress, Collected, collect, refuse_existing};
 pub use demo::{Recording, demo};
 pub use error::{RecordingError, Result};
-pub use extract::{ExtractEnd, ExtractOptions, Extracted, extract, recorded_task};
+pub use extract::{ExtractEnd, ExtractOptions, Extracted, extract, recorded_task, replay_error};

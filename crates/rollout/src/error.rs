@@ -280,3 +280,10 @@ pub enum FaultKind {
     #[error("pipe: {0}")]
     Pipe(std::io::Error),
 }
+
+impl FaultKind {
+    /// Whether what was asked cannot be done: the worker is well, and another one would say the same.
+    pub(crate) fn is_of_the_request(&self) -> bool {
+        matches!(self, Self::Reported { kind, .. } if ["bad_request", "model"].contains(&kind.as_str()))
+    }
+}

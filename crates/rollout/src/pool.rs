@@ -380,6 +380,9 @@ impl Slot {
             }
             // dropped, and with it the process and its children
             self.worker = None;
+            if fault.kind.is_of_the_request() {
+                return Err(RolloutError::Episode { seed, attempts, fault: Box::new(fault) }.into());
+            }
             lock(&shared.incidents).push(Incident { job: Some(job), text: fault.to_string() });
             if let Some(seeds) = shared.hang(seed, &fault) {
                 let (task, fault) = (shared.options.spec.task.clone(), Box::new(fault));

@@ -221,7 +221,7 @@ impl Conventions {
 
     /// Says the order of the features' numbers.
     pub fn set_state(&mut self, keys: &FeatureKeys) {
-        let images = |feature: &&str| !feature.starts_with(crate::experiment::PICTURE_PREFIX);
+        let images = |feature: &&str| !feature.starts_with(crate::experiment::IMAGE_PREFIX);
         let features: Vec<String> = keys
             .features()
             .filter(images)
@@ -293,7 +293,7 @@ impl Entry {
             return Ok(external.said());
         }
         let mut all = Conventions::of_meta(self.meta());
-        if self.meta().is_robot_policy() {
+        if self.meta().is_policy() {
             let experiment = Experiment::from_toml(&self.id().to_string(), &self.config_text()?)?;
             all.set_policy(&experiment, self.meta());
         }

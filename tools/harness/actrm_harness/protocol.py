@@ -123,12 +123,22 @@ def _fields_of(cls: type[Request]) -> tuple[frozenset[str], frozenset[str]]:
 _FIELDS = {kind: _fields_of(cls) for kind, cls in _REQUESTS.items()}
 
 
+LONGEST = 200
+"""Characters of another library's error that a message takes."""
+
+
 class RequestError(Exception):
     """A request that cannot be answered; `kind` is a stable word, the text says what was wrong."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
         self.kind = kind
+
+
+def brief(error: BaseException) -> str:
+    """What an error of another library says, in one line: MuJoCo lists every name that it knows."""
+    text = str(error).strip().partition("\n")[0]
+    return f"{type(error).__name__}: {text if len(text) <= LONGEST else text[:LONGEST] + ' ...'}"
 
 
 def parse_request(message: Message) -> Request:

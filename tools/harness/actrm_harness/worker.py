@@ -206,7 +206,7 @@ def serve(simulation: Simulation, requests: BinaryIO, replies: BinaryIO) -> int:
             reply, data = error_message(error.kind, str(error), number), {}
         except Exception as error:
             traceback.print_exc()
-            reply, data = error_message("failed", f"{type(error).__name__}: {error}", number), {}
+            reply, data = error_message("failed", protocol.brief(error), number), {}
         try:
             wire.write_frame(replies, reply, data)
         except ValueError as error:

@@ -205,7 +205,7 @@ impl Conversion<'_> {
         };
         let video_limit = (self.options.video_file_mb * f64::from(1 << 20)) as u64;
         let mut films = VideoWriter::new(self.root, video_limit, &self.mapping.columns, self.mapping.fps)?;
-        let mut tally = Tally::new(&features, self.mapping.fps, &tasks);
+        let mut tally = Tally::new(&features, self.mapping.fps, self.root);
         let total = self.plan.frames() as u64;
         let mut done = 0;
         tell(0, total)?;
@@ -223,7 +223,9 @@ impl Conversion<'_> {
                 let place = shards.append(output.group, begins)?;
                 for part in output.parts {
                     let task = task_of[part.part.episode];
-                    tally.add(part, place, &[task], &mut |camera, samples| films.append(camera, samples))?;
+                    tally.add(part, place, (&[task], &tasks[task]), &mut |camera, samples| {
+                        films.append(camera, samples)
+                    })?;
                 }
                 if let (Some(writer), Some(beside)) = (&mut side_writer, beside) {
                     writer.append(beside)?;
@@ -235,7 +237,7 @@ impl Conversion<'_> {
         if let Some(writer) = side_writer {
             files.extend(writer.finish()?);
         }
-        let told = tally.finish();
+        let told = tally.finish()?;
         files.extend(films.finish()?);
         Ok(Frames { tasks, told, files })
     }
@@ -264,7 +266,7 @@ impl Conversion<'_> {
             self.mapping.columns.iter().map(|c| (c.name.clone(), c.feature.is_visual())).collect();
         let mut files = frames.files;
         files.push(meta::write_tasks(self.root, &frames.tasks)?);
-        files.push(meta::write_episodes(self.root, &frames.tasks, &statistical, &frames.told.rows)?);
+        files.push(meta::write_episodes(self.root, &frames.tasks, &statistical, &frames.told.rows, &frames.told.each)?);
         files.push(meta::write_stats(self.root, &statistical, &frames.told.stats)?);
         let (left_out, left_out_notes) = self.left_out();
         let info = self.info(&frames.tasks, &frames.told.fingerprint, source_sha256, left_out);

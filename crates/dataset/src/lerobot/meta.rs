@@ -3,6 +3,7 @@
 use super::info::Info;
 use super::schema::{element, writer_properties};
 use super::shards::{GroupEncoder, HashingFile, Place, WrittenFile, write_parquet};
+use super::totals::EpisodeStats;
 use super::videos::Stretch;
 use crate::error::{DatasetError, Result};
 use crate::stats::FeatureStats;
@@ -21,8 +22,6 @@ use std::sync::Arc;
 
 /// Where the episodes lie; one file holds them all.
 pub(crate) const EPISODES_FILE: &str = "meta/episodes/chunk-000/file-000.parquet";
-/// Episodes in a row group of the episodes file.
-const EPISODES_PER_GROUP: usize = 1000;
 
 /// One row of the episodes file.
 #[derive(Debug, Clone)]
@@ -32,8 +31,6 @@ pub(crate) struct EpisodeRow {
     /// Tasks of its frames, in order of first use: one, unless LeRobot wrote it.
     pub tasks: Vec<usize>,
     pub place: Place,
-    /// Statistics of each feature that has them, by name.
-    pub stats: BTreeMap<String, FeatureStats>,
     /// Where the video of each camera is that has one, by name.
     pub videos: BTreeMap<String, Stretch>,
 }
@@ -43,7 +40,7 @@ fn write(
     relative: &str,
     schema: Schema,
     metadata: Vec<KeyValue>,
-    groups: &[Vec<ArrayRef>],
+    groups: impl IntoIterator<Item = Result<Vec<ArrayRef>>>,
 ) -> Result<WrittenFile> {
     let failed =
         |source: ParquetError| DatasetError::Parquet { path: root.join(relative), operation: "write it", source };
@@ -70,7 +67,7 @@ pub(crate) fn write_tasks(root: &Path, tasks: &[String]) -> Result<WrittenFile> 
         Arc::new(StringArray::from_iter_values(tasks)),
     ];
     let metadata = vec![KeyValue::new("pandas".to_owned(), pandas.to_string())];
-    write(root, "meta/tasks.parquet", schema, metadata, &[arrays])
+    write(root, "meta/tasks.parquet", schema, metadata, [Ok(arrays)])
 }
 
 /// The file of episodes: one row each, with its statistics in flat columns named `stats/<feature>/<statistic>`.
@@ -81,28 +78,23 @@ pub(crate) fn write_episodes(
     tasks: &[String],
     features: &[(String, bool)],
     rows: &[EpisodeRow],
+    stats: &EpisodeStats,
 ) -> Result<WrittenFile> {
-    let mut groups = Vec::new();
-    let mut schema = None;
-    let mut start = 0;
     // a camera has its places whether or not somebody counted its pictures
     let filmed = rows.first().into_iter().flat_map(|row| row.videos.keys());
     let filmed: Vec<&String> = filmed.filter(|&name| rows.iter().all(|row| row.videos.contains_key(name))).collect();
     // an episode without frames has no statistics
-    let counted = features.iter().filter(|(name, _)| rows.iter().all(|row| row.stats.contains_key(name)));
-    let counted: Vec<&(String, bool)> = counted.collect();
-    for part in rows.chunks(EPISODES_PER_GROUP) {
-        let columns = episode_columns(start, tasks, &filmed, &counted, part);
-        start += part.len();
-        if schema.is_none() {
-            let fields: Vec<Field> =
-                columns.iter().map(|(name, array)| Field::new(name, array.data_type().clone(), false)).collect();
-            schema = Some(Schema::new(fields));
-        }
-        groups.push(columns.into_iter().map(|(_, array)| array).collect());
-    }
-    let schema = schema.expect("a data set has an episode");
-    write(root, EPISODES_FILE, schema, Vec::new(), &groups)
+    let counted: Vec<&(String, bool)> = features.iter().filter(|(name, _)| stats.all_have(name)).collect();
+    let mut groups = rows.chunks(EpisodeStats::GROUP).enumerate().map(|(group, part)| {
+        let start = group * EpisodeStats::GROUP;
+        Ok(episode_columns(start, tasks, &filmed, &counted, part, &stats.group(group)?))
+    });
+    let first = groups.next().expect("a data set has an episode")?;
+    let field = |(name, array): &(String, ArrayRef)| Field::new(name, array.data_type().clone(), false);
+    let schema = Schema::new(first.iter().map(field).collect::<Vec<_>>());
+    let arrays = |columns: Vec<(String, ArrayRef)>| columns.into_iter().map(|(_, array)| array).collect();
+    let groups = std::iter::once(Ok(first)).chain(groups).map(|columns| columns.map(arrays));
+    write(root, EPISODES_FILE, schema, Vec::new(), groups)
 }
 
 fn episode_columns(
@@ -111,6 +103,7 @@ fn episode_columns(
     filmed: &[&String],
     counted: &[&(String, bool)],
     rows: &[EpisodeRow],
+    stats: &[BTreeMap<String, FeatureStats>],
 ) -> Vec<(String, ArrayRef)> {
     let ints = |f: &dyn Fn(usize, &EpisodeRow) -> usize| -> ArrayRef {
         let values = rows.iter().enumerate().map(|(i, row)| f(start + i, row) as i64);
@@ -143,13 +136,12 @@ fn episode_columns(
     }
     for (feature, is_image) in counted {
         // sets written before quantiles were stored have none
-        for (name, get) in
-            STATISTICS.into_iter().filter(|(_, get)| !rows.iter().any(|r| get(&r.stats[feature]).is_empty()))
+        for (name, get) in STATISTICS.into_iter().filter(|(_, get)| !stats.iter().any(|s| get(&s[feature]).is_empty()))
         {
             let mut values = Float64Builder::new();
             let mut lengths = Vec::with_capacity(rows.len());
-            for row in rows {
-                let of_row = get(&row.stats[feature]);
+            for of_episode in stats {
+                let of_row = get(&of_episode[feature]);
                 values.append_slice(of_row);
                 lengths.push(of_row.len());
             }
@@ -157,8 +149,8 @@ fn episode_columns(
             columns.push((format!("stats/{feature}/{name}"), list));
         }
         let mut counts = ListBuilder::new(Int64Builder::new()).with_field(element(DataType::Int64));
-        for row in rows {
-            counts.values().append_value(row.stats[feature].count as i64);
+        for of_episode in stats {
+            counts.values().append_value(of_episode[feature].count as i64);
             counts.append(true);
         }
         columns.push((format!("stats/{feature}/count"), Arc::new(counts.finish())));

@@ -1,6 +1,7 @@
 //! LeRobotDataset v3.0 directories: written from demonstrations, opened for training.
 
 mod check;
+mod columns;
 mod convert;
 mod depth;
 pub mod edit;
@@ -25,6 +26,7 @@ mod tables;
 mod tally;
 mod tiff;
 mod to_robomimic;
+mod totals;
 mod v2;
 mod values;
 mod verify;

@@ -1,6 +1,7 @@
 //! An opened data set: everything but pictures in memory, ready for training.
 
-use super::check::{self, TIME_TOLERANCE};
+use super::check;
+use super::columns::{Passing, SCANNED, read_columns, resident};
 use super::features::MISTAKE;
 use super::fingerprint::{Fingerprint, INDEX_COLUMNS};
 use super::info::{Feature, Info, Provenance};
@@ -12,7 +13,6 @@ use crate::error::{DatasetError, Result};
 use crate::shuffle::SplitMix64;
 use crate::stats::FeatureStats;
 use crate::windows::{Resident, WindowSpec, Windows, unmarked};
-use arrow::buffer::ScalarBuffer;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -91,6 +91,29 @@ impl Dataset {
     /// against the fingerprint that was recorded when it was made. What LeRobot accepts and is not as it should be is read as
     /// LeRobot reads it and named in [`Dataset::notes`].
     pub fn open(root: &Path) -> Result<Self> {
+        let (mut dataset, mut notes) = Self::open_tables(root)?;
+        let mut pieces: Vec<Vec<Resident>> = Vec::new();
+        read_columns(root, &dataset.info, &dataset.episodes, true, None, &mut notes, &mut |of_file| {
+            pieces.resize_with(of_file.len(), Vec::new);
+            pieces.iter_mut().zip(of_file).for_each(|(all, numbers)| all.push(numbers));
+        })?;
+        dataset.columns = resident(&dataset.info, pieces);
+        dataset.complete(notes, |set| set.content_fingerprint())
+    }
+
+    /// [`Dataset::open`], with its checks, for what copies a set: the numeric columns pass and are not kept.
+    pub(super) fn open_scanned(root: &Path) -> Result<Self> {
+        let (dataset, mut notes) = Self::open_tables(root)?;
+        let mut passing = Passing::new(&dataset.info, &dataset.episodes);
+        read_columns(root, &dataset.info, &dataset.episodes, true, Some(SCANNED), &mut notes, &mut |numbers| {
+            passing.take(&numbers);
+        })?;
+        let computed = passing.finish();
+        dataset.complete(notes, |_| computed)
+    }
+
+    /// Everything but the frames.
+    fn open_tables(root: &Path) -> Result<(Self, Vec<String>)> {
         let mut notes = Vec::new();
         let mut info = read_info(root)?;
         let table = read_tasks(root, &info)?;
@@ -98,10 +121,16 @@ impl Dataset {
         correct_totals(&mut info, &episodes, table.texts.len(), &mut notes);
         check::leave_out_stale_splits(&mut info, &mut notes);
         let (task_numbers, tasks) = table.read_as(root, &episodes, &mut notes)?;
-        let columns = read_columns(root, &info, &episodes, true, &mut notes)?;
-        let mut dataset = Self::of(root, info, episodes, (task_numbers, tasks), columns, notes)?;
-        dataset.fingerprint = dataset.checked_fingerprint()?;
-        Ok(dataset)
+        let dataset = Self::of(root, info, episodes, (task_numbers, tasks), BTreeMap::new(), Vec::new())?;
+        Ok((dataset, notes))
+    }
+
+    /// Once its columns have passed: their content hashes to `computed`.
+    fn complete(mut self, mut notes: Vec<String>, computed: impl FnOnce(&Self) -> String) -> Result<Self> {
+        notes.append(&mut self.notes);
+        self.notes = notes;
+        self.fingerprint = self.checked_fingerprint(computed)?;
+        Ok(self)
     }
 
     /// A data set whose episodes and tasks were derived from its frames, with the row of each episode in the table of episodes.
@@ -113,7 +142,12 @@ impl Dataset {
         table_rows: Option<Vec<usize>>,
     ) -> Result<Self> {
         let mut notes = Vec::new();
-        let columns = read_columns(root, &info, &episodes, false, &mut notes)?;
+        let mut pieces: Vec<Vec<Resident>> = Vec::new();
+        read_columns(root, &info, &episodes, false, None, &mut notes, &mut |of_file| {
+            pieces.resize_with(of_file.len(), Vec::new);
+            pieces.iter_mut().zip(of_file).for_each(|(all, numbers)| all.push(numbers));
+        })?;
+        let columns = resident(&info, pieces);
         let mut dataset = Self::of(root, info, episodes, tasks, columns, notes)?;
         dataset.table_rows = table_rows;
         dataset.fingerprint = dataset.content_fingerprint();
@@ -185,13 +219,13 @@ impl Dataset {
     }
 
     /// The fingerprint recorded, after comparing it with the content where the content is in memory.
-    fn checked_fingerprint(&self) -> Result<String> {
+    fn checked_fingerprint(&self, computed: impl FnOnce(&Self) -> String) -> Result<String> {
         let recorded = self.info.actrm.as_ref().map(|p| &p.fingerprint);
         let pictures = self.has_pictures();
         if let (Some(recorded), true) = (recorded, pictures) {
             return Ok(recorded.clone());
         }
-        let computed = self.content_fingerprint();
+        let computed = computed(self);
         match recorded {
             Some(recorded) if *recorded != computed => Err(DatasetError::BadDataset {
                 path: self.root.clone(),
@@ -672,134 +706,4 @@ pub(crate) fn read_episodes(root: &Path, info: &Info) -> Result<Vec<EpisodeMeta>
         }
     }
     Ok(episodes)
-}
-
-/// The numeric columns; `owned`: each frame must be of the episode that it lies in.
-fn read_columns(
-    root: &Path,
-    info: &Info,
-    episodes: &[EpisodeMeta],
-    owned: bool,
-    notes: &mut Vec<String>,
-) -> Result<BTreeMap<String, Resident>> {
-    // whole numbers do not fit f32; the index columns follow from the episodes
-    let wanted: Vec<(&str, &Feature)> = info
-        .features
-        .0
-        .iter()
-        .filter(|(name, f)| !INDEX_COLUMNS.contains(&name.as_str()) && !f.is_visual() && !f.is_text())
-        .map(|(name, f)| (name.as_str(), f))
-        .collect();
-    let mut names: Vec<&str> = wanted.iter().map(|(name, _)| *name).collect();
-    let timed = owned && info.features.get("timestamp").is_some();
-    if owned {
-        names.push("episode_index");
-    }
-    if timed {
-        names.push("timestamp");
-    }
-    let mut pieces: Vec<Vec<Resident>> = wanted.iter().map(|_| Vec::new()).collect();
-    let mut casts: BTreeMap<&str, String> = BTreeMap::new();
-    let mut late = Late::default();
-    let mut row = 0;
-    let mut episode = 0;
-    for path in read::files(root, "data")? {
-        let (rows, arrays) = match names.is_empty() {
-            true => (read::columns_there(&path, &[])?.0, Vec::new()),
-            false => read::columns(&path, &names)?,
-        };
-        for ((name, feature), (array, out)) in wanted.iter().zip(arrays.iter().zip(&mut pieces)) {
-            let other = check::stored_as(&path, name, &feature.dtype, array.data_type())?;
-            let mut numbers = read::numbers(&path, name, array, feature.dim())?;
-            if let Some(other) = other {
-                if feature.dtype == "bool" {
-                    numbers.data = numbers.data.iter().map(|&v| f32::from(u8::from(v != 0.0))).collect();
-                }
-                casts.entry(name).or_insert(other);
-            }
-            out.push(numbers);
-        }
-        let first = row;
-        row += rows;
-        if !owned {
-            continue;
-        }
-        let owners = read::integers(&path, "episode_index", &arrays[wanted.len()])?;
-        let times = match timed {
-            true => Some(read::numbers(&path, "timestamp", &arrays[wanted.len() + 1], 1)?.data),
-            false => None,
-        };
-        for (at, &owner) in owners.iter().enumerate() {
-            let frame = first + at;
-            while episodes.get(episode).is_some_and(|e| frame >= e.to) {
-                episode += 1;
-            }
-            let Some(mine) = episodes.get(episode).filter(|_| owner == episode as i64) else {
-                return Err(DatasetError::BadDataset {
-                    path,
-                    object: format!("frame {frame}"),
-                    expected: format!("episode {episode} of {}", episodes.len()),
-                    found: format!("episode_index {owner}"),
-                });
-            };
-            if let Some(times) = &times {
-                late.look(f64::from(times[at]), mine, frame - mine.from, info.fps);
-            }
-        }
-    }
-    let frames = episodes.last().map_or(0, |e| e.to);
-    if row != frames {
-        return Err(DatasetError::BadDataset {
-            path: root.to_path_buf(),
-            object: "data".to_owned(),
-            expected: format!("{frames} frames, as the episodes say"),
-            found: row.to_string(),
-        });
-    }
-    for (name, found) in casts {
-        let dtype = info.features.get(name).map_or("", |feature| &feature.dtype);
-        notes.push(format!("column {name}: expected {dtype}, as info.json says, found {found}: cast, as LeRobot does"));
-    }
-    notes.extend(late.note());
-    let mut columns = BTreeMap::new();
-    for ((name, feature), mut files) in wanted.into_iter().zip(pieces) {
-        let data = match files.len() {
-            1 => files.swap_remove(0).data,
-            _ => ScalarBuffer::from(files.iter().flat_map(|f| f.data.iter().copied()).collect::<Vec<f32>>()),
-        };
-        columns.insert(name.to_owned(), Resident { data, dim: feature.dim() });
-    }
-    Ok(columns)
-}
-
-/// Frames whose times are not those of the rate.
-#[derive(Default)]
-struct Late {
-    frames: usize,
-    /// Seconds.
-    most: f64,
-    /// Episode and frame of the first.
-    first: (usize, usize),
-}
-
-impl Late {
-    fn look(&mut self, time: f64, episode: &EpisodeMeta, frame: usize, fps: f64) {
-        if let Some(off) = check::time_off(time, frame, fps, TIME_TOLERANCE) {
-            if self.frames == 0 {
-                self.first = (episode.index, frame);
-            }
-            self.frames += 1;
-            self.most = self.most.max(off);
-        }
-    }
-
-    fn note(self) -> Option<String> {
-        let Self { frames, most, first: (episode, frame) } = self;
-        (frames > 0).then(|| {
-            format!(
-                "timestamp: {frames} frames are not at frame_index / fps, by up to {most:.6} s (LeRobot's tolerance_s is \
-                 {TIME_TOLERANCE} s); the first is frame {frame} of episode {episode}"
-            )
-        })
-    }
 }

@@ -3,9 +3,7 @@
 use crate::error::{DatasetError, InputError, Result};
 use crate::source::is_lfs_pointer;
 use crate::windows::Resident;
-use arrow::array::{
-    Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, LargeListArray, ListArray, RecordBatch,
-};
+use arrow::array::{Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, LargeListArray, ListArray};
 use arrow::buffer::ScalarBuffer;
 use arrow::compute::{cast, concat};
 use arrow::datatypes::DataType;
@@ -78,33 +76,47 @@ pub(crate) fn columns_there(path: &Path, wanted: &[&str]) -> Result<(usize, BTre
     Ok((rows, there.into_iter().map(str::to_owned).zip(arrays).collect()))
 }
 
-/// Reads columns of one file whole, each as one array, in the order of `columns`; a missing one is an error.
-pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<ArrayRef>)> {
-    let failed = |source| DatasetError::Parquet { path: path.to_path_buf(), operation: "read it", source };
+/// Columns of one file in the order of `columns`, so many rows at a time; a missing one is an error.
+pub(crate) fn batches<'p>(
+    path: &'p Path,
+    columns: &[&str],
+    rows: usize,
+) -> Result<impl Iterator<Item = Result<Vec<ArrayRef>>> + 'p> {
+    let failed = move |source| DatasetError::Parquet { path: path.to_path_buf(), operation: "read it", source };
     let builder = open(path)?;
-    let rows = builder.metadata().file_metadata().num_rows();
-    let rows = usize::try_from(rows).ok().ok_or_else(|| bad_count(path, rows))?;
     let mut indices = Vec::with_capacity(columns.len());
     for name in columns {
         indices.push(builder.schema().index_of(name).ok().ok_or_else(|| missing_column(path, name, &builder))?);
     }
-    let mask = ProjectionMask::roots(builder.parquet_schema(), indices);
-    // one batch for the whole file: its buffers become the resident columns without another copy
+    let mask = ProjectionMask::roots(builder.parquet_schema(), indices.iter().copied());
+    let mut sorted = indices.clone();
+    sorted.sort_unstable();
+    sorted.dedup();
+    let order: Vec<usize> = indices.iter().map(|index| sorted.partition_point(|known| known < index)).collect();
     let reader = builder.with_projection(mask).with_batch_size(rows.max(1)).build().map_err(failed)?;
-    let mut batches: Vec<RecordBatch> = Vec::new();
-    for batch in reader {
-        batches.push(batch.map_err(|e| failed(e.into()))?);
-    }
+    Ok(reader.map(move |batch| {
+        let batch = batch.map_err(|e| failed(e.into()))?;
+        Ok(order.iter().map(|&at| ArrayRef::clone(batch.column(at))).collect())
+    }))
+}
+
+/// Reads columns of one file whole, each as one array, in the order of `columns`; a missing one is an error.
+pub(crate) fn columns(path: &Path, columns: &[&str]) -> Result<(usize, Vec<ArrayRef>)> {
+    let rows = open(path)?.metadata().file_metadata().num_rows();
+    let rows = usize::try_from(rows).ok().ok_or_else(|| bad_count(path, rows))?;
+    // one batch for the whole file: its buffers become the resident columns without another copy
+    let batches = batches(path, columns, rows)?.collect::<Result<Vec<_>>>()?;
     let mut arrays = Vec::with_capacity(columns.len());
-    for name in columns {
-        let pieces: Vec<&ArrayRef> = batches.iter().filter_map(|b| b.column_by_name(name)).collect();
-        arrays.push(match pieces.as_slice() {
+    for (at, name) in columns.iter().enumerate() {
+        let pieces: Vec<&dyn Array> = batches.iter().map(|batch| batch[at].as_ref()).collect();
+        arrays.push(match batches.as_slice() {
             [] => return Err(BadColumn { path, name }.because("rows", "none")),
-            [one] => ArrayRef::clone(one),
-            many => {
-                let many: Vec<&dyn Array> = many.iter().map(|a| a.as_ref()).collect();
-                concat(&many).map_err(|e| failed(e.into()))?
-            }
+            [one] => ArrayRef::clone(&one[at]),
+            _ => concat(&pieces).map_err(|e| DatasetError::Parquet {
+                path: path.to_path_buf(),
+                operation: "read it",
+                source: e.into(),
+            })?,
         });
     }
     Ok((rows, arrays))

@@ -247,12 +247,12 @@ fn splice(writer: &mut SerializedFileWriter<HashingFile>, group: EncodedGroup) -
     writer.flush().map_err(ParquetError::from)
 }
 
-/// Writes a small Parquet file of one row group.
+/// Writes a Parquet file, a row group at a time.
 pub(crate) fn write_parquet(
     root: &Path,
     relative: &str,
     encoder: &GroupEncoder,
-    groups: &[Vec<ArrayRef>],
+    groups: impl IntoIterator<Item = Result<Vec<ArrayRef>>>,
 ) -> Result<WrittenFile> {
     let path: PathBuf = root.join(relative);
     create_parent(&path)?;
@@ -260,7 +260,7 @@ pub(crate) fn write_parquet(
     let file = HashingFile::create(&path)?;
     let mut writer = file_writer(file, encoder.schema(), &encoder.properties).map_err(failed)?;
     for arrays in groups {
-        let written = encoder.encode(arrays).and_then(|group| splice(&mut writer, group));
+        let written = encoder.encode(&arrays?).and_then(|group| splice(&mut writer, group));
         if let Err(e) = written {
             return Err(match writer.inner_mut().failure.take() {
                 Some(source) => DatasetError::Io { path, operation: "write it", source },

@@ -6,12 +6,13 @@ use super::fingerprint::{Fingerprint, INDEX_COLUMNS};
 use super::info::Features;
 use super::meta::EpisodeRow;
 use super::shards::Place;
-use super::values::{Values, stats_of};
+use super::totals::{ColumnTotal, EpisodeStats};
 use super::videos::Stretch;
 use super::work::Part;
 use crate::error::Result;
 use crate::stats::FeatureStats;
 use std::collections::BTreeMap;
+use std::path::Path;
 use video::Sample;
 
 /// Where the samples of an episode go, for the camera in a column.
@@ -20,45 +21,52 @@ pub(crate) type Film<'f> = dyn FnMut(usize, &[Sample]) -> Result<Stretch> + 'f;
 /// What the episodes said so far.
 pub(crate) struct Tally<'a> {
     features: &'a Features,
-    tasks: &'a [String],
     rows: Vec<EpisodeRow>,
-    /// Values of each column, an entry an episode.
-    values: Vec<Vec<Values>>,
+    /// Statistics of each episode.
+    each: EpisodeStats,
+    /// Values of each column.
+    values: Vec<ColumnTotal>,
     /// Pictures of each image column over all episodes (histograms only).
     totals: BTreeMap<usize, PictureSummary>,
     /// The episode that is being put together.
     open: Option<(Vec<ColumnSummary>, BTreeMap<usize, PictureSummary>)>,
+    /// The first task of that episode.
+    task: String,
     fingerprint: Fingerprint,
 }
 
 /// What is known once every episode was told.
 pub(crate) struct Told {
     pub rows: Vec<EpisodeRow>,
+    /// Statistics of each episode.
+    pub each: EpisodeStats,
     /// Statistics over all episodes of each column that has any.
     pub stats: BTreeMap<String, FeatureStats>,
     pub fingerprint: String,
 }
 
 impl<'a> Tally<'a> {
-    /// Nothing yet; `tasks` are the texts that episodes count.
-    pub(crate) fn new(features: &'a Features, fps: f64, tasks: &'a [String]) -> Self {
+    /// Nothing yet; what does not fit memory goes into files without a name in `folder`.
+    pub(crate) fn new(features: &'a Features, fps: f64, folder: &Path) -> Self {
         Self {
             features,
-            tasks,
             rows: Vec::new(),
-            values: features.0.iter().map(|_| Vec::new()).collect(),
+            each: EpisodeStats::new(folder),
+            values: features.0.iter().map(|(_, feature)| ColumnTotal::new(folder, feature.dim())).collect(),
             totals: BTreeMap::new(),
             open: None,
+            task: String::new(),
             fingerprint: Fingerprint::new(features, fps),
         }
     }
 
-    /// Takes the next part of the present episode, or the first of the next one, which lies at `place` and does `tasks`.
+    /// Takes the next part of the present episode, or the first of the next one, which lies at `place` and does
+    /// `tasks`, the first of which is `task`.
     pub(crate) fn add(
         &mut self,
         summary: PartSummary,
         place: Place,
-        tasks: &[usize],
+        (tasks, task): (&[usize], &str),
         film: &mut Film<'_>,
     ) -> Result<()> {
         let part = summary.part;
@@ -68,9 +76,9 @@ impl<'a> Tally<'a> {
                 from: part.first_frame,
                 tasks: tasks.to_vec(),
                 place,
-                stats: BTreeMap::new(),
                 videos: BTreeMap::new(),
             });
+            task.clone_into(&mut self.task);
             self.open = Some((summary.values, summary.pictures));
         } else if let Some((_, pictures)) = &mut self.open {
             for (column, next) in summary.pictures {
@@ -83,8 +91,8 @@ impl<'a> Tally<'a> {
     fn close(&mut self, part: &Part, film: &mut Film<'_>) -> Result<()> {
         let Some((columns, mut pictures)) = self.open.take() else { return Ok(()) };
         let row = self.rows.last_mut().expect("an open episode has its row");
-        let task = row.tasks.first().map_or("", |&task| self.tasks[task].as_str());
-        self.fingerprint.episode(part.length, task);
+        self.fingerprint.episode(part.length, &self.task);
+        let mut of_episode = BTreeMap::new();
         for (index, ((name, feature), summary)) in self.features.0.iter().zip(columns).enumerate() {
             let (mut stats, mut digest) = (summary.stats, summary.digest);
             if let Some(found) = pictures.remove(&index) {
@@ -98,33 +106,33 @@ impl<'a> Tally<'a> {
                 stats = found.stats().or(stats);
             }
             if let Some(stats) = stats {
-                row.stats.insert(name.clone(), stats);
+                of_episode.insert(name.clone(), stats);
             }
             if !INDEX_COLUMNS.contains(&name.as_str()) {
                 self.fingerprint.column(name, digest);
             }
-            self.values[index].push(summary.values);
+            self.values[index].add(summary.values)?;
         }
-        Ok(())
+        self.each.add(&of_episode)
     }
 
     /// The statistics of the whole and the fingerprint.
-    pub(crate) fn finish(self) -> Told {
+    pub(crate) fn finish(self) -> Result<Told> {
         let mut stats = BTreeMap::new();
         for (index, (name, feature)) in self.features.0.iter().enumerate() {
             let of_column = match self.totals.get(&index) {
                 Some(total) => FeatureStats::of_histograms(&total.histograms, total.sampled),
                 // depth, and pictures that were not looked at: what their episodes say, taken together
                 None if feature.is_visual() => {
-                    let each: Option<Vec<&FeatureStats>> = self.rows.iter().map(|row| row.stats.get(name)).collect();
-                    each.and_then(|each| FeatureStats::pooled(&each))
+                    let each = self.each.of_feature(name)?;
+                    each.and_then(|each| FeatureStats::pooled(&each.iter().collect::<Vec<_>>()))
                 }
-                None => stats_of(&self.values[index].iter().collect::<Vec<_>>(), feature.dim()),
+                None => self.values[index].stats()?,
             };
             if let Some(of_column) = of_column {
                 stats.insert(name.clone(), of_column);
             }
         }
-        Told { rows: self.rows, stats, fingerprint: self.fingerprint.finish() }
+        Ok(Told { rows: self.rows, each: self.each, stats, fingerprint: self.fingerprint.finish() })
     }
 }

@@ -9,6 +9,7 @@ use super::meta::{self, EpisodeRow, parse_stats, python_json};
 use super::open::{Dataset, read_file};
 use super::read;
 use super::shards::Place;
+use super::totals::EpisodeStats;
 use super::verify::not_finite;
 use super::videos::{Stretch, VIDEO_PATH};
 use crate::error::{DatasetError, InputError, Result};
@@ -229,6 +230,7 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
         found,
     };
     let mut rows = Vec::with_capacity(episodes.len());
+    let mut each = EpisodeStats::new(view);
     let mut from = 0;
     for (number, line) in episodes.into_iter().enumerate() {
         let chunk = number / info.chunks_size.max(1);
@@ -265,9 +267,9 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
             from,
             tasks: tasks.collect(),
             place: Place { folder: number / FILES_PER_FOLDER, file: number % FILES_PER_FOLDER },
-            stats: stats.remove(&number).unwrap_or_default(),
             videos,
         });
+        each.add(&stats.remove(&number).unwrap_or_default())?;
         from += length;
     }
     let images = root.join("images");
@@ -276,7 +278,7 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
         link(&images, &view.join("images"))?;
     }
     meta::write_tasks(view, &texts)?;
-    meta::write_episodes(view, &texts, &visual, &rows)?;
+    meta::write_episodes(view, &texts, &visual, &rows, &each)?;
     let totals = totals(root, &visual, from)?;
     let of_totals: Vec<(String, bool)> = totals.keys().map(|name| (name.clone(), true)).collect();
     meta::write_stats(view, &of_totals, &totals)?;

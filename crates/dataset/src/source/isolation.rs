@@ -144,7 +144,7 @@ fn serve(path: &Path) -> std::io::Result<()> {
             // links may lead to more files
             let seconds = allowed(bytes.max(plan.files.iter().map(|(_, bytes)| bytes).sum()));
             limit_cpu(seconds, Some(seconds))?;
-            send(&mut out, PLAN, &serde_json::to_vec(&plan)?)?;
+            send_json(&mut out, PLAN, &*plan)?;
             local
         }
         Err(error) => return send(&mut out, ERROR, &serde_json::to_vec(&error)?),
@@ -188,6 +188,32 @@ pub(super) fn next_request(requests: &mut impl Read) -> std::io::Result<Option<V
     let mut text = vec![0; usize::try_from(u64::from_le_bytes(length)).unwrap_or(0)];
     requests.read_exact(&mut text)?;
     Ok(Some(text))
+}
+
+/// Counts what is written.
+struct Counted(u64);
+
+impl Write for Counted {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0 += bytes.len() as u64;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Sends an answer whose text need not fit memory.
+fn send_json(out: &mut impl Write, kind: u8, value: &impl Serialize) -> std::io::Result<()> {
+    let mut length = Counted(0);
+    serde_json::to_writer(&mut length, value)?;
+    let mut out = std::io::BufWriter::with_capacity(1 << 16, out);
+    let mut head = [kind; 9];
+    head[1..].copy_from_slice(&length.0.to_le_bytes());
+    out.write_all(&head)?;
+    serde_json::to_writer(&mut out, value)?;
+    out.flush()
 }
 
 /// Sends one answer.

@@ -3,11 +3,12 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use super::dialect::{self, DemoDraft, Draft, Survey};
 use super::walk::{Walked, check_signature};
 use crate::error::InputError;
-use crate::plan::{Join, Plan, Problem};
+use crate::plan::{DemoPlan, Join, Plan, Problem};
 use crate::tree::{Array, Attrs, Demo};
 
 /// What a source can be asked for, in this process or in another.
@@ -23,8 +24,16 @@ pub(super) trait Backend: Send + Sync {
 /// An opened source.
 pub(super) struct Local {
     survey: Survey,
-    plan: Plan,
-    drafts: Vec<DemoDraft>,
+    plan: Arc<Plan>,
+    /// What is in each demo beside its datasets.
+    parts: Vec<Parts>,
+}
+
+/// See [`DemoDraft`].
+struct Parts {
+    home: Option<(usize, String)>,
+    groups: BTreeSet<String>,
+    inner: Vec<(String, usize, String)>,
 }
 
 /// Files of a folder beyond this many are opened one at a time.
@@ -32,7 +41,7 @@ const KEEP_OPEN: usize = 64;
 
 impl Local {
     /// Opens a file, or a folder of files, and plans it; `beat` is called as the work goes on.
-    pub fn open(path: &Path, beat: &mut dyn FnMut()) -> Result<(Self, Plan), InputError> {
+    pub fn open(path: &Path, beat: &mut dyn FnMut()) -> Result<(Self, Arc<Plan>), InputError> {
         let paths = files(path)?;
         let keep = paths.len() <= KEEP_OPEN;
         let (mut files, mut lost) = (Vec::new(), Vec::new());
@@ -68,11 +77,15 @@ impl Local {
         }
         let mut drafts = demos;
         drafts.sort_by(|a, b| (a.plan.number, &a.plan.id).cmp(&(b.plan.number, &b.plan.id)));
-        let plan = Plan {
+        let (demos, parts) = drafts
+            .into_iter()
+            .map(|DemoDraft { plan, home, groups, inner }| (plan, Parts { home, groups, inner }))
+            .unzip();
+        let plan = Arc::new(Plan {
             path: path.to_owned(),
             files: survey.files.iter().map(|f| (f.path.clone(), f.bytes)).chain(linked).collect(),
             dialect,
-            demos: drafts.iter().map(|d| d.plan.clone()).collect(),
+            demos,
             env_args,
             env_name,
             env_version,
@@ -80,16 +93,15 @@ impl Local {
             texts,
             notes,
             problems,
-        };
-        let local = Self { survey, plan: plan.clone(), drafts };
-        Ok((local, plan))
+        });
+        Ok((Self { survey, plan: Arc::clone(&plan), parts }, plan))
     }
 
-    fn draft(&self, index: usize) -> Result<&DemoDraft, InputError> {
-        self.drafts.get(index).ok_or_else(|| InputError::NoSuch {
+    fn at(&self, index: usize) -> Result<(&DemoPlan, &Parts), InputError> {
+        self.plan.demos.get(index).zip(self.parts.get(index)).ok_or_else(|| InputError::NoSuch {
             path: self.survey.path.clone(),
             wanted: format!("demo at position {index}"),
-            found: format!("{} demos", self.drafts.len()),
+            found: format!("{} demos", self.parts.len()),
         })
     }
 }
@@ -175,17 +187,17 @@ impl Backend for Local {
             }
         }
         let Some(file) = self.survey.single() else {
-            if self.drafts.iter().any(|d| d.home.as_ref().is_some_and(|(_, path)| !path.is_empty())) {
+            if self.parts.iter().any(|d| d.home.as_ref().is_some_and(|(_, path)| !path.is_empty())) {
                 self.roots(&mut root)?;
             }
             return Ok(root);
         };
-        if self.drafts.iter().any(|d| d.home.as_ref().is_some_and(|(_, path)| path.is_empty())) {
+        if self.parts.iter().any(|d| d.home.as_ref().is_some_and(|(_, path)| path.is_empty())) {
             // the file is the demo
             return Ok(root);
         }
         root.attrs.extend(file.attrs("")?);
-        let homes: Vec<String> = self.drafts.iter().filter_map(|d| Some(format!("{}/", d.home.as_ref()?.1))).collect();
+        let homes: Vec<String> = self.parts.iter().filter_map(|d| Some(format!("{}/", d.home.as_ref()?.1))).collect();
         let homes: BTreeSet<&str> = homes.iter().map(String::as_str).collect();
         // a home is `data/demo_3/` or `traj_3/`, so the first two levels of a path decide
         let in_demo = |path: &str| {
@@ -218,17 +230,17 @@ impl Backend for Local {
     }
 
     fn demo(&self, index: usize, keys: &[String]) -> Result<Demo, InputError> {
-        let draft = self.draft(index)?;
-        let mut demo = Demo { id: draft.plan.id.clone(), ..Demo::default() };
-        if let Some((file, path)) = &draft.home {
+        let (plan, parts) = self.at(index)?;
+        let mut demo = Demo { id: plan.id.clone(), ..Demo::default() };
+        if let Some((file, path)) = &parts.home {
             demo.attrs = self.survey.files[*file].attrs(path)?;
         }
-        demo.groups = draft.groups.clone();
-        for (below, file, path) in &draft.inner {
+        demo.groups = parts.groups.clone();
+        for (below, file, path) in &parts.inner {
             demo.inner_attrs.insert(below.clone(), self.survey.files[*file].attrs(path)?);
         }
         for key in keys {
-            let rows = draft.plan.keys.get(key).and_then(|k| k.shape.first().copied());
+            let rows = plan.keys.get(key).and_then(|k| k.shape.first().copied());
             let array = match rows {
                 Some(rows) => self.rows(index, key, 0, rows)?,
                 None => self.scalar(index, key)?,
@@ -297,12 +309,12 @@ impl Local {
     }
 
     fn place(&self, index: usize, key: &str) -> Result<&crate::plan::Place, InputError> {
-        let draft = self.draft(index)?;
-        draft.plan.keys.get(key).map(|k| &k.place).ok_or_else(|| InputError::MissingKey {
+        let (plan, _) = self.at(index)?;
+        plan.keys.get(key).map(|k| &k.place).ok_or_else(|| InputError::MissingKey {
             path: self.survey.path.clone(),
-            demo: draft.plan.id.clone(),
+            demo: plan.id.clone(),
             key: key.to_owned(),
-            found: dialect::list(draft.plan.keys.keys().map(String::as_str)),
+            found: dialect::list(plan.keys.keys().map(String::as_str)),
         })
     }
 

@@ -14,6 +14,7 @@ mod zarr;
 use std::collections::BTreeSet;
 use std::fs::File;
 use std::path::Path;
+use std::sync::Arc;
 
 use rustix::buffer::spare_capacity;
 
@@ -68,7 +69,7 @@ impl Source {
     pub fn open(path: &Path) -> Result<Self> {
         exists(path)?;
         let (backend, plan) = open_backend(path, &mut || {})?;
-        Self::with(plan, backend)
+        Self::with(Arc::unwrap_or_clone(plan), backend)
     }
 
     /// Opens with all parsing done in a child process with memory and time limits. The program has to have called
@@ -318,12 +319,12 @@ impl Source {
 }
 
 /// Opens a source of any format in this process.
-fn open_backend(path: &Path, beat: &mut dyn FnMut()) -> Result<(Box<dyn Backend>, Plan), InputError> {
+fn open_backend(path: &Path, beat: &mut dyn FnMut()) -> Result<(Box<dyn Backend>, Arc<Plan>), InputError> {
     if let Some((buffer, plan)) = zarr::Buffer::open(path, beat)? {
-        return Ok((Box::new(buffer), plan));
+        return Ok((Box::new(buffer), Arc::new(plan)));
     }
     if let Some((set, plan)) = rlds::Rlds::open(path, beat)? {
-        return Ok((Box::new(set), plan));
+        return Ok((Box::new(set), Arc::new(plan)));
     }
     let (local, plan) = Local::open(path, beat)?;
     Ok((Box::new(local), plan))

@@ -36,7 +36,7 @@ pub(super) struct DatasetNode {
     pub block_rows: usize,
     pub attrs: usize,
     /// Why it cannot be read, if it cannot.
-    pub fault: Option<InputError>,
+    pub fault: Option<Box<InputError>>,
 }
 
 /// An opened file with everything that it holds, by absolute path without the leading slash; the file's own
@@ -320,9 +320,10 @@ impl Walked {
     ) -> Result<(DatasetNode, bool), InputError> {
         let bad = |operation: &str, e: hdf5::Error| damaged(&self.path, full, operation, reason(&e));
         let unsupported =
-            |what: String| InputError::Unsupported { path: self.path.clone(), object: full.to_owned(), what };
-        let unavailable =
-            |reason: String| InputError::Unavailable { path: self.path.clone(), object: full.to_owned(), reason };
+            |what: String| Box::new(InputError::Unsupported { path: self.path.clone(), object: full.to_owned(), what });
+        let unavailable = |reason: String| {
+            Box::new(InputError::Unavailable { path: self.path.clone(), object: full.to_owned(), reason })
+        };
         let space = dataset.space().map_err(|e| bad("read the shape of", e))?;
         let null = space.is_null();
         let shape = if null { Vec::new() } else { space.shape() };
@@ -338,7 +339,8 @@ impl Walked {
             .iter()
             .try_fold(node.dtype.size().unwrap_or(16) as u64, |n, &e| n.checked_mul(e as u64))
             .unwrap_or(u64::MAX);
-        let too_large = |limit| InputError::TooLarge { path: self.path.clone(), object: full.to_owned(), bytes, limit };
+        let too_large =
+            |limit| Box::new(InputError::TooLarge { path: self.path.clone(), object: full.to_owned(), bytes, limit });
         if let Some(offset) = dataset.offset() {
             let size = from.map_or(self.bytes, |file| self.linked[file].1);
             // float16 takes more room in memory than in the file
@@ -369,12 +371,12 @@ impl Walked {
                         .try_fold(node.dtype.size().unwrap_or(16) as u64, |n, &e| n.checked_mul(e as u64))
                         .unwrap_or(u64::MAX);
                     if block > 256 << 20 {
-                        node.fault = Some(InputError::TooLarge {
+                        node.fault = Some(Box::new(InputError::TooLarge {
                             path: self.path.clone(),
                             object: format!("{full}: one stored block"),
                             bytes: block,
                             limit: 256 << 20,
-                        });
+                        }));
                     }
                 }
                 let stored = dataset.storage_size();
@@ -467,7 +469,7 @@ impl Walked {
             });
         };
         if let Some(fault) = &node.fault {
-            return Err(fault.clone());
+            return Err((**fault).clone());
         }
         let mut shape = node.shape.clone();
         if node.null {

@@ -8,7 +8,8 @@ use crate::ZooError;
 use crate::results::TrainingFacts;
 
 impl EntryMeta {
-    fn is_policy(&self) -> bool {
+    /// Whether it acts in simulators.
+    pub(crate) fn is_policy(&self) -> bool {
         self.kind.is_none() && self.section.is_none()
     }
 

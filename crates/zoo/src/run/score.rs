@@ -9,10 +9,11 @@ use serde::Serialize;
 use crate::ZooError;
 use crate::conventions::Conventions;
 use crate::entry::LoadedEntry;
+use crate::transforms::unreadable;
 
 use super::agreement::agree;
-use super::data::{self, PictureMemory};
-use super::preflight::picture_budget;
+use super::data::{self, ImageMemory};
+use super::preflight::image_budget;
 
 /// Windows gathered at once.
 const BATCH: usize = 64;
@@ -97,7 +98,7 @@ pub fn score(request: &ScoreRequest<'_>) -> Result<Score, ZooError> {
     let mask = request.mask.map(str::to_owned).or(held_out);
     (experiment.data.train_mask, experiment.data.valid_mask) = (mask.clone().unwrap_or_default(), String::new());
     let agreed = agree(&dataset, &path, &experiment, request.force)?;
-    let memory = PictureMemory { budget: picture_budget(), folder: request.work };
+    let memory = ImageMemory { budget: image_budget(), folder: request.work };
     let name = path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
     let demonstrations = data::prepare(&dataset, &path, &name, &agreed, &memory)?;
     let windows = &demonstrations.train;
@@ -124,7 +125,7 @@ pub fn score(request: &ScoreRequest<'_>) -> Result<Score, ZooError> {
     let mut policy = loaded.policy();
     let mut batch = WindowBatch::default();
     for chunk in indices.chunks(BATCH) {
-        windows.try_gather(chunk, &mut batch).map_err(data::unreadable(&demonstrations.meta.name))?;
+        windows.try_gather(chunk, &mut batch).map_err(unreadable(&demonstrations.meta.name))?;
         for at in 0..batch.n {
             policy.reset(0);
             let failed = |source| loaded.failed("ask", source);

@@ -67,7 +67,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         return Ok(ExitCode::from(INTERRUPTED));
     };
     let size = (usize::from(args.size), usize::from(args.size));
-    let rate = pool.ready().control_freq;
+    let ready = pool.ready().clone();
+    let rate = ready.control_freq;
     let mut video = VideoWriter::begin(&args.video, size, rate)?;
     let mut screen = Screen::new();
     screen.begin(format!("drawing {id}"), steps as u64);
@@ -82,9 +83,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut failure: Option<anyhow::Error> = None;
     let end = pool.run(0..parts as u64, &|job| job, &|| Ok(()), &work, &mut |job, result| {
         let last = job + 1 == parts as u64;
-        let drawn = result.map_err(anyhow::Error::from).and_then(|episode| {
+        let failed = |error| anyhow::Error::from(recording::replay_error(&args.input, &id, &ready, error));
+        let drawn = result.map_err(failed).and_then(|episode| {
             success |= episode.success;
-            let drawn = pictures(&args.camera, size, &episode, last)?;
+            let drawn = pictures(&args.camera, size, &episode, last);
+            let drawn = drawn.with_context(|| format!("{}: {id}", args.input.display()))?;
             drawn.iter().try_for_each(|image| video.push(image))?;
             images += drawn.len();
             Ok(())
@@ -102,7 +105,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     cli::close(pool);
     let end = end?;
     if let Some(error) = failure {
-        return Err(error.context(format!("{}: {id}", args.input.display())));
+        return Err(error);
     }
     if end == RunEnd::Stopped {
         cli::note(&format!("stopped after {images} of {} images; nothing was written", steps + 1));

@@ -7,7 +7,7 @@ use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use study::puzzle::{AnyExperiment, TrainOptions};
 use zoo::ZooError;
 use zoo::entry::member_name;
-use zoo::run::{COMMAND_FILE, Extended, Place, TrainEvent, TrainOutcome, extend, finished_entry};
+use zoo::run::{COMMAND_FILE, Extended, Place, TrainEvent, TrainOutcome, TrainRequest, extend, finished_entry, train};
 use zoo::write_atomic;
 
 use crate::places::{ConfigArgs, ZooArgs, entry_names, experiment_names};

@@ -10,10 +10,12 @@ use super::super::open::{Dataset, EpisodeMeta};
 use super::super::pictures::image_files;
 use super::super::read::{self, BadColumn};
 use super::super::schema;
-use super::super::shards::{GroupEncoder, Place, ShardWriter, WrittenFile};
+use super::super::shards::{GroupEncoder, ShardWriter, WrittenFile};
+use super::super::tally::{Tally, Told};
 use super::super::tiff;
 use super::super::values::Values;
 use super::super::work::{GROUP_BYTES, Part};
+use super::films::Copied as Filmed;
 use super::groups::Groups;
 use super::{Edit, Renames};
 use crate::error::{DatasetError, Result};
@@ -25,24 +27,16 @@ use parquet::file::metadata::KeyValue;
 use rayon::prelude::*;
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
-/// The data files of the result.
+/// The data files of the result, and what its episodes say of themselves.
 pub(super) struct Copied {
     pub files: Vec<WrittenFile>,
     /// Task texts in order of first use.
     pub tasks: Vec<String>,
-    pub episodes: Vec<CopiedEpisode>,
-}
-
-/// What an episode says of itself.
-pub(super) struct CopiedEpisode {
-    pub summary: PartSummary,
-    pub place: Place,
-    /// Its tasks, as [`Copied::tasks`] counts them.
-    pub tasks: Vec<usize>,
+    pub told: Told,
 }
 
 /// Whether the pictures of a feature are decoded for their statistics; others keep what is stored of them.
@@ -52,8 +46,8 @@ pub(super) fn is_looked_at(feature: &Feature) -> bool {
         && matches!(feature.shape[..], [height, width, c] if height > 0 && width > 0 && c == channels)
 }
 
-/// Copies the rows of all episodes taken.
-pub(super) fn copy(edit: &Edit<'_>, advance: &mut dyn FnMut(u64)) -> Result<Copied> {
+/// Copies the rows of all episodes taken, whose videos are in `films`.
+pub(super) fn copy(edit: &Edit<'_>, mut films: Vec<(usize, Filmed)>, advance: &mut dyn FnMut(u64)) -> Result<Copied> {
     let info = edit.inputs[0].set.info();
     let (names, schema, metadata) = written_as(edit.inputs[0].set.root(), edit.renames)?;
     let encoder = schema::writer_properties(&schema, metadata.into_iter().collect())
@@ -67,45 +61,61 @@ pub(super) fn copy(edit: &Edit<'_>, advance: &mut dyn FnMut(u64)) -> Result<Copi
     let mut shards = ShardWriter::new(edit.root, "data", &encoder, limit, FILES_PER_FOLDER);
     let mut append = |group, begins| shards.append(group, begins);
     let mut groups = Groups::new(edit.root, &encoder, limit);
-    let mut copied = Copied { files: Vec::new(), tasks: edit.tasks(), episodes: Vec::new() };
+    let (mut tasks, mut tally) = (edit.tasks(), Tally::new(&edit.features, info.fps, edit.root));
+    // episodes whose place is not known yet
+    let mut waiting: VecDeque<(PartSummary, Vec<usize>)> = VecDeque::new();
+    let mut settle = |groups: &mut Groups<'_>, waiting: &mut VecDeque<(PartSummary, Vec<usize>)>, texts: &[String]| {
+        while !waiting.is_empty()
+            && let Some(place) = groups.next_place()
+            && let Some((mut summary, tasks)) = waiting.pop_front()
+        {
+            let number = summary.part.episode;
+            for (column, film) in &mut films {
+                summary.pictures.insert(*column, std::mem::take(&mut film.pictures[number]));
+            }
+            let stretch = |camera, _: &[video::Sample]| {
+                let film = films.iter().find(|(column, _)| *column == camera);
+                Ok(film.expect("each camera was copied").1.stretches[number])
+            };
+            let first = tasks.first().map_or("", |&task| texts[task].as_str());
+            tally.add(summary, place, (&tasks, first), &mut { stretch })?;
+        }
+        Ok::<(), DatasetError>(())
+    };
     let picture_bytes: usize =
         edit.features.0.iter().filter(|(_, f)| f.dtype == "image").map(|(_, f)| f.picture_bytes()).sum();
     let batch_rows = (GROUP_BYTES as usize / picture_bytes.max(1)).clamp(1, 1024);
-    let (mut frames, mut summaries) = (0, Vec::new());
+    let (mut frames, mut number) = (0, 0);
     for (input, taken) in edit.inputs.iter().zip(&edit.taken) {
         let set = &input.set;
         let stored = stored_statistics(edit, set)?;
         let mut rows = Rows::open(set.root(), "data", None, batch_rows)?;
         for episode in set.episodes() {
             if taken.binary_search(&episode.index).is_err() {
-                // what it held is not kept in memory
-                for from in (0..episode.length).step_by(batch_rows) {
-                    rows.take(batch_rows.min(episode.length - from))?;
-                }
+                rows.skip(episode.length)?;
                 continue;
             }
-            let tasks = episode.tasks.iter().map(|text| number_of(&mut copied.tasks, text)).collect();
-            let part =
-                Part { episode: summaries.len(), length: episode.length, first_frame: frames, rows: 0..episode.length };
+            let own = episode.tasks.iter().map(|text| number_of(&mut tasks, text)).collect();
+            let part = Part { episode: number, length: episode.length, first_frame: frames, rows: 0..episode.length };
             let mut seen = Seen::new(edit, set, &schema, part, episode);
             groups.begin(episode.length, &mut append)?;
             for from in (0..episode.length).step_by(batch_rows) {
                 for batch in rows.take(batch_rows.min(episode.length - from))? {
-                    let arrays = seen.numbered(columns(set.root(), &batch, &names, &schema)?, &mut copied.tasks)?;
+                    let arrays = seen.numbered(columns(set.root(), &batch, &names, &schema)?, &mut tasks)?;
                     seen.look(&arrays)?;
                     groups.push(arrays, &mut append)?;
                 }
             }
             frames += episode.length;
             advance(episode.length as u64);
-            summaries.push((seen.summary(&stored), tasks));
+            number += 1;
+            waiting.push_back((seen.summary(&stored), own));
+            settle(&mut groups, &mut waiting, &tasks)?;
         }
     }
-    let places = groups.finish(&mut append)?;
-    copied.files = shards.finish()?;
-    let episodes = summaries.into_iter().zip(places);
-    copied.episodes = episodes.map(|((summary, tasks), place)| CopiedEpisode { summary, place, tasks }).collect();
-    Ok(copied)
+    groups.finish(&mut append)?;
+    settle(&mut groups, &mut waiting, &tasks)?;
+    Ok(Copied { files: shards.finish()?, tasks, told: tally.finish()? })
 }
 
 fn number_of(tasks: &mut Vec<String>, text: &str) -> usize {

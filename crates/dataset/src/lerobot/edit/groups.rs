@@ -5,6 +5,7 @@ use super::super::work::{GROUP_BYTES, GROUP_FRAMES};
 use crate::error::{DatasetError, Result};
 use arrow::array::{Array, ArrayRef};
 use arrow::compute::concat;
+use std::collections::VecDeque;
 use std::path::Path;
 
 /// Rows that become row groups: small episodes together, a large one in pieces.
@@ -22,7 +23,7 @@ pub(super) struct Groups<'a> {
     started: usize,
     /// Bytes of a row, as far as rows were seen.
     row_bytes: u64,
-    places: Vec<Place>,
+    places: VecDeque<Place>,
 }
 
 /// Where a row group is appended.
@@ -40,7 +41,7 @@ impl<'a> Groups<'a> {
             begins: false,
             started: 0,
             row_bytes: 0,
-            places: Vec::new(),
+            places: VecDeque::new(),
         }
     }
 
@@ -87,9 +88,13 @@ impl<'a> Groups<'a> {
         Ok(())
     }
 
-    /// Where each episode begins.
-    pub(super) fn finish(mut self, append: &mut Append<'_>) -> Result<Vec<Place>> {
-        self.flush(append)?;
-        Ok(self.places)
+    /// Where the next episode begins, once that is known.
+    pub(super) fn next_place(&mut self) -> Option<Place> {
+        self.places.pop_front()
+    }
+
+    /// Closes the last group.
+    pub(super) fn finish(&mut self, append: &mut Append<'_>) -> Result<()> {
+        self.flush(append)
     }
 }

@@ -24,9 +24,8 @@ use super::meta;
 use super::open::{ACTION, Dataset};
 use super::side::{Layout, write_manifest};
 use super::staging::Staging;
-use super::tally::Tally;
 use super::verify::picture_problem;
-use super::videos::{Stretch, VIDEO_PATH};
+use super::videos::VIDEO_PATH;
 use crate::error::{DatasetError, Result};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
@@ -80,7 +79,11 @@ impl Input {
     /// Opens a set and makes sure that it is what was written: what is damaged must not get a new fingerprint. The files of
     /// a set with a side folder have hashes; of one without, pictures are held against the fingerprint.
     fn open(root: &Path, progress: &mut Progress<'_>) -> Result<Self> {
-        let set = Dataset::open(root)?;
+        // pictures are held against the fingerprint together with the numbers
+        let set = match Dataset::open_scanned(root)? {
+            set if set.has_pictures() && set.provenance().is_some_and(|p| !p.lossless) => Dataset::open(root)?,
+            set => set,
+        };
         // depth that could not be looked at is told of before anything is copied
         set.depth_names().try_for_each(|name| set.depth_size(name).map(drop))?;
         let layout = match set.provenance() {
@@ -280,23 +283,32 @@ fn compose(
     let features = renamed(agree::features(inputs)?, renames);
     let edit = Edit { inputs, taken, features, renames, repair, root };
     let first = inputs[0].set.info();
-    let mut copied = frames::copy(&edit, advance)?;
-    let mut files = std::mem::take(&mut copied.files);
-    let mut stretches: BTreeMap<usize, Vec<Stretch>> = BTreeMap::new();
+    let (mut films, mut files) = (Vec::new(), Vec::new());
     for (index, (name, _)) in edit.features.0.iter().enumerate().filter(|(_, (_, f))| f.dtype == "video") {
-        let film = films::copy(&edit, name, advance)?;
-        for (episode, pictures) in copied.episodes.iter_mut().zip(film.pictures) {
-            episode.summary.pictures.insert(index, pictures);
-        }
-        files.extend(film.files);
-        stretches.insert(index, film.stretches);
+        let mut film = films::copy(&edit, name, advance)?;
+        files.append(&mut film.files);
+        films.push((index, film));
     }
-    let mut tally = Tally::new(&edit.features, first.fps, &copied.tasks);
-    for (number, episode) in copied.episodes.into_iter().enumerate() {
-        let film = &mut |camera, _: &[video::Sample]| Ok(stretches[&camera][number]);
-        tally.add(episode.summary, episode.place, &episode.tasks, film)?;
+    let filmed = !films.is_empty();
+    let mut origin = origin::of(&edit, &mut notes)?;
+    let lossless = origin.as_ref().filter(|provenance| provenance.lossless);
+    let (copied, side) = std::thread::scope(|scope| {
+        let side = lossless.map(|origin| scope.spawn(|| side::copy(&edit, origin)));
+        let copied = frames::copy(&edit, films, advance);
+        (copied, side.map(|side| side.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))))
+    });
+    let mut copied = copied?;
+    files.append(&mut copied.files);
+    let lossless = side.is_some();
+    if let Some(side) = side {
+        let (of_side, of_rest) = side?;
+        files.extend(of_side);
+        notes.extend(of_rest);
     }
-    let mut told = tally.finish();
+    let mut told = copied.told;
+    if let Some(origin) = &mut origin {
+        origin.fingerprint.clone_from(&told.fingerprint);
+    }
     edit.keep_stored_totals(&mut told.stats);
     // texts and the like have none
     let statistical: Vec<(String, bool)> = edit
@@ -306,13 +318,8 @@ fn compose(
         .filter(|(name, _)| told.stats.contains_key(name))
         .map(|(name, feature)| (name.clone(), feature.is_visual()))
         .collect();
-    let origin = origin::of(&edit, &told.fingerprint, &mut notes)?;
-    let lossless = origin.as_ref().is_some_and(|provenance| provenance.lossless);
-    if let Some(provenance) = origin.as_ref().filter(|_| lossless) {
-        files.extend(side::copy(&edit, provenance, &mut notes)?);
-    }
     files.push(meta::write_tasks(root, &copied.tasks)?);
-    files.push(meta::write_episodes(root, &copied.tasks, &statistical, &told.rows)?);
+    files.push(meta::write_episodes(root, &copied.tasks, &statistical, &told.rows, &told.each)?);
     files.push(meta::write_stats(root, &statistical, &told.stats)?);
     let info = Info {
         total_episodes: told.rows.len(),
@@ -321,7 +328,7 @@ fn compose(
         chunks_size: info::FILES_PER_FOLDER,
         splits: edit.splits(),
         data_path: info::DATA_PATH.to_owned(),
-        video_path: (!stretches.is_empty()).then(|| VIDEO_PATH.to_owned()),
+        video_path: filmed.then(|| VIDEO_PATH.to_owned()),
         features: edit.features.clone(),
         actrm: origin,
         ..first.clone()
@@ -331,7 +338,7 @@ fn compose(
         files.push(write_manifest(root, &files)?);
     }
     // what was just written opens, or it is not published
-    let set = Dataset::open(root)?;
+    let set = Dataset::open_scanned(root)?;
     Ok(EditReport {
         episodes: set.episodes().len(),
         frames: set.frames(),

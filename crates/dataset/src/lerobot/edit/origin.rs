@@ -27,8 +27,8 @@ fn seeds_of_all(texts: &[Option<String>]) -> Option<String> {
     Some(format!("{}-{}", ranges.iter().map(|r| r.0).min()?, ranges.iter().map(|r| r.1).max()?))
 }
 
-/// The provenance of the result; none unless every input has one.
-pub(super) fn of(edit: &Edit<'_>, fingerprint: &str, notes: &mut Vec<String>) -> Result<Option<Provenance>> {
+/// The provenance of the result, still without its fingerprint; none unless every input has one.
+pub(super) fn of(edit: &Edit<'_>, notes: &mut Vec<String>) -> Result<Option<Provenance>> {
     let all: Vec<&Provenance> = edit.inputs.iter().filter_map(|input| input.set.provenance()).collect();
     let first = match all.first() {
         Some(first) if all.len() == edit.inputs.len() => *first,
@@ -93,7 +93,7 @@ pub(super) fn of(edit: &Edit<'_>, fingerprint: &str, notes: &mut Vec<String>) ->
         source,
         source_sha256,
         dialect: dialects.into_iter().collect::<Vec<_>>().join(" + "),
-        fingerprint: fingerprint.to_owned(),
+        fingerprint: String::new(),
         env_name: first.env_name.clone(),
         env_version,
         env_args,

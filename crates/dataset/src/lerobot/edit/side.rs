@@ -13,11 +13,14 @@ use crate::tree::{Array, Demo, Dtype};
 use arrow::array::{ArrayRef, RecordBatch, new_null_array};
 use std::collections::BTreeMap;
 
-/// Rows of the side folder in memory at once: pictures may be among them.
+/// Rows of the side folder that are moved at once: pictures may be among them.
 const ROWS: usize = 64;
+/// Rows of numbers that are read at once.
+const NUMBER_ROWS: usize = 1024;
 
-/// Writes the side folder; `origin` has the demos' ids.
-pub(super) fn copy(edit: &Edit<'_>, origin: &Provenance, notes: &mut Vec<String>) -> Result<Vec<WrittenFile>> {
+/// Writes the side folder; `origin` has the demos' ids. Gives its files, and what of the inputs could not be kept.
+pub(super) fn copy(edit: &Edit<'_>, origin: &Provenance) -> Result<(Vec<WrittenFile>, Vec<String>)> {
+    let mut notes = Vec::new();
     let layout = layout(edit);
     let (frames, objects) = (frame_encoder(edit.root, &layout)?, object_encoder(edit.root)?);
     let limit = (edit.inputs[0].set.info().data_files_size_in_mb * f64::from(1 << 20)) as u64;
@@ -26,7 +29,7 @@ pub(super) fn copy(edit: &Edit<'_>, origin: &Provenance, notes: &mut Vec<String>
     for (input, objects) in edit.inputs.iter().zip(&mut stored) {
         rests.push(rest(input.set.root(), objects.of(NO_EPISODE)?)?);
     }
-    let belongs_to_none = Rest { edit, ids: &origin.demos }.of(rests, origin, notes);
+    let belongs_to_none = Rest { edit, ids: &origin.demos }.of(rests, origin, &mut notes);
     let mut writer = SideWriter::new(edit.root, &layout, &frames, &objects, limit, &belongs_to_none)?;
     let mut groups = Groups::new(edit.root, &frames, limit);
     let mut number = 0;
@@ -35,16 +38,15 @@ pub(super) fn copy(edit: &Edit<'_>, origin: &Provenance, notes: &mut Vec<String>
         let own = input.layout.as_ref().map_or(&[][..], |layout| &layout.columns);
         let mut rows = match own.is_empty() {
             true => None,
-            false => Some(Rows::open(root, FRAMES, None, ROWS)?),
+            false => {
+                let bulk = own.iter().any(|column| column.number_type().is_none());
+                Some(Rows::open(root, FRAMES, None, if bulk { ROWS } else { NUMBER_ROWS })?)
+            }
         };
         for episode in input.set.episodes() {
             let mine = objects.of(episode.index as i64)?;
             if taken.binary_search(&episode.index).is_err() {
-                if let Some(rows) = &mut rows {
-                    for from in (0..episode.length).step_by(ROWS) {
-                        rows.take(ROWS.min(episode.length - from))?;
-                    }
-                }
+                rows.as_mut().map_or(Ok(()), |rows| rows.skip(episode.length))?;
                 continue;
             }
             let mut append = |group, begins| writer.append_frames(group, begins);
@@ -79,7 +81,7 @@ pub(super) fn copy(edit: &Edit<'_>, origin: &Provenance, notes: &mut Vec<String>
         }
     }
     groups.finish(&mut |group, begins| writer.append_frames(group, begins))?;
-    writer.finish()
+    Ok((writer.finish()?, notes))
 }
 
 /// The columns of all inputs; of those with one path the first.

@@ -48,8 +48,8 @@ impl Layout for D4rl {
         let texts = attrs.iter().filter_map(|(k, v)| Some((k.clone(), v.to_text()?))).collect();
         let mut problems = Vec::new();
         for (path, node) in &file.datasets {
-            if let Some(error) = node.fault.clone() {
-                problems.push(Problem::new(None, Some(&name_of(path)), true, error));
+            if let Some(error) = &node.fault {
+                problems.push(Problem::new(None, Some(&name_of(path)), true, (**error).clone()));
             }
         }
         for (path, error) in &file.broken {

@@ -261,7 +261,7 @@ fn contents(
             key = path[prefix.len()..].to_owned();
         }
         if let Some(fault) = &node.fault {
-            problems.push(Problem::new(Some(id), Some(&key), true, fault.clone()));
+            problems.push(Problem::new(Some(id), Some(&key), true, (**fault).clone()));
         }
         if node.attrs > 0 {
             out.inner.push((key.clone(), index, path.clone()));

@@ -12,7 +12,7 @@ import numpy as np
 
 from actrm_harness.experts.parts import Expert, Marking, Scene
 from actrm_harness.experts.skills import USUAL, Demonstrator
-from actrm_harness.protocol import RequestError
+from actrm_harness.protocol import RequestError, brief
 from actrm_harness.simulators import Episode
 from actrm_harness.simulators.robosuite import envs
 from actrm_harness.simulators.robosuite.envs import Session
@@ -142,7 +142,10 @@ def extract(
     env.set_ep_meta(dict(ep_meta or {}))
     if model_file:
         env.reset()
-        env.reset_from_xml_string(env.edit_model_xml(model_file))
+        try:
+            env.reset_from_xml_string(env.edit_model_xml(model_file))
+        except Exception as error:
+            raise RequestError("model", f"its model_file does not load: {brief(error)}") from error
     else:
         env.reset()
     expected = envs.state(env).shape[0]
