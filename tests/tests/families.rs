@@ -101,7 +101,7 @@ fn what_was_not_run_under_the_same_rules_is_not_compared() {
 /// LeRobot's and other files stand beside sealed rows, are told from them, and are paired by seeds alone.
 #[test]
 fn results_of_other_programs_are_compared() {
-    let (_folder, entries) = shipped(&["lift-act", "stack-act"]);
+    let (_folder, entries) = shipped(&["lift-act"]);
     let file = |name: &str, text: &str| {
         let path = entries.join(name);
         fs::write(&path, text).expect("writable");
