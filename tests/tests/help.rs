@@ -213,7 +213,8 @@ fn messages_are_plain() {
     assert!(said.len() > 1500, "{}", said.len());
     let mut found = Vec::new();
     for (file, text) in said {
-        let plain = prose(&text.replace("\\n", " "));
+        let text = text.replace("\\n", "\n");
+        let plain = prose(&text);
         found.extend(COINED.iter().filter(|word| plain.contains(**word)).map(|word| format!("{file}: {word}: {text}")));
         // lists of examples are not sentences
         let sentences: Vec<String> = text.split(['\n', ';']).map(str::to_owned).collect();
