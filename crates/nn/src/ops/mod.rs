@@ -35,10 +35,11 @@ use candle_core::Tensor;
 
 /// The sizes of a tensor of `N` dimensions.
 fn sizes<const N: usize>(operation: &'static str, x: &Tensor) -> Result<[usize; N]> {
-    x.dims().try_into().map_err(|_| {
+    let Ok(sizes) = x.dims().try_into() else {
         let (found, expected) = (format!("of shape {:?}", x.dims()), format!("of {N} dimensions"));
-        ModelError::Input { operation, object: "input", found, expected }
-    })
+        return Err(ModelError::Input { operation, object: "input", found, expected });
+    };
+    Ok(sizes)
 }
 
 fn check_width(operation: &'static str, x: &Value, width: usize) -> Result<()> {

@@ -402,6 +402,9 @@ fn likelihoods_of_mixtures() {
 /// A call of an operation with these inputs.
 type Call<'a> = Box<dyn Fn(&mut Context<'_>, &[Value]) -> Result<()> + 'a>;
 
+/// Name of an operation, shapes that fit, an input and a shape that does not fit there, a call.
+type Row<'a> = (&'a str, Vec<&'a [usize]>, (usize, &'a [usize]), Call<'a>);
+
 /// Every operation refuses by its name inputs of another type and shape, on kernels and on candle's operations.
 #[test]
 fn every_operation_names_what_it_refuses() {
@@ -428,8 +431,7 @@ fn every_operation_names_what_it_refuses() {
         action_dim: 2,
     };
     let seq: &[usize] = &[2, 3, 4];
-    // name, shapes that fit, the input to change and a shape that does not fit, the call
-    let table: Vec<(&str, Vec<&[usize]>, (usize, &[usize]), Call<'_>)> = vec![
+    let table: Vec<Row<'_>> = vec![
         ("linear", vec![seq], (0, &[2, 3, 5]), Box::new(|cx, x| linear(cx, &x[0], &layer).map(drop))),
         (
             "linear",
