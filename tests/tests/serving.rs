@@ -68,7 +68,7 @@ fn a_served_policy_is_evaluated_as_its_entry_is() {
     assert!(config.contains("[external.conventions]") && config.contains("horizon = \"16\""), "{config}");
     let results = entries.join("served");
     let rerun = |more: &[&str]| {
-        let mut command = zoo(["rerun", "mine", "--workers", "1", "--json", "--zoo", text(&entries)]);
+        let mut command = zoo(["rerun", "mine@1", "--workers", "1", "--json", "--zoo", text(&entries)]);
         command.args(["--results", text(&results), "--work", text(&entries.join("work"))]).args(more);
         command.env_remove("ACTRM_TOKEN");
         command

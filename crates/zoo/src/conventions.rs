@@ -252,7 +252,7 @@ impl Conventions {
     }
 }
 
-/// The controllers of every arm in robosuite's configuration, in its forms of 1.4 and 1.5.
+/// The controller of each robot's (right) arm in robosuite's configuration, in its forms of 1.4 and 1.5.
 fn arms(configs: &Value) -> Vec<&Value> {
     if let Some(each) = configs.as_array() {
         return each.iter().flat_map(arms).collect();
@@ -261,8 +261,9 @@ fn arms(configs: &Value) -> Vec<&Value> {
         // the form of 1.4: the configuration of the arms alone
         return configs.get("type").map(|_| configs).into_iter().collect();
     };
+    // recordings list a left arm of robots that have none
     let parts = [Some(parts), parts.get("arms")].into_iter().flatten();
-    parts.flat_map(|parts| ["right", "left"].into_iter().filter_map(|arm| parts.get(arm))).collect()
+    parts.filter_map(|parts| parts.get("right").or_else(|| parts.get("left"))).collect()
 }
 
 /// Numbers of a list, or one.
