@@ -3,6 +3,7 @@
 `python libero_parity.py own|ours SIZE STEPS FOLDER TASK:INIT...`
 """
 
+import importlib
 import os
 import sys
 from pathlib import Path
@@ -24,21 +25,21 @@ def actions(steps: int) -> Any:
 
 def own(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
     """What examples/libero/main.py of openpi does: make, seed, reset, set the initial state, settle, step."""
-    from libero.libero import benchmark, get_libero_path
-    from libero.libero.envs import OffScreenRenderEnv
-
+    libero: Any = importlib.import_module("libero.libero")
+    benchmark: Any = importlib.import_module("libero.libero.benchmark")
+    envs: Any = importlib.import_module("libero.libero.envs")
     name, _, index = task.partition("/")
     number = int(index)
     suite = benchmark.get_benchmark_dict()[name]()
     row = suite.get_task(number)
-    path = os.path.join(get_libero_path("bddl_files"), row.problem_folder, row.bddl_file)
-    env = OffScreenRenderEnv(bddl_file_name=path, camera_heights=size, camera_widths=size)
+    path = os.path.join(libero.get_libero_path("bddl_files"), row.problem_folder, row.bddl_file)
+    env = envs.OffScreenRenderEnv(bddl_file_name=path, camera_heights=size, camera_widths=size)
     env.seed(7)
     env.reset()
     obs = env.set_init_state(suite.get_task_init_states(number)[init])
     for _ in range(10):
         obs, _, _, _ = env.step([0.0] * 6 + [-1.0])
-    seen = [(obs, env.get_sim_state(), 0.0, False)]
+    seen: list[Any] = [(obs, env.get_sim_state(), 0.0, False)]
     for action in actions(steps):
         obs, reward, done, _ = env.step(action.tolist())
         seen.append((obs, env.get_sim_state(), reward, done))
@@ -64,7 +65,7 @@ def ours(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
     simulation.reset(init + 1, demonstration=False)
     simulation.step(np.array([[0.5, 0.5, -0.5, 0.1, 0.1, 0.1, 1.0]] * 7))
     first = simulation.reset(init, demonstration=False)
-    seen = [(first.observation, simulation.control.get_sim_state(), 0.0, False)]
+    seen: list[Any] = [(first.observation, simulation.control.get_sim_state(), 0.0, False)]
     for action in actions(steps):
         done = simulation.step(action)
         seen.append((done.observation, simulation.control.get_sim_state(), done.rewards[-1], done.success))

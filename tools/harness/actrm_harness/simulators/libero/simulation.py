@@ -35,8 +35,10 @@ NO_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
 _DECIDING = ("robots", "controller_configs", "gripper_types", "control_freq", "initialization_noise")
 """Arguments of LIBERO's environment that decide what happens."""
-_DRAWN = ("xpos", "xmat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat")
-_DRAWN += ("light_xpos", "light_xdir")
+_DRAWN = (
+    *("xpos", "xmat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat"),
+    *("cam_xpos", "cam_xmat", "light_xpos", "light_xdir"),
+)
 """What images show of the simulation's data."""
 _LARGE = ("mesh_", "tex_", "hfield_", "name", "paths", "skin_", "flex_", "text_")
 """Arrays of a model that nothing changes."""
@@ -107,11 +109,11 @@ class Libero:
                     return self.remember()
 
                 env.add_observable(observables.Observable("moment", moment, sampling_rate=env.control_freq))
-            initialize, loads = env._initialize_sim, 0
+            initialize = env._initialize_sim
+            loads: list[str | None] = []
 
             def load(xml_string: str | None = None) -> None:
-                nonlocal loads
-                loads += 1
+                loads.append(xml_string)
                 initialize(xml_string)
                 # here LIBERO makes a renderer, which runs the solver once more
                 env.sim.forward()
@@ -134,7 +136,7 @@ class Libero:
             seed()
             self.control.reset()
             # LIBERO loads again where no placement was found; what it draws then depends on how often it has loaded
-            self.keeps = loads == 1
+            self.keeps = len(loads) == 1
             if self.keeps:
                 env._load_model = env._destroy_sim = lambda: None
                 env._initialize_sim = self.restore
@@ -240,7 +242,12 @@ class Libero:
             for _ in range(SETTLING):
                 raw, _, _, _ = self.control.step(NO_ACTION)
         files = self.files
-        meta = {"lang": files.language, "suite": files.suite, "task": files.number, "init_state": number}
+        meta = {
+            "lang": files.language or self.control.language_instruction,
+            "suite": files.suite,
+            "task": files.number,
+            "init_state": number,
+        }
         return Initial(self.observed(raw), self.fingerprint(), meta, self.drawing_ms)
 
     def again(self) -> None:

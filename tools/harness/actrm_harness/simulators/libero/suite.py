@@ -23,6 +23,9 @@ VERSIONS = {
 }
 """What libero.lock installs. Another MuJoCo moves and draws differently."""
 
+STANDARD = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
+"""LIBERO's own suites."""
+
 
 @dataclass(frozen=True, slots=True)
 class Files:
@@ -30,8 +33,8 @@ class Files:
 
     suite: str
     number: int
-    language: str
-    """The instruction, as evaluations of LIBERO give it to policies."""
+    language: str | None
+    """The instruction, as evaluations of LIBERO give it to policies; None where it is the problem's."""
     problem: Path
     """Scene and goal, in BDDL."""
     initial: Array
@@ -105,4 +108,6 @@ def files(task: str) -> Files:
             f"{text}; `make libero` installs every file that it has, `libero-pro audit` lists the rest",
         )
     initial: Array = np.asarray(found.get_task_init_states(int(number)), dtype=np.float64)
-    return Files(name, int(number), str(row.language), problem, initial)
+    # LIBERO-PRO changes the instruction in the problem, not in the file's name, and its runner takes it from there
+    language = str(row.language) if name in STANDARD else None
+    return Files(name, int(number), language, problem, initial)
