@@ -32,7 +32,7 @@ def own(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
     number = int(index)
     suite = benchmark.get_benchmark_dict()[name]()
     row = suite.get_task(number)
-    path: str = os.path.join(libero.get_libero_path("bddl_files"), row.problem_folder, row.bddl_file)
+    path = str(Path(libero.get_libero_path("bddl_files")) / row.problem_folder / row.bddl_file)
     env = envs.OffScreenRenderEnv(bddl_file_name=path, camera_heights=size, camera_widths=size)
     env.seed(7)
     env.reset()

