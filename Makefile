@@ -36,6 +36,16 @@ help: ## list the targets
 	@.venv/bin/python -m $(PIP) -r $<
 	@touch $@
 
+# One package has no wheel: it is built with the lock's setuptools.
+.venv-libero/.complete: tools/harness/libero.lock
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.11, 3.12 or 3.13 with venv found; name one: make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
+	@echo "Python: making .venv-libero from $< (two minutes, 2 GB)"
+	@rm -rf .venv-libero && "$(PYTHON)" -m venv .venv-libero
+	@sed -n '/^setuptools==/,/[^\\]$$/p' $< > .venv-libero/setuptools.lock
+	@.venv-libero/bin/python -m $(PIP) -r .venv-libero/setuptools.lock
+	@.venv-libero/bin/python -m $(PIP) --no-build-isolation -r $<
+	@touch $@
+
 .venv-peers/.complete: benches/peers/requirements.lock
 	@test -n "$(PEER_PYTHON)" || { echo "error: LeRobot 0.6.1 needs Python 3.12 or 3.13 and none was found; name one: make PEER_PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
 	@echo "Python: making .venv-peers from $< (torch and LeRobot: some minutes, several GB)"
@@ -58,6 +68,9 @@ help: ## list the targets
 
 .PHONY: venv
 venv: .venv/.complete ## Python with robosuite, in .venv
+
+.PHONY: libero
+libero: .venv-libero/.complete ## Python with LIBERO, in .venv-libero
 
 .PHONY: build
 build: .venv/.complete ## the programs, in target/release
@@ -162,4 +175,4 @@ references: build .venv-peers/.complete ## LeRobot and robomimic train on our de
 
 .PHONY: clean
 clean: ## remove what was built and installed (target, .venv, .venv-peers, out)
-	@rm -rf target .venv .venv-peers .venv-wheel .venv-docs out
+	@rm -rf target .venv .venv-libero .venv-peers .venv-wheel .venv-docs out

@@ -7,7 +7,7 @@ adds a row with `register`. Nothing here imports a simulator: what a row names i
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 DEFAULT_MAX_STEPS = 400
@@ -172,6 +172,20 @@ TASKS = {
     )
 }
 
+FAMILIES = {
+    task.name: task
+    for task in (
+        Task("libero_", simulator="libero"),
+        # openpi, OpenVLA and LeRobot (docs/libero.md); LIBERO-PRO's suites begin with the names of LIBERO's
+        Task("libero_spatial", simulator="libero", max_steps=220),
+        Task("libero_object", simulator="libero", max_steps=280),
+        Task("libero_goal", simulator="libero", max_steps=300),
+        Task("libero_10", simulator="libero", max_steps=520),
+        Task("libero_90", simulator="libero", max_steps=400),
+    )
+}
+"""Rows of many tasks, by what the names `SUITE/NUMBER` begin with."""
+
 
 def register(task: Task) -> None:
     """Add a row, or take the place of one."""
@@ -180,7 +194,11 @@ def register(task: Task) -> None:
 
 def row(name: str) -> Task:
     """The row of a task; a row of defaults where it has none."""
-    return TASKS.get(name, Task(name))
+    if name in TASKS:
+        return TASKS[name]
+    families = (task for prefix, task in FAMILIES.items() if "/" in name and name.startswith(prefix))
+    family = max(families, key=lambda task: len(task.name), default=Task(name))
+    return replace(family, name=name)
 
 
 def find(place: str | Callable[..., Any]) -> Any:

