@@ -131,7 +131,7 @@ lint: .venv/.complete ## formatting and lints, Rust and Python
 	@.venv/bin/python -m basedpyright --project crates/python --pythonpath .venv/bin/python
 
 .PHONY: reference
-reference: build ## write docs/reference/*.md from the code (tests check that they are current); docs/python.md: tools/python_api.py
+reference: build ## write docs/reference/*.md from the code (tests check that they are current); docs/reference/python.md: tools/python_api.py
 	@ACTRM_REFERENCE=write $(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- the_reference_of
 
 .PHONY: docs

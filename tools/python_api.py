@@ -1,6 +1,6 @@
-"""docs/python.md from the docstrings of the installed package.
+"""docs/reference/python.md from the docstrings of the installed package.
 
-target/wheel-venvs/3.11/bin/python tools/python_api.py > docs/python.md
+target/wheel-venvs/3.11/bin/python tools/python_api.py > docs/reference/python.md
 """
 
 import ast

@@ -152,8 +152,8 @@ def found_by_lerobot(entry: Path, task: str, folder: Path) -> str:
 
 
 def how_to(folder: Path) -> str:
-    """The example of docs/howto.md gives tensors of PyTorch."""
-    section = (ROOT / "docs/howto.md").read_text().split("## Load a data set in PyTorch")[1]
+    """The example of docs/howto/five_commands.md gives tensors of PyTorch."""
+    section = (ROOT / "docs/howto/five_commands.md").read_text().split("## Load a data set in PyTorch")[1]
     example = textwrap.dedent("\n".join(line for line in section.splitlines() if line.startswith("    ")))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "data").symlink_to(ROOT / "data")

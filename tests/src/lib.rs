@@ -254,12 +254,12 @@ pub fn screen(written: &str) -> Vec<String> {
     lines.iter().map(|line| line.iter().collect::<String>().trim_end().to_owned()).collect()
 }
 
-/// The commands of a how-to: indented lines under the heading of `docs/howto.md` that begins like this, word by word.
+/// The commands of a how-to: indented lines under the heading of `docs/howto/five_commands.md` that begins like this, word by word.
 ///
 /// # Panics
 /// If there is no such heading, or it has no commands or more than five.
 pub fn howto(heading: &str) -> Vec<Vec<String>> {
-    let page = std::fs::read_to_string(root().join("docs/howto.md")).expect("the page");
+    let page = std::fs::read_to_string(root().join("docs/howto/five_commands.md")).expect("the page");
     let section = page.split("\n## ").find(|section| section.starts_with(heading)).expect("a heading of the page");
     let lines = section.lines().filter_map(|line| line.strip_prefix("    "));
     let commands: Vec<Vec<String>> = lines.map(|line| line.split_whitespace().map(str::to_owned).collect()).collect();

@@ -51,7 +51,7 @@ def test_an_entry_s_policy_has_the_entry_s_outcomes(zoo: Path, tmp_path: Path) -
 
 
 def test_the_page_s_policy_is_ranked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (ROOT / "docs/howto_own_policy.md").read_text()
+    text = (ROOT / "docs/howto/own_policy.md").read_text()
     lines = text[text.index("    import actrm\n") :].splitlines()
     end = next(i for i, line in enumerate(lines) if line and not line.startswith("    "))
     example = textwrap.dedent("\n".join(lines[:end])).strip()

@@ -50,4 +50,4 @@ def test_the_api_page_is_the_docstrings() -> None:
 
     command = [sys.executable, str(ROOT / "tools/python_api.py")]
     page = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert page == (ROOT / "docs/python.md").read_text()
+    assert page == (ROOT / "docs/reference/python.md").read_text()

