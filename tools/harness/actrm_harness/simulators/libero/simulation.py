@@ -133,8 +133,7 @@ class Libero:
                 ]
 
             env._initialize_sim = load
-            seed()
-            self.control.reset()
+            self.begin()
             # LIBERO loads again where no placement was found; what it draws then depends on how often it has loaded
             self.keeps = len(loads) == 1
             if self.keeps:
@@ -234,7 +233,7 @@ class Libero:
         del demonstration
         number = seed % len(self.files.initial)
         if self.keeps:
-            self.again()
+            self.begin()
         else:
             self.make()
         with redirect_stdout(sys.stderr):
@@ -250,11 +249,17 @@ class Libero:
         }
         return Initial(self.observed(raw), self.fingerprint(), meta, self.drawing_ms)
 
-    def again(self) -> None:
-        """Reset LIBERO's environment as `make` did."""
+    def begin(self) -> None:
+        """Reset the environment until its objects find a place. LIBERO does so too, and hides every other error."""
+        unplaced = importlib.import_module("robosuite.utils.errors").RandomizationError
         with redirect_stdout(sys.stderr):
             seed()
-            self.control.reset()
+            while True:
+                try:
+                    self.env.reset()
+                except unplaced:
+                    continue
+                return
 
     def step(self, actions: Array) -> Stepped:
         """Do one action, or one a row until the task is solved."""
