@@ -14,8 +14,7 @@ import sys
 import time
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -62,10 +61,8 @@ class Libero:
     properties: list[tuple[Any, Any]] = field(default_factory=list[tuple[Any, Any]])
     """Objects, and what they said of themselves when they were loaded."""
     renderer: Renderer | None = None
-    moment: Any = None
-    """The simulation's data when LIBERO last observed: robosuite 1.4 does before a control step ends."""
-    site_rgba: Array | None = None
-    """The colours of sites at that moment: LIBERO changes them after it."""
+    moment: dict[str, Array] = field(default_factory=dict[str, Array])
+    """What images show, when LIBERO last observed: robosuite 1.4 does before a control step ends."""
     drawing_ms: float = 0.0
 
     @staticmethod
@@ -117,7 +114,6 @@ class Libero:
                 initialize(xml_string)
                 # here LIBERO makes a renderer, which runs the solver once more
                 env.sim.forward()
-                self.moment = None
                 model = env.sim.model._model
                 self.model = {
                     name: value.copy()
@@ -133,8 +129,7 @@ class Libero:
                 ]
 
             env._initialize_sim = load
-            seed()
-            self.control.reset()
+            self.begin()
             # LIBERO loads again where no placement was found; what it draws then depends on how often it has loaded
             self.keeps = len(loads) == 1
             if self.keeps:
@@ -156,14 +151,14 @@ class Libero:
         env.sim.forward()
         env.initialize_time(env.control_freq)
 
+    def shown(self) -> dict[str, Array]:
+        """What images show of the simulation; LIBERO changes colours of sites after it has observed."""
+        data, model = self.env.sim.data._data, self.env.sim.model._model
+        return {name: getattr(data, name) for name in _DRAWN} | {"site_rgba": model.site_rgba}
+
     def remember(self) -> float:
         """Keep what images show of this moment."""
-        sim = self.env.sim
-        if self.moment is None:
-            self.moment = importlib.import_module("mujoco").MjData(sim.model._model)
-        for name in _DRAWN:
-            getattr(self.moment, name)[...] = getattr(sim.data._data, name)
-        self.site_rgba = sim.model.site_rgba.copy()
+        self.moment = {name: value.copy() for name, value in self.shown().items()}
         return 0.0
 
     def env_args(self) -> dict[str, Any]:
@@ -234,7 +229,7 @@ class Libero:
         del demonstration
         number = seed % len(self.files.initial)
         if self.keeps:
-            self.again()
+            self.begin()
         else:
             self.make()
         with redirect_stdout(sys.stderr):
@@ -250,11 +245,17 @@ class Libero:
         }
         return Initial(self.observed(raw), self.fingerprint(), meta, self.drawing_ms)
 
-    def again(self) -> None:
-        """Reset LIBERO's environment as `make` did."""
+    def begin(self) -> None:
+        """Reset the environment until its objects find a place. LIBERO does so too, and hides every other error."""
+        unplaced = importlib.import_module("robosuite.utils.errors").RandomizationError
         with redirect_stdout(sys.stderr):
             seed()
-            self.control.reset()
+            while True:
+                try:
+                    self.env.reset()
+                except unplaced:
+                    continue
+                return
 
     def step(self, actions: Array) -> Stepped:
         """Do one action, or one a row until the task is solved."""
@@ -302,12 +303,11 @@ class Libero:
         if not self.cameras:
             return kept
         begun = time.perf_counter()
-        model = self.env.sim.model
-        colours = model.site_rgba.copy()
-        model.site_rgba[...] = self.site_rgba
-        sim = SimpleNamespace(model=model, data=SimpleNamespace(_data=self.moment))
-        seen = self.drawn_by().images(cast(Any, sim), self.cameras, self.size, self.size)
-        model.site_rgba[...] = colours
+        shown = self.shown()
+        now = {name: value.copy() for name, value in shown.items()}
+        put(self.moment, shown)
+        seen = self.drawn_by().images(self.env.sim, self.cameras, self.size, self.size)
+        put(now, shown)
         self.drawing_ms = 1e3 * (time.perf_counter() - begun)
         return kept | {f"{camera}_image": pixels for camera, pixels in zip(self.cameras, seen, strict=True)}
 
@@ -321,6 +321,12 @@ class Libero:
                 digest.update(f"{name} {value.dtype.str} {value.shape}\n".encode())
                 digest.update(value.tobytes())
         return digest.hexdigest()
+
+
+def put(values: dict[str, Array], there: dict[str, Array]) -> None:
+    """Write arrays into arrays of the same names."""
+    for name, value in values.items():
+        there[name][...] = value
 
 
 def seed() -> None:

@@ -3,6 +3,7 @@
 import importlib
 import importlib.metadata
 import os
+import re
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ VERSIONS = {
 }
 """What libero.lock installs. Another MuJoCo moves and draws differently."""
 
+MEMORY = "256M"
+"""What a model reserves for contacts and constraints; it has no other effect until that is full."""
 STANDARD = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 """LIBERO's own suites."""
 
@@ -66,13 +69,21 @@ def prepare() -> None:
 
 
 def import_robosuite() -> None:
-    """Import robosuite 1.4 without an OpenGL library."""
+    """Import robosuite 1.4 without an OpenGL library, and let models reserve less memory.
+
+    They ask for 5000 contacts and constraints. MuJoCo reserves 1.3 GB for these, to load a model and to run it.
+    """
     suite.mujoco()
     os.environ["MUJOCO_GL"] = "glx"
     try:
         suite.robosuite()
     finally:
         os.environ["MUJOCO_GL"] = "disable"
+    simulation: Any = importlib.import_module("robosuite.utils.binding_utils").MjSim
+    load = simulation.from_xml_string
+    # MuJoCo takes one of the two
+    size = re.compile(r'(<size [^>]*)njmax="\d+"')
+    simulation.from_xml_string = lambda xml: load(size.sub(rf'\1memory="{MEMORY}"', xml))
 
 
 def files(task: str) -> Files:
