@@ -3,6 +3,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, anyhow, bail};
+use clap::builder::ArgPredicate;
 use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use study::puzzle::{AnyExperiment, TrainOptions};
 use zoo::ZooError;
@@ -42,7 +43,7 @@ use crate::training::show;
   actrm-zoo train act_lift --print-config")]
 pub struct Args {
     /// Experiment: a name of `actrm-zoo list --experiments`, the path of a TOML file, or parts such as `policy=act`
-    #[arg(required_unless_present = "extend", default_value = "", hide_default_value = true, add = experiment_names())]
+    #[arg(required_unless_present = "extend", default_value_if("extend", ArgPredicate::IsPresent, ""), add = experiment_names())]
     experiment: String,
     /// Settings to override, such as `train.steps=5000` or `inputs=image`; `--print-config` shows all
     #[arg(value_name = "KEY=VALUE")]
