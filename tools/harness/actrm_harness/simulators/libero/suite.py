@@ -83,7 +83,11 @@ def import_robosuite() -> None:
     load = simulation.from_xml_string
     # MuJoCo takes one of the two
     size = re.compile(r'(<size [^>]*)njmax="\d+"')
-    simulation.from_xml_string = lambda xml: load(size.sub(rf'\1memory="{MEMORY}"', xml))
+
+    def reserve(xml: str) -> Any:
+        return load(size.sub(rf'\1memory="{MEMORY}"', xml))
+
+    simulation.from_xml_string = reserve
 
 
 def files(task: str) -> Files:
