@@ -19,7 +19,7 @@ pub fn name(task: &str, seed: u64, success: bool, seen: bool, conditions: &str) 
 }
 
 fn stem(task: &str, seed: u64, success: bool, seen: bool) -> String {
-    let word = if success { "success" } else { "failure" };
+    let (word, task) = (if success { "success" } else { "failure" }, task.replace('/', "-"));
     format!("{task}-{seed}-{word}{}", if seen { "-seen" } else { "" })
 }
 

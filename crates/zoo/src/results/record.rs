@@ -307,7 +307,8 @@ impl EvaluationRecord {
         let Self { entry, protocol, execution, seeds, versions, .. } = self;
         let hash = self.short_hash(&(entry, protocol, execution, seeds, versions));
         let shard = self.shard.map(|s| format!("_shard-{}-of-{}", s.index, s.count));
-        let (task, shard) = (&protocol.task, shard.unwrap_or_default());
+        // a suite's task has a slash
+        let (task, shard) = (protocol.task.replace('/', "-"), shard.unwrap_or_default());
         format!("{entry}_{task}_{seeds}_{hash}{shard}")
     }
 
@@ -571,6 +572,13 @@ pub(crate) mod tests {
         assert!(!old.is_same(&EvaluationRecord { demonstrated: true, ..with("openblas Zen") }));
         // they are one evaluation's, whoever tells
         assert_eq!(old.folder_name(), with("openblas Zen").folder_name());
+    }
+
+    #[test]
+    fn a_task_of_a_suite_has_one_folder() {
+        let mut record = sample("a", 1, 20);
+        record.protocol.task = "libero_object/0".into();
+        assert!(record.folder_name().contains("_libero_object-0_"), "{}", record.folder_name());
     }
 
     #[test]
