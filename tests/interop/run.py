@@ -653,7 +653,9 @@ def main() -> None:
             "from Python: LeRobot's samples with depth": lambda: python_door.compare_samples(folder / "depth" / "set"),
             "from Python: LeRobot's samples with videos": lambda: python_door.compare_samples(folder / "video"),
             "from Python: PyTorch's loader": lambda: python_door.compare_loaders(root),
-            "from Python: the PyTorch example of docs/howto/five_commands.md": lambda: python_door.how_to(folder / "howto"),
+            "from Python: the PyTorch example of docs/howto/five_commands.md": lambda: python_door.how_to(
+                folder / "howto"
+            ),
             "from Python: LeRobot's policy": lambda: python_door.compare_chunks(root, folder / "trained"),
             "from Python: LeRobot's policy that sees": lambda: python_door.compare_chunks(
                 plain, folder / "seen" / "trained"
