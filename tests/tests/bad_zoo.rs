@@ -57,7 +57,7 @@ fn an_empty_zoo() {
 }
 
 #[test]
-fn a_python_without_robosuite() {
+fn a_python_without_packages() {
     let (folder, entries) = copied_zoo();
     let bare = folder.path().join("bare");
     let made = std::process::Command::new(e2e::root().join(".venv/bin/python"))
@@ -69,7 +69,7 @@ fn a_python_without_robosuite() {
     let python = bare.join("bin/python");
     let mut command =
         zoo(["eval", "lift-act@1", "--episodes", "1", "--zoo", text(&entries), "--python", text(&python)]);
-    refused(&mut command, &[text(&python), "robosuite"]);
+    refused(&mut command, &[text(&python), "it has no numpy", "make venv"]);
 }
 
 #[test]

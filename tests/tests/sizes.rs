@@ -13,8 +13,8 @@ fn absurd_sizes_are_refused_beforehand() {
         command.args(arguments);
         command
     };
-    // a simulator that would be started is not there, which would be another message
-    let nowhere = ("ACTRM_PYTHON", "no/python");
+    // a simulator that would be started does not start, which would be another message
+    let nowhere = ("ACTRM_PYTHON", "/bin/false");
     for (arguments, words) in [
         (&["--workers", "100000"][..], &["--workers 100000", "memory", "free"][..]),
         (&["--workers", "0"], &["--workers 0"]),

@@ -294,8 +294,7 @@ impl Entry {
             return Ok(external.said());
         }
         let mut all = Conventions::of_meta(self.meta());
-        if self.meta().is_policy() {
-            let experiment = Experiment::from_toml(&self.id().to_string(), &self.config_text()?)?;
+        if let Some(experiment) = self.policy_experiment()? {
             all.set_policy(&experiment, self.meta());
         }
         Ok(all)

@@ -3,13 +3,13 @@
 
 use std::collections::BTreeSet;
 
-use super::EntryMeta;
+use super::{Entry, EntryMeta};
 use crate::ZooError;
+use crate::experiment::Experiment;
 use crate::results::TrainingFacts;
 
 impl EntryMeta {
-    /// Whether it acts in simulators.
-    pub(crate) fn is_policy(&self) -> bool {
+    fn is_policy(&self) -> bool {
         self.kind.is_none() && self.section.is_none()
     }
 
@@ -45,5 +45,16 @@ impl EntryMeta {
             tags.insert("imitation-learning");
         }
         "pipeline_tag: robotics\n"
+    }
+}
+
+impl Entry {
+    /// The experiment that a policy was trained by; none of what is no policy.
+    ///
+    /// # Errors
+    /// A config that cannot be read.
+    pub(crate) fn policy_experiment(&self) -> Result<Option<Experiment>, ZooError> {
+        let read = || Experiment::from_toml(&self.id().to_string(), &self.config_text()?);
+        self.meta().is_policy().then(read).transpose()
     }
 }
