@@ -114,6 +114,7 @@ fn a_model_that_does_not_load_is_one_line_with_file_and_demo() {
         xml.as_str().replacen("<worldbody>", "<worldbody><elsewhere/>", 1).parse().expect("text");
     let attr = demo.new_attr::<hdf5::types::VarLenUnicode>().create("model_file").expect("created");
     attr.write_scalar(&old).expect("written");
+    drop((model, attr, demo));
     file.close().expect("closes");
     let film = folder.path().join("film.mp4");
     let replay = ["replay", text(&raw), "--demo", "1", "--video", text(&film)];

@@ -147,7 +147,8 @@ fn prose(text: &str) -> String {
         plain.push(' ');
     }
     // no paths and no options
-    let words = plain.split_whitespace().filter(|word| !word.contains('/') && !word.trim_start_matches('(').starts_with("--"));
+    let words =
+        plain.split_whitespace().filter(|word| !word.contains('/') && !word.trim_start_matches('(').starts_with("--"));
     words.collect::<Vec<_>>().join(" ").to_lowercase()
 }
 
