@@ -120,6 +120,8 @@ impl Sample for i64 {
 
 /// Takes the next values of a dimension.
 pub(crate) type Streamed<'f, T> = dyn FnMut(&[T]) + 'f;
+/// Gives the values of a dimension to whom it is told, in order.
+type Each<'e, T, E> = dyn FnMut(usize, &mut Streamed<'_, T>) -> Result<(), E> + 'e;
 
 /// Order statistics of values that pass several times: each pass counts 16 more bits of those that may be wanted.
 struct Radix {
@@ -232,10 +234,7 @@ impl FeatureStats {
 
     /// The same, bit for bit, of values that are not in memory: `each` gives those of a dimension, in order, as often as it is
     /// asked.
-    pub(crate) fn streamed<T: Sample, E>(
-        dim: usize,
-        each: &mut dyn FnMut(usize, &mut Streamed<'_, T>) -> Result<(), E>,
-    ) -> Result<Option<Self>, E> {
+    pub(crate) fn streamed<T: Sample, E>(dim: usize, each: &mut Each<'_, T, E>) -> Result<Option<Self>, E> {
         let mut stats = Self::with_capacity(dim, 0);
         for d in 0..dim {
             let mut first = vec![0_u64; Radix::VALUES];

@@ -210,7 +210,7 @@ fn csv(text: &str, runs: &mut Runs) -> Result<(), String> {
             format!("line {line}: {}: expected {expected}, found `{found}`", header[at].trim())
         };
         let text = need(number)?;
-        let count = text.parse().map_err(|_| wrong(number, "an integer from 0 on", text))?;
+        let count = text.parse().ok().ok_or_else(|| wrong(number, "an integer from 0 on", text))?;
         let text = need(success)?;
         let won = match text.to_ascii_lowercase().as_str() {
             "true" | "1" | "1.0" => true,

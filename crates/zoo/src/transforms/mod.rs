@@ -348,6 +348,6 @@ mod tests {
         assert_eq!(after(Stage::Training(3)), 133.0);
         assert_eq!(after(Stage::Probe(5)), 15.0);
         assert_eq!(after(Stage::Validation), 1.0, "as it was recorded");
-        assert_eq!(transforms.draws(&[0..3]), None);
+        assert_eq!(transforms.draws(&[0..3, 3..5]), None);
     }
 }
