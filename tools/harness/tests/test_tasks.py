@@ -422,7 +422,7 @@ def test_an_environment_of_ones_own_is_registered_by_its_module() -> None:
 
 
 def test_the_documentation_shows_that_module() -> None:
-    page = (HERE.parents[2] / "docs" / "environments.md").read_text()
+    page = (HERE.parents[2] / "docs" / "howto" / "tasks.md").read_text()
     assert f"```python\n{(HERE / 'example_env.py').read_text()}```" in page
 
 
