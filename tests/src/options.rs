@@ -463,7 +463,7 @@ pub fn options_page() -> (String, usize) {
     }
     let head = format!(
         "# Options of an experiment\n\nAll {} options, generated from the code by `make reference`. Set any of them on the command line, \
-         `actrm-zoo train act_lift train.steps=1000`, or in a file ([experiments](../experiments.md)). The default is the program's, or \
+         `actrm-zoo train act_lift train.steps=1000`, or in a file ([experiments](../howto/experiments.md)). The default is the program's, or \
          that of `configs/base.toml` and the policy's file; tasks have settings of their own. \
          `actrm-zoo train act_lift --print-config` prints what an experiment really uses. An empty default means: not set.\n\n",
         page.options
