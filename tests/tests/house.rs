@@ -68,6 +68,7 @@ fn models_knows_tensors_and_numbers_only() {
     let words: Vec<&str> = [FILES, PROCESSES, PRINTING, &["std::env", "std::net"]].concat();
     assert_eq!(said("crates/nn/src", &words, &[]), [""; 0]);
     assert_eq!(said("crates/models/src", &words, &[]), [""; 0]);
+    assert_eq!(said("crates/solvers/src", &words, &[]), [""; 0]);
     assert_eq!(said("crates/puzzles/src", &words, &[]), [""; 0]);
     // a message of a stranger opens no file
     assert_eq!(said("crates/serving/src", FILES, &[]), [""; 0]);
@@ -82,7 +83,20 @@ fn a_report_is_a_function_of_results() {
 #[test]
 fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
     let reader = ["crates/dataset/src/source/isolation.rs"];
-    for room in ["analysis", "dataset", "query", "recording", "serving", "video", "zoo", "study", "python"] {
+    for room in [
+        "analysis",
+        "audit",
+        "dataset",
+        "interchange",
+        "python",
+        "query",
+        "recording",
+        "results",
+        "serving",
+        "study",
+        "video",
+        "zoo",
+    ] {
         assert_eq!(said(&format!("crates/{room}/src"), PROCESSES, &reader), [""; 0]);
     }
     assert!(!said("crates/rollout/src", PROCESSES, &[]).is_empty(), "the test finds what it looks for");
@@ -97,7 +111,10 @@ fn only_rollout_starts_processes_and_the_data_set_its_own_reader() {
 fn only_tools_print_and_read_arguments() {
     let rooms = [
         "analysis",
+        "audit",
         "dataset",
+        "interchange",
+        "results",
         "query",
         "recording",
         "rollout",
@@ -121,12 +138,12 @@ fn only_tools_print_and_read_arguments() {
 fn parts_of_a_crate_know_only_what_is_below_them() {
     for (folder, above) in [
         ("crates/zoo/src/config", &["crate::run", "crate::entry", "crate::experiment", "crate::evaluation"][..]),
-        ("crates/zoo/src/results", &["crate::run", "crate::entry", "crate::experiment", "crate::evaluation"]),
         ("crates/zoo/src/run", &["crate::evaluation", "crate::results", "crate::registry"]),
         ("crates/zoo/src/transforms", &["crate::run", "crate::evaluation", "crate::entry", "crate::results"]),
         ("crates/models/src/layers", &["crate::models", "crate::registry", "crate::train"]),
         ("crates/nn/src/kernels", &["crate::ops", "crate::context", "crate::tape"]),
         ("crates/rollout/src", &["models::", "candle"]),
+        ("crates/results/src", &["models::", "candle"]),
     ] {
         assert_eq!(said(folder, above, &[]), [""; 0]);
     }

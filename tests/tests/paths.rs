@@ -50,7 +50,7 @@ fn every_command_works_in_a_folder_whose_name_is_not_utf8() {
     ] {
         works(folder, data, arguments);
     }
-    let theirs = e2e::root().join("crates/zoo/tests/fixtures/robomimic/bc_rnn.pth");
+    let theirs = e2e::root().join("crates/interchange/tests/fixtures/robomimic/bc_rnn.pth");
     std::fs::copy(theirs, Path::new(folder).join("model.pth")).expect("copied");
     let places = ["--zoo", "@/zoo", "--runs", "@/runs"];
     let small = ["train", "act_lift", "train.steps=1", "--data"];

@@ -111,7 +111,7 @@ impl ProbeResult {
         let mut text = serde_json::to_string(self).expect("plain fields are always JSON");
         text = text.replace("{\"step\":", "\n{\"step\":");
         text.push('\n');
-        write_atomic(path, text.as_bytes())
+        Ok(write_atomic(path, text.as_bytes())?)
     }
 }
 

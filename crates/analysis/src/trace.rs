@@ -329,7 +329,7 @@ impl PolicyTrace {
             };
             (name.as_str(), Arc::new(rows.iter().map(of).collect::<Float64Array>()) as ArrayRef)
         });
-        write_table(path, columns.into_iter().chain(attended).collect())
+        Ok(write_table(path, columns.into_iter().chain(attended).collect())?)
     }
 
     /// What the actions attended to as a drawing: a row a step of thought, a column a token, mean over the actions; darker is

@@ -5,7 +5,6 @@
 //! slices (`Batch`), weights come in and go out as named tensors (`Params`), progress is returned as numbers. All
 //! randomness is drawn from `Rng`.
 
-pub mod baselines;
 mod batch;
 mod checks;
 mod chunk_policy;
@@ -22,7 +21,6 @@ mod normaliser;
 mod policy;
 mod preprocess;
 mod registry;
-pub mod rl;
 pub mod robomimic;
 #[cfg(test)]
 mod size;

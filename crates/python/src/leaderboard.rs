@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
+use audit::{KnownEntries, audit};
 use pyo3::exceptions::PyUserWarning;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 use report::column::Datum;
 use report::{COLUMNS, LeaderboardRow, Reading, rank};
-use zoo::audit::{KnownEntries, audit};
 use zoo::protocols::Protocols;
 
 use crate::error::{raised, words};

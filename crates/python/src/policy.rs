@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
+use interchange::lerobot::{ImportOptions, import};
 use models::{ActionChunk, Actor, FeatureKind, FeatureSpec, ModelError, Observation, Policy, Values};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -11,7 +12,6 @@ use zoo::ZooError;
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::acting;
 use zoo::experiment::DataSection;
-use zoo::lerobot::{ImportOptions, import};
 use zoo::registry::Registry;
 use zoo::results::Execution;
 

@@ -8,6 +8,7 @@ mod commands;
 mod demonstrations;
 mod depth;
 mod films;
+mod others;
 mod pairs;
 mod plot;
 mod solving;
@@ -18,11 +19,13 @@ use std::fmt::Write as _;
 pub use self::commands::Places;
 pub use self::depth::{DEPTH_COLUMNS, Depth};
 pub use self::films::{Film, MOST_FILM_BYTES};
+pub use self::others::OTHERS_COLUMNS;
 pub(crate) use self::plot::{COLOURS, Palette};
 use crate::across::{ACROSS_COLUMNS, across_tasks, speaking};
 use crate::charts;
 use crate::html::{self, escape};
 use crate::leaderboard::{COLUMNS, Group, LeaderboardRow, group, interval_text};
+use crate::others::Run;
 
 /// An entry's training loss over optimiser steps.
 #[derive(Debug, Clone, PartialEq)]
@@ -55,6 +58,8 @@ pub struct Beside {
     pub entries: BTreeMap<String, EntryFacts>,
     /// Evaluations at other depths of reasoning.
     pub depths: Vec<Depth>,
+    /// Results that other programs measured.
+    pub others: Vec<Run>,
     /// Films of episodes.
     pub films: Vec<Film>,
     /// Folders that its commands name.
@@ -102,9 +107,9 @@ pub fn to_html(rows: &[LeaderboardRow], beside: &Beside) -> String {
     let _ = writeln!(html, "<body>\n{}\n<main>\n<h1>Leaderboard</h1>", charts::patterns());
     let episodes: u64 = rows.iter().map(|row| row.counts.episodes).sum();
     let trainings: usize = rows.iter().map(LeaderboardRow::n_trainings).sum();
-    let thinking = depth::section(&beside.depths);
+    let (thinking, others) = (depth::section(&beside.depths), others::section(&beside.others));
     if rows.is_empty() {
-        html.push_str(if section.is_empty() && thinking.is_empty() {
+        html.push_str(if section.is_empty() && thinking.is_empty() && others.is_empty() {
             "<p>No finished evaluation yet.</p>\n"
         } else {
             ""
@@ -118,7 +123,15 @@ pub fn to_html(rows: &[LeaderboardRow], beside: &Beside) -> String {
             trainings,
             episodes
         );
-        contents(&groups, &thinking, section, &mut html);
+        contents(
+            &groups,
+            [
+                ("depth", "Reasoning depth", &thinking),
+                ("others", "Results of others", &others),
+                ("puzzles", "Puzzles", section),
+            ],
+            &mut html,
+        );
         html.push_str(&overview(rows));
         html.push_str(&all_rows(rows));
     }
@@ -131,6 +144,7 @@ pub fn to_html(rows: &[LeaderboardRow], beside: &Beside) -> String {
         task(rows, beside, groups.len() == 1, &palette, &mut room, &mut html);
     }
     html.push_str(&thinking);
+    html.push_str(&others);
     html.push_str(section);
     let _ = writeln!(
         html,
@@ -264,7 +278,7 @@ fn turning(rows: usize) -> String {
     )
 }
 
-fn contents(groups: &BTreeMap<Group, Vec<&LeaderboardRow>>, thinking: &str, section: &str, html: &mut String) {
+fn contents(groups: &BTreeMap<Group, Vec<&LeaderboardRow>>, sections: [(&str, &str, &str); 3], html: &mut String) {
     html.push_str(
         "<nav aria-label=\"Contents\"><ul class=\"contents\"><li><a href=\"#policies\">Policies by task</a></li><li><a \
          href=\"#rows\">All rows</a></li>",
@@ -273,11 +287,8 @@ fn contents(groups: &BTreeMap<Group, Vec<&LeaderboardRow>>, thinking: &str, sect
         let (task, protocol) = (escape(&title(rows[0])), escape(&rows[0].protocol_words()));
         let _ = write!(html, "<li><a href=\"#{}\">{task}</a> <small>{protocol}</small></li>", heading(rows[0]));
     }
-    if !thinking.is_empty() {
-        html.push_str("<li><a href=\"#depth\">Reasoning depth</a></li>");
-    }
-    if !section.is_empty() {
-        html.push_str("<li><a href=\"#puzzles\">Puzzles</a></li>");
+    for (id, title, _) in sections.iter().filter(|(_, _, content)| !content.is_empty()) {
+        let _ = write!(html, "<li><a href=\"#{id}\">{title}</a></li>");
     }
     html.push_str("</ul></nav>\n");
 }
@@ -564,6 +575,18 @@ mod tests {
         }
         let html = to_html(&rank(&[evaluation], &Reading::default()), &Beside::default());
         assert!(html.contains("16/20<br><small>seen 12/15 (55–93%)</small><br><small>unseen 4/5 (38–96%)</small>"));
+    }
+
+    #[test]
+    fn results_of_others_have_a_table_of_their_own_and_no_rank() {
+        let csv = "task,policy,seed,success\nLift,theirs,1,1\nLift,theirs,2,0\n";
+        let others = crate::others::parse("theirs.csv", csv).unwrap();
+        let html = to_html(&[], &Beside { others, ..Beside::default() });
+        let section = html.split("<h2 id=\"others\">").nth(1).unwrap();
+        for part in ["theirs", "1/2", "50.0", "9.5–90.5%"] {
+            assert!(section.contains(part), "{part} in {section}");
+        }
+        assert!(!html.contains("No finished evaluation"));
     }
 
     #[test]

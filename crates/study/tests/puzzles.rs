@@ -7,6 +7,7 @@ use std::cell::Cell;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use audit::KnownEntries;
 use puzzles::Task;
 use report::csv;
 use study::puzzle::{
@@ -14,7 +15,6 @@ use study::puzzle::{
     RECORD_FILE, SolverEntry, Starts, TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again,
     list_puzzle_evaluations, trace, train_puzzles,
 };
-use zoo::audit::KnownEntries;
 use zoo::config::Library;
 use zoo::entry::Entry;
 use zoo::registry::Registry;

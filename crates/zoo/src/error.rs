@@ -268,6 +268,9 @@ pub enum ZooError {
     /// A rollout in a worker process.
     #[error(transparent)]
     Rollout(#[from] rollout::RolloutError),
+    /// Results of evaluations, and files.
+    #[error(transparent)]
+    Results(#[from] results::ResultsError),
     /// A table of results cannot be read or written.
     #[error("cannot {operation} {}", path.display())]
     Table {
@@ -277,12 +280,6 @@ pub enum ZooError {
         path: PathBuf,
         /// What the Parquet library said.
         source: Box<dyn std::error::Error + Send + Sync>,
-    },
-    /// Another process evaluates the same thing into the same folder.
-    #[error("results folder {} is in use by another evaluation", folder.display())]
-    ResultsBusy {
-        /// The evaluation's folder.
-        folder: PathBuf,
     },
     /// There is no finished evaluation to compare with.
     #[error(
@@ -312,39 +309,6 @@ pub enum ZooError {
         /// Folders of the results that it fits.
         found: Vec<String>,
     },
-    /// What is stored and what was found now are not the same.
-    #[error("results in {}: {what} differs: stored {expected}, now {found}", folder.display())]
-    ResultsDiffer {
-        /// The evaluation's folder.
-        folder: PathBuf,
-        /// What differs.
-        what: String,
-        /// What is stored.
-        expected: String,
-        /// What was found.
-        found: String,
-    },
-    /// A finished evaluation without a seal: it was made before there were seals, or its seal was taken away.
-    #[error(
-        "results in {}: not sealed, so nothing says that they are as they were measured; run all of its episodes again with `eval --again`, which seals them where every outcome is the same",
-        folder.display()
-    )]
-    Unsealed {
-        /// The evaluation's folder.
-        folder: PathBuf,
-    },
-    /// A result does not fit its folder, its seal or its entry.
-    #[error("results in {}: {what}: expected {expected}, found {found}", folder.display())]
-    UnfitResult {
-        /// The evaluation's folder.
-        folder: PathBuf,
-        /// What does not fit.
-        what: String,
-        /// What the seal, the entry or the record says.
-        expected: String,
-        /// What is there.
-        found: String,
-    },
     /// A named protocol that is not there, or a file that is none.
     #[error("protocol `{name}`: {reason}")]
     Protocol {
@@ -364,18 +328,6 @@ pub enum ZooError {
         seeds: String,
         /// The demonstrations' seeds.
         demonstrations: String,
-    },
-    /// Shards that are not parts of one evaluation.
-    #[error("cannot merge {}: {what}: expected {expected}, found {found}", folder.display())]
-    Merge {
-        /// The shard.
-        folder: PathBuf,
-        /// What does not fit.
-        what: String,
-        /// What the others have.
-        expected: String,
-        /// What this one has.
-        found: String,
     },
     /// The entry was trained on demonstrations of another simulator generation.
     #[error(

@@ -141,7 +141,7 @@ pub fn evaluate(
         },
     )
     .map_err(|error| match failure.lock().unwrap_or_else(PoisonError::into_inner).take() {
-        Some(cause) => cause,
+        Some(cause) => ZooError::from(cause),
         None => error.into(),
     })?;
     let folder = folder.into_inner().unwrap_or_else(PoisonError::into_inner);

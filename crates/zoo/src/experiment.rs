@@ -264,7 +264,10 @@ impl Experiment {
     }
 
     /// What serde cannot see: values that do not go together.
-    pub(crate) fn check(&self) -> Result<(), ZooError> {
+    ///
+    /// # Errors
+    /// The first key that does not fit.
+    pub fn check(&self) -> Result<(), ZooError> {
         let invalid = |key: &str, expected: String, found: String| {
             Err(ZooError::InvalidValue { key: key.to_owned(), expected, found })
         };
@@ -287,7 +290,7 @@ impl Experiment {
         }
         if let Some(coefficient) = self.rollout.temporal_ensemble {
             let checked = crate::results::Execution::TemporalEnsemble { coefficient }.check(action_horizon);
-            if let Err(ZooError::InvalidValue { key, expected, found }) = checked {
+            if let Err(crate::results::ResultsError::InvalidValue { key, expected, found }) = checked {
                 return invalid(&format!("rollout.{key}"), expected, found);
             }
         }
@@ -321,7 +324,7 @@ impl Experiment {
     }
 
     /// Wraps an error of the model's configuration with where it comes from.
-    pub(crate) fn model_error(&self, operation: &'static str) -> impl FnOnce(ModelError) -> ZooError + use<> {
+    pub fn model_error(&self, operation: &'static str) -> impl FnOnce(ModelError) -> ZooError + use<> {
         let name = self.entry.clone();
         move |source| ZooError::Model { operation, name, source }
     }

@@ -281,7 +281,7 @@ impl External {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::entry::test_draft;
+    use crate::entry::testing::draft as test_draft;
 
     /// A greeting with these observations and actions of 7 numbers.
     fn ready(observations: serde_json::Value) -> Ready {

@@ -15,25 +15,19 @@ mod error;
 pub mod experiment;
 pub mod external;
 mod feature_keys;
-mod files;
-pub mod lerobot;
-pub mod onnx;
 pub mod registry;
-pub mod robomimic;
 pub mod run;
 pub mod tensors;
 mod transforms;
 
 // evaluations
-pub mod audit;
 pub mod evaluation;
 pub mod protocols;
-pub mod rerun;
-pub mod results;
 
+use ::results::files;
+pub use ::results::{self, sha256_file, sha256_hex, write_atomic, write_together};
 pub use error::ZooError;
 pub use feature_keys::{FeatureKeys, Past};
-pub use files::{sha256_file, sha256_hex, write_atomic, write_together};
 pub use transforms::{Stage, Transforms};
 
 /// What makes entries, by name: the software's versions, the compiler, what it compiled for, and the vectors of this

@@ -177,7 +177,7 @@ impl Registry {
             aliases.remove(alias);
         }
         let text = serde_json::to_string_pretty(&aliases).expect("names and numbers become JSON") + "\n";
-        write_atomic(&self.folder.join(&id.name).join(ALIASES), text.as_bytes())
+        Ok(write_atomic(&self.folder.join(&id.name).join(ALIASES), text.as_bytes())?)
     }
 
     /// Removes an entry that no result and no alias is of. Its version is never given again.
@@ -266,7 +266,7 @@ mod tests {
     use crate::entry::EntryDraft;
 
     fn draft(name: &str) -> EntryDraft {
-        crate::entry::test_draft(name)
+        crate::entry::testing::draft(name)
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! What a model card says of results.
 
+use audit::{KnownEntries, audit};
 use cli::shown;
 use report::{Reading, model_index, rank};
-use zoo::audit::{KnownEntries, audit};
 use zoo::entry::Entry;
 use zoo::results::StoredEvaluation;
 

@@ -210,7 +210,7 @@ def test_what_was_imported_is_summed(lift: Client, tmp_path: Path) -> None:
     """The simulator, what it stands on, the harness; a copy that says otherwise has another sum."""
     assert sorted(lift.ready["sources"]) == ["actrm_harness", "mujoco", "robosuite"]
     # evaluations from before sources were written down count as run on this release
-    released = HERE.parents[2] / "crates/zoo/src/results/record.rs"
+    released = HERE.parents[2] / "crates/results/src/record.rs"
     assert f'"1.5.2", "{lift.ready["sources"]["robosuite"]}"' in released.read_text()
 
     def sums() -> dict[str, str]:

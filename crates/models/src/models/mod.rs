@@ -10,4 +10,3 @@ pub mod diffusion;
 pub mod floors;
 pub mod flow;
 pub mod mip;
-pub mod trm;

@@ -59,7 +59,7 @@ impl Learner {
     }
 
     /// [`Self::step`] that also returns the gradient of a variable which it does not train.
-    pub(crate) fn step_with(&mut self, loss: &Tensor, other: Option<&Var>) -> Result<(LearnerMetrics, Option<Tensor>)> {
+    pub fn step_with(&mut self, loss: &Tensor, other: Option<&Var>) -> Result<(LearnerMetrics, Option<Tensor>)> {
         let value = loss.to_dtype(candle_core::DType::F32)?.to_scalar::<f32>()?;
         if !value.is_finite() {
             return Err(self.core.not_finite("loss".into(), value));

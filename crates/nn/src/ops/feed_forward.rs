@@ -78,13 +78,32 @@ pub fn feed_forward(cx: &mut Context<'_>, x: &Value, layer: &FeedForward, all: u
                 column_sums(into, &grad);
             }
             let before = before.as_ref().unwrap_or(&hidden);
-            let epilogue = |i: usize, j: usize, row: &mut [f32]| {
-                let before = &before[i * width + j..][..row.len()];
-                activate_backward(row, before, activation, mask, rows.full(i) * width + j);
-            };
-            let (g, w) = (Mat::rows(&grad, dim), (Mat::rows(w2, width), None));
-            let (size, pack) = ((n, width, dim), &mut back.space.pack);
-            gemm_with(size, g, w, Start::Zero, &mut middle, width, pack, epilogue);
+            let (g, w, size) = (Mat::rows(&grad, dim), Mat::rows(w2, width), (n, width, dim));
+            let pack = &mut back.space.pack;
+            if activation == Activation::Relu {
+                let epilogue = |i: usize, j: usize, row: &mut [f32]| {
+                    let before = &before[i * width + j..][..row.len()];
+                    activate_backward(row, before, activation, mask, rows.full(i) * width + j);
+                };
+                gemm_with(size, g, (w, None), Start::Zero, &mut middle, width, pack, epilogue);
+            } else {
+                // an epilogue is compiled for any CPU, which is too slow for anything but a comparison
+                product(size, g, w, Start::Zero, &mut middle, pack);
+                vectorised(
+                    #[inline(always)]
+                    || {
+                        for (i, row) in middle.chunks_exact_mut(width).enumerate() {
+                            activate_backward(
+                                row,
+                                &before[i * width..][..width],
+                                activation,
+                                mask,
+                                rows.full(i) * width,
+                            );
+                        }
+                    },
+                );
+            }
             if let Some((into, space)) = back.parameter(&one.weight) {
                 let (g, x) = (Mat::rows(&middle, width).t(), Mat::rows(x, dim));
                 product((width, dim, n), g, x, Start::Add, into, &mut space.pack);

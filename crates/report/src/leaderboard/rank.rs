@@ -3,7 +3,7 @@
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet};
 
-use zoo::audit::KnownEntries;
+use audit::KnownEntries;
 use zoo::entry::{EntryId, Families};
 use zoo::protocols::Protocols;
 use zoo::results::{EntryIdentity, StoredEvaluation};

@@ -9,7 +9,7 @@ use zoo::{ZooError, tensors};
 use super::experiment::PuzzleExperiment;
 use super::model::SolverConfig;
 use super::solver::Solver;
-use models::trm::Mixing;
+use solvers::trm::Mixing;
 
 /// The kind of entry that solves puzzles.
 pub const SOLVER: &str = "a puzzle solver";

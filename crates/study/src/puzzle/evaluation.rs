@@ -11,9 +11,9 @@ use parquet::arrow::ArrowWriter;
 use puzzles::{Puzzle, Split, Task};
 use serde::{Deserialize, Serialize};
 
-use zoo::audit::{Audit, KnownEntries, check_folder_name};
+use audit::{Audit, KnownEntries, check_folder_name};
 use zoo::entry::{CONFIG_FILE, training_facts};
-use zoo::results::{EntryIdentity, SEAL_FILE, Seal, TrainingFacts, result_folders};
+use zoo::results::{EntryIdentity, ResultsError, SEAL_FILE, Seal, TrainingFacts, result_folders};
 use zoo::{ZooError, sha256_file, sha256_hex, write_atomic};
 
 use super::entry::{ProgressPoint, SolverEntry};
@@ -235,7 +235,7 @@ impl PuzzleEvaluation {
     pub fn write(&self, path: &Path) -> Result<(), ZooError> {
         let mut text = serde_json::to_vec_pretty(self).expect("plain fields are always JSON");
         text.push(b'\n');
-        write_atomic(path, &text)
+        Ok(write_atomic(path, &text)?)
     }
 }
 
@@ -490,7 +490,7 @@ pub fn evaluate_puzzles(
 /// Answers the puzzles of a stored evaluation once more and compares every count and every puzzle's outcome.
 ///
 /// # Errors
-/// [`ZooError::NothingToCompare`] where none is stored, [`ZooError::ResultsDiffer`] naming what is not the same; as
+/// [`ZooError::NothingToCompare`] where none is stored, [`ResultsError::Differ`] naming what is not the same; as
 /// [`evaluate_puzzles`].
 pub fn evaluate_puzzles_again(
     entry: &SolverEntry,
@@ -511,7 +511,7 @@ pub fn evaluate_puzzles_again(
     let bytes = outcomes_bytes(&folder, &rows)?;
     let path = folder.join(OUTCOMES_FILE);
     let differs = |what: &str, expected: String, found: String| {
-        Err(ZooError::ResultsDiffer { folder: folder.clone(), what: what.to_owned(), expected, found })
+        Err(ZooError::from(ResultsError::Differ { folder: folder.clone(), what: what.to_owned(), expected, found }))
     };
     let text = |record: &PuzzleEvaluation| serde_json::to_string(record).unwrap_or_default();
     if stored != now {
@@ -527,7 +527,7 @@ pub fn evaluate_puzzles_again(
 fn seal(folder: &Path, record: &PuzzleEvaluation) -> Result<Seal, ZooError> {
     let rules = (&record.task, record.givens, record.seed, record.depth, record.answers.puzzles);
     let protocol = sha256_hex(&serde_json::to_vec(&rules).expect("plain fields are always JSON"));
-    Seal::of(folder, &record.folder_name(), &record.entry, &protocol, &[OUTCOMES_FILE, RECORD_FILE])
+    Ok(Seal::of(folder, &record.folder_name(), &record.entry, &protocol, &[OUTCOMES_FILE, RECORD_FILE])?)
 }
 
 /// The evaluation in `folder` if it has a seal, which then is whole.
@@ -547,7 +547,7 @@ fn read_sealed(folder: &Path) -> Result<Option<PuzzleEvaluation>, ZooError> {
 /// A folder of results that cannot be listed.
 pub fn audit_puzzles(results: &Path, entries: &KnownEntries) -> Result<Audit<PuzzleEvaluation>, ZooError> {
     let standing = |folder: &Path| {
-        let record = read_sealed(folder)?.ok_or_else(|| ZooError::UnfitResult {
+        let record = read_sealed(folder)?.ok_or_else(|| ResultsError::Unfit {
             folder: folder.to_owned(),
             what: "seal".to_owned(),
             expected: "one (evaluating again makes it)".to_owned(),
@@ -589,7 +589,7 @@ pub fn list_puzzle_evaluations(results: &Path) -> Result<Vec<PuzzleEvaluation>, 
 
 /// One row a puzzle: `index`, `exact`, `valid`, `steps`, `cells_right`.
 fn write_outcomes(path: &Path, rows: &[Row]) -> Result<(), ZooError> {
-    write_atomic(path, &outcomes_bytes(path, rows)?)
+    Ok(write_atomic(path, &outcomes_bytes(path, rows)?)?)
 }
 
 /// The same as the bytes of the file at `path`.

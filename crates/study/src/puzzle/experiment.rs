@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 
 use models::classification::ClassProbability;
-use models::trm::{PuzzleConfig, Release};
 use puzzles::{MazeTask, Task, View};
 use serde::{Deserialize, Serialize};
+use solvers::trm::{PuzzleConfig, Release};
 use toml::{Table, Value};
 
 use zoo::ZooError;

@@ -2,11 +2,11 @@
 
 use models::ModelError;
 use models::Size;
-use models::baselines::{GridConfig, GridDims, SmallTrmConfig, WalkerConfig};
 use models::classification::ClassProbability;
-use models::trm::{self, Mixing, Pooling, Positions};
 use puzzles::{MOVES, MazeTask, Task};
 use serde::{Deserialize, Serialize};
+use solvers::trm::{self, Mixing, Pooling, Positions};
+use solvers::{GridConfig, GridDims, SmallTrmConfig, WalkerConfig};
 use toml::{Table, Value};
 
 use zoo::ZooError;

@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 
 use candle_core::{Device, Tensor};
-use models::baselines::{GridDims, GridModel, WalkerNet};
 use models::classification::ClassProbability;
-use models::trm::{Carry, Gradient, Trm};
 use models::{ModelError, Rng};
 use puzzles::{MazeTask, Puzzle, PuzzleRng, Task, View};
+use solvers::trm::{Carry, Gradient, Trm};
+use solvers::{GridDims, GridModel, WalkerNet};
 
 /// A model for one family of puzzles.
 pub enum Solver {

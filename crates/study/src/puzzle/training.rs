@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 
 use candle_core::Tensor;
 use models::classification::cross_entropy;
-use models::trm::{Example, Trainer as TrmTrainer};
 use models::{Learner, ModelError, Signature};
 use puzzles::{Puzzle, Split, Task};
 use serde::{Deserialize, Serialize};
+use solvers::trm::{Example, Trainer as TrmTrainer};
 
 use zoo::entry::{CardWords, EntryDraft, EntryMeta, LICENSE, TrainingMeta, grouped};
 use zoo::run::{Checkpoint, MetricsRow, Place, Settings, TrainEvent, TrainOutcome, TrainSection, Training};

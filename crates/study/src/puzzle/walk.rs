@@ -2,11 +2,11 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use models::baselines::WalkerNet;
-use models::rl::{Agent, Algorithm, Choice, Decision, Episode, RlConfig};
 use models::{ModelError, Rng, TrainConfig};
 use puzzles::{MOVES, Maze, MazeTask, Puzzle, Split, Symmetry, Walker};
 use serde::{Deserialize, Serialize};
+use solvers::WalkerNet;
+use solvers::rl::{Agent, Algorithm, Choice, Decision, Episode, RlConfig};
 
 use super::grade::Counts;
 
@@ -333,7 +333,7 @@ pub(super) fn walk_all(
     for batch in puzzles.chunks(BATCH) {
         let mazes: Vec<Maze> = batch.iter().filter_map(maze).cloned().collect();
         let (episodes, reached) =
-            play(task, &mazes, &mut |seen, previous| models::rl::decide(net, seen, previous, rng.as_deref_mut()))?;
+            play(task, &mazes, &mut |seen, previous| solvers::rl::decide(net, seen, previous, rng.as_deref_mut()))?;
         walks.extend(episodes.iter().zip(reached).map(|(e, reached)| Walk { reached, moves: e.len() }));
     }
     Ok(walks)

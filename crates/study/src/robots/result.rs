@@ -197,6 +197,6 @@ impl CellResult {
         // a line an episode: small files that a version control system can compare
         text = text.replace("{\"seed\":", "\n{\"seed\":");
         text.push('\n');
-        write_atomic(path, text.as_bytes())
+        Ok(write_atomic(path, text.as_bytes())?)
     }
 }

@@ -156,7 +156,7 @@ mod tests {
 
     #[test]
     fn a_card_says_what_the_data_set_calls_its_numbers() {
-        let mut meta = super::super::test_draft("cube").meta;
+        let mut meta = super::super::testing::draft("cube").meta;
         let names = |text: &str| text.split(' ').map(str::to_owned).collect::<Vec<_>>();
         let data = meta.data.as_mut().unwrap();
         data.names.insert(models::STATE.to_owned(), names("z y x"));
@@ -180,7 +180,7 @@ mod tests {
 
     #[test]
     fn the_card_says_what_it_is() {
-        let mut meta = super::super::test_draft("lift-act").meta;
+        let mut meta = super::super::testing::draft("lift-act").meta;
         meta.version = 3;
         meta.parameters = 1_503_751;
         let card = render(&meta, &CardWords::default());

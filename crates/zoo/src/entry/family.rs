@@ -73,7 +73,7 @@ pub fn member_name(name: &str, seed: u64) -> String {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::test_draft as draft;
+    use super::super::testing::draft;
     use super::*;
 
     fn seal(zoo: &std::path::Path, name: &str, seed: u64, steps: u64, data: &str) -> Entry {

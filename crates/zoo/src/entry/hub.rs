@@ -91,7 +91,7 @@ pub fn export_hub(entry: &Entry, out: &Path, model_index: &str) -> Result<(), Zo
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::test_draft as draft;
+    use super::super::testing::draft;
     use super::*;
 
     const INDEX: &str = "model-index:\n- name: \"lift-act@1\"\n  results: []\n";

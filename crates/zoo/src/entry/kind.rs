@@ -17,7 +17,7 @@ impl EntryMeta {
     ///
     /// # Errors
     /// [`ZooError::UnfitEntry`].
-    pub(crate) fn require_policy(&self, expected: &str) -> Result<(), ZooError> {
+    pub fn require_policy(&self, expected: &str) -> Result<(), ZooError> {
         if self.is_policy() {
             return Ok(());
         }
@@ -31,7 +31,7 @@ impl EntryMeta {
     }
 
     /// The name of the data set that a result's facts have to agree with; what is no policy has none of its own.
-    pub(crate) fn data_set_of<'f>(&self, expected: &'f TrainingFacts, found: &'f TrainingFacts) -> &'f str {
+    pub fn data_set_of<'f>(&self, expected: &'f TrainingFacts, found: &'f TrainingFacts) -> &'f str {
         if self.is_policy() { &found.data_set } else { &expected.data_set }
     }
 

@@ -21,6 +21,8 @@ mod policy;
 mod reference;
 mod seal;
 mod subject;
+#[doc(hidden)]
+pub mod testing;
 
 pub use card::{CardWords, grouped};
 pub(crate) use curve::thinned;
@@ -30,11 +32,8 @@ pub use id::{EntryId, EntryRequest, LATEST, check_alias, check_name};
 pub use meta::{CamerasMeta, CurvePoint, DataMeta, EntryMeta, FileMeta, LICENSE, ModuleMeta, ParentMeta, TrainingMeta};
 pub use open::Entry;
 pub use policy::LoadedEntry;
-pub use reference::Repeats;
-pub(crate) use reference::reference;
+pub use reference::{Repeats, reference};
 pub use seal::EntryDraft;
-#[cfg(test)]
-pub(crate) use seal::tests::draft as test_draft;
 pub(crate) use seal::{REMOVED, lock_name};
 pub use subject::training_facts;
 

@@ -148,7 +148,7 @@ impl Entry {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::test_draft as draft;
+    use super::super::testing::draft;
     use super::*;
 
     #[test]

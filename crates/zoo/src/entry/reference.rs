@@ -42,7 +42,7 @@ pub enum Repeats {
 ///
 /// # Errors
 /// Weights and statistics that do not fit, a prediction that fails.
-pub(crate) fn reference(
+pub fn reference(
     id: &EntryId,
     experiment: &Experiment,
     signature: &Signature,

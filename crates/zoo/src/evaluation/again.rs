@@ -7,7 +7,9 @@ use rollout::{Pool, RolloutError};
 
 use super::{EvaluationOptions, Subject, run_episodes};
 use crate::ZooError;
-use crate::results::{EpisodeRecord, EvaluationRecord, ResultsFolder, StoredEvaluation, differing, evaluation_folders};
+use crate::results::{
+    EpisodeRecord, EvaluationRecord, ResultsError, ResultsFolder, StoredEvaluation, differing, evaluation_folders,
+};
 
 /// How running again ended.
 #[derive(Debug)]
@@ -38,7 +40,7 @@ pub struct Again {
 /// simulator will do where there is none under these.
 ///
 /// # Errors
-/// [`ZooError::NothingToCompare`] where no finished evaluation holds these seeds, [`ZooError::ResultsDiffer`] where it is
+/// [`ZooError::NothingToCompare`] where no finished evaluation holds these seeds, [`ResultsError::Differ`] where it is
 /// of another entry under the same name; as an evaluation otherwise.
 pub fn evaluate_again(
     subject: &Subject<'_>,
@@ -51,12 +53,13 @@ pub fn evaluate_again(
     let stored = find(results, &record)?;
     if stored.record.training != record.training {
         let text = |record: &EvaluationRecord| serde_json::to_string(&record.training).unwrap_or_default();
-        return Err(ZooError::ResultsDiffer {
+        return Err(ResultsError::Differ {
             folder: stored.folder,
             what: "evaluation.json".to_owned(),
             expected: text(&stored.record),
             found: text(&record),
-        });
+        }
+        .into());
     }
     let before: BTreeMap<u64, EpisodeRecord> = stored.episodes.iter().cloned().map(|e| (e.seed, e)).collect();
     let seeds = record.own_seeds();

@@ -120,7 +120,7 @@ fn lacks_usual_keys(path: &Path, experiment: &Experiment) -> bool {
 ///
 /// # Errors
 /// [`ZooError::DataNotFound`], and what `dataset` refuses.
-pub(crate) fn demonstrations(
+pub fn demonstrations(
     path: &Path,
     work: &Path,
     experiment: &Experiment,

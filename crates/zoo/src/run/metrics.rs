@@ -93,7 +93,7 @@ impl Metrics {
         for row in &self.rows {
             text.push_str(&self.line(row));
         }
-        write_atomic(&self.csv, text.as_bytes())
+        Ok(write_atomic(&self.csv, text.as_bytes())?)
     }
 
     /// Writes all rows as Parquet: `step` (u64) and one f64 column a metric, null where not computed.
@@ -101,7 +101,7 @@ impl Metrics {
     /// # Errors
     /// When the file cannot be written.
     pub fn write_parquet(&self, path: &Path) -> Result<(), ZooError> {
-        write_atomic(path, &self.to_parquet(path)?)
+        Ok(write_atomic(path, &self.to_parquet(path)?)?)
     }
 
     /// The same as bytes, for the file at `path`.

@@ -22,15 +22,13 @@ mod validation;
 
 pub(crate) use agreement::is_whole;
 pub use checkpoint::Checkpoint;
-pub(crate) use data::demonstrations;
-pub use data::{first_windows, locate};
+pub use data::{demonstrations, first_windows, locate};
 pub use extend::{Extended, extend};
 pub use folder::{COMMAND_FILE, RunFolder};
 pub use list::{FoundRun, RunState, list_runs};
 pub use metrics::{Metrics, MetricsRow};
 pub use score::{Score, ScoreRequest, score, score_folder};
 pub use section::{OptimiserKind, TrainSection, WeightsFormat};
-pub(crate) use session::same_settings;
-pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, finished_entry, run};
+pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, finished_entry, run, same_settings};
 pub use tensorboard::EventWriter;
 pub use training::{TrainRequest, train};

@@ -209,7 +209,7 @@ fn run_in<E: Settings, T: Training>(
     let entry = draft.seal_noting(&place.zoo, &mut |entry, sha256| {
         let note = Sealing { name: entry.name.clone(), version: entry.version, sha256: sha256.to_owned() };
         let text = serde_json::to_string_pretty(&note).expect("strings and numbers become JSON") + "\n";
-        write_atomic(&folder.sealing_path(), text.as_bytes())
+        Ok(write_atomic(&folder.sealing_path(), text.as_bytes())?)
     })?;
     finish(folder, entry, &training)
 }
@@ -388,7 +388,7 @@ fn machine() -> Option<String> {
 }
 
 /// Refuses to resume with other settings than the run began with; names the first that differs.
-pub(crate) fn same_settings(
+pub fn same_settings(
     folder: &Path,
     saved: &BTreeMap<String, String>,
     asked: &BTreeMap<String, String>,

@@ -1,8 +1,8 @@
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
+use audit::{KnownEntries, audit};
 use report::{LeaderboardRow, Reading, rank};
-use zoo::audit::{KnownEntries, audit};
 use zoo::entry::EntryId;
 use zoo::protocols::Block;
 use zoo::results::StoredEvaluation;

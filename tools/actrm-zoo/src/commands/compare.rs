@@ -2,13 +2,13 @@ use std::collections::BTreeMap;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
+use audit::{KnownEntries, audit};
 use cli::{INTERRUPTED, Stop, limits, shown};
 use report::comparison::{ALPHA, Comparison, Flips, compare, compare_progress};
 use report::statistics::{Difference, Estimate};
 use report::{LeaderboardRow, Reading, rank};
 use rollout::Pool;
 use serde_json::{Value, json};
-use zoo::audit::{KnownEntries, audit};
 use zoo::entry::{EntryId, LoadedEntry};
 use zoo::evaluation::{Environment, EvaluationOptions, FIRST_SEED, Subject};
 use zoo::results::{EvaluationRecord, Seeds, StoredEvaluation};

@@ -4,15 +4,15 @@ use std::process::ExitCode;
 
 use analysis::depth::thinking_subject;
 use anyhow::Context;
+use audit::{KnownEntries, LeftOut, audit};
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits};
 use models::actrm::{Intervention, Thinking};
 use report::Depth;
 use report::statistics::wilson_interval;
 use serde::Serialize;
 use zoo::ZooError;
-use zoo::audit::{KnownEntries, LeftOut, audit};
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, evaluate};
-use zoo::results::{Seeds, StoredEvaluation};
+use zoo::results::{ResultsError, Seeds, StoredEvaluation};
 
 use crate::places::{ZooArgs, entry_names};
 
@@ -44,7 +44,7 @@ pub(super) fn depths(work: &Path, entries: &KnownEntries) -> anyhow::Result<(Vec
         let Some((steps, how)) = of_folder(&name) else { continue };
         let found = audit(&folder, entries)?;
         depths.extend(found.standing.iter().map(|evaluation| Depth::new(steps, how, evaluation)));
-        let ours = |left: &LeftOut| !matches!(left.reason, ZooError::UnfitResult { .. });
+        let ours = |left: &LeftOut| !matches!(left.reason, ZooError::Results(ResultsError::Unfit { .. }));
         left_out.extend(found.left_out.into_iter().filter(ours));
     }
     Ok((depths, left_out))

@@ -2,11 +2,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::ExitCode;
 
 use anyhow::Context;
+use audit::{KnownEntries, audit};
 use cli::{Column, Table};
 use report::{LeaderboardRow, Reading, rank};
 use serde::Serialize;
 use serde_json::json;
-use zoo::audit::{KnownEntries, audit};
 use zoo::entry::{CurvePoint, Entry};
 use zoo::results::StoredEvaluation;
 

@@ -2,9 +2,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use cli::shown;
+use interchange::lerobot::export;
+use interchange::onnx;
 use zoo::entry::export_hub;
-use zoo::lerobot::export;
-use zoo::onnx;
 
 use crate::card::model_index_of;
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};

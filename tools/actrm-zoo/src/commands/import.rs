@@ -2,7 +2,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use cli::shown;
-use zoo::{lerobot, robomimic};
+use interchange::{lerobot, robomimic};
 
 use crate::places::ZooArgs;
 

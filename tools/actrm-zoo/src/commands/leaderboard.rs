@@ -3,14 +3,14 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
+use audit::{KnownEntries, audit};
 use cli::{Table, shown};
 use report::column::{Align, Column};
 use report::{
-    ACROSS_COLUMNS, Beside, COLUMNS, Curve, DEPTH_COLUMNS, EntryFacts, LeaderboardRow, Places, Reading, across_tasks,
-    csv, json, markdown, rank, to_html,
+    ACROSS_COLUMNS, Beside, COLUMNS, Curve, DEPTH_COLUMNS, EntryFacts, LeaderboardRow, OTHERS_COLUMNS, Places, Reading,
+    across_tasks, csv, json, markdown, rank, to_html,
 };
 use study::puzzle::{PUZZLE_COLUMNS, audit_puzzles, puzzle_section, rank_puzzles};
-use zoo::audit::{KnownEntries, audit};
 use zoo::entry::Entry;
 use zoo::{ZooError, write_together};
 
@@ -37,6 +37,7 @@ use crate::videos;
   actrm-zoo leaderboard --zoo my-zoo --out public
   actrm-zoo leaderboard --task Lift
   actrm-zoo leaderboard --trainings
+  actrm-zoo leaderboard --others outputs/eval/eval_info.json
   actrm-zoo leaderboard --json
   actrm-zoo leaderboard --markdown RESULTS.md")]
 pub struct Args {
@@ -54,6 +55,10 @@ pub struct Args {
     /// Folder of the results of `actrm-zoo depth`, which are shown in a section of their own
     #[arg(long, value_name = "DIR", default_value = WORK)]
     depths: PathBuf,
+    /// Also show the results in this file of LeRobot, vla-eval or CSV, in a table of their own and without a rank; may be
+    /// given several times
+    #[arg(long, value_name = "FILE")]
+    others: Vec<PathBuf>,
     /// Also show each training of a family
     #[arg(long)]
     trainings: bool,
@@ -83,7 +88,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
     };
     let (evaluations, puzzles) = (robots.standing, rank_puzzles(&solvers.standing));
-    let nothing = evaluations.is_empty() && puzzles.is_empty() && depths.is_empty();
+    let mut others = Vec::new();
+    for path in &args.others {
+        let file = shown(path);
+        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {file}"))?;
+        others.extend(report::others::parse(&file, &text)?);
+    }
+    let nothing = evaluations.is_empty() && puzzles.is_empty() && depths.is_empty() && others.is_empty();
     if nothing && failures.is_empty() && !args.json {
         cli::note(&format!("no evaluations in {}; make one with: actrm-zoo eval --all", shown(&results)));
         return Ok(ExitCode::SUCCESS);
@@ -104,6 +115,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         section: puzzle_section(&puzzles),
         entries: entries.good().map(facts).collect(),
         depths,
+        others,
         films: videos::of_episodes(&rows, &args.zoo.zoo),
         places: Places { zoo: args.zoo.named(), results: args.results.named(), protocols: args.protocols.named() },
     };
@@ -138,6 +150,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "across_tasks": json::rows(ACROSS_COLUMNS, &across),
             "puzzles": json::rows(PUZZLE_COLUMNS, &puzzles),
             "depths": json::rows(DEPTH_COLUMNS, &beside.depths),
+            "others": json::rows(OTHERS_COLUMNS, &beside.others),
             "left_out": failures,
         }))?;
         return Ok(end());
@@ -149,6 +162,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         table(COLUMNS, &told, args.wide),
         if all { table(ACROSS_COLUMNS, &across, args.wide) } else { String::new() },
         if all { table(PUZZLE_COLUMNS, &puzzles, args.wide) } else { String::new() },
+        table(OTHERS_COLUMNS, &beside.others, args.wide),
         written,
     ];
     tables.retain(|table| !table.is_empty());

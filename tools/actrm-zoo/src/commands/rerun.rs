@@ -2,13 +2,13 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
+use audit::rerun::{EPISODES, Report, Rerun, Retrained, Retraining, find_row};
 use cli::{Column, INTERRUPTED, Screen, SimulatorArgs, Stop, Table, limits, shown};
 use recording::{CollectEnd, CollectOptions, CollectProgress, collect};
 use rollout::{Control, Skill};
 use serde_json::json;
 use zoo::entry::Entry;
 use zoo::evaluation::{Environment, Subject};
-use zoo::rerun::{EPISODES, Report, Rerun, Retrained, Retraining, find_row};
 use zoo::results::EvaluationRecord;
 
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names};

@@ -1,9 +1,9 @@
 use std::collections::BTreeMap;
 use std::process::ExitCode;
 
+use audit::{KnownEntries, LeftOut, audit};
 use cli::shown;
 use study::puzzle::audit_puzzles;
-use zoo::audit::{KnownEntries, LeftOut, audit};
 use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE, Repeats};
 use zoo::tensors;
 

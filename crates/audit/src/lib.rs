@@ -1,0 +1,403 @@
+//! Which results stand: sealed, in the folder that their record belongs in, and of an entry of the zoo that says the same.
+//!
+//! One bad file stops nothing: what does not stand is left out and named, with the reason.
+
+pub mod rerun;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use results::{
+    EntryIdentity, OUTCOMES, RECORD, ResultsError, SEAL_FILE, StoredEvaluation, TrainingFacts, result_folders,
+};
+use zoo::ZooError;
+use zoo::entry::{Entry, EntryId, EntryMeta, Families, training_facts};
+use zoo::registry::Registry;
+
+/// A result that does not stand.
+#[derive(Debug)]
+pub struct LeftOut {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// Why it does not.
+    pub reason: ZooError,
+}
+
+/// Results that stand, and the others.
+#[derive(Debug)]
+pub struct Audit<E> {
+    /// Those that stand, by folder name.
+    pub standing: Vec<E>,
+    /// Those that do not.
+    pub left_out: Vec<LeftOut>,
+}
+
+impl<E> Default for Audit<E> {
+    fn default() -> Self {
+        Self { standing: Vec::new(), left_out: Vec::new() }
+    }
+}
+
+impl<E> Audit<E> {
+    /// Takes in what a folder holds; one still under way is neither.
+    pub fn add(&mut self, folder: &Path, found: Result<Option<E>, ZooError>) {
+        match found {
+            Ok(found) => self.standing.extend(found),
+            Err(reason) => self.left_out.push(LeftOut { folder: folder.to_owned(), reason }),
+        }
+    }
+}
+
+/// The entries of a zoo, each with every file's hash checked.
+#[derive(Debug)]
+pub struct KnownEntries {
+    zoo: PathBuf,
+    opened: BTreeMap<EntryId, Result<Entry, ZooError>>,
+}
+
+impl KnownEntries {
+    /// Opens every entry of `registry`.
+    ///
+    /// # Errors
+    /// A zoo that cannot be listed. Bad entries are [`KnownEntries::bad`].
+    pub fn open(registry: &Registry) -> Result<Self, ZooError> {
+        Ok(Self::only(registry, registry.ids()?))
+    }
+
+    /// Opens these entries of `registry` and no other.
+    pub fn only(registry: &Registry, ids: impl IntoIterator<Item = EntryId>) -> Self {
+        let zoo = registry.folder().to_owned();
+        let opened = ids.into_iter().map(|id| {
+            let entry = Entry::open(&zoo, &id);
+            (id, entry)
+        });
+        let opened = opened.collect();
+        Self { zoo, opened }
+    }
+
+    /// Those that are what was written, by name and version.
+    pub fn good(&self) -> impl Iterator<Item = &Entry> {
+        self.opened.values().filter_map(|entry| entry.as_ref().ok())
+    }
+
+    /// The families among those.
+    pub fn families(&self) -> Families {
+        Families::of(self.good())
+    }
+
+    /// Those that are not, with the reason.
+    pub fn bad(&self) -> impl Iterator<Item = (&EntryId, &ZooError)> {
+        self.opened.iter().filter_map(|(id, entry)| Some((id, entry.as_ref().err()?)))
+    }
+
+    /// The entry of that name and version, if it is there and whole.
+    pub fn get(&self, id: &EntryId) -> Option<&Entry> {
+        self.opened.get(id)?.as_ref().ok()
+    }
+
+    /// Compares what a result in `folder` says of its entry with the entry.
+    ///
+    /// # Errors
+    /// [`ResultsError::Unfit`]: an entry that is not in the zoo or damaged, another hash, other facts of its training.
+    pub fn check(&self, folder: &Path, claimed: &EntryIdentity, training: &TrainingFacts) -> Result<(), ZooError> {
+        let unfit = |what: &str, expected: String, found: String| {
+            Err(ZooError::from(ResultsError::Unfit {
+                folder: folder.to_owned(),
+                what: what.to_owned(),
+                expected,
+                found,
+            }))
+        };
+        let id = EntryId { name: claimed.name.clone(), version: claimed.version };
+        let entry = match self.opened.get(&id) {
+            Some(Ok(entry)) => entry,
+            Some(Err(error)) => return unfit("entry", format!("{id} as it was written"), error.to_string()),
+            None => return unfit("entry", format!("one of the zoo {}", self.zoo.display()), id.to_string()),
+        };
+        let hash = entry.meta().content_sha256();
+        if hash != claimed.hash {
+            return unfit("hash of the entry", hash, claimed.hash.clone());
+        }
+        match difference(entry.meta(), training) {
+            Some((what, expected, found)) => unfit(what, expected, found),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The first fact of the training that the entry states otherwise.
+fn difference(meta: &EntryMeta, found: &TrainingFacts) -> Option<(&'static str, String, String)> {
+    let expected = training_facts(meta);
+    // a number that went through JSON twice may differ in its last bit
+    let minutes = (expected.minutes - found.minutes).abs() <= 1e-9 * expected.minutes.abs();
+    let text = |value: &Option<String>| value.clone().unwrap_or_else(|| "none".to_owned());
+    let data_set = meta.data_set_of(&expected, found).to_owned();
+    let facts = [
+        ("policy", expected.policy, found.policy.clone()),
+        ("parameters", expected.parameters.to_string(), found.parameters.to_string()),
+        ("training steps", expected.steps.to_string(), found.steps.to_string()),
+        ("training seed", expected.seed.to_string(), found.seed.to_string()),
+        ("data set", expected.data_set, data_set),
+        ("fingerprint of the data", expected.data_fingerprint, found.data_fingerprint.clone()),
+        ("simulator of the data", text(&expected.data_simulator), text(&found.data_simulator)),
+        ("demos", expected.demos.to_string(), found.demos.to_string()),
+    ];
+    let other = facts.into_iter().find(|(_, expected, found)| expected != found);
+    let minutes = (!minutes).then(|| ("minutes", expected.minutes.to_string(), found.minutes.to_string()));
+    other.or(minutes)
+}
+
+/// Refuses a folder that is not called what its record says: a copy, or one that was renamed.
+///
+/// # Errors
+/// [`ResultsError::Unfit`].
+pub fn check_folder_name(folder: &Path, expected: &str) -> Result<(), ZooError> {
+    let found = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    if found == expected {
+        return Ok(());
+    }
+    let (what, expected) = ("name of the folder".to_owned(), expected.to_owned());
+    Err(ResultsError::Unfit { folder: folder.to_owned(), what, expected, found }.into())
+}
+
+/// Every finished evaluation of a robot policy under `results` that stands, and what does not.
+///
+/// # Errors
+/// A folder of results that cannot be listed.
+pub fn audit(results: &Path, entries: &KnownEntries) -> Result<Audit<StoredEvaluation>, ZooError> {
+    let mut audit = Audit::default();
+    for folder in result_folders(results)? {
+        if folder.join(RECORD).is_file() {
+            audit.add(&folder, standing(&folder, entries));
+        } else if let Some(sole) = unexplained(&folder) {
+            let path = folder.join(sole);
+            let reason = format!("a result without {RECORD}, which says what it is of");
+            audit.add(&folder, Err(ZooError::Malformed { path, reason }));
+        }
+    }
+    Ok(audit)
+}
+
+/// A file that only a result has, in a folder without any record.
+fn unexplained(folder: &Path) -> Option<&'static str> {
+    // other kinds of entries leave records of other names, which are read elsewhere
+    let other = |name: &str| name.ends_with(".json") && name != SEAL_FILE;
+    let names = folder.read_dir().ok()?.flatten().filter_map(|item| item.file_name().into_string().ok());
+    let names: Vec<String> = names.collect();
+    let tables = [OUTCOMES, SEAL_FILE].into_iter().find(|name| names.iter().any(|found| found == name));
+    tables.filter(|_| !names.iter().any(|name| other(name)))
+}
+
+/// The finished evaluation in `folder`; nothing if it is still under way.
+///
+/// # Errors
+/// Why it does not stand.
+pub fn standing(folder: &Path, entries: &KnownEntries) -> Result<Option<StoredEvaluation>, ZooError> {
+    let Some(stored) = StoredEvaluation::read(folder)? else { return Ok(None) };
+    check_folder_name(folder, &stored.record.folder_name())?;
+    if !stored.sealed {
+        return Err(ResultsError::Unsealed { folder: folder.to_owned() }.into());
+    }
+    entries.check(folder, &stored.record.entry, &stored.record.training)?;
+    Ok(Some(stored))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use std::fs;
+
+    use super::*;
+    use results::testing::{finished, sample, write_episodes};
+    use zoo::entry::testing::draft as test_draft;
+    use zoo::results::{EvaluationRecord, ResultsFolder};
+
+    /// A zoo with `lift-act@1` and a finished evaluation of it.
+    fn zoo() -> (tempfile::TempDir, PathBuf, EvaluationRecord) {
+        let zoo = tempfile::tempdir().unwrap();
+        let id = test_draft("lift-act").seal(zoo.path()).unwrap();
+        let record = record_of(&Entry::open(zoo.path(), &id).unwrap(), 20);
+        let folder = finished(&zoo.path().join("results"), &record).folder;
+        (zoo, folder, record)
+    }
+
+    fn record_of(entry: &Entry, episodes: u64) -> EvaluationRecord {
+        let mut record = sample("lift-act", 1, episodes);
+        record.entry.hash = entry.meta().content_sha256();
+        record.training = training_facts(entry.meta());
+        record
+    }
+
+    fn audited(zoo: &Path) -> Audit<StoredEvaluation> {
+        let entries = KnownEntries::open(&Registry::open(zoo)).unwrap();
+        audit(&zoo.join("results"), &entries).unwrap()
+    }
+
+    /// Why the only result is left out.
+    fn reason(zoo: &Path) -> String {
+        let audit = audited(zoo);
+        assert_eq!((audit.standing.len(), audit.left_out.len()), (0, 1), "{audit:?}");
+        audit.left_out[0].reason.to_string()
+    }
+
+    #[test]
+    fn what_was_measured_stands() {
+        let (zoo, folder, record) = zoo();
+        let audit = audited(zoo.path());
+        assert!(audit.left_out.is_empty(), "{:?}", audit.left_out);
+        assert_eq!(audit.standing[0].record, record);
+        let seal: serde_json::Value = serde_json::from_slice(&fs::read(folder.join(SEAL_FILE)).unwrap()).unwrap();
+        assert_eq!(seal["folder"], record.folder_name());
+        assert_eq!(seal["entry"]["hash"], record.entry.hash);
+        assert_eq!(seal["protocol"], record.protocol.hash());
+        let files: Vec<&String> = seal["files"].as_object().unwrap().keys().collect();
+        assert_eq!(files, ["evaluation.json", "outcomes.parquet", "timings.parquet"]);
+    }
+
+    /// Every bit of every file of a result: headers, payload, Parquet, seal.
+    #[test]
+    fn a_flipped_bit_anywhere_in_a_result_is_told() {
+        let (_zoo, folder, _) = zoo();
+        let mut flips = 0;
+        for name in [RECORD, OUTCOMES, "timings.parquet", SEAL_FILE] {
+            let path = folder.join(name);
+            let original = fs::read(&path).unwrap();
+            let mut bytes = original.clone();
+            // `tests/flips.rs` flips others
+            for bit in (0..8 * original.len()).step_by(37) {
+                bytes[bit / 8] ^= 1 << (bit % 8);
+                fs::write(&path, &bytes).unwrap();
+                let read = StoredEvaluation::read(&folder);
+                assert!(read.is_err(), "{name}: bit {bit} passed: {read:?}");
+                bytes[bit / 8] ^= 1 << (bit % 8);
+                flips += 1;
+            }
+            fs::write(&path, &original).unwrap();
+        }
+        assert!(StoredEvaluation::read(&folder).unwrap().is_some());
+        assert!(flips > 800, "{flips}");
+    }
+
+    #[test]
+    fn a_flipped_bit_anywhere_in_an_entry_leaves_its_results_out_and_names_it() {
+        let (zoo, _, _) = zoo();
+        let mut flips = 0;
+        for name in ["entry.json", "model.safetensors", "config.toml", "normaliser.safetensors", "README.md"] {
+            let path = zoo.path().join("lift-act/1").join(name);
+            let original = fs::read(&path).unwrap();
+            for bit in (0..8 * original.len()).step_by(23) {
+                let mut bytes = original.clone();
+                bytes[bit / 8] ^= 1 << (bit % 8);
+                fs::write(&path, &bytes).unwrap();
+                let entries = KnownEntries::open(&Registry::open(zoo.path())).unwrap();
+                assert_eq!(entries.bad().count(), 1, "{name}: bit {bit}");
+                assert_eq!(entries.good().count(), 0);
+                flips += 1;
+            }
+            fs::write(&path, original.iter().rev().copied().collect::<Vec<u8>>()).unwrap();
+            assert!(reason(zoo.path()).contains("entry: expected lift-act@1 as it was written"));
+            fs::write(&path, original).unwrap();
+        }
+        assert!(flips > 390, "{flips}");
+        assert_eq!(audited(zoo.path()).standing.len(), 1);
+    }
+
+    #[test]
+    fn forged_results_are_left_out_with_the_reason() {
+        let (zoo, folder, _) = zoo();
+        let results = zoo.path().join("results");
+        let path = folder.join(RECORD);
+        let original = fs::read_to_string(&path).unwrap();
+        // the story edited, one field after the other
+        for (from, to) in [
+            ("\"demos\": 45", "\"demos\": 5"),
+            ("\"minutes\": 1.25", "\"minutes\": 0.25"),
+            ("\"count\": 20", "\"count\": 19"),
+            ("\"name\": \"lift-act\"", "\"name\": \"lift-actrm\""),
+            ("\"max_steps\": 400", "\"max_steps\": 40"),
+        ] {
+            assert!(original.contains(from), "{from} in {original}");
+            fs::write(&path, original.replacen(from, to, 1)).unwrap();
+            let reason = reason(zoo.path());
+            assert!(reason.contains("evaluation.json: sha256 does not match"), "{from}: {reason}");
+        }
+        fs::write(&path, "").unwrap();
+        assert!(reason(zoo.path()).contains("evaluation.json: not an evaluation"));
+        fs::remove_file(&path).unwrap();
+        assert!(reason(zoo.path()).contains("a result without evaluation.json"));
+        fs::write(&path, &original).unwrap();
+
+        // every success set to true
+        let mine = folder.join(OUTCOMES);
+        let honest = fs::read(&mine).unwrap();
+        let mut forged = StoredEvaluation::read(&folder).unwrap().unwrap().episodes;
+        forged.iter_mut().for_each(|episode| episode.success = true);
+        write_episodes(&mine, &forged).unwrap();
+        assert!(reason(zoo.path()).contains("outcomes.parquet: sha256 does not match"));
+        fs::remove_file(&mine).unwrap();
+        assert!(reason(zoo.path()).contains("outcomes.parquet"));
+        fs::write(&mine, honest).unwrap();
+
+        // a seal taken away, or of another folder
+        let seal = fs::read(folder.join(SEAL_FILE)).unwrap();
+        fs::remove_file(folder.join(SEAL_FILE)).unwrap();
+        assert!(reason(zoo.path()).contains("not sealed"));
+        fs::write(folder.join(SEAL_FILE), &seal).unwrap();
+        assert_eq!(audited(zoo.path()).standing.len(), 1);
+
+        // a copy under another name: the original stands
+        let copy = results.join("lift-act@2_Lift_10000-10019_00000000");
+        fs::create_dir(&copy).unwrap();
+        for file in [RECORD, OUTCOMES, "timings.parquet", SEAL_FILE] {
+            fs::copy(folder.join(file), copy.join(file)).unwrap();
+        }
+        let audit = audited(zoo.path());
+        assert_eq!((audit.standing.len(), audit.left_out.len()), (1, 1));
+        let reason = audit.left_out[0].reason.to_string();
+        assert!(reason.contains("name of the folder: expected lift-act@1_Lift"), "{reason}");
+    }
+
+    /// Sealed anew after the edit, as only this program's code can: the entry says otherwise.
+    #[test]
+    fn results_that_say_other_things_than_their_entry_are_left_out() {
+        let (zoo, folder, record) = zoo();
+        fs::remove_dir_all(folder).unwrap();
+        #[allow(clippy::type_complexity)]
+        let changes: [(&str, fn(&mut EvaluationRecord)); 6] = [
+            ("one of the zoo", |r| r.entry.name = "better-act".into()),
+            ("one of the zoo", |r| r.entry.version = 2),
+            ("hash of the entry", |r| r.entry.hash = "0".repeat(64)),
+            ("parameters: expected", |r| r.training.parameters = 10),
+            ("minutes: expected 1.25, found 0.5", |r| r.training.minutes = 0.5),
+            ("demos: expected 45, found 1", |r| r.training.demos = 1),
+        ];
+        for (word, change) in changes {
+            let mut forged = record.clone();
+            change(&mut forged);
+            let folder = finished(&zoo.path().join("results"), &forged).folder;
+            let reason = reason(zoo.path());
+            assert!(reason.contains(word), "{word}: {reason}");
+            fs::remove_dir_all(folder).unwrap();
+        }
+    }
+
+    #[test]
+    fn killed_between_the_tables_and_the_seal_an_evaluation_ends_in_the_same_bytes() {
+        let (zoo, folder, record) = zoo();
+        let results = zoo.path().join("results");
+        let read = || [OUTCOMES, "timings.parquet", SEAL_FILE].map(|name| fs::read(folder.join(name)).unwrap());
+        let before = read();
+        let stored = StoredEvaluation::read(&folder).unwrap().unwrap();
+        fs::remove_dir_all(&folder).unwrap();
+        let mut again = ResultsFolder::open(&results, &record).unwrap();
+        for (episode, timing) in stored.episodes.iter().zip(&stored.timings) {
+            again.add(episode.clone(), timing.clone()).unwrap();
+        }
+        drop(again);
+        fs::write(folder.join(OUTCOMES), &before[0]).unwrap();
+        assert!(audited(zoo.path()).standing.is_empty() && audited(zoo.path()).left_out.is_empty());
+        ResultsFolder::open(&results, &record).unwrap().finish().unwrap();
+        assert_eq!(read(), before);
+        assert_eq!(audited(zoo.path()).standing.len(), 1);
+    }
+}
