@@ -23,6 +23,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 import depth
 import h5py
 import numpy as np
+import onnx_check
 import python_door
 import torch
 from PIL import Image
@@ -394,6 +395,13 @@ def export_entry(root: Path, folder: Path) -> str:
     return compare_actions(root, zoo, "lift-act@1", folder / "lift-act")
 
 
+def export_onnx(root: Path, folder: Path) -> str:
+    """Exported ACT and BC answer the same in onnxruntime."""
+    zoo, changes = folder / "zoo-bc", "train.steps=20"
+    ours("actrm-zoo", "train", "bc_lift", "--data", root, "--zoo", zoo, "--runs", folder / "runs", changes)
+    return onnx_check.check(ROOT / "zoo", zoo, folder / "onnx", BIN / "examples" / "predict", ours, run)
+
+
 def read_by_the_hub(root: Path, folder: Path) -> str:
     """The cards of entries, read by the Hub's own library, with the results that the leaderboard has."""
     from huggingface_hub import ModelCard
@@ -645,6 +653,7 @@ def main() -> None:
             "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
             "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),
+            "onnxruntime answers the same as our entries": lambda: export_onnx(root, folder),
             "the Hub's library reads our model cards": lambda: read_by_the_hub(root, folder / "hub"),
             "our entry that sees answers the same in LeRobot": lambda: export_seeing_entry(plain, folder / "seeing"),
             "LeRobot's policy that sees answers the same": lambda: import_seeing_entry(plain, folder / "seen"),
