@@ -28,7 +28,9 @@ def observations(zoo: Path, entry: str) -> dict[str, np.ndarray]:
     return drawn
 
 
-def compare(zoo: Path, entry: str, out: Path, predict: Path, ours: Callable[..., str], run: Callable[..., str]) -> float:
+def compare(
+    zoo: Path, entry: str, out: Path, predict: Path, ours: Callable[..., str], run: Callable[..., str]
+) -> float:
     """The largest difference of an entry's exported model from its own predictions, relative to the largest action."""
     drawn = observations(zoo, entry)
     asked = [
@@ -48,7 +50,7 @@ def compare(zoo: Path, entry: str, out: Path, predict: Path, ours: Callable[...,
 def check(
     shipped: Path, trained: Path, folder: Path, predict: Path, ours: Callable[..., str], run: Callable[..., str]
 ) -> str:
-    """Three shipped ACT entries, and a BC of a few steps, give the same actions in onnxruntime, to 1e-5 of the largest."""
+    """Three shipped ACT entries and a BC of a few steps give the same actions in onnxruntime, to 1e-5 of the largest."""
     folder.mkdir()
     found = {}
     cases = [(shipped, f"{task}-act@1") for task in ("lift", "door", "stack")] + [(trained, "lift-bc@1")]
