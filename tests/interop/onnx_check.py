@@ -50,7 +50,7 @@ def compare(
 def check(
     shipped: Path, trained: Path, folder: Path, predict: Path, ours: Callable[..., str], run: Callable[..., str]
 ) -> str:
-    """Three shipped ACT entries and a BC of a few steps give the same actions in onnxruntime, to 1e-5 of the largest."""
+    """Three shipped ACT entries and a BC answer the same in onnxruntime, to 1e-5 of the largest action."""
     folder.mkdir()
     found = {}
     cases = [(shipped, f"{task}-act@1") for task in ("lift", "door", "stack")] + [(trained, "lift-bc@1")]
