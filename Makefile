@@ -111,20 +111,28 @@ check: build ## the tests of one change, in five minutes: unit tests, the rules 
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --lib
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- architecture:: house:: help:: main_line:: bad_data:: bad_zoo::
 
-.PHONY: test
-test: build wheel ## every test: Rust, Python and end to end
+.PHONY: test test-rust test-python test-wheel
+test: test-rust test-python test-wheel ## every test: Rust, Python and end to end (with -j2 several at once)
+
+test-rust: build wheel
 	@$(CARGO) test $(CARGO_FLAGS) --workspace
 	@if [ -n "$(BROWSER)$${CI:-}" ]; then \
 	    $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test e2e -- --ignored; \
 	  else echo "not run: the tests of the pages in a browser (no Chromium on the PATH; ACTRM_CHROMIUM names one)"; fi
+
+test-python: build
 	@.venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests
+
+test-wheel: wheel
 	@tools/test_wheel.sh
 
+# With clippy's driver as the workspace's compiler (.ci/run) the build is the lint, and nothing is compiled for it alone.
+CLIPPY := $(if $(RUSTC_WORKSPACE_WRAPPER),build $(CARGO_FLAGS) --workspace --all-targets,clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings)
 .PHONY: lint
 lint: .venv/.complete ## formatting and lints, Rust and Python
 	@$(CARGO) fmt --all --check
 	@rustfmt --edition 2024 --check tools/*/src/commands/*.rs # a macro names these modules, and fmt does not see them
-	@$(CARGO) clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings
+	@$(CARGO) $(CLIPPY)
 	@.venv/bin/python -m ruff check tools benches tests crates/python
 	@.venv/bin/python -m ruff format --check tools benches tests crates/python
 	@.venv/bin/python -m basedpyright --project tools/harness --pythonpath .venv/bin/python
