@@ -25,6 +25,7 @@ import h5py
 import numpy as np
 import onnx_check
 import python_door
+import shards
 import torch
 from PIL import Image
 
@@ -687,6 +688,9 @@ def main() -> None:
             "LeRobot opens edited sets of its own": lambda: edit_theirs(folder, "image"),
             "LeRobot opens them with its own videos": lambda: edit_theirs(folder, "video"),
             "shards on a Ray cluster make one evaluation": lambda: evaluate_on_ray(root, folder / "ray"),
+            "shards by Ray and Slurm, from and to s3://": lambda: shards.compare_shards(
+                BIN / "actrm-data", source, folder / "staged"
+            ),
             "cells of a study run on a Ray cluster": lambda: study_on_ray(folder / "ray-study"),
         }
         for title, check in checks.items():

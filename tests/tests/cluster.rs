@@ -82,6 +82,44 @@ fn a_study_as_an_array_of_cells() {
 }
 
 #[test]
+fn a_conversion_as_an_array_of_shards() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (jobs, path) = (folder.path().join("jobs"), with_sbatch(folder.path()));
+    let (source, script) = (root().join("data/lift.hdf5"), root().join("tools/cluster/slurm_convert.sh"));
+    let run = || {
+        let mut command = Command::new(&script);
+        command.args(["3", text(&source), "set", "--file-size", "0.05"]).current_dir(folder.path());
+        command.env("PATH", &path).env("ACTRM_DATA", program("actrm-data").get_program()).env("JOBS", &jobs);
+        command.env("ACTRM_PYTHON", root().join(".venv/bin/python"));
+        command
+    };
+    succeeds(&mut run());
+    let said = fs::read_to_string(&jobs).expect("jobs were queued");
+    assert!(said.contains("--array=1-3") && said.contains("--dependency=afterok:4711"), "{said}");
+    assert!(said.contains("set.shards/3-of-3: shard 3/3, "), "{said}");
+    let mut whole = program("actrm-data");
+    whole.args(["convert", text(&source), "whole", "--file-size", "0.05"]).current_dir(folder.path());
+    succeeds(&mut whole);
+    let same =
+        Command::new("diff").args(["-r", "set", "whole"]).current_dir(folder.path()).output().expect("it starts");
+    assert!(same.status.success(), "{}", String::from_utf8_lossy(&same.stdout));
+    // what is there is not converted again, and nothing is overwritten
+    let again = run().output().expect("it starts");
+    assert!(String::from_utf8_lossy(&again.stderr).contains("set: exists already"));
+    assert_eq!(fs::read_to_string(&jobs).expect("jobs").matches("(complete already)").count(), 3);
+    // a shard is no data set
+    let shard = text(&folder.path().join("set.shards/1-of-3")).to_owned();
+    for command in ["inspect", "validate", "stats"] {
+        refused(program("actrm-data").args([command, &shard]), &["shard 1/3 of a conversion", "actrm-data merge"]);
+    }
+    refused(
+        program("actrm-data").args(["edit", "drop", &shard, "x", "--episodes", "0"]),
+        &["shard 1/3 of a conversion"],
+    );
+    refused(program("actrm-zoo").args(["train", "act_lift", "--data", &shard]), &["shard 1/3 of a conversion"]);
+}
+
+#[test]
 fn an_array_of_shards_and_the_job_that_merges_them() {
     let (folder, entries) = copied_zoo();
     let (jobs, path) = (folder.path().join("jobs"), with_sbatch(folder.path()));

@@ -1,5 +1,6 @@
 //! LeRobotDataset v3.0 directories: written from demonstrations, opened for training.
 
+mod assembly;
 mod check;
 mod columns;
 mod convert;
@@ -18,6 +19,7 @@ mod open;
 mod pictures;
 mod read;
 mod schema;
+mod sharded;
 mod shards;
 mod side;
 mod skip;
@@ -47,6 +49,8 @@ pub use notes::notes;
 pub(crate) use notes::{mask_note, shared_notes};
 pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};
 pub use pictures::{CameraFile, PictureFile, PictureStore, Pictures};
+pub(crate) use sharded::refuse as refuse_shard;
+pub use sharded::{Shard, ShardReport, convert_shard, merge_shards, shard_files};
 pub use to_robomimic::rewrite;
 pub use v2::OldSet;
 pub(crate) use v2::version as old_version;

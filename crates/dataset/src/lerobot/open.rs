@@ -8,6 +8,7 @@ use super::info::{Feature, Info, Provenance};
 use super::meta::{PROVENANCE_FILE, are_finite, parse_stats, python_json};
 use super::read;
 use super::schema::hex;
+use super::sharded::refuse as refuse_shard;
 use super::values::Values;
 use crate::error::{DatasetError, Result};
 use crate::shuffle::SplitMix64;
@@ -512,6 +513,7 @@ pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>> {
 pub(crate) fn parse_info(root: &Path) -> Result<(Info, Value)> {
     let path = root.join("meta/info.json");
     if !path.exists() {
+        refuse_shard(root)?;
         let found = if root.is_dir() {
             "a folder without it"
         } else if root.exists() {

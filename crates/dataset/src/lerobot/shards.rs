@@ -9,8 +9,13 @@ use arrow::array::ArrayRef;
 use arrow::datatypes::SchemaRef;
 use parquet::arrow::ArrowSchemaConverter;
 use parquet::arrow::arrow_writer::{ArrowColumnChunk, ArrowRowGroupWriterFactory, compute_leaves};
+use parquet::column::writer::ColumnCloseResult;
 use parquet::errors::{ParquetError, Result as ParquetResult};
+use parquet::file::metadata::{
+    ColumnChunkMetaData, PageIndexPolicy, ParquetMetaData, ParquetMetaDataOptions, ParquetMetaDataReader,
+};
 use parquet::file::properties::WriterProperties;
+use parquet::file::statistics::Statistics;
 use parquet::file::writer::SerializedFileWriter;
 use sha2::{Digest, Sha256};
 use std::fs::File;
@@ -102,9 +107,15 @@ pub(crate) struct GroupEncoder {
 
 /// A row group, compressed, not yet in a file.
 pub(crate) struct EncodedGroup {
-    chunks: Vec<ArrowColumnChunk>,
+    chunks: Chunks,
     pub rows: usize,
     pub bytes: u64,
+}
+
+enum Chunks {
+    Encoded(Vec<ArrowColumnChunk>),
+    /// In another file, as they are written there.
+    Stored(Arc<File>, Vec<ColumnCloseResult>),
 }
 
 impl GroupEncoder {
@@ -134,7 +145,7 @@ impl GroupEncoder {
                 chunks.push(chunk);
             }
         }
-        Ok(EncodedGroup { chunks, rows: arrays.first().map_or(0, |a| a.len()), bytes })
+        Ok(EncodedGroup { chunks: Chunks::Encoded(chunks), rows: arrays.first().map_or(0, |a| a.len()), bytes })
     }
 }
 
@@ -145,6 +156,69 @@ fn file_writer<W: Write + Send>(
 ) -> ParquetResult<SerializedFileWriter<W>> {
     let descriptor = ArrowSchemaConverter::new().convert(schema)?;
     SerializedFileWriter::new(to, descriptor.root_schema_ptr(), Arc::clone(properties))
+}
+
+/// Row groups of a file, to be spliced into others without encoding them again.
+pub(crate) struct StoredGroups {
+    file: Arc<File>,
+    metadata: ParquetMetaData,
+    next: usize,
+}
+
+impl StoredGroups {
+    pub(crate) fn open(path: &Path) -> Result<Self> {
+        let file = File::open(path).map_err(|source| DatasetError::Io {
+            path: path.to_path_buf(),
+            operation: "open it",
+            source,
+        })?;
+        // everything that was written about the pages is written again
+        let options = ParquetMetaDataOptions::new().with_encoding_stats_as_mask(false);
+        let metadata = ParquetMetaDataReader::new()
+            .with_page_index_policy(PageIndexPolicy::Optional)
+            .with_metadata_options(Some(options))
+            .parse_and_finish(&file)
+            .map_err(|source| DatasetError::Parquet { path: path.to_path_buf(), operation: "read it", source })?;
+        Ok(Self { file: Arc::new(file), metadata, next: 0 })
+    }
+
+    /// The next one, which took so many bytes when it was encoded.
+    pub(crate) fn next(&mut self, bytes: u64) -> Option<EncodedGroup> {
+        let group = self.metadata.row_groups().get(self.next)?;
+        let index = self.metadata.page_index();
+        let chunk = |(column, metadata): (usize, &ColumnChunkMetaData)| {
+            Ok(ColumnCloseResult {
+                bytes_written: metadata.compressed_size() as u64,
+                rows_written: group.num_rows() as u64,
+                metadata: as_encoded(metadata)?,
+                bloom_filter: None,
+                column_index: index.and_then(|index| index.column_index(self.next, column)).cloned(),
+                offset_index: index.and_then(|index| index.offset_index(self.next, column)).cloned(),
+            })
+        };
+        let chunks = group.columns().iter().enumerate().map(chunk).collect::<ParquetResult<_>>().ok()?;
+        let rows = group.num_rows() as usize;
+        self.next += 1;
+        Some(EncodedGroup { chunks: Chunks::Stored(Arc::clone(&self.file), chunks), rows, bytes })
+    }
+}
+
+/// What a column chunk says of itself as it does when it was just encoded: whoever reads extremes does not know that they
+/// were written in the old place too.
+fn as_encoded(metadata: &ColumnChunkMetaData) -> ParquetResult<ColumnChunkMetaData> {
+    let both = metadata.column_descr().sort_order().is_signed();
+    let statistics = metadata.statistics().cloned().map(|statistics| match statistics {
+        Statistics::Boolean(of) => of.with_backwards_compatible_min_max(both).into(),
+        Statistics::Int32(of) => of.with_backwards_compatible_min_max(both).into(),
+        Statistics::Int64(of) => of.with_backwards_compatible_min_max(both).into(),
+        Statistics::Float(of) => of.with_backwards_compatible_min_max(both).into(),
+        Statistics::Double(of) => of.with_backwards_compatible_min_max(both).into(),
+        other => other,
+    });
+    match statistics {
+        Some(statistics) => metadata.clone().into_builder().set_statistics(statistics).build(),
+        None => Ok(metadata.clone()),
+    }
 }
 
 /// Where a row group went.
@@ -240,8 +314,13 @@ impl<'a> ShardWriter<'a> {
 
 fn splice(writer: &mut SerializedFileWriter<HashingFile>, group: EncodedGroup) -> ParquetResult<()> {
     let mut row_group = writer.next_row_group()?;
-    for chunk in group.chunks {
-        chunk.append_to_row_group(&mut row_group)?;
+    match group.chunks {
+        Chunks::Encoded(chunks) => {
+            chunks.into_iter().try_for_each(|chunk| chunk.append_to_row_group(&mut row_group))?;
+        }
+        Chunks::Stored(file, chunks) => {
+            chunks.into_iter().try_for_each(|chunk| row_group.append_column(&*file, chunk))?;
+        }
     }
     row_group.close()?;
     writer.flush().map_err(ParquetError::from)

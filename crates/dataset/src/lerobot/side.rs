@@ -96,7 +96,7 @@ impl Kind {
         (Self::Picture, "picture"),
     ];
 
-    fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         Self::ALL.iter().find(|(kind, _)| *kind == self).map_or("", |(_, name)| name)
     }
 }
@@ -247,11 +247,6 @@ impl SideEncoder {
         let layout = layout(plan, &pictures, &left_out);
         let frames = frame_encoder(root, &layout)?;
         Ok(Self { layout, frames, pictures, left_out })
-    }
-
-    /// The encoder that the shards of the frames need.
-    pub(crate) fn frames(&self) -> &GroupEncoder {
-        &self.frames
     }
 
     /// Encodes the part of the side folder that belongs to a row group.

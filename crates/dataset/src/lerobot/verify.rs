@@ -35,15 +35,18 @@ pub(crate) fn hash_file(path: &Path) -> Result<String> {
 
 /// sha256 of a source file; of several, of the lines `<sha256>  <name>`.
 pub(crate) fn hash_files(files: &[(PathBuf, u64)]) -> Result<String> {
-    if let [(single, _)] = files {
-        return hash_file(single);
+    let name = |file: &Path| file.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let each = files.iter().map(|(file, _)| Ok((name(file), hash_file(file)?)));
+    Ok(joint_hash(&each.collect::<Result<Vec<_>>>()?))
+}
+
+/// [`hash_files`] of files of these names and hashes.
+pub(crate) fn joint_hash(files: &[(String, String)]) -> String {
+    if let [(_, single)] = files {
+        return single.clone();
     }
-    let mut lines = String::new();
-    for (file, _) in files {
-        let name = file.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
-        lines.push_str(&format!("{}  {name}\n", hash_file(file)?));
-    }
-    Ok(schema::hex(&Sha256::digest(lines)))
+    let lines: String = files.iter().map(|(name, sha256)| format!("{sha256}  {name}\n")).collect();
+    schema::hex(&Sha256::digest(lines))
 }
 
 /// [`hash_files`] of a file, of a folder, and of the files that links in them lead to.

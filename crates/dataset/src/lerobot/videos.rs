@@ -1,7 +1,7 @@
 //! Videos of a data set that is being written: a file a camera holds many episodes, as LeRobot has it.
 
 use super::features::{Column, VideoOptions};
-use super::info::FILES_PER_FOLDER;
+use super::info::{FILES_PER_FOLDER, Features};
 use super::shards::{HashingFile, WrittenFile, create_parent};
 use crate::error::{DatasetError, Result};
 use sha2::{Digest, Sha256};
@@ -98,16 +98,15 @@ impl Open {
 
 impl<'a> VideoWriter<'a> {
     /// `limit` is the size in bytes at which a file is closed.
-    pub fn new(root: &'a Path, limit: u64, columns: &[Column], fps: f64) -> Result<Self> {
+    pub fn new(root: &'a Path, limit: u64, features: &Features, fps: f64) -> Result<Self> {
         let mut cameras = BTreeMap::new();
-        for (index, column) in columns.iter().enumerate().filter(|(_, c)| c.feature.dtype == "video") {
-            let (height, width) = (column.feature.shape[0], column.feature.shape[1]);
+        for (index, (name, feature)) in features.0.iter().enumerate().filter(|(_, (_, f))| f.dtype == "video") {
+            let (height, width) = (feature.shape[0], feature.shape[1]);
             let rate = rate(fps, width, height)?;
             // the encoder refuses sides that do not fit
             let size = (width as u16, height as u16);
             let muxer = Muxer::new(size.0, size.1, rate);
-            cameras
-                .insert(index, Open { name: column.name.clone(), size, rate, number: 0, muxer, spool: spool(root)? });
+            cameras.insert(index, Open { name: name.clone(), size, rate, number: 0, muxer, spool: spool(root)? });
         }
         Ok(Self { root, limit, cameras, finished: Vec::new() })
     }

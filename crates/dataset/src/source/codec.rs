@@ -1,9 +1,9 @@
-//! Trees as bytes: how they cross from the reading process.
+//! Trees as bytes: how they cross from the reading process, and how a shard keeps them.
 
 use crate::tree::{Array, Attrs, Demo, Dtype};
 
 /// Appends a demo.
-pub(super) fn put_demo(out: &mut Vec<u8>, demo: &Demo) {
+pub(crate) fn put_demo(out: &mut Vec<u8>, demo: &Demo) {
     put_text(out, &demo.id);
     put_attrs(out, &demo.attrs);
     put_attrs(out, &demo.datasets);
@@ -19,7 +19,7 @@ pub(super) fn put_demo(out: &mut Vec<u8>, demo: &Demo) {
 }
 
 /// Appends an array.
-pub(super) fn put_array(out: &mut Vec<u8>, array: &Array) {
+pub(crate) fn put_array(out: &mut Vec<u8>, array: &Array) {
     let (code, width) = code_of(&array.dtype);
     out.push(code);
     put_count(out, width);
@@ -27,8 +27,7 @@ pub(super) fn put_array(out: &mut Vec<u8>, array: &Array) {
     for &extent in &array.shape {
         put_count(out, extent);
     }
-    put_count(out, array.bytes.len());
-    out.extend_from_slice(&array.bytes);
+    put_bytes(out, &array.bytes);
 }
 
 fn put_attrs(out: &mut Vec<u8>, attrs: &Attrs) {
@@ -39,17 +38,22 @@ fn put_attrs(out: &mut Vec<u8>, attrs: &Attrs) {
     }
 }
 
-fn put_count(out: &mut Vec<u8>, count: usize) {
+pub(crate) fn put_count(out: &mut Vec<u8>, count: usize) {
     out.extend_from_slice(&(count as u64).to_le_bytes());
 }
 
-fn put_text(out: &mut Vec<u8>, text: &str) {
-    put_count(out, text.len());
-    out.extend_from_slice(text.as_bytes());
+/// Appends bytes after their count.
+pub(crate) fn put_bytes(out: &mut Vec<u8>, bytes: &[u8]) {
+    put_count(out, bytes.len());
+    out.extend_from_slice(bytes);
+}
+
+pub(crate) fn put_text(out: &mut Vec<u8>, text: &str) {
+    put_bytes(out, text.as_bytes());
 }
 
 /// A number for each type, and the width of fixed-length strings.
-pub(super) fn code_of(dtype: &Dtype) -> (u8, usize) {
+pub(crate) fn code_of(dtype: &Dtype) -> (u8, usize) {
     match dtype {
         Dtype::U8 => (0, 0),
         Dtype::I8 => (1, 0),
@@ -94,9 +98,9 @@ fn dtype_of(code: u8, width: usize) -> Option<Dtype> {
 }
 
 /// Takes back what the `put_` functions wrote; `None` where the bytes are something else.
-pub(super) struct Taker<'a>(pub &'a [u8]);
+pub(crate) struct Taker<'a>(pub &'a [u8]);
 
-impl Taker<'_> {
+impl<'a> Taker<'a> {
     pub fn demo(&mut self) -> Option<Demo> {
         let id = self.text()?;
         let attrs = self.attrs()?;
@@ -112,26 +116,28 @@ impl Taker<'_> {
         let width = self.count()?;
         let dtype = dtype_of(code, width)?;
         let shape: Vec<usize> = (0..self.count()?).map(|_| self.count()).collect::<Option<_>>()?;
-        let count = self.count()?;
-        let (bytes, rest) = self.0.split_at_checked(count)?;
-        self.0 = rest;
-        Some(Array { dtype, shape, bytes: bytes.to_vec() })
+        Some(Array { dtype, shape, bytes: self.bytes()?.to_vec() })
     }
 
     fn attrs(&mut self) -> Option<Attrs> {
         (0..self.count()?).map(|_| Some((self.text()?, self.array()?))).collect()
     }
 
-    fn count(&mut self) -> Option<usize> {
+    pub fn count(&mut self) -> Option<usize> {
         let (count, rest) = self.0.split_first_chunk::<8>()?;
         self.0 = rest;
         usize::try_from(u64::from_le_bytes(*count)).ok()
     }
 
-    fn text(&mut self) -> Option<String> {
+    /// Bytes after their count.
+    pub fn bytes(&mut self) -> Option<&'a [u8]> {
         let count = self.count()?;
         let (bytes, rest) = self.0.split_at_checked(count)?;
         self.0 = rest;
-        String::from_utf8(bytes.to_vec()).ok()
+        Some(bytes)
+    }
+
+    pub fn text(&mut self) -> Option<String> {
+        String::from_utf8(self.bytes()?.to_vec()).ok()
     }
 }

@@ -1,6 +1,6 @@
 //! Reading files of demonstrations and writing robomimic ones.
 
-mod codec;
+pub(crate) mod codec;
 mod dialect;
 pub mod isolation;
 mod local;
@@ -19,7 +19,7 @@ use std::sync::Arc;
 use rustix::buffer::spare_capacity;
 
 use crate::error::{InputError, Result};
-use crate::lerobot::old_version;
+use crate::lerobot::{old_version, refuse_shard};
 use crate::plan::{DemoPlan, KeyPlan, Plan};
 use crate::tree::{Array, Demo};
 use local::{Backend, Local};
@@ -331,6 +331,7 @@ fn open_backend(path: &Path, beat: &mut dyn FnMut()) -> Result<(Box<dyn Backend>
 }
 
 fn exists(path: &Path) -> Result<(), InputError> {
+    refuse_shard(path)?;
     if let Some(version) = old_version(path) {
         let reason = "`actrm-data convert` makes a LeRobot v3.0 set of it".to_owned();
         let (path, object) = (path.to_owned(), format!("a LeRobot {version} folder"));

@@ -1,10 +1,11 @@
 use anyhow::{Result, anyhow, bail};
 use dataset::{
-    ActionKind, ConvertOptions, DatasetError, ImageForm, InputError, NonFinite, RotationForm, VideoOptions,
-    WriteOptions,
+    ActionKind, ConvertOptions, ConvertReport, DatasetError, ImageForm, InputError, NonFinite, RotationForm, Shard,
+    VideoOptions, WriteOptions,
 };
 use serde_json::json;
-use std::path::PathBuf;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
 
@@ -35,7 +36,8 @@ use std::time::Instant;
   actrm-data convert can.hdf5 can --state-keys robot0_eef_pos,robot0_gripper_qpos --env-keys object
   actrm-data convert stack.hdf5 stack --entity \"a=cubeA_pos,cubeA_pos - robot0_eef_pos\"
   actrm-data convert square.hdf5 square --actions absolute --rotation 6d
-  actrm-data convert recorded recorded.hdf5 --to robomimic")]
+  actrm-data convert recorded recorded.hdf5 --to robomimic
+  actrm-data convert many.hdf5 parts/2 --shard 2/8   # on one of 8 machines; then actrm-data merge many parts/*")]
 pub struct Args {
     /// HDF5 file, or a folder with one file an episode or a task; zarr store, RLDS or LeRobot v2.x folder
     source: PathBuf,
@@ -103,6 +105,13 @@ pub struct Args {
     /// Size at which a video file is closed, in MiB
     #[arg(long, value_name = "MIB", default_value_t = 200.0, requires = "video", value_parser = positive)]
     video_file_size: f64,
+    /// Convert one of N parts of the episodes into the folder OUT, which `actrm-data merge` takes. All parts come to the bytes of
+    /// one run. A part that OUT holds already is left as it is
+    #[arg(long, value_name = "I/N", conflicts_with = "skip_bad")]
+    shard: Option<Shard>,
+    /// With --shard: convert nothing, print the files of SOURCE that the part needs
+    #[arg(long, requires = "shard")]
+    list_files: bool,
     /// Threads [default: one a core]
     #[arg(long, default_value_t = 0, hide_default_value = true)]
     jobs: usize,
@@ -189,7 +198,9 @@ impl From<Nonfinite> for NonFinite {
 
 pub fn run(args: &Args) -> Result<ExitCode> {
     let file = args.out.extension().is_some_and(|extension| extension == "hdf5" || extension == "h5");
+    let robomimic = args.to == Some(Format::Robomimic) || (args.to.is_none() && file);
     match args.to {
+        _ if robomimic && args.shard.is_some() => bail!("--shard is for --to lerobot"),
         Some(Format::Robomimic) => return to_robomimic(args),
         None if file => return to_robomimic(args),
         _ if args.gzip.is_some() => bail!("--gzip is for --to robomimic"),
@@ -226,20 +237,78 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         data_file_mb: args.file_size,
         video_file_mb: args.video_file_size,
     };
+    if let Some(shard) = args.shard {
+        return convert_shard(args, &options, shard);
+    }
     let start = Instant::now();
     let mut screen = cli::Screen::new();
     let report = dataset::convert(&args.source, &args.out, &options, &mut screen.advance("converting"));
     screen.clear();
-    let report = report.map_err(|error| match error {
+    let report = report.map_err(|error| advised(error, args.skip_bad))?;
+    let source = Some(args.source.as_path());
+    tell(&report, source, &args.out, start.elapsed().as_secs_f64(), args.json)
+}
+
+/// An error with what can be done about bad demos.
+fn advised(error: DatasetError, skip_bad: bool) -> anyhow::Error {
+    match error {
         DatasetError::Input(InputError::NotFinite { .. }) => {
             anyhow!("{error} (--skip-bad leaves such demos out, --nonfinite keep stores such values)")
         }
-        DatasetError::Input(InputError::WrongLength { .. }) if !args.skip_bad => {
+        DatasetError::Input(InputError::WrongLength { .. }) if !skip_bad => {
             anyhow!("{error} (--skip-bad leaves such demos out)")
         }
         error => error.into(),
-    })?;
-    let seconds = start.elapsed().as_secs_f64();
+    }
+}
+
+fn convert_shard(args: &Args, options: &ConvertOptions, shard: Shard) -> Result<ExitCode> {
+    if args.list_files {
+        let files = dataset::shard_files(&args.source, options, shard)?;
+        match args.json {
+            true => cli::print_json(&files.iter().map(|file| cli::lossy(file)).collect::<Vec<_>>())?,
+            false => cli::print(&files.iter().map(|file| format!("{}\n", file.display())).collect::<String>())?,
+        }
+        return Ok(ExitCode::SUCCESS);
+    }
+    let mut screen = cli::Screen::new();
+    let mut advance = screen.advance("converting");
+    let report = dataset::convert_shard(&args.source, &args.out, options, shard, &mut |done, total| {
+        advance(done, total);
+        ControlFlow::Continue(())
+    });
+    drop(advance);
+    screen.clear();
+    let report = report.map_err(|error| advised(error, false))?;
+    report.notes.iter().for_each(|note| cli::note(&format!("note: {note}")));
+    if args.json {
+        cli::print_json(&json!({
+            "source": cli::lossy(&args.source), "out": cli::lossy(&args.out), "shard": shard.to_string(),
+            "episodes": report.episodes, "frames": report.frames, "total_episodes": report.total_episodes,
+            "bytes": report.bytes, "resumed": report.resumed, "notes": report.notes,
+        }))?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    cli::print(&format!(
+        "{}: shard {shard}, {} of {} episodes, {} frames, {}{}\n",
+        args.out.display(),
+        cli::count(report.episodes),
+        cli::count(report.total_episodes),
+        cli::count(report.frames),
+        cli::bytes(report.bytes),
+        if report.resumed { " (complete already)" } else { "" },
+    ))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Prints what a conversion or a merge made.
+pub fn tell(
+    report: &ConvertReport,
+    source: Option<&Path>,
+    out: &Path,
+    seconds: f64,
+    as_json: bool,
+) -> Result<ExitCode> {
     for note in &report.notes {
         cli::note(&format!("note: {note}"));
     }
@@ -247,14 +316,14 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         cli::note(&format!("left out: {}: {}", demo.demo, demo.reason));
     }
     let skipped: Vec<_> = report.skipped.iter().map(|s| json!({"demo": s.demo, "reason": s.reason})).collect();
-    if args.json {
+    if as_json {
         let features: serde_json::Map<_, _> = report
             .features
             .iter()
             .map(|(name, dtype, shape)| (name.clone(), json!({"dtype": dtype, "shape": shape})))
             .collect();
         cli::print_json(&json!({
-            "source": cli::lossy(&args.source), "out": cli::lossy(&args.out), "layout": report.dialect, "episodes": report.episodes,
+            "source": source.map(cli::lossy), "out": cli::lossy(out), "layout": report.dialect, "episodes": report.episodes,
             "frames": report.frames, "tasks": report.tasks, "features": features, "files": report.files,
             "bytes": report.bytes, "fingerprint": report.fingerprint, "seconds": seconds, "notes": report.notes,
             "skipped": skipped,
@@ -269,7 +338,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut text = cli::table(&["column", "type", "shape"], &rows, &[]);
     text.push_str(&format!(
         "{}: {} episodes, {} frames, {} files, {} in {seconds:.2} s\n",
-        args.out.display(),
+        out.display(),
         cli::count(report.episodes),
         cli::count(report.frames),
         report.files,

@@ -3,6 +3,6 @@
 cli::commands! {
     "Look": inspect, view, stats, plot, query, replay;
     "Record": collect, extract, puzzle;
-    "Convert and edit": convert, validate, edit, export;
+    "Convert and edit": convert, merge, validate, edit, export;
     "Shell": completions;
 }
