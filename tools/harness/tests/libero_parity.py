@@ -14,6 +14,8 @@ import numpy as np
 HARNESS = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(HARNESS))
 CAMERAS = ("agentview", "robot0_eye_in_hand")
+ADDED = ("target_", "goal_", "task_onehot")
+"""What begins the names of observations that LIBERO does not have."""
 
 
 def actions(steps: int) -> Any:
@@ -69,7 +71,7 @@ def ours(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
     for action in actions(steps):
         done = simulation.step(action)
         seen.append((done.observation, simulation.control.get_sim_state(), done.rewards[-1], done.success))
-    values = {name: [step[0][name] for step in seen] for name in first.observation}
+    values = {name: [step[0][name] for step in seen] for name in first.observation if not name.startswith(ADDED)}
     for camera in CAMERAS:
         # the mapping openpi-libero mirrors them
         values[f"{camera}_image"] = [image[:, ::-1] for image in values[f"{camera}_image"]]

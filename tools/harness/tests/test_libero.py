@@ -112,6 +112,39 @@ def test_the_instruction_of_a_perturbed_task_is_the_problems(libero: Path) -> No
     assert client.close() == 0
 
 
+def test_the_goal_has_the_same_names_in_every_task(libero: Path) -> None:
+    """Here the target is the bowl, which LIBERO observes by its name, and the goal a place in the cabinet."""
+    assert libero.is_file()
+    client = Client("--task", "libero_goal/3")
+    _, seen = client.ask("reset", seed=0)
+    seen, ready = {name.removeprefix("obs/"): value for name, value in seen.items()}, client.ready["observations"]
+    for name in ("pos", "quat", "to_robot0_eef_pos", "to_robot0_eef_quat"):
+        assert np.allclose(seen[f"target_{name}"], seen[f"akita_black_bowl_1_{name}"], atol=1e-12), name
+        assert ready[f"goal_{name}"] == ready[f"target_{name}"] == list(seen[f"goal_{name}"].shape)
+    assert np.linalg.norm(seen["goal_pos"] - seen["target_pos"]) > 0.2
+    assert seen["task_onehot"].tolist() == [0, 0, 0, 1, 0, 0, 0, 0, 0, 0]
+    assert client.close() == 0
+
+
+def test_initial_states_are_drawn_for_demonstrations_and_from_a_million_on(libero: Path) -> None:
+    """Each depends on its seed alone, whatever ran before."""
+    assert libero.is_file()
+    one, other = Client("--task", "libero_object/3"), Client("--task", "libero_object/3")
+    asked = [(5, "evaluation"), (5, "demonstration"), (6, "demonstration"), (1_000_005, "evaluation")]
+    found = {each: one.ask("reset", seed=each[0], split=each[1]) for each in asked}
+    for each in reversed(asked):
+        again, seen = other.ask("reset", seed=each[0], split=each[1])
+        message, values = found[each]
+        assert message["fingerprint"] == again["fingerprint"]
+        assert ("init_state" in message["ep_meta"]) == (each == asked[0])
+        assert all(np.array_equal(values[name], seen[name]) for name in values), each
+    places = [found[each][1]["obs/target_pos"] for each in asked]
+    assert len({place.tobytes() for place in places}) == len(asked)
+    # all in the same region of the floor
+    assert max(np.linalg.norm(place - places[0]) for place in places) < 0.1
+    assert one.close() == other.close() == 0
+
+
 def test_a_worker_repeats_an_episode(libero: Path) -> None:
     """With and without cameras, one action at a time or several; seeds beyond the initial states begin again."""
     assert libero.is_file()

@@ -3,6 +3,8 @@
 An episode is (suite, task, initial state). Seed k takes initial state k modulo their number. The environment is the one
 that LIBERO gives when it is made, seeded with `SEED` and reset once: that seed places the fixtures, the initial state
 does not. Then come `SETTLING` steps without action and with an open gripper.
+
+Seeds from `DRAWN` on, and demonstrations, have initial states that LIBERO draws, as it once drew its fixed ones.
 """
 
 import copy
@@ -30,7 +32,12 @@ SEED = 7
 """What openpi's evaluation seeds its environments with (examples/libero/main.py)."""
 SETTLING = 10
 """Steps while things fall: openpi, OpenVLA and vla-eval."""
+DRAWN = 1_000_000
+"""The first seed of an evaluation whose initial state is drawn."""
 NO_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+
+Pose = tuple[Array, Array]
+"""Position and quaternion (x, y, z, w)."""
 
 _DECIDING = ("robots", "controller_configs", "gripper_types", "control_freq", "initialization_noise")
 """Arguments of LIBERO's environment that decide what happens."""
@@ -54,8 +61,8 @@ class Libero:
     fast: bool = False
     control: Any = None
     """LIBERO's ControlEnv."""
-    keeps: bool = False
-    """Whether resets keep the model."""
+    keeps: bool | None = None
+    """Whether resets keep the model; None before it was loaded."""
     model: dict[str, Array] = field(default_factory=dict[str, Array])
     """The arrays of the model as it was loaded."""
     properties: list[tuple[Any, Any]] = field(default_factory=list[tuple[Any, Any]])
@@ -63,6 +70,8 @@ class Libero:
     renderer: Renderer | None = None
     moment: dict[str, Array] = field(default_factory=dict[str, Array])
     """What images show, when LIBERO last observed: robosuite 1.4 does before a control step ends."""
+    poses: dict[str, Pose] = field(default_factory=dict[str, Pose])
+    """Where the things of the goal were then, by their names."""
     drawing_ms: float = 0.0
 
     @staticmethod
@@ -85,11 +94,11 @@ class Libero:
         """The environment of robosuite in LIBERO's."""
         return self.control.env
 
-    def make(self) -> None:
+    def make(self, drawn_from: int | list[int] = SEED) -> None:
         """Make LIBERO's environment and reset it once."""
         with redirect_stdout(sys.stderr):
             wrapper = importlib.import_module("libero.libero.envs.env_wrapper")
-            seed()
+            np.random.seed(drawn_from)
             self.control = wrapper.ControlEnv(
                 bddl_file_name=str(self.files.problem),
                 use_camera_obs=False,
@@ -97,15 +106,14 @@ class Libero:
                 ignore_done=True,
             )
             env = self.env
-            if self.cameras:
-                observables = importlib.import_module("robosuite.utils.observables")
+            observables = importlib.import_module("robosuite.utils.observables")
 
-                @observables.sensor(modality="image")
-                def moment(cache: Any) -> float:
-                    del cache
-                    return self.remember()
+            @observables.sensor(modality="image")
+            def moment(cache: Any) -> float:
+                del cache
+                return self.remember()
 
-                env.add_observable(observables.Observable("moment", moment, sampling_rate=env.control_freq))
+            env.add_observable(observables.Observable("moment", moment, sampling_rate=env.control_freq))
             initialize = env._initialize_sim
             loads: list[str | None] = []
 
@@ -129,9 +137,10 @@ class Libero:
                 ]
 
             env._initialize_sim = load
-            self.begin()
+            self.begin(drawn_from)
             # LIBERO loads again where no placement was found; what it draws then depends on how often it has loaded
-            self.keeps = len(loads) == 1
+            if self.keeps is None:
+                self.keeps = len(loads) == 1
             if self.keeps:
                 env._load_model = env._destroy_sim = lambda: None
                 env._initialize_sim = self.restore
@@ -157,9 +166,48 @@ class Libero:
         return {name: getattr(data, name) for name in _DRAWN} | {"site_rgba": model.site_rgba}
 
     def remember(self) -> float:
-        """Keep what images show of this moment."""
-        self.moment = {name: value.copy() for name, value in self.shown().items()}
+        """Keep where the things of the goal are, and what images show."""
+        self.poses = {thing: self.pose(thing) for condition in self.goal for thing in condition[1:]}
+        if self.cameras:
+            self.moment = {name: value.copy() for name, value in self.shown().items()}
         return 0.0
+
+    @property
+    def goal(self) -> list[list[str]]:
+        """The conditions of the goal, each a predicate and one or two things."""
+        return self.env.parsed_problem["goal_state"]
+
+    def pose(self, thing: str) -> Pose:
+        """Position and quaternion (x, y, z, w) of an object, a fixture or a region."""
+        transforms = importlib.import_module("robosuite.utils.transform_utils")
+        data = self.env.sim.data
+        if thing in self.env.obj_body_id:
+            body = self.env.obj_body_id[thing]
+            return np.array(data.body_xpos[body]), transforms.convert_quat(np.array(data.body_xquat[body]), to="xyzw")
+        return np.array(data.get_site_xpos(thing)), transforms.mat2quat(np.array(data.get_site_xmat(thing)))
+
+    def aim(self, raw: dict[str, Array]) -> Tensors:
+        """What the task is about, under names that all tasks have.
+
+        It is the first condition of the goal that does not hold. Those that put a thing somewhere (In, On) come
+        before the others (Open, Close, Turnon). The target is the condition's first thing, the goal its second or,
+        where there is none, the target.
+        """
+        transforms = importlib.import_module("robosuite.utils.transform_utils")
+        conditions = sorted(self.goal, key=len, reverse=True)
+        left = (one for one in conditions[:-1] if not self.env._eval_predicate(one))
+        condition = next(left, conditions[-1])
+        gripper = transforms.pose_inv(transforms.pose2mat((raw["robot0_eef_pos"], raw["robot0_eef_quat"])))
+        said: Tensors = {}
+        for name, thing in (("target", condition[1]), ("goal", condition[-1])):
+            pose = self.poses[thing]
+            seen = transforms.mat2pose(transforms.pose_in_A_to_pose_in_B(transforms.pose2mat(pose), gripper))
+            for where, (position, quaternion) in (("", pose), ("_to_robot0_eef", seen)):
+                said[f"{name}{where}_pos"] = np.asarray(position, dtype=np.float64)
+                said[f"{name}{where}_quat"] = np.asarray(quaternion, dtype=np.float64)
+        onehot = np.zeros(self.files.tasks)
+        onehot[self.files.number] = 1.0
+        return said | {"task_onehot": onehot}
 
     def env_args(self) -> dict[str, Any]:
         """What robomimic calls `env_args`, as LIBERO's files hold them."""
@@ -225,31 +273,30 @@ class Libero:
         )
 
     def reset(self, seed: int, demonstration: bool) -> Initial:
-        """Begin the episode of `seed`; demonstrations and evaluations have the same."""
-        del demonstration
-        number = seed % len(self.files.initial)
-        if self.keeps:
-            self.begin()
-        else:
-            self.make()
-        with redirect_stdout(sys.stderr):
-            raw = self.control.set_init_state(self.files.initial[number])
-            for _ in range(SETTLING):
-                raw, _, _, _ = self.control.step(NO_ACTION)
+        """Begin the episode of `seed`."""
         files = self.files
-        meta = {
+        drawn = demonstration or seed >= DRAWN
+        (self.begin if self.keeps else self.make)([SEED, int(demonstration), seed] if drawn else SEED)
+        raw: dict[str, Array] = {}
+        meta: dict[str, Any] = {
             "lang": files.language or self.control.language_instruction,
             "suite": files.suite,
             "task": files.number,
-            "init_state": number,
         }
+        with redirect_stdout(sys.stderr):
+            if not drawn:
+                meta["init_state"] = seed % len(files.initial)
+                self.control.set_init_state(files.initial[meta["init_state"]])
+            for _ in range(SETTLING):
+                raw, _, _, _ = self.control.step(NO_ACTION)
         return Initial(self.observed(raw), self.fingerprint(), meta, self.drawing_ms)
 
-    def begin(self) -> None:
+    def begin(self, drawn_from: int | list[int] = SEED) -> None:
         """Reset the environment until its objects find a place. LIBERO does so too, and hides every other error."""
         unplaced = importlib.import_module("robosuite.utils.errors").RandomizationError
         with redirect_stdout(sys.stderr):
-            seed()
+            # LIBERO draws from NumPy's own generator
+            np.random.seed(drawn_from)
             while True:
                 try:
                     self.env.reset()
@@ -299,7 +346,7 @@ class Libero:
             "object" if name == "object-state" else name: np.asarray(value, dtype=np.float64)
             for name, value in raw.items()
             if name not in ("moment", "robot0_proprio-state")
-        }
+        } | self.aim(raw)
         if not self.cameras:
             return kept
         begun = time.perf_counter()
@@ -327,8 +374,3 @@ def put(values: dict[str, Array], there: dict[str, Array]) -> None:
     """Write arrays into arrays of the same names."""
     for name, value in values.items():
         there[name][...] = value
-
-
-def seed() -> None:
-    """Begin the numbers that LIBERO draws, from NumPy's own generator."""
-    np.random.seed(SEED)

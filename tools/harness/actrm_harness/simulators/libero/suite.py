@@ -42,6 +42,8 @@ class Files:
     """Scene and goal, in BDDL."""
     initial: Array
     """The fixed initial states, one a row."""
+    tasks: int
+    """How many tasks the suite has."""
 
 
 def check_versions() -> None:
@@ -125,4 +127,4 @@ def files(task: str) -> Files:
     first: Array = np.asarray(found.get_task_init_states(int(number)), dtype=np.float64)
     # LIBERO-PRO changes the instruction in the problem, not in the file's name, and its runner takes it from there
     language = str(row.language) if name in STANDARD else None
-    return Files(name, int(number), language, problem, first)
+    return Files(name, int(number), language, problem, first, count)
