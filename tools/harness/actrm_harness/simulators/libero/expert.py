@@ -4,6 +4,7 @@ How a thing is held follows from the shape of its collision geometry, not from i
 own state. Its moves, its noise and its mishaps are those of robosuite's experts (`experts.parts`).
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +17,23 @@ from actrm_harness.wire import Array
 
 WIDEST = 0.066
 """What fits between the fingers, in metres; open, they are 8 cm apart."""
-DEPTH = 0.05
-"""How far down from its top a tall thing is held: the palm is 10 cm above the finger tips."""
+DEPTH = 0.028
+"""How far down from its top a tall thing is held: the palm is 34 mm above that point."""
 LOWEST = 0.009
 """The lowest height over its support at which a thing is held."""
+PALM, PALM_ABOVE = np.array([0.034, 0.105]), 0.03
+"""Half of the palm, across the fingers and along the way that they open, and how far it is above the grip site."""
+FINGERS = np.array([0.012, 0.065])
+"""Half of the room that open fingers take."""
+PAD = 0.012
+"""Half the width of a finger, and how far it reaches down below the grip site."""
+CLEAR = 0.01
+"""How far a hand stays away from what stands beside a thing."""
+SHIFT = 0.025
+"""How far from its middle a thing is held at most."""
+TURNS = (0.0, -0.25, 0.25)
+NARROW = 0.05
+"""A hand may be askew to a thing that is narrower than this."""
 LEVEL = 0.5
 """An axis that rises by less than this, as a sine, lies flat."""
 
@@ -48,33 +62,77 @@ def box(boxes: Array, places: Array, rotations: Array) -> Box:
 
 
 @dataclass(frozen=True, slots=True)
+class Neighbour:
+    """What stands near a thing: a cylinder."""
+
+    place: Array
+    radius: float
+    top: float
+
+    @staticmethod
+    def of(shape: Box, place: Array, rotation: Array) -> "Neighbour":
+        """The cylinder that stands for a thing of this shape."""
+        corners = place + shape.corners() @ rotation.T
+        size = corners.max(axis=0) - corners.min(axis=0)
+        middle = (corners.max(axis=0) + corners.min(axis=0)) / 2
+        return Neighbour(middle[:2], float(size[:2].sum()) / 4, float(corners[:, 2].max()))
+
+
+@dataclass(frozen=True, slots=True)
 class Hold:
-    """Where and how a thing is held."""
+    """How a thing is held: where, in the frame of its body seen from above, and by which of its axes."""
 
-    point: Array
+    axis: int
     turn: float
-    """The hand's angle about the vertical."""
-    tall: float
-    """How far the thing stands up above the point."""
+    """Added to the axis's angle about the vertical."""
+    shift: Array
+    """From the middle of the thing, in the frame of its body."""
+
+    def point(self, shape: Box, place: Array, rotation: Array) -> Array:
+        """Where the fingers close."""
+        corners = place + shape.corners() @ rotation.T
+        low, top = float(corners[:, 2].min()), float(corners[:, 2].max())
+        middle = place + rotation @ ((shape.low + shape.high) / 2 + self.shift)
+        return np.array([middle[0], middle[1], max((low + top) / 2, top - DEPTH, low + LOWEST)])
+
+    def angle(self, rotation: Array, hand: float) -> float:
+        """The hand's angle about the vertical, near its present one; the fingers of a hand at 0 open along y."""
+        axis = rotation[:, self.axis]
+        return nearest(float(np.arctan2(axis[1], axis[0])) - np.pi / 2, np.pi, hand) + self.turn
 
 
-def hold(shape: Box, place: Array, rotation: Array, hand: float) -> Hold:
-    """How to hold a thing of this shape from above, with the least turn of a hand at the angle `hand`.
+def hold(shape: Box, place: Array, rotation: Array, neighbours: Sequence[Neighbour] = ()) -> Hold:
+    """How to hold a thing from above: clear of its neighbours, in its middle, and with the least turn of the hand.
 
-    The fingers close along one of the thing's level axes, one that they can span; where there is none, the narrowest.
+    The fingers close along one of the thing's level axes that they can span; where there is none, the narrowest.
     """
-    corners = place + shape.corners() @ rotation.T
-    low, top = float(corners[:, 2].min()), float(corners[:, 2].max())
-    middle = place + rotation @ (shape.low + shape.high) / 2
-    height = max(float(middle[2]), top - DEPTH, low + LOWEST)
-    level = [axis for axis in range(3) if abs(rotation[2, axis]) < LEVEL]
-    widths = {axis: float((shape.high - shape.low)[axis]) for axis in level}
-    spanned = [axis for axis in level if widths[axis] <= WIDEST] or sorted(level, key=widths.__getitem__)[:1]
-    # the fingers of a hand at 0 open along y
-    angles = [np.arctan2(rotation[1, axis], rotation[0, axis]) - np.pi / 2 for axis in spanned]
-    turns = [nearest(float(angle), np.pi, hand) for angle in angles]
-    turn = min(turns, key=lambda each: abs(each - hand), default=hand)
-    return Hold(np.array([middle[0], middle[1], height]), turn, top - height)
+    size = shape.high - shape.low
+    level = [axis for axis in range(3) if abs(rotation[2, axis]) < LEVEL] or [0]
+    spanned = [axis for axis in level if size[axis] <= WIDEST] or sorted(level, key=size.__getitem__)[:1]
+
+    def wanting(one: Hold) -> float:
+        point, angle = one.point(shape, place, rotation), one.angle(rotation, 0.0)
+        near = sum(max(0.0, CLEAR - room(point, angle, each)) for each in neighbours)
+        return 50.0 * near + 0.1 * abs(angle) + abs(one.turn) + 10.0 * float(np.abs(one.shift).sum())
+
+    def holds() -> Iterator[Hold]:
+        for axis in spanned:
+            across = [each for each in level if each != axis]
+            reach = max(0.0, min(SHIFT, float(size[across[0]]) / 2 - PAD)) if across else 0.0
+            for share in (0.0, -0.5, 0.5, -1.0, 1.0):
+                shift = np.zeros(3)
+                shift[across] = share * reach
+                for turn in TURNS if size[axis] <= NARROW else TURNS[:1]:
+                    yield Hold(axis, turn, shift)
+
+    return min(holds(), key=wanting)
+
+
+def room(point: Array, angle: float, neighbour: Neighbour) -> float:
+    """How far a hand that closes at this point is from a neighbour; negative where it would touch it."""
+    seen = np.abs(about_z(-angle)[:2, :2] @ (neighbour.place - point[:2]))
+    parts = [half for half, above in ((PALM, PALM_ABOVE), (FINGERS, -PAD)) if neighbour.top > point[2] + above]
+    return min((float(np.linalg.norm(np.maximum(seen - half, 0.0))) - neighbour.radius for half in parts), default=1.0)
 
 
 class LiberoScene(Scene):
@@ -106,6 +164,11 @@ class LiberoScene(Scene):
         data = self.env.sim.data
         return np.array(data.site_xpos[site]), np.array(data.site_xmat[site]).reshape(3, 3)
 
+    def neighbours(self, name: str) -> list[Neighbour]:
+        """What stands around a thing."""
+        others = (each for each in self.env.objects_dict if each != name)
+        return [Neighbour.of(self.shape(each), *self.thing(each)) for each in others]
+
     def shape(self, name: str) -> Box:
         """The box around what collides of a thing."""
         model, data = self.env.sim.model._model, self.env.sim.data._data
@@ -120,10 +183,14 @@ class LiberoScene(Scene):
         return box(model.geom_aabb[geoms], places, rotations)
 
 
-DROP = 0.02
+ABOVE_FLOOR = 0.01
 """How far above the floor of a container a thing is let go, if the hand reaches down there."""
-WALL = 0.015
-"""How far above a container's walls the hand stays, and a thing that is carried over them."""
+INTO = 0.01
+"""How far below the top of a container's walls the grip site goes."""
+MOVED = 0.02
+"""A thing that has moved so far since it was looked at is looked at again."""
+FALLEN, STUCK = 0.012, 20
+"""A thing has left the fingers where it is so far below where they held it; they wait for that for so many steps."""
 
 
 class PickAndPlace:
@@ -136,36 +203,48 @@ class PickAndPlace:
         self.container: str = scene.env.object_sites_dict[region].parent_name
         self.servo = Servo(scene, rng, pace=1.4)
         self.shape = scene.shape(thing)
-        place, rotation = scene.thing(thing)
-        self.grasp = Grasp(
-            scene,
-            self.servo.style,
-            tall=hold(self.shape, place, rotation, 0.0).tall,
-            mouth=(0.006, 0.018),
-            close=(0.008, 0.008),
-        )
+        self.how, self.seen = self.look()
+        tall = float((self.seen + self.shape.corners() @ scene.thing(thing)[1].T)[:, 2].max())
+        tall -= float(self.how.point(self.shape, *scene.thing(thing))[2])
+        self.grasp = Grasp(scene, self.servo.style, tall=tall, mouth=(0.006, 0.018), close=(0.008, 0.008))
         self.carry = Carry(scene, self.grasp, clear=0.0)
         self.margin = rng.uniform(0.03, 0.05)
-        walls = scene.shape(self.container)
-        self.walls = float((scene.thing(self.container)[0] + walls.high)[2])
+        self.walls = float((scene.thing(self.container)[0] + scene.shape(self.container).high)[2])
+        self.held_at = 0.0
+        self.waited = 0
+
+    def look(self) -> tuple[Hold, Array]:
+        """How to hold the thing where it is now."""
+        place, rotation = self.scene.thing(self.name)
+        return hold(self.shape, place, rotation, self.scene.neighbours(self.name)), place
 
     def act(self) -> Array:
         """The action for the current state."""
         scene = self.scene
         place, rotation = scene.thing(self.name)
         hand = hand_yaw(scene.hand_rotation)
-        goal = self.goal(place, rotation)
-        if self.carry.update(place, goal, flat=0.02, height=0.02, lost=0.2):
-            target, grip = self.carry.let_go()
-            return self.servo.move(target, grip, about_z(0.0) @ DOWN)
-        how = hold(self.shape, place, rotation, 0.0)
-        target, grip = self.grasp.reach(how.point, how.turn - hand)
+        if self.carry.update(place, self.goal(place, rotation), flat=0.02, height=0.015, lost=0.25):
+            return self.leave(place)
+        self.waited = 0
+        if not self.grasp.closing and float(np.linalg.norm(place - self.seen)) > MOVED:
+            self.how, self.seen = self.look()
+        turn = self.how.angle(rotation, 0.0)
+        target, grip = self.grasp.reach(self.how.point(self.shape, place, rotation), turn - hand)
         if self.grasp.held:
+            self.held_at = float(scene.hand[2] - place[2])
             # open by so much more, the fingers are off it
             self.carry.off = (scene.gap + 0.004, scene.gap + 0.012)
-            self.carry.clear = self.walls + self.margin + float(place[2] - self.lowest(place, rotation))
-            target = self.carry.bring(place, goal, near=0.02, far=0.06)
-        return self.servo.move(target, grip, about_z(how.turn) @ DOWN)
+            self.carry.clear = self.walls + self.margin + float(place[2]) - self.lowest(place, rotation)
+            target = self.carry.bring(place, self.goal(place, rotation), near=0.015, far=0.05)
+        return self.servo.move(target, grip, about_z(turn) @ DOWN)
+
+    def leave(self, place: Array) -> Array:
+        """Open, and go up once the thing has left the fingers; it may hang on one of them, off their middle."""
+        target, grip = self.carry.let_go()
+        self.waited += 1
+        if float(self.scene.hand[2] - place[2]) < self.held_at + FALLEN and self.waited < STUCK:
+            target = np.array([place[0], place[1], self.scene.hand[2]])
+        return self.servo.move(target, grip, about_z(hand_yaw(self.scene.hand_rotation)) @ DOWN)
 
     def lowest(self, place: Array, rotation: Array) -> float:
         """The height of a thing's lowest point."""
@@ -174,16 +253,16 @@ class PickAndPlace:
     def goal(self, place: Array, rotation: Array) -> Array:
         """Where the thing is let go: in the middle of the region, as deep as the hand gets."""
         middle, _ = self.scene.site(self.region)
+        floor = float(self.scene.thing(self.container)[0][2])
         below = float(place[2]) - self.lowest(place, rotation)
-        floor = self.scene.thing(self.container)[0][2]
-        held_at = float(self.scene.hand[2] - place[2]) if self.grasp.held else 0.0
-        height = max(float(floor) + DROP + below, self.walls + WALL - held_at)
+        height = max(floor + ABOVE_FLOOR + below, self.walls - INTO - self.held_at)
         return np.array([middle[0], middle[1], height])
 
 
 def expert(scene: LiberoScene, rng: np.random.Generator) -> PickAndPlace:
     """The expert of the environment's goal; RequestError where there is none."""
-    goal = scene.env.parsed_problem["goal_state"]
+    goal: list[list[str]] = scene.env.parsed_problem["goal_state"]
     if len(goal) == 1 and goal[0][0] == "in" and goal[0][1] in scene.env.objects_dict:
         return PickAndPlace(scene, rng, goal[0][1], goal[0][2])
-    raise RequestError("no_expert", f"no scripted expert for the goal {goal}")
+    text = "; ".join(" ".join(condition) for condition in goal)
+    raise RequestError("no_expert", f"there is no scripted expert for a goal like this one: {text}")
