@@ -184,7 +184,7 @@ FAMILIES = {
         Task("libero_90", simulator="libero", max_steps=400),
     )
 }
-"""Rows of many tasks, by what the names `SUITE/NUMBER` begin with."""
+"""Rows of many tasks, by what their names begin with: `SUITE/NUMBER`, or `SUITE` for all of its tasks."""
 
 
 def register(task: Task) -> None:
@@ -196,7 +196,7 @@ def row(name: str) -> Task:
     """The row of a task; a row of defaults where it has none."""
     if name in TASKS:
         return TASKS[name]
-    families = (task for prefix, task in FAMILIES.items() if "/" in name and name.startswith(prefix))
+    families = (task for prefix, task in FAMILIES.items() if name.startswith(prefix))
     family = max(families, key=lambda task: len(task.name), default=Task(name))
     return replace(family, name=name)
 

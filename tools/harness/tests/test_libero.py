@@ -37,10 +37,12 @@ def test_rows_of_suites_are_found_by_their_names() -> None:
         "libero_10_swap/1": 520,
         "libero_90/89": 400,
         "libero_study_table/0": 400,
+        "libero_object": 280,
+        "libero_10_swap": 520,
     }
     for name, most in steps.items():
         assert (row(name).name, row(name).simulator, row(name).max_steps) == (name, "libero", most)
-    assert row("libero_object").simulator == row("Lift").simulator == "robosuite"
+    assert row("Lift").simulator == row("liberos").simulator == "robosuite"
 
 
 def test_a_missing_environment_is_named() -> None:
@@ -56,6 +58,7 @@ def test_a_missing_environment_is_named() -> None:
     [
         ("libero_object/10", (), "unknown_task: .*libero_object has no task '10'; its tasks: 0 to 9"),
         ("libero_objects/0", (), "unknown_task: .*no suite 'libero_objects'.*libero_object, "),
+        ("libero_object_env", (), "missing_assets: libero_object_env/0 needs "),
         ("libero_object_env/0", (), "missing_assets: libero_object_env/0 needs .*alphabet_soup.*`make libero`"),
         ("libero_object_with_red_stick/0", (), "missing_assets: .* needs custom_objects/red_sticker.*`make libero`"),
         ("libero_object/0", ("--cameras", "agentvew"), "unknown_camera: .*'agentvew'; known: agentview"),
@@ -143,6 +146,30 @@ def test_initial_states_are_drawn_for_demonstrations_and_from_a_million_on(liber
     # all in the same region of the floor
     assert max(np.linalg.norm(place - places[0]) for place in places) < 0.1
     assert one.close() == other.close() == 0
+
+
+def test_a_suite_is_its_tasks_one_after_the_other(libero: Path) -> None:
+    """Seed s is initial state s // 10 of task s % 10, whatever ran before, and observes what all tasks have."""
+    assert libero.is_file()
+    single, suite = Client("--task", "libero_goal/3"), Client("--task", "libero_goal", "--cameras", "agentview")
+    assert (suite.ready["env_name"], suite.ready["max_steps"]) == ("libero_goal", 300)
+    assert not [name for name in suite.ready["observations"] if "bowl" in name or name == "object"]
+    actions = walk(1, 5)
+    for seed, own in ((10_003, 1_000), (27, None), (3, 0), (10_000_013, 1_000_001)):
+        there, seen = suite.ask("reset", seed=seed)
+        assert there["ep_meta"]["task"] == seed % 10 and there["group"] == f"libero_goal/{seed % 10}"
+        if own is None:
+            assert there["ep_meta"]["lang"] == "turn on the stove"
+            continue
+        first, values = single.ask("reset", seed=own)
+        assert (first["fingerprint"], first["group"]) == (there["fingerprint"], None)
+        for found, expected in (
+            (seen, values),
+            (suite.ask("step", {"action": actions})[1], single.ask("step", {"action": actions})[1]),
+        ):
+            numbers = [name for name in found if name != "obs/agentview_image"]
+            assert len(numbers) > 15 and all(np.array_equal(found[name], expected[name]) for name in numbers)
+    assert single.close() == suite.close() == 0
 
 
 def test_a_worker_repeats_an_episode(libero: Path) -> None:

