@@ -11,7 +11,6 @@ from actrm_harness.simulators.libero.expert import LiberoScene, expert
 from actrm_harness.simulators.libero.simulation import Libero
 from actrm_harness.simulators.robosuite.envs import StepResult
 from actrm_harness.simulators.robosuite.episodes import STEPS_AFTER_SUCCESS, Recorder
-from actrm_harness.wire import Tensors
 
 
 def expert_episode(
@@ -24,7 +23,7 @@ def expert_episode(
         raise RequestError("no_expert", text)
     shown_by = Demonstrator.draw(skill, seed)
     first = libero.reset(seed, demonstration)
-    recorder = Recorder(shared(libero, first.observation), whole=False)
+    recorder = Recorder(first.observation, whole=False)
     attrs = {"model_file": env.sim.model.get_xml(), "ep_meta": json.dumps(first.ep_meta)}
     if skill not in (None, USUAL):
         attrs["skill"] = shown_by.skill.name
@@ -34,15 +33,9 @@ def expert_episode(
         before = env.sim.get_state().flatten()
         action = np.clip(moves.act(), -1.0, 1.0)
         stepped = libero.step(action[None])
-        seen = shared(libero, stepped.observation)
-        recorder.add(before, action, StepResult(seen, float(stepped.rewards[-1]), stepped.success))
+        recorder.add(before, action, StepResult(stepped.observation, float(stepped.rewards[-1]), stepped.success))
         held = held + 1 if stepped.success else 0
         if held > STEPS_AFTER_SUCCESS:
             break
     return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors())
 
-
-def shared(libero: Libero, observation: Tensors) -> Tensors:
-    """What all tasks of a suite observe: `object` has the poses of the task's own things."""
-    own = tuple(f"{name}_" for name in libero.env.objects_dict)
-    return {name: value for name, value in observation.items() if not name.startswith(own)}
