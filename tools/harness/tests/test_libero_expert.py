@@ -8,7 +8,7 @@ from conftest import Client
 from test_libero import libero  # noqa: F401
 
 from actrm_harness.experts.parts import about_z
-from actrm_harness.simulators.libero.expert import CLEAR, DEPTH, WIDEST, Box, Neighbour, box, hold, room
+from actrm_harness.simulators.libero.expert import CLEAR, DEPTH, RIM, WIDEST, Box, Neighbour, box, hold, room
 
 UPRIGHT = np.eye(3)
 # what LIBERO's bottles are: their own y axis points up
@@ -43,8 +43,9 @@ def test_fingers_close_along_what_they_span(angle: float) -> None:
     # either will do: the one that needs the least turn
     cube = hold(brick(0.04, 0.04, 0.04), place, rotation)
     assert abs(cube.angle(rotation, 0.0)) <= np.pi / 4 + 1e-9
-    # none will do: the narrowest
-    assert hold(brick(0.12, 0.09, 0.02), place, rotation).axis == 1 and WIDEST < 0.09
+    # none will do: on the rim
+    bowl = hold(brick(0.12, 0.12, 0.05), place, rotation)
+    assert bowl.rim and np.abs(bowl.shift).max() == pytest.approx(0.06 - RIM) and WIDEST < 0.12
 
 
 def test_tall_things_are_held_near_their_top_and_flat_ones_in_their_middle() -> None:

@@ -21,6 +21,8 @@ DEPTH = 0.028
 """How far down from its top a tall thing is held: the palm is 34 mm above that point."""
 LOWEST = 0.009
 """The lowest height over its support at which a thing is held."""
+RIM, RIM_DEPTH = 0.006, 0.012
+"""How far inside a wide thing's box its rim is held, and how far below its top."""
 PALM, PALM_ABOVE = np.array([0.034, 0.105]), 0.03
 """Half of the palm, across the fingers and along the way that they open, and how far it is above the grip site."""
 FINGERS = np.array([0.012, 0.065])
@@ -87,13 +89,16 @@ class Hold:
     """Added to the axis's angle about the vertical."""
     shift: Array
     """From the middle of the thing, in the frame of its body."""
+    rim: bool = False
+    """Whether one finger is inside the thing."""
 
     def point(self, shape: Box, place: Array, rotation: Array) -> Array:
         """Where the fingers close."""
         corners = place + shape.corners() @ rotation.T
         low, top = float(corners[:, 2].min()), float(corners[:, 2].max())
         middle = place + rotation @ ((shape.low + shape.high) / 2 + self.shift)
-        return np.array([middle[0], middle[1], max((low + top) / 2, top - DEPTH, low + LOWEST)])
+        height = top - RIM_DEPTH if self.rim else max((low + top) / 2, top - DEPTH, low + LOWEST)
+        return np.array([middle[0], middle[1], height])
 
     def angle(self, rotation: Array, hand: float) -> float:
         """The hand's angle about the vertical, near its present one; the fingers of a hand at 0 open along y."""
@@ -104,11 +109,11 @@ class Hold:
 def hold(shape: Box, place: Array, rotation: Array, neighbours: Sequence[Neighbour] = ()) -> Hold:
     """How to hold a thing from above: clear of its neighbours, in its middle, and with the least turn of the hand.
 
-    The fingers close along one of the thing's level axes that they can span; where there is none, the narrowest.
+    The fingers close along one of the thing's level axes that they can span; where there is none, on its rim.
     """
     size = shape.high - shape.low
     level = [axis for axis in range(3) if abs(rotation[2, axis]) < LEVEL] or [0]
-    spanned = [axis for axis in level if size[axis] <= WIDEST] or sorted(level, key=size.__getitem__)[:1]
+    spanned = [axis for axis in level if size[axis] <= WIDEST]
 
     def wanting(one: Hold) -> float:
         point, angle = one.point(shape, place, rotation), one.angle(rotation, 0.0)
@@ -124,6 +129,11 @@ def hold(shape: Box, place: Array, rotation: Array, neighbours: Sequence[Neighbo
                 shift[across] = share * reach
                 for turn in TURNS if size[axis] <= NARROW else TURNS[:1]:
                     yield Hold(axis, turn, shift)
+        for axis in level if not spanned else []:
+            for side in (-1.0, 1.0):
+                shift = np.zeros(3)
+                shift[axis] = side * (float(size[axis]) / 2 - RIM)
+                yield Hold(axis, 0.0, shift, rim=True)
 
     return min(holds(), key=wanting)
 
@@ -187,31 +197,76 @@ ABOVE_FLOOR = 0.01
 """How far above the floor of a container a thing is let go, if the hand reaches down there."""
 INTO = 0.01
 """How far below the top of a container's walls the grip site goes."""
+BESIDE = 0.06
+"""What is nearer than this to a way stands in it."""
 MOVED = 0.02
 """A thing that has moved so far since it was looked at is looked at again."""
 FALLEN, STUCK = 0.012, 20
 """A thing has left the fingers where it is so far below where they held it; they wait for that for so many steps."""
 
 
-class PickAndPlace:
-    """Take a thing and lay it into a container, or onto another thing."""
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a thing goes."""
 
-    def __init__(self, scene: LiberoScene, rng: np.random.Generator, thing: str, region: str) -> None:
+    middle: Array
+    """The middle of what it lies on."""
+    walls: float
+    """The height of what stands around that."""
+
+
+class RimGrasp(Grasp):
+    """A grasp of something thin."""
+
+    THINNEST = 0.0015
+
+
+class PickAndPlace:
+    """Take a thing and lay it into a container, onto a region, or onto another thing."""
+
+    def __init__(self, scene: LiberoScene, rng: np.random.Generator, thing: str, onto: str) -> None:
         self.scene = scene
         self.name = thing
-        self.region = region
-        self.container: str = scene.env.object_sites_dict[region].parent_name
+        self.onto = onto
         self.servo = Servo(scene, rng, pace=1.4)
+        self.margin = rng.uniform(0.03, 0.05)
         self.shape = scene.shape(thing)
         self.how, self.seen = self.look()
-        tall = float((self.seen + self.shape.corners() @ scene.thing(thing)[1].T)[:, 2].max())
-        tall -= float(self.how.point(self.shape, *scene.thing(thing))[2])
-        self.grasp = Grasp(scene, self.servo.style, tall=tall, mouth=(0.006, 0.018), close=(0.008, 0.008))
-        self.carry = Carry(scene, self.grasp, clear=0.0)
-        self.margin = rng.uniform(0.03, 0.05)
-        self.walls = float((scene.thing(self.container)[0] + scene.shape(self.container).high)[2])
+        place, rotation = scene.thing(thing)
+        point = self.how.point(self.shape, place, rotation)
+        top = float((place + self.shape.corners() @ rotation.T)[:, 2].max())
+        kind = RimGrasp if self.how.rim else Grasp
+        self.grasp = kind(scene, self.servo.style, tall=top - point[2], mouth=(0.006, 0.018), close=(0.008, 0.008))
+        # down from above what is in the way
+        self.grasp.hover = max(self.grasp.hover, self.over(scene.hand, place) - float(point[2]))
+        self.carry = Carry(scene, self.grasp, clear=self.over(place, self.place().middle))
         self.held_at = 0.0
         self.waited = 0
+
+    def over(self, start: Array, end: Array) -> float:
+        """The height over all that stands along a way."""
+        names = [*self.scene.env.objects_dict, *self.scene.env.fixtures_dict]
+        things = (Neighbour.of(self.scene.shape(each), *self.scene.thing(each)) for each in names if each != self.name)
+        way = (end - start)[:2]
+        tops = [0.0]
+        for each in things:
+            along = float(np.clip((each.place - start[:2]) @ way / max(1e-9, float(way @ way)), 0.0, 1.0))
+            if float(np.linalg.norm(start[:2] + along * way - each.place)) < each.radius + BESIDE:
+                tops.append(each.top)
+        return max(tops) + self.margin
+
+    def place(self) -> Place:
+        """Where the thing goes, as it is now."""
+        scene, env = self.scene, self.scene.env
+        if self.onto in env.object_sites_dict:
+            middle, _ = scene.site(self.onto)
+            holder = getattr(env.object_sites_dict[self.onto], "parent_name", None)
+            if holder not in env.objects_dict:
+                return Place(middle, float(middle[2]))
+            floor = scene.thing(holder)[0]
+            return Place(np.array([middle[0], middle[1], floor[2]]), float((floor + scene.shape(holder).high)[2]))
+        floor, _ = scene.thing(self.onto)
+        return Place(floor, float((floor + scene.shape(self.onto).high)[2]))
 
     def look(self) -> tuple[Hold, Array]:
         """How to hold the thing where it is now."""
@@ -223,7 +278,8 @@ class PickAndPlace:
         scene = self.scene
         place, rotation = scene.thing(self.name)
         hand = hand_yaw(scene.hand_rotation)
-        if self.carry.update(place, self.goal(place, rotation), flat=0.02, height=0.015, lost=0.25):
+        goal = self.goal(place, rotation)
+        if self.carry.update(place, goal, flat=0.02, height=0.015, lost=0.25):
             return self.leave(place)
         self.waited = 0
         if not self.grasp.closing and float(np.linalg.norm(place - self.seen)) > MOVED:
@@ -234,15 +290,18 @@ class PickAndPlace:
             self.held_at = float(scene.hand[2] - place[2])
             # open by so much more, the fingers are off it
             self.carry.off = (scene.gap + 0.004, scene.gap + 0.012)
-            self.carry.clear = self.walls + self.margin + float(place[2]) - self.lowest(place, rotation)
-            target = self.carry.bring(place, self.goal(place, rotation), near=0.015, far=0.05)
+            carried = self.carry.clear
+            self.carry.clear = carried + float(place[2]) - self.lowest(place, rotation)
+            target = self.carry.bring(place, goal, near=0.015, far=0.05)
+            self.carry.clear = carried
         return self.servo.move(target, grip, about_z(turn) @ DOWN)
 
     def leave(self, place: Array) -> Array:
         """Open, and go up once the thing has left the fingers; it may hang on one of them, off their middle."""
         target, grip = self.carry.let_go()
         self.waited += 1
-        if float(self.scene.hand[2] - place[2]) < self.held_at + FALLEN and self.waited < STUCK:
+        hangs = float(self.scene.hand[2] - place[2]) < self.held_at + FALLEN
+        if hangs and not self.how.rim and self.waited < STUCK:
             target = np.array([place[0], place[1], self.scene.hand[2]])
         return self.servo.move(target, grip, about_z(hand_yaw(self.scene.hand_rotation)) @ DOWN)
 
@@ -251,18 +310,17 @@ class PickAndPlace:
         return float((place + self.shape.corners() @ rotation.T)[:, 2].min())
 
     def goal(self, place: Array, rotation: Array) -> Array:
-        """Where the thing is let go: in the middle of the region, as deep as the hand gets."""
-        middle, _ = self.scene.site(self.region)
-        floor = float(self.scene.thing(self.container)[0][2])
+        """Where the thing is let go: over the middle, as low as the hand gets."""
+        there = self.place()
         below = float(place[2]) - self.lowest(place, rotation)
-        height = max(floor + ABOVE_FLOOR + below, self.walls - INTO - self.held_at)
-        return np.array([middle[0], middle[1], height])
+        height = max(float(there.middle[2]) + ABOVE_FLOOR + below, there.walls - INTO - self.held_at)
+        return np.array([there.middle[0], there.middle[1], height])
 
 
 def expert(scene: LiberoScene, rng: np.random.Generator) -> PickAndPlace:
     """The expert of the environment's goal; RequestError where there is none."""
     goal: list[list[str]] = scene.env.parsed_problem["goal_state"]
-    if len(goal) == 1 and goal[0][0] == "in" and goal[0][1] in scene.env.objects_dict:
+    if len(goal) == 1 and goal[0][0] in ("in", "on") and goal[0][1] in scene.env.objects_dict:
         return PickAndPlace(scene, rng, goal[0][1], goal[0][2])
     text = "; ".join(" ".join(condition) for condition in goal)
     raise RequestError("no_expert", f"there is no scripted expert for a goal like this one: {text}")
