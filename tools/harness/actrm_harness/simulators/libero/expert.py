@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from actrm_harness.experts.parts import DOWN, Carry, Grasp, Scene, Servo, about_z, hand_yaw, nearest, yaw
+from actrm_harness.experts.parts import DOWN, Carry, Grasp, Scene, Servo, about_z, hand_yaw, nearest
 from actrm_harness.experts.skills import Demonstrator
 from actrm_harness.protocol import RequestError
 from actrm_harness.wire import Array
@@ -159,7 +159,7 @@ class LiberoScene(Scene):
 
     @property
     def base_rotation(self) -> Array:
-        """robosuite 1.4 moves the hand along the world's axes."""
+        """The identity: robosuite 1.4 moves the hand along the world's axes."""
         return np.eye(3)
 
     def thing(self, name: str) -> tuple[Array, Array]:
@@ -189,7 +189,7 @@ class LiberoScene(Scene):
         solid = (model.geom_contype > 0) | (model.geom_conaffinity > 0)
         geoms = [each for each in range(model.ngeom) if solid[each] and int(of[each]) in below]
         places = (data.geom_xpos[geoms] - place) @ rotation
-        rotations = np.einsum("ji,njk->nik", rotation, data.geom_xmat[geoms].reshape(-1, 3, 3))
+        rotations = rotation.T @ data.geom_xmat[geoms].reshape(-1, 3, 3)
         return box(model.geom_aabb[geoms], places, rotations)
 
 
@@ -260,7 +260,7 @@ class PickAndPlace:
         scene, env = self.scene, self.scene.env
         if self.onto in env.object_sites_dict:
             middle, _ = scene.site(self.onto)
-            holder = getattr(env.object_sites_dict[self.onto], "parent_name", None)
+            holder = str(getattr(env.object_sites_dict[self.onto], "parent_name", ""))
             if holder not in env.objects_dict:
                 return Place(middle, float(middle[2]))
             floor = scene.thing(holder)[0]

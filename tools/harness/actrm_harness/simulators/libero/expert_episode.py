@@ -13,9 +13,7 @@ from actrm_harness.simulators.robosuite.envs import StepResult
 from actrm_harness.simulators.robosuite.episodes import STEPS_AFTER_SUCCESS, Recorder
 
 
-def expert_episode(
-    libero: Libero, max_steps: int, seed: int, demonstration: bool, name: str | None, skill: str | None
-) -> Episode:
+def expert_episode(libero: Libero, seed: int, demonstration: bool, name: str | None, skill: str | None) -> Episode:
     """One episode of the task's expert; `skill` asks for less able demonstrators."""
     files, env = libero.files, libero.env
     if name is not None:
@@ -29,7 +27,7 @@ def expert_episode(
         attrs["skill"] = shown_by.skill.name
     moves = expert(LiberoScene(env, shown_by), np.random.default_rng([seed, 1]))
     held = 0
-    for _ in range(max_steps):
+    for _ in range(libero.max_steps):
         before = env.sim.get_state().flatten()
         action = np.clip(moves.act(), -1.0, 1.0)
         stepped = libero.step(action[None])
@@ -38,4 +36,3 @@ def expert_episode(
         if held > STEPS_AFTER_SUCCESS:
             break
     return Episode(recorder.successes[-1], len(recorder.actions), attrs, recorder.tensors())
-

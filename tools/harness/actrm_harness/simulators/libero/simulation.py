@@ -36,7 +36,7 @@ SETTLING = 10
 DRAWN = 1_000_000
 """The first seed of an evaluation whose initial state is drawn."""
 JOINT_NOISE = 0.02
-"""Standard deviation of the robot's joints in drawn initial states, in radians: robosuite's default, and that of LIBERO's fixed states."""
+"""Standard deviation of the robot's joints in drawn initial states, in radians, as in LIBERO's fixed ones."""
 NO_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
 COMMON = ("robot0_", "target_", "goal_", "task_onehot")
@@ -333,7 +333,7 @@ class Libero:
         """One whole episode of the task's scripted expert."""
         from actrm_harness.simulators.libero.expert_episode import expert_episode
 
-        return expert_episode(self, self.max_steps, seed, demonstration, expert, skill)
+        return expert_episode(self, seed, demonstration, expert, skill)
 
     def extract(self, stored: Stored) -> Episode:
         """Nothing is extracted yet."""

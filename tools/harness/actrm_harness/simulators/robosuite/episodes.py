@@ -50,6 +50,7 @@ class Recorder:
         self.observations.append(self.kept(result.observation))
 
     def kept(self, observation: Tensors) -> Tensors:
+        """The observations that are stored."""
         if not self.whole:
             return {name: value for name, value in observation.items() if not name.endswith(LEFT_OUT)}
         return {
@@ -57,7 +58,7 @@ class Recorder:
         }
 
     def tensors(self) -> Tensors:
-        """robomimic's arrays."""
+        """The arrays of a demonstration."""
         dones = np.array(self.successes, dtype=np.int64)
         dones[-1] = 1
         tensors: Tensors = {
