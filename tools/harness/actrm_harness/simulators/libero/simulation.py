@@ -26,6 +26,7 @@ from actrm_harness.simulators.libero import suite
 from actrm_harness.simulators.robosuite import envs
 from actrm_harness.simulators.robosuite.render import Renderer
 from actrm_harness.simulators.robosuite.simulation import kernels
+from actrm_harness.tasks import DEFAULT_MAX_STEPS
 from actrm_harness.wire import Array, Tensors
 
 SEED = 7
@@ -34,6 +35,8 @@ SETTLING = 10
 """Steps while things fall: openpi, OpenVLA and vla-eval."""
 DRAWN = 1_000_000
 """The first seed of an evaluation whose initial state is drawn."""
+JOINT_NOISE = 0.02
+"""Standard deviation of the robot's joints in drawn initial states, in radians, as in LIBERO's fixed ones."""
 NO_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
 COMMON = ("robot0_", "target_", "goal_", "task_onehot")
@@ -62,6 +65,7 @@ class Libero:
     cameras: tuple[str, ...] = ()
     size: int = 84
     fast: bool = False
+    max_steps: int = DEFAULT_MAX_STEPS
     control: Any = None
     """LIBERO's ControlEnv."""
     keeps: bool | None = None
@@ -82,7 +86,7 @@ class Libero:
         """Make the environment."""
         found = suite.files(options.task.name)
         suite.import_robosuite()
-        simulation = Libero(found, options.cameras, options.size, options.fast_render)
+        simulation = Libero(found, options.cameras, options.size, options.fast_render, options.task.max_steps)
         simulation.make()
         if options.env_args is not None:
             simulation.compare(options.env_args)
@@ -226,7 +230,8 @@ class Libero:
         if self.cameras:
             kwargs |= {"camera_names": list(self.cameras), "camera_heights": self.size, "camera_widths": self.size}
         described: dict[str, Any] = {
-            "env_name": type(self.env).__name__,
+            # what trains on demonstrations compares this with its task
+            "env_name": f"{self.files.suite}/{self.files.number}",
             "env_version": suite.VERSIONS["robosuite"],
             "type": 1,
             "env_kwargs": json.loads(json.dumps(kwargs)),
@@ -298,6 +303,10 @@ class Libero:
         """Reset the environment until its objects find a place. LIBERO does so too, and hides every other error."""
         unplaced = importlib.import_module("robosuite.utils.errors").RandomizationError
         with redirect_stdout(sys.stderr):
+            # its fixed states have this noise too
+            magnitude = 0.0 if drawn_from == SEED else JOINT_NOISE
+            for robot in self.env.robots:
+                robot.initialization_noise = {"magnitude": magnitude, "type": "gaussian"}
             # LIBERO draws from NumPy's own generator
             np.random.seed(drawn_from)
             while True:
@@ -321,9 +330,10 @@ class Libero:
         return Stepped(self.observed(raw), np.array(rewards), solved, None, self.drawing_ms)
 
     def expert(self, seed: int, demonstration: bool, expert: str | None = None, skill: str | None = None) -> Episode:
-        """There is none yet."""
-        del seed, demonstration, expert, skill
-        raise RequestError("no_expert", f"task {self.files.suite}/{self.files.number} has no scripted expert")
+        """One whole episode of the task's scripted expert."""
+        from actrm_harness.simulators.libero.expert_episode import expert_episode
+
+        return expert_episode(self, seed, demonstration, expert, skill)
 
     def extract(self, stored: Stored) -> Episode:
         """Nothing is extracted yet."""

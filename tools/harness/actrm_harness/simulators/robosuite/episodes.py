@@ -30,7 +30,9 @@ LEFT_OUT = ("_joint_pos_cos", "_joint_pos_sin", "_joint_acc", "_eef_quat_site")
 SINGLE = ("_eef_quat_site",)
 
 
-class _Recorder:
+class Recorder:
+    """What an episode has come by so far."""
+
     def __init__(self, first: Tensors, whole: bool) -> None:
         self.whole = whole
         self.observations = [self.kept(first)]
@@ -40,6 +42,7 @@ class _Recorder:
         self.successes: list[bool] = []
 
     def add(self, state: Array, action: Array, result: envs.StepResult) -> None:
+        """Keep a step: the state before it, the action, and what it led to."""
         self.states.append(state)
         self.actions.append(action)
         self.rewards.append(result.reward)
@@ -47,6 +50,7 @@ class _Recorder:
         self.observations.append(self.kept(result.observation))
 
     def kept(self, observation: Tensors) -> Tensors:
+        """The observations that are stored."""
         if not self.whole:
             return {name: value for name, value in observation.items() if not name.endswith(LEFT_OUT)}
         return {
@@ -54,6 +58,7 @@ class _Recorder:
         }
 
     def tensors(self) -> Tensors:
+        """The arrays of a demonstration."""
         dones = np.array(self.successes, dtype=np.int64)
         dones[-1] = 1
         tensors: Tensors = {
@@ -81,7 +86,7 @@ def expert_episode(
     shown_by = Demonstrator.draw(skill, seed)
     env = session.env
     session.foreign_model |= session.xml_forgotten
-    recorder = _Recorder(envs.reset(session, seed, demonstration), whole=False)
+    recorder = Recorder(envs.reset(session, seed, demonstration), whole=False)
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
     expert: Expert = find(place)(Scene(env, shown_by=shown_by), np.random.default_rng([seed, 1]))
     held = 0
@@ -152,7 +157,7 @@ def extract(
     if width != expected:
         raise RequestError("bad_request", f"extract: states have {width} values, the model has {expected}")
     env.sim.reset()
-    recorder = _Recorder(_put(session, states[0]), whole=True)
+    recorder = Recorder(_put(session, states[0]), whole=True)
     for index in range(steps):
         if index + 1 < steps:
             seen = _put(session, states[index + 1])
