@@ -3,7 +3,8 @@
     .venv/bin/python benches/tied_untied.py --simulate     error rates and power of the plan
     .venv/bin/python benches/tied_untied.py docs/thinking  the decision after the trainings that are there
 
-A training counts by its share of solved test episodes; all are tested on the same 200. At each look Welch's t-test compares the arms.
+A training counts by its share of solved test episodes; all are tested on the same 200. At each look Welch's t-test
+compares the arms.
 """
 
 import json
@@ -20,7 +21,7 @@ MARGIN = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """A look: trainings of each arm, two-sided level for a difference, one-sided level for equivalence (0: not tested)."""
+    """Trainings of each arm, two-sided level for a difference, one-sided level for equivalence (0: not tested)."""
 
     tied: int
     untied: int
@@ -54,8 +55,8 @@ def decide(tied: np.ndarray, untied: np.ndarray, look: Look) -> tuple[np.ndarray
 def simulate(gap: float, spread: tuple[float, float], failing: float, studies: int = 20_000) -> np.ndarray:
     """Shares of studies that end in a difference, in equivalence, undecided, and the mean number of trainings.
 
-    A training's success is normal around its arm's mean, cut at 0 and 1; with probability `failing` it learns little and
-    has 0.3. The means are such that the arms differ by `gap` in all.
+    A training's success is normal around its arm's mean, cut at 0 and 1; with probability `failing` it learns little
+    and has 0.3. The means are such that the arms differ by `gap` in all.
     """
     rng = np.random.default_rng(57)
     last = LOOKS[-1]
@@ -78,7 +79,8 @@ def simulate(gap: float, spread: tuple[float, float], failing: float, studies: i
 def table() -> str:
     """The plan's error rates as a Markdown table."""
     rows = [
-        "| true difference | deviation of trainings | that learn little | different | equivalent | undecided | trainings |",
+        "| true difference | deviation of trainings | that learn little "
+        "| different | equivalent | undecided | trainings |",
         "|---|---|---|---|---|---|---|",
     ]
     for spread in ((0.046, 0.084), (0.084, 0.084)):
