@@ -138,6 +138,9 @@ impl PolicyConfig {
         match self {
             Self::Act(config) => config.pointer.as_ref(),
             Self::Actrm(config) => config.pointer.as_ref(),
+            Self::Diffusion(diffusion::Config { transformer: Some(of), .. })
+            | Self::Flow(flow::Config { transformer: Some(of), .. })
+            | Self::Mip(mip::Config { transformer: Some(of), .. }) => of.pointer.as_ref(),
             _ => None,
         }
     }

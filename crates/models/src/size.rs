@@ -21,6 +21,7 @@ mod tests {
         let plain = serde_json::json!({});
         let levels = serde_json::json!({"network": {"down_dims": [32, 64, 128]}});
         let tokens = serde_json::json!({"transformer": {"dim_model": 64, "n_layers": 3}});
+        let encoded = serde_json::json!({"transformer": {"dim_model": 64, "n_layers": 1, "n_encoder_layers": 4}});
         let recurrent = serde_json::json!({"action_horizon": 1, "hidden_dim": 64});
         let shallow = serde_json::json!({"dim_model": 64, "n_layers": 2});
         for kind in PolicyConfig::TYPES {
@@ -30,7 +31,7 @@ mod tests {
                 "bc_rnn" => vec![&recurrent],
                 "bc_transformer" => vec![&shallow],
                 "diffusion" => vec![&levels, &tokens],
-                "flow" | "mip" => vec![&levels],
+                "flow" | "mip" => vec![&levels, &encoded],
                 _ => vec![&plain],
             };
             for keys in tried {

@@ -216,6 +216,8 @@ fn the_fallback_trains_to_the_same_losses() {
     let denoising = json!({"action_horizon": 4, "network": unet});
     let clean = with(&denoising, "prediction", json!("sample"));
     let tokens = json!({"dim_model": 12, "n_heads": 3, "n_layers": 1, "dropout": 0.1});
+    let encoded = with(&tokens, "n_encoder_layers", json!(2));
+    let encoded = with(&encoded, "pointer", json!({"among": "cube", "weight": 0.7}));
     let vision = json!({"width": 8, "blocks": [1, 0, 0, 0], "crop": 17, "shift": 1, "jitter": 0.2, "cell_features": 4});
     let frozen = with(&vision, "norm", json!("frozen"));
     let keypoints = with(&vision, "tokens", json!({"keypoints": {"count": 3}}));
@@ -237,6 +239,8 @@ fn the_fallback_trains_to_the_same_losses() {
         ("diffusion", with(&clean, "vision", keypoints), &of.image_history),
         ("diffusion", with(&denoising, "transformer", tokens), &of.entities),
         ("flow", denoising.clone(), &of.plain),
+        ("flow", with(&denoising, "transformer", encoded.clone()), &of.entities),
+        ("mip", with(&denoising, "transformer", encoded), &of.entities),
         ("mip", denoising, &of.history),
     ] {
         policy["type"] = kind.into();

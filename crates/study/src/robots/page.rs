@@ -13,7 +13,7 @@ use report::statistics::{Estimate, difference, hierarchical, holm};
 use zoo::ZooError;
 
 pub use self::charts::robot_charts;
-use self::charts::{all_arms, by_arm, by_steps, shown};
+use self::charts::{all_arms, by_arm, by_cost, by_steps, shown};
 use self::probes::probes;
 use super::cells::cells;
 use super::file::{Comparison, Data, Study};
@@ -61,10 +61,17 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
     if !study.verdict.is_empty() {
         let _ = writeln!(text, "{}\n", study.verdict.trim());
     }
-    let compared: Vec<Vec<Compared<'_>>> = [1, 2].into_iter().map(|stage| compare(study, &results, stage)).collect();
-    verdict(&mut text, study, &compared);
+    let stages: BTreeSet<u8> = study.comparisons.iter().map(|comparison| comparison.stage).collect();
+    let compared: Vec<_> = stages.iter().map(|stage| compare(study, &results, *stage)).collect();
+    if study.verdict.is_empty() {
+        verdict(&mut text, study, &compared);
+    }
     if let Some(chart) = all_arms(study, &results) {
         let _ = writeln!(text, "{}", shown(study, &chart));
+    }
+    // a verdict in words comes before what it is made of
+    if !study.verdict.is_empty() {
+        verdict(&mut text, study, &compared);
     }
     if !study.introduction.is_empty() {
         let _ = writeln!(text, "{}\n", study.introduction.trim());
@@ -104,8 +111,16 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
             folded(&mut text, &title, &part);
         }
     }
-    for (found, title) in compared.iter().zip(["Planned comparisons", "Comparisons that were added later"]) {
-        comparisons(&mut text, study, found, title);
+    for (stage, found) in stages.iter().zip(&compared) {
+        let title = match stage {
+            1 => "Planned comparisons".to_owned(),
+            2 => "Comparisons that were added later".to_owned(),
+            later => format!("Comparisons of stage {later}"),
+        };
+        comparisons(&mut text, study, found, &title);
+    }
+    for chart in by_cost(study, &results) {
+        let _ = writeln!(text, "{}", shown(study, &chart));
     }
     images_changed(&mut text, study, &results);
     other_refinement(&mut text, study, &results);

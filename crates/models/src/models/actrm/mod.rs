@@ -503,10 +503,17 @@ impl PolicyModel for Actrm {
 
     fn query_flops(&self) -> Option<f64> {
         let (config, r, layout) = (&self.config, &self.config.reasoning, self.tokens.layout());
-        if r.over == Over::Memory || layout.cameras.is_some() {
+        if layout.cameras.is_some() {
             return None;
         }
         let (dim, memory, horizon) = (config.dim_model, layout.len(), config.action_horizon);
+        if r.over == Over::Memory {
+            let updates = (r.h_cycles * (r.l_cycles + 1) * r.n_layers) as f64;
+            let decoder = flops::decoder_layer(config.shape(), horizon, memory) * config.n_decoder_layers as f64;
+            let step = flops::encoder_layer(config.shape(), memory) * updates + decoder;
+            let head = flops::linear(horizon, dim, self.signature.action_dim);
+            return Some(flops::tokens(layout, config.latent_dim, dim) + (step + head) * r.max_steps() as f64);
+        }
         let block = Shape { hidden: config.block_feedforward(), ..config.shape() };
         if let Design::Tokens(design) = &self.design {
             let read = memory + usize::from(config.pointer.is_some());

@@ -499,6 +499,12 @@ fn untied_steps_and_more_steps_cost_what_they_are() {
     // 3 tokens of memory: keys and values for each block
     assert_eq!(of(6, true) - of(6, false), 5.0 * 2.0 * (3 * 16 * 32) as f64);
     assert!(step > 0.0);
+    let of = |supervision_steps, l_cycles| {
+        flops(ReasoningConfig { supervision_steps, l_cycles, n_layers: 1, ..ReasoningConfig::original() })
+    };
+    // an update more in each of three rounds, in one step and in two
+    assert_eq!(of(2, 3) - of(2, 2), 2.0 * (of(1, 3) - of(1, 2)));
+    assert!(of(1, 3) > of(1, 2));
 }
 
 #[test]

@@ -15,13 +15,14 @@ use crate::checks::{check_batch, check_observation};
 use crate::chunk_policy::ChunkPolicy;
 use crate::encoders::VisionConfig;
 use crate::features::{FeatureKind, Features, Signature};
+use crate::layers::ask;
 use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::{DType, Tensor};
 use condition::Condition;
 use nn::ops::{Error, chunk_error};
-use nn::{Backend, Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Loss, ModelError, Params, Result, Rng, Size, Value};
 use std::fmt::Debug;
 use std::sync::Arc;
 use transformer::{Around, Transformer};
@@ -35,6 +36,9 @@ pub const READS: &[FeatureKind] =
 pub trait Method: Debug + Send + Sync + 'static {
     /// Name of the policy.
     const NAME: &'static str;
+
+    /// Answers of the network that an action sequence takes.
+    fn answers(&self) -> usize;
 
     /// What a training step asks of the network. actions: (b, H, A)
     ///
@@ -95,6 +99,30 @@ pub(crate) struct Setup<'a> {
     pub(crate) vision: Option<&'a VisionConfig>,
 }
 
+impl Setup<'_> {
+    /// How large the network will be, without what depends on observation and action.
+    pub(crate) fn size(&self) -> Size {
+        match self.transformer {
+            Some(transformer) => transformer.size(self.action_horizon),
+            None => self.network.size(self.action_horizon),
+        }
+    }
+
+    /// # Errors
+    /// The first field that makes it impossible.
+    pub(crate) fn validate(&self, model: &'static str) -> Result<()> {
+        match self.transformer {
+            Some(_) if self.vision.is_some() => {
+                let (found, expected) =
+                    ("given".to_string(), "none with a transformer, which sees no images".to_string());
+                Err(ModelError::Config { model, field: "vision", found, expected })
+            }
+            Some(transformer) => transformer.validate(model, self.action_horizon),
+            None => self.network.validate(model, self.action_horizon),
+        }
+    }
+}
+
 #[allow(clippy::large_enum_variant)] // a model has one
 #[derive(Debug)]
 enum Network {
@@ -136,13 +164,14 @@ impl<M: Method> Denoising<M> {
             return refuse("action_horizon", horizon.to_string(), format!("at least n_obs_steps, {n_obs_steps}"));
         }
         let (mut p, rng) = (Params::new(backend), &mut Rng::new(seed, "init"));
-        let condition = Condition::new(&mut p, M::NAME, signature, setup.vision, rng)?;
+        let condition = Condition::new(&mut p, (M::NAME, signature), setup.vision, setup.transformer, rng)?;
+        let (parts, width) = condition.parts();
         let network = match setup.transformer {
             Some(transformer) => {
-                let around = Around { horizon, action_dim, n_obs_steps, width: condition.width() / n_obs_steps };
+                let around = Around { horizon, action_dim, parts, width };
                 Network::Transformer(Transformer::new(&mut p, around, transformer, rng)?)
             }
-            None => Network::Unet(Unet::new(&mut p, "unet", (action_dim, condition.width()), setup.network, rng)?),
+            None => Network::Unet(Unet::new(&mut p, "unet", (action_dim, parts * width), setup.network, rng)?),
         };
         Ok(Self {
             method,
@@ -173,7 +202,7 @@ impl<M: Method> Denoising<M> {
         let rows = check_observation(M::NAME, &self.signature, observation)?;
         let steps: Vec<f32> = steps.iter().map(|&t| t as f32).collect();
         self.cache.composed_predict(&self.params, |cx| {
-            let cond = self.condition.apply(cx, rows, observation)?;
+            let (cond, _) = self.condition.apply(cx, rows, observation)?;
             Ok(self.answer(cx, x, &steps, &cond)?.into_graph())
         })
     }
@@ -186,12 +215,19 @@ impl<M: Method> Denoising<M> {
             true => (batch.is_pad.clone(), batch.total_valid_steps),
             false => (batch.is_pad.zeros_like()?, batch.total_rows * horizon),
         };
-        let cond = self.condition.apply(cx, rows, &batch.observation)?;
+        let (cond, scores) = self.condition.apply(cx, rows, &batch.observation)?;
         let mut loss = Loss::default();
         for target in targets {
             let answer = self.answer(cx, &target.x, &target.steps, &cond)?;
             let (term, _) = chunk_error(cx, (&answer, &target.wanted), &is_pad, Error::Squared, steps * width)?;
             loss.add(target.name, term, target.weight);
+        }
+        if let (Condition::Tokens(encoded), Some(scores)) = (&self.condition, &scores)
+            && let Some(pointer) = &encoded.pointer
+        {
+            let (term, right) = ask(cx, &pointer.asked(M::NAME, batch)?, scores)?;
+            loss.add("pointer_loss", term, pointer.weight);
+            loss.report("pointer_right", right);
         }
         Ok(loss)
     }
@@ -222,7 +258,7 @@ impl<M: Method> Denoising<M> {
     ) -> Result<Tensor> {
         let shape = (rows, self.action_horizon, self.signature.action_dim);
         let zeros = Tensor::zeros(shape, DType::F32, self.params.device())?;
-        let cond = self.condition.apply(cx, rows, observation)?;
+        let (cond, _) = self.condition.apply(cx, rows, observation)?;
         let mut answer = |x: &Tensor, step: f32| Ok(self.answer(cx, x, &vec![step; rows], &cond)?.detached());
         self.method.sample(&zeros, &mut || noise(&zeros), &mut answer)
     }
@@ -240,7 +276,7 @@ impl<M: Method> Denoising<M> {
     pub(crate) fn answered(&self, observation: &Features<Tensor>, x: &Tensor, steps: &[f32]) -> Result<Tensor> {
         let rows = check_observation(M::NAME, &self.signature, observation)?;
         self.cache.predict(&self.params, &mut || {}, |cx| {
-            let cond = self.condition.apply(cx, rows, observation)?;
+            let (cond, _) = self.condition.apply(cx, rows, observation)?;
             Ok(self.answer(cx, x, steps, &cond)?.detached())
         })
     }
@@ -282,6 +318,11 @@ impl<M: Method> PolicyModel for Denoising<M> {
     fn policy(self: Arc<Self>, preprocess: Arc<Preprocess>, clock: Box<dyn Clock>) -> Box<dyn Policy> {
         let past = self.signature.n_obs_steps - 1;
         Box::new(ChunkPolicy::new(self, preprocess).without_past(past).with_clock(clock))
+    }
+
+    fn query_flops(&self) -> Option<f64> {
+        let Network::Transformer(network) = &self.network else { return None };
+        Some(self.condition.flops()? + network.flops() * self.method.answers() as f64)
     }
 
     fn vision(&self) -> Option<&VisionConfig> {

@@ -5,9 +5,12 @@
 //! Deviations: every action attends to all observations (there, with `causal_attn`, the first ones not to the last ones);
 //! no dropout of tokens (0 in their experiments on low-dimensional observations) and no encoder over the observations
 //! (`n_cond_layers`, 0 there); no images.
+//!
+//! With `n_encoder_layers` it reads one encoded token a feature in place of those steps, as ACT's decoder does.
 
 use super::unet::embedding;
-use crate::layers::{Activation, DecoderLayer, LayerNorm, Linear, Shape};
+use crate::flops;
+use crate::layers::{Activation, DecoderLayer, LayerNorm, Linear, PointerConfig, Shape};
 use candle_core::Tensor;
 use nn::ops::{add, cat_tokens, layer_norm, linear, mish};
 use nn::{Context, Init, ModelError, Params, Result, Rng, Size, Value};
@@ -32,11 +35,22 @@ pub struct TransformerConfig {
     pub dropout: f64,
     /// whether an action attends only to itself and earlier ones (Chi et al.: `causal_attn`)
     pub causal: bool,
+    /// pre-norm encoder layers over one token for each feature of the observation, as ACT's; 0: a token for each step of it (Chi et al.)
+    #[serde(skip_serializing_if = "is_zero")]
+    pub n_encoder_layers: usize,
+    /// auxiliary loss on which entity was taken (with `n_encoder_layers`)
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pointer: Option<PointerConfig>,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)] // serde's
+fn is_zero(layers: &usize) -> bool {
+    *layers == 0
 }
 
 impl Default for TransformerConfig {
     fn default() -> Self {
-        Self { dim_model: 256, n_heads: 4, n_layers: 8, dropout: 0.3, causal: true }
+        Self { dim_model: 256, n_heads: 4, n_layers: 8, dropout: 0.3, causal: true, n_encoder_layers: 0, pointer: None }
     }
 }
 
@@ -64,6 +78,13 @@ impl TransformerConfig {
         if !(0.0..1.0).contains(&self.dropout) {
             return refuse("transformer.dropout", self.dropout.to_string(), "at least 0 and below 1".to_string());
         }
+        if let Some(pointer) = &self.pointer {
+            if self.n_encoder_layers == 0 {
+                let found = format!("among {}", pointer.among);
+                return refuse("transformer.pointer", found, "absent without n_encoder_layers".to_string());
+            }
+            pointer.validate(model)?;
+        }
         Ok(())
     }
 
@@ -71,11 +92,12 @@ impl TransformerConfig {
     pub fn size(&self, action_horizon: usize) -> Size {
         let (dim, steps) = (self.dim_model as f64, action_horizon as f64);
         let before = Size { weights: 8.0 * dim * dim + steps * dim, activations: 8.0 * dim };
-        before + self.shape().size(2, action_horizon) * self.n_layers
+        let encoder = self.shape().size(1, action_horizon) * self.n_encoder_layers;
+        before + encoder + self.shape().size(2, action_horizon) * self.n_layers
     }
 
     /// What its layers share.
-    fn shape(&self) -> Shape {
+    pub(super) fn shape(&self) -> Shape {
         Shape {
             dim: self.dim_model,
             heads: self.n_heads,
@@ -92,8 +114,8 @@ impl TransformerConfig {
 pub(super) struct Around {
     pub(super) horizon: usize,
     pub(super) action_dim: usize,
-    /// observations
-    pub(super) n_obs_steps: usize,
+    /// parts of an observation: its steps, or its tokens
+    pub(super) parts: usize,
     /// numbers of one of them
     pub(super) width: usize,
 }
@@ -102,6 +124,7 @@ pub(super) struct Around {
 #[derive(Debug)]
 pub(super) struct Transformer {
     dim: usize,
+    shape: Shape,
     around: Around,
     input_emb: Linear,
     /// (1, T, D)
@@ -122,7 +145,7 @@ impl Transformer {
     /// If the tensor library fails.
     pub(super) fn new(p: &mut Params, around: Around, config: &TransformerConfig, rng: &mut Rng) -> Result<Self> {
         let (dim, shape) = (config.dim_model, config.shape());
-        let Around { horizon, action_dim, n_obs_steps, width } = around;
+        let Around { horizon, action_dim, parts, width } = around;
         let name = |last: &str| format!("{PREFIX}.{last}");
         let normal = Init::Normal { std: STD };
         let linear = |p: &mut Params, last: &str, sizes, rng: &mut Rng| {
@@ -141,11 +164,12 @@ impl Transformer {
         }
         Ok(Self {
             dim,
+            shape,
             around,
             input_emb: linear(p, "input_emb", (action_dim, dim), rng)?,
             pos_emb: p.create(&name("pos_emb"), &[1, horizon, dim], normal, rng)?,
             cond_obs_emb: linear(p, "cond_obs_emb", (width, dim), rng)?,
-            cond_pos_emb: p.create(&name("cond_pos_emb"), &[1, 1 + n_obs_steps, dim], normal, rng)?,
+            cond_pos_emb: p.create(&name("cond_pos_emb"), &[1, 1 + parts, dim], normal, rng)?,
             encoder: [linear(p, "encoder.0", (dim, 4 * dim), rng)?, linear(p, "encoder.2", (4 * dim, dim), rng)?],
             layers,
             ln_f: LayerNorm::new(p, &name("ln_f"), dim, rng)?,
@@ -159,9 +183,9 @@ impl Transformer {
     /// Shapes that do not go together.
     pub(super) fn apply(&self, cx: &mut Context<'_>, x: &Value, steps: &[f32], cond: &Value) -> Result<Value> {
         let (rows, dim, device) = (steps.len(), self.dim, cx.device().clone());
-        let Around { horizon, n_obs_steps, width, .. } = self.around;
+        let Around { horizon, parts, width, .. } = self.around;
         let time = Value::of(embedding(steps, dim), (rows, 1, dim), &device)?;
-        let observed = linear(cx, &cond.reshape((rows, n_obs_steps, width))?, &self.cond_obs_emb)?;
+        let observed = linear(cx, &cond.reshape((rows, parts, width))?, &self.cond_obs_emb)?;
         let tokens = cat_tokens(cx, rows, &[&time, &observed])?;
         let positions = cx.parameter(&self.cond_pos_emb)?;
         let tokens = add(cx, &positions, &tokens)?;
@@ -171,7 +195,7 @@ impl Transformer {
         let memory = linear(cx, &hidden, second)?;
         // positions are in the tokens already
         let zeros = |tokens: usize| Value::zeros((1, tokens, dim), &device);
-        let (none, none_of_memory) = (zeros(horizon)?, zeros(1 + n_obs_steps)?);
+        let (none, none_of_memory) = (zeros(horizon)?, zeros(1 + parts)?);
         let x = linear(cx, x, &self.input_emb)?;
         let positions = cx.parameter(&self.pos_emb)?;
         let mut x = add(cx, &positions, &x)?;
@@ -180,5 +204,12 @@ impl Transformer {
         }
         let x = layer_norm(cx, &x, &self.ln_f)?;
         linear(cx, &x, &self.head)
+    }
+    /// Floating-point operations of an answer.
+    pub(super) fn flops(&self) -> f64 {
+        let (dim, Around { horizon, action_dim, parts, width }) = (self.dim, self.around);
+        let memory = flops::linear(parts, width, dim) + flops::linear(1 + parts, dim, 8 * dim);
+        let layers = flops::decoder_layer(self.shape, horizon, 1 + parts) * self.layers.len() as f64;
+        memory + layers + flops::linear(horizon, dim, 2 * action_dim)
     }
 }

@@ -1,7 +1,7 @@
 //! Diffusion's options.
 
 use crate::encoders::VisionConfig;
-use crate::models::denoising::{NetworkConfig, TransformerConfig};
+use crate::models::denoising::{NetworkConfig, Setup, TransformerConfig};
 use nn::Size;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
@@ -74,12 +74,19 @@ impl Default for Config {
 }
 
 impl Config {
+    pub(super) fn setup(&self) -> Setup<'_> {
+        Setup {
+            action_horizon: self.action_horizon,
+            network: &self.network,
+            transformer: self.transformer.as_ref(),
+            mask_padding: self.mask_padding,
+            vision: self.vision.as_ref(),
+        }
+    }
+
     /// How large the model will be.
     pub fn size(&self) -> Size {
-        match &self.transformer {
-            Some(transformer) => transformer.size(self.action_horizon),
-            None => self.network.size(self.action_horizon),
-        }
+        self.setup().size()
     }
 
     /// Checks that a model with this configuration can exist.
@@ -90,13 +97,7 @@ impl Config {
         let refuse = |field, found: String, expected: String| {
             Err(ModelError::Config { model: "diffusion", field, found, expected })
         };
-        match &self.transformer {
-            Some(transformer) => transformer.validate("diffusion", self.action_horizon)?,
-            None => self.network.validate("diffusion", self.action_horizon)?,
-        }
-        if self.transformer.is_some() && self.vision.is_some() {
-            return refuse("vision", "given".to_string(), "none with a transformer, which sees no images".to_string());
-        }
+        self.setup().validate("diffusion")?;
         if self.num_train_timesteps == 0 {
             return refuse("num_train_timesteps", "0".to_string(), "at least 1".to_string());
         }

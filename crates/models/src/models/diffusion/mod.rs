@@ -24,7 +24,7 @@ pub use super::denoising::{NetworkConfig, READS, TransformerConfig};
 pub use config::{Config, Prediction, Sampler};
 pub use schedule::NoiseSchedule;
 
-use super::denoising::{Denoising, Method, Setup, Target, normals_like};
+use super::denoising::{Denoising, Method, Target, normals_like};
 use crate::batch::Batch;
 use crate::features::{Features, Signature};
 use candle_core::Tensor;
@@ -56,6 +56,10 @@ impl Noising {
 impl Method for Noising {
     const NAME: &'static str = "diffusion";
 
+    fn answers(&self) -> usize {
+        self.config.inference_steps
+    }
+
     fn targets(&self, rng: &mut Rng, actions: &Tensor) -> Result<Vec<Target>> {
         let noise = normals_like(actions, rng)?;
         let of = self.schedule.steps() as u64;
@@ -85,15 +89,8 @@ impl Diffusion {
     /// A configuration or a signature that describes no possible model.
     pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
-        let setup = Setup {
-            action_horizon: config.action_horizon,
-            network: &config.network,
-            transformer: config.transformer.as_ref(),
-            mask_padding: config.mask_padding,
-            vision: config.vision.as_ref(),
-        };
         let schedule = NoiseSchedule::new(config.num_train_timesteps);
-        Self::build(Noising { config: config.clone(), schedule }, &setup, signature, seed, backend)
+        Self::build(Noising { config: config.clone(), schedule }, &config.setup(), signature, seed, backend)
     }
 
     /// The same model drawing its actions otherwise.

@@ -2,6 +2,7 @@
 use super::*;
 use crate::encoders::{ImageNorm, TokenKind, VisionConfig};
 use crate::features::FeatureKind;
+use crate::layers::PointerConfig;
 use crate::model::PolicyModel;
 use crate::testing::{
     assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training, move_parameters,
@@ -16,7 +17,20 @@ fn small() -> Config {
 }
 
 fn tokens() -> TransformerConfig {
-    TransformerConfig { dim_model: 12, n_heads: 3, n_layers: 2, dropout: 0.0, causal: true }
+    TransformerConfig {
+        dim_model: 12,
+        n_heads: 3,
+        n_layers: 2,
+        dropout: 0.0,
+        causal: true,
+        ..TransformerConfig::default()
+    }
+}
+
+/// Over a token for each feature, of which one is pointed at.
+fn pointing() -> TransformerConfig {
+    let pointer = Some(PointerConfig { among: "cube".into(), weight: 2.0 });
+    TransformerConfig { n_encoder_layers: 2, causal: false, pointer, ..tokens() }
 }
 
 fn attending(transformer: TransformerConfig) -> Config {
@@ -48,7 +62,8 @@ fn cases() -> Vec<(Signature, Config)> {
         (of.entities.clone(), Config { network: shifted, ..small() }),
         (of.no_env.clone(), Config { network: one_level, ..small() }),
         (of.no_env, Config { network: three, mask_padding: true, ..small() }),
-        (of.entities, attending(TransformerConfig { dropout: 0.2, ..tokens() })),
+        (of.entities.clone(), attending(TransformerConfig { dropout: 0.2, ..tokens() })),
+        (of.entities, attending(pointing())),
         (of.history, Config { mask_padding: true, ..attending(TransformerConfig { causal: false, ..tokens() }) }),
     ]
 }
@@ -191,6 +206,7 @@ fn impossible_configurations_name_the_field() {
     assert!(attends(|t| t.dim_model = 9).contains("transformer.dim_model is 9"));
     assert!(attends(|t| t.n_layers = 0).contains("transformer.n_layers is 0"));
     assert!(attends(|t| t.dropout = 1.0).contains("transformer.dropout is 1"));
+    assert!(attends(|t| t.pointer = pointing().pointer).contains("transformer.pointer is among cube, expected absent"));
     let both = Config { vision: Some(vision_config()), ..attending(tokens()) };
     assert!(error(both).contains("vision is given, expected none with a transformer"));
     // a signature with images brings an encoder of its own
@@ -236,4 +252,19 @@ fn what_a_camera_sees_decides_and_is_told_before_anything_is_drawn() {
             }
         }
     }
+}
+
+#[test]
+fn over_tokens_a_pointer_is_asked_beside_the_actions() {
+    let signature = signatures().entities;
+    let model = Diffusion::new(&attending(pointing()), &signature, 1, &Backend::CPU).unwrap();
+    let batch = batch(&signature, 8, 6, 3);
+    let loss = model.loss(&batch, &mut Rng::new(1, "loss")).unwrap();
+    assert!(loss.parts.contains_key("pointer_loss") && loss.parts.contains_key("pointer_right"), "{:?}", loss.parts);
+    // without a pointer it is a part less, and the data need not say what was taken
+    let silent = TransformerConfig { pointer: None, ..pointing() };
+    let model = Diffusion::new(&attending(silent), &signature, 1, &Backend::CPU).unwrap();
+    let untold = Batch { taken: None, ..batch };
+    assert!(!model.loss(&untold, &mut Rng::new(1, "loss")).unwrap().parts.contains_key("pointer_loss"));
+    assert!(model.query_flops().unwrap() > 1e3);
 }

@@ -1,7 +1,7 @@
 //! Flow matching's options.
 
 use crate::encoders::VisionConfig;
-use crate::models::denoising::NetworkConfig;
+use crate::models::denoising::{NetworkConfig, Setup, TransformerConfig};
 use nn::Size;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
@@ -14,6 +14,9 @@ pub struct Config {
     pub action_horizon: usize,
     /// the network
     pub network: NetworkConfig,
+    /// a transformer instead of the UNet
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub transformer: Option<TransformerConfig>,
     /// Euler steps from noise to actions
     pub inference_steps: usize,
     /// whether padding beyond an episode's ends is left out of the loss
@@ -28,6 +31,7 @@ impl Default for Config {
         Self {
             action_horizon: 16,
             network: NetworkConfig::default(),
+            transformer: None,
             inference_steps: 5,
             mask_padding: false,
             vision: None,
@@ -36,9 +40,19 @@ impl Default for Config {
 }
 
 impl Config {
+    pub(super) fn setup(&self) -> Setup<'_> {
+        Setup {
+            action_horizon: self.action_horizon,
+            network: &self.network,
+            transformer: self.transformer.as_ref(),
+            mask_padding: self.mask_padding,
+            vision: self.vision.as_ref(),
+        }
+    }
+
     /// How large the model will be.
     pub fn size(&self) -> Size {
-        self.network.size(self.action_horizon)
+        self.setup().size()
     }
 
     /// Checks that a model with this configuration can exist.
@@ -46,7 +60,7 @@ impl Config {
     /// # Errors
     /// The first field that makes it impossible.
     pub fn validate(&self) -> Result<()> {
-        self.network.validate("flow", self.action_horizon)?;
+        self.setup().validate("flow")?;
         if self.inference_steps == 0 {
             let (found, expected) = ("0".to_string(), "at least 1".to_string());
             return Err(ModelError::Config { model: "flow", field: "inference_steps", found, expected });

@@ -6,7 +6,7 @@
 //! (mean squared error, t even in 0 to 1). An action sequence is drawn by `inference_steps` Euler steps of the same length from
 //! noise.
 //!
-//! The network is diffusion's (`models/denoising/unet.rs`), which is shown 100 t as its step. No implementation is taken for the reference: the sampler is held to an oracle in NumPy, the network to
+//! The network is diffusion's (`models/denoising`), a UNet or a transformer, which is shown 100 t as its step. No implementation is taken for the reference: the sampler is held to an oracle in NumPy, the network to
 //! LeRobot's with diffusion. Deviations: π0 draws t from a beta distribution and has a transformer.
 
 mod config;
@@ -14,7 +14,7 @@ mod config;
 pub use super::denoising::READS;
 pub use config::Config;
 
-use super::denoising::{Denoising, Method, Setup, Target, between, normals_like};
+use super::denoising::{Denoising, Method, Target, between, normals_like};
 use crate::features::Signature;
 use candle_core::Tensor;
 use nn::{Backend, Result, Rng};
@@ -44,6 +44,10 @@ fn euler(z: &Tensor, steps: usize, mut velocity: impl FnMut(&Tensor, f32) -> Res
 impl Method for Velocity {
     const NAME: &'static str = "flow";
 
+    fn answers(&self) -> usize {
+        self.inference_steps
+    }
+
     fn targets(&self, rng: &mut Rng, actions: &Tensor) -> Result<Vec<Target>> {
         let noise = normals_like(actions, rng)?;
         let times: Vec<f32> = (0..actions.dim(0)?).map(|_| rng.uniform()).collect();
@@ -69,14 +73,7 @@ impl Flow {
     /// A configuration or a signature that describes no possible model.
     pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
-        let setup = Setup {
-            action_horizon: config.action_horizon,
-            network: &config.network,
-            transformer: None,
-            mask_padding: config.mask_padding,
-            vision: config.vision.as_ref(),
-        };
-        Self::build(Velocity { inference_steps: config.inference_steps }, &setup, signature, seed, backend)
+        Self::build(Velocity { inference_steps: config.inference_steps }, &config.setup(), signature, seed, backend)
     }
 }
 

@@ -1,7 +1,7 @@
 //! MIP's options.
 
 use crate::encoders::VisionConfig;
-use crate::models::denoising::NetworkConfig;
+use crate::models::denoising::{NetworkConfig, Setup, TransformerConfig};
 use nn::Size;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
@@ -14,6 +14,9 @@ pub struct Config {
     pub action_horizon: usize,
     /// the network
     pub network: NetworkConfig,
+    /// a transformer instead of the UNet
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub transformer: Option<TransformerConfig>,
     /// share of the actions in the second step's input; the rest is noise in training
     pub second_time: f64,
     /// whether padding beyond an episode's ends is left out of the loss
@@ -28,6 +31,7 @@ impl Default for Config {
         Self {
             action_horizon: 16,
             network: NetworkConfig::default(),
+            transformer: None,
             second_time: 0.9,
             mask_padding: false,
             vision: None,
@@ -36,9 +40,19 @@ impl Default for Config {
 }
 
 impl Config {
+    pub(super) fn setup(&self) -> Setup<'_> {
+        Setup {
+            action_horizon: self.action_horizon,
+            network: &self.network,
+            transformer: self.transformer.as_ref(),
+            mask_padding: self.mask_padding,
+            vision: self.vision.as_ref(),
+        }
+    }
+
     /// How large the model will be.
     pub fn size(&self) -> Size {
-        let once = self.network.size(self.action_horizon);
+        let once = self.setup().size();
         Size { activations: 2.0 * once.activations, ..once }
     }
 
@@ -47,7 +61,7 @@ impl Config {
     /// # Errors
     /// The first field that makes it impossible.
     pub fn validate(&self) -> Result<()> {
-        self.network.validate("mip", self.action_horizon)?;
+        self.setup().validate("mip")?;
         if !(self.second_time > 0.0 && self.second_time < 1.0) {
             let (found, expected) = (self.second_time.to_string(), "between 0 and 1".to_string());
             return Err(ModelError::Config { model: "mip", field: "second_time", found, expected });

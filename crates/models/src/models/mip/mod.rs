@@ -5,7 +5,7 @@
 //! demonstrated actions a, noise z and t = `second_time` the network π is trained on
 //! |π(o, 0, 0) - a|² + |π(o, t a + (1-t) z, t) - a|²; its answer is π(o, t a0, t) with a0 = π(o, 0, 0).
 //!
-//! The network is diffusion's (`models/denoising/unet.rs`), which is shown 100 t as its step. Deviations: written from the paper's equations, without its code to hold it to; the two steps are held to an
+//! The network is diffusion's (`models/denoising`), a UNet or a transformer, which is shown 100 t as its step. Deviations: written from the paper's equations, without its code to hold it to; the two steps are held to an
 //! oracle in NumPy, the network to LeRobot's with diffusion. The loss is half the sum, so that it compares with one step's.
 
 mod config;
@@ -13,7 +13,7 @@ mod config;
 pub use super::denoising::READS;
 pub use config::Config;
 
-use super::denoising::{Denoising, Method, Setup, Target, between, normals_like};
+use super::denoising::{Denoising, Method, Target, between, normals_like};
 use crate::features::Signature;
 use candle_core::Tensor;
 use nn::{Backend, Result, Rng};
@@ -42,6 +42,10 @@ fn two_steps(
 
 impl Method for TwoSteps {
     const NAME: &'static str = "mip";
+
+    fn answers(&self) -> usize {
+        2
+    }
 
     fn targets(&self, rng: &mut Rng, actions: &Tensor) -> Result<Vec<Target>> {
         let (rows, noise) = (actions.dim(0)?, normals_like(actions, rng)?);
@@ -72,14 +76,7 @@ impl Mip {
     /// A configuration or a signature that describes no possible model.
     pub fn new(config: &Config, signature: &Signature, seed: u64, backend: &Backend) -> Result<Self> {
         config.validate()?;
-        let setup = Setup {
-            action_horizon: config.action_horizon,
-            network: &config.network,
-            transformer: None,
-            mask_padding: config.mask_padding,
-            vision: config.vision.as_ref(),
-        };
-        Self::build(TwoSteps { second_time: config.second_time as f32 }, &setup, signature, seed, backend)
+        Self::build(TwoSteps { second_time: config.second_time as f32 }, &config.setup(), signature, seed, backend)
     }
 }
 

@@ -32,7 +32,8 @@ pub fn robot_charts(study: &Study) -> Result<Vec<(PathBuf, String)>, ZooError> {
     let all = all_arms(study, &results)
         .into_iter()
         .chain(by_arm)
-        .chain(by_steps(study, &results).into_iter().map(|(_, chart)| chart));
+        .chain(by_steps(study, &results).into_iter().map(|(_, chart)| chart))
+        .chain(by_cost(study, &results));
     Ok(all.map(|chart| (study.results.join(chart.name), chart.svg)).collect())
 }
 
@@ -121,6 +122,24 @@ pub(super) fn by_steps(study: &Study, results: &Results) -> Vec<((String, String
     charts
 }
 
+/// Success against operations of a query, a numbered point an arm, of every plain test with several counted arms.
+pub(super) fn by_cost(study: &Study, results: &Results) -> Vec<Chart> {
+    let mut tests: BTreeMap<(&str, &str), Vec<(&str, f64, f64)>> = BTreeMap::new();
+    for ((test, data, arm), trainings) in results.iter().filter(|((test, _, _), _)| study.tests[test].is_plain()) {
+        let flops = trainings.values().find_map(|result| result.query_flops).filter(|flops| *flops > 0.0);
+        if let Some((flops, success)) = flops.zip(mean(trainings, &[])) {
+            tests.entry((test, data)).or_default().push((&study.arms[arm].label, flops / 1e6, success));
+        }
+    }
+    tests.retain(|_, arms| arms.len() >= FEWEST_GROUPS);
+    let drawn = tests.into_iter().map(|((test, data), mut arms)| {
+        arms.sort_by(|a, b| a.1.total_cmp(&b.1));
+        let shows = format!("{} after {data}: success by MFLOP per query", study.tests[test].task);
+        Chart { name: format!("{test}_{data}_by-cost.svg"), svg: points(&shows, &arms), shows }
+    });
+    drawn.collect()
+}
+
 fn groups<'a>(trainings: impl Iterator<Item = &'a Trainings>) -> Vec<String> {
     let episodes = trainings.flat_map(BTreeMap::values).flat_map(|result| &result.episodes);
     let found: BTreeSet<String> = episodes.filter_map(|episode| episode.group.clone()).collect();
@@ -133,10 +152,12 @@ fn mean(trainings: &Trainings, groups: &[String]) -> Option<f64> {
     (!all.is_empty()).then(|| all.iter().sum::<f64>() / all.len() as f64)
 }
 
-/// Lines over `heads`, shares of one from bottom to top, with a legend at the right.
-fn drawn(title: &str, heads: &[String], lines: &[(String, Vec<Option<f64>>)]) -> String {
-    let (left, top, width, height) = (52.0, 34.0, 560.0, 240.0);
-    let x = |i: usize| left + width * (i as f64 + 0.5) / heads.len() as f64;
+/// Where a drawing begins, and its size.
+const FRAME: (f64, f64, f64, f64) = (52.0, 34.0, 560.0, 240.0);
+
+/// A drawing's title and its lines for shares of one, from bottom to top.
+fn framed(title: &str) -> String {
+    let (left, top, width, height) = FRAME;
     let y = |share: f64| top + height * (1.0 - share);
     let title = escaped(title);
     let mut svg = format!(
@@ -155,6 +176,40 @@ fn drawn(title: &str, heads: &[String], lines: &[(String, Vec<Option<f64>>)]) ->
             100.0 * share
         );
     }
+    svg
+}
+
+/// Numbered points, shares of one over a logarithmic axis, with a legend at the right.
+fn points(title: &str, arms: &[(&str, f64, f64)]) -> String {
+    let (left, top, width, height) = FRAME;
+    let (first, last) = (arms.first().map_or(1.0, |arm| arm.1), arms.last().map_or(1.0, |arm| arm.1));
+    let (low, high) = (first.log2().floor(), (last.log2() + 0.1).ceil());
+    let x = |value: f64| left + width * (value.log2() - low) / (high - low);
+    let mut svg = framed(title);
+    for value in (low as i32..=high as i32).map(|power| 2.0_f64.powi(power)) {
+        let (at, below) = (x(value), top + height + 20.0);
+        let _ = writeln!(svg, "<text x=\"{at:.1}\" y=\"{below:.1}\" text-anchor=\"middle\">{value}</text>");
+    }
+    for (i, (label, value, share)) in arms.iter().enumerate() {
+        let (at, up, color, number) = (x(*value), top + height * (1.0 - share), COLORS[i % COLORS.len()], i + 1);
+        let (beside, line, label) = (at + 6.0, top + 12.0 + 17.0 * i as f64, escaped(label));
+        let _ = writeln!(
+            svg,
+            "<circle cx=\"{at:.1}\" cy=\"{up:.1}\" r=\"3.5\" fill=\"{color}\"/><text x=\"{beside:.1}\" y=\"{up:.1}\" \
+             font-size=\"11\">{number}</text><text x=\"622\" y=\"{line}\" font-size=\"11\">{number}: {label}, {:.0}%</text>",
+            100.0 * share
+        );
+    }
+    svg.push_str("</svg>\n");
+    svg
+}
+
+/// Lines over `heads`, shares of one from bottom to top, with a legend at the right.
+fn drawn(title: &str, heads: &[String], lines: &[(String, Vec<Option<f64>>)]) -> String {
+    let (left, top, width, height) = FRAME;
+    let x = |i: usize| left + width * (i as f64 + 0.5) / heads.len() as f64;
+    let y = |share: f64| top + height * (1.0 - share);
+    let mut svg = framed(title);
     for (i, head) in heads.iter().enumerate() {
         let (at, below, head) = (x(i), top + height + 20.0, escaped(head));
         let _ = writeln!(svg, "<text x=\"{at:.1}\" y=\"{below:.1}\" text-anchor=\"middle\">{head}</text>");
@@ -201,5 +256,9 @@ mod tests {
         assert!(svg.contains("points=\"145.3,34.0 332.0,154.0 518.7,274.0\""), "{svg}");
         assert!(svg.contains("points=\"145.3,214.0 518.7,34.0\""), "{svg}");
         assert_eq!(svg.matches("<circle").count(), 5);
+        // from 2 to 8 on a logarithmic axis of 560
+        let svg = points("cost", &[("one", 2.0, 0.25), ("six", 4.0, 1.0), ("ten", 5.0, 0.5)]);
+        assert!(svg.contains("<circle cx=\"52.0\" cy=\"214.0\"") && svg.contains("cx=\"332.0\" cy=\"34.0\""), "{svg}");
+        assert!(svg.contains(">8</text>") && svg.contains(">2: six, 100%</text>"), "{svg}");
     }
 }

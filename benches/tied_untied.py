@@ -1,0 +1,130 @@
+"""Group-sequential comparison of six tied and six untied refinement steps on PickChain (docs/study_plan.md, stage 4).
+
+    .venv/bin/python benches/tied_untied.py --simulate     error rates and power of the plan
+    .venv/bin/python benches/tied_untied.py docs/thinking  the decision after the trainings that are there
+
+A training counts by its share of solved test episodes; all are tested on the same 200. At each look Welch's t-test
+compares the arms.
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+ARMS = ("k6", "k6-untied")
+MARGIN = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Trainings of each arm, two-sided level for a difference, one-sided level for equivalence (0: not tested)."""
+
+    tied: int
+    untied: int
+    difference: float
+    equivalence: float
+
+
+# The first look had been made when this plan was written.
+LOOKS = (Look(8, 5, 0.001, 0.0), Look(10, 10, 0.005, 0.01), Look(13, 13, 0.015, 0.02), Look(16, 16, 0.04, 0.04))
+
+
+def welch(tied: np.ndarray, untied: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Difference of means, its standard error and degrees of freedom; trainings are the last axis."""
+    parts = [side.var(axis=-1, ddof=1) / side.shape[-1] for side in (tied, untied)]
+    variance = np.maximum(parts[0] + parts[1], 1e-12)
+    spread = parts[0] ** 2 / (tied.shape[-1] - 1) + parts[1] ** 2 / (untied.shape[-1] - 1)
+    freedom = variance**2 / np.maximum(spread, 1e-30)
+    return tied.mean(axis=-1) - untied.mean(axis=-1), np.sqrt(variance), freedom
+
+
+def decide(tied: np.ndarray, untied: np.ndarray, look: Look) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the arms differ, and whether they are equivalent within MARGIN."""
+    difference, error, freedom = welch(tied[..., : look.tied], untied[..., : look.untied])
+    differ = 2 * stats.t.sf(np.abs(difference) / error, freedom) <= look.difference
+    equivalent = np.zeros_like(differ)
+    if look.equivalence > 0:
+        equivalent = stats.t.sf((MARGIN - np.abs(difference)) / error, freedom) <= look.equivalence
+    return differ, equivalent & ~differ
+
+
+def simulate(gap: float, spread: tuple[float, float], failing: float, studies: int = 20_000) -> np.ndarray:
+    """Shares of studies that end in a difference, in equivalence, undecided, and the mean number of trainings.
+
+    A training's success is normal around its arm's mean, cut at 0 and 1; with probability `failing` it learns little
+    and has 0.3. The means are such that the arms differ by `gap` in all.
+    """
+    rng = np.random.default_rng(57)
+    last = LOOKS[-1]
+
+    def draw(mean: float, deviation: float, trainings: int) -> np.ndarray:
+        good = np.clip(rng.normal(mean, deviation, (studies, trainings)), 0, 1)
+        return np.where(rng.random((studies, trainings)) < failing, 0.3, good)
+
+    tied = draw(0.85 + gap / 2 / (1 - failing), spread[0], last.tied)
+    untied = draw(0.85 - gap / 2 / (1 - failing), spread[1], last.untied)
+    ended, outcome, used = np.zeros(studies, bool), np.full(studies, 2), np.full(studies, last.tied + last.untied)
+    for look in LOOKS:
+        for verdict, holds in enumerate(decide(tied, untied, look)):
+            new = holds & ~ended
+            outcome[new], used[new] = verdict, look.tied + look.untied
+            ended |= new
+    return np.array([*(np.mean(outcome == kind) for kind in range(3)), used.mean()])
+
+
+def table() -> str:
+    """The plan's error rates as a Markdown table."""
+    rows = [
+        "| true difference | deviation of trainings | that learn little "
+        "| different | equivalent | undecided | trainings |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for spread in ((0.046, 0.084), (0.084, 0.084)):
+        for failing in (0.0, 0.1):
+            for gap in (0.0, 0.05, 0.1):
+                different, equivalent, undecided, trainings = simulate(gap, spread, failing)
+                rows.append(
+                    f"| {100 * gap:.0f} points | {100 * spread[0]:.1f}, {100 * spread[1]:.1f} | {100 * failing:.0f}% "
+                    f"| {100 * different:.1f}% | {100 * equivalent:.1f}% | {100 * undecided:.1f}% | {trainings:.1f} |"
+                )
+    return "\n".join(rows)
+
+
+def successes(folder: Path, arm: str) -> np.ndarray:
+    """Success of the trainings of an arm in the order of their seeds, up to the first that is missing."""
+    shares: list[float] = []
+    while (file := folder / f"{arm}-on-pickchain-seed{len(shares) + 1}_chain.json").exists():
+        episodes = json.loads(file.read_text())["episodes"]
+        shares.append(sum(episode["success"] for episode in episodes) / len(episodes))
+    return np.array(shares)
+
+
+def report(folder: Path) -> str:
+    """A line a look that can be made; a look after the decision is not made."""
+    tied, untied = (successes(folder, arm) for arm in ARMS)
+    lines = [f"tied: {len(tied)} trainings, untied: {len(untied)}"]
+    for number, look in enumerate(LOOKS, 1):
+        if len(tied) < look.tied or len(untied) < look.untied:
+            lines.append(f"look {number} ({look.tied} and {look.untied} trainings): to be made")
+            break
+        difference, error, freedom = welch(tied[: look.tied], untied[: look.untied])
+        p = 2 * stats.t.sf(abs(difference) / error, freedom)
+        differ, equivalent = decide(tied, untied, look)
+        verdict = "different" if differ else "equivalent" if equivalent else "undecided"
+        lines.append(
+            f"look {number} ({look.tied} and {look.untied} trainings): {100 * difference:+.1f} points, standard error "
+            f"{100 * error:.1f}, p = {p:.4f} against {look.difference}: {verdict}"
+        )
+        if differ or equivalent:
+            break
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: tied_untied.py --simulate | FOLDER")
+    print(table() if sys.argv[1] == "--simulate" else report(Path(sys.argv[1])))
