@@ -153,6 +153,23 @@ pub struct Plan {
 }
 
 impl Plan {
+    /// Everything but the demos.
+    pub(crate) fn without_demos(&self) -> Self {
+        Self {
+            path: self.path.clone(),
+            files: self.files.clone(),
+            dialect: self.dialect,
+            demos: Vec::new(),
+            env_args: self.env_args.clone(),
+            env_name: self.env_name.clone(),
+            env_version: self.env_version.clone(),
+            masks: self.masks.clone(),
+            texts: self.texts.clone(),
+            notes: self.notes.clone(),
+            problems: self.problems.clone(),
+        }
+    }
+
     /// Steps of all demos together.
     pub fn frames(&self) -> usize {
         self.demos.iter().map(|d| d.length).sum()
@@ -196,6 +213,15 @@ pub struct DemoPlan {
     pub attr_names: Vec<String>,
     /// The instruction in words, where the file has one for this demo.
     pub task: Option<String>,
+}
+
+impl DemoPlan {
+    /// The same in less memory: a tree that grew key by key has half-empty nodes.
+    pub(crate) fn packed(mut self) -> Self {
+        self.keys = std::mem::take(&mut self.keys).into_iter().collect();
+        self.keys.values_mut().for_each(|key| key.shape.shrink_to_fit());
+        self
+    }
 }
 
 /// One dataset of a demo, unread.

@@ -2,6 +2,7 @@
 
 mod assembly;
 mod check;
+mod chooser;
 mod columns;
 mod convert;
 mod depth;

@@ -16,7 +16,7 @@ use super::codec::{Taker, put_array, put_demo};
 use super::local::Backend;
 use super::{open_backend, video};
 use crate::error::InputError;
-use crate::plan::Plan;
+use crate::plan::{DemoPlan, Plan};
 use crate::tree::{Array, Demo};
 
 /// Set in a process that reads demonstrations: the file that it is to open.
@@ -37,8 +37,12 @@ const CPU_SECONDS: u64 = 6;
 const BYTES_PER_CPU_SECOND: u64 = 256 << 10;
 /// The longest answer.
 const MAX_ANSWER: u64 = 384 << 20;
+/// Demos of a plan that are sent together, and the most bytes of all of them.
+const DEMOS_AT_ONCE: usize = 256;
+const MAX_DEMOS: usize = 2 << 30;
 
 pub(super) const PLAN: u8 = b'P';
+const DEMOS: u8 = b'L';
 const DEMO: u8 = b'D';
 pub(super) const ARRAY: u8 = b'A';
 pub(super) const ERROR: u8 = b'E';
@@ -144,7 +148,10 @@ fn serve(path: &Path) -> std::io::Result<()> {
             // links may lead to more files
             let seconds = allowed(bytes.max(plan.files.iter().map(|(_, bytes)| bytes).sum()));
             limit_cpu(seconds, Some(seconds))?;
-            send_json(&mut out, PLAN, &*plan)?;
+            send_json(&mut out, PLAN, &plan.without_demos())?;
+            plan.demos.chunks(DEMOS_AT_ONCE).try_for_each(|demos| send_json(&mut out, DEMOS, &demos))?;
+            // no more
+            send_json(&mut out, DEMOS, &[(); 0])?;
             local
         }
         Err(error) => return send(&mut out, ERROR, &serde_json::to_vec(&error)?),
@@ -255,7 +262,23 @@ enum Failure {
 impl Remote {
     /// Starts a reading process on a file or folder and takes its plan.
     pub fn open(path: &Path) -> Result<(Self, Plan), InputError> {
-        Self::start(path, PATH_VARIABLE)
+        let (remote, mut plan): (Self, Plan) = Self::start(path, PATH_VARIABLE)?;
+        let mut bytes = 0;
+        loop {
+            let (kind, body) = remote.exchange::<Request>(None)?;
+            bytes += body.len();
+            let demos: Vec<DemoPlan> = match serde_json::from_slice(&body) {
+                Ok(demos) if kind == DEMOS && bytes <= MAX_DEMOS => demos,
+                _ => {
+                    let (path, reason) = (path.to_owned(), "its answer is no list of demos".to_owned());
+                    return Err(InputError::ReaderStart { path, reason });
+                }
+            };
+            if demos.is_empty() {
+                return Ok((remote, plan));
+            }
+            plan.demos.extend(demos.into_iter().map(DemoPlan::packed));
+        }
     }
 
     /// Starts a process that reads `path` as the variable says, and takes what it says unasked.
