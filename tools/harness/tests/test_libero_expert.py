@@ -98,7 +98,7 @@ def test_the_expert_shows_a_task_and_repeats_itself() -> None:
 
 @needs_libero
 def test_a_goal_without_an_expert_is_named() -> None:
-    worker = Client("--task", "libero_10/8")
+    worker = Client("--task", "libero_goal/3")
     with pytest.raises(Exception, match=r"no_expert.*no scripted expert for a goal like this one"):
         worker.ask("expert", seed=0, split="demonstration")
     assert worker.close() == 0

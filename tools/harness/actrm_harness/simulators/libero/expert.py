@@ -341,7 +341,11 @@ class PickAndPlace:
 def expert(scene: LiberoScene, rng: np.random.Generator) -> PickAndPlace:
     """The expert of the environment's goal; RequestError where there is none."""
     goal: list[list[str]] = scene.env.parsed_problem["goal_state"]
-    if len(goal) == 1 and goal[0][0] in ("in", "on") and goal[0][1] in scene.env.objects_dict:
-        return PickAndPlace(scene, rng, goal[0][1], goal[0][2])
+    things, regions = scene.env.objects_dict, scene.env.object_sites_dict
+    if len(goal) == 1 and goal[0][0] in ("in", "on") and goal[0][1] in things:
+        _, thing, onto = goal[0]
+        # what is in a fixture is behind a door or in a drawer
+        if goal[0][0] == "on" or getattr(regions.get(onto), "parent_name", "") in things:
+            return PickAndPlace(scene, rng, thing, onto)
     text = "; ".join(" ".join(condition) for condition in goal)
     raise RequestError("no_expert", f"there is no scripted expert for a goal like this one: {text}")
