@@ -246,6 +246,26 @@ def workers_of(program: int) -> list[int]:
     return [int(child) for path in children for child in path.read_text().split()]
 
 
+def test_the_compiled_loop_is_liberos_own_up_to_rounding(libero: Path, library: Path) -> None:
+    """Random actions with and without a turn, the gripper opening and closing, over two episodes: within 1e-9."""
+    assert libero.is_file()
+    plain = Client("--task", "libero_goal/7")
+    compiled = Client("--task", "libero_goal/7", env={"ACTRM_CONTROL_LIB": str(library)})
+    assert (plain.ready["control"], compiled.ready["control"]) == ("robosuite", "compiled")
+    actions = walk(4, 40)
+    actions[::5, 3:6] = 0.0
+    actions[:, 6] = np.where(np.arange(40) // 8 % 2, 1.0, -1.0)
+    furthest = 0.0
+    for seed in (3, 4):
+        found = [client.ask("reset", seed=seed)[1] for client in (plain, compiled)]
+        for begin in range(0, 40, 8):
+            for name, value in found[0].items():
+                furthest = max(furthest, np.abs(value - found[1][name]).max())
+            found = [client.ask("step", {"action": actions[begin : begin + 8]})[1] for client in (plain, compiled)]
+    assert 0.0 < furthest < 1e-9
+    assert plain.close() == compiled.close() == 0
+
+
 def test_a_worker_repeats_an_episode(libero: Path) -> None:
     """With and without cameras, one action at a time or several; seeds beyond the initial states begin again."""
     assert libero.is_file()

@@ -6,8 +6,8 @@ examples/libero/main.py: an `OffScreenRenderEnv` a task, for each episode a rese
 steps, then steps up to the cap. Needs .venv-libero (`make libero`) and a build. Processor seconds are those of all
 processes of a side. They count where other programs run beside, which time on the wall does not allow.
 
-    .venv/bin/python benches/libero.py                                  # 10 tasks x 10 episodes: an hour
-    .venv/bin/python benches/libero.py --task libero_object/0 --episodes 2 --steps 60
+    .venv/bin/python benches/libero_suite.py                                  # 10 tasks x 10 episodes: an hour
+    .venv/bin/python benches/libero_suite.py --task libero_object/0 --episodes 2 --steps 60
 """
 
 import argparse
