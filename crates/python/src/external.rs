@@ -24,6 +24,8 @@ pub(crate) struct PythonPolicy {
     source: String,
     signature: Signature,
     failure: Failure,
+    /// what is to be done in the episode, in words
+    instruction: Option<String>,
     /// why the episode could not begin
     unready: Option<ModelError>,
 }
@@ -39,7 +41,7 @@ impl PythonPolicy {
         let copied = Python::with_gil(|py| called.call_method0(py, "copy"));
         let called = copied.map_err(|error| raised(failure, source, error))?;
         let (source, signature) = (source.to_owned(), signature.clone());
-        Ok(Self { called, source, signature, failure: Arc::clone(failure), unready: None })
+        Ok(Self { called, source, signature, failure: Arc::clone(failure), instruction: None, unready: None })
     }
 
     fn observation<'py>(&self, py: Python<'py>, observation: &Observation) -> PyResult<Bound<'py, PyDict>> {
@@ -51,6 +53,10 @@ impl PythonPolicy {
                 _ => continue,
             };
             given.set_item(&spec.name, value)?;
+        }
+        if let Some(instruction) = &self.instruction {
+            // LeRobot's name of it
+            given.set_item("task", instruction)?;
         }
         Ok(given)
     }
@@ -83,5 +89,10 @@ impl Policy for PythonPolicy {
     fn reset(&mut self, seed: u64) {
         let reset = Python::with_gil(|py| self.called.call_method1(py, "reset", (seed,)).map(drop));
         self.unready = reset.map_err(|error| raised(&self.failure, &self.source, error)).err();
+        self.instruction = None;
+    }
+
+    fn instruct(&mut self, instruction: Option<&str>) {
+        self.instruction = instruction.map(str::to_owned);
     }
 }

@@ -80,12 +80,13 @@ impl Simulator {
 
     /// Begins the episode of `seed`: the observation, and what is known of the episode.
     fn reset<'py>(&self, py: Python<'py>, seed: u64) -> PyResult<(Bound<'py, PyDict>, Bound<'py, PyDict>)> {
-        let Initial { fingerprint, group, observations, .. } =
+        let Initial { fingerprint, group, instruction, observations, .. } =
             unlocked(py, || self.worker(|worker| worker.reset(seed).map_err(raised)))?;
         let info = PyDict::new(py);
         info.set_item("seed", seed)?;
         info.set_item("fingerprint", fingerprint)?;
         info.set_item("group", group)?;
+        info.set_item("instruction", instruction)?;
         let mut past = Past::default();
         let seen = self.keys.observe(&observations, &mut past).map_err(Error::new_err)?;
         *self.past() = past;

@@ -63,6 +63,19 @@ def test_the_page_s_policy_is_ranked(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert [row["entry"] for row in actrm.leaderboard("zoo")] == ["reach"]
 
 
+def test_the_episode_s_instruction_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tools/harness/tests"))
+    seen: list[Any] = []
+
+    def slide(observation: dict[str, Any]) -> np.ndarray:
+        seen.append(observation["task"])
+        return -np.ones(1)
+
+    task = {"task": "Slide", "env_module": "toy_simulator", "inputs": {"observation.state": ["place"]}}
+    actrm.evaluate(slide, episodes=2, workers=1, name="slide", zoo=tmp_path, progress=False, **task)
+    assert len(seen) > 2 and set(seen) == {"slide to zero"}
+
+
 def test_images_and_keys_that_are_asked_for_are_given(tmp_path: Path) -> None:
     seen: list[dict[str, np.ndarray]] = []
 

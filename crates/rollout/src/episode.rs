@@ -29,6 +29,9 @@ pub trait Agent: Send {
 
     /// Forgets the episode and begins that of `seed`.
     fn reset(&mut self, seed: u64);
+
+    /// Says what is to be done in the episode that just began, in words; `None` where the environment does not say it.
+    fn instruct(&mut self, _instruction: Option<&str>) {}
 }
 
 /// How an episode is run and when it ends.
@@ -130,7 +133,8 @@ impl EpisodePlan {
     ) -> Result<Outcome, JobError> {
         let begun = Instant::now();
         agent.reset(seed);
-        let Initial { fingerprint, group, mut observations, mut drawing } = worker.reset(seed)?;
+        let Initial { fingerprint, group, instruction, mut observations, mut drawing } = worker.reset(seed)?;
+        agent.instruct(instruction.as_deref());
         let mut simulator = begun.elapsed();
         if let Some(watch) = &mut watch {
             watch(worker, &observations)?;

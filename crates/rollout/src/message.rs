@@ -238,6 +238,9 @@ pub(crate) enum Reply {
         /// The group of episodes that this one belongs to, where the task has groups.
         #[serde(default)]
         group: Option<String>,
+        /// What an environment says of the episode: `lang` is the instruction, in words.
+        #[serde(default)]
+        ep_meta: serde_json::Value,
         /// How long the observation's pictures took, in milliseconds.
         #[serde(default)]
         drawing_ms: f64,

@@ -56,6 +56,8 @@ pub struct Initial {
     pub fingerprint: String,
     /// The group of episodes that this one belongs to, where the task has groups.
     pub group: Option<String>,
+    /// What is to be done, in words, where the environment says so.
+    pub instruction: Option<String>,
     /// What the environment shows.
     pub observations: Observations,
     /// How long its pictures took to draw, as the worker says; zero without any.
@@ -190,9 +192,10 @@ impl Worker {
         let request = Request::Reset { id: self.next_id, seed };
         let (reply, mut frame) = self.ask(&request, Vec::new(), self.limits.reset)?;
         match reply {
-            Reply::Reset { fingerprint, group, drawing_ms, .. } => {
+            Reply::Reset { fingerprint, group, ep_meta, drawing_ms, .. } => {
                 let observations = self.observations("reset", &mut frame)?;
-                Ok(Initial { fingerprint, group, observations, drawing: milliseconds(drawing_ms) })
+                let instruction = ep_meta.get("lang").and_then(serde_json::Value::as_str).map(str::to_owned);
+                Ok(Initial { fingerprint, group, instruction, observations, drawing: milliseconds(drawing_ms) })
             }
             other => Err(self.fault("reset", unexpected("reset", &other))),
         }

@@ -13,7 +13,7 @@ use tungstenite::{Error, HandshakeError, Message, WebSocket};
 
 use crate::codec::{Value, decode, encode, shown};
 use crate::error::{Result, ServingError};
-use crate::mapping::{Mapped, Mapping};
+use crate::mapping::{INSTRUCTION, Mapped, Mapping};
 use crate::session::{EPISODE_KEYS, EXECUTED, RESET, SEED, integer};
 
 /// Bytes of an answer.
@@ -32,7 +32,11 @@ pub struct RemotePolicy {
     address: Address,
     /// before the first reconnection
     pub(crate) pause: Duration,
+    /// the text under the key `prompt`, with `{instruction}` in it
     prompt: Option<String>,
+    task: String,
+    /// what is to be done in the episode, where its environment says it
+    instruction: Option<String>,
     items: Vec<Mapped>,
     action_dim: usize,
     /// what the server said of itself
@@ -203,6 +207,8 @@ impl RemotePolicy {
             address,
             pause: Duration::from_secs(1),
             prompt: mapping.prompt.clone(),
+            task: mapping.task.clone(),
+            instruction: None,
             items,
             action_dim: signature.action_dim,
             server,
@@ -357,7 +363,8 @@ impl RemotePolicy {
             pairs.push((mapped.item.key.clone(), mapped.value(&seen, stacked)?));
         }
         if let Some(prompt) = &self.prompt {
-            pairs.push(("prompt".to_owned(), Value::text(prompt.clone())));
+            let prompt = prompt.replace(INSTRUCTION, self.instruction.as_deref().unwrap_or(&self.task));
+            pairs.push(("prompt".to_owned(), Value::text(prompt)));
         }
         if self.server.keeps_episodes {
             match self.seed {
@@ -438,6 +445,11 @@ impl Policy for RemotePolicy {
         self.episode.clear();
         self.before.clear();
         (self.seed, self.executed) = (Some(seed), 0);
+        self.instruction = None;
+    }
+
+    fn instruct(&mut self, instruction: Option<&str>) {
+        self.instruction = instruction.map(str::to_owned);
     }
 }
 

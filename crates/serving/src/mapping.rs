@@ -16,8 +16,12 @@ const PRESETS: [(&str, &str); 2] = [("actrm", ""), ("openpi-libero", include_str
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Mapping {
-    /// Text under the key `prompt`; `{task}` is the task's name.
+    /// Text under the key `prompt`. `{instruction}` is what the episode's environment says that is to be done, or the task's
+    /// name where it says nothing; `{task}` is the task's name.
     pub prompt: Option<String>,
+    /// The task's name.
+    #[serde(skip)]
+    pub task: String,
     /// Actions of a chunk that are executed before the next query [default: as the server says, or all].
     pub n_action_steps: Option<usize>,
     /// Seconds that a query may take.
@@ -30,7 +34,8 @@ pub struct Mapping {
 
 impl Default for Mapping {
     fn default() -> Self {
-        Self { prompt: None, n_action_steps: None, timeout_s: 60, image_size: 84, observation: Vec::new() }
+        let (prompt, task, observation) = (None, String::new(), Vec::new());
+        Self { prompt, task, n_action_steps: None, timeout_s: 60, image_size: 84, observation }
     }
 }
 
@@ -61,6 +66,9 @@ pub enum Flip {
     /// both: half a turn
     Both,
 }
+
+/// What stands for an episode's instruction in a prompt.
+pub(crate) const INSTRUCTION: &str = "{instruction}";
 
 /// Side of an image at most.
 const MOST_SIZE: usize = 4096;
@@ -109,6 +117,7 @@ impl Mapping {
     #[must_use]
     pub fn of_task(mut self, task: &str) -> Self {
         self.prompt = self.prompt.map(|prompt| prompt.replace("{task}", task));
+        self.task = task.to_owned();
         self
     }
 
@@ -283,7 +292,11 @@ mod tests {
     #[test]
     fn libero_observations_have_openpis_keys_and_shapes() {
         let mapping = Mapping::preset("openpi-libero").unwrap().of_task("Lift");
-        assert_eq!((mapping.prompt.as_deref(), mapping.n_action_steps), (Some("Lift"), Some(5)));
+        assert_eq!((mapping.prompt.as_deref(), mapping.n_action_steps), (Some(INSTRUCTION), Some(5)));
+        assert_eq!(
+            Mapping::parse("m", "prompt = 'do {task}'").unwrap().of_task("Lift").prompt.as_deref(),
+            Some("do Lift")
+        );
         let items = mapping.items(&libero()).unwrap();
         let mut observation = Observation::of_state(vec![1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0], vec![]);
         // rows of 20 pixels, each with its column as red

@@ -363,6 +363,37 @@ fn scripted(metadata: Value<'static>, answers: Vec<Message>) -> String {
     url
 }
 
+#[test]
+fn a_prompt_is_what_the_environment_says_or_the_tasks_name() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("ws://{}", listener.local_addr().unwrap());
+    let server = thread::spawn(move || {
+        let mut socket = tungstenite::accept(listener.accept().unwrap().0).unwrap();
+        socket.send(Message::binary(encode(&empty()))).unwrap();
+        let mut prompts = Vec::new();
+        while let Ok(Message::Binary(query)) = socket.read() {
+            let Some(Value::Text(prompt)) = decode(&query).unwrap().get("prompt").cloned() else { panic!("no prompt") };
+            prompts.push(prompt.to_string());
+            let actions = Value::Array(Array::of_f32(vec![1, 2], &[0.0, 0.0]).unwrap());
+            socket.send(Message::binary(encode(&Value::map([("actions", actions)])))).unwrap();
+        }
+        prompts
+    });
+    let mapping = Mapping::parse("m", "prompt = '{instruction} ({task})'").unwrap().of_task("Lift");
+    let mut remote = RemotePolicy::connect(&url, None, &signature(1), &mapping).unwrap();
+    for instruction in [Some("lift the cube"), None] {
+        remote.reset(1);
+        remote.instruct(instruction);
+        remote.predict(&observation(1.0)).unwrap();
+    }
+    // an episode of which nothing is said
+    remote.instruct(Some("lift the cube"));
+    remote.reset(2);
+    remote.predict(&observation(1.0)).unwrap();
+    drop(remote);
+    assert_eq!(server.join().unwrap(), ["lift the cube (Lift)", "Lift (Lift)", "Lift (Lift)"]);
+}
+
 fn empty() -> Value<'static> {
     Value::Map(Vec::new())
 }

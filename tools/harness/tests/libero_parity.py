@@ -1,10 +1,14 @@
 """Episodes of LIBERO, by LIBERO's own environment or by ours, as arrays in a file: run in .venv-libero by test_libero.
 
-`python libero_parity.py own|ours SIZE STEPS FOLDER TASK:INIT...`
+`python libero_parity.py own|ours SIZE STEPS FOLDER TASK:INIT...`; of size 0 without images.
+
+`python libero_parity.py all FOLDER [SUITE...]` compares both over 10 tasks x 5 initial states of each suite, 50 random
+actions each, without images: half an hour. It runs a process a task, and begins where it was stopped.
 """
 
 import importlib
 import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -35,7 +39,8 @@ def own(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
     suite = benchmark.get_benchmark_dict()[name]()
     row = suite.get_task(number)
     path = str(Path(libero.get_libero_path("bddl_files")) / row.problem_folder / row.bddl_file)
-    env = envs.OffScreenRenderEnv(bddl_file_name=path, camera_heights=size, camera_widths=size)
+    images = {"camera_heights": size, "camera_widths": size} if size else {"use_camera_obs": False}
+    env = envs.OffScreenRenderEnv(bddl_file_name=path, **images)
     env.seed(7)
     env.reset()
     obs = env.set_init_state(suite.get_task_init_states(number)[init])
@@ -47,7 +52,8 @@ def own(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
         seen.append((obs, env.get_sim_state(), reward, done))
     env.close()
     # openpi turns images by 180 degrees
-    images = {f"{camera}_image": [step[0][f"{camera}_image"][::-1, ::-1] for step in seen] for camera in CAMERAS}
+    cameras = CAMERAS if size else ()
+    images = {f"{camera}_image": [step[0][f"{camera}_image"][::-1, ::-1] for step in seen] for camera in cameras}
     rest = {
         name: [step[0][name] for step in seen]
         for name in seen[0][0]
@@ -63,7 +69,8 @@ def ours(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
     from actrm_harness.tasks import row
 
     simulators.prepare("libero")
-    simulation: Any = simulators.start(simulators.Options(row(task), cameras=CAMERAS, size=size))
+    cameras = CAMERAS if size else ()
+    simulation: Any = simulators.start(simulators.Options(row(task), cameras=cameras, size=size))
     simulation.reset(init + 1, demonstration=False)
     simulation.step(np.array([[0.5, 0.5, -0.5, 0.1, 0.1, 0.1, 1.0]] * 7))
     first = simulation.reset(init, demonstration=False)
@@ -72,7 +79,7 @@ def ours(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
         done = simulation.step(action)
         seen.append((done.observation, simulation.control.get_sim_state(), done.rewards[-1], done.success))
     values = {name: [step[0][name] for step in seen] for name in first.observation if not name.startswith(ADDED)}
-    for camera in CAMERAS:
+    for camera in cameras:
         # the mapping openpi-libero mirrors them
         values[f"{camera}_image"] = [image[:, ::-1] for image in values[f"{camera}_image"]]
     return collected(values, [step[1:] for step in seen])
@@ -86,8 +93,39 @@ def collected(values: dict[str, Any], rest: list[Any]) -> dict[str, Any]:
     return arrays
 
 
+def differing(folder: Path, task: str, init: str) -> list[str]:
+    """What differs between the two sides of an episode."""
+    own, ours = (np.load(folder / f"{which}-{task.replace('/', '-')}-{init}.npz") for which in ("own", "ours"))
+    if set(own) != set(ours):
+        return sorted(set(own) ^ set(ours))
+    return [key for key in own.files if not np.array_equal(own[key], ours[key])]
+
+
+def every(folder: Path, suites: list[str]) -> None:
+    """Compare 10 tasks x 5 initial states of each suite, and say what differs."""
+    settings = {"MUJOCO_GL": "egl", "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    folder.mkdir(exist_ok=True)
+    compared, bad = 0, 0
+    for task in [f"{suite}/{number}" for suite in suites for number in range(10)]:
+        # spread over the 50 states, and others in every task
+        inits = [str((int(task.rpartition("/")[2]) + 11 * k) % 50) for k in range(5)]
+        for which in ("own", "ours"):
+            left = [init for init in inits if not (folder / f"{which}-{task.replace('/', '-')}-{init}.npz").exists()]
+            command = [sys.executable, __file__, which, "0", "50", str(folder), *(f"{task}:{init}" for init in left)]
+            if left:
+                subprocess.run(command, env=os.environ | settings, check=True, stderr=subprocess.DEVNULL)
+        for init in inits:
+            found = differing(folder, task, init)
+            compared, bad = compared + 1, bad + bool(found)
+            print(task, init, "differs: " + ", ".join(found) if found else "equal", flush=True)
+    print(f"{compared} episodes, {bad} differ")
+    sys.exit(bool(bad))
+
+
 def main() -> None:
     """Write a file for each task."""
+    if sys.argv[1] == "all":
+        every(Path(sys.argv[2]), sys.argv[3:] or ["libero_spatial", "libero_object", "libero_goal", "libero_10"])
     which, size, steps, folder = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
     for name in sys.argv[5:]:
         task, _, init = name.partition(":")

@@ -8,7 +8,7 @@ from conftest import Client
 from test_libero import PYTHON
 
 from actrm_harness.experts.parts import about_z
-from actrm_harness.simulators.libero.expert import CLEAR, DEPTH, RIM, WIDEST, Box, Neighbour, box, hold, room
+from actrm_harness.simulators.libero.expert import CLEAR, DEPTH, RIM, WIDEST, Around, Box, box, hold, room
 
 UPRIGHT = np.eye(3)
 # what LIBERO's bottles are: their own y axis points up
@@ -62,14 +62,18 @@ def test_tall_things_are_held_near_their_top_and_flat_ones_in_their_middle() -> 
 
 def test_the_palm_stays_clear_of_a_tall_neighbour() -> None:
     place, shape = np.array([0.0, 0.0, 0.009]), brick(0.08, 0.04, 0.018)
-    can = Neighbour(np.array([0.045, -0.1]), 0.033, 0.076)
-    how = hold(shape, place, UPRIGHT, [can])
+    can = Around(np.array([[0.045, -0.1]]), np.array([0.033]), np.array([0.076]))
+    how = hold(shape, place, UPRIGHT, can)
     point = how.point(shape, place, UPRIGHT)
     angle = how.angle(UPRIGHT, 0.0)
     assert room(np.array([0.0, 0.0, 0.009]), 0.0, can) < CLEAR <= room(point, angle, can)
     assert abs(point[0]) < 0.03
-    low = Neighbour(can.place, can.radius, 0.03)
-    assert not hold(shape, place, UPRIGHT, [low]).shift.any()
+    low = Around(can.places, can.radii, np.array([0.03]))
+    assert not hold(shape, place, UPRIGHT, low).shift.any()
+    # the same can, as a thing of a shape
+    seen = Around.of([(brick(0.066, 0.066, 0.076), np.array([0.045, -0.1, 0.038]), UPRIGHT)])
+    for one, other in zip((seen.places, seen.radii, seen.tops), (can.places, can.radii, can.tops), strict=True):
+        np.testing.assert_allclose(one, other)
 
 
 @needs_libero
@@ -94,7 +98,7 @@ def test_the_expert_shows_a_task_and_repeats_itself() -> None:
 
 @needs_libero
 def test_a_goal_without_an_expert_is_named() -> None:
-    worker = Client("--task", "libero_10/8")
+    worker = Client("--task", "libero_goal/3")
     with pytest.raises(Exception, match=r"no_expert.*no scripted expert for a goal like this one"):
         worker.ask("expert", seed=0, split="demonstration")
     assert worker.close() == 0

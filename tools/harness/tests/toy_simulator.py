@@ -26,7 +26,9 @@ class Slide:
         """Somewhere right of zero."""
         del demonstration
         self.place = np.random.default_rng(seed).uniform(1.0, 2.0, size=1)
-        return Initial({"place": self.place}, hashlib.sha256(self.place.tobytes()).hexdigest(), {})
+        return Initial(
+            {"place": self.place}, hashlib.sha256(self.place.tobytes()).hexdigest(), {"lang": "slide to zero"}
+        )
 
     def step(self, actions: Array) -> Stepped:
         """Move, until it is there."""

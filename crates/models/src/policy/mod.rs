@@ -89,6 +89,9 @@ pub trait Policy: Send {
     /// Forgets the episode and begins another; what it draws from now on depends on `seed` only.
     fn reset(&mut self, seed: u64);
 
+    /// Says what is to be done in the episode that just began, in words; `None` where the environment does not say it.
+    fn instruct(&mut self, _instruction: Option<&str>) {}
+
     /// What it thought at the last query, step by step; nothing if it does not think.
     ///
     /// # Errors
@@ -117,6 +120,9 @@ impl<P: Policy + ?Sized> Policy for Box<P> {
     fn reset(&mut self, seed: u64) {
         (**self).reset(seed);
     }
+    fn instruct(&mut self, instruction: Option<&str>) {
+        (**self).instruct(instruction);
+    }
     fn thought(&self) -> Result<Vec<ThoughtStep>> {
         (**self).thought()
     }
@@ -133,6 +139,8 @@ pub trait Actor: Send {
     }
     /// Forgets the episode and begins that of `seed`.
     fn reset(&mut self, seed: u64);
+    /// As [`Policy::instruct`].
+    fn instruct(&mut self, _instruction: Option<&str>) {}
 }
 
 #[cfg(test)]

@@ -55,6 +55,10 @@ impl<P: Policy> Actor for RecedingHorizon<P> {
         self.queue.clear();
         self.policy.reset(seed);
     }
+
+    fn instruct(&mut self, instruction: Option<&str>) {
+        self.policy.instruct(instruction);
+    }
 }
 
 #[cfg(test)]

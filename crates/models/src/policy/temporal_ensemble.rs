@@ -58,6 +58,10 @@ impl<P: Policy> Actor for TemporalEnsemble<P> {
         self.ahead.clear();
         self.policy.reset(seed);
     }
+
+    fn instruct(&mut self, instruction: Option<&str>) {
+        self.policy.instruct(instruction);
+    }
 }
 
 #[cfg(test)]

@@ -147,8 +147,9 @@ def evaluate(
 
     A policy of yours is a function, or an object with `select_action` or `predict_action_chunk`, and `reset` if it
     remembers anything. It gets a dict of NumPy arrays without a batch axis: float32 numbers, uint8 images (height,
-    width, 3). It returns one action (D,) or a chunk (T, D). It is evaluated under `name`, as a new entry of the zoo
-    that says where it comes from and holds no weights.
+    width, 3). If the environment says what is to be done, that text is under `task`. It returns one action (D,) or a
+    chunk (T, D). It is evaluated under `name`, as a new entry of the zoo that says where it comes from and holds no
+    weights.
 
     Parameters
     ----------

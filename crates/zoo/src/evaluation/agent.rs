@@ -68,6 +68,10 @@ impl Agent for PolicyAgent {
         self.ahead.clear();
         self.actor.reset(seed);
     }
+
+    fn instruct(&mut self, instruction: Option<&str>) {
+        self.actor.instruct(instruction);
+    }
 }
 
 /// A policy whose queries are timed.
@@ -126,6 +130,10 @@ impl Policy for Timed {
 
     fn reset(&mut self, seed: u64) {
         self.policy.reset(seed);
+    }
+
+    fn instruct(&mut self, instruction: Option<&str>) {
+        self.policy.instruct(instruction);
     }
 
     fn encoding(&self) -> Option<f64> {

@@ -31,6 +31,8 @@ PAD = 0.012
 """Half the width of a finger, and how far it reaches down below the grip site."""
 CLEAR = 0.01
 """How far a hand stays away from what stands beside a thing."""
+POINTS, POINT = 5, 0.01
+"""How many points along each side stand for a part of a fixture, and for how much around them."""
 SHIFT = 0.025
 """How far from its middle a thing is held at most."""
 TURNS = (0.0, -0.25, 0.25)
@@ -64,20 +66,25 @@ def box(boxes: Array, places: Array, rotations: Array) -> Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Neighbour:
-    """What stands near a thing: a cylinder."""
+class Around:
+    """What stands around a thing, as cylinders: one a row."""
 
-    place: Array
-    radius: float
-    top: float
+    places: Array
+    radii: Array
+    tops: Array
 
     @staticmethod
-    def of(shape: Box, place: Array, rotation: Array) -> "Neighbour":
-        """The cylinder that stands for a thing of this shape."""
-        corners = place + shape.corners() @ rotation.T
-        size = corners.max(axis=0) - corners.min(axis=0)
-        middle = (corners.max(axis=0) + corners.min(axis=0)) / 2
-        return Neighbour(middle[:2], float(size[:2].sum()) / 4, float(corners[:, 2].max()))
+    def of(things: Sequence[tuple[Box, Array, Array]], points: Array | None = None) -> "Around":
+        """The cylinders that stand for things of a shape, at a place and rotation, and for points of larger ones."""
+        corners = [place + shape.corners() @ rotation.T for shape, place, rotation in things]
+        low = np.array([each.min(axis=0) for each in corners]).reshape(-1, 3)
+        high = np.array([each.max(axis=0) for each in corners]).reshape(-1, 3)
+        points = np.zeros((0, 3)) if points is None else points
+        return Around(
+            np.concatenate([(low + high)[:, :2] / 2, points[:, :2]]),
+            np.concatenate([(high - low)[:, :2].sum(axis=1) / 4, np.full(len(points), POINT)]),
+            np.concatenate([high[:, 2], points[:, 2]]),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +113,7 @@ class Hold:
         return nearest(float(np.arctan2(axis[1], axis[0])) - np.pi / 2, np.pi, hand) + self.turn
 
 
-def hold(shape: Box, place: Array, rotation: Array, neighbours: Sequence[Neighbour] = ()) -> Hold:
+def hold(shape: Box, place: Array, rotation: Array, around: Around | None = None) -> Hold:
     """How to hold a thing from above: clear of its neighbours, in its middle, and with the least turn of the hand.
 
     The fingers close along one of the thing's level axes that they can span; where there is none, on its rim.
@@ -117,7 +124,7 @@ def hold(shape: Box, place: Array, rotation: Array, neighbours: Sequence[Neighbo
 
     def wanting(one: Hold) -> float:
         point, angle = one.point(shape, place, rotation), one.angle(rotation, 0.0)
-        near = sum(max(0.0, CLEAR - room(point, angle, each)) for each in neighbours)
+        near = 0.0 if around is None else max(0.0, CLEAR - room(point, angle, around))
         return 50.0 * near + 0.1 * abs(angle) + abs(one.turn) + 10.0 * float(np.abs(one.shift).sum())
 
     def holds() -> Iterator[Hold]:
@@ -138,11 +145,14 @@ def hold(shape: Box, place: Array, rotation: Array, neighbours: Sequence[Neighbo
     return min(holds(), key=wanting)
 
 
-def room(point: Array, angle: float, neighbour: Neighbour) -> float:
-    """How far a hand that closes at this point is from a neighbour; negative where it would touch it."""
-    seen = np.abs(about_z(-angle)[:2, :2] @ (neighbour.place - point[:2]))
-    parts = [half for half, above in ((PALM, PALM_ABOVE), (FINGERS, -PAD)) if neighbour.top > point[2] + above]
-    return min((float(np.linalg.norm(np.maximum(seen - half, 0.0))) - neighbour.radius for half in parts), default=1.0)
+def room(point: Array, angle: float, around: Around) -> float:
+    """How far a hand that closes at this point is from what stands around; negative where it would touch it."""
+    seen = np.abs((around.places - point[:2]) @ about_z(angle)[:2, :2])
+    least = 1.0
+    for half, above in ((PALM, PALM_ABOVE), (FINGERS, -PAD)):
+        away = np.linalg.norm(np.maximum(seen - half, 0.0), axis=1) - around.radii
+        least = min(least, float(away[around.tops > point[2] + above].min(initial=1.0)))
+    return least
 
 
 class LiberoScene(Scene):
@@ -174,20 +184,33 @@ class LiberoScene(Scene):
         data = self.env.sim.data
         return np.array(data.site_xpos[site]), np.array(data.site_xmat[site]).reshape(3, 3)
 
-    def neighbours(self, name: str) -> list[Neighbour]:
+    def around(self, name: str) -> Around:
         """What stands around a thing."""
-        others = (each for each in self.env.objects_dict if each != name)
-        return [Neighbour.of(self.shape(each), *self.thing(each)) for each in others]
+        others = [(self.shape(each), *self.thing(each)) for each in self.env.objects_dict if each != name]
+        return Around.of(others, self.fixtures())
+
+    def fixtures(self) -> Array:
+        """Points of all that collides of the fixtures, one a row."""
+        grid = np.array(np.meshgrid(*[np.linspace(-1.0, 1.0, POINTS)] * 3)).reshape(3, -1).T
+        model, data = self.env.sim.model._model, self.env.sim.data._data
+        points = [np.zeros((0, 3))]
+        for geom in (geom for each in self.env.fixtures_dict for geom in self.solid(each)):
+            own = model.geom_aabb[geom, :3] + grid * model.geom_aabb[geom, 3:]
+            points.append(data.geom_xpos[geom] + own @ data.geom_xmat[geom].reshape(3, 3).T)
+        return np.concatenate(points)
+
+    def solid(self, name: str) -> list[int]:
+        """The geoms of a thing that collide."""
+        model = self.env.sim.model._model
+        root = model.body_rootid[self.env.obj_body_id[name]]
+        collides = (model.geom_contype > 0) | (model.geom_conaffinity > 0)
+        return [int(each) for each in np.flatnonzero(collides & (model.body_rootid[model.geom_bodyid] == root))]
 
     def shape(self, name: str) -> Box:
         """The box around what collides of a thing."""
         model, data = self.env.sim.model._model, self.env.sim.data._data
-        body = self.env.obj_body_id[name]
         place, rotation = self.thing(name)
-        of = model.geom_bodyid
-        below = {each for each in range(model.nbody) if model.body_rootid[each] == model.body_rootid[body]}
-        solid = (model.geom_contype > 0) | (model.geom_conaffinity > 0)
-        geoms = [each for each in range(model.ngeom) if solid[each] and int(of[each]) in below]
+        geoms = self.solid(name)
         places = (data.geom_xpos[geoms] - place) @ rotation
         rotations = rotation.T @ data.geom_xmat[geoms].reshape(-1, 3, 3)
         return box(model.geom_aabb[geoms], places, rotations)
@@ -245,15 +268,13 @@ class PickAndPlace:
 
     def over(self, start: Array, end: Array) -> float:
         """The height over all that stands along a way."""
-        names = [*self.scene.env.objects_dict, *self.scene.env.fixtures_dict]
-        things = (Neighbour.of(self.scene.shape(each), *self.scene.thing(each)) for each in names if each != self.name)
+        scene = self.scene
+        names = [*scene.env.objects_dict, *scene.env.fixtures_dict]
+        things = Around.of([(scene.shape(each), *scene.thing(each)) for each in names if each != self.name])
         way = (end - start)[:2]
-        tops = [0.0]
-        for each in things:
-            along = float(np.clip((each.place - start[:2]) @ way / max(1e-9, float(way @ way)), 0.0, 1.0))
-            if float(np.linalg.norm(start[:2] + along * way - each.place)) < each.radius + BESIDE:
-                tops.append(each.top)
-        return max(tops) + self.margin
+        along = np.clip((things.places - start[:2]) @ way / max(1e-9, float(way @ way)), 0.0, 1.0)
+        away = np.linalg.norm(start[:2] + along[:, None] * way - things.places, axis=1) - things.radii
+        return float(things.tops[away < BESIDE].max(initial=0.0)) + self.margin
 
     def place(self) -> Place:
         """Where the thing goes, as it is now."""
@@ -271,7 +292,7 @@ class PickAndPlace:
     def look(self) -> tuple[Hold, Array]:
         """How to hold the thing where it is now."""
         place, rotation = self.scene.thing(self.name)
-        return hold(self.shape, place, rotation, self.scene.neighbours(self.name)), place
+        return hold(self.shape, place, rotation, self.scene.around(self.name)), place
 
     def act(self) -> Array:
         """The action for the current state."""
@@ -320,7 +341,11 @@ class PickAndPlace:
 def expert(scene: LiberoScene, rng: np.random.Generator) -> PickAndPlace:
     """The expert of the environment's goal; RequestError where there is none."""
     goal: list[list[str]] = scene.env.parsed_problem["goal_state"]
-    if len(goal) == 1 and goal[0][0] in ("in", "on") and goal[0][1] in scene.env.objects_dict:
-        return PickAndPlace(scene, rng, goal[0][1], goal[0][2])
+    things, regions = scene.env.objects_dict, scene.env.object_sites_dict
+    if len(goal) == 1 and goal[0][0] in ("in", "on") and goal[0][1] in things:
+        _, thing, onto = goal[0]
+        # what is in a fixture is behind a door or in a drawer
+        if goal[0][0] == "on" or getattr(regions.get(onto), "parent_name", "") in things:
+            return PickAndPlace(scene, rng, thing, onto)
     text = "; ".join(" ".join(condition) for condition in goal)
     raise RequestError("no_expert", f"there is no scripted expert for a goal like this one: {text}")

@@ -23,6 +23,7 @@ import numpy as np
 from actrm_harness.protocol import RequestError
 from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped, Stored, packages, verdict
 from actrm_harness.simulators.libero import suite
+from actrm_harness.simulators.libero.control import Loop, attach
 from actrm_harness.simulators.robosuite import envs
 from actrm_harness.simulators.robosuite.render import Renderer
 from actrm_harness.simulators.robosuite.simulation import kernels
@@ -66,8 +67,12 @@ class Libero:
     size: int = 84
     fast: bool = False
     max_steps: int = DEFAULT_MAX_STEPS
+    compiled: bool = False
+    """Whether the compiled control loop is asked for."""
     control: Any = None
     """LIBERO's ControlEnv."""
+    loop: Loop | None = None
+    """What steps it, if not LIBERO's own loop does."""
     keeps: bool | None = None
     """Whether resets keep the model; None before it was loaded."""
     model: dict[str, Array] = field(default_factory=dict[str, Array])
@@ -86,7 +91,9 @@ class Libero:
         """Make the environment."""
         found = suite.files(options.task.name)
         suite.import_robosuite()
-        simulation = Libero(found, options.cameras, options.size, options.fast_render, options.task.max_steps)
+        task = options.task
+        compiled = options.control == "compiled"
+        simulation = Libero(found, options.cameras, options.size, options.fast_render, task.max_steps, compiled)
         simulation.make()
         if options.env_args is not None:
             simulation.compare(options.env_args)
@@ -148,6 +155,7 @@ class Libero:
             # LIBERO loads again where no placement was found; what it draws then depends on how often it has loaded
             if self.keeps is None:
                 self.keeps = len(loads) == 1
+            self.loop = attach(env) if self.compiled else None
             if self.keeps:
                 env._load_model = env._destroy_sim = lambda: None
                 env._initialize_sim = self.restore
@@ -260,7 +268,7 @@ class Libero:
         models = [getattr(robot, "robot_model", None) for robot in env.robots]
         return Description(
             env_name=type(env).__name__,
-            control="robosuite",
+            control="robosuite" if self.loop is None else "compiled",
             control_freq=int(env.control_freq),
             action_low=low,
             action_high=high,
@@ -296,7 +304,7 @@ class Libero:
                 meta["init_state"] = seed % len(files.initial)
                 self.control.set_init_state(files.initial[meta["init_state"]])
             for _ in range(SETTLING):
-                raw, _, _, _ = self.control.step(NO_ACTION)
+                raw, _, _ = self.stepped(NO_ACTION)
         return Initial(self.observed(raw), self.fingerprint(), meta, self.drawing_ms)
 
     def begin(self, drawn_from: int | list[int] = SEED) -> None:
@@ -316,15 +324,21 @@ class Libero:
                     continue
                 return
 
+    def stepped(self, action: Array) -> tuple[dict[str, Array], float, bool]:
+        """Do one action: LIBERO's observations, the reward, and whether the task is solved."""
+        if self.loop is not None:
+            return self.loop.step(action)
+        raw, reward, done, _ = self.control.step(action)
+        return raw, float(reward), verdict(done)
+
     def step(self, actions: Array) -> Stepped:
         """Do one action, or one a row until the task is solved."""
         rewards: list[float] = []
         raw: dict[str, Array] = {}
         solved = False
         for action in envs.check_actions(self.env, actions):
-            raw, reward, done, _ = self.control.step(action)
-            rewards.append(float(reward))
-            solved = verdict(done)
+            raw, reward, solved = self.stepped(action)
+            rewards.append(reward)
             if solved:
                 break
         return Stepped(self.observed(raw), np.array(rewards), solved, None, self.drawing_ms)

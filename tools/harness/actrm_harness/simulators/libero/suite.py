@@ -142,6 +142,8 @@ def files(task: str) -> Files:
             "missing_assets", f"{text}; `make libero` installs it, `libero-pro audit` lists what it lacks"
         )
     first: Array = np.asarray(found.get_task_init_states(int(number)), dtype=np.float64)
+    if not len(first):
+        raise RequestError("missing_assets", f"{task}: {states} holds no initial state")
     # LIBERO-PRO changes the instruction in the problem, not in the file's name, and its runner takes it from there
     language = str(row.language) if name in STANDARD else None
     return Files(name, int(number), language, problem, first, count)

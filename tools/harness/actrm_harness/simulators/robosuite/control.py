@@ -48,7 +48,7 @@ def attach(env: Any) -> "CompiledControl | None":
         return None
 
 
-def _binding(env: Any, functions: dict[str, int]) -> Binding:
+def binding(env: Any, functions: dict[str, int]) -> Binding:
     """Where everything of this environment is."""
     model, data = env.sim.model._model, env.sim.data._data
     arrays = {
@@ -131,7 +131,7 @@ class CompiledControl:
             raise ControlError(reason)
         self.release()
         arms = [arm_binding(env, robot) for robot in env.robots]
-        self._handle = self._library.open(_binding(env, self._functions), arms)
+        self._handle = self._library.open(binding(env, self._functions), arms)
         self._robots = [SharedRobot(env, robot, state) for robot, state in zip(env.robots, self._states, strict=True)]
         self._substeps = int(env.control_timestep / env.model_timestep)
         self._clocks.clear()
