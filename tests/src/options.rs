@@ -177,7 +177,7 @@ fn is_setting(key: &str) -> bool {
 impl Sources {
     fn read() -> Self {
         let mut files = Vec::new();
-        for folder in ["nn", "models", "zoo", "study"] {
+        for folder in ["nn", "models", "solvers", "zoo", "study"] {
             rust_files(&root().join("crates").join(folder).join("src"), &mut files);
         }
         files.sort();
