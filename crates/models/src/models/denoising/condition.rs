@@ -8,7 +8,7 @@ use crate::features::{Features, Signature};
 use crate::flops;
 use crate::layers::{Encoder, InputTokens, LayerInit, Pointer, Steps, TokenLayout, environment_state};
 use candle_core::Tensor;
-use nn::ops::cat_rows;
+use nn::ops::{add, cat_rows};
 use nn::{Context, Params, Result, Rng, Value};
 
 /// The condition of diffusion, flow matching and MIP.
@@ -109,13 +109,15 @@ impl Encoded {
         observation: &Features<Tensor>,
     ) -> Result<(Value, Option<Value>)> {
         let none = Value::zeros((rows, 1), &cx.device().clone())?;
-        let (tokens, pos) = (self.tokens.apply(cx, &none, observation)?, self.tokens.apply_positions(cx)?);
+        let (tokens, mut pos) = (self.tokens.apply(cx, &none, observation)?, self.tokens.apply_positions(cx)?);
         let candidates = self.pointer.as_ref().map(|pointer| pointer.candidates(cx, &tokens)).transpose()?;
         let (mut memory, mut scores) = (self.encoder.apply(cx, &tokens, &pos, None, tokens.dim(1)?)?, None);
         if let (Some(pointer), Some(candidates)) = (&self.pointer, &candidates) {
-            let (read, _, found) = pointer.apply(cx, (&memory, candidates), &pos)?;
-            (memory, scores) = (read, Some(found));
+            let found;
+            (memory, pos, found) = pointer.apply(cx, (&memory, candidates), &pos)?;
+            scores = Some(found);
         }
+        let memory = add(cx, &pos, &memory)?;
         let (_, tokens, dim) = memory.dims3()?;
         Ok((memory.reshape((rows, tokens * dim))?, scores))
     }
