@@ -225,6 +225,8 @@ INTO = 0.01
 """How far below the top of a container's walls the grip site goes."""
 BESIDE = 0.06
 """What is nearer than this to a way stands in it."""
+AMISS, LEFT = 0.03, 0.1
+"""A thing that lies so far from its place is taken again, once the hand is so far above it."""
 MOVED = 0.02
 """A thing that has moved so far since it was looked at is looked at again."""
 FALLEN, STUCK = 0.012, 20
@@ -303,6 +305,10 @@ class PickAndPlace:
         place, rotation = scene.thing(self.name)
         hand = hand_yaw(scene.hand_rotation)
         goal = self.goal(place, rotation)
+        off = float(np.linalg.norm((place - goal)[:2])) > AMISS
+        if off and float(scene.hand[2] - place[2]) > self.held_at + LEFT:
+            # it fell beside its place
+            self.carry.released = False
         if self.carry.update(place, goal, flat=0.02, height=0.015, lost=0.25):
             return self.leave(place)
         self.waited = 0
