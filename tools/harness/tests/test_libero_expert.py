@@ -8,7 +8,9 @@ from conftest import Client
 from test_libero import PYTHON
 
 from actrm_harness.experts.parts import about_z
+from actrm_harness.protocol import RequestError
 from actrm_harness.simulators.libero.expert import CLEAR, DEPTH, RIM, WIDEST, Around, Box, box, hold, room
+from actrm_harness.simulators.libero.family import of_tasks
 
 UPRIGHT = np.eye(3)
 # what LIBERO's bottles are: their own y axis points up
@@ -94,6 +96,15 @@ def test_the_expert_shows_a_task_and_repeats_itself() -> None:
     _, other = worker.ask("expert", seed=1_000_004, split="demonstration")
     assert not np.array_equal(shown["states"][0, :10], other["states"][0, :10]), "the arm begins elsewhere, too"
     assert worker.close() == 0
+
+
+def test_a_suites_recorded_arguments_are_those_of_its_tasks() -> None:
+    given = {"env_name": "libero_object", "env_kwargs": {"robots": ["Panda"], "bddl_file_name": "libero_object"}}
+    assert of_tasks("libero_object", given) == {"env_name": "libero_object", "env_kwargs": {"robots": ["Panda"]}}
+    with pytest.raises(RequestError, match=r"libero_goal: expected bddl_file_name 'libero_goal'.*'libero_object'"):
+        of_tasks("libero_goal", given)
+    # what are no arguments at all, the task says
+    assert of_tasks("libero_goal", {"env_kwargs": 3}) == {"env_kwargs": 3}
 
 
 @needs_libero

@@ -113,8 +113,10 @@ class Hold:
         return nearest(float(np.arctan2(axis[1], axis[0])) - np.pi / 2, np.pi, hand) + self.turn
 
 
-def hold(shape: Box, place: Array, rotation: Array, around: Around | None = None) -> Hold:
+def hold(shape: Box, place: Array, rotation: Array, around: Around | None = None, base: Array | None = None) -> Hold:
     """How to hold a thing from above: clear of its neighbours, in its middle, and with the least turn of the hand.
+
+    Of two sides of a rim it is the one near the robot's base.
 
     The fingers close along one of the thing's level axes that they can span; where there is none, on its rim.
     """
@@ -125,7 +127,8 @@ def hold(shape: Box, place: Array, rotation: Array, around: Around | None = None
     def wanting(one: Hold) -> float:
         point, angle = one.point(shape, place, rotation), one.angle(rotation, 0.0)
         near = 0.0 if around is None else max(0.0, CLEAR - room(point, angle, around))
-        return 50.0 * near + 0.1 * abs(angle) + abs(one.turn) + 10.0 * float(np.abs(one.shift).sum())
+        far = 0.0 if base is None else float(np.linalg.norm((point - base)[:2]))
+        return 50.0 * near + far + 0.1 * abs(angle) + abs(one.turn) + 10.0 * float(np.abs(one.shift).sum())
 
     def holds() -> Iterator[Hold]:
         for axis in spanned:
@@ -222,6 +225,8 @@ INTO = 0.01
 """How far below the top of a container's walls the grip site goes."""
 BESIDE = 0.06
 """What is nearer than this to a way stands in it."""
+AMISS, LEFT = 0.03, 0.1
+"""A thing that lies so far from its place is taken again, once the hand is so far above it."""
 MOVED = 0.02
 """A thing that has moved so far since it was looked at is looked at again."""
 FALLEN, STUCK = 0.012, 20
@@ -263,7 +268,7 @@ class PickAndPlace:
         # down from above what is in the way
         self.grasp.hover = max(self.grasp.hover, self.over(scene.hand, place) - float(point[2]))
         self.carry = Carry(scene, self.grasp, clear=self.over(place, self.place().middle))
-        self.held_at = 0.0
+        self.held_at = self.turn = 0.0
         self.waited = 0
 
     def over(self, start: Array, end: Array) -> float:
@@ -292,7 +297,7 @@ class PickAndPlace:
     def look(self) -> tuple[Hold, Array]:
         """How to hold the thing where it is now."""
         place, rotation = self.scene.thing(self.name)
-        return hold(self.shape, place, rotation, self.scene.around(self.name)), place
+        return hold(self.shape, place, rotation, self.scene.around(self.name), self.scene.base), place
 
     def act(self) -> Array:
         """The action for the current state."""
@@ -300,13 +305,19 @@ class PickAndPlace:
         place, rotation = scene.thing(self.name)
         hand = hand_yaw(scene.hand_rotation)
         goal = self.goal(place, rotation)
+        off = float(np.linalg.norm((place - goal)[:2])) > AMISS
+        if off and float(scene.hand[2] - place[2]) > self.held_at + LEFT:
+            # it fell beside its place
+            self.carry.released = False
         if self.carry.update(place, goal, flat=0.02, height=0.015, lost=0.25):
             return self.leave(place)
         self.waited = 0
         if not self.grasp.closing and float(np.linalg.norm(place - self.seen)) > MOVED:
             self.how, self.seen = self.look()
-        turn = self.how.angle(rotation, 0.0)
-        target, grip = self.grasp.reach(self.how.point(self.shape, place, rotation), turn - hand)
+        if not self.grasp.held:
+            # what is held turns with the hand
+            self.turn = self.how.angle(rotation, 0.0)
+        target, grip = self.grasp.reach(self.how.point(self.shape, place, rotation), self.turn - hand)
         if self.grasp.held:
             self.held_at = float(scene.hand[2] - place[2])
             # open by so much more, the fingers are off it
@@ -315,7 +326,7 @@ class PickAndPlace:
             self.carry.clear = carried + float(place[2]) - self.lowest(place, rotation)
             target = self.carry.bring(place, goal, near=0.015, far=0.05)
             self.carry.clear = carried
-        return self.servo.move(target, grip, about_z(turn) @ DOWN)
+        return self.servo.move(target, grip, about_z(self.turn) @ DOWN)
 
     def leave(self, place: Array) -> Array:
         """Open, and go up once the thing has left the fingers; it may hang on one of them, off their middle."""

@@ -7,6 +7,7 @@ The environments of the first `KEPT` tasks that are asked for stay. Of the other
 import ctypes
 import gc
 from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 from actrm_harness.protocol import RequestError
 from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped, Stored
@@ -34,9 +35,7 @@ class Family:
     def start(options: Options) -> "Family":
         """Look for the files of all tasks."""
         if options.env_args is not None:
-            raise RequestError(
-                "env_args", f"{options.task.name} is a suite; recorded arguments are of one of its tasks"
-            )
+            options = replace(options, env_args=of_tasks(options.task.name, options.env_args))
         tasks = suite.tasks(options.task.name)
         for number in range(tasks):
             suite.files(f"{options.task.name}/{number}")
@@ -121,3 +120,15 @@ class Family:
             if not (place := name.split("/", 1))[0].endswith("obs") or self.shared(place[-1])
         }
         return replace(episode, tensors=kept)
+
+
+def of_tasks(name: str, recorded: dict[str, Any]) -> dict[str, Any]:
+    """The recorded arguments of a suite as each of its tasks has them; RequestError where they are of another one."""
+    kwargs = recorded.get("env_kwargs")
+    problem = cast("dict[str, Any]", kwargs).get("bddl_file_name", name) if isinstance(kwargs, dict) else name
+    if problem != name:
+        raise RequestError("env_args", f"{name}: expected bddl_file_name {name!r}, the suite, found {problem!r}")
+    if not isinstance(kwargs, dict):
+        return recorded
+    others = {key: value for key, value in cast("dict[str, Any]", kwargs).items() if key != "bddl_file_name"}
+    return recorded | {"env_kwargs": others}

