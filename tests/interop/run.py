@@ -326,9 +326,11 @@ def video_backends() -> list[str]:
     return found
 
 
-def compare_videos(source: Path, root: Path) -> str:
+def compare_videos(source: Path, root: Path, encoder: str) -> str:
     """A video set of ours: LeRobot's readers see the pictures that we see, bit by bit, and LeRobot trains on it."""
-    ours("actrm-data", "convert", source, root, "--video")
+    asked = "import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())"
+    os.environ["ACTRM_FFMPEG"] = run([ROOT / ".venv" / "bin" / "python", "-c", asked]).strip()
+    ours("actrm-data", "convert", source, root, "--video", "--video-encoder", encoder)
     said: list[str] = []
     for backend in video_backends():
         data = open_lerobot(root, video_backend=backend)
@@ -650,7 +652,8 @@ def main() -> None:
             "LeRobot shows depth as it was recorded": lambda: depth.compare_depth(
                 folder / "depth", ours, open_lerobot, compare_trees
             ),
-            "LeRobot reads and trains on our videos": lambda: compare_videos(images, folder / "video"),
+            "LeRobot reads and trains on our videos": lambda: compare_videos(images, folder / "video", "builtin"),
+            "LeRobot reads and trains on FFmpeg's videos": lambda: compare_videos(images, folder / "svt", "ffmpeg"),
             "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
             "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),

@@ -2,6 +2,7 @@
 //! what does not fit.
 
 use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
@@ -161,6 +162,48 @@ fn videos_become_windows_and_pictures_may_stay_in_a_file() {
     succeeds(&mut data(["convert", text(&short), text(&at("short")), "--env-keys", "", "--video"]));
     fs::copy(at("short").join(format!("videos/{AGENT}/chunk-000/file-000.mp4")), file(AGENT)).expect("copied");
     stopped(&mut train(&at("video"), &at("cut"), &[]), &[AGENT, "frame 0 of episode 1", "within 0.0001 s of"]);
+}
+
+#[test]
+fn ffmpeg_encodes_videos_where_it_is_and_is_named_where_it_cannot() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let at = |name: &str| folder.path().join(name);
+    let asked = "import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())";
+    let python = Command::new(e2e::root().join(".venv/bin/python")).args(["-c", asked]).output().expect("it starts");
+    let ffmpeg = String::from_utf8(python.stdout).expect("a path").trim().to_owned();
+    let convert = |program: &str, out: &str, more: &[&str]| {
+        let mut command =
+            data(["convert", text(&seen().join("seen.hdf5")), text(&at(out)), "--env-keys", "", "--video"]);
+        command.args(more).env("ACTRM_FFMPEG", program);
+        command
+    };
+    succeeds(&mut convert(&ffmpeg, "one", &["--video-encoder", "ffmpeg"]));
+    succeeds(&mut convert(&ffmpeg, "again", &["--jobs", "1"]));
+    assert_eq!(listing(&at("one")), listing(&at("again")));
+    let film = format!("videos/{AGENT}/chunk-000/file-000.mp4");
+    let (one, again) = (fs::read(at("one").join(&film)).expect("a film"), fs::read(at("again").join(&film)));
+    assert!(one == again.expect("a film"), "the same command writes the same bytes");
+    succeeds(&mut data(["validate", text(&at("one"))]));
+    let info = fs::read_to_string(at("one/actrm/info.json")).expect("readable");
+    assert!(info.contains("SVT-AV1 by FFmpeg"), "{info}");
+    // the built-in encoder has no need of it
+    succeeds(&mut convert("nowhere", "plain", &["--quantizer", "120"]));
+    succeeds(&mut convert("nowhere", "builtin", &["--quantizer", "120", "--video-encoder", "builtin"]));
+    let info = fs::read_to_string(at("plain/actrm/info.json")).expect("readable");
+    assert!(info.contains("rav1e"), "{info}");
+    stopped(
+        &mut convert("nowhere", "x", &["--video-encoder", "ffmpeg"]),
+        &["FFmpeg cannot be used: nowhere", "ACTRM_FFMPEG"],
+    );
+    stopped(&mut convert("/bin/true", "x", &["--video-encoder", "ffmpeg"]), &["/bin/true: no FFmpeg", "builtin"]);
+    // one that breaks
+    let broken = at("ffmpeg");
+    let script =
+        format!("#!/bin/sh\ncase \"$*\" in *rawvideo*) echo no room >&2; exit 1;; esac\nexec {ffmpeg} \"$@\"\n");
+    fs::write(&broken, script).expect("writable");
+    fs::set_permissions(&broken, fs::Permissions::from_mode(0o755)).expect("executable");
+    stopped(&mut convert(text(&broken), "x", &[]), &["cannot be encoded", "exit status: 1: no room"]);
+    assert!(!at("x").exists());
 }
 
 #[test]

@@ -29,6 +29,13 @@ pub enum DatasetError {
     #[error(transparent)]
     Video(#[from] video::VideoError),
 
+    /// FFmpeg is to encode and cannot.
+    #[error("FFmpeg cannot be used: {reason}; --video-encoder builtin needs none")]
+    Ffmpeg {
+        /// Which program, and why.
+        reason: String,
+    },
+
     /// A file operation failed.
     #[error("{path}: cannot {operation}", path = path.display())]
     Io {

@@ -215,15 +215,6 @@ pub struct DemoPlan {
     pub task: Option<String>,
 }
 
-impl DemoPlan {
-    /// The same in less memory: a tree that grew key by key has half-empty nodes.
-    pub(crate) fn packed(mut self) -> Self {
-        self.keys = std::mem::take(&mut self.keys).into_iter().collect();
-        self.keys.values_mut().for_each(|key| key.shape.shrink_to_fit());
-        self
-    }
-}
-
 /// One dataset of a demo, unread.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct KeyPlan {

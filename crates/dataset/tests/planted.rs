@@ -409,6 +409,11 @@ const OTHERS: &[Planted] = &[
         &["timestamp", "episode 0, row 1", "0.05", "0.006"],
     ),
     (
+        "a column that is no feature",
+        |s| edit_json(s, INFO, |i| drop(i["features"].as_object_mut().unwrap().remove("next.done"))),
+        &["meta/info.json: features: expected next.done, a column of data/chunk-000/file-000.parquet, found none"],
+    ),
+    (
         "times that begin later",
         |s| edit_times(s, |_, time| time + 1.5),
         &["timestamp", "row 0: expected 0 s, found 1.5 s"],

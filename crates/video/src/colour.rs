@@ -54,7 +54,7 @@ pub(crate) fn to_rgb(planes: &Planes<'_>, width: usize, height: usize, out: &mut
 }
 
 /// The planes of an RGB picture, without filling between rows: luma, then the two of chroma.
-pub(crate) fn from_rgb(rgb: &[u8], width: usize, height: usize) -> [Vec<u8>; 3] {
+pub fn from_rgb(rgb: &[u8], width: usize, height: usize) -> [Vec<u8>; 3] {
     // the standard's factors by 2^16, so rounded that grey has no colour
     let luma = |[r, g, b]: [i32; 3]| 16 + ((16_829 * r + 33_039 * g + 6_416 * b + (1 << 15)) >> 16);
     let mut y = Vec::with_capacity(width * height);

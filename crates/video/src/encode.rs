@@ -9,7 +9,6 @@ use crate::Sample;
 use crate::colour;
 use crate::error::{Result, VideoError};
 use crate::mux::Rate;
-use crate::sequence;
 
 /// How pictures are encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -114,7 +113,8 @@ impl Encoder {
                         return Err(refused(self.width, self.height, self.rate, "the encoder changed their order"));
                     }
                     let key = packet.frame_type == FrameType::KEY;
-                    self.samples.push(Sample { bytes: without_delimiters(&packet.data), key });
+                    let sample = Sample::of_unit(&packet.data).expect("the encoder writes whole units");
+                    self.samples.push(Sample { key, ..sample });
                 }
                 Err(EncoderStatus::Encoded) => {}
                 Err(EncoderStatus::NeedMoreData | EncoderStatus::LimitReached) => return Ok(()),
@@ -130,11 +130,4 @@ impl Encoder {
 
 fn refused(width: usize, height: usize, rate: Rate, reason: &str) -> VideoError {
     VideoError::Encode { width, height, fps: rate.fps(), reason: reason.to_owned() }
-}
-
-/// MP4 files leave temporal delimiters out.
-fn without_delimiters(data: &[u8]) -> Vec<u8> {
-    let units = sequence::units(data).expect("the encoder writes whole units");
-    let kept = units.iter().filter(|u| u.kind != sequence::DELIMITER);
-    kept.flat_map(|u| u.whole.iter().copied()).collect()
 }

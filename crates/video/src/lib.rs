@@ -23,6 +23,7 @@ mod sequence;
 mod table;
 mod video;
 
+pub use colour::from_rgb as yuv420;
 pub use demux::Codec;
 pub use encode::{EncodeOptions, Encoder, check_size};
 pub use error::{Result, VideoError};
@@ -39,6 +40,15 @@ pub struct Sample {
 }
 
 impl Sample {
+    /// The sample of a temporal unit of AV1 as an encoder makes it; `None` where the bytes are none.
+    pub fn of_unit(data: &[u8]) -> Option<Self> {
+        let units = sequence::units(data)?;
+        let key = units.iter().any(|unit| unit.kind == sequence::SEQUENCE);
+        // MP4 files leave temporal delimiters out
+        let kept = units.iter().filter(|unit| unit.kind != sequence::DELIMITER);
+        Some(Self { bytes: kept.flat_map(|unit| unit.whole.iter().copied()).collect(), key })
+    }
+
     /// Whether a file of AV1 can begin with it, or go on with it after samples of another encoder.
     pub fn begins(&self) -> bool {
         let units = sequence::units(&self.bytes).unwrap_or_default();

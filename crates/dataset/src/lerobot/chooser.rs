@@ -90,7 +90,7 @@ impl Chooser<'_> {
     pub fn filmed(&self, mapping: &mut Mapping, options: &ConvertOptions) -> Result<()> {
         if let Some(video) = &options.video {
             self.check_films(&mapping.columns)?;
-            mapping.film(video, options.lossless);
+            mapping.film(video, options.lossless)?;
         }
         Ok(())
     }

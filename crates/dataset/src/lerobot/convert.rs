@@ -8,6 +8,7 @@ use super::depth;
 use super::encode::{GroupOutput, Job};
 use super::encoded;
 use super::features::{ConvertOptions, Mapping};
+use super::ffmpeg;
 use super::info::{self, Info, Provenance, SkippedDemo, VideoProvenance};
 use super::schema::CREATED_BY;
 use super::side::{self, SideEncoder, SideOutput};
@@ -291,7 +292,10 @@ impl Opened {
                 lossless: options.lossless,
                 seal: None,
                 video: options.video.filter(|_| films).map(|v| VideoProvenance {
-                    encoder: videos::ENCODER.to_owned(),
+                    encoder: match ffmpeg::chosen(v.encoder) {
+                        Ok(Some(ffmpeg)) => ffmpeg.name(),
+                        _ => videos::ENCODER.to_owned(),
+                    },
                     speed: v.speed,
                     quantizer: v.quantizer,
                     key_interval: v.key_interval,

@@ -2,6 +2,7 @@
 
 use super::chooser::{Chooser, index_columns, usual};
 use super::depth::DepthKind;
+use super::ffmpeg;
 use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm};
 use crate::error::{InputError, Result};
 use crate::keys::KeyItem;
@@ -27,9 +28,23 @@ pub enum ImageForm {
     Ppm,
 }
 
+/// What makes AV1 of pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum VideoEncoder {
+    /// FFmpeg where there is one with SVT-AV1, the built-in encoder otherwise.
+    #[default]
+    Auto,
+    /// FFmpeg.
+    Ffmpeg,
+    /// The built-in encoder.
+    Builtin,
+}
+
 /// How pictures become videos.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct VideoOptions {
+    /// What encodes.
+    pub encoder: VideoEncoder,
     /// 0 (slow, small) to 10.
     pub speed: u8,
     /// 1 (large, nearly exact) to 255.
@@ -43,7 +58,7 @@ pub struct VideoOptions {
 impl Default for VideoOptions {
     fn default() -> Self {
         let video::EncodeOptions { speed, quantizer, key_interval } = video::EncodeOptions::default();
-        Self { speed, quantizer, key_interval, side_pictures: true }
+        Self { encoder: VideoEncoder::default(), speed, quantizer, key_interval, side_pictures: true }
     }
 }
 
@@ -248,7 +263,11 @@ impl Mapping {
     }
 
     /// Makes videos of the columns of colour images.
-    pub(super) fn film(&mut self, options: &VideoOptions, lossless: bool) {
+    pub(super) fn film(&mut self, options: &VideoOptions, lossless: bool) -> Result<()> {
+        let (backend, settings) = match ffmpeg::chosen(options.encoder)? {
+            Some(_) => ("ffmpeg", json!({"preset": ffmpeg::preset(options), "crf": ffmpeg::crf(options)})),
+            None => ("rav1e", json!({"speed": options.speed, "quantizer": options.quantizer})),
+        };
         let exact = lossless && options.side_pictures;
         for column in &mut self.columns {
             if column.feature.is_depth() {
@@ -263,8 +282,7 @@ impl Mapping {
             column.feature.info = Some(json!({
                 "video.height": height, "video.width": width, "video.codec": "av1", "video.pix_fmt": "yuv420p",
                 "video.fps": fps, "video.channels": 3, "has_audio": false, "video.g": options.key_interval,
-                "video.video_backend": "rav1e",
-                "video.extra_options": {"speed": options.speed, "quantizer": options.quantizer},
+                "video.video_backend": backend, "video.extra_options": settings,
                 "is_depth_map": false,
             }));
             let fate = match exact {
@@ -278,6 +296,7 @@ impl Mapping {
                 format!("{} is AV1 video: its images are close to the recording's, not equal; {fate}", column.name);
             self.notes.push(note);
         }
+        Ok(())
     }
 
     /// The columns as `info.json` lists them.

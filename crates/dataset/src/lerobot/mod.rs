@@ -11,6 +11,7 @@ mod encode;
 mod encoded;
 mod export;
 mod features;
+mod ffmpeg;
 mod fingerprint;
 mod images;
 mod info;
@@ -40,7 +41,7 @@ pub use check::TIME_TOLERANCE;
 pub use convert::{ConvertReport, convert, convert_unless};
 pub use depth::{DepthMaps, DepthUnit};
 pub use export::{ExportReport, export};
-pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, MISTAKE, VideoOptions};
+pub use features::{ConvertOptions, ENTITY_PREFIX, ImageForm, MISTAKE, VideoEncoder, VideoOptions};
 pub(crate) use images::{decode as decode_image, encode_png, is_jpeg};
 pub use info::{
     ActionKind, ActionProvenance, Feature, Features, Info, Provenance, RotationForm, SkippedDemo, VideoProvenance,

@@ -57,6 +57,8 @@ pub(super) struct Tables {
     number_of: BTreeMap<String, i64>,
     rows: Vec<Row>,
     files: Vec<DataFile>,
+    /// Columns of the files that are no features, each with the first file that has it.
+    strangers: BTreeMap<String, String>,
     frames: usize,
     /// The columns that number frames, as far as the files have them.
     numbers: BTreeMap<String, Vec<i64>>,
@@ -90,6 +92,7 @@ impl Tables {
             texts: Vec::new(),
             number_of: BTreeMap::new(),
             files: Vec::new(),
+            strangers: BTreeMap::new(),
             frames: 0,
             numbers: BTreeMap::new(),
             times: None,
@@ -107,6 +110,11 @@ impl Tables {
         let mut numbers: BTreeMap<&str, Vec<i64>> = NUMBERS.into_iter().map(|name| (name, Vec::new())).collect();
         for path in read::files(&self.root, "data")? {
             let (rows, arrays) = read::columns_there(&path, &wanted)?;
+            for field in read::open(&path)?.schema().fields() {
+                if self.info.features.get(field.name()).is_none() {
+                    self.strangers.entry(field.name().clone()).or_insert_with(|| relative(&self.root, &path));
+                }
+            }
             for name in NUMBERS {
                 match (arrays.get(name), numbers.get_mut(name)) {
                     (Some(array), Some(all)) => all.extend_from_slice(&read::integers(&path, name, array)?),

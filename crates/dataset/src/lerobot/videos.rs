@@ -1,6 +1,7 @@
 //! Videos of a data set that is being written: a file a camera holds many episodes, as LeRobot has it.
 
 use super::features::{Column, VideoOptions};
+use super::ffmpeg::{self, Encoding};
 use super::info::{FILES_PER_FOLDER, Features};
 use super::shards::{HashingFile, WrittenFile, create_parent};
 use crate::error::{DatasetError, Result};
@@ -31,25 +32,42 @@ pub(crate) struct Stretch {
 pub(crate) struct Camera {
     size: (usize, usize),
     rate: Rate,
-    encoder: Encoder,
+    encoder: Making,
+}
+
+enum Making {
+    Builtin(Box<Encoder>),
+    Ffmpeg(Encoding),
 }
 
 impl Camera {
     pub fn new(column: &Column, fps: f64, options: &VideoOptions) -> Result<Self> {
         let (height, width) = (column.feature.shape[0], column.feature.shape[1]);
         let rate = rate(fps, width, height)?;
-        let settings =
-            EncodeOptions { speed: options.speed, quantizer: options.quantizer, key_interval: options.key_interval };
-        Ok(Self { size: (height, width), rate, encoder: Encoder::new(width, height, rate, &settings)? })
+        let encoder = match ffmpeg::chosen(options.encoder)? {
+            Some(ffmpeg) => Making::Ffmpeg(Encoding::new(ffmpeg, (width, height), rate, options)?),
+            None => {
+                let &VideoOptions { speed, quantizer, key_interval, .. } = options;
+                let settings = EncodeOptions { speed, quantizer, key_interval };
+                Making::Builtin(Box::new(Encoder::new(width, height, rate, &settings)?))
+            }
+        };
+        Ok(Self { size: (height, width), rate, encoder })
     }
 
     pub fn push(&mut self, rgb: &[u8]) -> Result<()> {
-        Ok(self.encoder.push(rgb)?)
+        match &mut self.encoder {
+            Making::Builtin(encoder) => Ok(encoder.push(rgb)?),
+            Making::Ffmpeg(encoding) => encoding.push(rgb),
+        }
     }
 
     /// The samples, and sha256 of each picture as a reader will get it.
     pub fn finish(self) -> Result<(Vec<Sample>, Vec<[u8; 32]>)> {
-        let samples = self.encoder.finish()?;
+        let samples = match self.encoder {
+            Making::Builtin(encoder) => encoder.finish()?,
+            Making::Ffmpeg(encoding) => encoding.finish()?,
+        };
         let (height, width) = self.size;
         let mut muxer = Muxer::new(width as u16, height as u16, self.rate);
         samples.iter().try_for_each(|s| muxer.push(s))?;

@@ -277,7 +277,7 @@ impl Remote {
             if demos.is_empty() {
                 return Ok((remote, plan));
             }
-            plan.demos.extend(demos.into_iter().map(DemoPlan::packed));
+            plan.demos.extend(demos);
         }
     }
 

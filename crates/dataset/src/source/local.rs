@@ -79,7 +79,7 @@ impl Local {
         drafts.sort_by(|a, b| (a.plan.number, &a.plan.id).cmp(&(b.plan.number, &b.plan.id)));
         let (demos, parts) = drafts
             .into_iter()
-            .map(|DemoDraft { plan, home, groups, inner }| (plan.packed(), Parts { home, groups, inner }))
+            .map(|DemoDraft { plan, home, groups, inner }| (plan, Parts { home, groups, inner }))
             .unzip();
         let plan = Arc::new(Plan {
             path: path.to_owned(),

@@ -70,6 +70,10 @@ pub struct Args {
     /// Store images as AV1 videos, which are small and not exact; the side folder keeps the exact images
     #[arg(long, conflicts_with = "images")]
     video: bool,
+    /// With --video: FFmpeg's SVT-AV1, or the built-in encoder, which is slower [default: FFmpeg where ACTRM_FFMPEG names one
+    /// or the PATH has one]
+    #[arg(long, value_enum, value_name = "ENCODER", requires = "video")]
+    video_encoder: Option<VideoEncoder>,
     /// With --video: 1 (large, nearly exact) to 255 (small)
     #[arg(long, value_name = "N", default_value_t = VideoOptions::default().quantizer, requires = "video", value_parser = clap::value_parser!(u8).range(1..))]
     quantizer: u8,
@@ -124,6 +128,12 @@ pub struct Args {
 enum Format {
     Lerobot,
     Robomimic,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum VideoEncoder {
+    Ffmpeg,
+    Builtin,
 }
 
 #[derive(Clone, Copy, clap::ValueEnum)]
@@ -225,6 +235,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             Rotation::SixD => RotationForm::SixD,
         },
         video: args.video.then(|| VideoOptions {
+            encoder: match args.video_encoder {
+                None => dataset::VideoEncoder::Auto,
+                Some(VideoEncoder::Ffmpeg) => dataset::VideoEncoder::Ffmpeg,
+                Some(VideoEncoder::Builtin) => dataset::VideoEncoder::Builtin,
+            },
             speed: args.video_speed,
             quantizer: args.quantizer,
             side_pictures: !args.no_side_pictures,

@@ -30,7 +30,7 @@ pub(in crate::lerobot) enum Area {
 
 impl Area {
     pub(in crate::lerobot) const ALL: [(Self, &str); 7] = [
-        (Self::Info, "totals and splits are those of the frames"),
+        (Self::Info, "totals, splits and features are those of the frames"),
         (Self::Tasks, "tasks are numbered in order, and episodes name those of their frames"),
         (Self::Episodes, "episodes name their frames and the files that hold them"),
         (Self::Videos, "episodes name their part of the videos"),
@@ -122,6 +122,11 @@ impl Tables {
         }
         if let Err((expected, found)) = check::splits(&info.splits, self.episodes.len()) {
             faults.push(Fault::new(Area::Info, FILE, "splits", expected, found));
+        }
+        for (column, file) in &self.strangers {
+            // LeRobot refuses to open such a set
+            let fault = Fault::new(Area::Info, FILE, "features", format!("{column}, a column of {file}"), "none");
+            faults.push(Fault { repairable: false, ..fault });
         }
         for file in &self.files {
             let Some((chunk, number)) = place_of(&file.relative) else { continue };
