@@ -12,6 +12,7 @@ use nn::ops::{add, cat_rows};
 use nn::{Context, Params, Result, Rng, Value};
 
 /// The condition of diffusion, flow matching and MIP.
+#[allow(clippy::large_enum_variant)] // a model has one
 #[derive(Debug)]
 pub(crate) enum Condition {
     Steps(Steps),
