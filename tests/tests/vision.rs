@@ -196,13 +196,18 @@ fn ffmpeg_encodes_videos_where_it_is_and_is_named_where_it_cannot() {
         &["FFmpeg cannot be used: nowhere", "ACTRM_FFMPEG"],
     );
     stopped(&mut convert("/bin/true", "x", &["--video-encoder", "ffmpeg"]), &["/bin/true: no FFmpeg", "builtin"]);
-    // one that breaks
+    // one that breaks, one that is killed midway, one that makes nothing
     let broken = at("ffmpeg");
-    let script =
-        format!("#!/bin/sh\ncase \"$*\" in *rawvideo*) echo no room >&2; exit 1;; esac\nexec {ffmpeg} \"$@\"\n");
-    fs::write(&broken, script).expect("writable");
-    fs::set_permissions(&broken, fs::Permissions::from_mode(0o755)).expect("executable");
-    stopped(&mut convert(text(&broken), "x", &[]), &["cannot be encoded", "exit status: 1: no room"]);
+    for (does, words) in [
+        ("echo no room >&2; exit 1", "exit status: 1: no room"),
+        ("head -c 3000 >/dev/null; kill -9 $$", "signal: 9"),
+        ("cat >/dev/null", "it made 0 frames of"),
+    ] {
+        let script = format!("#!/bin/sh\ncase \"$*\" in *rawvideo*) {does}; exit;; esac\nexec '{ffmpeg}' \"$@\"\n");
+        fs::write(&broken, script).expect("writable");
+        fs::set_permissions(&broken, fs::Permissions::from_mode(0o755)).expect("executable");
+        stopped(&mut convert(text(&broken), "x", &[]), &["cannot be encoded", words]);
+    }
     assert!(!at("x").exists());
 }
 

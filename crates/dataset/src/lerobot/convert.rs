@@ -265,7 +265,7 @@ impl Opened {
             splits: BTreeMap::from([("train".to_owned(), format!("0:{}", plan.demos.len()))]),
             data_path: info::DATA_PATH.to_owned(),
             video_path: films.then(|| videos::VIDEO_PATH.to_owned()),
-            features: features,
+            features,
             other: BTreeMap::new(),
             actrm: Some(Provenance {
                 format: 1,

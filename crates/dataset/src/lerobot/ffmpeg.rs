@@ -183,7 +183,7 @@ impl Encoding {
         let (Some(bytes), Ok(true)) = (bytes, self.child.wait().map(|status| status.success())) else {
             return Err(self.ended());
         };
-        let samples = frames(&bytes).map(|frame| Sample::of_unit(frame)).collect::<Option<Vec<_>>>();
+        let samples = frames(&bytes).map(Sample::of_unit).collect::<Option<Vec<_>>>();
         match samples {
             Some(samples) if samples.len() == self.pushed => Ok(samples),
             other => {
@@ -212,52 +212,4 @@ fn frames(file: &[u8]) -> impl Iterator<Item = &[u8]> {
         rest = after;
         Some(frame)
     })
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::*;
-    use std::os::unix::fs::PermissionsExt;
-
-    fn program(folder: &Path, script: &str) -> PathBuf {
-        let path = folder.join("ffmpeg");
-        std::fs::write(&path, format!("#!/bin/sh\n{script}")).unwrap();
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
-        path
-    }
-
-    const GOOD: &str =
-        "case \"$*\" in *-version*) echo ffmpeg version 9.9; exit;; *encoder=*) echo Encoder libsvtav1; exit;; esac\n";
-
-    #[test]
-    fn what_is_no_ffmpeg_is_named() {
-        let dir = tempfile::tempdir().unwrap();
-        let told = |script: &str| Ffmpeg::look(&program(dir.path(), script)).unwrap_err();
-        assert!(told("echo hello").ends_with("ffmpeg: no FFmpeg"));
-        assert!(told("exit 3").contains("exit status: 3 when it was asked -version"));
-        assert!(told("echo ffmpeg version 4.4").ends_with("FFmpeg 4.4 has no encoder libsvtav1"));
-        assert!(Ffmpeg::look(&dir.path().join("none")).unwrap_err().contains("no such program"));
-        assert_eq!(Ffmpeg::look(&program(dir.path(), GOOD)).unwrap().name(), "SVT-AV1 by FFmpeg 9.9");
-    }
-
-    #[test]
-    fn an_ffmpeg_that_breaks_is_named_with_its_last_words() {
-        let dir = tempfile::tempdir().unwrap();
-        let told = |script: &str| {
-            let ffmpeg = Ffmpeg::look(&program(dir.path(), &format!("{GOOD}{script}"))).unwrap();
-            let options = VideoOptions::default();
-            let rate = Rate::of(20.0).unwrap();
-            let mut encoding = Encoding::new(Box::leak(Box::new(ffmpeg)), (256, 256), rate, &options).unwrap();
-            let image = vec![7; 256 * 256 * 3];
-            let pushed = (0..40).try_for_each(|_| encoding.push(&image));
-            pushed.and_then(|()| encoding.finish().map(drop)).unwrap_err().to_string()
-        };
-        let text = told("echo no room >&2; exit 1");
-        assert!(text.contains("exit status: 1: no room") && text.contains("256 x 256"), "{text}");
-        let text = told("head -c 100000 >/dev/null; kill -9 $$");
-        assert!(text.contains("signal: 9"), "{text}");
-        let text = told("cat >/dev/null");
-        assert!(text.contains("it made 0 frames of 40"), "{text}");
-    }
 }
