@@ -70,7 +70,7 @@ impl WorkerSpec {
             cameras: Vec::new(),
             image_size: 84,
             fast_render: false,
-            memory_limit: Some(4 << 30),
+            memory_limit: Some(8 << 30),
             limits: TimeLimits::default(),
         }
     }
