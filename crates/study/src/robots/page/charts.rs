@@ -122,9 +122,12 @@ pub(super) fn by_steps(study: &Study, results: &Results) -> Vec<((String, String
     charts
 }
 
+/// An arm's label, MFLOP of its query, and its success.
+type Costed<'a> = (&'a str, f64, f64);
+
 /// Success against operations of a query, a numbered point an arm, of every plain test with several counted arms.
 pub(super) fn by_cost(study: &Study, results: &Results) -> Vec<Chart> {
-    let mut tests: BTreeMap<(&str, &str), Vec<(&str, f64, f64)>> = BTreeMap::new();
+    let mut tests: BTreeMap<(&str, &str), Vec<Costed<'_>>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results.iter().filter(|((test, _, _), _)| study.tests[test].is_plain()) {
         let flops = trainings.values().find_map(|result| result.query_flops).filter(|flops| *flops > 0.0);
         if let Some((flops, success)) = flops.zip(mean(trainings, &[])) {
@@ -180,7 +183,7 @@ fn framed(title: &str) -> String {
 }
 
 /// Numbered points, shares of one over a logarithmic axis, with a legend at the right.
-fn points(title: &str, arms: &[(&str, f64, f64)]) -> String {
+fn points(title: &str, arms: &[Costed<'_>]) -> String {
     let (left, top, width, height) = FRAME;
     let (first, last) = (arms.first().map_or(1.0, |arm| arm.1), arms.last().map_or(1.0, |arm| arm.1));
     let (low, high) = (first.log2().floor(), (last.log2() + 0.1).ceil());
