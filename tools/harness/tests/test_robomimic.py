@@ -24,7 +24,7 @@ from actrm_harness import pickles, robomimic, wire
 # what every demonstration of this calls
 SYSTEM: Any = vars(os)["system"]
 # robomimic's own, of crates/zoo's tests
-FIXTURES = Path(__file__).resolve().parents[3] / "crates" / "zoo" / "tests" / "fixtures" / "robomimic"
+FIXTURES = Path(__file__).resolve().parents[3] / "crates" / "interchange" / "tests" / "fixtures" / "robomimic"
 RNN = FIXTURES / "bc_rnn.pth"
 PARTS: dict[str, Any] = {
     "model": OrderedDict(),
