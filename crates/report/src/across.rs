@@ -106,8 +106,8 @@ pub fn across_tasks(rows: &[LeaderboardRow]) -> Vec<AcrossTasks> {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::testing::{finished, sample};
     use crate::{Reading, rank};
+    use zoo::results::testing::{finished, sample};
 
     #[test]
     fn the_interval_needs_several_trainings_in_every_task() {

@@ -60,7 +60,7 @@ fn rounded(share: f64) -> f64 {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::testing::{finished, sample};
+    use zoo::results::testing::{finished, sample};
 
     #[test]
     fn a_row_is_a_result_with_its_interval() {

@@ -19,8 +19,6 @@ pub mod markdown;
 pub mod others;
 mod page;
 pub mod statistics;
-#[cfg(test)]
-mod testing;
 
 pub use across::{ACROSS_COLUMNS, AcrossTasks, across_tasks};
 pub use card::model_index;

@@ -510,9 +510,9 @@ mod tests {
     #![allow(clippy::unwrap_used)]
 
     use super::*;
-    use crate::testing::{finished, sample};
     use crate::{Reading, rank};
     use zoo::results::list_evaluations;
+    use zoo::results::testing::{finished, sample};
 
     fn page() -> String {
         let dir = tempfile::tempdir().unwrap();

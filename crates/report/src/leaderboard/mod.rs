@@ -18,9 +18,9 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::column::cells;
-    use crate::testing::{finished, sample};
     use crate::{csv, markdown};
     use zoo::protocols::{Block, Protocols};
+    use zoo::results::testing::{finished, sample};
     use zoo::results::{Execution, Seeds, Shard, StoredEvaluation, list_evaluations};
 
     /// The rows where no entry is of a family.

@@ -148,9 +148,9 @@ fn forced(record: &EvaluationRecord) -> bool {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::testing::{finished, sample};
     use crate::{Reading, rank};
     use zoo::protocols::Protocols;
+    use zoo::results::testing::{finished, sample};
 
     fn row(change: &dyn Fn(&mut EvaluationRecord)) -> LeaderboardRow {
         let dir = tempfile::tempdir().unwrap();

@@ -61,8 +61,8 @@ fn rate(row: &LeaderboardRow) -> String {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::testing::{finished, sample};
     use crate::{Reading, rank};
+    use zoo::results::testing::{finished, sample};
 
     /// Rows: policy, demonstrations, successes of 40.
     fn rows(of: &[(&str, u64, usize)]) -> Vec<LeaderboardRow> {

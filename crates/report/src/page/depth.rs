@@ -170,7 +170,7 @@ fn chart(depths: &[&Depth]) -> String {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::testing::{finished, sample};
+    use zoo::results::testing::{finished, sample};
 
     #[test]
     fn depths_of_one_entry_are_one_chart_and_one_table() {

@@ -65,7 +65,7 @@ fn base64_length(bytes: usize) -> usize {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::testing::{finished, sample};
+    use zoo::results::testing::{finished, sample};
 
     #[test]
     fn films_are_shown_while_there_is_room() {

@@ -83,8 +83,8 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::comparison::{MOST_PAIRED, compare};
-    use crate::testing::{finished, sample};
     use crate::{Reading, rank};
+    use zoo::results::testing::{finished, sample};
 
     /// Rows of 40 episodes each, of which the first ones succeed.
     fn rows(won: &[usize]) -> Vec<LeaderboardRow> {

@@ -93,8 +93,8 @@ fn short(value: f64) -> String {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::testing::{finished, sample};
     use crate::{Reading, rank};
+    use zoo::results::testing::{finished, sample};
 
     #[test]
     fn failures_never_get_there() {
