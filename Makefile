@@ -111,19 +111,13 @@ check: build ## the tests of one change, in five minutes: unit tests, the rules 
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --lib
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- architecture:: house:: help:: main_line:: bad_data:: bad_zoo::
 
-.PHONY: test test-rust test-python test-wheel
-test: test-rust test-python test-wheel ## every test: Rust, Python and end to end (with -j2 several at once)
-
-test-rust: build wheel
+.PHONY: test
+test: build wheel ## every test: Rust, Python and end to end
 	@$(CARGO) test $(CARGO_FLAGS) --workspace
 	@if [ -n "$(BROWSER)$${CI:-}" ]; then \
 	    $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test e2e -- --ignored; \
 	  else echo "not run: the tests of the pages in a browser (no Chromium on the PATH; ACTRM_CHROMIUM names one)"; fi
-
-test-python: build
 	@.venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests
-
-test-wheel: wheel
 	@tools/test_wheel.sh
 
 # With clippy's driver as the workspace's compiler (.ci/run) the build is the lint, and nothing is compiled for it alone.

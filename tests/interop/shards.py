@@ -134,7 +134,7 @@ def compare_shards(program: Path, lift: Path, folder: Path) -> str:
         on_slurm(program, 2, "s3://lab/lift.hdf5", folder / "lift_merged", folder)
         assert content(folder / "lift_merged") == content(folder / "lift")
         assert not list(scratch.iterdir()), list(scratch.iterdir())
-    return f"{len(first)} files from s3:// to s3://, a lost shard made again, and a file to a path"
+    return f"{len(first)} files from s3:// to s3://, one shard removed and converted again, one file to a plain path"
 
 
 def content_of(fs: object, path: str, local: Path) -> dict[str, bytes]:
