@@ -10,6 +10,7 @@ pub mod results;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
+use std::time::{Duration, Instant};
 
 use tempfile::TempDir;
 
@@ -265,4 +266,19 @@ pub fn howto(heading: &str) -> Vec<Vec<String>> {
     let commands: Vec<Vec<String>> = lines.map(|line| line.split_whitespace().map(str::to_owned).collect()).collect();
     assert!((1..=5).contains(&commands.len()), "{heading}: {} commands", commands.len());
     commands
+}
+
+/// Waits until something has come about, looking every few milliseconds.
+///
+/// # Panics
+/// After two minutes; with `what` was to be.
+pub fn wait_until<T>(what: &str, mut found: impl FnMut() -> Option<T>) -> T {
+    let until = Instant::now() + Duration::from_secs(120);
+    loop {
+        if let Some(found) = found() {
+            return found;
+        }
+        assert!(Instant::now() < until, "{what}: not within two minutes");
+        std::thread::sleep(Duration::from_millis(5));
+    }
 }

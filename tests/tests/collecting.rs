@@ -3,26 +3,30 @@
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
 
-use e2e::{data, listing, refused, succeeds, text};
+use e2e::{data, listing, refused, succeeds, text, wait_until};
 
 fn collect(out: &Path, more: &[&str]) -> Command {
-    let mut command = data(["collect", "--task", "Lift", "--episodes", "3", "--out", text(out)]);
+    let mut command = data(["collect", "--task", "Lift", "--out", text(out)]);
+    if !more.contains(&"--episodes") {
+        command.args(["--episodes", "3"]);
+    }
     command.args(more);
     command
 }
 
-/// Runs it until its first attempt is on disk and kills it there.
+/// Kills it once its first attempt is on disk. It is asked for more than it can record until then.
 fn killed(out: &Path) {
-    let mut child =
-        collect(out, &["--workers", "1"]).stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("it starts");
+    let mut child = collect(out, &["--workers", "1", "--episodes", "300"])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("it starts");
     let attempts = out.with_file_name(format!(".{}.attempts", out.file_name().expect("a file").to_string_lossy()));
-    let until = Instant::now() + Duration::from_secs(120);
-    while !listing(&attempts).iter().any(|name| name.starts_with("attempt-")) {
-        assert!(Instant::now() < until, "no attempt within two minutes");
-        std::thread::sleep(Duration::from_millis(5));
-    }
+    wait_until("the first attempt", || {
+        assert!(child.try_wait().expect("its state").is_none(), "it ended by itself");
+        listing(&attempts).iter().any(|name| name.starts_with("attempt-")).then_some(())
+    });
     child.kill().expect("it can be killed");
     child.wait().expect("it ends");
     assert!(!out.exists());

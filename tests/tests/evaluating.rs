@@ -3,9 +3,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
 
-use e2e::{copied_zoo, data, lift, listing, refused, succeeds, text, train_lift, trained, zoo};
+use e2e::{copied_zoo, data, lift, listing, refused, succeeds, text, train_lift, trained, wait_until, zoo};
 
 /// An evaluation of the trained entry: short episodes, whose number does not matter to what is tested.
 fn eval(entries: &Path, episodes: &str, more: &[&str]) -> Command {
@@ -37,16 +36,10 @@ fn ctrl_c_once_finishes_the_episode_and_saves_and_the_same_command_goes_on() {
     let mut command = eval(&entries, "24", &["--workers", "2", "--results", text(&stopped)]);
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it starts");
     // as soon as the first episode is on disk
-    let until = Instant::now() + Duration::from_secs(120);
-    let journal = loop {
-        let name = listing(&stopped).pop();
-        let path = name.map(|name| stopped.join(name).join("journal.jsonl"));
-        if let Some(path) = path.filter(|path| fs::metadata(path).is_ok_and(|m| m.len() > 0)) {
-            break path;
-        }
-        assert!(Instant::now() < until, "no episode within two minutes");
-        std::thread::sleep(Duration::from_millis(5));
-    };
+    let journal = wait_until("an episode", || {
+        let path = stopped.join(listing(&stopped).pop()?).join("journal.jsonl");
+        fs::metadata(&path).is_ok_and(|m| m.len() > 0).then_some(path)
+    });
     let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
     assert!(killed.success());
     let output = child.wait_with_output().expect("it ends");

@@ -6,9 +6,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
-use std::time::{Duration, Instant};
 
-use e2e::{copy, data, howto, lift, listing, refused, root, signal, succeeds, text, zoo};
+use e2e::{copy, data, howto, lift, listing, refused, root, signal, succeeds, text, wait_until, zoo};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -135,11 +134,7 @@ fn a_rerun_that_was_interrupted_goes_on() {
     let mut command = rerun(folder.path(), &["--data", text(&lift()), "--episodes", "1"]);
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it starts");
     let checkpoint = folder.path().join("work/run/checkpoints/latest.json");
-    let until = Instant::now() + Duration::from_secs(120);
-    while !checkpoint.is_file() {
-        assert!(Instant::now() < until, "no checkpoint within two minutes");
-        std::thread::sleep(Duration::from_millis(2));
-    }
+    wait_until("a checkpoint", || checkpoint.is_file().then_some(()));
     signal(&child, "INT");
     let output = child.wait_with_output().expect("it ends");
     let notes = String::from_utf8_lossy(&output.stderr).into_owned();

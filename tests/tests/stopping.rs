@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use e2e::{copied_zoo, data, listing, program, signal, succeeds, text, trained, zoo};
+use e2e::{copied_zoo, data, listing, program, signal, succeeds, text, trained, wait_until, zoo};
 
 /// Two seconds, and what a crowded machine takes to notice.
 const SOON: Duration = Duration::from_secs(4);
@@ -49,11 +49,7 @@ fn one_signal_ends_a_program_that_starts_its_simulators() {
             let child = started(&mut command);
             let id = child.id();
             // from the first worker's start on
-            let until = Instant::now() + Duration::from_secs(120);
-            while workers(id) == 0 {
-                assert!(Instant::now() < until, "no simulator within two minutes");
-                std::thread::sleep(Duration::from_millis(5));
-            }
+            wait_until("a simulator", || (workers(id) > 0).then_some(()));
             std::thread::sleep(Duration::from_millis(wait));
             let error = ends(child, name);
             assert!(error.contains("run the same command again"), "{error}");
@@ -82,11 +78,7 @@ fn a_stopped_training_says_the_command_that_goes_on_and_runs_lists_it() {
     };
     assert_eq!(listed(), serde_json::json!([]));
     let child = started(&mut long_training(folder));
-    let until = Instant::now() + Duration::from_secs(120);
-    while !runs.join("act_lift/001/metrics.csv").exists() {
-        assert!(Instant::now() < until, "no step within two minutes");
-        std::thread::sleep(Duration::from_millis(10));
-    }
+    wait_until("a step", || runs.join("act_lift/001/metrics.csv").exists().then_some(()));
     assert_eq!((&listed()[0]["state"], &listed()[0]["steps"]), (&"training".into(), &1_000_000.into()));
     let error = ends(child, "TERM");
     let hint = error.lines().find_map(|line| line.split_once("resume with: ")).expect("a hint").1.to_owned();
@@ -104,11 +96,7 @@ fn a_stopped_training_says_the_command_that_goes_on_and_runs_lists_it() {
     resumed.args(["-c", &format!("exec {hint}")]).env("PATH", path).current_dir("/");
     let child = started(&mut resumed);
     let before = run["step"].as_u64();
-    let until = Instant::now() + Duration::from_secs(120);
-    while listed()[0]["state"] != "training" {
-        assert!(Instant::now() < until, "it does not go on");
-        std::thread::sleep(Duration::from_millis(20));
-    }
+    wait_until("the training again", || (listed()[0]["state"] == "training").then_some(()));
     std::thread::sleep(Duration::from_secs(2));
     let error = ends(child, "INT");
     assert!(error.contains("resumed after step") && error.contains(&hint), "{error}");
