@@ -10,7 +10,6 @@ use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rollout::{Control, Pool, PoolOptions, Ready, find_python, harness_folder, remembered_greeting};
-use zoo::conventions::Conventions;
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::{
     Environment, EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate as run_missing, finished,
@@ -23,7 +22,7 @@ use zoo::{FeatureKeys, ZooError};
 use crate::arrays::{array, flags};
 use crate::error::{Error, raised, words};
 use crate::external::{Failure, Given, PythonPolicy};
-use crate::policy::registry;
+use crate::policy::{registry, stated};
 use crate::work::interruptible;
 
 /// What an evaluation tells on its way.
@@ -155,11 +154,7 @@ pub(crate) fn evaluate<'py>(
                         image_size,
                         execution,
                         inputs: inputs.clone().unwrap_or_default(),
-                        conventions: Conventions::try_from(conventions).map_err(|found| ZooError::InvalidValue {
-                            key: "conventions".to_owned(),
-                            expected: "names of conventions".to_owned(),
-                            found,
-                        })?,
+                        conventions: stated(conventions)?,
                     };
                     let environment = Environment::usual(&task, env_module.as_deref(), external.cameras());
                     let named = Named { name, description: String::new() };

@@ -1,5 +1,6 @@
 //! Policies: entries of a zoo and checkpoints of LeRobot's, asked from Python.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -9,6 +10,7 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use zoo::ZooError;
+use zoo::conventions::Conventions;
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::acting;
 use zoo::experiment::DataSection;
@@ -226,6 +228,13 @@ impl PyPolicy {
         Ok(all)
     }
 
+    /// How its numbers are meant, as far as the entry says so: `control_freq`, `action_space`, `gripper`, ...; see `conventions`
+    /// of `load_policy`.
+    #[getter]
+    fn conventions(&self) -> BTreeMap<String, String> {
+        self.loaded.conventions().iter().map(|(name, value)| (name.to_owned(), value.to_owned())).collect()
+    }
+
     /// Actions in a chunk (LeRobot: `chunk_size`), without those of past observations.
     #[getter]
     fn action_horizon(&self) -> usize {
@@ -375,19 +384,39 @@ fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>
 /// path: an entry by its folder (`zoo/stack-act/1`, or `zoo/stack-act` for its newest version, `zoo/stack-act@1`), by its
 ///     name in `zoo` (`stack-act`, `stack-act@1`), or the folder of a LeRobot checkpoint.
 /// zoo: the folder that names are looked up in; `$ACTRM_ZOO_DIR` or `zoo` unless given.
+/// conventions: what your robot or environment does, such as `{"control_freq": "20", "gripper": "-1 opens, 1 closes"}`. A
+///     policy that says otherwise is refused. Names and values: `policy.conventions`.
 #[pyfunction]
-#[pyo3(signature = (path, zoo=None))]
-pub(crate) fn load_policy(py: Python<'_>, path: PathBuf, zoo: Option<PathBuf>) -> PyResult<PyPolicy> {
+#[pyo3(signature = (path, zoo=None, *, conventions=None))]
+pub(crate) fn load_policy(
+    py: Python<'_>,
+    path: PathBuf,
+    zoo: Option<PathBuf>,
+    conventions: Option<BTreeMap<String, String>>,
+) -> PyResult<PyPolicy> {
     unlocked(py, || {
         run(|| {
-            if let Some(folder) = lerobot_checkpoint(&path) {
+            let yours = stated(conventions.unwrap_or_default()).map_err(raised)?;
+            let (folder, loaded) = if let Some(folder) = lerobot_checkpoint(&path) {
                 let loaded = import_checkpoint(&folder).map_err(raised)?;
-                return PyPolicy::new(std::path::absolute(folder)?, loaded);
-            }
-            let entry = registry(zoo).locate(&path.to_string_lossy()).map_err(raised)?;
-            let folder = std::path::absolute(entry.folder())?;
-            PyPolicy::new(folder, entry.load().map_err(raised)?)
+                (folder, loaded)
+            } else {
+                let entry = registry(zoo).locate(&path.to_string_lossy()).map_err(raised)?;
+                (entry.folder().to_owned(), entry.load().map_err(raised)?)
+            };
+            let (id, task) = (loaded.entry().id().to_string(), &loaded.entry().meta().task);
+            loaded.conventions().check(&yours, "`conventions`", &id, task).map_err(raised)?;
+            PyPolicy::new(std::path::absolute(folder)?, loaded)
         })
+    })
+}
+
+/// The conventions that a caller states.
+pub(crate) fn stated(conventions: BTreeMap<String, String>) -> Result<Conventions, ZooError> {
+    Conventions::try_from(conventions).map_err(|found| ZooError::InvalidValue {
+        key: "conventions".to_owned(),
+        expected: "names of conventions".to_owned(),
+        found,
     })
 }
 

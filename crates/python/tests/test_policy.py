@@ -56,6 +56,18 @@ def test_what_remembers_and_what_draws_computes_the_same(lift: Path, tmp_path: P
         np.testing.assert_array_equal(ours.view(np.uint32), wanted.view(np.uint32))
 
 
+def test_a_robot_s_conventions_are_compared_by_name(zoo: Path) -> None:
+    said = actrm.load_policy(zoo / "lift-act-s1").conventions
+    assert said["control_freq"] == "20" and said["gripper"] == "-1 opens, 1 closes"
+    actrm.load_policy(zoo / "lift-act-s1", conventions=said)
+    for name, value in said.items():
+        with pytest.raises(actrm.Error) as error:
+            actrm.load_policy(zoo / "lift-act-s1", conventions={**said, name: "another"})
+        assert name in str(error.value) and value in str(error.value)
+    with pytest.raises(actrm.Error, match="unknown convention `rate`"):
+        actrm.load_policy(zoo / "lift-act-s1", conventions={"rate": "20"})
+
+
 def test_a_policy_is_found_by_path_and_by_name(zoo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = [zoo / "lift-act", f"{zoo}/lift-act@1", str(zoo / "lift-act/1"), f"{zoo}/lift-act/"]
     found = [actrm.load_policy(path) for path in paths] + [actrm.load_policy("lift-act", zoo=zoo)]

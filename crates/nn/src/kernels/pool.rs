@@ -2,16 +2,22 @@
 
 use std::collections::BTreeMap;
 
-/// Free buffers by length. A training step asks for the same lengths every time, so after the first nothing is allocated.
+/// Free buffers by capacity. A training step asks for the same lengths every time, so after the first ones nothing is allocated.
 #[derive(Debug, Default)]
 pub struct Pool {
     free: BTreeMap<usize, Vec<Vec<f32>>>,
 }
 
+/// A buffer may be larger than asked for by this share of it: what layers of about one size need is one buffer then.
+const SPARE: usize = 4;
+
 impl Pool {
     /// A buffer of `len` numbers with any content.
     pub fn take(&mut self, len: usize) -> Vec<f32> {
-        self.free.get_mut(&len).and_then(Vec::pop).unwrap_or_else(|| vec![0.0; len])
+        let mut fitting = self.free.range_mut(len..=len + len / SPARE);
+        let Some(mut buffer) = fitting.find_map(|(_, buffers)| buffers.pop()) else { return vec![0.0; len] };
+        buffer.resize(len, 0.0);
+        buffer
     }
 
     /// A buffer of zeros.
@@ -30,11 +36,27 @@ impl Pool {
 
     /// Takes a buffer back.
     pub fn give(&mut self, buffer: Vec<f32>) {
-        self.free.entry(buffer.len()).or_default().push(buffer);
+        self.free.entry(buffer.capacity()).or_default().push(buffer);
     }
+}
 
-    /// Numbers in all free buffers.
-    pub fn numbers(&self) -> usize {
-        self.free.iter().map(|(len, buffers)| len * buffers.len()).sum()
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn a_buffer_serves_again_for_what_is_not_much_smaller() {
+        let mut pool = Pool::default();
+        let first = pool.take(100);
+        let at = first.as_ptr();
+        pool.give(first);
+        let other = pool.take(79);
+        assert_ne!(other.as_ptr(), at);
+        let again = pool.take(80);
+        assert_eq!((again.as_ptr(), again.len()), (at, 80));
+        pool.give(again);
+        let whole = pool.take(100);
+        assert_eq!((whole.as_ptr(), whole.len()), (at, 100));
     }
 }

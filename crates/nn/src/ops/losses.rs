@@ -78,8 +78,8 @@ pub fn chunk_error(
         return Ok((cx.term(total / entries, false, |_, _| Ok(())), rows));
     }
     let term = cx.term(total / entries, true, move |weight, back| {
-        let scale = (weight / entries) as f32;
-        slopes.iter_mut().for_each(|slope| *slope *= scale);
+        let scale = weight / entries;
+        slopes.iter_mut().for_each(|slope| *slope = (f64::from(*slope) * scale) as f32);
         back.add(node, slopes);
         Ok(())
     });
