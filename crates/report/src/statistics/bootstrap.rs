@@ -28,14 +28,18 @@ pub struct Estimate {
 /// width, so the interval is never narrower than Wilson's of the episodes of one training. `None` without outcomes or for
 /// ragged ones.
 pub fn hierarchical(outcomes: &[Vec<f64>], seed: u64) -> Option<Estimate> {
+    hierarchical_of(RESAMPLES, outcomes, seed)
+}
+
+fn hierarchical_of(resamples: usize, outcomes: &[Vec<f64>], seed: u64) -> Option<Estimate> {
     let (trainings, episodes) = (outcomes.len(), outcomes.first()?.len());
     if episodes == 0 || outcomes.iter().any(|training| training.len() != episodes) {
         return None;
     }
     let rng = &mut Rng::new(seed, "hierarchical bootstrap");
-    let mut means = Vec::with_capacity(RESAMPLES);
+    let mut means = Vec::with_capacity(resamples);
     let mut weights = vec![0.0; episodes];
-    for _ in 0..RESAMPLES {
+    for _ in 0..resamples {
         weights.fill(0.0);
         for _ in 0..episodes {
             weights[rng.below(episodes as u64) as usize] += 1.0;
@@ -74,6 +78,10 @@ pub struct Difference {
 /// of freedom, where `m` is the smaller number of trainings. `None` for fewer than two trainings a side, which cannot
 /// tell a training's luck from a difference, and for ragged outcomes.
 pub fn difference(first: &[Vec<f64>], second: &[Vec<f64>], seed: u64) -> Option<Difference> {
+    difference_of(RESAMPLES, first, second, seed)
+}
+
+fn difference_of(resamples: usize, first: &[Vec<f64>], second: &[Vec<f64>], seed: u64) -> Option<Difference> {
     let episodes = first.first()?.len();
     let m = first.len().min(second.len());
     if m < 2 || episodes == 0 || first.iter().chain(second).any(|training| training.len() != episodes) {
@@ -81,8 +89,8 @@ pub fn difference(first: &[Vec<f64>], second: &[Vec<f64>], seed: u64) -> Option<
     }
     let rng = &mut Rng::new(seed, "bootstrap of a difference");
     let mut weights = vec![0.0; episodes];
-    let mut drawn = Vec::with_capacity(RESAMPLES);
-    for _ in 0..RESAMPLES {
+    let mut drawn = Vec::with_capacity(resamples);
+    for _ in 0..resamples {
         weights.fill(0.0);
         for _ in 0..episodes {
             weights[rng.below(episodes as u64) as usize] += 1.0;
@@ -242,6 +250,9 @@ mod tests {
     use super::*;
     use crate::statistics::wilson_interval;
 
+    /// Resamples where hundreds of intervals are drawn.
+    const FEW: usize = 1000;
+
     #[test]
     fn tails_agree_with_scipy() {
         // scipy.stats.norm.cdf(-sqrt(m / (m - 1)) * scipy.stats.t.ppf(0.975, m - 1))
@@ -300,7 +311,7 @@ mod tests {
                         (0..episodes).map(|_| f64::from(u8::from(f64::from(rng.uniform()) < own))).collect()
                     })
                     .collect();
-                let found = hierarchical(&outcomes, run).unwrap();
+                let found = hierarchical_of(FEW, &outcomes, run).unwrap();
                 found.low <= rate && rate <= found.high
             })
             .count();
@@ -356,7 +367,7 @@ mod tests {
         let wrong = (0..100)
             .filter(|&run| {
                 let [a, b] = sides([0.7, 0.7]);
-                difference(&a, &b, run).unwrap().p_value < 0.05
+                difference_of(FEW, &a, &b, run).unwrap().p_value < 0.05
             })
             .count();
         assert!(wrong <= 9, "{wrong} of 100");
