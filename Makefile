@@ -99,12 +99,12 @@ wheel: .venv/.complete .venv-wheel/.complete ## the Python package, with the pro
 
 .PHONY: zoo
 zoo: build ## every policy on every robot task, three trainings each, and the leaderboard (hours; goes on where it was)
-	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/zoo.toml --jobs $(or $(JOBS),2)
+	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/policies.toml --jobs $(or $(JOBS),2)
 	@target/release/actrm-zoo leaderboard
 
-.PHONY: study-thinking
-study-thinking: build ## does thinking help: the studies of robot policies, as far as they have not been run (days)
-	@for study in thinking towers fewer; do RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/$$study.toml --jobs $(or $(JOBS),2); done
+.PHONY: study-recursion
+study-recursion: build ## does recursion help: the studies of robot policies, as far as they have not been run (days)
+	@for study in recursion towers fewer_demonstrations; do RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/$$study.toml --jobs $(or $(JOBS),2); done
 
 .PHONY: check
 check: build ## the tests of one change, in five minutes: unit tests, the rules of the house, the whole line once
@@ -147,8 +147,8 @@ bench: build wheel .venv-peers/.complete ## our speed beside the peers', measure
 	@tools/bench.sh
 
 .PHONY: study-puzzles
-study-puzzles: build ## the puzzle study, as far as it has not been run (hours), and its page, docs/puzzles.md
-	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study --page docs/puzzles.md
+study-puzzles: build ## the puzzle study, as far as it has not been run (hours), and its page, docs/results/puzzles.md
+	@RAYON_NUM_THREADS=1 target/release/actrm-zoo study --page docs/results/puzzles.md
 
 # other files, and more of them: make campaign MUTATIONS=20000 SEED=7
 MUTATIONS ?= 2000

@@ -1,7 +1,7 @@
-"""Group-sequential comparison of six tied and six untied refinement steps on PickChain (docs/study_plan.md, stage 4).
+"""Group-sequential comparison of six tied and six untied refinement steps on PickChain (docs/results/study_plan.md, stage 4).
 
     .venv/bin/python benches/tied_untied.py --simulate     error rates and power of the plan
-    .venv/bin/python benches/tied_untied.py docs/thinking  the decision after the trainings that are there
+    .venv/bin/python benches/tied_untied.py docs/results/recursion  the decision after the trainings that are there
 
 A training counts by its share of solved test episodes; all are tested on the same 200. At each look Welch's t-test
 compares the arms.

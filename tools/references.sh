@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Other people's training code on our demonstrations, judged by our harness: docs/references.md. What is done is not done
+# Other people's training code on our demonstrations, judged by our harness: docs/results/references.md. What is done is not done
 # again; Ctrl-C at any moment, and the same command goes on (a training of robomimic's begins anew, LeRobot's goes on).
 #
 #   tools/references.sh [--data FOLDER] [--only WORD]... [--train-only]
 #
-# FOLDER holds lift-200-seed1.hdf5 and pickplacecan-200-seed1.hdf5; without it they are collected as studies/zoo.toml says.
+# FOLDER holds lift-200-seed1.hdf5 and pickplacecan-200-seed1.hdf5; without it they are collected as studies/policies.toml says.
 # Wants `make build`, .venv and .venv-peers (`make venv`, `make bench` make them). One thread; about an hour alone.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -26,7 +26,7 @@ fi
 
 args=("$@")
 if [[ " $* " != *" --data "* ]]; then
-    RAYON_NUM_THREADS=1 "${CARGO_TARGET_DIR:-target}/release/actrm-zoo" study studies/zoo.toml --data-only \
+    RAYON_NUM_THREADS=1 "${CARGO_TARGET_DIR:-target}/release/actrm-zoo" study studies/policies.toml --data-only \
         --only act-on-lift-seed1 --only act-on-pickplacecan-seed1
     args+=(--data out/study/zoo/data)
 fi

@@ -1,6 +1,6 @@
-"""Writes docs/references.md from docs/references/*.json and our own results in docs/zoo: python references_page.py.
+"""Writes docs/results/references.md from docs/results/references/*.json and our own results in docs/results/policies: python references_page.py.
 
-`references.py` makes the former, `actrm-zoo study studies/zoo.toml` the latter; `--check` fails where the page is not
+`references.py` makes the former, `actrm-zoo study studies/policies.toml` the latter; `--check` fails where the page is not
 what this would write.
 """
 
@@ -118,7 +118,7 @@ our own did ([policies and tasks](policies.md)). Each row is one training beside
 
 95% intervals: Wilson's of a share, Newcombe's of the difference, theirs minus ours. "Only theirs" counts seeds that
 theirs solved and ours did not. Seconds are of a machine of two cores that also did other work. They are no
-comparison of speed ([speed](notes/performance_policies.md)). Versions: {versions}.
+comparison of speed ([speed](speed_policies.md)). Versions: {versions}.
 
 ## Differences in training
 

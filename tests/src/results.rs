@@ -1,4 +1,4 @@
-//! docs/results.md: success per task and input, read from the stored results of the studies.
+//! docs/results/README.md: success per task and input, read from the stored results of the studies.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -103,7 +103,7 @@ pub fn results_page() -> (String, [String; 2]) {
 ACT and ACTRM solve Lift, Stack, PickPlaceCan and Door almost always, from state and from images. Recursion helps where a chain or a path
 has to be followed, and not otherwise. All rates on this page are computed from the stored results (`make reference`).
 
-![Success of every policy on every task, from state](zoo/success.svg)
+![Success of every policy on every task, from state](policies/success.svg)
 
 ## Success per task and input
 
@@ -112,7 +112,7 @@ Success on 200 test seeds after 200 scripted demonstrations. State: mean of thre
 {short}
 ¹ With an auxiliary loss on object positions and mirrored samples; StackColor also with goal-dependent colour channels. ² With the auxiliary
 loss and demonstrations with marked mistakes (two different sets). Intervals, trainings and settings: [state](policies.md),
-[images](eyes.md).
+[images](image_policies.md).
 
 Other policies and floors, from state; the mean of one to three trainings, empty where there is no result:
 
@@ -129,18 +129,18 @@ One network, applied once or six times in training and test:
 | TableMaze, 10 x 10 cells, never demonstrated | {} | {} | | {} |
 
 Six steps are better than one on PickChain and in both mazes. Against six untied blocks the difference is not significant. Intervals and
-tests: [PickChain](thinking.md), [mazes](maze.md). On [Stack and PickPlaceCan](notes/first_results.md) recursion does not help.
+tests: [PickChain](recursion.md), [mazes](mazes.md). On [Stack and PickPlaceCan](first_results.md) recursion does not help.
 
 ## Speed
 
-Measured beside LeRobot and robomimic by `make bench`: [data sets](notes/performance_data.md), [loading in Python](notes/performance_python.md),
-[ACT](notes/performance_act.md), [images](notes/performance_vision.md), [other policies](notes/performance_policies.md),
-[puzzles](notes/performance_trm.md).
+Measured beside LeRobot and robomimic by `make bench`: [data sets](speed_data.md), [loading in Python](speed_python.md),
+[ACT](speed_act.md), [images](speed_vision.md), [other policies](speed_policies.md),
+[puzzles](speed_trm.md).
 
 ## More
 
-[LeRobot's and robomimic's own trainers](references.md) · [further tasks](further.md) · [towers](towers.md) · [the square nut](nuts.md) ·
-[mixed skill](skills.md) · [two modes](pillar.md) · [memory](recall.md) · [puzzles](puzzles.md)
+[LeRobot's and robomimic's own trainers](references.md) · [further tasks](further_tasks.md) · [towers](towers.md) · [the square nut](recovery_demonstrations.md) ·
+[mixed skill](mixed_skill.md) · [two modes](pillar.md) · [memory](goal_memory.md) · [puzzles](puzzles.md)
 ",
         chain("k1"),
         chain("k6"),

@@ -251,7 +251,7 @@ fn the_reference_of_options_is_current() {
 #[test]
 fn the_reference_of_results_is_current() {
     let (page, of_readme) = results_page();
-    assert_current("docs/results.md", &page);
+    assert_current("docs/results/README.md", &page);
     let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
     let readme = words(&fs::read_to_string(root().join("README.md")).expect("the README"));
     for said in of_readme {

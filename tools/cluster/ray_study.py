@@ -1,6 +1,6 @@
 """A study of robot policies over a Ray cluster: the demonstrations, then one cell a task, then the page.
 
-    python tools/cluster/ray_study.py studies/zoo.toml -- --work /shared/study
+    python tools/cluster/ray_study.py studies/policies.toml -- --work /shared/study
 
 What follows `--` are arguments of `actrm-zoo study`. The folders that the study names, and that of --work, must lie on
 a file system that all nodes see. What has a result is not run again; a cell whose node dies is run again by Ray and

@@ -3,7 +3,7 @@
 # writes the page.
 #
 #   tools/cluster/slurm_study.sh STUDY ACTRM_ZOO_STUDY_ARGUMENTS...
-#   tools/cluster/slurm_study.sh studies/zoo.toml --work /shared/study
+#   tools/cluster/slurm_study.sh studies/policies.toml --work /shared/study
 #
 # The folders that the study names, and that of --work, must lie on a file system that all nodes see. SBATCH_OPTIONS holds
 # further options for all jobs (partition, account, time); ACTRM_ZOO names the program if it is not on PATH. What has a

@@ -84,7 +84,7 @@ def test_where_a_contact_tips_robosuite_leaves_itself_as_the_compiled_loop_leave
     """TwoArmTransport, seed 17: a closed gripper's pads touch in four points or in five, as the last bit says.
 
     In substep 261 the two loops are 4e-15 apart and MuJoCo finds four contacts in one and five in the other: 1e-7.
-    Robosuite whose joints were moved by 1e-15 is as far from itself. docs/notes/control_parity.md has the numbers.
+    Robosuite whose joints were moved by 1e-15 is as far from itself. docs/results/control_parity.md has the numbers.
     """
     rng = np.random.default_rng(17)
     action = np.zeros(14)

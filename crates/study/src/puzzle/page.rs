@@ -1,4 +1,4 @@
-//! The page of the study, `docs/puzzles.md`: what others claimed, what we measured on their tasks, what on repaired ones.
+//! The page of the study, `docs/results/puzzles.md`: what others claimed, what we measured on their tasks, what on repaired ones.
 //!
 //! A pure function of the stored results.
 
@@ -130,7 +130,7 @@ pub fn study_page(library: &Library, results: &Path) -> Result<(String, String),
          processor seconds of training, all threads, without validation, mean over the seeds. Settings were chosen on validation \
          puzzles. Those of dfs10, sudoku4 and open8 were changed again after earlier ones had missed their bars by one or two of the \
          600 test puzzles. Those of PPO with K=5 on maze5-rl were changed after greedy test walks had failed in some seeds.\n\n\
-         `actrm-zoo study --page docs/puzzles.md` writes this page from the results in `docs/puzzles/`. `make study-puzzles` first runs \
+         `actrm-zoo study --page docs/results/puzzles.md` writes this page from the results in `docs/results/puzzles/`. `make study-puzzles` first runs \
          what is missing.\n"
     );
     page.push_str(CLAIMS);

@@ -399,7 +399,7 @@ mod tests {
 
     #[test]
     fn the_zoo_is_tested_as_named_protocols_say() {
-        let study = Study::open(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../studies/zoo.toml")).unwrap();
+        let study = Study::open(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../studies/policies.toml")).unwrap();
         let protocols = zoo::protocols::Protocols::built_in();
         for (name, test) in &study.tests {
             let protocol = protocols.get(&format!("{name}-v1")).unwrap();

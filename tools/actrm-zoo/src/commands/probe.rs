@@ -17,7 +17,7 @@ use crate::places::{ZooArgs, entry_names};
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo probe pickchain-actrm --data out/robots/pickchain.hdf5
-  actrm-zoo probe pickchain-actrm --data out/robots/pickchain.hdf5 --steps 12 --out docs/thinking/probe_k6.json")]
+  actrm-zoo probe pickchain-actrm --data out/robots/pickchain.hdf5 --steps 12 --out docs/results/recursion/probe_k6.json")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]

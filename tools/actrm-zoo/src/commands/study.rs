@@ -24,15 +24,15 @@ const GOES_ON: &str = "stopped; run the same command again to resume";
 /// checkpoints, and the same command resumes from them. One thread (RAYON_NUM_THREADS=1) needs the least processor time.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  actrm-zoo study studies/thinking.toml --jobs 2
-  actrm-zoo study studies/thinking.toml --stage 1
-  actrm-zoo study studies/thinking.toml --page-only
-  actrm-zoo study studies/zoo.toml --only act-on-lift
-  actrm-zoo study studies/zoo.toml --cell act-on-lift-seed1
-  actrm-zoo study --page docs/puzzles.md
+  actrm-zoo study studies/recursion.toml --jobs 2
+  actrm-zoo study studies/recursion.toml --stage 1
+  actrm-zoo study studies/recursion.toml --page-only
+  actrm-zoo study studies/policies.toml --only act-on-lift
+  actrm-zoo study studies/policies.toml --cell act-on-lift-seed1
+  actrm-zoo study --page docs/results/puzzles.md
   actrm-zoo study --only trm_dfs10 --only trm_open8 --seeds 1
-  actrm-zoo study --page-only --page docs/puzzles.md
-  actrm-zoo study studies/zoo.toml --list
+  actrm-zoo study --page-only --page docs/results/puzzles.md
+  actrm-zoo study studies/policies.toml --list
   actrm-zoo study --list")]
 pub struct Args {
     /// Study file of robot policies; it names the folder of its results and its page
@@ -45,7 +45,7 @@ pub struct Args {
     #[arg(long, value_name = "PATH", env = "ACTRM_PYTHON")]
     python: Option<PathBuf>,
     /// Folder of results of the puzzle study, one file per row
-    #[arg(long, value_name = "DIR", default_value = "docs/puzzles")]
+    #[arg(long, value_name = "DIR", default_value = "docs/results/puzzles")]
     results: PathBuf,
     /// Folder for demonstrations, runs and entries
     #[arg(long, value_name = "DIR", default_value = "out/study")]

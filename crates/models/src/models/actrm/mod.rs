@@ -20,7 +20,7 @@
 //! through the same pre-norm encoder layers (`l_cycles` times); what it leaves goes on to the next step with its graph. After
 //! every step ACT's decoder reads them under a norm. With `pointer` they are asked which entity is meant, the decoder reads that
 //! entity's token as one more, and each step's answer has a loss of its own: that is how a step learns to follow
-//! a relation from thing to thing, which the loss on actions alone did not teach (docs/study_plan.md).
+//! a relation from thing to thing, which the loss on actions alone did not teach (docs/results/study_plan.md).
 //!
 //! With `grid` the states are the cells of a grid alone: a convolution takes the place of attention, so that what a cell knows
 //! goes on to its neighbours, and as in TRM every step begins from the states under a norm, with what is observed added
