@@ -14,7 +14,7 @@ type Successes = BTreeMap<(String, String, String), Vec<f64>>;
 
 fn read(study: &str) -> Successes {
     let mut found = Successes::new();
-    for file in fs::read_dir(root().join("docs").join(study)).expect("the results of a study").flatten() {
+    for file in fs::read_dir(root().join("docs/results").join(study)).expect("the results of a study").flatten() {
         let path = file.path();
         if path.extension().is_none_or(|ending| ending != "json") {
             continue;
@@ -74,7 +74,7 @@ fn images(results: &Successes, policy: &str) -> Vec<String> {
 
 /// The page, and what of it the README says: the table, and a sentence.
 pub fn results_page() -> (String, [String; 2]) {
-    let (zoo, eyes, thinking, maze) = (read("zoo"), read("eyes"), read("thinking"), read("maze"));
+    let (zoo, eyes, thinking, maze) = (read("policies"), read("image_policies"), read("recursion"), read("mazes"));
     let short = table(&[
         ("ACT, state", state(&zoo, "act")),
         ("ACTRM, state", state(&zoo, "actrm")),

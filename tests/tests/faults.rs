@@ -260,7 +260,8 @@ fn the_page_of_a_study_survives_a_fault_at_any_call() {
     let results = root.join("results");
     copy(&e2e::root().join("docs/results/recursion"), &results);
     let shipped = shipped.replace("\"docs/results/recursion\"", &format!("{results:?}"));
-    fs::write(&file, shipped.replace("\"docs/results/recursion.md\"", &format!("{:?}", out.join("page.md")))).expect("writable");
+    fs::write(&file, shipped.replace("\"docs/results/recursion.md\"", &format!("{:?}", out.join("page.md"))))
+        .expect("writable");
     let study = || zoo(["study", text(&file), "--page-only"]);
     fs::create_dir(&out).expect("creatable");
     let page = || fs::read_to_string(out.join("page.md")).ok();
