@@ -2,10 +2,8 @@
 
 #![allow(clippy::unwrap_used)]
 
-mod common;
-
+use crate::common::copy;
 use arrow::array::{Array as _, ArrayRef, BinaryArray, RecordBatch, StructArray};
-use common::copy;
 use dataset::edit::{Destination, Renames, Selection, keep, merge, rename, without};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, DepthUnit, Dtype, FeatureStats, RobomimicWriter, SampleSpec, Source,

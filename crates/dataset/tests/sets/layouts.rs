@@ -2,15 +2,12 @@
 
 #![allow(clippy::unwrap_used)]
 
-#[path = "common/made.rs"]
-mod made;
-
+use crate::made::{jpeg, value};
 use dataset::{
     ConvertOptions, ConvertReport, Dataset, Dialect, Dtype, NonFinite, Source, VideoOptions, WriteOptions, convert,
     export, rewrite, verify, verify_source,
 };
 use hdf5::File;
-use made::{jpeg, value};
 use std::path::Path;
 
 const CAMERA: &str = "observation.images.top";
@@ -164,7 +161,7 @@ fn column<'s>(set: &'s Dataset, name: &str) -> &'s [f32] {
 fn isaac_lab_converts_under_its_own_names_and_from_its_states() {
     let dir = tempfile::tempdir().unwrap();
     let (source, out) = (dir.path().join("own.hdf5"), dir.path().join("own"));
-    made::isaac_lab(&source, true);
+    crate::made::isaac_lab(&source, true);
     let plan = Source::open(&source).unwrap().plan().clone();
     assert_eq!((plan.dialect, plan.problems.as_slice()), (Dialect::IsaacLab, &[][..]));
     let (set, report) = converted(&source, &out);
@@ -178,7 +175,7 @@ fn isaac_lab_converts_under_its_own_names_and_from_its_states() {
     said("these demos failed: demo_1");
 
     let (source, out) = (dir.path().join("states.hdf5"), dir.path().join("states"));
-    made::isaac_lab(&source, false);
+    crate::made::isaac_lab(&source, false);
     let (set, _) = converted(&source, &out);
     let state = column(&set, "observation.state");
     // cube_root_pose, then robot_joint_position; the first is the initial one, the others those before the action
@@ -196,8 +193,8 @@ fn isaac_lab_converts_under_its_own_names_and_from_its_states() {
 fn what_has_no_observations_is_refused_in_a_line() {
     let dir = tempfile::tempdir().unwrap();
     let (behavior, maniskill) = (dir.path().join("b.hdf5"), dir.path().join("trajectory.h5"));
-    made::behavior(&behavior);
-    made::maniskill(&maniskill, "none");
+    crate::made::behavior(&behavior);
+    crate::made::maniskill(&maniskill, "none");
     for (source, words) in [(behavior, "DataPlaybackWrapper"), (maniskill, "replay_trajectory")] {
         let out = dir.path().join("out");
         let error = convert(&source, &out, &ConvertOptions::default(), &mut quiet).unwrap_err().to_string();
@@ -213,8 +210,8 @@ fn jpeg_files_of_any_length_become_a_camera() {
     let dir = tempfile::tempdir().unwrap();
     let (source, out, back) = (dir.path().join("aloha"), dir.path().join("set"), dir.path().join("back.hdf5"));
     std::fs::create_dir(&source).unwrap();
-    made::aloha(&source.join("episode_0.hdf5"), &[jpeg(0), jpeg(1), jpeg(0)]);
-    made::aloha(&source.join("episode_1.hdf5"), &[jpeg(1)]);
+    crate::made::aloha(&source.join("episode_0.hdf5"), &[jpeg(0), jpeg(1), jpeg(0)]);
+    crate::made::aloha(&source.join("episode_1.hdf5"), &[jpeg(1)]);
     let (set, report) = converted(&source, &out);
     assert!(report.notes.iter().any(|note| note.contains("50 Hz is taken")), "{:?}", report.notes);
     let seen = set.pictures(CAMERA).unwrap();
@@ -240,8 +237,8 @@ fn a_folder_of_libero_files_is_one_set_of_many_tasks() {
     let dir = tempfile::tempdir().unwrap();
     let (suite, out) = (dir.path().join("libero/spatial"), dir.path().join("set"));
     std::fs::create_dir_all(&suite).unwrap();
-    made::libero(&suite.join("open_demo.hdf5"), "open it");
-    made::libero(&suite.join("pick_demo.hdf5"), "pick the bowl up");
+    crate::made::libero(&suite.join("open_demo.hdf5"), "open it");
+    crate::made::libero(&suite.join("pick_demo.hdf5"), "pick the bowl up");
     let (set, report) = converted(&dir.path().join("libero"), &out);
     assert_eq!(report.tasks, ["open it", "pick the bowl up"]);
     let tasks: Vec<_> = set.episodes().iter().map(|e| e.tasks[0].as_str()).collect();
@@ -264,7 +261,7 @@ fn a_folder_of_libero_files_is_one_set_of_many_tasks() {
 
     // a pointer among them, and a file of something else
     std::fs::write(suite.join("close_demo.hdf5"), "version https://git-lfs.github.com/spec/v1\n").unwrap();
-    made::droid(&suite.join("zzz.hdf5"), 3);
+    crate::made::droid(&suite.join("zzz.hdf5"), 3);
     let error =
         convert(&suite, &dir.path().join("no"), &ConvertOptions::default(), &mut quiet).unwrap_err().to_string();
     assert!(error.contains("close_demo.hdf5") && error.contains("git lfs pull"), "{error}");
@@ -278,7 +275,7 @@ fn a_folder_of_libero_files_is_one_set_of_many_tasks() {
 fn maniskill_observations_end_before_the_last_state() {
     let dir = tempfile::tempdir().unwrap();
     let source = dir.path().join("trajectory.h5");
-    made::maniskill(&source, "rgbd");
+    crate::made::maniskill(&source, "rgbd");
     let (set, report) = converted(&source, &dir.path().join("rgbd"));
     assert_eq!(set.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), [4, 3, 2]);
     assert_eq!(set.cameras().collect::<Vec<_>>(), ["observation.images.base_camera", "observation.images.hand_camera"]);
@@ -290,7 +287,7 @@ fn maniskill_observations_end_before_the_last_state() {
     assert_eq!(demo.datasets["next_obs/qpos"].to_f32().unwrap(), rows(3, 9, 1..5));
     assert_eq!(demo.datasets["env_states/actors/cube"].shape, [5, 13]);
 
-    made::maniskill(&dir.path().join("state.h5"), "state");
+    crate::made::maniskill(&dir.path().join("state.h5"), "state");
     let (set, _) = converted(&dir.path().join("state.h5"), &dir.path().join("state"));
     assert_eq!(column(&set, "observation.state")[..42 * 4], rows(3, 42, 0..4));
     std::fs::write(dir.path().join("state.json"), "{").unwrap();
@@ -304,8 +301,8 @@ fn robotwin_acts_with_the_joints_of_the_next_frame() {
     let (task, out) = (dir.path().join("beat_block"), dir.path().join("set"));
     std::fs::create_dir_all(task.join("data")).unwrap();
     std::fs::create_dir(task.join("instructions")).unwrap();
-    made::robotwin(&task.join("data/episode0.hdf5"), 4);
-    made::robotwin(&task.join("data/episode1.hdf5"), 3);
+    crate::made::robotwin(&task.join("data/episode0.hdf5"), 4);
+    crate::made::robotwin(&task.join("data/episode1.hdf5"), 3);
     std::fs::write(task.join("instructions/episode0.json"), r#"{"seen": ["beat the block"], "unseen": []}"#).unwrap();
     let (set, report) = converted(&task, &out);
     assert_eq!(report.tasks, ["beat the block", "beat_block"]);
@@ -324,7 +321,7 @@ fn droid_actions_are_velocities_and_gripper() {
     let folder = dir.path().join("success/2023-07-07");
     for (name, steps) in [("a", 3), ("b", 2)] {
         std::fs::create_dir_all(folder.join(name).join("recordings/MP4")).unwrap();
-        made::droid(&folder.join(name).join("trajectory.h5"), steps);
+        crate::made::droid(&folder.join(name).join("trajectory.h5"), steps);
     }
     let (set, report) = converted(dir.path(), &dir.path().join("set"));
     assert_eq!((report.episodes, report.tasks.as_slice()), (2, &["Put the cup on the shelf".to_owned()][..]));
@@ -339,7 +336,7 @@ fn droid_actions_are_velocities_and_gripper() {
 fn a_data_set_becomes_robomimic_and_comes_back_frame_by_frame() {
     let dir = tempfile::tempdir().unwrap();
     let path = |name: &str| dir.path().join(name);
-    made::maniskill(&path("trajectory.h5"), "rgbd");
+    crate::made::maniskill(&path("trajectory.h5"), "rgbd");
     let (first, file, second) = (path("first"), path("file.hdf5"), path("second"));
     let bare = ConvertOptions { lossless: false, ..ConvertOptions::default() };
     convert(&path("trajectory.h5"), &first, &bare, &mut quiet).unwrap();
@@ -366,7 +363,7 @@ fn a_data_set_becomes_robomimic_and_comes_back_frame_by_frame() {
 #[test]
 fn every_layout_goes_through_robomimic() {
     let dir = tempfile::tempdir().unwrap();
-    for file in made::each(dir.path()) {
+    for file in crate::made::each(dir.path()) {
         let name = file.file_stem().unwrap().to_string_lossy().into_owned();
         if name.starts_with("behavior") {
             continue;
@@ -388,7 +385,7 @@ fn every_layout_goes_through_robomimic() {
 #[test]
 fn a_dataset_that_is_missing_or_too_short_is_named() {
     let dir = tempfile::tempdir().unwrap();
-    let files = made::each(dir.path());
+    let files = crate::made::each(dir.path());
     for (layout, path, short) in [
         ("isaac", "data/demo_0/actions", true),
         ("isaac", "data/demo_0/actions", false),
@@ -408,7 +405,7 @@ fn a_dataset_that_is_missing_or_too_short_is_named() {
         let shape = file.dataset(path).unwrap().shape();
         file.unlink(path).unwrap();
         if short {
-            made::floats(&file, path, &[&[1], &shape[1..]].concat(), 0);
+            crate::made::floats(&file, path, &[&[1], &shape[1..]].concat(), 0);
         }
         file.close().unwrap();
         let out = dir.path().join("out");

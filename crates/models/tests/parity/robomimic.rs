@@ -2,8 +2,6 @@
 //! the same layout below `$ACTRM_PARITY_DIR` (`benches/peers/make_robomimic_fixture.py` makes fresh ones).
 #![allow(clippy::unwrap_used)]
 
-mod common;
-
 use candle_core::{DType, Device, Tensor};
 use models::layers::Mixture;
 use models::{
@@ -39,7 +37,7 @@ fn fixtures() -> Vec<Fixture> {
         io: Tensor::read_npz(folder.join("robomimic.npz")).unwrap().into_iter().collect(),
         folder,
     };
-    common::fixtures(&common::ROBOMIMIC, 4).into_iter().map(read).collect()
+    crate::common::fixtures(&crate::common::ROBOMIMIC, 4).into_iter().map(read).collect()
 }
 
 fn largest_of(t: &Tensor) -> f32 {

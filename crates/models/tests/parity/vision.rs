@@ -3,11 +3,9 @@
 //! gradients, probes of them.
 #![allow(clippy::unwrap_used)]
 
-mod common;
-
+use crate::common::npz::{self, Array};
+use crate::common::recipe::{self, assert_probes};
 use candle_core::{DType, Device, Tensor};
-use common::npz::{self, Array};
-use common::recipe::{self, assert_probes};
 use models::act::Act;
 use models::lerobot::{self, LerobotAct};
 use models::{
@@ -41,7 +39,7 @@ fn safetensors(path: &Path) -> BTreeMap<String, Tensor> {
 
 /// Folders with networks that we have: Bottleneck blocks are refused by name.
 fn folders() -> Vec<PathBuf> {
-    let mut all = common::fixtures(&common::SEEING_ACT, 4);
+    let mut all = crate::common::fixtures(&crate::common::SEEING_ACT, 4);
     all.retain(|folder| {
         let config = json(&folder.join("config.json"));
         let known = !config["vision_backbone"].as_str().unwrap().starts_with("resnet50");

@@ -2,9 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
-mod common;
-
-use common::{copy, files};
+use crate::common::{copy, files};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, RobomimicWriter, STATE, Source, VideoOptions, WindowBatch, WindowSpec,
     WriteOptions, convert, export, verify,

@@ -2,11 +2,9 @@
 //! Weights come from a formula (`common/recipe.rs`), so a fixture is inputs, outputs and probes of the gradients.
 #![allow(clippy::unwrap_used)]
 
-mod common;
-
+use crate::common::npz::{self, Array};
+use crate::common::recipe::{self, assert_probes};
 use candle_core::{Device, Tensor, Var};
-use common::npz::{self, Array};
-use common::recipe::{self, assert_probes};
 use models::encoders::{ImageNorm, ResNet, ResNetShape, SpatialSoftmax, position_table};
 use models::{Backend, Params, Rng};
 use nn::{Value, compose};

@@ -2,12 +2,12 @@
 
 #![allow(clippy::unwrap_used)]
 
-mod common;
+#[path = "sharded.rs"]
 mod sharded;
 
+use crate::common::files;
 use arrow::array::{ArrayRef, AsArray, Float64Array, RecordBatch};
 use arrow::datatypes::Float64Type;
-use common::files;
 use dataset::edit::{Destination, EditReport, Parts, Renames, Selection, keep, merge, rename, split, without};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, ImageForm, RobomimicWriter, Source, VideoOptions, WriteOptions, convert,

@@ -3,15 +3,13 @@
 
 #![allow(clippy::unwrap_used)]
 
-mod common;
-
+use crate::common::{copy, files};
 use arrow::array::{
     Array as _, ArrayRef, AsArray, BinaryArray, Float32Array, Float64Array, Int64Array, ListBuilder, RecordBatch,
     StringArray, StringBuilder, StructArray,
 };
 use arrow::compute::{cast, concat_batches, take_record_batch};
 use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int64Type};
-use common::{copy, files};
 use dataset::edit::{Destination, Repair, Selection, keep, repair};
 use dataset::{
     Array, Check, ConvertOptions, Dataset, Demo, RobomimicWriter, WriteOptions, convert, verify, verify_within,

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used)]
 
-mod common;
+#[path = "sources/mod.rs"]
 mod sources;
 
 use dataset::{

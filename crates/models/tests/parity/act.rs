@@ -2,8 +2,6 @@
 //! same layout below `$ACTRM_PARITY_DIR` (`benches/peers/make_act_fixture.py --random N` makes fresh ones).
 #![allow(clippy::unwrap_used)]
 
-mod common;
-
 use candle_core::{DType, Device, Tensor};
 use models::act::{Act, Config};
 use models::{Backend, Batch, Features, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
@@ -36,7 +34,7 @@ fn read(folder: &Path) -> Fixture {
 }
 
 fn fixtures() -> Vec<Fixture> {
-    common::fixtures(&common::ACT, 7).iter().map(|folder| read(folder)).collect()
+    crate::common::fixtures(&crate::common::ACT, 7).iter().map(|folder| read(folder)).collect()
 }
 
 impl Fixture {

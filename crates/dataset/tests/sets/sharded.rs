@@ -1,16 +1,13 @@
 //! A conversion in shards has the bytes of a conversion in one run.
 
-use super::common::files;
 use super::{kinds, quiet, synthetic, write};
+use crate::common::files;
 use dataset::{
     Array, ConvertOptions, ConvertReport, Dataset, DatasetError, Shard, Source, convert, convert_shard, merge_shards,
     shard_files,
 };
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
-
-#[path = "../common/made.rs"]
-mod made;
 
 fn plain() -> ConvertOptions {
     ConvertOptions { fps: Some(20.0), ..ConvertOptions::default() }
@@ -60,7 +57,7 @@ fn shards_come_to_the_bytes_of_one_run() {
         if name == "png" {
             for demo in &mut demos {
                 let shape = vec![demo.datasets["actions"].shape[0], 24, 24, 1];
-                let depth: Vec<f32> = (0..shape.iter().product()).map(|at| made::value(1, at % 977)).collect();
+                let depth: Vec<f32> = (0..shape.iter().product()).map(|at| crate::made::value(1, at % 977)).collect();
                 demo.datasets.insert("obs/agentview_depth".to_owned(), Array::from_f32(shape, &depth));
             }
         }
@@ -75,7 +72,7 @@ fn shards_come_to_the_bytes_of_one_run() {
 #[test]
 fn shards_of_every_layout_come_to_the_bytes_of_one_run() {
     let dir = tempfile::tempdir().unwrap();
-    for (at, source) in made::each(dir.path()).into_iter().enumerate() {
+    for (at, source) in crate::made::each(dir.path()).into_iter().enumerate() {
         let options = ConvertOptions { fps: Some(10.0), ..ConvertOptions::default() };
         if convert(&source, &dir.path().join(format!("{at}_tried")), &options, &mut quiet).is_ok() {
             is_the_same(&at.to_string(), &source, dir.path(), &options);
@@ -92,8 +89,8 @@ fn aloha(folder: &Path, episodes: usize) {
     std::fs::create_dir_all(folder).unwrap();
     for episode in 0..episodes {
         let file = hdf5::File::create(folder.join(format!("episode_{episode}.hdf5"))).unwrap();
-        made::floats(&file, "action", &[1500, 14], 1 + episode);
-        made::floats(&file, "observations/qpos", &[1500, 14], 50 + episode);
+        crate::made::floats(&file, "action", &[1500, 14], 1 + episode);
+        crate::made::floats(&file, "observations/qpos", &[1500, 14], 50 + episode);
         file.close().unwrap();
     }
 }
@@ -113,7 +110,7 @@ fn a_shard_reads_its_own_files_alone() {
         assert!(!mine.is_empty() && mine.len() < 12, "{}", mine.len());
         // what is no file of the shard loses its values, but for the first ones
         let other = dir.path().join(format!("stage_{index}/aloha"));
-        super::common::copy(&source, &other);
+        crate::common::copy(&source, &other);
         for entry in std::fs::read_dir(&other).unwrap() {
             let path = entry.unwrap().path();
             if !mine.contains(&source.join(path.file_name().unwrap())) {

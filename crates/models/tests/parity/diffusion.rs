@@ -3,8 +3,6 @@
 //! `make_transformer_fixture.py` make fresh ones).
 #![allow(clippy::unwrap_used)]
 
-mod common;
-
 use candle_core::{DType, Device, Tensor};
 use models::diffusion::{Config, Diffusion, Sampler, TransformerConfig, lerobot};
 use models::{Backend, Batch, Features, PolicyModel, Rng, Signature};
@@ -82,7 +80,7 @@ fn fixtures() -> Vec<Fixture> {
         io: Tensor::read_npz(folder.join("draws.npz")).unwrap().into_iter().collect(),
         folder,
     };
-    common::fixtures(&common::DIFFUSION, 3).into_iter().map(read).collect()
+    crate::common::fixtures(&crate::common::DIFFUSION, 3).into_iter().map(read).collect()
 }
 
 fn largest_of(t: &Tensor) -> f32 {
@@ -153,7 +151,7 @@ fn what_is_written_for_lerobot_is_what_it_wrote() {
 
 #[test]
 fn the_transformer_its_error_and_its_gradients_are_chi_et_als() {
-    for folder in common::fixtures(&common::TRANSFORMER, 2) {
+    for folder in crate::common::fixtures(&crate::common::TRANSFORMER, 2) {
         let name = folder.file_name().unwrap().to_string_lossy().into_owned();
         let io = Tensor::read_npz(folder.join("transformer.npz")).unwrap().into_iter().collect();
         let f = Fixture { name, io, folder };

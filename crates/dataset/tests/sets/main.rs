@@ -1,0 +1,15 @@
+//! The tests of data sets, in one program: one link, and no core waits while the last test of a file runs.
+
+#[path = "../common/mod.rs"]
+mod common;
+#[path = "../common/made.rs"]
+mod made;
+
+mod depth;
+mod edit;
+mod edited;
+mod layouts;
+mod lerobot;
+mod planted;
+mod unclean;
+mod videos;

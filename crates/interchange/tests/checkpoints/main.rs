@@ -1,0 +1,4 @@
+//! Checkpoints of others, in one program.
+
+mod lerobot;
+mod robomimic;
