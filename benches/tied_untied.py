@@ -1,4 +1,4 @@
-"""Group-sequential comparison of six tied and six untied refinement steps on PickChain (docs/results/study_plan.md, stage 4).
+"""Group-sequential comparison of six tied and six untied refinement steps on PickChain: docs/results/study_plan.md.
 
     .venv/bin/python benches/tied_untied.py --simulate     error rates and power of the plan
     .venv/bin/python benches/tied_untied.py docs/results/recursion  the decision after the trainings that are there

@@ -6,7 +6,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 export ACTRM_PEER_PYTHON="$PWD/.venv-peers/bin/python"
 examples=target/release/examples
-names=(puzzles data act policies trm control evaluation vision python report)
+names=(puzzles data act policies trm control evaluation vision python external report)
 
 for name in "${@:-}"; do
     if [[ -n $name && " ${names[*]} " != *" $name "* ]]; then
@@ -34,12 +34,12 @@ for name in ${*:-${names[*]}}; do
     act | trm | vision) "$examples/bench_$name" --peer "$ACTRM_PEER_PYTHON" || code=$? ;;
     policies) RAYON_NUM_THREADS=1 "$examples/bench_policies" --peer "$ACTRM_PEER_PYTHON" || code=$? ;;
     control | evaluation) .venv/bin/python "benches/$name.py" || code=$? ;;
-    python)
+    python | external)
         # the peers' environment, with the wheel beside it
         site=target/bench/python
         rm -rf "$site"
         "$ACTRM_PEER_PYTHON" -m pip install --quiet --no-index --no-deps --target "$site" target/wheels/actrm-*.whl
-        PYTHONPATH="$PWD/$site" "$ACTRM_PEER_PYTHON" benches/python.py || code=$?
+        PYTHONPATH="$PWD/$site" "$ACTRM_PEER_PYTHON" "benches/$name.py" || code=$?
         ;;
     esac
     ended+=("$name=$code")

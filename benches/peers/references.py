@@ -2,11 +2,12 @@
 
     python references.py --data FOLDER [--only WORD] [--stop-after train|eval]
 
-For every cell (policy, task, seed) the demonstrations of `studies/policies.toml`'s cell are learned from by other people's
-code: ACT by LeRobot's `lerobot_train` on a data set that `actrm-data` converted, BC-RNN by robomimic's `train` on the
-HDF5 file. Sizes, batches, steps and learning rates are read from the experiments of `configs/` that our own cells were
-trained with. Each checkpoint becomes an entry of a zoo of its own by `actrm-zoo import` and is evaluated on the test
-block of the task's protocol; what came of it is a small file in `docs/results/references`. What is done is not done again.
+For every cell (policy, task, seed) the demonstrations of the cell in `studies/policies.toml` are learned from by
+other people's code: ACT by LeRobot's `lerobot_train` on a data set that `actrm-data` converted, BC-RNN by robomimic's
+`train` on the HDF5 file. Sizes, batches, steps and learning rates are read from the experiments of `configs/` that
+our own cells were trained with. Each checkpoint becomes an entry of a zoo of its own by `actrm-zoo import` and is
+evaluated on the test block of the task's protocol; what came of it is a small file in `docs/results/references`. What
+is done is not done again.
 """
 
 import argparse
@@ -30,7 +31,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "release"
 WORK = ROOT / "out" / "references"
-RESULTS = ROOT / "docs" / "references"
+RESULTS = ROOT / "docs/results/references"
 ZOO = WORK / "zoo"
 TASKS = {"lift": "Lift", "pickplacecan": "PickPlaceCan"}
 # one thread, and no question to any hub

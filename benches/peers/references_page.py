@@ -1,7 +1,7 @@
-"""Writes docs/results/references.md from docs/results/references/*.json and our own results in docs/results/policies: python references_page.py.
+"""Writes docs/results/references.md: python references_page.py. Run from the root of the checkout.
 
-`references.py` makes the former, `actrm-zoo study studies/policies.toml` the latter; `--check` fails where the page is not
-what this would write.
+It reads docs/results/references/*.json, which `references.py` makes, and our own results in docs/results/policies,
+which `actrm-zoo study studies/policies.toml` makes; `--check` fails where the page is not what this would write.
 """
 
 import argparse
@@ -13,8 +13,8 @@ from typing import Any
 
 from references import ARMS, CELLS, RESULTS, ROOT, TASKS, Cell
 
-PAGE = ROOT / "docs" / "references.md"
-ZOO = ROOT / "docs" / "zoo"
+PAGE = ROOT / "docs/results/references.md"
+ZOO = ROOT / "docs/results/policies"
 # 97.5% quantile of the standard normal distribution
 Z = 1.959963984540054
 
