@@ -27,6 +27,7 @@ import onnx_check
 import python_door
 import readers
 import robomimic_training
+import served
 import shards
 import torch
 from PIL import Image
@@ -689,6 +690,7 @@ def main() -> None:
             "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
             "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),
+            "LeRobot's policy served has our episodes": lambda: served.compare(folder / "served", ours),
             "onnxruntime answers the same as our entries": lambda: export_onnx(root, folder),
             "the Hub's library reads our model cards": lambda: read_by_the_hub(root, folder / "hub"),
             "our entry that sees answers the same in LeRobot": lambda: export_seeing_entry(plain, folder / "seeing"),
