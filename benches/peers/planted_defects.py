@@ -244,6 +244,7 @@ def main() -> int:
             given = ("--episodes", "0-5") if command[0] == "edit" else ()
             subprocess.run([args.program, *command, *given], check=True, capture_output=True)
         alarms = {tool: say(sound) for tool, say in tools.items()}
+        false = {tool: len(alarms[tool]) + len(say(lift)) for tool, say in tools.items()}
         for defect, plant in DEFECTS.items():
             root = folder / "planted"
             shutil.copytree(sound, root)
@@ -260,7 +261,6 @@ def main() -> int:
             shutil.rmtree(root)
     count = len(DEFECTS)
     print(f"| **found of {count}** | {' | '.join(f'**{found[tool]}**' for tool in tools)} |")
-    false = {tool: len(alarms[tool]) + len(say(lift)) for tool, say in tools.items()}
     print(f"| **false alarms on two sound sets** | {' | '.join(f'**{false[tool]}**' for tool in tools)} |")
     return int(found["actrm-data validate"] < count or bool(false["actrm-data validate"]))
 
