@@ -168,7 +168,7 @@ bench-memory: build ## memory that converting a 3 GB image file takes (needs 6 G
 	@target/release/examples/bench_memory
 
 .PHONY: interop
-interop: build wheel .venv-peers/.complete ## LeRobot and robomimic, from PyPI, open what we write and the other way round; Ray runs shards
+interop: build wheel .venv-peers/.complete ## LeRobot, robomimic and other readers, from PyPI, open what we write and the other way round; Ray runs shards
 	@.venv-peers/bin/python tests/interop/run.py
 
 .PHONY: references

@@ -1,6 +1,7 @@
 """Serves a LeRobot checkpoint to `actrm-zoo eval --policy ws://127.0.0.1:8000 --name theirs --task Lift`.
 
-pip install lerobot==0.6.1 websockets openpi-client==0.1.2 && python serve_lerobot.py CHECKPOINT
+pip install lerobot==0.6.1 websockets msgpack && pip install --no-deps openpi-client==0.1.2  # it asks for NumPy 1
+python serve_lerobot.py CHECKPOINT [PORT]
 """
 
 import sys
@@ -25,5 +26,6 @@ def answer(client: ServerConnection) -> None:
         client.send(msgpack_numpy.packb({"actions": actions[0].cpu().numpy()}))
 
 
-with serve(answer, "127.0.0.1", 8000, compression=None, max_size=None) as server:
+port = int(sys.argv[2]) if len(sys.argv) > 2 else 8000
+with serve(answer, "127.0.0.1", port, compression=None, max_size=None) as server:
     server.serve_forever()

@@ -1,7 +1,7 @@
 """What we write, opened by the others; what the others write, opened by us; shards run by Ray. Run by `make interop`.
 
-LeRobot, robomimic and Ray are the released packages from PyPI. Every check compares numbers with their source, and any
-difference ends the run with exit code 1.
+LeRobot, robomimic, Ray and the other readers are the released packages from PyPI. Every check compares numbers with
+their source, and any difference ends the run with exit code 1.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ import h5py
 import numpy as np
 import onnx_check
 import python_door
+import readers
+import robomimic_training
+import served
 import shards
 import torch
 from PIL import Image
@@ -175,6 +178,14 @@ def compare_images(source: Path, root: Path, form: str) -> str:
     ours("actrm-data", "export", root, back)
     compare_trees(source, back)
     return f"{pictures} pictures, pixel by pixel, and back"
+
+
+def episodes_of(source: Path, cameras: tuple[str, ...] = ()) -> list[dict[str, np.ndarray]]:
+    """What the columns of a converted set must hold, episode by episode."""
+    with h5py.File(source) as file:
+        found = [file["data"][name] for name in demos(file)]
+        images = [{f"observation.images.{c}": demo[f"obs/{c}_image"][:] for c in cameras} for demo in found]
+        return [expected_columns(demo) | seen for demo, seen in zip(found, images, strict=True)]
 
 
 def write_jpeg_recording(folder: Path) -> None:
@@ -587,6 +598,19 @@ def open_theirs(folder: Path) -> str:
     return f"{frames} frames"
 
 
+def through_robomimic(folder: Path) -> str:
+    """A set of LeRobot's becomes a robomimic file, on which robomimic trains, and comes back with every frame."""
+    file, back = folder / "theirs-image.hdf5", folder / "theirs-back"
+    ours("actrm-data", "convert", folder / "theirs-image", file, "--to", "robomimic")
+    said = robomimic_training.train(file, folder / "trained-on-theirs", ["state", "environment_state"], ["front_image"])
+    ours("actrm-data", "convert", file, back)
+    before, after = open_lerobot(folder / "theirs-image"), open_lerobot(back)
+    frames = sum(same_episode(before, i, after, i, {}) for i in range(before.num_episodes))
+    # robomimic has no text at a frame: the file keeps it, a policy's features do not
+    assert before.meta.features.keys() - after.meta.features.keys() == {"note"}, after.meta.features.keys()
+    return f"{said}; {frames} frames there and back"
+
+
 def evaluate_on_ray(root: Path, folder: Path) -> str:
     """The driver for Ray: shards on a cluster of two cores, merged, are the bytes of an evaluation in one piece."""
     # enough steps for some of the episodes to succeed
@@ -652,11 +676,21 @@ def main() -> None:
             "LeRobot shows depth as it was recorded": lambda: depth.compare_depth(
                 folder / "depth", ours, open_lerobot, compare_trees
             ),
+            "Ray Data, Daft, DuckDB, datasets read our frames": lambda: readers.compare(
+                folder / "shards", episodes_of(source), "Lift"
+            ),
+            "Ray Data, Daft, DuckDB, datasets decode images": lambda: readers.compare(
+                folder / "png", episodes_of(images, ("agentview", "robot0_eye_in_hand")), "Lift"
+            ),
             "LeRobot reads and trains on our videos": lambda: compare_videos(images, folder / "video", "builtin"),
             "LeRobot reads and trains on FFmpeg's videos": lambda: compare_videos(images, folder / "svt", "ffmpeg"),
+            "other readers decode our videos": lambda: readers.compare_videos(
+                folder / "video", episodes_of(images), "Lift"
+            ),
             "LeRobot trains its ACT on our set": lambda: train_lerobot(root, folder / "trained"),
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
             "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),
+            "LeRobot's policy served has our episodes": lambda: served.compare(folder / "served", ours),
             "onnxruntime answers the same as our entries": lambda: export_onnx(root, folder),
             "the Hub's library reads our model cards": lambda: read_by_the_hub(root, folder / "hub"),
             "our entry that sees answers the same in LeRobot": lambda: export_seeing_entry(plain, folder / "seeing"),
@@ -684,12 +718,16 @@ def main() -> None:
             "robomimic reads the collected file": lambda: compare_robomimic(source),
             "export rebuilds the source": lambda: compare_trees(source, exported),
             "robomimic reads the exported file": lambda: compare_robomimic(exported),
+            "robomimic's script trains on the exported file": lambda: robomimic_training.train(
+                exported, folder / "trained-by-robomimic", [*STATE_KEYS, *ENV_KEYS], []
+            ),
             "a data set written by LeRobot opens in ours": lambda: open_theirs(folder),
             "LeRobot opens edited sets of ours": lambda: edit_and_open(root, folder / "edits"),
             "LeRobot opens them with PNG pictures": lambda: edit_and_open(folder / "png", folder / "png-edits"),
             "LeRobot opens them with videos": lambda: edit_and_open(folder / "video", folder / "video-edits"),
             "LeRobot opens edited sets of its own": lambda: edit_theirs(folder, "image"),
             "LeRobot opens them with its own videos": lambda: edit_theirs(folder, "video"),
+            "LeRobot's set trains in robomimic and comes back": lambda: through_robomimic(folder),
             "shards on a Ray cluster make one evaluation": lambda: evaluate_on_ray(root, folder / "ray"),
             "shards by Ray and Slurm, from and to s3://": lambda: shards.compare_shards(
                 BIN / "actrm-data", source, folder / "staged"

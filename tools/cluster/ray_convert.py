@@ -5,7 +5,7 @@
 What follows `--` are arguments of `actrm-data convert`. SOURCE and OUT are plain paths that all nodes see, or addresses
 that fsspec knows (s3://, gs://); then a node needs disk for a shard only, and the one that merges for the data set. A
 shard whose node dies is run again by Ray. Shards are kept in OUT.shards, and the same command goes on where it was.
-Needs the package `ray` (tried with 2.51.1), and for addresses `fsspec`, `s3fs` or `gcsfs`, and `h5py`, on this machine
+Needs the package `ray` (tried with 2.60.0), and for addresses `fsspec`, `s3fs` or `gcsfs`, and `h5py`, on this machine
 and the nodes.
 """
 

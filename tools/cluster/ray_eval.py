@@ -4,7 +4,7 @@
 
 What follows `--` are arguments of `actrm-zoo eval`. The zoo must lie on a file system that all nodes see. A shard whose
 node dies is run again by Ray and goes on where it was. Needs the package `ray`, on this machine and the nodes (tried
-with 2.51.1). Ray runs its workers at a lower priority than everything else on a node (nice 15); where other programs
+with 2.60.0). Ray runs its workers at a lower priority than everything else on a node (nice 15); where other programs
 share it, RAY_worker_niceness=0 in the environment of `ray start` changes that.
 """
 

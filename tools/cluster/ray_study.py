@@ -4,7 +4,7 @@
 
 What follows `--` are arguments of `actrm-zoo study`. The folders that the study names, and that of --work, must lie on
 a file system that all nodes see. What has a result is not run again; a cell whose node dies is run again by Ray and
-goes on where it was. Needs the package `ray`, on this machine and the nodes (tried with 2.51.1).
+goes on where it was. Needs the package `ray`, on this machine and the nodes (tried with 2.60.0).
 """
 
 import argparse

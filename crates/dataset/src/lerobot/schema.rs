@@ -14,9 +14,10 @@ use std::sync::Arc;
 /// Name and version that Parquet files carry.
 pub(crate) const CREATED_BY: &str = concat!("actrm ", env!("CARGO_PKG_VERSION"));
 
-/// The Arrow schema of the data files.
+/// The Arrow schema of the data files. `datasets` takes a column for images only if it may be null, as those that it writes.
 pub(crate) fn data_schema(features: &Features) -> SchemaRef {
-    let fields: Fields = in_files(features).map(|(name, f)| Field::new(name, data_type(f), false)).collect();
+    let fields: Fields =
+        in_files(features).map(|(name, f)| Field::new(name, data_type(f), f.dtype == "image")).collect();
     Arc::new(Schema::new(fields))
 }
 
@@ -46,7 +47,7 @@ pub(crate) fn element(value: DataType) -> Arc<Field> {
 
 /// An image column is a struct of the encoded file and its name.
 pub(crate) fn image_fields() -> Fields {
-    Fields::from(vec![Field::new("bytes", DataType::Binary, false), Field::new("path", DataType::Utf8, false)])
+    Fields::from(vec![Field::new("bytes", DataType::Binary, true), Field::new("path", DataType::Utf8, true)])
 }
 
 /// The `huggingface` entry of a data file.

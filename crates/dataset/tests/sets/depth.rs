@@ -4,6 +4,7 @@
 
 use crate::common::copy;
 use arrow::array::{Array as _, ArrayRef, BinaryArray, RecordBatch, StructArray};
+use arrow::datatypes::Field;
 use dataset::edit::{Destination, Renames, Selection, keep, merge, rename, without};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, DepthUnit, Dtype, FeatureStats, RobomimicWriter, SampleSpec, Source,
@@ -122,6 +123,12 @@ fn with_files(root: &Path, column: &str, change: &dyn Fn(usize, &[u8]) -> Vec<u8
     writer.close().unwrap();
 }
 
+/// How a set's data file describes a column.
+fn field(root: &Path, column: &str) -> Field {
+    let file = File::open(root.join("data/chunk-000/file-000.parquet")).unwrap();
+    ParquetRecordBatchReaderBuilder::try_new(file).unwrap().schema().field_with_name(column).unwrap().clone()
+}
+
 fn numbers(episodes: &[usize]) -> Selection {
     Selection { episodes: episodes.to_vec(), ..Selection::default() }
 }
@@ -146,6 +153,8 @@ fn depth_becomes_columns_and_the_file_comes_back_bit_by_bit() {
     let set = Dataset::open(&out).unwrap();
     assert_eq!(set.cameras().collect::<Vec<_>>(), [FRONT]);
     assert_eq!(set.depth_names().collect::<Vec<_>>(), [FRONT_DEPTH, SIDE_DEPTH, WRIST_DEPTH]);
+    // otherwise `datasets` shows the files of images, not images
+    assert_eq!(field(&out, FRONT), field(&theirs(), FRONT_DEPTH).with_name(FRONT));
     for (name, key, unit) in
         [(FRONT_DEPTH, "front_depth", "m"), (SIDE_DEPTH, "side_depth", "m"), (WRIST_DEPTH, "wrist_depth", "mm")]
     {
