@@ -82,7 +82,7 @@ fn a_report_is_a_function_of_results() {
 
 #[test]
 fn only_rollout_starts_processes_and_the_data_set_its_own_reader_and_ffmpeg() {
-    let reader = ["crates/dataset/src/source/isolation.rs", "crates/dataset/src/lerobot/ffmpeg.rs"];
+    let reader = ["crates/dataset/src/source/isolation.rs", "crates/dataset/src/ffmpeg.rs"];
     for room in [
         "analysis",
         "audit",

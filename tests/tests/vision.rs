@@ -164,13 +164,79 @@ fn videos_become_windows_and_pictures_may_stay_in_a_file() {
     stopped(&mut train(&at("video"), &at("cut"), &[]), &[AGENT, "frame 0 of episode 1", "within 0.0001 s of"]);
 }
 
+/// The FFmpeg of the Python package `imageio-ffmpeg`.
+fn ffmpeg() -> String {
+    let asked = "import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())";
+    let python = Command::new(e2e::root().join(".venv/bin/python")).args(["-c", asked]).output().expect("it starts");
+    String::from_utf8(python.stdout).expect("a path").trim().to_owned()
+}
+
+/// All images of a camera in a robomimic file.
+fn images(file: &Path) -> Vec<u8> {
+    let file = hdf5::File::open(file).expect("an HDF5 file");
+    let of = |demo: usize| file.dataset(&format!("data/demo_{demo}/obs/agentview_image")).expect("images");
+    (0..3).flat_map(|demo| of(demo).read_raw::<u8>().expect("bytes")).collect()
+}
+
+#[test]
+fn ffmpeg_decodes_what_is_not_read_here_and_is_asked_for_where_it_is_not() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let at = |name: &str| folder.path().join(name);
+    let ffmpeg = ffmpeg();
+    let mut convert = data(["convert", text(&seen().join("seen.hdf5")), text(&at("set")), "--env-keys", "", "--video"]);
+    convert.args(["--video-encoder", "h264", "--quantizer", "40", "--no-lossless"]).env("ACTRM_FFMPEG", &ffmpeg);
+    succeeds(&mut convert);
+    // a set of somebody else's: nothing is known of its content
+    fs::remove_dir_all(at("set/actrm")).expect("a side folder");
+    let export = |name: &str, program: &str| {
+        let mut command = data(["convert", text(&at("set")), text(&at(name)), "--to", "robomimic"]);
+        command.env("ACTRM_FFMPEG", program);
+        command
+    };
+    succeeds(&mut export("first.hdf5", "nowhere"));
+    let expected = images(&at("first.hdf5"));
+    let film = at("set").join(format!("videos/{AGENT}/chunk-000/file-000.mp4"));
+    let original = at("original.mp4");
+    fs::rename(&film, &original).expect("moved");
+    let video = |more: &[&str]| {
+        let mut command = Command::new(&ffmpeg);
+        command.args(["-y", "-loglevel", "error", "-i", text(&original)]).args(more).arg(&film);
+        succeeds(&mut command);
+    };
+    for (what, more) in [
+        ("HEVC (H.265)", &["-c:v", "libx265", "-crf", "8", "-x265-params", "log-level=none"][..]),
+        (
+            "HEVC (H.265)",
+            &["-c:v", "libx265", "-pix_fmt", "yuv420p10le", "-crf", "8", "-x265-params", "log-level=none"],
+        ),
+        ("AV1 with 10 bits", &["-c:v", "libsvtav1", "-pix_fmt", "yuv420p10le", "-crf", "8"]),
+        ("AV1 with 4:4:4", &["-c:v", "libaom-av1", "-pix_fmt", "yuv444p", "-crf", "8", "-cpu-used", "8"]),
+        ("H.264 with 10 bits", &["-c:v", "libx264", "-pix_fmt", "yuv420p10le", "-crf", "8"]),
+        ("H.264 with 4:4:4", &["-c:v", "libx264", "-pix_fmt", "yuv444p", "-crf", "8"]),
+        ("VP8 or VP9", &["-c:v", "libvpx-vp9", "-crf", "8"]),
+    ] {
+        video(more);
+        let name = more.join("_") + ".hdf5";
+        succeeds(&mut export(&name, &ffmpeg));
+        let found = images(&at(&name));
+        assert_eq!(found.len(), expected.len(), "{what}");
+        let off: u64 = found.iter().zip(&expected).map(|(&a, &b)| u64::from(a.abs_diff(b))).sum();
+        assert!(off < 6 * found.len() as u64, "{what}: {off} levels in {} values", found.len());
+        stopped(&mut export("x.hdf5", "nowhere"), &["file-000.mp4", what, "install `ffmpeg`", "imageio-ffmpeg"]);
+    }
+    // FFmpeg cannot be led to other files, and a damaged one is named
+    let bytes = fs::read(&film).expect("a film");
+    let (start, end) = (bytes.len() / 2, bytes.len());
+    fs::write(&film, [&bytes[..start], &vec![0x55; end - start]].concat()).expect("writable");
+    stopped(&mut export("x.hdf5", &ffmpeg), &["file-000.mp4"]);
+    assert!(!at("x.hdf5").exists());
+}
+
 #[test]
 fn ffmpeg_encodes_videos_where_it_is_and_is_named_where_it_cannot() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let at = |name: &str| folder.path().join(name);
-    let asked = "import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())";
-    let python = Command::new(e2e::root().join(".venv/bin/python")).args(["-c", asked]).output().expect("it starts");
-    let ffmpeg = String::from_utf8(python.stdout).expect("a path").trim().to_owned();
+    let ffmpeg = ffmpeg();
     let convert = |program: &str, out: &str, more: &[&str]| {
         let mut command =
             data(["convert", text(&seen().join("seen.hdf5")), text(&at(out)), "--env-keys", "", "--video"]);
@@ -186,13 +252,23 @@ fn ffmpeg_encodes_videos_where_it_is_and_is_named_where_it_cannot() {
     succeeds(&mut data(["validate", text(&at("one"))]));
     let info = fs::read_to_string(at("one/actrm/info.json")).expect("readable");
     assert!(info.contains("SVT-AV1 by FFmpeg"), "{info}");
+    // H.264, which LeRobot's users know by this name
+    succeeds(&mut convert(&ffmpeg, "h264", &["--video-encoder", "h264"]));
+    succeeds(&mut convert(&ffmpeg, "h264_again", &["--video-encoder", "h264", "--jobs", "1"]));
+    let (one, again) = (fs::read(at("h264").join(&film)).expect("a film"), fs::read(at("h264_again").join(&film)));
+    assert!(one == again.expect("a film") && one.windows(4).any(|kind| kind == b"avc1"));
+    succeeds(&mut data(["validate", text(&at("h264"))]));
+    for (file, words) in [("meta/info.json", "\"video.codec\": \"h264\""), ("actrm/info.json", "x264 by FFmpeg")] {
+        let info = fs::read_to_string(at("h264").join(file)).expect("readable");
+        assert!(info.contains(words), "{info}");
+    }
     // the built-in encoder has no need of it
     succeeds(&mut convert("nowhere", "plain", &["--quantizer", "120"]));
     succeeds(&mut convert("nowhere", "builtin", &["--quantizer", "120", "--video-encoder", "builtin"]));
     let info = fs::read_to_string(at("plain/actrm/info.json")).expect("readable");
     assert!(info.contains("rav1e"), "{info}");
     stopped(
-        &mut convert("nowhere", "x", &["--video-encoder", "ffmpeg"]),
+        &mut convert("nowhere", "x", &["--video-encoder", "libsvtav1"]),
         &["FFmpeg cannot be used: nowhere", "ACTRM_FFMPEG"],
     );
     stopped(&mut convert("/bin/true", "x", &["--video-encoder", "ffmpeg"]), &["/bin/true: no FFmpeg", "builtin"]);

@@ -6,14 +6,14 @@
 //! isolated reader's. Without the peers' Python only our own numbers are shown.
 //!
 //! `bench_data --pictures` measures pictures instead: into memory from PNG columns and from AV1 videos, random windows with
-//! two of them, and writing videos; it writes `target/bench/pictures.json`.
+//! two of them, and writing videos by the built-in encoder and by FFmpeg beside LeRobot; it writes `target/bench/pictures.json`.
 
 #![allow(clippy::print_stdout)]
 
 use dataset::shuffle::SplitMix64;
 use dataset::{
-    Array, ConvertOptions, Dataset, DatasetError, Demo, ImageForm, RobomimicWriter, VideoOptions, WindowBatch,
-    WindowSpec, WriteOptions, convert, isolation,
+    Array, ConvertOptions, Dataset, DatasetError, Demo, ImageForm, RobomimicWriter, VideoEncoder, VideoOptions,
+    WindowBatch, WindowSpec, WriteOptions, convert, isolation,
 };
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -230,6 +230,7 @@ impl Bench {
         let as_video = ConvertOptions { video: Some(VideoOptions::default()), ..options(ImageForm::Png) };
         let begun = cpu_seconds()?;
         convert(&file, &video, &as_video, &mut |_, _| {})?;
+        self.film(&file, 2.0 * frames as f64, rows)?;
         let both = 2.0 * frames as f64;
         let written = both / (cpu_seconds()? - begun);
         rows.push(row("write AV1 84 x 84 (convert --video), CPU", "pictures/s", written, None, None, None));
@@ -254,12 +255,65 @@ impl Bench {
         Ok(())
     }
 
+    /// Videos of the same images by FFmpeg's SVT-AV1 and by LeRobot's, with the same settings; ours read them from HDF5, and
+    /// decode what they wrote.
+    fn film(&self, file: &Path, images: f64, rows: &mut Vec<Value>) -> Result<(), AnyError> {
+        let out = self.fresh("film")?;
+        // LeRobot's crf 30
+        let video = VideoOptions {
+            encoder: VideoEncoder::SvtAv1,
+            quantizer: 120,
+            side_pictures: false,
+            ..VideoOptions::default()
+        };
+        let plan = ConvertOptions { video: Some(video), lossless: false, ..options(ImageForm::Png) };
+        let cost = measure(|| {
+            remove(&out);
+            convert(file, &out, &plan, &mut |_, _| {}).map(drop)
+        });
+        let cost = match cost {
+            Ok(cost) => cost,
+            Err(error) => {
+                println!("videos by FFmpeg are not measured: {error}");
+                return Ok(());
+            }
+        };
+        let peer = match &self.peers {
+            None => None,
+            Some(peers) => {
+                let folder = self.fresh("peer")?;
+                let mut bytes = 0.0;
+                let rate = best_rate("images", "cpu_seconds", || {
+                    let report = peers.run("encode_lerobot.py", &[text(file)?, text(&folder)?])?;
+                    bytes = report["bytes"].as_f64().unwrap_or(f64::NAN) / images;
+                    Ok(report)
+                })?;
+                Some((format!("LeRobot, {bytes:.0} bytes"), rate))
+            }
+        };
+        let bytes = films(&out.join("videos"))? as f64 / images;
+        let work = format!("SVT-AV1 84 x 84, {bytes:.0} bytes each, CPU");
+        let peer = peer.as_ref().map(|(name, rate)| (name.as_str(), *rate));
+        rows.push(row(&work, "images/s", images / cost.cpu, peer, Some(1.0), None));
+        Ok(())
+    }
+
     /// A path in the work folder with nothing at it.
     fn fresh(&self, name: &str) -> Result<PathBuf, AnyError> {
         let path = self.work.join(name);
         remove(&path);
         Ok(path)
     }
+}
+
+/// Bytes of all files below a folder.
+fn films(folder: &Path) -> std::io::Result<u64> {
+    let mut bytes = 0;
+    for entry in std::fs::read_dir(folder)? {
+        let entry = entry?;
+        bytes += if entry.file_type()?.is_dir() { films(&entry.path())? } else { entry.metadata()?.len() };
+    }
+    Ok(bytes)
 }
 
 fn text(path: &Path) -> Result<&str, AnyError> {

@@ -13,6 +13,7 @@
 #![allow(clippy::result_large_err)]
 
 mod error;
+mod ffmpeg;
 mod keys;
 mod lerobot;
 mod plan;
@@ -21,6 +22,7 @@ pub mod rotation;
 mod samples;
 mod sheet;
 pub mod shuffle;
+mod sorted_map;
 mod source;
 mod stats;
 mod tree;
@@ -39,6 +41,7 @@ pub use plan::{DemoPlan, Dialect, Join, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};
 pub use samples::{SampleColumn, SamplePlace, SampleSpec, Samples};
 pub use sheet::Picture;
+pub use sorted_map::SortedMap;
 pub use source::{NonFinite, RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};

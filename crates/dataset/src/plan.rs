@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::error::InputError;
+use crate::sorted_map::SortedMap;
 use crate::tree::Dtype;
 
 /// Whose layout a file follows.
@@ -153,21 +154,26 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Everything but the demos.
-    pub(crate) fn without_demos(&self) -> Self {
-        Self {
-            path: self.path.clone(),
-            files: self.files.clone(),
-            dialect: self.dialect,
-            demos: Vec::new(),
-            env_args: self.env_args.clone(),
-            env_name: self.env_name.clone(),
-            env_version: self.env_version.clone(),
-            masks: self.masks.clone(),
-            texts: self.texts.clone(),
-            notes: self.notes.clone(),
-            problems: self.problems.clone(),
+    /// Everything but the demos, to be sent.
+    pub(crate) fn without_demos(&self) -> impl Serialize {
+        #[derive(Serialize)]
+        struct Rest<'a> {
+            path: &'a PathBuf,
+            files: &'a [(PathBuf, u64)],
+            dialect: Dialect,
+            demos: [(); 0],
+            env_args: &'a Option<serde_json::Value>,
+            env_name: &'a Option<String>,
+            env_version: &'a Option<String>,
+            masks: &'a BTreeMap<String, Vec<String>>,
+            texts: &'a BTreeMap<String, String>,
+            notes: &'a [String],
+            problems: &'a [Problem],
         }
+        let Self { path, files, dialect, demos: _, env_args, env_name, env_version, masks, texts, notes, problems } =
+            self;
+        let dialect = *dialect;
+        Rest { path, files, dialect, demos: [], env_args, env_name, env_version, masks, texts, notes, problems }
     }
 
     /// Steps of all demos together.
@@ -208,7 +214,7 @@ pub struct DemoPlan {
     /// Steps.
     pub length: usize,
     /// Datasets by path below the demo.
-    pub keys: BTreeMap<String, KeyPlan>,
+    pub keys: SortedMap<KeyPlan>,
     /// Names of the attributes of the demo's group.
     pub attr_names: Vec<String>,
     /// The instruction in words, where the file has one for this demo.

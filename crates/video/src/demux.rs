@@ -24,6 +24,8 @@ pub enum Codec {
     Av1,
     /// H.264, also AVC.
     H264,
+    /// Another one, by its name in LeRobot, which is not read here.
+    Other(&'static str),
 }
 
 impl Codec {
@@ -32,6 +34,7 @@ impl Codec {
         match self {
             Self::Av1 => "av1",
             Self::H264 => "h264",
+            Self::Other(name) => name,
         }
     }
 }
@@ -78,6 +81,8 @@ pub(crate) struct Track {
     pub places: Vec<Place>,
     /// Content of `av1C` or `avcC`.
     pub config: Vec<u8>,
+    /// Why its pictures are not read here, as far as the tables say.
+    pub unread: Option<String>,
 }
 
 /// Finds the track in a file.
@@ -113,8 +118,8 @@ pub(crate) fn track(name: &str, bytes: &Bytes) -> Result<Track> {
     let edits =
         child(name, "trak", trak, *b"edts")?.map(|edts| child(name, "edts", edts, *b"elst")).transpose()?.flatten();
     shift(name, edits, movie, timescale, &mut places)?;
-    let (codec, width, height, config) = entry;
-    Ok(Track { codec, width, height, timescale, places, config: config.to_vec() })
+    let Entry { codec, width, height, config, unread } = entry;
+    Ok(Track { codec, width, height, timescale, places, config: config.to_vec(), unread })
 }
 
 /// Whether box `tkhd` asks players to turn, mirror or scale the pictures. LeRobot's readers do not agree on what that means.
@@ -219,22 +224,30 @@ fn timescale(name: &str, kind: &str, data: &[u8]) -> Result<u32> {
     }
 }
 
-/// Names of codecs that are known and not read.
-const OTHERS: [(&[Kind], &str); 9] = [
-    (&[*b"hvc1", *b"hev1", *b"dvh1", *b"dvhe"], "HEVC (H.265)"),
-    (&[*b"vvc1", *b"vvi1"], "VVC (H.266)"),
-    (&[*b"vp08", *b"vp09"], "VP8 or VP9"),
-    (&[*b"mp4v"], "MPEG-4 part 2"),
-    (&[*b"avc2", *b"avc3", *b"avc4"], "H.264 with parameters inside the stream"),
-    (&[*b"mjpa", *b"mjpb", *b"jpeg", *b"mjp2"], "Motion JPEG"),
-    (&[*b"png ", *b"raw "], "images without a video codec"),
-    (&[*b"apcn", *b"apch", *b"apcs", *b"apco", *b"ap4h"], "ProRes"),
-    (&[*b"encv"], "encrypted video"),
+/// Names of codecs that are known and not read, for people and in FFmpeg.
+const OTHERS: [(&[Kind], &str, &str); 8] = [
+    (&[*b"hvc1", *b"hev1", *b"dvh1", *b"dvhe"], "HEVC (H.265)", "hevc"),
+    (&[*b"vvc1", *b"vvi1"], "VVC (H.266)", "vvc"),
+    (&[*b"vp08", *b"vp09"], "VP8 or VP9", "vp9"),
+    (&[*b"mp4v"], "MPEG-4 part 2", "mpeg4"),
+    (&[*b"avc2", *b"avc3", *b"avc4"], "H.264 with parameters inside the stream", "h264"),
+    (&[*b"mjpa", *b"mjpb", *b"jpeg", *b"mjp2"], "Motion JPEG", "mjpeg"),
+    (&[*b"png ", *b"raw "], "images without a video codec", "rawvideo"),
+    (&[*b"apcn", *b"apch", *b"apcs", *b"apco", *b"ap4h"], "ProRes", "prores"),
 ];
 
+/// What a sample entry says.
+struct Entry<'a> {
+    codec: Codec,
+    width: u16,
+    height: u16,
+    config: &'a [u8],
+    /// Why it is not read.
+    unread: Option<String>,
+}
+
 /// Codec, size and configuration of the one sample entry in box `stsd`.
-fn entry<'a>(name: &'a str, stsd: &'a [u8]) -> Result<(Codec, u16, u16, &'a [u8])> {
-    let unsupported = |what: String| VideoError::Unsupported { name: name.to_owned(), what };
+fn entry<'a>(name: &'a str, stsd: &'a [u8]) -> Result<Entry<'a>> {
     let mut fields = Fields(stsd);
     let count = fields.version().and_then(|_| fields.u32());
     let mut entries = children(name, "stsd", fields.0);
@@ -242,15 +255,19 @@ fn entry<'a>(name: &'a str, stsd: &'a [u8]) -> Result<(Codec, u16, u16, &'a [u8]
         return Err(bad_box(name, "stsd", "one sample entry", format!("{count:?}")));
     };
     let (kind, content) = first?;
-    let (codec, config_kind) = match &kind {
-        b"av01" => (Codec::Av1, *b"av1C"),
-        b"avc1" => (Codec::H264, *b"avcC"),
+    let kind_name = name_of(kind);
+    let (codec, config_kind, mut unread) = match &kind {
+        b"av01" => (Codec::Av1, Some(*b"av1C"), None),
+        b"avc1" => (Codec::H264, Some(*b"avcC"), None),
+        b"encv" => {
+            return Err(VideoError::Unsupported { name: name.to_owned(), what: "encrypted video (encv)".to_owned() });
+        }
         _ => {
-            let known = OTHERS.iter().find(|(kinds, _)| kinds.contains(&kind)).map(|(_, what)| *what);
-            return Err(unsupported(format!("{} ({})", known.unwrap_or("a codec unknown here"), name_of(kind))));
+            let known = OTHERS.iter().find(|(kinds, ..)| kinds.contains(&kind));
+            let (what, codec) = known.map_or(("a codec unknown here", "unknown"), |(_, what, codec)| (*what, *codec));
+            (Codec::Other(codec), None, Some(format!("{what} ({kind_name})")))
         }
     };
-    let kind_name = name_of(kind);
     let mut fields = Fields(content);
     // reserved, index of the data reference, then reserved again up to the size
     let size = fields.take(24).and_then(|_| fields.u16()).zip(fields.u16());
@@ -272,35 +289,44 @@ fn entry<'a>(name: &'a str, stsd: &'a [u8]) -> Result<(Codec, u16, u16, &'a [u8]
     }
     if height % 2 == 1 {
         // LeRobot's readers interpolate the colour of such pictures; a rule that was not measured is not guessed
-        return Err(unsupported(format!("a video of odd height ({width} x {height})")));
+        unread = unread.or(Some(format!("a video of odd height ({width} x {height})")));
     }
+    let Some(config_kind) = config_kind else { return Ok(Entry { codec, width, height, config: &[], unread }) };
     if let Some(colr) = child(name, "av01", rest, *b"colr")? {
-        colour(name, colr)?;
+        unread = unread.or(colour(colr));
     }
     let kind_name: &'static str = if codec == Codec::Av1 { "av01" } else { "avc1" };
-    Ok((codec, width, height, needed(name, kind_name, rest, config_kind)?))
+    let config = needed(name, kind_name, rest, config_kind)?;
+    Ok(Entry { codec, width, height, config, unread })
 }
 
-fn colour(name: &str, colr: &[u8]) -> Result<()> {
+/// Why the colours that box `colr` states are not read.
+fn colour(colr: &[u8]) -> Option<String> {
     let mut fields = Fields(colr);
     if !matches!(fields.array().as_ref(), Some(b"nclx" | b"nclc")) {
-        return Ok(()); // an ICC profile, which video players pass over
+        return None; // an ICC profile, which video players pass over
     }
     let matrix = fields.take(4).and_then(|_| fields.u16());
     let full = fields.u8().is_some_and(|flags| flags & 0x80 != 0);
-    refuse_colour(name, matrix.unwrap_or(2), full)
+    unread_colour(matrix.unwrap_or(2), full)
 }
 
 /// Refuses colours that the rule of `colour.rs` does not hold for; `matrix` counts as in H.273.
 pub(crate) fn refuse_colour(name: &str, matrix: u16, full_range: bool) -> Result<()> {
-    let unsupported = |what: String| Err(VideoError::Unsupported { name: name.to_owned(), what });
+    match unread_colour(matrix, full_range) {
+        Some(what) => Err(VideoError::Unsupported { name: name.to_owned(), what }),
+        None => Ok(()),
+    }
+}
+
+fn unread_colour(matrix: u16, full_range: bool) -> Option<String> {
     match matrix {
-        _ if full_range => unsupported("full-range colour".to_owned()),
-        2 | 5 | 6 => Ok(()),
-        0 => unsupported("RGB inside the video (identity matrix)".to_owned()),
-        1 => unsupported("colour matrix BT.709".to_owned()),
-        9 | 10 => unsupported("colour matrix BT.2020".to_owned()),
-        n => unsupported(format!("colour matrix {n}")),
+        _ if full_range => Some("full-range colour".to_owned()),
+        2 | 5 | 6 => None,
+        0 => Some("RGB inside the video (identity matrix)".to_owned()),
+        1 => Some("colour matrix BT.709".to_owned()),
+        9 | 10 => Some("colour matrix BT.2020".to_owned()),
+        n => Some(format!("colour matrix {n}")),
     }
 }
 

@@ -1,4 +1,4 @@
-//! An MP4 file of AV1 samples, as LeRobot's own are: one track, one chunk, constant rate.
+//! An MP4 file of AV1 or H.264 samples, as LeRobot's own are: one track, one chunk, constant rate.
 
 use crate::Sample;
 use crate::error::{Result, VideoError};
@@ -62,12 +62,23 @@ pub struct Muxer {
     bytes: u64,
     /// Sequence header of the first sample, with which it begins.
     sequence: Vec<u8>,
+    /// Parameters of the first sample, where that is H.264.
+    parameters: Vec<u8>,
 }
 
 impl Muxer {
     /// A file for pictures of one size at one rate.
     pub fn new(width: u16, height: u16, rate: Rate) -> Self {
-        Self { width, height, rate, sizes: Vec::new(), keys: Vec::new(), bytes: 0, sequence: Vec::new() }
+        Self {
+            width,
+            height,
+            rate,
+            sizes: Vec::new(),
+            keys: Vec::new(),
+            bytes: 0,
+            sequence: Vec::new(),
+            parameters: Vec::new(),
+        }
     }
 
     /// Takes note of the next sample; its bytes follow those of the one before.
@@ -80,6 +91,11 @@ impl Muxer {
             reason: format!("frame {number}: {reason}"),
         };
         if number == 0 {
+            self.parameters.clone_from(&sample.parameters);
+        } else if !sample.parameters.is_empty() && sample.parameters != self.parameters {
+            return Err(refused("its parameters differ from those of the first frame"));
+        }
+        if number == 0 && self.parameters.is_empty() {
             let units = sequence::units(&sample.bytes).unwrap_or_default();
             let header = units.iter().find(|u| u.kind == sequence::SEQUENCE && sample.key);
             let header = header.ok_or_else(|| refused("a file begins with a key frame that has a sequence header"))?;
@@ -106,7 +122,7 @@ impl Muxer {
 
     /// Everything that stands before the samples.
     pub fn header(&self) -> Vec<u8> {
-        let ftyp = boxed(b"ftyp", &[b"isom", &512_u32.to_be_bytes(), b"isom", b"av01", b"iso2", b"mp41"]);
+        let ftyp = boxed(b"ftyp", &[b"isom", &512_u32.to_be_bytes(), b"isom", self.codec(), b"iso2", b"mp41"]);
         let large = self.bytes + 16 > u64::from(u32::MAX);
         let mdat = match large {
             false => [&(self.bytes as u32 + 8).to_be_bytes()[..], b"mdat"].concat(),
@@ -115,6 +131,11 @@ impl Muxer {
         // the place of the samples does not change the length of what stands before them
         let before = ftyp.len() + self.moov(0).len() + mdat.len();
         [ftyp, self.moov(before as u32), mdat].concat()
+    }
+
+    /// The name of the sample entry.
+    fn codec(&self) -> &'static [u8; 4] {
+        if self.parameters.is_empty() { b"av01" } else { b"avc1" }
     }
 
     fn moov(&self, samples_at: u32) -> Vec<u8> {
@@ -166,9 +187,12 @@ impl Muxer {
         // marker and version; main profile, level as the header says; 8 bits, 4:2:0
         let sequence = sequence::units(&self.sequence).unwrap_or_default();
         let level = sequence.first().map_or(0, |u| level(u.content));
-        let av1c = boxed(b"av1C", &[&[0x81, level, 0x0c, 0], &self.sequence]);
+        let config = match self.parameters.is_empty() {
+            true => boxed(b"av1C", &[&[0x81, level, 0x0c, 0], &self.sequence]),
+            false => boxed(b"avcC", &[&self.parameters]),
+        };
         let entry = boxed(
-            b"av01",
+            self.codec(),
             &[
                 &[0, 0, 0, 0, 0, 0, 0, 1],
                 &zeros[..16],
@@ -181,7 +205,7 @@ impl Muxer {
                 &[0, 1],
                 &zeros,
                 &[0, 24, 0xff, 0xff],
-                &av1c,
+                &config,
             ],
         );
         let count = self.sizes.len() as u32;

@@ -33,6 +33,12 @@ pub struct Info {
 }
 
 impl Info {
+    /// What the tables of a file say, whatever it is encoded with: for a decoder of others.
+    pub fn of(path: &Path) -> Result<Self> {
+        let (name, bytes) = opened(path)?;
+        Ok(tables(&name, &bytes)?.1)
+    }
+
     /// Bytes of a picture.
     pub fn picture_bytes(&self) -> usize {
         self.width * self.height * 3
@@ -73,14 +79,8 @@ pub struct Frame {
 impl Video {
     /// Opens a file: reads its tables and its first sample, decodes nothing.
     pub fn open(path: &Path) -> Result<Self> {
-        let name = path.display().to_string();
-        let failed = |operation| {
-            let name = name.clone();
-            move |source| VideoError::Io { name, operation, source }
-        };
-        let file = File::open(path).map_err(failed("open it"))?;
-        let length = file.metadata().map_err(failed("look at it"))?.len();
-        Self::new(name, Bytes::File(file, length))
+        let (name, bytes) = opened(path)?;
+        Self::new(name, bytes)
     }
 
     /// A file that is in memory; `name` stands for it in errors.
@@ -89,24 +89,10 @@ impl Video {
     }
 
     fn new(name: String, bytes: Bytes) -> Result<Self> {
-        let track = demux::track(&name, &bytes)?;
-        let mut order: Vec<u32> = (0..track.places.len() as u32).collect();
-        order.sort_by_key(|&sample| track.places[sample as usize].time);
-        let seconds = |ticks: i64| ticks as f64 / f64::from(track.timescale);
-        let timestamps: Vec<f64> = order.iter().map(|&s| seconds(track.places[s as usize].time)).collect();
-        if let Some(at) = timestamps.windows(2).position(|t| t[0] == t[1]) {
-            return Err(VideoError::Malformed {
-                name,
-                object: "box stts".to_owned(),
-                expected: "a time of its own for each frame".to_owned(),
-                found: format!("{} s for frames {at} and {}", timestamps[at], at + 1),
-            });
+        let (track, info, order) = tables(&name, &bytes)?;
+        if let Some(what) = track.unread {
+            return Err(VideoError::Unsupported { name, what });
         }
-        let duration = seconds(track.places.iter().map(|p| i64::from(p.ticks)).sum());
-        let frames = order.len();
-        let fps = if duration > 0.0 { frames as f64 / duration } else { f64::from(track.timescale) };
-        let (width, height) = (usize::from(track.width), usize::from(track.height));
-        let info = Info { width, height, fps, frames, codec: track.codec, timestamps };
         let mut first = Vec::new();
         read_sample(&name, &bytes, &track, 0, &mut first)?;
         let setup = Setup::of(&name, &track, &first)?;
@@ -166,7 +152,7 @@ impl Video {
         for frame in range {
             let mut bytes = Vec::new();
             read_sample(&self.name, &self.bytes, &self.track, frame, &mut bytes)?;
-            samples.push(Sample { bytes, key: self.track.places[frame].key });
+            samples.push(Sample { bytes, key: self.track.places[frame].key, parameters: Vec::new() });
         }
         Ok(samples)
     }
@@ -176,6 +162,41 @@ impl Video {
         let found = format!("{} frames from {} to {last} s", self.order.len(), self.info.timestamps[0]);
         VideoError::NoSuchFrame { name: self.name.clone(), wanted, found }
     }
+}
+
+/// A file with its name for errors.
+fn opened(path: &Path) -> Result<(String, Bytes)> {
+    let name = path.display().to_string();
+    let failed = |operation| {
+        let name = name.clone();
+        move |source| VideoError::Io { name, operation, source }
+    };
+    let file = File::open(path).map_err(failed("open it"))?;
+    let length = file.metadata().map_err(failed("look at it"))?.len();
+    Ok((name, Bytes::File(file, length)))
+}
+
+/// What the tables of a file say: its track, all that is known of it, and the sample of each frame.
+fn tables(name: &str, bytes: &Bytes) -> Result<(Track, Info, Vec<u32>)> {
+    let track = demux::track(name, bytes)?;
+    let mut order: Vec<u32> = (0..track.places.len() as u32).collect();
+    order.sort_by_key(|&sample| track.places[sample as usize].time);
+    let seconds = |ticks: i64| ticks as f64 / f64::from(track.timescale);
+    let timestamps: Vec<f64> = order.iter().map(|&s| seconds(track.places[s as usize].time)).collect();
+    if let Some(at) = timestamps.windows(2).position(|t| t[0] == t[1]) {
+        return Err(VideoError::Malformed {
+            name: name.to_owned(),
+            object: "box stts".to_owned(),
+            expected: "a time of its own for each frame".to_owned(),
+            found: format!("{} s for frames {at} and {}", timestamps[at], at + 1),
+        });
+    }
+    let duration = seconds(track.places.iter().map(|p| i64::from(p.ticks)).sum());
+    let frames = order.len();
+    let fps = if duration > 0.0 { frames as f64 / duration } else { f64::from(track.timescale) };
+    let (width, height) = (usize::from(track.width), usize::from(track.height));
+    let info = Info { width, height, fps, frames, codec: track.codec, timestamps };
+    Ok((track, info, order))
 }
 
 fn read_sample(name: &str, bytes: &Bytes, track: &Track, sample: usize, out: &mut Vec<u8>) -> Result<()> {

@@ -103,6 +103,6 @@ fn what_cannot_be_encoded_is_named() {
     assert!(text.contains("frame 0 has 100 bytes instead of 21168"), "{text}");
     assert!(Encoder::new(84, 84, rate, &EncodeOptions::default()).unwrap().finish().unwrap().is_empty());
     let mut muxer = Muxer::new(84, 84, rate);
-    let late = Sample { bytes: vec![0x32, 0], key: false };
+    let late = Sample { bytes: vec![0x32, 0], key: false, parameters: Vec::new() };
     assert!(muxer.push(&late).unwrap_err().to_string().contains("sequence header"));
 }

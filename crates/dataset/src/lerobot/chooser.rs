@@ -41,7 +41,7 @@ pub(super) fn usual(plan: &Plan) -> Option<&DemoPlan> {
     let mut kinds: BTreeMap<Kind<'_>, (usize, usize)> = BTreeMap::new();
     for (index, demo) in plan.demos.iter().enumerate() {
         let step = |key: &'_ KeyPlan| key.shape.len().min(1);
-        let keys = demo.keys.iter().map(|(path, key)| (path.as_str(), &key.dtype, &key.shape[step(key)..])).collect();
+        let keys = demo.keys.iter().map(|(path, key)| (path, &key.dtype, &key.shape[step(key)..])).collect();
         kinds.entry(keys).or_insert((0, index)).0 += 1;
     }
     let most = kinds.into_values().max_by_key(|&(count, index)| (count, std::cmp::Reverse(index)));
@@ -217,7 +217,7 @@ impl Chooser<'_> {
     pub fn images(&self) -> Result<Vec<Column>> {
         let mut columns = Vec::new();
         let mut taken = BTreeSet::new();
-        let mut cameras: BTreeMap<&String, &KeyPlan> = BTreeMap::new();
+        let mut cameras: BTreeMap<&str, &KeyPlan> = BTreeMap::new();
         for (path, key) in std::iter::once(self.first).chain(&self.plan.demos).flat_map(|demo| &demo.keys) {
             if self.files.contains_key(path) || key.is_image() {
                 cameras.entry(path).or_insert(key);
@@ -260,7 +260,7 @@ impl Chooser<'_> {
                     names: json!(["height", "width", "channels"]),
                     info: None,
                 },
-                origin: Origin::Image { key: path.clone(), height, width, jpeg },
+                origin: Origin::Image { key: path.to_owned(), height, width, jpeg },
             });
         }
         Ok(columns)
@@ -289,14 +289,14 @@ impl Chooser<'_> {
                     columns.push(Column {
                         name: format!("observation.images.{camera}"),
                         feature: depth::feature(height, width, kind),
-                        origin: Origin::Depth { key: path.clone(), height, width, dtype: key.dtype.clone(), kind },
+                        origin: Origin::Depth { key: path.to_owned(), height, width, dtype: key.dtype.clone(), kind },
                     });
                     continue;
                 }
                 (true, Some(demo)) => format!("{} has other depth than {} or none", demo.id, self.first.id),
                 (false, _) => "no depth does (--no-depth)".to_owned(),
             };
-            left_out.insert(path.clone(), reason);
+            left_out.insert(path.to_owned(), reason);
         }
     }
 
@@ -463,13 +463,9 @@ impl Chooser<'_> {
             return error.clone();
         }
         let folder = path.rsplit_once('/').map_or("", |(folder, _)| folder);
-        let near: Vec<&str> = demo
-            .keys
-            .keys()
-            .filter(|k| k.rsplit_once('/').map_or("", |(f, _)| f) == folder)
-            .map(String::as_str)
-            .collect();
-        let found = if near.is_empty() { demo.keys.keys().map(String::as_str).collect::<Vec<_>>() } else { near };
+        let near: Vec<&str> =
+            demo.keys.keys().filter(|k| k.rsplit_once('/').map_or("", |(f, _)| f) == folder).collect();
+        let found = if near.is_empty() { demo.keys.keys().collect::<Vec<_>>() } else { near };
         InputError::MissingKey {
             path: self.plan.path.clone(),
             demo: demo.id.clone(),

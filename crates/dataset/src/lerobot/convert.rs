@@ -8,7 +8,6 @@ use super::depth;
 use super::encode::{GroupOutput, Job};
 use super::encoded;
 use super::features::{ConvertOptions, Mapping};
-use super::ffmpeg;
 use super::info::{self, Info, Provenance, SkippedDemo, VideoProvenance};
 use super::schema::CREATED_BY;
 use super::side::{self, SideEncoder, SideOutput};
@@ -19,6 +18,7 @@ use super::verify::hash_files;
 use super::videos;
 use super::work::{self, Part};
 use crate::error::{DatasetError, InputError, Result};
+use crate::ffmpeg;
 use crate::plan::{Plan, Problem};
 use crate::source::Source;
 use crate::tree::Demo;
@@ -145,7 +145,7 @@ impl Opened {
             // the side folder keeps it, whatever its values
             let keys = input.plan().demos.iter().flat_map(|demo| &demo.keys);
             let depth = keys.filter(|(path, key)| depth::size(&path.replacen("next_obs/", "obs/", 1), key).is_some());
-            let depth: BTreeSet<String> = depth.map(|(path, _)| path.clone()).collect();
+            let depth: BTreeSet<String> = depth.map(|(path, _)| path.to_owned()).collect();
             input.exempt(depth);
         }
         let (mapping, skipped) = match options.skip_bad {
@@ -293,7 +293,7 @@ impl Opened {
                 seal: None,
                 video: options.video.filter(|_| films).map(|v| VideoProvenance {
                     encoder: match ffmpeg::chosen(v.encoder) {
-                        Ok(Some(ffmpeg)) => ffmpeg.name(),
+                        Ok(Some(chosen)) => chosen.name(),
                         _ => videos::ENCODER.to_owned(),
                     },
                     speed: v.speed,

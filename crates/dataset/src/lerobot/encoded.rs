@@ -28,7 +28,7 @@ pub(crate) fn sizes(source: &Source) -> Result<BTreeMap<String, (usize, usize)>>
                 let row = source.read_rows(index, path, 0, 1)?;
                 let file = row.byte_rows().and_then(|rows| images::jpeg(rows.first()?));
                 let size = file.and_then(|file| images::jpeg_size(file).ok());
-                found.insert(path.clone(), size);
+                found.insert(path.to_owned(), size);
             }
         }
     }

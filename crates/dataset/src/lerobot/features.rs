@@ -2,9 +2,9 @@
 
 use super::chooser::{Chooser, index_columns, usual};
 use super::depth::DepthKind;
-use super::ffmpeg;
 use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm};
 use crate::error::{InputError, Result};
+use crate::ffmpeg;
 use crate::keys::KeyItem;
 use crate::plan::Plan;
 use crate::source::NonFinite;
@@ -28,15 +28,17 @@ pub enum ImageForm {
     Ppm,
 }
 
-/// What makes AV1 of pictures.
+/// What makes videos of pictures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum VideoEncoder {
     /// FFmpeg where there is one with SVT-AV1, the built-in encoder otherwise.
     #[default]
     Auto,
-    /// FFmpeg.
-    Ffmpeg,
-    /// The built-in encoder.
+    /// AV1 by SVT-AV1 in FFmpeg.
+    SvtAv1,
+    /// H.264 by x264 in FFmpeg.
+    H264,
+    /// AV1 by the built-in encoder.
     Builtin,
 }
 
@@ -264,10 +266,11 @@ impl Mapping {
 
     /// Makes videos of the columns of colour images.
     pub(super) fn film(&mut self, options: &VideoOptions, lossless: bool) -> Result<()> {
-        let (backend, settings) = match ffmpeg::chosen(options.encoder)? {
-            Some(_) => ("ffmpeg", json!({"preset": ffmpeg::preset(options), "crf": ffmpeg::crf(options)})),
-            None => ("rav1e", json!({"speed": options.speed, "quantizer": options.quantizer})),
+        let (codec, backend, settings) = match ffmpeg::chosen(options.encoder)? {
+            Some(chosen) => (chosen.codec(), "ffmpeg", chosen.settings(options)),
+            None => ("av1", "rav1e", json!({"speed": options.speed, "quantizer": options.quantizer})),
         };
+        let shown = if codec == "av1" { "AV1" } else { "H.264" };
         let exact = lossless && options.side_pictures;
         for column in &mut self.columns {
             if column.feature.is_depth() {
@@ -280,7 +283,7 @@ impl Mapping {
             column.feature.dtype = "video".to_owned();
             let fps = if self.fps.fract() == 0.0 { json!(self.fps as i64) } else { json!(self.fps) };
             column.feature.info = Some(json!({
-                "video.height": height, "video.width": width, "video.codec": "av1", "video.pix_fmt": "yuv420p",
+                "video.height": height, "video.width": width, "video.codec": codec, "video.pix_fmt": "yuv420p",
                 "video.fps": fps, "video.channels": 3, "has_audio": false, "video.g": options.key_interval,
                 "video.video_backend": backend, "video.extra_options": settings,
                 "is_depth_map": false,
@@ -293,7 +296,7 @@ impl Mapping {
                 false => "the exact ones are left out (--no-lossless)",
             };
             let note =
-                format!("{} is AV1 video: its images are close to the recording's, not equal; {fate}", column.name);
+                format!("{} is {shown} video: its images are close to the recording's, not equal; {fate}", column.name);
             self.notes.push(note);
         }
         Ok(())

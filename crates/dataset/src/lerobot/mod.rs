@@ -11,7 +11,6 @@ mod encode;
 mod encoded;
 mod export;
 mod features;
-mod ffmpeg;
 mod fingerprint;
 mod images;
 mod info;

@@ -113,6 +113,12 @@ impl Dataset {
         dataset.complete(notes, |_| computed)
     }
 
+    /// [`Self::open_scanned`] of what was just written of rows that were looked at: their content hashes to `fingerprint`.
+    pub(super) fn open_written(root: &Path, fingerprint: &str) -> Result<Self> {
+        let (dataset, notes) = Self::open_tables(root)?;
+        dataset.complete(notes, |_| fingerprint.to_owned())
+    }
+
     /// Everything but the frames.
     fn open_tables(root: &Path) -> Result<(Self, Vec<String>)> {
         let mut notes = Vec::new();

@@ -175,7 +175,7 @@ fn layout(plan: &Plan, pictures: &BTreeMap<String, String>, left_out: &BTreeSet<
     for demo in &plan.demos {
         for (path, key) in &demo.keys {
             let elsewhere = pictures.contains_key(path) || left_out.contains(path);
-            if columns.contains_key(path.as_str()) || elsewhere || base_of(demo, path).is_some() {
+            if columns.contains_key(path) || elsewhere || base_of(demo, path).is_some() {
                 continue;
             }
             if let Some(column) = column_of(path, key, demo.length) {
@@ -348,7 +348,7 @@ impl SideEncoder {
                 .collect();
             for (path, key) in &demo.keys {
                 let elsewhere = self.pictures.contains_key(path) || self.left_out.contains(path);
-                if columns.contains(path.as_str()) || elsewhere || base_of(demo, path).is_some() {
+                if columns.contains(path) || elsewhere || base_of(demo, path).is_some() {
                     continue;
                 }
                 let array = match l.demo.datasets.get(path) {

@@ -307,7 +307,7 @@ impl Stated {
                     continue;
                 }
                 (_, None) => {
-                    let found = plan.demos.first().map(|demo| demo.keys.keys().cloned().collect::<Vec<_>>().join(", "));
+                    let found = plan.demos.first().map(|demo| demo.keys.keys().collect::<Vec<_>>().join(", "));
                     return Err(InputError::MissingKey {
                         path: plan.path.clone(),
                         demo: plan.demos.first().map(|demo| demo.id.clone()).unwrap_or_default(),

@@ -1,10 +1,10 @@
 //! Videos of a data set that is being written: a file a camera holds many episodes, as LeRobot has it.
 
 use super::features::{Column, VideoOptions};
-use super::ffmpeg::{self, Encoding};
 use super::info::{FILES_PER_FOLDER, Features};
 use super::shards::{HashingFile, WrittenFile, create_parent};
 use crate::error::{DatasetError, Result};
+use crate::ffmpeg::{self, Encoding};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -45,7 +45,7 @@ impl Camera {
         let (height, width) = (column.feature.shape[0], column.feature.shape[1]);
         let rate = rate(fps, width, height)?;
         let encoder = match ffmpeg::chosen(options.encoder)? {
-            Some(ffmpeg) => Making::Ffmpeg(Encoding::new(ffmpeg, (width, height), rate, options)?),
+            Some(chosen) => Making::Ffmpeg(Encoding::new(chosen, (width, height), rate, options)?),
             None => {
                 let &VideoOptions { speed, quantizer, key_interval, .. } = options;
                 let settings = EncodeOptions { speed, quantizer, key_interval };

@@ -267,7 +267,7 @@ impl Remote {
         loop {
             let (kind, body) = remote.exchange::<Request>(None)?;
             bytes += body.len();
-            let demos: Vec<DemoPlan> = match serde_json::from_slice(&body) {
+            let mut demos: Vec<DemoPlan> = match serde_json::from_slice(&body) {
                 Ok(demos) if kind == DEMOS && bytes <= MAX_DEMOS => demos,
                 _ => {
                     let (path, reason) = (path.to_owned(), "its answer is no list of demos".to_owned());
@@ -276,6 +276,13 @@ impl Remote {
             };
             if demos.is_empty() {
                 return Ok((remote, plan));
+            }
+            let mut before = plan.demos.last();
+            for demo in &mut demos {
+                if let Some(before) = before {
+                    demo.keys.share_names(&before.keys);
+                }
+                before = Some(demo);
             }
             plan.demos.extend(demos);
         }

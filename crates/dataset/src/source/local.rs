@@ -218,12 +218,12 @@ impl Backend for Local {
             }
         }
         for (path, node) in &file.datasets {
-            if in_demo(path) || used.contains(path.as_str()) {
+            if in_demo(path) || used.contains(path) {
                 continue;
             }
-            root.datasets.insert(path.clone(), file.read(path, None)?);
+            root.datasets.insert(path.to_owned(), file.read(path, None)?);
             if node.attrs > 0 {
-                root.inner_attrs.insert(path.clone(), file.attrs(path)?);
+                root.inner_attrs.insert(path.to_owned(), file.attrs(path)?);
             }
         }
         Ok(root)
@@ -314,7 +314,7 @@ impl Local {
             path: self.survey.path.clone(),
             demo: plan.id.clone(),
             key: key.to_owned(),
-            found: dialect::list(plan.keys.keys().map(String::as_str)),
+            found: dialect::list(plan.keys.keys()),
         })
     }
 

@@ -145,7 +145,7 @@ impl Source {
     /// What is wrong with datasets that are not wanted is no fault.
     pub fn read_demo_where(&self, index: usize, wanted: &dyn Fn(&str) -> bool) -> Result<Demo> {
         let plan = self.check(index, wanted)?;
-        let chosen: Vec<(&String, &KeyPlan)> = plan.keys.iter().filter(|(key, _)| wanted(key)).collect();
+        let chosen: Vec<(&str, &KeyPlan)> = plan.keys.iter().filter(|(key, _)| wanted(key)).collect();
         let bytes =
             chosen.iter().fold(0_u64, |sum, (_, k)| sum.saturating_add(k.bytes().unwrap_or(u64::from(u8::MAX))));
         if bytes > MAX_DEMO {
@@ -176,7 +176,7 @@ impl Source {
             Ok(())
         };
         for (key, k) in small {
-            batch.push(key.clone());
+            batch.push(key.to_owned());
             batch_bytes += k.bytes().unwrap_or(1 << 16);
             if batch_bytes > WINDOW {
                 ask(&mut batch, false)?;
@@ -188,12 +188,12 @@ impl Source {
         for (key, k) in direct {
             let rows = k.shape.first().copied();
             let array = self.read_direct(k, 0, rows)?;
-            demo.datasets.insert(key.clone(), array);
+            demo.datasets.insert(key.to_owned(), array);
         }
         for (key, k) in large {
             let rows = k.shape.first().copied().unwrap_or(0);
             let array = self.read_rows(index, key, 0, rows)?;
-            demo.datasets.insert(key.clone(), array);
+            demo.datasets.insert(key.to_owned(), array);
         }
         for (key, array) in &demo.datasets {
             self.check_values(&plan.id, key, array, 0)?;
@@ -206,7 +206,7 @@ impl Source {
         let plan = self.check(index, &|k| k == key)?;
         let none = |wanted: String, found: String| InputError::NoSuch { path: self.plan.path.clone(), wanted, found };
         let Some(k) = plan.keys.get(key) else {
-            let found = dialect::list(plan.keys.keys().map(String::as_str));
+            let found = dialect::list(plan.keys.keys());
             return Err(none(format!("{key} in {}", plan.id), found).into());
         };
         let rows = k.shape.first().copied();

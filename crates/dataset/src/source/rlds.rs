@@ -523,7 +523,7 @@ impl Rlds {
                         id: id.clone(),
                         number: position as u64,
                         length: steps,
-                        keys: keys.clone(),
+                        keys: keys.clone().into(),
                         attr_names: attrs.keys().cloned().collect(),
                         task,
                     });

@@ -5,13 +5,14 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
-use video::{Frames, TOLERANCE, Video, VideoError};
+use video::{Frames, Info, TOLERANCE, Video, VideoError};
 
 use super::isolation::{
     self, ARRAY, Ask, BEAT, ERROR, PLAN, Remote, VIDEO_VARIABLE, limit_cpu, limit_self, next_request, send,
 };
 use super::walk::is_lfs_pointer;
 use crate::error::InputError;
+use crate::ffmpeg::{self, Decoding, Ffmpeg};
 
 /// Processor time for opening a file.
 const OPEN_SECONDS: u64 = 6;
@@ -34,7 +35,7 @@ pub struct VideoInfo {
     pub fps: f64,
     /// Frames.
     pub frames: usize,
-    /// `av1` or `h264`.
+    /// `av1`, `h264`, or another one that FFmpeg decodes.
     pub codec: String,
     /// When each frame is shown, in seconds as the bits of an f64: text would round.
     times: Vec<u64>,
@@ -74,7 +75,7 @@ pub struct VideoFile {
 }
 
 enum Backend {
-    Local(Box<Video>),
+    Local(Box<Film>),
     Remote(Remote),
 }
 
@@ -105,6 +106,74 @@ pub(crate) fn plain(path: &Path, error: &VideoError) -> InputError {
     }
 }
 
+/// A video, and what decodes it.
+enum Film {
+    Builtin(Video),
+    Ffmpeg(PathBuf, Info, &'static Ffmpeg),
+}
+
+impl Film {
+    fn open(path: &Path) -> Result<Self, InputError> {
+        let error = match Video::open(path) {
+            Ok(video) => return Ok(Self::Builtin(video)),
+            Err(error) => error,
+        };
+        // the tables are ours whatever decodes the pictures
+        match (&error, Info::of(path), ffmpeg::found()) {
+            (VideoError::Unsupported { .. }, Ok(info), Ok(ffmpeg)) => Ok(Self::Ffmpeg(path.to_owned(), info, ffmpeg)),
+            (VideoError::Unsupported { .. }, Ok(_), Err(reason)) => {
+                let text = format!(
+                    "{error}. FFmpeg reads it: install `ffmpeg`, or `pip install imageio-ffmpeg` and set ACTRM_FFMPEG to its \
+                     program (now: {reason})"
+                );
+                Err(InputError::Video { path: path.to_owned(), text })
+            }
+            _ => Err(plain(path, &error)),
+        }
+    }
+
+    fn info(&self) -> &Info {
+        match self {
+            Self::Builtin(video) => video.info(),
+            Self::Ffmpeg(_, info, _) => info,
+        }
+    }
+
+    /// Frames of a range, which lies in the file.
+    fn range(&self, range: Range<usize>) -> Result<Decoder<'_>, VideoError> {
+        match self {
+            Self::Builtin(video) => Ok(Decoder::Builtin(video.range(range)?)),
+            Self::Ffmpeg(path, info, ffmpeg) => Ok(Decoder::Ffmpeg(ffmpeg.decode(path, info)?, range)),
+        }
+    }
+}
+
+/// Frames, one after the other.
+enum Decoder<'v> {
+    Builtin(Frames<'v>),
+    Ffmpeg(Decoding, Range<usize>),
+}
+
+impl Decoder<'_> {
+    /// The next frame into `out`; `decoded` is called after every one that had to be decoded for it.
+    fn next_into(&mut self, out: &mut [u8], decoded: &mut dyn FnMut()) -> Option<Result<usize, VideoError>> {
+        match self {
+            Self::Builtin(frames) => frames.next_watched(out, decoded),
+            Self::Ffmpeg(decoding, range) => {
+                let wanted = range.next()?;
+                loop {
+                    let frame = decoding.next_into(out);
+                    decoded();
+                    match frame {
+                        Ok(frame) if frame < wanted => {}
+                        other => return Some(other),
+                    }
+                }
+            }
+        }
+    }
+}
+
 impl VideoFile {
     /// Opens a file: in a process of its own where the program has called [`isolation::serve_if_child`], in this one
     /// else.
@@ -115,8 +184,8 @@ impl VideoFile {
                 (info, Backend::Remote(remote))
             }
             false => {
-                let video = Video::open(path).map_err(|e| plain(path, &e))?;
-                (VideoInfo::of(video.info()), Backend::Local(Box::new(video)))
+                let film = Film::open(path)?;
+                (VideoInfo::of(film.info()), Backend::Local(Box::new(film)))
             }
         };
         Ok(Self { path: path.to_owned(), info, backend })
@@ -138,11 +207,11 @@ impl VideoFile {
         }
         let size = self.info.width * self.info.height * 3;
         match &self.backend {
-            Backend::Local(video) => {
+            Backend::Local(film) => {
                 let failed = |e: VideoError| plain(&self.path, &e);
                 let mut picture = vec![0; size];
-                let mut decoded = video.range(frames).map_err(failed)?;
-                while let Some(frame) = decoded.next_into(&mut picture) {
+                let mut decoded = film.range(frames).map_err(failed)?;
+                while let Some(frame) = decoded.next_into(&mut picture, &mut || {}) {
                     take(frame.map_err(failed)?, &picture);
                 }
             }
@@ -171,11 +240,11 @@ pub(super) fn serve(path: &Path) -> std::io::Result<()> {
     limit_self(OPEN_SECONDS, None)?;
     let mut out = std::io::stdout().lock();
     let _ = rustix::pipe::fcntl_setpipe_size(&out, 1 << 20);
-    let video = match Video::open(path) {
-        Ok(video) => video,
-        Err(error) => return send(&mut out, ERROR, &serde_json::to_vec(&plain(path, &error))?),
+    let film = match Film::open(path) {
+        Ok(film) => film,
+        Err(error) => return send(&mut out, ERROR, &serde_json::to_vec(&error)?),
     };
-    let info = video.info();
+    let info = film.info();
     let pixels = (info.width * info.height).max(64 * 64) as u64 * info.frames as u64;
     let seconds = OPEN_SECONDS + READINGS * pixels / PIXELS_PER_CPU_SECOND;
     limit_cpu(seconds, Some(seconds))?;
@@ -184,12 +253,12 @@ pub(super) fn serve(path: &Path) -> std::io::Result<()> {
     let mut requests = std::io::stdin().lock();
     let mut body = Vec::new();
     // decoding goes on where the last request ended
-    let mut going: Option<(usize, Frames<'_>)> = None;
+    let mut going: Option<(usize, Decoder<'_>)> = None;
     while let Some(text) = next_request(&mut requests)? {
         let Pictures { first, count } = serde_json::from_slice(&text)?;
         let mut frames = match going.take() {
             Some((next, frames)) if next == first => Ok(frames),
-            _ => video.range(first..video.info().frames),
+            _ => film.range(first..info.frames),
         };
         body.resize(count * size, 0);
         let mut filled = Ok(());
@@ -197,7 +266,7 @@ pub(super) fn serve(path: &Path) -> std::io::Result<()> {
             let missing = || VideoError::NoSuchFrame {
                 name: path.display().to_string(),
                 wanted: format!("frames {first} to {}", first + count),
-                found: format!("{} frames", video.info().frames),
+                found: format!("{} frames", info.frames),
             };
             // a sound file may have its last key frame minutes before what is wanted
             let mut told = Instant::now();
@@ -209,7 +278,7 @@ pub(super) fn serve(path: &Path) -> std::io::Result<()> {
                 }
             };
             filled = body.chunks_exact_mut(size).try_for_each(|picture| {
-                frames.next_watched(picture, &mut beat).unwrap_or_else(|| Err(missing())).map(|_| ())
+                frames.next_into(picture, &mut beat).unwrap_or_else(|| Err(missing())).map(|_| ())
             });
         }
         match frames.and_then(|frames| filled.map(|()| frames)) {

@@ -7,11 +7,13 @@ use std::path::{Path, PathBuf};
 
 use hdf5::dataset::Layout;
 use hdf5::filters::Filter;
+use hdf5::plist::file_access::MetadataCacheConfig;
 use hdf5::types::TypeDescriptor;
 use hdf5::{Dataset, Datatype, Group, IndexType, IterationOrder, LinkType, LocationType};
 
 use super::value::{self, MAX_FIXED, Part, dtype_of, one_line, reason};
 use crate::error::InputError;
+use crate::sorted_map::SortedMap;
 use crate::tree::{Array, Attrs, Dtype};
 
 /// A group as found.
@@ -47,7 +49,9 @@ pub(super) struct Walked {
     /// Kept open; a folder of many files opens each when it is read.
     file: Option<hdf5::File>,
     pub groups: BTreeMap<String, GroupNode>,
-    pub datasets: BTreeMap<String, DatasetNode>,
+    pub datasets: SortedMap<DatasetNode>,
+    /// Those that were found so far, while the file is walked.
+    found: BTreeMap<String, DatasetNode>,
     /// Numbers that are converted when read: another byte order, another precision.
     pub foreign: Vec<String>,
     /// Files that links lead to, with their sizes.
@@ -61,6 +65,8 @@ pub(super) struct Walked {
 /// Groups from the file's own down to the one that is walked: file and place of each.
 type Above = Vec<(u64, hdf5::LocationToken)>;
 
+/// Bytes of the library's cache of what is in a file.
+const METADATA_CACHE: usize = 2 << 20;
 const SIGNATURE: [u8; 8] = [0x89, b'H', b'D', b'F', b'\r', b'\n', 0x1a, b'\n'];
 /// Nesting beyond this is a loop or an attack; real files have at most about six levels.
 const MAX_DEPTH: usize = 32;
@@ -130,7 +136,9 @@ fn truncated(text: &str) -> Option<(u64, u64)> {
 }
 
 fn open_file(path: &Path) -> Result<hdf5::File, InputError> {
-    hdf5::File::with_options().with_fapl(|p| p.file_locking(false)).open(path).map_err(|e| {
+    // each object is looked at once or twice: a large cache of them would only fill the memory
+    let cache = MetadataCacheConfig { max_size: METADATA_CACHE, initial_size: METADATA_CACHE, ..Default::default() };
+    hdf5::File::with_options().with_fapl(|p| p.file_locking(false).mdc_config(&cache)).open(path).map_err(|e| {
         let text = reason(&e);
         match truncated(&text) {
             Some((expected, found)) => InputError::Truncated { path: path.to_owned(), expected, found },
@@ -148,7 +156,8 @@ impl Walked {
             path: path.to_owned(),
             bytes,
             groups: BTreeMap::new(),
-            datasets: BTreeMap::new(),
+            datasets: SortedMap::default(),
+            found: BTreeMap::new(),
             foreign: Vec::new(),
             linked: Vec::new(),
             broken: BTreeMap::new(),
@@ -160,6 +169,7 @@ impl Walked {
         let info = root.loc_info().map_err(|e| damaged(path, "/", "look at", reason(&e)))?;
         let mut above = vec![(info.fileno, info.token)];
         walked.group(&root, "", info.num_attrs, None, &types, &mut above, beat)?;
+        walked.datasets = std::mem::take(&mut walked.found).into();
         if keep {
             walked.file = Some(file);
         }
@@ -216,7 +226,7 @@ impl Walked {
                 Err(e) => return Err(damaged(&self.path, &full, "follow the link", reason(&e))),
             };
             // each object takes some 100 bytes; more of them than fit are the same ones again and again
-            let found = (self.groups.len() + self.datasets.len()) as u64;
+            let found = (self.groups.len() + self.found.len()) as u64;
             if found.is_multiple_of(256) {
                 beat();
             }
@@ -246,7 +256,7 @@ impl Walked {
                     if node.dtype.is_numeric() && node.dtype != Dtype::Bool && !native {
                         self.foreign.push(full.clone());
                     }
-                    self.datasets.insert(full, node);
+                    self.found.insert(full, node);
                 }
                 _ => {
                     let what = "a named type".to_owned();

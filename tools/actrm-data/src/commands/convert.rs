@@ -67,11 +67,11 @@ pub struct Args {
     /// How to store images
     #[arg(long, value_enum, default_value_t = Images::Png)]
     images: Images,
-    /// Store images as AV1 videos, which are small and not exact; the side folder keeps the exact images
+    /// Store images as videos (AV1 unless --video-encoder says otherwise), which are small and not exact; the side folder keeps the exact images
     #[arg(long, conflicts_with = "images")]
     video: bool,
-    /// With --video: FFmpeg's SVT-AV1, or the built-in encoder, which is slower [default: FFmpeg where ACTRM_FFMPEG names one
-    /// or the PATH has one]
+    /// With --video: AV1 by FFmpeg, H.264 by FFmpeg, or AV1 without FFmpeg, which is slower. FFmpeg is the program that
+    /// ACTRM_FFMPEG names, or `ffmpeg` on the PATH [default: libsvtav1 where FFmpeg has it, else builtin]
     #[arg(long, value_enum, value_name = "ENCODER", requires = "video")]
     video_encoder: Option<VideoEncoder>,
     /// With --video: 1 (large, nearly exact) to 255 (small)
@@ -132,7 +132,9 @@ enum Format {
 
 #[derive(Clone, Copy, clap::ValueEnum)]
 enum VideoEncoder {
-    Ffmpeg,
+    #[value(name = "libsvtav1", alias = "ffmpeg")]
+    SvtAv1,
+    H264,
     Builtin,
 }
 
@@ -237,7 +239,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         video: args.video.then(|| VideoOptions {
             encoder: match args.video_encoder {
                 None => dataset::VideoEncoder::Auto,
-                Some(VideoEncoder::Ffmpeg) => dataset::VideoEncoder::Ffmpeg,
+                Some(VideoEncoder::SvtAv1) => dataset::VideoEncoder::SvtAv1,
+                Some(VideoEncoder::H264) => dataset::VideoEncoder::H264,
                 Some(VideoEncoder::Builtin) => dataset::VideoEncoder::Builtin,
             },
             speed: args.video_speed,

@@ -174,7 +174,7 @@ fn of_source(args: &Args) -> Result<Summary> {
     for demo in &plan.demos {
         for (path, key) in &demo.keys {
             let row = keys.entry(path).or_insert_with(|| KeyRow {
-                key: path.clone(),
+                key: path.to_owned(),
                 dtype: dtype_name(&key.dtype),
                 shapes: Vec::new(),
                 demos: 0,

@@ -68,7 +68,7 @@ impl Opened {
                 let pictures = first.into_iter().flat_map(|demo| &demo.keys);
                 let pictures =
                     pictures.filter(|(path, key)| path.starts_with("obs/") && key.is_image() && key.shape[3] == 3);
-                pictures.map(|(path, _)| path.clone()).collect()
+                pictures.map(|(path, _)| path.to_owned()).collect()
             }
         }
     }
@@ -92,7 +92,7 @@ impl Opened {
                     let rows = key.shape.first() == Some(&demo.length);
                     let dim: usize = key.shape.get(1..).unwrap_or_default().iter().product();
                     (wanted && rows && key.dtype.is_numeric() && !key.is_image())
-                        .then(|| Drawn { name: path.clone(), names: names_of(&usual_names(source, path, dim), dim) })
+                        .then(|| Drawn { name: path.to_owned(), names: names_of(&usual_names(source, path, dim), dim) })
                 });
                 drawn.collect()
             }

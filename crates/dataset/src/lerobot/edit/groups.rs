@@ -56,6 +56,11 @@ impl<'a> Groups<'a> {
         Ok(())
     }
 
+    /// Whether so many more rows are sure to fit, with numbers in them: they may come in any pieces.
+    pub(super) fn holds(&self, rows: usize) -> bool {
+        self.row_bytes > 0 && self.bytes + (self.row_bytes + 1) * rows as u64 <= GROUP_BYTES / 2
+    }
+
     pub(super) fn push(&mut self, arrays: Vec<ArrayRef>, append: &mut Append<'_>) -> Result<()> {
         let rows = arrays.first().map_or(0, |a| a.len());
         let bytes: u64 = arrays.iter().map(|a| a.to_data().get_slice_memory_size().unwrap_or(0) as u64).sum();

@@ -337,8 +337,11 @@ fn compose(
     if lossless {
         files.push(write_manifest(root, &files)?);
     }
-    // what was just written opens, or it is not published
-    let set = Dataset::open_scanned(root)?;
+    // what was just written opens, or it is not published; rows of sets with a fingerprint were held against it as they came
+    let set = match edit.digests() && edit.repair.is_none() {
+        true => Dataset::open_written(root, &told.fingerprint)?,
+        false => Dataset::open_scanned(root)?,
+    };
     Ok(EditReport {
         episodes: set.episodes().len(),
         frames: set.frames(),

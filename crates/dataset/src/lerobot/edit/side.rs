@@ -55,8 +55,10 @@ pub(super) fn copy(edit: &Edit<'_>, origin: &Provenance) -> Result<(Vec<WrittenF
             }
             let mut apart: Vec<RecordBatch> = Vec::new();
             let misfits: Vec<usize> = (0..own.len()).filter(|&at| !layout.columns.contains(&own[at])).collect();
-            for from in (0..episode.length).step_by(ROWS) {
-                let count = ROWS.min(episode.length - from);
+            // pieces of an episode that is cut end where they always did
+            let at_once = if groups.holds(episode.length) { NUMBER_ROWS } else { ROWS };
+            for from in (0..episode.length).step_by(at_once) {
+                let count = at_once.min(episode.length - from);
                 let batches = match &mut rows {
                     Some(rows) => rows.take(count)?,
                     None => Vec::new(),

@@ -150,8 +150,12 @@ fn put_pictures(out: &mut Vec<u8>, pictures: &PictureSummary) {
     put_bytes(out, digests.as_flattened());
     put_count(out, samples.len());
     for sample in samples {
-        put_count(out, usize::from(sample.key));
+        // 2: a key frame with parameters
+        put_count(out, usize::from(sample.key) + usize::from(!sample.parameters.is_empty()));
         put_bytes(out, &sample.bytes);
+        if !sample.parameters.is_empty() {
+            put_bytes(out, &sample.parameters);
+        }
     }
     put_count(out, histograms.len());
     histograms.as_flattened().iter().for_each(|&count| put_count(out, count as usize));
@@ -163,7 +167,11 @@ fn put_pictures(out: &mut Vec<u8>, pictures: &PictureSummary) {
 fn pictures(from: &mut Taker<'_>) -> Option<PictureSummary> {
     let digests = from.bytes()?.as_chunks().0.to_vec();
     let samples = (0..from.count()?)
-        .map(|_| Some(video::Sample { key: from.count()? == 1, bytes: from.bytes()?.to_vec() }))
+        .map(|_| {
+            let (kind, bytes) = (from.count()?, from.bytes()?.to_vec());
+            let parameters = if kind == 2 { from.bytes()?.to_vec() } else { Vec::new() };
+            Some(video::Sample { bytes, key: kind > 0, parameters })
+        })
         .collect::<Option<_>>()?;
     let mut histograms = Vec::new();
     for _ in 0..from.count()? {

@@ -51,7 +51,7 @@ fn episode(index: usize, file: &Walked, out: &mut Draft) -> Result<(), InputErro
     let found = contents((index, file), "", &id, &name_of, &mut out.problems);
     let length = file.datasets["action"].shape.first().copied().unwrap_or(0);
     out.problems.extend(wrong_lengths(file, &id, (length, "action"), &found.keys));
-    let plan = DemoPlan { id, number, length, keys: found.keys, attr_names, task: None };
+    let plan = DemoPlan { id, number, length, keys: found.keys.into(), attr_names, task: None };
     out.demos.push(DemoDraft { plan, home: Some((index, String::new())), groups: found.groups, inner: found.inner });
     Ok(())
 }

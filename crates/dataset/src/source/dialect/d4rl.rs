@@ -105,7 +105,7 @@ fn demo(file: &Walked, number: usize, first: usize, length: usize, steps: usize)
         id: format!("demo_{number}"),
         number: number as u64,
         length,
-        keys,
+        keys: keys.into(),
         attr_names: Vec::new(),
         task: None,
     };

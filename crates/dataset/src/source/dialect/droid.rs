@@ -97,7 +97,7 @@ fn episode(index: usize, file: &Walked, out: &mut Draft) -> Result<bool, InputEr
         }
     }
     let task = attrs.get("current_task").and_then(Array::to_text).filter(|task| !task.is_empty());
-    let plan = DemoPlan { id, number, length, keys: found.keys, attr_names, task };
+    let plan = DemoPlan { id, number, length, keys: found.keys.into(), attr_names, task };
     out.demos.push(DemoDraft { plan, home: Some((index, String::new())), groups: found.groups, inner: found.inner });
     Ok(attrs.get("success").and_then(Array::to_i64) != Some(0))
 }

@@ -125,6 +125,7 @@ fn draft_file(
         let members = file
             .groups
             .keys()
+            .map(String::as_str)
             .chain(file.datasets.keys())
             .filter_map(|p| p.strip_prefix("data/"))
             .filter(|p| !p.contains('/'));
@@ -234,8 +235,11 @@ fn demo(
         .and_then(|meta| meta.get("lang")?.as_str().map(str::to_owned))
         .filter(|t| !t.is_empty())
         .or_else(|| language.map(str::to_owned));
-    let plan = DemoPlan { id: id.to_owned(), number, length, keys: found.keys, attr_names, task };
+    let mut plan = DemoPlan { id: id.to_owned(), number, length, keys: found.keys.into(), attr_names, task };
     check(file, &plan, out);
+    if let Some(before) = out.demos.last() {
+        plan.keys.share_names(&before.plan.keys);
+    }
     let home = Some((index, home.to_owned()));
     out.demos.push(DemoDraft { plan, home, groups: found.groups, inner: found.inner });
     Ok(())
@@ -275,7 +279,7 @@ fn length(
 fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
     let id = plan.id.as_str();
     let path = || file.path.clone();
-    let found = || list(plan.keys.keys().map(String::as_str));
+    let found = || list(plan.keys.keys());
     let missing =
         |key: &str| InputError::MissingKey { path: path(), demo: id.to_owned(), key: key.to_owned(), found: found() };
     if plan.length == 0 {
@@ -341,12 +345,8 @@ fn total(file: &Walked, attrs: &Attrs, out: &mut Draft) {
 
 fn masks(file: &Walked, demos: &[(u64, String, String)], out: &mut Draft) -> Result<(), InputError> {
     let known: BTreeMap<&str, &str> = demos.iter().map(|(_, id, name)| (name.as_str(), id.as_str())).collect();
-    let paths: Vec<&String> = file
-        .datasets
-        .range("mask/".to_owned()..)
-        .map(|(path, _)| path)
-        .take_while(|path| path.starts_with("mask/"))
-        .collect();
+    let paths: Vec<&str> =
+        file.datasets.from_name("mask/").map(|(path, _)| path).take_while(|path| path.starts_with("mask/")).collect();
     for path in paths {
         let name = path["mask/".len()..].to_owned();
         let array = file.read(path, None)?;

@@ -76,7 +76,7 @@ fn demo(file: &Walked, number: u64, home: &str, out: &mut Draft) -> Result<(), I
         false => out.problems.push(missing(file, &id, "actions", &found.keys)),
     }
     // an empty group obs is what obs_mode none writes
-    let plan = DemoPlan { id, number, length, keys: found.keys, attr_names, task: None };
+    let plan = DemoPlan { id, number, length, keys: found.keys.into(), attr_names, task: None };
     out.demos.push(DemoDraft { plan, home: Some((0, home.to_owned())), groups: found.groups, inner: found.inner });
     Ok(())
 }

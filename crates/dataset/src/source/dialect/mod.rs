@@ -49,14 +49,14 @@ impl Survey {
                     .keys()
                     .filter(|p| !p.is_empty() && p.matches('/').count() < 2)
                     .map(|p| format!("{p}/"))
-                    .chain(file.datasets.keys().filter(|p| !p.contains('/')).cloned())
+                    .chain(file.datasets.keys().filter(|p| !p.contains('/')).map(str::to_owned))
                     .collect();
                 list(names.iter().map(String::as_str))
             }
             [first, ..] => format!(
                 "{} files, the first with {}",
                 self.files.len(),
-                list(first.groups.keys().chain(first.datasets.keys()).map(String::as_str))
+                list(first.groups.keys().map(String::as_str).chain(first.datasets.keys()))
             ),
         }
     }
@@ -177,7 +177,7 @@ fn ragged(survey: &Survey, out: &mut Draft) {
                 let error = InputError::WrongShape {
                     path: survey.path.clone(),
                     demo: plan.id.clone(),
-                    key: key.clone(),
+                    key: key.to_owned(),
                     expected: format!("{dtype} {shape:?} per step as in {first}"),
                     found: format!("{} {step:?} per step", k.dtype),
                 };
@@ -206,7 +206,7 @@ fn ragged(survey: &Survey, out: &mut Draft) {
                 path: survey.path.clone(),
                 demo: plan.id.clone(),
                 key: key.to_owned(),
-                found: format!("it in {}; here {}", all[key].0, list(plan.keys.keys().map(String::as_str))),
+                found: format!("it in {}; here {}", all[key].0, list(plan.keys.keys())),
             };
             missing.push((position, Problem::new(Some(&plan.id), Some(key), false, error)));
         }
@@ -250,11 +250,11 @@ fn contents(
 ) -> Contents {
     let mut out = Contents { keys: BTreeMap::new(), groups: BTreeSet::new(), inner: Vec::new() };
     let prefix = if home.is_empty() { String::new() } else { format!("{home}/") };
-    let inside = |path: &String| path.starts_with(&prefix);
+    let inside = |path: &str| path.starts_with(&prefix);
     for (path, error) in file.broken.range(prefix.clone()..).take_while(|(path, _)| inside(path)) {
         problems.push(Problem::new(Some(id), Some(&named(&path[prefix.len()..])), true, error.clone()));
     }
-    for (path, node) in file.datasets.range(prefix.clone()..).take_while(|(path, _)| inside(path)) {
+    for (path, node) in file.datasets.from_name(&prefix).take_while(|(path, _)| inside(path)) {
         let mut key = named(&path[prefix.len()..]);
         if out.keys.contains_key(&key) {
             // two datasets of one name here keep the names that they have there
@@ -264,7 +264,7 @@ fn contents(
             problems.push(Problem::new(Some(id), Some(&key), true, (**fault).clone()));
         }
         if node.attrs > 0 {
-            out.inner.push((key.clone(), index, path.clone()));
+            out.inner.push((key.clone(), index, path.to_owned()));
         }
         if let Some(plan) = key_plan(index, file, path) {
             out.keys.insert(key, plan);
@@ -295,24 +295,27 @@ fn missing(file: &Walked, id: &str, key: &str, keys: &BTreeMap<String, KeyPlan>)
 }
 
 /// Problems of the datasets that have not one row a step; `of` says where the length was found, if not in the demo.
-fn wrong_lengths(
+fn wrong_lengths<'k>(
     file: &Walked,
     id: &str,
     (length, of): (usize, &str),
-    keys: &BTreeMap<String, KeyPlan>,
+    keys: impl IntoIterator<Item = (impl AsRef<str>, &'k KeyPlan)>,
 ) -> Vec<Problem> {
-    let wrong = keys.iter().filter(|(key, k)| per_step(key) && k.shape.first() != Some(&length));
-    let problem = |(key, k): (&String, &KeyPlan)| {
+    let problem = |(key, k): (_, &KeyPlan)| {
+        let key = AsRef::<str>::as_ref(&key);
+        if !per_step(key) || k.shape.first() == Some(&length) {
+            return None;
+        }
         let error = InputError::WrongLength {
             path: file.path.clone(),
             demo: id.to_owned(),
-            key: key.clone(),
+            key: key.to_owned(),
             expected: if of.is_empty() { length.to_string() } else { format!("{length} ({of})") },
             found: format!("shape {:?}", k.shape),
         };
-        Problem::new(Some(id), Some(key), true, error)
+        Some(Problem::new(Some(id), Some(key), true, error))
     };
-    wrong.map(problem).collect()
+    keys.into_iter().filter_map(problem).collect()
 }
 
 /// A demo of no steps, which nothing can be made of.
@@ -358,7 +361,7 @@ fn stranger(file: &Walked, index: usize, expected: &str) -> Problem {
     let unknown = || InputError::UnknownLayout {
         path: file.path.clone(),
         expected: expected.to_owned(),
-        found: list(file.datasets.keys().map(String::as_str)),
+        found: list(file.datasets.keys()),
     };
     let error = file.broken.values().next().cloned().unwrap_or_else(unknown);
     Problem::new(Some(&format!("demo_{}", number_of(&file.path, index))), None, true, error)

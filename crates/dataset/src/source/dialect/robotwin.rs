@@ -109,7 +109,7 @@ fn episode(index: usize, file: &Walked, out: &mut Draft) -> Result<(), InputErro
         }
     }
     let task = instruction(file);
-    let plan = DemoPlan { id, number, length, keys: found.keys, attr_names, task };
+    let plan = DemoPlan { id, number, length, keys: found.keys.into(), attr_names, task };
     out.demos.push(DemoDraft { plan, home: Some((index, String::new())), groups: found.groups, inner: found.inner });
     Ok(())
 }

@@ -424,7 +424,7 @@ impl Buffer {
                 id: id.clone(),
                 number: number as u64,
                 length: end - first,
-                keys: of_demo.collect(),
+                keys: of_demo.collect::<BTreeMap<_, _>>().into(),
                 attr_names: Vec::new(),
                 task: None,
             });
