@@ -17,6 +17,7 @@ from actrm_harness import wire  # noqa: E402
 from actrm_harness.wire import Array, Message, Tensors  # noqa: E402
 
 TARGET = Path(os.environ.get("CARGO_TARGET_DIR", HARNESS.parents[1] / "target"))
+LIBERO = Path(os.environ.get("ACTRM_PYTHON_LIBERO") or Path(sys.prefix).parent / ".venv-libero/bin/python")
 LIBRARY = Path(os.environ.get("ACTRM_CONTROL_LIB") or TARGET / "release" / "libcontrol.so")
 
 
@@ -80,6 +81,23 @@ class Client:
 def lift() -> Iterator[Client]:
     """A Lift worker shared by tests; every test begins with a reset of its own."""
     client = Client("--task", "Lift")
+    yield client
+    client.close()
+
+
+@pytest.fixture(scope="session")
+def libero() -> Path:
+    """The interpreter that has LIBERO."""
+    if not LIBERO.is_file():
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(f"{LIBERO} is missing: make libero")
+    return LIBERO
+
+
+@pytest.fixture(scope="session")
+def cabinet(libero: Path) -> Iterator[Client]:
+    """A worker of libero_goal/3, where a bowl goes onto a cabinet, shared as `lift` is."""
+    assert libero.is_file()
+    client = Client("--task", "libero_goal/3")
     yield client
     client.close()
 

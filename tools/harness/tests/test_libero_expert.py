@@ -1,11 +1,11 @@
 """The scripted expert of LIBERO's tasks. Its episodes need .venv-libero (`make libero`)."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import Client
-from test_libero import PYTHON
 
 from actrm_harness.experts.parts import about_z
 from actrm_harness.protocol import RequestError
@@ -15,9 +15,6 @@ from actrm_harness.simulators.libero.family import of_tasks
 UPRIGHT = np.eye(3)
 # what LIBERO's bottles are: their own y axis points up
 STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-
-
-needs_libero = pytest.mark.skipif(not PYTHON.is_file(), reason=f"{PYTHON} is missing: make libero")
 
 
 def brick(x: float, y: float, z: float) -> Box:
@@ -78,8 +75,8 @@ def test_the_palm_stays_clear_of_a_tall_neighbour() -> None:
         np.testing.assert_allclose(one, other)
 
 
-@needs_libero
-def test_the_expert_shows_a_task_and_repeats_itself() -> None:
+def test_the_expert_shows_a_task_and_repeats_itself(libero: Path) -> None:
+    assert libero.is_file()
     worker = Client("--task", "libero_object/1")
     message, shown = worker.ask("expert", seed=1_000_003, split="demonstration")
     assert message["success"] and 60 < message["steps"] < 280
@@ -107,9 +104,6 @@ def test_a_suites_recorded_arguments_are_those_of_its_tasks() -> None:
     assert of_tasks("libero_goal", {"env_kwargs": 3}) == {"env_kwargs": 3}
 
 
-@needs_libero
-def test_a_goal_without_an_expert_is_named() -> None:
-    worker = Client("--task", "libero_goal/3")
+def test_a_goal_without_an_expert_is_named(cabinet: Client) -> None:
     with pytest.raises(Exception, match=r"no_expert.*no scripted expert for a goal like this one"):
-        worker.ask("expert", seed=0, split="demonstration")
-    assert worker.close() == 0
+        cabinet.ask("expert", seed=0, split="demonstration")

@@ -41,9 +41,11 @@ class Family:
             suite.files(f"{options.task.name}/{number}")
         return Family(options, tasks)
 
-    def task(self, number: int) -> Libero:
+    def task(self, number: int, keep: bool = True) -> Libero:
         """The environment of a task, with no other episode under way."""
         one = self.made.get(number)
+        if one is None and self.present is not None and self.present.files.number == number:
+            one = self.present
         if one is None:
             if self.present is not None and self.present.files.number not in self.made:
                 self.present = None
@@ -52,8 +54,8 @@ class Family:
             one = Libero.start(replace(self.options, task=replace(self.options.task, name=name)))
             # what loading a model took beside the model
             ctypes.CDLL(None).malloc_trim(0)
-            if len(self.made) < KEPT:
-                self.made[number] = one
+        if keep and len(self.made) < KEPT:
+            self.made[number] = one
         if self.options.cameras and self.renderer is None:
             self.renderer = one.drawn_by()
         one.renderer, self.present = self.renderer, one
@@ -67,7 +69,7 @@ class Family:
 
     def describe(self) -> Description:
         """What its first task is, and the observations that all of its tasks have."""
-        first = self.task(0).describe()
+        first = self.task(0, keep=False).describe()
         kwargs = first.env_args["env_kwargs"] | {"bddl_file_name": self.options.task.name}
         observations = {name: shape for name, shape in first.observations.items() if self.shared(name)}
         arguments = first.env_args | {"env_name": self.options.task.name, "env_kwargs": kwargs}
