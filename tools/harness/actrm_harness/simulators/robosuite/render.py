@@ -9,7 +9,6 @@ it, and drawing only reads the simulation's data: what it shows is what the last
 import ctypes
 import ctypes.util
 import importlib
-import itertools
 import os
 import re
 from collections.abc import Generator, Sequence
@@ -35,9 +34,8 @@ _NO_RENDERER = (
 class Renderer:
     """Draws a simulation's cameras; the model's textures and meshes are loaded again when the model changes.
 
-    What lies outside of an image is left out where it can neither be mirrored nor throw a shadow in it: the camera on a
-    hand sees little of the arm. `fast` draws without reflections and multisampling, which takes a third of the time
-    where a processor draws.
+    `fast` draws without reflections and multisampling, which takes a third of the time where a processor draws, and
+    leaves out what lies outside of the picture: much of an arm is nothing that the camera on its hand can see.
     """
 
     def __init__(self, fast: bool = False) -> None:
@@ -82,7 +80,8 @@ class Renderer:
         self.make_current()
         self._load(sim.model._model, height, width)
         data, everything = sim.data._data, mujoco.mjtCatBit.mjCAT_ALL
-        shadows = bool(np.any(self._model.light_castshadow))
+        # what cannot be seen itself may be mirrored or throw a shadow
+        alone = self._fast and not np.any(self._model.light_castshadow)
         viewport = mujoco.MjrRect(0, 0, width, height)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         drawn: list[Array] = []
@@ -91,7 +90,7 @@ class Renderer:
             mujoco.mjv_updateScene(
                 self._model, data, self._options, mujoco.MjvPerturb(), self._camera, everything, self._scene
             )
-            if not shadows:
+            if alone:
                 self._leave_out(data, self._camera.fixedcamid, width / height)
             mujoco.mjr_render(viewport, self._scene, self._context)
             mujoco.mjr_readPixels(pixels, None, viewport, self._context)
@@ -99,15 +98,14 @@ class Renderer:
         return drawn
 
     def _leave_out(self, data: Any, camera: int, aspect: float) -> None:
-        """Take the shape of all whose bounding sphere is outside of what `camera` sees, unless it sees a mirror."""
+        """Take the shape of everything in the scene whose bounding sphere is outside of what `camera` sees."""
         mujoco, model = suite.mujoco(), self._model
         if model.cam_orthographic[camera] or model.cam_sensorsize[camera].any():
             return
         drawn = self._scene.geoms[: self._scene.ngeom]
         of_model = [geom for geom in drawn if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM]
         ids = np.fromiter((geom.objid for geom in of_model), dtype=np.intp, count=len(of_model))
-        # OpenGL rounds to single precision
-        radius = 1.001 * model.geom_rbound[ids]
+        radius = model.geom_rbound[ids]
         right, up, backward = data.cam_xmat[camera].reshape(3, 3).T
         from_camera = data.geom_xpos[ids] - data.cam_xpos[camera]
         depth = -(from_camera @ backward)
@@ -116,16 +114,8 @@ class Renderer:
         for aside, tangent in ((from_camera @ right, tall * aspect), (from_camera @ up, tall)):
             beyond |= np.abs(aside) - tangent * depth > radius * np.sqrt(1.0 + tangent * tangent)
         # planes have no bounds
-        unseen = list(itertools.compress(of_model, beyond & (radius > 0.0)))
-        kinds = [geom.type for geom in unseen]
-        for geom in unseen:
-            geom.type = mujoco.mjtGeom.mjGEOM_NONE
-        mirrors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX)
-        if self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] and any(
-            geom.reflectance > 0 and geom.type in mirrors for geom in drawn
-        ):
-            for geom, kind in zip(unseen, kinds, strict=True):
-                geom.type = kind
+        for index in np.flatnonzero(beyond & (radius > 0.0)):
+            of_model[index].type = mujoco.mjtGeom.mjGEOM_NONE
 
     def _load(self, model: Any, height: int, width: int) -> None:
         fits = self._context is not None and width <= self._context.offWidth and height <= self._context.offHeight
