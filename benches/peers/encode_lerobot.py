@@ -1,7 +1,7 @@
 """LeRobot's own encoding of the images of a robomimic file as AV1 videos, a video for each demonstration and camera.
 
-Prints images, bytes of the videos and CPU seconds of encoding as JSON; writing the PNG files that LeRobot's encoder reads is not
-counted.
+Prints images, bytes of the videos and CPU seconds of encoding as JSON; writing the PNG files that LeRobot's encoder
+reads is not counted.
 """
 
 import json
