@@ -41,7 +41,7 @@ impl<V> SortedMap<V> {
 
     /// All names with their values.
     pub fn iter(&self) -> Iter<'_, V> {
-        self.from_name("")
+        self.starting_at("")
     }
 
     /// All names.
@@ -55,7 +55,7 @@ impl<V> SortedMap<V> {
     }
 
     /// The names from this one on, with their values.
-    pub(crate) fn from_name(&self, name: &str) -> Iter<'_, V> {
+    pub(crate) fn starting_at(&self, name: &str) -> Iter<'_, V> {
         let at = self.0.partition_point(|(known, _)| **known < *name);
         let pair = (|(name, value)| (&**name, value)) as fn(&(Arc<str>, V)) -> (&str, &V);
         self.0[at..].iter().map(pair)
@@ -149,7 +149,7 @@ mod tests {
         assert_eq!(pairs(&sorted), map);
         assert!(sorted.keys().eq(map.keys().map(String::as_str)) && sorted.values().eq(map.values()));
         assert_eq!((sorted.get("obs/a"), sorted.get("obs/"), sorted["obs"], sorted.len()), (Some(&1), None, 3, 4));
-        assert_eq!(sorted.from_name("obs/").map(|(name, _)| name).collect::<Vec<_>>(), ["obs/a", "obs/b"]);
+        assert_eq!(sorted.starting_at("obs/").map(|(name, _)| name).collect::<Vec<_>>(), ["obs/a", "obs/b"]);
         let back: SortedMap<usize> = serde_json::from_str(&serde_json::to_string(&sorted).unwrap()).unwrap();
         assert_eq!(back, sorted);
         sorted.extend([("dones".to_owned(), 7), ("obs".to_owned(), 8)]);

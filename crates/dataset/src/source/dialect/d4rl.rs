@@ -18,7 +18,7 @@ impl Layout for D4rl {
 
     fn recognises(&self, survey: &Survey) -> bool {
         survey.single().is_some_and(|file| {
-            ["observations", "actions", "rewards", "terminals"].iter().all(|key| file.datasets.contains_key(*key))
+            ["observations", "actions", "rewards", "terminals"].iter().all(|key| file.datasets.contains_key(key))
         })
     }
 

@@ -346,7 +346,7 @@ fn total(file: &Walked, attrs: &Attrs, out: &mut Draft) {
 fn masks(file: &Walked, demos: &[(u64, String, String)], out: &mut Draft) -> Result<(), InputError> {
     let known: BTreeMap<&str, &str> = demos.iter().map(|(_, id, name)| (name.as_str(), id.as_str())).collect();
     let paths: Vec<&str> =
-        file.datasets.from_name("mask/").map(|(path, _)| path).take_while(|path| path.starts_with("mask/")).collect();
+        file.datasets.starting_at("mask/").map(|(path, _)| path).take_while(|path| path.starts_with("mask/")).collect();
     for path in paths {
         let name = path["mask/".len()..].to_owned();
         let array = file.read(path, None)?;

@@ -254,7 +254,7 @@ fn contents(
     for (path, error) in file.broken.range(prefix.clone()..).take_while(|(path, _)| inside(path)) {
         problems.push(Problem::new(Some(id), Some(&named(&path[prefix.len()..])), true, error.clone()));
     }
-    for (path, node) in file.datasets.from_name(&prefix).take_while(|(path, _)| inside(path)) {
+    for (path, node) in file.datasets.starting_at(&prefix).take_while(|(path, _)| inside(path)) {
         let mut key = named(&path[prefix.len()..]);
         if out.keys.contains_key(&key) {
             // two datasets of one name here keep the names that they have there
