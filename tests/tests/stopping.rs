@@ -78,7 +78,9 @@ fn a_stopped_training_says_the_command_that_goes_on_and_runs_lists_it() {
     };
     assert_eq!(listed(), serde_json::json!([]));
     let child = started(&mut long_training(folder));
-    wait_until("a step", || runs.join("act_lift/001/metrics.csv").exists().then_some(()));
+    // its first line names the columns
+    let metrics = || std::fs::read_to_string(runs.join("act_lift/001/metrics.csv")).unwrap_or_default();
+    wait_until("a step", || (metrics().lines().count() > 1).then_some(()));
     assert_eq!((&listed()[0]["state"], &listed()[0]["steps"]), (&"training".into(), &1_000_000.into()));
     let error = ends(child, "TERM");
     let hint = error.lines().find_map(|line| line.split_once("resume with: ")).expect("a hint").1.to_owned();
