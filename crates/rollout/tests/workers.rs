@@ -398,7 +398,8 @@ fn an_environment_that_hangs_ends_the_run_after_three_seeds_from_the_first_step_
         assert_eq!((seeds.len(), fault.phase), (3, phase), "{error}");
         assert!(error.to_string().contains("no answer within 1.0 s"), "{error}");
         assert!(results.iter().all(Result::is_err), "no episode has a result");
-        assert!(pool.incidents().len() <= 9, "{:?}", pool.incidents());
+        // three workers for each of two seeds, one for the third, and what the other worker had begun meanwhile
+        assert!(pool.incidents().len() < 15, "{:?}", pool.incidents());
     }
 }
 
