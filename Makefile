@@ -117,8 +117,9 @@ test: build wheel ## every test: Rust, Python and end to end
 	@if [ -n "$(BROWSER)$${CI:-}" ]; then \
 	    $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test e2e -- --ignored; \
 	  else echo "not run: the tests of the pages in a browser (no Chromium on the PATH; ACTRM_CHROMIUM names one)"; fi
-	@.venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests
-	@tools/test_wheel.sh
+	@tools/test_wheel.sh >target/test_wheel.log 2>&1 & harness=0 wheel=0; \
+	    .venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests || harness=$$?; \
+	    wait $$! || wheel=$$?; cat target/test_wheel.log; exit $$((harness | wheel))
 
 # With clippy's driver as the workspace's compiler (.ci/run) the build is the lint, and nothing is compiled for it alone.
 CLIPPY := $(if $(RUSTC_WORKSPACE_WRAPPER),build $(CARGO_FLAGS) --workspace --all-targets,clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings)
