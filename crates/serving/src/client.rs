@@ -52,6 +52,19 @@ pub struct RemotePolicy {
 
 type Connection = WebSocket<Timed>;
 
+/// How long a goodbye may take.
+const GOODBYE: Duration = Duration::from_secs(1);
+
+impl Drop for RemotePolicy {
+    /// Closes the connection as the protocol has it, so that the server does not take the end for a fault.
+    fn drop(&mut self) {
+        if let Some(mut socket) = self.connection.take() {
+            socket.get_mut().until = Instant::now() + GOODBYE;
+            let _ = socket.close(None); // a server that has gone needs none
+        }
+    }
+}
+
 /// What a server's metadata says, as far as we read it.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Facts {

@@ -371,12 +371,17 @@ fn a_prompt_is_what_the_environment_says_or_the_tasks_name() {
         let mut socket = tungstenite::accept(listener.accept().unwrap().0).unwrap();
         socket.send(Message::binary(encode(&empty()))).unwrap();
         let mut prompts = Vec::new();
-        while let Ok(Message::Binary(query)) = socket.read() {
+        let end = loop {
+            let query = match socket.read() {
+                Ok(Message::Binary(query)) => query,
+                end => break end,
+            };
             let Some(Value::Text(prompt)) = decode(&query).unwrap().get("prompt").cloned() else { panic!("no prompt") };
             prompts.push(prompt.to_string());
             let actions = Value::Array(Array::of_f32(vec![1, 2], &[0.0, 0.0]).unwrap());
             socket.send(Message::binary(encode(&Value::map([("actions", actions)])))).unwrap();
-        }
+        };
+        assert!(matches!(end, Ok(Message::Close(_))), "{end:?}");
         prompts
     });
     let mapping = Mapping::parse("m", "prompt = '{instruction} ({task})'").unwrap().of_task("Lift");
