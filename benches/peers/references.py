@@ -6,8 +6,8 @@ For every cell (policy, task, seed) the demonstrations of the cell in `studies/p
 other people's code: ACT by LeRobot's `lerobot_train` on a data set that `actrm-data` converted, BC-RNN by robomimic's
 `train` on the HDF5 file. Sizes, batches, steps and learning rates are read from the experiments of `configs/` that
 our own cells were trained with. Each checkpoint becomes an entry of a zoo of its own by `actrm-zoo import` and is
-evaluated on the test block of the task's protocol; what came of it is a small file in `docs/results/references`. What
-is done is not done again.
+evaluated on the test block of the task's protocol. Each result is a small file in `docs/results/references`. Cells
+that have a result are skipped.
 """
 
 import argparse
