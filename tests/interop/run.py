@@ -27,6 +27,7 @@ import onnx_check
 import python_door
 import readers
 import robomimic_training
+import sequential
 import served
 import shards
 import torch
@@ -714,6 +715,9 @@ def main() -> None:
             ),
             "lerobot-eval runs it before cameras": lambda: python_door.lerobot_eval(
                 folder / "eyes/zoo/lift-act-image", "Lift", folder / "b", 1, None
+            ),
+            "compare's sequential tests are their packages'": lambda: sequential.compare(
+                folder / "sequential", ours, run
             ),
             "robomimic reads the collected file": lambda: compare_robomimic(source),
             "export rebuilds the source": lambda: compare_trees(source, exported),

@@ -255,13 +255,16 @@ fn the_page_of_a_study_survives_a_fault_at_any_call() {
     let root = tempfile::tempdir().expect("a temporary folder");
     let root = root.path().canonicalize().expect("it is there");
     let (file, out) = (root.join("thinking.toml"), root.join("out"));
-    let shipped = fs::read_to_string(e2e::root().join("studies/recursion.toml")).expect("a study");
+    let shipped = fs::read_to_string(e2e::root().join("studies/recovery_demonstrations.toml")).expect("a study");
     // charts are drawn beside the results
     let results = root.join("results");
-    copy(&e2e::root().join("docs/results/recursion"), &results);
-    let shipped = shipped.replace("\"docs/results/recursion\"", &format!("{results:?}"));
-    fs::write(&file, shipped.replace("\"docs/results/recursion.md\"", &format!("{:?}", out.join("page.md"))))
-        .expect("writable");
+    copy(&e2e::root().join("docs/results/recovery_demonstrations"), &results);
+    let shipped = shipped.replace("\"docs/results/recovery_demonstrations\"", &format!("{results:?}"));
+    fs::write(
+        &file,
+        shipped.replace("\"docs/results/recovery_demonstrations.md\"", &format!("{:?}", out.join("page.md"))),
+    )
+    .expect("writable");
     let study = || zoo(["study", text(&file), "--page-only"]);
     fs::create_dir(&out).expect("creatable");
     let page = || fs::read_to_string(out.join("page.md")).ok();

@@ -5,7 +5,8 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-use arrow::array::{ArrayRef, BooleanArray, Float64Array, Float64Builder, ListBuilder, UInt32Array, UInt64Array};
+use arrow_array::builder::{Float64Builder, ListBuilder};
+use arrow_array::{ArrayRef, BooleanArray, Float64Array, UInt32Array, UInt64Array};
 use models::actrm::{Actrm, Config, Over};
 use models::{ActionChunk, ModelError, Observation, Policy, Preprocess, ThoughtStep, Values};
 use rollout::{Pool, RolloutError};
@@ -388,7 +389,7 @@ impl PolicyTrace {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use arrow::array::AsArray;
+    use arrow_array::cast::AsArray;
     use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
     use super::*;
@@ -456,9 +457,9 @@ mod tests {
         assert_eq!(halt.null_count(), 2);
         let actions = batch.column_by_name("action").unwrap().as_list::<i32>();
         let cube = batch.column_by_name("attention to observation.entity.cube0").unwrap();
-        assert_eq!(cube.as_primitive::<arrow::datatypes::Float64Type>().values()[..3], [0.75, 0.0, 0.75]);
+        assert_eq!(cube.as_primitive::<arrow_array::types::Float64Type>().values()[..3], [0.75, 0.0, 0.75]);
         let last = actions.value(4);
-        assert_eq!(last.as_primitive::<arrow::datatypes::Float64Type>().values()[..], [1.0, -1.0]);
+        assert_eq!(last.as_primitive::<arrow_array::types::Float64Type>().values()[..], [1.0, -1.0]);
     }
 
     #[test]

@@ -5,9 +5,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
 
-use arrow::array::{
-    ArrayRef, BooleanArray, ListBuilder, RecordBatch, StringArray, UInt8Builder, UInt32Array, UInt64Array,
-};
+use arrow_array::builder::{ListBuilder, UInt8Builder};
+use arrow_array::{ArrayRef, BooleanArray, RecordBatch, StringArray, UInt32Array, UInt64Array};
 use parquet::arrow::ArrowWriter;
 use parquet::basic::Compression;
 use parquet::errors::ParquetError;
@@ -77,7 +76,7 @@ fn batch(
     set: &PuzzleSet,
     first: u64,
     puzzles: &[Puzzle],
-) -> std::result::Result<RecordBatch, arrow::error::ArrowError> {
+) -> std::result::Result<RecordBatch, arrow_schema::ArrowError> {
     let rows = puzzles.len();
     let same = |value: &str| -> ArrayRef { Arc::new(StringArray::from(vec![value; rows])) };
     let side = set.task.side() as u32;

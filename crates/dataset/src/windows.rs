@@ -9,7 +9,7 @@
 
 use crate::error::Result;
 use crate::lerobot::PictureStore;
-use arrow::buffer::ScalarBuffer;
+use arrow_buffer::ScalarBuffer;
 use std::ops::Range;
 
 /// Which windows to make.

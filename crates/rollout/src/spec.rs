@@ -126,7 +126,7 @@ impl WorkerSpec {
         for name in ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"] {
             command.env(name, "1");
         }
-        command.env("PYTHONHASHSEED", "0");
+        command.envs([("PYTHONHASHSEED", "0"), ("MALLOC_ARENA_MAX", "2")]);
         if std::env::var_os(BLAS_KERNELS).is_none() && has_haswells_kernels() {
             command.env(BLAS_KERNELS, "Haswell");
         }

@@ -28,8 +28,8 @@ key = "observation/state"
 feature = "observation.state"
 """
 
-TASKS = ("libero_spatial/0:0", "libero_goal/7:1", "libero_10/3:2", "libero_object/9:4")
-"""A task and an initial state of each suite; goal 7 has a stove, 10/3 a drawer."""
+TASKS = ("libero_goal/7:1", "libero_10/3:2")
+"""Tasks and initial states; goal 7 has a stove, 10/3 a drawer. `libero_parity.py all` compares all of four suites."""
 
 
 def test_rows_of_suites_are_found_by_their_names() -> None:
@@ -93,17 +93,17 @@ def test_another_version_is_named(libero: Path, tmp_path: Path) -> None:
 
 
 def test_episodes_equal_those_of_liberos_own_script(libero: Path, tmp_path: Path) -> None:
-    """States, observations, images, rewards and success of 25 random actions, bit for bit."""
+    """States, observations, images, rewards and success of 15 random actions, bit for bit."""
     for which in ("own", "ours"):
         env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         env |= {"MUJOCO_GL": "egl", "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        command = [str(libero), str(HERE / "libero_parity.py"), which, "64", "25", str(tmp_path), *TASKS]
+        command = [str(libero), str(HERE / "libero_parity.py"), which, "64", "15", str(tmp_path), *TASKS]
         subprocess.run(command, env=env, check=True)
     for task, _, init in (name.partition(":") for name in TASKS):
         assert not differing(tmp_path, task, init), task
         own = np.load(tmp_path / f"own-{task.replace('/', '-')}-{init}.npz")
         assert {"states", "rewards", "success", "obs/agentview_image", "obs/robot0_eye_in_hand_image"} <= set(own)
-        assert all(own[key].shape[0] == 26 for key in own.files)
+        assert all(own[key].shape[0] == 16 for key in own.files)
         assert own["obs/agentview_image"].std() > 10 and own["states"].shape[0] == len(
             {state.tobytes() for state in own["states"]}
         )
@@ -187,7 +187,7 @@ def test_outcomes_of_a_suite_do_not_depend_on_workers_or_interruptions(libero: P
 
     def run(name: str, workers: int, server: Any) -> subprocess.Popen[bytes]:
         command = [str(program), "eval", "--policy", server.address, "--name", "constant", "--mapping", str(mapping)]
-        command += ["--task", "libero_object", "--episodes", "4", "--max-steps", "15", "--workers", str(workers)]
+        command += ["--task", "libero_object", "--episodes", "3", "--max-steps", "15", "--workers", str(workers)]
         command += ["--zoo", str(tmp_path / name)]
         return subprocess.Popen(command, env=settings, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
 
@@ -198,8 +198,8 @@ def test_outcomes_of_a_suite_do_not_depend_on_workers_or_interruptions(libero: P
     shown = serve()
     plain = run("plain", 1, shown)
     said = plain.communicate()[0].decode()
-    assert plain.returncode == 0 and "libero_object/3: 0 of 1" in said, said
-    assert len(shown.prompts) == 4 and "pick up the bbq sauce and place it in the basket" in shown.prompts
+    assert plain.returncode == 0 and "libero_object/2: 0 of 1" in said, said
+    assert len(shown.prompts) == 3 and "pick up the salad dressing and place it in the basket" in shown.prompts
 
     server = serve()
     killed = run("killed", 3, server)

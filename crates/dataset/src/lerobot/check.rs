@@ -7,7 +7,7 @@ use super::fingerprint::INDEX_COLUMNS;
 use super::info::Info;
 use super::schema::hex;
 use crate::error::{DatasetError, Result};
-use arrow::datatypes::DataType;
+use arrow_schema::DataType;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;

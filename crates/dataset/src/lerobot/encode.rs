@@ -13,12 +13,12 @@ use crate::error::{DatasetError, InputError, Result};
 use crate::source::{NonFinite, Source};
 use crate::stats::FeatureStats;
 use crate::tree::{Array, Demo};
-use arrow::array::{
+use arrow_array::{
     ArrayRef, BinaryArray, BooleanArray, FixedSizeListArray, Float32Array, Float64Array, Int64Array, StringArray,
     StructArray,
 };
-use arrow::buffer::{OffsetBuffer, ScalarBuffer};
-use arrow::datatypes::DataType;
+use arrow_buffer::{OffsetBuffer, ScalarBuffer};
+use arrow_schema::DataType;
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;

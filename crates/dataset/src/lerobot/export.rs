@@ -16,7 +16,7 @@ use crate::error::{DatasetError, Result};
 use crate::plan::Dialect;
 use crate::source::{RobomimicWriter, WriteOptions};
 use crate::tree::{Array, Attrs, Demo, Dtype};
-use arrow::array::{
+use arrow_array::{
     Array as _, ArrayRef, BinaryArray, FixedSizeBinaryArray, FixedSizeListArray, Float32Array, Float64Array,
     Int32Array, Int64Array, ListArray, RecordBatch, StringArray,
 };

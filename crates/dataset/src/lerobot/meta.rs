@@ -7,12 +7,10 @@ use super::totals::EpisodeStats;
 use super::videos::Stretch;
 use crate::error::{DatasetError, Result};
 use crate::stats::FeatureStats;
-use arrow::array::{
-    ArrayRef, Float64Array, Float64Builder, Int64Array, Int64Builder, ListArray, ListBuilder, StringArray,
-    StringBuilder,
-};
-use arrow::buffer::OffsetBuffer;
-use arrow::datatypes::{DataType, Field, Schema};
+use arrow_array::builder::{Float64Builder, Int64Builder, ListBuilder, StringBuilder};
+use arrow_array::{ArrayRef, Float64Array, Int64Array, ListArray, StringArray};
+use arrow_buffer::OffsetBuffer;
+use arrow_schema::{DataType, Field, Schema};
 use parquet::errors::ParquetError;
 use parquet::file::metadata::KeyValue;
 use serde_json::{Map, Value, json};

@@ -7,8 +7,9 @@ use super::open::{Dataset, EpisodeMeta};
 use super::read;
 use crate::error::{DatasetError, Result};
 use crate::source::{VideoFile, VideoInfo};
-use arrow::array::{Array, ArrayRef, BinaryArray, BinaryBuilder, StringArray, StructArray};
-use arrow::datatypes::DataType;
+use arrow_array::builder::BinaryBuilder;
+use arrow_array::{Array, ArrayRef, BinaryArray, StringArray, StructArray};
+use arrow_schema::DataType;
 use rayon::prelude::*;
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -394,14 +395,13 @@ pub(crate) fn image_files(root: &Path, column: &ArrayRef) -> Result<BinaryArray,
         Some(fields) => (fields.column_by_name("bytes"), fields.column_by_name("path")),
         None => (Some(column), None),
     };
-    let binary = |array: &ArrayRef| arrow::compute::cast(array, &DataType::Binary).map_err(|e| e.to_string());
+    let binary = |array: &ArrayRef| arrow_cast::cast(array, &DataType::Binary).map_err(|e| e.to_string());
     let files = bytes.map(binary).transpose()?;
     let files = files.as_ref().and_then(|array| array.as_any().downcast_ref::<BinaryArray>());
     if let Some(files) = files.filter(|files| files.null_count() == 0) {
         return Ok(files.clone());
     }
-    let paths =
-        paths.map(|array| arrow::compute::cast(array, &DataType::Utf8).map_err(|e| e.to_string())).transpose()?;
+    let paths = paths.map(|array| arrow_cast::cast(array, &DataType::Utf8).map_err(|e| e.to_string())).transpose()?;
     let paths = paths.as_ref().and_then(|array| array.as_any().downcast_ref::<StringArray>());
     let mut all = BinaryBuilder::new();
     for row in 0..column.len() {

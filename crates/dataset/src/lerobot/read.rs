@@ -3,10 +3,11 @@
 use crate::error::{DatasetError, InputError, Result};
 use crate::source::is_lfs_pointer;
 use crate::windows::Resident;
-use arrow::array::{Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, LargeListArray, ListArray};
-use arrow::buffer::ScalarBuffer;
-use arrow::compute::{cast, concat};
-use arrow::datatypes::DataType;
+use arrow_array::{Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, LargeListArray, ListArray};
+use arrow_buffer::ScalarBuffer;
+use arrow_cast::cast;
+use arrow_schema::DataType;
+use arrow_select::concat::concat;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use std::collections::BTreeMap;
@@ -221,7 +222,7 @@ pub(crate) fn integers(path: &Path, name: &str, array: &ArrayRef) -> Result<Scal
         return Err(column.because("whole numbers", format!("{} with {} nulls", array.data_type(), array.null_count())));
     }
     let cast = cast(array, &DataType::Int64).map_err(|e| column.because("64-bit numbers", e.to_string()))?;
-    let longs = cast.as_any().downcast_ref::<arrow::array::Int64Array>().expect("an int64 column");
+    let longs = cast.as_any().downcast_ref::<arrow_array::Int64Array>().expect("an int64 column");
     Ok(longs.values().clone())
 }
 
@@ -232,7 +233,7 @@ pub(crate) fn doubles(path: &Path, name: &str, array: &ArrayRef) -> Result<Scala
         return Err(column.because("numbers", format!("{} with {} nulls", array.data_type(), array.null_count())));
     }
     let cast = cast(array, &DataType::Float64).map_err(|e| column.because("numbers", e.to_string()))?;
-    let doubles = cast.as_any().downcast_ref::<arrow::array::Float64Array>().expect("a column of doubles");
+    let doubles = cast.as_any().downcast_ref::<arrow_array::Float64Array>().expect("a column of doubles");
     Ok(doubles.values().clone())
 }
 
@@ -240,7 +241,7 @@ pub(crate) fn doubles(path: &Path, name: &str, array: &ArrayRef) -> Result<Scala
 pub(crate) fn texts(path: &Path, name: &str, array: &ArrayRef) -> Result<Vec<String>> {
     let column = BadColumn { path, name };
     let plain = cast(array, &DataType::Utf8).map_err(|e| column.because("texts", e.to_string()))?;
-    let plain = plain.as_any().downcast_ref::<arrow::array::StringArray>().expect("a text column");
+    let plain = plain.as_any().downcast_ref::<arrow_array::StringArray>().expect("a text column");
     if plain.null_count() > 0 {
         return Err(column.because("a text in every row", format!("{} nulls", plain.null_count())));
     }

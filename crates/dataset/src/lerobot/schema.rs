@@ -1,7 +1,7 @@
 //! Arrow and Parquet schemas of the data files, and the metadata that Hugging Face's `datasets` reads.
 
 use super::info::{Feature, Features};
-use arrow::datatypes::{DataType, Field, Fields, Schema, SchemaRef};
+use arrow_schema::{DataType, Field, Fields, Schema, SchemaRef};
 use parquet::arrow::{ArrowSchemaConverter, add_encoded_arrow_schema_to_metadata};
 use parquet::basic::{Compression, Encoding, Type as PhysicalType, ZstdLevel};
 use parquet::errors::Result as ParquetResult;

@@ -5,8 +5,8 @@
 
 use super::schema::hex;
 use crate::error::{DatasetError, Result};
-use arrow::array::ArrayRef;
-use arrow::datatypes::SchemaRef;
+use arrow_array::ArrayRef;
+use arrow_schema::SchemaRef;
 use parquet::arrow::ArrowSchemaConverter;
 use parquet::arrow::arrow_writer::{ArrowColumnChunk, ArrowRowGroupWriterFactory, compute_leaves};
 use parquet::column::writer::ColumnCloseResult;

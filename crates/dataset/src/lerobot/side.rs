@@ -19,12 +19,11 @@ use super::work::{BULK_ROW_BYTES, Part};
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::{DemoPlan, KeyPlan, Plan};
 use crate::tree::{Array, Attrs, Demo, Dtype};
-use arrow::array::{
-    ArrayRef, BinaryBuilder, FixedSizeBinaryArray, FixedSizeListArray, Int64Builder, ListBuilder, PrimitiveArray,
-    StringBuilder,
-};
-use arrow::buffer::{BooleanBuffer, MutableBuffer, NullBuffer, ScalarBuffer};
-use arrow::datatypes::{ArrowPrimitiveType, DataType, Field, Float32Type, Float64Type, Int32Type, Int64Type, Schema};
+use arrow_array::builder::{BinaryBuilder, Int64Builder, ListBuilder, StringBuilder};
+use arrow_array::types::{ArrowPrimitiveType, Float32Type, Float64Type, Int32Type, Int64Type};
+use arrow_array::{ArrayRef, FixedSizeBinaryArray, FixedSizeListArray, PrimitiveArray};
+use arrow_buffer::{BooleanBuffer, MutableBuffer, NullBuffer, ScalarBuffer};
+use arrow_schema::{DataType, Field, Schema};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;

@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used)]
 
 use crate::common::copy;
-use arrow::array::{Array as _, ArrayRef, BinaryArray, RecordBatch, StructArray};
-use arrow::datatypes::Field;
+use arrow_array::{Array as _, ArrayRef, BinaryArray, RecordBatch, StructArray};
+use arrow_schema::Field;
 use dataset::edit::{Destination, Renames, Selection, keep, merge, rename, without};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, DepthUnit, Dtype, FeatureStats, RobomimicWriter, SampleSpec, Source,

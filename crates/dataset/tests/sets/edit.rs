@@ -6,8 +6,9 @@
 mod sharded;
 
 use crate::common::files;
-use arrow::array::{ArrayRef, AsArray, Float64Array, RecordBatch};
-use arrow::datatypes::Float64Type;
+use arrow_array::cast::AsArray;
+use arrow_array::types::Float64Type;
+use arrow_array::{ArrayRef, Float64Array, RecordBatch};
 use dataset::edit::{Destination, EditReport, Parts, Renames, Selection, keep, merge, rename, split, without};
 use dataset::{
     Array, ConvertOptions, Dataset, Demo, ImageForm, RobomimicWriter, Source, VideoOptions, WriteOptions, convert,

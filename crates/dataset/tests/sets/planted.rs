@@ -4,12 +4,16 @@
 #![allow(clippy::unwrap_used)]
 
 use crate::common::{copy, files};
-use arrow::array::{
-    Array as _, ArrayRef, AsArray, BinaryArray, Float32Array, Float64Array, Int64Array, ListBuilder, RecordBatch,
-    StringArray, StringBuilder, StructArray,
+use arrow_array::builder::{ListBuilder, StringBuilder};
+use arrow_array::cast::AsArray;
+use arrow_array::types::{Float32Type, Float64Type, Int64Type};
+use arrow_array::{
+    Array as _, ArrayRef, BinaryArray, Float32Array, Float64Array, Int64Array, RecordBatch, StringArray, StructArray,
 };
-use arrow::compute::{cast, concat_batches, take_record_batch};
-use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int64Type};
+use arrow_cast::cast;
+use arrow_schema::{DataType, Field};
+use arrow_select::concat::concat_batches;
+use arrow_select::take::take_record_batch;
 use dataset::edit::{Destination, Repair, Selection, keep, repair};
 use dataset::{
     Array, Check, ConvertOptions, Dataset, Demo, RobomimicWriter, WriteOptions, convert, verify, verify_within,
@@ -162,13 +166,13 @@ fn edit_list(root: &Path, file: &str, name: &str, edit: impl Fn(usize, f64) -> f
         let numbers = numbers.as_primitive::<Float64Type>().values();
         let edited = Float64Array::from_iter_values(numbers.iter().enumerate().map(|(i, &number)| edit(i, number)));
         let edited = cast(&edited, inner.data_type()).unwrap();
-        arrow::array::make_array(column.to_data().into_builder().child_data(vec![edited.to_data()]).build().unwrap())
+        arrow_array::make_array(column.to_data().into_builder().child_data(vec![edited.to_data()]).build().unwrap())
     });
 }
 
 /// The rows of a table in another order, or fewer or more of them.
 fn edit_rows(root: &Path, file: &str, rows: &[u32]) {
-    let rows = arrow::array::UInt32Array::from(rows.to_vec());
+    let rows = arrow_array::UInt32Array::from(rows.to_vec());
     edit_table(root, file, |table| take_record_batch(&table, &rows).unwrap());
 }
 

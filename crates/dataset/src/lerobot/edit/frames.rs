@@ -20,9 +20,9 @@ use super::groups::Groups;
 use super::{Edit, Renames};
 use crate::error::{DatasetError, Result};
 use crate::stats::FeatureStats;
-use arrow::array::{Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, RecordBatch, StructArray};
-use arrow::compute::cast;
-use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
+use arrow_array::{Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, RecordBatch, StructArray};
+use arrow_cast::cast;
+use arrow_schema::{DataType, Field, Schema, SchemaRef};
 use parquet::file::metadata::KeyValue;
 use rayon::prelude::*;
 use serde_json::{Map, Value};
@@ -323,7 +323,7 @@ impl<'a> Seen<'a> {
                 continue;
             }
             let column = BadColumn { path: &path, name: edit.before(name) };
-            let wrong = |e: arrow::error::ArrowError| column.because(feature.dtype.clone(), e.to_string());
+            let wrong = |e: arrow_schema::ArrowError| column.because(feature.dtype.clone(), e.to_string());
             let leaf = |to: DataType| -> Result<ArrayRef> {
                 cast(&read::leaf(&column, array, array.len(), feature.dim())?, &to).map_err(wrong)
             };

@@ -3,8 +3,8 @@
 use super::super::shards::{EncodedGroup, GroupEncoder, Place};
 use super::super::work::{GROUP_BYTES, GROUP_FRAMES};
 use crate::error::{DatasetError, Result};
-use arrow::array::{Array, ArrayRef};
-use arrow::compute::concat;
+use arrow_array::{Array, ArrayRef};
+use arrow_select::concat::concat;
 use std::collections::VecDeque;
 use std::path::Path;
 

@@ -10,7 +10,7 @@ use super::Edit;
 use super::groups::Groups;
 use crate::error::Result;
 use crate::tree::{Array, Demo, Dtype};
-use arrow::array::{ArrayRef, RecordBatch, new_null_array};
+use arrow_array::{ArrayRef, RecordBatch, new_null_array};
 use std::collections::BTreeMap;
 
 /// Rows of the side folder that are moved at once: pictures may be among them.

@@ -2,8 +2,8 @@
 
 use super::{fixture, quiet};
 use crate::common::copy;
-use arrow::array::AsArray;
-use arrow::datatypes::{Float32Type, Int64Type};
+use arrow_array::cast::AsArray;
+use arrow_array::types::{Float32Type, Int64Type};
 use dataset::edit::{Destination, Selection, keep};
 use dataset::{ConvertOptions, Dataset, OldSet, Source, VideoFile, convert, verify};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
