@@ -254,7 +254,7 @@ fn the_page_of_a_study_survives_a_fault_at_any_call() {
     }
     let root = tempfile::tempdir().expect("a temporary folder");
     let root = root.path().canonicalize().expect("it is there");
-    let (file, out) = (root.join("thinking.toml"), root.join("out"));
+    let (file, out) = (root.join("study.toml"), root.join("out"));
     let shipped = fs::read_to_string(e2e::root().join("studies/recovery_demonstrations.toml")).expect("a study");
     // charts are drawn beside the results
     let results = root.join("results");
@@ -271,7 +271,7 @@ fn the_page_of_a_study_survives_a_fault_at_any_call() {
     let whole = run(&mut study(), &out, None);
     assert!(whole.status.success(), "{}", whole.stderr);
     let expected = page();
-    assert!(expected.as_ref().is_some_and(|page| page.contains("# Does recursion help?")));
+    assert!(expected.as_ref().is_some_and(|page| page.contains("# The square nut")));
     let faults = faults(&whole.calls, 8);
     for fault in &faults {
         fs::write(out.join("page.md"), "old").expect("writable");
