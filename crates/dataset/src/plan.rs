@@ -227,7 +227,7 @@ pub struct KeyPlan {
     /// Element type.
     pub dtype: Dtype,
     /// Shape as the demo sees it: the first axis is time for everything that has the demo's length.
-    pub shape: Vec<usize>,
+    pub shape: Box<[usize]>,
     /// Reading rows in multiples of this many avoids decoding a stored block twice; 1 if it does not matter.
     pub block_rows: usize,
     /// Where the elements are.
@@ -264,23 +264,23 @@ pub struct Place {
     /// Index into [`Plan::files`].
     pub file: usize,
     /// Absolute path of the dataset in that file.
-    pub path: String,
+    pub path: Box<str>,
     /// First row that belongs to the demo (0 unless several demos share a dataset).
     pub first_row: usize,
     /// Position in the file of the demo's first element, where they lie there as they are in memory.
     pub offset: Option<u64>,
     /// What is read together with it.
     #[serde(default)]
-    pub join: Option<Join>,
+    pub join: Option<Box<Join>>,
 }
 
 /// Datasets of the same file that make one with another.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Join {
     /// The first row is the only one of this dataset; the rows of the other follow.
-    Before(String),
+    Before(Box<str>),
     /// Each row goes on with that of each of these.
-    Beside(Vec<String>),
+    Beside(Vec<Box<str>>),
 }
 
 impl Problem {

@@ -328,7 +328,7 @@ impl SideEncoder {
             objects.extend(attributes_and_groups(&l.demo));
             for (path, column) in &self.pictures {
                 if let Some(key) = demo.keys.get(path) {
-                    let array = Array { dtype: key.dtype.clone(), shape: key.shape.clone(), bytes: Vec::new() };
+                    let array = Array { dtype: key.dtype.clone(), shape: key.shape.to_vec(), bytes: Vec::new() };
                     objects.push(Object {
                         kind: Kind::Picture,
                         path: path.clone(),
@@ -388,7 +388,7 @@ impl SideEncoder {
                 }
             }
         })?;
-        let array = Array { dtype: key.dtype.clone(), shape: key.shape.clone(), bytes };
+        let array = Array { dtype: key.dtype.clone(), shape: key.shape.to_vec(), bytes };
         Ok(Object { kind: Kind::Shifted, path: path.to_owned(), name: base, rows: different, array: Some(array) })
     }
 }

@@ -318,12 +318,12 @@ impl Stated {
                     .into());
                 }
                 (_, Some(array)) if feature.is_depth() => {
-                    let &[_, height, width, 1] = array.shape.as_slice() else { return Err(self.shape(plan, key)) };
+                    let &[_, height, width, 1] = &*array.shape else { return Err(self.shape(plan, key)) };
                     let Some(kind) = DepthKind::of(&array.dtype) else { return Err(self.shape(plan, key)) };
                     Origin::Depth { key: key.clone(), height, width, dtype: array.dtype.clone(), kind }
                 }
                 ("image" | "video", Some(array)) => {
-                    let &[_, height, width, 3] = array.shape.as_slice() else { return Err(self.shape(plan, key)) };
+                    let &[_, height, width, 3] = &*array.shape else { return Err(self.shape(plan, key)) };
                     feature = Feature {
                         dtype: "image".to_owned(),
                         shape: vec![height, width, 3],

@@ -205,7 +205,7 @@ impl Backend for Local {
             ends.any(|end| homes.contains(format!("{}/", &path[..end]).as_str()))
         };
         let used: BTreeSet<&str> =
-            self.plan.demos.iter().flat_map(|d| d.keys.values().map(|k| k.place.path.as_str())).collect();
+            self.plan.demos.iter().flat_map(|d| d.keys.values().map(|k| &*k.place.path)).collect();
         for (path, node) in &file.groups {
             if path.is_empty() || in_demo(path) {
                 continue;
@@ -254,7 +254,7 @@ impl Backend for Local {
         let place = self.place(index, key)?;
         let file = &self.survey.files[place.file];
         let from = place.first_row + first;
-        let beside = match &place.join {
+        let beside = match place.join.as_deref() {
             None => return file.read(&place.path, Some((from, count))),
             Some(Join::Before(path)) => {
                 let mut array = file.read(path, Some((0, usize::from(from == 0 && count > 0))))?;

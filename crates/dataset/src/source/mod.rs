@@ -223,7 +223,7 @@ impl Source {
         let row = k.bytes().unwrap_or(WINDOW) / (rows.unwrap_or(1).max(1) as u64);
         let blocks = (WINDOW / row.max(1)) as usize / k.block_rows;
         let window = blocks.max(1) * k.block_rows;
-        let mut shape = k.shape.clone();
+        let mut shape = k.shape.to_vec();
         shape[0] = count;
         let mut bytes = Vec::with_capacity(row as usize * count);
         let mut at = first;
@@ -256,7 +256,7 @@ impl Source {
 
     /// Elements that lie in the file as they are in memory: straight from there.
     fn read_direct(&self, k: &KeyPlan, first: usize, count: Option<usize>) -> Result<Array> {
-        let mut shape = k.shape.clone();
+        let mut shape = k.shape.to_vec();
         if let (Some(extent), Some(count)) = (shape.first_mut(), count) {
             *extent = count;
         }

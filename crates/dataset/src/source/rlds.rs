@@ -598,8 +598,8 @@ impl Rlds {
                     }
                 }
             }
-            let place = Place { file: 0, path: leaf.name.clone(), first_row: 0, offset: None, join: None };
-            keys.insert(key, KeyPlan { dtype, shape, block_rows: 1, place });
+            let place = Place { file: 0, path: leaf.name.as_str().into(), first_row: 0, offset: None, join: None };
+            keys.insert(key, KeyPlan { dtype, shape: shape.into(), block_rows: 1, place });
         }
         let mut attrs = Attrs::new();
         for leaf in metadata {
@@ -652,7 +652,7 @@ impl Rlds {
     fn rows_of(&self, record: &[u8], leaf: &Leaf, key: &KeyPlan, first: usize, count: usize) -> Result<Array, String> {
         let lists = lists(record)?;
         let &(kind, list) = lists.get(leaf.name.as_str()).ok_or("it is not there any more")?;
-        let mut shape = key.shape.clone();
+        let mut shape = key.shape.to_vec();
         shape[0] = count;
         let row = key.bytes().map_or(0, |bytes| bytes as usize / key.shape[0].max(1));
         if row.saturating_mul(count) > MAX_ROWS {
@@ -721,7 +721,7 @@ impl Backend for Rlds {
     fn rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array, InputError> {
         let record = self.record(index)?;
         let plan = record.keys.get(key);
-        let leaf = plan.and_then(|plan| self.leaves.iter().find(|leaf| leaf.name == plan.place.path));
+        let leaf = plan.and_then(|plan| self.leaves.iter().find(|leaf| *leaf.name == *plan.place.path));
         let none = || InputError::NoSuch {
             path: self.path.clone(),
             wanted: format!("rows {first} and the {count} after of {key} in {}", record.id),

@@ -81,7 +81,7 @@ fn fixture_is_planned_in_full() {
     assert_eq!(train, ["demo_1", "demo_2", "demo_3"], "in robomimic's shuffled order");
     assert_eq!(plan.masks["valid"], Vec::<String>::new());
     let object = &plan.demos[0].keys["obs/object"];
-    assert_eq!((&object.dtype, object.shape.as_slice()), (&Dtype::F64, &[56, 10][..]));
+    assert_eq!((&object.dtype, &*object.shape), (&Dtype::F64, &[56, 10][..]));
     assert_eq!(object.place.offset, Some(27080), "as h5py states it");
     let demo = source.read_demo(0).unwrap();
     assert_eq!(demo.datasets.len(), 30);

@@ -187,7 +187,7 @@ fn of_source(args: &Args) -> Result<Summary> {
             // a step's shape where there is one row a step, the whole shape otherwise
             let shape = match key.shape.split_first() {
                 Some((&rows, rest)) if rows == demo.length => rest.to_vec(),
-                _ => key.shape.clone(),
+                _ => key.shape.to_vec(),
             };
             if !row.shapes.contains(&shape) {
                 row.shapes.push(shape);

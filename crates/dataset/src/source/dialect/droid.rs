@@ -70,9 +70,9 @@ fn actions(index: usize, file: &Walked) -> Option<KeyPlan> {
         return None;
     }
     let width = |key: &KeyPlan| key.shape.iter().skip(1).product::<usize>();
-    velocity.shape = vec![*velocity.shape.first()?, width(&velocity) + width(&gripper)];
+    velocity.shape = [*velocity.shape.first()?, width(&velocity) + width(&gripper)].into();
     velocity.place.offset = None;
-    velocity.place.join = Some(Join::Beside(vec![gripper.place.path]));
+    velocity.place.join = Some(Box::new(Join::Beside(vec![gripper.place.path])));
     Some(velocity)
 }
 

@@ -71,7 +71,7 @@ fn observe(plan: &mut DemoPlan) -> bool {
         let name = below.split_once('/').map_or(below, |(_, name)| name).replace('/', "_");
         let mut observed = state.clone();
         observed.place.offset = None;
-        observed.place.join = Some(Join::Before(first.place.path.clone()));
+        observed.place.join = Some(Box::new(Join::Before(first.place.path.clone())));
         made.push((format!("obs/{name}"), observed));
     }
     let any = !made.is_empty();

@@ -221,7 +221,7 @@ fn ragged(survey: &Survey, out: &mut Draft) {
 /// bytes each.
 fn key_plan(file: usize, walked: &Walked, path: &str) -> Option<KeyPlan> {
     let node = walked.datasets.get(path).filter(|node| node.fault.is_none())?;
-    let place = Place { file, path: path.to_owned(), first_row: 0, offset: node.offset, join: None };
+    let place = Place { file, path: path.into(), first_row: 0, offset: node.offset, join: None };
     let (mut dtype, mut shape) = (node.dtype.clone(), node.shape.clone());
     if let (&Dtype::FixedStr(width), [rows], Some(offset)) = (&node.dtype, shape.as_slice(), node.offset)
         && *rows > 0
@@ -229,7 +229,7 @@ fn key_plan(file: usize, walked: &Walked, path: &str) -> Option<KeyPlan> {
     {
         (dtype, shape) = (Dtype::U8, vec![*rows, width]);
     }
-    Some(KeyPlan { dtype, shape, block_rows: node.block_rows, place })
+    Some(KeyPlan { dtype, shape: shape.into(), block_rows: node.block_rows, place })
 }
 
 /// What belongs to one demo of a file, by its name here.

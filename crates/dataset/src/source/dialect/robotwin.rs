@@ -75,9 +75,9 @@ fn vector(index: usize, file: &Walked) -> Option<KeyPlan> {
     let same = parts.iter().all(|part| part.dtype == parts[0].dtype && part.shape.first() == parts[0].shape.first());
     let width = parts.iter().map(|part| part.shape.iter().skip(1).product::<usize>()).sum();
     let mut vector = parts[0].clone();
-    vector.shape = vec![*vector.shape.first()?, width];
+    vector.shape = [*vector.shape.first()?, width].into();
     vector.place.offset = None;
-    vector.place.join = Some(Join::Beside(parts[1..].iter().map(|part| part.place.path.clone()).collect()));
+    vector.place.join = Some(Box::new(Join::Beside(parts[1..].iter().map(|part| part.place.path.clone()).collect())));
     same.then_some(vector)
 }
 

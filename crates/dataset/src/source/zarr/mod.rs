@@ -403,9 +403,13 @@ impl Buffer {
                 self.levels(&mut array, &mut notes)?;
             }
             let block = if array.chunk_bytes() as u64 <= WHOLE { array.chunks[0] } else { 1 };
-            let place = Place { file: 0, path, first_row: 0, offset: None, join: None };
-            let plan =
-                KeyPlan { dtype: array.stored.dtype.clone(), shape: array.shape.clone(), block_rows: block, place };
+            let place = Place { file: 0, path: path.into(), first_row: 0, offset: None, join: None };
+            let plan = KeyPlan {
+                dtype: array.stored.dtype.clone(),
+                shape: array.shape.clone().into(),
+                block_rows: block,
+                place,
+            };
             self.arrays.insert(key.clone(), array);
             keys.push((key, plan));
         }
@@ -495,8 +499,9 @@ impl Buffer {
         let Some(first) = parts.first().and_then(|part| keys.iter().find(|(key, _)| key == part)) else { return };
         let mut plan = first.1.clone();
         plan.shape =
-            vec![plan.shape[0], parts.iter().map(|part| self.arrays[part].shape[1..].iter().product::<usize>()).sum()];
-        plan.place.path = "data/action".to_owned();
+            [plan.shape[0], parts.iter().map(|part| self.arrays[part].shape[1..].iter().product::<usize>()).sum()]
+                .into();
+        plan.place.path = "data/action".into();
         keys.push(("actions".to_owned(), plan));
         let names: Vec<&str> = parts.iter().map(|part| part.trim_start_matches("obs/")).collect();
         notes.push(format!("no action is stored: it is {}, as UMI's own loader has it", names.join(", ")));
