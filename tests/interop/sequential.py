@@ -1,4 +1,4 @@
-"""`actrm-zoo compare` beside the packages of N-SCORE and SAVI, and STEP by its authors' package on two shipped results."""
+"""`actrm-zoo compare` beside the packages of N-SCORE and SAVI; STEP by its authors' package on two shipped results."""
 
 import csv
 import json
