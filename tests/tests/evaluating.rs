@@ -6,8 +6,8 @@ use std::process::{Command, Stdio};
 
 use e2e::{copied_zoo, data, lift, listing, refused, succeeds, text, train_lift, trained, wait_until, zoo};
 
-/// An evaluation of the trained entry: short episodes, whose number does not matter to what is tested.
-/// Short episodes, by one worker where `more` does not say how many.
+/// An evaluation of the trained entry: short episodes, whose number does not matter to what is tested, by one worker
+/// where `more` does not say how many.
 fn eval(entries: &Path, episodes: &str, more: &[&str]) -> Command {
     let mut command = zoo(["eval", "lift-act@1", "--max-steps", "6", "--episodes", episodes, "--zoo", text(entries)]);
     command.args(if more.contains(&"--workers") { &[][..] } else { &["--workers", "1"] }).args(more);
