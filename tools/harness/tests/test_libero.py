@@ -28,8 +28,8 @@ key = "observation/state"
 feature = "observation.state"
 """
 
-TASKS = ("libero_goal/7:1", "libero_10/3:2")
-"""Tasks and initial states; goal 7 has a stove, 10/3 a drawer. `libero_parity.py all` compares all of four suites."""
+TASKS = ("libero_goal/7:1", "libero_object/9:4")
+"""Tasks and initial states; goal 7 has a stove. `libero_parity.py all` compares all tasks of four suites."""
 
 
 def test_rows_of_suites_are_found_by_their_names() -> None:
