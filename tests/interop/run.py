@@ -716,7 +716,7 @@ def main() -> None:
             "lerobot-eval runs it before cameras": lambda: python_door.lerobot_eval(
                 folder / "eyes/zoo/lift-act-image", "Lift", folder / "b", 1, None
             ),
-            "compare's sequential tests are their packages'": lambda: sequential.compare(
+            "compare has the p-values of other packages": lambda: sequential.compare(
                 folder / "sequential", ours, run
             ),
             "robomimic reads the collected file": lambda: compare_robomimic(source),
