@@ -716,9 +716,7 @@ def main() -> None:
             "lerobot-eval runs it before cameras": lambda: python_door.lerobot_eval(
                 folder / "eyes/zoo/lift-act-image", "Lift", folder / "b", 1, None
             ),
-            "compare has the p-values of other packages": lambda: sequential.compare(
-                folder / "sequential", ours, run
-            ),
+            "compare has the p-values of other packages": lambda: sequential.compare(folder / "sequential", ours, run),
             "robomimic reads the collected file": lambda: compare_robomimic(source),
             "export rebuilds the source": lambda: compare_trees(source, exported),
             "robomimic reads the exported file": lambda: compare_robomimic(exported),
