@@ -3,6 +3,8 @@
 import dataclasses
 import gc
 import importlib
+import platform
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -149,6 +151,16 @@ def test_where_nothing_can_draw_the_error_names_a_package(
     with pytest.raises(envs.RequestError, match="libosmesa6") as caught:
         envs.image(session, "agentview", 32, 32)
     assert caught.value.kind == "no_renderer"
+
+
+def test_a_software_renderer_names_the_processor(session: envs.Session) -> None:
+    name = envs.renderer(session).name()
+    if "llvmpipe" not in name:
+        pytest.skip(f"a device draws here: {name}")
+    assert " bits" not in name
+    cpuinfo = Path("/proc/cpuinfo").read_text(errors="replace")
+    vendor = next((line.split(":")[1].strip() for line in cpuinfo.splitlines() if line.startswith("vendor_id")), None)
+    assert f", {vendor or platform.machine()})" in name
 
 
 @pytest.mark.parametrize("devices", ["", "-1", "GPU-1a2b", "77,0"])

@@ -10,6 +10,7 @@ import ctypes
 import ctypes.util
 import importlib
 import os
+import platform
 import re
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -57,14 +58,18 @@ class Renderer:
         self._gl.make_current()
 
     def name(self) -> str:
-        """What draws, as OpenGL names it: device or software, and driver. Another one draws other pictures."""
+        """What draws, as OpenGL names it: device or software, and driver. Another one draws other pictures.
+
+        llvmpipe compiles for the processor and uses instructions whose last bits are the vendor's own, so that the vendor
+        is a part of the name.
+        """
         self.make_current()
         lookup = importlib.import_module("OpenGL.platform").PLATFORM.getExtensionProcedure
         get_string = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_uint)(lookup(b"glGetString"))
         told = (get_string(_GL_RENDERER), get_string(_GL_VERSION))
         text = ", OpenGL ".join(text.decode("ascii", "replace") for text in told if text)
         # llvmpipe says how wide a processor's vectors are, and draws the same pixels with all of them
-        return re.sub(r"(llvmpipe \(LLVM [\d.]+), \d+ bits", r"\1", text)
+        return re.sub(r"(llvmpipe \(LLVM [\d.]+), \d+ bits", rf"\1, {_processor()}", text)
 
     def image(self, sim: Sim, camera: str, height: int, width: int) -> Array:
         """Draw what `camera` sees: uint8 of (height, width, 3), upright."""
@@ -135,6 +140,16 @@ class Renderer:
             if self._fast:
                 self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._model = model
+
+
+def _processor() -> str:
+    """The processor's vendor, such as GenuineIntel, or its architecture where none is told."""
+    try:
+        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as told:
+            vendors = (line.partition(":")[2].strip() for line in told if line.startswith("vendor_id"))
+            return next(vendors, "") or platform.machine()
+    except OSError:
+        return platform.machine()
 
 
 def _gl_context() -> Any:
