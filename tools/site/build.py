@@ -35,6 +35,9 @@ def main() -> None:
     staged.mkdir(parents=True)
     config = load_config(str(CONFIG))
     left = pages(config.nav or [])
+    lost = {str(file.relative_to(ROOT)) for file in ROOT.glob("docs/**/*.md")} - set(left)
+    if lost:
+        sys.exit(f"tools/site/mkdocs.yml: its nav misses {', '.join(sorted(lost))}")
     while left:
         name = left.pop()
         source, target = ROOT / name, staged / name

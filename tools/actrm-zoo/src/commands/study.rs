@@ -136,6 +136,10 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
         cli::print(&listed(&study, &args.configs.library()?)?)?;
         return Ok(ExitCode::SUCCESS);
     }
+    if args.page_only && !has_results(&study.results) {
+        let (file, results) = (shown(file), shown(&study.results));
+        anyhow::bail!("{file}: {results} has no results, so there is no page to write; run the study without --page-only");
+    }
     let mut whole = true;
     if !args.page_only {
         let stop = Stop::install(GOES_ON)?;
@@ -195,6 +199,11 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::from(INTERRUPTED));
     }
     Ok(ExitCode::SUCCESS)
+}
+
+fn has_results(folder: &Path) -> bool {
+    let Ok(mut files) = std::fs::read_dir(folder) else { return false };
+    files.any(|file| file.is_ok_and(|file| file.path().extension().is_some_and(|name| name == "json")))
 }
 
 /// A line a cell: `k6-on-pickchain-200-seed1: chain (171 of 200), chain-2 (not run)`
