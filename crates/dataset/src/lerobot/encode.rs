@@ -195,6 +195,10 @@ impl Job<'_> {
         let mut offsets = vec![0_i32];
         let mut names = Vec::new();
         let extension = if jpeg { "jpg" } else { images::extension(self.images) };
+        if !jpeg && self.images == ImageForm::Ppm {
+            let frames: usize = loaded.iter().map(|l| l.part.rows.len()).sum();
+            files.reserve(frames * images::ppm_bytes(height, width));
+        }
         for (l, summary) in loaded.iter().zip(summaries) {
             let sampled = sample(l.part.length);
             let mut pictures = PictureSummary { histograms: vec![[0; 256]; 3], ..PictureSummary::default() };

@@ -20,6 +20,12 @@ pub(crate) fn extension(form: ImageForm) -> &'static str {
     }
 }
 
+/// Bytes that a PPM file of this size needs at most.
+pub(crate) fn ppm_bytes(height: usize, width: usize) -> usize {
+    const HEADER: usize = 64;
+    HEADER + height * width * 3
+}
+
 /// Appends one RGB picture as a file. `pixels` is `height * width * 3` bytes.
 pub(crate) fn encode(
     form: ImageForm,

@@ -22,6 +22,7 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::thread::JoinHandle;
 
 /// A file that is hashed while it is written.
 pub(crate) struct HashingFile {
@@ -30,7 +31,13 @@ pub(crate) struct HashingFile {
     bytes: u64,
     /// Parquet's writer turns I/O errors into text; the original waits here.
     failure: Option<io::Error>,
+    /// Bytes that were on the disk or on their way there when it was last asked for.
+    sent: u64,
+    sending: Option<JoinHandle<io::Result<()>>>,
 }
+
+/// Bytes that are sent to the disk while further ones are made.
+const SENT_AT_ONCE: u64 = 16 << 20;
 
 impl HashingFile {
     pub(crate) fn create(path: &Path) -> Result<Self> {
@@ -39,7 +46,7 @@ impl HashingFile {
             operation: "create it",
             source,
         })?;
-        Ok(Self { file, hash: Sha256::new(), bytes: 0, failure: None })
+        Ok(Self { file, hash: Sha256::new(), bytes: 0, failure: None, sent: 0, sending: None })
     }
 
     /// Writes everything at once and returns what was written.
@@ -49,6 +56,25 @@ impl HashingFile {
         let mut file = Self::create(&path)?;
         file.write_all(content).map_err(|source| DatasetError::Io { path, operation: "write it", source })?;
         Ok(file.written(relative))
+    }
+
+    /// Begins to send to the disk what has been written, so that less of it is left to do at the end.
+    fn send(&mut self) -> io::Result<()> {
+        let busy = self.sending.as_ref().is_some_and(|thread| !thread.is_finished());
+        if busy || self.bytes - self.sent < SENT_AT_ONCE {
+            return Ok(());
+        }
+        self.arrived()?;
+        let file = self.file.try_clone()?;
+        self.sent = self.bytes;
+        self.sending = Some(std::thread::spawn(move || file.sync_data()));
+        Ok(())
+    }
+
+    /// Waits for what was sent. A failure is told once: who synchronises the file later does not hear of it.
+    fn arrived(&mut self) -> io::Result<()> {
+        let sent = self.sending.take().map(JoinHandle::join);
+        sent.map_or(Ok(()), |sent| sent.unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
     }
 
     /// What has been written so far, under the path that it has in the data set.
@@ -290,6 +316,7 @@ impl<'a> ShardWriter<'a> {
             let failure = writer.inner_mut().failure.take();
             return Err(self.error(failure, e));
         }
+        writer.inner_mut().send().map_err(|e| self.lost(e))?;
         self.current = Some((writer, written + bytes));
         Ok(Place { folder: self.number / self.files_per_folder, file: self.number % self.files_per_folder })
     }
@@ -301,8 +328,13 @@ impl<'a> ShardWriter<'a> {
             let failure = writer.inner_mut().failure.take();
             return Err(self.error(failure, e));
         }
+        writer.inner_mut().arrived().map_err(|e| self.lost(e))?;
         self.finished.push(writer.inner().written(&self.relative()));
         Ok(())
+    }
+
+    fn lost(&self, source: io::Error) -> DatasetError {
+        DatasetError::Io { path: self.root.join(self.relative()), operation: "flush it to disk", source }
     }
 
     /// Closes the last file; returns all of them in order.
