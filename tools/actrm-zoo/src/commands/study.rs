@@ -138,7 +138,9 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
     }
     if args.page_only && !has_results(&study.results) {
         let (file, results) = (shown(file), shown(&study.results));
-        anyhow::bail!("{file}: {results} has no results, so there is no page to write; run the study without --page-only");
+        anyhow::bail!(
+            "{file}: {results} has no results, so there is no page to write; run the study without --page-only"
+        );
     }
     let mut whole = true;
     if !args.page_only {
