@@ -60,8 +60,7 @@ class Renderer:
     def name(self) -> str:
         """What draws, as OpenGL names it: device or software, and driver. Another one draws other pictures.
 
-        llvmpipe compiles for the processor. The last bits of some instructions are the vendor's own, so its name holds
-        the vendor.
+        llvmpipe compiles for the processor, so its name holds the processor's vendor.
         """
         self.make_current()
         lookup = importlib.import_module("OpenGL.platform").PLATFORM.getExtensionProcedure
