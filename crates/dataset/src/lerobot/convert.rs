@@ -14,7 +14,7 @@ use super::side::{self, SideEncoder, SideOutput};
 use super::skip;
 use super::staging::Staging;
 use super::v2::OldSet;
-use super::verify::hash_files;
+use super::verify::hash_files_unless;
 use super::videos;
 use super::work::{self, Part};
 use crate::error::{DatasetError, InputError, Result};
@@ -25,6 +25,7 @@ use crate::tree::Demo;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::ControlFlow;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// What a conversion did.
 #[derive(Debug, Clone, PartialEq)]
@@ -79,12 +80,23 @@ pub fn convert_unless(
     if let Some(old) = OldSet::open(source)? {
         return old.convert(out, options, progress);
     }
+    keep_freed_memory();
     let staging = Staging::create(out)?;
-    let opened = Opened::new(source, options, staging.path())?;
-    let head = opened.head(source, options);
+    let stop = AtomicBool::new(false);
     let report = std::thread::scope(|scope| {
-        // the file's hash needs nothing of what the conversion does
-        let hash = scope.spawn(|| hash_files(&opened.input.plan().files));
+        // after a failure nobody waits for the hash of a large file
+        let _stop = StopWhenDropped(&stop);
+        // the hash needs nothing of what the conversion does; most often the source is this one file
+        let whole = source.is_file().then(|| scope.spawn(|| hash_files_unless(&[(source.to_owned(), 0)], &stop)));
+        let opened = Opened::new(source, options, staging.path())?;
+        let hash = match (&opened.input.plan().files[..], whole) {
+            ([(single, _)], Some(whole)) if single == source => whole,
+            (files, _) => {
+                let (files, stop) = (files.to_vec(), &stop);
+                scope.spawn(move || hash_files_unless(&files, stop))
+            }
+        };
+        let head = opened.head(source, options);
         let encoders = Encoders::new(staging.path(), &head)?;
         let rest = opened.rest()?;
         let mut assembly = Assembly::new(staging.path(), &head, &encoders, rest.as_ref())?;
@@ -97,6 +109,22 @@ pub fn convert_unless(
     })?;
     staging.publish()?;
     Ok(report)
+}
+
+struct StopWhenDropped<'a>(&'a AtomicBool);
+
+impl Drop for StopWhenDropped<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Row groups are made and freed one after the other. After a large block has been freed, glibc keeps freed memory of up to
+/// twice its size instead of returning it, and getting it back would cost a page fault for every 4 KiB. Nothing is touched
+/// here, so this takes no memory; other allocators do not mind.
+fn keep_freed_memory() {
+    const LARGEST_THAT_COUNTS: usize = 31 << 20;
+    drop(std::hint::black_box(Vec::<u8>::with_capacity(LARGEST_THAT_COUNTS)));
 }
 
 /// Refuses demonstrations that have no observations, and says how they get them.

@@ -283,24 +283,29 @@ impl Job<'_> {
     /// Calls `take` with every picture of a part: its frame, its file if the source has one, and its pixels.
     fn each_picture(&self, l: &Loaded, stored: Stored<'_>, take: &mut TakePicture<'_>) -> Result<()> {
         let Stored { key, height, width, jpeg } = stored;
-        let (rows, size) = (l.part.rows.clone(), height * width * 3);
-        let array = self.source.read_rows(l.part.episode, key, rows.start, rows.len())?;
-        if jpeg {
-            let expected = format!("a JPEG file of {height} x {width}");
-            let mut pixels = Vec::with_capacity(size);
-            for (frame, bytes) in rows.zip(array.byte_rows().unwrap_or_default()) {
-                let bad = |found| self.bad_picture(l, key, frame, &expected, found);
-                let file = images::jpeg(bytes).ok_or_else(|| bad("other bytes".to_owned()))?;
-                pixels.clear();
-                images::decode(file, height, width, &mut pixels).map_err(bad)?;
-                take(frame, Some(file), &pixels)?;
+        let (size, expected) = (height * width * 3, format!("a JPEG file of {height} x {width}"));
+        let mut pixels = Vec::with_capacity(if jpeg { size } else { 0 });
+        for rows in self.source.windows(l.part.episode, key, l.part.rows.clone()) {
+            let array = self.source.read_rows(l.part.episode, key, rows.start, rows.len())?;
+            if jpeg {
+                for (frame, bytes) in rows.zip(array.byte_rows().unwrap_or_default()) {
+                    let bad = |found| self.bad_picture(l, key, frame, &expected, found);
+                    let file = images::jpeg(bytes).ok_or_else(|| bad("other bytes".to_owned()))?;
+                    pixels.clear();
+                    images::decode(file, height, width, &mut pixels).map_err(bad)?;
+                    take(frame, Some(file), &pixels)?;
+                }
+                continue;
             }
-            return Ok(());
+            if array.bytes.len() != size * rows.len() {
+                let wanted = format!("{} images of {height} x {width} x 3", rows.len());
+                return Err(self.wrong_shape(l, key, wanted, &array));
+            }
+            for (frame, picture) in rows.zip(array.bytes.chunks_exact(size)) {
+                take(frame, None, picture)?;
+            }
         }
-        if array.bytes.len() != size * rows.len() {
-            return Err(self.wrong_shape(l, key, format!("{} images of {height} x {width} x 3", rows.len()), &array));
-        }
-        rows.zip(array.bytes.chunks_exact(size)).try_for_each(|(frame, pixels)| take(frame, None, pixels))
+        Ok(())
     }
 
     /// Encodes the pictures of a part as video; the statistics are those of the pictures as they were recorded, as

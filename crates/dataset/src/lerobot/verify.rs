@@ -18,14 +18,22 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// sha256 of a file in hexadecimal.
 pub(crate) fn hash_file(path: &Path) -> Result<String> {
+    hash_file_unless(path, &AtomicBool::new(false))
+}
+
+fn hash_file_unless(path: &Path, stop: &AtomicBool) -> Result<String> {
     let failed = |source| DatasetError::Io { path: path.to_path_buf(), operation: "read it", source };
     let mut file = File::open(path).map_err(failed)?;
     let mut hash = Sha256::new();
     let mut buffer = vec![0; 1 << 18];
     loop {
+        if stop.load(Ordering::Relaxed) {
+            return Err(DatasetError::Stopped { path: path.to_path_buf() });
+        }
         match file.read(&mut buffer).map_err(failed)? {
             0 => return Ok(schema::hex(&hash.finalize())),
             n => hash.update(&buffer[..n]),
@@ -35,8 +43,13 @@ pub(crate) fn hash_file(path: &Path) -> Result<String> {
 
 /// sha256 of a source file; of several, of the lines `<sha256>  <name>`.
 pub(crate) fn hash_files(files: &[(PathBuf, u64)]) -> Result<String> {
+    hash_files_unless(files, &AtomicBool::new(false))
+}
+
+/// [`hash_files`], unless it is stopped meanwhile.
+pub(crate) fn hash_files_unless(files: &[(PathBuf, u64)], stop: &AtomicBool) -> Result<String> {
     let name = |file: &Path| file.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let each = files.iter().map(|(file, _)| Ok((name(file), hash_file(file)?)));
+    let each = files.iter().map(|(file, _)| Ok((name(file), hash_file_unless(file, stop)?)));
     Ok(joint_hash(&each.collect::<Result<Vec<_>>>()?))
 }
 

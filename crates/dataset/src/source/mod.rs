@@ -13,6 +13,7 @@ mod zarr;
 
 use std::collections::BTreeSet;
 use std::fs::File;
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -34,6 +35,8 @@ pub use writer::{RobomimicWriter, WriteOptions};
 const MAX_DEMO: u64 = 512 << 20;
 /// How much is asked of the HDF5 library in one go.
 const WINDOW: u64 = 16 << 20;
+/// How much is read straight from the file at once where it is used in order: it stays in a processor's cache.
+const DIRECT_WINDOW: u64 = 1 << 20;
 
 /// What is done with values that are NaN or infinite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -199,6 +202,18 @@ impl Source {
             self.check_values(&plan.id, key, array, 0)?;
         }
         Ok(demo)
+    }
+
+    /// Rows of one dataset of a demo, cut into windows that are cheap to read one by one: small where the elements lie in
+    /// the file as they are in memory, one window otherwise.
+    pub(crate) fn windows(&self, index: usize, key: &str, rows: Range<usize>) -> impl Iterator<Item = Range<usize>> {
+        let plan = self.plan.demos.get(index).and_then(|demo| demo.keys.get(key));
+        let step = plan.filter(|k| k.place.offset.is_some()).map_or(rows.len(), |k| {
+            let row = k.bytes().unwrap_or(0) / k.shape.first().map_or(1, |&n| n.max(1) as u64);
+            (DIRECT_WINDOW / row.max(1)) as usize
+        });
+        let (end, step) = (rows.end, step.max(1));
+        rows.step_by(step).map(move |at| at..(at + step).min(end))
     }
 
     /// Rows `first .. first + count` of one dataset of a demo.
