@@ -111,15 +111,16 @@ check: build ## the tests of one change, in five minutes: unit tests, the rules 
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --lib
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- architecture:: house:: help:: main_line:: bad_data:: bad_zoo::
 
+# Python's tests run beside Rust's, because neither keeps two cores busy; what they print comes at the end.
 .PHONY: test
 test: build wheel ## every test: Rust, Python and end to end
-	@$(CARGO) test $(CARGO_FLAGS) --workspace
-	@if [ -n "$(BROWSER)$${CI:-}" ]; then \
-	    $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test e2e -- --ignored; \
-	  else echo "not run: the tests of the pages in a browser (no Chromium on the PATH; ACTRM_CHROMIUM names one)"; fi
-	@tools/test_wheel.sh >target/test_wheel.log 2>&1 & harness=0 wheel=0; \
-	    .venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests || harness=$$?; \
-	    wait $$! || wheel=$$?; cat target/test_wheel.log; exit $$((harness | wheel))
+	@tools/test_wheel.sh >target/test_wheel.log 2>&1 & wheel=$$!; \
+	    .venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests >target/test_harness.log 2>&1 & harness=$$!; \
+	    failed=0; $(CARGO) test $(CARGO_FLAGS) --workspace --no-fail-fast || failed=1; \
+	    if [ -n "$(BROWSER)$${CI:-}" ]; then \
+	      $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test e2e -- --ignored || failed=1; \
+	    else echo "not run: the tests of the pages in a browser (no Chromium on the PATH; ACTRM_CHROMIUM names one)"; fi; \
+	    wait $$harness || failed=1; wait $$wheel || failed=1; cat target/test_harness.log target/test_wheel.log; exit $$failed
 
 # With clippy's driver as the workspace's compiler (.ci/run) the build is the lint, and nothing is compiled for it alone.
 CLIPPY := $(if $(RUSTC_WORKSPACE_WRAPPER),build $(CARGO_FLAGS) --workspace --all-targets,clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings)
