@@ -17,6 +17,8 @@ from scipy import stats
 
 ARMS = ("k6", "k6-untied")
 MARGIN = 0.05
+DEMONSTRATIONS = "8b7e7b64"
+"""Fingerprint of the demonstrations that the study collects today; trainings on others do not count (study_plan.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +31,7 @@ class Look:
     equivalence: float
 
 
-# The first look had been made when this plan was written.
+# The first look had been made when this plan was written, on other demonstrations; here it is repeated on these.
 LOOKS = (Look(8, 5, 0.001, 0.0), Look(10, 10, 0.005, 0.01), Look(13, 13, 0.015, 0.02), Look(16, 16, 0.04, 0.04))
 
 
@@ -95,11 +97,16 @@ def table() -> str:
 
 
 def successes(folder: Path, arm: str) -> np.ndarray:
-    """Success of the trainings of an arm in the order of their seeds, up to the first that is missing."""
+    """Success of an arm's trainings on DEMONSTRATIONS in the order of their seeds, up to the first that is missing."""
     shares: list[float] = []
-    while (file := folder / f"{arm}-on-pickchain-seed{len(shares) + 1}_chain.json").exists():
-        episodes = json.loads(file.read_text())["episodes"]
-        shares.append(sum(episode["success"] for episode in episodes) / len(episodes))
+    for seed in range(1, 100):
+        file = folder / f"{arm}-on-pickchain-seed{seed}_chain.json"
+        if not file.exists():
+            break
+        result = json.loads(file.read_text())
+        if result["training"]["data_fingerprint"].startswith(DEMONSTRATIONS):
+            episodes = result["episodes"]
+            shares.append(sum(episode["success"] for episode in episodes) / len(episodes))
     return np.array(shares)
 
 
