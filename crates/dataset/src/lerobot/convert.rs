@@ -104,6 +104,8 @@ pub fn convert_unless(
         opened.each_group((source, options), &head, &encoders, &groups, progress, &mut |output, beside| {
             assembly.take(output, beside)
         })?;
+        // the reading process ends before what all episodes say is put together: they need not be in memory at once
+        drop(opened);
         let hash = hash.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         assembly.finish(hash)
     })?;
@@ -123,8 +125,8 @@ impl Drop for StopWhenDropped<'_> {
 /// twice its size instead of returning it, and getting it back would cost a page fault for every 4 KiB. Nothing is touched
 /// here, so this takes no memory; other allocators do not mind.
 fn keep_freed_memory() {
-    const LARGEST_THAT_COUNTS: usize = 31 << 20;
-    drop(std::hint::black_box(Vec::<u8>::with_capacity(LARGEST_THAT_COUNTS)));
+    const LARGE: usize = 12 << 20;
+    drop(std::hint::black_box(Vec::<u8>::with_capacity(LARGE)));
 }
 
 /// Refuses demonstrations that have no observations, and says how they get them.
