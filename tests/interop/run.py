@@ -31,6 +31,7 @@ import sequential
 import served
 import shards
 import torch
+import vla_eval_client
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -692,6 +693,7 @@ def main() -> None:
             "our entry answers the same in LeRobot": lambda: export_entry(root, folder),
             "LeRobot's policy answers the same in ours": lambda: import_entry(root, folder),
             "LeRobot's policy served has our episodes": lambda: served.compare(folder / "served", ours),
+            "vla-eval's connection gets an entry's actions": lambda: vla_eval_client.compare(BIN / "actrm-zoo"),
             "onnxruntime answers the same as our entries": lambda: export_onnx(root, folder),
             "the Hub's library reads our model cards": lambda: read_by_the_hub(root, folder / "hub"),
             "our entry that sees answers the same in LeRobot": lambda: export_seeing_entry(plain, folder / "seeing"),

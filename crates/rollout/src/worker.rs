@@ -27,6 +27,11 @@ pub struct Observations {
 }
 
 impl Observations {
+    /// Numbers and the bytes of pictures, by key.
+    pub fn new(values: BTreeMap<String, Vec<f64>>, pictures: BTreeMap<String, Vec<u8>>) -> Self {
+        Self { values, pictures }
+    }
+
     /// The numbers of a key.
     pub fn get(&self, key: &str) -> Option<&Vec<f64>> {
         self.values.get(key)

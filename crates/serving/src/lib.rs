@@ -7,6 +7,8 @@
 //! Three keys of an observation belong to the episode, which openpi has no message for: `reset: true` or `seed` begins one,
 //! and `executed` says how many actions of the last chunk were executed, where that is not `n_action_steps`. A policy that
 //! reads several observations gets them with a leading axis, oldest first.
+//!
+//! Under the path `/vla-eval` the server speaks vla-eval's protocol instead, which is asked for an action at every step.
 
 mod client;
 mod codec;
@@ -17,6 +19,7 @@ mod server;
 mod session;
 #[cfg(test)]
 mod tests;
+mod vla_eval;
 
 pub use client::{Facts, RemotePolicy};
 pub use codec::{Array, Dtype, Kind, Value, decode, encode};
@@ -24,3 +27,4 @@ pub use error::{Result, ServingError};
 pub use mapping::{Flip, Item, Mapping};
 pub use server::{Limits, Server};
 pub use session::{Service, Session};
+pub use vla_eval::{PATH as VLA_EVAL_PATH, Shown, Stepper, Steps};

@@ -67,6 +67,18 @@ pub enum Flip {
     Both,
 }
 
+impl Flip {
+    /// The flipped image of these pixels, whose rows have this width.
+    pub(crate) fn of(self, pixels: &[u8], width: usize) -> Vec<u8> {
+        let rows = pixels.chunks_exact(3 * width);
+        match self {
+            Self::Vertical => rows.rev().flatten().copied().collect(),
+            Self::Horizontal => rows.flat_map(|row| row.chunks_exact(3).rev().flatten()).copied().collect(),
+            Self::Both => pixels.chunks_exact(3).rev().flatten().copied().collect(),
+        }
+    }
+}
+
 /// What stands for an episode's instruction in a prompt.
 pub(crate) const INSTRUCTION: &str = "{instruction}";
 
@@ -221,15 +233,7 @@ impl Mapped {
 
     fn drawn(&self, pixels: &[u8]) -> Vec<u8> {
         let (height, width) = (self.spec.shape[0], self.spec.shape[1]);
-        let line = 3 * width;
-        let flipped: Vec<u8> = match self.item.flip {
-            None => pixels.to_vec(),
-            Some(Flip::Vertical) => pixels.chunks_exact(line).rev().flatten().copied().collect(),
-            Some(Flip::Horizontal) => {
-                pixels.chunks_exact(line).flat_map(|row| row.chunks_exact(3).rev().flatten()).copied().collect()
-            }
-            Some(Flip::Both) => pixels.chunks_exact(3).rev().flatten().copied().collect(),
-        };
+        let flipped = self.item.flip.map_or_else(|| pixels.to_vec(), |flip| flip.of(pixels, width));
         match self.item.size {
             Some(size) => resize_with_pad(&flipped, height, width, size),
             None => flipped,

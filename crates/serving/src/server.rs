@@ -1,4 +1,4 @@
-//! openpi's protocol, as a server: a thread a client, health and metrics on the same port.
+//! openpi's and vla-eval's protocol, as a server: a thread a client, health and metrics on the same port.
 
 use std::collections::BTreeMap;
 use std::io::{self, ErrorKind, Read, Write};
@@ -19,6 +19,7 @@ use tungstenite::{Message, WebSocket};
 use crate::codec::encode;
 use crate::error::{Result, ServingError};
 use crate::session::{Service, Session};
+use crate::vla_eval;
 
 /// What a server takes at most.
 #[derive(Debug, Clone, Copy)]
@@ -163,6 +164,24 @@ impl Drop for Client<'_> {
     }
 }
 
+/// What a client speaks.
+enum Talk<'a> {
+    /// openpi's: a chunk for every query
+    Chunks(Session<'a>),
+    /// vla-eval's: an action for every step
+    Steps(vla_eval::Session<'a>),
+}
+
+impl Talk<'_> {
+    /// The message that says what is wrong with the client's message `seq`.
+    fn error(&self, text: &str, seq: i128) -> Message {
+        match self {
+            Self::Chunks(_) => Message::text(text.to_owned()),
+            Self::Steps(_) => Message::binary(vla_eval::error(text.to_owned(), seq)),
+        }
+    }
+}
+
 /// The head of a request, as far as it matters.
 struct Request {
     path: String,
@@ -223,6 +242,11 @@ impl Shared {
             let text = "expected a WebSocket, or GET /healthz or /metrics\n";
             return answer(&mut stream, "426 Upgrade Required", text);
         };
+        let mut talk = match (request.path == vla_eval::PATH, &self.service.steps) {
+            (false, _) => Talk::Chunks(Session::new(&self.service)),
+            (true, Some(steps)) => Talk::Steps(vla_eval::Session::new(steps)),
+            (true, None) => return answer(&mut stream, "404 Not Found", "expected a policy that vla-eval can ask\n"),
+        };
         let count = self.clients.fetch_add(1, Ordering::SeqCst);
         let _client = Client(&self.clients);
         if count >= self.limits.clients as u64 {
@@ -239,7 +263,8 @@ impl Shared {
             .max_message_size(Some(self.limits.message))
             .max_frame_size(Some(self.limits.message));
         // what closes it is no matter of the server's
-        let _ = self.talk(&mut WebSocket::from_partially_read(stream, request.rest, Role::Server, Some(config)));
+        let mut socket = WebSocket::from_partially_read(stream, request.rest, Role::Server, Some(config));
+        let _ = self.talk(&mut socket, &mut talk);
         Ok(())
     }
 
@@ -260,15 +285,18 @@ impl Shared {
         }
     }
 
-    fn talk(&self, socket: &mut WebSocket<TcpStream>) -> tungstenite::Result<()> {
+    fn talk<'a>(&'a self, socket: &mut WebSocket<TcpStream>, talk: &mut Talk<'a>) -> tungstenite::Result<()> {
         use tungstenite::Error;
-        socket.send(Message::binary(self.metadata.clone()))?;
-        let mut session = Session::new(&self.service);
+        if let Talk::Chunks(_) = talk {
+            socket.send(Message::binary(self.metadata.clone()))?;
+        }
         loop {
             let answer = match socket.read() {
-                Ok(Message::Binary(message)) => self.query(&mut session, &message),
+                Ok(Message::Binary(message)) => self.query(talk, &message),
                 Ok(Message::Text(_)) => {
-                    Err(ServingError::message("message", "a binary one (MessagePack)", "a text").to_string())
+                    self.errors.fetch_add(1, Ordering::Relaxed);
+                    let error = ServingError::message("message", "a binary one (MessagePack)", "a text");
+                    Some(talk.error(&error.to_string(), 0))
                 }
                 Ok(_) => continue,
                 Err(Error::Io(error)) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
@@ -282,7 +310,7 @@ impl Shared {
                         other => other.to_string(),
                     };
                     let error = ServingError::message("message", expected, found).to_string();
-                    socket.send(Message::text(error.clone()))?;
+                    socket.send(talk.error(&error, 0))?;
                     let reason = "message too big".into();
                     socket.close(Some(CloseFrame { code: CloseCode::Size, reason }))?;
                     drain(socket.get_mut());
@@ -290,30 +318,35 @@ impl Shared {
                 }
                 Err(error) => return Err(error),
             };
-            socket.send(match answer {
-                Ok(answer) => Message::binary(answer),
-                Err(error) => {
-                    self.errors.fetch_add(1, Ordering::Relaxed);
-                    Message::text(error)
-                }
-            })?;
+            if let Some(answer) = answer {
+                socket.send(answer)?;
+            }
         }
     }
 
-    /// The answer to an observation, or the error in one line.
-    fn query<'a>(&'a self, session: &mut Session<'a>, message: &[u8]) -> std::result::Result<Vec<u8>, String> {
+    /// The answer to a message, where it asks for one; an error is one line.
+    fn query<'a>(&'a self, talk: &mut Talk<'a>, message: &[u8]) -> Option<Message> {
         let begun = Instant::now();
-        let answer = catch_unwind(AssertUnwindSafe(|| session.answer(message)));
+        let answered = catch_unwind(AssertUnwindSafe(|| match talk {
+            Talk::Chunks(session) => session.answer(message).map(Some).map_err(|error| (error, 0)),
+            Talk::Steps(session) => session.answer(message),
+        }));
         let microseconds = u64::try_from(begun.elapsed().as_micros()).unwrap_or(u64::MAX);
         self.microseconds.fetch_add(microseconds, Ordering::Relaxed);
         self.queries.fetch_add(1, Ordering::Relaxed);
-        match answer {
-            Ok(answer) => answer.map_err(|error| error.to_string().replace(['\n', '\r'], " ")),
+        let (error, seq) = match answered {
+            Ok(Ok(answer)) => return answer.map(Message::binary),
+            Ok(Err((error, seq))) => (error.to_string().replace(['\n', '\r'], " "), seq),
             Err(_) => {
-                *session = Session::new(&self.service);
-                Err("policy: it failed on this observation, and its episode was ended".to_owned())
+                *talk = match talk {
+                    Talk::Chunks(_) => Talk::Chunks(Session::new(&self.service)),
+                    Talk::Steps(session) => Talk::Steps(session.anew()),
+                };
+                ("policy: it failed on this observation, and its episode was ended".to_owned(), 0)
             }
-        }
+        };
+        self.errors.fetch_add(1, Ordering::Relaxed);
+        Some(talk.error(&error, seq))
     }
 
     /// For Prometheus.

@@ -6,6 +6,7 @@ use models::{FeatureKind, FeatureSpec, Observation, Policy, Signature, Values};
 
 use crate::codec::{Array, Value, decode, encode, shown};
 use crate::error::{Result, ServingError};
+use crate::vla_eval::Steps;
 
 /// Keys of an observation that belong to no feature.
 pub(crate) const RESET: &str = "reset";
@@ -26,6 +27,8 @@ pub struct Service {
     pub facts: Vec<(String, Value<'static>)>,
     /// Makes the policy of one client; weights are shared behind it.
     pub policy: Box<dyn Fn() -> Box<dyn Policy> + Send + Sync>,
+    /// The same, asked at every step: for vla-eval.
+    pub steps: Option<Steps>,
 }
 
 impl Service {

@@ -66,7 +66,7 @@ fn signature(n_obs_steps: usize) -> Signature {
 fn service(n_obs_steps: usize) -> Service {
     let policy = Box::new(|| Box::<Tells>::default() as Box<dyn Policy>);
     let facts = vec![("entry".to_owned(), Value::text("tells@1"))];
-    Service { signature: signature(n_obs_steps), action_horizon: 3, n_action_steps: 2, facts, policy }
+    Service { signature: signature(n_obs_steps), action_horizon: 3, n_action_steps: 2, facts, policy, steps: None }
 }
 
 /// A server on a thread, which ends with this.

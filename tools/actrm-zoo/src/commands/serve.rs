@@ -2,17 +2,20 @@ use std::process::ExitCode;
 
 use anyhow::bail;
 use cli::Stop;
+use models::FeatureKind;
+use rollout::{Agent, Observations};
 use serde_json::Value as Json;
-use serving::{Limits, Server, Service, Value};
+use serving::{Limits, Server, Service, Shown, Stepper, Steps, VLA_EVAL_PATH, Value};
 use zoo::entry::LoadedEntry;
+use zoo::evaluation::PolicyAgent;
 
 use crate::places::{ZooArgs, entry_names};
 
 /// Serve an entry to robots and scripts: openpi's protocol, for `openpi-client` and others
 ///
 /// Clients send observations with the entry's features under LeRobot's names, and get chunks of actions in the units of the
-/// data. The first message describes the policy. Each client has an episode of its own. `GET /healthz` and `GET /metrics` are
-/// on the same port. Ctrl-C ends it.
+/// data. The first message describes the policy. Each client has an episode of its own. Under `/vla-eval` the protocol is that
+/// of vla-eval, which evaluates entries for LIBERO. `GET /healthz` and `GET /metrics` are on the same port. Ctrl-C ends it.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo serve lift-act
@@ -43,7 +46,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let stop = Stop::install("stopped")?;
     let server = Server::bind(&args.host, args.port, args.token.clone(), service(loaded), Limits::default())?;
-    cli::print(&format!("{id} on ws://{}\n", server.address()))?;
+    let address = server.address();
+    cli::print(&format!("{id} on ws://{address}\nfor vla-eval: ws://{address}{VLA_EVAL_PATH}\n"))?;
     server.run(&|| stop.asked());
     let queries = server.queries();
     cli::note(&format!("stopped after {queries} {}", if queries == 1 { "query" } else { "queries" }));
@@ -90,7 +94,60 @@ fn service(loaded: LoadedEntry) -> Service {
         action_horizon,
         n_action_steps,
         facts: facts.into_iter().map(|(key, value)| (key.to_owned(), value)).collect(),
+        steps: Some(steps(loaded.clone())),
         policy: Box::new(move || loaded.policy()),
+    }
+}
+
+/// The entry's policy, asked at every step in the simulator's terms.
+fn steps(loaded: LoadedEntry) -> Steps {
+    let meta = loaded.entry().meta();
+    let (mut numbers, mut images) = (Vec::new(), Vec::new());
+    for spec in &meta.signature.observation {
+        let items = meta.keys.items(&spec.name);
+        for key in items.iter().flat_map(|item| item.keys()).map(str::to_owned) {
+            match (spec.kind, spec.shape.as_slice()) {
+                (FeatureKind::Image, &[height, width, _]) => images.push((key, height, width)),
+                _ => {
+                    // as many numbers as make the feature's width, if the other keys have those of the robot
+                    let width_of =
+                        |count| items.iter().map(|item| item.width(robot(&key, count))).sum::<Result<usize, _>>();
+                    let count = (1..=spec.width()).find(|count| width_of(*count) == Ok(spec.width()));
+                    numbers.push((key, count));
+                }
+            }
+        }
+    }
+    let name = meta.id().to_string();
+    let agent = move || match loaded.subject().agent() {
+        Ok((agent, _)) => Ok(Box::new(Acting(agent)) as Box<dyn Stepper>),
+        Err(error) => Err(error.to_string()),
+    };
+    Steps { name, numbers, images, policy: Box::new(agent) }
+}
+
+/// How many numbers keys of the robot have; `count` for `key`.
+fn robot(key: &str, count: usize) -> impl Fn(&str) -> Option<usize> {
+    move |other| match other {
+        _ if other == key => Some(count),
+        "robot0_eef_pos" => Some(3),
+        "robot0_eef_quat" => Some(4),
+        "robot0_gripper_qpos" => Some(2),
+        _ => None,
+    }
+}
+
+/// An agent that a server asks.
+struct Acting(PolicyAgent);
+
+impl Stepper for Acting {
+    fn begin(&mut self, seed: u64, instruction: Option<&str>) {
+        self.0.reset(seed);
+        self.0.instruct(instruction);
+    }
+
+    fn act(&mut self, shown: Shown) -> Result<Vec<f32>, String> {
+        self.0.act(&Observations::new(shown.numbers, shown.images)).map_err(|error| error.to_string())
     }
 }
 
