@@ -118,6 +118,22 @@ def test_the_instruction_of_a_perturbed_task_is_the_problems(libero: Path) -> No
     assert client.close() == 0
 
 
+def test_a_perturbed_task_counts_as_the_one_that_it_asks_for(libero: Path) -> None:
+    """Suites list tasks in other orders, ask for others, or word them anew; one that LIBERO lacks counts as none."""
+    script = """
+from actrm_harness.simulators.libero import suite
+suite.prepare()
+for task in ("object_with_mug/1", "object_task/0", "object_lan/3", "object_object/4", "spatial_task/1", "object/7"):
+    files = suite.files(f"libero_{task}")
+    print(files.meant, files.tasks)
+"""
+    command = [str(libero), "-c", script]
+    said = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": str(HERE.parent)}, stdout=subprocess.PIPE, check=True
+    )
+    assert said.stdout.decode().splitlines()[-6:] == ["3 10", "1 10", "3 10", "4 10", "None 10", "7 10"]
+
+
 def test_the_goal_has_the_same_names_in_every_task(cabinet: Client) -> None:
     """Here the target is the bowl, which LIBERO observes by its name, and the goal a place in the cabinet."""
     _, seen = cabinet.ask("reset", seed=0)

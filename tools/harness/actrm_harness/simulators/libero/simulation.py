@@ -221,7 +221,8 @@ class Libero:
                 said[f"{name}{where}_pos"] = np.asarray(position, dtype=np.float64)
                 said[f"{name}{where}_quat"] = np.asarray(quaternion, dtype=np.float64)
         onehot = np.zeros(self.files.tasks)
-        onehot[self.files.number] = 1.0
+        if self.files.meant is not None:
+            onehot[self.files.meant] = 1.0
         return said | {"task_onehot": onehot}
 
     def env_args(self) -> dict[str, Any]:

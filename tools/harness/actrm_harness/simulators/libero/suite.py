@@ -44,7 +44,9 @@ class Files:
     initial: Array
     """The fixed initial states, one a row."""
     tasks: int
-    """How many tasks the suite has."""
+    """How many tasks `meant` counts."""
+    meant: int | None
+    """Which of the tasks of LIBERO's own suite it is: LIBERO-PRO lists them in another order, or asks for others."""
 
 
 def check_versions() -> None:
@@ -146,4 +148,29 @@ def files(task: str) -> Files:
         raise RequestError("missing_assets", f"{task}: {states} holds no initial state")
     # LIBERO-PRO changes the instruction in the problem, not in the file's name, and its runner takes it from there
     language = str(row.language) if name in STANDARD else None
-    return Files(name, int(number), language, problem, first, count)
+    own = next((own for own in STANDARD if name.startswith(f"{own}_")), None)
+    if own is None:
+        return Files(name, int(number), language, problem, first, count, int(number))
+    instruction, goal = asked(problem)
+    others = problems(own)
+    same = [at for at, other in enumerate(others) if asked(other)[0] == instruction]
+    # another wording of the same task
+    same += [at for at, other in enumerate(others) if other.name == problem.name and asked(other)[1] == goal]
+    return Files(name, int(number), language, problem, first, len(others), next(iter(same), None))
+
+
+@cache
+def asked(problem: Path) -> tuple[str, str]:
+    """A problem's instruction, in small letters, and its goal."""
+    parsed = importlib.import_module("libero.libero.envs.bddl_utils").robosuite_parse_problem(str(problem))
+    words = cast("list[str]", parsed["language_instruction"])
+    return " ".join(words).lower(), str(parsed["goal_state"])
+
+
+@cache
+def problems(name: str) -> list[Path]:
+    """The problems of a suite, in the order of its tasks."""
+    folder = Path(os.path.normpath(importlib.import_module("libero.libero").get_libero_path("bddl_files")))
+    found = benchmark(name)
+    rows = [found.get_task(number) for number in range(int(found.get_num_tasks()))]
+    return [folder / row.problem_folder / row.bddl_file for row in rows]
