@@ -140,7 +140,7 @@ Measured beside LeRobot and robomimic by `make bench`: [data sets](speed_data.md
 ## More
 
 [LeRobot's and robomimic's own trainers](references.md) · [further tasks](further_tasks.md) · [towers](towers.md) · [the square nut](recovery_demonstrations.md) ·
-[mixed skill](mixed_skill.md) · [two modes](pillar.md) · [memory](goal_memory.md) · [puzzles](puzzles.md)
+[mixed skill](mixed_skill.md) · [two modes](pillar.md) · [memory](goal_memory.md) · [puzzles](puzzles.md) · [LIBERO](libero.md)
 ",
         chain("k1"),
         chain("k6"),

@@ -25,6 +25,9 @@ const CAMERAS: [(&str, &str); 2] = [("agentview", "agentview_image"), ("wrist", 
 const STATE: [&str; 3] = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"];
 /// Its key of the task: 1 at the task's number.
 const TASK: &str = "task_onehot";
+/// Suites whose tasks have the numbers that they have in LIBERO: its own, and LIBERO-PRO's of these endings.
+const SUITES: [&str; 5] = ["libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90"];
+const ENDINGS: [&str; 4] = ["", "_swap", "_object", "_lan"];
 
 /// What is shown at a step, under the simulator's names.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -63,6 +66,7 @@ pub struct Steps {
 pub(crate) struct Session<'a> {
     steps: &'a Steps,
     policy: Option<Box<dyn Stepper>>,
+    suite: String,
     task: usize,
 }
 
@@ -109,7 +113,7 @@ pub(crate) fn error(text: String, seq: i128) -> Vec<u8> {
 
 impl<'a> Session<'a> {
     pub fn new(steps: &'a Steps) -> Self {
-        Self { steps, policy: None, task: 0 }
+        Self { steps, policy: None, suite: String::new(), task: 0 }
     }
 
     /// Another one, without an episode.
@@ -162,13 +166,14 @@ impl<'a> Session<'a> {
     fn begin(&mut self, payload: &Value<'_>) -> Result<()> {
         let task = payload.get("task");
         let number = |key: &str| task.and_then(|task| task.get(key)).and_then(Value::count).unwrap_or(0);
-        let instruction = match task.and_then(|task| task.get("name")) {
-            Some(Value::Text(name)) => Some(name.as_ref()),
+        let text = |key: &str| match task.and_then(|task| task.get(key)) {
+            Some(Value::Text(text)) => Some(text.as_ref()),
             _ => None,
         };
+        self.suite = text("suite").unwrap_or_default().to_owned();
         self.task = usize::try_from(number("task_id")).unwrap_or(usize::MAX);
         let mut policy = self.policy()?;
-        policy.begin(number("episode_idx"), instruction);
+        policy.begin(number("episode_idx"), text("name"));
         self.policy = Some(policy);
         Ok(())
     }
@@ -200,6 +205,12 @@ impl<'a> Session<'a> {
 
     fn numbers(&self, payload: &Value<'_>, key: &str, count: Option<usize>) -> Result<Vec<f64>> {
         if key == TASK {
+            let numbered = |ending| SUITES.iter().any(|suite| self.suite.strip_suffix(ending) == Some(suite));
+            if !ENDINGS.into_iter().any(numbered) {
+                let suites = format!("one of {}, or of these with {}", SUITES.join(", "), ENDINGS[1..].join(", "));
+                let expected = format!("a suite that numbers tasks as LIBERO does, {suites}");
+                return Err(ServingError::message("suite", expected, shown(&self.suite)));
+            }
             let Some(tasks) = count.filter(|tasks| self.task < *tasks) else {
                 let expected = format!("below {}, the tasks that the policy knows", count.unwrap_or(0));
                 return Err(ServingError::message("task_id", expected, self.task.to_string()));
@@ -431,6 +442,9 @@ mod tests {
         }
         steps.numbers[0].1 = Some(2);
         assert!(failed(&steps, &messages[1..3]).starts_with("3 task_id: expected below 2, the tasks"));
+        let other = Value::map([("task", Value::map([("suite", Value::text("libero_object_with_mug"))]))]);
+        let other = one("episode_start", other);
+        assert!(failed(&steps, &[&other, messages[2]]).starts_with("3 suite: expected a suite that numbers tasks as"));
         steps.numbers[0].0 = "target_pos".to_owned();
         assert!(failed(&steps, &messages[1..3]).starts_with("3 target_pos: expected a policy that reads no more than"));
     }
