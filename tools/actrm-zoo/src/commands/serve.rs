@@ -119,9 +119,10 @@ fn steps(loaded: LoadedEntry) -> Steps {
         }
     }
     let name = meta.id().to_string();
-    let agent = move || match loaded.subject().agent() {
-        Ok((agent, _)) => Ok(Box::new(Acting(agent)) as Box<dyn Stepper>),
-        Err(error) => Err(error.to_string()),
+    let agent = move || {
+        let subject = loaded.subject();
+        let agent = (subject.policy)().and_then(|policy| subject.acting(policy)).map_err(|error| error.to_string())?;
+        Ok(Box::new(Acting(agent)) as Box<dyn Stepper>)
     };
     Steps { name, numbers, images, policy: Box::new(agent) }
 }
