@@ -227,8 +227,11 @@ impl<'a> Session<'a> {
             return Err(ServingError::message("states", wanted, format!("no such key in {payload}")));
         };
         let state: Vec<f64> = state.numbers().into_iter().map(f64::from).collect();
-        if state.len() != 8 || state.iter().any(|number| !number.is_finite()) {
-            return Err(ServingError::message("states", wanted, format!("{state:?}")));
+        if state.len() != 8 {
+            return Err(ServingError::message("states", wanted, format!("{} numbers", state.len())));
+        }
+        if let Some(other) = state.iter().find(|number| !number.is_finite()) {
+            return Err(ServingError::message("states", wanted, other.to_string()));
         }
         Ok(match part {
             0 => state[..3].to_vec(),
