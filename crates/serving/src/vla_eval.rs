@@ -186,6 +186,18 @@ impl<'a> Session<'a> {
     }
 
     fn act(&mut self, payload: &Value<'_>) -> Result<Vec<f32>> {
+        let all = self.shown(payload);
+        let Some(policy) = &mut self.policy else {
+            return Err(ServingError::message("type", "episode_start before the first observation", "none"));
+        };
+        let action = policy.act(all?).map_err(|reason| ServingError::message("action", "one", reason))?;
+        match action.iter().find(|number| !number.is_finite()) {
+            Some(other) => Err(ServingError::message("actions", "finite numbers from the policy", other.to_string())),
+            None => Ok(action),
+        }
+    }
+
+    fn shown(&self, payload: &Value<'_>) -> Result<Shown> {
         let mut all = Shown::default();
         for (key, height, width) in &self.steps.images {
             all.images.insert(key.clone(), image(payload, key, *height, *width)?);
@@ -193,14 +205,7 @@ impl<'a> Session<'a> {
         for (key, count) in &self.steps.numbers {
             all.numbers.insert(key.clone(), self.numbers(payload, key, *count)?);
         }
-        let Some(policy) = &mut self.policy else {
-            return Err(ServingError::message("type", "episode_start before the first observation", "none"));
-        };
-        let action = policy.act(all).map_err(|reason| ServingError::message("action", "one", reason))?;
-        match action.iter().find(|number| !number.is_finite()) {
-            Some(other) => Err(ServingError::message("actions", "finite numbers from the policy", other.to_string())),
-            None => Ok(action),
-        }
+        Ok(all)
     }
 
     fn numbers(&self, payload: &Value<'_>, key: &str, count: Option<usize>) -> Result<Vec<f64>> {
