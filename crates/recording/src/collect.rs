@@ -14,7 +14,7 @@ use rollout::collection::{Attempt, Collection, CollectionRecord};
 use rollout::{Pool, RunEnd, Skill};
 use serde_json::Value;
 
-use crate::demo::demo;
+use crate::demo::{demo, of_the_file};
 use crate::error::{RecordingError, Result};
 
 /// Share of the demonstrations in the mask `valid`.
@@ -177,6 +177,9 @@ fn write(
         let id = format!("demo_{index}");
         let lost = || RecordingError::LostAttempt { task: task.to_owned(), attempt: attempt.index };
         let episode = collection.get(attempt.index)?.ok_or_else(lost)?;
+        for (name, value) in of_the_file(&episode).filter(|_| index == 0) {
+            writer.set_data_attr(name, &value)?;
+        }
         writer.add_demo(&demo(&id, episode, options.next_obs)?)?;
         ids.push(id);
     }

@@ -7,18 +7,30 @@ use rollout::{FrameTensor, RecordedEpisode};
 
 use crate::error::{RecordingError, Result};
 
+/// Begins the name of an attribute that is not the demo's but the group `data`'s.
+const OF_THE_FILE: &str = "data/";
+
+/// A recorded attribute as HDF5 holds it: a text, or JSON.
+fn attribute(value: &serde_json::Value) -> Array {
+    match value {
+        serde_json::Value::String(text) => Array::from_str(text),
+        other => Array::from_str(&other.to_string()),
+    }
+}
+
+/// What a recorded episode says of all demonstrations of its task: attributes of the group `data`.
+pub(crate) fn of_the_file(episode: &RecordedEpisode) -> impl Iterator<Item = (&str, Array)> {
+    episode.attrs.iter().filter_map(|(name, value)| Some((name.strip_prefix(OF_THE_FILE)?, attribute(value))))
+}
+
 /// A demo in robomimic's layout from what a worker recorded; with or without `next_obs`.
 ///
 /// # Errors
 /// A tensor of a kind that files of demonstrations do not hold.
 pub fn demo(id: &str, episode: RecordedEpisode, next_obs: bool) -> Result<Demo> {
     let mut demo = Demo { id: id.to_owned(), ..Demo::default() };
-    for (name, value) in &episode.attrs {
-        let text = match value {
-            serde_json::Value::String(text) => text.clone(),
-            other => other.to_string(),
-        };
-        demo.attrs.insert(name.clone(), Array::from_str(&text));
+    for (name, value) in episode.attrs.iter().filter(|(name, _)| !name.starts_with(OF_THE_FILE)) {
+        demo.attrs.insert(name.clone(), attribute(value));
     }
     let steps = i64::try_from(episode.steps).expect("an episode has fewer steps than 2^63");
     demo.attrs.insert("num_samples".to_owned(), Array::from_i64(Vec::new(), &[steps]));
@@ -94,5 +106,22 @@ impl Recording {
             states: tensor("states")?,
             actions: tensor("actions")?,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn attributes_of_the_file_are_none_of_the_demos() {
+        let attrs = [("model_file", "<mujoco/>"), ("data/tag", "libero-v1")];
+        let attrs = attrs.map(|(name, text)| (name.to_owned(), serde_json::json!(text))).into();
+        let episode = RecordedEpisode { success: true, steps: 2, attrs, tensors: std::collections::BTreeMap::new() };
+        let said: Vec<_> = of_the_file(&episode).map(|(name, text)| (name.to_owned(), text.to_text())).collect();
+        assert_eq!(said, [("tag".to_owned(), Some("libero-v1".to_owned()))]);
+        let demo = demo("demo_0", episode, false).unwrap();
+        assert_eq!(demo.attrs.keys().collect::<Vec<_>>(), ["model_file", "num_samples"]);
     }
 }

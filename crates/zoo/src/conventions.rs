@@ -64,6 +64,11 @@ pub struct Difference {
 
 /// robosuite's images as our workers draw them.
 const UPRIGHT: &str = "upright";
+/// Those of LIBERO's files, and of the simulator's cameras that are called as there: `agentview_rgb`.
+const UPSIDE_DOWN: &str = "upside down";
+const STORED: &str = "_rgb";
+/// Begins the names of LIBERO's tasks.
+const LIBERO: &str = "libero_";
 /// Likewise: an array (height, width, 3) of red, green and blue.
 const RGB: &str = "RGB, last axis";
 
@@ -195,8 +200,9 @@ impl Conventions {
         {
             all.set("action_range", format!("{low} to {high}"));
         }
-        // our workers turn and order what any simulator draws
-        all.set("image_flip", UPRIGHT);
+        // our workers turn and order what any simulator draws, unless its cameras are named as those of LIBERO's files
+        let opengl = ready.env_args.get("image_convention").is_some_and(|convention| convention == "opengl");
+        all.set("image_flip", if opengl { UPSIDE_DOWN } else { UPRIGHT });
         all.set("image_channels", RGB);
         all
     }
@@ -211,7 +217,8 @@ impl Conventions {
                 all.set("image_size", format!("{height} x {width}"));
             }
             if known && meta.data.is_some() {
-                all.set("image_flip", UPRIGHT);
+                let as_stored = meta.task.starts_with(LIBERO) && image.name.ends_with(STORED);
+                all.set("image_flip", if as_stored { UPSIDE_DOWN } else { UPRIGHT });
                 all.set("image_channels", RGB);
             }
         }

@@ -18,8 +18,8 @@ import numpy as np
 HARNESS = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(HARNESS))
 CAMERAS = ("agentview", "robot0_eye_in_hand")
-ADDED = ("target_", "goal_", "task_onehot")
-"""What begins the names of observations that LIBERO does not have."""
+ADDED = ("target_", "goal_", "task_onehot", "ee_", "gripper_states", "joint_states")
+"""What begins the names of observations that LIBERO's environment does not have."""
 
 
 def actions(steps: int) -> Any:

@@ -273,7 +273,8 @@ def test_a_worker_repeats_an_episode(libero: Path) -> None:
     """With and without cameras, one action at a time or several; seeds beyond the initial states begin again."""
     assert libero.is_file()
     actions = walk(1, 12)
-    blind, seeing = Client("--task", "libero_object/0"), Client("--task", "libero_object/0", "--cameras", "agentview")
+    cameras = ("--cameras", "agentview,agentview_rgb")
+    blind, seeing = Client("--task", "libero_object/0"), Client("--task", "libero_object/0", *cameras)
     ready = seeing.ready
     assert (ready["simulator"], ready["versions"]["libero"], ready["versions"]["robosuite"]) == (
         "libero",
@@ -296,6 +297,8 @@ def test_a_worker_repeats_an_episode(libero: Path) -> None:
     assert first["ep_meta"]["lang"] == "pick up the alphabet soup and place it in the basket"
     assert (first["ep_meta"]["init_state"], other["ep_meta"]["init_state"]) == (7, 8)
     assert seen["obs/agentview_image"].shape == (84, 84, 3)
+    # as LIBERO's files hold it
+    assert np.array_equal(seen["obs/agentview_rgb_image"], seen["obs/agentview_image"][::-1])
     one = {}
     for action in actions:
         _, one = blind.step(action)

@@ -85,6 +85,15 @@ def test_the_expert_shows_a_task_and_repeats_itself(libero: Path) -> None:
     assert shown["states"].shape == (steps, 110) and shown["rewards"][-1] == 1.0 and shown["dones"].sum() >= 10
     assert json.loads(message["attrs"]["ep_meta"])["lang"] == "pick up the cream cheese and place it in the basket"
     assert {"obs/target_pos", "obs/goal_pos", "obs/task_onehot", "obs/cream_cheese_1_pos"} <= set(shown)
+    # and what LIBERO's own files hold
+    said = json.loads(message["attrs"]["data/problem_info"])
+    assert said["language_instruction"].lower() == "pick the cream cheese and place it in the basket"
+    assert message["attrs"]["data/bddl_file_name"].startswith("libero_object/pick_up_the_cream_cheese")
+    assert shown["robot_states"].shape == (steps, 9) and shown["obs/joint_states"].shape == (steps, 7)
+    assert np.array_equal(shown["obs/ee_states"], np.hstack([shown["obs/ee_pos"], shown["obs/ee_ori"]]))
+    assert np.allclose(
+        np.cos(np.linalg.norm(shown["obs/ee_ori"], axis=1) / 2), shown["obs/robot0_eef_quat"][:, 3], atol=1e-9
+    )
     # opens, closes once, opens
     grip = shown["actions"][:, 6]
     assert grip[0] == grip[-1] == -1.0 and (np.diff(grip) != 0).sum() == 2

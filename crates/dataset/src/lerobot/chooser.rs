@@ -7,7 +7,7 @@ use super::info::{ActionKind, ActionProvenance, Feature, RotationForm};
 use super::to_robomimic::{Stated, stated};
 use crate::error::{DatasetError, InputError, Result};
 use crate::keys::KeyItem;
-use crate::plan::{DemoPlan, KeyPlan, Plan};
+use crate::plan::{DemoPlan, Dialect, KeyPlan, Plan};
 use crate::tree::Dtype;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -230,12 +230,10 @@ impl Chooser<'_> {
                 (None, true) if key.shape[3] == 3 => (false, (key.shape[1], key.shape[2])),
                 _ => continue,
             };
-            let camera = name
-                .strip_suffix("_image")
-                .or_else(|| name.strip_suffix("_rgb"))
-                .unwrap_or(name)
-                .trim_start_matches("images/")
-                .replace('/', ".");
+            // LIBERO's `agentview_rgb` is upside down, `agentview_image` of the same simulator is not
+            let colour = if self.plan.dialect == Dialect::Libero { None } else { name.strip_suffix("_rgb") };
+            let camera =
+                name.strip_suffix("_image").or(colour).unwrap_or(name).trim_start_matches("images/").replace('/', ".");
             // two datasets of one camera name keep their full names apart
             let camera = if taken.insert(camera.clone()) { camera } else { name.replace('/', ".") };
             for demo in &self.plan.demos {

@@ -65,6 +65,14 @@ fn libero_has_its_instruction_and_orientation() {
     assert!(plan.notes[0].contains("OpenGL"));
     assert!(plan.problems.is_empty(), "{:?}", plan.problems);
     assert_eq!(source.read_demo(0).unwrap().datasets["obs/agentview_rgb"].bytes[5], 5);
+    // the task's suite is the folder of its problem
+    let (_dir, source) = made(|file| {
+        demo(file, 0, 4);
+        let data = file.group("data").unwrap();
+        text(&data, "bddl_file_name", "/home/me/bddl_files/libero_goal/open.bddl");
+        text(&data, "env_args", r#"{"env_name": "Libero_Tabletop_Manipulation", "type": 1, "env_kwargs": {}}"#);
+    });
+    assert_eq!(source.plan().env_name.as_deref(), Some("libero_goal"));
 }
 
 #[test]

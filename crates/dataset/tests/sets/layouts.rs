@@ -239,6 +239,14 @@ fn a_folder_of_libero_files_is_one_set_of_many_tasks() {
     std::fs::create_dir_all(&suite).unwrap();
     crate::made::libero(&suite.join("open_demo.hdf5"), "open it");
     crate::made::libero(&suite.join("pick_demo.hdf5"), "pick the bowl up");
+    for name in ["open", "pick"] {
+        let file = hdf5::File::open_rw(suite.join(format!("{name}_demo.hdf5"))).unwrap();
+        for (demo, steps) in [(0, 3), (1, 2)] {
+            let seen = file.group(&format!("data/demo_{demo}/obs")).unwrap().new_dataset::<u8>();
+            let seen = seen.shape([steps, 2, 2, 3]).create("eye_in_hand_rgb").unwrap();
+            seen.write_raw(&vec![7_u8; steps * 12]).unwrap();
+        }
+    }
     let (set, report) = converted(&dir.path().join("libero"), &out);
     assert_eq!(report.tasks, ["open it", "pick the bowl up"]);
     let tasks: Vec<_> = set.episodes().iter().map(|e| e.tasks[0].as_str()).collect();
@@ -250,6 +258,8 @@ fn a_folder_of_libero_files_is_one_set_of_many_tasks() {
         "{:?}",
         report.notes
     );
+    // upside down, so it keeps its name
+    assert!(set.info().features.0.iter().any(|(name, _)| name == "observation.images.eye_in_hand_rgb"));
     // what the files agree in, and no task of one of them
     let env = set.provenance().unwrap().env_args.clone().unwrap();
     assert_eq!((env.get("bddl_file"), &env["env_kwargs"]["x"]), (None, &serde_json::json!(1)));

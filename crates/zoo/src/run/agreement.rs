@@ -46,7 +46,9 @@ pub(super) fn agree(dataset: &Dataset, path: &Path, experiment: &Experiment, for
         false => Err(unfit(format!("{reason}; {remedy}"))),
     };
     let task = &experiment.task.name;
-    if let Some(recorded) = recorded_task(dataset).filter(|recorded| recorded != task) {
+    // LIBERO's files say which suite, which is all that `SUITE/NUMBER` and they have to share
+    let other = |recorded: &String| recorded != task && task.split_once('/').is_none_or(|(suite, _)| suite != recorded);
+    if let Some(recorded) = recorded_task(dataset).filter(other) {
         let reason = format!("demonstrations of {recorded}, but the experiment's task is {task}");
         let remedy = format!("train with task.name={recorded}, with demonstrations of {task}, or with --force");
         doubt(&mut agreed.notes, reason, &remedy)?;

@@ -54,7 +54,26 @@ fn locate_from(path: &Path, roots: &[PathBuf]) -> Result<PathBuf, ZooError> {
     Err(ZooError::DataNotFound { path: path.to_owned(), tried })
 }
 
-/// Opens a LeRobotDataset folder, or converts an HDF5 file into the run's folder and opens that; with what the conversion noted.
+/// Whether `path` is a data set: anything else is recordings, in a file or in a folder of files, that are converted first.
+pub(super) fn is_set(path: &Path) -> bool {
+    path.is_dir() && path.join("meta").exists()
+}
+
+/// Begins the hash of recordings.
+///
+/// # Errors
+/// Files that cannot be read.
+pub(super) fn short_hash(path: &Path) -> Result<String, ZooError> {
+    let mut hash = match path.is_dir() {
+        true => dataset::source_hash(path)
+            .map_err(|source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) })?,
+        false => crate::sha256_file(path)?,
+    };
+    hash.truncate(8);
+    Ok(hash)
+}
+
+/// Opens a LeRobotDataset folder, or converts recordings into the run's folder and opens that; with what the conversion noted.
 ///
 /// # Errors
 /// What `dataset` refuses.
@@ -69,7 +88,7 @@ pub(super) fn open(
             Dataset::open(&folder).map_err(|source| ZooError::Dataset { path: folder, source: Box::new(source) })?;
         Ok((dataset, Vec::new()))
     };
-    if path.is_dir() {
+    if is_set(path) {
         return opened(path.to_owned());
     }
     let folder = run.join(CONVERTED);
@@ -104,7 +123,7 @@ pub(super) fn open(
     Ok((opened(folder)?.0, converted.notes))
 }
 
-/// Whether an HDF5 file, for a task that no simulator has, lacks the keys that experiments have by default.
+/// Whether recordings, for a task that no simulator has, lack the keys that experiments have by default.
 fn lacks_usual_keys(path: &Path, experiment: &Experiment) -> bool {
     let (data, usual) = (&experiment.data, DataSection::default());
     if !takes_keys(experiment) || data.state_keys != usual.state_keys {
@@ -115,7 +134,7 @@ fn lacks_usual_keys(path: &Path, experiment: &Experiment) -> bool {
     usual.state_keys.iter().any(|key| !demo.keys.contains_key(&format!("obs/{key}")))
 }
 
-/// The data set that a training of `experiment` on `path` reads, and its folder: `path` itself, or what an HDF5 file is
+/// The data set that a training of `experiment` on `path` reads, and its folder: `path` itself, or what recordings are
 /// converted to, below `work`.
 ///
 /// # Errors
@@ -127,12 +146,12 @@ pub fn demonstrations(
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<(PathBuf, Dataset), ZooError> {
     let path = locate(path)?;
-    if path.is_dir() {
+    if is_set(&path) {
         let (dataset, _) = open(&path, work, experiment, progress)?;
         return Ok((path, dataset));
     }
     // a folder for each file: another one may be tried in the same place
-    let folder = work.join(format!("demonstrations-{}", &crate::sha256_file(&path)?[..8]));
+    let folder = work.join(format!("demonstrations-{}", short_hash(&path)?));
     std::fs::create_dir_all(&folder).map_err(ZooError::io("create folder", &folder))?;
     let (dataset, _) = open(&path, &folder, experiment, progress)?;
     Ok((folder.join(CONVERTED), dataset))
@@ -413,6 +432,16 @@ fn tensors(statistics: &BTreeMap<String, FeatureStats>) -> candle_core::Result<B
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+
+    #[test]
+    fn a_folder_without_meta_holds_recordings() {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::write(root.path().join("a_demo.hdf5"), "").unwrap();
+        assert!(!is_set(root.path()) && !is_set(&root.path().join("a_demo.hdf5")));
+        assert_eq!(short_hash(&root.path().join("a_demo.hdf5")).unwrap(), "e3b0c442", "SHA-256 of nothing");
+        std::fs::create_dir(root.path().join("meta")).unwrap();
+        assert!(is_set(root.path()));
+    }
 
     #[test]
     fn data_is_found_above_and_every_place_is_named() {

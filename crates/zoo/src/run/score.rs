@@ -187,5 +187,5 @@ fn observation(batch: &WindowBatch, window: usize, step: usize) -> Observation {
 /// A file that cannot be read.
 pub fn score_folder(work: &Path, data: &Path) -> Result<PathBuf, ZooError> {
     let data = data::locate(data)?;
-    Ok(if data.is_dir() { work.to_owned() } else { work.join(&crate::sha256_file(&data)?[..8]) })
+    Ok(if data::is_set(&data) { work.to_owned() } else { work.join(data::short_hash(&data)?) })
 }

@@ -100,6 +100,10 @@ class Stepped:
     """Which share of its way the episode has come, 1 where the task is solved; where stages are known."""
 
 
+OF_THE_FILE = "data/"
+"""Begins the name of an attribute that is not the demo's but the group `data`'s."""
+
+
 @dataclass(frozen=True, slots=True)
 class Episode:
     """One recorded episode and the attributes of its demo."""

@@ -31,18 +31,34 @@ impl Layout for Libero {
             let file = demo.home.as_ref().map_or(0, |(file, _)| *file);
             demo.plan.task = demo.plan.task.take().or_else(|| instructions[file].clone());
         }
+        let suites: Vec<Option<String>> = survey.files.iter().map(suite).collect();
+        if let [Some(suite), others @ ..] = suites.as_slice()
+            && others.iter().all(|other| other.as_ref() == Some(suite))
+            && !draft.env_name.as_ref().is_some_and(|name| name.starts_with(suite))
+        {
+            // LIBERO says how its scene is made: `Libero_Floor_Manipulation`
+            draft.env_name = Some(suite.clone());
+        }
         if draft.env_name.is_none() {
             draft.env_name = draft.texts.get("data/env_name").cloned();
         }
         if draft.demos.iter().any(|d| d.plan.keys.values().any(|k| k.is_image())) {
             draft.notes.push(
                 "images are kept as stored: in the simulator's OpenGL orientation, upside down \
-                 against robomimic's"
+                 against robomimic's; cameras keep their names (agentview_rgb), and the simulator's of these names \
+                 give such images"
                     .to_owned(),
             );
         }
         Ok(draft)
     }
+}
+
+/// The suite of a file's task: the folder that its problem is in.
+fn suite(file: &Walked) -> Option<String> {
+    let problem = family::data_attr(file, "bddl_file_name")?;
+    let (folder, _) = problem.rsplit_once('/')?;
+    Some(folder.rsplit('/').next().unwrap_or(folder).to_owned()).filter(|suite| !suite.is_empty())
 }
 
 /// What a file's robot is told to do.

@@ -185,6 +185,12 @@ fn ragged(survey: &Survey, out: &mut Draft) {
             }
         }
     }
+    // the files of a suite are of tasks with other things each
+    let of_files = |key: &str, has: bool| -> BTreeSet<usize> {
+        let demos = out.demos.iter().filter(|demo| demo.plan.keys.contains_key(key) == has);
+        demos.filter_map(|demo| Some(demo.home.as_ref()?.0)).collect()
+    };
+    let of_tasks = |key: &str| out.dialect == Dialect::Libero && of_files(key, true).is_disjoint(&of_files(key, false));
     // actions, rewards and dones have been asked for already
     let family = !out.dialect.is_a_recording();
     let asked = |key: &str| family && matches!(key, "actions" | "rewards" | "dones");
@@ -192,7 +198,7 @@ fn ragged(survey: &Survey, out: &mut Draft) {
     let (mut notes, mut missing) = (Vec::new(), Vec::new());
     for (key, count) in some {
         let lacking = || demos.iter().enumerate().filter(|(_, plan)| !plan.keys.contains_key(key));
-        if !per_step(key) {
+        if !per_step(key) || of_tasks(key) {
             let without = list(lacking().map(|(_, plan)| plan.id.as_str()));
             notes.push(format!("{key} is in {count} of {} demos, not in {without}", demos.len()));
             continue;

@@ -89,8 +89,10 @@ class Family:
 
     def expert(self, seed: int, demonstration: bool, expert: str | None = None, skill: str | None = None) -> Episode:
         """One whole episode of the scripted expert of the seed's task."""
+        from actrm_harness.simulators.libero.expert_episode import expert_episode
+
         one = self.task(seed % self.tasks)
-        return self.shortened(one.expert(seed // self.tasks, demonstration, expert, skill))
+        return self.shortened(expert_episode(one, seed // self.tasks, demonstration, expert, skill))
 
     def extract(self, stored: Stored) -> Episode:
         """What the states of a demonstration look like, of the task that it names."""

@@ -22,7 +22,7 @@ import numpy as np
 
 from actrm_harness.protocol import RequestError
 from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped, Stored, packages, verdict
-from actrm_harness.simulators.libero import suite
+from actrm_harness.simulators.libero import stored, suite
 from actrm_harness.simulators.libero.control import Loop, attach
 from actrm_harness.simulators.robosuite import envs
 from actrm_harness.simulators.robosuite.render import Renderer
@@ -40,7 +40,7 @@ JOINT_NOISE = 0.02
 """Standard deviation of the robot's joints in drawn initial states, in radians, as in LIBERO's fixed ones."""
 NO_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
-COMMON = ("robot0_", "target_", "goal_", "task_onehot")
+COMMON = ("robot0_", "target_", "goal_", "task_onehot", *stored.NAMES)
 """What begins the names of observations that all tasks have."""
 
 Pose = tuple[Array, Array]
@@ -99,8 +99,9 @@ class Libero:
             simulation.compare(options.env_args)
         known = simulation.control.sim.model.camera_names
         for camera in options.cameras:
-            if camera not in known:
-                raise RequestError("unknown_camera", f"unknown camera {camera!r}; known: {', '.join(sorted(known))}")
+            if stored.camera(camera) not in known:
+                text = f"unknown camera {camera!r}; known: {', '.join(sorted({*known, *stored.CAMERAS}))}"
+                raise RequestError("unknown_camera", text)
         return simulation
 
     @property
@@ -237,7 +238,8 @@ class Libero:
             "bddl_file_name": "/".join(self.files.problem.parts[-2:]),
         }
         if self.cameras:
-            kwargs |= {"camera_names": list(self.cameras), "camera_heights": self.size, "camera_widths": self.size}
+            cameras = [stored.camera(name) for name in self.cameras]
+            kwargs |= {"camera_names": cameras, "camera_heights": self.size, "camera_widths": self.size}
         described: dict[str, Any] = {
             # what trains on demonstrations compares this with its task
             "env_name": f"{self.files.suite}/{self.files.number}",
@@ -248,6 +250,8 @@ class Libero:
         }
         if self.cameras and self.fast:
             described["fast_render"] = True
+        if not stored.CAMERAS.keys().isdisjoint(self.cameras):
+            described["image_convention"] = "opengl"
         return described
 
     def compare(self, given: dict[str, Any]) -> None:
@@ -346,10 +350,11 @@ class Libero:
         return Stepped(self.observed(raw), np.array(rewards), solved, None, self.drawing_ms)
 
     def expert(self, seed: int, demonstration: bool, expert: str | None = None, skill: str | None = None) -> Episode:
-        """One whole episode of the task's scripted expert."""
+        """One whole episode of the task's scripted expert, in the layout of LIBERO's files."""
         from actrm_harness.simulators.libero.expert_episode import expert_episode
 
-        return expert_episode(self, seed, demonstration, expert, skill)
+        shown = expert_episode(self, seed, demonstration, expert, skill)
+        return stored.layout(shown, stored.attributes(self.control, self.files.problem))
 
     def extract(self, stored: Stored) -> Episode:
         """Nothing is extracted yet."""
@@ -358,7 +363,7 @@ class Libero:
 
     def image(self, camera: str, height: int, width: int) -> Array:
         """What a camera sees now, upright."""
-        return self.drawn_by().image(self.env.sim, camera, height, width)
+        return stored.turned(camera, self.drawn_by().image(self.env.sim, stored.camera(camera), height, width))
 
     def drawn_by(self) -> Renderer:
         """What draws, made when it is asked for."""
@@ -369,23 +374,27 @@ class Libero:
     def observed(self, raw: dict[str, Array]) -> Tensors:
         """LIBERO's observations under our names, and what the cameras saw when they were made.
 
-        The robot's and the objects' values keep their names; `object` joins those of the objects.
+        The robot's and the objects' values keep their names; `object` joins those of the objects. The robot's are also
+        there as LIBERO's demonstrations name them.
         """
         kept: Tensors = {
             "object" if name == "object-state" else name: np.asarray(value, dtype=np.float64)
             for name, value in raw.items()
             if name not in ("moment", "robot0_proprio-state")
         } | self.aim(raw)
+        kept |= stored.state(kept)
         if not self.cameras:
             return kept
         begun = time.perf_counter()
         shown = self.shown()
         now = {name: value.copy() for name, value in shown.items()}
         put(self.moment, shown)
-        seen = self.drawn_by().images(self.env.sim, self.cameras, self.size, self.size)
+        cameras = [stored.camera(name) for name in self.cameras]
+        seen = self.drawn_by().images(self.env.sim, cameras, self.size, self.size)
         put(now, shown)
         self.drawing_ms = 1e3 * (time.perf_counter() - begun)
-        return kept | {f"{camera}_image": pixels for camera, pixels in zip(self.cameras, seen, strict=True)}
+        named = zip(self.cameras, seen, strict=True)
+        return kept | {f"{camera}_image": stored.turned(camera, pixels) for camera, pixels in named}
 
     def fingerprint(self) -> str:
         """SHA-256 of the state, of what a reset changes in the model, and of the problem."""
