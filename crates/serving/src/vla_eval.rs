@@ -19,10 +19,18 @@ pub const PATH: &str = "/vla-eval";
 const VERSION: u64 = 1;
 /// Side of an image at most, in pixels.
 const MOST_SIDE: usize = 1024;
-/// The runner's cameras and the simulator's keys of their images.
-const CAMERAS: [(&str, &str); 2] = [("agentview", "agentview_image"), ("wrist", "robot0_eye_in_hand_image")];
-/// The simulator's keys of a state: position, quaternion (x, y, z, w) and finger joints.
-const STATE: [&str; 3] = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"];
+/// The runner's cameras and the simulator's keys of their images, upright, and upside down as LIBERO's files hold them. The
+/// runner turns the latter by half a circle.
+const CAMERAS: [(&str, &str, Flip); 4] = [
+    ("agentview", "agentview_image", Flip::Horizontal),
+    ("wrist", "robot0_eye_in_hand_image", Flip::Horizontal),
+    ("agentview", "agentview_rgb_image", Flip::Both),
+    ("wrist", "eye_in_hand_rgb_image", Flip::Both),
+];
+/// The simulator's keys of a state, its own and those of LIBERO's files: position, quaternion (x, y, z, w) or axis-angle,
+/// finger joints.
+const STATE: [&str; 7] =
+    ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "ee_pos", "ee_ori", "ee_states", "gripper_states"];
 /// Its key of the task: 1 at the task's number.
 const TASK: &str = "task_onehot";
 /// Suites whose tasks have the numbers that they have in LIBERO: its own, and LIBERO-PRO's of these endings.
@@ -150,8 +158,8 @@ impl<'a> Session<'a> {
         }
         // what the runner has to send: states whose quaternions keep their sign, and the hand's camera where it is read
         let mut wanted = vec![("send_state", Value::Bool(true)), ("quat_no_antipodal", Value::Bool(true))];
-        let (_, wrist) = CAMERAS[1];
-        if self.steps.images.iter().any(|(key, ..)| key == wrist) {
+        let wrist = |key: &str| CAMERAS.iter().any(|(camera, name, _)| (*camera, *name) == ("wrist", key));
+        if self.steps.images.iter().any(|(key, ..)| wrist(key)) {
             wanted.push(("send_wrist_image", Value::Bool(true)));
         }
         Ok(Value::map([
@@ -222,11 +230,10 @@ impl<'a> Session<'a> {
             };
             return Ok((0..tasks).map(|task| f64::from(u8::from(task == self.task))).collect());
         }
-        let Some(part) = STATE.iter().position(|name| *name == key) else {
-            let known =
-                format!("{}, {TASK} and images of {}", STATE.join(", "), CAMERAS.map(|(name, _)| name).join(", "));
+        if !STATE.contains(&key) {
+            let known = format!("{}, {TASK} and {}", STATE.join(", "), CAMERAS.map(|(_, name, _)| name).join(", "));
             return Err(ServingError::message(key, format!("a policy that reads no more than {known}"), "its key"));
-        };
+        }
         let wanted = "8 numbers: position, axis-angle, finger joints (the benchmark's parameter send_state)";
         let Some(state) = payload.get("states").and_then(Value::to_array) else {
             return Err(ServingError::message("states", wanted, format!("no such key in {payload}")));
@@ -238,9 +245,11 @@ impl<'a> Session<'a> {
         if let Some(other) = state.iter().find(|number| !number.is_finite()) {
             return Err(ServingError::message("states", wanted, other.to_string()));
         }
-        Ok(match part {
-            0 => state[..3].to_vec(),
-            1 => quaternion([state[3], state[4], state[5]]).to_vec(),
+        Ok(match key {
+            "robot0_eef_pos" | "ee_pos" => state[..3].to_vec(),
+            "robot0_eef_quat" => quaternion([state[3], state[4], state[5]]).to_vec(),
+            "ee_ori" => state[3..6].to_vec(),
+            "ee_states" => state[..6].to_vec(),
             _ => state[6..].to_vec(),
         })
     }
@@ -257,10 +266,10 @@ fn quaternion(turn: [f64; 3]) -> [f64; 4] {
     [x, y, z, cosine]
 }
 
-/// The image of a key of the simulator's: the runner's, which is turned by half a circle, upright and in the policy's size.
+/// The image of a key of the simulator's: the runner's, turned as the key says and in the policy's size.
 fn image(payload: &Value<'_>, key: &str, height: usize, width: usize) -> Result<Vec<u8>> {
-    let Some((camera, _)) = CAMERAS.iter().find(|(_, name)| *name == key) else {
-        let known = CAMERAS.map(|(_, name)| name).join(", ");
+    let Some((camera, _, flip)) = CAMERAS.iter().find(|(_, name, _)| *name == key) else {
+        let known = CAMERAS.map(|(_, name, _)| name).join(", ");
         return Err(ServingError::message(key, format!("a policy that sees no more than {known}"), "its key"));
     };
     let within = format!("images.{camera}");
@@ -274,7 +283,7 @@ fn image(payload: &Value<'_>, key: &str, height: usize, width: usize) -> Result<
         let expected = format!("uint8 (height, width, 3) or a PNG file of that, of at most {MOST_SIDE} pixels a side");
         ServingError::message(within, expected, found)
     })?;
-    Ok(resize_with_pad(&Flip::Horizontal.of(&rgb, columns), rows, columns, height))
+    Ok(resize_with_pad(&flip.of(&rgb, columns), rows, columns, height))
 }
 
 /// Pixels with height and width; what was found instead, in words.
@@ -344,18 +353,21 @@ mod tests {
         }
 
         fn act(&mut self, shown: Shown) -> std::result::Result<Vec<f32>, String> {
-            let numbers = [TASK, STATE[0], STATE[1], STATE[2]].map(|key| shown.numbers[key].iter().map(|x| *x as f32));
-            let images = CAMERAS.map(|(_, key)| shown.images[key][..3].iter().map(|x| f32::from(*x)));
+            let numbers = [TASK]
+                .iter()
+                .chain(&STATE)
+                .map(|key| shown.numbers[*key].iter().map(|x| *x as f32).collect::<Vec<_>>());
+            let images = CAMERAS.map(|(_, key, _)| shown.images[key][..3].iter().map(|x| f32::from(*x)));
             Ok([self.0].into_iter().chain(numbers.into_iter().flatten()).chain(images.into_iter().flatten()).collect())
         }
     }
 
     fn steps() -> Steps {
-        let numbers = [(TASK, Some(4)), (STATE[0], None), (STATE[1], None), (STATE[2], None)];
+        let numbers = [(TASK, Some(4))].into_iter().chain(STATE.map(|key| (key, None)));
         Steps {
             name: "echo@1".to_owned(),
-            numbers: numbers.map(|(key, count)| (key.to_owned(), count)).to_vec(),
-            images: CAMERAS.map(|(_, key)| (key.to_owned(), 6, 6)).to_vec(),
+            numbers: numbers.map(|(key, count)| (key.to_owned(), count)).collect(),
+            images: CAMERAS.map(|(_, key, _)| (key.to_owned(), 6, 6)).to_vec(),
             policy: Box::new(|| Ok(Box::new(Echo::default()))),
         }
     }
@@ -393,14 +405,13 @@ mod tests {
             assert_eq!(payload.get("observation_params").unwrap().get(wanted), Some(&Value::Bool(true)), "{wanted}");
         }
         assert!(session.answer(start).is_ok_and(|answer| answer.is_none()));
-        let pixels: Vec<f32> = ["agentview", "wrist"]
-            .into_iter()
-            .flat_map(|camera| match written.get("pixels").unwrap().get(camera) {
-                // the last pixel of the first row comes first
-                Some(Value::Bytes(bytes)) => bytes[15..18].iter().map(|x| f32::from(*x)).collect::<Vec<_>>(),
-                other => panic!("{other:?}"),
-            })
-            .collect();
+        // the last pixel of the first row comes first, or the last of all
+        let first = |camera: &str, row: usize| match written.get("pixels").unwrap().get(camera) {
+            Some(Value::Bytes(bytes)) => bytes[18 * row + 15..18 * row + 18].iter().map(|x| f32::from(*x)).collect(),
+            other => panic!("{other:?}"),
+        };
+        let seen = [("agentview", 0), ("wrist", 0), ("agentview", 5), ("wrist", 5)];
+        let pixels: Vec<f32> = seen.into_iter().flat_map(|(camera, row)| -> Vec<f32> { first(camera, row) }).collect();
         let Some(Value::List(quaternions)) = written.get("quaternions") else { panic!("none") };
         assert_eq!(observed.len(), quaternions.len());
         for (at, (message, quaternion)) in observed.iter().zip(quaternions).enumerate() {
@@ -412,10 +423,16 @@ mod tests {
             let quaternion = quaternion.to_array().unwrap().numbers();
             let length = quaternion.iter().map(|part| part * part).sum::<f32>().sqrt();
             let turn: Vec<f32> = quaternion.iter().map(|part| part / length).collect();
-            let expected = [&[105.0, 0.0, 0.0, 1.0, 0.0, 0.1, -0.2, 1.3][..], &turn, &[0.02, -0.03], &pixels].concat();
+            let (place, fingers) = ([0.1, -0.2, 1.3], [0.02, -0.03]);
+            let half = turn[3].clamp(-1.0, 1.0).acos();
+            let size = if half == 0.0 { 0.0 } else { 2.0 * half / half.sin() };
+            let axis_angle: Vec<f32> = turn[..3].iter().map(|part| part * size).collect();
+            let own = [&[105.0, 0.0, 0.0, 1.0, 0.0][..], &place, &turn, &fingers].concat();
+            let stored = [&place[..], &axis_angle, &place, &axis_angle, &fingers].concat();
+            let expected = [own, stored, pixels.clone()].concat();
             assert_eq!(action.len(), expected.len());
             for (found, expected) in action.iter().zip(&expected) {
-                assert!((found - expected).abs() < 1e-6, "{action:?} {expected:?}");
+                assert!((found - expected).abs() < 1e-6 * expected.abs().max(1.0), "{action:?} {expected:?}");
             }
         }
         assert!(session.answer(end).is_ok_and(|answer| answer.is_none()));

@@ -166,6 +166,8 @@ const SUDOKU6: &[StudyTest] = &[with_bar(Bar { right: 0.99, ..BAR })];
 const SUDOKU9: &[StudyTest] = &[
     with_bar(Bar { right: 0.9, ..BAR }),
     StudyTest { givens: Some(30), ..PLAIN },
+    StudyTest { givens: Some(30), depth: 128, ..PLAIN },
+    StudyTest { givens: Some(30), depth: 32, starts: STARTS, ..PLAIN },
     StudyTest { givens: Some(30), depth: 64, views: VIEWS, ..PLAIN },
     hard(30, 1),
     hard(30, VIEWS),
