@@ -89,7 +89,7 @@ def ours(args: argparse.Namespace) -> Outcomes:
 
 
 def timed(run: Callable[[argparse.Namespace], Outcomes], args: argparse.Namespace) -> tuple[Outcomes, float, float]:
-    """What it finds, and the seconds that it takes: on the wall, and of the processor in all programs that it starts."""
+    """What it finds, and the seconds that it takes: on the wall, and of the processor in what it starts."""
     begun, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     found, after = run(args), resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=280, help="of an episode at most (default: %(default)s)")
     args = parser.parse_args()
     (mine, wall, cpu), (other, other_wall, other_cpu) = timed(ours, args), timed(theirs, args)
-    print(f"wall {wall:.0f} and {other_wall:.0f} s, processor {cpu:.0f} and {other_cpu:.0f} s: {other_cpu / cpu:.1f} times")
+    print(f"wall {wall:.0f} and {other_wall:.0f} s, processor {cpu:.0f} and {other_cpu:.0f} s: {other_cpu / cpu:.1f}x")
     differing = 0
     for (task, state), outcome in sorted(mine.items()):
         same = other.get((task, state)) == outcome
