@@ -69,7 +69,7 @@ const UPSIDE_DOWN: &str = "upside down";
 const STORED: &str = "_rgb";
 /// Begins the names of LIBERO's tasks.
 const LIBERO: &str = "libero_";
-/// Likewise: an array (height, width, 3) of red, green and blue.
+/// All of them: an array (height, width, 3) of red, green and blue.
 const RGB: &str = "RGB, last axis";
 
 impl Conventions {
