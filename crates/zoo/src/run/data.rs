@@ -56,7 +56,7 @@ fn locate_from(path: &Path, roots: &[PathBuf]) -> Result<PathBuf, ZooError> {
 
 /// Whether `path` is a data set: anything else is recordings, in a file or in a folder of files, that are converted first.
 pub(super) fn is_set(path: &Path) -> bool {
-    path.is_dir() && path.join("meta").exists()
+    path.join("meta/info.json").exists()
 }
 
 /// Begins the hash of recordings.
@@ -434,12 +434,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_without_meta_holds_recordings() {
+    fn a_folder_without_info_holds_recordings() {
         let root = tempfile::tempdir().unwrap();
         std::fs::write(root.path().join("a_demo.hdf5"), "").unwrap();
         assert!(!is_set(root.path()) && !is_set(&root.path().join("a_demo.hdf5")));
         assert_eq!(short_hash(&root.path().join("a_demo.hdf5")).unwrap(), "e3b0c442", "SHA-256 of nothing");
         std::fs::create_dir(root.path().join("meta")).unwrap();
+        assert!(!is_set(root.path()), "zarr replay buffers have a group of this name");
+        std::fs::write(root.path().join("meta/info.json"), "{}").unwrap();
         assert!(is_set(root.path()));
     }
 

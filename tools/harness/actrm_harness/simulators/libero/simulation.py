@@ -362,7 +362,7 @@ class Libero:
         raise RequestError("bad_request", "LIBERO's stored states are not extracted")
 
     def image(self, camera: str, height: int, width: int) -> Array:
-        """What a camera sees now, upright."""
+        """What a camera sees now, upright unless its name is one of LIBERO's files."""
         return stored.turned(camera, self.drawn_by().image(self.env.sim, stored.camera(camera), height, width))
 
     def drawn_by(self) -> Renderer:
