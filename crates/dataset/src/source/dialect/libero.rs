@@ -44,9 +44,8 @@ impl Layout for Libero {
         }
         if draft.demos.iter().any(|d| d.plan.keys.values().any(|k| k.is_image())) {
             draft.notes.push(
-                "images are kept as stored: in the simulator's OpenGL orientation, upside down \
-                 against robomimic's; cameras keep their names (agentview_rgb), and the simulator's of these names \
-                 give such images"
+                "images are kept as stored: upside down, as OpenGL reads them. Cameras keep LIBERO's names, such as \
+                 agentview_rgb. The tasks of LIBERO have cameras of these names, which are upside down as well"
                     .to_owned(),
             );
         }
