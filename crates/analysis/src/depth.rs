@@ -1,5 +1,5 @@
 //! A trained policy that thinks otherwise than its experiment says: other numbers of steps, with or without halting, its
-//! reasoning tampered with.
+//! reasoning tampered with, several thoughts from noise.
 //!
 //! What such a policy does is no result of the entry: keep it apart from the zoo's results.
 
@@ -7,7 +7,7 @@ use std::ops::ControlFlow;
 use std::sync::Arc;
 
 use models::Observation;
-use models::actrm::{DisturbedPolicy, Intervention, Thinking};
+use models::actrm::{DisturbedPolicy, Intervention, RestartedPolicy, Thinking};
 use rollout::{Pool, RolloutError, Worker};
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::Subject;
@@ -83,6 +83,11 @@ pub fn thinking_subject(
             let (model, preprocess) = (Arc::clone(&model), Arc::clone(&preprocess));
             Ok(Box::new(DisturbedPolicy::new(model, preprocess, intervene, Arc::clone(&others))?))
         });
+    }
+    if let (Some(starts), Some(model)) = (thinking.starts, entry.reasoner()?) {
+        let preprocess = Arc::clone(entry.preprocess());
+        subject.policy =
+            Box::new(move || Ok(Box::new(RestartedPolicy::new(Arc::clone(&model), Arc::clone(&preprocess), starts))));
     }
     Ok(Some(subject))
 }

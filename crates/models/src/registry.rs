@@ -173,7 +173,7 @@ impl PolicyConfig {
             other => Err(ModelError::Config {
                 model: other.policy_type(),
                 field: "thinking",
-                found: "steps, halting or an intervention".to_string(),
+                found: "steps, halting, starts or an intervention".to_string(),
                 expected: "none: it does not think step by step".to_string(),
             }),
         }

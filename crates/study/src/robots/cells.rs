@@ -37,7 +37,7 @@ pub fn cells(study: &Study) -> Vec<Cell> {
     let mut rows: Vec<&CellRow> = study.cells.iter().collect();
     rows.sort_by_key(|row| row.stage);
     for row in rows {
-        for seed in 1..=row.seeds {
+        for seed in row.first_seed..=row.seeds {
             for arm in &row.arms {
                 let same = |cell: &&mut Cell| {
                     cell.arm == *arm && cell.data == row.data && cell.seed == seed && cell.stage == row.stage
@@ -69,10 +69,11 @@ mod tests {
             arms: arms.iter().map(|a| (*a).to_owned()).collect(),
             data: "d".to_owned(),
             seeds,
+            first_seed: 1,
             tests: tests.iter().map(|t| (*t).to_owned()).collect(),
             stage: 1,
         };
-        let later = CellRow { stage: 2, ..row(&["a"], 1, &["z"]) };
+        let later = CellRow { stage: 2, first_seed: 2, ..row(&["a"], 3, &["z"]) };
         let study = Study {
             title: String::new(),
             verdict: String::new(),
@@ -93,7 +94,8 @@ mod tests {
             "a-on-d-seed2 x",
             "b-on-d-seed2 x+y",
             "b-on-d-seed3 x+y",
-            "a-on-d-seed1 z",
+            "a-on-d-seed2 z",
+            "a-on-d-seed3 z",
         ];
         assert_eq!(found, expected);
     }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use models::actrm::{Intervention, Thinking};
+use models::actrm::{Intervention, Starts, Thinking};
 use rollout::Skill;
 use serde::{Deserialize, Serialize};
 use zoo::ZooError;
@@ -131,7 +131,7 @@ impl Test {
 
     /// How policies think in it, in words; `None` where it is as they were trained.
     pub fn thinking_words(&self) -> Option<String> {
-        let Thinking { steps, halting, halt_threshold, change_threshold, intervene } = self.thinking;
+        let Thinking { steps, halting, halt_threshold, change_threshold, intervene, starts } = self.thinking;
         let steps = steps.map(|n| format!("{n} step{}", if n == 1 { "" } else { "s" }));
         let halting = halting.map(|halting| if halting { "early stopping" } else { "no early stopping" }.to_owned());
         let sure = halt_threshold.map(|threshold| format!("halting probability above {threshold}"));
@@ -140,7 +140,8 @@ impl Test {
             Intervention::Freeze => "reasoning frozen after the first step".to_owned(),
             Intervention::Shuffle => "reasoning of another episode".to_owned(),
         });
-        let words: Vec<String> = [steps, halting, sure, still, intervene].into_iter().flatten().collect();
+        let starts = starts.map(|Starts { count, noise }| format!("best of {count} thoughts, noise {noise}"));
+        let words: Vec<String> = [steps, halting, sure, still, intervene, starts].into_iter().flatten().collect();
         (!words.is_empty()).then(|| words.join(", "))
     }
 }
@@ -153,8 +154,11 @@ pub struct CellRow {
     pub arms: Vec<String>,
     /// The demonstrations.
     pub data: String,
-    /// Trainings of each arm; their seeds are 1 to this.
+    /// Trainings of each arm; their seeds are `first_seed` to this.
     pub seeds: u64,
+    /// The seed of the first training.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub first_seed: u64,
     /// What each training is tested on.
     pub tests: Vec<String>,
     /// 1 for what was planned first; what was added later is run and reported after it.
@@ -189,6 +193,10 @@ pub struct Comparison {
 
 fn one() -> u64 {
     1
+}
+
+fn is_one(seed: &u64) -> bool {
+    *seed == 1
 }
 
 fn first() -> u8 {
@@ -363,6 +371,8 @@ mod tests {
             "early stopping, halting probability above 0.9, chunk change below 0.005"
         );
         assert_eq!(words("{ steps = 6, intervene = \"shuffle\" }").unwrap(), "6 steps, reasoning of another episode");
+        let starts = "{ steps = 6, starts = { count = 8, noise = 0.5 } }";
+        assert_eq!(words(starts).unwrap(), "6 steps, best of 8 thoughts, noise 0.5");
         assert!(open(&with("{ step = 1 }")).unwrap_err().contains("step"));
         // a test as trained keeps its text
         assert!(!serde_json::to_string(&open(TEXT).unwrap().tests["lift"]).unwrap().contains("thinking"));

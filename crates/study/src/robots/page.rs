@@ -281,12 +281,13 @@ fn other_refinement(text: &mut String, study: &Study, results: &Results) {
     let _ = writeln!(
         text,
         "## Other refinement settings\n\nThe weights of the policies above, tested with another number of refinement steps, with or without \
-         early stopping, or with their latent reasoning frozen or taken from another episode.\n"
+         early stopping, with their latent reasoning frozen or taken from another episode, or with further thoughts from noise, of \
+         which the halting head chooses.\n"
     );
     for ((task, data), mut rows) in rows {
         rows.sort_by_key(|(arm, _, trainings)| {
             let thinking = trainings.values().next().map(|result| result.test_definition.thinking).unwrap_or_default();
-            (*arm, thinking.intervene.map(|i| i.name()), thinking.steps)
+            (*arm, thinking.intervene.map(|i| i.name()), thinking.starts.map(|starts| starts.count), thinking.steps)
         });
         let groups: BTreeSet<String> = rows
             .iter()

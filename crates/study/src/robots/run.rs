@@ -365,7 +365,8 @@ impl Shared<'_> {
                 return Ok(CellEnd::Stopped);
             };
             let of_test = (test.as_str(), definition);
-            let flops = entry.thinking(&definition.thinking)?.model().query_flops();
+            let thoughts = definition.thinking.starts.map_or(1, |starts| starts.count) as f64;
+            let flops = entry.thinking(&definition.thinking)?.model().query_flops().map(|flops| flops * thoughts);
             let result =
                 CellResult::new(cell, (arm, data), of_test, settings.clone(), flops, stored.meta(), &evaluation);
             result.write(&study.results.join(cell.file_name(&test)))?;

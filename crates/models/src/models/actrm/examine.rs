@@ -1,13 +1,13 @@
 //! Looking into a thought: its states after every step, what its action tokens attend to, and what becomes of it where
-//! its reasoning is tampered with.
+//! its reasoning is tampered with or begins from noise.
 
-use super::{Actrm, Carry, Config, Design, Observed, OverActions};
+use super::{Actrm, Carry, Config, Design, Observed, Over, OverActions, Start};
 use crate::features::{Features, Observation};
 use crate::history::History;
 use crate::policy::{ActionChunk, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
-use nn::{Context, ModelError, Result, Value};
+use nn::{Context, ModelError, Result, Rng, Value};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -34,6 +34,16 @@ impl Intervention {
     }
 }
 
+/// Several thoughts about one observation; the halting head chooses the one whose chunk is executed.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Starts {
+    /// Thoughts, at least 2: the usual one and others from noise
+    pub count: usize,
+    /// Standard deviation of the normal noise added to the states that the others begin with
+    pub noise: f64,
+}
+
 /// How a trained policy thinks where that is not as its configuration says; it is not trained again for it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -53,19 +63,40 @@ pub struct Thinking {
     /// What is done to its reasoning; such thoughts do not halt
     #[serde(skip_serializing_if = "Option::is_none")]
     pub intervene: Option<Intervention>,
+    /// Further thoughts from noise (arXiv 2605.19943), over actions or tokens
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub starts: Option<Starts>,
 }
 
 impl Config {
     /// The configuration of a model with the same weights that thinks otherwise.
     ///
     /// # Errors
-    /// No steps; halting together with an intervention; a threshold of halting that is none or without it.
+    /// No steps; halting together with an intervention; a threshold of halting that is none or without it; starts that
+    /// are no several, from no noise, together with an intervention, or over the memory.
     pub fn thinking(&self, thinking: &Thinking) -> Result<Self> {
         let mut config = self.clone();
         let reasoning = &mut config.reasoning;
         if thinking.halting == Some(true) && thinking.intervene.is_some() {
             let (found, expected) = ("true".to_string(), "false with an intervention".to_string());
             return Err(ModelError::Config { model: "actrm", field: "thinking.halting", found, expected });
+        }
+        if let Some(starts) = thinking.starts {
+            let wrong = |field, found: String, expected: &str| {
+                Err(ModelError::Config { model: "actrm", field, found, expected: expected.to_string() })
+            };
+            if starts.count < 2 {
+                return wrong("thinking.starts.count", starts.count.to_string(), "at least 2");
+            }
+            if !(starts.noise > 0.0 && starts.noise.is_finite()) {
+                return wrong("thinking.starts.noise", starts.noise.to_string(), "a positive number");
+            }
+            if let Some(intervene) = thinking.intervene {
+                return wrong("thinking.starts", intervene.name().to_string(), "no intervention beside it");
+            }
+            if reasoning.over == Over::Memory {
+                return wrong("thinking.starts", "over memory".to_string(), "reasoning over actions or tokens");
+            }
         }
         if thinking.steps.is_some() {
             (reasoning.max_steps, reasoning.budget_ms) = (thinking.steps, None);
@@ -304,5 +335,59 @@ impl Policy for DisturbedPolicy {
     fn reset(&mut self, seed: u64) {
         self.history.clear();
         self.other = (seed % self.others.len().max(1) as u64) as usize;
+    }
+}
+
+/// ACTRM as a policy that thinks several times about every observation, and does what the thought says that the halting
+/// head gives the highest probability of being done.
+pub struct RestartedPolicy {
+    model: Arc<Actrm>,
+    preprocess: Arc<Preprocess>,
+    starts: Starts,
+    rng: Rng,
+    history: History,
+}
+
+impl RestartedPolicy {
+    /// Shares `model`. What it draws depends on the episode's seed.
+    pub fn new(model: Arc<Actrm>, preprocess: Arc<Preprocess>, starts: Starts) -> Self {
+        let history = History::new(preprocess.signature().n_obs_steps);
+        Self { model, preprocess, starts, rng: Rng::new(0, Self::STREAM), history }
+    }
+
+    const STREAM: &str = "starts";
+}
+
+impl Policy for RestartedPolicy {
+    fn predict(&mut self, observation: &Observation) -> Result<ActionChunk> {
+        let seen = self.history.see(&self.preprocess, observation)?;
+        let count = self.starts.count;
+        let mut rows = Features::new();
+        for (name, values) in seen.iter() {
+            rows.insert(name, Tensor::cat(&vec![values; count], 0)?);
+        }
+        let [_, tokens, dim] = self.model.thought_shape(count);
+        let mut noise = vec![0.0; tokens * dim];
+        let drawn = self.rng.normals((count - 1) * tokens * dim).into_iter();
+        noise.extend(drawn.map(|x| x * self.starts.noise as f32));
+        let noise = Tensor::from_vec(noise, (count, tokens, dim), self.model.params.device())?;
+        let thoughts = self.model.reason_seen(&rows, Start::Noise(&noise), &mut || {}, &mut |_| false)?;
+        // of equals the first, so the usual one where noise changes nothing
+        let done = |row: usize| thoughts.steps[thoughts.depth[row] - 1].halt[row];
+        let best = (1..count).fold(0, |best, row| if done(row) > done(best) { row } else { best });
+        self.preprocess.chunk(&thoughts.chunk.narrow(0, best, 1)?)
+    }
+
+    fn n_obs_steps(&self) -> usize {
+        self.history.steps()
+    }
+
+    fn observe(&mut self, observation: &Observation) {
+        self.history.observe(observation);
+    }
+
+    fn reset(&mut self, seed: u64) {
+        self.history.clear();
+        self.rng = Rng::new(seed, Self::STREAM);
     }
 }

@@ -52,7 +52,7 @@ mod reasoning;
 mod tests;
 
 pub use config::{Config, Over, ReasoningConfig, WarmStart};
-pub use examine::{DisturbedPolicy, ExaminedStep, Intervention, Thinking};
+pub use examine::{DisturbedPolicy, ExaminedStep, Intervention, RestartedPolicy, Starts, Thinking};
 pub use reasoning::{Reasoning, ReasoningPolicy, ReasoningStep};
 
 use crate::batch::Batch;
@@ -76,6 +76,7 @@ use nn::{Backend, Cache, Context, Loss, Params, Result, Rng, Term, Value};
 use over_actions::{OverActions, Read};
 use over_memory::OverMemory;
 use over_tokens::{OverTokens, TokenLayers};
+use reasoning::Start;
 use std::sync::Arc;
 
 /// The kinds of features that it reads.

@@ -1,6 +1,6 @@
 //! Thinking at inference: step by step, until a rule says stop, with everything on record.
 
-use super::{Actrm, Carry, Config, Over, ReasoningConfig};
+use super::{Actrm, Carry, Config, Observed, Over, ReasoningConfig};
 use crate::checks::check_shape;
 use crate::features::{Features, Observation};
 use crate::history::History;
@@ -8,7 +8,7 @@ use crate::policy::{ActionChunk, Clock, Policy, ThoughtStep};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::linear;
-use nn::{Context, ModelError, Result, Value};
+use nn::{Context, Result, Value};
 use std::cell::RefCell;
 use std::sync::Arc;
 
@@ -37,6 +37,29 @@ pub struct Reasoning {
     pub answer: Tensor,
 }
 
+/// What a thought begins with.
+#[derive(Clone, Copy)]
+pub(super) enum Start<'a> {
+    Usual,
+    /// an answer, (b, tokens, D)
+    Answer(&'a Tensor),
+    /// the usual beginning and this noise, (b, tokens, D)
+    Noise(&'a Tensor),
+}
+
+impl<'a> Start<'a> {
+    fn of(answer: Option<&'a Tensor>) -> Self {
+        answer.map_or(Self::Usual, Self::Answer)
+    }
+
+    fn given(self) -> Option<&'a Tensor> {
+        match self {
+            Self::Usual => None,
+            Self::Answer(tensor) | Self::Noise(tensor) => Some(tensor),
+        }
+    }
+}
+
 impl Actrm {
     /// Thinks about observations in network units: the signature's features, (b, …) each. `start`
     /// is the answer state to begin from, (b, H, D) (`over = "actions"`). After each step
@@ -52,18 +75,18 @@ impl Actrm {
         start: Option<&Tensor>,
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
-        self.reason_seen(observation, start, &mut || {}, should_stop)
+        self.reason_seen(observation, Start::of(start), &mut || {}, should_stop)
     }
 
     /// The same, and `on_seen` is called when images have become tokens.
-    fn reason_seen(
+    pub(super) fn reason_seen(
         &self,
         observation: &Features<Tensor>,
-        start: Option<&Tensor>,
+        start: Start<'_>,
         on_seen: &mut dyn FnMut(),
         should_stop: &mut dyn FnMut(usize) -> bool,
     ) -> Result<Reasoning> {
-        let rows = self.check_thought(observation, start)?;
+        let rows = self.check_thought(observation, start.given())?;
         let observation = self.tokens.prepare(observation, None)?;
         let thought = Thought::new(&self.config.reasoning, rows, should_stop);
         self.cache.predict(&self.params, on_seen, |cx| self.think(cx, rows, &observation, start, thought))
@@ -80,7 +103,7 @@ impl Actrm {
         let rows = self.check_thought(observation, start)?;
         let observation = self.tokens.prepare(observation, None)?;
         let thought = Thought::new(&self.config.reasoning, rows, should_stop);
-        self.cache.composed_predict(&self.params, |cx| self.think(cx, rows, &observation, start, thought))
+        self.cache.composed_predict(&self.params, |cx| self.think(cx, rows, &observation, Start::of(start), thought))
     }
 
     /// Images are as the network reads them.
@@ -89,14 +112,13 @@ impl Actrm {
         cx: &mut Context<'_>,
         rows: usize,
         observation: &Features<Tensor>,
-        start: Option<&Tensor>,
+        start: Start<'_>,
         mut thought: Thought<'_>,
     ) -> Result<Reasoning> {
         let latent = Value::zeros((rows, self.config.latent_dim), &cx.device().clone())?;
         let memory = self.memory(cx, &latent, observation)?;
         let observed = self.observe(cx, memory)?;
-        let answer = start.map(|start| Ok::<_, ModelError>(Value::from(&start.contiguous()?))).transpose()?;
-        let mut carry = Carry { answer, reasoning: None };
+        let mut carry = Carry { answer: self.first_answer(&observed, start)?, reasoning: None };
         loop {
             let step = self.step(cx, &observed, &carry, thought.steps.len())?;
             let logits = linear(cx, &step.mean, &self.halt_head)?.detached().flatten_all()?.to_vec1()?;
@@ -107,15 +129,31 @@ impl Actrm {
         }
     }
 
-    /// The number of rows.
-    fn check_thought(&self, observation: &Features<Tensor>, start: Option<&Tensor>) -> Result<usize> {
-        let rows = self.check_inputs(observation)?;
+    /// The answer that the first step begins with, if it is given one.
+    fn first_answer(&self, observed: &Observed, start: Start<'_>) -> Result<Option<Value>> {
+        let Some(given) = start.given() else { return Ok(None) };
+        let given = given.contiguous()?;
+        Ok(Some(match (start, self.config.reasoning.over) {
+            // over tokens a thought begins with what is observed, over actions with zeros
+            (Start::Noise(_), Over::Tokens) => Value::from(&(observed.begun.detached() + given)?),
+            _ => Value::from(&given),
+        }))
+    }
+
+    /// Of the answer's states of `rows` thoughts: (b, tokens, D).
+    pub(super) fn thought_shape(&self, rows: usize) -> [usize; 3] {
         let tokens = match self.config.reasoning.over {
             Over::Actions => self.config.action_horizon,
             Over::Memory | Over::Tokens => self.tokens.layout().len(),
         };
+        [rows, tokens, self.config.dim_model]
+    }
+
+    /// The number of rows.
+    fn check_thought(&self, observation: &Features<Tensor>, start: Option<&Tensor>) -> Result<usize> {
+        let rows = self.check_inputs(observation)?;
         if let Some(start) = start {
-            check_shape("actrm", "warm start", start, &[rows, tokens, self.config.dim_model])?;
+            check_shape("actrm", "warm start", start, &self.thought_shape(rows))?;
         }
         Ok(rows)
     }
@@ -216,7 +254,7 @@ impl Policy for ReasoningPolicy {
         let now = || clock.borrow_mut().milliseconds();
         let begun = now();
         let seen = self.history.see(&self.preprocess, observation)?;
-        let start = warm_start(&self.model.config, self.last.as_ref(), self.executed)?;
+        let warm = warm_start(&self.model.config, self.last.as_ref(), self.executed)?;
         let (mut before, mut times) = (begun, Vec::new());
         let mut should_stop = |_: usize| {
             let now = now();
@@ -225,7 +263,7 @@ impl Policy for ReasoningPolicy {
         };
         let mut encoding = None;
         let mut on_seen = || encoding = Some(now() - begun);
-        let reasoning = self.model.reason_seen(&seen, start.as_ref(), &mut on_seen, &mut should_stop)?;
+        let reasoning = self.model.reason_seen(&seen, Start::of(warm.as_ref()), &mut on_seen, &mut should_stop)?;
         let chunk = self.preprocess.chunk(&reasoning.chunk)?;
         (self.last, self.executed, self.times, self.encoding) = (Some(reasoning), 0, times, encoding);
         Ok(chunk)

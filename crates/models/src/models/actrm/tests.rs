@@ -2,6 +2,7 @@
 use super::*;
 use crate::batch::Taken;
 use crate::features::{FeatureSpec, Features, Observation, ValuesRef};
+use crate::history::History;
 use crate::layers::{AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::models::act::{self, Act};
 use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, Normaliser, STATE};
@@ -10,7 +11,7 @@ use crate::preprocess::Preprocess;
 use crate::registry::PolicyConfig;
 use crate::testing::{assert_the_gradient_is_the_slope, move_parameters, signatures};
 use crate::train::{TrainConfig, Trainer};
-use candle_core::Device;
+use candle_core::{DType, Device};
 use nn::Gradients;
 use nn::ParamLayout;
 use std::collections::BTreeMap;
@@ -484,6 +485,53 @@ fn a_disturbed_policy_depends_on_the_episode_only() {
     assert_ne!(make(Intervention::Freeze).predict(&observation(1)).unwrap(), undisturbed);
     let nobody = DisturbedPolicy::new(model, identity(), Intervention::Shuffle, Arc::default());
     assert!(nobody.is_err());
+}
+
+#[test]
+fn of_several_thoughts_the_halting_head_chooses_one() {
+    let thinking = |count, noise| Thinking { starts: Some(Starts { count, noise }), ..Thinking::default() };
+    for over in [Over::Actions, Over::Tokens] {
+        let config = small(ReasoningConfig { over, ..ReasoningConfig::default() });
+        let config = config.thinking(&Thinking { steps: Some(4), ..thinking(5, 1.0) }).unwrap();
+        let model = Arc::new(Actrm::new(&config, &signature(), 5, &Backend::CPU).unwrap());
+        let make = |noise| RestartedPolicy::new(Arc::clone(&model), identity(), Starts { count: 5, noise });
+        let mut policy = make(1.0);
+        let mut of = |seed: u64| {
+            policy.reset(seed);
+            policy.predict(&observation(1)).unwrap()
+        };
+        let chunks: Vec<_> = (0..20).map(&mut of).collect();
+        assert_eq!(of(3), chunks[3], "an episode repeats itself");
+        // the same thoughts one by one
+        let seen = History::new(1).see(&identity(), &observation(1)).unwrap();
+        let [_, tokens, dim] = model.thought_shape(1);
+        let plain = model.reason(&seen, None, &mut |_| false).unwrap();
+        let none = Tensor::zeros((1, tokens, dim), DType::F32, &Device::Cpu).unwrap();
+        let none = model.reason_seen(&seen, Start::Noise(&none), &mut || {}, &mut |_| false).unwrap();
+        assert_eq!(identity().chunk(&none.chunk).unwrap(), identity().chunk(&plain.chunk).unwrap());
+        for (seed, chosen) in chunks.iter().enumerate() {
+            let drawn = Rng::new(seed as u64, "starts").normals(4 * tokens * dim);
+            let drawn = Tensor::from_vec(drawn, (4, tokens, dim), &Device::Cpu).unwrap();
+            let mut thoughts = vec![plain.clone()];
+            thoughts.extend((0..4).map(|row| {
+                let noise = drawn.narrow(0, row, 1).unwrap();
+                model.reason_seen(&seen, Start::Noise(&noise), &mut || {}, &mut |_| false).unwrap()
+            }));
+            let sure = |thought: &Reasoning| thought.steps[3].halt[0];
+            let best = thoughts.iter().max_by(|a, b| sure(a).total_cmp(&sure(b))).unwrap();
+            let best = identity().chunk(&best.chunk).unwrap().actions;
+            assert!(best.iter().zip(&chosen.actions).all(|(a, b)| (a - b).abs() < 1e-5), "{best:?} {chosen:?}");
+        }
+        let usual = Arc::clone(&model).policy(identity(), ticking()).predict(&observation(1)).unwrap();
+        assert!(chunks.iter().any(|chunk| *chunk != usual), "noise finds other thoughts");
+    }
+    let config = small(ReasoningConfig::default());
+    let refused = |config: &Config, thinking| config.thinking(&thinking).unwrap_err().to_string();
+    assert!(refused(&config, thinking(1, 1.0)).contains("thinking.starts.count"));
+    assert!(refused(&config, thinking(8, 0.0)).contains("thinking.starts.noise"));
+    let both = Thinking { intervene: Some(Intervention::Freeze), ..thinking(8, 1.0) };
+    assert!(refused(&config, both).contains("no intervention"));
+    assert!(refused(&designs()[2], thinking(8, 1.0)).contains("over memory"));
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+use models::actrm::Thinking;
 use report::statistics::{Estimate, hierarchical};
 use zoo::ZooError;
 
@@ -96,7 +97,8 @@ pub(super) fn by_steps(study: &Study, results: &Results) -> Vec<((String, String
     let mut arms: BTreeMap<(&str, &str, &str), BTreeMap<usize, &Trainings>> = BTreeMap::new();
     for ((test, data, arm), trainings) in results {
         let test = &study.tests[test];
-        if let (Some(steps), None, None) = (test.thinking.steps, test.thinking.halting, test.thinking.intervene) {
+        let steps = test.thinking.steps;
+        if let Some(steps) = steps.filter(|_| test.thinking == Thinking { steps, ..Thinking::default() }) {
             arms.entry((&test.task, data, arm)).or_default().insert(steps, trainings);
         }
     }
