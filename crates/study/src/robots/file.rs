@@ -245,6 +245,13 @@ impl Study {
             data(format!("cells[{i}].data"), &row.data)?;
             row.tests.iter().try_for_each(|name| tests(format!("cells[{i}].tests"), name))?;
             row.tests.iter().try_for_each(|name| self.check_camera(name, &row.data))?;
+            if !(1..=row.seeds).contains(&row.first_seed) {
+                return Err(ZooError::InvalidValue {
+                    key: format!("cells[{i}].first_seed"),
+                    expected: format!("1 to the last seed, {}", row.seeds),
+                    found: row.first_seed.to_string(),
+                });
+            }
         }
         for (i, comparison) in self.comparisons.iter().enumerate() {
             arms(format!("comparisons[{i}].first"), &comparison.first)?;
@@ -355,6 +362,8 @@ mod tests {
         let error = open(&TEXT.replace("[arms.act]", "[arms.Act_1]")).unwrap_err();
         assert!(error.contains("cells[0].arms") || error.contains("arms.Act_1"), "{error}");
         assert!(open(&TEXT.replace("seeds = 2", "seed = 2")).unwrap_err().contains("seed"));
+        let error = open(&TEXT.replace("seeds = 2", "seeds = 2\nfirst_seed = 3")).unwrap_err();
+        assert_eq!(error, "key `cells[0].first_seed`: expected 1 to the last seed, 2, found 3");
     }
 
     #[test]
