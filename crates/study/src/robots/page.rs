@@ -281,8 +281,8 @@ fn other_refinement(text: &mut String, study: &Study, results: &Results) {
     let _ = writeln!(
         text,
         "## Other refinement settings\n\nThe weights of the policies above, tested with another number of refinement steps, with or without \
-         early stopping, with their latent reasoning frozen or taken from another episode, or with further thoughts from noise, of \
-         which the halting head chooses.\n"
+         early stopping, or with their latent reasoning frozen or taken from another episode. Where several thoughts begin from noise, the \
+         halting head chooses one.\n"
     );
     for ((task, data), mut rows) in rows {
         rows.sort_by_key(|(arm, _, trainings)| {
