@@ -1,5 +1,5 @@
 //! Looking into a thought: its states after every step, what its action tokens attend to, and what becomes of it where
-//! its reasoning is tampered with or begins from noise.
+//! its reasoning is tampered with or it begins from noise.
 
 use super::{Actrm, Carry, Config, Design, Observed, Over, OverActions, Start};
 use crate::features::{Features, Observation};
@@ -72,8 +72,8 @@ impl Config {
     /// The configuration of a model with the same weights that thinks otherwise.
     ///
     /// # Errors
-    /// No steps; halting together with an intervention; a threshold of halting that is none or without it; starts that
-    /// are no several, from no noise, together with an intervention, or over the memory.
+    /// No steps; halting together with an intervention; a threshold of halting that is none or without it; fewer than two
+    /// starts, noise that is not positive, starts together with an intervention or over the memory.
     pub fn thinking(&self, thinking: &Thinking) -> Result<Self> {
         let mut config = self.clone();
         let reasoning = &mut config.reasoning;
@@ -338,8 +338,8 @@ impl Policy for DisturbedPolicy {
     }
 }
 
-/// ACTRM as a policy that thinks several times about every observation, and does what the thought says that the halting
-/// head gives the highest probability of being done.
+/// ACTRM as a policy that thinks several times about every observation. It executes the chunk of the thought whose last
+/// step has the highest halting probability.
 pub struct RestartedPolicy {
     model: Arc<Actrm>,
     preprocess: Arc<Preprocess>,
@@ -372,9 +372,9 @@ impl Policy for RestartedPolicy {
         noise.extend(drawn.map(|x| x * self.starts.noise as f32));
         let noise = Tensor::from_vec(noise, (count, tokens, dim), self.model.params.device())?;
         let thoughts = self.model.reason_seen(&rows, Start::Noise(&noise), &mut || {}, &mut |_| false)?;
-        // of equals the first, so the usual one where noise changes nothing
-        let done = |row: usize| thoughts.steps[thoughts.depth[row] - 1].halt[row];
-        let best = (1..count).fold(0, |best, row| if done(row) > done(best) { row } else { best });
+        let halt = |row: usize| thoughts.steps[thoughts.depth[row] - 1].halt[row];
+        // of equal ones the first, which is the usual thought
+        let best = (1..count).fold(0, |best, row| if halt(row) > halt(best) { row } else { best });
         self.preprocess.chunk(&thoughts.chunk.narrow(0, best, 1)?)
     }
 
