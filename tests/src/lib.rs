@@ -188,13 +188,21 @@ pub fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// Sends a signal (`INT`, `TERM`) to a program that a test started.
+/// Sends a signal (`INT`, `TERM`) to a program that a test started, as soon as it handles signals.
 ///
 /// # Panics
 /// If it cannot be sent.
 pub fn signal(child: &Child, name: &str) {
+    wait_until("a program that handles SIGINT", || handles_interrupts(child.id()).then_some(()));
     let sent = Command::new("kill").args([&format!("-{name}"), &child.id().to_string()]).status();
     assert!(sent.expect("kill runs").success(), "no signal to {}", child.id());
+}
+
+/// Whether a process has a handler for SIGINT.
+fn handles_interrupts(process: u32) -> bool {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).unwrap_or_default();
+    let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).expect("a process of Linux").trim();
+    u64::from_str_radix(caught, 16).expect("a mask") & (1 << (2 - 1)) != 0
 }
 
 /// Runs a shell command in a terminal of this many columns; returns all that was written to it, and its exit code.

@@ -43,16 +43,16 @@ fn several_seeds_make_a_family_that_is_one_row() {
     refused(&mut train(folder, "2..1", &[]), &["2..1"]);
     assert_eq!(json(&mut zoo(["list", "--json", "--zoo", text(&entries)])).as_array().map(Vec::len), Some(4));
 
-    let mut eval = zoo(["eval", "lift-act-s*@1", "--episodes", "20", "--max-steps", "4", "--json"]);
+    let mut eval = zoo(["eval", "lift-act-s*@1", "--episodes", "6", "--max-steps", "4", "--json"]);
     let evaluated = json(eval.args(["--zoo", text(&entries)]));
     assert_eq!(evaluated.as_array().map(Vec::len), Some(3), "{evaluated}");
-    assert_eq!((&evaluated[0]["episodes"], &evaluated[0]["evaluated_before"]), (&20.into(), &false.into()));
+    assert_eq!((&evaluated[0]["episodes"], &evaluated[0]["evaluated_before"]), (&6.into(), &false.into()));
 
     let board = json(&mut zoo(["leaderboard", "--json", "--zoo", text(&entries)]));
     let rows = board["rows"].as_array().expect("rows");
     assert_eq!(rows.len(), 1, "{board}");
     let row = &rows[0];
-    assert_eq!((&row["entry"], &row["trainings"], &row["episodes"]), (&"lift-act-s".into(), &3.into(), &60.into()));
+    assert_eq!((&row["entry"], &row["trainings"], &row["episodes"]), (&"lift-act-s".into(), &3.into(), &18.into()));
     assert_eq!(row["training_seed"], "1 2 3");
     assert_eq!(board["trainings"].as_array().map(Vec::len), Some(3));
     let each = fs::read_to_string(entries.join("leaderboard_trainings.csv")).expect("each training");

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use e2e::{copied_zoo, data, lift, listing, shipped, succeeds, text, trained, zoo};
 
 fn kills() -> u64 {
-    std::env::var("ACTRM_KILLS").ok().map_or(3, |text| text.parse().expect("a number"))
+    std::env::var("ACTRM_KILLS").ok().map_or(2, |text| text.parse().expect("a number"))
 }
 
 /// A number from 0 to 1, another for every `k`, spread evenly.

@@ -27,6 +27,7 @@ mod source;
 mod stats;
 mod tree;
 mod windows;
+mod words;
 
 pub use error::{DatasetError, InputError, Result};
 pub use keys::{KeyItem, Moment};
@@ -46,3 +47,4 @@ pub use source::{NonFinite, RobomimicWriter, Source, VideoFile, VideoInfo, Write
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};
 pub use windows::{WindowBatch, WindowSpec, Windows};
+pub use words::{INSTRUCTION_WIDTH, INSTRUCTION_WORDS, instruction_words};

@@ -18,7 +18,7 @@ import numpy as np
 HARNESS = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(HARNESS))
 CAMERAS = ("agentview", "robot0_eye_in_hand")
-ADDED = ("target_", "goal_", "task_onehot", "ee_", "gripper_states", "joint_states")
+ADDED = ("target_", "goal_", "task_onehot", "instruction_words", "ee_", "gripper_states", "joint_states")
 """What begins the names of observations that LIBERO's environment does not have."""
 
 

@@ -104,7 +104,7 @@ def test_where_a_contact_tips_robosuite_leaves_itself_as_the_compiled_loop_leave
         apart.append(distance(plain, ours))
     assert max(apart[:10]) < 1e-12 and apart[10] < 1e-5, apart
     itself: list[float] = []
-    for seed in range(4):
+    for seed in range(2):
         seeded(ours, 17)
         for step in actions[:10]:
             ours.step(step)
@@ -320,8 +320,8 @@ def test_far_along_the_loops_differ_as_robosuite_differs_from_itself(lift: Any) 
 
     plain = ending(None, lift.step, lift)
     ours = float(np.abs(ending(None, compiled.step, other) - plain).max())
-    moved = [float(np.abs(ending(joint, lift.step, lift) - plain).max()) for joint in (0, 3)]
-    assert ours <= 100 * max(moved), (ours, moved)
+    moved = float(np.abs(ending(0, lift.step, lift) - plain).max())
+    assert ours <= 100 * moved, (ours, moved)
 
 
 def test_an_episode_is_the_same_bits_every_time(lift: Any) -> None:

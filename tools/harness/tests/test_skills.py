@@ -97,13 +97,13 @@ def test_an_episode_of_a_mixed_collection_is_its_demonstrators_own() -> None:
 @pytest.mark.usefixtures("library")
 @pytest.mark.parametrize("task", SHOWN)
 def test_poor_demonstrators_take_longer_and_solve_the_task(task: str) -> None:
-    """Six seeds each; `actrm_harness.check_experts --skill poor` counts over 200."""
-    seeds = range(FIRST, FIRST + 6)
+    """Three seeds each; `actrm_harness.check_experts --skill poor` counts over 200."""
+    seeds = range(FIRST, FIRST + 3)
     with driven(task) as session:
         good = [shown(session, seed, None) for seed in seeds]
         poor = [shown(session, seed, "poor") for seed in seeds]
     solved = [episode.steps for episode in poor if episode.success]
-    assert len(solved) >= 4
+    assert len(solved) >= 2
     assert np.median(solved) > 1.4 * np.median([episode.steps for episode in good if episode.success])
     assert all(episode.attrs["skill"] == "poor" for episode in poor)
 
@@ -132,8 +132,8 @@ def longest_rest(episode: Episode) -> int:
 @pytest.mark.usefixtures("library")
 def test_poor_demonstrators_miss_hesitate_and_go_astray() -> None:
     with driven("PickPlaceCan") as session:
-        good = [shown(session, FIRST + seed, None) for seed in range(8)]
-        poor = [shown(session, FIRST + seed, "poor") for seed in range(8)]
+        good = [shown(session, FIRST + seed, None) for seed in range(4)]
+        poor = [shown(session, FIRST + seed, "poor") for seed in range(4)]
     assert sum(map(times_missed, good)) == 0
     assert sum(map(times_missed, poor)) >= 1
     assert np.median([longest_rest(each) for each in poor]) > np.median([longest_rest(each) for each in good])

@@ -77,17 +77,6 @@ def test_lifts_cube_drawn_anew_gives_the_model_that_loading_gives() -> None:
 
 
 @pytest.mark.usefixtures("library")
-@pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task.expert and name != "Lift"])
-def test_the_expert_solves_the_task(task: str) -> None:
-    """Two seeds each; `actrm_harness.check_experts` counts over 200."""
-    session = envs.make(task)
-    session.control = control.attach(session.env)
-    solved = [episodes.expert_episode(session, 1_000_000 + seed).success for seed in range(2)]
-    session.env.close()
-    assert all(solved)
-
-
-@pytest.mark.usefixtures("library")
 def test_a_thing_that_slips_out_of_the_hand_is_taken_again() -> None:
     """The milk is put back where it was while the hand carries it."""
     session = envs.make("PickPlaceMilk")
@@ -135,9 +124,9 @@ def test_further_experts_solve_the_task_otherwise(task: str, expert: str) -> Non
     session = envs.make(task)
     session.control = control.attach(session.env)
     usual = episodes.expert_episode(session, 1_000_000)
-    further = [episodes.expert_episode(session, 1_000_000 + seed, True, expert) for seed in range(3)]
+    further = [episodes.expert_episode(session, 1_000_000 + seed, True, expert) for seed in range(2)]
     session.env.close()
-    assert sum(episode.success for episode in further) >= 2
+    assert any(episode.success for episode in further)
     marks = not TASKS[task].experts[expert].endswith(":RecoveringTowerExpert")
     assert all(("mistakes" in episode.tensors) == marks for episode in further)
     assert not np.array_equal(further[0].tensors["actions"], usual.tensors["actions"])
@@ -435,23 +424,15 @@ def test_a_task_without_an_expert_says_so() -> None:
 
 @pytest.mark.usefixtures("library")
 @pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task.expert])
-def test_an_expert_passes_every_stage_before_success_and_who_does_nothing_none(task: str) -> None:
-    """Stages come in an order that who solves the task goes through; looking at them changes nothing."""
+def test_an_expert_solves_the_task_by_its_stages_and_who_does_nothing_passes_none(task: str) -> None:
+    """Two seeds each; `actrm_harness.check_experts` counts over 200. Looking at stages changes nothing."""
     session = envs.make(task)
     session.control = control.attach(session.env)
-    solved = 0
-    for seed in (1_000_003, 1_000_004, 1_000_005):
-        passed: list[int] = []
+    names: list[str] = []
+    for seed in (1_000_000, 1_000_001):
         episode = episodes.expert_episode(session, seed)
-        passed.append(session.reached)
-        if not episode.success:
-            assert episode.progress is not None and episode.progress < 1.0
-            continue
-        solved += 1
-        assert episode.progress == 1.0
-        assert passed == [len(session.stages)], [name for name, _ in session.stages]
-    assert solved >= 2
-    names = [name for name, _ in session.stages]
+        names = [name for name, _ in session.stages]
+        assert (episode.success, episode.progress, session.reached) == (True, 1.0, len(names)), names
     assert len(set(names)) == len(names) > 0
     envs.reset(session, 10_000)
     assert session.reached == 0

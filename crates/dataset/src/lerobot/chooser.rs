@@ -9,6 +9,7 @@ use crate::error::{DatasetError, InputError, Result};
 use crate::keys::KeyItem;
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Plan};
 use crate::tree::Dtype;
+use crate::words::{INSTRUCTION_WIDTH, INSTRUCTION_WORDS};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -175,7 +176,11 @@ impl Chooser<'_> {
             let item: KeyItem = key.parse().map_err(unfit)?;
             let mut widths = BTreeMap::new();
             for key in item.keys() {
-                widths.insert(key.to_owned(), self.width_everywhere(&format!("obs/{key}"))?);
+                let width = match self.made_of_words(key).map_err(unfit)? {
+                    true => INSTRUCTION_WIDTH,
+                    false => self.width_everywhere(&format!("obs/{key}"))?,
+                };
+                widths.insert(key.to_owned(), width);
             }
             let width = item.width(|key| widths.get(key).copied()).map_err(unfit)?;
             names.extend(item.names(width));
@@ -186,6 +191,18 @@ impl Chooser<'_> {
             feature: Feature { dtype: "float32".to_owned(), shape: vec![names.len()], names: json!(names), info: None },
             origin: Origin::Concat(parts),
         })
+    }
+
+    /// Whether a conversion makes this observation of the instructions: no demo holds it.
+    fn made_of_words(&self, key: &str) -> std::result::Result<bool, String> {
+        let place = format!("obs/{key}");
+        if key != INSTRUCTION_WORDS || self.plan.demos.iter().any(|demo| demo.keys.contains_key(&place)) {
+            return Ok(false);
+        }
+        match self.plan.demos.iter().find(|demo| demo.task.is_none()) {
+            Some(demo) => Err(format!("{key} is made of the instruction, and {} has none", demo.id)),
+            None => Ok(true),
+        }
     }
 
     pub fn action(&self, options: &ConvertOptions) -> Result<(Column, ActionProvenance)> {

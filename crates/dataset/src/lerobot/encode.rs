@@ -103,7 +103,8 @@ impl Job<'_> {
                 task_index: self.task_of[part.episode],
                 length: part.length,
             };
-            let values = episode_values(self.path, self.mapping, &demo, position)?;
+            let task = plan.task.as_deref().unwrap_or_default();
+            let values = episode_values(self.path, self.mapping, &demo, task, position)?;
             if self.nonfinite == NonFinite::Refuse {
                 self.mapping.columns.iter().zip(&values).try_for_each(|(c, values)| self.finite(c, values, &demo))?;
             }

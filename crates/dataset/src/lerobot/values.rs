@@ -7,6 +7,7 @@ use crate::keys::{KeyItem, Moment};
 use crate::rotation;
 use crate::stats::FeatureStats;
 use crate::tree::{Array, Demo, Dtype};
+use crate::words::{INSTRUCTION_WORDS, instruction_words};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -108,11 +109,18 @@ fn hash_numbers<T, const N: usize>(hash: &mut Sha256, values: &[T], bytes: impl 
 }
 
 /// Takes the values of one column out of `demo`, for the whole episode.
-pub(crate) fn column_values(path: &Path, column: &Column, demo: &Demo, fps: f64, position: Position) -> Result<Values> {
+fn column_values(
+    path: &Path,
+    column: &Column,
+    demo: &Demo,
+    task: &str,
+    fps: f64,
+    position: Position,
+) -> Result<Values> {
     let length = position.length;
     let single = |key: &str| numbers(path, demo, key, 1, length);
     Ok(match &column.origin {
-        Origin::Concat(parts) => Values::F32(concat(path, demo, parts, column.dim(), length)?),
+        Origin::Concat(parts) => Values::F32(concat(path, demo, task, parts, column.dim(), length)?),
         Origin::Action { key, width, rotation } => {
             let stored = numbers(path, demo, key, *width, length)?;
             Values::F32(match rotation {
@@ -129,9 +137,15 @@ pub(crate) fn column_values(path: &Path, column: &Column, demo: &Demo, fps: f64,
     })
 }
 
-/// Every column's values for one episode, in the mapping's order.
-pub(crate) fn episode_values(path: &Path, mapping: &Mapping, demo: &Demo, position: Position) -> Result<Vec<Values>> {
-    mapping.columns.iter().map(|c| column_values(path, c, demo, mapping.fps, position)).collect()
+/// Every column's values for one episode, in the mapping's order; `task` is its instruction.
+pub(crate) fn episode_values(
+    path: &Path,
+    mapping: &Mapping,
+    demo: &Demo,
+    task: &str,
+    position: Position,
+) -> Result<Vec<Values>> {
+    mapping.columns.iter().map(|c| column_values(path, c, demo, task, mapping.fps, position)).collect()
 }
 
 /// Values of the five columns that follow from an episode's place.
@@ -151,6 +165,7 @@ pub(crate) fn index_values(index: IndexColumn, fps: f64, position: Position) -> 
 fn concat(
     path: &Path,
     demo: &Demo,
+    task: &str,
     parts: &[(KeyItem, BTreeMap<String, usize>)],
     width: usize,
     length: usize,
@@ -160,7 +175,14 @@ fn concat(
     for (item, widths) in parts {
         let mut datasets = Vec::with_capacity(widths.len());
         for (key, &width) in widths {
-            datasets.push((key, width, numbers(path, demo, &format!("obs/{key}"), width, length)?));
+            let place = format!("obs/{key}");
+            // the chooser saw that the source has the words or an instruction
+            let made = key == INSTRUCTION_WORDS && !demo.datasets.contains_key(&place);
+            let values = match made {
+                true => instruction_words(task).repeat(length),
+                false => numbers(path, demo, &place, width, length)?,
+            };
+            datasets.push((key, width, values));
         }
         for (step, out) in out.chunks_exact_mut(width).enumerate() {
             let values_of = |key: &str, moment: Moment| {

@@ -4,8 +4,8 @@
 
 use crate::made::{jpeg, value};
 use dataset::{
-    ConvertOptions, ConvertReport, Dataset, Dialect, Dtype, NonFinite, Source, VideoOptions, WriteOptions, convert,
-    export, rewrite, verify, verify_source,
+    ConvertOptions, ConvertReport, Dataset, Dialect, Dtype, ENVIRONMENT_STATE, INSTRUCTION_WORDS, NonFinite, Source,
+    VideoOptions, WriteOptions, convert, export, instruction_words, rewrite, verify, verify_source,
 };
 use hdf5::File;
 use std::path::Path;
@@ -91,6 +91,15 @@ fn jpeg_files_become_a_camera_and_come_back_as_they_were() {
     for demo in 0..2 {
         assert_eq!(first.read_demo(demo).unwrap().datasets[KEY], again.read_demo(demo).unwrap().datasets[KEY]);
     }
+}
+
+#[test]
+fn words_of_an_instruction_that_is_not_there_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    recording(&dir.path().join("aloha"));
+    let words = ConvertOptions { env_keys: Some(vec![INSTRUCTION_WORDS.to_owned()]), ..options() };
+    let error = convert(&dir.path().join("aloha"), &dir.path().join("set"), &words, &mut quiet).unwrap_err().to_string();
+    assert!(error.contains("instruction_words is made of the instruction, and demo_0 has none"), "{error}");
 }
 
 #[test]
@@ -268,6 +277,14 @@ fn a_folder_of_libero_files_is_one_set_of_many_tasks() {
     let root = Source::open(&back).unwrap().root().unwrap();
     let bddl = &root.inner_attrs["files/pick_demo.hdf5/data"]["bddl_file_name"];
     assert_eq!(bddl.to_text().unwrap(), "pick the bowl up.bddl");
+
+    // what a policy of all tasks reads, which these files lack
+    let words = ConvertOptions { env_keys: Some(vec![INSTRUCTION_WORDS.to_owned()]), ..ConvertOptions::default() };
+    convert(&suite, &dir.path().join("words"), &words, &mut quiet).unwrap();
+    let set = Dataset::open(&dir.path().join("words")).unwrap();
+    let expected = ["open it", "pick the bowl up"].map(|text| instruction_words(text).repeat(5)).concat();
+    assert_eq!(column(&set, ENVIRONMENT_STATE), expected);
+    verify_source(&dir.path().join("words"), &suite).unwrap();
 
     // a pointer among them, and a file of something else
     std::fs::write(suite.join("close_demo.hdf5"), "version https://git-lfs.github.com/spec/v1\n").unwrap();

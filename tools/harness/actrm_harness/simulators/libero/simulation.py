@@ -29,6 +29,7 @@ from actrm_harness.simulators.robosuite.render import Renderer
 from actrm_harness.simulators.robosuite.simulation import kernels
 from actrm_harness.tasks import DEFAULT_MAX_STEPS
 from actrm_harness.wire import Array, Tensors
+from actrm_harness.words import KEY, instruction_words
 
 SEED = 7
 """What openpi's evaluation seeds its environments with (examples/libero/main.py)."""
@@ -40,7 +41,7 @@ JOINT_NOISE = 0.02
 """Standard deviation of the robot's joints in drawn initial states, in radians, as in LIBERO's fixed ones."""
 NO_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
-COMMON = ("robot0_", "target_", "goal_", "task_onehot", *stored.NAMES)
+COMMON = ("robot0_", "target_", "goal_", "task_onehot", KEY, *stored.NAMES)
 """What begins the names of observations that all tasks have."""
 
 Pose = tuple[Array, Array]
@@ -224,7 +225,8 @@ class Libero:
         onehot = np.zeros(self.files.tasks)
         if self.files.meant is not None:
             onehot[self.files.meant] = 1.0
-        return said | {"task_onehot": onehot}
+        # as LIBERO's own demonstrations word it
+        return said | {"task_onehot": onehot, KEY: instruction_words(self.control.language_instruction)}
 
     def env_args(self) -> dict[str, Any]:
         """What robomimic calls `env_args`, as LIBERO's files hold them."""
