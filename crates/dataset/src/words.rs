@@ -2,8 +2,8 @@
 
 use sha2::{Digest, Sha256};
 
-/// Observation key of the words of an episode's instruction. A conversion makes it of the text where a source does not
-/// hold it.
+/// Observation key of the words of an episode's instruction. A conversion makes it of the instruction of LIBERO's own files,
+/// which do not hold it.
 pub const INSTRUCTION_WORDS: &str = "instruction_words";
 
 /// Numbers of [`instruction_words`].

@@ -193,14 +193,19 @@ impl Chooser<'_> {
         })
     }
 
-    /// Whether a conversion makes this observation of the instructions: no demo holds it.
+    /// Whether a conversion makes this observation of the instructions: LIBERO's own files do not hold it. Others may word
+    /// their tasks (`ep_meta`) in another way than the simulator does.
     fn made_of_words(&self, key: &str) -> std::result::Result<bool, String> {
         let place = format!("obs/{key}");
         if key != INSTRUCTION_WORDS || self.plan.demos.iter().any(|demo| demo.keys.contains_key(&place)) {
             return Ok(false);
         }
-        match self.plan.demos.iter().find(|demo| demo.task.is_none()) {
-            Some(demo) => Err(format!("{key} is made of the instruction, and {} has none", demo.id)),
+        let own = |demo: &DemoPlan| demo.task.is_some() && !demo.attr_names.iter().any(|name| name == "ep_meta");
+        match self.plan.demos.iter().find(|demo| self.plan.dialect != Dialect::Libero || !own(demo)) {
+            Some(demo) => Err(format!(
+                "{key} is made of the instruction of LIBERO's own files; {} is none of theirs and does not hold it (collect it again)",
+                demo.id
+            )),
             None => Ok(true),
         }
     }

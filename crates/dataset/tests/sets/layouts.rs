@@ -94,12 +94,16 @@ fn jpeg_files_become_a_camera_and_come_back_as_they_were() {
 }
 
 #[test]
-fn words_of_an_instruction_that_is_not_there_are_refused() {
+fn words_of_other_files_than_liberos_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     recording(&dir.path().join("aloha"));
     let words = ConvertOptions { env_keys: Some(vec![INSTRUCTION_WORDS.to_owned()]), ..options() };
-    let error = convert(&dir.path().join("aloha"), &dir.path().join("set"), &words, &mut quiet).unwrap_err().to_string();
-    assert!(error.contains("instruction_words is made of the instruction, and demo_0 has none"), "{error}");
+    let error =
+        convert(&dir.path().join("aloha"), &dir.path().join("set"), &words, &mut quiet).unwrap_err().to_string();
+    assert!(
+        error.contains("instruction_words is made of the instruction of LIBERO's own files; demo_0 is none"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -52,8 +52,8 @@ pub struct Args {
     /// Observation keys of observation.state, in order [default: those of the file's layout]
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     state_keys: Option<Vec<String>>,
-    /// Observation keys of observation.environment_state, in order; "" makes no such column. instruction_words, 32
-    /// numbers, is made of the instruction where no file holds it [default: object, where there is one]
+    /// Observation keys of observation.environment_state, in order; "" makes no such column. instruction_words is made
+    /// of the instruction of LIBERO's own files [default: object, where there is one]
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     env_keys: Option<Vec<String>>,
     /// An entity: observation.entity.NAME of these observation keys, of parts of them (key[0:3]), of differences
