@@ -211,7 +211,7 @@ def test_what_is_left_out_cannot_be_seen(task: str, monkeypatch: pytest.MonkeyPa
     fast, whole = render.Renderer(fast=True), render.Renderer(fast=True)
     monkeypatch.setattr(whole, "_leave_out", do_nothing)
     left_out = 0
-    for action in walk(2, 24):
+    for action in walk(2, 10):
         session.env.step(action)
         for height, width in ((84, 84), (48, 96)):
             drawn = fast.images(session.env.sim, cameras, height, width)
