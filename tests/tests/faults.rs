@@ -172,7 +172,7 @@ fn an_evaluation_survives_a_fault_at_any_call() {
     assert!(whole.status.success(), "{}", whole.stderr);
     assert_eq!(recorded(&whole), EPISODES, "a line an episode");
     let expected = outcomes(&straight);
-    let faults = faults(&whole.calls, 4);
+    let faults = faults(&whole.calls, 3);
     for fault in &faults {
         let results = at("struck");
         let ended = struck(&mut eval(&results), &results, *fault);
