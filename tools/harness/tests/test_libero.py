@@ -191,7 +191,7 @@ def test_a_suite_is_its_tasks_one_after_the_other(cabinet: Client) -> None:
 
 
 def test_outcomes_of_a_suite_do_not_depend_on_workers_or_interruptions(libero: Path, tmp_path: Path) -> None:
-    """With one worker and two, where one is killed, and where two resume what was stopped: the same files.
+    """With one worker and three, where one is killed, and where two resume what was stopped: the same files.
 
     A server that speaks openpi's protocol is the policy. It is shown the same in each, and the instructions.
     """
@@ -221,7 +221,7 @@ def test_outcomes_of_a_suite_do_not_depend_on_workers_or_interruptions(libero: P
     assert len(shown.prompts) == 3 and "pick up the salad dressing and place it in the basket" in shown.prompts
 
     server = serve()
-    killed = run("killed", 2, server)
+    killed = run("killed", 3, server)
     wait_for(lambda: bool(server.queries), killed)
     os.kill(workers_of(killed.pid)[0], signal.SIGKILL)
     assert killed.wait() == 0

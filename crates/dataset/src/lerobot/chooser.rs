@@ -203,8 +203,8 @@ impl Chooser<'_> {
         let own = |demo: &DemoPlan| demo.task.is_some() && !demo.attr_names.iter().any(|name| name == "ep_meta");
         match self.plan.demos.iter().find(|demo| self.plan.dialect != Dialect::Libero || !own(demo)) {
             Some(demo) => Err(format!(
-                "{key} is made of the instruction of LIBERO's own files; {} is of no such file and does not hold it \
-                 (what `collect` writes of LIBERO's tasks now does)",
+                "{key} is made from the instruction of LIBERO's own files alone, and {} comes from another file, which lacks \
+                 it; collect the demonstrations again, or leave the key out",
                 demo.id
             )),
             None => Ok(true),

@@ -101,7 +101,7 @@ fn words_of_other_files_than_liberos_are_refused() {
     let error =
         convert(&dir.path().join("aloha"), &dir.path().join("set"), &words, &mut quiet).unwrap_err().to_string();
     assert!(
-        error.contains("instruction_words is made of the instruction of LIBERO's own files; demo_0 is of no"),
+        error.contains("made from the instruction of LIBERO's own files alone, and demo_0 comes from another file"),
         "{error}"
     );
 }
