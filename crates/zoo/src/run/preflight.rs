@@ -19,12 +19,12 @@ pub(super) fn check(place: &Place, experiment: &impl Settings) -> Result<(), Zoo
     Ok(())
 }
 
-/// Refuses a folder that could not be made or written to; nothing is left of the attempt.
+/// Refuses a folder that could not be made or written to. The file of the attempt has no name: nothing is left of it, even
+/// of one that is killed.
 fn writable(folder: &Path) -> Result<(), ZooError> {
     let mut there = folder.ancestors().filter(|path| path.symlink_metadata().is_ok());
     let there = there.next().unwrap_or(Path::new("."));
-    let tried = tempfile::Builder::new().prefix(".tmp-").tempfile_in(there);
-    tried.map(drop).map_err(ZooError::io("write into", there))
+    tempfile::tempfile_in(there).map(drop).map_err(ZooError::io("write into", there))
 }
 
 /// Refuses an experiment whose training takes more than the `available` bytes.
