@@ -89,16 +89,17 @@ fn which_expert_recorded_demonstrations_goes_with_them() {
 fn who_showed_demonstrations_goes_with_them() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let place = |name: &str| folder.path().join(name);
-    let few = |out: &Path, more: &[&str]| {
-        let mut command = data(["collect", "--task", "Lift", "--episodes", "6", "--workers", "1", "--out", text(out)]);
+    let few = |out: &Path, episodes: &str, more: &[&str]| {
+        let mut command =
+            data(["collect", "--task", "Lift", "--episodes", episodes, "--workers", "1", "--out", text(out)]);
         command.args(more);
         command
     };
     let (mixed, usual, good) = (place("mixed.hdf5"), place("usual.hdf5"), place("good.hdf5"));
-    refused(&mut few(&mixed, &["--skill", "careless"]), &["careless", "good", "mixed", "poor"]);
-    succeeds(&mut few(&mixed, &["--skill", "mixed"]));
-    succeeds(&mut few(&usual, &[]));
-    succeeds(&mut few(&good, &["--skill", "good"]));
+    refused(&mut few(&mixed, "6", &["--skill", "careless"]), &["careless", "good", "mixed", "poor"]);
+    succeeds(&mut few(&mixed, "6", &["--skill", "mixed"]));
+    succeeds(&mut few(&usual, "2", &[]));
+    succeeds(&mut few(&good, "2", &["--skill", "good"]));
     assert!(fs::read(&usual).expect("a file") == fs::read(&good).expect("a file"), "good is not the usual");
 
     let word = |place: &hdf5::Group| {

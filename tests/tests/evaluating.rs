@@ -81,26 +81,11 @@ fn parts_are_joined_to_the_whole_and_others_are_refused() {
 }
 
 #[test]
-fn a_finished_evaluation_runs_again_to_the_same_outcomes() {
+fn a_finished_evaluation_or_part_of_it_runs_again_to_the_same_outcomes() {
     let (_folder, entries) = copied_zoo();
-    refused(&mut eval(&entries, "2", &["--again"]), &["nothing to run again"]);
-    succeeds(&mut eval(&entries, "2", &[]));
-    assert!(said(&mut eval(&entries, "2", &["--again"])).contains("2 episodes run again, every outcome the same"));
-    let results = entries.join("results");
-    assert_eq!(listing(&results).len(), 1, "{:?}", listing(&results));
-    // results of another entry of that name
-    let record = result(&results, "lift-act").join("evaluation.json");
-    let changed = fs::read_to_string(&record).expect("a record").replace("\"demos\": 45", "\"demos\": 44");
-    fs::write(&record, changed).expect("writable");
-    fs::remove_file(record.with_file_name("seal.json")).expect("results made before seals have none");
-    refused(&mut eval(&entries, "2", &["--again"]), &["evaluation.json differs", "44", "45"]);
-}
-
-#[test]
-fn part_of_a_finished_evaluation_can_be_run_again() {
-    let (_folder, entries) = copied_zoo();
+    refused(&mut eval(&entries, "3", &["--again"]), &["nothing to run again"]);
     succeeds(&mut eval(&entries, "3", &[]));
-    assert!(said(&mut eval(&entries, "2", &["--again"])).contains("2 of 3 episodes run again, every outcome the same"));
+    assert!(said(&mut eval(&entries, "3", &["--again"])).contains("3 episodes run again, every outcome the same"));
     refused(&mut eval(&entries, "4", &["--again"]), &["nothing to run again", "10000-10003", "stored: 10000-10002"]);
     assert_eq!(listing(&entries.join("results")).len(), 1);
     // under another version of what was there: run, compared, and told
@@ -116,11 +101,15 @@ fn part_of_a_finished_evaluation_can_be_run_again() {
     fs::write(&record, changed).expect("writable");
     fs::remove_file(record.with_file_name("seal.json")).expect("results made before seals have none");
     let output = succeeds(&mut eval(&entries, "2", &["--again"]));
-    assert!(String::from_utf8_lossy(&output.stdout).contains("every outcome the same"));
+    let told = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(told.contains("2 of 3 episodes run again, every outcome the same"), "{told}");
     let note = String::from_utf8_lossy(&output.stderr).into_owned();
     for told in ["numpy 1.0.0", numpy, "kernels openblas Other", kernels] {
         assert!(note.contains(told), "{told}: {note}");
     }
+    // results of another entry of that name
+    fs::write(&record, text.replace("\"demos\": 45", "\"demos\": 44")).expect("writable");
+    refused(&mut eval(&entries, "2", &["--again"]), &["evaluation.json differs", "44", "45"]);
 }
 
 #[test]
@@ -142,7 +131,7 @@ fn more_episodes_run_only_what_is_missing_and_none_starts_no_simulator() {
 }
 
 #[test]
-fn one_bad_entry_does_not_keep_the_others_from_being_evaluated() {
+fn all_is_the_newest_versions_and_one_bad_entry_keeps_no_other_from_being_evaluated() {
     let (folder, entries) = copied_zoo();
     for _ in 0..2 {
         train_lift(&trained().join("lift"), &entries, &folder.path().join("runs"));
@@ -151,8 +140,10 @@ fn one_bad_entry_does_not_keep_the_others_from_being_evaluated() {
     let mut bytes = fs::read(&model).expect("a model");
     bytes[3000] ^= 4;
     fs::write(&model, bytes).expect("writable");
-    let mut command = zoo(["eval", "--all-versions", "--episodes", "1", "--max-steps", "2", "--zoo", text(&entries)]);
-    let output = command.output().expect("it runs");
+    let all = |flag: &str| zoo(["eval", flag, "--episodes", "1", "--max-steps", "2", "--zoo", text(&entries)]);
+    let newest = said(&mut all("--all"));
+    assert!(newest.contains("lift-act@3 on") && !newest.contains("lift-act@1 on"), "{newest}");
+    let output = all("--all-versions").output().expect("it runs");
     let (out, error) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert_eq!(output.status.code(), Some(1), "{error}");
     assert!(out.contains("lift-act@1 on") && out.contains("lift-act@3 on") && !out.contains("lift-act@2"), "{out}");
@@ -163,28 +154,13 @@ fn one_bad_entry_does_not_keep_the_others_from_being_evaluated() {
 fn another_way_to_act_is_another_evaluation() {
     let (_folder, entries) = copied_zoo();
     succeeds(&mut eval(&entries, "1", &[]));
-    succeeds(&mut eval(&entries, "1", &["--n-action-steps", "2"]));
     succeeds(&mut eval(&entries, "1", &["--temporal-ensemble", "0.01"]));
-    assert_eq!(listing(&entries.join("results")).len(), 3);
+    assert_eq!(listing(&entries.join("results")).len(), 2);
     refused(
         &mut eval(&entries, "1", &["--n-action-steps", "17"]),
         &["--n-action-steps", "1 to the action horizon, 16", "17"],
     );
     refused(&mut eval(&entries, "1", &["--temporal-ensemble", "nan"]), &["--temporal-ensemble", "finite", "NaN"]);
-}
-
-#[test]
-fn all_means_the_newest_versions() {
-    let (folder, entries) = copied_zoo();
-    train_lift(&trained().join("lift"), &entries, &folder.path().join("runs"));
-    let all = |flag: &str| {
-        let arguments = ["eval", flag, "--episodes", "1", "--max-steps", "2", "--zoo", text(&entries)];
-        said(&mut zoo(arguments))
-    };
-    let newest = all("--all");
-    assert!(newest.contains("lift-act@2 ") && !newest.contains("lift-act@1 "), "{newest}");
-    let every = all("--all-versions");
-    assert!(every.contains("lift-act@2 ") && every.contains("lift-act@1 "), "{every}");
 }
 
 /// Say of a file that robosuite 1.4.1 recorded it.
@@ -253,12 +229,19 @@ fn a_page_shows_the_film_of_a_failure_and_its_commands_are_taken() {
         shell.current_dir(folder.path());
         said(shell.args(["-c", &format!("exec \"$0\" {words}{quick}")]).arg(&program))
     };
-    for line in &commands {
+    // one of each kind is run, and all of the result that has a flag of its own
+    let others = commands.iter().filter(|line| line.contains(" rerun ")).take(1);
+    let run_now = commands.iter().filter(|line| line.contains("--n-action-steps 2")).chain(others);
+    let run_now = run_now.chain(commands.iter().filter(|line| line.contains("--seed-start 10001")));
+    let mut told_of = 0;
+    for line in run_now {
         let told = run(line);
         let word = if line.contains(" rerun ") { "is the same" } else { "every outcome the same" };
         assert!(told.contains(word), "{line}: {told}");
         assert_eq!(told.contains(".mp4"), line.contains(" --video 1"), "{line}: {told}");
+        told_of += 1;
     }
+    assert_eq!(told_of, 4, "{commands:#?}");
     assert_eq!(listing(&results).len(), 2, "no command leaves another result");
     // now the other result has a film of its first failure as well
     let page = board(&folder.path().join("out"));

@@ -1,5 +1,6 @@
 """What makes resets cheap and the process small leaves no trace."""
 
+import dataclasses
 from typing import Any
 
 import pytest
@@ -40,6 +41,7 @@ def test_looking_at_the_robots_model_leaves_the_scenes_text(kept: envs.Session) 
 
 def test_a_slimmed_session_writes_its_model_again(kept: envs.Session) -> None:
     """An evaluation forgets the model's text; an expert's episode and an extraction after it have it all the same."""
+    kept.task = dataclasses.replace(kept.task, max_steps=30)
     first = again = episodes.expert_episode(kept, 5)
     for _ in range(2):
         envs.reset(kept, 1)
@@ -47,7 +49,7 @@ def test_a_slimmed_session_writes_its_model_again(kept: envs.Session) -> None:
         assert kept.xml_forgotten
         again = episodes.expert_episode(kept, 5)
         assert again.attrs["model_file"].startswith("<mujoco")
-        assert again.steps == first.steps
+        assert again.tensors["states"].tobytes() == first.tensors["states"].tobytes()
     envs.reset(kept, 1)
     envs.slim(kept)
     states, actions = again.tensors["states"], again.tensors["actions"]

@@ -115,21 +115,21 @@ def test_the_hand_turns_only_where_there_is_no_room() -> None:
     assert turn != 0.0 and min(float(np.linalg.norm(finger - neighbour)) for finger in fingers) >= CLEAR
 
 
-FURTHER = [(task.name, name) for task in TASKS.values() for name in task.experts]
-
-
 @pytest.mark.usefixtures("library")
-@pytest.mark.parametrize(("task", "expert"), FURTHER)
-def test_further_experts_solve_the_task_otherwise(task: str, expert: str) -> None:
+@pytest.mark.parametrize("task", [task.name for task in TASKS.values() if task.experts])
+def test_further_experts_solve_the_task_otherwise(task: str) -> None:
     session = envs.make(task)
     session.control = control.attach(session.env)
     usual = episodes.expert_episode(session, 1_000_000)
-    further = [episodes.expert_episode(session, 1_000_000 + seed, True, expert) for seed in range(2)]
+    for name, expert in TASKS[task].experts.items():
+        marks = not expert.endswith(":RecoveringTowerExpert")
+        episode = episodes.expert_episode(session, 1_000_000, True, name)
+        assert not np.array_equal(episode.tensors["actions"], usual.tensors["actions"]), name
+        assert ("mistakes" in episode.tensors) == marks, name
+        if not episode.success:
+            episode = episodes.expert_episode(session, 1_000_001, True, name)
+        assert episode.success, name
     session.env.close()
-    assert any(episode.success for episode in further)
-    marks = not TASKS[task].experts[expert].endswith(":RecoveringTowerExpert")
-    assert all(("mistakes" in episode.tensors) == marks for episode in further)
-    assert not np.array_equal(further[0].tensors["actions"], usual.tensors["actions"])
 
 
 @pytest.mark.usefixtures("library")
@@ -179,10 +179,10 @@ def test_a_hand_that_reached_beside_the_nut_reaches_again_and_succeeds() -> None
             run = (run + 1) * bool(wrong)
             longest = max(longest, run)
         missed += found.success and longest > 16
-        if missed == 3:
+        if missed == 2:
             break
     session.env.close()
-    assert missed == 3
+    assert missed == 2
 
 
 @pytest.mark.usefixtures("library")
@@ -200,10 +200,10 @@ def test_a_hand_that_carried_nothing_comes_back_for_the_thing() -> None:
         starts = np.flatnonzero(nothing[1:] & ~nothing[:-1]) + 1
         ways = [hand[at : at + int(np.argmin(np.append(nothing[at:], False))), 1] for at in starts]
         carried += found.success and any(np.ptp(way) > 0.1 for way in ways)
-        if carried == 2:
+        if carried:
             break
     session.env.close()
-    assert carried == 2
+    assert carried == 1
 
 
 @pytest.mark.usefixtures("library")
