@@ -111,11 +111,12 @@ check: build ## the tests of one change, in five minutes: unit tests, the rules 
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --lib
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- architecture:: house:: help:: main_line:: bad_data:: bad_zoo::
 
-# Python's tests run beside Rust's, because neither keeps two cores busy; what they print comes at the end.
+# Python's tests run beside Rust's, because neither keeps two cores busy; what they print comes at the end. Rust's go first:
+# what is left of them at the end runs in one process at a time.
 .PHONY: test
 test: build wheel ## every test: Rust, Python and end to end
-	@tools/test_wheel.sh >target/test_wheel.log 2>&1 & wheel=$$!; \
-	    .venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests >target/test_harness.log 2>&1 & harness=$$!; \
+	@nice -n 3 tools/test_wheel.sh >target/test_wheel.log 2>&1 & wheel=$$!; \
+	    nice -n 3 .venv/bin/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal tools/harness/tests >target/test_harness.log 2>&1 & harness=$$!; \
 	    failed=0; $(CARGO) test $(CARGO_FLAGS) --workspace --no-fail-fast || failed=1; \
 	    if [ -n "$(BROWSER)$${CI:-}" ]; then \
 	      $(CARGO) test $(CARGO_FLAGS) --workspace --test many_rows --test e2e -- --ignored || failed=1; \
