@@ -111,8 +111,8 @@ check: build ## the tests of one change, in five minutes: unit tests, the rules 
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --lib
 	@$(CARGO) test $(CARGO_FLAGS) --workspace --test e2e -- architecture:: house:: help:: main_line:: bad_data:: bad_zoo::
 
-# Python's tests run beside Rust's, because neither keeps two cores busy; what they print comes at the end. Rust's go first:
-# what is left of them at the end runs in one process at a time.
+# Python's tests run beside Rust's, because neither keeps two cores busy; what they print comes at the end. Rust's have
+# priority: they take longest, and many of them use one core only.
 .PHONY: test
 test: build wheel ## every test: Rust, Python and end to end
 	@nice -n 3 tools/test_wheel.sh >target/test_wheel.log 2>&1 & wheel=$$!; \

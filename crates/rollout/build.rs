@@ -1,7 +1,7 @@
 //! Lists the Python sources of the harness, so that the binaries carry them and work from any folder.
 //!
-//! The files are watched one by one. Of a folder cargo would watch `__pycache__` too: a Python that ran would have everything
-//! compiled again. A file that is new is found when another changes; a test says when one is missing.
+//! Cargo watches the files one by one. If it watched the folder, it would see `__pycache__` too, and running Python would
+//! cause a rebuild. A new file is found when another file changes; a test fails if one is missing.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};

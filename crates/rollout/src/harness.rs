@@ -218,7 +218,7 @@ mod tests {
 
     use super::*;
 
-    /// Names of the Python sources below a folder, as they are built in.
+    /// Names of the files below a folder, relative to it, without those that Python caches.
     fn sources(folder: &Path, below: &str, into: &mut Vec<String>) {
         for item in fs::read_dir(folder).unwrap().map(Result::unwrap) {
             let name = format!("{below}{}", item.file_name().to_str().unwrap());
@@ -237,7 +237,10 @@ mod tests {
         there.sort();
         let mut built_in: Vec<&str> = FILES.iter().map(|(name, _)| *name).collect();
         built_in.sort_unstable();
-        assert_eq!(built_in, there, "build again after `touch crates/rollout/build.rs`");
+        assert_eq!(
+            built_in, there,
+            "files were added since the build: `touch crates/rollout/build.rs` and build again"
+        );
     }
 
     #[test]

@@ -19,8 +19,7 @@ pub(super) fn check(place: &Place, experiment: &impl Settings) -> Result<(), Zoo
     Ok(())
 }
 
-/// Refuses a folder that could not be made or written to. The file of the attempt has no name: nothing is left of it, even
-/// of one that is killed.
+/// Refuses a folder that cannot be made or written to. The file that tries it has no name, so a killed process leaves nothing.
 fn writable(folder: &Path) -> Result<(), ZooError> {
     let mut there = folder.ancestors().filter(|path| path.symlink_metadata().is_ok());
     let there = there.next().unwrap_or(Path::new("."));
