@@ -53,6 +53,15 @@ help: ## list the targets
 	@.venv-peers/bin/python -m $(PIP) -r $<
 	@touch $@
 
+# NVIDIA's compiler and libraries, for a machine without a CUDA toolkit.
+.venv-cuda/.complete: tools/cuda/requirements.lock
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.11, 3.12 or 3.13 with venv found; name one: make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
+	@echo "Python: making .venv-cuda from $< (a minute, 1.7 GB)"
+	@rm -rf .venv-cuda && "$(PYTHON)" -m venv .venv-cuda
+	@.venv-cuda/bin/python -m $(PIP) -r $<
+	@tools/cuda/toolkit.sh .venv-cuda
+	@touch $@
+
 # What the wheel is built with.
 .venv-wheel/.complete: crates/python/requirements.lock
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.11, 3.12 or 3.13 with venv found; name one: make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
@@ -80,6 +89,18 @@ build: .venv/.complete ## the programs, in target/release
 .PHONY: programs
 programs: .venv/.complete
 	@$(CARGO) build $(CARGO_FLAGS) -p actrm-data -p actrm-zoo -p control
+
+# Another toolkit: make cuda CUDA_HOME=/usr/local/cuda. Cards of this compute capability (8.0: A100) and later ones run the program.
+OWN_CUDA := $(CURDIR)/.venv-cuda/cuda
+CUDA_HOME ?= $(OWN_CUDA)
+CUDA_COMPUTE_CAP ?= 80
+
+.PHONY: cuda
+cuda: .venv/.complete $(if $(filter $(OWN_CUDA),$(CUDA_HOME)),.venv-cuda/.complete) ## actrm-zoo for NVIDIA's GPUs, in target/cuda/release (docs/howto/gpu.md)
+	@export CUDA_HOME="$(CUDA_HOME)" CUDA_COMPUTE_CAP=$(CUDA_COMPUTE_CAP) PATH="$(CUDA_HOME)/bin:$$PATH"; \
+	    for target in "--bin actrm-zoo" "--example gpu_check"; do \
+	      $(CARGO) rustc $(CARGO_FLAGS) --target-dir target/cuda -p actrm-zoo --features cuda $$target -- -C link-arg=-Wl,-rpath,"$(CUDA_HOME)/lib"; \
+	    done
 
 # ---- the main job ---------------------------------------------------------------------------------------------
 
@@ -180,4 +201,4 @@ references: build .venv-peers/.complete ## LeRobot and robomimic train on our de
 
 .PHONY: clean
 clean: ## remove what was built and installed (target, .venv, .venv-peers, out)
-	@rm -rf target .venv .venv-libero .venv-peers .venv-wheel .venv-docs out
+	@rm -rf target .venv .venv-libero .venv-peers .venv-wheel .venv-cuda .venv-docs out

@@ -61,6 +61,7 @@ fn subject(reasoning: ReasoningConfig) -> Subject<'static> {
         is_scripted: false,
         fast_render: None,
         perturbation: None,
+        gpu: None,
         max_steps: Some(18),
         signature,
         policy: Box::new(move || Ok(Arc::clone(&model).policy(Arc::clone(&preprocess), Box::new(WallClock::new())))),

@@ -61,6 +61,7 @@ fn trained(root: &Path, zoo: &Path) -> EntryId {
         from_zoo: None,
         force: false,
         image_memory: None,
+        device: zoo::run::DeviceChoice::Cpu,
         command: Some("actrm-zoo train act_lift".to_owned()),
     };
     match train(&request, &|| false, &mut |_| {}).unwrap() {

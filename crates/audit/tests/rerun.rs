@@ -39,6 +39,7 @@ fn trained(folder: &Path, data: &Path) -> Entry {
         from_zoo: None,
         force: false,
         image_memory: None,
+        device: zoo::run::DeviceChoice::Cpu,
         command: None,
     };
     match train(&request, &|| false, &mut |_| {}).unwrap() {

@@ -90,8 +90,11 @@ pub struct WindowBatch {
     pub indices: Vec<u32>,
     /// By column, in the order asked for: `(n, n_obs_steps, dim)`, oldest first.
     pub observation: Vec<(String, Vec<f32>)>,
-    /// By camera, in the order in which they were added: `(n, n_obs_steps, height, width, 3)`, oldest first.
+    /// By camera, in the order in which they were added: `(n, n_obs_steps, height, width, 3)`, oldest first. Empty where the
+    /// pictures are elsewhere.
     pub pictures: Vec<(String, Vec<u8>)>,
+    /// Frames of the data set, where pictures are elsewhere: `(n, n_obs_steps)`, oldest first.
+    pub frames: Vec<u32>,
     /// `(n, action_horizon, action_dim)`
     pub actions: Vec<f32>,
     /// `(n, action_horizon)`; true where the first or last action of the episode is repeated.
@@ -233,7 +236,15 @@ impl Windows {
         if !named {
             batch.pictures = self.pictures.iter().map(|(name, _)| (name.clone(), Vec::new())).collect();
         }
+        batch.frames.clear();
+        if self.pictures.iter().any(|(_, pictures)| matches!(pictures, PictureStore::Elsewhere(..))) {
+            batch.frames.extend(indices.iter().flat_map(|&index| self.frames(index)).map(|frame| frame as u32));
+        }
         for ((_, values), (_, pictures)) in batch.pictures.iter_mut().zip(&self.pictures) {
+            if matches!(pictures, PictureStore::Elsewhere(..)) {
+                values.clear();
+                continue;
+            }
             values.resize(n * self.n_obs_steps * pictures.picture_bytes(), 0);
             let rows = values.chunks_exact_mut(pictures.picture_bytes().max(1));
             for (row, frame) in rows.zip(indices.iter().flat_map(|&index| self.frames(index))) {
@@ -348,6 +359,7 @@ mod tests {
             let indices: Vec<u32> = picks.iter().map(|p| p.index(frames.len()) as u32).collect();
             // a batch that held something else before must not leak it
             let mut batch = WindowBatch {
+                frames: vec![7],
                 n: 1,
                 n_obs_steps: 9,
                 indices: vec![9; 3],
@@ -408,5 +420,9 @@ mod tests {
         let expected = [2, 2, 3, 4, 0, 1].map(|frame| pictures.frame(frame));
         assert_eq!((name.as_str(), frames.as_slice()), ("front", &expected[..]));
         assert_eq!(batch.column("c").unwrap(), [2.0, 2.0, 3.0, 4.0, 0.0, 1.0]);
+        assert!(batch.frames.is_empty());
+        let windows = Windows { pictures: Vec::new(), ..windows }.with_pictures("front", PictureStore::Elsewhere(1, 2));
+        windows.gather(&[2, 4, 1], &mut batch);
+        assert_eq!((&batch.frames[..], batch.pictures[0].1.len()), (&[2, 2, 3, 4, 0, 1][..], 0));
     }
 }

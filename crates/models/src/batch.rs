@@ -45,7 +45,8 @@ impl Taken {
 }
 
 impl Batch {
-    /// On a device, from row-major values: those of the signature's features, `actions` n*H*A, `is_pad` n*H.
+    /// On a device, from row-major values: those of the signature's features, `actions` n*H*A, `is_pad` n*H. Features that are
+    /// there already come as tensors in `placed`.
     ///
     /// # Errors
     /// Values of the wrong length, by name, or an empty batch.
@@ -53,6 +54,7 @@ impl Batch {
         signature: &Signature,
         action_horizon: usize,
         mut observation: Features<Values>,
+        placed: &Features<Tensor>,
         actions: Vec<f32>,
         is_pad: &[bool],
         device: &Device,
@@ -60,13 +62,21 @@ impl Batch {
         let n = is_pad.len() / action_horizon.max(1);
         check("is_pad", is_pad.len(), &[n, action_horizon])?;
         check("actions", actions.len(), &[n, action_horizon, signature.action_dim])?;
-        for spec in &signature.observation {
+        for spec in signature.observation.iter().filter(|spec| placed.get(&spec.name).is_none()) {
             observation.require("batch", &spec.name)?;
         }
         let mut tensors = Features::new();
         for spec in &signature.observation {
-            let values = observation.take("batch", &spec.name)?;
-            tensors.insert(&spec.name, tensor(&spec.name, values, &signature.batch_shape(spec, n), device)?);
+            let shape = signature.batch_shape(spec, n);
+            let made = match placed.get(&spec.name) {
+                Some(placed) if placed.dims() == shape => placed.clone(),
+                Some(placed) => {
+                    let (operation, name, found) = ("batch", spec.name.clone(), placed.dims().to_vec());
+                    return Err(ModelError::FeatureShape { operation, name, expected: shape, found });
+                }
+                None => tensor(&spec.name, observation.take("batch", &spec.name)?, &shape, device)?,
+            };
+            tensors.insert(&spec.name, made);
         }
         let pad: Vec<f32> = is_pad.iter().map(|&p| if p { 1.0 } else { 0.0 }).collect();
         Ok(Self {
@@ -94,7 +104,7 @@ impl Batch {
         is_pad: &[bool],
     ) -> Result<Self> {
         let owned = observation.map(|_, values| values.to_values());
-        Self::new(signature, action_horizon, owned, actions.to_vec(), is_pad, &Device::Cpu)
+        Self::new(signature, action_horizon, owned, &Features::new(), actions.to_vec(), is_pad, &Device::Cpu)
     }
 
     /// Rows in this shard.
@@ -105,6 +115,20 @@ impl Batch {
     /// Where its tensors are.
     pub fn device(&self) -> &Device {
         self.actions.device()
+    }
+
+    /// The same on a device.
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn to_device(&self, device: &Device) -> Result<Self> {
+        let placed = |tensor: &Tensor| tensor.to_device(device);
+        Ok(Self {
+            observation: self.observation.try_map(|_, tensor| placed(tensor))?,
+            actions: placed(&self.actions)?,
+            is_pad: placed(&self.is_pad)?,
+            ..self.clone()
+        })
     }
 
     /// Cuts the batch into at most `n` shards of consecutive rows whose losses add up to the loss of the whole.

@@ -5,7 +5,7 @@
 //! type: stablemax's sums lose too much in f32 once one class dominates, and the official code
 //! casts to f64 for the same reason.
 
-use candle_core::{CpuStorage, CustomOp1, DType, Layout, Result as CandleResult, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp1, DType, Device, Layout, Result as CandleResult, Shape, Tensor};
 
 /// A label that takes no part in the loss.
 pub const IGNORE_LABEL: i64 = -100;
@@ -142,8 +142,24 @@ pub fn cross_entropy(logits: &Tensor, labels: &[i64], probability: ClassProbabil
             candle_core::bail!("cross-entropy: label {label} among {classes} classes");
         }
     }
-    let op = CrossEntropy { labels: labels.to_vec(), probability };
-    logits.to_dtype(DType::F32)?.contiguous()?.apply_op1(op)
+    let logits = logits.to_dtype(DType::F32)?.contiguous()?;
+    match (logits.device(), probability) {
+        (Device::Cpu, _) => logits.apply_op1(CrossEntropy { labels: labels.to_vec(), probability }),
+        (_, ClassProbability::Softmax) => composed(&logits, labels),
+        (_, ClassProbability::Stablemax) => candle_core::bail!("cross-entropy of stablemax: on the CPU only"),
+    }
+}
+
+/// [`cross_entropy`] of a softmax, of candle's operations.
+fn composed(logits: &Tensor, labels: &[i64]) -> CandleResult<Tensor> {
+    let (device, n) = (logits.device(), labels.len());
+    let counts = labels.iter().map(|label| f64::from(u8::from(*label != IGNORE_LABEL)));
+    let counts = Tensor::from_vec(counts.collect::<Vec<_>>(), n, device)?;
+    let labels =
+        Tensor::from_vec(labels.iter().map(|label| (*label).max(0) as u32).collect::<Vec<_>>(), (n, 1), device)?;
+    let shifted = logits.broadcast_sub(&logits.detach().max_keepdim(1)?)?.to_dtype(DType::F64)?;
+    let taken = shifted.gather(&labels, 1)?.squeeze(1)?;
+    (shifted.exp()?.sum(1)?.log()? - taken)? * counts
 }
 
 /// Binary cross-entropy of `logits` against `targets` of the same shape, element by element,
@@ -212,6 +228,25 @@ mod tests {
                     grad[i]
                 );
             }
+        }
+    }
+
+    #[test]
+    fn the_composition_is_the_operation() {
+        let labels = [2, IGNORE_LABEL, 3];
+        let [direct, of_candle] = [false, true].map(|composition| {
+            let var = candle_core::Var::from_vec(logits(), (3, 4), &Device::Cpu).unwrap();
+            let losses = match composition {
+                false => cross_entropy(&var, &labels, ClassProbability::Softmax).unwrap(),
+                true => composed(&var, &labels).unwrap(),
+            };
+            let weights = Tensor::new(&[0.5f64, 2.0, 1.5], &Device::Cpu).unwrap();
+            let grads = losses.mul(&weights).unwrap().sum_all().unwrap().backward().unwrap();
+            let grads = grads.get(&var).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            losses.to_vec1::<f64>().unwrap().into_iter().chain(grads.into_iter().map(f64::from)).collect::<Vec<_>>()
+        });
+        for (a, b) in direct.iter().zip(&of_candle) {
+            assert!((a - b).abs() < 1e-6, "{direct:?} and {of_candle:?}");
         }
     }
 

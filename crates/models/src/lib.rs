@@ -6,6 +6,8 @@
 //! randomness is drawn from `Rng`.
 
 mod batch;
+#[doc(hidden)]
+pub mod cases;
 mod checks;
 mod chunk_policy;
 pub mod classification;
@@ -35,11 +37,11 @@ pub use history::History;
 pub use model::{Memory, PolicyModel};
 pub use models::*;
 pub use nn::{
-    Backend, Context, Gradients, Init, Loss, LossParts, LossValues, ModelError, Optimiser, OptimiserConfig,
-    ParamLayout, Params, Result, Rng, Size, Value, vectors,
+    Backend, Context, DeviceChoice, Gradients, HAS_CUDA, Init, Loss, LossNumbers, LossParts, LossValues, ModelError,
+    Number, Optimiser, OptimiserConfig, ParamLayout, Params, Result, Rng, Size, Value, vectors,
 };
 pub use normaliser::{ACTION, ENVIRONMENT_STATE, Guarded, NormMode, Normaliser, STATE};
 pub use policy::{ActionChunk, Actor, Clock, Policy, RecedingHorizon, TemporalEnsemble, ThoughtStep};
 pub use preprocess::Preprocess;
 pub use registry::{PolicyConfig, PolicyType};
-pub use train::{Learner, LearnerMetrics, Schedule, StepMetrics, TrainConfig, Trainer, TrainerState};
+pub use train::{Learner, LearnerMetrics, Schedule, StepMetrics, StepNumbers, TrainConfig, Trainer, TrainerState};

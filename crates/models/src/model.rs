@@ -6,7 +6,7 @@ use crate::features::{Features, Signature};
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
-use nn::{Cache, Context, Gradients, Loss, LossParts, LossValues, ModelError, Params, Result, Rng};
+use nn::{Cache, Context, Gradients, Loss, LossNumbers, LossParts, ModelError, Params, Result, Rng};
 use std::sync::Arc;
 
 /// A model that maps observations to action chunks and can be trained on windows.
@@ -46,7 +46,7 @@ pub trait PolicyModel: Send + Sync {
     ///
     /// # Errors
     /// `NoGradient` if the loss does not reach a parameter.
-    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossValues> {
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, into: &mut Gradients) -> Result<LossNumbers> {
         match self.cache() {
             Some(cache) => cache.step(self.params(), Some(rng), into, |cx| self.forward_loss(cx, batch)),
             None => autograd(self, batch, rng, into),
@@ -120,12 +120,8 @@ pub(crate) fn autograd<M: PolicyModel + ?Sized>(
     batch: &Batch,
     rng: &mut Rng,
     into: &mut Gradients,
-) -> Result<LossValues> {
+) -> Result<LossNumbers> {
     let loss = model.loss(batch, rng)?;
-    let grads = loss.total.backward()?;
-    for (name, var) in model.params().iter() {
-        let grad = grads.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() })?;
-        into.add_tensor(name, grad)?;
-    }
-    LossValues::from_parts(&loss)
+    into.add_graph(model.params(), &loss.total.backward()?)?;
+    Ok(LossNumbers::from(&loss))
 }

@@ -52,14 +52,29 @@ impl Preprocess {
         actions: &[f32],
         is_pad: &[bool],
     ) -> Result<Batch> {
+        self.batch_with(action_horizon, observation, &Features::new(), actions, is_pad)
+    }
+
+    /// The same with features that are on the device already, as a network reads them: images that are in no other colours.
+    ///
+    /// # Errors
+    /// As [`Self::batch`].
+    pub fn batch_with(
+        &self,
+        action_horizon: usize,
+        observation: &Features<ValuesRef<'_>>,
+        placed: &Features<Tensor>,
+        actions: &[f32],
+        is_pad: &[bool],
+    ) -> Result<Batch> {
         let mut raw = Features::new();
-        for spec in &self.signature.observation {
+        for spec in self.signature.observation.iter().filter(|spec| placed.get(&spec.name).is_none()) {
             raw.insert(&spec.name, observation.require("batch", &spec.name)?.to_values());
         }
         let seen = self.read(raw)?;
         let mut actions = actions.to_vec();
         self.normaliser.normalise(ACTION, &mut actions)?;
-        Batch::new(&self.signature, action_horizon, seen, actions, is_pad, &self.device)
+        Batch::new(&self.signature, action_horizon, seen, placed, actions, is_pad, &self.device)
     }
 
     /// What a network reads at the last of `history`, the observations of an episode so far, oldest first; of more than
@@ -104,7 +119,8 @@ impl Preprocess {
 
     /// Raw values of every feature, of any number of steps -> what a network reads.
     fn read(&self, mut raw: Features<Values>) -> Result<Features<Values>> {
-        for spec in self.signature.observation.iter().filter(|spec| !spec.colours.is_empty()) {
+        let given: Vec<_> = self.signature.observation.iter().filter(|spec| raw.get(&spec.name).is_some()).collect();
+        for spec in given.iter().filter(|spec| !spec.colours.is_empty()) {
             let Values::U8(mut images) = raw.require("see", &spec.name)?.clone() else {
                 return Err(wrong_type(spec, "numbers", "bytes"));
             };
@@ -130,7 +146,7 @@ impl Preprocess {
             raw.insert(&spec.name, Values::U8(images));
         }
         let mut read = Features::new();
-        for spec in &self.signature.observation {
+        for spec in given {
             let values = raw.take("see", &spec.name)?;
             read.insert(&spec.name, self.normalised(spec, values)?);
         }

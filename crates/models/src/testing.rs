@@ -1,9 +1,8 @@
 //! What the tests of models share: the same model on candle's operations and finite differences as oracles.
 #![allow(clippy::unwrap_used)]
 
-use crate::batch::{Batch, Taken};
-use crate::encoders::VisionConfig;
-use crate::features::{FeatureKind, FeatureSpec, Features, Signature, Values};
+use crate::batch::Batch;
+pub(crate) use crate::cases::{batch, signatures, vision_config};
 use crate::model::PolicyModel;
 use crate::train::{StepMetrics, TrainConfig, Trainer};
 use candle_core::{Device, Tensor};
@@ -18,76 +17,6 @@ pub(crate) fn move_parameters(model: &dyn PolicyModel) {
         let noise = Tensor::from_vec(rng.normals(var.elem_count()), var.dims(), &Device::Cpu).unwrap();
         var.set(&(var.as_tensor() + (noise * 0.1).unwrap()).unwrap()).unwrap();
     }
-}
-
-/// Random windows, some of them padded.
-pub(crate) fn batch(signature: &Signature, horizon: usize, rows: usize, seed: u64) -> Batch {
-    let mut rng = Rng::new(seed, "batch");
-    let mut observation = Features::new();
-    for spec in &signature.observation {
-        let n = rows * signature.n_obs_steps * spec.width();
-        let values = match spec.kind {
-            FeatureKind::Image => Values::U8((0..n).map(|_| rng.below(256) as u8).collect()),
-            _ => Values::F32(rng.normals(n)),
-        };
-        observation.insert(&spec.name, values);
-    }
-    let a = rng.normals(rows * horizon * signature.action_dim);
-    let pad: Vec<bool> = (0..rows * horizon).map(|i| i / horizon % 2 == 1 && i % horizon > horizon / 2).collect();
-    let mut batch = Batch::new(signature, horizon, observation, a, &pad, &candle_core::Device::Cpu).unwrap();
-    batch.seed = seed;
-    // of a pointer: of every third row it is not asked
-    let cubes = signature.observation.iter().enumerate().filter(|(_, spec)| spec.group() == "cube");
-    let cubes: Vec<u32> = cubes.map(|(at, _)| at as u32).collect();
-    let taken = (0..rows).map(|row| cubes.get(row % cubes.len().max(1)).copied().filter(|_| row % 3 != 2));
-    batch.taken = Some(Taken::new(taken.collect()));
-    let cells = signature.observation.iter().filter(|spec| spec.group() == "cell").count();
-    let visited = (0..rows * cells).map(|_| rng.below(2) as f32).collect();
-    batch.visited = (cells > 0).then(|| Tensor::from_vec(visited, (rows, cells), &Device::Cpu).unwrap());
-    let shape = (rows, signature.auxiliary_dim);
-    let values = rng.normals(shape.0 * shape.1);
-    batch.auxiliary = (shape.1 > 0).then(|| Tensor::from_vec(values, shape, &Device::Cpu).unwrap());
-    batch
-}
-
-/// What models are tried on: with and without an environment state, with a history, with entities in two groups, of which
-/// one has positions, with a grid of cells and a thing beside it, with images of three cameras, and with a history of two images.
-pub(crate) struct Signatures {
-    pub(crate) plain: Signature,
-    pub(crate) no_env: Signature,
-    pub(crate) entities: Signature,
-    pub(crate) grid: Signature,
-    pub(crate) history: Signature,
-    pub(crate) images: Signature,
-    pub(crate) image_history: Signature,
-    /// `plain`, with three numbers of auxiliary supervision
-    pub(crate) with_auxiliary: Signature,
-}
-
-/// Eyes for the images: parts at random, colours changed, tokens of all maps.
-pub(crate) fn vision_config() -> VisionConfig {
-    VisionConfig { width: 8, crop: Some(33), shift: 1, jitter: 0.2, ..VisionConfig::default() }
-}
-
-pub(crate) fn signatures() -> Signatures {
-    let (plain, no_env) = (Signature::low_dimensional(3, 2, 2), Signature::low_dimensional(3, 0, 2));
-    let cube = |name: &str| FeatureSpec::entity(name, 5, "cube", false);
-    let goal = |name: &str| FeatureSpec::entity(name, 2, "goal", true);
-    let mut entities = no_env.clone();
-    entities.observation.extend([cube("cube0"), cube("cube1"), cube("cube2"), goal("goal0"), goal("goal1")]);
-    let mut grid = no_env.clone();
-    grid.observation.extend((0..6).map(|i| FeatureSpec::entity(&format!("cell{i}"), 2, "cell", i == 4)));
-    grid.observation.push(FeatureSpec::entity("peg", 3, "peg", false));
-    let mut history = Signature { n_obs_steps: 3, ..plain.clone() };
-    history.observation.extend([cube("cube0"), cube("cube1")]);
-    let mut images = plain.clone();
-    images.observation.extend(["a", "b"].map(|name| FeatureSpec::image(name, 40, 36)));
-    images.observation.push(FeatureSpec::image("c", 34, 34));
-    images.observation.push(cube("cube0"));
-    let mut image_history = Signature { n_obs_steps: 2, ..no_env.clone() };
-    image_history.observation.push(FeatureSpec::image("a", 36, 40));
-    let with_auxiliary = Signature { auxiliary_dim: 3, ..plain.clone() };
-    Signatures { plain, no_env, entities, grid, history, images, image_history, with_auxiliary }
 }
 
 /// The losses of a training on one batch, after making sure that it gives the same bits twice.
@@ -108,9 +37,9 @@ pub(crate) fn losses_of_training<M: PolicyModel + 'static>(
 
 /// Loss and gradients as the trainer gets them.
 pub(crate) fn gradients(model: &dyn PolicyModel, batch: &Batch) -> (LossValues, Gradients) {
-    let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(model.params())));
+    let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(model.params()))).unwrap();
     let loss = model.accumulate_gradients(batch, &mut Rng::new(4, "step"), &mut grads).unwrap();
-    (loss, grads)
+    (loss.read().unwrap(), grads)
 }
 
 /// On every instruction set of this machine: loss, its parts and all gradients are those of `loss` on autograd, with

@@ -34,6 +34,42 @@ impl Backend {
         self.composed
     }
 
+    /// The device in words, such as `NVIDIA H200, CUDA 13.0`; nothing on the CPU.
+    pub fn gpu(&self) -> Option<String> {
+        match &self.device {
+            #[cfg(feature = "cuda")]
+            Device::Cuda(device) => {
+                let context = device.cuda_stream().context().clone();
+                let name = context.name().unwrap_or_else(|_| "GPU".to_owned());
+                let version = candle_core::cuda_backend::cudarc::driver::sys::CUDA_VERSION;
+                Some(format!("{name}, CUDA {}.{}", version / 1000, version % 1000 / 10))
+            }
+            _ => None,
+        }
+    }
+
+    /// Bytes that are free on a GPU; nothing on the CPU.
+    pub fn free_bytes(&self) -> Option<u64> {
+        match &self.device {
+            #[cfg(feature = "cuda")]
+            Device::Cuda(_) => {
+                candle_core::cuda_backend::cudarc::driver::result::mem_get_info().ok().map(|(free, _)| free as u64)
+            }
+            _ => None,
+        }
+    }
+
+    /// Sets the seed of numbers that the device draws itself: masks of dropout. The CPU draws none.
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn seed(&self, seed: u64) -> Result<()> {
+        if !self.device.is_cpu() {
+            self.device.set_seed(seed)?;
+        }
+        Ok(())
+    }
+
     /// For what runs on the CPU only.
     ///
     /// # Errors

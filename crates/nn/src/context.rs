@@ -5,7 +5,7 @@ use crate::error::{ModelError, Result};
 use crate::gradients::Gradients;
 use crate::kernels::{Mat, Pack, Packed, Pool};
 use crate::layers::DropoutMask;
-use crate::loss::{Loss, LossParts, LossValues};
+use crate::loss::{Loss, LossNumbers, LossParts};
 use crate::params::Params;
 use crate::rng::Rng;
 use crate::tape::{Backward, Tape};
@@ -84,15 +84,11 @@ impl Cache {
         rng: Option<&mut Rng>,
         into: &mut Gradients,
         forward: impl FnOnce(&mut Context<'_>) -> Result<Loss>,
-    ) -> Result<LossValues> {
+    ) -> Result<LossNumbers> {
         if params.backend().is_composed() {
             let loss = self.composed_loss(params, rng, forward)?;
-            let grads = loss.total.backward()?;
-            for (name, var) in params.iter() {
-                let grad = grads.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() })?;
-                into.add_tensor(name, grad)?;
-            }
-            return LossValues::from_parts(&loss);
+            into.add_graph(params, &loss.total.backward()?)?;
+            return Ok(LossNumbers::from(&loss));
         }
         self.with(|space| {
             let mut cx = Context { tape: Some(Tape::default()), rng, ..Context::new(space, params.backend()) };
@@ -102,7 +98,7 @@ impl Cache {
                 loss.seed(&mut backward);
                 tape.backward(&mut backward)?;
             }
-            Ok(loss.values())
+            loss.numbers()
         })
     }
 
@@ -214,6 +210,11 @@ impl<'a> Context<'a> {
             }
         }
         Ok(self.composed)
+    }
+
+    /// Whether operations are candle's.
+    pub fn is_composed(&self) -> bool {
+        self.composed
     }
 
     /// Where tensors are made.

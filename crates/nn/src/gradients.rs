@@ -1,20 +1,32 @@
 //! The gradients of a model, in the order of the parameters' names.
 
+use crate::backend::Backend;
 use crate::error::{ModelError, Result};
+use crate::number::Number;
 use crate::params::Params;
-use crate::per_parameter::PerParameter;
+use crate::per_parameter::{PerParameter, joined};
 use crate::simd::{sum_of_squares, vectorised};
-use candle_core::{DType, Tensor};
+use crate::values::with_values;
+use candle_core::backprop::GradStore;
+use candle_core::{Device, Var};
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Where each parameter lies in a flat buffer, and whether there is one: composed operations have a tensor per parameter.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// Where each parameter lies in a flat buffer, and where that is.
+#[derive(Debug, Clone)]
 pub struct ParamLayout {
     spans: BTreeMap<String, Range<usize>>,
     len: usize,
-    composed: bool,
+    backend: Backend,
+}
+
+impl PartialEq for ParamLayout {
+    fn eq(&self, other: &Self) -> bool {
+        self.spans == other.spans
+            && self.is_composed() == other.is_composed()
+            && self.device().same_device(other.device())
+    }
 }
 
 impl ParamLayout {
@@ -26,7 +38,7 @@ impl ParamLayout {
             spans.insert(name.to_string(), len..len + var.elem_count());
             len += var.elem_count();
         }
-        Self { spans, len, composed: params.backend().is_composed() }
+        Self { spans, len, backend: params.backend().clone() }
     }
 
     /// Numbers in all.
@@ -41,7 +53,12 @@ impl ParamLayout {
 
     /// Whether operations on the parameters are candle's.
     pub fn is_composed(&self) -> bool {
-        self.composed
+        self.backend.is_composed()
+    }
+
+    /// Where the parameters are.
+    pub fn device(&self) -> &Device {
+        self.backend.device()
     }
 
     /// Names and places in order.
@@ -59,9 +76,12 @@ pub struct Gradients {
 
 impl Gradients {
     /// All zero.
-    pub fn zeros(layout: Arc<ParamLayout>) -> Self {
-        let values = PerParameter::zeros(&layout);
-        Self { layout, values }
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn zeros(layout: Arc<ParamLayout>) -> Result<Self> {
+        let values = PerParameter::zeros(&layout)?;
+        Ok(Self { layout, values })
     }
 
     /// Where each parameter lies.
@@ -77,7 +97,7 @@ impl Gradients {
     pub fn values(&self) -> &[f32] {
         match &self.values {
             PerParameter::Flat(values) => values,
-            PerParameter::Tensors(_) => &[],
+            PerParameter::Tensor(_) => &[],
         }
     }
 
@@ -85,15 +105,30 @@ impl Gradients {
     pub fn values_mut(&mut self) -> &mut [f32] {
         match &mut self.values {
             PerParameter::Flat(values) => values,
-            PerParameter::Tensors(_) => &mut [],
+            PerParameter::Tensor(_) => &mut [],
         }
     }
 
     /// Sets everything to 0.
-    pub fn clear(&mut self) {
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn clear(&mut self) -> Result<()> {
         match &mut self.values {
             PerParameter::Flat(values) => values.fill(0.0),
-            PerParameter::Tensors(tensors) => tensors.fill(None),
+            PerParameter::Tensor(values) => *values = values.zeros_like()?,
+        }
+        Ok(())
+    }
+
+    /// All values, in the order of the layout, wherever they are.
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn read(&self) -> Result<Vec<f32>> {
+        match &self.values {
+            PerParameter::Flat(values) => Ok(values.clone()),
+            PerParameter::Tensor(values) => with_values(values, <[f32]>::to_vec),
         }
     }
 
@@ -106,19 +141,12 @@ impl Gradients {
     ///
     /// # Errors
     /// If the tensor library fails.
-    pub fn norm(&self) -> Result<f64> {
-        match &self.values {
-            PerParameter::Flat(values) => Ok(sum_of_squares(values).sqrt()),
-            PerParameter::Tensors(tensors) => {
-                let squares = tensors.iter().flatten().map(|t| t.sqr()?.sum_all());
-                let squares = squares.collect::<candle_core::Result<Vec<_>>>()?;
-                // one transfer for all of them
-                match squares.is_empty() {
-                    true => Ok(0.0),
-                    false => Ok(f64::from(Tensor::stack(&squares, 0)?.sum_all()?.to_scalar::<f32>()?).sqrt()),
-                }
-            }
-        }
+    pub fn norm(&self) -> Result<Number> {
+        Ok(match &self.values {
+            PerParameter::Flat(values) => Number::Here(sum_of_squares(values).sqrt()),
+            PerParameter::Tensor(_) if self.layout.is_empty() => Number::Here(0.0),
+            PerParameter::Tensor(values) => Number::There(values.sqr()?.sum_all()?.sqrt()?),
+        })
     }
 
     /// Adds the gradients of another shard.
@@ -130,17 +158,16 @@ impl Gradients {
             let detail = "the gradients to add are those of other parameters".to_string();
             return Err(ModelError::State { object: "gradients", detail });
         }
-        if let PerParameter::Tensors(tensors) = &other.values {
-            for ((name, _), grad) in other.layout.iter().zip(tensors) {
-                grad.iter().try_for_each(|grad| self.add_tensor(name, grad))?;
+        match (&mut self.values, &other.values) {
+            (PerParameter::Tensor(sum), PerParameter::Tensor(other)) => *sum = (&*sum + other)?,
+            _ => {
+                let sum = self.values_mut();
+                vectorised(
+                    #[inline(always)]
+                    || sum.iter_mut().zip(other.values()).for_each(|(a, b)| *a += b),
+                );
             }
-            return Ok(());
         }
-        let sum = self.values_mut();
-        vectorised(
-            #[inline(always)]
-            || sum.iter_mut().zip(other.values()).for_each(|(a, b)| *a += b),
-        );
         Ok(())
     }
 
@@ -149,51 +176,51 @@ impl Gradients {
     /// # Errors
     /// If the tensor library fails.
     pub fn not_finite(&self) -> Result<Option<(&str, f32)>> {
-        for (at, (name, span)) in self.layout.iter().enumerate() {
-            let bad = |values: &[f32]| values.iter().copied().find(|x| !x.is_finite());
-            let found = match &self.values {
-                PerParameter::Flat(values) => bad(&values[span]),
-                PerParameter::Tensors(tensors) => match &tensors[at] {
-                    Some(tensor) => crate::values::with_values(tensor, bad)?,
-                    None => None,
-                },
+        let bad = |values: &[f32]| {
+            let first = |(name, span): (_, Range<usize>)| {
+                let found = values[span].iter().copied().find(|x| !x.is_finite());
+                found.map(|value| (name, value))
             };
-            if let Some(value) = found {
-                return Ok(Some((name, value)));
-            }
+            self.layout.iter().find_map(first)
+        };
+        match &self.values {
+            PerParameter::Flat(values) => Ok(bad(values)),
+            PerParameter::Tensor(values) => with_values(values, bad),
         }
-        Ok(None)
     }
 
-    /// Adds a tensor to the gradient of `name`.
+    /// Adds the gradients that candle's backward pass found.
     ///
     /// # Errors
-    /// If there is no such parameter or the sizes differ.
-    pub fn add_tensor(&mut self, name: &str, grad: &Tensor) -> Result<()> {
-        let spans = &self.layout.spans;
-        let span = spans.get(name).cloned().ok_or_else(|| ModelError::MissingTensor {
-            name: name.to_string(),
-            given: crate::error::some_names(spans.keys()),
-        })?;
-        if span.len() != grad.elem_count() {
-            return Err(ModelError::Shape {
-                operation: "add a gradient",
-                object: "gradient",
-                expected: vec![span.len()],
-                found: grad.dims().to_vec(),
-            });
-        }
+    /// A parameter that the loss does not reach.
+    pub fn add_graph(&mut self, params: &Params, found: &GradStore) -> Result<()> {
+        self.check_parameters(params)?;
+        let grads = params
+            .iter()
+            .map(|(name, var)| found.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() }));
+        let grads = grads.collect::<Result<Vec<_>>>()?;
         match &mut self.values {
             PerParameter::Flat(values) => {
-                let grad = grad.to_dtype(DType::F32)?.flatten_all()?.to_vec1::<f32>()?;
-                values[span].iter_mut().zip(grad).for_each(|(a, b)| *a += b);
+                let mut rest = values.as_mut_slice();
+                for grad in grads {
+                    let (sum, tail) = rest.split_at_mut(grad.elem_count());
+                    rest = tail;
+                    with_values(grad, |grad| sum.iter_mut().zip(grad).for_each(|(a, b)| *a += b))?;
+                }
             }
-            PerParameter::Tensors(tensors) => {
-                let at = spans.keys().take_while(|known| *known != name).count();
-                let sum = tensors[at].take().map_or_else(|| Ok(grad.clone()), |sum| sum + grad)?;
-                tensors[at] = Some(sum.detach());
-            }
+            PerParameter::Tensor(_) if grads.is_empty() => {}
+            PerParameter::Tensor(sum) => *sum = (&*sum + joined(grads.into_iter().cloned())?)?.detach(),
         }
         Ok(())
+    }
+
+    fn check_parameters(&self, params: &Params) -> Result<()> {
+        let sizes = |(name, var): (_, &Var)| (name, var.elem_count());
+        let own = self.layout.iter().map(|(name, span)| (name, span.len()));
+        if params.iter().map(sizes).eq(own) {
+            return Ok(());
+        }
+        let detail = "the gradients to add are those of other parameters".to_string();
+        Err(ModelError::State { object: "gradients", detail })
     }
 }

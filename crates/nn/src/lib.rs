@@ -8,6 +8,7 @@
 
 mod backend;
 mod context;
+mod device;
 mod error;
 mod gradients;
 #[doc(hidden)]
@@ -16,7 +17,7 @@ pub mod layers;
 mod loss;
 #[doc(hidden)]
 pub mod losses;
-
+mod number;
 pub mod ops;
 mod optim;
 mod params;
@@ -32,9 +33,11 @@ pub mod values;
 
 pub use backend::Backend;
 pub use context::{Cache, Context, Workspace, compose};
+pub use device::{DeviceChoice, HAS_CUDA, Opened};
 pub use error::{ModelError, Result, some_names};
 pub use gradients::{Gradients, ParamLayout};
-pub use loss::{Loss, LossParts, LossValues, Term};
+pub use loss::{Loss, LossNumbers, LossParts, LossValues, Term};
+pub use number::Number;
 pub use optim::{Optimiser, OptimiserConfig};
 pub use params::{Init, Params};
 pub use per_parameter::PerParameter;

@@ -2,8 +2,9 @@
 
 use crate::error::{ModelError, Result};
 use crate::gradients::{Gradients, ParamLayout};
+use crate::number::Number;
 use crate::params::Params;
-use crate::per_parameter::PerParameter;
+use crate::per_parameter::{PerParameter, joined};
 use crate::simd::vectorised;
 use candle_core::{CpuStorage, InplaceOp1, Layout, Tensor, Var};
 use serde::{Deserialize, Serialize};
@@ -51,6 +52,8 @@ pub struct Optimiser {
     moments: [PerParameter; 2],
     step: u64,
     threads: usize,
+    /// the parameters one after the other, and their version, where operations are candle's
+    values: Option<(Tensor, u64)>,
 }
 
 /// One step's constants.
@@ -87,28 +90,31 @@ fn atan2(y: &Tensor, x: &Tensor) -> candle_core::Result<Tensor> {
 }
 
 impl Update {
-    /// The same on candle's operations.
-    fn apply_composed(
+    /// The same on candle's operations, of all parameters at once; `rates` are relative to the learning rate.
+    fn composed(
         &self,
-        var: &Var,
-        grad: Option<&Tensor>,
-        [first, second]: [&mut Option<Tensor>; 2],
-    ) -> candle_core::Result<()> {
-        let value = var.as_detached_tensor();
-        let grad = grad.map_or_else(|| value.zeros_like(), |grad| grad * f64::from(self.grad_scale))?;
+        values: &Tensor,
+        grads: &Tensor,
+        [first, second]: [&mut Tensor; 2],
+        rates: Option<&Tensor>,
+    ) -> Result<Tensor> {
         let [beta1, beta2] = self.config.betas();
-        let blend = |mean: &mut Option<Tensor>, keep: f64, now: &Tensor| {
-            let now = (now * (1.0 - keep))?;
-            let sum = mean.take().map_or(Ok(now.clone()), |mean| (mean * keep)? + now)?;
-            candle_core::Result::Ok(mean.insert(sum).clone())
-        };
-        let m = (blend(first, beta1, &grad)? / self.corrections.0)?;
-        let root = (blend(second, beta2, &grad.sqr()?)? / self.corrections.1)?.sqrt()?;
+        *first = ((&*first * beta1)? + (grads * (1.0 - beta1))?)?;
+        *second = ((&*second * beta2)? + (grads.sqr()? * (1.0 - beta2))?)?;
+        let m = (&*first / self.corrections.0)?;
+        let root = (&*second / self.corrections.1)?.sqrt()?;
         let (direction, weight_decay) = match self.config {
             OptimiserConfig::AdamW { eps, weight_decay, .. } => ((m / (root + eps)?)?, weight_decay),
             OptimiserConfig::AdamAtan2 { weight_decay, .. } => (atan2(&m, &root)?, weight_decay),
         };
-        var.set(&((value * (1.0 - self.lr * weight_decay))? - (direction * self.lr)?)?)
+        Ok(match rates {
+            None => ((values * (1.0 - self.lr * weight_decay))? - (direction * self.lr)?)?,
+            Some(rates) => {
+                let rates = (rates * self.lr)?;
+                let kept = (1.0 - (&rates * weight_decay)?)?;
+                (values.mul(&kept)? - direction.mul(&rates)?)?
+            }
+        })
     }
 
     /// Elementwise, so the order does not matter.
@@ -179,9 +185,57 @@ impl InplaceOp1 for InPlace<'_> {
 
 impl Optimiser {
     /// Moments at zero.
-    pub fn new(config: OptimiserConfig, layout: Arc<ParamLayout>) -> Self {
-        let moments = [PerParameter::zeros(&layout), PerParameter::zeros(&layout)];
-        Self { config, layout, moments, step: 0, threads: rayon::current_num_threads() }
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn new(config: OptimiserConfig, layout: Arc<ParamLayout>) -> Result<Self> {
+        let moments = [PerParameter::zeros(&layout)?, PerParameter::zeros(&layout)?];
+        Ok(Self { config, layout, moments, step: 0, threads: rayon::current_num_threads(), values: None })
+    }
+
+    /// The parameters one after the other, (n), where operations are candle's.
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn values(&mut self, params: &Params) -> Result<Tensor> {
+        if let Some((values, version)) = &self.values
+            && *version == params.version()
+        {
+            return Ok(values.clone());
+        }
+        let values = joined(params.iter().map(|(_, var)| var.as_detached_tensor()))?;
+        self.values = Some((values.clone(), params.version()));
+        Ok(values)
+    }
+
+    /// A step of [`Self::step`] on candle's operations.
+    fn step_composed(&mut self, params: &Params, grads: &Tensor, grad_scale: &Number, update: Update) -> Result<()> {
+        let grads = match grad_scale {
+            Number::Here(scale) => (grads * *scale)?,
+            Number::There(scale) => grads.broadcast_mul(scale)?,
+        };
+        let rates = self.rates(params)?;
+        let values = self.values(params)?;
+        let [PerParameter::Tensor(first), PerParameter::Tensor(second)] = &mut self.moments else {
+            unreachable!("gradients and moments have the same layout")
+        };
+        let values = update.composed(&values, &grads, [first, second], rates.as_ref())?;
+        for ((_, var), (_, span)) in params.iter().zip(self.layout.iter()) {
+            var.set(&values.narrow(0, span.start, span.len())?.reshape(var.dims())?)?;
+        }
+        params.changed();
+        self.values = Some((values, params.version()));
+        Ok(())
+    }
+
+    /// The parameters' rates relative to the learning rate, (n), where they are not all 1.
+    fn rates(&self, params: &Params) -> Result<Option<Tensor>> {
+        if params.iter().all(|(name, _)| params.rate(name) == 1.0) {
+            return Ok(None);
+        }
+        let each =
+            params.iter().flat_map(|(name, var)| std::iter::repeat_n(params.rate(name) as f32, var.elem_count()));
+        Ok(Some(Tensor::from_vec(each.collect::<Vec<_>>(), self.layout.len(), self.layout.device())?))
     }
 
     /// Steps taken.
@@ -198,7 +252,7 @@ impl Optimiser {
     ///
     /// # Errors
     /// If `params` are not those of the layout.
-    pub fn step(&mut self, params: &Params, grads: &Gradients, grad_scale: f32, lr: f64) -> Result<()> {
+    pub fn step(&mut self, params: &Params, grads: &Gradients, grad_scale: &Number, lr: f64) -> Result<()> {
         if **grads.layout() != *self.layout || params.iter().count() != self.layout.iter().count() {
             return Err(ModelError::State {
                 object: "optimiser",
@@ -209,21 +263,15 @@ impl Optimiser {
         let [beta1, beta2] = self.config.betas();
         let t = self.step as f64;
         let corrections = (1.0 - beta1.powf(t), 1.0 - beta2.powf(t));
-        let update = Update { config: self.config, lr, grad_scale, corrections };
-        let [first, second] = &mut self.moments;
-        let (mut first, mut second) = match (first, second, grads.stored()) {
-            (PerParameter::Flat(first), PerParameter::Flat(second), _) => (first.as_mut_slice(), second.as_mut_slice()),
-            (PerParameter::Tensors(first), PerParameter::Tensors(second), PerParameter::Tensors(grads)) => {
-                let moments = first.iter_mut().zip(second);
-                for (((name, var), grad), (m, v)) in params.iter().zip(grads).zip(moments) {
-                    let update = Update { lr: lr * params.rate(name), ..update };
-                    update.apply_composed(var, grad.as_ref(), [m, v])?;
-                }
-                params.changed();
-                return Ok(());
-            }
-            _ => unreachable!("gradients and moments have the same layout"),
+        let update = Update { config: self.config, lr, grad_scale: 1.0, corrections };
+        if let PerParameter::Tensor(grads) = grads.stored() {
+            return self.step_composed(params, grads, grad_scale, update);
+        }
+        let update = Update { grad_scale: grad_scale.read()? as f32, ..update };
+        let [PerParameter::Flat(first), PerParameter::Flat(second)] = &mut self.moments else {
+            unreachable!("gradients and moments have the same layout")
         };
+        let (mut first, mut second) = (first.as_mut_slice(), second.as_mut_slice());
         let mut work: Vec<(&Var, InPlace<'_>)> = Vec::new();
         for ((name, var), (_, span)) in params.iter().zip(self.layout.iter()) {
             let update = Update { lr: lr * params.rate(name), ..update };
@@ -300,17 +348,22 @@ mod tests {
     fn steps_on(backend: &Backend, config: OptimiserConfig) -> Vec<f32> {
         let mut params = Params::new(backend);
         let start = Tensor::new(&[1f32, -2.0, 0.5], &Device::Cpu).unwrap();
-        params.insert("w", start).unwrap();
+        params.insert("w", start.clone()).unwrap();
+        params.insert("slow", start).unwrap();
+        params.set_rate("slow", 0.1);
         let layout = Arc::new(ParamLayout::new(&params));
-        let mut optimiser = Optimiser::new(config, layout.clone());
-        let mut grads = Gradients::zeros(layout);
+        let mut optimiser = Optimiser::new(config, layout.clone()).unwrap();
+        let mut grads = Gradients::zeros(layout).unwrap();
         for k in 1..=3 {
             let grad = Tensor::new(&[0.1 * k as f32, -0.3, 2.0 / k as f32], &Device::Cpu).unwrap();
-            grads.clear();
-            grads.add_tensor("w", &grad).unwrap();
-            optimiser.step(&params, &grads, 1.0, 0.01).unwrap();
+            let loss = params.iter().map(|(_, var)| var.mul(&grad).unwrap().sum_all().unwrap());
+            let loss = loss.reduce(|a, b| (a + b).unwrap()).unwrap();
+            grads.clear().unwrap();
+            grads.add_graph(&params, &loss.backward().unwrap()).unwrap();
+            optimiser.step(&params, &grads, &Number::Here(1.0), 0.01).unwrap();
         }
-        params.get("w").unwrap().to_vec1().unwrap()
+        let values = ["w", "slow"].map(|name| params.get(name).unwrap().to_vec1().unwrap());
+        values.concat()
     }
 
     #[test]
@@ -361,18 +414,18 @@ mod tests {
         params.create("a", &[3, 5], Init::XavierUniform, &mut rng).unwrap();
         params.create("b", &[7], Init::Ones, &mut rng).unwrap();
         let layout = Arc::new(ParamLayout::new(&params));
-        let mut grads = Gradients::zeros(layout.clone());
-        let mut one = Optimiser::new(OptimiserConfig::default(), layout.clone());
+        let mut grads = Gradients::zeros(layout.clone()).unwrap();
+        let mut one = Optimiser::new(OptimiserConfig::default(), layout.clone()).unwrap();
         grads.values_mut().copy_from_slice(&rng.normals(22));
-        one.step(&params, &grads, 0.5, 0.1).unwrap();
+        one.step(&params, &grads, &Number::Here(0.5), 0.1).unwrap();
         let saved = one.state(&params).unwrap();
         let weights: BTreeMap<_, _> = params.tensors().iter().map(|(k, v)| (k.clone(), v.copy().unwrap())).collect();
-        one.step(&params, &grads, 0.5, 0.1).unwrap();
+        one.step(&params, &grads, &Number::Here(0.5), 0.1).unwrap();
         let expected = params.get("a").unwrap().to_vec2::<f32>().unwrap();
         params.load(&weights).unwrap();
-        let mut two = Optimiser::new(OptimiserConfig::default(), layout);
+        let mut two = Optimiser::new(OptimiserConfig::default(), layout).unwrap();
         two.restore(two.saved(&params, &saved).unwrap(), 1);
-        two.step(&params, &grads, 0.5, 0.1).unwrap();
+        two.step(&params, &grads, &Number::Here(0.5), 0.1).unwrap();
         assert_eq!(params.get("a").unwrap().to_vec2::<f32>().unwrap(), expected);
         assert!(two.saved(&params, &BTreeMap::new()).is_err());
     }

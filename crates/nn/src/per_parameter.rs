@@ -4,25 +4,28 @@ use crate::error::{ModelError, Result};
 use crate::gradients::ParamLayout;
 use crate::params::Params;
 use crate::values::with_values;
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
 
 /// A number for every number of the parameters, in the order of the parameters' names.
 #[derive(Debug, Clone)]
 pub enum PerParameter {
-    /// in one buffer, where hand-written kernels run
+    /// where hand-written kernels run
     Flat(Vec<f32>),
-    /// one tensor per parameter on its device; `None` is zero
-    Tensors(Vec<Option<Tensor>>),
+    /// on the parameters' device, (n), where operations are candle's: one tensor, so that a step has few of them
+    Tensor(Tensor),
 }
 
 impl PerParameter {
     /// Zeros.
-    pub fn zeros(layout: &ParamLayout) -> Self {
-        match layout.is_composed() {
+    ///
+    /// # Errors
+    /// If the tensor library fails.
+    pub fn zeros(layout: &ParamLayout) -> Result<Self> {
+        Ok(match layout.is_composed() {
             false => Self::Flat(vec![0.0; layout.len()]),
-            true => Self::Tensors(vec![None; layout.iter().count()]),
-        }
+            true => Self::Tensor(Tensor::zeros(layout.len(), DType::F32, layout.device())?),
+        })
     }
 
     /// The parameters' own values, copied.
@@ -31,8 +34,7 @@ impl PerParameter {
     /// If the tensor library fails.
     pub fn copy_of(params: &Params, layout: &ParamLayout) -> Result<Self> {
         if layout.is_composed() {
-            let copies = params.iter().map(|(_, var)| Ok(Some(var.as_detached_tensor().copy()?)));
-            return Ok(Self::Tensors(copies.collect::<Result<_>>()?));
+            return Ok(Self::Tensor(joined(params.iter().map(|(_, var)| var.as_detached_tensor()))?));
         }
         let mut values = Vec::with_capacity(layout.len());
         for (_, var) in params.iter() {
@@ -51,7 +53,7 @@ impl PerParameter {
         kind: &str,
         saved: &BTreeMap<String, Tensor>,
     ) -> Result<Self> {
-        let mut all = Vec::new();
+        let mut values = Vec::with_capacity(layout.len());
         for (parameter, var) in params.iter() {
             let name = format!("{kind}.{parameter}");
             let tensor = saved.get(&name).ok_or_else(|| ModelError::MissingTensor {
@@ -62,19 +64,12 @@ impl PerParameter {
                 let (expected, found) = (vec![var.elem_count()], tensor.dims().to_vec());
                 return Err(ModelError::MisshapenTensor { name, expected, found });
             }
-            all.push(tensor);
-        }
-        if layout.is_composed() {
-            let placed = all.into_iter().zip(params.iter());
-            let placed =
-                placed.map(|(tensor, (_, var))| Ok(Some(tensor.reshape(var.shape())?.to_device(var.device())?)));
-            return Ok(Self::Tensors(placed.collect::<Result<_>>()?));
-        }
-        let mut values = Vec::with_capacity(layout.len());
-        for tensor in all {
             with_values(tensor, |v| values.extend_from_slice(v))?;
         }
-        Ok(Self::Flat(values))
+        Ok(match layout.is_composed() {
+            false => Self::Flat(values),
+            true => Self::Tensor(Tensor::from_vec(values, layout.len(), layout.device())?),
+        })
     }
 
     /// Copies as tensors of the parameters' shapes, with the parameters' names.
@@ -82,17 +77,19 @@ impl PerParameter {
     /// # Errors
     /// If the tensor library fails.
     pub fn named<'a>(&self, params: &'a Params, layout: &ParamLayout) -> Result<Vec<(&'a str, Tensor)>> {
-        let mut named = Vec::new();
-        for (at, ((name, var), (_, span))) in params.iter().zip(layout.iter()).enumerate() {
+        let each = params.iter().zip(layout.iter()).map(|((name, var), (_, span))| {
             let tensor = match self {
                 Self::Flat(values) => Tensor::from_slice(&values[span], var.dims(), var.device())?,
-                Self::Tensors(tensors) => match &tensors[at] {
-                    Some(tensor) => tensor.copy()?,
-                    None => var.as_detached_tensor().zeros_like()?,
-                },
+                Self::Tensor(values) => values.narrow(0, span.start, span.len())?.reshape(var.dims())?.copy()?,
             };
-            named.push((name, tensor));
-        }
-        Ok(named)
+            Ok((name, tensor))
+        });
+        each.collect()
     }
+}
+
+/// Tensors one after the other: (n)
+pub(crate) fn joined(tensors: impl Iterator<Item = Tensor>) -> Result<Tensor> {
+    let flat = tensors.map(|tensor| tensor.flatten_all()).collect::<candle_core::Result<Vec<_>>>()?;
+    Ok(Tensor::cat(&flat, 0)?)
 }

@@ -65,7 +65,7 @@ fn peak_of_actrm(over: Over, (h_cycles, l_cycles): (usize, usize)) -> usize {
     let (state, environment, actions) = (rng.normals(rows * 3), rng.normals(rows * 2), rng.normals(rows * 4 * 2));
     let observation = Features::of_slices(&state, &environment);
     let batch = Batch::from_slices(&signature, 4, &observation, &actions, &vec![false; rows * 4]).unwrap();
-    let mut gradients = Gradients::zeros(Arc::new(ParamLayout::new(model.params())));
+    let mut gradients = Gradients::zeros(Arc::new(ParamLayout::new(model.params()))).unwrap();
     let before = LIVE.load(SeqCst);
     PEAK.store(before, SeqCst);
     model.accumulate_gradients(&batch, &mut rng, &mut gradients).unwrap();

@@ -271,6 +271,7 @@ impl External {
             is_scripted: false,
             conventions: self.said(),
             fast_render: self.cameras().map(|cameras| cameras.fast_render),
+            gpu: None,
             perturbation: None,
             policy: Box::new(policy),
         }

@@ -86,6 +86,7 @@ fn subject() -> Subject<'static> {
         is_scripted: false,
         fast_render: None,
         perturbation: None,
+        gpu: None,
         policy: Box::new(|| Ok(Box::new(Grasper::default()))),
     }
 }

@@ -36,6 +36,7 @@ fn request(root: &Path, data: &Path, extra: &[&str]) -> TrainRequest {
         from_zoo: None,
         force: false,
         image_memory: None,
+        device: models::DeviceChoice::Cpu,
         command: None,
     }
 }

@@ -25,7 +25,10 @@ pub fn show(event: &TrainEvent<'_>, screen: &mut Screen, stop: &Stop) {
         }
         TrainEvent::Step(row) => {
             screen.at(row.step);
-            screen.message(&summary(row));
+            // without numbers where a GPU is not waited for
+            if !row.values.is_empty() {
+                screen.message(&summary(row));
+            }
         }
         TrainEvent::Saved(_) => stop.wait_for_work(!screen.is_full()),
     }

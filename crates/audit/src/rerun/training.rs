@@ -12,7 +12,9 @@ use zoo::config::check_experiment_name;
 use zoo::entry::{CurvePoint, Entry, EntryMeta, MODEL_FILE, NORMALISER_FILE, grouped};
 use zoo::experiment::Experiment;
 use zoo::registry::Registry;
-use zoo::run::{TrainEvent, TrainOutcome, TrainRequest, demonstrations, finished_entry, same_settings, train};
+use zoo::run::{
+    DeviceChoice, TrainEvent, TrainOutcome, TrainRequest, demonstrations, finished_entry, same_settings, train,
+};
 
 /// How a row is trained again.
 #[derive(Debug, Clone, Default)]
@@ -136,6 +138,7 @@ impl Rerun {
                     // what was refused then would have made no entry
                     force: true,
                     image_memory: how.image_memory,
+                    device: DeviceChoice::Cpu,
                     command: None,
                 };
                 match train(&request, stop, on_event)? {

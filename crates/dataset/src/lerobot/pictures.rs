@@ -66,7 +66,7 @@ pub struct PictureFile {
 }
 
 impl PictureFile {
-    /// Fills `out` with the picture of a frame of the data set.
+    /// Fills `out` with the picture of a frame of the data set, unless it is elsewhere.
     ///
     /// # Errors
     /// A file that cannot be read, a frame beyond its end.
@@ -85,6 +85,8 @@ pub enum PictureStore {
     Memory(Arc<Pictures>),
     /// In a file.
     File(PictureFile),
+    /// In the caller's keeping, such as on a GPU: height and width. Windows tell which frames they have and copy no pixels.
+    Elsewhere(usize, usize),
 }
 
 impl From<Arc<Pictures>> for PictureStore {
@@ -105,6 +107,7 @@ impl PictureStore {
         match self {
             Self::Memory(pictures) => (pictures.height, pictures.width),
             Self::File(pictures) => (pictures.height, pictures.width),
+            Self::Elsewhere(height, width) => (*height, *width),
         }
     }
 
@@ -114,7 +117,7 @@ impl PictureStore {
         height * width * 3
     }
 
-    /// Fills `out` with the picture of a frame of the data set.
+    /// Fills `out` with the picture of a frame of the data set, unless it is elsewhere.
     ///
     /// # Errors
     /// A file that cannot be read.
@@ -122,6 +125,7 @@ impl PictureStore {
         match self {
             Self::Memory(pictures) => out.copy_from_slice(pictures.frame(frame)),
             Self::File(pictures) => pictures.read(frame, out)?,
+            Self::Elsewhere(..) => {}
         }
         Ok(())
     }

@@ -64,7 +64,7 @@ fn tokens_and_gradients_are_the_composed_ones() {
         for level in Level::ALL {
             at_most(level, || {
                 let step = || {
-                    let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(&params)));
+                    let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(&params))).unwrap();
                     cache.step(&params, None, &mut grads, loss).unwrap();
                     grads
                 };

@@ -8,7 +8,7 @@ use super::tokens::TokenLayout;
 use super::{FeedForward, LayerInit, LayerNorm, Linear, Shape};
 use crate::batch::Batch;
 use crate::classification::binary_cross_entropy;
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 use nn::ops::{cat_tokens, feed_forward, grid_convolution, layer_norm, linear, narrow_tokens, residual};
 use nn::values::with_values;
 use nn::{Context, Init, ModelError, Params, Result, Rng, Value};
@@ -201,6 +201,12 @@ impl Question for Visited {
     fn loss(&self, scores: &Tensor) -> Result<Tensor> {
         let targets = Tensor::from_slice(&self.values, scores.shape(), scores.device())?;
         Ok((binary_cross_entropy(scores, &targets)?.sum_all()? / self.total as f64)?)
+    }
+
+    fn right(&self, scores: &Tensor) -> Result<Tensor> {
+        let targets = Tensor::from_slice(&self.values, scores.shape(), scores.device())?;
+        let cells = scores.gt(0.0)?.eq(&targets.gt(0.5)?)?.to_dtype(DType::F32)?;
+        Ok((cells.min(1)?.sum_all()? * (self.cells as f64 / self.total as f64))?)
     }
 
     /// The same on a slice; writes `weight` times the gradient of the loss into `grad`, (b, cells). Right is a row of which

@@ -14,7 +14,8 @@ use candle_core::{DType, Tensor};
 use nn::Params;
 use nn::Rng;
 use nn::ops::{cat_tokens, linear, select_tokens, term_of, weighted_mean};
-use nn::{Context, Term, Value};
+use nn::values::with_values;
+use nn::{Context, Number, Term, Value};
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -162,12 +163,18 @@ pub(crate) trait Question {
 
     /// Their loss on candle's graph.
     fn loss(&self, scores: &Tensor) -> Result<Tensor>;
+
+    /// The share of rows that are answered rightly, of candle's operations.
+    fn right(&self, scores: &Tensor) -> Result<Tensor>;
 }
 
 /// The loss of these scores, and the share of rows that are answered rightly.
-pub(crate) fn ask(cx: &mut Context<'_>, question: &Arc<dyn Question>, scores: &Value) -> Result<(Term, f32)> {
-    let values = scores.detached().flatten_all()?.to_vec1::<f32>()?;
-    let (right, on_slices) = (question.answers(&values, None).right, Arc::clone(question));
+pub(crate) fn ask(cx: &mut Context<'_>, question: &Arc<dyn Question>, scores: &Value) -> Result<(Term, Number)> {
+    let right = match cx.is_composed() {
+        true => Number::There(question.right(&scores.detached())?),
+        false => with_values(&scores.detached(), |scores| question.answers(scores, None).right)?.into(),
+    };
+    let on_slices = Arc::clone(question);
     let on_slices = move |scores: &[f32], grad: Option<(&mut [f32], f64)>| on_slices.answers(scores, grad).loss;
     Ok((term_of(cx, scores, on_slices, |scores| question.loss(scores))?, right))
 }
@@ -179,6 +186,15 @@ impl Question for Asked {
         let labels: Vec<i64> = self.candidates.iter().map(label).collect();
         let each = cross_entropy(scores, &labels, ClassProbability::Softmax)?.to_dtype(DType::F32)?;
         Ok((each.sum_all()? / self.total as f64)?)
+    }
+
+    fn right(&self, scores: &Tensor) -> Result<Tensor> {
+        let of = |f: fn(&Option<usize>) -> u32| self.candidates.iter().map(f).collect::<Vec<u32>>();
+        let rows = self.candidates.len();
+        let taken = Tensor::from_vec(of(|taken| taken.unwrap_or(0) as u32), rows, scores.device())?;
+        let asked = Tensor::from_vec(of(|taken| u32::from(taken.is_some())), rows, scores.device())?;
+        let right = scores.argmax(1)?.eq(&taken)?.to_dtype(DType::F32)?.mul(&asked.to_dtype(DType::F32)?)?;
+        Ok((right.sum_all()? / self.total as f64)?)
     }
 
     /// The same on a slice; writes `weight` times the gradient of the loss into `grad`, (b, candidates).

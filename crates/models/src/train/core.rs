@@ -5,7 +5,7 @@ use super::config::TrainConfig;
 use candle_core::Tensor;
 use nn::simd::vectorised;
 use nn::values::with_values;
-use nn::{Gradients, ModelError, Optimiser, ParamLayout, Params, PerParameter, Result};
+use nn::{Gradients, ModelError, Number, Optimiser, ParamLayout, Params, PerParameter, Result};
 use std::collections::BTreeMap;
 use std::marker::PhantomData;
 use std::sync::Arc;
@@ -60,7 +60,7 @@ impl<P: Precision> Core<P> {
         config.validate()?;
         let layout = Arc::new(ParamLayout::new(params));
         let ema = config.ema_decay.map(|_| PerParameter::copy_of(params, &layout)).transpose()?;
-        let optimiser = Optimiser::new(config.optimiser, layout.clone());
+        let optimiser = Optimiser::new(config.optimiser, layout.clone())?;
         Ok(Self { params: params.clone(), config, layout, optimiser, ema, precision: PhantomData })
     }
 
@@ -86,12 +86,16 @@ impl<P: Precision> Core<P> {
     }
 
     /// One step down `gradients`, whose global norm is `grad_norm`; returns its learning rate.
-    pub(super) fn step(&mut self, gradients: &Gradients, grad_norm: f64) -> Result<f64> {
+    pub(super) fn step(&mut self, gradients: &Gradients, norm: &Number) -> Result<f64> {
         let lr = self.config.lr_at(self.steps());
         let clip = self.config.clip_norm;
         // torch.nn.utils.clip_grad_norm_'s factor
-        let scale = if clip > 0.0 { (clip / (grad_norm + 1e-6)).min(1.0) } else { 1.0 };
-        self.optimiser.step(&self.params, gradients, scale as f32, lr)?;
+        let scale = match norm {
+            _ if clip <= 0.0 => Number::Here(1.0),
+            Number::Here(norm) => Number::Here((clip / (norm + 1e-6)).min(1.0)),
+            Number::There(norm) => Number::There(((norm + 1e-6)?.recip()? * clip)?.minimum(1.0)?),
+        };
+        self.optimiser.step(&self.params, gradients, &scale, lr)?;
         match (&mut self.ema, self.config.ema_decay) {
             (Some(PerParameter::Flat(ema)), Some(decay)) => {
                 let mut rest = ema.as_mut_slice();
@@ -101,11 +105,9 @@ impl<P: Precision> Core<P> {
                     with_values(var.as_tensor(), |now| P::blend(decay, mean, now))?;
                 }
             }
-            (Some(PerParameter::Tensors(ema)), Some(decay)) => {
-                for ((_, var), mean) in self.params.iter().zip(ema) {
-                    let now = (var.as_detached_tensor() * (1.0 - decay))?;
-                    *mean = Some(mean.take().map_or_else(|| Ok(now.clone()), |mean| (mean * decay)? + &now)?);
-                }
+            (Some(PerParameter::Tensor(ema)), Some(decay)) => {
+                let now = self.optimiser.values(&self.params)?;
+                *ema = ((&*ema * decay)? + (now * (1.0 - decay))?)?;
             }
             _ => {}
         }

@@ -7,7 +7,7 @@ use super::core::{Core, Double};
 use candle_core::{Tensor, Var};
 use nn::Gradients;
 use nn::Params;
-use nn::{ModelError, Result};
+use nn::Result;
 use std::collections::BTreeMap;
 
 /// What a step measured.
@@ -36,7 +36,7 @@ impl Learner {
     /// A configuration out of range.
     pub fn new(params: &Params, config: TrainConfig) -> Result<Self> {
         let core = Core::new(params, config)?;
-        Ok(Self { gradients: Gradients::zeros(core.layout().clone()), core })
+        Ok(Self { gradients: Gradients::zeros(core.layout().clone())?, core })
     }
 
     /// Steps taken.
@@ -65,17 +65,15 @@ impl Learner {
             return Err(self.core.not_finite("loss".into(), value));
         }
         let grads = loss.backward()?;
-        self.gradients.clear();
-        for (name, var) in self.core.params().iter() {
-            let grad = grads.get(var).ok_or_else(|| ModelError::NoGradient { name: name.to_string() })?;
-            self.gradients.add_tensor(name, grad)?;
-        }
-        let grad_norm = self.gradients.norm()?;
+        self.gradients.clear()?;
+        self.gradients.add_graph(self.core.params(), &grads)?;
+        let norm = self.gradients.norm()?;
+        let grad_norm = norm.read()?;
         if !grad_norm.is_finite() {
             let fault = self.core.gradient_at_fault(&self.gradients)?;
             return Err(fault.unwrap_or_else(|| self.core.not_finite("gradient norm".into(), grad_norm as f32)));
         }
-        let lr = self.core.step(&self.gradients, grad_norm)?;
+        let lr = self.core.step(&self.gradients, &norm)?;
         let other = other.and_then(|var| grads.get(var).cloned());
         Ok((LearnerMetrics { loss: value, grad_norm, lr }, other))
     }

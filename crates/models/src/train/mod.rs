@@ -10,4 +10,4 @@ mod trainer;
 
 pub use config::{Schedule, TrainConfig};
 pub use learner::{Learner, LearnerMetrics};
-pub use trainer::{StepMetrics, Trainer, TrainerState};
+pub use trainer::{StepMetrics, StepNumbers, Trainer, TrainerState};

@@ -197,54 +197,7 @@ fn the_schedule_rises_then_falls() {
 /// included: 50 steps of training end with the same losses, weights and predictions.
 #[test]
 fn the_fallback_trains_to_the_same_losses() {
-    use serde_json::json;
-    let of = crate::testing::signatures();
-    let act = json!({"action_horizon": 5, "dim_model": 12, "n_heads": 3, "dim_feedforward": 19, "latent_dim": 3});
-    let with = |base: &serde_json::Value, key: &str, value: serde_json::Value| {
-        let mut config = base.clone();
-        config[key] = value;
-        config
-    };
-    let actrm = |reasoning| with(&act, "reasoning", reasoning);
-    let pointing = with(&actrm(json!({"over": "tokens"})), "pointer", json!({"among": "cube", "weight": 0.7}));
-    let grid = json!({"over": "tokens", "grid": {"among": "cell", "columns": 3, "way": 0.5}});
-    let memory = json!({"over": "memory", "n_layers": 1, "h_cycles": 2, "l_cycles": 2, "supervision_steps": 2});
-    let bc = json!({"action_horizon": 3, "hidden": [11, 7]});
-    let rnn = |cell| json!({"action_horizon": 3, "hidden_dim": 9, "n_modes": 2, "min_std": 0.05, "cell": cell});
-    let transformer = json!({"dim_model": 12, "n_heads": 2, "n_layers": 2, "n_modes": 2, "min_std": 0.05});
-    let unet = json!({"down_dims": [8, 16], "n_groups": 4, "step_embed_dim": 8});
-    let denoising = json!({"action_horizon": 4, "network": unet});
-    let clean = with(&denoising, "prediction", json!("sample"));
-    let tokens = json!({"dim_model": 12, "n_heads": 3, "n_layers": 1, "dropout": 0.1});
-    let encoded = with(&tokens, "n_encoder_layers", json!(2));
-    let encoded = with(&encoded, "pointer", json!({"among": "cube", "weight": 0.7}));
-    let vision = json!({"width": 8, "blocks": [1, 0, 0, 0], "crop": 17, "shift": 1, "jitter": 0.2, "cell_features": 4});
-    let frozen = with(&vision, "norm", json!("frozen"));
-    let keypoints = with(&vision, "tokens", json!({"keypoints": {"count": 3}}));
-    for (kind, mut policy, signature) in [
-        ("act", act.clone(), &of.plain),
-        ("act", with(&act, "vision", vision.clone()), &of.images),
-        ("act", with(&act, "auxiliary", json!({"weight": 0.5})), &of.with_auxiliary),
-        ("actrm", actrm(json!({"h_cycles": 2, "l_cycles": 2})), &of.entities),
-        ("actrm", actrm(json!({"warm_start": {"noise": 0.1}})), &of.plain),
-        ("actrm", pointing, &of.entities),
-        ("actrm", actrm(grid), &of.grid),
-        ("actrm", actrm(memory), &of.plain),
-        ("bc", bc.clone(), &of.plain),
-        ("bc", with(&bc, "vision", frozen), &of.image_history),
-        ("bc_rnn", rnn("lstm"), &of.history),
-        ("bc_rnn", rnn("gru"), &of.history),
-        ("bc_transformer", transformer, &of.history),
-        ("diffusion", denoising.clone(), &of.history),
-        ("diffusion", with(&clean, "vision", keypoints), &of.image_history),
-        ("diffusion", with(&denoising, "transformer", tokens), &of.entities),
-        ("flow", denoising.clone(), &of.plain),
-        ("flow", with(&denoising, "transformer", encoded.clone()), &of.entities),
-        ("mip", with(&denoising, "transformer", encoded), &of.entities),
-        ("mip", denoising, &of.history),
-    ] {
-        policy["type"] = kind.into();
-        let policy: PolicyConfig = serde_json::from_value(policy).unwrap();
+    for (policy, signature) in &crate::cases::policies() {
         let train = |backend: nn::Backend| {
             let model = policy.build(signature, 1, &backend).unwrap();
             let config =

@@ -1,7 +1,8 @@
 //! The training step of a policy: gradients of two half batches on two threads, then the core's step.
 //!
-//! The batch is always cut in the same number of shards and their gradients are added in the same order, so the weights
-//! depend on the seed and the data, not on the number of cores.
+//! On the CPU the batch is always cut in the same number of shards and their gradients are added in the same order, so the
+//! weights depend on the seed and the data, not on the number of cores. Other devices take it whole, and a step does not wait
+//! for them: numbers are read when they are asked for.
 
 use super::config::TrainConfig;
 use super::core::{Core, Single};
@@ -9,14 +10,14 @@ use crate::batch::Batch;
 use crate::model::PolicyModel;
 use candle_core::Tensor;
 use nn::Gradients;
-use nn::LossValues;
 use nn::Rng;
 use nn::values::with_values;
+use nn::{LossNumbers, Number};
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Shards of a batch that run at the same time. Part of what defines a training: changing it changes the weights.
+/// Shards of a batch that run at the same time on the CPU. Part of what defines a training: changing it changes the weights.
 const SHARDS: usize = 2;
 
 /// What one step measured.
@@ -32,6 +33,15 @@ pub struct StepMetrics {
     pub grad_norm: f64,
     /// learning rate of this step
     pub lr: f64,
+}
+
+/// What one step measured, which the device may still be computing.
+#[derive(Debug, Clone)]
+pub struct StepNumbers {
+    step: u64,
+    loss: LossNumbers,
+    norm: Number,
+    lr: f64,
 }
 
 /// Everything that a training needs to go on.
@@ -74,7 +84,9 @@ impl Trainer {
     /// A configuration out of range.
     pub fn new(model: Box<dyn PolicyModel>, config: TrainConfig, seed: u64) -> Result<Self> {
         let core = Core::new(model.params(), config)?;
-        let gradients = vec![Gradients::zeros(core.layout().clone()); SHARDS];
+        let shards = if core.params().device().is_cpu() { SHARDS } else { 1 };
+        let gradients = vec![Gradients::zeros(core.layout().clone())?; shards];
+        core.params().backend().seed(seed)?;
         Ok(Self { model, core, gradients, rng: Rng::new(seed, "train"), threads: rayon::current_num_threads() })
     }
 
@@ -87,7 +99,7 @@ impl Trainer {
 
     /// Threads that a step is spread over.
     pub fn threads(&self) -> usize {
-        self.threads.min(SHARDS)
+        self.threads.min(self.gradients.len())
     }
 
     /// The model as it is now.
@@ -105,34 +117,57 @@ impl Trainer {
     /// # Errors
     /// `NotFinite` naming step and tensor if the loss or a gradient is not finite.
     pub fn step(&mut self, batch: &Batch) -> Result<StepMetrics> {
+        let numbers = self.step_ahead(batch, true)?;
+        self.read(&numbers, batch)
+    }
+
+    /// The same without waiting for the device, unless `check` says so. What is not finite is then found by [`Self::read`], in
+    /// this step or in a later one.
+    ///
+    /// # Errors
+    /// `NotFinite` as [`Self::step`], where operations run on the CPU or `check` is set.
+    pub fn step_ahead(&mut self, batch: &Batch, check: bool) -> Result<StepNumbers> {
         let step = self.step_count();
         let rng_before = self.rng.clone();
-        let (loss, grad_norm) = match self.gradients_of(batch) {
+        let check = check || batch.device().is_cpu();
+        let (loss, norm) = match self.gradients_of(batch, check) {
             Ok(found) => found,
             Err(error) => {
                 self.rng = rng_before;
                 return Err(error);
             }
         };
-        let lr = self.core.step(&self.gradients[0], grad_norm)?;
-        Ok(StepMetrics { step: step + 1, loss: loss.total, parts: loss.parts, grad_norm, lr })
+        let lr = self.core.step(&self.gradients[0], &norm)?;
+        Ok(StepNumbers { step: step + 1, loss, norm, lr })
+    }
+
+    /// Waits for what the last step, on `batch`, measured.
+    ///
+    /// # Errors
+    /// `NotFinite` naming what is not, in this step or in one before that was not read.
+    pub fn read(&self, numbers: &StepNumbers, batch: &Batch) -> Result<StepMetrics> {
+        let (loss, grad_norm) = (numbers.loss.read()?, numbers.norm.read()?);
+        if !loss.total.is_finite() || !grad_norm.is_finite() {
+            return Err(self.not_finite(batch, &numbers.loss)?);
+        }
+        Ok(StepMetrics { step: numbers.step, loss: loss.total, parts: loss.parts, grad_norm, lr: numbers.lr })
     }
 
     /// Leaves the gradient of the whole batch in the first buffer; returns loss and gradient norm.
-    fn gradients_of(&mut self, batch: &Batch) -> Result<(LossValues, f64)> {
+    fn gradients_of(&mut self, batch: &Batch, check: bool) -> Result<(LossNumbers, Number)> {
         let mut batch = batch.clone();
         batch.seed = self.rng.next_u64();
-        self.gradients.iter_mut().for_each(Gradients::clear);
+        self.gradients.iter_mut().try_for_each(Gradients::clear)?;
         let model = self.model.as_ref();
-        let mut loss = LossValues::default();
+        let mut loss = LossNumbers::default();
         for part in batch.shards(self.core.config().accumulation)? {
-            let shards = part.shards(SHARDS)?;
+            let shards = part.shards(self.gradients.len())?;
             let mut work: Vec<_> = shards
                 .iter()
                 .zip(&mut self.gradients)
                 .map(|(shard, into)| (shard, Rng::new(self.rng.next_u64(), "shard"), into))
                 .collect();
-            let alone = if self.threads == 1 { work.len() } else { 1 };
+            let alone = if self.threads == 1 { work.len() } else { work.len().min(1) };
             let mine: Vec<_> = work.drain(..alone).collect();
             let run = |(shard, mut rng, into): (&Batch, Rng, &mut Gradients)| {
                 model.accumulate_gradients(shard, &mut rng, into)
@@ -146,20 +181,21 @@ impl Trainer {
                 values
             });
             for value in values {
-                loss.add(&value?);
+                loss.add(&value?)?;
             }
         }
         let (first, others) = self.gradients.split_at_mut(1);
         others.iter().try_for_each(|other| first[0].add(other))?;
         let norm = first[0].norm()?;
-        if !loss.total.is_finite() || !norm.is_finite() {
+        if check && !(loss.total.read()?.is_finite() && norm.read()?.is_finite()) {
             return Err(self.not_finite(&batch, &loss)?);
         }
         Ok((loss, norm))
     }
 
     /// Finds out what is not finite: data, then weights, then parts of the loss, then gradients.
-    fn not_finite(&self, batch: &Batch, loss: &LossValues) -> Result<ModelError> {
+    fn not_finite(&self, batch: &Batch, loss: &LossNumbers) -> Result<ModelError> {
+        let loss = loss.read()?;
         let bad = |values: &[f32]| values.iter().copied().find(|x| !x.is_finite());
         let found = |tensor: String, value: f32| self.core.not_finite(tensor, value);
         for (name, tensor) in batch.observation.iter().chain([("actions", &batch.actions)]) {
@@ -208,6 +244,7 @@ impl Trainer {
         }
         let rng = Rng::from_state(&meta.rng)?;
         self.core.restore(&state.tensors, meta.step)?;
+        self.core.params().backend().seed(rng.clone().next_u64())?;
         self.rng = rng;
         Ok(())
     }

@@ -4,7 +4,7 @@
 
 use candle_core::{DType, Device, Tensor};
 use models::act::{Act, Config};
-use models::{Backend, Batch, Features, Gradients, LossValues, ParamLayout, PolicyModel, Rng, lerobot};
+use models::{Backend, Batch, Features, Gradients, LossNumbers, ParamLayout, PolicyModel, Rng, lerobot};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -118,13 +118,14 @@ fn the_training_forward_pass_and_the_loss_are_lerobots() {
                 close(&f.name, name, got, &expected[&format!("model.{name}")]);
             }
             // shards add up to the whole, and the fused path has the same gradients
-            let mut sum = Gradients::zeros(Arc::new(ParamLayout::new(f.act.params())));
-            let mut values = LossValues::default();
+            let mut sum = Gradients::zeros(Arc::new(ParamLayout::new(f.act.params()))).unwrap();
+            let mut values = LossNumbers::default();
             let at = batch.rows() / 2;
             for (from, shard) in [0, at].into_iter().zip(batch.shards(2).unwrap()) {
                 let eps = eps.narrow(0, from, shard.rows()).unwrap().contiguous().unwrap();
-                values.add(&f.act.gradients_with(&shard, &eps, None, &mut sum).unwrap());
+                values.add(&f.act.gradients_with(&shard, &eps, None, &mut sum).unwrap()).unwrap();
             }
+            let values = values.read().unwrap();
             assert!((values.total - got).abs() <= TOLERANCE * got.abs().max(1.0), "{}: {values:?} {got}", f.name);
             for (name, _) in f.act.params().iter() {
                 let expected = &expected[&format!("model.{name}")];
@@ -162,7 +163,7 @@ fn known_zero(config: &Config) -> Vec<&'static str> {
 #[test]
 fn every_parameter_gets_a_gradient() {
     for f in fixtures() {
-        let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(f.act.params())));
+        let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(f.act.params()))).unwrap();
         f.act.accumulate_gradients(&f.batch(), &mut Rng::new(1, "test"), &mut grads).unwrap();
         for (name, span) in grads.layout().clone().iter() {
             let zero = known_zero(f.act.config()).contains(&name);

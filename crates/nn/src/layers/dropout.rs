@@ -4,7 +4,7 @@
 
 use crate::error::Result;
 use crate::rng::Rng;
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 
 /// One drawn mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,9 +35,14 @@ impl DropoutMask {
         1.0 / (1.0 - self.threshold as f32 / u32::MAX as f32)
     }
 
-    /// The mask of a whole tensor: 0 or `scale()`.
+    /// The mask of a whole tensor: 0 or `scale()`. A device other than the CPU draws its own.
     pub fn tensor(self, shape: &[usize], device: &Device) -> Result<Tensor> {
         let scale = self.scale();
+        if !device.is_cpu() {
+            let dropped = f64::from(self.threshold) / f64::from(u32::MAX);
+            let kept = Tensor::rand(0f32, 1f32, shape, device)?.ge(dropped)?;
+            return Ok((kept.to_dtype(DType::F32)? * f64::from(scale))?);
+        }
         let values: Vec<f32> =
             (0..shape.iter().product::<usize>()).map(|i| if self.keeps(i as u32) { scale } else { 0.0 }).collect();
         Ok(Tensor::from_vec(values, shape, device)?)

@@ -69,7 +69,7 @@ pub fn kl_divergence(cx: &mut Context<'_>, latent: &Value, total_rows: usize) ->
     if cx.composed("KL divergence", [&latent.tensor])? {
         let (mean, log_variance) = parts(&latent.tensor)?;
         let terms = ((&log_variance + 1.0)? - mean.sqr()? - log_variance.exp()?)?;
-        return Term::composed((terms.sum_all()? * (-0.5 / total as f64))?);
+        return Ok(Term::composed((terms.sum_all()? * (-0.5 / total as f64))?));
     }
     let (width, rows) = (latent.width() / 2, total as f32);
     let mut sum = 0.0f64;

@@ -16,6 +16,15 @@ pub enum Error {
     Squared,
 }
 
+/// The sum of errors of each row, (b).
+#[derive(Debug, Clone)]
+pub enum RowErrors {
+    /// known
+    Here(Vec<f64>),
+    /// a device may still be computing them
+    There(Tensor),
+}
+
 /// The error of a chunk, (b, H, A), over steps that are not padding, is_pad: (b, H): the sum divided by `entries`, and the sum
 /// of each row.
 ///
@@ -27,7 +36,7 @@ pub fn chunk_error(
     is_pad: &Tensor,
     error: Error,
     entries: usize,
-) -> Result<(Term, Vec<f64>)> {
+) -> Result<(Term, RowErrors)> {
     let [b, h, a] = super::sizes("loss", &got.tensor)?;
     super::check_shape("loss", "actions", want, &[b, h, a])?;
     super::check_shape("loss", "padding", is_pad, &[b, h])?;
@@ -40,8 +49,8 @@ pub fn chunk_error(
             Error::Squared => difference.sqr()?,
         };
         let each = each.broadcast_mul(&valid)?;
-        let rows = each.detach().sum((1, 2))?.to_vec1::<f32>()?.into_iter().map(f64::from).collect();
-        return Ok((Term::composed((each.sum_all()? / entries)?)?, rows));
+        let rows = RowErrors::There(each.detach().sum((1, 2))?);
+        return Ok((Term::composed((each.sum_all()? / entries)?), rows));
     }
     // the sign of each difference, or twice the difference itself
     let mut slopes = cx.space.pool.take(got.len());
@@ -75,7 +84,7 @@ pub fn chunk_error(
     let node = got.node;
     if node.is_none() || !cx.records() {
         cx.space.pool.give(slopes);
-        return Ok((cx.term(total / entries, false, |_, _| Ok(())), rows));
+        return Ok((cx.term(total / entries, false, |_, _| Ok(())), RowErrors::Here(rows)));
     }
     let term = cx.term(total / entries, true, move |weight, back| {
         let scale = weight / entries;
@@ -83,7 +92,7 @@ pub fn chunk_error(
         back.add(node, slopes);
         Ok(())
     });
-    Ok((term, rows))
+    Ok((term, RowErrors::Here(rows)))
 }
 
 /// A term by a function on numbers: `on_slices` gives its value and, where it is asked, writes so many times its gradient;
@@ -98,7 +107,7 @@ pub fn term_of(
     composed: impl FnOnce(&Tensor) -> Result<Tensor>,
 ) -> Result<Term> {
     if cx.composed("loss", [&x.tensor])? {
-        return Term::composed(composed(&x.tensor)?);
+        return Ok(Term::composed(composed(&x.tensor)?));
     }
     let value = read("loss", [&x.tensor], |[x]| Ok(on_slices(x, None)))?;
     let (node, x) = (x.node, x.tensor.clone());

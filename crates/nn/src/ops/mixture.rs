@@ -5,6 +5,7 @@ use crate::error::{ModelError, Result};
 use crate::layers::MixtureParts;
 use crate::loss::Term;
 use crate::losses::absolute;
+use crate::number::Number;
 use candle_core::Tensor;
 
 /// ln(1 + e^x), which cannot overflow so
@@ -22,7 +23,7 @@ pub fn mixture_likelihood(
     parts: &MixtureParts,
     (actions, real): (&Tensor, &Tensor),
     total: usize,
-) -> Result<(Term, f32)> {
+) -> Result<(Term, Number)> {
     let [n, modes] = super::sizes("likelihood", &parts.logits.tensor)?;
     let (width, total) = (parts.action_dim, total.max(1));
     super::check_shape("likelihood", "actions", actions, &[n, width])?;
@@ -39,8 +40,8 @@ pub fn mixture_likelihood(
         let mixtures = parts.mixture()?;
         let nll = ((mixtures.log_prob(actions)?.mul(real)?.sum_all()? / total as f64)? * -1.0)?;
         let away = absolute(&(mixtures.likeliest()?.detach() - actions)?)?.broadcast_mul(&real.unsqueeze(1)?)?;
-        let l1 = (away.sum_all()? / (total * width) as f64)?.to_scalar::<f32>()?;
-        return Ok((Term::composed(nll)?, l1));
+        let l1 = Number::There((away.sum_all()? / (total * width) as f64)?.detach());
+        return Ok((Term::composed(nll), l1));
     }
     let (mut nll, mut l1, share) = (0.0, 0.0, 1.0 / total as f64);
     let pool = &mut cx.space.pool;
@@ -91,7 +92,7 @@ pub fn mixture_likelihood(
     let nodes = [parts.means.node, parts.scales.node, parts.logits.node];
     if !cx.records() {
         grads.into_iter().for_each(|buffer| cx.space.pool.give(buffer));
-        return Ok((cx.term(nll * share, false, |_, _| Ok(())), (l1 * share / width as f64) as f32));
+        return Ok((cx.term(nll * share, false, |_, _| Ok(())), ((l1 * share / width as f64) as f32).into()));
     }
     let has_gradient = nodes.iter().any(Option::is_some);
     let term = cx.term(nll * share, has_gradient, move |weight, back| {
@@ -103,5 +104,5 @@ pub fn mixture_likelihood(
         }
         Ok(())
     });
-    Ok((term, (l1 * share / width as f64) as f32))
+    Ok((term, ((l1 * share / width as f64) as f32).into()))
 }

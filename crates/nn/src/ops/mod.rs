@@ -23,7 +23,7 @@ pub use feed_forward::feed_forward;
 pub use grid::grid_convolution;
 pub use latent::{kl_divergence, sample_latent};
 pub use linear::{linear, linear_rows};
-pub use losses::{Error, chunk_error, term_of};
+pub use losses::{Error, RowErrors, chunk_error, term_of};
 pub use mixture::mixture_likelihood;
 pub use norm::{layer_norm, residual};
 pub use recurrent::{gru, lstm};

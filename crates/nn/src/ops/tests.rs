@@ -68,9 +68,9 @@ impl Case {
         let composed = cache.composed_loss(&self.params, Some(&mut rng()), &loss).unwrap();
         let (want, graph) = (composed.total.to_scalar::<f32>().unwrap(), composed.total.backward().unwrap());
         let step = || {
-            let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(&self.params)));
+            let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(&self.params))).unwrap();
             let values = cache.step(&self.params, Some(&mut rng()), &mut grads, &loss).unwrap();
-            (values.total, grads)
+            (values.read().unwrap().total, grads)
         };
         for level in Level::ALL {
             at_most(level, || {

@@ -4,6 +4,7 @@
 
 use std::path::PathBuf;
 
+use models::DeviceChoice;
 use zoo::ZooError;
 use zoo::config::{Library, apply_overrides};
 use zoo::entry::Entry;
@@ -55,6 +56,8 @@ pub struct TrainOptions {
     pub force: bool,
     /// Bytes of memory for images; `None`: half of what is free.
     pub image_memory: Option<u64>,
+    /// Where it trains.
+    pub device: DeviceChoice,
 }
 
 impl AnyExperiment {
@@ -137,7 +140,7 @@ impl AnyExperiment {
         stop: &dyn Fn() -> bool,
         on_event: &mut dyn FnMut(TrainEvent<'_>),
     ) -> Result<TrainOutcome, ZooError> {
-        let TrainOptions { place, data, force, image_memory } = options;
+        let TrainOptions { place, data, force, image_memory, device } = options;
         let Place { name, runs, run, resume, zoo, command } = place;
         match self.0 {
             Kind::Robot(experiment) => {
@@ -154,9 +157,15 @@ impl AnyExperiment {
                     force,
                     image_memory,
                     command,
+                    device,
                 };
                 train(&request, stop, on_event)
             }
+            Kind::Puzzle(_) if matches!(device, DeviceChoice::Cuda(_)) => Err(ZooError::InvalidValue {
+                key: "--device".to_owned(),
+                expected: "cpu: puzzle solvers train on the CPU".to_owned(),
+                found: device.to_string(),
+            }),
             Kind::Puzzle(experiment) => {
                 let experiment = *experiment;
                 let request = PuzzleTrainRequest { name, experiment, runs, run, resume, zoo, command };

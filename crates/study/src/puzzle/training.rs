@@ -276,7 +276,7 @@ impl Training for PuzzleTraining<'_> {
         candle_core::utils::get_num_threads()
     }
 
-    fn step(&mut self, _: u64) -> Result<BTreeMap<String, f64>, ZooError> {
+    fn step(&mut self, _: u64, _: bool) -> Result<BTreeMap<String, f64>, ZooError> {
         let puzzles = self.stream.take(self.student.wanted());
         let done = self.student.step(self.task, &puzzles);
         let mut values = done.map_err(self.experiment.model_error("train"))?;

@@ -335,6 +335,7 @@ impl Shared<'_> {
                     from_zoo: None,
                     force: false,
                     image_memory: None,
+                    device: models::DeviceChoice::Cpu,
                 };
                 let mut steps = 0;
                 let outcome = train(&request, &|| self.stopped(), &mut |event| match event {

@@ -170,6 +170,9 @@ pub struct TrainingMeta {
     /// The machine that it ended on: processor, cores and kernel.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub machine: Option<String>,
+    /// The GPU and CUDA's version; `None` on the CPU. Another training on it may end in other bytes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gpu: Option<String>,
     /// The loss on the way, thinned; in `entry.json` of entries without `train.parquet` alone.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub curve: Vec<CurvePoint>,

@@ -23,11 +23,19 @@ pub struct LoadedEntry {
 }
 
 impl Entry {
-    /// Reads weights and normaliser. Every tensor must be there, in its shape, and no other.
+    /// Reads weights and normaliser, to predict on the CPU. Every tensor must be there, in its shape, and no other.
     ///
     /// # Errors
     /// What does not fit, by name.
     pub fn load(&self) -> Result<LoadedEntry, ZooError> {
+        self.load_on(&Backend::CPU)
+    }
+
+    /// [`Self::load`], to predict on another device.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_on(&self, backend: &Backend) -> Result<LoadedEntry, ZooError> {
         if self.meta().is_external() {
             return Err(ZooError::External { entry: self.id().to_string() });
         }
@@ -36,7 +44,7 @@ impl Entry {
         let (weights, _) = tensors::read(&self.folder().join(MODEL_FILE))?;
         let (statistics, _) = tensors::read(&self.folder().join(NORMALISER_FILE))?;
         let signature = &self.meta().signature;
-        let (model, preprocess) = assemble(&self.id(), &experiment, signature, &weights, &statistics)?;
+        let (model, preprocess) = assemble(&self.id(), &experiment, signature, &weights, &statistics, backend)?;
         Ok(LoadedEntry { entry: self.clone(), experiment, model, preprocess })
     }
 }
@@ -51,9 +59,10 @@ pub(super) fn assemble(
     signature: &Signature,
     weights: &BTreeMap<String, Tensor>,
     statistics: &BTreeMap<String, Tensor>,
+    backend: &Backend,
 ) -> Result<(Arc<dyn PolicyModel>, Arc<Preprocess>), ZooError> {
     let failed = |operation| move |source| ZooError::Model { operation, name: id.to_string(), source };
-    let model = experiment.policy.build(signature, 0, &Backend::CPU).map_err(failed("build the policy of"))?;
+    let model = experiment.policy.build(signature, 0, backend).map_err(failed("build the policy of"))?;
     model.params().load(weights).map_err(failed("load the weights of"))?;
     let modes = experiment.normalisation.modes(signature);
     let preprocess = Normaliser::new(&modes, statistics)

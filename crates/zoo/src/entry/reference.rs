@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use candle_core::{DType, Device, Tensor};
-use models::{FeatureKind, FeatureSpec, Normaliser, Observation, Policy, Rng, Signature, Values};
+use models::{Backend, FeatureKind, FeatureSpec, Normaliser, Observation, Policy, Rng, Signature, Values};
 
 use crate::evaluation::WallClock;
 use crate::experiment::Experiment;
@@ -49,7 +49,7 @@ pub fn reference(
     weights: &BTreeMap<String, Tensor>,
     statistics: &BTreeMap<String, Tensor>,
 ) -> Result<Option<Vec<u8>>, ZooError> {
-    let (model, preprocess) = assemble(id, experiment, signature, weights, statistics)?;
+    let (model, preprocess) = assemble(id, experiment, signature, weights, statistics, &Backend::CPU)?;
     if model.depends_on_time() {
         return Ok(None);
     }

@@ -50,6 +50,7 @@ impl LoadedEntry {
                 .next()
                 .map(|_| meta.env_args.as_ref().is_some_and(CamerasMeta::draws_fast)),
             perturbation: None,
+            gpu: self.model().params().backend().gpu(),
             policy: Box::new(move || Ok(this.policy())),
         }
     }

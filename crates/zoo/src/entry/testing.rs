@@ -44,6 +44,7 @@ pub fn draft(name: &str) -> EntryDraft {
             kind: None,
             section: None,
             training: Some(TrainingMeta {
+                gpu: None,
                 steps: 3,
                 batch_size: 64,
                 seed: 1,

@@ -44,6 +44,8 @@ pub struct Subject<'a> {
     pub fast_render: Option<bool>,
     /// What becomes of its pictures on their way to it.
     pub perturbation: Option<Perturbation>,
+    /// The GPU that it predicts on; `None` on the CPU.
+    pub gpu: Option<String>,
     /// Makes a policy of its own for one environment.
     pub policy: Box<dyn Fn() -> Result<Box<dyn Policy>, ModelError> + Sync + 'a>,
 }
@@ -86,7 +88,12 @@ impl Subject<'_> {
             demonstrated: demonstrated.is_some(),
             seeds: options.seeds,
             shard: options.shard,
-            versions: ready.versions.clone(),
+            versions: ready
+                .versions
+                .clone()
+                .into_iter()
+                .chain(self.gpu.clone().map(|gpu| ("gpu".to_owned(), gpu)))
+                .collect(),
             kernels: ready.kernels.clone(),
             renderer: ready.renderer.clone(),
             sources: ready.sources.clone(),

@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
-use dataset::{ConvertOptions, Dataset, FeatureStats, PictureStore, WindowBatch, WindowSpec, Windows};
+use dataset::{ConvertOptions, Dataset, FeatureStats, PictureStore, Pictures, WindowBatch, WindowSpec, Windows};
 use models::{
-    Batch, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureSpec, Normaliser, Preprocess, STATE, Signature, ValuesRef,
+    Backend, Batch, ENTITY_PREFIX, ENVIRONMENT_STATE, FeatureSpec, Features, ModelError, Normaliser, Preprocess, STATE,
+    Signature, ValuesRef,
 };
 
 use crate::ZooError;
@@ -161,6 +162,8 @@ pub fn demonstrations(
 pub(super) struct ImageMemory<'a> {
     pub budget: u64,
     pub folder: &'a Path,
+    /// Where batches are made; a GPU keeps pictures itself, if they fit and no transform changes them.
+    pub device: &'a Backend,
 }
 
 fn gigabytes(bytes: u64) -> String {
@@ -175,6 +178,8 @@ pub(super) struct Demonstrations {
     pub transforms: Transforms,
     /// Mean and standard deviation of each camera's colours, on the scale from 0 to 1, where the data set has them.
     pub image_statistics: Option<Vec<([f32; 3], [f32; 3])>>,
+    /// By camera the pictures of all frames that a GPU keeps: (frames, height, width, 3) bytes.
+    pub on_device: Features<Tensor>,
     pub meta: DataMeta,
     /// What a user should know: a missing mask, constant dimensions.
     pub notes: Vec<String>,
@@ -289,8 +294,19 @@ pub(super) fn prepare(
             "images take {bytes}, {budget} are for them: kept in a file in the run's folder, read ahead"
         ));
     }
+    let data = &experiment.data;
+    let unchanged = data.mirror.is_empty() && data.symmetries.is_empty() && data.picture_colours.is_empty();
+    let free = memory.device.free_bytes();
+    let resident = fits && unchanged && free.is_some_and(|free| bytes <= free / 2);
+    let mut on_device = Features::new();
     for name in cameras {
         let pictures: PictureStore = match fits {
+            true if resident => {
+                let pictures = dataset.pictures(&name).map_err(failed)?;
+                let (height, width) = (pictures.height, pictures.width);
+                on_device.insert(&name, placed(pictures, memory.device.device()).map_err(|e| unfit(e.to_string()))?);
+                PictureStore::Elsewhere(height, width)
+            }
             true => Arc::new(dataset.pictures(&name).map_err(failed)?).into(),
             false => dataset.picture_file(&name, memory.folder).map_err(failed)?.into(),
         };
@@ -308,13 +324,13 @@ pub(super) fn prepare(
             guarded.feature, guarded.dim, guarded.spread
         ));
     }
-    let preprocess = Preprocess::new(signature, normaliser, &Device::Cpu)
+    let preprocess = Preprocess::new(signature, normaliser, memory.device.device())
         .map_err(experiment.model_error("take the statistics for"))?;
     let signature = preprocess.signature();
     let source = Source { experiment, dataset, path, windows: &train, statistics: &statistics, signature };
     let transforms = Transforms::fit(&source)?;
     let image_statistics = image_statistics.into_iter().collect();
-    Ok(Demonstrations { train, valid, preprocess, transforms, image_statistics, meta, notes })
+    Ok(Demonstrations { train, valid, preprocess, transforms, image_statistics, on_device, meta, notes })
 }
 
 impl Demonstrations {
@@ -325,16 +341,44 @@ impl Demonstrations {
     pub fn batch(&self, stage: Stage, windows: &mut WindowBatch, experiment: &Experiment) -> Result<Batch, ZooError> {
         self.transforms.apply(stage, windows);
         let numbers = windows.observation.iter().map(|(name, values)| (name.clone(), ValuesRef::F32(values)));
-        let images = windows.pictures.iter().map(|(name, values)| (name.clone(), ValuesRef::U8(values)));
+        let images = windows.pictures.iter().filter(|(name, _)| self.on_device.get(name).is_none());
+        let images = images.map(|(name, values)| (name.clone(), ValuesRef::U8(values)));
         let observation = numbers.chain(images).collect();
         let action_horizon = experiment.policy.action_horizon();
-        let made = self.preprocess.batch(action_horizon, &observation, &windows.actions, &windows.is_pad);
+        let made = seen_on_device(&self.on_device, self.preprocess.signature(), windows).and_then(|placed| {
+            self.preprocess.batch_with(action_horizon, &observation, &placed, &windows.actions, &windows.is_pad)
+        });
         let made = made.and_then(|mut batch| {
             self.transforms.targets(stage, windows, &mut batch)?;
             Ok(batch)
         });
         made.map_err(experiment.model_error("make a batch for"))
     }
+}
+
+/// By camera the pictures of these windows, of those that a GPU keeps: (frames, height, width, 3) -> (n, …, height, width, 3)
+fn seen_on_device(
+    pictures: &Features<Tensor>,
+    signature: &Signature,
+    windows: &WindowBatch,
+) -> Result<Features<Tensor>, ModelError> {
+    let Some((_, any)) = pictures.iter().next() else { return Ok(Features::new()) };
+    let frames = Tensor::from_slice(&windows.frames, windows.frames.len(), any.device())?;
+    let mut seen = Features::new();
+    for (name, pictures) in pictures.iter() {
+        if let Some(spec) = signature.get(name) {
+            let shape = signature.batch_shape(spec, windows.n);
+            seen.insert(name, pictures.index_select(&frames, 0)?.reshape(shape)?);
+        }
+    }
+    Ok(seen)
+}
+
+/// Pictures on a device: (frames, height, width, 3)
+fn placed(pictures: Pictures, device: &Device) -> candle_core::Result<Tensor> {
+    let (height, width) = (pictures.height, pictures.width);
+    let frames = pictures.data.len() / (height * width * 3).max(1);
+    Tensor::from_vec(pictures.data, (frames, height, width, 3), device)
 }
 
 /// The windows of the episodes that a training of `experiment` learns from, its data transforms, and the number of each episode's
@@ -353,7 +397,7 @@ pub fn first_windows(
     let episodes: Vec<usize> = dataset.split(&experiment.data.train_mask).unwrap_or_else(all);
     let lengths = episodes.iter().map(|&episode| dataset.episodes()[episode].length as u32);
     let firsts = lengths.scan(0, |next, length| Some(std::mem::replace(next, *next + length))).collect();
-    let memory = ImageMemory { budget: image_budget(), folder: work };
+    let memory = ImageMemory { budget: image_budget(), folder: work, device: &Backend::CPU };
     // what an entry was trained on is not asked again
     let agreed = agree(&dataset, path, experiment, true)?;
     let demonstrations = prepare(&dataset, path, &path.display().to_string(), &agreed, &memory)?;
@@ -432,6 +476,21 @@ fn tensors(statistics: &BTreeMap<String, FeatureStats>) -> candle_core::Result<B
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+
+    #[test]
+    fn a_batch_has_the_pictures_of_its_frames() {
+        let mut signature = Signature { n_obs_steps: 2, ..Signature::low_dimensional(1, 0, 1) };
+        signature.observation.push(FeatureSpec::image("front", 1, 2));
+        let pictures = Pictures { height: 1, width: 2, data: (0..5 * 6).collect() };
+        let mut kept = Features::new();
+        kept.insert("front", placed(pictures.clone(), &Device::Cpu).unwrap());
+        let windows = WindowBatch { n: 3, n_obs_steps: 2, frames: vec![2, 2, 3, 4, 0, 1], ..WindowBatch::default() };
+        let seen = seen_on_device(&kept, &signature, &windows).unwrap();
+        let front = seen.get("front").unwrap();
+        assert_eq!(front.dims(), [3, 2, 1, 2, 3]);
+        let expected: Vec<u8> = windows.frames.iter().flat_map(|&f| pictures.frame(f as usize).to_vec()).collect();
+        assert_eq!(front.flatten_all().unwrap().to_vec1::<u8>().unwrap(), expected);
+    }
 
     #[test]
     fn a_folder_without_info_holds_recordings() {

@@ -27,6 +27,7 @@ pub use extend::{Extended, extend};
 pub use folder::{COMMAND_FILE, RunFolder};
 pub use list::{FoundRun, RunState, list_runs};
 pub use metrics::{Metrics, MetricsRow};
+pub use models::DeviceChoice;
 pub use score::{Score, ScoreRequest, score, score_folder};
 pub use section::{OptimiserKind, TrainSection, WeightsFormat};
 pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, finished_entry, run, same_settings};

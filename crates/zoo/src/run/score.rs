@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use dataset::WindowBatch;
-use models::{ACTION, Observation, Values};
+use models::{ACTION, Backend, Observation, Values};
 use serde::Serialize;
 
 use crate::ZooError;
@@ -98,7 +98,7 @@ pub fn score(request: &ScoreRequest<'_>) -> Result<Score, ZooError> {
     let mask = request.mask.map(str::to_owned).or(held_out);
     (experiment.data.train_mask, experiment.data.valid_mask) = (mask.clone().unwrap_or_default(), String::new());
     let agreed = agree(&dataset, &path, &experiment, request.force)?;
-    let memory = ImageMemory { budget: image_budget(), folder: request.work };
+    let memory = ImageMemory { budget: image_budget(), folder: request.work, device: &Backend::CPU };
     let name = path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
     let demonstrations = data::prepare(&dataset, &path, &name, &agreed, &memory)?;
     let windows = &demonstrations.train;

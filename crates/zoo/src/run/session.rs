@@ -111,11 +111,17 @@ pub trait Training {
     /// Threads that it works on.
     fn threads(&self) -> usize;
 
-    /// One optimiser step, number `step` from 0; what it measured, by name.
+    /// The GPU that it works on, and CUDA's version; nothing on the CPU.
+    fn gpu(&self) -> Option<String> {
+        None
+    }
+
+    /// One optimiser step, number `step` from 0; what it measured, by name. Without `read` it may say nothing, so as not to wait
+    /// for a GPU.
     ///
     /// # Errors
     /// A model that fails; [`ModelError::NotFinite`] inside [`ZooError::Model`] ends the run at its last checkpoint.
-    fn step(&mut self, step: u64) -> Result<BTreeMap<String, f64>, ZooError>;
+    fn step(&mut self, step: u64, read: bool) -> Result<BTreeMap<String, f64>, ZooError>;
 
     /// What a validation of the present weights finds, by name.
     ///
@@ -318,21 +324,25 @@ impl<'a, T: Training> Session<'a, T> {
                 self.save(on_event)?;
                 return Ok(false);
             }
-            let mut values = self.training.step(self.step).map_err(|error| self.step_error(error))?;
-            self.step += 1;
-            let last = self.step == section.steps;
-            let validate = last || self.step.is_multiple_of(section.validate_every);
+            let next = self.step + 1;
+            let last = next == section.steps;
+            let validate = last || next.is_multiple_of(section.validate_every);
+            let log = validate || next.is_multiple_of(section.log_every);
+            let save = last || next.is_multiple_of(section.checkpoint_every);
+            let values = self.training.step(self.step, log || save);
+            let mut values = values.map_err(|error| self.step_error(error))?;
+            self.step = next;
             if validate {
                 values.extend(self.training.validate()?);
             }
             let row = MetricsRow { step: self.step, values };
             on_event(TrainEvent::Step(&row));
-            if validate || self.step.is_multiple_of(section.log_every) {
+            if log {
                 self.events.push(&row, wall_time())?;
                 self.metrics.push(row)?;
                 self.training.logged();
             }
-            if last || self.step.is_multiple_of(section.checkpoint_every) {
+            if save {
                 self.save(on_event)?;
             }
         }
@@ -371,6 +381,7 @@ impl<'a, T: Training> Session<'a, T> {
             minutes: self.seconds() / 60.0,
             threads: self.training.threads() as u64,
             machine: machine(),
+            gpu: self.training.gpu(),
             curve: curve(self.metrics.rows()),
         }
     }

@@ -7,7 +7,7 @@ use std::time::Instant;
 use candle_core::Tensor;
 use dataset::EnvMeta;
 use dataset::shuffle::Sampler;
-use models::{Backend, PolicyModel, Trainer, TrainerState};
+use models::{DeviceChoice, PolicyModel, Trainer, TrainerState};
 use serde::{Deserialize, Serialize};
 
 use crate::conventions::Conventions;
@@ -53,6 +53,8 @@ pub struct TrainRequest {
     pub image_memory: Option<u64>,
     /// The command that trains it, for the entry.
     pub command: Option<String>,
+    /// Where it trains.
+    pub device: DeviceChoice,
 }
 
 impl TrainRequest {
@@ -98,6 +100,9 @@ struct RunNote {
     data: PathBuf,
     /// Set once the data is open.
     fingerprint: String,
+    /// The GPU that it began on; `None` on the CPU.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    gpu: Option<String>,
 }
 
 /// Trains, or goes on training, until all steps are done or `stop` says so.
@@ -131,6 +136,12 @@ fn begun(note_path: &Path, folder: &RunFolder, request: &TrainRequest) -> Result
         });
     }
     Ok(Some(note))
+}
+
+/// What a user should know of a run that began elsewhere.
+fn moved(from: Option<&str>, to: Option<&str>) -> String {
+    let on = |gpu: Option<&str>| gpu.unwrap_or("the CPU").to_owned();
+    format!("this run began on {} and resumes on {}: its weights may differ in their last digits", on(from), on(to))
 }
 
 /// A policy that learns from demonstrations.
@@ -173,7 +184,6 @@ impl PolicyTraining {
             None => path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
         };
         let budget = request.image_memory.unwrap_or_else(image_budget);
-        let memory = ImageMemory { budget, folder: folder.path() };
         if let Some(note) = &earlier
             && note.fingerprint != dataset.fingerprint()
         {
@@ -185,9 +195,15 @@ impl PolicyTraining {
             });
         }
         let agreed = agree(&dataset, &path, experiment, request.force)?;
+        let opened = request.device.open().map_err(experiment.model_error("open the device for"))?;
+        let (gpu, backend) = (opened.backend.gpu(), opened.backend);
+        let memory = ImageMemory { budget, folder: folder.path(), device: &backend };
         let demonstrations = data::prepare(&dataset, &path, &name, &agreed, &memory)?;
         let experiment = agreed.experiment;
-        for note in converted.iter().chain(&agreed.notes).chain(&demonstrations.notes) {
+        let moved =
+            earlier.as_ref().filter(|note| note.gpu != gpu).map(|note| moved(note.gpu.as_deref(), gpu.as_deref()));
+        let of_device = opened.note.iter().chain(&moved);
+        for note in converted.iter().chain(&agreed.notes).chain(&demonstrations.notes).chain(of_device) {
             on_event(TrainEvent::Note(note));
         }
         let section = &experiment.train;
@@ -197,7 +213,7 @@ impl PolicyTraining {
             initial.check(&Conventions::of_env_args(&env.env_args), &name, &experiment.task.name)?;
         }
         let build = || {
-            let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed, &Backend::CPU);
+            let model = experiment.policy.build(demonstrations.preprocess.signature(), section.seed, &backend);
             let model = model.map_err(experiment.model_error("build the policy of"))?;
             super::image_encoder::initialise(model.as_ref(), &demonstrations, &experiment)?;
             super::memory::fill(model.as_ref(), &demonstrations, &experiment)?;
@@ -214,8 +230,8 @@ impl PolicyTraining {
             on_event(TrainEvent::Note(&initial.note(&evaluated.params().tensors())?));
         }
         if earlier.is_none() {
-            let note =
-                RunNote { experiment: request.name.clone(), data: path, fingerprint: dataset.fingerprint().to_owned() };
+            let (experiment, fingerprint) = (request.name.clone(), dataset.fingerprint().to_owned());
+            let note = RunNote { experiment, data: path, fingerprint, gpu };
             let text = serde_json::to_string_pretty(&note).expect("strings become JSON") + "\n";
             write_atomic(&note_path, text.as_bytes())?;
         }
@@ -253,13 +269,21 @@ impl Training for PolicyTraining {
         self.trainer.threads()
     }
 
-    fn step(&mut self, step: u64) -> Result<BTreeMap<String, f64>, ZooError> {
+    fn gpu(&self) -> Option<String> {
+        self.trainer.model().params().backend().gpu()
+    }
+
+    fn step(&mut self, step: u64, read: bool) -> Result<BTreeMap<String, f64>, ZooError> {
         let unreadable = unreadable(&self.demonstrations.meta.name);
         let windows = self.feed.take(&self.demonstrations.train, step).map_err(unreadable)?;
         let rows = windows.n;
         let batch = self.demonstrations.batch(Stage::Training(step), windows, &self.experiment)?;
-        let done = self.trainer.step(&batch).map_err(self.experiment.model_error("train"))?;
+        let done = self.trainer.step_ahead(&batch, false).map_err(self.experiment.model_error("train"))?;
         self.rate.1 += rows as u64;
+        if !read && !batch.device().is_cpu() {
+            return Ok(BTreeMap::new());
+        }
+        let done = self.trainer.read(&done, &batch).map_err(self.experiment.model_error("train"))?;
         let mut values = BTreeMap::from([
             ("loss".to_owned(), f64::from(done.loss)),
             ("grad_norm".to_owned(), done.grad_norm),

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, Stop, limits, shown};
-use models::FeatureKind;
+use models::{DeviceChoice, FeatureKind};
 use report::{COLUMNS, LeaderboardRow, json};
 use rollout::{Pool, Ready, remembered_greeting};
 use serde_json::{Value, json};
@@ -90,6 +90,9 @@ pub struct Args {
     /// Query at every step and average the predictions for it with this coefficient (ACT's paper: 0.01)
     #[arg(long, help_heading = EXECUTION, value_name = "C", conflicts_with = "n_action_steps", allow_negative_numbers = true)]
     temporal_ensemble: Option<f64>,
+    /// Where policies predict: `cpu`, `auto` (the first GPU, else the CPU), `cuda` or `cuda:N`; results name the GPU
+    #[arg(long, help_heading = EXECUTION, value_name = "DEVICE", default_value_t = DeviceChoice::Cpu)]
+    device: DeviceChoice,
     #[command(flatten, next_help_heading = EXECUTION)]
     run: RunArgs,
     /// Run only this part of the episodes, so that several machines can share them
@@ -293,7 +296,7 @@ fn open(
         return Ok(None);
     }
     asked.check_task(task.unwrap_or(&entry.meta().task))?;
-    Ok(Some(entry.load()?))
+    Ok(Some(entry.load_on(&args.device.open()?.backend)?))
 }
 
 /// Evaluates the entries of an environment on one set of simulators.

@@ -4,6 +4,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, anyhow, bail};
 use clap::builder::ArgPredicate;
+use models::DeviceChoice;
 use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use study::puzzle::{AnyExperiment, TrainOptions};
 use zoo::ZooError;
@@ -39,6 +40,7 @@ use crate::training::show;
   actrm-zoo train --extend runs/act_lift/001 train.steps=5000
   actrm-zoo train act_lift --resume
   actrm-zoo train act_lift --seeds 1..8
+  actrm-zoo train act_lift inputs=image --device cuda
   actrm-zoo train trm_dfs10 train.seed=2
   actrm-zoo train act_lift --print-config")]
 pub struct Args {
@@ -75,6 +77,9 @@ pub struct Args {
     /// Memory for images, such as 2G or 500M; the rest is kept in a file [default: half of the free memory]
     #[arg(long, value_name = "SIZE", value_parser = limits::bytes)]
     image_memory: Option<u64>,
+    /// Where to train: `auto` (the first GPU, else the CPU), `cpu`, `cuda` or `cuda:N`; GPUs need the program of `make cuda`
+    #[arg(long, value_name = "DEVICE", default_value_t = DeviceChoice::Auto)]
+    device: DeviceChoice,
     /// Print the resolved experiment and do not train
     #[arg(long)]
     print_config: bool,
@@ -237,6 +242,7 @@ fn extend_run(args: &Args, run: &Path) -> anyhow::Result<ExitCode> {
         force: args.force,
         image_memory: args.image_memory,
         command: None,
+        device: args.device,
     };
     let outcome = train(&request, &|| stop.asked(), &mut |event| show(&event, &mut screen, &stop));
     drop(screen);
@@ -278,7 +284,7 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
         bail!("--data: experiment `{}` draws its own puzzles", args.experiment);
     }
     let (data, force, image_memory) = (args.data.clone(), args.force, args.image_memory);
-    let options = TrainOptions { place, data, force, image_memory };
+    let options = TrainOptions { place, data, force, image_memory, device: args.device };
     // the error of a file that is for people only must not end a training
     let mut unwritten = None;
     let mut on_event = |event: TrainEvent<'_>| {
@@ -328,6 +334,9 @@ fn trains(args: &Args, own: &[String]) -> Vec<OsString> {
     }
     if args.force {
         words.push("--force".into());
+    }
+    if args.device != DeviceChoice::Auto {
+        words.extend(["--device".into(), args.device.to_string().into()]);
     }
     words
 }

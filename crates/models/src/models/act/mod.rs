@@ -47,7 +47,7 @@ use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::{Error, chunk_error, kl_divergence, linear, sample_latent};
-use nn::{Backend, Cache, Context, Gradients, Loss, LossParts, LossValues, Params, Result, Rng, Value};
+use nn::{Backend, Cache, Context, Gradients, Loss, LossNumbers, LossParts, Params, Result, Rng, Value};
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -196,7 +196,7 @@ impl Act {
         eps: &Tensor,
         rng: Option<&mut Rng>,
         into: &mut Gradients,
-    ) -> Result<LossValues> {
+    ) -> Result<LossNumbers> {
         let batch = &self.with_images(batch, None)?;
         self.cache.step(&self.params, rng, into, |cx| self.loss_with(cx, batch, &Value::from(eps)))
     }

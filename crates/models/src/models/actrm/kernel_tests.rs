@@ -1,12 +1,13 @@
 //! Steps and thoughts on hand-written kernels beside those on candle's operations, in all designs.
 #![allow(clippy::unwrap_used)]
 use super::*;
+use crate::cases::Signatures;
 use crate::encoders::{TokenKind, VisionConfig};
 use crate::features::Signature;
 use crate::layers::{Activation, AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::testing::{
-    Signatures, assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients,
-    move_parameters, signatures, vision_config,
+    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, gradients, move_parameters,
+    signatures, vision_config,
 };
 use candle_core::Tensor;
 use nn::simd::{Level, at_most};

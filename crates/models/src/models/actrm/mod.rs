@@ -68,9 +68,10 @@ use crate::layers::{
 use crate::model::PolicyModel;
 use crate::policy::{Clock, Policy};
 use crate::preprocess::Preprocess;
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 use nn::ops::{
-    Error, add, alias, cat_tokens, chunk_error, detached_mean, kl_divergence, linear, residual, sample_latent, term_of,
+    Error, RowErrors, add, alias, cat_tokens, chunk_error, detached_mean, kl_divergence, linear, residual,
+    sample_latent, term_of,
 };
 use nn::{Backend, Cache, Context, Loss, Params, Result, Rng, Term, Value};
 use over_actions::{OverActions, Read};
@@ -376,7 +377,7 @@ impl Actrm {
     }
 
     /// The halting head's loss: it is asked of each step, errors: (b), whether the next would lower them no more.
-    fn halting(&self, cx: &mut Context<'_>, batch: &Batch, steps: &[Step], errors: &[Vec<f64>]) -> Result<Term> {
+    fn halting(&self, cx: &mut Context<'_>, batch: &Batch, steps: &[Step], errors: &[RowErrors]) -> Result<Term> {
         let rows = batch.rows();
         // backwards, so that gradients are added in the order of the steps
         let logits = steps.iter().rev().map(|step| linear(cx, &step.mean, &self.halt_head)?.reshape((1, rows, 1)));
@@ -384,14 +385,23 @@ impl Actrm {
         logits.reverse();
         let logits = cat_tokens(cx, 1, &logits.iter().collect::<Vec<_>>())?;
         let still = 1.0 - self.config.reasoning.halt_margin;
-        let halted = errors.windows(2).flat_map(|pair| pair[0].iter().zip(&pair[1]));
-        let targets: Vec<f64> = halted.map(|(here, next)| f64::from(u8::from(*next >= here * still))).collect();
+        let (mut targets, mut on_device) = (Vec::new(), Vec::new());
+        for pair in errors.windows(2) {
+            match (&pair[0], &pair[1]) {
+                (RowErrors::Here(here), RowErrors::Here(next)) => {
+                    targets
+                        .extend(here.iter().zip(next).map(|(here, next)| f64::from(u8::from(*next >= here * still))));
+                }
+                (RowErrors::There(here), RowErrors::There(next)) => {
+                    on_device.push(next.ge(&(here * still)?)?.to_dtype(DType::F32)?);
+                }
+                _ => unreachable!("the steps of a batch are computed in one place"),
+            }
+        }
         let total = (batch.total_rows.max(1) * steps.len()) as f64;
         let share = 1.0 / total;
-        let asked: Arc<[f64]> = targets.into();
-        let on_slices = Arc::clone(&asked);
         let on_slices = move |logits: &[f32], grad: Option<(&mut [f32], f64)>| {
-            let each = || logits.iter().zip(&*on_slices).map(|(logit, target)| (f64::from(*logit), *target));
+            let each = || logits.iter().zip(&targets).map(|(logit, target)| (f64::from(*logit), *target));
             if let Some((grad, weight)) = grad {
                 for (grad, (x, target)) in grad.iter_mut().zip(each()) {
                     *grad = ((1.0 / (1.0 + (-x).exp()) - target) * share * weight) as f32;
@@ -400,8 +410,7 @@ impl Actrm {
             each().fold(0.0, |sum, (x, target)| sum + (x.max(0.0) - x * target + (-x.abs()).exp().ln_1p()) * share)
         };
         term_of(cx, &logits, on_slices, |logits| {
-            let targets = asked.iter().map(|target| *target as f32).collect::<Vec<_>>();
-            let targets = Tensor::from_vec(targets, logits.shape(), logits.device())?;
+            let targets = Tensor::cat(&on_device, 0)?.reshape(logits.shape())?;
             Ok((binary_cross_entropy(logits, &targets)?.sum_all()? / total)?)
         })
     }
@@ -469,12 +478,12 @@ impl PolicyModel for Actrm {
         for (step, weight) in steps.iter().zip(self.step_weights(steps.len())) {
             let (l1, of_rows) = error(cx, &step.chunk)?;
             // the last step's is the one comparable with ACT's
-            loss.report_first("l1_loss_first", l1.value() as f32);
+            loss.report_first("l1_loss_first", l1.value());
             loss.add("l1_loss", l1, weight);
             errors.push(of_rows);
             if let (Some((name, question, share)), Some(scores)) = (&question, &step.scores) {
                 let (term, right) = ask(cx, question, scores)?;
-                loss.report_first(&format!("{name}_right_first"), right);
+                loss.report_first(&format!("{name}_right_first"), right.clone());
                 loss.report(&format!("{name}_right"), right);
                 loss.add(&format!("{name}_loss"), term, weight * share);
             }

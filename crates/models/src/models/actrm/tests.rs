@@ -89,7 +89,7 @@ fn every_parameter_gets_a_gradient() {
         for seed in 0..2 {
             let mut batch = batch(&config, 6, seed);
             batch.seed = seed;
-            let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(model.params())));
+            let mut grads = Gradients::zeros(Arc::new(ParamLayout::new(model.params()))).unwrap();
             model.accumulate_gradients(&batch, &mut Rng::new(seed, "loss"), &mut grads).unwrap();
             let composed = model.loss(&batch, &mut Rng::new(seed, "loss")).unwrap().total.backward().unwrap();
             for (name, var) in model.params().iter() {

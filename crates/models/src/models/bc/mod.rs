@@ -133,7 +133,7 @@ impl PolicyModel for Bc {
             Loss::L2 => {
                 // L1 in any case: it is what other policies report
                 let l1 = error(cx, &actions.detach(), Error::Absolute)?;
-                loss.report("l1_loss", l1.value() as f32);
+                loss.report("l1_loss", l1.value());
                 loss.add("l2_loss", error(cx, &actions, Error::Squared)?, 1.0);
             }
         }

@@ -24,7 +24,7 @@ use nn::Params;
 use nn::Rng;
 use nn::Size;
 use nn::losses::absolute;
-use nn::{LossParts, LossValues};
+use nn::{LossNumbers, LossParts};
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -165,8 +165,8 @@ impl<R: Rule> PolicyModel for Floor<R> {
         Ok(LossParts { total: l1.clone(), parts: BTreeMap::from([("l1_loss".to_string(), l1)]) })
     }
 
-    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, _into: &mut Gradients) -> Result<LossValues> {
-        LossValues::from_parts(&self.loss(batch, rng)?)
+    fn accumulate_gradients(&self, batch: &Batch, rng: &mut Rng, _into: &mut Gradients) -> Result<LossNumbers> {
+        Ok(LossNumbers::from(&self.loss(batch, rng)?))
     }
 
     fn predict(&self, observation: &Features<Tensor>) -> Result<Tensor> {
