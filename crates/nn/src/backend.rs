@@ -1,6 +1,7 @@
 //! Where tensors are, and which operations run there.
 
 use crate::error::{ModelError, Result};
+use crate::precision::Precision;
 use candle_core::Device;
 
 /// A device, and whether its operations are hand-written kernels or compositions of candle's.
@@ -8,20 +9,39 @@ use candle_core::Device;
 pub struct Backend {
     device: Device,
     composed: bool,
+    precision: Precision,
 }
 
 impl Backend {
     /// Hand-written kernels on the CPU.
-    pub const CPU: Self = Self { device: Device::Cpu, composed: false };
+    pub const CPU: Self = Self { device: Device::Cpu, composed: false, precision: Precision::F32 };
 
     /// The fastest operations that the device has: hand-written kernels on the CPU, candle's elsewhere.
     pub fn new(device: Device) -> Self {
-        Self { composed: !device.is_cpu(), device }
+        Self { composed: !device.is_cpu(), device, precision: Precision::F32 }
     }
 
     /// Candle's operations on any device. On the CPU this is for tests.
     pub fn composed(device: Device) -> Self {
-        Self { device, composed: true }
+        Self { device, composed: true, precision: Precision::F32 }
+    }
+
+    /// The same with products in this precision.
+    ///
+    /// # Errors
+    /// Another precision than f32 on the CPU.
+    pub fn with_precision(self, precision: Precision) -> Result<Self> {
+        if precision != Precision::F32 && self.device.is_cpu() {
+            let (found, expected) = (format!("{precision:?}").to_lowercase(), "f32 on the CPU".to_string());
+            return Err(ModelError::Input { operation: "device", object: "precision", found, expected });
+        }
+        candle_core::cuda::set_gemm_reduced_precision_f32(precision == Precision::Tf32);
+        Ok(Self { precision, ..self })
+    }
+
+    /// In which precision products are computed.
+    pub fn precision(&self) -> Precision {
+        self.precision
     }
 
     /// Where tensors are.

@@ -7,6 +7,7 @@ use crate::kernels::{Mat, Pack, Packed, Pool};
 use crate::layers::DropoutMask;
 use crate::loss::{Loss, LossNumbers, LossParts};
 use crate::params::Params;
+use crate::precision::Precision;
 use crate::rng::Rng;
 use crate::tape::{Backward, Tape};
 use crate::value::Value;
@@ -176,6 +177,8 @@ pub struct Context<'a> {
     rng: Option<&'a mut Rng>,
     on_seen: Option<&'a mut dyn FnMut()>,
     device: Device,
+    /// of composed products
+    precision: Precision,
 }
 
 impl std::fmt::Debug for Context<'_> {
@@ -189,8 +192,8 @@ impl std::fmt::Debug for Context<'_> {
 
 impl<'a> Context<'a> {
     fn new(space: &'a mut Workspace, backend: &Backend) -> Self {
-        let (composed, device) = (backend.is_composed(), backend.device().clone());
-        Self { space, tape: None, composed, prepared: None, rng: None, on_seen: None, device }
+        let (composed, device, precision) = (backend.is_composed(), backend.device().clone(), backend.precision());
+        Self { space, tape: None, composed, prepared: None, rng: None, on_seen: None, device, precision }
     }
 
     /// Whether an operation is candle's, after a look at its inputs: every operation begins with it.
@@ -215,6 +218,11 @@ impl<'a> Context<'a> {
     /// Whether operations are candle's.
     pub fn is_composed(&self) -> bool {
         self.composed
+    }
+
+    /// In which precision composed products are computed.
+    pub(crate) fn precision(&self) -> Precision {
+        self.precision
     }
 
     /// Where tensors are made.

@@ -83,10 +83,7 @@ impl DeviceChoice {
 
 #[cfg(feature = "cuda")]
 fn cuda(n: usize) -> std::result::Result<Device, String> {
-    let device = Device::new_cuda(n).map_err(|e| e.to_string())?;
-    // products of f32 in full precision, unless a training asks for less
-    candle_core::cuda::set_gemm_reduced_precision_f32(false);
-    Ok(device)
+    Device::new_cuda(n).map_err(|e| e.to_string())
 }
 
 #[cfg(not(feature = "cuda"))]

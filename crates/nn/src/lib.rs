@@ -7,6 +7,7 @@
 //! This crate knows tensors and numbers only. It opens no file, starts no process and prints nothing.
 
 mod backend;
+mod composed;
 mod context;
 mod device;
 mod error;
@@ -22,6 +23,7 @@ pub mod ops;
 mod optim;
 mod params;
 mod per_parameter;
+mod precision;
 mod rng;
 #[doc(hidden)]
 pub mod simd;
@@ -41,6 +43,7 @@ pub use number::Number;
 pub use optim::{Optimiser, OptimiserConfig};
 pub use params::{Init, Params};
 pub use per_parameter::PerParameter;
+pub use precision::Precision;
 pub use rng::Rng;
 pub use simd::vectors;
 pub use size::Size;

@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use interchange::lerobot::{ImportOptions, import};
-use models::{ActionChunk, Actor, FeatureKind, FeatureSpec, ModelError, Observation, Policy, Values};
+use models::{
+    ActionChunk, Actor, Backend, DeviceChoice, FeatureKind, FeatureSpec, ModelError, Observation, Policy, Values,
+};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
@@ -386,23 +388,27 @@ fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>
 /// zoo: the folder that names are looked up in; `$ACTRM_ZOO_DIR` or `zoo` unless given.
 /// conventions: what your robot or environment does, such as `{"control_freq": "20", "gripper": "-1 opens, 1 closes"}`. A
 ///     policy that says otherwise is refused. Names and values: `policy.conventions`.
+/// device: where it predicts: "cpu", "auto" (the first GPU, else the CPU), "cuda" or "cuda:N". The wheel has no CUDA.
 #[pyfunction]
-#[pyo3(signature = (path, zoo=None, *, conventions=None))]
+#[pyo3(signature = (path, zoo=None, *, conventions=None, device="cpu"))]
 pub(crate) fn load_policy(
     py: Python<'_>,
     path: PathBuf,
     zoo: Option<PathBuf>,
     conventions: Option<BTreeMap<String, String>>,
+    device: &str,
 ) -> PyResult<PyPolicy> {
+    let device: DeviceChoice = device.parse().map_err(PyValueError::new_err)?;
     unlocked(py, || {
         run(|| {
             let yours = stated(conventions.unwrap_or_default()).map_err(raised)?;
+            let backend = device.open().map_err(|e| PyValueError::new_err(e.to_string()))?.backend;
             let (folder, loaded) = if let Some(folder) = lerobot_checkpoint(&path) {
-                let loaded = import_checkpoint(&folder).map_err(raised)?;
+                let loaded = import_checkpoint(&folder, &backend).map_err(raised)?;
                 (folder, loaded)
             } else {
                 let entry = registry(zoo).locate(&path.to_string_lossy()).map_err(raised)?;
-                (entry.folder().to_owned(), entry.load().map_err(raised)?)
+                (entry.folder().to_owned(), entry.load_on(&backend).map_err(raised)?)
             };
             let (id, task) = (loaded.entry().id().to_string(), &loaded.entry().meta().task);
             loaded.conventions().check(&yours, "`conventions`", &id, task).map_err(raised)?;
@@ -433,11 +439,11 @@ fn lerobot_checkpoint(path: &Path) -> Option<PathBuf> {
 }
 
 /// A checkpoint as an entry that nobody keeps.
-fn import_checkpoint(folder: &Path) -> Result<LoadedEntry, ZooError> {
+fn import_checkpoint(folder: &Path, backend: &Backend) -> Result<LoadedEntry, ZooError> {
     let zoo = tempfile::tempdir().map_err(ZooError::io("create folder", std::env::temp_dir()))?;
     let DataSection { state_keys, env_keys, .. } = DataSection::default();
     let (name, task) = ("lerobot-checkpoint".to_owned(), "unknown".to_owned());
     let options = ImportOptions { name, task, state_keys, env_keys, fast_render: false };
     let id = import(folder, &options, zoo.path())?;
-    Registry::open(zoo.path()).entry(&id.to_string())?.load()
+    Registry::open(zoo.path()).entry(&id.to_string())?.load_on(backend)
 }

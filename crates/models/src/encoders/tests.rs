@@ -26,7 +26,8 @@ fn tokens_and_gradients_are_the_composed_ones() {
         (8, ImageNorm::Frozen, vec![(40, 33)], 2, map, Some([1, 2, 0, 0])),
     ] {
         let config = VisionConfig { width, norm, tokens, blocks, ..VisionConfig::default() };
-        let (mut params, mut rng, cache) = (Params::new(&Backend::CPU), Rng::new(5, "init"), Cache::default());
+        let (mut params, mut rng, cache) = (Params::new(&Backend::CPU), Rng::new(6, "init"), Cache::default());
+        // with seed 5 one maximum is decided by rounding
         let encoder = ImageEncoder::without_positions(&mut params, &config, &sizes, DIM, &mut rng).unwrap();
         for (name, var) in params.all() {
             // away from 1 and 0; variances stay positive

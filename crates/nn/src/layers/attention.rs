@@ -1,6 +1,7 @@
 //! Multi-head attention with torch's tensor names.
 
 use super::Linear;
+use crate::composed::softmax;
 use crate::context::Context;
 use crate::error::{ModelError, Result};
 use crate::ops::{self, Attention, linear, linear_rows};
@@ -158,7 +159,5 @@ pub fn masked_softmax(scores: &Tensor, key_pad: Option<&Tensor>) -> Result<Tenso
         }
         None => scores.clone(),
     };
-    let max = scores.max_keepdim(D::Minus1)?.detach();
-    let exp = scores.broadcast_sub(&max)?.exp()?;
-    Ok(exp.broadcast_div(&exp.sum_keepdim(D::Minus1)?)?)
+    softmax(&scores)
 }

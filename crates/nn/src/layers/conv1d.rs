@@ -6,6 +6,7 @@
 use super::Linear;
 use crate::error::Result;
 use crate::params::{Init, Params};
+use crate::precision::Precision;
 use crate::rng::Rng;
 use candle_core::Tensor;
 
@@ -63,13 +64,13 @@ impl Conv1d {
     }
 
     /// x: (b, steps, in) -> (b, steps / stride, out)
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    pub fn forward(&self, x: &Tensor, precision: Precision) -> Result<Tensor> {
         let (output, input, kernel) = self.weight.dims3()?;
         let (outputs, padding) = (x.dim(1)?.div_ceil(self.stride), kernel / 2);
         // the weight as that of a dense layer over the numbers under the kernel
         let weight = self.weight.transpose(1, 2)?.contiguous()?.reshape((output, kernel * input))?;
         let layer = Linear { weight, bias: Some(self.bias.clone()) };
-        layer.forward(&unfold(x, (-(padding as i64), self.stride), kernel, outputs)?)
+        layer.forward_in(&unfold(x, (-(padding as i64), self.stride), kernel, outputs)?, precision)
     }
 }
 
@@ -92,7 +93,7 @@ impl Upsample1d {
     }
 
     /// x: (b, steps, in) -> (b, 2 steps, out)
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    pub fn forward(&self, x: &Tensor, precision: Precision) -> Result<Tensor> {
         let (b, steps, _) = x.dims3()?;
         let (_, output, _) = self.weight.dims3()?;
         // output 2i sees steps i-1 and i through taps 3 and 1, output 2i+1 steps i and i+1 through taps 2 and 0
@@ -101,7 +102,7 @@ impl Upsample1d {
             let [one, other] = taps;
             let weight = Tensor::cat(&[one?, other?], 0)?.t()?;
             let layer = Linear { weight, bias: Some(self.bias.clone()) };
-            layer.forward(&unfold(x, (first, 1), 2, steps)?)
+            layer.forward_in(&unfold(x, (first, 1), 2, steps)?, precision)
         };
         let both = Tensor::stack(&[half(-1, [3, 1])?, half(0, [2, 0])?], 2)?;
         Ok(both.reshape((b, 2 * steps, output))?)
@@ -137,7 +138,12 @@ mod tests {
             let x = random(&[2, steps, 3], 5);
             let first = x.transpose(1, 2).unwrap().contiguous().unwrap();
             let theirs = first.conv1d(&conv.weight, kernel / 2, stride, 1, 1).unwrap();
-            assert_same(&conv.forward(&x).unwrap(), &theirs, &conv.bias, &format!("{kernel} {stride} {steps}"));
+            assert_same(
+                &conv.forward(&x, Precision::F32).unwrap(),
+                &theirs,
+                &conv.bias,
+                &format!("{kernel} {stride} {steps}"),
+            );
         }
     }
 
@@ -149,7 +155,7 @@ mod tests {
             let x = random(&[2, steps, 3], 6);
             let first = x.transpose(1, 2).unwrap().contiguous().unwrap();
             let theirs = first.conv_transpose1d(&up.weight, 1, 0, 2, 1, 1).unwrap();
-            assert_same(&up.forward(&x).unwrap(), &theirs, &up.bias, &format!("{steps}"));
+            assert_same(&up.forward(&x, Precision::F32).unwrap(), &theirs, &up.bias, &format!("{steps}"));
         }
     }
 }

@@ -1,9 +1,10 @@
 //! Layer normalisation with a gradient.
 
+use crate::composed;
 use crate::error::Result;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
-use candle_core::{D, Tensor};
+use candle_core::Tensor;
 
 /// `(x - mean) / sqrt(var + 1e-5) * weight + bias` over the last dimension.
 #[derive(Debug, Clone)]
@@ -28,9 +29,6 @@ impl LayerNorm {
 
     /// x: (…, dim) -> (…, dim)
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
-        let var = centred.sqr()?.mean_keepdim(D::Minus1)?;
-        let normed = centred.broadcast_div(&(var + Self::EPS)?.sqrt()?)?;
-        Ok(normed.broadcast_mul(&self.weight)?.broadcast_add(&self.bias)?)
+        composed::layer_norm(x, &self.weight, &self.bias, Self::EPS)
     }
 }

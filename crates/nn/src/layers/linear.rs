@@ -2,6 +2,7 @@
 
 use crate::error::Result;
 use crate::params::{Init, Params};
+use crate::precision::Precision;
 use crate::rng::Rng;
 use candle_core::{D, Tensor};
 
@@ -41,11 +42,16 @@ impl Linear {
 
     /// x: (…, in) -> (…, out)
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        self.forward_in(x, Precision::F32)
+    }
+
+    /// The same with a product in this precision.
+    pub(crate) fn forward_in(&self, x: &Tensor, precision: Precision) -> Result<Tensor> {
         let mut shape = x.dims().to_vec();
         let (output, input) = self.weight.dims2()?;
         let rows = x.elem_count() / input.max(1);
         let x = if x.dim(D::Minus1)? == input { x.reshape((rows, input))? } else { x.clone() };
-        let y = x.matmul(&self.weight.t()?)?;
+        let y = precision.product(&x, &self.weight.t()?)?;
         let y = match &self.bias {
             Some(bias) => y.broadcast_add(bias)?,
             None => y,

@@ -5,8 +5,10 @@
 //! channels of the first layer and the number of blocks are free; with `norm = "group"` every norm is a GroupNorm of
 //! `max(1, channels / 16)` groups, as Diffusion Policy and R3PL have it, under the names of the batch norms.
 
+use crate::composed;
 use crate::context::Context;
 use crate::ops::{ConvNorm, conv2d, max_pool};
+use crate::precision::Precision;
 use crate::value::Value;
 use crate::{Init, Params, Result, Rng};
 use candle_core::{DType, Tensor};
@@ -101,19 +103,18 @@ impl Conv {
     }
 }
 
-/// x: (b, C, h, w), padding half the kernel -> (b, C', h / stride, w / stride). What no window reaches is cut off first: candle's
-/// backward pass wants as much left over in width as in height.
-pub(crate) fn conv2d_composed(x: &Tensor, weight: &Tensor, stride: usize) -> Result<Tensor> {
+/// x: (b, h, w, C), padding half the kernel -> (b, h / stride, w / stride, C'). What no window reaches is cut off first.
+pub(crate) fn conv2d_composed(x: &Tensor, weight: &Tensor, stride: usize, precision: Precision) -> Result<Tensor> {
     let kernel = weight.dim(2)?;
     let before = kernel / 2;
     let mut x = x.clone();
-    for axis in [2, 3] {
+    for axis in [1, 2] {
         let size = x.dim(axis)?;
         let reached = (size.div_ceil(stride) - 1) * stride + kernel;
         let after = reached.saturating_sub(before + size);
         x = x.pad_with_zeros(axis, before, after)?.narrow(axis, 0, reached)?;
     }
-    Ok(x.contiguous()?.conv2d(weight, 0, stride, 1, 1)?)
+    composed::conv2d(&x.contiguous()?, weight, stride, precision)
 }
 
 impl ConvNorm {
@@ -140,22 +141,21 @@ impl ConvNorm {
         })
     }
 
-    /// (b, C, h, w) -> the same
+    /// (b, h, w, C) -> the same
     pub(crate) fn composed(&self, x: &Tensor) -> Result<Tensor> {
-        let (b, c, h, w) = x.dims4()?;
-        let a_channel = |t: &Tensor| t.reshape((1, c, 1, 1));
+        let (b, h, w, c) = x.dims4()?;
         match self {
             Self::Group { weight, bias, groups } => {
-                let x = x.reshape((b, *groups, c / groups * h * w))?;
-                let centred = x.broadcast_sub(&x.mean_keepdim(2)?)?;
-                let spread = (centred.sqr()?.mean_keepdim(2)? + CONV_NORM_EPS)?.sqrt()?;
-                let x = centred.broadcast_div(&spread)?.reshape((b, c, h, w))?;
-                Ok(x.broadcast_mul(&a_channel(weight)?)?.broadcast_add(&a_channel(bias)?)?)
+                let x = x.reshape((b, h * w, *groups, c / groups))?;
+                let centred = x.broadcast_sub(&x.mean_keepdim((1, 3))?)?;
+                let spread = (centred.sqr()?.mean_keepdim((1, 3))? + CONV_NORM_EPS)?.sqrt()?;
+                let x = centred.broadcast_div(&spread)?.reshape((b, h, w, c))?;
+                Ok(x.broadcast_mul(weight)?.broadcast_add(bias)?)
             }
             Self::Frozen { weight, bias, mean, variance } => {
                 let scale = (weight / (variance + CONV_NORM_EPS)?.sqrt()?)?.detach();
                 let shift = (bias - (mean * &scale)?)?.detach();
-                Ok(x.broadcast_mul(&a_channel(&scale)?)?.broadcast_add(&a_channel(&shift)?)?)
+                Ok(x.broadcast_mul(&scale)?.broadcast_add(&shift)?)
             }
         }
     }

@@ -97,7 +97,7 @@ fn composed(cx: &Context<'_>, q: &Value, kv: &Value, how: Attention<'_>, mask: O
     };
     let (k, v) = (kv.tensor.narrow(D::Minus1, 0, dim)?, kv.tensor.narrow(D::Minus1, dim, dim)?);
     let (q, k, v) = (split(&q.tensor, queries)?, split(&k.contiguous()?, keys)?, split(&v.contiguous()?, keys)?);
-    let mut scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (dim as f64 / heads as f64).sqrt()))?;
+    let mut scores = (cx.precision().product(&q, &k.transpose(2, 3)?)? * (1.0 / (dim as f64 / heads as f64).sqrt()))?;
     if causal {
         let later = (0..queries * keys).map(|i| if i % keys > i / keys { UNSEEN } else { 0.0 }).collect::<Vec<f32>>();
         scores = scores.broadcast_add(&Tensor::from_vec(later, (1, 1, queries, keys), cx.device())?)?;
@@ -107,7 +107,7 @@ fn composed(cx: &Context<'_>, q: &Value, kv: &Value, how: Attention<'_>, mask: O
         let mask = mask.tensor(&[batch, heads, all_queries, keys], cx.device())?;
         weights = weights.mul(&mask.narrow(2, 0, queries)?)?;
     }
-    Ok(Value::constant(weights.matmul(&v)?.transpose(1, 2)?.reshape((batch, queries, dim))?))
+    Ok(Value::constant(cx.precision().product(&weights, &v)?.transpose(1, 2)?.reshape((batch, queries, dim))?))
 }
 
 /// Attention among tokens, (b or 1, t, D), with positions, (1, t, D), added to what queries and keys are made of: the first

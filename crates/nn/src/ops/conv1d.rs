@@ -59,7 +59,7 @@ fn of_bias(back: &mut Backward<'_>, layer: &Conv1d, rows: &[f32]) {
 pub fn conv1d(cx: &mut Context<'_>, x: &Value, layer: &Conv1d) -> Result<Value> {
     let conv = convolution(x, layer)?;
     if cx.composed("convolution", [&x.tensor, &layer.weight, &layer.bias])? {
-        return Ok(Value::constant(layer.forward(&x.tensor)?));
+        return Ok(Value::constant(layer.forward(&x.tensor, cx.precision())?));
     }
     let made = conv.made((0, 0));
     let mut y = vec![0.0; made.inside()];
@@ -101,7 +101,7 @@ pub fn conv1d_mish(
         Then::Nothing => None,
     };
     if cx.composed("convolution", [&x.tensor, &layer.weight, &layer.bias].into_iter().chain(other))? {
-        let y = crate::layers::mish(&norm.forward(&layer.forward(&x.tensor)?)?)?;
+        let y = crate::layers::mish(&norm.forward(&layer.forward(&x.tensor, cx.precision())?)?)?;
         return Ok(Value::constant(match then {
             Then::Nothing => y,
             Then::Film(film) if scales => {
@@ -187,7 +187,7 @@ pub fn upsample1d(cx: &mut Context<'_>, x: &Value, layer: &Upsample1d) -> Result
         return Err(ModelError::Shape { operation: "upsample", object: "weight", expected, found });
     }
     if cx.composed("upsample", [&x.tensor, &layer.weight, &layer.bias])? {
-        return Ok(Value::constant(layer.forward(&x.tensor)?));
+        return Ok(Value::constant(layer.forward(&x.tensor, cx.precision())?));
     }
     // the way back of a convolution that halves the steps
     let conv = along((n, 2 * steps, output), input, kernel, 2);

@@ -187,8 +187,8 @@ pub fn conv2d(
     }
     let tensors = [&x.tensor, weight].into_iter().chain(shortcut.map(|shortcut| &shortcut.tensor));
     if cx.composed("convolution", tensors)? {
-        let y = crate::layers::conv2d_composed(&x.tensor.permute((0, 3, 1, 2))?, weight, stride)?;
-        let y = norm.composed(&y)?.permute((0, 2, 3, 1))?;
+        let y = crate::layers::conv2d_composed(&x.tensor, weight, stride, cx.precision())?;
+        let y = norm.composed(&y)?;
         let y = shortcut.map_or(Ok(y.clone()), |shortcut| &y + &shortcut.tensor)?;
         return Ok(Value::constant(if relu { y.relu()? } else { y }.contiguous()?));
     }

@@ -19,7 +19,7 @@ pub fn feed_forward(cx: &mut Context<'_>, x: &Value, layer: &FeedForward, all: u
     let (one, two) = (&layer.linear1, &layer.linear2);
     super::check_width("feed forward", x, one.weight.dim(1)?)?;
     if cx.composed("feed forward", [&x.tensor, &one.weight, &two.weight])? {
-        let hidden = activation.forward(&layer.linear1.forward(&x.tensor)?)?;
+        let hidden = activation.forward(&layer.linear1.forward_in(&x.tensor, cx.precision())?)?;
         let hidden = match mask {
             Some(mask) => {
                 let mask = mask.tensor(&[b, all, layer.linear1.weight.dim(0)?], cx.device())?;
@@ -27,7 +27,7 @@ pub fn feed_forward(cx: &mut Context<'_>, x: &Value, layer: &FeedForward, all: u
             }
             None => hidden,
         };
-        return Ok(Value::constant(layer.linear2.forward(&hidden)?));
+        return Ok(Value::constant(layer.linear2.forward_in(&hidden, cx.precision())?));
     }
     let (Some(b1), Some(b2)) = (&one.bias, &two.bias) else {
         let (found, expected) = ("without a bias".to_string(), "with one".to_string());

@@ -21,7 +21,7 @@ pub fn linear(cx: &mut Context<'_>, x: &Value, layer: &Linear) -> Result<Value> 
     if cx.composed("linear", [&x.tensor, &layer.weight].into_iter().chain(&layer.bias))? {
         // a convolution of one pixel is a dense layer
         let layer = Linear { weight: layer.weight.flatten_from(1)?, bias: layer.bias.clone() };
-        return Ok(Value::constant(layer.forward(&x.tensor)?));
+        return Ok(Value::constant(layer.forward_in(&x.tensor, cx.precision())?));
     }
     by_rows(cx, x, None, (&layer.weight, layer.bias.as_ref()), rows, false)
 }
@@ -49,10 +49,11 @@ pub fn linear_rows(
             let weight = weight.narrow(0, rows.start, rows.len())?;
             Ok(Linear { weight, bias: bias.map(|bias| bias.narrow(0, rows.start, rows.len())).transpose()? })
         };
-        let y = part(&rows)?.forward(&x.tensor)?;
+        let y = part(&rows)?.forward_in(&x.tensor, cx.precision())?;
         let Some(positions) = positions else { return Ok(Value::constant(y)) };
         let first = Linear { bias: None, ..part(&(rows.start..rows.start + dim))? };
-        let first = first.forward(&positions.tensor)?.pad_with_zeros(D::Minus1, 0, rows.len() - dim)?;
+        let first =
+            first.forward_in(&positions.tensor, cx.precision())?.pad_with_zeros(D::Minus1, 0, rows.len() - dim)?;
         return Ok(Value::constant(y.broadcast_add(&first)?));
     }
     let first = rows.start..rows.start + dim;

@@ -4,7 +4,7 @@
 
 use std::path::PathBuf;
 
-use models::DeviceChoice;
+use models::{DeviceChoice, Precision};
 use zoo::ZooError;
 use zoo::config::{Library, apply_overrides};
 use zoo::entry::Entry;
@@ -165,6 +165,11 @@ impl AnyExperiment {
                 key: "--device".to_owned(),
                 expected: "cpu: puzzle solvers train on the CPU".to_owned(),
                 found: device.to_string(),
+            }),
+            Kind::Puzzle(experiment) if experiment.train.precision != Precision::F32 => Err(ZooError::InvalidValue {
+                key: "train.precision".to_owned(),
+                expected: "f32: puzzle solvers train on the CPU".to_owned(),
+                found: format!("{:?}", experiment.train.precision).to_lowercase(),
             }),
             Kind::Puzzle(experiment) => {
                 let experiment = *experiment;

@@ -14,7 +14,7 @@ use zoo::evaluation::{Environment, EvaluationEnd, EvaluationOptions, evaluate};
 use zoo::experiment::Experiment;
 use zoo::registry::Registry;
 use zoo::results::Seeds;
-use zoo::run::{TrainEvent, TrainOutcome, TrainRequest, train};
+use zoo::run::{DeviceChoice, TrainEvent, TrainOutcome, TrainRequest, train};
 use zoo::{ZooError, sha256_hex};
 
 use super::cells::{Cell, cells};
@@ -40,6 +40,8 @@ pub struct RobotStudyRequest {
     pub data_only: bool,
     /// Cells at once.
     pub jobs: usize,
+    /// Where policies are trained.
+    pub device: DeviceChoice,
     /// Python with robosuite.
     pub python: Python,
     /// Whether to stop.
@@ -335,7 +337,7 @@ impl Shared<'_> {
                     from_zoo: None,
                     force: false,
                     image_memory: None,
-                    device: models::DeviceChoice::Cpu,
+                    device: self.request.device,
                 };
                 let mut steps = 0;
                 let outcome = train(&request, &|| self.stopped(), &mut |event| match event {
@@ -518,6 +520,7 @@ mod tests {
             cells: Vec::new(),
             stage: None,
             data_only: false,
+            device: DeviceChoice::Cpu,
             jobs: 1,
             python: Python { path: "nowhere".into(), origin: "a test".to_owned() },
             stop: Arc::new(|| false),

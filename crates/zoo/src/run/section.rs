@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use candle_core::Tensor;
-use models::{OptimiserConfig, Schedule, TrainConfig};
+use models::{OptimiserConfig, Precision, Schedule, TrainConfig};
 use serde::{Deserialize, Serialize};
 
 use crate::entry::MODEL_FILE;
@@ -66,12 +66,19 @@ pub struct TrainSection {
     /// How an entry stores its weights; absent: as float32.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub weights: Option<WeightsFormat>,
+    /// Precision of products on a GPU: `f32`, `tf32` or `bf16`; weights and sums are f32. The CPU computes in f32.
+    #[serde(skip_serializing_if = "is_f32")]
+    pub precision: Precision,
     /// Steps between rows of metrics.
     pub log_every: u64,
     /// Steps between validations.
     pub validate_every: u64,
     /// Steps between checkpoints.
     pub checkpoint_every: u64,
+}
+
+fn is_f32(precision: &Precision) -> bool {
+    *precision == Precision::F32
 }
 
 impl Default for TrainSection {
@@ -92,6 +99,7 @@ impl Default for TrainSection {
             accumulation: 1,
             ema_decay: None,
             weights: None,
+            precision: Precision::F32,
             log_every: 10,
             validate_every: 100,
             checkpoint_every: 250,

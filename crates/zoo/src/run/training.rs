@@ -196,7 +196,9 @@ impl PolicyTraining {
         }
         let agreed = agree(&dataset, &path, experiment, request.force)?;
         let opened = request.device.open().map_err(experiment.model_error("open the device for"))?;
-        let (gpu, backend) = (opened.backend.gpu(), opened.backend);
+        let backend = opened.backend.with_precision(experiment.train.precision);
+        let backend = backend.map_err(experiment.model_error("open the device for"))?;
+        let gpu = backend.gpu();
         let memory = ImageMemory { budget, folder: folder.path(), device: &backend };
         let demonstrations = data::prepare(&dataset, &path, &name, &agreed, &memory)?;
         let experiment = agreed.experiment;

@@ -10,7 +10,7 @@ use study::robots::{
     stored_results,
 };
 use zoo::config::Library;
-use zoo::run::TrainEvent;
+use zoo::run::{DeviceChoice, TrainEvent};
 use zoo::write_atomic;
 
 use crate::places::ConfigArgs;
@@ -41,6 +41,9 @@ pub struct Args {
     /// Number of trainings at once, for a study of robot policies
     #[arg(long, short, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64), requires = "study")]
     jobs: u16,
+    /// Where robot policies are trained: `cpu`, `auto` (the first GPU, else the CPU), `cuda` or `cuda:N`; weights repeat on the CPU only
+    #[arg(long, value_name = "DEVICE", default_value_t = DeviceChoice::Cpu, requires = "study")]
+    device: DeviceChoice,
     /// Python with robosuite, for a study of robot policies
     #[arg(long, value_name = "PATH", env = "ACTRM_PYTHON")]
     python: Option<PathBuf>,
@@ -155,6 +158,7 @@ fn robots(args: &Args, file: &Path) -> anyhow::Result<ExitCode> {
             stage: args.stage,
             data_only: args.data_only,
             jobs: usize::from(args.jobs),
+            device: args.device,
             python: rollout::find_python(args.python.as_deref())?,
             stop: stop.flag(),
         };

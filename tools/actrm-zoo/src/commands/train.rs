@@ -4,8 +4,8 @@ use std::process::ExitCode;
 
 use anyhow::{Context, anyhow, bail};
 use clap::builder::ArgPredicate;
-use models::DeviceChoice;
 use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
+use models::DeviceChoice;
 use study::puzzle::{AnyExperiment, TrainOptions};
 use zoo::ZooError;
 use zoo::entry::member_name;
