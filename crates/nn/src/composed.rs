@@ -1,19 +1,36 @@
 //! Compositions of candle's operations with a gradient of their own: candle's has more steps, or none that is fast.
 
-use crate::error::Result;
+use crate::error::{ModelError, Result};
 use crate::precision::Precision;
 use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CudaStorage, CustomOp3, D, DType, Layout, Result as CandleResult, Shape, Tensor};
+use candle_core::{
+    CpuStorage, CudaStorage, CustomOp3, D, DType, Layout, Result as CandleResult, Shape, Storage, Tensor,
+};
+use std::sync::{Mutex, PoisonError};
 
-/// Gradients of three inputs; of one that is not asked for it may be left out.
+/// Gradients of up to three inputs; one that is not asked for may be left out.
 type Gradients = [Option<Tensor>; 3];
 
-/// A result that is there already as an operation on its inputs: the last input is the result.
-struct Known<F>(&'static str, F);
+/// A result that is there already, as an operation with a gradient.
+struct Known<F> {
+    name: &'static str,
+    result: Mutex<Option<Tensor>>,
+    gradient: F,
+}
+
+impl<F> Known<F> {
+    /// Lends the result once.
+    fn with<R>(&self, f: impl FnOnce(&Storage, &Layout) -> CandleResult<R>) -> CandleResult<(R, Shape)> {
+        let result = self.result.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let Some(result) = result else { candle_core::bail!("{}: the result was taken before", self.name) };
+        let (storage, layout) = result.storage_and_layout();
+        Ok((f(&storage, layout)?, layout.shape().clone()))
+    }
+}
 
 impl<F: Fn(&Tensor) -> Result<Gradients>> CustomOp3 for Known<F> {
     fn name(&self) -> &'static str {
-        self.0
+        self.name
     }
 
     fn cpu_fwd(
@@ -22,10 +39,13 @@ impl<F: Fn(&Tensor) -> Result<Gradients>> CustomOp3 for Known<F> {
         _: &Layout,
         _: &CpuStorage,
         _: &Layout,
-        result: &CpuStorage,
-        layout: &Layout,
+        _: &CpuStorage,
+        _: &Layout,
     ) -> CandleResult<(CpuStorage, Shape)> {
-        Ok((result.try_clone(layout)?, layout.shape().clone()))
+        self.with(|storage, layout| match storage {
+            Storage::Cpu(storage) => storage.try_clone(layout),
+            _ => candle_core::bail!("{}: inputs on the CPU, the result elsewhere", self.name),
+        })
     }
 
     fn cuda_fwd(
@@ -34,10 +54,13 @@ impl<F: Fn(&Tensor) -> Result<Gradients>> CustomOp3 for Known<F> {
         _: &Layout,
         _: &CudaStorage,
         _: &Layout,
-        result: &CudaStorage,
-        layout: &Layout,
+        _: &CudaStorage,
+        _: &Layout,
     ) -> CandleResult<(CudaStorage, Shape)> {
-        Ok((result.try_clone(layout)?, layout.shape().clone()))
+        self.with(|storage, layout| match storage {
+            Storage::Cuda(storage) => storage.try_clone(layout),
+            _ => candle_core::bail!("{}: inputs on a GPU, the result elsewhere", self.name),
+        })
     }
 
     fn bwd(
@@ -48,8 +71,7 @@ impl<F: Fn(&Tensor) -> Result<Gradients>> CustomOp3 for Known<F> {
         _: &Tensor,
         grad: &Tensor,
     ) -> CandleResult<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let [one, two, _] = (self.1)(grad).map_err(candle_core::Error::wrap)?;
-        Ok((one, two, None))
+        (self.gradient)(grad).map(<(_, _, _)>::from).map_err(candle_core::Error::wrap)
     }
 }
 
@@ -58,24 +80,126 @@ fn is_tracked(x: &Tensor) -> bool {
     x.detach().id() != x.id()
 }
 
-/// `result`, computed without a graph, as a function of two inputs with this gradient.
+/// `result`, computed without a graph, as a function of up to three inputs with this gradient.
 fn known(
     name: &'static str,
-    (one, two): (&Tensor, &Tensor),
-    result: &Tensor,
+    inputs: &[&Tensor],
+    result: Tensor,
     gradient: impl Fn(&Tensor) -> Result<Gradients> + Send + Sync + 'static,
 ) -> Result<Tensor> {
-    if !is_tracked(one) && !is_tracked(two) {
-        return Ok(result.clone());
+    if !inputs.iter().any(|input| is_tracked(input)) {
+        return Ok(result);
     }
-    Ok(one.apply_op3(two, &result.contiguous()?, Known(name, gradient))?)
+    let one = inputs[0];
+    // a place that no input has is held by one without a gradient
+    let [two, three] = [1, 2].map(|at| inputs.get(at).map_or_else(|| one.detach(), |input| (*input).clone()));
+    // the operation copies a storage from its beginning
+    let result = match result.is_contiguous() && result.layout().start_offset() == 0 {
+        true => result,
+        false => result.force_contiguous()?,
+    };
+    let result = Mutex::new(Some(result));
+    Ok(one.apply_op3(&two, &three, Known { name, result, gradient })?)
+}
+
+/// `max(x, 0)`, whose gradient at 0 is 0
+pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
+    let y = x.detach().relu()?;
+    let kept = y.clone();
+    known("relu", &[x], y, move |grad| Ok([Some(grad.mul(&kept.gt(0.0)?.to_dtype(DType::F32)?)?), None, None]))
+}
+
+/// x times a mask without a gradient.
+pub(crate) fn masked(x: &Tensor, mask: Tensor) -> Result<Tensor> {
+    let y = x.detach().mul(&mask)?;
+    known("mask", &[x], y, move |grad| Ok([Some(grad.mul(&mask)?), None, None]))
+}
+
+/// x: (…, in), weight: (out, in), bias: (out) -> (…, out)
+pub(crate) fn linear(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>, precision: Precision) -> Result<Tensor> {
+    let mut shape = x.dims().to_vec();
+    let (output, input) = weight.dims2()?;
+    let rows = x.elem_count() / input.max(1);
+    if let Some(last) = shape.last_mut() {
+        *last = output;
+    }
+    let (asked, given) = (is_tracked(x), x.dims().to_vec());
+    let seen = precision.cast(&x.detach().reshape((rows, input))?)?;
+    let kept = precision.cast(&weight.detach())?;
+    let y = seen.matmul(&kept.t()?)?.to_dtype(DType::F32)?;
+    let y = bias.map_or(Ok(y.clone()), |bias| y.broadcast_add(&bias.detach()))?;
+    let has_bias = bias.is_some();
+    let inputs: Vec<&Tensor> = [x, weight].into_iter().chain(bias).collect();
+    known("linear", &inputs, y.reshape(shape)?, move |grad| {
+        let grad = grad.reshape((rows, output))?;
+        let of_bias = if has_bias { Some(grad.sum(0)?) } else { None };
+        let grad = precision.cast(&grad)?;
+        let of_x = match asked {
+            true => Some(grad.matmul(&kept)?.to_dtype(DType::F32)?.reshape(given.as_slice())?),
+            false => None,
+        };
+        Ok([of_x, Some(grad.t()?.matmul(&seen)?.to_dtype(DType::F32)?), of_bias])
+    })
+}
+
+/// What attention among heads needs to know beside its inputs.
+pub(crate) struct Among<'a> {
+    pub heads: usize,
+    pub batch: usize,
+    /// added to the scores, such as (1, 1, n, m)
+    pub bias: Option<Tensor>,
+    /// (b, m), 1 where a key is not there
+    pub key_pad: Option<&'a Tensor>,
+    /// of the shares, (b, heads, n, m)
+    pub dropout: Option<Tensor>,
+}
+
+/// q: (b or 1, n, D), kv: (b or 1, m, 2D) -> (b, n, D)
+pub(crate) fn attention(q: &Tensor, kv: &Tensor, among: Among<'_>, precision: Precision) -> Result<Tensor> {
+    let ((q_batch, queries, dim), (kv_batch, keys, _)) = (q.dims3()?, kv.dims3()?);
+    let Among { heads, batch, bias, key_pad, dropout } = among;
+    let size = dim / heads;
+    let split = move |x: &Tensor, n: usize| -> Result<Tensor> {
+        let x = x.reshape((x.dim(0)?, n, heads, size))?.transpose(1, 2)?;
+        precision.cast(&x.broadcast_as((batch, heads, n, size))?.contiguous()?)
+    };
+    // (b, heads, n, d) -> (b or 1, n, D)
+    let merge = move |x: &Tensor, n: usize, given: usize| -> Result<Tensor> {
+        let x = x.to_dtype(DType::F32)?.transpose(1, 2)?.reshape((batch, n, dim))?;
+        Ok(if given == batch { x } else { x.sum_keepdim(0)? })
+    };
+    let (seen, told) = (q.detach(), kv.detach());
+    let part = |at: usize| Ok::<_, ModelError>(told.narrow(D::Minus1, at * dim, dim)?.contiguous()?);
+    let (q4, k4, v4) = (split(&seen, queries)?, split(&part(0)?, keys)?, split(&part(1)?, keys)?);
+    let scale = 1.0 / (size as f64).sqrt();
+    let mut scores = (q4.matmul(&k4.transpose(2, 3)?)?.to_dtype(DType::F32)? * scale)?;
+    if let Some(bias) = bias {
+        scores = scores.broadcast_add(&bias)?;
+    }
+    let shares = crate::layers::masked_softmax(&scores, key_pad)?;
+    let mixing = dropout.as_ref().map_or(Ok(shares.clone()), |mask| shares.mul(mask))?;
+    let mixing = precision.cast(&mixing)?;
+    let y = merge(&mixing.matmul(&v4)?, queries, batch)?;
+    known("attention", &[q, kv], y, move |grad| {
+        let grad = split(grad, queries)?;
+        let of_v = mixing.transpose(2, 3)?.matmul(&grad)?;
+        let of_shares = grad.matmul(&v4.transpose(2, 3)?)?.to_dtype(DType::F32)?;
+        let of_shares = dropout.as_ref().map_or(Ok(of_shares.clone()), |mask| of_shares.mul(mask))?;
+        let weighted = of_shares.mul(&shares)?;
+        let of_scores = (&weighted - shares.broadcast_mul(&weighted.sum_keepdim(D::Minus1)?)?)?;
+        let of_scores = precision.cast(&(of_scores * scale)?)?;
+        let of_q = merge(&of_scores.matmul(&k4)?, queries, q_batch)?;
+        let of_k = merge(&of_scores.transpose(2, 3)?.matmul(&q4)?, keys, kv_batch)?;
+        let of_kv = Tensor::cat(&[of_k, merge(&of_v, keys, kv_batch)?], D::Minus1)?;
+        Ok([Some(of_q), Some(of_kv), None])
+    })
 }
 
 /// Softmax over the last dimension.
 pub(crate) fn softmax(x: &Tensor) -> Result<Tensor> {
     let shares = candle_nn::ops::softmax_last_dim(&x.detach().contiguous()?)?;
     let kept = shares.clone();
-    known("softmax", (x, &shares), &shares, move |grad| {
+    known("softmax", &[x], shares, move |grad| {
         let weighted = grad.mul(&kept)?;
         let of = (&weighted - kept.broadcast_mul(&weighted.sum_keepdim(D::Minus1)?)?)?;
         Ok([Some(of), None, None])
@@ -89,14 +213,15 @@ pub(crate) fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor, eps: f64) -
     let centred = values.broadcast_sub(&values.mean_keepdim(D::Minus1)?)?;
     let spread = (centred.sqr()?.mean_keepdim(D::Minus1)? + eps)?.sqrt()?;
     let normed = centred.broadcast_div(&spread)?;
-    let result = known("layer norm", (x, weight), &normed.broadcast_mul(&scale)?, move |grad| {
+    let result = normed.broadcast_mul(&scale)?.broadcast_add(&bias.detach())?;
+    known("layer norm", &[x, weight, bias], result, move |grad| {
+        let of_bias = grad.flatten_to(normed.rank() - 2)?.sum(0)?;
         let of_weight = grad.mul(&normed)?.flatten_to(normed.rank() - 2)?.sum(0)?;
         let grad = grad.broadcast_mul(&scale)?;
         let along = normed.broadcast_mul(&grad.mul(&normed)?.mean_keepdim(D::Minus1)?)?;
         let of_x = grad.broadcast_sub(&grad.mean_keepdim(D::Minus1)?)?;
-        Ok([Some((of_x - along)?.broadcast_div(&spread)?), Some(of_weight), None])
-    })?;
-    Ok(result.broadcast_add(bias)?)
+        Ok([Some((of_x - along)?.broadcast_div(&spread)?), Some(of_weight), Some(of_bias)])
+    })
 }
 
 /// x: (b, H, W, C), framed with what the kernel reaches beyond the image; weight: (C', C, k, k) -> (b, h, w, C') with
@@ -105,7 +230,7 @@ pub(crate) fn conv2d(x: &Tensor, weight: &Tensor, stride: usize, precision: Prec
     let (values, kernel) = (precision.cast(&x.detach())?, precision.cast(&weight.detach())?);
     let result = convolved(&values, &kernel, stride, precision)?;
     let asked = is_tracked(x);
-    known("convolution", (x, weight), &result, move |grad| {
+    known("convolution", &[x, weight], result, move |grad| {
         let grad = precision.cast(grad)?;
         let of_x = if asked { Some(of_input(&grad, &kernel, stride, values.dims(), precision)?) } else { None };
         Ok([of_x, Some(of_kernel(&grad, &values, &kernel, stride)?), None])

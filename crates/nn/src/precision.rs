@@ -25,9 +25,4 @@ impl Precision {
             Self::Bf16 => x.to_dtype(DType::BF16)?,
         })
     }
-
-    /// a times b, in f32.
-    pub(crate) fn product(self, a: &Tensor, b: &Tensor) -> Result<Tensor> {
-        Ok(self.cast(a)?.matmul(&self.cast(b)?)?.to_dtype(DType::F32)?)
-    }
 }

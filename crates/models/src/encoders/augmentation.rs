@@ -158,17 +158,19 @@ impl ImageEncoder {
     /// The same on candle's operations.
     fn prepare_composed(&self, camera: usize, images: &Tensor, augmentations: &[Augmentation]) -> Result<Tensor> {
         let ((h, w), (seen_h, seen_w), device) = (self.given[camera], self.sizes[camera], images.device());
-        let places = |from: isize, count: usize, all: usize| {
-            let places = (0..count).map(|i| (from + i as isize).clamp(0, all as isize - 1) as u32);
-            Tensor::from_iter(places, device)
+        // lines of all images at once, first the rows of each and then, turned, its columns
+        let part = |x: &Tensor, from: fn(&Augmentation) -> isize, (count, all): (usize, usize)| {
+            let places = augmentations.iter().enumerate().flat_map(|(image, augmentation)| {
+                let place = |i: usize| (from(augmentation) + i as isize).clamp(0, all as isize - 1) as u32;
+                (0..count).map(move |i| (image * all) as u32 + place(i)).collect::<Vec<_>>()
+            });
+            let (images, _, across, _) = x.dims4()?;
+            let lines = x.contiguous()?.reshape((images * all, across * 3))?;
+            lines.index_select(&Tensor::from_iter(places, device)?, 0)?.reshape((images, count, across, 3))
         };
-        let images = (images.to_dtype(DType::F32)? / 255.0)?;
-        let part = |(row, augmentation): (usize, &Augmentation)| {
-            let part = images.get(row)?.index_select(&places(augmentation.top, seen_h, h)?, 0)?;
-            part.index_select(&places(augmentation.left, seen_w, w)?, 1)
-        };
-        let parts = augmentations.iter().enumerate().map(part).collect::<candle_core::Result<Vec<_>>>()?;
-        let mut x = Tensor::stack(&parts, 0)?;
+        let x = part(images, |augmentation| augmentation.top, (seen_h, h))?;
+        let x = part(&x.transpose(1, 2)?, |augmentation| augmentation.left, (seen_w, w))?.transpose(1, 2)?;
+        let mut x = (x.contiguous()?.to_dtype(DType::F32)? / 255.0)?;
         if augmentations.iter().any(|augmentation| augmentation.colour != [1.0; 3]) {
             let factor = |at: usize| {
                 let factors = augmentations.iter().map(|augmentation| augmentation.colour[at]).collect::<Vec<_>>();

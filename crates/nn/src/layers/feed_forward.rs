@@ -1,6 +1,7 @@
 //! Two dense layers with an activation between them.
 
 use super::Linear;
+use crate::composed;
 use crate::error::Result;
 use crate::params::{Init, Params};
 use crate::rng::Rng;
@@ -24,7 +25,7 @@ impl Activation {
     /// x: (…, n) -> (…, n), or (…, n/2) for `Glu`
     pub fn forward(self, x: &Tensor) -> Result<Tensor> {
         match self {
-            Self::Relu => Ok(x.relu()?),
+            Self::Relu => composed::relu(x),
             Self::Gelu => Ok(x.gelu_erf()?),
             Self::Glu => {
                 let last = x.rank() - 1;

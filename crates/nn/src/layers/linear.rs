@@ -1,10 +1,11 @@
 //! `y = x Wᵀ + b`.
 
+use crate::composed;
 use crate::error::Result;
 use crate::params::{Init, Params};
 use crate::precision::Precision;
 use crate::rng::Rng;
-use candle_core::{D, Tensor};
+use candle_core::Tensor;
 
 /// A dense layer with torch's layout: weight `(out, in)`, bias `(out)`.
 #[derive(Debug, Clone)]
@@ -47,18 +48,6 @@ impl Linear {
 
     /// The same with a product in this precision.
     pub(crate) fn forward_in(&self, x: &Tensor, precision: Precision) -> Result<Tensor> {
-        let mut shape = x.dims().to_vec();
-        let (output, input) = self.weight.dims2()?;
-        let rows = x.elem_count() / input.max(1);
-        let x = if x.dim(D::Minus1)? == input { x.reshape((rows, input))? } else { x.clone() };
-        let y = precision.product(&x, &self.weight.t()?)?;
-        let y = match &self.bias {
-            Some(bias) => y.broadcast_add(bias)?,
-            None => y,
-        };
-        if let Some(last) = shape.last_mut() {
-            *last = output;
-        }
-        Ok(y.reshape(shape)?)
+        composed::linear(x, &self.weight, self.bias.as_ref(), precision)
     }
 }

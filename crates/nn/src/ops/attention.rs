@@ -2,12 +2,13 @@
 
 use super::linear::{linear_rows, times};
 use super::tokens::narrow_tokens;
+use crate::composed::{self, Among};
 use crate::context::{Context, Workspace, read};
 use crate::error::{ModelError, Result};
 use crate::kernels::{Heads, Mat, Start, attend, attend_backward, column_sums, product, sum_over_sequences};
-use crate::layers::{DropoutMask, UNSEEN, masked_softmax};
+use crate::layers::{DropoutMask, UNSEEN};
 use crate::value::Value;
-use candle_core::{D, Tensor};
+use candle_core::Tensor;
 
 /// What an attention is like.
 #[derive(Debug, Clone, Copy)]
@@ -89,25 +90,19 @@ pub fn attention(cx: &mut Context<'_>, q: &Value, kv: &Value, how: Attention<'_>
 }
 
 fn composed(cx: &Context<'_>, q: &Value, kv: &Value, how: Attention<'_>, mask: Option<DropoutMask>) -> Result<Value> {
-    let ((_, queries, dim), (_, keys, _)) = (q.dims3()?, kv.dims3()?);
+    let ((_, queries, _), (_, keys, _)) = (q.dims3()?, kv.dims3()?);
     let Attention { heads, batch, all_queries, causal, key_pad, .. } = how;
-    let split = |x: &Tensor, n: usize| -> Result<Tensor> {
-        let x = x.reshape((x.dim(0)?, n, heads, dim / heads))?.transpose(1, 2)?;
-        Ok(x.broadcast_as((batch, heads, n, dim / heads))?.contiguous()?)
-    };
-    let (k, v) = (kv.tensor.narrow(D::Minus1, 0, dim)?, kv.tensor.narrow(D::Minus1, dim, dim)?);
-    let (q, k, v) = (split(&q.tensor, queries)?, split(&k.contiguous()?, keys)?, split(&v.contiguous()?, keys)?);
-    let mut scores = (cx.precision().product(&q, &k.transpose(2, 3)?)? * (1.0 / (dim as f64 / heads as f64).sqrt()))?;
-    if causal {
-        let later = (0..queries * keys).map(|i| if i % keys > i / keys { UNSEEN } else { 0.0 }).collect::<Vec<f32>>();
-        scores = scores.broadcast_add(&Tensor::from_vec(later, (1, 1, queries, keys), cx.device())?)?;
-    }
-    let mut weights = masked_softmax(&scores, key_pad)?;
-    if let Some(mask) = mask {
+    let later = |i: usize| if i % keys > i / keys { UNSEEN } else { 0.0 };
+    let bias = causal.then(|| {
+        let later: Vec<f32> = (0..queries * keys).map(later).collect();
+        Tensor::from_vec(later, (1, 1, queries, keys), cx.device())
+    });
+    let dropout = mask.map(|mask| {
         let mask = mask.tensor(&[batch, heads, all_queries, keys], cx.device())?;
-        weights = weights.mul(&mask.narrow(2, 0, queries)?)?;
-    }
-    Ok(Value::constant(cx.precision().product(&weights, &v)?.transpose(1, 2)?.reshape((batch, queries, dim))?))
+        Ok::<_, ModelError>(mask.narrow(2, 0, queries)?.contiguous()?)
+    });
+    let among = Among { heads, batch, bias: bias.transpose()?, key_pad, dropout: dropout.transpose()? };
+    Ok(Value::constant(composed::attention(&q.tensor, &kv.tensor, among, cx.precision())?))
 }
 
 /// Attention among tokens, (b or 1, t, D), with positions, (1, t, D), added to what queries and keys are made of: the first

@@ -1,5 +1,6 @@
 //! Number by number.
 
+use crate::composed;
 use crate::context::{Context, read};
 use crate::error::Result;
 use crate::kernels::{Rows, activate, activate_backward, mish_backward};
@@ -84,7 +85,7 @@ pub fn mish(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
 pub fn dropout(cx: &mut Context<'_>, x: &Value, p: f64) -> Result<Value> {
     let Some(mask) = cx.dropout(p) else { return Ok(x.clone()) };
     if cx.composed("dropout", [&x.tensor])? {
-        return Ok(Value::constant(x.tensor.mul(&mask.tensor(x.dims(), cx.device())?)?));
+        return Ok(Value::constant(composed::masked(&x.tensor, mask.tensor(x.dims(), cx.device())?)?));
     }
     let rows = Rows { computed: 1, all: 1 };
     let width = x.len();

@@ -1,6 +1,7 @@
 //! `linear2(dropout(activation(linear1(x))))` in one: the wide rows in the middle are nobody else's.
 
 use super::linear::{UNPACKED_ROWS, times};
+use crate::composed;
 use crate::context::{Context, read};
 use crate::error::{ModelError, Result};
 use crate::kernels::{Mat, Rows, Start, activate, activate_backward, column_sums, gemm_with, product};
@@ -23,7 +24,7 @@ pub fn feed_forward(cx: &mut Context<'_>, x: &Value, layer: &FeedForward, all: u
         let hidden = match mask {
             Some(mask) => {
                 let mask = mask.tensor(&[b, all, layer.linear1.weight.dim(0)?], cx.device())?;
-                hidden.mul(&mask.narrow(1, 0, t)?)?
+                composed::masked(&hidden, mask.narrow(1, 0, t)?)?
             }
             None => hidden,
         };

@@ -1,5 +1,6 @@
 //! Layer norm, of a tensor or of a residual sum. What was normed is computed again for the backward pass, not kept.
 
+use crate::composed;
 use crate::context::{Context, read};
 use crate::error::Result;
 use crate::kernels::{Rows, Summed, dropped};
@@ -41,7 +42,10 @@ pub fn residual(
     let of_norm = norm.into_iter().flat_map(|norm| [&norm.weight, &norm.bias]);
     if cx.composed("residual", [&x.tensor, &branch.tensor].into_iter().chain(of_norm))? {
         let branch = match mask {
-            Some(mask) => branch.tensor.mul(&mask.tensor(&[b, all, dim], cx.device())?.narrow(1, 0, computed)?)?,
+            Some(mask) => {
+                let mask = mask.tensor(&[b, all, dim], cx.device())?.narrow(1, 0, computed)?;
+                composed::masked(&branch.tensor, mask)?
+            }
             None => branch.tensor.clone(),
         };
         let sum = branch.broadcast_add(&x.tensor)?;
