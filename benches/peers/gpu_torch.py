@@ -1,7 +1,8 @@
-"""A training step of LeRobot's ACT or diffusion policy on PyTorch: python gpu_torch.py DEVICE WORK ROUNDS STEPS
+"""A training step of LeRobot's ACT or diffusion policy: python gpu_torch.py DEVICE WORK PRECISION ROUNDS STEPS
 
 WORK is "act_d256", "act_images" or "diffusion_images"; sizes are those of tools/actrm-zoo/examples/gpu_check.rs.
-Prints {"ms": least of all rounds, "torch": version}. LeRobot trains in f32 with TF32 allowed, and so does this.
+PRECISION is "f32", "tf32" (what LeRobot trains in) or "bf16" (autocast).
+Prints {"ms": least of all rounds, "torch": version}.
 """
 
 import json
@@ -52,13 +53,14 @@ def diffusion(device: str, rows: int) -> tuple[torch.nn.Module, dict[str, torch.
     return DiffusionPolicy(config), batch | {"action": torch.randn(rows, config.horizon, ACTION)}
 
 
-def step_of(policy: torch.nn.Module, batch: dict[str, torch.Tensor]) -> Callable[[], None]:
+def step_of(policy: torch.nn.Module, batch: dict[str, torch.Tensor], device: str, precision: str) -> Callable[[], None]:
     optimiser = torch.optim.AdamW(policy.get_optim_params(), lr=1e-4, weight_decay=1e-4)
     policy.train()
 
     def step() -> None:
         # the policy adds names of its own
-        loss, _ = policy(dict(batch))
+        with torch.autocast(device, torch.bfloat16, enabled=precision == "bf16"):
+            loss, _ = policy(dict(batch))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
         optimiser.step()
@@ -68,8 +70,8 @@ def step_of(policy: torch.nn.Module, batch: dict[str, torch.Tensor]) -> Callable
 
 
 def main() -> None:
-    device, work, rounds, steps = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-    torch.backends.cuda.matmul.allow_tf32 = True
+    device, work, precision, rounds, steps = *sys.argv[1:4], int(sys.argv[4]), int(sys.argv[5])
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = precision != "f32"
     torch.backends.cudnn.benchmark = True
     cameras = {f"observation.images.{name}": picture(224) for name in ("front", "wrist")}
     policy, batch = {
@@ -79,7 +81,7 @@ def main() -> None:
     }[work]()
     policy.to(device)
     batch["action_is_pad"] = torch.zeros(batch["action"].shape[:2], dtype=torch.bool)
-    step = step_of(policy, {name: tensor.to(device) for name, tensor in batch.items()})
+    step = step_of(policy, {name: tensor.to(device) for name, tensor in batch.items()}, device, precision)
 
     def timed() -> float:
         begun = time.perf_counter()

@@ -10,9 +10,10 @@ use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::time::Instant;
 
+use candle_core::Tensor;
 use models::{
-    Backend, Batch, DeviceChoice, FeatureSpec, Gradients, Number, Optimiser, OptimiserConfig, ParamLayout,
-    PolicyConfig, PolicyModel, Rng, Signature, TrainConfig, Trainer, cases,
+    Backend, Batch, DeviceChoice, FeatureKind, FeatureSpec, Gradients, Number, Optimiser, OptimiserConfig, ParamLayout,
+    PolicyConfig, PolicyModel, Precision, Rng, Signature, TrainConfig, Trainer, cases,
 };
 use serde_json::{Value, json};
 
@@ -20,6 +21,8 @@ use serde_json::{Value, json};
 const TOLERANCE: f64 = 1e-4;
 /// Optimiser steps that are compared.
 const STEPS: u64 = 20;
+/// Frames that batches are gathered from.
+const FRAMES: usize = 2000;
 
 /// Sets dropout to 0: a GPU draws masks of its own.
 fn without_dropout(value: &mut Value) {
@@ -121,13 +124,42 @@ fn works() -> Vec<(&'static str, Value, Signature, usize)> {
     ]
 }
 
+/// Batches like this one, whose images are gathered on the device from [`FRAMES`] frames, as a training does it.
+fn gathering(signature: &Signature, batch: &Batch) -> impl FnMut() -> Batch {
+    let images = signature.of_kind(FeatureKind::Image).map(|spec| {
+        let (frames, device) = (batch.observation.get(&spec.name).unwrap(), batch.device());
+        let size = spec.width();
+        let flat = frames.reshape((frames.elem_count() / size, size)).unwrap();
+        let copies = FRAMES / flat.dim(0).unwrap();
+        let all = Tensor::cat(&vec![flat; copies], 0).unwrap().to_device(device).unwrap();
+        (spec.name.clone(), all, frames.dims().to_vec())
+    });
+    let (images, batch) = (images.collect::<Vec<_>>(), batch.clone());
+    let mut rng = Rng::new(1, "gathering");
+    move || {
+        let mut batch = batch.clone();
+        for (name, all, shape) in &images {
+            let (frames, size) = all.dims2().unwrap();
+            let count = shape.iter().product::<usize>() / size;
+            let places: Vec<u32> = (0..count).map(|_| rng.below(frames as u64) as u32).collect();
+            let places = Tensor::from_vec(places, count, all.device()).unwrap();
+            batch.observation.insert(name, all.index_select(&places, 0).unwrap().reshape(shape.as_slice()).unwrap());
+        }
+        batch
+    }
+}
+
 /// Milliseconds of a training step: the least of all rounds.
-fn step_ms(trainer: &mut Trainer, batch: &Batch, (rounds, steps): (usize, usize)) -> f64 {
+fn step_ms(trainer: &mut Trainer, batch: &mut dyn FnMut() -> Batch, (rounds, steps): (usize, usize)) -> f64 {
     let mut run = |steps: usize| {
         let begun = Instant::now();
         let mut last = None;
-        (0..steps).for_each(|_| last = Some(trainer.step_ahead(batch, false).unwrap()));
-        trainer.read(&last.unwrap(), batch).unwrap();
+        for _ in 0..steps {
+            let batch = batch();
+            last = Some((trainer.step_ahead(&batch, false).unwrap(), batch));
+        }
+        let (numbers, batch) = last.unwrap();
+        trainer.read(&numbers, &batch).unwrap();
         begun.elapsed().as_secs_f64() * 1e3 / steps as f64
     };
     run(steps.min(3));
@@ -135,11 +167,16 @@ fn step_ms(trainer: &mut Trainer, batch: &Batch, (rounds, steps): (usize, usize)
 }
 
 /// The peer's milliseconds of the same work.
-fn peer_ms(python: &str, device: DeviceChoice, work: &str, (rounds, steps): (usize, usize)) -> Option<f64> {
+fn peer_ms(
+    python: &str,
+    device: DeviceChoice,
+    (work, precision): (&str, &str),
+    (rounds, steps): (usize, usize),
+) -> Option<f64> {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../../benches/peers/gpu_torch.py");
     let device = if device == DeviceChoice::Cpu { "cpu" } else { "cuda" };
     let (rounds, steps) = (rounds.to_string(), steps.to_string());
-    let output = Command::new(python).args([script, device, work, &rounds, &steps]).output().unwrap();
+    let output = Command::new(python).args([script, device, work, precision, &rounds, &steps]).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     let answer = text.lines().rev().find_map(|line| serde_json::from_str::<Value>(line).ok());
     if answer.is_none() {
@@ -160,21 +197,35 @@ fn main() -> ExitCode {
     println!("{}\n", gpu.as_deref().unwrap_or("no GPU: candle's operations on the CPU"));
     let parity = parity(&backend);
     let steps = if gpu.is_some() { 30 } else { 1 };
+    let precisions: &[Precision] =
+        if gpu.is_some() { &[Precision::F32, Precision::Tf32, Precision::Bf16] } else { &[Precision::F32] };
     let mut speed = Vec::new();
     let works = if rounds == 0 { Vec::new() } else { works() };
-    println!("\n{:<24} {:>10} {:>10} {:>7}", "training step", "ours, ms", "LeRobot's", "ratio");
+    println!(
+        "\n{:<24} {:>9} {:>10} {:>10} {:>7} {:>9}",
+        "training step", "products", "ours, ms", "LeRobot's", "ratio", "gathered"
+    );
     for (name, config, signature, rows) in works {
         let policy: PolicyConfig = serde_json::from_value(config).unwrap();
         let batch = cases::batch(&signature, policy.action_horizon(), rows, 3).to_device(backend.device()).unwrap();
-        let model: Box<dyn PolicyModel> = policy.build(&signature, 1, &backend).unwrap();
-        let mut trainer = Trainer::new(model, TrainConfig::default(), 1).unwrap();
-        let ours = step_ms(&mut trainer, &batch, (rounds, steps));
-        drop(trainer);
-        let theirs = option("--peer").and_then(|python| peer_ms(&python, device, name, (rounds, steps)));
-        let ratio = theirs.map(|theirs| ours / theirs);
-        let show = |x: Option<f64>| x.map_or("-".to_owned(), |x| format!("{x:.2}"));
-        println!("{name:<24} {ours:>10.2} {:>10} {:>7}", show(theirs), show(ratio));
-        speed.push(json!({"work": name, "ours_ms": ours, "peer_ms": theirs, "ratio": ratio}));
+        for &precision in precisions {
+            let backend = backend.clone().with_precision(precision).unwrap();
+            let model: Box<dyn PolicyModel> = policy.build(&signature, 1, &backend).unwrap();
+            let mut trainer = Trainer::new(model, TrainConfig::default(), 1).unwrap();
+            let ours = step_ms(&mut trainer, &mut || batch.clone(), (rounds, steps));
+            let mut gathering = gathering(&signature, &batch);
+            let gathered = step_ms(&mut trainer, &mut gathering, (rounds, steps));
+            drop(trainer);
+            let word = format!("{precision:?}").to_lowercase();
+            let theirs = option("--peer").and_then(|python| peer_ms(&python, device, (name, &word), (rounds, steps)));
+            let ratio = theirs.map(|theirs| ours / theirs);
+            let show = |x: Option<f64>| x.map_or("-".to_owned(), |x| format!("{x:.2}"));
+            println!("{name:<24} {word:>9} {ours:>10.2} {:>10} {:>7} {gathered:>9.2}", show(theirs), show(ratio));
+            speed.push(json!({
+                "work": name, "products": word, "ours_ms": ours, "peer_ms": theirs, "ratio": ratio,
+                "with_images_gathered_ms": gathered,
+            }));
+        }
     }
     let met = parity.iter().all(|row| row["met"] == true);
     let all = json!({"gpu": gpu, "parity": parity, "speed": speed});
