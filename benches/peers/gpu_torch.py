@@ -2,7 +2,7 @@
 
 WORK is "act_d256", "act_images" or "diffusion_images"; sizes are those of tools/actrm-zoo/examples/gpu_check.rs.
 PRECISION is "f32", "tf32" (what LeRobot trains in) or "bf16" (autocast).
-Prints {"ms": least of all rounds, "torch": version}.
+Prints {"ms": least of all rounds, "parameters": number of weights, "torch": version}.
 """
 
 import json
@@ -92,7 +92,9 @@ def main() -> None:
         return 1e3 * (time.perf_counter() - begun) / steps
 
     timed()
-    print(json.dumps({"ms": min(timed() for _ in range(rounds)), "torch": torch.__version__}))
+    parameters = sum(parameter.numel() for parameter in policy.parameters())
+    ms = min(timed() for _ in range(rounds))
+    print(json.dumps({"ms": ms, "parameters": parameters, "torch": torch.__version__}))
 
 
 if __name__ == "__main__":

@@ -166,13 +166,13 @@ fn step_ms(trainer: &mut Trainer, batch: &mut dyn FnMut() -> Batch, (rounds, ste
     (0..rounds).map(|_| run(steps)).fold(f64::INFINITY, f64::min)
 }
 
-/// The peer's milliseconds of the same work.
-fn peer_ms(
+/// What the peer says of the same work.
+fn peer(
     python: &str,
     device: DeviceChoice,
     (work, precision): (&str, &str),
     (rounds, steps): (usize, usize),
-) -> Option<f64> {
+) -> Option<Value> {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../../benches/peers/gpu_torch.py");
     let device = if device == DeviceChoice::Cpu { "cpu" } else { "cuda" };
     let (rounds, steps) = (rounds.to_string(), steps.to_string());
@@ -182,7 +182,7 @@ fn peer_ms(
     if answer.is_none() {
         eprintln!("the peer gave no time for {work}:\n{}", String::from_utf8_lossy(&output.stderr));
     }
-    answer?["ms"].as_f64()
+    answer
 }
 
 fn main() -> ExitCode {
@@ -211,19 +211,22 @@ fn main() -> ExitCode {
         for &precision in precisions {
             let backend = backend.clone().with_precision(precision).unwrap();
             let model: Box<dyn PolicyModel> = policy.build(&signature, 1, &backend).unwrap();
+            let count = model.params().count() as u64;
             let mut trainer = Trainer::new(model, TrainConfig::default(), 1).unwrap();
             let ours = step_ms(&mut trainer, &mut || batch.clone(), (rounds, steps));
             let mut gathering = gathering(&signature, &batch);
             let gathered = step_ms(&mut trainer, &mut gathering, (rounds, steps));
             drop(trainer);
             let word = format!("{precision:?}").to_lowercase();
-            let theirs = option("--peer").and_then(|python| peer_ms(&python, device, (name, &word), (rounds, steps)));
+            let theirs = option("--peer").and_then(|python| peer(&python, device, (name, &word), (rounds, steps)));
+            let parameters = (count, theirs.as_ref().and_then(|theirs| theirs["parameters"].as_u64()));
+            let theirs = theirs.and_then(|theirs| theirs["ms"].as_f64());
             let ratio = theirs.map(|theirs| ours / theirs);
             let show = |x: Option<f64>| x.map_or("-".to_owned(), |x| format!("{x:.2}"));
             println!("{name:<24} {word:>9} {ours:>10.2} {:>10} {:>7} {gathered:>9.2}", show(theirs), show(ratio));
             speed.push(json!({
                 "work": name, "products": word, "ours_ms": ours, "peer_ms": theirs, "ratio": ratio,
-                "with_images_gathered_ms": gathered,
+                "with_images_gathered_ms": gathered, "parameters": parameters.0, "peer_parameters": parameters.1,
             }));
         }
     }
