@@ -17,7 +17,7 @@ while [ $# -gt 0 ]; do
     esac
 done
 programs=target/cuda/release
-[ "$device" != cpu ] || [ -x $programs/actrm-zoo ] || programs=target/release
+[ "$device" != cpu ] || [ ! -x target/release/examples/gpu_check ] || programs=target/release
 for program in $programs/actrm-zoo $programs/examples/gpu_check; do
     [ -x "$program" ] || { echo "error: $program is not there: make cuda" >&2; exit 1; }
 done

@@ -115,6 +115,49 @@ pub(crate) fn masked(x: &Tensor, mask: Tensor) -> Result<Tensor> {
     known("mask", &[x], y, move |grad| Ok([Some(grad.mul(&mask)?), None, None]))
 }
 
+/// `x * scale + shift`, neither of which has a gradient.
+pub(crate) fn affine(x: &Tensor, scale: Tensor, shift: &Tensor) -> Result<Tensor> {
+    let y = x.detach().broadcast_mul(&scale)?.broadcast_add(shift)?;
+    known("affine", &[x], y, move |grad| Ok([Some(grad.broadcast_mul(&scale)?), None, None]))
+}
+
+/// The largest of 3 x 3 numbers that are not negative, in steps of 2, with a frame of zeros: (b, h, w, C) -> (b, h / 2, w / 2, C).
+/// The first of several equal ones gets the gradient.
+pub(crate) fn max_pool(x: &Tensor) -> Result<Tensor> {
+    let (b, h, w, c) = x.dims4()?;
+    let (down, right) = (h.div_ceil(2), w.div_ceil(2));
+    let framed = x.detach().pad_with_zeros(1, 1, 2 * down + 1 - h)?.pad_with_zeros(2, 1, 2 * right + 1 - w)?;
+    // even and odd rows and columns: what windows see at one place lies side by side there
+    let framed = framed.contiguous()?.reshape((b, down + 1, 2, right + 1, 2 * c))?;
+    let parts: Vec<Tensor> = (0..4)
+        .map(|at| framed.narrow(2, at / 2, 1)?.squeeze(2)?.narrow(3, at % 2 * c, c)?.contiguous())
+        .collect::<candle_core::Result<_>>()?;
+    // which part a tap is in, and from where
+    let taps = (0..9).map(|tap| (tap / 3, tap % 3)).map(|(dy, dx)| (dy % 2 * 2 + dx % 2, dy / 2, dx / 2));
+    let seen: Vec<_> = taps
+        .map(|(part, y, x)| Ok((part, y, x, parts[part].narrow(1, y, down)?.narrow(2, x, right)?.contiguous()?)))
+        .collect::<Result<_>>()?;
+    let mut best = seen[0].3.clone();
+    for (.., tap) in &seen[1..] {
+        best = best.maximum(tap)?;
+    }
+    let kept = best.clone();
+    known("max pool", &[x], best, move |grad| {
+        // what is zero passes no gradient on
+        let mut open = kept.gt(0.0)?.to_dtype(DType::F32)?;
+        let mut of_parts = vec![Tensor::zeros((b, down + 1, right + 1, c), DType::F32, grad.device())?; 4];
+        for (part, y, x, tap) in &seen {
+            let hit = tap.eq(&kept)?.to_dtype(DType::F32)?.mul(&open)?;
+            open = (&open - &hit)?;
+            let of = grad.mul(&hit)?.pad_with_zeros(1, *y, 1 - y)?.pad_with_zeros(2, *x, 1 - x)?;
+            of_parts[*part] = (&of_parts[*part] + of)?;
+        }
+        let row = |at: usize| Tensor::stack(&of_parts[at..at + 2], 3);
+        let all = Tensor::stack(&[row(0)?, row(2)?], 2)?.reshape((b, 2 * down + 2, 2 * right + 2, c))?;
+        Ok([Some(all.narrow(1, 1, h)?.narrow(2, 1, w)?.contiguous()?), None, None])
+    })
+}
+
 /// x: (…, in), weight: (out, in), bias: (out) -> (…, out)
 pub(crate) fn linear(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>, precision: Precision) -> Result<Tensor> {
     let mut shape = x.dims().to_vec();

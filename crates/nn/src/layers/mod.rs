@@ -33,8 +33,8 @@ pub use position::sinusoid_table;
 pub use recurrent::{Cell, Recurrent, RecurrentState};
 #[doc(hidden)]
 pub use resnet::CONV_NORM_EPS;
+pub(crate) use resnet::conv2d_composed;
 pub use resnet::{ImageNorm, ResNet, ResNetShape};
-pub(crate) use resnet::{conv2d_composed, max_pool_composed};
 pub use spatial_softmax::SpatialSoftmax;
 #[doc(hidden)]
 pub use spatial_softmax::cell_places;

@@ -11,7 +11,7 @@ use crate::ops::{ConvNorm, conv2d, max_pool};
 use crate::precision::Precision;
 use crate::value::Value;
 use crate::{Init, Params, Result, Rng};
-use candle_core::{DType, Tensor};
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// Added to variances, torch's.
@@ -155,7 +155,7 @@ impl ConvNorm {
             Self::Frozen { weight, bias, mean, variance } => {
                 let scale = (weight / (variance + CONV_NORM_EPS)?.sqrt()?)?.detach();
                 let shift = (bias - (mean * &scale)?)?.detach();
-                Ok(x.broadcast_mul(&scale)?.broadcast_add(&shift)?)
+                composed::affine(x, scale, &shift)
             }
         }
     }
@@ -240,28 +240,4 @@ impl ResNet {
         }
         Ok(x)
     }
-}
-
-/// 3x3, stride 2, padding 1, of numbers that are not negative: the first of several equal ones wins, as in torch. candle's
-/// own has no gradient for windows that overlap.
-pub(crate) fn max_pool_composed(x: &Tensor) -> Result<Tensor> {
-    let (_, _, h, w) = x.dims4()?;
-    // zeros lose against every positive number, and what is zero passes no gradient on
-    let x = x.pad_with_zeros(2, 1, 2)?.pad_with_zeros(3, 1, 2)?;
-    let every_second = |from: usize, n: usize| {
-        let at: Vec<u32> = (0..n.div_ceil(2)).map(|i| (from + 2 * i) as u32).collect();
-        Tensor::new(at, x.device())
-    };
-    let mut best: Option<Tensor> = None;
-    for dy in 0..3 {
-        let rows = x.index_select(&every_second(dy, h)?, 2)?;
-        for dx in 0..3 {
-            let one = rows.index_select(&every_second(dx, w)?, 3)?;
-            best = Some(match best {
-                None => one,
-                Some(best) => one.gt(&best)?.where_cond(&one, &best)?,
-            });
-        }
-    }
-    Ok(best.expect("nine windows").to_dtype(DType::F32)?)
 }

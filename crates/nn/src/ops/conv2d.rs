@@ -1,12 +1,13 @@
 //! Convolutions of images, (n, h, w, C): rows after rows, as they come. Frames of zeros and panels are the operations' own.
 
+use crate::composed;
 use crate::context::{Context, read};
 use crate::error::Result;
 use crate::kernels::{
     Conv, Frame, Pool, Shortcut, Winograd, add, exp, group_norm, group_norm_backward, max_pool as max_pool_on,
     max_pool_backward, relu_backward, scale_backward, scale_relu,
 };
-use crate::layers::{CONV_NORM_EPS, cell_places, max_pool_composed};
+use crate::layers::{CONV_NORM_EPS, cell_places};
 use crate::tape::Backward;
 use crate::value::Value;
 use candle_core::Tensor;
@@ -190,7 +191,7 @@ pub fn conv2d(
         let y = crate::layers::conv2d_composed(&x.tensor, weight, stride, cx.precision())?;
         let y = norm.composed(&y)?;
         let y = shortcut.map_or(Ok(y.clone()), |shortcut| &y + &shortcut.tensor)?;
-        return Ok(Value::constant(if relu { y.relu()? } else { y }.contiguous()?));
+        return Ok(Value::constant(if relu { composed::relu(&y)? } else { y }.contiguous()?));
     }
     let input = Frame { images: n, height: h, width: w, channels: c, border: (k / 2, k / 2) };
     let conv = Conv { input, output, kernel: (k, k), stride: (stride, stride) };
@@ -273,8 +274,7 @@ pub fn conv2d(
 pub fn max_pool(cx: &mut Context<'_>, x: &Value) -> Result<Value> {
     let [n, h, w, c] = super::sizes("max pool", &x.tensor)?;
     if cx.composed("max pool", [&x.tensor])? {
-        let y = max_pool_composed(&x.tensor.permute((0, 3, 1, 2))?.contiguous()?)?;
-        return Ok(Value::constant(y.permute((0, 2, 3, 1))?.contiguous()?));
+        return Ok(Value::constant(composed::max_pool(&x.tensor)?));
     }
     let from = Frame { images: n, height: h, width: w, channels: c, border: (1, 1) };
     let to = Frame { height: h.div_ceil(2), width: w.div_ceil(2), border: (0, 0), ..from };
