@@ -37,8 +37,8 @@ pub use history::History;
 pub use model::{Memory, PolicyModel};
 pub use models::*;
 pub use nn::{
-    Backend, Context, DeviceChoice, Gradients, HAS_CUDA, Init, Loss, LossNumbers, LossParts, LossValues, ModelError,
-    Number, Optimiser, OptimiserConfig, ParamLayout, Params, Precision, Result, Rng, Size, Value, vectors,
+    Backend, Context, DeviceChoice, Gradients, Init, Loss, LossNumbers, LossParts, LossValues, ModelError, Number,
+    Optimiser, OptimiserConfig, ParamLayout, Params, Precision, Result, Rng, Size, Value, vectors,
 };
 pub use normaliser::{ACTION, ENVIRONMENT_STATE, Guarded, NormMode, Normaliser, STATE};
 pub use policy::{ActionChunk, Actor, Clock, Policy, RecedingHorizon, TemporalEnsemble, ThoughtStep};

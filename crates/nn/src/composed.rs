@@ -1,4 +1,4 @@
-//! Compositions of candle's operations with a gradient of their own: candle's has more steps, or none that is fast.
+//! Compositions of candle's operations with a gradient of their own: candle's takes more operations.
 
 use crate::error::{ModelError, Result};
 use crate::precision::Precision;

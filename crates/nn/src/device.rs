@@ -7,7 +7,7 @@ use std::fmt;
 use std::str::FromStr;
 
 /// Whether this program can use a GPU: it was built with CUDA.
-pub const HAS_CUDA: bool = cfg!(feature = "cuda");
+const HAS_CUDA: bool = cfg!(feature = "cuda");
 
 /// Where operations run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

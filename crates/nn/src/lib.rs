@@ -35,7 +35,7 @@ pub mod values;
 
 pub use backend::Backend;
 pub use context::{Cache, Context, Workspace, compose};
-pub use device::{DeviceChoice, HAS_CUDA, Opened};
+pub use device::{DeviceChoice, Opened};
 pub use error::{ModelError, Result, some_names};
 pub use gradients::{Gradients, ParamLayout};
 pub use loss::{Loss, LossNumbers, LossParts, LossValues, Term};
