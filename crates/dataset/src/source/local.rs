@@ -132,11 +132,7 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
         }
     }
     if found.is_empty() {
-        return Err(InputError::UnknownLayout {
-            path: folder.to_owned(),
-            expected: "a file, or a folder of HDF5 files with one episode each".to_owned(),
-            found: dialect::list(others.iter().map(String::as_str)),
-        });
+        return Err(no_demonstrations(folder, &others));
     }
     let number = |path: &Path| {
         let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
@@ -145,6 +141,25 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
     };
     found.sort_by_cached_key(|path| (number(path), path.clone()));
     Ok(found)
+}
+
+/// Files by which a folder is known as a data set: of LeRobot, zarr, RLDS.
+const MARKS: [&str; 3] = ["meta/info.json", "meta/episode_ends/.zarray", "features.json"];
+
+/// Why a folder without an HDF5 file is refused: it is a LeRobot data set already, its folders are sets, or it is none.
+fn no_demonstrations(folder: &Path, names: &BTreeSet<String>) -> InputError {
+    let is_set = |name: &&str| MARKS.iter().any(|mark| folder.join(name).join(mark).is_file());
+    let sets: Vec<&str> = names.iter().map(String::as_str).filter(is_set).collect();
+    let (expected, found) = if folder.join(MARKS[0]).is_file() {
+        let ready = "a LeRobot data set, which needs no conversion: `actrm-data edit` changes it, `convert --to robomimic` writes HDF5";
+        ("demonstrations to convert", ready.to_owned())
+    } else if !sets.is_empty() {
+        ("one data set: name one of its folders", dialect::list(sets.into_iter()))
+    } else {
+        let all = dialect::list(names.iter().map(String::as_str));
+        ("a file, or a folder of HDF5 files with one episode each", all)
+    };
+    InputError::UnknownLayout { path: folder.to_owned(), expected: expected.to_owned(), found }
 }
 
 /// Folders in folders are looked through so deep: DROID has four.

@@ -275,6 +275,21 @@ fn what_is_no_regular_file_is_refused_at_once() {
 }
 
 #[test]
+fn a_folder_of_data_sets_and_a_data_set_say_what_to_name_instead() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir_all(dir.path().join("sets/lift/meta")).unwrap();
+    std::fs::write(dir.path().join("sets/lift/meta/info.json"), "{}").unwrap();
+    for (folder, end) in [
+        ("", "folder of HDF5 files with one episode each; found sets"),
+        ("sets", "expected one data set: name one of its folders; found lift"),
+        ("sets/lift", "`convert --to robomimic` writes HDF5"),
+    ] {
+        let error = input_error(Source::open(&dir.path().join(folder))).to_string();
+        assert!(error.ends_with(end), "{error}");
+    }
+}
+
+#[test]
 fn no_data_group_and_no_demos() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("x.hdf5");
