@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use e2e::{copied_zoo, listing, refused, text, trained, zoo};
+use e2e::{copied_zoo, listing, refused, succeeds, text, trained, zoo};
 
 /// Train in a fresh folder with these arguments: refused, and neither a run nor an entry comes of it.
 fn train_refused(arguments: &[&str], words: &[&str]) {
@@ -17,6 +17,16 @@ fn train_refused(arguments: &[&str], words: &[&str]) {
 #[test]
 fn an_unknown_experiment() {
     train_refused(&["act_lfit", "--data", text(&trained().join("lift"))], &["act_lfit", "act_lift"]);
+}
+
+#[test]
+fn a_list_of_nothing_names_what_there_is() {
+    for (what, other) in [("--task", "Lfit"), ("--policy", "atc")] {
+        let output = succeeds(&mut zoo(["list", "--experiments", what, other]));
+        let said = String::from_utf8_lossy(&output.stderr);
+        let expected = if what == "--task" { "PickChain, PickPlace" } else { "act, actrm" };
+        assert!(said.contains(&format!("`{other}`; there are: ")) && said.contains(expected), "{said}");
+    }
 }
 
 #[test]

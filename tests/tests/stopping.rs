@@ -164,6 +164,11 @@ fn a_third_signal_ends_a_training_at_once() {
 fn a_signal_while_demonstrations_are_read_ends_a_training_that_never_began() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let child = started(&mut long_training(folder.path()));
-    std::thread::sleep(Duration::from_millis(30));
+    // a program that has only just begun listens to nothing
+    wait_until("its handler", || {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", child.id())).ok()?;
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:\t"))?;
+        (u64::from_str_radix(caught, 16).ok()? & 2 != 0).then_some(())
+    });
     ends(child, "INT");
 }

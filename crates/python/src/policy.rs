@@ -345,10 +345,24 @@ impl PyPolicy {
 /// How far beyond 0 to 1 a picture's values may lie and are still taken for rounding.
 const BEYOND: f64 = 1e-3;
 
+/// The index along each axis of the `at`-th value, row by row.
+fn place(mut at: usize, shape: &[usize]) -> Vec<usize> {
+    let mut index = vec![0; shape.len()];
+    for (index, size) in index.iter_mut().zip(shape).rev() {
+        (*index, at) = (at % size, at / size);
+    }
+    index
+}
+
 /// The shape and values of a feature; pictures with their colours last.
 fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>, Values)> {
     if spec.kind != FeatureKind::Image {
         let (shape, values) = read::<f32>(value)?;
+        if let Some(at) = values.iter().position(|number| !number.is_finite()) {
+            let (name, place) = (&spec.name, place(at, &shape));
+            let text = format!("predict: {name}{place:?} is {}, expected a finite number", values[at]);
+            return Err(PyValueError::new_err(text));
+        }
         return Ok((shape, Values::F32(values)));
     }
     let numpy = numpy(value.py())?;

@@ -184,6 +184,12 @@ def test_what_does_not_fit_is_named(zoo: Path) -> None:
                 ask(asked)
     with pytest.raises(ValueError):
         policy.select_action({**good, "observation.state": ["a"] * 9})
+    broken = np.stack([state, state])
+    broken[1, 4] = np.nan
+    with pytest.raises(ValueError, match=r"observation.state\[1, 4\] is NaN, expected a finite number"):
+        policy.select_action({"observation.state": broken, "observation.environment_state": np.stack([objects] * 2)})
+    with pytest.raises(ValueError, match=r"observation.state\[0\] is inf"):
+        policy.predict_action_chunk({**good, "observation.state": np.full(9, np.inf)})
     with pytest.raises(TypeError):
         policy.select_action(3)  # type: ignore[arg-type]
     policy.reset(seed=[1])

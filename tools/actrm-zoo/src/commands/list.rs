@@ -1,3 +1,4 @@
+use std::collections::BTreeSet;
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -38,10 +39,31 @@ pub struct Args {
     zoo: ZooArgs,
 }
 
+/// What there is to ask for with `--policy` and `--task`.
+#[derive(Default)]
+struct Seen {
+    policies: BTreeSet<String>,
+    tasks: BTreeSet<String>,
+}
+
 impl Args {
-    fn wanted(&self, policy: &str, task: &str) -> bool {
+    /// Whether a row of this policy and task is asked for.
+    fn wanted(&self, policy: &str, task: &str, seen: &mut Seen) -> bool {
+        seen.policies.insert(policy.to_owned());
+        seen.tasks.insert(task.to_owned());
         let is = |wanted: &Option<String>, found: &str| wanted.as_ref().is_none_or(|w| w.eq_ignore_ascii_case(found));
         is(&self.policy, policy) && is(&self.task, task)
+    }
+
+    /// Says which policy or task there is none of, with those there are.
+    fn say_what_is_not_there(&self, seen: &Seen) {
+        for (what, wanted, there) in [("policy", &self.policy, &seen.policies), ("task", &self.task, &seen.tasks)] {
+            let Some(wanted) = wanted else { continue };
+            if !there.iter().any(|name| name.eq_ignore_ascii_case(wanted)) {
+                let names: Vec<&str> = there.iter().map(String::as_str).collect();
+                cli::note(&format!("nothing of {what} `{wanted}`; there are: {}", names.join(", ")));
+            }
+        }
     }
 }
 
@@ -49,7 +71,7 @@ impl Args {
 fn experiments(args: &Args) -> anyhow::Result<ExitCode> {
     let library = args.configs.library()?;
     let mut table = Table::new(["experiment", "policy", "task", "inputs"].map(Column::new).to_vec());
-    let (mut names, mut failures) = (Vec::new(), Vec::new());
+    let (mut names, mut failures, mut seen) = (Vec::new(), Vec::new(), Seen::default());
     for name in library.names()? {
         let Summary { policy, task, inputs } = match AnyExperiment::load(&library, &name, &[]) {
             Ok(experiment) => experiment.summary(&name),
@@ -59,7 +81,7 @@ fn experiments(args: &Args) -> anyhow::Result<ExitCode> {
                 continue;
             }
         };
-        if args.wanted(&policy, &task) {
+        if args.wanted(&policy, &task, &mut seen) {
             table.push(vec![name.clone(), policy, task, inputs]);
             names.push(name);
         }
@@ -68,6 +90,7 @@ fn experiments(args: &Args) -> anyhow::Result<ExitCode> {
         true => cli::print_json(&names)?,
         false => cli::print(&table.text(args.wide))?,
     }
+    args.say_what_is_not_there(&seen);
     for failure in &failures {
         cli::note(&format!("error: {failure:#}"));
     }
@@ -93,8 +116,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Column::new("minutes").right().dispensable(3),
         Column::new("data").dispensable(4),
     ]);
-    let mut failures = Vec::new();
-    let mut all = Vec::new();
+    let (mut all, mut failures, mut seen) = (Vec::new(), Vec::new(), Seen::default());
     for id in ids {
         // one bad entry must not hide the others
         let entry = match Entry::open_meta(registry.folder(), &id) {
@@ -105,7 +127,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             }
         };
         let meta = entry.meta();
-        if !args.wanted(&meta.policy, &meta.task) {
+        if !args.wanted(&meta.policy, &meta.task, &mut seen) {
             continue;
         }
         if args.json {
@@ -132,6 +154,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         true => cli::print_json(&all)?,
         false => cli::print(&table.text(args.wide))?,
     }
+    args.say_what_is_not_there(&seen);
     for failure in &failures {
         cli::note(&format!("error: {failure:#}"));
     }
