@@ -11,7 +11,6 @@ use super::schema::hex;
 use super::sharded::refuse as refuse_shard;
 use super::values::Values;
 use crate::error::{DatasetError, Result};
-use crate::shuffle::SplitMix64;
 use crate::stats::FeatureStats;
 use crate::windows::{Resident, WindowSpec, Windows, unmarked};
 use serde_json::Value;
@@ -443,23 +442,6 @@ impl Dataset {
             Some(provenance) => provenance.masks.keys().map(String::as_str).collect(),
             None => self.info.splits.keys().map(String::as_str).collect(),
         }
-    }
-
-    /// `count` of `episodes`, chosen by `seed`, ascending. With one seed a smaller choice lies in every larger.
-    pub fn subset(&self, episodes: &[usize], count: usize, seed: u64) -> Result<Vec<usize>> {
-        if count == 0 || count > episodes.len() {
-            return Err(DatasetError::NotInDataset {
-                path: self.root.clone(),
-                wanted: format!("{count} demos"),
-                found: format!("{} to choose from", episodes.len()),
-            });
-        }
-        self.ranges(episodes)?;
-        let mut chosen = episodes.to_vec();
-        SplitMix64::new(seed, 0).shuffle(&mut chosen);
-        chosen.truncate(count);
-        chosen.sort_unstable();
-        Ok(chosen)
     }
 
     /// Windows over some episodes.
