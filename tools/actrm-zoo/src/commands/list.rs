@@ -39,7 +39,7 @@ pub struct Args {
     zoo: ZooArgs,
 }
 
-/// What there is to ask for with `--policy` and `--task`.
+/// The policies and tasks of all rows, whatever was asked for.
 #[derive(Default)]
 struct Seen {
     policies: BTreeSet<String>,
@@ -55,13 +55,14 @@ impl Args {
         is(&self.policy, policy) && is(&self.task, task)
     }
 
-    /// Says which policy or task there is none of, with those there are.
-    fn say_what_is_not_there(&self, seen: &Seen) {
-        for (what, wanted, there) in [("policy", &self.policy, &seen.policies), ("task", &self.task, &seen.tasks)] {
+    /// Notes that no row has the policy or task asked for, and lists those that rows have.
+    fn note_no_match(&self, seen: &Seen) {
+        for (option, wanted, there) in [("--policy", &self.policy, &seen.policies), ("--task", &self.task, &seen.tasks)]
+        {
             let Some(wanted) = wanted else { continue };
             if !there.iter().any(|name| name.eq_ignore_ascii_case(wanted)) {
                 let names: Vec<&str> = there.iter().map(String::as_str).collect();
-                cli::note(&format!("nothing of {what} `{wanted}`; there are: {}", names.join(", ")));
+                cli::note(&format!("no match for {option} {wanted}; expected one of: {}", names.join(", ")));
             }
         }
     }
@@ -90,7 +91,7 @@ fn experiments(args: &Args) -> anyhow::Result<ExitCode> {
         true => cli::print_json(&names)?,
         false => cli::print(&table.text(args.wide))?,
     }
-    args.say_what_is_not_there(&seen);
+    args.note_no_match(&seen);
     for failure in &failures {
         cli::note(&format!("error: {failure:#}"));
     }
@@ -154,7 +155,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         true => cli::print_json(&all)?,
         false => cli::print(&table.text(args.wide))?,
     }
-    args.say_what_is_not_there(&seen);
+    args.note_no_match(&seen);
     for failure in &failures {
         cli::note(&format!("error: {failure:#}"));
     }
