@@ -43,7 +43,9 @@ pub use puzzle_table::{PuzzleSet, write_puzzles};
 pub use samples::{SampleColumn, SamplePlace, SampleSpec, Samples};
 pub use sheet::Picture;
 pub use sorted_map::SortedMap;
-pub use source::{NonFinite, RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation};
+pub use source::{
+    NonFinite, RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation, remove_unfinished,
+};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};
 pub use windows::{WindowBatch, WindowSpec, Windows};

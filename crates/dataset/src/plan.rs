@@ -1,7 +1,7 @@
 //! What is in a file or folder of demonstrations, before any of it is read.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
@@ -287,6 +287,18 @@ impl Problem {
     pub(crate) fn new(demo: Option<&str>, key: Option<&str>, fatal: bool, error: InputError) -> Self {
         let (demo, key) = (demo.map(str::to_owned), key.map(str::to_owned));
         Self { demo, key, fatal, message: error.to_string(), error }
+    }
+
+    /// A demo of no steps, which nothing can be made of.
+    pub(crate) fn empty(path: &Path, id: &str, key: &str) -> Self {
+        let error = InputError::WrongLength {
+            path: path.to_owned(),
+            demo: id.to_owned(),
+            key: key.to_owned(),
+            expected: "at least 1".to_owned(),
+            found: "0: the demo is empty".to_owned(),
+        };
+        Self::new(Some(id), None, true, error)
     }
 }
 

@@ -140,6 +140,11 @@ impl Windows {
         begins.windows(2).map(|pair| pair[0]..pair[1]).collect()
     }
 
+    /// The windows of the frames that are `wanted`, counted over the whole data set.
+    pub fn of_frames(&self, wanted: impl Fn(usize) -> bool) -> Vec<u32> {
+        (0..self.spans.len() as u32).filter(|&i| wanted(self.spans[i as usize].frame as usize)).collect()
+    }
+
     /// The same windows with the pictures of a camera of the same data set, which are shared.
     #[must_use]
     pub fn with_pictures(mut self, camera: &str, pictures: impl Into<PictureStore>) -> Self {

@@ -5,9 +5,11 @@ use crate::layers::{AuxiliaryConfig, GridConfig, PointerConfig};
 use crate::model::PolicyModel;
 use crate::models::floors::{expert, nearest, random, replay, zero};
 use crate::models::{act, actrm, bc, bc_rnn, bc_transformer, diffusion, flow, mip};
+use candle_core::Tensor;
 use nn::{Backend, ModelError, Result, Size};
 use serde::de::{DeserializeSeed, Deserializer};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// What each row of the table becomes.
 macro_rules! policies {
@@ -52,6 +54,19 @@ macro_rules! policies {
                 match self {
                     $(Self::$variant(config) => config.size(),)+
                 }
+            }
+
+            /// Checks that the model is no larger than `weights` are: before it is built, of a file of anybody's.
+            ///
+            /// # Errors
+            /// Options that say a larger model.
+            pub fn check_size(&self, weights: &BTreeMap<String, Tensor>) -> Result<()> {
+                let (count, least) = (weights.values().map(Tensor::elem_count).sum::<usize>(), self.size().weights);
+                if least <= count as f64 {
+                    return Ok(());
+                }
+                let (found, expected) = (format!("{count} numbers"), format!("at least {least:.0}, as the options say"));
+                Err(ModelError::Input { operation: "load", object: "weights", found, expected })
             }
 
             /// Checks that a model with this configuration can exist.

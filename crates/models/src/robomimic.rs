@@ -435,9 +435,9 @@ impl RobomimicBc {
 
     /// Fails where the options say another size than the weights have: before a model of that size is built.
     fn check_sizes(&self, weights: &BTreeMap<String, Tensor>) -> Result<()> {
-        let (modes, size, timesteps) = match &self.policy {
-            PolicyConfig::BcRnn(config) => (config.n_modes, config.size(), None),
-            PolicyConfig::BcTransformer(config) => (config.n_modes, config.size(), Some(config.dim_model)),
+        let (modes, timesteps) = match &self.policy {
+            PolicyConfig::BcRnn(config) => (config.n_modes, None),
+            PolicyConfig::BcTransformer(config) => (config.n_modes, Some(config.dim_model)),
             _ => return Ok(()),
         };
         let means = modes.saturating_mul(self.signature.action_dim);
@@ -454,13 +454,7 @@ impl RobomimicBc {
                 return Err(ModelError::MisshapenTensor { name: name.to_string(), expected, found });
             }
         }
-        let count: usize = weights.values().map(Tensor::elem_count).sum();
-        if size.weights > count as f64 {
-            let expected = "those of a model of the sizes that the options say".to_string();
-            let (object, found) = ("weights", format!("{count} numbers"));
-            return Err(ModelError::Input { operation: "load robomimic bc", object, found, expected });
-        }
-        Ok(())
+        self.policy.check_size(weights)
     }
 
     fn reordered(&self, name: &str, tensor: &Tensor) -> Result<Tensor> {

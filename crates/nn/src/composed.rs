@@ -285,40 +285,31 @@ fn convolved(x: &Tensor, kernel: &Tensor, stride: usize, precision: Precision) -
     let (output, _, k, _) = kernel.dims4()?;
     if precision != Precision::F32 {
         // cuDNN's, which rounds f32 to TF32
-        let y = x.permute((0, 3, 1, 2))?.conv2d(&kernel.contiguous()?, 0, stride, 1, 1)?;
+        let y = x.permute((0, 3, 1, 2))?.contiguous()?.conv2d(&kernel.contiguous()?, 0, stride, 1, 1)?;
         return Ok(y.permute((0, 2, 3, 1))?.to_dtype(DType::F32)?);
     }
     let (b, height, width, _) = x.dims4()?;
-    let (h, w) = ((height - k) / stride + 1, (width - k) / stride + 1);
-    let mut sum: Option<Tensor> = None;
-    for dy in 0..k {
-        let seen = patches(x, (dy, k), (h, w), stride)?;
-        // (C', C, k) of this row of the kernel -> (k C, C')
-        let row = kernel.narrow(2, dy, 1)?.squeeze(2)?.permute((2, 1, 0))?.contiguous()?.flatten_to(1)?;
-        let part = seen.matmul(&row)?;
-        sum = Some(sum.map_or(Ok(part.clone()), |sum| sum + &part)?);
-    }
-    Ok(sum.expect("a kernel has rows").reshape((b, h, w, output))?)
+    let taps = kernel.permute((2, 3, 1, 0))?.contiguous()?.flatten_to(2)?;
+    let y = patches(x, k, stride)?.matmul(&taps)?;
+    Ok(y.reshape((b, (height - k) / stride + 1, (width - k) / stride + 1, output))?)
 }
 
-/// What a row of the kernel sees at every place: (b h w, k C)
-fn patches(x: &Tensor, (dy, k): (usize, usize), (h, w): (usize, usize), stride: usize) -> Result<Tensor> {
-    let rows = every(x, 1, (dy, h), stride)?;
-    let taps = (0..k).map(|dx| every(&rows, 2, (dx, w), stride)).collect::<Result<Vec<_>>>()?;
-    Ok(Tensor::cat(&taps, D::Minus1)?.flatten_to(2)?)
-}
-
-/// Every `stride`-th of a dimension, `count` of them from `from` on.
-fn every(x: &Tensor, dim: usize, (from, count): (usize, usize), stride: usize) -> Result<Tensor> {
-    let reach = (count - 1) * stride + 1;
-    let x = x.narrow(dim, from, reach)?;
-    if stride == 1 {
-        return Ok(x);
+/// What the kernel sees at every place: (b h w, k k C)
+fn patches(x: &Tensor, k: usize, stride: usize) -> Result<Tensor> {
+    let (b, height, width, channels) = x.dims4()?;
+    let x = x.contiguous()?.reshape((b, height * width, channels))?;
+    if (k, stride) == (1, 1) {
+        return Ok(x.flatten_to(1)?);
     }
-    let mut shape = x.dims().to_vec();
-    let x = x.pad_with_zeros(dim, 0, count * stride - reach)?.contiguous()?;
-    shape.splice(dim..=dim, [count, stride]);
-    Ok(x.reshape(shape)?.narrow(dim + 1, 0, 1)?.squeeze(dim + 1)?)
+    // where every tap of every place is in an image: one part for its row, one for its column
+    let part = |size: usize, step: usize| -> Result<(Tensor, usize)> {
+        let count = (size - k) / stride + 1;
+        let places = (0..count).flat_map(|at| (0..k).map(move |tap| ((at * stride + tap) * step) as u32));
+        Ok((Tensor::from_iter(places, x.device())?, count))
+    };
+    let ((rows, h), (columns, w)) = (part(height, width)?, part(width, 1)?);
+    let places = rows.reshape((h, 1, k, 1))?.broadcast_add(&columns.reshape((1, w, 1, k))?)?;
+    Ok(x.index_select(&places.flatten_all()?, 1)?.reshape((b * h * w, k * k * channels))?)
 }
 
 /// The gradient of the input: the kernel turned round over the gradient, with zeros between its places where the stride left
@@ -345,12 +336,9 @@ fn of_input(grad: &Tensor, kernel: &Tensor, stride: usize, shape: &[usize], prec
 /// The gradient of the kernel, f32. grad: (b, h, w, C'), x: (b, H, W, C)
 fn of_kernel(grad: &Tensor, x: &Tensor, kernel: &Tensor, stride: usize) -> Result<Tensor> {
     let (output, input, k, _) = kernel.dims4()?;
-    let (_, h, w, _) = grad.dims4()?;
     let grad = grad.contiguous()?.flatten_to(2)?.t()?;
-    // each (C', k C)
-    let rows = (0..k).map(|dy| Ok(grad.matmul(&patches(x, (dy, k), (h, w), stride)?)?.reshape((output, k, input))?));
-    let rows = rows.collect::<Result<Vec<_>>>()?;
-    Ok(Tensor::stack(&rows, 1)?.permute((0, 3, 1, 2))?.contiguous()?.to_dtype(DType::F32)?)
+    let of = grad.matmul(&patches(x, k, stride)?)?.reshape((output, k, k, input))?;
+    Ok(of.permute((0, 3, 1, 2))?.contiguous()?.to_dtype(DType::F32)?)
 }
 
 #[cfg(test)]

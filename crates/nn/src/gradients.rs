@@ -51,9 +51,9 @@ impl ParamLayout {
         self.len == 0
     }
 
-    /// Whether operations on the parameters are candle's.
+    /// Whether operations on the parameters are candle's, if there are any.
     pub fn is_composed(&self) -> bool {
-        self.backend.is_composed()
+        self.backend.is_composed() && self.len > 0
     }
 
     /// Where the parameters are.

@@ -139,6 +139,14 @@ fn plain(name: &str) -> String {
     name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect()
 }
 
+/// A name that no other column has: with underscores behind it where one has it.
+fn named(mut name: String, taken: &mut BTreeSet<String>) -> String {
+    while !taken.insert(name.clone()) {
+        name.push('_');
+    }
+    name
+}
+
 fn frames(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
     let episodes = dataset.episodes();
     let total = dataset.frames();
@@ -170,13 +178,12 @@ fn frames(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
                 1 => plain(name),
                 _ => format!("{}_{d}", plain(name)),
             };
-            let unique = given.filter(|n| values.dim > 1 && !taken.contains(n)).unwrap_or(own);
+            let unique = named(given.filter(|n| values.dim > 1 && !taken.contains(n)).unwrap_or(own), &mut taken);
             let data: Vec<f32> = values.data.iter().skip(d).step_by(values.dim).copied().collect();
             columns.push(match feature.dtype.as_str() {
                 "bool" => column(&unique, data.iter().map(|&v| v != 0.0).collect::<Vec<bool>>()),
                 _ => column(&unique, data),
             });
-            taken.insert(unique);
         }
     }
     DataFrame::new(total, columns)
@@ -198,10 +205,11 @@ fn episodes(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
         let any = episodes.iter().map(|e| success.data[e.from..e.to].iter().any(|&v| v != 0.0));
         columns.push(column("success", any.collect::<Vec<bool>>()));
     }
+    let mut taken: BTreeSet<String> = columns.iter().map(|c| c.name().to_string()).collect();
     for name in dataset.split_names() {
         let members: BTreeSet<usize> = dataset.split(name).unwrap_or_default().into_iter().collect();
         let inside = episodes.iter().map(|e| members.contains(&e.index)).collect::<Vec<bool>>();
-        columns.push(column(&format!("in_{}", plain(name)), inside));
+        columns.push(column(&named(format!("in_{}", plain(name)), &mut taken), inside));
     }
     DataFrame::new(episodes.len(), columns)
 }

@@ -25,6 +25,7 @@ pub use card::model_index;
 pub use charts::curves_svg;
 pub use leaderboard::{Bound, COLUMNS, Counts, FEWEST_TO_RANK, LeaderboardRow, Reading, Seeing, count_text, rank};
 pub use page::{
-    Beside, Curve, DEPTH_COLUMNS, Depth, EntryFacts, Film, MOST_FILM_BYTES, OTHERS_COLUMNS, Places, to_html,
+    Beside, Curve, DEPTH_COLUMNS, Depth, EntryFacts, Film, MOST_FILM_BYTES, OTHERS_COLUMNS, Places, shell_quoted,
+    to_html,
 };
 pub use statistics::{mean, percent, quantile, wilson_interval};

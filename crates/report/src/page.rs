@@ -16,7 +16,7 @@ mod solving;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-pub use self::commands::Places;
+pub use self::commands::{Places, shell_quoted};
 pub use self::depth::{DEPTH_COLUMNS, Depth};
 pub use self::films::{Film, MOST_FILM_BYTES};
 pub use self::others::OTHERS_COLUMNS;

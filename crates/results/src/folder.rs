@@ -147,8 +147,18 @@ pub fn read_record(folder: &Path) -> Result<EvaluationRecord, ResultsError> {
         let (expected, found) = (EvaluationRecord::FORMAT, record.format);
         return Err(malformed(format!("format: expected {expected}, found {found}")));
     }
+    if let Some(shard) = record.shard.filter(|shard| !(1..=shard.count).contains(&shard.index)) {
+        return Err(malformed(format!("shard: expected I/N with 1 <= I <= N, found {shard}")));
+    }
+    if record.seeds.count > MOST_EPISODES {
+        let found = record.seeds.count;
+        return Err(malformed(format!("seeds.count: expected at most {MOST_EPISODES}, found {found}")));
+    }
     Ok(record)
 }
+
+/// More episodes than any evaluation has.
+const MOST_EPISODES: u64 = 100_000_000;
 
 #[derive(Serialize, Deserialize)]
 struct JournalLine {
@@ -232,7 +242,7 @@ impl ResultsFolder {
                 (rows.map(|(e, t)| (e.seed, (e, t))).collect(), None)
             }
             None => {
-                let done = read_journal(&path, record)?;
+                let done = read_journal(&path, record, true)?;
                 let journal = OpenOptions::new().create(true).append(true).open(&path);
                 (done, Some(journal.map_err(ResultsError::io("open", &path))?))
             }
@@ -256,7 +266,7 @@ impl ResultsFolder {
             }
             let done = match StoredEvaluation::read(&folder) {
                 Ok(Some(stored)) => stored.episodes.len(),
-                Ok(None) => read_journal(&folder.join(JOURNAL), &other).map_or(0, |done| done.len()),
+                Ok(None) => read_journal(&folder.join(JOURNAL), &other, false).map_or(0, |done| done.len()),
                 Err(_) => return None,
             };
             let differing = differing(&other, record);
@@ -420,6 +430,7 @@ fn json<T: Serialize>(value: &T) -> String {
 fn read_journal(
     path: &Path,
     record: &EvaluationRecord,
+    repair: bool,
 ) -> Result<BTreeMap<u64, (EpisodeRecord, EpisodeTiming)>, ResultsError> {
     let text = match fs::read(path) {
         Ok(text) => text,
@@ -427,7 +438,7 @@ fn read_journal(
         Err(error) => return Err(ResultsError::io("read", path)(error)),
     };
     let whole = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
-    if whole < text.len() {
+    if repair && whole < text.len() {
         let cut = OpenOptions::new().write(true).open(path).and_then(|f| f.set_len(whole as u64));
         cut.map_err(ResultsError::io("cut the unfinished last line of", path))?;
     }

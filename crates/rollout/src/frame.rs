@@ -13,8 +13,8 @@ use safetensors::{Dtype, SafeTensors};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-/// The largest body that either side may send: 256 MiB.
-pub const MAX_FRAME_BYTES: u64 = 256 << 20;
+/// The largest body that either side may send: 2 GiB, an episode of 2700 steps with two 256 x 256 images.
+pub const MAX_FRAME_BYTES: u64 = 2 << 30;
 
 /// The key of the message in the safetensors metadata.
 pub const MESSAGE_KEY: &str = "actrm";

@@ -19,7 +19,7 @@ Tensors = dict[str, Array]
 Message = dict[str, Any]
 
 METADATA_KEY = "actrm"
-MAX_FRAME_BYTES = 256 * 1024 * 1024
+MAX_FRAME_BYTES = 2 * 1024 * 1024 * 1024
 
 _DTYPES = {"F64": "<f8", "F32": "<f4", "I64": "<i8", "U8": "|u1"}
 _LAYOUTS = {name: np.dtype(layout) for name, layout in _DTYPES.items()}

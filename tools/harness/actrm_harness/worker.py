@@ -213,6 +213,9 @@ def serve(simulation: Simulation, requests: BinaryIO, replies: BinaryIO) -> int:
             # JSON has no NaN and no infinity; nothing was written yet
             text = f"{message.get('type')}: what the environment gave cannot be sent: {error}: {reply}"
             wire.write_frame(replies, error_message("environment", text, number))
+        except wire.WireError as error:
+            # too long, or of a type that frames do not carry; nothing was written either
+            wire.write_frame(replies, error_message("bad_request", f"{message.get('type')}: {error}", number))
 
 
 Answer = tuple[wire.Message, wire.Tensors]

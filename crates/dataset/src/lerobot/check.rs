@@ -90,6 +90,10 @@ pub(super) fn info(root: &Path, value: &Value, info: &Info) -> Result<()> {
         return bad("fps", "a number above 0".to_owned(), info.fps.to_string());
     }
     for (name, feature) in &info.features.0 {
+        // paths are made of names
+        if name.is_empty() || name.split('/').any(|part| part == "..") || name.starts_with('/') {
+            return bad("features", "names that stay inside the folder".to_owned(), format!("{name:?}"));
+        }
         if INDEX_COLUMNS.contains(&name.as_str()) && feature.dim() != 1 {
             return bad(&format!("features.{name}.shape"), "[1]".to_owned(), format!("{:?}", feature.shape));
         }

@@ -57,7 +57,7 @@ pub(crate) struct ColumnTotal {
     spill: Spill,
     /// Places and rows of the blocks that are in the file, each with its dimensions one after the other.
     blocks: Vec<(u64, usize)>,
-    /// Those that follow; of truths as float32.
+    /// Those that follow, none right after a block; of truths as float32. Once there was an episode, it says their type.
     waiting: Option<Values>,
 }
 
@@ -87,10 +87,10 @@ impl ColumnTotal {
     }
 
     fn flush(&mut self) -> Result<()> {
-        let (bytes, rows) = match self.waiting.take() {
-            Some(Values::F32(v)) => by_dimension(&v, self.dim),
-            Some(Values::F64(v)) => by_dimension(&v, self.dim),
-            Some(Values::I64(v)) => by_dimension(&v, self.dim),
+        let (bytes, rows) = match &mut self.waiting {
+            Some(Values::F32(v)) => taken(v, self.dim),
+            Some(Values::F64(v)) => taken(v, self.dim),
+            Some(Values::I64(v)) => taken(v, self.dim),
             _ => return Ok(()),
         };
         let at = self.spill.append(&bytes)?;
@@ -135,13 +135,15 @@ fn joined<T: Copy>(all: &mut Vec<T>, more: &[T]) -> bool {
     std::mem::size_of_val(all.as_slice()) >= BLOCK_BYTES
 }
 
-/// The bytes of rows of `dim` values, one dimension after the other, and the number of rows.
-fn by_dimension<T: Sample>(values: &[T], dim: usize) -> (Vec<u8>, usize) {
+/// Takes rows of `dim` values: their bytes, one dimension after the other, and their number.
+fn taken<T: Sample>(values: &mut Vec<T>, dim: usize) -> (Vec<u8>, usize) {
     let mut bytes = Vec::with_capacity(values.len() * T::BYTES);
     for dimension in 0..dim {
         values.iter().skip(dimension).step_by(dim).for_each(|value| value.put(&mut bytes));
     }
-    (bytes, values.len() / dim.max(1))
+    let rows = values.len() / dim.max(1);
+    values.clear();
+    (bytes, rows)
 }
 
 /// The statistics of each episode's features.
@@ -286,6 +288,20 @@ mod tests {
             assert_eq!((got.count, bits(&got)), (expected.count, bits(&expected)));
         }
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn the_last_episode_may_complete_a_block() {
+        let folder = tempfile::tempdir().unwrap();
+        let values: Vec<f32> = (0..BLOCK_BYTES as i32 / 4).map(|i| (i % 1000) as f32).collect();
+        let mut total = ColumnTotal::new(folder.path(), 2);
+        for half in values.chunks(values.len() / 2) {
+            total.add(Values::F32(half.to_vec())).unwrap();
+        }
+        assert_eq!(total.blocks.len(), 1);
+        let expected = Values::F32(values).stats(2).unwrap();
+        let got = total.stats().unwrap().unwrap();
+        assert_eq!((got.count, got.vectors()), (expected.count, expected.vectors()));
     }
 
     #[test]

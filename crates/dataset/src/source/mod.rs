@@ -29,7 +29,7 @@ pub(crate) use dialect::list;
 pub(crate) use local::files;
 pub use video::{VideoFile, VideoInfo};
 pub(crate) use walk::is_lfs_pointer;
-pub use writer::{RobomimicWriter, WriteOptions};
+pub use writer::{RobomimicWriter, WriteOptions, remove_unfinished};
 
 /// The most that [`Source::read_demo`] reads at once.
 const MAX_DEMO: u64 = 512 << 20;

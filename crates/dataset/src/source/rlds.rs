@@ -518,6 +518,7 @@ impl Rlds {
                 false => Err("its checksum is wrong".to_owned()),
             };
             match episode {
+                Ok((0, ..)) => problems.push(Problem::empty(path, &id, "steps")),
                 Ok((steps, keys, attrs, task)) => {
                     demos.push(DemoPlan {
                         id: id.clone(),

@@ -56,12 +56,15 @@ impl RobomimicWriter {
             let path = path.to_owned();
             move |source| DatasetError::Io { path, operation, source }
         };
+        sweep(folder, &name);
         let temporary = tempfile::Builder::new()
-            .prefix(&format!(".{name}."))
+            .prefix(&format!(".{name}.{}-", std::process::id()))
             .suffix(".part")
             .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666))
             .tempfile_in(folder)
             .map_err(io("create a file beside it"))?;
+        // where there are no locks nobody sweeps either
+        let _ = temporary.as_file().try_lock();
         let file = hdf5::File::with_options()
             .with_fcpl(|p| p.obj_track_times(false))
             // since 1.8 an attribute may exceed 64 KB; a model_file does
@@ -238,6 +241,33 @@ impl RobomimicWriter {
         File::open(folder_of(&path)).and_then(|f| f.sync_all()).map_err(io("sync the folder of"))?;
         Ok(())
     }
+}
+
+/// Removes what killed writers of the file `name` left. Best effort: what is locked is in use.
+fn sweep(folder: &Path, name: &str) {
+    for path in unfinished(folder, &format!(".{name}.")) {
+        if File::open(&path).is_ok_and(|file| file.try_lock().is_ok()) {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+}
+
+/// Removes the unfinished file that this process keeps beside `path`: before it ends without unwinding.
+pub fn remove_unfinished(path: &Path) {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    for unfinished in unfinished(folder_of(path), &format!(".{name}.{}-", std::process::id())) {
+        // what stays is removed by the next writer
+        let _ = std::fs::remove_file(unfinished);
+    }
+}
+
+fn unfinished(folder: &Path, begins: &str) -> Vec<PathBuf> {
+    let Ok(items) = std::fs::read_dir(folder) else { return Vec::new() };
+    let names = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        name.starts_with(begins) && name.ends_with(".part")
+    };
+    items.flatten().map(|item| item.path()).filter(names).collect()
 }
 
 /// Takes `step` bytes of the disk for a file of which `from` bytes are taken and which is about to grow to `end`.

@@ -108,6 +108,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
         },
     };
     experiment.check()?;
+    experiment.policy.check_size(&weights).map_err(config::misfit(&model_path))?;
 
     let model =
         experiment.policy.build(signature, 0, &Backend::CPU).map_err(experiment.model_error("build the policy of"))?;

@@ -147,16 +147,6 @@ impl ImageEncoder {
         Ok(Self { config, backbone, head, given, sizes, mean, std, composed })
     }
 
-    /// The network in front of the tokens.
-    pub fn backbone(&self) -> &ResNet {
-        &self.backbone
-    }
-
-    /// Sizes of what is seen of the cameras' images.
-    pub fn sizes(&self) -> &[Size] {
-        &self.sizes
-    }
-
     /// Sets what the images of each camera are normalised by, on the scale from 0 to 1.
     ///
     /// # Errors

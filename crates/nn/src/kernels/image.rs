@@ -69,19 +69,8 @@ fn channel_sums(image: &[f32], sums: &mut [f32], of: impl Fn(f32, usize) -> f32)
     }
 }
 
-/// What is added before the ReLU.
-#[derive(Clone, Copy)]
-pub enum Shortcut<'a> {
-    /// nothing
-    None,
-    /// the block's input, in its frame
-    Framed(&'a [f32], &'a Frame),
-    /// (n, pixels, C) times the first row plus the second
-    Scaled(&'a [f32], &'a [f32], &'a [f32]),
-}
-
-/// `out = relu(y * scale + shift + shortcut)` into a frame, whose border is not touched.
-pub fn scale_relu(y: &[f32], scale: &[f32], shift: &[f32], shortcut: Shortcut<'_>, frame: &Frame, out: &mut [f32]) {
+/// `out = relu(y * scale + shift + shortcut)` into a frame, whose border is not touched; the shortcut is in the same frame.
+pub fn scale_relu(y: &[f32], scale: &[f32], shift: &[f32], shortcut: Option<&[f32]>, frame: &Frame, out: &mut [f32]) {
     let row = frame.width * frame.channels;
     let c = frame.channels;
     vectorised(
@@ -95,20 +84,8 @@ pub fn scale_relu(y: &[f32], scale: &[f32], shift: &[f32], shortcut: Shortcut<'_
                         *out = y * scale + shift;
                     }
                 }
-                match shortcut {
-                    Shortcut::None => {}
-                    Shortcut::Framed(x, frame) => {
-                        let at = frame.at(r / frame.height, r % frame.height);
-                        out.iter_mut().zip(&x[at..at + row]).for_each(|(out, x)| *out += x);
-                    }
-                    Shortcut::Scaled(x, scale, shift) => {
-                        let x = &x[r * row..][..row];
-                        for (out, x) in out.chunks_exact_mut(c).zip(x.chunks_exact(c)) {
-                            for (((out, x), scale), shift) in out.iter_mut().zip(x).zip(scale).zip(shift) {
-                                *out += x * scale + shift;
-                            }
-                        }
-                    }
+                if let Some(x) = shortcut {
+                    out.iter_mut().zip(&x[at..at + row]).for_each(|(out, x)| *out += x);
                 }
                 out.iter_mut().for_each(|x| *x = x.max(0.0));
             }

@@ -18,7 +18,7 @@ pub use conv::{Conv, Frame};
 pub use elementwise::{activate, activate_backward, add, column_sums, dot, drop_scale, exp};
 pub use gemm::{Mat, Pack, Packed, Start, gemm, gemm_with, product};
 pub use image::{
-    Shortcut, group_norm, group_norm_backward, max_pool, max_pool_backward, relu_backward, scale_backward, scale_relu,
+    group_norm, group_norm_backward, max_pool, max_pool_backward, relu_backward, scale_backward, scale_relu,
 };
 pub use pool::Pool;
 pub use residual::{Rows, Summed, dropped, sum_over_sequences};

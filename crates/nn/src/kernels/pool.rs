@@ -36,7 +36,9 @@ impl Pool {
 
     /// Takes a buffer back.
     pub fn give(&mut self, buffer: Vec<f32>) {
-        self.free.entry(buffer.capacity()).or_default().push(buffer);
+        if buffer.capacity() > 0 {
+            self.free.entry(buffer.capacity()).or_default().push(buffer);
+        }
     }
 }
 
@@ -58,5 +60,7 @@ mod tests {
         pool.give(again);
         let whole = pool.take(100);
         assert_eq!((whole.as_ptr(), whole.len()), (at, 100));
+        pool.give(Vec::new());
+        assert!(!pool.free.contains_key(&0), "nobody asks for none, so they would pile up");
     }
 }

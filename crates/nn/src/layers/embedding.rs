@@ -19,9 +19,4 @@ impl Embedding {
         let weight = params.create(&format!("{prefix}.weight"), &[rows, dim], init, rng)?;
         Ok(Self { weight })
     }
-
-    /// indices: (n) of u32 -> (n, dim)
-    pub fn forward(&self, indices: &Tensor) -> Result<Tensor> {
-        Ok(self.weight.index_select(indices, 0)?)
-    }
 }

@@ -2,10 +2,10 @@
 
 use crate::composed;
 use crate::context::{Context, read};
-use crate::error::Result;
+use crate::error::{ModelError, Result};
 use crate::kernels::{
-    Conv, Frame, Pool, Shortcut, Winograd, add, exp, group_norm, group_norm_backward, max_pool as max_pool_on,
-    max_pool_backward, relu_backward, scale_backward, scale_relu,
+    Conv, Frame, Pool, Winograd, add, exp, group_norm, group_norm_backward, max_pool as max_pool_on, max_pool_backward,
+    relu_backward, scale_backward, scale_relu,
 };
 use crate::layers::{CONV_NORM_EPS, cell_places};
 use crate::tape::Backward;
@@ -183,6 +183,10 @@ pub fn conv2d(
     let (output, _, k, _) = weight.dims4()?;
     super::check_shape("convolution", "weight", weight, &[output, c, k, k])?;
     if let Some(shortcut) = shortcut {
+        if !relu {
+            let (found, expected) = ("without ReLU".to_string(), "with it".to_string());
+            return Err(ModelError::Input { operation: "convolution", object: "shortcut", found, expected });
+        }
         let made = [n, h.div_ceil(stride), w.div_ceil(stride), output];
         super::check_shape("convolution", "shortcut", &shortcut.tensor, &made)?;
     }
@@ -214,10 +218,10 @@ pub fn conv2d(
     if relu {
         match shortcut {
             Some(shortcut) => read("convolution", [&shortcut.tensor], |[x]| {
-                scale_relu(&y, &scale, &shift, Shortcut::Framed(x, &made), &made, &mut out);
+                scale_relu(&y, &scale, &shift, Some(x), &made, &mut out);
                 Ok(())
             })?,
-            None => scale_relu(&y, &scale, &shift, Shortcut::None, &made, &mut out),
+            None => scale_relu(&y, &scale, &shift, None, &made, &mut out),
         }
     } else {
         for (out, y) in out.chunks_exact_mut(output).zip(y.chunks_exact(output)) {

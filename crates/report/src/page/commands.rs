@@ -41,12 +41,12 @@ impl Words {
     }
 
     fn line(&self) -> String {
-        self.0.iter().map(|word| quoted(word)).collect::<Vec<_>>().join(" ")
+        self.0.iter().map(|word| shell_quoted(word)).collect::<Vec<_>>().join(" ")
     }
 }
 
 /// A word as a shell reads it back.
-fn quoted(word: &str) -> String {
+pub fn shell_quoted(word: &str) -> String {
     let harmless = |c: char| c.is_ascii_alphanumeric() || "_-./=:,@%+".contains(c);
     match !word.is_empty() && word.chars().all(harmless) {
         true => word.to_owned(),

@@ -2,7 +2,7 @@
 //!
 //! `[task] puzzle = "dfs10"` distinguishes an experiment on puzzles from one on a robot task.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use models::{DeviceChoice, Precision};
 use zoo::ZooError;
@@ -125,9 +125,12 @@ impl AnyExperiment {
         }
     }
 
-    /// Whether it is trained on demonstrations that can be named.
-    pub fn takes_data(&self) -> bool {
-        matches!(self.0, Kind::Robot(_))
+    /// The demonstrations that it is trained on unless others are named; puzzles take none.
+    pub fn data(&self) -> Option<&Path> {
+        match &self.0 {
+            Kind::Robot(experiment) => Some(Path::new(&experiment.data.path)),
+            Kind::Puzzle(_) => None,
+        }
     }
 
     /// Trains it, or resumes its training.

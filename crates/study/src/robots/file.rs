@@ -101,7 +101,13 @@ impl Data {
     pub fn file_name(&self) -> String {
         let expert = self.expert.as_ref().map(|expert| format!("{expert}-")).unwrap_or_default();
         let skill = if self.skill.is_good() { String::new() } else { format!("{}-", self.skill) };
-        let seen = self.cameras.as_ref().map(|cameras| format!("seen{}-", cameras.size)).unwrap_or_default();
+        let seen = self.cameras.as_ref().map(|cameras| {
+            let usual = cameras.names == ["agentview", "robot0_eye_in_hand"];
+            let names = if usual { String::new() } else { format!("{}-", cameras.names.join("+")) };
+            let drawn = if cameras.fast_render { "" } else { "reflections-" };
+            format!("seen{}-{names}{drawn}", cameras.size)
+        });
+        let seen = seen.unwrap_or_default();
         format!("{}-{expert}{skill}{seen}{}-seed{}.hdf5", self.task.to_lowercase(), self.episodes, self.seed)
     }
 

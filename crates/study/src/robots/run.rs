@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use analysis::depth::thinking_subject;
 use recording::{CollectEnd, CollectOptions, collect};
+use report::shell_quoted;
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, harness_folder};
 use zoo::config::Library;
 use zoo::entry::{Entry, LoadedEntry, member_name};
@@ -206,12 +207,10 @@ fn experiment(study: &Study, library: &Library, cell: &Cell) -> Result<(Experime
 /// The same training without the study, as a command.
 fn train_command(study: &Study, cell: &Cell, entry: &str, data: &Path) -> String {
     let arm = &study.arms[&cell.arm];
-    let plain = |c: char| c.is_ascii_alphanumeric() || "_-=./".contains(c);
-    let quoted = |word: &String| if word.chars().all(plain) { word.clone() } else { format!("'{word}'") };
     let mut words = vec!["actrm-zoo".to_owned(), "train".to_owned(), study.experiment_on(&cell.arm, &cell.data)];
-    words.extend(arm.set.iter().map(quoted));
+    words.extend(arm.set.iter().map(|word| shell_quoted(word)));
     words.extend([format!("train.seed={}", cell.seed), format!("entry={entry}"), "--data".to_owned()]);
-    words.push(quoted(&data.display().to_string()));
+    words.push(shell_quoted(&data.display().to_string()));
     words.join(" ")
 }
 
@@ -225,7 +224,7 @@ fn settings_hash(experiment: &Experiment) -> String {
     sha256_hex(text.concat().as_bytes())
 }
 
-/// The folder of a cell's run, by its name and its settings.
+/// A cell by its name and the hash of what it depends on.
 fn run_name(cell: &Cell, settings: &str) -> String {
     format!("{}-{}", cell.name(), &settings[..8])
 }
@@ -319,7 +318,9 @@ impl Shared<'_> {
         if !told && trained()?.is_none() {
             return Ok(CellEnd::Left);
         }
-        let run = self.request.work.join("runs").join(run_name(cell, &settings));
+        // other demonstrations are another run
+        let depends = sha256_hex(format!("{settings} {}", data.file_name()).as_bytes());
+        let run = self.request.work.join("runs").join(run_name(cell, &depends));
         let training = lock(&self.training[&cell.name()]);
         let stored = match trained()? {
             Some(entry) => entry,

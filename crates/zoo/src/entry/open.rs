@@ -1,5 +1,6 @@
 //! Opening an entry: every byte is checked before any is used.
 
+use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -63,6 +64,9 @@ impl Entry {
         let meta: EntryMeta = serde_json::from_value(value).map_err(not_an_entry)?;
         if meta.id() != *id {
             return Err(malformed(format!("expected entry {id}, found {}", meta.id())));
+        }
+        if let Some(name) = meta.files.keys().find(|name| Path::new(name).file_name() != Some(OsStr::new(name))) {
+            return Err(malformed(format!("files: expected plain names, found {name:?}")));
         }
         for name in [MODEL_FILE, CONFIG_FILE, NORMALISER_FILE, CARD_FILE] {
             if !meta.files.contains_key(name) {

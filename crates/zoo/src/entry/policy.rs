@@ -62,6 +62,7 @@ pub(super) fn assemble(
     backend: &Backend,
 ) -> Result<(Arc<dyn PolicyModel>, Arc<Preprocess>), ZooError> {
     let failed = |operation| move |source| ZooError::Model { operation, name: id.to_string(), source };
+    experiment.policy.check_size(weights).map_err(failed("load the weights of"))?;
     let model = experiment.policy.build(signature, 0, backend).map_err(failed("build the policy of"))?;
     model.params().load(weights).map_err(failed("load the weights of"))?;
     let modes = experiment.normalisation.modes(signature);

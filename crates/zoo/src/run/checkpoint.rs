@@ -67,7 +67,7 @@ impl Checkpoint {
         let latest = Latest { sha256: sha256_hex(&bytes), step: self.step, file };
         let text = serde_json::to_string_pretty(&latest).expect("strings become JSON") + "\n";
         write_atomic(&latest_path, text.as_bytes())?;
-        prune(folder)?;
+        prune(folder, &path)?;
         Ok(path)
     }
 
@@ -113,17 +113,18 @@ fn file_name(step: u64) -> String {
     format!("{step:08}.safetensors")
 }
 
-fn prune(folder: &Path) -> Result<(), ZooError> {
+/// Forgets checkpoints but for `newest` and the latest of the others.
+fn prune(folder: &Path, newest: &Path) -> Result<(), ZooError> {
     let mut paths = Vec::new();
     for item in fs::read_dir(folder).map_err(ZooError::io("read folder", folder))? {
         let path = item.map_err(ZooError::io("read folder", folder))?.path();
         let is_step = path.file_stem().and_then(|s| s.to_str()).is_some_and(|s| s.parse::<u64>().is_ok());
-        if is_step {
+        if is_step && path != newest {
             paths.push(path);
         }
     }
     paths.sort();
-    paths.truncate(paths.len().saturating_sub(KEEP));
+    paths.truncate((paths.len() + 1).saturating_sub(KEEP));
     for path in paths {
         fs::remove_file(&path).map_err(ZooError::io("remove", path))?;
     }

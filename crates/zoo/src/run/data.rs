@@ -1,6 +1,6 @@
 //! The demonstrations of a run: found, converted if need be, split and normalised.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -60,11 +60,11 @@ pub(super) fn is_set(path: &Path) -> bool {
     path.join("meta/info.json").exists()
 }
 
-/// Begins the hash of recordings.
+/// Begins the hash of recordings, or of a data set.
 ///
 /// # Errors
 /// Files that cannot be read.
-pub(super) fn short_hash(path: &Path) -> Result<String, ZooError> {
+pub fn short_hash(path: &Path) -> Result<String, ZooError> {
     let mut hash = match path.is_dir() {
         true => dataset::source_hash(path)
             .map_err(|source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) })?,
@@ -286,7 +286,9 @@ pub(super) fn prepare(
     };
     let mut image_statistics = Vec::new();
     let cameras: Vec<String> = experiment.data.cameras.iter().map(|camera| format!("{IMAGE_PREFIX}{camera}")).collect();
-    let bytes = cameras.iter().map(|name| dataset.decoded_bytes(name)).sum::<Result<u64, _>>().map_err(failed)?;
+    let each =
+        cameras.iter().map(|name| dataset.decoded_bytes(name)).collect::<Result<Vec<u64>, _>>().map_err(failed)?;
+    let bytes = each.iter().sum::<u64>();
     let fits = bytes <= memory.budget;
     if !fits {
         let (bytes, budget) = (gigabytes(bytes), gigabytes(memory.budget));
@@ -297,7 +299,9 @@ pub(super) fn prepare(
     let data = &experiment.data;
     let unchanged = data.mirror.is_empty() && data.symmetries.is_empty() && data.picture_colours.is_empty();
     let free = memory.device.free_bytes();
-    let resident = fits && unchanged && free.is_some_and(|free| bytes <= free / 2);
+    // candle's kernel that gathers them counts in 32 bits
+    let counted = each.iter().all(|bytes| *bytes < 1 << 32);
+    let resident = fits && unchanged && counted && free.is_some_and(|free| bytes <= free / 2);
     let mut on_device = Features::new();
     for name in cameras {
         let pictures: PictureStore = match fits {
@@ -382,7 +386,7 @@ fn placed(pictures: Pictures, device: &Device) -> candle_core::Result<Tensor> {
 }
 
 /// The windows of the episodes that a training of `experiment` learns from, its data transforms, and the number of each episode's
-/// first window. An HDF5 file is converted into `work`.
+/// first window; an episode that begins with a marked mistake has none. An HDF5 file is converted into `work`.
 ///
 /// # Errors
 /// What a training would refuse.
@@ -395,12 +399,12 @@ pub fn first_windows(
     let (dataset, _) = open(path, work, experiment, &mut |_, _| {})?;
     let all = || (0..dataset.episodes().len()).collect();
     let episodes: Vec<usize> = dataset.split(&experiment.data.train_mask).unwrap_or_else(all);
-    let lengths = episodes.iter().map(|&episode| dataset.episodes()[episode].length as u32);
-    let firsts = lengths.scan(0, |next, length| Some(std::mem::replace(next, *next + length))).collect();
+    let begins: BTreeSet<usize> = episodes.iter().map(|&episode| dataset.episodes()[episode].from).collect();
     let memory = ImageMemory { budget: image_budget(), folder: work, device: &Backend::CPU };
     // what an entry was trained on is not asked again
     let agreed = agree(&dataset, path, experiment, true)?;
     let demonstrations = prepare(&dataset, path, &path.display().to_string(), &agreed, &memory)?;
+    let firsts = demonstrations.train.of_frames(|frame| begins.contains(&frame));
     Ok((demonstrations.train, demonstrations.transforms, firsts))
 }
 

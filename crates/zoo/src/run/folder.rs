@@ -13,6 +13,8 @@ pub const COMMAND_FILE: &str = "command.txt";
 #[derive(Debug)]
 pub struct RunFolder {
     path: PathBuf,
+    /// Whether demonstrations stood here before: then they are not this run's to remove.
+    had_data: bool,
     _lock: File,
 }
 
@@ -86,11 +88,13 @@ impl RunFolder {
 
     fn lock(path: PathBuf) -> Result<Self, ZooError> {
         let file_path = path.join("lock");
-        let file = File::create(&file_path).map_err(ZooError::io("create", &file_path))?;
+        let file = File::options().write(true).create(true).truncate(false).open(&file_path);
+        let file = file.map_err(ZooError::io("create", &file_path))?;
         if !rollout::try_lock(&file, &path).map_err(ZooError::io("lock", file_path))? {
             return Err(ZooError::RunLocked { folder: path });
         }
-        let folder = Self { path, _lock: file };
+        let had_data = path.join(super::data::CONVERTED).exists();
+        let folder = Self { path, had_data, _lock: file };
         sweep(&folder.path)?;
         sweep(&folder.checkpoints())?;
         Ok(folder)
@@ -102,7 +106,9 @@ impl RunFolder {
         // whatever cannot be removed is not worth hiding the error that led here
         let _ = fs::remove_file(self.path.join("lock"));
         let _ = fs::remove_file(self.begun_path());
-        let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));
+        if !self.had_data {
+            let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));
+        }
         for folder in self.path.ancestors().take(3) {
             if fs::remove_dir(folder).is_err() {
                 return;
@@ -175,6 +181,20 @@ mod tests {
         assert!(matches!(RunFolder::resume(&path), Err(ZooError::RunLocked { .. })));
         drop(first);
         RunFolder::fresh(&path).unwrap();
+    }
+
+    #[test]
+    fn a_run_that_never_began_removes_its_own_alone() {
+        let root = tempfile::tempdir().unwrap();
+        fs::create_dir(root.path().join("data")).unwrap();
+        fs::write(root.path().join("data/mine.hdf5"), "mine").unwrap();
+        RunFolder::fresh(root.path()).unwrap().discard();
+        assert_eq!(fs::read_to_string(root.path().join("data/mine.hdf5")).unwrap(), "mine");
+        let path = root.path().join("r");
+        let folder = RunFolder::fresh(&path).unwrap();
+        fs::create_dir(path.join("data")).unwrap();
+        folder.discard();
+        assert!(!path.exists());
     }
 
     #[test]

@@ -22,7 +22,7 @@ mod validation;
 
 pub(crate) use agreement::is_whole;
 pub use checkpoint::Checkpoint;
-pub use data::{demonstrations, first_windows, locate};
+pub use data::{demonstrations, first_windows, locate, short_hash};
 pub use extend::{Extended, extend};
 pub use folder::{COMMAND_FILE, RunFolder};
 pub use list::{FoundRun, RunState, list_runs};

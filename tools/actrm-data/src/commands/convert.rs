@@ -104,7 +104,7 @@ pub struct Args {
     #[arg(long)]
     no_lossless: bool,
     /// Size at which a data file is closed, in MiB
-    #[arg(long, value_name = "MIB", default_value_t = 100.0, value_parser = positive)]
+    #[arg(long, value_name = "MIB", default_value_t = FILE_SIZE, value_parser = positive)]
     file_size: f64,
     /// Size at which a video file is closed, in MiB
     #[arg(long, value_name = "MIB", default_value_t = 200.0, requires = "video", value_parser = positive)]
@@ -181,15 +181,45 @@ fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
+/// Demonstrations become robomimic HDF5 as they are: what chooses or changes columns is refused.
+fn refuse_choices(args: &Args, set: bool) -> Result<()> {
+    let Args { state_keys, env_keys, entities, fps, images, video, no_depth, .. } = args;
+    let Args { actions, rotation, nonfinite, skip_bad, no_lossless, file_size, shard, .. } = args;
+    let given = [
+        (state_keys.is_some(), "--state-keys"),
+        (env_keys.is_some(), "--env-keys"),
+        (!entities.is_empty(), "--entity"),
+        (fps.is_some(), "--fps"),
+        (!matches!(images, Images::Png), "--images"),
+        (*video, "--video"),
+        (*no_depth, "--no-depth"),
+        (!matches!(actions, Actions::Delta), "--actions"),
+        (!matches!(rotation, Rotation::AxisAngle), "--rotation"),
+        (set && !matches!(nonfinite, Nonfinite::Refuse), "--nonfinite"),
+        (*skip_bad, "--skip-bad"),
+        (*no_lossless, "--no-lossless"),
+        (*file_size != FILE_SIZE, "--file-size"),
+        (shard.is_some(), "--shard"),
+    ];
+    match given.into_iter().find(|(given, _)| *given) {
+        None => Ok(()),
+        Some((_, option)) => {
+            bail!("{option} is for --to lerobot; a data set that it wrote becomes robomimic HDF5 after it")
+        }
+    }
+}
+
+/// Size at which a data file is closed, in MiB.
+const FILE_SIZE: f64 = 100.0;
+
 /// Writes a robomimic file, of a LeRobot data set or of demonstrations of any layout.
 fn to_robomimic(args: &Args) -> Result<ExitCode> {
     let export =
         super::export::Args { dir: args.source.clone(), out: args.out.clone(), gzip: args.gzip, json: args.json };
-    if args.source.join("meta/info.json").exists() {
+    let set = args.source.join("meta/info.json").exists();
+    refuse_choices(args, set)?;
+    if set {
         return super::export::run(&export);
-    }
-    if args.skip_bad {
-        bail!("--skip-bad is for --to lerobot; a data set that it wrote becomes robomimic HDF5 after it");
     }
     let nonfinite = args.nonfinite.into();
     let mut screen = cli::Screen::new();
@@ -211,12 +241,11 @@ impl From<Nonfinite> for NonFinite {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let file = args.out.extension().is_some_and(|extension| extension == "hdf5" || extension == "h5");
     let robomimic = args.to == Some(Format::Robomimic) || (args.to.is_none() && file);
-    match args.to {
-        _ if robomimic && args.shard.is_some() => bail!("--shard is for --to lerobot"),
-        Some(Format::Robomimic) => return to_robomimic(args),
-        None if file => return to_robomimic(args),
-        _ if args.gzip.is_some() => bail!("--gzip is for --to robomimic"),
-        _ => {}
+    if robomimic {
+        return to_robomimic(args);
+    }
+    if args.gzip.is_some() {
+        bail!("--gzip is for --to robomimic");
     }
     let options = ConvertOptions {
         state_keys: args.state_keys.as_deref().map(keys),

@@ -168,11 +168,14 @@ struct Rename {
     features: Vec<(String, String)>,
 }
 
+/// More than any data set has.
+const MOST_EPISODES: usize = 100_000_000;
+
 /// `7` or `7-9`
 fn numbers(text: &str) -> Result<std::ops::RangeInclusive<usize>, String> {
     let (from, to) = text.split_once('-').unwrap_or((text, text));
     match (from.trim().parse(), to.trim().parse()) {
-        (Ok(from), Ok(to)) if from <= to => Ok(from..=to),
+        (Ok(from), Ok(to)) if from <= to && to - from < MOST_EPISODES => Ok(from..=to),
         _ => Err("expected a number or a range such as 7-9".to_owned()),
     }
 }

@@ -4,7 +4,7 @@ use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop};
 use dataset::Source;
 use recording::{ExtractEnd, ExtractOptions, extract, recorded_task};
 use serde_json::json;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 /// Add observations, rewards and dones to a raw robosuite recording by replaying its states.
@@ -43,7 +43,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     cli::make_parent(&args.out)?;
     let stop = Stop::install("stopped; nothing was written")?;
     let out = args.out.clone();
-    stop.last_act(move || remove_unfinished(&out));
+    stop.last_act(move || dataset::remove_unfinished(&out));
     let mut spec = args.simulator.recorded_spec(&task, source.plan().env_args.as_ref())?;
     args.cameras.set(&mut spec);
     let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
@@ -77,19 +77,4 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         cli::print(&format!("{}: {task}, {demos} demos, {steps} steps\n", args.out.display()))?;
     }
     Ok(ExitCode::SUCCESS)
-}
-
-/// Removes the unfinished files that a writer of `out` keeps beside it.
-fn remove_unfinished(out: &Path) {
-    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let begins = format!(".{}.", out.file_name().unwrap_or_default().to_string_lossy());
-    let Ok(items) = std::fs::read_dir(folder) else { return };
-    for item in items.flatten() {
-        let name = item.file_name();
-        let name = name.to_string_lossy();
-        if name.starts_with(&begins) && name.ends_with(".part") {
-            // what stays is as a killed program leaves it
-            let _ = std::fs::remove_file(item.path());
-        }
-    }
 }

@@ -9,7 +9,10 @@ use models::DeviceChoice;
 use study::puzzle::{AnyExperiment, TrainOptions};
 use zoo::ZooError;
 use zoo::entry::member_name;
-use zoo::run::{COMMAND_FILE, Extended, Place, TrainEvent, TrainOutcome, TrainRequest, extend, finished_entry, train};
+use zoo::run::{
+    COMMAND_FILE, Extended, Place, TrainEvent, TrainOutcome, TrainRequest, extend, finished_entry, locate, short_hash,
+    train,
+};
 use zoo::write_atomic;
 
 use crate::places::{ConfigArgs, ZooArgs, entry_names, experiment_names};
@@ -185,8 +188,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let Some(set) = args.overrides.iter().find(|set| set.starts_with("train.seed=") || set.starts_with("entry=")) {
         bail!("--seeds: expected no `{set}` beside it: every training has a seed and an entry of its own");
     }
-    // other settings are another family, with runs of its own
-    let settings = zoo::sha256_hex(format!("{}\n{:?}", experiment.to_toml(), args.data).as_bytes());
+    // other settings or demonstrations are another family, with runs of its own
+    let data = experiment.data().map(|data| args.data.as_deref().unwrap_or(data));
+    let data = data.map(|data| short_hash(&locate(data)?)).transpose()?;
+    let settings = zoo::sha256_hex(format!("{}\n{data:?}", experiment.to_toml()).as_bytes());
     for &seed in seeds {
         let name = member_name(experiment.entry(), seed);
         let own = vec![format!("train.seed={seed}"), format!("entry={name}")];
@@ -280,7 +285,7 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
         zoo: args.zoo.zoo.clone(),
         command: Some(command_line(&trains(args, &one.own))),
     };
-    if args.data.is_some() && !experiment.takes_data() {
+    if args.data.is_some() && experiment.data().is_none() {
         bail!("--data: experiment `{}` draws its own puzzles", args.experiment);
     }
     let (data, force, image_memory) = (args.data.clone(), args.force, args.image_memory);

@@ -225,7 +225,7 @@ impl<'a> Job<'a> {
         let opened = Opened::new(source, options, source)?;
         let total = opened.input.plan().frames().max(1);
         // a row group belongs to the shard that its first episode's first frame lies in
-        let owner = |part: &Part| part.first_frame * shard.of / total + 1;
+        let owner = |part: &Part| (part.first_frame * shard.of / total + 1).min(shard.of);
         let all = opened.groups(options);
         let mut owners = vec![0; opened.input.plan().files.len()];
         for part in all.iter().flatten().filter(|part| part.begins()) {

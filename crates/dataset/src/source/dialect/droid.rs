@@ -2,9 +2,9 @@
 //! velocities and the gripper's position, as openpi trains on them; `action_dict` has all of `action`.
 //! `observation/robot_state/joint_positions` is `obs/joint_positions`.
 
-use super::{DemoDraft, Draft, Layout, Survey, contents, empty, id_of, key_plan, missing, stranger, wrong_lengths};
+use super::{DemoDraft, Draft, Layout, Survey, contents, id_of, key_plan, missing, stranger, wrong_lengths};
 use crate::error::InputError;
-use crate::plan::{DemoPlan, Dialect, Join, KeyPlan};
+use crate::plan::{DemoPlan, Dialect, Join, KeyPlan, Problem};
 use crate::source::walk::Walked;
 use crate::tree::Array;
 
@@ -91,7 +91,7 @@ fn episode(index: usize, file: &Walked, out: &mut Draft) -> Result<bool, InputEr
             length = actions.shape[0];
             found.keys.insert("actions".to_owned(), actions);
             match length {
-                0 => out.problems.push(empty(file, &id, PARTS[0])),
+                0 => out.problems.push(Problem::empty(&file.path, &id, PARTS[0])),
                 _ => out.problems.extend(wrong_lengths(file, &id, (length, PARTS[0]), &found.keys)),
             }
         }

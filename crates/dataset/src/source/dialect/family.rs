@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{DemoDraft, Draft, Survey, behavior, contents, empty, list, number_after, wrong_lengths};
+use super::{DemoDraft, Draft, Survey, behavior, contents, list, number_after, wrong_lengths};
 use crate::error::InputError;
 use crate::lerobot::{mask_note, shared_notes};
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Problem};
@@ -283,7 +283,7 @@ fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
     let missing =
         |key: &str| InputError::MissingKey { path: path(), demo: id.to_owned(), key: key.to_owned(), found: found() };
     if plan.length == 0 {
-        return out.problems.push(empty(file, id, "actions"));
+        return out.problems.push(Problem::empty(&file.path, id, "actions"));
     }
     let known: Vec<String> =
         out.problems.iter().filter(|p| p.demo.as_deref() == Some(id)).filter_map(|p| p.key.clone()).collect();

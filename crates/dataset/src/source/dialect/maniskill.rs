@@ -5,8 +5,7 @@
 use serde_json::{Value, json};
 
 use super::{
-    BESIDE, DemoDraft, Draft, Layout, Survey, beside, contents, empty, list, missing, number_after, observed,
-    wrong_lengths,
+    BESIDE, DemoDraft, Draft, Layout, Survey, beside, contents, list, missing, number_after, observed, wrong_lengths,
 };
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Dialect, Problem};
@@ -68,7 +67,7 @@ fn demo(file: &Walked, number: u64, home: &str, out: &mut Draft) -> Result<(), I
     let mut found = contents((0, file), home, &id, &name_of, &mut out.problems);
     let length = found.keys.get("actions").and_then(|k| k.shape.first().copied()).unwrap_or(0);
     match found.keys.contains_key("actions") {
-        true if length == 0 => out.problems.push(empty(file, &id, "actions")),
+        true if length == 0 => out.problems.push(Problem::empty(&file.path, &id, "actions")),
         true => {
             observed(&mut found.keys, length);
             out.problems.extend(wrong_lengths(file, &id, (length, "actions"), &found.keys));

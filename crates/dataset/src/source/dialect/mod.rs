@@ -324,18 +324,6 @@ fn wrong_lengths<'k>(
     keys.into_iter().filter_map(problem).collect()
 }
 
-/// A demo of no steps, which nothing can be made of.
-fn empty(file: &Walked, id: &str, key: &str) -> Problem {
-    let error = InputError::WrongLength {
-        path: file.path.clone(),
-        demo: id.to_owned(),
-        key: key.to_owned(),
-        expected: "at least 1".to_owned(),
-        found: "0: the demo is empty".to_owned(),
-    };
-    Problem::new(Some(id), None, true, error)
-}
-
 /// Takes the rows `first .. first + length` of a dataset that has a row for the state after the last step too, and the rows
 /// one step later as `next_obs`.
 fn observed(keys: &mut BTreeMap<String, KeyPlan>, length: usize) {

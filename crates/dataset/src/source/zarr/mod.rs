@@ -11,6 +11,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use half::f16;
 use serde::Deserialize;
 use serde_json::Value;
 
@@ -203,7 +204,8 @@ impl Stored {
             Dtype::F32 if self.kind != Kind::Half => (number as f32).to_le_bytes().to_vec(),
             Dtype::F64 => number.to_le_bytes().to_vec(),
             Dtype::U64 => value.as_u64().unwrap_or(0).to_le_bytes().to_vec(),
-            _ if self.kind == Kind::Half || !self.dtype.is_numeric() => Vec::new(),
+            Dtype::F32 => f16::from_f64(number).to_le_bytes().to_vec(),
+            _ if !self.dtype.is_numeric() => Vec::new(),
             _ => value.as_i64().unwrap_or(number as i64).to_le_bytes().to_vec(),
         };
         bytes.resize(self.size, 0);
@@ -223,7 +225,7 @@ impl Stored {
             Kind::Bool => bytes.into_iter().map(|v| u8::from(v != 0)).collect(),
             Kind::Half => {
                 let (halves, _) = bytes.as_chunks::<2>();
-                halves.iter().flat_map(|&half| half_to_f32(u16::from_le_bytes(half)).to_le_bytes()).collect()
+                halves.iter().flat_map(|&half| f16::from_le_bytes(half).to_f32().to_le_bytes()).collect()
             }
             Kind::Levels => {
                 let (values, _) = bytes.as_chunks::<4>();
@@ -237,17 +239,6 @@ impl Stored {
 
 fn level(value: f32) -> Option<u8> {
     (value.fract() == 0.0 && (0.0..=255.0).contains(&value)).then_some(value as u8)
-}
-
-fn half_to_f32(half: u16) -> f32 {
-    let sign = if half >> 15 == 1 { -1.0 } else { 1.0 };
-    let (exponent, fraction) = (i32::from(half >> 10 & 31), f32::from(half & 1023));
-    sign * match exponent {
-        0 => fraction * 2_f32.powi(-24),
-        31 if fraction == 0.0 => f32::INFINITY,
-        31 => f32::NAN,
-        _ => (1.0 + fraction / 1024.0) * 2_f32.powi(exponent - 15),
-    }
 }
 
 impl ZArray {
@@ -418,6 +409,10 @@ impl Buffer {
         let mut first = 0;
         for (number, &end) in ends.iter().enumerate() {
             let id = format!("demo_{number}");
+            if end == first {
+                problems.push(Problem::empty(&self.path, &id, "meta/episode_ends"));
+                continue;
+            }
             let of_demo = keys.iter().map(|(key, plan)| {
                 let mut plan = plan.clone();
                 plan.shape[0] = end - first;

@@ -354,6 +354,11 @@ impl Config {
         if r.untied && r.over == Over::Memory {
             return refuse("reasoning.untied", "true".into(), "false with over = \"memory\"");
         }
+        if r.untied && r.h_cycles > 1 && !r.deep_supervision {
+            // a round before the last has no gradient, so that only the last block would learn
+            let expected = "false with h_cycles above 1 and without deep supervision";
+            return refuse("reasoning.untied", "true".into(), expected);
+        }
         if r.start_noise > 0.0 && (r.over == Over::Memory || r.warm_start.is_some()) {
             let expected = "0 with over = \"memory\" or a warm start";
             return refuse("reasoning.start_noise", r.start_noise.to_string(), expected);

@@ -98,8 +98,8 @@ impl Config {
             Err(ModelError::Config { model: "diffusion", field, found, expected })
         };
         self.setup().validate("diffusion")?;
-        if self.num_train_timesteps == 0 {
-            return refuse("num_train_timesteps", "0".to_string(), "at least 1".to_string());
+        if !(1..=100_000).contains(&self.num_train_timesteps) {
+            return refuse("num_train_timesteps", self.num_train_timesteps.to_string(), "1 to 100000".to_string());
         }
         if !(1..=self.num_train_timesteps).contains(&self.inference_steps) {
             let expected = format!("1 to num_train_timesteps, {}", self.num_train_timesteps);
