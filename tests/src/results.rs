@@ -101,8 +101,8 @@ pub fn results_page() -> (String, [String; 2]) {
     let page = format!(
         "# Results
 
-ACT and ACTRM solve Lift, Stack, PickPlaceCan and Door almost always, from state and from images. Recursion helps where a chain or a path
-has to be followed, and not otherwise. All rates on this page are computed from the stored results (`make reference`).
+ACT and ACTRM solve Lift, Stack, PickPlaceCan and Door almost always, from state and from images. Several refinement
+steps help where a chain or a path has to be followed, and not otherwise; whether their weights have to be shared is undecided. All rates on this page are computed from the stored results (`make reference`).
 
 ![Success of every policy on every task, from state](policies/success.svg)
 

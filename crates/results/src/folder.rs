@@ -158,7 +158,7 @@ pub fn read_record(folder: &Path) -> Result<EvaluationRecord, ResultsError> {
 }
 
 /// More episodes than any evaluation has.
-const MOST_EPISODES: u64 = 100_000_000;
+const MOST_EPISODES: u64 = 1_000_000;
 
 #[derive(Serialize, Deserialize)]
 struct JournalLine {

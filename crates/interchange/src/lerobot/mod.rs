@@ -13,6 +13,7 @@ mod provenance;
 
 pub use export::export;
 pub use import::{ImportOptions, import};
+pub use provenance::exported_task;
 
 const MODEL_FILE: &str = "model.safetensors";
 const CONFIG_FILE: &str = "config.json";

@@ -40,6 +40,14 @@ pub(super) fn text(meta: &EntryMeta, model_sha256: &str) -> String {
     serde_json::to_string_pretty(&provenance).expect("strings and numbers become JSON") + "\n"
 }
 
+/// The task of the entry that was exported to `folder`, if it is an export.
+///
+/// # Errors
+/// A file that is not what an export writes.
+pub fn exported_task(folder: &Path) -> Result<Option<String>, ZooError> {
+    Ok(read(folder)?.map(|meta| meta.task))
+}
+
 /// What the entry that was exported to `folder` said of itself; none where LeRobot trained the weights, from the start or
 /// further.
 ///

@@ -124,7 +124,7 @@ pub fn study_page(library: &Library, results: &Path) -> Result<(String, String),
     let _ = write!(page, "\n![{title}](puzzles/success.svg)\n");
     let _ = writeln!(
         page,
-        "\n## How it was measured\n\nThe tables have {runs} of {wanted} planned trainings; `actrm-zoo study --list` names the others. Every number is over {STUDY_PUZZLES} held-out \
+        "\n## How it was measured\n\nThe tables have {runs} of {wanted} planned trainings. Every number is over {STUDY_PUZZLES} held-out \
          test puzzles (or walks) a seed; \"worst\" is the worst seed, with its 95% Wilson interval. *Right*: any shortest path, the \
          solution, or the goal reached. *Exact*: cell by cell the stored answer (for walkers: reached in the fewest moves). *CPU s*: \
          processor seconds of training, all threads, without validation, mean over the seeds. Settings were chosen on validation \

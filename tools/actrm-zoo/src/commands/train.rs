@@ -60,7 +60,7 @@ pub struct Args {
     #[arg(long, value_name = "ENTRY", add = entry_names())]
     from: Option<String>,
     /// Continue the finished run in this folder, in a new folder, to `train.steps=N`; its schedule must be constant
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["run", "resume", "seeds", "data", "from", "configs", "runs"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["run", "resume", "seeds", "data", "from", "runs"])]
     extend: Option<PathBuf>,
     /// Train even if the demonstrations are of another task or their dimensions have other names
     #[arg(long)]
