@@ -68,6 +68,18 @@ fn an_empty_zoo() {
 }
 
 #[test]
+fn a_folder_that_was_named_has_to_be_there() {
+    let (folder, entries) = copied_zoo();
+    let nowhere = folder.path().join("nowhere");
+    for command in ["verify", "leaderboard"] {
+        refused(&mut zoo([command, "--zoo", text(&nowhere)]), &["--zoo ", "nowhere: expected a folder, found none"]);
+        let results = [command, "--zoo", text(&entries), "--results", text(&nowhere)];
+        refused(&mut zoo(results), &["--results ", "nowhere: expected a folder, found none"]);
+    }
+    assert!(!nowhere.exists());
+}
+
+#[test]
 fn a_python_without_packages() {
     let (folder, entries) = copied_zoo();
     let bare = folder.path().join("bare");

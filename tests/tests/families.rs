@@ -95,7 +95,9 @@ fn entries_are_compared_seed_by_seed() {
 fn what_was_not_run_under_the_same_rules_is_not_compared() {
     let (_folder, entries) = shipped(&["lift-act", "stack-act"]);
     let arguments = ["compare", "lift-act", "stack-act", "--zoo", text(&entries)];
-    refused(&mut zoo(arguments), &["lift-act@1", "stack-act@1", "same protocol"]);
+    refused(&mut zoo(arguments), &["lift-act@1", "stack-act@1", "same protocol: the tasks differ, Lift and Stack"]);
+    let beside_itself = ["compare", "lift-act", "lift-act@1", "--zoo", text(&entries)];
+    refused(&mut zoo(beside_itself), &["lift-act@1: both names are the same entry"]);
 }
 
 /// LeRobot's and other files stand beside sealed rows, are told from them, and are paired by seeds alone.

@@ -106,6 +106,24 @@ fn bad_files_stop_nothing_and_are_named() {
     assert_eq!((verify.status.code(), named.lines().count()), (Some(1), 9), "{named}");
     let one = zoo(["verify", "stackthreecubes-act", "--zoo", text(&entries)]).output().expect("the program starts");
     assert_eq!(one.status.code(), Some(0), "only what was asked for: {}", String::from_utf8_lossy(&one.stderr));
+
+    // of an entry that was asked for, a result under another's name; one without its seal that looks unfinished
+    let stray = entries.join("results/stackthreecubes-act@1_copied");
+    fs::rename(result(&entries, "nutassemblysquare-act@1_NutAssemblySquare_40000"), stray).expect("renamed");
+    let hidden = result(&entries, "door-act@1_Door_40000");
+    fs::remove_file(hidden.join("seal.json")).expect("removed");
+    fs::write(hidden.join("journal.jsonl"), "").expect("writable");
+    let said = |name: &str| {
+        let output = zoo(["verify", name, "--zoo", text(&entries)]).output().expect("the program starts");
+        String::from_utf8(output.stderr).expect("text")
+    };
+    assert!(
+        said("nutassemblysquare-act").contains("stackthreecubes-act@1_copied: "),
+        "{}",
+        said("nutassemblysquare-act")
+    );
+    let words = "not finished: 0 of 200 episodes; outcomes.parquet is there without a seal";
+    assert!(said("door-act").contains(words), "{}", said("door-act"));
 }
 
 #[test]

@@ -8,10 +8,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use results::{
-    EntryIdentity, OUTCOMES, RECORD, ResultsError, SEAL_FILE, StoredEvaluation, TrainingFacts, result_folders,
+    EntryIdentity, OUTCOMES, RECORD, ResultsError, SEAL_FILE, StoredEvaluation, TrainingFacts, UnderWay, entries_named,
+    result_folders,
 };
 use zoo::ZooError;
-use zoo::entry::{Entry, EntryId, EntryMeta, Families, training_facts};
+use zoo::entry::{Entry, EntryId, EntryMeta, Families, MODEL_FILE, family_of, training_facts};
 use zoo::registry::Registry;
 
 /// A result that does not stand.
@@ -30,11 +31,13 @@ pub struct Audit<E> {
     pub standing: Vec<E>,
     /// Those that do not.
     pub left_out: Vec<LeftOut>,
+    /// Those that have not ended.
+    pub under_way: Vec<UnderWay>,
 }
 
 impl<E> Default for Audit<E> {
     fn default() -> Self {
-        Self { standing: Vec::new(), left_out: Vec::new() }
+        Self { standing: Vec::new(), left_out: Vec::new(), under_way: Vec::new() }
     }
 }
 
@@ -46,6 +49,15 @@ impl<E> Audit<E> {
             Err(reason) => self.left_out.push(LeftOut { folder: folder.to_owned(), reason }),
         }
     }
+}
+
+/// Entries of several names with the same weights.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SameWeights {
+    /// Those entries.
+    pub entries: Vec<EntryId>,
+    /// Whether two of them are of one family and say other seeds: other seeds give other weights.
+    pub impossible: bool,
 }
 
 /// The entries of a zoo, each with every file's hash checked.
@@ -78,6 +90,25 @@ impl KnownEntries {
     /// Those that are what was written, by name and version.
     pub fn good(&self) -> impl Iterator<Item = &Entry> {
         self.opened.values().filter_map(|entry| entry.as_ref().ok())
+    }
+
+    /// Entries of several names with the same weights; those without weights, such as baselines, are left out.
+    pub fn same_weights(&self) -> Vec<SameWeights> {
+        let mut by_hash: BTreeMap<&str, Vec<&Entry>> = BTreeMap::new();
+        let has_weights = |entry: &&Entry| entry.meta().parameters > 0 && !entry.meta().is_external();
+        for entry in self.good().filter(has_weights) {
+            if let Some(file) = entry.meta().files.get(MODEL_FILE) {
+                by_hash.entry(&file.sha256).or_default().push(entry);
+            }
+        }
+        by_hash.retain(|_, found| found.iter().any(|entry| entry.meta().name != found[0].meta().name));
+        let seed = |entry: &Entry| Some((family_of(entry)?, entry.meta().training.as_ref()?.seed));
+        let of = |found: Vec<&Entry>| {
+            let seeds: Vec<(String, u64)> = found.iter().filter_map(|entry| seed(entry)).collect();
+            let twice = |(family, seed): &(String, u64)| seeds.iter().any(|(of, other)| of == family && other != seed);
+            SameWeights { impossible: seeds.iter().any(twice), entries: found.iter().map(|entry| entry.id()).collect() }
+        };
+        by_hash.into_values().map(of).collect()
     }
 
     /// The families among those.
@@ -167,8 +198,15 @@ pub fn check_folder_name(folder: &Path, expected: &str) -> Result<(), ZooError> 
 pub fn audit(results: &Path, entries: &KnownEntries) -> Result<Audit<StoredEvaluation>, ZooError> {
     let mut audit = Audit::default();
     for folder in result_folders(results)? {
-        if folder.join(RECORD).is_file() {
-            audit.add(&folder, standing(&folder, entries));
+        // whatever it is: a pipe in its place is an error, too
+        if folder.join(RECORD).symlink_metadata().is_ok() {
+            match standing(&folder, entries) {
+                Ok(None) => match UnderWay::read(&folder) {
+                    Ok(found) => audit.under_way.push(found),
+                    Err(error) => audit.add(&folder, Err(error.into())),
+                },
+                found => audit.add(&folder, found),
+            }
         } else if let Some(sole) = unexplained(&folder) {
             let path = folder.join(sole);
             let reason = format!("a result without {RECORD}, which says what it is of");
@@ -176,6 +214,13 @@ pub fn audit(results: &Path, entries: &KnownEntries) -> Result<Audit<StoredEvalu
         }
     }
     Ok(audit)
+}
+
+/// Whether a result's folder, its record or its seal says that it is of this entry.
+pub fn is_of(folder: &Path, id: &EntryId) -> bool {
+    let name = folder.file_name().unwrap_or_default().to_string_lossy();
+    let is = |entry: EntryIdentity| entry.name == id.name && entry.version == id.version;
+    name.starts_with(&format!("{id}_")) || entries_named(folder).into_iter().any(is)
 }
 
 /// A file that only a result has, in a folder without any record.
@@ -355,6 +400,62 @@ mod tests {
         assert_eq!((audit.standing.len(), audit.left_out.len()), (1, 1));
         let reason = audit.left_out[0].reason.to_string();
         assert!(reason.contains("name of the folder: expected lift-act@1_Lift"), "{reason}");
+        let id = |name: &str, version| EntryId { name: name.to_owned(), version };
+        assert!(is_of(&copy, &id("lift-act", 1)) && is_of(&copy, &id("lift-act", 2)) && !is_of(&copy, &id("lift", 1)));
+        fs::remove_file(copy.join(RECORD)).unwrap();
+        assert!(is_of(&copy, &id("lift-act", 1)), "its seal says so");
+    }
+
+    /// A result without its seal that looks as if it was under way is named, though it is no error.
+    #[test]
+    fn what_is_not_finished_is_named() {
+        let (zoo, folder, _) = zoo();
+        fs::remove_file(folder.join(SEAL_FILE)).unwrap();
+        fs::write(folder.join("journal.jsonl"), "").unwrap();
+        let said = || {
+            let audit = audited(zoo.path());
+            assert_eq!((audit.standing.len(), audit.left_out.len(), audit.under_way.len()), (0, 0, 1));
+            audit.under_way[0].to_string()
+        };
+        assert_eq!(said(), "not finished: 0 of 20 episodes; outcomes.parquet is there without a seal");
+        for file in [OUTCOMES, "timings.parquet", "journal.jsonl"] {
+            fs::remove_file(folder.join(file)).unwrap();
+        }
+        assert_eq!(said(), "not finished: 0 of 20 episodes");
+        fs::write(folder.join("journal.jsonl"), "{}\n").unwrap();
+        assert!(reason(zoo.path()).contains("journal.jsonl: line 1: not an episode"));
+        fs::remove_file(folder.join(RECORD)).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", folder.join(RECORD)).unwrap();
+        assert!(reason(zoo.path()).contains("evaluation.json"));
+    }
+
+    #[test]
+    fn the_same_weights_under_two_names_are_told() {
+        let zoo = tempfile::tempdir().unwrap();
+        let seal = |name: &str, seed: u64, parameters: u64, weights: &str| {
+            let mut draft = test_draft(name);
+            draft.meta.training.as_mut().unwrap().seed = seed;
+            (draft.meta.parameters, draft.model) = (parameters, weights.as_bytes().to_vec());
+            draft.config = format!("entry = \"{name}\"\n[train]\nseed = {seed}\n");
+            draft.seal(zoo.path()).unwrap()
+        };
+        let same = || KnownEntries::open(&Registry::open(zoo.path())).unwrap().same_weights();
+        for (name, parameters) in [("a-s1", 12), ("a-s1", 12), ("zero", 0), ("random", 0)] {
+            seal(name, 1, parameters, if parameters > 0 { "w" } else { "" });
+        }
+        seal("a-s2", 2, 12, "other");
+        assert_eq!(same(), []);
+        seal("b", 1, 12, "w");
+        let names = |found: &SameWeights| found.entries.iter().map(ToString::to_string).collect::<Vec<_>>();
+        let found = same();
+        assert_eq!(
+            (names(&found[0]), found[0].impossible),
+            (["a-s1@1", "a-s1@2", "b@1"].map(String::from).into(), false)
+        );
+        seal("a-s3", 3, 12, "other");
+        let found = same();
+        let family = found.iter().find(|found| found.impossible).unwrap();
+        assert_eq!((found.len(), names(family)), (2, ["a-s2@1", "a-s3@1"].map(String::from).into()));
     }
 
     /// Sealed anew after the edit, as only this program's code can: the entry says otherwise.
@@ -395,7 +496,10 @@ mod tests {
         }
         drop(again);
         fs::write(folder.join(OUTCOMES), &before[0]).unwrap();
-        assert!(audited(zoo.path()).standing.is_empty() && audited(zoo.path()).left_out.is_empty());
+        let audit = audited(zoo.path());
+        assert!(audit.standing.is_empty() && audit.left_out.is_empty());
+        let said = audit.under_way[0].to_string();
+        assert_eq!(said, "not finished: 20 of 20 episodes; outcomes.parquet is there without a seal");
         ResultsFolder::open(&results, &record).unwrap().finish().unwrap();
         assert_eq!(read(), before);
         assert_eq!(audited(zoo.path()).standing.len(), 1);

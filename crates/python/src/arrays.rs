@@ -11,6 +11,8 @@ use pyo3::prelude::*;
 use pyo3::sync::GILOnceCell;
 use pyo3::types::{PyByteArray, PyDict, PyTuple, PyType};
 
+use crate::work::Inside;
+
 /// numpy's `ndarray`.
 fn ndarray(py: Python<'_>) -> PyResult<&Bound<'_, PyType>> {
     static NDARRAY: GILOnceCell<Py<PyType>> = GILOnceCell::new();
@@ -90,12 +92,28 @@ fn made<'py, T: Pod>(
 /// The shape and the values, row-major, of whatever numpy can make an array of.
 pub(crate) fn read<T: Number + pyo3::buffer::Element>(value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>, Vec<T>)> {
     let py = value.py();
+    let _inside = Inside::with_lock(py);
     let options = PyDict::new(py);
     options.set_item(intern!(py, "dtype"), T::NAME)?;
     options.set_item(intern!(py, "order"), "C")?;
-    let array = numpy(py)?.call_method(intern!(py, "asarray"), (value,), Some(&options))?;
-    let shape = array.getattr(intern!(py, "shape"))?.extract()?;
+    let array = numpy(py)?.call_method(intern!(py, "asarray"), (readable(value)?,), Some(&options))?;
+    let shape: Vec<usize> = array.getattr(intern!(py, "shape"))?.extract()?;
+    // a single number without an axis has no shape that a buffer could state
+    let array = if shape.is_empty() { array.call_method1(intern!(py, "reshape"), (1,))? } else { array };
     Ok((shape, PyBuffer::<T>::get(&array)?.to_vec(py)?))
+}
+
+/// What numpy can read: tensors of PyTorch's without gradients, on the CPU, of a type that numpy has.
+pub(crate) fn readable<'py>(value: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+    let py = value.py();
+    if !value.hasattr(intern!(py, "detach"))? {
+        return Ok(value.clone());
+    }
+    let tensor = value.call_method0(intern!(py, "detach"))?.call_method0(intern!(py, "cpu"))?;
+    match tensor.call_method0(intern!(py, "is_floating_point"))?.is_truthy()? {
+        true => tensor.call_method0(intern!(py, "float")),
+        false => Ok(tensor),
+    }
 }
 
 /// The module.

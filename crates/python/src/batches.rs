@@ -16,7 +16,7 @@ use rustix::process::{Pid, getpid};
 use crate::arrays::{Number, filled, flags};
 use crate::dataset::PyDataset;
 use crate::error::{Error, defect};
-use crate::work::LOOK;
+use crate::work::{LOOK, released};
 
 /// The most threads that make batches ahead.
 const MOST_THREADS: usize = 256;
@@ -137,7 +137,7 @@ impl Order {
     }
 }
 
-/// Batches of a data set, one after the other.
+/// Batches of a data set, one after the other: what `batches` of a `Dataset` gives.
 #[pyclass(frozen, module = "actrm")]
 pub(crate) struct Batches {
     dataset: Py<PyDataset>,
@@ -220,7 +220,7 @@ impl Batches {
         let Some(mut made) = self.ahead(py, pool) else { return Ok(None) };
         let parts = loop {
             let waiting = &mut made;
-            match py.allow_threads(move || waiting.recv_timeout(LOOK)) {
+            match released(py, move || waiting.recv_timeout(LOOK)).0 {
                 Ok(parts) => break parts?,
                 Err(RecvTimeoutError::Timeout) => py.check_signals()?,
                 Err(RecvTimeoutError::Disconnected) => return Err(Error::new_err("a thread that makes batches ended")),

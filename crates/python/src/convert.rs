@@ -10,7 +10,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::error::raised;
+use crate::error::{natural, raised};
 use crate::work::interruptible;
 
 /// `actrm.convert` without its bar: `tell(done, total)` is called as frames are written.
@@ -33,7 +33,7 @@ pub(crate) fn convert<'py>(
     nonfinite: &str,
     skip_bad: bool,
     lossless: bool,
-    jobs: usize,
+    jobs: i128,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (images, video) = match images {
         "png" => (ImageForm::Png, None),
@@ -56,6 +56,7 @@ pub(crate) fn convert<'py>(
         "keep" => NonFinite::Keep,
         other => return Err(unknown("nonfinite", "refuse or keep", other)),
     };
+    let jobs = natural("jobs", jobs)?;
     let options = ConvertOptions {
         state_keys,
         env_keys,

@@ -10,7 +10,7 @@ use pyo3::types::{PyDict, PyList, PyTuple};
 
 use crate::arrays::array;
 use crate::batches::{Arrays, Batches, Columns, Kind, Order};
-use crate::error::raised;
+use crate::error::{natural, raised};
 use crate::work::{run, unlocked};
 
 /// The most samples in a batch.
@@ -35,8 +35,9 @@ const MOST_SAMPLES: usize = 1 << 24;
 /// depth_output_unit: unit of depth and of its statistics, `mm` or `m`.
 /// return_uint8: images as they are stored, 0 to 255, instead of float32 from 0 to 1.
 ///
-/// It can be pickled (by path), and works in a `torch.utils.data.DataLoader` whose workers are forked or spawned.
-#[pyclass(frozen, module = "actrm", name = "Dataset", subclass)]
+/// It can be pickled (by path), and works in a `torch.utils.data.DataLoader` whose workers are forked or spawned. It has
+/// no subclasses: a class of yours that changes samples holds one and has `__len__` and `__getitem__`.
+#[pyclass(frozen, module = "actrm", name = "Dataset")]
 pub(crate) struct PyDataset {
     given: Given,
     dataset: dataset::Dataset,
@@ -67,7 +68,7 @@ impl PyDataset {
         path: PathBuf,
         delta_timestamps: Option<&Bound<'_, PyAny>>,
         split: Option<&str>,
-        episodes: Option<Vec<usize>>,
+        episodes: Option<Vec<i128>>,
         cameras: Option<Vec<String>>,
         depth: Option<Vec<String>>,
         depth_output_unit: &str,
@@ -81,7 +82,9 @@ impl PyDataset {
         let chosen = match (split, episodes) {
             (Some(_), Some(_)) => return Err(PyValueError::new_err("split and episodes: expected one of them")),
             (Some(split), None) => dataset.required_split(split).map_err(raised)?,
-            (None, Some(episodes)) => episodes,
+            (None, Some(episodes)) => {
+                episodes.into_iter().map(|episode| natural("episodes", episode)).collect::<PyResult<_>>()?
+            }
             (None, None) => (0..dataset.episodes().len()).collect(),
         };
         let offsets = delta_timestamps.map_or_else(|| Ok(BTreeMap::new()), |given| offsets(&dataset, given))?;
@@ -125,17 +128,28 @@ impl PyDataset {
     #[expect(clippy::too_many_arguments, reason = "options by name")]
     fn batches(
         slf: Bound<'_, Self>,
-        batch_size: usize,
-        seed: Option<u64>,
-        epoch: u64,
-        steps: Option<u64>,
-        start: u64,
+        batch_size: i128,
+        seed: Option<i128>,
+        epoch: i128,
+        steps: Option<i128>,
+        start: i128,
         drop_last: bool,
-        threads: usize,
+        threads: i128,
     ) -> PyResult<Batches> {
         let len = slf.get().samples.len();
-        if !(1..=MOST_SAMPLES).contains(&batch_size) {
+        if !(1..=MOST_SAMPLES as i128).contains(&batch_size) {
             return Err(PyValueError::new_err(format!("batch_size: expected 1 to {MOST_SAMPLES}, found {batch_size}")));
+        }
+        let seed: Option<u64> = seed.map(|seed| natural("seed", seed)).transpose()?;
+        let steps: Option<u64> = steps.map(|steps| natural("steps", steps)).transpose()?;
+        let (epoch, start): (u64, u64) = (natural("epoch", epoch)?, natural("start", start)?);
+        let (batch_size, threads): (usize, usize) = (natural("batch_size", batch_size)?, natural("threads", threads)?);
+        if start > 0 && steps.is_none() {
+            return Err(PyValueError::new_err("start: expected steps with it, found none"));
+        }
+        if epoch > 0 && (seed.is_none() || steps.is_some()) {
+            let found = if steps.is_some() { "steps" } else { "no seed" };
+            return Err(PyValueError::new_err(format!("epoch: expected a seed with it and no steps, found {found}")));
         }
         let last = start.checked_add(steps.unwrap_or(0)).and_then(|end| end.checked_mul(batch_size as u64));
         if last.is_none() {

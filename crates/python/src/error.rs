@@ -3,7 +3,7 @@
 use std::any::Any;
 
 use pyo3::create_exception;
-use pyo3::exceptions::PyException;
+use pyo3::exceptions::{PyException, PyValueError};
 use pyo3::prelude::*;
 
 create_exception!(
@@ -33,4 +33,19 @@ pub(crate) fn defect(panic: &(dyn Any + Send)) -> PyErr {
 /// An error of ours as an exception.
 pub(crate) fn raised(error: impl std::error::Error) -> PyErr {
     Error::new_err(words(&error))
+}
+
+/// The argument `name` as a number that is not negative.
+pub(crate) fn natural<T: TryFrom<i128>>(name: &str, value: i128) -> PyResult<T> {
+    T::try_from(value).ok().ok_or_else(|| {
+        let bits = 8 * size_of::<T>();
+        PyValueError::new_err(format!("{name}: expected a whole number from 0, below 2^{bits}, found {value}"))
+    })
+}
+
+/// An error of Python's about `what`, which it does not name.
+pub(crate) fn named(py: Python<'_>, what: &str, error: PyErr) -> PyErr {
+    let named = PyValueError::new_err(format!("{what}: {}", error.value(py)));
+    named.set_cause(py, Some(error));
+    named
 }

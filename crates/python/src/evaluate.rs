@@ -20,7 +20,7 @@ use zoo::results::{Execution, Seeds, StoredEvaluation};
 use zoo::{FeatureKeys, ZooError};
 
 use crate::arrays::{array, flags};
-use crate::error::{Error, raised, words};
+use crate::error::{Error, natural, raised, words};
 use crate::external::{Failure, Given, PythonPolicy};
 use crate::policy::{registry, stated};
 use crate::work::interruptible;
@@ -42,7 +42,13 @@ enum End {
 /// The policy that is asked about.
 enum Asked {
     Entry(Box<LoadedEntry>),
-    External { external: Box<External>, inputs: Option<FeatureKeys>, named: Named, called: Py<PyAny> },
+    External {
+        external: Box<External>,
+        code: Option<String>,
+        inputs: Option<FeatureKeys>,
+        named: Named,
+        called: Py<PyAny>,
+    },
 }
 
 impl Asked {
@@ -50,10 +56,10 @@ impl Asked {
     fn subject<'a>(&'a self, zoo: &Path, ready: &Ready, failure: &'a Failure) -> Result<Subject<'a>, ZooError> {
         match self {
             Self::Entry(loaded) => Ok(loaded.subject()),
-            Self::External { external, inputs, named, called } => {
+            Self::External { external, code, inputs, named, called } => {
                 let inputs = inputs.clone().map_or_else(|| usual_inputs(ready), Ok)?;
                 let external = External { inputs, ..(**external).clone() };
-                let entry = external.entry(zoo, named, ready)?;
+                let entry = external.entry_of_code(zoo, named, ready, code.as_deref())?;
                 let (source, signature) = (external.source.clone(), entry.meta().signature.clone());
                 let policy = move || -> Result<Box<dyn Policy>, ModelError> {
                     Ok(Box::new(PythonPolicy::new(called, &source, &signature, failure)?))
@@ -61,6 +67,17 @@ impl Asked {
                 Ok(external.subject(&entry, policy))
             }
         }
+    }
+
+    /// What is said where episodes of an earlier call are taken over: nobody knows whether a policy is still the same.
+    fn taken_over(&self, subject: &Subject<'_>, episodes: u64) -> Option<String> {
+        (matches!(self, Self::External { .. }) && episodes > 0).then(|| {
+            format!(
+                "{episodes} of the episodes are those of an earlier call, of entry {}: give another policy another name=, \
+                 and the same one with other weights another declared=",
+                subject.entry
+            )
+        })
     }
 }
 
@@ -77,12 +94,12 @@ pub(crate) fn evaluate<'py>(
     external: Option<Given>,
     tell: &Bound<'py, PyAny>,
     protocol: Option<String>,
-    episodes: Option<u64>,
-    workers: usize,
-    seed: u64,
+    episodes: Option<i128>,
+    workers: i128,
+    seed: i128,
     task: Option<String>,
-    max_steps: Option<usize>,
-    n_action_steps: Option<usize>,
+    max_steps: Option<i128>,
+    n_action_steps: Option<i128>,
     temporal_ensemble: Option<f64>,
     control: &str,
     python: Option<PathBuf>,
@@ -93,8 +110,11 @@ pub(crate) fn evaluate<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let mut control: Control = control.parse().map_err(PyValueError::new_err)?;
     let invalid = |text: String| Err(PyValueError::new_err(text));
+    let max_steps: Option<usize> = max_steps.map(|steps| natural("max_steps", steps)).transpose()?;
+    let n_action_steps: Option<usize> = n_action_steps.map(|steps| natural("n_action_steps", steps)).transpose()?;
+    let workers: usize = natural("workers", workers)?;
     let (mut task, mut max_steps) = (task, max_steps);
-    let mut seeds = Seeds { start: seed, count: episodes.unwrap_or(20) };
+    let mut seeds = Seeds { start: natural("seed", seed)?, count: natural("episodes", episodes.unwrap_or(20))? };
     let mut execution = match (n_action_steps, temporal_ensemble) {
         (Some(_), Some(_)) => {
             return invalid("n_action_steps and temporal_ensemble: expected one of them".to_owned());
@@ -103,6 +123,18 @@ pub(crate) fn evaluate<'py>(
         (None, Some(coefficient)) => Some(Execution::TemporalEnsemble { coefficient }),
         (None, None) => None,
     };
+    if external.is_some() {
+        // its horizon is known only once it is asked
+        match execution {
+            Some(Execution::RecedingHorizon { n_action_steps: 0 }) => {
+                return invalid("n_action_steps: expected at least 1, found 0".to_owned());
+            }
+            Some(ensemble @ Execution::TemporalEnsemble { .. }) => {
+                ensemble.check(1).map_err(|error| PyValueError::new_err(words(&error)))?;
+            }
+            _ => {}
+        }
+    }
     if let Some(name) = &protocol {
         let protocols = Protocols::built_in();
         let rules = protocols.get(name).map_err(raised)?;
@@ -128,6 +160,10 @@ pub(crate) fn evaluate<'py>(
     if max_steps == Some(0) {
         return invalid("max_steps: expected at least 1, found 0".to_owned());
     }
+    let image_size: usize = external.as_ref().map_or(Ok(1), |given| natural("image_size", given.6))?;
+    if image_size == 0 {
+        return invalid("image_size: expected at least 1, found 0".to_owned());
+    }
     let registry = registry(zoo);
     let failure = Failure::default();
     let end = interruptible(
@@ -142,7 +178,8 @@ pub(crate) fn evaluate<'py>(
                     let environment = Environment::of(entry.meta(), task.as_deref(), env_module.as_deref())?;
                     (Asked::Entry(Box::new(loaded)), environment, zoo)
                 }
-                (None, Some((called, name, source, declared, inputs, image_size, conventions))) => {
+                (None, Some(given)) => {
+                    let (called, name, source, code, declared, inputs, _, conventions) = given;
                     let task = task.ok_or_else(|| missing("task", "a task, such as Lift, or a protocol"))?;
                     let inputs = inputs.map(feature_keys).transpose()?;
                     let execution = execution.unwrap_or(Execution::RecedingHorizon { n_action_steps: 1 });
@@ -158,7 +195,7 @@ pub(crate) fn evaluate<'py>(
                     };
                     let environment = Environment::usual(&task, env_module.as_deref(), external.cameras());
                     let named = Named { name, description: String::new() };
-                    let asked = Asked::External { external: Box::new(external), inputs, named, called };
+                    let asked = Asked::External { external: Box::new(external), code, inputs, named, called };
                     (asked, environment, registry.folder().to_owned())
                 }
                 (None, None) => return Err(missing("policy", "an entry or a policy")),
@@ -173,15 +210,17 @@ pub(crate) fn evaluate<'py>(
             let mut spec = environment.worker(find_python(python.as_deref())?, harness_folder()?);
             spec.control = control;
             let options = EvaluationOptions { seeds, shard: None, env_module: environment.env_module.clone(), force };
-            if let Some(ready) = remembered_greeting(&spec)
-                && let Some(stored) = finished(&subject_of(&ready)?, &ready, &results, &options)?
-            {
-                return Ok(End::Complete(Box::new(stored)));
+            let note = |text: String| drop(news.send(News::Note(text)));
+            if let Some(ready) = remembered_greeting(&spec) {
+                let subject = subject_of(&ready)?;
+                if let Some(stored) = finished(&subject, &ready, &results, &options)? {
+                    asked.taken_over(&subject, stored.episodes.len() as u64).into_iter().for_each(note);
+                    return Ok(End::Complete(Box::new(stored)));
+                }
             }
             let flag = Arc::clone(stop);
             let stopped = move || flag.load(Ordering::SeqCst);
             let mut pool = Pool::start(PoolOptions { stop: Arc::new(stopped), ..PoolOptions::new(spec, workers) })?;
-            let note = |text: String| drop(news.send(News::Note(text)));
             pool.fallback().into_iter().for_each(|why| note(why.to_owned()));
             let subject = subject_of(pool.ready())?;
             let mut at = (0, 0);
@@ -191,7 +230,10 @@ pub(crate) fn evaluate<'py>(
                         note(other.to_string());
                         return;
                     }
-                    Progress::Begin { done, total, .. } => (done, total),
+                    Progress::Begin { done, total, .. } => {
+                        asked.taken_over(&subject, done).into_iter().for_each(note);
+                        (done, total)
+                    }
                     Progress::Episode(_) => (at.0 + 1, at.1),
                 };
                 drop(news.send(News::At(at.0, at.1)));

@@ -8,12 +8,15 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays::{array, read};
+use crate::work::locked;
 
 /// Names and lists of keys, or other texts.
 type Named<T> = BTreeMap<String, T>;
 
-/// A policy, name of its entry, its source, what its owner declares, keys of its features, side of its images, conventions.
-pub(crate) type Given = (Py<PyAny>, String, String, Option<String>, Option<Named<Vec<String>>>, usize, Named<String>);
+/// A policy, name of its entry, its source, SHA-256 of its class's text, what its owner declares, keys of its features,
+/// side of its images, conventions.
+pub(crate) type Given =
+    (Py<PyAny>, String, String, Option<String>, Option<String>, Option<Named<Vec<String>>>, i128, Named<String>);
 
 /// The first exception that the policy raised.
 pub(crate) type Failure = Arc<Mutex<Option<PyErr>>>;
@@ -31,14 +34,14 @@ pub(crate) struct PythonPolicy {
 }
 
 impl PythonPolicy {
-    /// A copy of `called` for one simulator.
+    /// `called` for one simulator: a copy where there are several.
     pub(crate) fn new(
         called: &Py<PyAny>,
         source: &str,
         signature: &Signature,
         failure: &Failure,
     ) -> Result<Self, ModelError> {
-        let copied = Python::with_gil(|py| called.call_method0(py, "copy"));
+        let copied = locked(|py| called.call_method0(py, "copy"));
         let called = copied.map_err(|error| raised(failure, source, error))?;
         let (source, signature) = (source.to_owned(), signature.clone());
         Ok(Self { called, source, signature, failure: Arc::clone(failure), instruction: None, unready: None })
@@ -74,7 +77,7 @@ impl Policy for PythonPolicy {
         if let Some(error) = self.unready.take() {
             return Err(error);
         }
-        let predicted = Python::with_gil(|py| {
+        let predicted = locked(|py| {
             let actions = self.called.bind(py).call_method1("predict", (self.observation(py, observation)?,))?;
             read::<f32>(&actions)
         });
@@ -87,7 +90,7 @@ impl Policy for PythonPolicy {
     }
 
     fn reset(&mut self, seed: u64) {
-        let reset = Python::with_gil(|py| self.called.call_method1(py, "reset", (seed,)).map(drop));
+        let reset = locked(|py| self.called.call_method1(py, "reset", (seed,)).map(drop));
         self.unready = reset.map_err(|error| raised(&self.failure, &self.source, error)).err();
         self.instruction = None;
     }

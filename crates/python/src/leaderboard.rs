@@ -1,9 +1,9 @@
 //! The leaderboard of a zoo as rows.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use audit::{KnownEntries, audit};
-use pyo3::exceptions::PyUserWarning;
+use pyo3::exceptions::{PyFileNotFoundError, PyUserWarning};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 use report::column::Datum;
@@ -32,7 +32,18 @@ pub(crate) fn leaderboard<'py>(
     results: Option<PathBuf>,
 ) -> PyResult<Bound<'py, PyList>> {
     let registry = registry(zoo);
-    let results = results.unwrap_or_else(|| registry.folder().join("results"));
+    let there = |word: &str, folder: &Path| match folder.is_dir() {
+        true => Ok(()),
+        false => {
+            Err(PyFileNotFoundError::new_err(format!("{word}: expected a folder, found none: {}", folder.display())))
+        }
+    };
+    there("zoo", registry.folder())?;
+    // a zoo without evaluations has no results yet
+    let results = match results {
+        Some(results) => there("results", &results).map(|()| results)?,
+        None => registry.folder().join("results"),
+    };
     let (entries, found) = unlocked(py, || {
         let entries = KnownEntries::open(&registry).map_err(raised)?;
         let found = audit(&results, &entries).map_err(raised)?;

@@ -40,6 +40,8 @@ fn panics(py: Python<'_>) -> PyResult<()> {
 #[pymodule]
 fn _actrm(module: &Bound<'_, PyModule>) -> PyResult<()> {
     work::at_home();
+    let ending = wrap_pyfunction!(work::ending, module)?;
+    module.py().import("atexit")?.call_method1("register", (ending,))?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("Error", module.py().get_type::<error::Error>())?;
     module.add_class::<dataset::PyDataset>()?;

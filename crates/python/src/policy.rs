@@ -2,15 +2,16 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, TryLockError};
 
-use interchange::lerobot::{ImportOptions, import};
+use interchange::lerobot::{ImportOptions, exported_task, import};
 use models::{
     ActionChunk, Actor, Backend, DeviceChoice, FeatureKind, FeatureSpec, ModelError, Observation, Policy, Values,
 };
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyTuple};
+use pyo3::types::{PyDict, PyMapping, PyTuple};
+use rustix::process::{Pid, getpid};
 use zoo::ZooError;
 use zoo::conventions::Conventions;
 use zoo::entry::LoadedEntry;
@@ -19,9 +20,9 @@ use zoo::experiment::DataSection;
 use zoo::registry::Registry;
 use zoo::results::Execution;
 
-use crate::arrays::{array, numpy, read};
-use crate::error::{Error, raised};
-use crate::work::{run, unlocked};
+use crate::arrays::{array, numpy, read, readable};
+use crate::error::{Error, named, natural, raised};
+use crate::work::{Inside, run, unlocked};
 
 /// The most rows of a batch of observations, each with a policy's state of its own.
 const MOST_ROWS: usize = 1 << 16;
@@ -29,9 +30,9 @@ const MOST_ROWS: usize = 1 << 16;
 /// A trained policy: an entry of a zoo, or a checkpoint of LeRobot's. Made by `load_policy`.
 ///
 /// Observations are dicts with LeRobot's keys, in the units of the data. `observation.state` and the others are arrays
-/// or what numpy converts to arrays, such as tensors. Images are 0 to 255 (uint8) or 0 to 1 (float), channels first or
-/// last. Further keys are ignored. A leading axis makes a batch, in which each row is an episode of its own. Actions
-/// are in the units of the data: nothing has to be normalised before or after.
+/// or what numpy converts to arrays, or tensors; a feature of one number needs no axis of it. Images are 0 to 255 (uint8)
+/// or 0 to 1 (float), channels first or last. Further keys are ignored. A leading axis makes a batch, in which each row
+/// is an episode of its own. Actions are in the units of the data: nothing has to be normalised before or after.
 ///
 /// `select_action` and `predict_action_chunk` each keep the state of their own episode: past observations and, with a
 /// warm start, the previous chunk. `reset` clears both. A policy may be used from several threads, one after the other.
@@ -41,8 +42,20 @@ pub(crate) struct PyPolicy {
     path: PathBuf,
     loaded: LoadedEntry,
     execution: Execution,
+    /// Locked for a moment only, by who has Python's lock, so that a fork never finds it locked.
+    episodes: Mutex<(Pid, Arc<Episodes>)>,
+}
+
+/// What it keeps of its episodes.
+struct Episodes {
     acting: Mutex<Rows<Box<dyn Actor>>>,
     predicting: Mutex<Rows<Predicting>>,
+}
+
+impl Episodes {
+    fn new() -> Arc<Self> {
+        Arc::new(Self { acting: Mutex::new(Rows::new()), predicting: Mutex::new(Rows::new()) })
+    }
 }
 
 /// A policy and whether it was asked before in its episode.
@@ -58,11 +71,30 @@ struct Rows<T> {
 }
 
 /// The seeds of the rows' episodes.
-#[derive(Clone, FromPyObject)]
+#[derive(Clone)]
 enum Seeds {
     /// Of the first; the others count up from it.
     First(u64),
     Each(Vec<u64>),
+}
+
+/// The argument `seed` of `reset`.
+#[derive(FromPyObject)]
+enum Seed {
+    First(i128),
+    Each(Vec<i128>),
+}
+
+impl TryFrom<Seed> for Seeds {
+    type Error = PyErr;
+
+    fn try_from(seed: Seed) -> PyResult<Self> {
+        let one = |seed| natural("seed", seed);
+        match seed {
+            Seed::First(seed) => one(seed).map(Self::First),
+            Seed::Each(seeds) => seeds.into_iter().map(one).collect::<PyResult<_>>().map(Self::Each),
+        }
+    }
 }
 
 impl Seeds {
@@ -102,27 +134,31 @@ impl PyPolicy {
     /// Begins an episode and clears the last one. Random draws of a policy depend on the seed only; row `i` of a batch has
     /// the seed `seed + i`, or the `i`-th of a list.
     #[pyo3(signature = (seed=None))]
-    fn reset(&self, py: Python<'_>, seed: Option<Seeds>) -> PyResult<()> {
-        let seeds = seed.unwrap_or(Seeds::First(0));
+    fn reset(&self, py: Python<'_>, seed: Option<Seed>) -> PyResult<()> {
+        let seeds = seed.map_or(Ok(Seeds::First(0)), Seeds::try_from)?;
+        let episodes = self.episodes(py);
         unlocked(py, || {
-            *lock(&self.acting) = Rows { seeds: seeds.clone(), rows: Vec::new() };
-            *lock(&self.predicting) = Rows { seeds, rows: Vec::new() };
+            *lock(&episodes.acting) = Rows { seeds: seeds.clone(), rows: Vec::new() };
+            *lock(&episodes.predicting) = Rows { seeds, rows: Vec::new() };
             Ok(())
         })
     }
 
     /// The action to execute now: (action_dim,), or (rows, action_dim) for a batch. Queries the network when the actions
     /// that were planned are used up, as the entry's evaluations do.
-    fn select_action<'py>(&self, py: Python<'py>, observation: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
-        let asked = self.asked(observation)?;
+    fn select_action<'py>(&self, py: Python<'py>, observation: &Bound<'py, PyMapping>) -> PyResult<Bound<'py, PyAny>> {
+        let (asked, episodes) = (self.asked(observation)?, self.episodes(py));
         let actions = unlocked(py, || {
-            let mut rows = lock(&self.acting);
+            let mut rows = lock(&episodes.acting);
             let rows = rows.grow(asked.observations.len(), |seed| {
                 let mut actor = acting(self.loaded.policy(), self.execution).map_err(raised)?;
                 actor.reset(seed);
                 Ok(actor)
             })?;
-            let act = |(actor, seen): (&mut Box<dyn Actor>, _)| actor.act(seen).map_err(raised);
+            let act = |(actor, seen): (&mut Box<dyn Actor>, _)| {
+                let action = actor.act(seen).map_err(raised)?;
+                finite(&action, seen).map(|()| action)
+            };
             run(|| rows.iter_mut().zip(&asked.observations).map(act).collect::<PyResult<Vec<_>>>())
         })?;
         let width = self.loaded.preprocess().signature().action_dim;
@@ -137,19 +173,20 @@ impl PyPolicy {
     fn predict_action_chunk<'py>(
         &self,
         py: Python<'py>,
-        observation: &Bound<'py, PyDict>,
-        executed: Option<usize>,
+        observation: &Bound<'py, PyMapping>,
+        executed: Option<i128>,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let asked = self.asked(observation)?;
-        let executed = executed.unwrap_or_else(|| self.n_action_steps());
+        let executed = executed.map_or_else(|| Ok(self.n_action_steps()), |executed| natural("executed", executed))?;
+        let (asked, episodes) = (self.asked(observation)?, self.episodes(py));
         let chunks = unlocked(py, || {
-            let mut rows = lock(&self.predicting);
+            let mut rows = lock(&episodes.predicting);
             let rows = rows.grow(asked.observations.len(), |seed| Ok(self.predicting_from(seed)))?;
             let predict = |(row, seen): (&mut Predicting, _)| {
                 if std::mem::replace(&mut row.asked, true) {
                     row.policy.executed(executed);
                 }
-                row.policy.predict(seen).map_err(raised)
+                let chunk = row.policy.predict(seen).map_err(raised)?;
+                finite(&chunk.actions, seen).map(|()| chunk)
             };
             run(|| rows.iter_mut().zip(&asked.observations).map(predict).collect::<PyResult<Vec<ActionChunk>>>())
         })?;
@@ -159,10 +196,10 @@ impl PyPolicy {
     }
 
     /// Adds the observation of a step at which `predict_action_chunk` is not called; `select_action` needs no such call.
-    fn observe(&self, py: Python<'_>, observation: &Bound<'_, PyDict>) -> PyResult<()> {
-        let asked = self.asked(observation)?;
+    fn observe(&self, py: Python<'_>, observation: &Bound<'_, PyMapping>) -> PyResult<()> {
+        let (asked, episodes) = (self.asked(observation)?, self.episodes(py));
         unlocked(py, || {
-            let mut rows = lock(&self.predicting);
+            let mut rows = lock(&episodes.predicting);
             let rows = rows.grow(asked.observations.len(), |seed| Ok(self.predicting_from(seed)))?;
             rows.iter_mut().zip(&asked.observations).for_each(|(row, seen)| row.policy.observe(seen));
             Ok(())
@@ -279,6 +316,21 @@ fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// Refuses actions that are no numbers, which come of observations that are far too large.
+fn finite(actions: &[f32], seen: &Observation) -> PyResult<()> {
+    let Some(value) = actions.iter().find(|value| !value.is_finite()) else { return Ok(()) };
+    let size = |values: &Values| match values {
+        Values::F32(all) => all.iter().fold(0.0_f32, |most, value| most.max(value.abs())),
+        Values::U8(_) => 0.0,
+    };
+    let largest = seen.iter().map(|(name, values)| (name, size(values))).max_by(|a, b| a.1.total_cmp(&b.1));
+    let (name, size) = largest.unwrap_or(("nothing", 0.0));
+    Err(Error::new_err(format!(
+        "predict: an action is {value}, expected finite numbers; the largest number observed is {size:e} in {name}: give \
+         observations in the units of the data, after a reset"
+    )))
+}
+
 fn shape(batch: Option<usize>, rest: &[usize]) -> Vec<usize> {
     batch.into_iter().chain(rest.iter().copied()).collect()
 }
@@ -290,7 +342,23 @@ impl PyPolicy {
             Some(coefficient) => Execution::TemporalEnsemble { coefficient },
             None => Execution::RecedingHorizon { n_action_steps: rollout.n_action_steps },
         };
-        Ok(Self { path, loaded, execution, acting: Mutex::new(Rows::new()), predicting: Mutex::new(Rows::new()) })
+        Ok(Self { path, loaded, execution, episodes: Mutex::new((getpid(), Episodes::new())) })
+    }
+
+    /// The state of its episodes. A forked process goes on with them, unless another thread was using them then: that
+    /// thread is not there to give them back, and the episodes begin anew.
+    fn episodes(&self, _py: Python<'_>) -> Arc<Episodes> {
+        let mut held = lock(&self.episodes);
+        let (process, episodes) = &mut *held;
+        if *process != getpid() {
+            let in_use = matches!(episodes.acting.try_lock(), Err(TryLockError::WouldBlock))
+                || matches!(episodes.predicting.try_lock(), Err(TryLockError::WouldBlock));
+            if in_use {
+                *episodes = Episodes::new();
+            }
+            *process = getpid();
+        }
+        Arc::clone(episodes)
     }
 
     /// A row that begins the episode of a seed.
@@ -300,21 +368,43 @@ impl PyPolicy {
         Predicting { policy, asked: false }
     }
 
-    /// The features of an observation, row by row. What is missing the network says by name.
-    fn asked(&self, observation: &Bound<'_, PyDict>) -> PyResult<Asked> {
+    /// The features of an observation, row by row.
+    fn asked(&self, observation: &Bound<'_, PyMapping>) -> PyResult<Asked> {
+        let operation = "predict";
         let mut batch: Option<(Option<usize>, &str)> = None;
         let mut features = Vec::new();
-        for spec in &self.loaded.preprocess().signature().observation {
-            let Some(value) = observation.get_item(&spec.name)? else { continue };
-            let (found, values) = feature(spec, &value)?;
-            let rows = match found.strip_suffix(spec.shape.as_slice()) {
-                Some([]) => None,
-                Some(&[rows]) if (1..=MOST_ROWS).contains(&rows) => Some(rows),
-                _ => {
-                    let (operation, name, expected) = ("predict", spec.name.clone(), spec.shape.clone());
-                    return Err(raised(ModelError::FeatureShape { operation, name, expected, found }));
-                }
+        let specs = &self.loaded.preprocess().signature().observation;
+        // a feature of one number may be without its axis, and is then the last to say how many rows there are
+        let (one, several): (Vec<_>, Vec<_>) = specs.iter().partition(|spec| spec.shape == [1]);
+        for spec in several.into_iter().chain(one) {
+            if !observation.contains(&spec.name)? {
+                let is_given = |name: &&String| observation.contains(name).unwrap_or(false);
+                let names: Vec<&str> =
+                    specs.iter().map(|spec| &spec.name).filter(is_given).map(String::as_str).collect();
+                let given = if names.is_empty() { "nothing".to_owned() } else { names.join(", ") };
+                return Err(raised(ModelError::MissingFeature { operation, name: spec.name.clone(), given }));
+            }
+            let (found, values) = feature(spec, &observation.get_item(&spec.name)?)?;
+            let before = batch.and_then(|(rows, _)| rows);
+            let rows = match (spec.shape.as_slice(), found.as_slice()) {
+                ([1], []) => None,
+                ([1], &[rows]) if (2..=MOST_ROWS).contains(&rows) || before == Some(rows) => Some(rows),
+                (shape, found) => match found.strip_suffix(shape) {
+                    Some([]) => None,
+                    Some(&[rows]) if (1..=MOST_ROWS).contains(&rows) => Some(rows),
+                    _ => {
+                        let (name, expected, found) = (spec.name.clone(), spec.shape.clone(), found.to_vec());
+                        return Err(raised(ModelError::FeatureShape { operation, name, expected, found }));
+                    }
+                },
             };
+            if let Values::F32(values) = &values
+                && let Some(at) = values.iter().position(|number| !number.is_finite())
+            {
+                let (name, place) = (&spec.name, place(at, &found));
+                let text = format!("predict: {name}{place:?} is {}, expected a finite number", values[at]);
+                return Err(PyValueError::new_err(text));
+            }
             match batch {
                 Some((before, other)) if before != rows => {
                     let words = |rows: Option<usize>| rows.map_or("no".to_owned(), |rows| rows.to_string());
@@ -356,17 +446,15 @@ fn place(mut at: usize, shape: &[usize]) -> Vec<usize> {
 
 /// The shape and values of a feature; pictures with their colours last.
 fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>, Values)> {
+    let py = value.py();
+    let _inside = Inside::with_lock(py);
     if spec.kind != FeatureKind::Image {
-        let (shape, values) = read::<f32>(value)?;
-        if let Some(at) = values.iter().position(|number| !number.is_finite()) {
-            let (name, place) = (&spec.name, place(at, &shape));
-            let text = format!("predict: {name}{place:?} is {}, expected a finite number", values[at]);
-            return Err(PyValueError::new_err(text));
-        }
+        let of = |error| named(py, &format!("predict: {}", spec.name), error);
+        let (shape, values) = read::<f32>(value).map_err(of)?;
         return Ok((shape, Values::F32(values)));
     }
-    let numpy = numpy(value.py())?;
-    let mut picture = numpy.call_method1("asarray", (value,))?;
+    let numpy = numpy(py)?;
+    let mut picture = numpy.call_method1("asarray", (readable(value)?,))?;
     let kind: String = picture.getattr("dtype")?.getattr("name")?.extract()?;
     if kind.starts_with("float") {
         // 0 to 1, as PyTorch has them: back to the bytes that they were made of
@@ -456,7 +544,8 @@ fn lerobot_checkpoint(path: &Path) -> Option<PathBuf> {
 fn import_checkpoint(folder: &Path, backend: &Backend) -> Result<LoadedEntry, ZooError> {
     let zoo = tempfile::tempdir().map_err(ZooError::io("create folder", std::env::temp_dir()))?;
     let DataSection { state_keys, env_keys, .. } = DataSection::default();
-    let (name, task) = ("lerobot-checkpoint".to_owned(), "unknown".to_owned());
+    let task = exported_task(folder)?.unwrap_or_else(|| "unknown".to_owned());
+    let name = "lerobot-checkpoint".to_owned();
     let options = ImportOptions { name, task, state_keys, env_keys, fast_render: false };
     let id = import(folder, &options, zoo.path())?;
     Registry::open(zoo.path()).entry(&id.to_string())?.load_on(backend)

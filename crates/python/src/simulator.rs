@@ -8,13 +8,16 @@ use models::{Observation, Values};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use rollout::{Control, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerSpec, find_python, harness_folder};
+use rollout::{
+    Control, FaultKind, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerFault, WorkerSpec, find_python,
+    harness_folder,
+};
 use zoo::evaluation::Environment;
 use zoo::external::usual_inputs;
 use zoo::{FeatureKeys, Past};
 
 use crate::arrays::{array, filled, read};
-use crate::error::{Error, raised};
+use crate::error::{Error, named, natural, raised};
 use crate::policy::registry;
 use crate::work::{interruptible, unlocked};
 
@@ -79,9 +82,10 @@ impl Simulator {
     }
 
     /// Begins the episode of `seed`: the observation, and what is known of the episode.
-    fn reset<'py>(&self, py: Python<'py>, seed: u64) -> PyResult<(Bound<'py, PyDict>, Bound<'py, PyDict>)> {
+    fn reset<'py>(&self, py: Python<'py>, seed: i128) -> PyResult<(Bound<'py, PyDict>, Bound<'py, PyDict>)> {
+        let seed: u64 = natural("seed", seed)?;
         let Initial { fingerprint, group, instruction, observations, .. } =
-            unlocked(py, || self.worker(|worker| worker.reset(seed).map_err(raised)))?;
+            unlocked(py, || self.worker(|worker| worker.reset(seed)))?;
         let info = PyDict::new(py);
         info.set_item("seed", seed)?;
         info.set_item("fingerprint", fingerprint)?;
@@ -100,10 +104,10 @@ impl Simulator {
         py: Python<'py>,
         action: &Bound<'py, PyAny>,
     ) -> PyResult<(Bound<'py, PyDict>, f64, bool, Option<String>)> {
-        let (shape, values) = read::<f32>(action)?;
+        let (shape, values) = read::<f32>(action).map_err(|error| named(py, "action", error))?;
         let action = self.executable(&shape, &values)?;
         let Stepped { rewards, success, failure, observations, .. } =
-            unlocked(py, || self.worker(|worker| worker.step(&[action]).map_err(raised)))?;
+            unlocked(py, || self.worker(|worker| worker.step(&[action])))?;
         let seen = {
             let mut past = self.past();
             past.pass(1);
@@ -114,11 +118,12 @@ impl Simulator {
 
     /// An image of the present state: (height, width, 3), uint8.
     #[pyo3(signature = (camera="agentview", height=256, width=256))]
-    fn render<'py>(&self, py: Python<'py>, camera: &str, height: usize, width: usize) -> PyResult<Bound<'py, PyAny>> {
+    fn render<'py>(&self, py: Python<'py>, camera: &str, height: i128, width: i128) -> PyResult<Bound<'py, PyAny>> {
         if !(1..=4096).contains(&height) || !(1..=4096).contains(&width) {
             return Err(PyValueError::new_err(format!("image: expected a side of 1 to 4096, found {height}x{width}")));
         }
-        let image = unlocked(py, || self.worker(|worker| worker.render(camera, height, width).map_err(raised)))?;
+        let (height, width) = (natural("height", height)?, natural("width", width)?);
+        let image = unlocked(py, || self.worker(|worker| worker.render(camera, height, width)))?;
         filled(py, &[height, width, 3], |out| out.copy_from_slice(&image.rgb))
     }
 
@@ -194,18 +199,19 @@ impl Simulator {
         self.pool.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Asks the worker; one that failed is gone.
-    fn worker<T>(&self, ask: impl FnOnce(&mut Worker) -> PyResult<T>) -> PyResult<T> {
+    /// Asks the worker; one that failed is gone, one that says what is wrong with the request stays.
+    fn worker<T>(&self, ask: impl FnOnce(&mut Worker) -> Result<T, WorkerFault>) -> PyResult<T> {
         let mut held = self.lock();
         let Some(worker) = held.as_mut().and_then(Pool::first_worker) else {
             return Err(Error::new_err(format!("the simulator of task {} was closed", self.ready.task)));
         };
-        let answer = ask(worker);
-        if answer.is_err() {
-            // whatever it says from now on is not to be believed
-            *held = None;
-        }
-        answer
+        ask(worker).map_err(|fault| {
+            if !matches!(&fault.kind, FaultKind::Reported { kind, .. } if kind != "failed") {
+                // whatever it says from now on is not to be believed
+                *held = None;
+            }
+            raised(fault)
+        })
     }
 
     /// The action that is executed: of the right length, finite, inside the environment's limits.

@@ -1,11 +1,12 @@
-//! Work that takes long: elsewhere than on the thread that Python waits in, so that Ctrl-C is heard; and work in a
-//! process that was forked.
+//! Work that takes long: elsewhere than on the thread that Python waits in, so that Ctrl-C is heard; work in a process
+//! that was forked; and threads that are at work when Python ends.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
-use std::time::Duration;
+use std::thread::ThreadId;
+use std::time::{Duration, Instant};
 
 use pyo3::prelude::*;
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -34,7 +35,9 @@ pub(crate) fn interruptible<T: Send, M: Send>(
         let mut going = true;
         while going {
             let listening = &mut receiver;
-            let news = match py.allow_threads(move || listening.recv_timeout(LOOK)) {
+            // Python's own code, which `tell` may be, is waited for at the end
+            let (heard, _inside) = released(py, move || listening.recv_timeout(LOOK));
+            let news = match heard {
                 Ok(message) if failure.is_none() => tell(message),
                 Ok(_) | Err(RecvTimeoutError::Timeout) => Ok(()),
                 Err(RecvTimeoutError::Disconnected) => {
@@ -47,14 +50,88 @@ pub(crate) fn interruptible<T: Send, M: Send>(
                 failure.get_or_insert(error);
             }
         }
-        let done = py.allow_threads(|| working.join());
+        let (done, _inside) = released(py, || working.join());
         failure.map_or_else(|| done.map_err(|panic| defect(&*panic)), Err)
     })
 }
 
 /// Does `work` without Python's lock.
 pub(crate) fn unlocked<T: Send>(py: Python<'_>, work: impl FnOnce() -> PyResult<T> + Send) -> PyResult<T> {
-    py.allow_threads(|| catch_unwind(AssertUnwindSafe(work))).unwrap_or_else(|panic| Err(defect(&*panic)))
+    released(py, || catch_unwind(AssertUnwindSafe(work))).0.unwrap_or_else(|panic| Err(defect(&*panic)))
+}
+
+/// Does `work`, which does not panic, without Python's lock, and says that this thread is inside from then on.
+pub(crate) fn released<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> (T, Inside) {
+    py.allow_threads(|| (work(), Inside::enter()))
+}
+
+/// Does `work` with Python's lock, on a thread that does not have it.
+pub(crate) fn locked<T>(work: impl FnOnce(Python<'_>) -> T) -> T {
+    let _inside = Inside::enter();
+    Python::with_gil(work)
+}
+
+/// The thread in which Python ends, once it does. Python kills every other one that takes its lock from then on, which
+/// aborts the process where frames of ours are on its stack.
+static ENDING: OnceLock<ThreadId> = OnceLock::new();
+/// How many threads take Python's lock, or run Python's code, with frames of ours on their stack.
+static INSIDE: AtomicUsize = AtomicUsize::new(0);
+/// How long the end waits for them: Python's code may take as long as it likes.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// That a thread is counted.
+pub(crate) struct Inside(());
+
+impl Inside {
+    /// Before a thread without Python's lock takes it; at the end of Python it goes no further.
+    fn enter() -> Self {
+        let inside = Self::count();
+        if Self::is_too_late() {
+            drop(inside);
+            loop {
+                std::thread::park();
+            }
+        }
+        inside
+    }
+
+    /// The same for a thread that has the lock, before it calls Python's code.
+    pub(crate) fn with_lock(py: Python<'_>) -> Self {
+        match Self::is_too_late() {
+            true => py.allow_threads(Self::enter),
+            false => Self::count(),
+        }
+    }
+
+    fn count() -> Self {
+        INSIDE.fetch_add(1, Ordering::SeqCst);
+        Self(())
+    }
+
+    fn is_too_late() -> bool {
+        ENDING.get().is_some_and(|thread| *thread != std::thread::current().id())
+    }
+}
+
+impl Drop for Inside {
+    fn drop(&mut self) {
+        INSIDE.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+/// What Python calls when it begins to end: lets no other thread back in, and waits for those that are.
+#[pyfunction]
+pub(crate) fn ending(py: Python<'_>) {
+    let first = ENDING.set(std::thread::current().id()).is_ok();
+    // what others counted before a fork is nobody's here
+    if first && HOME.get() == Some(&getpid()) {
+        py.allow_threads(|| {
+            let begun = Instant::now();
+            while INSIDE.load(Ordering::SeqCst) > 0 && begun.elapsed() < PATIENCE {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        });
+    }
 }
 
 /// The process that loaded this library.

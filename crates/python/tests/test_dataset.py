@@ -174,7 +174,7 @@ def test_loaders_ask_for_several_at_once(lift: Path) -> None:
         ({"delta_timestamps": {"action": [1 << 70]}}, (actrm.Error, OverflowError), "."),
         ({"delta_timestamps": 3}, AttributeError, "items"),
         ({"episodes": [1000]}, actrm.Error, "no episode 1000; there is 0 to 49"),
-        ({"episodes": [-1]}, OverflowError, "."),
+        ({"episodes": [-1]}, ValueError, "episodes: expected a whole number from 0"),
         ({"cameras": ["front"]}, actrm.Error, "no camera front; there is no camera"),
         ({"split": "train", "episodes": [0]}, ValueError, "expected one of them"),
         ({"path": "a\0b"}, (ValueError, actrm.Error, OSError), "."),
@@ -199,6 +199,17 @@ def test_what_cannot_be_asked_for_is_an_exception(lift: Path) -> None:
         ds.batches(4, steps=3)
     with pytest.raises(ValueError, match="more samples"):
         ds.batches(1 << 20, seed=1, steps=1, start=1 << 60)
+    for arguments, words in (
+        ({"start": 5}, "start: expected steps with it"),
+        ({"epoch": 1}, "epoch: expected a seed with it and no steps, found no seed"),
+        ({"seed": 1, "epoch": 1, "steps": 3}, "epoch: expected a seed with it and no steps, found steps"),
+        ({"seed": -1}, "seed: expected a whole number from 0"),
+        ({"threads": -1}, "threads: expected a whole number from 0"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            ds.batches(4, **arguments)
+    with pytest.raises(TypeError, match="not an acceptable base type"):
+        type("Mine", (actrm.Dataset,), {})
     far = actrm.Dataset(lift, {"action": [-(1 << 62), 0, 1 << 62]})[10]
     assert far["action_is_pad"].tolist() == [True, False, True]
 

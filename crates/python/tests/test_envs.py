@@ -86,9 +86,28 @@ def test_a_cap_truncates_and_bad_actions_are_refused() -> None:
     for action in (np.zeros(6), np.full(7, np.nan), np.zeros((1, 7))):
         with pytest.raises(ValueError, match="action"):
             env.step(action)
+    for action in (0.0, None):
+        with pytest.raises(ValueError, match=r"action: expected shape \[7\], found \[\]"):
+            env.step(action)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="action: could not convert"):
+        env.step("a")  # type: ignore[arg-type]
     env.step(np.full(7, 1e9))
     env.close()
+    for argument in ({"max_steps": 0}, {"render_mode": "foo"}):
+        with pytest.raises(ValueError, match=f"{next(iter(argument))}: expected"):
+            actrm.envs.RobotEnv("Lift", **argument)  # type: ignore[arg-type]
     with pytest.raises(actrm.Error, match="NoSuchTask"):
         actrm.envs.RobotEnv("NoSuchTask")
     with pytest.raises(actrm.Error, match="observation.state"):
         actrm.envs.RobotEnv("Lift", keys={"observation.state": ["no_such_key"]})
+
+
+def test_a_request_that_cannot_be_done_leaves_the_simulator() -> None:
+    simulator = actrm.Simulator("Lift")
+    simulator.reset(1)
+    with pytest.raises(actrm.Error, match="unknown camera 'frontveiw'"):
+        simulator.render("frontveiw")
+    with pytest.raises(ValueError, match="seed: expected a whole number from 0"):
+        simulator.reset(-1)
+    simulator.step([0] * 7)
+    simulator.close()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import json
+import sys
 import textwrap
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +130,30 @@ def test_a_policy_that_fails_is_no_failed_episode(tmp_path: Path) -> None:
             actrm.evaluate(lambda _, answer=answer: answer, progress=False, **{**options, "name": "other"})
 
 
+def test_another_policy_under_one_name_is_not_taken_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An edited class is another version; what nobody can tell apart is said."""
+    monkeypatch.syspath_prepend(tmp_path)
+    text = "class Policy:\n    def select_action(self, observation):\n        return [{}] * 7\n"
+    options = {"name": "mine", "task": "Lift", "workers": 1, "max_steps": 3, "zoo": tmp_path / "zoo", "progress": False}
+    for number, version in (("0.0", 1), ("0.25", 2), ("0.0", 1)):
+        (tmp_path / f"policy_{version}.py").write_text(text.format(number))
+        module = importlib.import_module(f"policy_{version}")
+        module.Policy.__module__ = "policy"
+        monkeypatch.setitem(sys.modules, "policy", module)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            actrm.evaluate(module.Policy(), episodes=2, **options)
+        versions = sorted(path.name for path in (tmp_path / "zoo/mine").iterdir() if path.is_dir())
+        assert versions == ["1", "2"][: len(versions)] and str(version) in versions
+    # the last one is the first one again
+    assert [str(one.message) for one in said if "earlier call" in str(one.message)] == [
+        "2 of the episodes are those of an earlier call, of entry mine@1: give another policy another name=, and the "
+        "same one with other weights another declared="
+    ]
+    with pytest.warns(RuntimeWarning, match="^2 of the episodes are those of an earlier call, of entry mine@1"):
+        actrm.evaluate(module.Policy(), episodes=3, **options)
+
+
 class Chunks:
     def predict_action_chunk(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         return np.zeros((4, 7))
@@ -135,11 +162,19 @@ class Chunks:
 class Uncopied:
     def __init__(self) -> None:
         self.file = (one for one in ())
+        self.begun = 0
 
-    def reset(self) -> None: ...
+    def reset(self) -> None:
+        self.begun += 1
 
     def select_action(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         return np.zeros(7)
+
+
+def test_one_simulator_takes_the_object_itself(tmp_path: Path) -> None:
+    policy = Uncopied()
+    actrm.evaluate(policy, name="mine", task="Lift", episodes=2, workers=1, max_steps=2, zoo=tmp_path, progress=False)
+    assert policy.begun == 2
 
 
 def test_what_cannot_be_asked_is_refused_by_name(zoo: Path, tmp_path: Path) -> None:
@@ -151,6 +186,10 @@ def test_what_cannot_be_asked_is_refused_by_name(zoo: Path, tmp_path: Path) -> N
             {"task": "Lift", "n_action_steps": 2},
             "n_action_steps: expected a policy with predict_action_chunk",
         ),
+        (Chunks(), {"task": "Lift", "n_action_steps": 1, "image_size": 0}, "image_size: expected at least 1, found 0"),
+        (Chunks(), {"task": "Lift", "n_action_steps": 0}, "n_action_steps: expected at least 1, found 0"),
+        (Chunks(), {"task": "Lift", "temporal_ensemble": float("nan")}, "temporal_ensemble`: expected a finite number"),
+        (Chunks(), {"task": "Lift", "temporal_ensemble": 0.0, "workers": 0}, "workers: expected 1 to 1024, found 0"),
         (Chunks().predict_action_chunk, {"task": "Stack", "protocol": "lift-v1"}, "task: expected as protocol lift-v1"),
     ):
         with pytest.raises(ValueError, match=words):
@@ -160,9 +199,14 @@ def test_what_cannot_be_asked_is_refused_by_name(zoo: Path, tmp_path: Path) -> N
         ({"task": "Lift", "name": "lift-act", "zoo": zoo}, "lift-act@"),
         ({"task": "Lift", "inputs": {"observation.state": ["robot0_eef_pso"]}}, "robot0_eef_pso"),
         ({"protocol": "lfit-v1"}, "did you mean `lift-v1`"),
+        ({"task": "Lift", "conventions": {"control_freq": "10"}}, "control_freq: expected 10, found 20"),
     ):
         with pytest.raises(actrm.Error, match=words):
             actrm.evaluate(lambda _: np.zeros(7), **{"name": "mine", "zoo": tmp_path, **options})
+    # and leaves nothing behind
+    assert not (tmp_path / "mine").exists() and not (tmp_path / "results").exists()
+    with pytest.raises(TypeError, match=r"inputs\['a'\]: expected a list of names, such as \['object'\]"):
+        actrm.evaluate(Chunks(), name="mine", task="Lift", n_action_steps=1, inputs={"a": "object"})
     with pytest.raises(TypeError, match="found int"):
         actrm.evaluate(3, name="mine", task="Lift")
     with pytest.raises(ValueError, match="name: expected"):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import pickle
 import threading
 from pathlib import Path
+from types import MappingProxyType
 
 import actrm
 import numpy as np
 import pytest
-from conftest import computed, train
+from conftest import LIFT, computed, train
 
 ENTRIES = ("door-act", "lift-act", "nutassemblysquare-act", "pickplacecan-act", "stack-act", "stackthreecubes-act")
 # small ones, of every kind that remembers, draws or copies
@@ -138,6 +139,47 @@ def test_other_types_are_taken_as_numpy_takes_them(zoo: Path) -> None:
         np.testing.assert_array_equal(policy.predict_action_chunk(other), wanted)
 
 
+def test_tensors_are_taken(zoo: Path) -> None:
+    torch = pytest.importorskip("torch")
+    policy = actrm.load_policy(zoo / "lift-act")
+    one = {key: value.astype(np.float16).astype(np.float32) for key, value in observations(policy, 1)[0].items()}
+    wanted = policy.predict_action_chunk(one)
+    for form in (lambda t: t, lambda t: t.requires_grad_(), lambda t: t.half()):
+        given = {key: form(torch.from_numpy(value.copy())) for key, value in one.items()}
+        np.testing.assert_array_equal(policy.predict_action_chunk(given), wanted)
+    given = {key: torch.from_numpy(value).bfloat16() for key, value in one.items()}
+    assert policy.predict_action_chunk(given).shape == wanted.shape
+
+
+def test_a_feature_of_one_number_needs_no_axis(tmp_path: Path) -> None:
+    """Samples have none, as in LeRobot."""
+    actrm.convert(LIFT, tmp_path / "data", state_keys=["robot0_gripper_qpos[0:1]"], progress=False)
+    settings = ("data.state_keys=['robot0_gripper_qpos[0:1]']",)
+    policy = actrm.load_policy(train("bc_lift", tmp_path / "data", tmp_path, *settings))
+    assert policy.input_features["observation.state"] == (1,)
+    ds = actrm.Dataset(tmp_path / "data")
+    state = "observation.state"
+    assert ds[0][state].shape == ()
+    wanted = [policy.predict_action_chunk({**ds[i], state: ds[i][state][None]}) for i in (0, 1)]
+    np.testing.assert_array_equal(policy.predict_action_chunk(ds[0]), wanted[0])
+    np.testing.assert_array_equal(policy.predict_action_chunk(ds.batch([0, 1])), wanted)
+    np.testing.assert_array_equal(policy.predict_action_chunk(ds.batch([0])), wanted[:1])
+
+
+def test_a_refused_observation_changes_nothing(zoo: Path) -> None:
+    """In the middle of a plan too, where the network is not asked."""
+    policy = actrm.load_policy(zoo / "stack-act")
+    asked = observations(policy, policy.n_action_steps + 2)
+    policy.reset(seed=3)
+    wanted = [policy.select_action(one) for one in asked]
+    policy.reset(seed=3)
+    for one, action in zip(asked, wanted, strict=True):
+        for ask in (policy.select_action, policy.observe):
+            with pytest.raises(actrm.Error, match="observation.environment_state is missing; given: observation.state"):
+                ask({"observation.state": one["observation.state"]})
+        np.testing.assert_array_equal(policy.select_action(MappingProxyType(one)), action)
+
+
 def test_a_policy_pickles(zoo: Path) -> None:
     policy = actrm.load_policy(zoo / "lift-act")
     one = observations(policy, 1)[0]
@@ -173,6 +215,8 @@ def test_what_does_not_fit_is_named(zoo: Path) -> None:
         ({**good, "observation.state": state[:5]}, r"observation.state has shape \[5\], expected \[9\]"),
         ({**good, "observation.state": np.zeros((0, 9))}, r"has shape \[0, 9\], expected \[9\]"),
         ({**good, "observation.state": np.zeros((2, 3, 9))}, r"has shape \[2, 3, 9\]"),
+        ({**good, "observation.state": None}, r"observation.state has shape \[\], expected \[9\]"),
+        ({**good, "observation.state": 1.0}, r"observation.state has shape \[\], expected \[9\]"),
         ({**good, "observation.state": state[None]}, "observation.environment_state has no rows, expected 1"),
         (
             {"observation.state": state[None], "observation.environment_state": np.stack([objects] * 2)},
@@ -182,7 +226,7 @@ def test_what_does_not_fit_is_named(zoo: Path) -> None:
         for ask in (policy.predict_action_chunk, policy.select_action):
             with pytest.raises(actrm.Error, match=words):
                 ask(asked)
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="observation.state: could not convert"):
         policy.select_action({**good, "observation.state": ["a"] * 9})
     broken = np.stack([state, state])
     broken[1, 4] = np.nan
@@ -192,6 +236,9 @@ def test_what_does_not_fit_is_named(zoo: Path) -> None:
         policy.predict_action_chunk({**good, "observation.state": np.full(9, np.inf)})
     with pytest.raises(TypeError):
         policy.select_action(3)  # type: ignore[arg-type]
+    for seed in (-1, [3, -1]):
+        with pytest.raises(ValueError, match="seed: expected a whole number from 0, below 2\\^64, found -1"):
+            policy.reset(seed)
     policy.reset(seed=[1])
     with pytest.raises(ValueError, match="one for each row"):
         policy.select_action({key: np.stack([value] * 2) for key, value in good.items()})
@@ -200,10 +247,13 @@ def test_what_does_not_fit_is_named(zoo: Path) -> None:
 
 
 def test_the_largest_numbers_do_no_harm(zoo: Path) -> None:
-    """Whatever comes out, nothing crashes."""
+    """Nothing crashes, and what comes out is no action."""
     policy = actrm.load_policy(zoo / "lift-act")
-    one = {key: np.full(shape, 3e38, np.float32) for key, shape in policy.input_features.items()}
-    assert policy.predict_action_chunk(one).shape == (policy.action_horizon, 7)
+    one = observations(policy, 1)[0]
+    one["observation.environment_state"][3] = -3e38
+    for ask in (policy.predict_action_chunk, policy.select_action):
+        with pytest.raises(actrm.Error, match="an action is NaN, .* 3e38 in observation.environment_state"):
+            ask(one)
 
 
 def test_every_byte_of_an_entry_is_checked(zoo: Path, tmp_path: Path) -> None:

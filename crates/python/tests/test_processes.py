@@ -128,6 +128,56 @@ def test_threads_of_another_process_are_not_waited_for(lift: Path) -> None:
     assert process.exitcode == 0 and len(next(batches)["action"]) == 64
 
 
+def test_a_policy_in_use_elsewhere_begins_anew_in_a_fork(zoo: Path) -> None:
+    script = """
+import os, sys, threading, time
+import actrm, numpy as np
+policy = actrm.load_policy(sys.argv[1])
+seen = {key: np.zeros(shape, np.float32) for key, shape in policy.input_features.items()}
+wanted = policy.predict_action_chunk(seen)
+def ask():
+    while True:
+        policy.predict_action_chunk(seen)
+threading.Thread(target=ask, daemon=True).start()
+for _ in range(10):
+    time.sleep(0.03)
+    child = os.fork()
+    if child == 0:
+        policy.reset(1)
+        os._exit(0 if (policy.predict_action_chunk(seen) == wanted).all() else 1)
+    assert os.waitpid(child, 0)[1] == 0
+"""
+    command = [sys.executable, "-W", "ignore", "-c", script, str(zoo / "lift-act")]
+    subprocess.run(command, check=True, timeout=60)
+
+
+@pytest.mark.parametrize("what", ["policy.predict_action_chunk(seen)", "list(ds.batches(16, threads=2))", "own()"])
+def test_python_ends_while_a_daemon_thread_is_at_work(lift: Path, zoo: Path, tmp_path: Path, what: str) -> None:
+    script = """
+import sys, threading, time
+import actrm, numpy as np
+policy, ds = actrm.load_policy(sys.argv[1]), actrm.Dataset(sys.argv[2])
+seen = {key: np.zeros(shape, np.float32) for key, shape in policy.input_features.items()}
+asked = threading.Event()
+def act(observation):
+    asked.set()
+    return [sum(range(10_000)) * 0.0] * 7
+def own():
+    actrm.evaluate(act, name="own", task="Lift", episodes=9, workers=2, zoo=sys.argv[3], progress=False)
+def work():
+    while True:
+        WHAT
+        asked.set()
+threading.Thread(target=work, daemon=True).start()
+asked.wait()
+time.sleep(0.1)
+""".replace("WHAT", what)
+    for turn in range(3):
+        command = [sys.executable, "-c", script, str(zoo / "lift-act"), str(lift), str(tmp_path / f"{turn}")]
+        said = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert (said.returncode, said.stderr) == (0, "")
+
+
 @pytest.mark.skipif(not find_spec("torch"), reason="torch is not installed here")
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_pytorch_s_loader_gives_the_same_with_workers(lift: Path, method: str) -> None:

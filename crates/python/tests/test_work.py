@@ -34,12 +34,18 @@ def test_progress_is_told_and_the_report_says_what_was_written(tmp_path: Path) -
     assert told[0] == (0, len(ds)) and told[-1] == (len(ds), len(ds)) and told == sorted(told)
 
 
-def test_a_bar_is_drawn_where_it_is_wanted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bar_is_drawn_where_it_is_wanted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     actrm.convert(LIFT, tmp_path / "a", progress=True)
     shown = capsys.readouterr()
     assert "\rconvert:" in shown.err and "100%|" in shown.err and shown.out == ""
     actrm.convert(LIFT, tmp_path / "b")
     assert capsys.readouterr().err == ""
+    # a program with windows has no standard error
+    monkeypatch.setattr(sys, "stderr", None)
+    for progress in (None, True):
+        actrm.convert(LIFT, tmp_path / f"c{progress}", progress=progress)
 
 
 def test_a_caller_that_fails_ends_the_conversion(tmp_path: Path) -> None:
@@ -112,6 +118,10 @@ def test_what_cannot_be_converted_is_an_exception(lift: Path, tmp_path: Path) ->
         actrm.convert(LIFT, tmp_path / "set", state_keys=["no_such_key"])
     with pytest.raises(ValueError, match="images: expected png, ppm or video, found jpg"):
         actrm.convert(LIFT, tmp_path / "set", images="jpg")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="state_keys: expected a list of names, such as ..object"):
+        actrm.convert(LIFT, tmp_path / "set", state_keys="object")
+    with pytest.raises(ValueError, match="jobs: expected a whole number from 0"):
+        actrm.convert(LIFT, tmp_path / "set", jobs=-1)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -133,7 +143,11 @@ def test_the_leaderboard_is_the_program_s(zoo: Path, tmp_path: Path) -> None:
                     assert str(value) == text[key], key
     stack = next(row for row in rows if row["entry"] == "stack-act" and row["episodes"] == 200)
     assert (stack["successes"], stack["episodes"], stack["rank"]) == (199, 200, 1)
-    assert actrm.leaderboard(tmp_path / "no zoo") == []
+    for given in ({"zoo": tmp_path / "no zoo"}, {"zoo": ROOT / "zoo", "results": tmp_path / "no zoo"}):
+        with pytest.raises(FileNotFoundError, match=f"{list(given)[-1]}: expected a folder, found none: .*no zoo"):
+            actrm.leaderboard(**given)
+    (tmp_path / "empty").mkdir()
+    assert actrm.leaderboard(tmp_path / "empty") == []
 
 
 def test_results_that_do_not_stand_are_left_out_and_named(zoo: Path, tmp_path: Path) -> None:
@@ -198,7 +212,9 @@ def test_what_cannot_be_evaluated_is_an_exception(zoo: Path, tmp_path: Path) -> 
     evaluate = actrm.evaluate
     for arguments, words in [
         ({"episodes": 0}, "episodes: expected 1"),
+        ({"episodes": -1}, "episodes: expected a whole number from 0"),
         ({"workers": 5000}, "workers: expected 1 to 1024"),
+        ({"workers": 0}, "workers: expected 1 to 1024"),
         ({"max_steps": 0}, "max_steps"),
         ({"n_action_steps": 3, "temporal_ensemble": 0.1}, "expected one of them"),
         ({"control": "none"}, 'expected "robosuite" or "compiled"'),

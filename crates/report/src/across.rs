@@ -45,7 +45,7 @@ impl AcrossTasks {
         let mean = format!("{:.1}%", self.mean * 1e2);
         match self.interval {
             Some((low, high)) => format!("{mean} [{:.0}-{:.0}]", low * 1e2, high * 1e2),
-            None => format!("{mean} (one training a task)"),
+            None => format!("{mean} (a task has one training)"),
         }
     }
 
@@ -56,8 +56,8 @@ impl AcrossTasks {
 
 /// The row that speaks for each kind of policy in each task: `table[policy][task]`.
 ///
-/// For each task the protocol with most episodes counts, a named test block before others, and in it the policy's first
-/// row, floors and ceilings among them. What became of a policy whose pictures were changed does not speak for it.
+/// For each task the protocol with most episodes counts, a named test block before others, and in it the policy's row of most
+/// trainings, the first of several, floors and ceilings among them. What became of a policy whose pictures were changed does not speak for it.
 pub(crate) fn speaking(rows: &[LeaderboardRow]) -> BTreeMap<String, BTreeMap<String, &LeaderboardRow>> {
     let as_seen = || rows.iter().filter(|row| row.record().protocol.perturbation.is_none());
     let mut protocols: BTreeMap<&str, BTreeMap<Asked, (bool, u64)>> = BTreeMap::new();
@@ -72,13 +72,16 @@ pub(crate) fn speaking(rows: &[LeaderboardRow]) -> BTreeMap<String, BTreeMap<Str
     let chosen: BTreeMap<&str, _> = protocols.into_iter().filter_map(|(task, of)| Some((task, first(of)?))).collect();
     let mut table: BTreeMap<String, BTreeMap<String, &LeaderboardRow>> = BTreeMap::new();
     for row in as_seen().filter(|row| chosen.get(row.task()) == Some(&asked(row))) {
-        table.entry(row.kind()).or_default().entry(row.task().to_owned()).or_insert(row);
+        let speaks = table.entry(row.kind()).or_default().entry(row.task().to_owned()).or_insert(row);
+        if row.evaluations().len() > speaks.evaluations().len() {
+            *speaks = row;
+        }
     }
     table
 }
 
-/// Every kind of policy that has ranked rows in at least two tasks, by name; in each task its first row under the protocol
-/// with most episodes. Policies of other sets of tasks cannot be compared by these numbers.
+/// Every kind of policy that has ranked rows in at least two tasks, by name; in each task its row of most trainings under
+/// the protocol with most episodes. Policies of other sets of tasks cannot be compared by these numbers.
 pub fn across_tasks(rows: &[LeaderboardRow]) -> Vec<AcrossTasks> {
     speaking(rows)
         .into_iter()

@@ -191,7 +191,7 @@ mod tests {
         assert_eq!(csv::table(COLUMNS, &rows), "name,value,whole\na|b,1.250,7\n\"<c>, \"\"d\"\"\nmore\",,\n");
         assert_eq!(
             markdown::table(COLUMNS, &rows),
-            "| who | value |\n| --- | ---: |\n| a\\|b | 1.2 |\n| <c>, \"d\"<br>more | - |\n"
+            "| who | value |\n| --- | ---: |\n| a\\|b | 1.2 |\n| &lt;c>, \"d\"<br>more | - |\n"
         );
         let page = html::table(COLUMNS, &rows);
         assert!(

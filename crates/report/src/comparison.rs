@@ -17,9 +17,6 @@ pub const MOST_PAIRED: usize = 12;
 /// Level of every decision.
 pub const ALPHA: f64 = 0.05;
 
-/// Seed of bootstraps: the same results give the same table.
-const BOOTSTRAP_SEED: u64 = 1;
-
 /// Which test a p-value comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Test {
@@ -98,7 +95,7 @@ fn compare_outcomes(first: &[Outcomes], second: &[Outcomes]) -> Comparison {
                 |one: &Outcomes| joined(one, other).iter().map(|(success, _)| f64::from(u8::from(*success))).collect();
             side.iter().map(kept).collect()
         };
-        if let Some(found) = difference(&side(first, &second[0]), &side(second, &first[0]), BOOTSTRAP_SEED) {
+        if let Some(found) = difference(&side(first, &second[0]), &side(second, &first[0])) {
             let interval = Some((found.estimate.low, found.estimate.high));
             let (difference, p_value) = (found.estimate.value, found.p_value);
             return Comparison { difference, interval, p_value, test: Test::Bootstrap, shared };
@@ -162,7 +159,7 @@ pub fn compare_progress(first: &LeaderboardRow, second: &LeaderboardRow) -> Opti
     let (first, second) = (kept(&first)?, kept(&second)?);
     match (first.as_slice(), second.as_slice()) {
         ([one], [two]) => mean_difference(&one.iter().zip(two).map(|(a, b)| a - b).collect::<Vec<_>>()),
-        _ => difference(&first, &second, BOOTSTRAP_SEED),
+        _ => difference(&first, &second),
     }
 }
 

@@ -148,7 +148,7 @@ pub fn to_html(rows: &[LeaderboardRow], beside: &Beside) -> String {
     html.push_str(section);
     let _ = writeln!(
         html,
-        "<footer>All intervals are 95% intervals: Wilson's for one training, a bootstrap over trainings and episodes for several. \
+        "<footer>All intervals are 95% intervals: Wilson's for one training, Student's t over trainings and episodes for several. \
          Rows are ranked by the lower end of their interval. Letters and ranges of ranks come from exact McNemar tests on \
          equal seeds (Barnard's on different seeds, a bootstrap between families) with Holm's correction over the whole \
          table. Made by <code>actrm-zoo leaderboard</code> {} from the results in the zoo. The page loads nothing from \

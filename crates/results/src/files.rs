@@ -1,7 +1,8 @@
 //! Files that are either whole or not there, and their hashes.
 
 use std::fs::{self, File};
-use std::io::{Read, Write};
+use std::io::{self, Read, Write};
+use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 
 use rustix::fs::{CWD, RenameFlags, renameat_with};
@@ -12,17 +13,50 @@ use crate::ResultsError;
 /// How names begin of what is not finished.
 const TEMPORARY: &str = ".tmp-";
 
+/// More bytes than a record or a seal has.
+pub(crate) const MOST_TEXT: u64 = 1 << 26;
+
 /// Lower-case hexadecimal SHA-256 of `bytes`.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
+/// Opens a regular file, or a link to one, to read it. A pipe or a device could be read for ever.
+///
+/// # Errors
+/// When it cannot be opened or is something else.
+pub fn open_file(path: &Path) -> io::Result<File> {
+    let kind = fs::metadata(path)?.file_type();
+    if kind.is_file() {
+        return File::open(path);
+    }
+    let found = match (kind.is_dir(), kind.is_fifo()) {
+        (true, _) => "a folder",
+        (_, true) => "a pipe",
+        _ => "a device or a socket",
+    };
+    Err(io::Error::other(format!("expected a regular file, found {found}")))
+}
+
+/// The content of a regular file that holds at most `most` bytes.
+///
+/// # Errors
+/// As [`open_file`]; a longer file.
+pub fn read_file(path: &Path, most: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open_file(path)?.take(most.saturating_add(1)).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > most {
+        return Err(io::Error::other(format!("expected at most {most} bytes, found more")));
+    }
+    Ok(bytes)
+}
+
 /// Lower-case hexadecimal SHA-256 of a file's content.
 ///
 /// # Errors
-/// When the file cannot be read.
+/// When the file cannot be read or is no regular file.
 pub fn sha256_file(path: &Path) -> Result<String, ResultsError> {
-    let mut file = File::open(path).map_err(ResultsError::io("read", path))?;
+    let mut file = open_file(path).map_err(ResultsError::io("read", path))?;
     let mut hasher = Sha256::new();
     let mut buffer = vec![0_u8; 1 << 16];
     loop {
@@ -222,6 +256,23 @@ mod tests {
         let mut left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|item| item.unwrap().file_name()).collect();
         left.sort();
         assert_eq!(left, [".hidden", "kept"]);
+    }
+
+    #[test]
+    fn what_is_no_regular_file_is_refused_and_not_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        rustix::fs::mknodat(CWD, at("pipe"), rustix::fs::FileType::Fifo, rustix::fs::Mode::RWXU, 0).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", at("device")).unwrap();
+        fs::write(at("file"), "text").unwrap();
+        std::os::unix::fs::symlink(at("file"), at("link")).unwrap();
+        for (path, kind) in [(at("pipe"), "a pipe"), (at("device"), "a device"), (folder.path().into(), "a folder")] {
+            let error = sha256_file(&path).unwrap_err();
+            let reason = std::error::Error::source(&error).unwrap().to_string();
+            assert!(reason.starts_with(&format!("expected a regular file, found {kind}")), "{reason}");
+        }
+        assert_eq!(read_file(&at("link"), 4).unwrap(), b"text");
+        assert_eq!(read_file(&at("file"), 3).unwrap_err().to_string(), "expected at most 3 bytes, found more");
     }
 
     #[test]

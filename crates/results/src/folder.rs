@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::record::{EpisodeRecord, EpisodeTiming, EvaluationRecord, differing};
-use super::seal::{SEAL_FILE, seal_of};
+use super::record::{EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, differing};
+use super::seal::{SEAL_FILE, Seal, seal_of};
 use super::tables;
 use crate::ResultsError;
-use crate::files::{sweep, sync_folder, write_atomic};
+use crate::files::{MOST_TEXT, read_file, sweep, sync_folder, write_atomic};
 
 /// What an evaluation is of.
 pub const RECORD: &str = "evaluation.json";
@@ -69,6 +69,7 @@ impl StoredEvaluation {
                 return Err(ResultsError::Malformed { path, reason });
             }
         }
+        check_outcomes(&folder.join(OUTCOMES), &record, &episodes)?;
         Ok(Some(Self { folder: folder.to_owned(), record, episodes, timings, sealed }))
     }
 
@@ -92,6 +93,46 @@ impl StoredEvaluation {
     pub fn successes(&self) -> u64 {
         self.episodes.iter().filter(|episode| episode.success).count() as u64
     }
+}
+
+/// An evaluation that has not ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct UnderWay {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// Episodes that it has.
+    pub done: u64,
+    /// Episodes that it is to have.
+    pub total: u64,
+    /// Whether a table of outcomes is there all the same, without a seal.
+    pub unsealed: bool,
+}
+
+impl UnderWay {
+    /// How far the evaluation in `folder` is.
+    ///
+    /// # Errors
+    /// A record or a journal that cannot be read.
+    pub fn read(folder: &Path) -> Result<Self, ResultsError> {
+        let record = read_record(folder)?;
+        let done = read_journal(&folder.join(JOURNAL), &record, false)?.len() as u64;
+        let (total, unsealed) = (record.own_seeds().len() as u64, folder.join(OUTCOMES).exists());
+        Ok(Self { folder: folder.to_owned(), done, total, unsealed })
+    }
+}
+
+impl std::fmt::Display for UnderWay {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { done, total, unsealed, .. } = self;
+        let table = if *unsealed { format!("; {OUTCOMES} is there without a seal") } else { String::new() };
+        write!(f, "not finished: {done} of {total} episodes{table}")
+    }
+}
+
+/// The entries that the record and the seal in `folder` say its result is of, as far as they can be read.
+pub fn entries_named(folder: &Path) -> Vec<EntryIdentity> {
+    let record = read_record(folder).ok().map(|record| record.entry);
+    record.into_iter().chain(Seal::read(folder).ok().map(|seal| seal.entry)).collect()
 }
 
 /// Every finished evaluation under `results`, by folder name. A folder that does not exist holds none.
@@ -131,6 +172,29 @@ pub fn result_folders(results: &Path) -> Result<Vec<PathBuf>, ResultsError> {
     Ok(folders)
 }
 
+/// Refuses outcomes that no episode can have.
+fn check_outcomes(path: &Path, record: &EvaluationRecord, episodes: &[EpisodeRecord]) -> Result<(), ResultsError> {
+    let most = record.protocol.max_steps;
+    let is_hash = |text: &str| text.len() == 64 && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'));
+    for episode in episodes {
+        let EpisodeRecord { seed, steps, total_reward, fingerprint, progress, .. } = episode;
+        let (key, expected, found) = if *steps == 0 || *steps as usize > most {
+            ("steps", format!("1 to {most}"), steps.to_string())
+        } else if !total_reward.is_finite() {
+            ("return", "a finite number".to_owned(), total_reward.to_string())
+        } else if let Some(progress) = progress.filter(|progress| !(0.0..=1.0).contains(progress)) {
+            ("progress", "0 to 1".to_owned(), progress.to_string())
+        } else if !is_hash(fingerprint) {
+            ("fingerprint", "64 hexadecimal digits".to_owned(), format!("{fingerprint:?}"))
+        } else {
+            continue;
+        };
+        let reason = format!("seed {seed}: {key}: expected {expected}, found {found}");
+        return Err(ResultsError::Malformed { path: path.to_owned(), reason });
+    }
+    Ok(())
+}
+
 /// Whether every episode is done and sealed. Evaluations from before there were seals have tables and no journal.
 pub(super) fn is_finished(folder: &Path) -> bool {
     folder.join(SEAL_FILE).exists() || (folder.join(OUTCOMES).exists() && !folder.join(JOURNAL).exists())
@@ -139,7 +203,7 @@ pub(super) fn is_finished(folder: &Path) -> bool {
 /// What an evaluation in `folder` is of, finished or not.
 pub fn read_record(folder: &Path) -> Result<EvaluationRecord, ResultsError> {
     let path = folder.join(RECORD);
-    let text = fs::read(&path).map_err(ResultsError::io("read", &path))?;
+    let text = read_file(&path, MOST_TEXT).map_err(ResultsError::io("read", &path))?;
     let malformed = |reason: String| ResultsError::Malformed { path: path.clone(), reason };
     let record: EvaluationRecord =
         serde_json::from_slice(&text).map_err(|e| malformed(format!("not an evaluation: {e}")))?;
@@ -150,9 +214,9 @@ pub fn read_record(folder: &Path) -> Result<EvaluationRecord, ResultsError> {
     if let Some(shard) = record.shard.filter(|shard| !(1..=shard.count).contains(&shard.index)) {
         return Err(malformed(format!("shard: expected I/N with 1 <= I <= N, found {shard}")));
     }
-    if record.seeds.count > MOST_EPISODES {
+    if !(1..=MOST_EPISODES).contains(&record.seeds.count) {
         let found = record.seeds.count;
-        return Err(malformed(format!("seeds.count: expected at most {MOST_EPISODES}, found {found}")));
+        return Err(malformed(format!("seeds.count: expected 1 to {MOST_EPISODES}, found {found}")));
     }
     Ok(record)
 }
@@ -432,7 +496,7 @@ fn read_journal(
     record: &EvaluationRecord,
     repair: bool,
 ) -> Result<BTreeMap<u64, (EpisodeRecord, EpisodeTiming)>, ResultsError> {
-    let text = match fs::read(path) {
+    let text = match read_file(path, u64::MAX) {
         Ok(text) => text,
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(BTreeMap::new()),
         Err(error) => return Err(ResultsError::io("read", path)(error)),
@@ -596,6 +660,36 @@ mod tests {
             let error = ResultsFolder::open(dir.path(), &record).err().unwrap().to_string();
             assert!(error.contains(word), "{error}");
         }
+    }
+
+    #[test]
+    fn outcomes_that_no_episode_can_have_are_refused_though_they_are_sealed() {
+        let dir = tempfile::tempdir().unwrap();
+        let record = sample("a", 1, 3);
+        let stored = finished(dir.path(), &record);
+        #[allow(clippy::type_complexity)]
+        let changes: [(&str, fn(&mut EpisodeRecord)); 7] = [
+            ("steps: expected 1 to 400, found 0", |e| e.steps = 0),
+            ("steps: expected 1 to 400, found 401", |e| e.steps = 401),
+            ("return: expected a finite number, found NaN", |e| e.total_reward = f64::NAN),
+            ("return: expected a finite number, found inf", |e| e.total_reward = f64::INFINITY),
+            ("progress: expected 0 to 1, found 1.5", |e| e.progress = Some(1.5)),
+            ("progress: expected 0 to 1, found NaN", |e| e.progress = Some(f64::NAN)),
+            ("fingerprint: expected 64 hexadecimal digits, found \"x\"", |e| e.fingerprint = "x".into()),
+        ];
+        for (word, change) in changes {
+            let mut episodes = stored.episodes.clone();
+            change(&mut episodes[1]);
+            tables::write_episodes(&stored.folder.join(OUTCOMES), &episodes).unwrap();
+            stored.seal().unwrap();
+            let error = StoredEvaluation::read(&stored.folder).unwrap_err().to_string();
+            let whole = format!("{}: seed 10001: {word}", stored.folder.join(OUTCOMES).display());
+            assert_eq!(error, whole);
+        }
+        let empty = EvaluationRecord { seeds: crate::Seeds { start: 10_000, count: 0 }, ..record };
+        fs::write(stored.folder.join(RECORD), serde_json::to_vec(&empty).unwrap()).unwrap();
+        let error = read_record(&stored.folder).unwrap_err().to_string();
+        assert!(error.ends_with("seeds.count: expected 1 to 1000000, found 0"), "{error}");
     }
 
     #[test]

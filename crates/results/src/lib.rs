@@ -22,8 +22,8 @@ pub mod testing;
 pub use error::ResultsError;
 pub use files::{sha256_file, sha256_hex, write_atomic, write_together};
 pub use folder::{
-    OUTCOMES, OtherSimulator, RECORD, ResultsFolder, StoredEvaluation, evaluation_folders, list_evaluations,
-    read_record, result_folders,
+    OUTCOMES, OtherSimulator, RECORD, ResultsFolder, StoredEvaluation, UnderWay, entries_named, evaluation_folders,
+    list_evaluations, read_record, result_folders,
 };
 pub use merge::merge_shards;
 pub use record::{

@@ -124,7 +124,7 @@ mod tests {
         #[allow(clippy::type_complexity)]
         let changes: [(&str, fn(&mut EvaluationRecord)); 3] = [
             ("entry", |r| r.entry.hash = "f".repeat(64)),
-            ("protocol", |r| r.protocol.max_steps = 1),
+            ("protocol", |r| r.protocol.max_steps = 401),
             ("versions", |r| drop(r.versions.insert("mujoco".into(), "4.0".into()))),
         ];
         for (what, change) in changes {

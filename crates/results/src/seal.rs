@@ -4,14 +4,13 @@
 //! it anew is found by running it again (`eval --again`), not by a hash.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::io::ErrorKind;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use super::record::EntryIdentity;
-use crate::files::{sha256_file, sha256_hex, write_atomic};
+use crate::files::{MOST_TEXT, read_file, sha256_file, sha256_hex, write_atomic};
 use crate::{EvaluationRecord, ResultsError};
 
 /// The seal's file.
@@ -64,6 +63,21 @@ impl Seal {
         })
     }
 
+    /// What the seal in `folder` says, true or not.
+    ///
+    /// # Errors
+    /// A file that is not there, cannot be read or is no seal.
+    pub(super) fn read(folder: &Path) -> Result<Self, ResultsError> {
+        let path = folder.join(SEAL_FILE);
+        let text = read_file(&path, MOST_TEXT).map_err(ResultsError::io("read", &path))?;
+        Self::parse(&path, &text)
+    }
+
+    fn parse(path: &Path, text: &[u8]) -> Result<Self, ResultsError> {
+        let malformed = |e| ResultsError::Malformed { path: path.to_owned(), reason: format!("not a seal: {e}") };
+        serde_json::from_slice(text).map_err(malformed)
+    }
+
     fn text(&self) -> Vec<u8> {
         let mut text = serde_json::to_vec_pretty(self).expect("plain fields are always JSON");
         text.push(b'\n');
@@ -85,7 +99,7 @@ impl Seal {
     /// the seal says otherwise, [`ResultsError::Malformed`] for a seal that is none.
     pub fn check(&self, folder: &Path) -> Result<bool, ResultsError> {
         let path = folder.join(SEAL_FILE);
-        let text = match fs::read(&path) {
+        let text = match read_file(&path, MOST_TEXT) {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(false),
             Err(error) => return Err(ResultsError::io("read", path)(error)),
@@ -94,7 +108,7 @@ impl Seal {
             return Ok(true);
         }
         let malformed = |reason: String| ResultsError::Malformed { path: path.clone(), reason };
-        let stored: Self = serde_json::from_slice(&text).map_err(|e| malformed(format!("not a seal: {e}")))?;
+        let stored = Self::parse(&path, &text)?;
         for (file, found) in &self.files {
             let expected = stored.files.get(file).cloned().unwrap_or_else(|| "a file that the seal names".to_owned());
             if expected != *found {

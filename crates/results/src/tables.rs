@@ -1,6 +1,5 @@
 //! Episodes and timings as Parquet.
 
-use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -16,7 +15,7 @@ use parquet::file::properties::WriterProperties;
 
 use super::record::{EpisodeRecord, EpisodeTiming};
 use crate::ResultsError;
-use crate::files::write_atomic;
+use crate::files::{open_file, write_atomic};
 
 fn table_error<E: std::error::Error + Send + Sync + 'static>(
     operation: &'static str,
@@ -54,7 +53,7 @@ struct Columns<'a> {
 
 impl<'a> Columns<'a> {
     fn read(path: &'a Path) -> Result<Self, ResultsError> {
-        let file = File::open(path).map_err(ResultsError::io("read", path))?;
+        let file = open_file(path).map_err(ResultsError::io("read", path))?;
         let reader = ParquetRecordBatchReaderBuilder::try_new(file)
             .and_then(ParquetRecordBatchReaderBuilder::build)
             .map_err(table_error("read table", path))?;

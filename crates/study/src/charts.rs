@@ -4,9 +4,6 @@ use std::fmt::Write as _;
 
 use report::statistics::Estimate;
 
-/// Seed of every bootstrap.
-pub(crate) const BOOTSTRAP_SEED: u64 = 1;
-
 /// Colours of lines, which differ to the colour-blind as well.
 pub(crate) const COLORS: [&str; 8] =
     ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a7f00"];

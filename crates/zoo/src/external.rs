@@ -51,6 +51,9 @@ pub struct External {
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct File {
+    /// SHA-256 of the text of the policy's class, where that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    code: Option<String>,
     external: External,
 }
 
@@ -114,7 +117,7 @@ impl External {
         self.conventions.clone().or(self.asked())
     }
 
-    /// Compares what is said of its conventions with how it is asked.
+    /// Compares what is said of its conventions with how it is asked, and with the simulator.
     fn check_said(&self, named: &Named, ready: &Ready) -> Result<(), ZooError> {
         let mut asked = self.asked();
         if let (Some(horizon), Execution::RecedingHorizon { n_action_steps }) =
@@ -123,7 +126,9 @@ impl External {
         {
             asked.set("horizon", format!("at least {n_action_steps} for n_action_steps"));
         }
-        self.conventions.check(&asked, "this evaluation", &named.name, &ready.task)
+        self.conventions.check(&asked, "this evaluation", &named.name, &ready.task)?;
+        let simulator = Conventions::of_simulator(ready).without(&["image_size"]);
+        self.said().check(&simulator, &ready.simulator, &named.name, &ready.task)
     }
 
     /// What follows from how it is asked.
@@ -163,16 +168,30 @@ impl External {
         Ok(Signature { observation, action_dim: ready.action_dim, ..Signature::default() })
     }
 
-    /// Its entry in `zoo`: the newest version under its name if that says the same, else a new one.
+    /// Its entry in `zoo`: the newest version under its name that says the same, else a new one.
     ///
     /// # Errors
-    /// A name that is an entry with weights; keys that the environment does not have; files that cannot be written.
+    /// A name that is an entry with weights; conventions that do not hold here; keys that the environment does not have;
+    /// files that cannot be written.
     pub fn entry(&self, zoo: &Path, named: &Named, ready: &Ready) -> Result<Entry, ZooError> {
+        self.entry_of_code(zoo, named, ready, None)
+    }
+
+    /// As [`External::entry`], for a policy whose class has a text of this SHA-256: another text is another version.
+    ///
+    /// # Errors
+    /// As [`External::entry`].
+    pub fn entry_of_code(
+        &self,
+        zoo: &Path,
+        named: &Named,
+        ready: &Ready,
+        code: Option<&str>,
+    ) -> Result<Entry, ZooError> {
         self.check_said(named, ready)?;
-        let (signature, config) = (self.signature(ready)?, self.to_toml());
+        let (signature, config) = (self.signature(ready)?, self.to_toml(code));
         let registry = Registry::open(zoo);
-        let newest = registry.ids()?.into_iter().filter(|id| id.name == named.name).max();
-        if let Some(id) = newest {
+        for id in registry.ids()?.into_iter().rev().filter(|id| id.name == named.name) {
             let entry = registry.entry(&id.to_string())?;
             let meta = entry.meta();
             if !meta.is_external() {
@@ -246,8 +265,9 @@ impl External {
         Ok(Some(file.external))
     }
 
-    fn to_toml(&self) -> String {
-        toml::to_string(&File { external: self.clone() }).expect("texts, numbers and lists become TOML")
+    fn to_toml(&self, code: Option<&str>) -> String {
+        toml::to_string(&File { code: code.map(str::to_owned), external: self.clone() })
+            .expect("texts, numbers and lists become TOML")
     }
 
     /// The policy of `entry` as an evaluation takes it; `policy` makes one for each simulator.
@@ -338,6 +358,11 @@ mod tests {
         let two = declared.entry(zoo.path(), &named, &ready).unwrap();
         assert_eq!(two.id().to_string(), "mine@2");
         assert_ne!(one.meta().content_sha256(), two.meta().content_sha256());
+        // so is another text of its class; who comes back finds the version of before
+        for (code, version) in [(Some("abc"), 3), (Some("abd"), 4), (Some("abc"), 3), (None, 1)] {
+            let entry = external().entry_of_code(zoo.path(), &named, &ready, code).unwrap();
+            assert_eq!((entry.id().version, External::of(&entry).unwrap().unwrap()), (version, external()));
+        }
 
         let error = one.load().err().unwrap().to_string();
         assert!(error.contains("mine@1") && error.contains("not in this zoo"), "{error}");
@@ -365,19 +390,12 @@ mod tests {
             let error = other.entry(zoo.path(), &named, &ready).unwrap_err().to_string();
             assert!(error.contains(&format!("convention {name}: expected {value}, found")), "{error}");
         }
-        // and what the simulator says otherwise, before an episode begins
+        // and what the simulator says otherwise, before there is an entry
         let mut other = usual;
         other.conventions.set("control_freq", 10);
-        let entry = other.entry(zoo.path(), &named, &ready).unwrap();
-        let subject = other.subject(&entry, || unreachable!());
-        let options = crate::evaluation::EvaluationOptions {
-            seeds: crate::results::Seeds { start: 0, count: 1 },
-            shard: None,
-            env_module: None,
-            force: true,
-        };
-        let error = subject.record(&ready, &options).unwrap_err().to_string();
-        assert_eq!(error, "entry mine@2 in task Lift: convention control_freq: expected 10, found 20 in robosuite");
+        let error = other.entry(zoo.path(), &named, &ready).unwrap_err().to_string();
+        assert_eq!(error, "entry mine in task Lift: convention control_freq: expected 10, found 20 in robosuite");
+        assert_eq!(Registry::open(zoo.path()).ids().unwrap().len(), 1);
     }
 
     #[test]

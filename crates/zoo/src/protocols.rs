@@ -15,10 +15,12 @@ use serde::Deserialize;
 
 use crate::ZooError;
 use crate::config::{from_value, nearest};
-use crate::results::{EvaluationRecord, Execution, Seeds};
+use crate::results::{EvaluationRecord, Execution, Protocol, Seeds};
 
 /// The files of `protocols/`, built into the binary.
 const BUILT_IN: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/protocols.rs"));
+/// More seeds than a block has, and more steps than an episode takes.
+const MOST: u64 = 1_000_000;
 
 /// Which of a protocol's seeds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -64,7 +66,7 @@ pub struct NamedProtocol {
 #[serde(deny_unknown_fields)]
 struct Text {
     task: String,
-    max_steps: usize,
+    max_steps: i64,
     control: String,
     #[serde(default)]
     execution: Option<Execution>,
@@ -78,7 +80,8 @@ impl NamedProtocol {
     /// Reads the text of the file called `name`.
     ///
     /// # Errors
-    /// [`ZooError::Protocol`]: a name without a version, text that is no protocol, blocks that overlap.
+    /// [`ZooError::Protocol`]: a name without a version, text that is no protocol, a cap or a block that no evaluation can have,
+    /// blocks that overlap.
     pub fn read(name: &str, text: &str) -> Result<Self, ZooError> {
         let refuse = |reason: String| Err(ZooError::Protocol { name: name.to_owned(), reason });
         let version = name.rsplit_once("-v").and_then(|(_, version)| version.parse::<u32>().ok());
@@ -95,13 +98,25 @@ impl NamedProtocol {
                 .map_err(|reason| ZooError::Protocol { name: name.to_owned(), reason: format!("{key}: {reason}") })
         };
         let (dev, test) = (seeds("dev", &read.dev)?, seeds("test", &read.test)?);
+        if let Some((key, block)) = [("dev", dev), ("test", test)].into_iter().find(|(_, block)| block.count > MOST) {
+            return refuse(format!("{key}: expected at most {MOST} seeds, found {} ({block})", block.count));
+        }
         if dev.overlap(&test) {
             return refuse(format!("test: expected seeds that are none of dev, {dev}, found {test}"));
         }
         let Ok(control) = read.control.parse() else {
             return refuse(format!("control: expected compiled or robosuite, found {}", read.control));
         };
-        let Text { task, max_steps, execution, versions, .. } = read;
+        let max_steps = match usize::try_from(read.max_steps) {
+            Ok(steps @ 1..) if steps as u64 <= MOST => steps,
+            _ => {
+                return refuse(format!(
+                    "max_steps: expected a positive integer up to {MOST}, found {}",
+                    read.max_steps
+                ));
+            }
+        };
+        let Text { task, execution, versions, .. } = read;
         Ok(Self { name: name.to_owned(), task, max_steps, control, execution, dev, test, versions })
     }
 
@@ -113,11 +128,23 @@ impl NamedProtocol {
         }
     }
 
+    /// Whether it is built into the binary.
+    fn is_built_in(&self) -> bool {
+        BUILT_IN.iter().any(|(name, _)| *name == self.name)
+    }
+
+    /// Whether both play by the same rules, whatever their seeds.
+    fn plays_as(&self, other: &Self) -> bool {
+        self.task == other.task && self.max_steps == other.max_steps && self.control == other.control
+    }
+
     /// The block that an evaluation ran, whole and by these rules; nothing for any other.
     pub fn block_of(&self, record: &EvaluationRecord) -> Option<Block> {
         let rules = &record.protocol;
         let same = (rules.task == self.task && rules.max_steps == self.max_steps && rules.control == self.control && rules.perturbation.is_none())
+            && rules.rules == Protocol::RULES
             // the task's own environment
+            && rules.env_name == self.task
             && rules.env_module.is_none()
             && rules.env_args_sha256.is_none()
             && record.changed_sources().is_empty()
@@ -145,7 +172,8 @@ impl Protocols {
     /// Those built in and the files of `folder`, which must have names of their own.
     ///
     /// # Errors
-    /// Files that are no protocols; a name that is built in with another text.
+    /// Files that are no protocols; a name that is built in with another text; a block for choosing that has seeds of another
+    /// protocol's block for reporting, by the same rules.
     pub fn with_folder(folder: &Path) -> Result<Self, ZooError> {
         let mut all = Self::built_in();
         let mut paths = Vec::new();
@@ -156,6 +184,7 @@ impl Protocols {
         for path in paths.into_iter().filter(|path| path.extension().is_some_and(|extension| extension == "toml")) {
             all.add(&path)?;
         }
+        all.check_blocks()?;
         all.0.sort_by(|a, b| a.name.cmp(&b.name));
         Ok(all)
     }
@@ -178,6 +207,19 @@ impl Protocols {
         }
     }
 
+    /// Refuses a user's protocol that chooses by the seeds that another one reports on.
+    fn check_blocks(&self) -> Result<(), ZooError> {
+        for own in self.0.iter().filter(|protocol| !protocol.is_built_in()) {
+            let other = self.0.iter().find(|other| other.plays_as(own) && own.dev.overlap(&other.test));
+            if let Some(other) = other {
+                let (test, name) = (other.test, &other.name);
+                let reason = format!("dev: expected seeds that are none of test of {name}, {test}, found {}", own.dev);
+                return Err(ZooError::Protocol { name: own.name.clone(), reason });
+            }
+        }
+        Ok(())
+    }
+
     /// Every one.
     pub fn iter(&self) -> impl Iterator<Item = &NamedProtocol> {
         self.0.iter()
@@ -196,9 +238,13 @@ impl Protocols {
         })
     }
 
-    /// The protocol and the block that an evaluation ran, if it is one of these.
+    /// The protocol and the block that an evaluation ran, if it is one of these. One that is built in comes before a user's.
     pub fn block_of(&self, record: &EvaluationRecord) -> Option<(String, Block)> {
-        self.0.iter().find_map(|protocol| Some((protocol.name.clone(), protocol.block_of(record)?)))
+        let of = |built_in: bool| {
+            let mut known = self.0.iter().filter(move |protocol| protocol.is_built_in() == built_in);
+            known.find_map(|protocol| Some((protocol.name.clone(), protocol.block_of(record)?)))
+        };
+        of(true).or_else(|| of(false))
     }
 }
 
@@ -239,8 +285,10 @@ mod tests {
         record.seeds = Seeds { start: 40_000, count: 200 };
         assert_eq!(protocol.block_of(&record), Some(Block::Test));
         #[allow(clippy::type_complexity)]
-        let changes: [fn(&mut EvaluationRecord); 8] = [
+        let changes: [fn(&mut EvaluationRecord); 10] = [
             |r| r.seeds.count = 199,
+            |r| r.protocol.rules = 2,
+            |r| r.protocol.env_name = "LiftEasy".into(),
             |r| r.protocol.max_steps = 500,
             |r| r.protocol.control = Control::Compiled,
             |r| r.protocol.env_args_sha256 = Some("0".repeat(64)),
@@ -266,6 +314,13 @@ mod tests {
             ("lift-v1", LIFT.replace("max_steps", "max_stepz"), "max_stepz"),
             ("lift-v1", LIFT.replace("'robosuite'", "'other'"), "control: expected"),
             ("lift-v1", "task = ".to_owned(), "lift-v1"),
+            ("lift-v1", LIFT.replace("= 400", "= 0"), "max_steps: expected a positive integer up to 1000000, found 0"),
+            (
+                "lift-v1",
+                LIFT.replace("= 400", "= -1"),
+                "max_steps: expected a positive integer up to 1000000, found -1",
+            ),
+            ("lift-v1", LIFT.replace("40199", "2000000"), "test: expected at most 1000000 seeds, found 1960001"),
         ] {
             let error = NamedProtocol::read(name, &text).unwrap_err().to_string();
             assert!(error.contains(word), "{word}: {error}");
@@ -281,5 +336,20 @@ mod tests {
         std::fs::write(folder.path().join("lift-v1.toml"), LIFT).unwrap();
         let error = Protocols::with_folder(folder.path()).unwrap_err().to_string();
         assert!(error.contains("another version"), "{error}");
+        std::fs::remove_file(folder.path().join("lift-v1.toml")).unwrap();
+
+        // the block that lift-v1 reports on is for choosing nowhere, and keeps its name
+        let mine = LIFT.replace("'robosuite'", "'compiled'");
+        let write = |text: String| std::fs::write(folder.path().join("a-v1.toml"), text).unwrap();
+        write(mine.replace("40000-40199", "50000-50199").replace("10000-10099", "40100-40299"));
+        let error = Protocols::with_folder(folder.path()).unwrap_err().to_string();
+        let expected =
+            "protocol `a-v1`: dev: expected seeds that are none of test of lift-v1, 40000-40199, found 40100-40299";
+        assert_eq!(error, expected);
+        write(mine);
+        let all = Protocols::with_folder(folder.path()).unwrap();
+        let mut record = sample("a", 1, 200);
+        (record.seeds.start, record.protocol.control) = (40_000, Control::Compiled);
+        assert_eq!(all.block_of(&record), Some(("lift-v1".to_owned(), Block::Test)));
     }
 }

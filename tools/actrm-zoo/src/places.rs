@@ -33,6 +33,14 @@ impl ZooArgs {
         (self.zoo != Path::new(USUAL_ZOO)).then(|| cli::lossy(&self.zoo))
     }
 
+    /// Refuses a folder that was named and is not there; the usual one may be yet to be made.
+    ///
+    /// # Errors
+    /// Such a folder.
+    pub fn check(&self) -> anyhow::Result<()> {
+        check_folder("--zoo", self.named().is_some().then_some(&self.zoo))
+    }
+
     /// Its entries.
     pub fn registry(&self) -> Registry {
         Registry::open(&self.zoo)
@@ -53,9 +61,24 @@ impl ResultsArgs {
         self.results.as_deref().map(cli::lossy)
     }
 
+    /// Refuses a folder that was named and is not there.
+    ///
+    /// # Errors
+    /// Such a folder.
+    pub fn check(&self) -> anyhow::Result<()> {
+        check_folder("--results", self.results.as_ref())
+    }
+
     /// The folder that was named, or the zoo's.
     pub fn folder(&self, zoo: &ZooArgs) -> PathBuf {
         self.results.clone().unwrap_or_else(|| zoo.zoo.join("results"))
+    }
+}
+
+fn check_folder(option: &str, folder: Option<&PathBuf>) -> anyhow::Result<()> {
+    match folder.filter(|folder| !folder.is_dir()) {
+        Some(folder) => anyhow::bail!("{option} {}: expected a folder, found none", cli::shown(folder)),
+        None => Ok(()),
     }
 }
 

@@ -5,9 +5,10 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use cli::{Screen, SimulatorArgs, limits};
-use rollout::{Control, Pool, WorkerSpec, harness_folder};
+use cli::{Screen, SimulatorArgs, Stop, limits};
+use rollout::{Control, Pool, RolloutError, WorkerSpec, harness_folder};
 use zoo::ZooError;
+use zoo::config::nearest;
 use zoo::entry::EntryMeta;
 use zoo::evaluation::{Environment, EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate};
 use zoo::results::StoredEvaluation;
@@ -83,6 +84,25 @@ pub fn limited_worker(environment: &Environment, args: &RunArgs, control: Contro
     Ok(spec)
 }
 
+/// Starts simulators; nothing if it was stopped.
+///
+/// # Errors
+/// No worker could be started. A task that none has comes with the name most like it.
+pub fn start(args: &RunArgs, spec: WorkerSpec, stop: &Stop) -> anyhow::Result<Option<Pool>> {
+    let started = args.simulator.start(spec, args.worker_logs.clone(), stop);
+    started.map_err(|error| match error.downcast_ref().and_then(meant) {
+        Some(task) => error.context(format!("did you mean `--task {task}`?")),
+        None => error,
+    })
+}
+
+/// The task that was meant where the simulator knows none of that name.
+fn meant(error: &RolloutError) -> Option<String> {
+    let RolloutError::Refused { task, kind, message } = error else { return None };
+    let known = message.split_once("known: ").filter(|_| kind == "unknown_task")?.1;
+    nearest(task, &known.split(", ").map(str::to_owned).collect::<Vec<_>>())
+}
+
 /// An evaluation that was run to its end, and whether nothing had to be run.
 pub struct Evaluated {
     pub evaluation: Box<StoredEvaluation>,
@@ -124,5 +144,20 @@ pub fn run_missing(
             let first = errors.into_iter().next().context("an evaluation failed without saying why")?;
             Err(anyhow::Error::new(first).context(format!("entry {id}: {done} episodes done, others could not be run")))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_an_unknown_task_the_name_most_like_it_is_told() {
+        let hint = |task: &str, kind: &str| {
+            let message = format!("unknown task '{task}'; known: Door, Lift, Stack");
+            meant(&RolloutError::Refused { task: task.to_owned(), kind: kind.to_owned(), message })
+        };
+        assert_eq!(hint("Lfit", "unknown_task").as_deref(), Some("Lift"));
+        assert_eq!((hint("Transport", "unknown_task"), hint("Lfit", "bad_config")), (None, None));
     }
 }

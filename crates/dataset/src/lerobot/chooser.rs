@@ -36,6 +36,9 @@ const VECTOR: usize = 4096;
 /// Control frequency of robosuite environments whose arguments state none, in Hz.
 const ROBOSUITE_CONTROL_FREQ: f64 = 20.0;
 
+/// The most frames a second.
+const MOST_FPS: f64 = 100_000.0;
+
 /// The first of the demos whose datasets most demos have, by type and shape of a step.
 pub(super) fn usual(plan: &Plan) -> Option<&DemoPlan> {
     type Kind<'a> = Vec<(&'a str, &'a Dtype, &'a [usize])>;
@@ -82,7 +85,7 @@ impl Chooser<'_> {
         };
         stated.mapping(self.plan, &mut mapping)?;
         mapping.columns.extend(index_columns());
-        mapping.fps = options.fps.unwrap_or(mapping.fps);
+        mapping.fps = self.checked(options.fps.unwrap_or(mapping.fps))?;
         self.filmed(&mut mapping, options)?;
         Ok(mapping)
     }
@@ -330,13 +333,15 @@ impl Chooser<'_> {
         options: &ConvertOptions,
     ) -> Vec<String> {
         const NO_COLOUR: &str = "only uint8 [height, width, 3] and JPEG files do";
+        let of_camera = |path: &str| path.starts_with("obs/images/") || path.ends_with("_image");
+        let numbers: BTreeSet<String> = columns.iter().flat_map(Column::keys).collect();
         let mut found: BTreeMap<&str, (String, &str)> = BTreeMap::new();
         for (path, key) in self.plan.demos.iter().flat_map(|d| &d.keys) {
             let shape = key.shape.get(1..).unwrap_or_default();
             let is_column = |c: &Column| matches!(&c.origin, Origin::Depth { key, .. } if key == path);
             let reason = match (shape, &key.dtype) {
                 _ if !path.starts_with("obs/") || self.files.contains_key(path) => continue,
-                _ if columns.iter().any(is_column) => continue,
+                _ if columns.iter().any(is_column) || numbers.contains(path) => continue,
                 ([_, _, 3], _) if key.is_image() => continue,
                 ([_, _, 1], Dtype::U8) => "LeRobot records no grey images, and its ACT takes three channels",
                 ([_, _, 4], Dtype::U8) => "LeRobot records no fourth channel, and its ACT takes three",
@@ -345,7 +350,9 @@ impl Chooser<'_> {
                 ([_, _, 1], _) => "LeRobot's depth is float or uint16",
                 ([_, _, 3 | 4], _) => NO_COLOUR,
                 // bytes for each step under the name of a camera that are no JPEG file
-                ([_] | [], _) if path.starts_with("obs/images/") || path.ends_with("_image") => NO_COLOUR,
+                ([_] | [], _) if of_camera(path) => NO_COLOUR,
+                // grey, channels first, or several pictures a step
+                ([_, _, ..], kind) if *kind == Dtype::U8 || of_camera(path) || path.contains("rgb") => NO_COLOUR,
                 ([], Dtype::VarBytes) => NO_COLOUR,
                 _ => continue,
             };
@@ -362,7 +369,7 @@ impl Chooser<'_> {
     }
 
     /// Rewards, dones and success, where the demos have them. A file that has none gets no such columns.
-    pub fn outcomes(&self) -> Result<Vec<Column>> {
+    pub fn outcomes(&self, notes: &mut Vec<String>) -> Result<Vec<Column>> {
         let scalar = |name: &str, dtype: &str, origin| Column {
             name: name.to_owned(),
             feature: Feature { dtype: dtype.to_owned(), shape: vec![1], names: Value::Null, info: None },
@@ -382,6 +389,10 @@ impl Chooser<'_> {
         } else if self.usual("success") {
             self.one_a_step("success")?;
             columns.push(scalar("next.success", "bool", Origin::Flag("success".to_owned())));
+        } else if self.usual("rewards") && self.is_robosuite() {
+            notes.push(
+                "no next.success is made: env_args state reward_shaping, and such rewards do not tell it".to_owned(),
+            );
         }
         if self.usual("mistakes") {
             self.one_a_step("mistakes")?;
@@ -390,9 +401,15 @@ impl Chooser<'_> {
         Ok(columns)
     }
 
-    /// robosuite's sparse reward, and that of everything built on it, is 1 exactly when the task is solved.
+    /// robosuite's sparse reward, and that of everything built on it, is 1 exactly when the task is solved; a shaped one tells
+    /// nothing.
     fn rewards_tell_success(&self) -> bool {
-        self.is_robosuite()
+        let shaped = self.env_kwargs().and_then(|kwargs| kwargs.get("reward_shaping")?.as_bool());
+        self.is_robosuite() && shaped != Some(true)
+    }
+
+    fn env_kwargs(&self) -> Option<&Value> {
+        self.plan.env_args.as_ref()?.get("env_kwargs")
     }
 
     /// Whether `env_args` says so: robomimic numbers the kinds of environments.
@@ -410,8 +427,16 @@ impl Chooser<'_> {
     }
 
     pub fn fps(&self, options: &ConvertOptions, notes: &mut Vec<String>) -> Result<f64> {
-        let kwargs = self.plan.env_args.as_ref().and_then(|args| args.get("env_kwargs"));
-        let stated = kwargs.and_then(|kwargs| kwargs.get("control_freq")?.as_f64());
+        let stated = self.env_kwargs().and_then(|kwargs| kwargs.get("control_freq")).filter(|rate| !rate.is_null());
+        let stated = match stated {
+            Some(rate) if options.fps.is_none() => {
+                let number = rate.as_f64().or_else(|| rate.as_str()?.trim().parse().ok());
+                Some(number.ok_or_else(|| {
+                    self.bad_rate("env_args", "a number as env_kwargs.control_freq (--fps decides)", rate)
+                })?)
+            }
+            _ => None,
+        };
         // Isaac Lab states its steps
         let sim = self.plan.env_args.as_ref().and_then(|args| args.get("sim_args"));
         let step = sim.and_then(|sim| Some(sim.get("dt")?.as_f64()? * sim.get("decimation")?.as_f64()?));
@@ -428,24 +453,31 @@ impl Chooser<'_> {
             notes.push(format!("no rate is stated; {usual} Hz is taken, as is usual of {name} (--fps decides)"));
             Some(usual)
         };
-        let fps = options.fps.or(stated).or_else(&mut default).ok_or_else(|| InputError::BadAttribute {
-            path: self.plan.path.clone(),
-            object: "data".to_owned(),
-            attribute: "env_args".to_owned(),
-            expected: "env_kwargs.control_freq, or a rate given by hand (--fps)".to_owned(),
-            found: "neither".to_owned(),
+        let fps = options.fps.or(stated).or_else(&mut default).ok_or_else(|| {
+            self.bad_rate("env_args", "env_kwargs.control_freq, or a rate given by hand (--fps)", "neither")
         })?;
-        if fps.is_finite() && fps > 0.0 {
-            return Ok(fps);
+        self.checked(fps)
+    }
+
+    /// A rate, if there can be one like it: beyond it times of frames are not told apart.
+    fn checked(&self, fps: f64) -> Result<f64> {
+        match fps > 0.0 && fps <= MOST_FPS {
+            true => Ok(fps),
+            false => {
+                let expected = format!("a number above 0, at most {MOST_FPS}");
+                Err(self.bad_rate("frames a second", &expected, fps).into())
+            }
         }
-        Err(InputError::BadAttribute {
+    }
+
+    fn bad_rate(&self, attribute: &str, expected: &str, found: impl ToString) -> InputError {
+        InputError::BadAttribute {
             path: self.plan.path.clone(),
             object: "data".to_owned(),
-            attribute: "frames a second".to_owned(),
-            expected: "a number above 0".to_owned(),
-            found: fps.to_string(),
+            attribute: attribute.to_owned(),
+            expected: expected.to_owned(),
+            found: found.to_string(),
         }
-        .into())
     }
 
     /// Values a step of dataset `path`, the same in every demo.

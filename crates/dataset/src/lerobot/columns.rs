@@ -10,7 +10,7 @@ use crate::windows::Resident;
 use arrow_array::{Array, ArrayRef};
 use arrow_buffer::ScalarBuffer;
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Rows that pass at a time where they are not kept.
@@ -43,9 +43,14 @@ pub(super) fn read_columns(
         names.push("timestamp");
     }
     let mut casts: BTreeMap<&str, String> = BTreeMap::new();
-    let mut late = Late::default();
+    let (mut late, mut strangers) = (Late::default(), BTreeSet::new());
     let (mut row, mut episode) = (0, 0);
     for path in read::files(root, "data")? {
+        for field in read::open(&path)?.schema().fields().iter().filter(|_| owned) {
+            if info.features.get(field.name()).is_none() {
+                strangers.insert(field.name().clone());
+            }
+        }
         if names.is_empty() {
             row += read::columns_there(&path, &[])?.0;
             continue;
@@ -115,6 +120,12 @@ pub(super) fn read_columns(
         let dtype = info.features.get(name).map_or("", |feature| &feature.dtype);
         notes.push(format!("column {name}: expected {dtype}, as info.json says, found {found}: cast, as LeRobot does"));
     }
+    notes.extend(strangers.into_iter().map(|name| {
+        format!(
+            "column {name}: meta/info.json states no such feature, and LeRobot opens no set with such a column: it is left \
+             out, with its values"
+        )
+    }));
     notes.extend(late.note());
     Ok(())
 }
@@ -203,7 +214,9 @@ impl Late {
                 self.first = (episode.index, frame);
             }
             self.frames += 1;
-            self.most = self.most.max(off);
+            if off.is_nan() || off > self.most {
+                self.most = off;
+            }
         }
     }
 

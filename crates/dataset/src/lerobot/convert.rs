@@ -5,6 +5,7 @@
 
 use super::assembly::{Assembly, Encoders, Head, bytes_of};
 use super::depth;
+use super::doubts::Doubts;
 use super::encode::{GroupOutput, Job};
 use super::encoded;
 use super::features::{ConvertOptions, Mapping};
@@ -101,13 +102,16 @@ pub fn convert_unless(
         let rest = opened.rest()?;
         let mut assembly = Assembly::new(staging.path(), &head, &encoders, rest.as_ref())?;
         let groups = opened.groups(options);
-        opened.each_group((source, options), &head, &encoders, &groups, progress, &mut |output, beside| {
-            assembly.take(output, beside)
-        })?;
+        let doubts =
+            opened.each_group((source, options), &head, &encoders, &groups, progress, &mut |output, beside| {
+                assembly.take(output, beside)
+            })?;
         // the reading process ends before what all episodes say is put together: they need not be in memory at once
         drop(opened);
         let hash = hash.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
-        assembly.finish(hash)
+        let mut report = assembly.finish(hash)?;
+        report.notes.extend(doubts.notes());
+        Ok::<_, DatasetError>(report)
     })?;
     staging.publish()?;
     Ok(report)
@@ -212,7 +216,8 @@ impl Opened {
         Ok(Some(rest))
     }
 
-    /// Reads and encodes row groups on several threads and hands them over in order, on this one.
+    /// Reads and encodes row groups on several threads and hands them over in order, on this one. Gives what is to be noted
+    /// of their values.
     pub(super) fn each_group(
         &self,
         (source, options): (&Path, &ConvertOptions),
@@ -221,7 +226,7 @@ impl Opened {
         groups: &[Vec<Part>],
         progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
         take: &mut TakeGroup<'_>,
-    ) -> Result<()> {
+    ) -> Result<Doubts> {
         let mut tell = |done, total| match progress(done, total) {
             ControlFlow::Continue(()) => Ok(()),
             ControlFlow::Break(()) => Err(DatasetError::Stopped { path: source.to_owned() }),
@@ -237,7 +242,7 @@ impl Opened {
             task_of: &head.task_of,
         };
         let total = groups.iter().flatten().map(|part| part.rows.len() as u64).sum();
-        let mut done = 0;
+        let (mut done, mut doubts) = (0, Doubts::default());
         tell(0, total)?;
         work::in_order(
             groups.len(),
@@ -245,14 +250,17 @@ impl Opened {
             |index| {
                 let mut loaded = job.load(&groups[index])?;
                 let beside = self.side.as_ref().map(|side| side.encode(&job, &loaded)).transpose()?;
-                Ok((job.encode(&mut loaded)?, beside))
+                let doubts = Doubts::of(&self.mapping.columns, &loaded);
+                Ok((job.encode(&mut loaded)?, beside, doubts))
             },
-            |(output, beside): (GroupOutput, Option<SideOutput>)| {
+            |(output, beside, found): (GroupOutput, Option<SideOutput>, Doubts)| {
                 done += output.group.rows as u64;
+                doubts.extend(&found);
                 take(output, beside)?;
                 tell(done, total)
             },
-        )
+        )?;
+        Ok(doubts)
     }
 
     /// What the result says of itself, as far as that is known before its frames are.

@@ -251,11 +251,11 @@ impl Mapping {
         }
         let (mut pictures, mut left_out) = (chooser.images()?, BTreeMap::new());
         chooser.depth(options, &mut pictures, &mut left_out);
-        notes.extend(chooser.pictures_left_out(&pictures, left_out, options));
         columns.extend(pictures);
+        notes.extend(chooser.pictures_left_out(&columns, left_out, options));
         let (action, provenance) = chooser.action(options)?;
         columns.push(action);
-        columns.extend(chooser.outcomes()?);
+        columns.extend(chooser.outcomes(&mut notes)?);
         columns.extend(index_columns());
         let fps = chooser.fps(options, &mut notes)?;
         let entities = options.entities.clone();

@@ -147,9 +147,13 @@ fn opened(file: &[u8]) -> Result<(Jpeg<'_>, (usize, usize)), String> {
     Ok((decoder, (height, width)))
 }
 
-/// Height and width of a JPEG file; in words what is wrong otherwise.
+/// Height and width of a JPEG file in colour, which LeRobot records; in words what is wrong otherwise.
 pub(crate) fn jpeg_size(file: &[u8]) -> Result<(usize, usize), String> {
-    opened(file).map(|(_, size)| size)
+    let (decoder, size) = opened(file)?;
+    match decoder.input_colorspace() {
+        Some(ColorSpace::Luma) => Err("a grey JPEG file".to_owned()),
+        _ => Ok(size),
+    }
 }
 
 fn decode_jpeg(file: &[u8], expected: (usize, usize), out: &mut Vec<u8>) -> Result<(usize, usize), String> {

@@ -196,8 +196,14 @@ pub(crate) fn write_stats(
     let mut all = Map::new();
     for (name, is_image) in features {
         let mut one = Map::new();
+        let of_feature = stats.get(name).ok_or_else(|| DatasetError::BadDataset {
+            path: root.join("meta/stats.json"),
+            object: name.clone(),
+            expected: "statistics of every column".to_owned(),
+            found: "none".to_owned(),
+        })?;
         for (statistic, get) in STATISTICS {
-            let values = get(&stats[name]);
+            let values = get(of_feature);
             if values.is_empty() {
                 continue;
             }
@@ -207,7 +213,7 @@ pub(crate) fn write_stats(
             };
             one.insert(statistic.to_owned(), value);
         }
-        one.insert("count".to_owned(), json!([stats[name].count]));
+        one.insert("count".to_owned(), json!([of_feature.count]));
         all.insert(name.clone(), Value::Object(one));
     }
     write_json(root, "meta/stats.json", &Value::Object(all))

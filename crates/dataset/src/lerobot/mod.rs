@@ -6,6 +6,7 @@ mod chooser;
 mod columns;
 mod convert;
 mod depth;
+mod doubts;
 pub mod edit;
 mod encode;
 mod encoded;

@@ -5,8 +5,8 @@ use crate::source::is_lfs_pointer;
 use crate::windows::Resident;
 use arrow_array::{Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, LargeListArray, ListArray};
 use arrow_buffer::ScalarBuffer;
-use arrow_cast::cast;
-use arrow_schema::DataType;
+use arrow_cast::{CastOptions, cast, cast_with_options};
+use arrow_schema::{ArrowError, DataType};
 use arrow_select::concat::concat;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
@@ -215,13 +215,18 @@ fn even(mut offsets: impl Iterator<Item = usize>) -> bool {
     })
 }
 
+/// A cast that fails at what the type cannot hold, instead of leaving it out.
+pub(crate) fn cast_all(array: &ArrayRef, to: &DataType) -> std::result::Result<ArrayRef, ArrowError> {
+    cast_with_options(array, to, &CastOptions { safe: false, ..CastOptions::default() })
+}
+
 /// A column of whole numbers.
 pub(crate) fn integers(path: &Path, name: &str, array: &ArrayRef) -> Result<ScalarBuffer<i64>> {
     let column = BadColumn { path, name };
     if array.null_count() > 0 || !array.data_type().is_integer() {
         return Err(column.because("whole numbers", format!("{} with {} nulls", array.data_type(), array.null_count())));
     }
-    let cast = cast(array, &DataType::Int64).map_err(|e| column.because("64-bit numbers", e.to_string()))?;
+    let cast = cast_all(array, &DataType::Int64).map_err(|e| column.because("64-bit numbers", e.to_string()))?;
     let longs = cast.as_any().downcast_ref::<arrow_array::Int64Array>().expect("an int64 column");
     Ok(longs.values().clone())
 }

@@ -140,6 +140,16 @@ pub(super) fn from_columns(
         }
         columns.push(StatedColumn { name: name.clone(), key, feature: feature.clone() });
     }
+    if notes.iter().any(|note| note.starts_with("timestamp: ")) {
+        notes.push("timestamp is left out: a robomimic file has steps, and no times of a clock".to_owned());
+    }
+    let lacking: Vec<&str> = ["rewards", "dones"].into_iter().filter(|key| !taken.contains(*key)).collect();
+    if !lacking.is_empty() {
+        notes.push(format!(
+            "the data set has no {}, which robomimic wants: rewards are 0, and a demo is done at its last step",
+            lacking.join(" and no ")
+        ));
+    }
     let mut cursors = BTreeMap::new();
     for column in columns.iter().filter(|c| c.feature.dtype != "video") {
         let rows = if column.feature.is_visual() { 32 } else { 1024 };

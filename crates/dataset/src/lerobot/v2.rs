@@ -13,12 +13,12 @@ use super::totals::EpisodeStats;
 use super::verify::not_finite;
 use super::videos::{Stretch, VIDEO_PATH};
 use crate::error::{DatasetError, InputError, Result};
-use crate::source::NonFinite;
+use crate::source::{NonFinite, list};
 use crate::stats::FeatureStats;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::ControlFlow;
 use std::os::unix::fs::symlink;
 use std::path::{Component, Path, PathBuf};
@@ -150,13 +150,19 @@ impl OldSet {
         progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
     ) -> Result<ConvertReport> {
         refuse_choices(&self.root, options)?;
-        if let (NonFinite::Refuse, Some(found)) = (options.nonfinite, not_finite(&self.set)) {
-            return Err(DatasetError::BadDataset {
-                path: self.root,
-                object: "frames".to_owned(),
-                expected: "finite numbers (--nonfinite keep stores others)".to_owned(),
-                found: found.lines().next().unwrap_or_default().to_owned(),
-            });
+        if options.nonfinite == NonFinite::Refuse {
+            let found = match not_finite(&self.set) {
+                Some(found) => Some(found),
+                None => no_time(self.view.path()).map_err(|error| named(error, self.view.path(), &self.root))?,
+            };
+            if let Some(found) = found {
+                return Err(DatasetError::BadDataset {
+                    path: self.root,
+                    object: "frames".to_owned(),
+                    expected: "finite numbers (--nonfinite keep stores others)".to_owned(),
+                    found: found.lines().next().unwrap_or_default().to_owned(),
+                });
+            }
         }
         let Self { root, version, view, mut set, notes } = self;
         set.limit_files(options.data_file_mb, options.video_file_mb);
@@ -231,11 +237,19 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
     };
     let mut rows = Vec::with_capacity(episodes.len());
     let mut each = EpisodeStats::new(view);
+    let mut others = data_files(root, &info.data_path);
+    if info.total_episodes != episodes.len() {
+        let (there, stated) = (episodes.len(), info.total_episodes);
+        notes.push(format!(
+            "meta/info.json: total_episodes: expected {there}, as meta/episodes.jsonl lists, found {stated}: read as {there}"
+        ));
+    }
     let mut from = 0;
     for (number, line) in episodes.into_iter().enumerate() {
         let chunk = number / info.chunks_size.max(1);
         let relative = fill(&info.data_path, "", chunk, number);
         let file = root.join(relative.ok_or_else(|| bad_path("data_path", info.data_path.clone()))?);
+        others.remove(&file);
         let found = read::open(&file)?.metadata().file_metadata().num_rows();
         let length = usize::try_from(found).unwrap_or(0);
         if length != line.length {
@@ -272,6 +286,12 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
         each.add(&stats.remove(&number).unwrap_or_default())?;
         from += length;
     }
+    if !others.is_empty() {
+        let names: Vec<String> =
+            others.iter().map(|file| file.strip_prefix(root).unwrap_or(file).display().to_string()).collect();
+        let of = list(names.iter().map(String::as_str));
+        notes.push(format!("meta/episodes.jsonl lists no episode of {} files, which are left out: {of}", names.len()));
+    }
     let images = root.join("images");
     if images.is_dir() {
         // images that frames name by path
@@ -292,6 +312,26 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
     }
     info.actrm = None;
     meta::write_info(view, &info).map(drop)
+}
+
+/// The first time that is NaN or infinite, in a view, which has a file an episode.
+fn no_time(view: &Path) -> Result<Option<String>> {
+    for (episode, path) in read::files(view, "data")?.iter().enumerate() {
+        let (_, arrays) = read::columns_there(path, &["timestamp"])?;
+        let Some(array) = arrays.get("timestamp") else { continue };
+        let times = read::doubles(path, "timestamp", array)?;
+        if let Some(frame) = times.iter().position(|time| !time.is_finite()) {
+            return Ok(Some(format!("timestamp: episode {episode}, frame {frame}: {}", times[frame])));
+        }
+    }
+    Ok(None)
+}
+
+/// The Parquet files beside those that `template` names.
+fn data_files(root: &Path, template: &str) -> BTreeSet<PathBuf> {
+    let top = template.split('/').next().unwrap_or_default();
+    // whoever reads the files says what is wrong with them
+    read::files(root, top).into_iter().flatten().collect()
 }
 
 fn link(file: &Path, view: &Path) -> Result<()> {

@@ -145,6 +145,24 @@ fn d4rl_is_cut_at_terminals_and_timeouts() {
     assert_eq!(root.datasets.keys().collect::<Vec<_>>(), ["metadata/weights"]);
 }
 
+#[test]
+fn d4rl_arrays_of_another_length_are_named() {
+    let run = |observed: usize| {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("run.hdf5");
+        let file = File::create(&path).unwrap();
+        floats(&file, "observations", &[observed, 4]);
+        floats(&file, "actions", &[10, 2]);
+        floats(&file, "rewards", &[9]);
+        bytes(&file, "terminals", &[10], |i| u8::from(i == 9));
+        file.close().unwrap();
+        Source::open(&path).map(|source| source.plan().notes.clone()).map_err(|e| e.to_string())
+    };
+    assert!(run(10).unwrap()[0].starts_with("rewards has 9 rows where actions has 10"), "{:?}", run(10));
+    let error = run(8).unwrap_err();
+    assert!(error.ends_with("observations: expected 10 (the actions) steps, found shape [8, 4]"), "{error}");
+}
+
 fn episode(path: &Path, steps: usize) {
     let file = File::create(path).unwrap();
     file.new_attr::<bool>().create("sim").unwrap().write_scalar(&true).unwrap();
@@ -171,6 +189,10 @@ fn a_folder_of_aloha_episodes_is_one_data_set() {
     let last = source.read_demo(2).unwrap();
     assert_eq!(last.datasets["actions"].shape, [4, 14]);
     assert_eq!(last.attrs["sim"].bytes, [1]);
+    // an episode that was stopped before its first step
+    episode(&dir.path().join("episode_3.hdf5"), 0);
+    let problems = Source::open(dir.path()).unwrap().plan().problems.clone();
+    assert!(problems[0].message.ends_with("demo_3: action: expected at least 1 steps, found 0: the demo is empty"));
     // one file of them is a data set of one demo
     let one = Source::open(&dir.path().join("episode_2.hdf5")).unwrap();
     assert_eq!(one.plan().demos.len(), 1);
@@ -247,6 +269,63 @@ fn a_type_that_cannot_be_carried_is_a_fault_of_its_dataset_only() {
     let error = source.read_demo(0).unwrap_err().to_string();
     assert!(error.ends_with("data/demo_0/ragged: the type [float32] (var len) is not supported"), "{error}");
     assert!(source.read_demo_where(0, &|key| key != "ragged").is_ok());
+}
+
+#[test]
+fn packed_byte_strings_keep_their_zero_bytes() {
+    let picture = include_bytes!("../../tests/fixtures/jpeg/0.jpg");
+    let make = |group: &Group, name: &str, width: usize, bytes: Vec<u8>| {
+        let array = Array { dtype: crate::tree::Dtype::FixedStr(width), shape: vec![bytes.len() / width], bytes };
+        let dtype = super::value::descriptor_of(&array.dtype).unwrap();
+        let dataset = group.new_dataset_builder().chunk(2).deflate(3).empty_as(&dtype).shape(3).create(name).unwrap();
+        super::value::write(&dataset, &array).unwrap();
+        array
+    };
+    let mut written = Vec::new();
+    let (_dir, source) = made(|file| {
+        let one = demo(file, 0, 3);
+        written.push(make(&one, "tags", 5, b"\x01\0\x02\0\x03".repeat(3)));
+        written.push(make(&one.group("obs").unwrap(), "front_image", picture.len(), picture.repeat(3)));
+    });
+    let read = source.read_demo(0).unwrap();
+    assert_eq!(read.datasets["tags"], written[0]);
+    assert_eq!(source.read_rows(0, "tags", 1, 2).unwrap().bytes, b"\x01\0\x02\0\x03".repeat(2));
+    let pictures = &read.datasets["obs/front_image"];
+    assert_eq!((&pictures.shape[..], &pictures.bytes), (&[3, picture.len()][..], &written[1].bytes));
+}
+
+#[test]
+fn attributes_of_odd_types_are_left_out_with_a_note() {
+    let (_dir, source) = made(|file| {
+        for number in 0..2 {
+            let one = demo(file, number, 3);
+            let ragged = one.dataset("actions").unwrap().new_attr::<hdf5::types::VarLenArray<f32>>().shape([1]);
+            ragged.create("DIMENSION_LIST").unwrap();
+            text(&one, "note", "kept");
+        }
+    });
+    let expected = "attribute DIMENSION_LIST of data/demo_0/actions and 1 more is left out: \
+        the type [float32] (var len) is not supported";
+    assert_eq!(source.plan().notes, [expected]);
+    let read = source.read_demo(1).unwrap();
+    assert_eq!((read.attrs["note"].to_text().as_deref(), read.inner_attrs["actions"].len()), (Some("kept"), 0));
+}
+
+#[test]
+fn members_that_look_like_demos_are_named() {
+    let (_dir, source) = made(|file| {
+        demo(file, 0, 3);
+        let data = file.group("data").unwrap();
+        for name in ["Demo_3", "demo_1_fixed", "demo_99999999999999999999"] {
+            floats(&data.create_group(name).unwrap(), "actions", &[3, 7]);
+        }
+        floats(&data, "demo_5", &[3]);
+        data.create_group("statistics").unwrap();
+    });
+    let expected = "in data, these are no demos: a demo is a group called demo_ and a whole number below 2^64: Demo_3, \
+        demo_1_fixed, demo_5, demo_99999999999999999999";
+    assert_eq!(source.plan().notes, [expected]);
+    assert_eq!(source.plan().demos.len(), 1);
 }
 
 #[test]

@@ -8,8 +8,8 @@ use std::sync::Arc;
 use super::dialect::{self, DemoDraft, Draft, Survey};
 use super::walk::{Walked, check_signature};
 use crate::error::InputError;
-use crate::plan::{DemoPlan, Join, Plan, Problem};
-use crate::tree::{Array, Attrs, Demo};
+use crate::plan::{DemoPlan, Join, KeyPlan, Plan, Problem};
+use crate::tree::{Array, Attrs, Demo, Dtype};
 
 /// What a source can be asked for, in this process or in another.
 pub(super) trait Backend: Send + Sync {
@@ -266,11 +266,19 @@ impl Backend for Local {
     }
 
     fn rows(&self, index: usize, key: &str, first: usize, count: usize) -> Result<Array, InputError> {
-        let place = self.place(index, key)?;
+        let KeyPlan { place, dtype, .. } = self.key(index, key)?;
         let file = &self.survey.files[place.file];
         let from = place.first_row + first;
         let beside = match place.join.as_deref() {
-            None => return file.read(&place.path, Some((from, count))),
+            None => {
+                let mut array = file.read(&place.path, Some((from, count)))?;
+                // byte strings that hold JPEG files are rows of bytes
+                if let (Dtype::U8, &Dtype::FixedStr(width)) = (dtype, &array.dtype) {
+                    array.dtype = Dtype::U8;
+                    array.shape.push(width);
+                }
+                return Ok(array);
+            }
             Some(Join::Before(path)) => {
                 let mut array = file.read(path, Some((0, usize::from(from == 0 && count > 0))))?;
                 let rest = file.read(&place.path, Some((from.saturating_sub(1), count - array.shape[0])))?;
@@ -323,9 +331,9 @@ impl Local {
         Ok(())
     }
 
-    fn place(&self, index: usize, key: &str) -> Result<&crate::plan::Place, InputError> {
+    fn key(&self, index: usize, key: &str) -> Result<&KeyPlan, InputError> {
         let (plan, _) = self.at(index)?;
-        plan.keys.get(key).map(|k| &k.place).ok_or_else(|| InputError::MissingKey {
+        plan.keys.get(key).ok_or_else(|| InputError::MissingKey {
             path: self.survey.path.clone(),
             demo: plan.id.clone(),
             key: key.to_owned(),
@@ -334,7 +342,7 @@ impl Local {
     }
 
     fn scalar(&self, index: usize, key: &str) -> Result<Array, InputError> {
-        let place = self.place(index, key)?;
+        let place = &self.key(index, key)?.place;
         self.survey.files[place.file].read(&place.path, None)
     }
 }

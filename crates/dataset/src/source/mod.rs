@@ -2,6 +2,7 @@
 
 pub(crate) mod codec;
 mod dialect;
+mod field;
 pub mod isolation;
 mod local;
 mod rlds;

@@ -62,6 +62,8 @@ struct Record {
     id: String,
     attrs: Attrs,
     keys: BTreeMap<String, KeyPlan>,
+    /// Whether its steps have different instructions.
+    several: bool,
 }
 
 #[derive(Deserialize)]
@@ -234,7 +236,7 @@ fn count(kind: u64, list: &[u8]) -> Result<usize, String> {
 
 /// The numbers of a list in their own type.
 fn elements(kind: u64, list: &[u8], dtype: &Dtype) -> Result<Vec<u8>, String> {
-    let mut out = Vec::new();
+    let (mut out, mut beyond) = (Vec::new(), None);
     let whole = kind == 3;
     let put = &mut |float: f32, number: i64| {
         let bytes = number.to_le_bytes();
@@ -244,14 +246,35 @@ fn elements(kind: u64, list: &[u8], dtype: &Dtype) -> Result<Vec<u8>, String> {
             Dtype::F64 if whole => out.extend_from_slice(&(number as f64).to_le_bytes()),
             Dtype::F64 => out.extend_from_slice(&f64::from(float).to_le_bytes()),
             Dtype::Bool => out.push(u8::from(number != 0)),
-            other => out.extend_from_slice(&bytes[..other.size().unwrap_or(8)]),
+            other => {
+                if !holds(other, number) {
+                    beyond.get_or_insert(number);
+                }
+                out.extend_from_slice(&bytes[..other.size().unwrap_or(8)]);
+            }
         }
     };
     if !whole && !matches!(dtype, Dtype::F32 | Dtype::F64) {
         return Err(format!("floats where {dtype} is stated"));
     }
     numbers(kind, list, put)?;
-    Ok(out)
+    match beyond {
+        Some(number) => Err(format!("the number {number} where {dtype} is stated")),
+        None => Ok(out),
+    }
+}
+
+/// Whether a type has this number; the records have those of uint64 as int64 of the same bits.
+fn holds(dtype: &Dtype, number: i64) -> bool {
+    match dtype {
+        Dtype::U8 => u8::try_from(number).is_ok(),
+        Dtype::I8 => i8::try_from(number).is_ok(),
+        Dtype::U16 => u16::try_from(number).is_ok(),
+        Dtype::I16 => i16::try_from(number).is_ok(),
+        Dtype::U32 => u32::try_from(number).is_ok(),
+        Dtype::I32 => i32::try_from(number).is_ok(),
+        _ => true,
+    }
 }
 
 // ---- what features.json states ----
@@ -434,6 +457,16 @@ impl Rlds {
         if demos.is_empty() && problems.iter().all(|p| p.demo.is_none()) {
             return Err(InputError::NoDemos { path: self.path.clone(), found: "no record".to_owned() });
         }
+        for demo in &mut demos {
+            // the folder is called after the version
+            demo.task.get_or_insert_with(|| info.name.clone());
+        }
+        let mut notes = Vec::new();
+        let several: Vec<&str> = self.records.iter().filter(|r| r.several).map(|r| r.id.as_str()).collect();
+        if !several.is_empty() {
+            let ids = super::dialect::list(several.into_iter());
+            notes.push(format!("steps have different instructions, of which the first becomes the task: {ids}"));
+        }
         Ok(Plan {
             path: self.path.clone(),
             files: files.into_iter().map(|f| (f.clone(), std::fs::metadata(&f).map_or(0, |m| m.len()))).collect(),
@@ -444,7 +477,7 @@ impl Rlds {
             env_version: None,
             masks,
             texts: BTreeMap::new(),
-            notes: Vec::new(),
+            notes,
             problems,
         })
     }
@@ -520,6 +553,7 @@ impl Rlds {
             match episode {
                 Ok((0, ..)) => problems.push(Problem::empty(path, &id, "steps")),
                 Ok((steps, keys, attrs, task)) => {
+                    let (task, several) = task.map_or((None, false), |(task, several)| (Some(task), several));
                     demos.push(DemoPlan {
                         id: id.clone(),
                         number: position as u64,
@@ -529,7 +563,7 @@ impl Rlds {
                         task,
                     });
                     let (file, offset) = (path.to_owned(), at + 12);
-                    self.records.push(Record { file, offset, length: content.len(), id, attrs, keys });
+                    self.records.push(Record { file, offset, length: content.len(), id, attrs, keys, several });
                 }
                 Err(reason) => {
                     problems.push(Problem::new(Some(&id), None, true, self.damaged(path, &object, &reason)));
@@ -542,17 +576,17 @@ impl Rlds {
         Ok(())
     }
 
-    /// Steps, keys, attributes and instruction of a record.
+    /// Steps, keys, attributes and instruction of a record, and whether there are others.
     #[allow(clippy::type_complexity)]
     fn episode(
         &self,
         record: &[u8],
         metadata: &[Leaf],
-    ) -> Result<(usize, BTreeMap<String, KeyPlan>, Attrs, Option<String>), String> {
+    ) -> Result<(usize, BTreeMap<String, KeyPlan>, Attrs, Option<(String, bool)>), String> {
         let lists = lists(record)?;
         let mut steps: Option<(usize, &str)> = None;
         let mut keys = BTreeMap::new();
-        let mut task: Option<(usize, String)> = None;
+        let mut task: Option<(usize, (String, bool))> = None;
         for leaf in &self.leaves {
             let Some(&(kind, list)) = lists.get(leaf.name.as_str()) else { continue };
             let (all, width) = (count(kind, list)?, leaf.shape.iter().product::<usize>());
@@ -582,7 +616,8 @@ impl Rlds {
                     if let (true, Some(said)) = (leaf.name.contains("instruction"), said)
                         && task.as_ref().is_none_or(|(length, _)| leaf.name.len() < *length)
                     {
-                        task = Some((leaf.name.len(), String::from_utf8_lossy(said).into_owned()));
+                        let several = texts.iter().any(|text| !text.is_empty() && text != said);
+                        task = Some((leaf.name.len(), (String::from_utf8_lossy(said).into_owned(), several)));
                     }
                     dtype = Dtype::VarStr;
                 }
@@ -607,7 +642,7 @@ impl Rlds {
             let Some(&(kind, list)) = lists.get(leaf.name.as_str()) else { continue };
             let value = match &leaf.form {
                 Form::Numbers(dtype) => {
-                    let bytes = elements(kind, list, dtype)?;
+                    let bytes = elements(kind, list, dtype).map_err(|e| format!("{}: {e}", leaf.name))?;
                     let expected = leaf.shape.iter().product::<usize>() * dtype.size().unwrap_or(0);
                     (bytes.len() == expected).then(|| Array { dtype: dtype.clone(), shape: leaf.shape.clone(), bytes })
                 }
@@ -621,7 +656,7 @@ impl Rlds {
             attrs.extend(value.map(|value| (name.to_owned(), value)));
         }
         let (steps, _) = steps.ok_or("none of the steps that features.json states")?;
-        Ok((steps, keys, attrs, task.map(|(_, text)| text)))
+        Ok((steps, keys, attrs, task.map(|(_, said)| said)))
     }
 
     /// A record's content.
@@ -736,3 +771,6 @@ impl Backend for Rlds {
         rows.map_err(|reason| self.damaged(&record.file, &format!("{} of {}", leaf.name, record.id), &reason))
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -44,7 +44,8 @@ fn array() -> impl Strategy<Value = Array> {
         };
         let bytes = match &dtype {
             Dtype::Bool => (0..count).map(|i| at(i) % 2).collect(),
-            Dtype::FixedStr(n) | Dtype::FixedUtf8(n) => (0..count)
+            Dtype::FixedStr(n) => (0..count * n).map(at).collect(),
+            Dtype::FixedUtf8(n) => (0..count)
                 .flat_map(|i| {
                     let mut field = word(i, *n).into_bytes();
                     field.resize(*n, 0);

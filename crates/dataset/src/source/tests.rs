@@ -194,6 +194,16 @@ fn every_kind_of_element_survives() {
     put("scalar", Array::from_str("one"));
     let ascii = Array { dtype: Dtype::VarAscii, ..Array::from_str("plain") };
     put("ascii", ascii.clone());
+    // byte strings are any bytes, whatever their type says
+    let raw = Array { dtype: Dtype::FixedStr(5), shape: vec![2], bytes: b"\x01\0\x02\0\x03\0\0\xe9\0\0".to_vec() };
+    put("raw", raw.clone());
+    put(
+        "wide",
+        Array { dtype: Dtype::FixedStr(150_001), shape: vec![1], bytes: [0, 200].repeat(75_001)[..150_001].to_vec() },
+    );
+    put("broken_utf8", Array { dtype: Dtype::FixedUtf8(2), shape: vec![2], bytes: b"\xe9\0\0a".to_vec() });
+    put("latin", Array { dtype: Dtype::VarAscii, shape: vec![], bytes: b"\x03\0\0\0\xe9t\xe9".to_vec() });
+    demo.attrs.insert("raw".to_owned(), raw);
     let huge = "<mujoco/>".repeat(20_000);
     demo.attrs.insert("model_file".to_owned(), Array::from_str(&huge));
     demo.attrs.insert("fixed".to_owned(), Array::from_fixed_strings(&[&huge[..60_000]]));
@@ -339,7 +349,10 @@ fn wrong_length_and_wrong_num_samples() {
     demo.attrs.insert("num_samples".to_owned(), Array::from_i32(vec![], &[6]));
     let (_dir, path) = saved(&[demo], |_| {});
     let error = input_error(Source::open(&path).unwrap().read_demo(0));
-    assert!(error.to_string().ends_with("demo_0: actions: expected 6 steps, found shape [5, 7]"), "{error}");
+    assert!(
+        error.to_string().ends_with("demo_0: actions: expected 6 (num_samples) steps, found shape [5, 7]"),
+        "{error}"
+    );
 }
 
 #[test]

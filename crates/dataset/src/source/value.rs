@@ -1,11 +1,10 @@
 //! Elements between HDF5 and [`Array`]: which types are carried, and how they are read and written.
 
-use hdf5::types::{
-    FixedAscii, FixedUnicode, FloatSize, H5Type, IntSize, TypeDescriptor, VarLenArray, VarLenAscii, VarLenUnicode,
-};
+use hdf5::types::{FloatSize, H5Type, IntSize, TypeDescriptor, VarLenArray, VarLenAscii, VarLenUnicode};
 use hdf5::{Container, Hyperslab, Selection, SliceOrIndex};
 use ndarray::IxDyn;
 
+use super::field;
 use crate::tree::{Array, Dtype, push_str};
 
 /// Why elements could not be read or written, in words; the caller knows where.
@@ -57,46 +56,8 @@ pub(super) fn descriptor_of(dtype: &Dtype) -> ValueResult<TypeDescriptor> {
     })
 }
 
-/// Widest fixed-length string that is carried, in bytes. Memory types have their width at compile time, so a
-/// string travels in the next wider of a few widths.
-pub(super) const MAX_FIXED: usize = 65_536;
-
-macro_rules! for_width {
-    ($n:expr, $kind:ident, $call:ident ( $($arg:expr),* )) => {
-        match $n {
-            0..=8 => $call::<$kind<8>>($($arg),*),
-            9..=64 => $call::<$kind<64>>($($arg),*),
-            65..=1024 => $call::<$kind<1024>>($($arg),*),
-            1025..=16_384 => $call::<$kind<16_384>>($($arg),*),
-            _ => $call::<$kind<MAX_FIXED>>($($arg),*),
-        }
-    };
-}
-
-/// A type whose values are text of a width known at compile time.
-trait FixedText: H5Type + Sized {
-    fn text(&self) -> &[u8];
-    fn make(bytes: &[u8]) -> ValueResult<Self>;
-}
-
-impl<const N: usize> FixedText for FixedAscii<N> {
-    fn text(&self) -> &[u8] {
-        self.as_bytes()
-    }
-    fn make(bytes: &[u8]) -> ValueResult<Self> {
-        Self::from_ascii(bytes).map_err(|e| format!("a byte string that is not ASCII: {e}"))
-    }
-}
-
-impl<const N: usize> FixedText for FixedUnicode<N> {
-    fn text(&self) -> &[u8] {
-        self.as_bytes()
-    }
-    fn make(bytes: &[u8]) -> ValueResult<Self> {
-        let text = std::str::from_utf8(bytes).map_err(|e| format!("a string that is not UTF-8: {e}"))?;
-        text.parse().map_err(|e| format!("a string that does not fit: {e}"))
-    }
-}
+/// Widest fixed-length string that libhdf5 is asked for, in bytes.
+pub(super) const MAX_FIXED: usize = 8 << 20;
 
 /// Which part of a dataset to read: everything, or rows.
 #[derive(Clone, Copy)]
@@ -105,7 +66,7 @@ pub(super) enum Part<'a> {
     Rows { first: usize, count: usize, shape: &'a [usize] },
 }
 
-fn elements<T: H5Type>(from: &Container, part: Part<'_>) -> ValueResult<Vec<T>> {
+pub(super) fn elements<T: H5Type>(from: &Container, part: Part<'_>) -> ValueResult<Vec<T>> {
     let words = |e: hdf5::Error| reason(&e);
     match part {
         Part::All => from.read_raw::<T>().map_err(words),
@@ -124,26 +85,6 @@ fn elements<T: H5Type>(from: &Container, part: Part<'_>) -> ValueResult<Vec<T>> 
             }
         }
     }
-}
-
-fn fixed<T: FixedText>(from: &Container, part: Part<'_>, width: usize) -> ValueResult<Vec<u8>> {
-    let values = elements::<T>(from, part)?;
-    let mut bytes = Vec::with_capacity(values.len() * width);
-    for value in &values {
-        let text = value.text();
-        // the library ends each string at its first zero byte, so only text comes whole
-        if text.starts_with(&[0xFF, 0xD8, 0xFF]) {
-            return Err(
-                "JPEG files as byte strings are read only from datasets that are neither chunked nor packed".to_owned()
-            );
-        }
-        if text.len() > width {
-            return Err(format!("a string of {} bytes in a field of {width}", text.len()));
-        }
-        bytes.extend_from_slice(text);
-        bytes.resize(bytes.len() + width - text.len(), 0);
-    }
-    Ok(bytes)
 }
 
 /// Reads the elements as [`Array`] keeps them.
@@ -177,8 +118,7 @@ pub(super) fn read(from: &Container, dtype: &Dtype, part: Part<'_>) -> ValueResu
             }
             values
         }
-        Dtype::FixedStr(n) => for_width!(*n, FixedAscii, fixed(from, part, *n))?,
-        Dtype::FixedUtf8(n) => for_width!(*n, FixedUnicode, fixed(from, part, *n))?,
+        Dtype::FixedStr(n) | Dtype::FixedUtf8(n) => field::read(from, part, *n, matches!(dtype, Dtype::FixedUtf8(_)))?,
         Dtype::VarAscii => {
             let mut bytes = Vec::new();
             for value in elements::<VarLenAscii>(from, part)? {
@@ -205,16 +145,8 @@ pub(super) fn read(from: &Container, dtype: &Dtype, part: Part<'_>) -> ValueResu
     })
 }
 
-fn put<T: H5Type>(to: &Container, values: &[T]) -> ValueResult<()> {
+pub(super) fn put<T: H5Type>(to: &Container, values: &[T]) -> ValueResult<()> {
     to.write_raw(values).map_err(|e| reason(&e))
-}
-
-fn put_fixed<T: FixedText>(to: &Container, bytes: &[u8], width: usize) -> ValueResult<()> {
-    let values: Vec<T> = bytes
-        .chunks_exact(width)
-        .map(|b| T::make(&b[..b.iter().rposition(|&c| c != 0).map_or(0, |last| last + 1)]))
-        .collect::<ValueResult<_>>()?;
-    put(to, &values)
 }
 
 /// Checks that shape, type and bytes of an array agree.
@@ -227,7 +159,7 @@ pub(super) fn check(array: &Array) -> ValueResult<()> {
     let (expected, found) = match array.dtype.size() {
         Some(0) => return Err("strings of no bytes".to_owned()),
         Some(size) => (count * size, array.bytes.len()),
-        None if array.dtype == Dtype::VarBytes => (count, array.byte_rows().ok_or("bytes that are cut off")?.len()),
+        None if array.dtype != Dtype::VarStr => (count, array.byte_rows().ok_or("bytes that are cut off")?.len()),
         None => (count, array.to_strings().ok_or("strings that are cut off or not UTF-8")?.len()),
     };
     if expected == found {
@@ -264,16 +196,12 @@ pub(super) fn write(to: &Container, array: &Array) -> ValueResult<()> {
             let values: Vec<bool> = array.bytes.iter().map(|&b| b != 0).collect();
             put(to, &values)
         }
-        Dtype::FixedStr(n) => for_width!(*n, FixedAscii, put_fixed(to, &array.bytes, *n)),
-        Dtype::FixedUtf8(n) => for_width!(*n, FixedUnicode, put_fixed(to, &array.bytes, *n)),
+        Dtype::FixedStr(n) | Dtype::FixedUtf8(n) => {
+            field::write(to, &array.bytes, *n, matches!(array.dtype, Dtype::FixedUtf8(_)))
+        }
         Dtype::VarAscii => {
-            let values: Vec<VarLenAscii> = array
-                .to_strings()
-                .ok_or("strings that are not UTF-8")?
-                .iter()
-                .map(|s| VarLenAscii::from_ascii(s).map_err(|e| format!("not ASCII: {e}")))
-                .collect::<ValueResult<_>>()?;
-            put(to, &values)
+            let rows = array.byte_rows().ok_or("strings that are cut off")?;
+            put(to, &rows.into_iter().map(field::ascii).collect::<ValueResult<Vec<_>>>()?)
         }
         Dtype::VarStr => {
             let values: Vec<VarLenUnicode> = array

@@ -60,6 +60,8 @@ pub(super) struct Walked {
     pub broken: BTreeMap<String, InputError>,
     /// Objects that are neither group nor dataset.
     pub faults: Vec<InputError>,
+    /// Attributes of types that are not carried, by object and name: they are left out.
+    pub odd_attrs: BTreeMap<(String, String), String>,
 }
 
 /// Groups from the file's own down to the one that is walked: file and place of each.
@@ -162,6 +164,7 @@ impl Walked {
             linked: Vec::new(),
             broken: BTreeMap::new(),
             faults: Vec::new(),
+            odd_attrs: BTreeMap::new(),
             file: None,
         };
         let types = NativeTypes::new().map_err(|e| damaged(path, "the library", "set up", reason(&e)))?;
@@ -176,8 +179,11 @@ impl Walked {
         Ok(walked)
     }
 
-    /// Whether the file has these bytes at this place.
-    pub fn begins_with(&self, offset: u64, expected: &[u8]) -> bool {
+    /// Whether the first element of a dataset begins with these bytes.
+    pub fn begins_with(&self, path: &str, node: &DatasetNode, expected: &[u8]) -> bool {
+        let Some(offset) = node.offset else {
+            return self.read(path, Some((0, 1))).is_ok_and(|first| first.bytes.starts_with(expected));
+        };
         let read = File::open(&self.path).and_then(|mut file| {
             let mut found = vec![0; expected.len()];
             file.seek(SeekFrom::Start(offset))?;
@@ -209,6 +215,9 @@ impl Walked {
             .links(IndexType::Name, IterationOrder::Increasing)
             .map_err(|e| damaged(&self.path, path, "list", reason(&e)))?;
         self.groups.insert(path.to_owned(), GroupNode { attrs, empty: links.is_empty() });
+        if attrs > 0 {
+            self.look_at_attrs(group, path);
+        }
         for (name, link) in links {
             let full = if path.is_empty() { name.clone() } else { format!("{path}/{name}") };
             self.check_name(&name, &full)?;
@@ -253,6 +262,9 @@ impl Walked {
                 LocationType::Dataset => {
                     let dataset = group.dataset(&name).map_err(|e| damaged(&self.path, &full, "open", reason(&e)))?;
                     let (node, native) = self.dataset(&dataset, &full, info.num_attrs, from, types)?;
+                    if info.num_attrs > 0 {
+                        self.look_at_attrs(&dataset, &full);
+                    }
                     if node.dtype.is_numeric() && node.dtype != Dtype::Bool && !native {
                         self.foreign.push(full.clone());
                     }
@@ -309,6 +321,28 @@ impl Walked {
         let bytes = std::fs::metadata(&target).map_err(|e| format!("{}: {e}", target.display()))?.len();
         self.linked.push((target, bytes));
         Ok(Some(self.linked.len() - 1))
+    }
+
+    /// Takes note of the attributes whose types are not carried.
+    fn look_at_attrs(&mut self, location: &hdf5::Location, object: &str) {
+        // what cannot be looked at is an error once it is read
+        for name in location.attr_names().unwrap_or_default() {
+            let dtype = location.attr(&name).and_then(|attr| attr.dtype());
+            if let Ok(Dtype::Other(what)) = dtype.map(|dtype| carrier(&dtype)) {
+                self.odd_attrs.insert((object.to_owned(), name), what);
+            }
+        }
+    }
+
+    /// Names of the attributes that are carried.
+    fn attr_names(&self, location: &hdf5::Location, object: &str) -> Result<Vec<String>, InputError> {
+        let names =
+            location.attr_names().map_err(|e| damaged(&self.path, object, "list the attributes of", reason(&e)));
+        let mut names = names?;
+        let path = object.trim_start_matches('/').to_owned();
+        names.retain(|name| !self.odd_attrs.contains_key(&(path.clone(), name.clone())));
+        names.iter().try_for_each(|name| self.check_name(name, &format!("attribute {name} of {object}")))?;
+        Ok(names)
     }
 
     /// Refuses names that no program writes and that would command the terminal they are shown on.
@@ -425,8 +459,7 @@ impl Walked {
     /// Names of the attributes of a group, and the values of those among them that are wanted.
     pub fn some_attrs(&self, path: &str, wanted: &[&str]) -> Result<(Vec<String>, Attrs), InputError> {
         let group = self.file()?.group(path).map_err(|e| damaged(&self.path, path, "open", reason(&e)))?;
-        let names = group.attr_names().map_err(|e| damaged(&self.path, path, "list the attributes of", reason(&e)))?;
-        names.iter().try_for_each(|name| self.check_name(name, &format!("attribute {name} of {path}")))?;
+        let names = self.attr_names(&group, path)?;
         let mut values = Attrs::new();
         for name in names.iter().filter(|n| wanted.contains(&n.as_str())) {
             values.insert(name.clone(), self.one_attr(&group, path, name)?);
@@ -435,10 +468,10 @@ impl Walked {
     }
 
     fn attrs_of(&self, location: &hdf5::Location, object: &str) -> Result<Attrs, InputError> {
-        let names =
-            location.attr_names().map_err(|e| damaged(&self.path, object, "list the attributes of", reason(&e)))?;
-        names.iter().try_for_each(|name| self.check_name(name, &format!("attribute {name} of {object}")))?;
-        names.into_iter().map(|name| Ok((name.clone(), self.one_attr(location, object, &name)?))).collect()
+        self.attr_names(location, object)?
+            .into_iter()
+            .map(|name| Ok((name.clone(), self.one_attr(location, object, &name)?)))
+            .collect()
     }
 
     fn one_attr(&self, location: &hdf5::Location, object: &str, name: &str) -> Result<Array, InputError> {

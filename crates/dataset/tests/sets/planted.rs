@@ -16,7 +16,7 @@ use arrow_select::concat::concat_batches;
 use arrow_select::take::take_record_batch;
 use dataset::edit::{Destination, Repair, Selection, keep, repair};
 use dataset::{
-    Array, Check, ConvertOptions, Dataset, Demo, RobomimicWriter, WriteOptions, convert, verify, verify_within,
+    Array, Check, ConvertOptions, Dataset, Demo, RobomimicWriter, WriteOptions, convert, export, verify, verify_within,
 };
 use parquet::arrow::ArrowWriter;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
@@ -506,6 +506,73 @@ fn times_of_a_clock_open_with_a_note_and_are_rewritten_when_asked_for() {
     let report = repair(&set, &Destination::InPlace, Repair { timestamps: true }, &mut quiet).unwrap();
     assert!(report.left.is_empty() && report.corrected.iter().any(|l| l.contains("timestamp")), "{report:?}");
     assert_eq!(problems(&verify(&set, &mut quiet).unwrap()), Vec::<String>::new());
+}
+
+#[test]
+fn statistics_of_times_of_a_clock_and_of_large_numbers_follow_from_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let (set, out) = (dir.path().join("set"), dir.path().join("out"));
+    sound(&set);
+    std::fs::remove_dir_all(set.join("actrm")).unwrap();
+    edit_json(&set, INFO, |info| info["features"]["next.reward"]["dtype"] = json!("uint64"));
+    for file in
+        ["data/chunk-000/file-000.parquet", "data/chunk-000/file-001.parquet", "data/chunk-000/file-002.parquet"]
+    {
+        edit_table(&set, file, |table| {
+            let times = |column: &ArrayRef| -> ArrayRef {
+                let times = column.as_primitive::<Float32Type>().values();
+                Arc::new(Float64Array::from_iter_values(times.iter().map(|&time| 1.7e9 + f64::from(time))))
+            };
+            let table = with_column(&table, "timestamp", times);
+            let rows = table.num_rows() as u64;
+            let large = |_: &ArrayRef| -> ArrayRef {
+                Arc::new(arrow_array::UInt64Array::from_iter_values((0..rows).map(|row| u64::MAX - (row << 50))))
+            };
+            with_column(&table, "next.reward", large)
+        });
+    }
+    keep(&set, &Destination::New(out.clone()), &numbers(0..DEMOS), &mut quiet).unwrap();
+    let stats = Dataset::open(&out).unwrap().stats().clone();
+    assert!(stats["timestamp"].std[0] > 0.01, "{:?}", stats["timestamp"]);
+    assert_eq!(stats["next.reward"].max, [u64::MAX as f64]);
+    let problems = problems(&verify(&out, &mut quiet).unwrap());
+    assert!(matches!(problems.as_slice(), [times] if times.starts_with("timestamps are")), "{problems:?}");
+}
+
+#[test]
+fn doubles_that_went_through_robomimic_are_edited() {
+    let dir = tempfile::tempdir().unwrap();
+    let (set, file) = (dir.path().join("set"), dir.path().join("through.hdf5"));
+    let (again, out) = (dir.path().join("again"), dir.path().join("out"));
+    sound(&set);
+    std::fs::remove_dir_all(set.join("actrm")).unwrap();
+    edit_json(&set, INFO, |info| info["features"]["next.reward"]["dtype"] = json!("float64"));
+    for number in 0..3 {
+        edit_table(&set, &format!("data/chunk-000/file-00{number}.parquet"), |table| {
+            let rows = table.num_rows();
+            with_column(&table, "next.reward", |_| Arc::new(Float64Array::from_iter_values((0..rows).map(noise))))
+        });
+    }
+    export(&set, &file, &WriteOptions::default(), &mut quiet).unwrap();
+    convert(&file, &again, &ConvertOptions::default(), &mut quiet).unwrap();
+    keep(&again, &Destination::New(out.clone()), &numbers(0..DEMOS), &mut quiet).unwrap();
+    assert_eq!(Dataset::open(&out).unwrap().fingerprint(), Dataset::open(&again).unwrap().fingerprint());
+}
+
+#[test]
+fn an_episode_without_frames_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let set = dir.path().join("set");
+    sound(&set);
+    std::fs::remove_dir_all(set.join("actrm")).unwrap();
+    edit_rows(&set, EPISODES, &(0..DEMOS as u32).chain([DEMOS as u32 - 1]).collect::<Vec<_>>());
+    let last = DEMOS;
+    edit_numbers(&set, EPISODES, "episode_index", |row, number| if row == last { last as i64 } else { number });
+    edit_numbers(&set, EPISODES, "length", |row, number| if row == last { 0 } else { number });
+    let frames = (DEMOS * FRAMES) as i64;
+    edit_numbers(&set, EPISODES, "dataset_from_index", |row, number| if row == last { frames } else { number });
+    edit_json(&set, INFO, |info| info["total_episodes"] = json!(DEMOS + 1));
+    named(&verify(&set, &mut quiet).unwrap(), "empty", &["length, episode 12, row 12: expected 1 or more, found 0"]);
 }
 
 #[test]

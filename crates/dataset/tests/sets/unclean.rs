@@ -61,9 +61,14 @@ fn demo(number: usize) -> Demo {
 }
 
 fn write(path: &Path, demos: &[Demo], masks: &[(&str, &[&str])]) {
+    write_of("{}", path, demos, masks);
+}
+
+/// A file that states these arguments of its environment.
+fn write_of(env_kwargs: &str, path: &Path, demos: &[Demo], masks: &[(&str, &[&str])]) {
     let mut writer = RobomimicWriter::create(path, &WriteOptions::default()).unwrap();
-    let env = r#"{"env_name": "Lift", "type": 1, "env_kwargs": {}}"#;
-    writer.set_data_attr("env_args", &Array::from_str(env)).unwrap();
+    let env = format!(r#"{{"env_name": "Lift", "type": 1, "env_kwargs": {env_kwargs}}}"#);
+    writer.set_data_attr("env_args", &Array::from_str(&env)).unwrap();
     let total: i64 = demos.iter().map(|d| d.attrs["num_samples"].to_i64().unwrap()).sum();
     writer.set_data_attr("total", &Array::from_i64(vec![], &[total])).unwrap();
     demos.iter().for_each(|demo| writer.add_demo(demo).unwrap());
@@ -604,4 +609,104 @@ fn d4rl_and_its_kind_are_held_to_the_same() {
     assert!(text.contains("walker.hdf5: demo_1: obs/flat: step 3, dimension 1: "), "{text}");
     let report = convert(&path, &set, &skipping(), &mut quiet).unwrap();
     assert_eq!((report.episodes, report.skipped[0].demo.as_str()), (1, "demo_1"));
+}
+
+#[test]
+fn pictures_of_other_shapes_are_named() {
+    let mut one = demo(0);
+    let cameras: [(&str, &[usize]); 3] =
+        [("obs/agentview_image", &[3, 8, 8]), ("obs/scene", &[8, 8]), ("obs/pair", &[2, 8, 8, 3])];
+    for (key, frame) in cameras {
+        let shape: Vec<usize> = [STEPS].iter().chain(frame).copied().collect();
+        one.datasets.insert(key.to_owned(), Array::from_u8(shape.clone(), &vec![7; shape.iter().product()]));
+    }
+    let floats = Array::from_f64(vec![STEPS, 3, 8, 8], &ramp(&[STEPS, 3, 8, 8]));
+    one.datasets.insert("obs/front_rgb".to_owned(), floats.clone());
+    // no picture, and one that is asked for as numbers
+    one.datasets.insert("obs/voxels".to_owned(), floats);
+    let chosen = ConvertOptions { env_keys: Some(vec!["object".to_owned(), "scene".to_owned()]), ..options() };
+    for (lossless, fate) in [(true, "the side folder keeps it as stored"), (false, "it is left out (--no-lossless)")] {
+        let place = Place::of(&[one.clone()]);
+        let notes = place.convert(&ConvertOptions { lossless, ..chosen.clone() }).unwrap().notes;
+        let named = |key: &str| notes.iter().filter(|note| note.starts_with(key)).collect::<Vec<_>>();
+        let end = format!("becomes no column: only uint8 [height, width, 3] and JPEG files do; {fate}");
+        for (key, what) in [
+            ("obs/agentview_image", "uint8 [3, 8, 8]"),
+            ("obs/pair", "uint8 [2, 8, 8, 3]"),
+            ("obs/front_rgb", "float64 [3, 8, 8]"),
+        ] {
+            assert_eq!(named(key), [&format!("{key} ({what}) {end}")]);
+        }
+        assert_eq!((named("obs/voxels").len(), named("obs/scene").len()), (0, 0));
+    }
+}
+
+#[test]
+fn values_that_their_column_does_not_hold_are_noted() {
+    let mut demos = [demo(0), demo(1)];
+    let plain = Place::of(&demos).convert(&options()).unwrap().notes;
+    demos[0].datasets.insert("dones".to_owned(), Array::from_i64(vec![STEPS], &[-1, -1, 0, 0, 1, 1]));
+    demos[1].datasets.insert("dones".to_owned(), Array::from_i64(vec![STEPS], &[0, 0, 0, 0, 0, 7]));
+    for (demo, time) in demos.iter_mut().zip([3_i64, 1_700_000_000_123_456_789]) {
+        let times: Vec<i64> = (0..STEPS as i64).map(|step| time + step).collect();
+        demo.datasets.insert("obs/t".to_owned(), Array::from_i64(vec![STEPS, 1], &times));
+    }
+    let place = Place::of(&demos);
+    let chosen = ConvertOptions { env_keys: Some(vec!["object".to_owned(), "t".to_owned()]), ..options() };
+    let expected = [
+        "dones: 3 steps are neither 0 nor 1; next.done is true wherever they are not 0",
+        "obs/t: whole numbers up to 1700000000123456794 are rounded in observation.environment_state, which is float32",
+    ];
+    assert_eq!(place.convert(&chosen).unwrap().notes, [&plain[..], &expected.map(str::to_owned)].concat());
+    let shard = dataset::convert_shard(
+        &place.file(),
+        &place.0.path().join("part"),
+        &chosen,
+        "1/1".parse().unwrap(),
+        &mut |_, _| std::ops::ControlFlow::Continue(()),
+    );
+    assert_eq!(shard.unwrap().notes[plain.len()..], expected);
+}
+
+#[test]
+fn shaped_rewards_tell_no_success() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let mut one = demo(0);
+    let convert = |name: &str, kwargs: &str, one: &Demo| {
+        let (file, set) = (place.0.path().join(format!("{name}.hdf5")), place.0.path().join(name));
+        write_of(kwargs, &file, std::slice::from_ref(one), &[]);
+        let notes = convert(&file, &set, &options(), &mut quiet).unwrap().notes;
+        let success = Dataset::open(&set).unwrap().column("next.success").map(|column| column.data.to_vec());
+        (success, notes.iter().any(|note| note.starts_with("no next.success is made")))
+    };
+    one.datasets.insert("rewards".to_owned(), Array::from_f64(vec![STEPS], &[0.0, 0.5, 1.0, 1.5, 2.0, 2.25]));
+    let of_rewards = Some(vec![0.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
+    assert_eq!(convert("sparse", r#"{"reward_shaping": false}"#, &one), (of_rewards, false));
+    assert_eq!(convert("shaped", r#"{"reward_shaping": true}"#, &one), (None, true));
+    one.datasets.insert("success".to_owned(), Array::from_i64(vec![STEPS], &[0, 0, 0, 0, 0, 1]));
+    assert_eq!(convert("told", r#"{"reward_shaping": true}"#, &one), (Some(vec![0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), false));
+}
+
+#[test]
+fn a_rate_is_read_as_text_too_and_refused_where_it_is_none() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let rate = |control_freq: &str, fps| {
+        write_of(&format!(r#"{{"control_freq": {control_freq}}}"#), &place.file(), &[demo(0)], &[]);
+        let found = place.convert(&ConvertOptions { fps, ..options() }).map(|report| {
+            assert!(report.notes.iter().all(|note| !note.contains("control_freq")), "{:?}", report.notes);
+            let fps = Dataset::open(&place.set()).unwrap().info().fps;
+            std::fs::remove_dir_all(place.set()).unwrap();
+            fps
+        });
+        std::fs::remove_file(place.file()).unwrap();
+        found.map_err(|error| error.to_string())
+    };
+    assert_eq!(rate(r#""50""#, None), Ok(50.0));
+    assert_eq!(rate(r#""fast""#, Some(10.0)), Ok(10.0));
+    let text = rate(r#""fast""#, None).unwrap_err();
+    assert!(text.contains("a number as env_kwargs.control_freq") && text.ends_with(r#"found "fast""#), "{text}");
+    for fps in [0.0, -1.0, 1e300, f64::NAN, f64::INFINITY] {
+        let text = rate("20", Some(fps)).unwrap_err();
+        assert!(text.ends_with(&format!("expected a number above 0, at most 100000, found {fps}")), "{text}");
+    }
 }

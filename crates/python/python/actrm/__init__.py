@@ -21,8 +21,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from . import _actrm
-from ._actrm import Dataset, Error, Policy, Simulator, __version__, leaderboard, load_policy
-from ._policies import Called, source
+from ._actrm import Batches, Dataset, Error, Policy, Simulator, __version__, leaderboard, load_policy
+from ._policies import Called, code, source
 from ._programs import CONTROL, folder
 from ._progress import Progress, teller
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     Path = str | PathLike[str]
 
 __all__ = [
+    "Batches",
     "Dataset",
     "Error",
     "Policy",
@@ -100,9 +101,9 @@ def convert(
             src,
             dst,
             tell,
-            state_keys=None if state_keys is None else list(state_keys),
-            env_keys=None if env_keys is None else list(env_keys),
-            entities={name: list(keys) for name, keys in (entities or {}).items()},
+            state_keys=None if state_keys is None else _names("state_keys", state_keys),
+            env_keys=None if env_keys is None else _names("env_keys", env_keys),
+            entities={name: _names(f"entities[{name!r}]", keys) for name, keys in (entities or {}).items()},
             fps=fps,
             images=images,
             depth=depth,
@@ -142,21 +143,21 @@ def evaluate(
     """Evaluate a policy in simulation, one episode per seed, as `actrm-zoo eval` does: an entry, or a policy of yours.
 
     The results are stored where the leaderboard finds them. Finished episodes are not run again: an
-    interrupted evaluation resumes, a finished one is returned at once. The outcome of an episode does not depend on
-    the number of workers.
+    interrupted evaluation resumes, a finished one is returned at once, for a policy of yours with a `RuntimeWarning`.
+    The outcome of an episode does not depend on the number of workers.
 
     A policy of yours is a function, or an object with `select_action` or `predict_action_chunk`, and `reset` if it
     remembers anything. It gets a dict of NumPy arrays without a batch axis: float32 numbers, uint8 images (height,
     width, 3). If the environment says what is to be done, that text is under `task`. It returns one action (D,) or a
     chunk (T, D). It is evaluated under `name`, as a new entry of the zoo that says where it comes from and holds no
-    weights.
+    weights. Other settings and another text of its class are another version of the entry.
 
     Parameters
     ----------
     policy: an entry's folder (`zoo/stack-act`), its name in `zoo`, or a policy of yours.
     episodes: how many; their seeds count up from `seed`. 20 unless given.
-    workers: number of simulators at once; one per core unless given. Each gets a copy (`copy.deepcopy`) of a policy of
-        yours that has `reset`; others are shared by threads.
+    workers: number of simulators at once; one per core unless given. Where there are several, each gets a copy
+        (`copy.deepcopy`) of a policy of yours that has `reset`; others are shared by threads.
     progress: as in `convert`, in episodes.
     name: name of your policy's entry.
     task: another task than the entry's; the task that your policy is evaluated on.
@@ -185,7 +186,7 @@ def evaluate(
     `inference_ms` (mean of its queries) as arrays, `fingerprint` (of the initial state), `group` and `failure` as
     lists.
     """
-    workers = workers or os.cpu_count() or 1
+    workers = workers if workers is not None else os.cpu_count() or 1
     entry, external = None, None
     if isinstance(policy, (str, os.PathLike)):
         given = {"name": name, "inputs": inputs, "declared": declared, "conventions": conventions}
@@ -195,9 +196,12 @@ def evaluate(
     else:
         if name is None:
             raise ValueError("name: expected a name for your policy's entry, such as name='mine', found none")
-        called = Called.of(policy, workers=workers, chunks=(n_action_steps or temporal_ensemble) is not None)
-        keys = None if inputs is None else {feature: list(of) for feature, of in inputs.items()}
-        external = (called, name, source(policy), declared, keys, image_size, dict(conventions or {}))
+        chunks = n_action_steps is not None or temporal_ensemble is not None
+        called = Called.of(policy, workers=workers, chunks=chunks)
+        keys = None
+        if inputs is not None:
+            keys = {feature: _names(f"inputs[{feature!r}]", of) for feature, of in inputs.items()}
+        external = (called, name, source(policy), code(policy), declared, keys, image_size, dict(conventions or {}))
     with teller("eval", progress) as tell:
         return _actrm.evaluate(
             entry,
@@ -218,6 +222,13 @@ def evaluate(
             results=results,
             force=force,
         )
+
+
+def _names(argument: str, given: Sequence[str]) -> list[str]:
+    """A list of names, and not the letters of one."""
+    if isinstance(given, str):
+        raise TypeError(f"{argument}: expected a list of names, such as [{given!r}], found the text {given!r}")
+    return list(given)
 
 
 def simulator_python() -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -14,18 +15,39 @@ if TYPE_CHECKING:
     Observation = dict[str, NDArray[Any]]
 
 
+def kind_of(policy: Any) -> Any:
+    """A policy's class, or the function that it is."""
+    return policy if hasattr(policy, "__qualname__") else type(policy)  # pyright: ignore[reportUnknownVariableType]
+
+
 def source(policy: Any) -> str:
     """Where a policy comes from: `python package.module.Class`."""
-    kind: Any = policy if hasattr(policy, "__qualname__") else type(policy)  # pyright: ignore[reportUnknownVariableType]
+    kind = kind_of(policy)
     return f"python {kind.__module__}.{kind.__qualname__}"
+
+
+def code(policy: Any) -> str | None:
+    """SHA-256 of the text of its class, where there is one."""
+    kind = kind_of(policy)
+    try:
+        text = inspect.getsource(kind)
+    except (OSError, TypeError):
+        # a notebook's classes are in no file; their methods are known
+        try:
+            parts: list[Any] = list(getattr(kind, "__dict__", {}).values())
+            text = "".join(inspect.getsource(part) for part in parts if inspect.isfunction(part))
+        except (OSError, TypeError):
+            return None
+    return hashlib.sha256(text.encode()).hexdigest() if text else None
 
 
 class Called:
     """A policy with a state of its own: `reset(seed)`, and `predict(observation)`, which gives actions (T, D)."""
 
-    def __init__(self, policy: Any, ask: str | None) -> None:
+    def __init__(self, policy: Any, ask: str | None, *, shared: bool) -> None:
         self.policy = policy
         self.ask = ask
+        self.shared = shared
         self.predicted: Callable[[Observation], Any] = getattr(policy, ask) if ask else policy
         self.takes_seed = False
         if reset := getattr(policy, "reset", None):
@@ -53,17 +75,16 @@ class Called:
             raise ValueError(
                 "n_action_steps: expected how many actions of a chunk are executed before the next query, found none"
             )
-        called = cls(policy, asks[0] if asks else None)
-        if workers > 1:
-            called.copy()
+        called = cls(policy, asks[0] if asks else None, shared=workers == 1 or not hasattr(policy, "reset"))
+        called.copy()
         return called
 
     def copy(self) -> Called:
         """The same for another simulator."""
-        if not hasattr(self.policy, "reset"):
+        if self.shared:
             return self
         try:
-            return Called(copy.deepcopy(self.policy), self.ask)
+            return Called(copy.deepcopy(self.policy), self.ask, shared=False)
         except Exception as error:
             text = "workers: expected 1 with a policy that has reset and cannot be copied (copy.deepcopy)"
             raise ValueError(text) from error
@@ -79,7 +100,8 @@ class Called:
 
         found = self.predicted(observation)
         if hasattr(found, "detach"):
-            found = found.detach().cpu()
+            # numpy has no bfloat16
+            found = found.detach().cpu().float()
         actions = np.asarray(found, np.float32)
         # a batch of one
         if actions.ndim == 3 and actions.shape[0] == 1:

@@ -19,8 +19,10 @@ def teller(what: str, progress: Progress) -> Generator[Callable[[int, int], obje
     if callable(progress):
         yield progress
         return
-    shown = progress if progress is not None else sys.stderr.isatty() or "ipykernel" in sys.modules
-    if not shown:
+    stream = sys.stderr
+    shown = progress if progress is not None else "ipykernel" in sys.modules or bool(stream and stream.isatty())
+    # programs with windows and no terminal have no standard error
+    if not shown or stream is None:  # pyright: ignore[reportUnnecessaryComparison]
         yield lambda _done, _total: None
         return
     bar = Bar(what)

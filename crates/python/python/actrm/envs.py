@@ -78,6 +78,10 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         python: str | None = None,
         env_module: str | None = None,
     ) -> None:
+        if max_steps is not None and max_steps < 1:
+            raise ValueError(f"max_steps: expected at least 1, found {max_steps}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode: expected 'rgb_array' or None, found {render_mode!r}")
         self._simulator = Simulator(
             task,
             entry=entry,
@@ -88,7 +92,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         )
         self.task = self._simulator.task
         self.render_mode = render_mode
-        self.max_steps = max_steps or self._simulator.max_steps
+        self.max_steps = max_steps if max_steps is not None else self._simulator.max_steps
         self._camera, self._size = camera, size
         self._steps = 0
         low, high = self._simulator.action_limits

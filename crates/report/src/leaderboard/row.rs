@@ -7,15 +7,12 @@ use zoo::protocols::Block;
 use zoo::results::{EpisodeTiming, EvaluationRecord, Execution, StoredEvaluation};
 
 use crate::comparison::Standing;
-use crate::statistics::{Estimate, hierarchical, mean, mean_interval, percent, quantile, wilson_interval};
+use crate::statistics::{Estimate, mean, mean_interval, over_trainings, percent, quantile, wilson_interval};
 
 /// With fewer episodes a training a row stands last in its protocol and has no rank.
 pub const FEWEST_TO_RANK: u64 = 20;
 
 pub(super) const TOO_FEW: &str = "too few to rank";
-
-/// Seed of the bootstrap: the same results give the same interval.
-const BOOTSTRAP_SEED: u64 = 1;
 
 /// What a policy is measured against: rows that say how little and how much a task can give.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,7 +51,7 @@ pub struct LeaderboardRow {
     pub counts: Counts,
     /// The same for each group of episodes, where the task has groups.
     pub groups: BTreeMap<String, Counts>,
-    /// The 95% interval of the success rate: Wilson's for one training; for several that of the hierarchical bootstrap,
+    /// The 95% interval of the success rate: Wilson's for one training; for several that of both variances,
     /// which holds the chance of training.
     pub interval: (f64, f64),
     /// The family, where the entry was trained here.
@@ -176,14 +173,14 @@ impl LeaderboardRow {
             one.episodes.iter().map(|episode| f64::from(u8::from(episode.success))).collect()
         };
         let several = (trainings.len() > 1)
-            .then(|| hierarchical(&trainings.iter().map(outcomes).collect::<Vec<_>>(), BOOTSTRAP_SEED))
+            .then(|| over_trainings(&trainings.iter().map(outcomes).collect::<Vec<_>>()))
             .flatten();
         let interval = several.map_or_else(|| counts.interval(), |estimate| (estimate.low, estimate.high));
         let come: Option<Vec<Vec<f64>>> =
             trainings.iter().map(|one| one.episodes.iter().map(|episode| episode.progress).collect()).collect();
         let progress = come.and_then(|come| match come.as_slice() {
             [one] => mean_interval(one),
-            _ => hierarchical(&come, BOOTSTRAP_SEED),
+            _ => over_trainings(&come),
         });
         let timings = trainings.iter().flat_map(|one| &one.timings);
         let mut queries: Vec<f64> = timings.flat_map(|t| t.inference_ms.iter().copied()).collect();

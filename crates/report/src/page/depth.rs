@@ -201,7 +201,7 @@ mod tests {
         let mut other = at(8, "whole", 20);
         other.row = {
             let mut record = sample("think", 1, 40);
-            record.protocol.max_steps = 100;
+            record.protocol.max_steps = 500;
             LeaderboardRow::new(&finished(dir.path(), &record))
         };
         assert_eq!(section(&[at(4, "whole", 20), other]), "");

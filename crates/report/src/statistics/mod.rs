@@ -7,7 +7,7 @@ mod multiple;
 mod paired;
 mod sequential;
 
-pub use bootstrap::{Difference, Estimate, difference, hierarchical, interquartile, mean_difference, mean_interval};
+pub use bootstrap::{Difference, Estimate, difference, interquartile, mean_difference, mean_interval, over_trainings};
 pub use multiple::{Distinct, holm, pairs};
 pub use paired::{Paired, barnard};
 pub use sequential::{Bet, EProcess, Unpaired};

@@ -103,6 +103,19 @@ impl Paired {
     }
 }
 
+/// The first of `from..to` that `is` holds for, and for all after it; `to` if there is none.
+fn first(mut from: u64, mut to: u64, is: impl Fn(u64) -> bool) -> u64 {
+    while from < to {
+        let middle = from + (to - from) / 2;
+        if is(middle) {
+            to = middle;
+        } else {
+            from = middle + 1;
+        }
+    }
+    from
+}
+
 /// Points at which the unknown common success rate is tried.
 const NUISANCE_GRID: usize = 200;
 
@@ -125,9 +138,14 @@ pub fn barnard((x1, n1): (u64, u64), (x2, n2): (u64, u64)) -> f64 {
     if observed <= 0.0 {
         return 1.0;
     }
-    // for each count of the first, the counts of the second that are as extreme, as ranges from both ends
-    let extreme: Vec<Vec<u64>> =
-        (0..=n1).map(|a| (0..=n2).filter(|&b| statistic(a, b) >= observed).collect()).collect();
+    // for each count of the first, the counts of the second that are as extreme: so many from 0 on, and those from one on
+    let extreme: Vec<(usize, usize)> = (0..=n1)
+        .map(|a| {
+            let middle = (u128::from(a) * u128::from(n2) / u128::from(n1)) as u64;
+            let below = first(0, middle + 1, |b| statistic(a, b) < observed);
+            (below as usize, first(middle + 1, n2 + 1, |b| statistic(a, b) >= observed) as usize)
+        })
+        .collect();
     let (logs1, logs2) = (log_factorials(n1), log_factorials(n2));
     let probabilities = |n: u64, logs: &[f64], rate: f64| -> Vec<f64> {
         let (yes, no) = (rate.ln(), (-rate).ln_1p());
@@ -140,7 +158,13 @@ pub fn barnard((x1, n1): (u64, u64), (x2, n2): (u64, u64)) -> f64 {
     };
     let p_value = |rate: f64| -> f64 {
         let (p1, p2) = (probabilities(n1, &logs1, rate), probabilities(n2, &logs2, rate));
-        p1.iter().zip(&extreme).map(|(p, others)| p * others.iter().map(|&b| p2[b as usize]).sum::<f64>()).sum()
+        let summed = |sum: &mut f64, p: f64| {
+            *sum += p;
+            Some(*sum)
+        };
+        let below: Vec<f64> = std::iter::once(0.0).chain(p2.iter().copied().scan(0.0, summed)).collect();
+        let above: Vec<f64> = std::iter::once(0.0).chain(p2.iter().rev().copied().scan(0.0, summed)).collect();
+        p1.iter().zip(&extreme).map(|(p, &(low, high))| p * (below[low] + above[p2.len() - high])).sum()
     };
     let step = 1.0 / NUISANCE_GRID as f64;
     let (mut best, mut at) = (0.0, 0.5);

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use report::statistics::{Estimate, hierarchical};
+use report::statistics::{Estimate, over_trainings};
 use report::wilson_interval;
 use zoo::ZooError;
 use zoo::config::Library;
@@ -14,7 +14,7 @@ use zoo::config::Library;
 use super::evaluation::{Judge, PuzzleEvaluation, TEST_SEED};
 use super::grade::{Baseline, Counts};
 use super::study::{Bar, STUDY_PUZZLES, StudyRow, StudyTest, TestedRow as Row, study_results};
-use crate::charts::{BOOTSTRAP_SEED, intervals};
+use crate::charts::intervals;
 
 /// A question, and the success of each model that answers it.
 type Compared = (String, Vec<(String, Estimate)>);
@@ -468,7 +468,7 @@ fn thesis(rows: &[Row]) -> (String, Vec<Compared>) {
             let (valid, all) = (r.answers.valid as usize, r.answers.puzzles as usize);
             [vec![1.0; valid], vec![0.0; all.saturating_sub(valid)]].concat()
         };
-        hierarchical(&results.iter().map(solved).collect::<Vec<_>>(), BOOTSTRAP_SEED)
+        over_trainings(&results.iter().map(solved).collect::<Vec<_>>())
     };
     let mut text = String::new();
     let mut compared: Vec<Compared> = Vec::new();

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
 
-use report::statistics::{Estimate, difference, hierarchical, holm};
+use report::statistics::{Estimate, difference, holm, over_trainings};
 use zoo::ZooError;
 
 pub use self::charts::robot_charts;
@@ -18,7 +18,6 @@ use self::probes::probes;
 use super::cells::cells;
 use super::file::{Comparison, Data, Study};
 use super::result::CellResult;
-use crate::charts::BOOTSTRAP_SEED;
 
 /// Results of one arm on one test, by the training's seed.
 type Trainings = BTreeMap<u64, CellResult>;
@@ -187,7 +186,7 @@ fn overview(text: &mut String, study: &Study, results: &Results) {
             let Some(&seeds) = planned.get(&(arm, *data)) else { return "-".to_owned() };
             let key = ((*test).to_owned(), (*data).to_owned(), arm.to_owned());
             let Some(trainings) = results.get(&key) else { return "-".to_owned() };
-            let estimate = hierarchical(&outcomes(trainings, &[]), BOOTSTRAP_SEED);
+            let estimate = over_trainings(&outcomes(trainings, &[]));
             let estimate = estimate.as_ref().map_or_else(|| "-".to_owned(), percent);
             match trainings.len() as u64 {
                 there if there == seeds => format!("{estimate}, {seeds}"),
@@ -414,7 +413,7 @@ fn megaflops(results: &[&CellResult]) -> String {
 /// `97% [95-99]` and, below, every training's count.
 fn cell_text(trainings: &Trainings, groups: &[String]) -> String {
     let outcomes = outcomes(trainings, groups);
-    let Some(estimate) = hierarchical(&outcomes, BOOTSTRAP_SEED) else { return "-".to_owned() };
+    let Some(estimate) = over_trainings(&outcomes) else { return "-".to_owned() };
     let each: Vec<String> = outcomes.iter().map(|o| format!("{:.0}", o.iter().sum::<f64>())).collect();
     let n = outcomes.first().map_or(0, Vec::len);
     format!("{}<br>{} of {n}", percent(&estimate), each.join(", "))
@@ -447,7 +446,7 @@ fn compare<'a>(study: &'a Study, results: &Results, stage: u8) -> Vec<Compared<'
             let all = side.concat();
             all.iter().sum::<f64>() / all.len().max(1) as f64
         };
-        let counted = difference(&a, &b, BOOTSTRAP_SEED).map(|d| (d.estimate, d.p_value));
+        let counted = difference(&a, &b).map(|d| (d.estimate, d.p_value));
         let trainings = (a.len(), b.len());
         found.push(Compared { comparison, trainings, success: [mean(&a), mean(&b)], difference: counted });
     }

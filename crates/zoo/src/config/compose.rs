@@ -11,7 +11,7 @@
 
 use toml::{Table, Value};
 
-use super::{Library, check_experiment_name, merge, nearest_of};
+use super::{Library, check_experiment_name, merge, nearest, nearest_of};
 use crate::ZooError;
 
 const STATE: &str = "state";
@@ -106,7 +106,7 @@ impl Library {
     /// of which these change a part.
     ///
     /// # Errors
-    /// When the policy or the task is missing.
+    /// When the policy or the task is missing or unknown.
     pub fn choose(&self, words: &[String]) -> Result<(String, Vec<String>), ZooError> {
         let (mut name, mut chosen, mut rest) = (None, [None, None, None], Vec::new());
         for (n, word) in words.iter().enumerate() {
@@ -137,7 +137,28 @@ impl Library {
             task: task.or(of_name.as_ref().map(|p| p.task.clone())).ok_or_else(|| missing("task"))?,
             inputs: inputs.or(of_name.map(|p| p.inputs)).unwrap_or_else(|| STATE.to_owned()),
         };
-        Ok((format!("{}_{}", parts.policy, parts.combination()), rest))
+        let name = format!("{}_{}", parts.policy, parts.combination());
+        for (key, part) in [("policy", &parts.policy), ("task", &parts.task)] {
+            let known = self.group(key)?;
+            // a puzzle is no task, and what learns it no policy
+            if !known.contains(part) && !self.names()?.contains(&name) {
+                let hint = nearest(part, &known).map_or(String::new(), |near| format!(" (did you mean `{near}`?)"));
+                return Err(ZooError::InvalidValue {
+                    key: key.to_owned(),
+                    expected: format!("one of {}", known.join(", ")),
+                    found: format!("`{part}`{hint}"),
+                });
+            }
+        }
+        Ok((name, rest))
+    }
+
+    /// Names of the policies that experiments are made of, sorted.
+    ///
+    /// # Errors
+    /// When a folder cannot be read.
+    pub fn policies(&self) -> Result<Vec<String>, ZooError> {
+        self.group("policy")
     }
 
     /// The settings of experiment `name`.

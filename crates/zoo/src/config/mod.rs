@@ -227,6 +227,22 @@ mod tests {
     }
 
     #[test]
+    fn a_part_that_is_not_there_is_named_with_those_that_are() {
+        let choose = |words: &[&str]| {
+            let words: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
+            Library::built_in().choose(&words).map(|(name, _)| name).map_err(|error| error.to_string())
+        };
+        let error = choose(&["act_lift", "policy=nope"]).unwrap_err();
+        assert!(
+            error.starts_with("key `policy`: expected one of act, actrm, ") && error.ends_with("`nope`"),
+            "{error}"
+        );
+        let error = choose(&["policy=act", "task=lfit"]).unwrap_err();
+        assert!(error.ends_with("found `lfit` (did you mean `lift`?)"), "{error}");
+        assert_eq!(choose(&["policy=trm", "task=dfs10"]).unwrap(), "trm_dfs10");
+    }
+
+    #[test]
     fn every_file_of_configs_is_built_in() {
         fn below(folder: &Path, group: &str, into: &mut Vec<(String, String)>) {
             for item in std::fs::read_dir(folder).unwrap() {

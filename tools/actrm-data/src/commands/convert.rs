@@ -4,6 +4,7 @@ use dataset::{
     VideoOptions, WriteOptions,
 };
 use serde_json::json;
+use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -174,6 +175,17 @@ fn entity(text: &str) -> Result<(String, Vec<String>), String> {
     Ok((name.to_owned(), items.split(',').map(|item| item.trim().to_owned()).collect()))
 }
 
+/// What an option says of each name, which may be given once.
+pub(super) fn once<T: Clone>(option: &str, pairs: &[(String, T)]) -> Result<BTreeMap<String, T>> {
+    let mut all = BTreeMap::new();
+    for (name, value) in pairs {
+        if all.insert(name.clone(), value.clone()).is_some() {
+            bail!("{option} {name}=... is given twice; expected each name once");
+        }
+    }
+    Ok(all)
+}
+
 fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(v) if v.is_finite() && v > 0.0 => Ok(v),
@@ -222,6 +234,7 @@ fn to_robomimic(args: &Args) -> Result<ExitCode> {
         return super::export::run(&export);
     }
     let nonfinite = args.nonfinite.into();
+    cli::make_parent(&args.out)?;
     let mut screen = cli::Screen::new();
     let options = WriteOptions { gzip: args.gzip };
     let report = dataset::rewrite(&args.source, &args.out, nonfinite, &options, &mut screen.advance("converting"));
@@ -250,7 +263,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let options = ConvertOptions {
         state_keys: args.state_keys.as_deref().map(keys),
         env_keys: args.env_keys.as_deref().map(keys),
-        entities: args.entities.iter().cloned().collect(),
+        entities: once("--entity", &args.entities)?,
         fps: args.fps,
         images: match args.images {
             Images::Png => ImageForm::Png,
@@ -287,22 +300,25 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if let Some(shard) = args.shard {
         return convert_shard(args, &options, shard);
     }
+    cli::make_parent(&args.out)?;
     let start = Instant::now();
     let mut screen = cli::Screen::new();
     let report = dataset::convert(&args.source, &args.out, &options, &mut screen.advance("converting"));
     screen.clear();
-    let report = report.map_err(|error| advised(error, args.skip_bad))?;
+    let set = args.source.join("meta/info.json").exists();
+    let report = report.map_err(|error| advised(error, args.skip_bad || set))?;
     let source = Some(args.source.as_path());
     tell(&report, source, &args.out, start.elapsed().as_secs_f64(), args.json)
 }
 
-/// An error with what can be done about bad demos.
+/// An error with what can be done about bad demos, unless they are left out already or cannot be.
 fn advised(error: DatasetError, skip_bad: bool) -> anyhow::Error {
     match error {
         DatasetError::Input(InputError::NotFinite { .. }) => {
             anyhow!("{error} (--skip-bad leaves such demos out, --nonfinite keep stores such values)")
         }
-        DatasetError::Input(InputError::WrongLength { .. }) if !skip_bad => {
+        // of demonstrations, a picture
+        DatasetError::Input(InputError::WrongLength { .. }) | DatasetError::BadDataset { .. } if !skip_bad => {
             anyhow!("{error} (--skip-bad leaves such demos out)")
         }
         error => error.into(),
@@ -318,6 +334,7 @@ fn convert_shard(args: &Args, options: &ConvertOptions, shard: Shard) -> Result<
         }
         return Ok(ExitCode::SUCCESS);
     }
+    cli::make_parent(&args.out)?;
     let mut screen = cli::Screen::new();
     let mut advance = screen.advance("converting");
     let report = dataset::convert_shard(&args.source, &args.out, options, shard, &mut |done, total| {

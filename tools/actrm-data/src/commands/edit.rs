@@ -188,11 +188,14 @@ fn pair<T: std::str::FromStr>(text: &str) -> Result<(String, T), String> {
 }
 
 impl OneSet {
-    fn destination(&self) -> Destination {
-        match &self.out {
-            Some(out) => Destination::New(out.clone()),
+    fn destination(&self) -> Result<Destination> {
+        Ok(match &self.out {
+            Some(out) => {
+                cli::make_parent(out)?;
+                Destination::New(out.clone())
+            }
             None => Destination::InPlace,
-        }
+        })
     }
 
     /// Where the result is.
@@ -226,29 +229,31 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut advance = screen.advance("copying");
     let (made, json) = match &args.operation {
         Operation::Drop(Chosen { sets, which }) => {
-            let report = edit::without(&sets.set, &sets.destination(), &which.selection(), &mut advance)?;
+            let report = edit::without(&sets.set, &sets.destination()?, &which.selection(), &mut advance)?;
             (vec![(sets.result().to_path_buf(), report)], sets.json)
         }
         Operation::Keep(Chosen { sets, which }) => {
-            let report = edit::keep(&sets.set, &sets.destination(), &which.selection(), &mut advance)?;
+            let report = edit::keep(&sets.set, &sets.destination()?, &which.selection(), &mut advance)?;
             (vec![(sets.result().to_path_buf(), report)], sets.json)
         }
         Operation::Split(split) => {
+            cli::make_parent(&split.out)?;
             let made = edit::split(&split.set, &split.out, &split.parts.parts(), split.seed, &mut advance)?;
             (made.into_iter().map(|(name, report)| (split.out.join(name), report)).collect(), split.json)
         }
         Operation::Merge(merge) => {
+            cli::make_parent(&merge.out)?;
             let report = edit::merge(&merge.sets, &merge.out, &mut advance)?;
             (vec![(merge.out.clone(), report)], merge.json)
         }
         Operation::Rename(Rename { sets, features }) => {
-            let renames: Renames = features.iter().cloned().collect();
-            let report = edit::rename(&sets.set, &sets.destination(), &renames, &mut advance)?;
+            let renames: Renames = super::convert::once("--feature", features)?;
+            let report = edit::rename(&sets.set, &sets.destination()?, &renames, &mut advance)?;
             (vec![(sets.result().to_path_buf(), report)], sets.json)
         }
         Operation::Repair(Repair { sets, timestamps }) => {
             let what = edit::Repair { timestamps: *timestamps };
-            let report = edit::repair(&sets.set, &sets.destination(), what, &mut advance)?;
+            let report = edit::repair(&sets.set, &sets.destination()?, what, &mut advance)?;
             drop(advance);
             screen.clear();
             return tell_repair(sets, report);

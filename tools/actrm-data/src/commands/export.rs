@@ -27,6 +27,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
+    cli::make_parent(&args.out)?;
     let mut screen = cli::Screen::new();
     let options = WriteOptions { gzip: args.gzip };
     let report = dataset::export(&args.dir, &args.out, &options, &mut screen.advance("exporting"));

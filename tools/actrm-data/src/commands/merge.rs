@@ -26,6 +26,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
+    cli::make_parent(&args.out)?;
     let start = Instant::now();
     let mut screen = cli::Screen::new();
     let mut advance = screen.advance("merging");

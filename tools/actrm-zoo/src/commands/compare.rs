@@ -1,4 +1,5 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
@@ -15,7 +16,7 @@ use zoo::results::{EvaluationRecord, Seeds, StoredEvaluation};
 
 use crate::compared::{self, Compared, Side, counts, flips_json, list, p_text, sequential_text};
 use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
-use crate::simulation::{RunArgs, environment, limited_worker, run_missing};
+use crate::simulation::{RunArgs, environment, limited_worker, run_missing, start};
 
 const GOES_ON: &str = "stopped; run the same command again to resume";
 
@@ -83,13 +84,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let [first, second] = rows(args, [&sides[0], &sides[1]])?;
     let found = pairs(&first, &second, sides[0] == sides[1]);
     if found.is_empty() {
-        let ids = |ids: &[EntryId]| ids.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-        bail!(
-            "{} and {}: no evaluations in {} under the same protocol; make some with: actrm-zoo eval",
-            ids(&sides[0]),
-            ids(&sides[1]),
-            shown(&results)
-        );
+        bail!("{}", nothing(&sides, [&first, &second], &results));
     }
     let told: Vec<Told> = found.iter().map(|(one, two)| Told::of(one, two)).collect();
     match args.json {
@@ -145,17 +140,49 @@ fn with_files(args: &Args, files: [bool; 2]) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// Why no two rows of both sides can be compared.
+fn nothing(sides: &[Vec<EntryId>; 2], rows: [&[LeaderboardRow]; 2], results: &Path) -> String {
+    let ids = |ids: &[EntryId]| ids.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    let (one, two, results) = (ids(&sides[0]), ids(&sides[1]), shown(results));
+    if let Some((_, side)) = rows.iter().zip([&one, &two]).find(|(rows, _)| rows.is_empty()) {
+        return format!("{side}: no evaluations in {results}; make some with: actrm-zoo eval");
+    }
+    if sides[0] == sides[1] {
+        let how = "evaluate it in another way, such as with --n-action-steps, or name another entry";
+        return format!(
+            "{one}: both names are the same entry, and no seed was run in two ways under the same protocol in {results}; {how}"
+        );
+    }
+    if rows[0].iter().any(|row| rows[1].iter().any(|other| is_same(row, other))) {
+        return format!("{one} and {two}: both have the same evaluations in {results}, and no others under the same protocol");
+    }
+    let tasks = rows.map(|rows| rows.iter().map(LeaderboardRow::task).collect::<BTreeSet<_>>());
+    if tasks[0].is_disjoint(&tasks[1]) {
+        let [first, second] = tasks.map(|tasks| Vec::from_iter(tasks).join(", "));
+        return format!(
+            "{one} and {two}: no evaluations in {results} under the same protocol: the tasks differ, {first} and {second}"
+        );
+    }
+    format!("{one} and {two}: no evaluations in {results} under the same protocol; make some with: actrm-zoo eval")
+}
+
+/// Whether both rows are of the same evaluations.
+fn is_same(one: &LeaderboardRow, two: &LeaderboardRow) -> bool {
+    one.evaluations().map(|of| &of.folder).eq(two.evaluations().map(|of| &of.folder))
+}
+
 /// Rows of both sides under the same rules; those that share seeds, if there are any.
 fn pairs<'a>(
     first: &'a [LeaderboardRow],
     second: &'a [LeaderboardRow],
     same: bool,
 ) -> Vec<(&'a LeaderboardRow, &'a LeaderboardRow)> {
-    let mut all = Vec::new();
-    for (i, one) in first.iter().enumerate() {
-        // beside itself: each pair once, and no row beside itself
-        for two in second.iter().skip(if same { i + 1 } else { 0 }) {
-            if one.record().protocol == two.record().protocol {
+    let mut all: Vec<(&LeaderboardRow, &LeaderboardRow)> = Vec::new();
+    for one in first {
+        for two in second.iter().filter(|two| one.record().protocol == two.record().protocol) {
+            // where both sides have an entry: each pair once, and no row beside itself
+            let before = all.iter().any(|(a, b)| is_same(a, two) && is_same(b, one));
+            if !is_same(one, two) && !before {
                 all.push((one, two));
             }
         }
@@ -359,7 +386,7 @@ fn until_decided(args: &Args, sides: &[Vec<EntryId>; 2]) -> anyhow::Result<ExitC
         let key = environment(&args.run, entry.entry().meta())?;
         if !keys.contains(&key) {
             let spec = limited_worker(&key, &args.run, args.run.control)?;
-            let Some(pool) = args.run.simulator.start(spec, args.run.worker_logs.clone(), &stop)? else {
+            let Some(pool) = start(&args.run, spec, &stop)? else {
                 return Ok(interrupted(pools));
             };
             pools.push(pool);

@@ -21,7 +21,7 @@ use zoo::results::{Execution, Seeds, Shard, StoredEvaluation};
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names, of_entry};
 use crate::puzzles::{self, PuzzleArgs};
 use crate::remote::{Remote, RemoteArgs};
-use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing};
+use crate::simulation::{Evaluated, RunArgs, environment, limited_worker, run_missing, start};
 use crate::videos;
 
 /// Headings of its help.
@@ -330,7 +330,7 @@ fn evaluate_on(
     if subjects.is_empty() {
         return Ok(());
     }
-    let Some(mut pool) = args.run.simulator.start(spec, args.run.worker_logs.clone(), stop)? else { return Ok(()) };
+    let Some(mut pool) = start(&args.run, spec, stop)? else { return Ok(()) };
     for entry in entries {
         note_other_module(entry.entry().meta(), pool.ready().module_sha256.as_deref());
         note_unrecorded(entry.entry().meta(), pool.ready());
@@ -412,7 +412,7 @@ fn evaluate_remote(
     {
         return says.evaluation(&evaluation, true);
     }
-    let Some(mut pool) = args.run.simulator.start(spec, args.run.worker_logs.clone(), stop)? else { return Ok(()) };
+    let Some(mut pool) = start(&args.run, spec, stop)? else { return Ok(()) };
     let subject = subject(pool.ready())?;
     let ended = evaluate_entry((args, asked), &options, &subject, &mut pool, stop, says);
     cli::close(pool);

@@ -75,6 +75,8 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    args.zoo.check()?;
+    args.results.check()?;
     let results = args.results.folder(&args.zoo);
     let entries = KnownEntries::open(&args.zoo.registry())?;
     let (robots, solvers) = (audit(&results, &entries)?, audit_puzzles(&results, &entries)?);
@@ -83,7 +85,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (depths, damaged) = depths(&args.depths, &entries)?;
     let left_out = left_out.chain(&damaged);
     failures.extend(left_out.map(|left| failure(&format!("left out: {}", shown(&left.folder)), &left.reason)));
+    let notes: Vec<String> =
+        robots.under_way.iter().map(|found| format!("note: {}: {found}", shown(&found.folder))).collect();
     let end = || {
+        notes.iter().for_each(|note| cli::note(note));
         failures.iter().for_each(|failure| cli::note(failure));
         if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
     };
@@ -97,7 +102,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let nothing = evaluations.is_empty() && puzzles.is_empty() && depths.is_empty() && others.is_empty();
     if nothing && failures.is_empty() && !args.json {
         cli::note(&format!("no evaluations in {}; make one with: actrm-zoo eval --all", shown(&results)));
-        return Ok(ExitCode::SUCCESS);
+        return Ok(end());
     }
     let reading = Reading::of(&entries, args.protocols.protocols()?);
     let rows = rank(&evaluations, &reading);

@@ -8,6 +8,7 @@ use cli::{INTERRUPTED, Screen, Stop, command_line, limits, shown};
 use models::DeviceChoice;
 use study::puzzle::{AnyExperiment, TrainOptions};
 use zoo::ZooError;
+use zoo::config::{Library, nearest};
 use zoo::entry::member_name;
 use zoo::run::{
     COMMAND_FILE, Extended, Place, TrainEvent, TrainOutcome, TrainRequest, extend, finished_entry, locate, short_hash,
@@ -148,9 +149,13 @@ fn in_words(error: ZooError) -> ZooError {
 }
 
 /// What to do about a change of the policy's type, which leaves the other settings of another policy behind.
-fn other_policy(args: &Args) -> Option<String> {
+fn other_policy(args: &Args, library: &Library) -> Option<String> {
     let policy = args.overrides.iter().find_map(|set| set.strip_prefix("policy.type="))?.replace('-', "_");
-    Some(format!("another policy has other settings; did you mean `policy={policy}`?"))
+    let known = library.policies().ok()?;
+    if known.contains(&policy) {
+        return Some(format!("another policy has other settings; did you mean `policy={policy}`?"));
+    }
+    Some(format!("did you mean `policy={}`?", nearest(&policy, &known)?))
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
@@ -168,7 +173,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let args = &Args { experiment, overrides, from: None, ..args.clone() };
     let load = |overrides: &[String]| {
         AnyExperiment::load(&library, &args.experiment, overrides).map_err(in_words).with_context(
-            || match other_policy(args) {
+            || match other_policy(args, &library) {
                 Some(hint) => format!("experiment `{}`: {hint}", args.experiment),
                 None => format!("experiment `{}`", args.experiment),
             },
@@ -373,6 +378,24 @@ fn going_on(args: &Args, folder: &Path, seeded: bool) -> String {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+
+    #[test]
+    fn a_policy_that_is_not_there_is_not_suggested() {
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            args: Args,
+        }
+        let hint = |set: &str| {
+            let line: Line = clap::Parser::parse_from(["train", "act_lift", set]);
+            other_policy(&line.args, &Library::built_in())
+        };
+        let other = |policy: &str| Some(format!("another policy has other settings; did you mean `policy={policy}`?"));
+        assert_eq!(hint("policy.type=diffusion"), other("diffusion"));
+        assert_eq!(hint("policy.type=bc-rnn"), other("bc_rnn"));
+        assert_eq!(hint("policy.type=actt").as_deref(), Some("did you mean `policy=act`?"));
+        assert_eq!((hint("policy.type=something_else"), hint("train.steps=5")), (None, None));
+    }
 
     #[test]
     fn seeds_are_ranges_and_lists() {

@@ -1,10 +1,12 @@
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::process::ExitCode;
 
-use audit::{KnownEntries, LeftOut, audit};
+use anyhow::bail;
+use audit::{KnownEntries, LeftOut, SameWeights, audit, is_of};
 use cli::shown;
 use study::puzzle::audit_puzzles;
-use zoo::entry::{Entry, EntryId, MODEL_FILE, NORMALISER_FILE, Repeats};
+use zoo::entry::{CONFIG_FILE, ENTRY_FILE, Entry, EntryId, LoadedEntry, MODEL_FILE, NORMALISER_FILE, Repeats};
 use zoo::tensors;
 
 use crate::places::{ResultsArgs, ZooArgs, entry_names, of_entry};
@@ -13,7 +15,7 @@ use crate::puzzles;
 /// Check the hashes and seals of entries and results, and with --deep every tensor and predicted action
 ///
 /// A valid result equals its seal, lies in the folder that its record names, and agrees with its entry in the zoo about the
-/// training. Hashes detect damage and edits. `eval --again` shows whether a result can be measured again.
+/// training. Results that are not finished are named. Hashes detect damage and edits. `eval --again` shows whether a result can be measured again.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo verify
@@ -24,7 +26,7 @@ pub struct Args {
     #[arg(add = entry_names())]
     entries: Vec<String>,
     /// Also build each network, check the names, shapes and values of its tensors, and compare its actions with those stored
-    /// with it
+    /// with it. `entry.json` must agree with the network and with `config.toml`
     #[arg(long)]
     deep: bool,
     #[command(flatten)]
@@ -34,6 +36,8 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    args.zoo.check()?;
+    args.results.check()?;
     let (registry, results) = (args.zoo.registry(), args.results.folder(&args.zoo));
     let entries = KnownEntries::open(&registry)?;
     let ids: Vec<EntryId> = match args.entries.is_empty() {
@@ -57,14 +61,29 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Err(error) => failures.push(error),
         }
     }
+    // asked for nothing in particular, all that is wrong is told
+    let asked = |folder: &Path| args.entries.is_empty() || ids.iter().any(|id| is_of(folder, id));
+    let mut notes = Vec::new();
+    for found in robots.under_way.iter().filter(|found| asked(&found.folder)) {
+        notes.push(format!("result {}: {found}", shown(&found.folder)));
+    }
+    for SameWeights { entries, impossible } in entries.same_weights() {
+        if args.entries.is_empty() || entries.iter().any(|id| ids.contains(id)) {
+            let names: Vec<String> = entries.iter().map(ToString::to_string).collect();
+            let said = format!("entries {}: the same weights", names.join(", "));
+            match impossible {
+                true => failures.push(anyhow::anyhow!("{said}, though trainings of one family say other seeds")),
+                false => notes.push(format!("{said} under several names")),
+            }
+        }
+    }
     for LeftOut { folder, reason } in robots.left_out.into_iter().chain(solvers.left_out) {
-        let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        // a folder is called after its entry; asked for nothing in particular, all that is wrong is told
-        if args.entries.is_empty() || ids.iter().any(|id| name.starts_with(&format!("{id}_"))) {
+        if asked(&folder) {
             failures.push(anyhow::Error::new(reason).context(format!("result {}", shown(&folder))));
         }
     }
     cli::print(&text)?;
+    notes.iter().for_each(|note| cli::note(&format!("note: {note}")));
     for failure in &failures {
         cli::note(&format!("error: {failure:#}"));
     }
@@ -101,9 +120,37 @@ fn deep_check(entry: &Entry) -> anyhow::Result<String> {
     if puzzles::deep_check(entry)? {
         return Ok(String::new());
     }
-    Ok(match entry.load()?.repeats()? {
+    let loaded = entry.load()?;
+    check_meta(&loaded)?;
+    Ok(match loaded.repeats()? {
         Repeats::NotStored => "; no reference output is stored".to_owned(),
         Repeats::Exactly => "; it gives the stored actions again, bit for bit".to_owned(),
         Repeats::Within(far) => format!("; it gives the stored actions again, no value further off than {far:.1e}"),
     })
+}
+
+/// Compares what `entry.json` says with the network and with the experiment in `config.toml`.
+fn check_meta(loaded: &LoadedEntry) -> anyhow::Result<()> {
+    let (entry, experiment) = (loaded.entry(), loaded.experiment());
+    let meta = entry.meta();
+    let parameters = loaded.model().params().count();
+    let said = |key: &str| format!("as {key} of {CONFIG_FILE}");
+    let mut facts = vec![
+        ("parameters", "as the network has".to_owned(), parameters.to_string(), meta.parameters.to_string()),
+        ("name", said("entry"), experiment.entry.clone(), meta.name.clone()),
+        ("policy", said("policy.type"), experiment.policy_type(), meta.policy.clone()),
+        ("task", said("task.name"), experiment.task.name.clone(), meta.task.clone()),
+    ];
+    // the config of an imported entry says nothing of its training
+    if let Some(training) = meta.training.as_ref().filter(|_| meta.parent.is_none()) {
+        let train = &experiment.train;
+        facts.push(("training.steps", said("train.steps"), train.steps.to_string(), training.steps.to_string()));
+        facts.push(("training.seed", said("train.seed"), train.seed.to_string(), training.seed.to_string()));
+    }
+    for (key, of, expected, found) in facts {
+        if expected != found {
+            bail!("{}: {key}: expected {expected} {of}, found {found}", shown(&entry.folder().join(ENTRY_FILE)));
+        }
+    }
+    Ok(())
 }

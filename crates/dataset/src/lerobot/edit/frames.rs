@@ -4,6 +4,7 @@
 use super::super::depth;
 use super::super::encode::{ColumnSummary, PartSummary, PictureSummary, add_to_histograms, sample};
 use super::super::export::Rows;
+use super::super::fingerprint::INDEX_COLUMNS;
 use super::super::images;
 use super::super::info::{FILES_PER_FOLDER, Feature};
 use super::super::open::{Dataset, EpisodeMeta};
@@ -15,9 +16,9 @@ use super::super::tally::{Tally, Told};
 use super::super::tiff;
 use super::super::values::Values;
 use super::super::work::{GROUP_BYTES, Part};
+use super::Edit;
 use super::films::Copied as Filmed;
 use super::groups::Groups;
-use super::{Edit, Renames};
 use crate::error::{DatasetError, Result};
 use crate::stats::FeatureStats;
 use arrow_array::{Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, RecordBatch, StructArray};
@@ -49,7 +50,7 @@ pub(super) fn is_looked_at(feature: &Feature) -> bool {
 /// Copies the rows of all episodes taken, whose videos are in `films`.
 pub(super) fn copy(edit: &Edit<'_>, mut films: Vec<(usize, Filmed)>, advance: &mut dyn FnMut(u64)) -> Result<Copied> {
     let info = edit.inputs[0].set.info();
-    let (names, schema, metadata) = written_as(edit.inputs[0].set.root(), edit.renames)?;
+    let (names, schema, metadata) = written_as(edit)?;
     let encoder = schema::writer_properties(&schema, metadata.into_iter().collect())
         .and_then(|properties| GroupEncoder::new(Arc::clone(&schema), properties))
         .map_err(|source| DatasetError::Parquet {
@@ -125,33 +126,41 @@ fn number_of(tasks: &mut Vec<String>, text: &str) -> usize {
     })
 }
 
-/// The names of the columns of a set's data files, their schema under the new names, and what the files tell Hugging
-/// Face's `datasets`.
-fn written_as(root: &Path, renames: &Renames) -> Result<(Vec<String>, SchemaRef, Option<KeyValue>)> {
-    let path = read::files(root, "data")?.swap_remove(0);
+/// The names of the columns of the first set's data files that are written, their schema under the new names, and what the
+/// files tell Hugging Face's `datasets`. What is no feature is left out, unless the tables alone are made anew.
+fn written_as(edit: &Edit<'_>) -> Result<(Vec<String>, SchemaRef, Option<KeyValue>)> {
+    let (set, renames) = (&edit.inputs[0].set, edit.renames);
+    let path = read::files(set.root(), "data")?.swap_remove(0);
     let builder = read::open(&path)?;
-    let names: Vec<String> = builder.schema().fields().iter().map(|f| f.name().clone()).collect();
-    let new = |name: &String| renames.get(name).unwrap_or(name).clone();
+    let features = &set.info().features;
+    let known =
+        |name: &String| edit.repair.is_some() || features.get(name).is_some() || INDEX_COLUMNS.contains(&name.as_str());
+    let fields: Vec<&Arc<Field>> = builder.schema().fields().iter().filter(|f| known(f.name())).collect();
+    let names: Vec<String> = fields.iter().map(|f| f.name().clone()).collect();
+    let new = |name: &String| known(name).then(|| renames.get(name).unwrap_or(name).clone());
     let field = |field: &Arc<Field>| {
         Field::clone(field)
-            .with_name(new(field.name()))
+            .with_name(renames.get(field.name()).unwrap_or(field.name()))
             .with_metadata(std::collections::HashMap::<String, String>::new())
     };
-    let schema = Schema::new(builder.schema().fields().iter().map(field).collect::<Vec<_>>());
+    let schema = Schema::new(fields.iter().copied().map(field).collect::<Vec<_>>());
     let pairs = builder.metadata().file_metadata().key_value_metadata();
     let told = pairs.into_iter().flatten().find(|pair| pair.key == "huggingface").cloned();
     let told = match told {
-        Some(pair) if !renames.is_empty() => renamed_entry(&pair, &new),
+        Some(pair) if !renames.is_empty() || names.len() < builder.schema().fields().len() => {
+            renamed_entry(&pair, &new)
+        }
         told => told,
     };
     Ok((names, Arc::new(schema), told))
 }
 
-/// The entry with its columns under other names; none where it is not what `datasets` writes.
-fn renamed_entry(pair: &KeyValue, new: &dyn Fn(&String) -> String) -> Option<KeyValue> {
+/// The entry with its columns under other names, or without them; none where it is not what `datasets` writes.
+fn renamed_entry(pair: &KeyValue, new: &dyn Fn(&String) -> Option<String>) -> Option<KeyValue> {
     let told: Value = serde_json::from_str(pair.value.as_ref()?).ok()?;
     let columns = told.get("info")?.get("features")?.as_object()?;
-    let columns: Map<String, Value> = columns.iter().map(|(name, what)| (new(name), what.clone())).collect();
+    let columns: Map<String, Value> =
+        columns.iter().filter_map(|(name, what)| Some((new(name)?, what.clone()))).collect();
     Some(schema::described_as(columns))
 }
 
@@ -228,10 +237,14 @@ struct Seen<'a> {
 impl<'a> Seen<'a> {
     fn new(edit: &'a Edit<'a>, set: &'a Dataset, schema: &Schema, part: Part, episode: &EpisodeMeta) -> Self {
         let place = |name: &str| schema.index_of(name).ok();
-        let values = edit.features.0.iter().map(|(_, feature)| match feature.dtype.as_str() {
+        let doubles = |name: &str| schema.field_with_name(name).is_ok_and(|f| *f.data_type() == DataType::Float64);
+        let values = edit.features.0.iter().map(|(name, feature)| match feature.dtype.as_str() {
             _ if feature.is_visual() || feature.is_text() => Values::Pictures,
             "bool" => Values::Bool(Vec::new()),
-            "float64" => Values::F64(Vec::new()),
+            // beyond what int64 holds
+            "float64" | "uint64" => Values::F64(Vec::new()),
+            // times of a clock, of which float32 leaves nothing
+            _ if name == "timestamp" && doubles(name) => Values::F64(Vec::new()),
             whole if whole.contains("int") => Values::I64(Vec::new()),
             _ => Values::F32(Vec::new()),
         });
@@ -325,7 +338,7 @@ impl<'a> Seen<'a> {
             let column = BadColumn { path: &path, name: edit.before(name) };
             let wrong = |e: arrow_schema::ArrowError| column.because(feature.dtype.clone(), e.to_string());
             let leaf = |to: DataType| -> Result<ArrayRef> {
-                cast(&read::leaf(&column, array, array.len(), feature.dim())?, &to).map_err(wrong)
+                read::cast_all(&read::leaf(&column, array, array.len(), feature.dim())?, &to).map_err(wrong)
             };
             match &mut self.values[index] {
                 Values::Pictures => {}
@@ -404,7 +417,8 @@ impl<'a> Seen<'a> {
                 Some(each) => each.get(self.episode).cloned(),
                 None => values.stats(feature.dim()),
             },
-            digest: values.digest(),
+            // as opening the result hashes them
+            digest: values.digest_as_read(),
             values,
         };
         let values = self.values.into_iter().zip(&self.edit.features.0).map(column).collect();

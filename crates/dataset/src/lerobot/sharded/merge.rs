@@ -2,6 +2,7 @@
 
 use super::super::assembly::{Assembly, Encoders};
 use super::super::convert::ConvertReport;
+use super::super::doubts::Doubts;
 use super::super::shards::StoredGroups;
 use super::super::staging::Staging;
 use super::super::verify::{hash_file, joint_hash};
@@ -39,13 +40,14 @@ pub fn merge_shards(
     let encoders = Encoders::new(staging.path(), &head)?;
     let mut assembly = Assembly::new(staging.path(), &head, &encoders, rest.as_ref())?;
     let total = shards.iter().map(|(_, state)| state.frames as u64).sum();
-    let mut done = 0;
+    let (mut done, mut doubts) = (0, Doubts::default());
     let mut tell = |done| match progress(done, total) {
         ControlFlow::Continue(()) => Ok(()),
         ControlFlow::Break(()) => Err(DatasetError::Stopped { path: out.to_owned() }),
     };
     tell(0)?;
     for (folder, state) in &shards {
+        doubts.extend(&state.doubts);
         for name in state.files.keys() {
             check(folder, state, name)?;
         }
@@ -76,7 +78,8 @@ pub fn merge_shards(
             tell(done)?;
         }
     }
-    let report = assembly.finish(source_sha256)?;
+    let mut report = assembly.finish(source_sha256)?;
+    report.notes.extend(doubts.notes());
     staging.publish()?;
     Ok(report)
 }

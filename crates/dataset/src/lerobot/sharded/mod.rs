@@ -17,6 +17,7 @@ pub use merge::merge_shards;
 
 use super::assembly::{Encoders, Head};
 use super::convert::Opened;
+use super::doubts::Doubts;
 use super::features::ConvertOptions;
 use super::info::{Feature, Features, Info};
 use super::open::read_json;
@@ -110,6 +111,8 @@ struct State {
     /// Name of each file of the source, and its sha256 where this shard is the one that states it.
     source_files: Vec<(String, Option<String>)>,
     head: StoredHead,
+    #[serde(default)]
+    doubts: Doubts,
     /// sha256 of each file of the shard.
     files: BTreeMap<String, String>,
 }
@@ -345,7 +348,7 @@ pub fn convert_shard(
         total_episodes: head.info.total_episodes,
         bytes,
         resumed,
-        notes: notes.clone(),
+        notes: notes.iter().cloned().chain(state.doubts.notes()).collect(),
     };
     if let Some(state) = there.filter(|state| state.conversion == conversion) {
         let names = state.files.keys().map(String::as_str).chain([STATE_FILE]);
@@ -360,10 +363,11 @@ pub fn convert_shard(
         put_demo(&mut bytes, &rest);
         files.push(HashingFile::write_whole(root, REST_FILE, &bytes)?);
     }
-    let hashes = std::thread::scope(|scope| {
+    let (hashes, doubts) = std::thread::scope(|scope| {
         let hashes = scope.spawn(|| job.hashes());
-        files.extend(job.write(root, &head, progress)?);
-        hashes.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        let (written, doubts) = job.write(root, &head, progress)?;
+        files.extend(written);
+        Ok::<_, DatasetError>((hashes.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?, doubts))
     })?;
     let state = State {
         format: FORMAT,
@@ -376,6 +380,7 @@ pub fn convert_shard(
         frames: job.groups.iter().flatten().map(|part| part.rows.len()).sum(),
         source_files: hashes,
         head: stored,
+        doubts,
         files: files.iter().map(|file| (file.path.clone(), file.sha256.clone())).collect(),
     };
     let text = serde_json::to_vec(&state).map_err(json)?;
@@ -394,20 +399,20 @@ impl Job<'_> {
         self.plan().files.iter().zip(&self.owners).map(of).collect()
     }
 
-    /// Writes the row groups and their records.
+    /// Writes the row groups and their records; gives what is to be noted of their values too.
     fn write(
         &self,
         root: &Path,
         head: &Head,
         progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
-    ) -> Result<Vec<WrittenFile>> {
+    ) -> Result<(Vec<WrittenFile>, Doubts)> {
         let encoders = Encoders::new(root, head)?;
         let mut rows = ShardWriter::new(root, ROWS, &encoders.data, u64::MAX, 1);
         let mut side = encoders.side_frames().map(|frames| ShardWriter::new(root, SIDE, frames, u64::MAX, 1));
         let path = root.join(RECORDS_FILE);
         let mut records = HashingFile::create(&path)?;
         let from = (self.source, self.options);
-        self.opened.each_group(from, head, &encoders, &self.groups, progress, &mut |output, beside| {
+        let doubts = self.opened.each_group(from, head, &encoders, &self.groups, progress, &mut |output, beside| {
             let record = record::put(&output, beside.as_ref());
             let failed = |source| DatasetError::Io { path: path.clone(), operation: "write it", source };
             records.write_all(&(record.len() as u64).to_le_bytes()).map_err(failed)?;
@@ -423,7 +428,7 @@ impl Job<'_> {
             files.extend(side.finish()?);
         }
         files.push(records.written(RECORDS_FILE));
-        Ok(files)
+        Ok((files, doubts))
     }
 }
 

@@ -194,6 +194,10 @@ impl Tables {
                 let fault = Fault::new(Area::Episodes, &row.file, "order of rows", format!("episode {at}"), number);
                 faults.push(fault.of(number, row.at));
             }
+            if episode.length == 0 {
+                let fault = Fault::new(Area::Episodes, &row.file, "length", "1 or more", 0).of(number, row.at);
+                faults.push(Fault { repairable: false, ..fault });
+            }
             let last = (episode.first + episode.length).saturating_sub(1).max(episode.first);
             let file = self.file_of(episode.first);
             let place = file.and_then(|file| place_of(&file.relative));

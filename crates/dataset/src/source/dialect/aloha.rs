@@ -4,7 +4,7 @@
 
 use super::{DemoDraft, Draft, Layout, Survey, contents, id_of, stranger, wrong_lengths};
 use crate::error::InputError;
-use crate::plan::{DemoPlan, Dialect};
+use crate::plan::{DemoPlan, Dialect, Problem};
 use crate::source::walk::Walked;
 
 pub(super) struct Aloha;
@@ -50,7 +50,10 @@ fn episode(index: usize, file: &Walked, out: &mut Draft) -> Result<(), InputErro
     let (number, id) = id_of(&file.path, index, &out.demos);
     let found = contents((index, file), "", &id, &name_of, &mut out.problems);
     let length = file.datasets["action"].shape.first().copied().unwrap_or(0);
-    out.problems.extend(wrong_lengths(file, &id, (length, "action"), &found.keys));
+    match length {
+        0 => out.problems.push(Problem::empty(&file.path, &id, "action")),
+        _ => out.problems.extend(wrong_lengths(file, &id, (length, "action"), &found.keys)),
+    }
     let plan = DemoPlan { id, number, length, keys: found.keys.into(), attr_names, task: None };
     out.demos.push(DemoDraft { plan, home: Some((index, String::new())), groups: found.groups, inner: found.inner });
     Ok(())

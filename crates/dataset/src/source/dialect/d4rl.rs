@@ -30,6 +30,19 @@ impl Layout for D4rl {
             let timeouts = flags(file, "timeouts", steps)?;
             ends.iter_mut().zip(timeouts).for_each(|(end, timeout)| *end |= timeout);
         }
+        let mut notes = Vec::new();
+        for (path, node) in &file.datasets {
+            match node.shape.first() {
+                Some(&rows) if rows != steps && path == "observations" => {
+                    return Err(wrong_length(file, path, steps, format!("shape {:?}", node.shape)));
+                }
+                // what was trained with the run has lengths of its own
+                Some(&rows) if rows != steps && !path.starts_with("metadata/") => notes.push(format!(
+                    "{path} has {rows} rows where actions has {steps}: it is kept with the file and is in no episode"
+                )),
+                _ => {}
+            }
+        }
         let mut demos = Vec::new();
         let mut first = 0;
         for (step, _) in ends.iter().enumerate().filter(|(_, end)| **end) {
@@ -37,7 +50,6 @@ impl Layout for D4rl {
             first = step + 1;
             beat();
         }
-        let mut notes = Vec::new();
         if first < steps {
             notes.push(format!(
                 "the last {} steps belong to an episode that does not end and are left out",
@@ -70,13 +82,17 @@ fn flags(file: &Walked, key: &str, steps: usize) -> Result<Vec<bool>, InputError
     let array = file.read(key, None)?;
     match array.to_f64().filter(|v| v.len() == steps) {
         Some(values) => Ok(values.iter().map(|&v| v != 0.0).collect()),
-        None => Err(InputError::WrongLength {
-            path: file.path.clone(),
-            demo: "the run".to_owned(),
-            key: key.to_owned(),
-            expected: format!("{steps} (the actions)"),
-            found: format!("{} of shape {:?}", array.dtype, array.shape),
-        }),
+        None => Err(wrong_length(file, key, steps, format!("{} of shape {:?}", array.dtype, array.shape))),
+    }
+}
+
+fn wrong_length(file: &Walked, key: &str, steps: usize, found: String) -> InputError {
+    InputError::WrongLength {
+        path: file.path.clone(),
+        demo: "the run".to_owned(),
+        key: key.to_owned(),
+        expected: format!("{steps} (the actions)"),
+        found,
     }
 }
 

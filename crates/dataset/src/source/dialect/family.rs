@@ -1,6 +1,6 @@
 //! What robomimic's layout and everything derived from it share: `/data/demo_<k>` and `/mask`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::{DemoDraft, Draft, Survey, behavior, contents, list, number_after, wrong_lengths};
 use crate::error::InputError;
@@ -153,6 +153,10 @@ fn draft_file(
             }
         }
     }
+    out.notes.extend(no_demos(file, &ids).map(|note| match base {
+        None => note,
+        Some(_) => format!("{}: {note}", file.path.file_name().unwrap_or_default().to_string_lossy()),
+    }));
     environment(file, &data_attrs, &mut out);
     let language = file_language(&out);
     for (number, id, name) in &ids {
@@ -168,6 +172,26 @@ fn draft_file(
     total(file, &data_attrs, &mut out);
     masks(file, &ids, &mut out)?;
     Ok(out)
+}
+
+/// A note on the members of `data` that look like demos and are called otherwise.
+fn no_demos(file: &Walked, ids: &[(u64, String, String)]) -> Option<String> {
+    let parts = ["actions", "obs"].map(|part| format!("/{part}"));
+    let paths = file.groups.keys().map(String::as_str).chain(file.datasets.keys());
+    let alike = |path: &str| {
+        let name = path.strip_prefix("data/")?;
+        let group = parts.iter().find_map(|part| name.strip_suffix(part.as_str()));
+        let dataset = (name.starts_with("demo_") && file.datasets.contains_key(path)).then_some(name);
+        group.or(dataset).filter(|name| !name.contains('/')).map(str::to_owned)
+    };
+    let mut names: BTreeSet<String> = paths.filter_map(alike).collect();
+    for (.., name) in ids {
+        names.remove(name);
+    }
+    let some: Vec<&str> = names.iter().take(5).map(String::as_str).collect();
+    let more = if names.len() > some.len() { format!(", ... ({} in all)", names.len()) } else { String::new() };
+    let expected = "no demos: a demo is a group called demo_ and a whole number below 2^64";
+    (!some.is_empty()).then(|| format!("in data, these are {expected}: {}{more}", some.join(", ")))
 }
 
 fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
@@ -227,7 +251,7 @@ fn demo(
     let behavior = out.dialect == Dialect::Behavior;
     let named = |path: &str| if behavior { behavior::name_of(path).to_owned() } else { path.to_owned() };
     let found = contents((index, file), home, id, &named, &mut out.problems);
-    let length = length(file, (id, home), &attrs, &found.keys, out);
+    let (length, of) = length(file, (id, home), &attrs, &found.keys, out);
     let task = attrs
         .get("ep_meta")
         .and_then(Array::to_text)
@@ -236,7 +260,7 @@ fn demo(
         .filter(|t| !t.is_empty())
         .or_else(|| language.map(str::to_owned));
     let mut plan = DemoPlan { id: id.to_owned(), number, length, keys: found.keys.into(), attr_names, task };
-    check(file, &plan, out);
+    check(file, &plan, of, out);
     if let Some(before) = out.demos.last() {
         plan.keys.share_names(&before.plan.keys);
     }
@@ -245,18 +269,19 @@ fn demo(
     Ok(())
 }
 
-/// Steps of a demo: `num_samples` where it is there, else the length of its actions.
+/// Steps of a demo: `num_samples` where it is there, else the length of its actions; and who says so, where the actions
+/// say otherwise.
 fn length(
     file: &Walked,
     (id, home): (&str, &str),
     attrs: &Attrs,
     keys: &BTreeMap<String, KeyPlan>,
     out: &mut Draft,
-) -> usize {
+) -> (usize, &'static str) {
     let rows = keys.get("actions").and_then(|k| k.shape.first().copied()).unwrap_or(0);
     let stated = attrs.get("num_samples");
     match stated.and_then(Array::to_i64).and_then(|n| usize::try_from(n).ok()) {
-        Some(n) => n,
+        Some(n) => (n, if n == rows { "" } else { "num_samples" }),
         None => {
             if out.dialect != Dialect::RobosuiteRaw {
                 let error = InputError::BadAttribute {
@@ -271,12 +296,12 @@ fn length(
                 };
                 out.problems.push(Problem::new(Some(id), None, stated.is_some(), error));
             }
-            rows
+            (rows, "")
         }
     }
 }
 
-fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
+fn check(file: &Walked, plan: &DemoPlan, of: &str, out: &mut Draft) {
     let id = plan.id.as_str();
     let path = || file.path.clone();
     let found = || list(plan.keys.keys());
@@ -324,7 +349,7 @@ fn check(file: &Walked, plan: &DemoPlan, out: &mut Draft) {
             }
         }
     }
-    let wrong = wrong_lengths(file, id, (plan.length, ""), &plan.keys);
+    let wrong = wrong_lengths(file, id, (plan.length, of), &plan.keys);
     out.problems.extend(wrong.into_iter().filter(|p| !known.iter().any(|known| p.key.as_ref() == Some(known))));
 }
 

@@ -17,6 +17,7 @@ mod robotwin;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use super::value::one_line;
 use super::walk::Walked;
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Place, Problem};
@@ -149,8 +150,23 @@ pub(super) fn draft(survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, In
     let mut draft = layout.draft(survey, beat)?;
     let faults = survey.files.iter().flat_map(|file| &file.faults);
     draft.problems.splice(0..0, faults.map(|fault| Problem::new(None, None, false, fault.clone())));
+    draft.notes.extend(odd_attrs(survey));
     ragged(survey, &mut draft);
     Ok(draft)
+}
+
+/// Notes on the attributes that are left out, one for each name.
+fn odd_attrs(survey: &Survey) -> Vec<String> {
+    let mut all: BTreeMap<&str, (usize, &str, &str)> = BTreeMap::new();
+    for ((object, name), what) in survey.files.iter().flat_map(|file| &file.odd_attrs) {
+        all.entry(name).or_insert((0, object, what)).0 += 1;
+    }
+    let note = |(name, (count, object, what)): (&str, (usize, &str, &str))| {
+        let object = if object.is_empty() { "the file" } else { object };
+        let more = if count > 1 { format!(" and {} more", count - 1) } else { String::new() };
+        format!("attribute {} of {object}{more} is left out: the type {what} is not supported", one_line(name))
+    };
+    all.into_iter().map(note).collect()
 }
 
 /// Datasets that have one row per step wherever they occur.
@@ -229,11 +245,11 @@ fn key_plan(file: usize, walked: &Walked, path: &str) -> Option<KeyPlan> {
     let node = walked.datasets.get(path).filter(|node| node.fault.is_none())?;
     let place = Place { file, path: path.into(), first_row: 0, offset: node.offset, join: None };
     let (mut dtype, mut shape) = (node.dtype.clone(), node.shape.clone());
-    if let (&Dtype::FixedStr(width), [rows], Some(offset)) = (&node.dtype, shape.as_slice(), node.offset)
-        && *rows > 0
-        && walked.begins_with(offset, &JPEG)
+    if let (&Dtype::FixedStr(width), &[rows]) = (&node.dtype, shape.as_slice())
+        && rows > 0
+        && walked.begins_with(path, node, &JPEG)
     {
-        (dtype, shape) = (Dtype::U8, vec![*rows, width]);
+        (dtype, shape) = (Dtype::U8, vec![rows, width]);
     }
     Some(KeyPlan { dtype, shape: shape.into(), block_rows: node.block_rows, place })
 }

@@ -19,7 +19,7 @@ use super::local::Backend;
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
 use crate::tree::{Array, Demo, Dtype};
-use store::Store;
+use store::{MARK, MARK_3, Store, ZARR_3};
 
 /// Bytes of a chunk, and of a step, at most.
 const MAX_CHUNK: u64 = 192 << 20;
@@ -160,7 +160,7 @@ impl Stated {
                 ));
             }
         };
-        let fill = stored.fill(&self.fill_value);
+        let fill = stored.fill(&self.fill_value).ok_or_else(|| format!("the fill_value {}", self.fill_value))?;
         let number = |all: Vec<u64>| all.into_iter().map(|n| n as usize).collect();
         let separator = self.dimension_separator.unwrap_or_else(|| ".".to_owned());
         Ok(ZArray { path, stored, shape: number(self.shape), chunks: number(self.chunks), codec, fill, separator })
@@ -193,26 +193,39 @@ fn stored(name: &str) -> Option<Stored> {
 }
 
 impl Stored {
-    /// An element of this value, as it is stored.
-    fn fill(&self, value: &Value) -> Vec<u8> {
-        let number = match value {
-            Value::String(text) => text.replace("Infinity", "inf").parse().unwrap_or(0.0),
-            Value::Bool(truth) => f64::from(u8::from(*truth)),
-            other => other.as_f64().unwrap_or(0.0),
+    /// An element of this value, as it is stored; `None` where none can be made of it.
+    fn fill(&self, value: &Value) -> Option<Vec<u8>> {
+        let padded = |mut bytes: Vec<u8>| {
+            bytes.resize(self.size, 0);
+            if self.swapped {
+                bytes.reverse();
+            }
+            bytes
         };
-        let mut bytes = match self.dtype {
+        let number = match value {
+            // bytes are written in base64
+            Value::String(text) if !self.dtype.is_numeric() => {
+                return base64(text).filter(|bytes| bytes.len() <= self.size).map(padded);
+            }
+            // the bits of a NaN that is another than numpy's
+            Value::String(text) if text.starts_with("0x") => {
+                let bits = u64::from_str_radix(&text[2..], 16).ok()?;
+                let fits = self.size >= 8 || bits >> (8 * self.size) == 0;
+                return fits.then(|| padded(bits.to_le_bytes()[..self.size.min(8)].to_vec()));
+            }
+            Value::String(text) => text.replace("Infinity", "inf").parse().ok()?,
+            Value::Bool(truth) => f64::from(u8::from(*truth)),
+            Value::Null => 0.0,
+            other => other.as_f64()?,
+        };
+        Some(padded(match self.dtype {
             Dtype::F32 if self.kind != Kind::Half => (number as f32).to_le_bytes().to_vec(),
             Dtype::F64 => number.to_le_bytes().to_vec(),
             Dtype::U64 => value.as_u64().unwrap_or(0).to_le_bytes().to_vec(),
             Dtype::F32 => f16::from_f64(number).to_le_bytes().to_vec(),
             _ if !self.dtype.is_numeric() => Vec::new(),
             _ => value.as_i64().unwrap_or(number as i64).to_le_bytes().to_vec(),
-        };
-        bytes.resize(self.size, 0);
-        if self.swapped {
-            bytes.reverse();
-        }
-        bytes
+        }))
     }
 
     /// Elements as they are stored, as they are read.
@@ -235,6 +248,21 @@ impl Stored {
             }
         })
     }
+}
+
+/// The bytes that a text in base64 stands for.
+fn base64(text: &str) -> Option<Vec<u8>> {
+    const LETTERS: &[u8] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let digits: Option<Vec<u32>> = text
+        .trim_end_matches('=')
+        .bytes()
+        .map(|letter| LETTERS.iter().position(|&known| known == letter).map(|digit| digit as u32))
+        .collect();
+    let bytes = |four: &[u32]| {
+        let bits = four.iter().fold(0, |bits, digit| bits << 6 | digit) << (6 * (4 - four.len()));
+        bits.to_be_bytes()[1..four.len()].to_vec()
+    };
+    Some(digits?.chunks(4).flat_map(bytes).collect())
 }
 
 fn level(value: f32) -> Option<u8> {
@@ -319,12 +347,19 @@ impl ZArray {
 impl Buffer {
     /// Opens a replay buffer; `None` where the path is none.
     pub fn open(path: &Path, beat: &mut dyn FnMut()) -> Result<Option<(Self, Plan)>, InputError> {
+        let unavailable = |object: &str, reason: String| {
+            let reason = super::value::one_line(&reason);
+            InputError::Unavailable { path: path.to_owned(), object: object.to_owned(), reason }
+        };
         let store = match path.is_dir() {
-            true if path.join("meta/episode_ends/.zarray").is_file() => Store::Folder(path.to_owned()),
-            false if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("zip")) => match Store::zip(path) {
-                Some(store) => store,
-                None => return Ok(None),
-            },
+            true if path.join(MARK).is_file() => Store::Folder(path.to_owned()),
+            true if path.join(MARK_3).is_file() => return Err(unavailable("the folder", ZARR_3.to_owned())),
+            false if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("zip")) => {
+                match Store::zip(path).map_err(|reason| unavailable("the zip file", reason))? {
+                    Some(store) => store,
+                    None => return Ok(None),
+                }
+            }
             _ => return Ok(None),
         };
         let (arrays, demos, kept) = (BTreeMap::new(), Vec::new(), Mutex::new(Vec::new()));
@@ -352,7 +387,12 @@ impl Buffer {
         let steps = ends.last().copied().unwrap_or(0);
         let (mut notes, mut problems) = (Vec::new(), Vec::new());
         let mut keys: Vec<(String, KeyPlan)> = Vec::new();
-        for name in self.store.arrays("data").map_err(|e| self.damaged("data", e))? {
+        let members = |mark: &str| self.store.members("data", mark).map_err(|e| self.damaged("data", e));
+        let (names, groups) = (members(".zarray")?, members(".zgroup")?);
+        let groups: Vec<String> = groups.iter().map(|name| format!("data/{name}")).collect();
+        // the array that ends first, where one lacks steps
+        let mut short: Option<(usize, String, String)> = None;
+        for name in names {
             beat();
             let path = format!("data/{name}");
             let stated = self.stated(&path)?;
@@ -377,14 +417,8 @@ impl Buffer {
                 }
             };
             let rows = array.shape[0];
-            if rows < steps {
-                return Err(InputError::WrongLength {
-                    path: self.path.clone(),
-                    demo: format!("demo_{}", ends.partition_point(|&end| end <= rows)),
-                    key: path,
-                    expected: format!("{steps} (meta/episode_ends)"),
-                    found: format!("shape {:?}", array.shape),
-                });
+            if short.as_ref().map_or(steps, |(least, ..)| *least) > rows {
+                short = Some((rows, path.clone(), format!("shape {:?}", array.shape)));
             }
             if rows > steps {
                 let more = rows - steps;
@@ -405,12 +439,37 @@ impl Buffer {
             keys.push((key, plan));
         }
         self.poses(&mut keys, &mut notes);
+        if !groups.is_empty() {
+            let names = super::dialect::list(groups.iter().map(String::as_str));
+            if !keys.iter().any(|(key, _)| key.starts_with("obs/")) {
+                let advice = format!("groups below data are not read: {names}; put their arrays into data itself");
+                return Err(InputError::NoObservations { path: self.path.clone(), advice });
+            }
+            notes.push(format!("groups below data are not read: {names}"));
+        }
+        // a recording whose observations cannot be read is not one without any
+        let unread = problems.iter().find(|p: &&Problem| p.key.as_ref().is_some_and(|key| key.starts_with("obs/")));
+        if let Some(unread) = unread.filter(|_| !keys.iter().any(|(key, _)| key.starts_with("obs/"))) {
+            return Err(unread.error.clone());
+        }
         let mut demos = Vec::with_capacity(ends.len());
         let mut first = 0;
         for (number, &end) in ends.iter().enumerate() {
             let id = format!("demo_{number}");
             if end == first {
                 problems.push(Problem::empty(&self.path, &id, "meta/episode_ends"));
+                continue;
+            }
+            if let Some((_, key, found)) = short.as_ref().filter(|(rows, ..)| end > *rows) {
+                let error = InputError::WrongLength {
+                    path: self.path.clone(),
+                    demo: id.clone(),
+                    key: key.clone(),
+                    expected: format!("{steps} (meta/episode_ends)"),
+                    found: found.clone(),
+                };
+                problems.push(Problem::new(Some(&id), None, true, error));
+                first = end;
                 continue;
             }
             let of_demo = keys.iter().map(|(key, plan)| {
@@ -431,10 +490,11 @@ impl Buffer {
             first = end;
         }
         if demos.is_empty() {
-            return Err(InputError::NoDemos {
+            let none = || InputError::NoDemos {
                 path: self.path.clone(),
                 found: "meta/episode_ends without an end".to_owned(),
-            });
+            };
+            return Err(problems.iter().find(|p| p.demo.is_some()).map_or_else(none, |p| p.error.clone()));
         }
         Ok(Plan {
             path: self.path.clone(),
@@ -610,3 +670,6 @@ impl Backend for Buffer {
         Ok(Array { dtype: Dtype::F32, shape: vec![count, width], bytes })
     }
 }
+
+#[cfg(test)]
+mod tests;

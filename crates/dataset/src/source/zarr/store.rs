@@ -5,22 +5,47 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use zip::ZipArchive;
+use flate2::Crc;
+use flate2::read::DeflateDecoder;
+use zip::{CompressionMethod, ZipArchive};
 
 pub(super) enum Store {
     Folder(PathBuf),
-    Zip(Mutex<ZipArchive<File>>),
+    /// An archive, and the folder in it.
+    Zip(Mutex<ZipArchive<File>>, String),
 }
 
+/// What a replay buffer has.
+pub(super) const MARK: &str = "meta/episode_ends/.zarray";
+/// What a store of zarr 3 has.
+pub(super) const MARK_3: &str = "zarr.json";
+
+/// Why a store of zarr 3 is not read.
+pub(super) const ZARR_3: &str = "it is stored as zarr 3, and zarr 2 is read: copy its arrays into a group that \
+    `zarr.open_group(path, mode=\"w\", zarr_format=2)` opens";
 /// Folders of a store lie no deeper.
 const DEPTH: usize = 6;
 
 impl Store {
-    /// Opens a zip file as a store; `None` where it holds none.
-    pub fn zip(path: &Path) -> Option<Self> {
-        let archive = ZipArchive::new(File::open(path).ok()?).ok()?;
-        let store = archive.file_names().flatten().any(|name| name == "meta/episode_ends/.zarray");
-        store.then(|| Self::Zip(Mutex::new(archive)))
+    /// Opens a zip file as a store; `None` where the file is no zip file, in words why a zip file is none.
+    pub fn zip(path: &Path) -> Result<Option<Self>, String> {
+        let Ok(mut file) = File::open(path) else { return Ok(None) };
+        let mut begin = [0; 4];
+        if file.read_exact(&mut begin).is_err() || begin != *b"PK\x03\x04" {
+            return Ok(None);
+        }
+        let archive = ZipArchive::new(file).map_err(|e| format!("{e}: it may be cut off"))?;
+        let ends = |mark: &str| {
+            let above = |name: &str| {
+                name.strip_suffix(mark).filter(|above| above.is_empty() || above.ends_with('/')).map(str::to_owned)
+            };
+            archive.file_names().flatten().filter_map(|name| above(&name)).min_by_key(String::len)
+        };
+        match (ends(MARK), ends(MARK_3)) {
+            (Some(above), _) => Ok(Some(Self::Zip(Mutex::new(archive), above))),
+            (None, Some(_)) => Err(ZARR_3.to_owned()),
+            (None, None) => Err("no meta/episode_ends of a replay buffer is in it".to_owned()),
+        }
     }
 
     /// A file of the store; `None` where there is none.
@@ -40,35 +65,44 @@ impl Store {
                 }
                 file.take(limit).read_to_end(&mut bytes).map_err(|e| format!("{name}: {e}"))?;
             }
-            Self::Zip(archive) => {
+            Self::Zip(archive, above) => {
                 let mut archive = archive.lock().unwrap_or_else(PoisonError::into_inner);
-                let file = match archive.by_name(name) {
-                    Ok(file) => file,
-                    Err(zip::result::ZipError::FileNotFound) => return Ok(None),
-                    Err(e) => return Err(format!("{name}: {e}")),
-                };
-                if file.size() > limit {
-                    return too_long(file.size());
+                let Some(index) = archive.index_for_name(&format!("{above}{name}")) else { return Ok(None) };
+                let file = archive.by_index_raw(index).map_err(|e| format!("{name}: {e}"))?;
+                let (size, crc, method) = (file.size(), file.crc32(), file.compression());
+                if size > limit {
+                    return too_long(size);
                 }
-                file.take(limit).read_to_end(&mut bytes).map_err(|e| format!("{name}: {e}"))?;
+                match method {
+                    CompressionMethod::STORE => file.take(limit).read_to_end(&mut bytes),
+                    CompressionMethod::DEFLATE => DeflateDecoder::new(file).take(limit).read_to_end(&mut bytes),
+                    other => return Err(format!("{name}: it is packed with {other}: `zip -r -0` packs nothing")),
+                }
+                .map_err(|e| format!("{name}: {e}"))?;
+                let mut found = Crc::new();
+                found.update(&bytes);
+                if found.sum() != crc {
+                    return Err(format!("{name}: its checksum is wrong"));
+                }
             }
         }
         Ok(Some(bytes))
     }
 
-    /// Names of the arrays of a group, sorted.
-    pub fn arrays(&self, group: &str) -> Result<Vec<String>, String> {
+    /// Names of the members of a group that have this file (`.zarray`, `.zgroup`), sorted.
+    pub fn members(&self, group: &str, mark: &str) -> Result<Vec<String>, String> {
         let mut names: Vec<String> = match self {
             Self::Folder(root) => std::fs::read_dir(root.join(group))
                 .map_err(|e| format!("{group}: {e}"))?
                 .flatten()
-                .filter(|entry| entry.path().join(".zarray").is_file())
+                .filter(|entry| entry.path().join(mark).is_file())
                 .map(|entry| entry.file_name().to_string_lossy().into_owned())
                 .collect(),
-            Self::Zip(archive) => {
+            Self::Zip(archive, above) => {
                 let archive = archive.lock().unwrap_or_else(PoisonError::into_inner);
                 let name = |path: &str| {
-                    let name = path.strip_prefix(group)?.strip_prefix('/')?.strip_suffix("/.zarray")?;
+                    let name = path.strip_prefix(above.as_str())?.strip_prefix(group)?.strip_prefix('/')?;
+                    let name = name.strip_suffix(mark)?.strip_suffix('/')?;
                     (!name.contains('/')).then(|| name.to_owned())
                 };
                 archive.file_names().flatten().filter_map(|path| name(&path)).collect()
@@ -92,7 +126,7 @@ impl Store {
         let mut found = Vec::new();
         match self {
             Self::Folder(root) => walk(root, DEPTH, &mut found),
-            Self::Zip(_) => found.push((path.to_owned(), std::fs::metadata(path).map_or(0, |m| m.len()))),
+            Self::Zip(..) => found.push((path.to_owned(), std::fs::metadata(path).map_or(0, |m| m.len()))),
         }
         found.sort();
         found

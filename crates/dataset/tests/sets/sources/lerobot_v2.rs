@@ -4,11 +4,14 @@ use super::{fixture, quiet};
 use crate::common::copy;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Int64Type};
+use arrow_array::{ArrayRef, Float32Array, RecordBatch};
 use dataset::edit::{Destination, Selection, keep};
-use dataset::{ConvertOptions, Dataset, OldSet, Source, VideoFile, convert, verify};
+use dataset::{ConvertOptions, Dataset, NonFinite, OldSet, Source, VideoFile, convert, verify};
+use parquet::arrow::ArrowWriter;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use std::fs::File;
 use std::path::Path;
+use std::sync::Arc;
 
 const TOP: &str = "observation.images.top";
 
@@ -114,8 +117,15 @@ fn a_count_that_is_wrong_is_noted_and_other_doors_say_what_to_do() {
     let path = old.join("meta/episodes.jsonl");
     let lines = std::fs::read_to_string(&path).unwrap().replace("\"length\": 4", "\"length\": 9");
     std::fs::write(&path, lines).unwrap();
+    let info = std::fs::read_to_string(old.join("meta/info.json")).unwrap();
+    std::fs::write(old.join("meta/info.json"), info.replace("\"total_episodes\": 3", "\"total_episodes\": 4")).unwrap();
+    let data = old.join("data/chunk-000");
+    std::fs::copy(data.join("episode_000001.parquet"), data.join("episode_000003.parquet")).unwrap();
     let opened = OldSet::open(&old).unwrap().unwrap();
-    assert!(opened.notes()[0].contains("episode 1: expected 4 frames"), "{:?}", opened.notes());
+    let [total, length, files] = opened.notes() else { panic!("{:?}", opened.notes()) };
+    assert!(total.contains("total_episodes: expected 3, as meta/episodes.jsonl lists, found 4"), "{total}");
+    assert!(length.contains("episode 1: expected 4 frames"), "{length}");
+    assert!(files.contains("1 files, which are left out: data/chunk-000/episode_000003.parquet"), "{files}");
     assert_eq!(opened.set().frames(), 15);
     let chosen = Selection { episodes: vec![0], ..Selection::default() };
     let kept = keep(&old, &Destination::New(dir.path().join("kept")), &chosen, &mut quiet).map(drop);
@@ -126,4 +136,52 @@ fn a_count_that_is_wrong_is_noted_and_other_doors_say_what_to_do() {
     let fps = ConvertOptions { fps: Some(5.0), ..ConvertOptions::default() };
     let text = convert(&old, &dir.path().join("out"), &fps, &mut quiet).unwrap_err().to_string();
     assert!(text.contains("--fps is not supported"), "{text}");
+}
+
+#[test]
+fn a_column_that_is_not_stated_is_left_out_and_times_are_finite() {
+    let dir = tempfile::tempdir().unwrap();
+    let old = dir.path().join("old");
+    copy(&fixture("lerobot_v21"), &old);
+    let path = old.join("data/chunk-000/episode_000001.parquet");
+    let reader = ParquetRecordBatchReaderBuilder::try_new(File::open(&path).unwrap()).unwrap().build().unwrap();
+    for batch in reader.collect::<Vec<_>>() {
+        let batch = batch.unwrap();
+        let schema = batch.schema();
+        let column = |(field, column): (&Arc<arrow_schema::Field>, &ArrayRef)| match field.name().as_str() {
+            "timestamp" => {
+                let times: ArrayRef = Arc::new(Float32Array::from(vec![f32::NAN; batch.num_rows()]));
+                ("timestamp".to_owned(), times)
+            }
+            name => (name.to_owned(), Arc::clone(column)),
+        };
+        let changed = schema.fields().iter().zip(batch.columns()).map(column);
+        let changed = RecordBatch::try_from_iter(changed).unwrap();
+        let mut writer = ArrowWriter::try_new(File::create(&path).unwrap(), changed.schema(), None).unwrap();
+        writer.write(&changed).unwrap();
+        writer.close().unwrap();
+    }
+    let info = std::fs::read(old.join("meta/info.json")).unwrap();
+    let mut info: serde_json::Value = serde_json::from_slice(&info).unwrap();
+    info["features"].as_object_mut().unwrap().remove("next.done").unwrap();
+    std::fs::write(old.join("meta/info.json"), info.to_string()).unwrap();
+    let out = dir.path().join("set");
+    let text = convert(&old, &out, &ConvertOptions::default(), &mut quiet).unwrap_err().to_string();
+    assert!(text.contains("timestamp: episode 1, frame 0: NaN") && text.contains("--nonfinite keep"), "{text}");
+    let keep = ConvertOptions { nonfinite: NonFinite::Keep, ..ConvertOptions::default() };
+    let notes = convert(&old, &out, &keep, &mut quiet).unwrap().notes;
+    let [column, times] = notes.as_slice() else { panic!("{notes:?}") };
+    assert!(
+        column.starts_with("column next.done: ") && column.ends_with("it is left out, with its values"),
+        "{column}"
+    );
+    assert!(times.contains("by up to NaN s"), "{times}");
+    let file = File::open(out.join("data/chunk-000/file-000.parquet")).unwrap();
+    let file = ParquetRecordBatchReaderBuilder::try_new(file).unwrap();
+    assert!(file.schema().index_of("next.done").is_err() && file.schema().index_of("action").is_ok());
+    // LeRobot's robomimic twin has what is lacking
+    let again = dir.path().join("again.hdf5");
+    let report = dataset::export(&out, &again, &dataset::WriteOptions::default(), &mut quiet).unwrap();
+    let named = |text: &str| report.notes.iter().any(|note| note.contains(text));
+    assert!(named("timestamp is left out") && named("the data set has no rewards and no dones"), "{:?}", report.notes);
 }

@@ -6,12 +6,12 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use models::actrm::Thinking;
-use report::statistics::{Estimate, hierarchical};
+use report::statistics::{Estimate, over_trainings};
 use zoo::ZooError;
 
 use super::super::file::Study;
 use super::{Results, Trainings, outcomes, read_results};
-use crate::charts::{BOOTSTRAP_SEED, COLORS, escaped, intervals};
+use crate::charts::{COLORS, escaped, intervals};
 
 /// Groups of episodes that make a line worth drawing.
 const FEWEST_GROUPS: usize = 4;
@@ -49,7 +49,7 @@ pub(super) fn shown(study: &Study, chart: &Chart) -> String {
 pub(super) fn all_arms(study: &Study, results: &Results) -> Option<Chart> {
     let mut rows: Vec<(String, Vec<(String, Estimate)>)> = Vec::new();
     for ((test, data, arm), trainings) in results.iter().filter(|((test, _, _), _)| study.tests[test].is_plain()) {
-        let Some(estimate) = hierarchical(&outcomes(trainings, &[]), BOOTSTRAP_SEED) else { continue };
+        let Some(estimate) = over_trainings(&outcomes(trainings, &[])) else { continue };
         let of = &study.data[data];
         let expert = of.expert.as_ref().map(|expert| format!(", {expert}")).unwrap_or_default();
         let skill = if of.skill.is_good() { String::new() } else { format!(", {}", of.skill) };
