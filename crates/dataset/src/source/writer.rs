@@ -58,7 +58,7 @@ impl RobomimicWriter {
         };
         sweep(folder, &name);
         let temporary = tempfile::Builder::new()
-            .prefix(&format!(".{name}.{}-", std::process::id()))
+            .prefix(&format!(".{name}.{}-", process()))
             .suffix(".part")
             .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666))
             .tempfile_in(folder)
@@ -243,6 +243,11 @@ impl RobomimicWriter {
     }
 }
 
+/// This process, as a number.
+fn process() -> i32 {
+    rustix::process::getpid().as_raw_nonzero().get()
+}
+
 /// Removes what killed writers of the file `name` left. Best effort: what is locked is in use.
 fn sweep(folder: &Path, name: &str) {
     for path in unfinished(folder, &format!(".{name}.")) {
@@ -255,7 +260,7 @@ fn sweep(folder: &Path, name: &str) {
 /// Removes the unfinished file that this process keeps beside `path`: before it ends without unwinding.
 pub fn remove_unfinished(path: &Path) {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    for unfinished in unfinished(folder_of(path), &format!(".{name}.{}-", std::process::id())) {
+    for unfinished in unfinished(folder_of(path), &format!(".{name}.{}-", process())) {
         // what stays is removed by the next writer
         let _ = std::fs::remove_file(unfinished);
     }

@@ -88,8 +88,8 @@ pub struct Difference {
 /// The standard error is that of a hierarchical bootstrap which draws the trainings of each side and, for both alike, the
 /// episodes (Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007), computed rather than drawn. As trainings
 /// are few, it is widened by `sqrt(m / (m - 1))` and compared with Student's t of `m - 1` degrees of freedom, where `m` is the
-/// smaller number of trainings. The interval is never narrower than Newcombe's of two rates over so many episodes. `None` for
-/// fewer than two trainings a side, which cannot tell a training's luck from a difference, and for ragged outcomes.
+/// smaller number of trainings. Outcomes that are all alike have no error: the interval is Newcombe's of two rates over so many
+/// episodes then. `None` for fewer than two trainings a side, which cannot tell a training's luck from a difference, and for ragged outcomes.
 pub fn difference(first: &[Vec<f64>], second: &[Vec<f64>]) -> Option<Difference> {
     let (one, two) = (Spread::of(first)?, Spread::of(second)?);
     let (m, n) = (first.len().min(second.len()), one.episodes.len());
@@ -109,10 +109,11 @@ pub fn difference(first: &[Vec<f64>], second: &[Vec<f64>]) -> Option<Difference>
         false => 2.0 / choices(first.len() + second.len(), first.len()),
     };
     let half = student_quantile(m) * error;
-    let (least, most) = newcombe(one.mean, two.mean, n as f64);
-    let estimate =
-        Estimate { value, low: (value - half).max(-1.0).min(least), high: (value + half).min(1.0).max(most) };
-    Some(Difference { estimate, p_value: p_value.min(1.0) })
+    let (low, high) = match error > 1e-12 {
+        true => ((value - half).max(-1.0), (value + half).min(1.0)),
+        false => newcombe(one.mean, two.mean, n as f64),
+    };
+    Some(Difference { estimate: Estimate { value, low, high }, p_value: p_value.min(1.0) })
 }
 
 /// In how many ways `k` of `n` can be chosen.
@@ -124,7 +125,8 @@ fn choices(n: usize, k: usize) -> f64 {
 fn newcombe(first: f64, second: f64, n: f64) -> (f64, f64) {
     let ((low, high), (other_low, other_high)) = (wilson(first * n, n), wilson(second * n, n));
     let value = first - second;
-    (value - (first - low).hypot(other_high - second), value + (high - first).hypot(second - other_low))
+    let far = |a: f64, b: f64| (a * a + b * b).sqrt();
+    (value - far(first - low, other_high - second), value + far(high - first, second - other_low))
 }
 
 /// The mean of shares between 0 and 1 with its 95% interval by Student's t, cut off at 0 and 1; `None` of none. Shares that

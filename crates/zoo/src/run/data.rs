@@ -65,9 +65,10 @@ pub(super) fn is_set(path: &Path) -> bool {
 /// # Errors
 /// Files that cannot be read.
 pub fn short_hash(path: &Path) -> Result<String, ZooError> {
+    let failed = |source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) };
     let mut hash = match path.is_dir() {
-        true => dataset::source_hash(path)
-            .map_err(|source| ZooError::Dataset { path: path.to_owned(), source: Box::new(source) })?,
+        true if is_set(path) => Dataset::open(path).map_err(failed)?.fingerprint().to_owned(),
+        true => dataset::source_hash(path).map_err(failed)?,
         false => crate::sha256_file(path)?,
     };
     hash.truncate(8);
