@@ -154,7 +154,9 @@ fn nothing(sides: &[Vec<EntryId>; 2], rows: [&[LeaderboardRow]; 2], results: &Pa
         );
     }
     if rows[0].iter().any(|row| rows[1].iter().any(|other| is_same(row, other))) {
-        return format!("{one} and {two}: both have the same evaluations in {results}, and no others under the same protocol");
+        return format!(
+            "{one} and {two}: both have the same evaluations in {results}, and no others under the same protocol"
+        );
     }
     let tasks = rows.map(|rows| rows.iter().map(LeaderboardRow::task).collect::<BTreeSet<_>>());
     if tasks[0].is_disjoint(&tasks[1]) {
