@@ -66,6 +66,13 @@ pub fn succeeds(command: &mut Command) -> Output {
     output
 }
 
+/// Verifies what is in a zoo, if anything is.
+pub fn verified(folder: &Path) {
+    if folder.exists() {
+        succeeds(&mut zoo(["verify", "--zoo", text(folder)]));
+    }
+}
+
 /// Run a command that must be refused: an exit code (not a signal) other than 0, and one line on standard error that
 /// holds every one of `words`. Returns the line.
 ///

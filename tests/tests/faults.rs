@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use e2e::faults::{Action, Call, Ended, Fault, allowed, run};
-use e2e::{copied_zoo, copy, listing, succeeds, text, trained, zoo};
+use e2e::{copied_zoo, copy, listing, succeeds, text, trained, verified, zoo};
 
 /// Some of the faults that these calls can have: `few` of them, or as many as were asked for.
 fn faults(calls: &[Call], few: usize) -> Vec<Fault> {
@@ -118,7 +118,7 @@ fn a_training_survives_a_fault_at_any_call() {
         fs::create_dir(&folder).expect("creatable");
         struck(&mut train(&folder), &folder, *fault);
         // what is there is whole, and there is an entry or none
-        succeeds(&mut zoo(["verify", "--zoo", text(&folder.join("zoo"))]));
+        verified(&folder.join("zoo"));
         succeeds(&mut zoo(["list", "--zoo", text(&folder.join("zoo"))]));
         succeeds(&mut zoo(["runs", "--runs", text(&folder.join("runs")), "--all"]));
         succeeds(&mut train(&folder));

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use e2e::{copied_zoo, data, lift, listing, shipped, succeeds, text, trained, zoo};
+use e2e::{copied_zoo, data, lift, listing, shipped, succeeds, text, trained, verified, zoo};
 
 fn kills() -> u64 {
     std::env::var("ACTRM_KILLS").ok().map_or(2, |text| text.parse().expect("a number"))
@@ -75,7 +75,7 @@ fn a_killed_training_goes_on_to_the_same_bytes() {
             died += u32::from(killed(&mut train(&folder), takes, spread(3 * k + again)));
             // whatever is there can be listed and read
             succeeds(&mut zoo(["runs", "--runs", text(&folder.join("runs")), "--all"]));
-            succeeds(&mut zoo(["verify", "--zoo", text(&folder.join("zoo"))]));
+            verified(&folder.join("zoo"));
         }
         succeeds(&mut train(&folder));
         assert_eq!(weights(&folder), weights(&straight), "after {died} kills");
@@ -175,7 +175,7 @@ fn a_killed_study_goes_on_to_the_same_bytes() {
         for again in 0..3 {
             let takes = takes[(k % 2) as usize];
             died += u32::from(killed(&mut study(&folder, demonstrations), takes, spread(3 * k + again)));
-            succeeds(&mut zoo(["verify", "--zoo", text(&folder.join("work/small/zoo"))]));
+            verified(&folder.join("work/small/zoo"));
         }
         succeeds(&mut study(&folder, demonstrations));
         assert_eq!(studied(&folder), studied(&straight), "after {died} kills");
