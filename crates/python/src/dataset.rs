@@ -43,8 +43,17 @@ pub(crate) struct PyDataset {
     dataset: dataset::Dataset,
     chosen: Vec<usize>,
     samples: Samples,
-    /// The index of each episode's task, where each has one.
-    tasks: Option<Vec<usize>>,
+    tasks: Tasks,
+}
+
+/// Where a frame's task stands.
+enum Tasks {
+    /// Nowhere.
+    None,
+    /// The index of each episode's only task.
+    OfEpisodes(Vec<usize>),
+    /// The index of each frame's.
+    OfFrames(Vec<usize>),
 }
 
 /// What it was made with.
@@ -92,7 +101,7 @@ impl PyDataset {
         let depth = depth.unwrap_or_else(|| dataset.depth_names().map(str::to_owned).collect());
         let spec = SampleSpec { offsets, cameras, depth, depth_unit, episodes: chosen.clone() };
         let samples = unlocked(py, || run(|| dataset.samples(&spec)).map_err(raised))?;
-        let tasks = task_indices(&dataset);
+        let tasks = unlocked(py, || run(|| tasks_of(&dataset)).map_err(raised))?;
         let SampleSpec { offsets, cameras, depth, .. } = spec;
         let given = Given { path, offsets, cameras, depth, depth_unit, return_uint8 };
         Ok(Self { given, dataset, chosen, samples, tasks })
@@ -408,9 +417,16 @@ impl PyDataset {
         set("frame_index", &|place| place.frame)?;
         set("episode_index", &|place| place.episode)?;
         set("index", &|place| place.index)?;
-        let Some(tasks) = &self.tasks else { return Ok(()) };
-        set("task_index", &|place| tasks[place.episode])?;
-        let texts = places.iter().map(|place| self.dataset.tasks()[tasks[place.episode]].as_str());
+        let task = |place: &dataset::SamplePlace| match &self.tasks {
+            Tasks::None => 0,
+            Tasks::OfEpisodes(tasks) => tasks[place.episode],
+            Tasks::OfFrames(tasks) => tasks[place.index],
+        };
+        if matches!(self.tasks, Tasks::None) {
+            return Ok(());
+        }
+        set("task_index", &task)?;
+        let texts = places.iter().map(|place| self.dataset.tasks()[task(place)].as_str());
         out.texts("task", texts.collect(), batch.is_none())
     }
 }
@@ -434,11 +450,14 @@ fn offsets(dataset: &dataset::Dataset, given: &Bound<'_, PyAny>) -> PyResult<BTr
     Ok(all)
 }
 
-/// The index of each episode's task; nothing where an episode has several, whose frames then differ.
-fn task_indices(dataset: &dataset::Dataset) -> Option<Vec<usize>> {
+/// The tasks of episodes, or of frames where an episode has several.
+fn tasks_of(dataset: &dataset::Dataset) -> Result<Tasks, dataset::DatasetError> {
     let index = |episode: &dataset::EpisodeMeta| match episode.tasks.as_slice() {
         [task] => dataset.tasks().iter().position(|text| text == task),
         _ => None,
     };
-    dataset.episodes().iter().map(index).collect()
+    match dataset.episodes().iter().map(index).collect() {
+        Some(tasks) => Ok(Tasks::OfEpisodes(tasks)),
+        None => Ok(dataset.frame_tasks()?.map_or(Tasks::None, Tasks::OfFrames)),
+    }
 }

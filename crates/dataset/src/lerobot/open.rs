@@ -316,6 +316,30 @@ impl Dataset {
         &self.tasks
     }
 
+    /// Each frame's task, counted in [`Self::tasks`]; nothing where frames have no `task_index`.
+    ///
+    /// # Errors
+    /// Files that cannot be read, and a number that no task has.
+    pub fn frame_tasks(&self) -> Result<Option<Vec<usize>>> {
+        let mut all = Vec::with_capacity(self.frames());
+        for path in read::files(&self.root, "data")? {
+            let (_, arrays) = match read::columns(&path, &["task_index"]) {
+                Err(DatasetError::NotInDataset { .. }) => return Ok(None),
+                columns => columns?,
+            };
+            for &number in read::integers(&path, "task_index", &arrays[0])?.iter() {
+                let at = self.task_numbers.iter().position(|&task| task == number);
+                all.push(at.ok_or_else(|| DatasetError::BadDataset {
+                    path: path.clone(),
+                    object: "column task_index".to_owned(),
+                    expected: format!("numbers of meta/tasks.parquet, which has {} tasks", self.tasks.len()),
+                    found: number.to_string(),
+                })?);
+            }
+        }
+        Ok(Some(all))
+    }
+
     /// A numeric column, if there is one of this name.
     pub fn column(&self, name: &str) -> Option<Column<'_>> {
         self.columns.get(name).map(|c| Column { data: &c.data, dim: c.dim })

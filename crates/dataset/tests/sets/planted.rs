@@ -682,6 +682,12 @@ fn tasks_in_disorder_are_those_of_the_episodes() {
         assert_eq!(after.tasks(), before.tasks(), "by row: {by_row}");
         assert!(after.notes()[0].contains("task_index: expected 0, 1, 2, ... in order"), "{:?}", after.notes());
         assert_eq!(after.fingerprint(), before.fingerprint());
+        let tasks = after.frame_tasks().unwrap().unwrap();
+        assert_eq!(tasks, before.frame_tasks().unwrap().unwrap());
+        for episode in after.episodes() {
+            let texts: Vec<_> = tasks[episode.from..episode.to].iter().map(|&task| &after.tasks()[task]).collect();
+            assert!(texts.len() == episode.length && texts.iter().all(|text| episode.tasks.contains(text)));
+        }
     }
 }
 
