@@ -111,7 +111,7 @@ demo: demo-cost programs ## the whole line: demonstrations, data set, training, 
 # Said before anything is built.
 .PHONY: demo-cost
 demo-cost:
-	@echo "make demo takes about 12 minutes on two idle cores the first time (9 to compile, 3 to run), then 3, and 6 GB of disk."
+	@echo "make demo takes about 12 minutes on two idle cores the first time (9 to compile, 3 to run), then 3, and 4 GB of disk."
 
 .PHONY: wheel
 wheel: .venv/.complete .venv-wheel/.complete ## the Python package, with the programs in it, in target/wheels

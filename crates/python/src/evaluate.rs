@@ -73,8 +73,8 @@ impl Asked {
     fn taken_over(&self, subject: &Subject<'_>, episodes: u64) -> Option<String> {
         (matches!(self, Self::External { .. }) && episodes > 0).then(|| {
             format!(
-                "{episodes} of the episodes are those of an earlier call, of entry {}: give another policy another name=, \
-                 and the same one with other weights another declared=",
+                "{episodes} of the episodes are those of an earlier call, of entry {}: another policy needs another name=, \
+                 and other weights need another declared=",
                 subject.entry
             )
         })

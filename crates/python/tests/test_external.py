@@ -147,8 +147,8 @@ def test_another_policy_under_one_name_is_not_taken_for_it(tmp_path: Path, monke
         assert versions == ["1", "2"][: len(versions)] and str(version) in versions
     # the last one is the first one again
     assert [str(one.message) for one in said if "earlier call" in str(one.message)] == [
-        "2 of the episodes are those of an earlier call, of entry mine@1: give another policy another name=, and the "
-        "same one with other weights another declared="
+        "2 of the episodes are those of an earlier call, of entry mine@1: another policy needs another name=, and "
+        "other weights need another declared="
     ]
     with pytest.warns(RuntimeWarning, match="^2 of the episodes are those of an earlier call, of entry mine@1"):
         actrm.evaluate(module.Policy(), episodes=3, **options)

@@ -391,7 +391,8 @@ impl Chooser<'_> {
             columns.push(scalar("next.success", "bool", Origin::Flag("success".to_owned())));
         } else if self.usual("rewards") && self.is_robosuite() {
             notes.push(
-                "no next.success is made: env_args state reward_shaping, and such rewards do not tell it".to_owned(),
+                "no next.success is made: env_args say reward_shaping, and shaped rewards do not show success"
+                    .to_owned(),
             );
         }
         if self.usual("mistakes") {
@@ -459,7 +460,7 @@ impl Chooser<'_> {
         self.checked(fps)
     }
 
-    /// A rate, if there can be one like it: beyond it times of frames are not told apart.
+    /// A frame rate that can be stored: at a higher one two frames would have the same timestamp.
     fn checked(&self, fps: f64) -> Result<f64> {
         match fps > 0.0 && fps <= MOST_FPS {
             true => Ok(fps),

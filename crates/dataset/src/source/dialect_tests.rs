@@ -322,8 +322,8 @@ fn members_that_look_like_demos_are_named() {
         floats(&data, "demo_5", &[3]);
         data.create_group("statistics").unwrap();
     });
-    let expected = "in data, these are no demos: a demo is a group called demo_ and a whole number below 2^64: Demo_3, \
-        demo_1_fixed, demo_5, demo_99999999999999999999";
+    let expected = "not read as demos (a demo is a group named demo_ and a whole number below 2^64): data/Demo_3, \
+        data/demo_1_fixed, data/demo_5, data/demo_99999999999999999999";
     assert_eq!(source.plan().notes, [expected]);
     assert_eq!(source.plan().demos.len(), 1);
 }

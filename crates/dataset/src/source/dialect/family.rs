@@ -190,8 +190,8 @@ fn no_demos(file: &Walked, ids: &[(u64, String, String)]) -> Option<String> {
     }
     let some: Vec<&str> = names.iter().take(5).map(String::as_str).collect();
     let more = if names.len() > some.len() { format!(", ... ({} in all)", names.len()) } else { String::new() };
-    let expected = "no demos: a demo is a group called demo_ and a whole number below 2^64";
-    (!some.is_empty()).then(|| format!("in data, these are {expected}: {}{more}", some.join(", ")))
+    let expected = "a demo is a group named demo_ and a whole number below 2^64";
+    (!some.is_empty()).then(|| format!("not read as demos ({expected}): data/{}{more}", some.join(", data/")))
 }
 
 fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
