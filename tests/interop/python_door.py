@@ -46,12 +46,13 @@ def open_both(root: Path, deltas: dict[str, list[float]]) -> tuple[Any, Any]:
 
 
 def compare_samples(root: Path) -> str:
-    """Keys, shapes, types and numbers of samples, at both ends of episodes and between."""
+    """Keys, shapes, types and numbers of samples, at both ends of episodes and between; features and statistics."""
     import actrm
 
-    cameras = actrm.Dataset(root).features
-    deltas = {"action": [k / 20 for k in range(HORIZON)], "observation.state": [-0.05, 0.0], "next.done": [0.0, 0.05]}
-    deltas |= {name: [-0.05, 0.0] for name, feature in cameras.items() if feature["dtype"] in {"image", "video"}}
+    columns = actrm.Dataset(root).features
+    deltas = {"action": [k / 20 for k in range(HORIZON)], "observation.state": [-0.05, 0.0]}
+    deltas |= {name: [0.0, 0.05] for name in ("next.done", "cells") if name in columns}
+    deltas |= {name: [-0.05, 0.0] for name, feature in columns.items() if feature["dtype"] in {"image", "video"}}
     mine, theirs = open_both(root, deltas)
     assert len(mine) == len(theirs)
     ends = [edge for row in mine.episodes for edge in (row["dataset_from_index"], row["dataset_to_index"] - 1)]
@@ -66,6 +67,11 @@ def compare_samples(root: Path) -> str:
             assert one[key].shape == tuple(value.shape), (key, one[key].shape, value.shape)
             assert str(one[key].dtype) == str(value.dtype).removeprefix("torch."), (key, one[key].dtype, value.dtype)
             assert np.array_equal(one[key], value.numpy()), (i, key)
+    assert json.loads(json.dumps(mine.features)) == json.loads(json.dumps(theirs.meta.features))
+    assert {key for key in theirs.meta.stats if key in mine.features} == mine.stats.keys()
+    for key, stats in mine.stats.items():
+        for statistic, value in stats.items():
+            assert value.shape == np.shape(theirs.meta.stats[key][statistic]), (key, statistic)
     return f"{len(places)} samples, {len(mine[0])} keys"
 
 

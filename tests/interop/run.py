@@ -563,6 +563,8 @@ def write_lerobot(root: Path, form: str | None = None) -> int:
     if form:
         features["note"] = {"dtype": "string", "shape": (1,), "names": None}
         features["next.reward"] = {"dtype": "float64", "shape": (1,), "names": None}
+        features["count"] = {"dtype": "int64", "shape": (1,), "names": None}
+        features["cells"] = {"dtype": "int32", "shape": (2,), "names": ["row", "column"]}
         pictures = {"dtype": form, "shape": (64, 64, 3), "names": ["height", "width", "channels"]}
         features["observation.images.front"] = pictures
     data = LeRobotDataset.create("actrm/theirs", fps=20, features=features, root=root, use_videos=form == "video")
@@ -574,6 +576,8 @@ def write_lerobot(root: Path, form: str | None = None) -> int:
             return f"step {step}"
         if key.startswith("observation.images."):
             return rng.integers(0, 256, feature["shape"], dtype=np.uint8)
+        if feature["dtype"].startswith("int"):
+            return rng.integers(-(1 << 24), 1 << 24, feature["shape"], dtype=feature["dtype"], endpoint=True)
         return rng.normal(size=feature["shape"]).astype(feature["dtype"])
 
     for episode, length in enumerate(lengths):
@@ -730,6 +734,7 @@ def main() -> None:
             "LeRobot opens them with PNG pictures": lambda: edit_and_open(folder / "png", folder / "png-edits"),
             "LeRobot opens them with videos": lambda: edit_and_open(folder / "video", folder / "video-edits"),
             "LeRobot opens edited sets of its own": lambda: edit_theirs(folder, "image"),
+            "from Python: samples of LeRobot's set": lambda: python_door.compare_samples(folder / "theirs-image"),
             "LeRobot opens them with its own videos": lambda: edit_theirs(folder, "video"),
             "LeRobot's set trains in robomimic and comes back": lambda: through_robomimic(folder),
             "shards on a Ray cluster make one evaluation": lambda: evaluate_on_ray(root, folder / "ray"),

@@ -40,7 +40,7 @@ pub use lerobot::{
 };
 pub use plan::{DemoPlan, Dialect, Join, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};
-pub use samples::{SampleColumn, SamplePlace, SampleSpec, Samples};
+pub use samples::{NumberKind, SampleColumn, SamplePlace, SampleSpec, Samples};
 pub use sheet::Picture;
 pub use sorted_map::SortedMap;
 pub use source::{

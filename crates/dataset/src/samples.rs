@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::error::{DatasetError, Result};
-use crate::lerobot::{Dataset, DepthUnit, Pictures};
+use crate::lerobot::{Dataset, DepthUnit, Feature, Pictures};
 use crate::windows::Resident;
 
 /// The most rows of one column in one sample.
@@ -44,17 +44,38 @@ pub struct SampleColumn {
     pub shape: Vec<usize>,
     /// Offsets in frames of its rows; `None` for the one row of the sample's own frame.
     pub offsets: Option<Vec<i64>>,
-    /// Whether its numbers are truth values.
-    pub boolean: bool,
+    /// What its numbers are.
+    pub kind: NumberKind,
     consecutive: bool,
 }
 
+/// What a column of a LeRobot set states its numbers to be. Samples hold all of them as float32.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NumberKind {
+    /// Numbers with a fraction, and images.
+    Real,
+    /// Whole numbers; beyond 2^24 float32 rounds them.
+    Whole,
+    /// Truth values.
+    Truth,
+}
+
+impl NumberKind {
+    fn of(feature: Option<&Feature>) -> Self {
+        match feature.map_or("", |feature| &feature.dtype) {
+            "bool" => Self::Truth,
+            dtype if dtype.starts_with("int") || dtype.starts_with("uint") => Self::Whole,
+            _ => Self::Real,
+        }
+    }
+}
+
 impl SampleColumn {
-    fn new(name: &str, shape: Vec<usize>, offsets: Option<&Vec<i64>>, boolean: bool) -> Self {
+    fn new(name: &str, shape: Vec<usize>, offsets: Option<&Vec<i64>>, kind: NumberKind) -> Self {
         let offsets = offsets.cloned();
         let listed = offsets.as_deref().unwrap_or(&[0]);
         let consecutive = listed.windows(2).all(|pair| pair[0].checked_add(1) == Some(pair[1]));
-        Self { name: name.to_owned(), shape, offsets, boolean, consecutive }
+        Self { name: name.to_owned(), shape, offsets, kind, consecutive }
     }
 
     fn listed(&self) -> &[i64] {
@@ -192,8 +213,8 @@ impl Dataset {
             let resident = self.required(name)?;
             let feature = self.info().features.get(name);
             let shape = feature.map_or_else(|| vec![resident.dim], |f| f.shape.clone());
-            let boolean = feature.is_some_and(|f| f.dtype == "bool");
-            numbers.push((SampleColumn::new(name, shape, spec.offsets.get(name), boolean), resident));
+            let kind = NumberKind::of(feature);
+            numbers.push((SampleColumn::new(name, shape, spec.offsets.get(name), kind), resident));
         }
         for name in &spec.depth {
             let maps = self.depth_of(name, 0..self.episodes().len())?;
@@ -201,14 +222,14 @@ impl Dataset {
             let data: Vec<f32> = maps.data.iter().map(|&depth| spec.depth_unit.of(stored, depth)).collect();
             let resident = Resident { data: data.into(), dim: maps.height * maps.width };
             let shape = vec![1, maps.height, maps.width];
-            numbers.push((SampleColumn::new(name, shape, spec.offsets.get(name), false), resident));
+            numbers.push((SampleColumn::new(name, shape, spec.offsets.get(name), NumberKind::Real), resident));
         }
         numbers.sort_by(|(one, _), (other, _)| one.name.cmp(&other.name));
         let mut pictures = Vec::new();
         for name in &spec.cameras {
             let seen = self.pictures(name)?;
             let shape = vec![seen.height, seen.width, 3];
-            pictures.push((SampleColumn::new(name, shape, spec.offsets.get(name), false), Arc::new(seen)));
+            pictures.push((SampleColumn::new(name, shape, spec.offsets.get(name), NumberKind::Real), Arc::new(seen)));
         }
         Ok(Samples { numbers, pictures, spans })
     }
@@ -307,7 +328,7 @@ mod tests {
             spans.extend((begin..end).map(|frame| Span { episode: episode as u32, begin, frame, end }));
             begin = end;
         }
-        let column = SampleColumn::new("c", vec![dim], offsets.as_ref(), false);
+        let column = SampleColumn::new("c", vec![dim], offsets.as_ref(), NumberKind::Real);
         (Samples { numbers: vec![(column, resident.clone())], pictures: Vec::new(), spans }, resident)
     }
 

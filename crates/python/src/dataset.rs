@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use ::dataset::{DepthUnit, Feature, SampleColumn, SampleSpec, Samples};
+use ::dataset::{DepthUnit, Feature, NumberKind, SampleColumn, SampleSpec, Samples};
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList, PyTuple};
@@ -16,11 +16,15 @@ use crate::work::{run, unlocked};
 /// The most samples in a batch.
 const MOST_SAMPLES: usize = 1 << 24;
 
+/// The largest whole number up to which float32 holds each, in which columns are kept in memory.
+const MOST_WHOLE: f64 = 16_777_216.0;
+
 /// A LeRobotDataset v3.0 folder, written by actrm or by LeRobot, as a map-style data set.
 ///
 /// Sample `i` is the `i`-th frame of the chosen episodes: a dict with LeRobot's keys and shapes. A numeric column is an
 /// array (a scalar without an axis), a camera (3, height, width), depth (1, height, width). Numbers are float32,
-/// booleans bool and the index columns int64. Numeric columns and images stay in memory.
+/// booleans bool, texts str and whole numbers int64 (beyond 2^24 rounded to float32; `notes` says so). All columns stay
+/// in memory.
 ///
 /// Parameters
 /// ----------
@@ -44,6 +48,8 @@ pub(crate) struct PyDataset {
     chosen: Vec<usize>,
     samples: Samples,
     tasks: Tasks,
+    /// Of each frame of the whole set, by column.
+    texts: BTreeMap<String, Vec<String>>,
 }
 
 /// Where a frame's task stands.
@@ -102,9 +108,10 @@ impl PyDataset {
         let spec = SampleSpec { offsets, cameras, depth, depth_unit, episodes: chosen.clone() };
         let samples = unlocked(py, || run(|| dataset.samples(&spec)).map_err(raised))?;
         let tasks = unlocked(py, || run(|| tasks_of(&dataset)).map_err(raised))?;
+        let texts = unlocked(py, || run(|| dataset.texts()).map_err(raised))?;
         let SampleSpec { offsets, cameras, depth, .. } = spec;
         let given = Given { path, offsets, cameras, depth, depth_unit, return_uint8 };
-        Ok(Self { given, dataset, chosen, samples, tasks })
+        Ok(Self { given, dataset, chosen, samples, tasks, texts })
     }
 
     fn __len__(&self) -> usize {
@@ -190,11 +197,13 @@ impl PyDataset {
                 ("q90", &stats.q90),
                 ("q99", &stats.q99),
             ];
-            let unit = self.dataset.info().features.get(name).and_then(Feature::depth_unit);
-            let factor = self.given.depth_unit.factor(unit);
+            let feature = self.dataset.info().features.get(name);
+            let factor = self.given.depth_unit.factor(feature.and_then(Feature::depth_unit));
+            // one number a channel, which fits images with their channels first
+            let axes = if feature.is_some_and(Feature::is_visual) { &[1, 1][..] } else { &[] };
             for (statistic, values) in lists {
                 let values: Vec<f64> = values.iter().map(|value| value * factor).collect();
-                of.set_item(statistic, array(py, &[values.len()], &values)?)?;
+                of.set_item(statistic, array(py, &[&[values.len()], axes].concat(), &values)?)?;
             }
             of.set_item("count", array(py, &[1], &[stats.count as i64])?)?;
             all.set_item(name, of)?;
@@ -220,16 +229,13 @@ impl PyDataset {
         PyList::new(py, self.chosen.iter().map(row).collect::<PyResult<Vec<_>>>()?)
     }
 
-    /// Type, shape and dimension names of every column, from `meta/info.json`.
+    /// What `meta/info.json` says of every column: `dtype`, `shape`, `names`, and `info` of depth and videos.
     #[getter]
-    fn features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let all = PyDict::new(py);
+    fn features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let text = serde_json::to_string(&self.dataset.info().features).map_err(raised)?;
+        let all = py.import("json")?.call_method1("loads", (text,))?;
         for (name, feature) in &self.dataset.info().features.0 {
-            let of = PyDict::new(py);
-            of.set_item("dtype", &feature.dtype)?;
-            of.set_item("shape", PyTuple::new(py, &feature.shape)?)?;
-            of.set_item("names", self.dataset.names(name))?;
-            all.set_item(name, of)?;
+            all.get_item(name)?.set_item("shape", PyTuple::new(py, &feature.shape)?)?;
         }
         Ok(all)
     }
@@ -252,10 +258,20 @@ impl PyDataset {
         self.dataset.tasks().to_vec()
     }
 
-    /// Faults of the data set that were read as LeRobot reads them.
+    /// Faults of the data set that were read as LeRobot reads them, columns whose whole numbers are rounded, and columns
+    /// that samples lack.
     #[getter]
     fn notes(&self) -> Vec<String> {
-        self.dataset.notes().to_vec()
+        let whole = self.samples.numbers().filter(|column| column.kind == NumberKind::Whole);
+        let rounded = whole.filter_map(|SampleColumn { name, .. }| {
+            let stats = self.dataset.stats().get(name)?;
+            let most = stats.min.iter().chain(&stats.max).map(|value| value.abs()).fold(0.0, f64::max);
+            (most > MOST_WHOLE).then(|| format!("{name}: whole numbers beyond {MOST_WHOLE} are rounded to float32"))
+        });
+        let features = &self.dataset.info().features.0;
+        let language = features.iter().filter(|(_, feature)| feature.dtype == "language");
+        let language = language.map(|(name, _)| format!("{name}: samples have no language"));
+        self.dataset.notes().iter().cloned().chain(rounded).chain(language).collect()
     }
 
     /// Names of the masks that `split` takes.
@@ -283,8 +299,8 @@ impl PyDataset {
     }
 
     fn __repr__(&self) -> String {
-        let columns: Vec<&str> =
-            self.samples.numbers().chain(self.samples.pictures()).map(|column| column.name.as_str()).collect();
+        let columns = self.samples.numbers().chain(self.samples.pictures()).map(|column| column.name.as_str());
+        let columns: Vec<&str> = columns.chain(self.texts.keys().map(String::as_str)).collect();
         format!(
             "Dataset({:?}, {} episodes, {} frames: {})",
             self.given.path.display().to_string(),
@@ -342,13 +358,21 @@ impl PyDataset {
     pub(crate) fn columns(&self, samples: &[u32], batch: Option<usize>, out: &mut impl Columns) -> PyResult<()> {
         for (i, column) in self.samples.numbers().enumerate() {
             let shape = self.shape(batch, column);
-            match column.boolean {
-                false => out.add(&column.name, &shape, Kind::Numbers, |out| {
+            let copied = |len| {
+                let mut values = vec![0.0; len];
+                self.samples.copy_numbers(i, samples, &mut values);
+                values
+            };
+            match column.kind {
+                NumberKind::Real => out.add(&column.name, &shape, Kind::Numbers, |out| {
                     self.samples.copy_numbers(i, samples, out);
                 })?,
-                true => out.add(&column.name, &shape, Kind::Flags, |out: &mut [u8]| {
-                    let mut values = vec![0.0; out.len()];
-                    self.samples.copy_numbers(i, samples, &mut values);
+                NumberKind::Whole => out.add(&column.name, &shape, Kind::Numbers, |out: &mut [i64]| {
+                    let values = copied(out.len());
+                    out.iter_mut().zip(values).for_each(|(out, value)| *out = value as i64);
+                })?,
+                NumberKind::Truth => out.add(&column.name, &shape, Kind::Flags, |out: &mut [u8]| {
+                    let values = copied(out.len());
                     out.iter_mut().zip(values).for_each(|(out, value)| *out = u8::from(value != 0.0));
                 })?,
             }
@@ -365,6 +389,10 @@ impl PyDataset {
                 }
             }
             self.padding(samples, batch, column, out)?;
+        }
+        for (name, texts) in &self.texts {
+            let chosen = samples.iter().map(|&sample| texts[self.samples.place(sample).index].as_str());
+            out.texts(name, chosen.collect(), batch.is_none())?;
         }
         self.places(samples, batch, out)
     }

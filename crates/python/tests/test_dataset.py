@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from conftest import RELEASE, output
 
+FIXTURES = Path(__file__).parents[2] / "dataset/tests/fixtures"
+
 
 def test_samples_have_lerobot_s_keys_and_shapes(lift: Path) -> None:
     ds = actrm.Dataset(lift, delta_timestamps={"action": range(16), "observation.state": [-0.05, 0.0]})
@@ -40,6 +42,21 @@ def test_samples_have_lerobot_s_keys_and_shapes(lift: Path) -> None:
     assert sample["task"] == ds.tasks[0]
     assert sample["observation.state_is_pad"].tolist() == [True, False]
     assert (sample["observation.state"][0] == sample["observation.state"][1]).all()
+
+
+def test_columns_have_the_types_that_lerobot_wrote() -> None:
+    ds = actrm.Dataset(FIXTURES / "lerobot_texts", {"cells": [0, 1]})
+    assert [(int(ds[i]["count"]), ds[i]["note"]) for i in (1, 3)] == [(-1, "step 1 of 0"), (100, "step 0 of 1")]
+    last = actrm.Dataset(FIXTURES / "lerobot_texts", {"cells": [0, 1]}, episodes=[1]).batch([0, 1])
+    assert last["note"] == ["step 0 of 1", "step 1 of 1"]
+    assert str(last["count"].dtype) == str(last["cells"].dtype) == "int64" and last["count"].tolist() == [100, 99]
+    assert last["cells"].tolist() == [[[0, 0], [1, -1]], [[1, -1], [1, -1]]]
+    assert ds.features["cells"] == {"dtype": "int32", "shape": (2,), "names": ["row", "column"]}
+    assert ds.features["note"]["names"] is None and ds.notes == []
+    assert actrm.Dataset(FIXTURES / "lerobot_language").notes == [
+        "language_persistent: samples have no language",
+        "language_events: samples have no language",
+    ]
 
 
 def test_rows_follow_each_other_and_end_with_the_episode(lift: Path) -> None:

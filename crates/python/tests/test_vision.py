@@ -46,6 +46,7 @@ def test_pictures_have_lerobot_s_shape_and_range(seen: Path) -> None:
     np.testing.assert_array_equal(first[CAMERAS[0]][0], first[CAMERAS[0]][1])
     np.testing.assert_array_equal(stored[5][CAMERAS[0]][0], stored[4][CAMERAS[0]][1])
     assert len(np.unique(first[CAMERAS[1]])) > 20
+    assert stored.stats[CAMERAS[0]]["mean"].shape == (3, 1, 1)
     assert [key for key in actrm.Dataset(seen, cameras=[CAMERAS[1]])[0] if "images" in key] == [CAMERAS[1]]
 
 

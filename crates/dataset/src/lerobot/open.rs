@@ -340,6 +340,27 @@ impl Dataset {
         Ok(Some(all))
     }
 
+    /// The columns of texts, one a frame, by name. LeRobot's `language` columns, which hold lists, are none of them.
+    ///
+    /// # Errors
+    /// Files that cannot be read, and frames without a text.
+    pub fn texts(&self) -> Result<BTreeMap<String, Vec<String>>> {
+        let is_text = |(_, feature): &&(String, Feature)| feature.dtype == "string" && feature.dim() == 1;
+        let mut names: Vec<&str> = self.info.features.0.iter().filter(is_text).map(|(name, _)| name.as_str()).collect();
+        names.sort_unstable();
+        let mut all: BTreeMap<String, Vec<String>> = names.iter().map(|&name| (name.to_owned(), Vec::new())).collect();
+        if names.is_empty() {
+            return Ok(all);
+        }
+        for path in read::files(&self.root, "data")? {
+            let (_, arrays) = read::columns(&path, &names)?;
+            for ((name, array), texts) in names.iter().zip(&arrays).zip(all.values_mut()) {
+                texts.extend(read::texts(&path, name, array)?);
+            }
+        }
+        Ok(all)
+    }
+
     /// A numeric column, if there is one of this name.
     pub fn column(&self, name: &str) -> Option<Column<'_>> {
         self.columns.get(name).map(|c| Column { data: &c.data, dim: c.dim })

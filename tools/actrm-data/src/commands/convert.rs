@@ -306,23 +306,24 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let report = dataset::convert(&args.source, &args.out, &options, &mut screen.advance("converting"));
     screen.clear();
     let set = args.source.join("meta/info.json").exists();
-    let report = report.map_err(|error| advised(error, args.skip_bad || set))?;
+    let report = report
+        .map_err(|error| advised(error, (!args.skip_bad && !set).then_some("--skip-bad leaves such demos out")))?;
     let source = Some(args.source.as_path());
     tell(&report, source, &args.out, start.elapsed().as_secs_f64(), args.json)
 }
 
-/// An error with what can be done about bad demos, unless they are left out already or cannot be.
-fn advised(error: DatasetError, skip_bad: bool) -> anyhow::Error {
-    match error {
-        DatasetError::Input(InputError::NotFinite { .. }) => {
-            anyhow!("{error} (--skip-bad leaves such demos out, --nonfinite keep stores such values)")
-        }
+/// An error with what can be done about bad demos: `skip` says how to leave them out, if they can be.
+fn advised(error: DatasetError, skip: Option<&str>) -> anyhow::Error {
+    let nonfinite = matches!(error, DatasetError::Input(InputError::NotFinite { .. }));
+    let keep = nonfinite.then_some("--nonfinite keep stores such values");
+    let skip = match error {
         // of demonstrations, a picture
-        DatasetError::Input(InputError::WrongLength { .. }) | DatasetError::BadDataset { .. } if !skip_bad => {
-            anyhow!("{error} (--skip-bad leaves such demos out)")
-        }
-        error => error.into(),
-    }
+        DatasetError::Input(InputError::NotFinite { .. } | InputError::WrongLength { .. })
+        | DatasetError::BadDataset { .. } => skip,
+        _ => None,
+    };
+    let advice: Vec<&str> = skip.into_iter().chain(keep).collect();
+    if advice.is_empty() { error.into() } else { anyhow!("{error} ({})", advice.join(", ")) }
 }
 
 fn convert_shard(args: &Args, options: &ConvertOptions, shard: Shard) -> Result<ExitCode> {
@@ -343,7 +344,7 @@ fn convert_shard(args: &Args, options: &ConvertOptions, shard: Shard) -> Result<
     });
     drop(advance);
     screen.clear();
-    let report = report.map_err(|error| advised(error, false))?;
+    let report = report.map_err(|error| advised(error, Some("--skip-bad without --shard leaves such demos out")))?;
     report.notes.iter().for_each(|note| cli::note(&format!("note: {note}")));
     if args.json {
         cli::print_json(&json!({
