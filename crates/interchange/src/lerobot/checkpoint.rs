@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use candle_core::Tensor;
+use models::act::lerobot::{self as act, LerobotAct};
 use models::diffusion::lerobot::{self as diffusion, LerobotDiffusion};
-use models::lerobot::{self as act, LerobotAct};
 use models::{ModelError, NormMode, Params, PolicyConfig, Signature};
 use serde_json::Value;
 

@@ -1,5 +1,5 @@
 //! LeRobot's checkpoints of ACT and of diffusion in and out: `config.json`, `model.safetensors` and the two processors.
-//! What stands in the first two is `models::lerobot`'s and `models::diffusion::lerobot`'s business; here are the files.
+//! What stands in the first two is `models::act::lerobot`'s and `models::diffusion::lerobot`'s business; here are the files.
 //!
 //! LeRobot loads weights by name without complaint about missing or extra ones, and passes features through
 //! whose statistics are missing. Here both are errors that name what is wrong.

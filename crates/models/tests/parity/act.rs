@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used)]
 
 use candle_core::{DType, Device, Tensor};
-use models::act::{Act, Config};
-use models::{Backend, Batch, Features, Gradients, LossNumbers, ParamLayout, PolicyModel, Rng, lerobot};
+use models::act::{Act, Config, lerobot};
+use models::{Backend, Batch, Features, Gradients, LossNumbers, ParamLayout, PolicyModel, Rng};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;

@@ -7,7 +7,7 @@ use crate::common::npz::{self, Array};
 use crate::common::recipe::{self, assert_probes};
 use candle_core::{DType, Device, Tensor};
 use models::act::Act;
-use models::lerobot::{self, LerobotAct};
+use models::act::lerobot::{self, LerobotAct};
 use models::{
     Backend, Batch, FeatureKind, Features, Gradients, LossNumbers, OptimiserConfig, ParamLayout, PolicyModel, Schedule,
     TrainConfig,

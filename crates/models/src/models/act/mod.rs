@@ -27,6 +27,7 @@
 //! every sample.
 
 mod config;
+pub mod lerobot;
 #[cfg(test)]
 mod tests;
 

@@ -1,39 +1,26 @@
-//! LeRobot's diffusion files as values: `config.json` and the names of the tensors. Files are read and written in `zoo`.
+//! LeRobot's diffusion files as values: `config.json` and the names of the tensors. Files are read and written in `interchange`.
 
 use super::{Config, NetworkConfig, Prediction, Sampler};
-use crate::features::{FeatureKind, Signature};
-use crate::lerobot::{mode_name, mode_of};
-use crate::normaliser::{ACTION, ENVIRONMENT_STATE, NormMode, STATE};
+use crate::features::Signature;
+use crate::lerobot::{FeatureKeys, PolicyFile};
+use crate::normaliser::{ENVIRONMENT_STATE, NormMode};
 use candle_core::Tensor;
-use nn::Params;
-use nn::{ModelError, Result, some_names};
+use nn::{Params, Result};
 use serde::Deserialize;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use std::collections::BTreeMap;
 
-/// The prefix of every tensor in LeRobot's files.
-const PREFIX: &str = "diffusion.";
+const DIFFUSION: PolicyFile =
+    PolicyFile { kind: "diffusion", model: "LeRobot diffusion", prefix: "diffusion.", images: false };
 
-/// Keys that LeRobot knows and that do not matter to a policy at rest that sees no images.
-const OF_NO_MATTER: [&str; 35] = [
-    "type",
-    "device",
-    "use_amp",
-    "use_peft",
-    "push_to_hub",
-    "repo_id",
-    "private",
-    "tags",
-    "license",
-    "pretrained_path",
-    "pretrained_revision",
+/// Keys that do not matter to a diffusion policy at rest that sees no images.
+const OF_NO_MATTER: [&str; 21] = [
     "drop_n_last_frames",
     "vision_backbone",
     "resize_shape",
     "crop_ratio",
     "crop_shape",
     "crop_is_random",
-    "pretrained_backbone_weights",
     "use_group_norm",
     "spatial_softmax_num_keypoints",
     "use_separate_rgb_encoder_per_camera",
@@ -43,10 +30,8 @@ const OF_NO_MATTER: [&str; 35] = [
     "beta_end",
     "compile_model",
     "compile_mode",
-    "optimizer_lr",
     "optimizer_betas",
     "optimizer_eps",
-    "optimizer_weight_decay",
     "scheduler_name",
     "scheduler_warmup_steps",
     "use_policy_training_preset",
@@ -92,13 +77,6 @@ struct Keys {
     output_features: BTreeMap<String, FeatureKeys>,
 }
 
-#[derive(Debug, Deserialize)]
-struct FeatureKeys {
-    #[serde(rename = "type")]
-    kind: String,
-    shape: Vec<usize>,
-}
-
 impl Default for Keys {
     fn default() -> Self {
         let network = NetworkConfig::default();
@@ -127,64 +105,26 @@ impl Default for Keys {
     }
 }
 
-fn refuse(field: &'static str, found: impl Into<String>, expected: &str) -> ModelError {
-    ModelError::Config { model: "LeRobot diffusion", field, found: found.into(), expected: expected.to_string() }
-}
-
 /// Reads a `config.json`.
 ///
 /// # Errors
 /// Another type of policy, images, another schedule of noise, a missing feature, or a configuration that is impossible.
 pub fn read_config(config: &Value) -> Result<LerobotDiffusion> {
-    let kind = config.get("type").and_then(Value::as_str).unwrap_or("absent");
-    if kind != "diffusion" {
-        return Err(refuse("type", kind, "diffusion"));
-    }
-    let mut given: Map<String, Value> = config.as_object().cloned().unwrap_or_default();
-    // LeRobot writes `null` for absent options
-    given.retain(|key, value| !value.is_null() && !OF_NO_MATTER.contains(&key.as_str()));
-    let keys: Keys = serde_json::from_value(Value::Object(given))
-        .map_err(|e| refuse("config.json", e.to_string(), "LeRobot's keys and types"))?;
+    let keys: Keys = DIFFUSION.keys(config, &OF_NO_MATTER)?;
     if keys.beta_schedule != "squaredcos_cap_v2" {
-        return Err(refuse("beta_schedule", keys.beta_schedule, "squaredcos_cap_v2"));
+        return Err(DIFFUSION.refuse("beta_schedule", keys.beta_schedule, "squaredcos_cap_v2"));
     }
     let sampler = match keys.noise_scheduler_type.as_str() {
         "DDPM" => Sampler::Ddpm,
         "DDIM" => Sampler::Ddim,
-        other => return Err(refuse("noise_scheduler_type", other, "DDPM or DDIM")),
+        other => return Err(DIFFUSION.refuse("noise_scheduler_type", other, "DDPM or DDIM")),
     };
-    let (mut state, mut env) = (0, 0);
-    for (name, feature) in &keys.input_features {
-        match (feature.kind.as_str(), name.as_str(), &feature.shape[..]) {
-            ("STATE", STATE, &[n]) => state = n,
-            ("ENV", ENVIRONMENT_STATE, &[n]) => env = n,
-            (kind, _, shape) => {
-                let found = format!("{name} of type {kind} and shape {shape:?}");
-                let expected = "observation.state of type STATE, observation.environment_state of type ENV";
-                return Err(refuse("input_features", found, expected));
-            }
-        }
-    }
-    let action = match keys.output_features.get(ACTION).map(|f| &f.shape[..]) {
-        Some([n]) => *n,
-        other => return Err(refuse("output_features", format!("action of shape {other:?}"), "one dimension")),
-    };
-    if state == 0 {
-        return Err(refuse("input_features", "no observation.state", "observation.state"));
-    }
-    let mut modes = BTreeMap::new();
-    for (feature, kind, present) in
-        [(STATE, "STATE", true), (ENVIRONMENT_STATE, "ENV", env > 0), (ACTION, "ACTION", true)]
-    {
-        let mode = mode_of(&keys.normalization_mapping, kind)?;
-        if present {
-            modes.insert(feature.to_string(), mode);
-        }
-    }
+    let (signature, modes) =
+        DIFFUSION.read_features(&keys.input_features, &keys.output_features, &keys.normalization_mapping)?;
     let most = (keys.horizon + 1).saturating_sub(keys.n_obs_steps);
     if keys.n_action_steps == 0 || keys.n_action_steps > most {
         let expected = format!("1 to horizon - n_obs_steps + 1, {most}");
-        return Err(refuse("n_action_steps", keys.n_action_steps.to_string(), &expected));
+        return Err(DIFFUSION.refuse("n_action_steps", keys.n_action_steps.to_string(), &expected));
     }
     let config = Config {
         action_horizon: keys.horizon,
@@ -205,7 +145,7 @@ pub fn read_config(config: &Value) -> Result<LerobotDiffusion> {
         vision: None,
     };
     config.validate()?;
-    let signature = Signature { n_obs_steps: keys.n_obs_steps, ..Signature::low_dimensional(state, env, action) };
+    let signature = Signature { n_obs_steps: keys.n_obs_steps, ..signature };
     Ok(LerobotDiffusion { config, signature, n_action_steps: keys.n_action_steps, modes })
 }
 
@@ -216,37 +156,17 @@ pub fn read_config(config: &Value) -> Result<LerobotDiffusion> {
 pub fn write_config(diffusion: &LerobotDiffusion) -> Result<Value> {
     let (c, signature) = (&diffusion.config, &diffusion.signature);
     if c.transformer.is_some() {
-        return Err(refuse("transformer", "a transformer", "LeRobot's UNet, the only network that its diffusion has"));
-    }
-    let mut inputs = json!({});
-    for spec in &signature.observation {
-        let kind = match spec.kind {
-            FeatureKind::State => "STATE",
-            FeatureKind::EnvironmentState => "ENV",
-            FeatureKind::Entity | FeatureKind::Image => {
-                let expected = "features that are written for LeRobot: state and environment_state";
-                return Err(refuse("input_features", format!("{} of kind {}", spec.name, spec.kind), expected));
-            }
-        };
-        inputs[&spec.name] = json!({ "type": kind, "shape": spec.shape });
+        return Err(DIFFUSION.refuse(
+            "transformer",
+            "a transformer",
+            "LeRobot's UNet, the only network that its diffusion has",
+        ));
     }
     if signature.get(ENVIRONMENT_STATE).is_none() {
         let expected = "observation.environment_state, without which LeRobot has no diffusion on states";
-        return Err(refuse("input_features", "observation.state alone", expected));
+        return Err(DIFFUSION.refuse("input_features", "observation.state alone", expected));
     }
-    let mut mapping = Map::from_iter([("VISUAL".to_string(), json!("MEAN_STD"))]);
-    for (feature, kind) in [(STATE, "STATE"), (ENVIRONMENT_STATE, "ENV"), (ACTION, "ACTION")] {
-        if let Some(mode) = diffusion.modes.get(feature) {
-            mapping.insert(kind.to_string(), json!(mode_name(*mode)));
-        }
-    }
-    Ok(json!({
-        "type": "diffusion",
-        "n_obs_steps": signature.n_obs_steps,
-        "input_features": inputs,
-        "output_features": { ACTION: { "type": "ACTION", "shape": [signature.action_dim] } },
-        "device": "cpu",
-        "normalization_mapping": mapping,
+    let own = json!({
         "horizon": c.action_horizon,
         "n_action_steps": diffusion.n_action_steps,
         "down_dims": c.network.down_dims,
@@ -262,7 +182,8 @@ pub fn write_config(diffusion: &LerobotDiffusion) -> Result<Value> {
         "clip_sample_range": if c.clip_sample > 0.0 { c.clip_sample } else { 1.0 },
         "num_inference_steps": c.inference_steps,
         "do_mask_loss_for_padding": c.mask_padding,
-    }))
+    });
+    DIFFUSION.write_config(signature, &diffusion.modes, own)
 }
 
 /// Loads the tensors of a LeRobot `model.safetensors` into the parameters of a diffusion model: the name set must be exactly
@@ -271,20 +192,12 @@ pub fn write_config(diffusion: &LerobotDiffusion) -> Result<Value> {
 /// # Errors
 /// The first tensor that is missing, extra or misshapen.
 pub fn load_tensors(params: &Params, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
-    let mut own = BTreeMap::new();
-    for (name, tensor) in tensors {
-        let known = || params.names().map(|n| format!("{PREFIX}{n}")).collect::<Vec<_>>();
-        let short = name
-            .strip_prefix(PREFIX)
-            .ok_or_else(|| ModelError::ExtraTensor { name: name.clone(), known: some_names(&known()) })?;
-        own.insert(short.to_string(), tensor.clone());
-    }
-    params.load(&own)
+    params.load(&DIFFUSION.own_names(params, tensors)?)
 }
 
 /// The tensors of a LeRobot `model.safetensors` for the parameters of a diffusion model.
 pub fn tensors_out(params: &Params) -> BTreeMap<String, Tensor> {
-    params.tensors().into_iter().map(|(name, tensor)| (format!("{PREFIX}{name}"), tensor)).collect()
+    params.tensors().into_iter().map(|(name, tensor)| (DIFFUSION.prefixed(&name), tensor)).collect()
 }
 
 #[cfg(test)]
@@ -292,6 +205,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::features::FeatureSpec;
+    use crate::normaliser::{ACTION, STATE};
 
     fn example() -> LerobotDiffusion {
         let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, ..NetworkConfig::default() };
