@@ -1,10 +1,10 @@
-"""Group-sequential comparison of six tied and six untied refinement steps on PickChain: docs/results/study_plan.md.
+"""Group-sequential comparisons of six tied and six untied refinement steps on PickChain: docs/results/study_plan.md.
 
-    .venv/bin/python benches/tied_untied.py --simulate     error rates and power of the plan
-    .venv/bin/python benches/tied_untied.py docs/results/recursion  the decision after the trainings that are there
+    .venv/bin/python benches/tied_untied.py --simulate [FOLDER]     error rates and power of stage 4 [of stage 5]
+    .venv/bin/python benches/tied_untied.py docs/results/recursion  the decisions after the trainings that are there
 
-A training counts by its share of solved test episodes; all are tested on the same 200. At each look Welch's t-test
-compares the arms.
+A training counts by its share of solved test episodes; all are tested on the same 200. At each look of stage 4 Welch's
+t-test compares the arms, at each of stage 5 the Mann-Whitney test compares new trainings on new demonstrations.
 """
 
 import json
@@ -33,6 +33,10 @@ class Look:
 
 # The first look had been made when this plan was written, on other demonstrations; here it is repeated on these.
 LOOKS = (Look(8, 5, 0.001, 0.0), Look(10, 10, 0.005, 0.01), Look(13, 13, 0.015, 0.02), Look(16, 16, 0.04, 0.04))
+
+
+RANK_LOOKS = ((10, 0.02), (16, 0.04))
+"""Stage 5: trainings of each arm, two-sided level."""
 
 
 def welch(tied: np.ndarray, untied: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,15 +100,41 @@ def table() -> str:
     return "\n".join(rows)
 
 
-def successes(folder: Path, arm: str) -> np.ndarray:
-    """Success of an arm's trainings on DEMONSTRATIONS in the order of their seeds, up to the first that is missing."""
+def rank_table(folder: Path) -> str:
+    """The error rates of stage 5, whose trainings are drawn from those of stage 4 (20,000 studies a row)."""
+    rng, last = np.random.default_rng(57), RANK_LOOKS[-1][0]
+    arms = [successes(folder, arm)[: LOOKS[-1].tied] for arm in ARMS]
+    pool = np.concatenate(arms)
+    rows = ["| trainings | different | trainings needed |", "|---|---|---|"]
+    for name, alike in (("both arms from all 32", 1.0), ("half from all 32", 0.5), ("as in stage 4", 0.0)):
+        from_pool = rng.random((2, 20_000, last)) < alike
+        drawn = [
+            np.where(common, rng.choice(pool, common.shape), rng.choice(arm, common.shape))
+            for common, arm in zip(from_pool, arms, strict=True)
+        ]
+        differ, used = np.zeros(20_000, bool), np.full(20_000, 2 * last)
+        for trainings, level in RANK_LOOKS:
+            new = (rank_test(*(side[:, :trainings] for side in drawn)) <= level) & ~differ
+            differ |= new
+            used[new] = 2 * trainings
+        rows.append(f"| {name} | {100 * differ.mean():.1f}% | {used.mean():.1f} |")
+    return "\n".join(rows)
+
+
+def rank_test(tied: np.ndarray, untied: np.ndarray) -> np.ndarray:
+    """Two-sided p values of the Mann-Whitney test, corrected for ties; trainings are the last axis."""
+    return stats.mannwhitneyu(tied, untied, axis=-1, method="asymptotic").pvalue
+
+
+def successes(folder: Path, arm: str, data: str = "pickchain", fingerprint: str = DEMONSTRATIONS) -> np.ndarray:
+    """Success of an arm's trainings on these demonstrations by seed, up to the first that is missing."""
     shares: list[float] = []
     for seed in range(1, 100):
-        file = folder / f"{arm}-on-pickchain-seed{seed}_chain.json"
+        file = folder / f"{arm}-on-{data}-seed{seed}_chain.json"
         if not file.exists():
             break
         result = json.loads(file.read_text())
-        if result["training"]["data_fingerprint"].startswith(DEMONSTRATIONS):
+        if result["training"]["data_fingerprint"].startswith(fingerprint):
             episodes = result["episodes"]
             shares.append(sum(episode["success"] for episode in episodes) / len(episodes))
     return np.array(shares)
@@ -128,10 +158,32 @@ def report(folder: Path) -> str:
         )
         if differ or equivalent:
             break
+    new = [successes(folder, arm, "pickchain-new", "") for arm in ARMS]
+    lines.append(f"stage 5: tied: {len(new[0])} trainings, untied: {len(new[1])}")
+    for trainings, level in RANK_LOOKS:
+        if min(map(len, new)) < trainings:
+            lines.append(f"look at {trainings} and {trainings} trainings: to be made")
+            break
+        tied, untied = (side[:trainings] for side in new)
+        p = rank_test(tied, untied)
+        better = (np.sign(tied[:, None] - untied) + 1).mean() / 2
+        lines.append(
+            f"look at {trainings} and {trainings} trainings: medians {100 * np.median(tied):.1f}% and "
+            f"{100 * np.median(untied):.1f}%, a tied training is better in {100 * better:.0f}% of pairs, p = {p:.4f} "
+            f"against {level}: {'different' if p <= level else 'undecided'}"
+        )
+        if p <= level:
+            break
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: tied_untied.py --simulate | FOLDER")
-    print(table() if sys.argv[1] == "--simulate" else report(Path(sys.argv[1])))
+    match sys.argv[1:]:
+        case ["--simulate"]:
+            print(table())
+        case ["--simulate", folder]:
+            print(rank_table(Path(folder)))
+        case [folder]:
+            print(report(Path(folder)))
+        case _:
+            sys.exit("usage: tied_untied.py --simulate [FOLDER] | FOLDER")
