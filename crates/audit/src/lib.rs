@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use results::{
-    EntryIdentity, OUTCOMES, RECORD, ResultsError, SEAL_FILE, StoredEvaluation, TrainingFacts, UnderWay, entries_named,
-    result_folders,
+    EntryIdentity, EvaluationRecord, OUTCOMES, Protocol, RECORD, ResultsError, SEAL_FILE, StoredEvaluation,
+    TrainingFacts, UnderWay, entries_named, result_folders,
 };
 use zoo::ZooError;
 use zoo::entry::{Entry, EntryId, EntryMeta, Families, MODEL_FILE, family_of, training_facts};
@@ -92,7 +92,8 @@ impl KnownEntries {
         self.opened.values().filter_map(|entry| entry.as_ref().ok())
     }
 
-    /// Entries of several names with the same weights; those without weights, such as baselines, are left out.
+    /// Entries of several names, or of several seeds of one family, with the same weights; those without weights, such as
+    /// baselines, are left out.
     pub fn same_weights(&self) -> Vec<SameWeights> {
         let mut by_hash: BTreeMap<&str, Vec<&Entry>> = BTreeMap::new();
         let has_weights = |entry: &&Entry| entry.meta().parameters > 0 && !entry.meta().is_external();
@@ -101,14 +102,16 @@ impl KnownEntries {
                 by_hash.entry(&file.sha256).or_default().push(entry);
             }
         }
-        by_hash.retain(|_, found| found.iter().any(|entry| entry.meta().name != found[0].meta().name));
         let seed = |entry: &Entry| Some((family_of(entry)?, entry.meta().training.as_ref()?.seed));
         let of = |found: Vec<&Entry>| {
             let seeds: Vec<(String, u64)> = found.iter().filter_map(|entry| seed(entry)).collect();
             let twice = |(family, seed): &(String, u64)| seeds.iter().any(|(of, other)| of == family && other != seed);
-            SameWeights { impossible: seeds.iter().any(twice), entries: found.iter().map(|entry| entry.id()).collect() }
+            let impossible = seeds.iter().any(twice);
+            // versions of one name may be the same training, made again
+            let told = impossible || found.iter().any(|entry| entry.meta().name != found[0].meta().name);
+            told.then(|| SameWeights { impossible, entries: found.iter().map(|entry| entry.id()).collect() })
         };
-        by_hash.into_values().map(of).collect()
+        by_hash.into_values().filter_map(of).collect()
     }
 
     /// The families among those.
@@ -213,7 +216,60 @@ pub fn audit(results: &Path, entries: &KnownEntries) -> Result<Audit<StoredEvalu
             audit.add(&folder, Err(ZooError::Malformed { path, reason }));
         }
     }
+    audit.other_beginnings();
+    audit.parts();
     Ok(audit)
+}
+
+impl Audit<StoredEvaluation> {
+    /// Leaves out results in which an episode begins otherwise than in most results of the same simulator and seed: an initial
+    /// state depends on nothing else.
+    fn other_beginnings(&mut self) {
+        let mut beginnings: BTreeMap<(String, u64), BTreeMap<&str, Vec<&Path>>> = BTreeMap::new();
+        for StoredEvaluation { folder, record, episodes, .. } in &self.standing {
+            let rules = Protocol { max_steps: 0, ..record.protocol.clone() };
+            let simulator = format!("{rules:?} {:?} {:?} {:?}", record.versions, record.sources, record.kernels);
+            for episode in episodes {
+                let of_seed = beginnings.entry((simulator.clone(), episode.seed)).or_default();
+                of_seed.entry(&episode.fingerprint).or_default().push(folder);
+            }
+        }
+        let mut unlike = BTreeMap::new();
+        for ((_, seed), found) in &beginnings {
+            let most = found.values().map(Vec::len).max().unwrap_or(0);
+            let usual: Vec<&str> = found.iter().filter(|(_, of)| of.len() == most).map(|(print, _)| *print).collect();
+            for (print, folders) in found.iter().filter(|(print, _)| usual != [**print]) {
+                let other =
+                    found.iter().find(|(other, _)| other != &print).map(|(_, of)| of[0]).unwrap_or(Path::new(""));
+                for &folder in folders {
+                    let expected = format!("that of {}", other.display());
+                    let what = format!("seed {seed}: initial state");
+                    let found = print.get(..12).unwrap_or(print).to_owned();
+                    let folder = folder.to_owned();
+                    unlike.entry(folder.clone()).or_insert(ResultsError::Unfit { folder, what, expected, found });
+                }
+            }
+        }
+        self.standing.retain(|stored| !unlike.contains_key(&stored.folder));
+        self.left_out.extend(unlike.into_iter().map(|(folder, reason)| LeftOut { folder, reason: reason.into() }));
+    }
+
+    /// Names parts of evaluations that nobody has joined.
+    fn parts(&mut self) {
+        let whole = |record: &EvaluationRecord| EvaluationRecord { shard: None, ..record.clone() };
+        let parts = self.standing.iter().filter_map(|stored| Some((stored, stored.record.shard?)));
+        let parts = parts.filter(|(part, _)| {
+            let joined = whole(&part.record);
+            !self.standing.iter().any(|other| other.record.shard.is_none() && other.record.is_same(&joined))
+        });
+        let waiting: Vec<UnderWay> = parts
+            .map(|(StoredEvaluation { folder, episodes, .. }, shard)| {
+                let done = episodes.len() as u64;
+                UnderWay { folder: folder.clone(), done, total: done, unsealed: false, ended: Some(shard) }
+            })
+            .collect();
+        self.under_way.extend(waiting);
+    }
 }
 
 /// Whether a result's folder, its record or its seal says that it is of this entry.
@@ -255,7 +311,7 @@ mod tests {
     use super::*;
     use results::testing::{finished, sample, write_episodes};
     use zoo::entry::testing::draft as test_draft;
-    use zoo::results::{EvaluationRecord, ResultsFolder};
+    use zoo::results::{Execution, ResultsFolder, Seeds, Shard};
 
     /// A zoo with `lift-act@1` and a finished evaluation of it.
     fn zoo() -> (tempfile::TempDir, PathBuf, EvaluationRecord) {
@@ -297,6 +353,41 @@ mod tests {
         assert_eq!(seal["protocol"], record.protocol.hash());
         let files: Vec<&String> = seal["files"].as_object().unwrap().keys().collect();
         assert_eq!(files, ["evaluation.json", "outcomes.parquet", "timings.parquet"]);
+    }
+
+    /// Sealed, and possible by itself: but other results of the simulator say how these episodes begin.
+    #[test]
+    fn an_episode_begins_as_in_most_results() {
+        let (zoo, folder, record) = zoo();
+        let results = zoo.path().join("results");
+        for n_action_steps in [1, 2] {
+            finished(
+                &results,
+                &EvaluationRecord { execution: Execution::RecedingHorizon { n_action_steps }, ..record.clone() },
+            );
+        }
+        assert_eq!(audited(zoo.path()).standing.len(), 3);
+        let mut stored = StoredEvaluation::read(&folder).unwrap().unwrap();
+        stored.episodes[4].fingerprint = "0".repeat(64);
+        write_episodes(&folder.join(OUTCOMES), &stored.episodes).unwrap();
+        stored.seal().unwrap();
+        let found = audited(zoo.path());
+        assert_eq!((found.standing.len(), found.left_out.len()), (2, 1), "{found:?}");
+        let reason = found.left_out[0].reason.to_string();
+        assert!(reason.contains("seed 10004: initial state") && found.left_out[0].folder == folder, "{reason}");
+    }
+
+    #[test]
+    fn parts_that_nobody_has_joined_are_named() {
+        let (zoo, _, record) = zoo();
+        let seeds = Seeds { start: 50_000, count: 20 };
+        let part = |index| EvaluationRecord { shard: Some(Shard { index, count: 2 }), seeds, ..record.clone() };
+        let results = zoo.path().join("results");
+        finished(&results, &part(1));
+        let said = audited(zoo.path()).under_way[0].to_string();
+        assert!(said.starts_with("part 1/2, not shown until"), "{said}");
+        finished(&results, &EvaluationRecord { seeds, ..record.clone() });
+        assert_eq!(audited(zoo.path()).under_way, []);
     }
 
     /// Every bit of every file of a result: headers, payload, Parquet, seal.
@@ -456,6 +547,11 @@ mod tests {
         let found = same();
         let family = found.iter().find(|found| found.impossible).unwrap();
         assert_eq!((found.len(), names(family)), (2, ["a-s2@1", "a-s3@1"].map(String::from).into()));
+        // versions of one name that say other seeds are one family, too
+        seal("c-s1", 1, 12, "third");
+        seal("c-s1", 2, 12, "third");
+        let found = same();
+        assert!(found.iter().any(|found| found.impossible && names(found) == ["c-s1@1", "c-s1@2"]), "{found:?}");
     }
 
     /// Sealed anew after the edit, as only this program's code can: the entry says otherwise.

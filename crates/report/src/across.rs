@@ -57,7 +57,7 @@ impl AcrossTasks {
 /// The row that speaks for each kind of policy in each task: `table[policy][task]`.
 ///
 /// For each task the protocol with most episodes counts, a named test block before others, and in it the policy's row of most
-/// trainings, the first of several, floors and ceilings among them. What became of a policy whose pictures were changed does not speak for it.
+/// trainings, a ranked one before others, the first of several, floors and ceilings among them. What became of a policy whose pictures were changed does not speak for it.
 pub(crate) fn speaking(rows: &[LeaderboardRow]) -> BTreeMap<String, BTreeMap<String, &LeaderboardRow>> {
     let as_seen = || rows.iter().filter(|row| row.record().protocol.perturbation.is_none());
     let mut protocols: BTreeMap<&str, BTreeMap<Asked, (bool, u64)>> = BTreeMap::new();
@@ -73,7 +73,8 @@ pub(crate) fn speaking(rows: &[LeaderboardRow]) -> BTreeMap<String, BTreeMap<Str
     let mut table: BTreeMap<String, BTreeMap<String, &LeaderboardRow>> = BTreeMap::new();
     for row in as_seen().filter(|row| chosen.get(row.task()) == Some(&asked(row))) {
         let speaks = table.entry(row.kind()).or_default().entry(row.task().to_owned()).or_insert(row);
-        if row.evaluations().len() > speaks.evaluations().len() {
+        let weight = |row: &LeaderboardRow| (row.rank.is_some(), row.evaluations().len());
+        if weight(row) > weight(speaks) {
             *speaks = row;
         }
     }
@@ -92,7 +93,8 @@ pub fn across_tasks(rows: &[LeaderboardRow]) -> Vec<AcrossTasks> {
         .filter(|(_, of)| of.len() > 1)
         .filter_map(|(policy, of)| {
             let scores: Vec<Vec<f64>> = of.values().map(|row| row.each().iter().map(Counts::rate).collect()).collect();
-            let Estimate { value, low, high } = interquartile(&scores, BOOTSTRAP_SEED)?;
+            let episodes = of.values().flat_map(|row| row.each()).map(|counts| counts.episodes).min()?;
+            let Estimate { value, low, high } = interquartile(&scores, episodes, BOOTSTRAP_SEED)?;
             let several = scores.iter().all(|trainings| trainings.len() > 1);
             Some(AcrossTasks {
                 policy,

@@ -166,8 +166,8 @@ fn overview(rows: &[LeaderboardRow]) -> String {
     let tasks: BTreeMap<&str, String> =
         table.values().flatten().map(|(task, row)| (task.as_str(), row.protocol_words())).collect();
     let mut html = String::from(
-        "<h2 id=\"policies\">Policies by task</h2>\n<p class=\"lead\">Success, 95% interval and letter of the highest \
-         ranked row of each policy in each task. The highest of several rows is slightly optimistic.</p>\n<div class=\"card \
+        "<h2 id=\"policies\">Policies by task</h2>\n<p class=\"lead\">Success, 95% interval and letter of each \
+         policy's row of most trainings in each task. The best of several such rows is slightly optimistic.</p>\n<div class=\"card \
          scroll\" role=\"region\" aria-label=\"Policies by task\" tabindex=\"0\"><table id=\"overview\"><thead><tr><th \
          scope=\"col\" class=\"words\">policy</th>",
     );

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::record::{EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, differing};
+use super::record::{EntryIdentity, EpisodeRecord, EpisodeTiming, EvaluationRecord, Seeds, Shard, differing};
 use super::seal::{SEAL_FILE, Seal, seal_of};
 use super::tables;
 use crate::ResultsError;
@@ -95,7 +95,7 @@ impl StoredEvaluation {
     }
 }
 
-/// An evaluation that has not ended.
+/// An evaluation that has not ended, or a part of one that has and waits for the others.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UnderWay {
     /// Its folder.
@@ -106,6 +106,8 @@ pub struct UnderWay {
     pub total: u64,
     /// Whether a table of outcomes is there all the same, without a seal.
     pub unsealed: bool,
+    /// The part that this is, where it has ended.
+    pub ended: Option<Shard>,
 }
 
 impl UnderWay {
@@ -117,13 +119,16 @@ impl UnderWay {
         let record = read_record(folder)?;
         let done = read_journal(&folder.join(JOURNAL), &record, false)?.len() as u64;
         let (total, unsealed) = (record.own_seeds().len() as u64, folder.join(OUTCOMES).exists());
-        Ok(Self { folder: folder.to_owned(), done, total, unsealed })
+        Ok(Self { folder: folder.to_owned(), done, total, unsealed, ended: None })
     }
 }
 
 impl std::fmt::Display for UnderWay {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { done, total, unsealed, .. } = self;
+        let Self { done, total, unsealed, ended, .. } = self;
+        if let Some(part) = ended {
+            return write!(f, "part {part}, not shown until `actrm-zoo merge` joins it with the others");
+        }
         let table = if *unsealed { format!("; {OUTCOMES} is there without a seal") } else { String::new() };
         write!(f, "not finished: {done} of {total} episodes{table}")
     }
@@ -177,13 +182,18 @@ fn check_outcomes(path: &Path, record: &EvaluationRecord, episodes: &[EpisodeRec
     let most = record.protocol.max_steps;
     let is_hash = |text: &str| text.len() == 64 && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'));
     for episode in episodes {
-        let EpisodeRecord { seed, steps, total_reward, fingerprint, progress, .. } = episode;
+        let EpisodeRecord { seed, success, steps, total_reward, fingerprint, failure, progress, .. } = episode;
         let (key, expected, found) = if *steps == 0 || *steps as usize > most {
             ("steps", format!("1 to {most}"), steps.to_string())
         } else if !total_reward.is_finite() {
             ("return", "a finite number".to_owned(), total_reward.to_string())
         } else if let Some(progress) = progress.filter(|progress| !(0.0..=1.0).contains(progress)) {
             ("progress", "0 to 1".to_owned(), progress.to_string())
+        } else if let Some(progress) = progress.filter(|progress| (*progress == 1.0) != *success) {
+            let expected = if *success { "1 of a success" } else { "less than 1 of a failure" };
+            ("progress", expected.to_owned(), progress.to_string())
+        } else if let Some(failure) = failure.as_ref().filter(|_| *success) {
+            ("failure", "none of a success".to_owned(), failure.clone())
         } else if !is_hash(fingerprint) {
             ("fingerprint", "64 hexadecimal digits".to_owned(), format!("{fingerprint:?}"))
         } else {
@@ -214,9 +224,11 @@ pub fn read_record(folder: &Path) -> Result<EvaluationRecord, ResultsError> {
     if let Some(shard) = record.shard.filter(|shard| !(1..=shard.count).contains(&shard.index)) {
         return Err(malformed(format!("shard: expected I/N with 1 <= I <= N, found {shard}")));
     }
-    if !(1..=MOST_EPISODES).contains(&record.seeds.count) {
-        let found = record.seeds.count;
-        return Err(malformed(format!("seeds.count: expected 1 to {MOST_EPISODES}, found {found}")));
+    let Seeds { start, count } = record.seeds;
+    if !(1..=MOST_EPISODES).contains(&count) || start.checked_add(count).is_none() {
+        return Err(malformed(format!(
+            "seeds: expected 1 to {MOST_EPISODES} below 2^64, found {count} from {start} on"
+        )));
     }
     Ok(record)
 }
@@ -668,13 +680,15 @@ mod tests {
         let record = sample("a", 1, 3);
         let stored = finished(dir.path(), &record);
         #[allow(clippy::type_complexity)]
-        let changes: [(&str, fn(&mut EpisodeRecord)); 7] = [
+        let changes: [(&str, fn(&mut EpisodeRecord)); 9] = [
             ("steps: expected 1 to 400, found 0", |e| e.steps = 0),
             ("steps: expected 1 to 400, found 401", |e| e.steps = 401),
             ("return: expected a finite number, found NaN", |e| e.total_reward = f64::NAN),
             ("return: expected a finite number, found inf", |e| e.total_reward = f64::INFINITY),
             ("progress: expected 0 to 1, found 1.5", |e| e.progress = Some(1.5)),
             ("progress: expected 0 to 1, found NaN", |e| e.progress = Some(f64::NAN)),
+            ("progress: expected 1 of a success, found 0.5", |e| e.progress = Some(0.5)),
+            ("failure: expected none of a success, found dropped", |e| e.failure = Some("dropped".into())),
             ("fingerprint: expected 64 hexadecimal digits, found \"x\"", |e| e.fingerprint = "x".into()),
         ];
         for (word, change) in changes {
@@ -686,10 +700,13 @@ mod tests {
             let whole = format!("{}: seed 10001: {word}", stored.folder.join(OUTCOMES).display());
             assert_eq!(error, whole);
         }
-        let empty = EvaluationRecord { seeds: crate::Seeds { start: 10_000, count: 0 }, ..record };
-        fs::write(stored.folder.join(RECORD), serde_json::to_vec(&empty).unwrap()).unwrap();
-        let error = read_record(&stored.folder).unwrap_err().to_string();
-        assert!(error.ends_with("seeds.count: expected 1 to 1000000, found 0"), "{error}");
+        for (start, count) in [(10_000, 0), (u64::MAX, 1)] {
+            let none = EvaluationRecord { seeds: Seeds { start, count }, ..record.clone() };
+            fs::write(stored.folder.join(RECORD), serde_json::to_vec(&none).unwrap()).unwrap();
+            let error = read_record(&stored.folder).unwrap_err().to_string();
+            let expected = format!("seeds: expected 1 to 1000000 below 2^64, found {count} from {start} on");
+            assert!(error.ends_with(&expected), "{error}");
+        }
     }
 
     #[test]

@@ -171,6 +171,14 @@ pub enum ZooError {
         /// The run's folder.
         folder: PathBuf,
     },
+    /// A fresh training was asked for among files of others.
+    #[error("run folder {}: expected a new or empty folder, found {found} in it", folder.display())]
+    NotARun {
+        /// The folder.
+        folder: PathBuf,
+        /// What is in it.
+        found: String,
+    },
     /// Nothing to resume.
     #[error("nothing to resume in {}: {reason}", folder.display())]
     NothingToResume {

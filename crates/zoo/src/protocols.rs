@@ -143,8 +143,8 @@ impl NamedProtocol {
         let rules = &record.protocol;
         let same = (rules.task == self.task && rules.max_steps == self.max_steps && rules.control == self.control && rules.perturbation.is_none())
             && rules.rules == Protocol::RULES
-            // the task's own environment
-            && rules.env_name == self.task
+            // the task's own environment; those of a suite, `suite/task`, are of the suite's class
+            && (rules.env_name == self.task || self.task.contains('/'))
             && rules.env_module.is_none()
             && rules.env_args_sha256.is_none()
             && record.changed_sources().is_empty()
@@ -172,8 +172,7 @@ impl Protocols {
     /// Those built in and the files of `folder`, which must have names of their own.
     ///
     /// # Errors
-    /// Files that are no protocols; a name that is built in with another text; a block for choosing that has seeds of another
-    /// protocol's block for reporting, by the same rules.
+    /// Files that are no protocols; a name that is built in with another text.
     pub fn with_folder(folder: &Path) -> Result<Self, ZooError> {
         let mut all = Self::built_in();
         let mut paths = Vec::new();
@@ -184,7 +183,6 @@ impl Protocols {
         for path in paths.into_iter().filter(|path| path.extension().is_some_and(|extension| extension == "toml")) {
             all.add(&path)?;
         }
-        all.check_blocks()?;
         all.0.sort_by(|a, b| a.name.cmp(&b.name));
         Ok(all)
     }
@@ -207,17 +205,29 @@ impl Protocols {
         }
     }
 
-    /// Refuses a user's protocol that chooses by the seeds that another one reports on.
-    fn check_blocks(&self) -> Result<(), ZooError> {
-        for own in self.0.iter().filter(|protocol| !protocol.is_built_in()) {
-            let other = self.0.iter().find(|other| other.plays_as(own) && own.dev.overlap(&other.test));
-            if let Some(other) = other {
-                let (test, name) = (other.test, &other.name);
-                let reason = format!("dev: expected seeds that are none of test of {name}, {test}, found {}", own.dev);
-                return Err(ZooError::Protocol { name: own.name.clone(), reason });
-            }
+    /// Why a user's protocol is not used: by the same rules it chooses by seeds that another one reports on, or reports on seeds
+    /// by which one that is built in chooses.
+    fn clash(&self, own: &NamedProtocol) -> Option<String> {
+        if own.is_built_in() {
+            return None;
         }
-        Ok(())
+        self.0.iter().filter(|other| other.plays_as(own)).find_map(|other| {
+            let (block, of_other, seeds, found) = if own.dev.overlap(&other.test) {
+                ("dev", "test", other.test, own.dev)
+            } else if other.is_built_in() && own.test.overlap(&other.dev) {
+                ("test", "dev", other.dev, own.test)
+            } else {
+                return None;
+            };
+            let name = &other.name;
+            Some(format!("{block}: expected seeds that are none of {of_other} of {name}, {seeds}, found {found}"))
+        })
+    }
+
+    /// What is to be said of protocols that are not used.
+    pub fn notes(&self) -> Vec<String> {
+        let told = |own: &NamedProtocol| Some(format!("protocol `{}` is not used: {}", own.name, self.clash(own)?));
+        self.0.iter().filter_map(told).collect()
     }
 
     /// Every one.
@@ -228,21 +238,27 @@ impl Protocols {
     /// The protocol of that name.
     ///
     /// # Errors
-    /// [`ZooError::Protocol`] with what there is.
+    /// [`ZooError::Protocol`] with what there is, or with why it is not used.
     pub fn get(&self, name: &str) -> Result<&NamedProtocol, ZooError> {
-        self.0.iter().find(|protocol| protocol.name == name).ok_or_else(|| {
+        let found = self.0.iter().find(|protocol| protocol.name == name).ok_or_else(|| {
             let names: Vec<String> = self.0.iter().map(|protocol| protocol.name.clone()).collect();
             let hint = nearest(name, &names).map_or(String::new(), |near| format!(" (did you mean `{near}`?)"));
             let reason = format!("not found{hint}; protocols: {}", names.join(", "));
             ZooError::Protocol { name: name.to_owned(), reason }
-        })
+        })?;
+        match self.clash(found) {
+            Some(reason) => Err(ZooError::Protocol { name: name.to_owned(), reason }),
+            None => Ok(found),
+        }
     }
 
     /// The protocol and the block that an evaluation ran, if it is one of these. One that is built in comes before a user's.
     pub fn block_of(&self, record: &EvaluationRecord) -> Option<(String, Block)> {
         let of = |built_in: bool| {
-            let mut known = self.0.iter().filter(move |protocol| protocol.is_built_in() == built_in);
-            known.find_map(|protocol| Some((protocol.name.clone(), protocol.block_of(record)?)))
+            let known = self.0.iter().filter(move |protocol| protocol.is_built_in() == built_in);
+            let mut of_record = known.filter_map(|protocol| Some((protocol, protocol.block_of(record)?)));
+            let found = of_record.find(|(protocol, _)| self.clash(protocol).is_none());
+            found.map(|(protocol, block)| (protocol.name.clone(), block))
         };
         of(true).or_else(|| of(false))
     }
@@ -342,10 +358,18 @@ mod tests {
         let mine = LIFT.replace("'robosuite'", "'compiled'");
         let write = |text: String| std::fs::write(folder.path().join("a-v1.toml"), text).unwrap();
         write(mine.replace("40000-40199", "50000-50199").replace("10000-10099", "40100-40299"));
-        let error = Protocols::with_folder(folder.path()).unwrap_err().to_string();
+        let refused = || Protocols::with_folder(folder.path()).unwrap().get("a-v1").unwrap_err().to_string();
         let expected =
             "protocol `a-v1`: dev: expected seeds that are none of test of lift-v1, 40000-40199, found 40100-40299";
-        assert_eq!(error, expected);
+        assert_eq!(refused(), expected);
+        write(mine.replace("10000-10099", "50000-50199").replace("40000-40199", "10050-10149"));
+        assert!(refused().contains("test: expected seeds that are none of dev of lift-v1, 10000-10099"));
+        let all = Protocols::with_folder(folder.path()).unwrap();
+        assert!(all.notes()[0].starts_with("protocol `a-v1` is not used: test: ") && all.get("mine-v2").is_ok());
+        let mut record = sample("a", 1, 100);
+        record.protocol.control = Control::Compiled;
+        record.seeds.start = 10_050;
+        assert_eq!(all.block_of(&record), None);
         write(mine);
         let all = Protocols::with_folder(folder.path()).unwrap();
         let mut record = sample("a", 1, 200);

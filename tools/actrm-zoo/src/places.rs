@@ -113,10 +113,10 @@ impl ProtocolArgs {
 
     /// The protocols.
     pub fn protocols(&self) -> anyhow::Result<Protocols> {
-        Ok(match &self.protocols {
-            Some(folder) => Protocols::with_folder(folder)?,
-            None => Protocols::built_in(),
-        })
+        let Some(folder) = &self.protocols else { return Ok(Protocols::built_in()) };
+        let all = Protocols::with_folder(folder)?;
+        all.notes().iter().for_each(|note| cli::note(&format!("note: {note}")));
+        Ok(all)
     }
 }
 

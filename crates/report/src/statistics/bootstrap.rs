@@ -89,7 +89,7 @@ pub struct Difference {
 /// episodes (Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007), computed rather than drawn. As trainings
 /// are few, it is widened by `sqrt(m / (m - 1))` and compared with Student's t of `m - 1` degrees of freedom, where `m` is the
 /// smaller number of trainings. Outcomes that are all alike have no error: the interval is Newcombe's of two rates over so many
-/// episodes then. `None` for fewer than two trainings a side, which cannot tell a training's luck from a difference, and for ragged outcomes.
+/// episodes then, and the error of the p-value that of one episode of one training that is otherwise. `None` for fewer than two trainings a side, which cannot tell a training's luck from a difference, and for ragged outcomes.
 pub fn difference(first: &[Vec<f64>], second: &[Vec<f64>]) -> Option<Difference> {
     let (one, two) = (Spread::of(first)?, Spread::of(second)?);
     let (m, n) = (first.len().min(second.len()), one.episodes.len());
@@ -105,8 +105,13 @@ pub fn difference(first: &[Vec<f64>], second: &[Vec<f64>]) -> Option<Difference>
     let p_value = match error > 1e-12 {
         true => 2.0 * student_tail(value.abs() / error, m - 1),
         false if value.abs() < 1e-12 => 1.0,
-        // all trainings of a side alike: as if trainings were dealt to the sides at random
-        false => 2.0 / choices(first.len() + second.len(), first.len()),
+        // as if one episode of one training had been otherwise, which is the smallest error that there is
+        false => {
+            let (m, n) = (m as f64, n as f64);
+            let others = 1.0 - 1.0 / n;
+            let variance = ((1.0 - 1.0 / m) * (1.0 + others) + others) / (m * n).powi(2);
+            2.0 * student_tail(value.abs() / (variance * m / (m - 1.0)).sqrt(), first.len().min(second.len()) - 1)
+        }
     };
     let half = student_quantile(m) * error;
     let (low, high) = match error > 1e-12 {
@@ -114,11 +119,6 @@ pub fn difference(first: &[Vec<f64>], second: &[Vec<f64>]) -> Option<Difference>
         false => newcombe(one.mean, two.mean, n as f64),
     };
     Some(Difference { estimate: Estimate { value, low, high }, p_value: p_value.min(1.0) })
-}
-
-/// In how many ways `k` of `n` can be chosen.
-fn choices(n: usize, k: usize) -> f64 {
-    (0..k).map(|i| (n - i) as f64 / (i + 1) as f64).product()
 }
 
 /// Newcombe's 95% interval of a difference of two rates over `n` episodes each (Statistics in Medicine 17, 1998, method 10).
@@ -196,8 +196,9 @@ fn student_tail(t: f64, degrees: usize) -> f64 {
 ///
 /// Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", NeurIPS 2021. Few trainings a task
 /// vary less than many would: the error is widened by `sqrt(m / (m - 1))`, where `m` is the smallest number of trainings, and by
-/// Student's t of `m - 1` degrees of freedom for every task. `None` without scores, or where a task has none.
-pub fn interquartile(scores: &[Vec<f64>], seed: u64) -> Option<Estimate> {
+/// Student's t of `m - 1` degrees of freedom for every task. Scores that are all alike have no error: the interval is never
+/// narrower than Wilson's of `episodes`, those of one training. `None` without scores, or where a task has none.
+pub fn interquartile(scores: &[Vec<f64>], episodes: u64, seed: u64) -> Option<Estimate> {
     let m = scores.iter().map(Vec::len).min().filter(|least| *least > 0)?;
     let rng = &mut Rng::new(seed, "stratified bootstrap");
     let value = trimmed_mean(scores.concat());
@@ -216,7 +217,8 @@ pub fn interquartile(scores: &[Vec<f64>], seed: u64) -> Option<Estimate> {
         1 => 0.0,
         m => student_quantile(scores.len() * (m - 1) + 1) * (m as f64 / (m - 1) as f64).sqrt() * error,
     };
-    Some(Estimate { value, low: (value - half).max(0.0), high: (value + half).min(1.0) })
+    let (low, high) = wilson(value * episodes as f64, episodes as f64);
+    Some(Estimate { value, low: (value - half).max(0.0).min(low), high: (value + half).min(1.0).max(high) })
 }
 
 /// The mean of what lies between the quartiles, as `scipy.stats.trim_mean(values, 0.25)`.
@@ -269,10 +271,13 @@ mod tests {
         assert!((trimmed_mean(vec![0.1, 0.5, 0.9, 0.3, 0.7, 1.0, 0.2]) - 0.52).abs() < 1e-12);
         assert!((trimmed_mean(vec![1.0, 2.0, 3.0, 4.0]) - 2.5).abs() < 1e-12);
         assert_eq!(trimmed_mean(vec![3.0]), 3.0);
-        let even = interquartile(&[vec![0.5; 3], vec![0.7; 3]], 1).unwrap();
-        assert!((even.value - 0.6).abs() < 1e-12 && even.low <= 0.6 && even.high >= 0.6);
-        assert_eq!(interquartile(&[], 1), None);
-        assert_eq!(interquartile(&[vec![]], 1), None);
+        let even = interquartile(&[vec![0.5; 3], vec![0.7; 3]], 200, 1).unwrap();
+        assert!((even.value - 0.6).abs() < 1e-12 && even.low < 0.55 && even.high > 0.65);
+        let all = interquartile(&[vec![1.0; 3], vec![1.0; 3]], 200, 1).unwrap();
+        assert_eq!((all.value, all.high), (1.0, 1.0));
+        assert!((all.low - wilson_interval(200, 200).0).abs() < 1e-12, "{all:?}");
+        assert_eq!(interquartile(&[], 1, 1), None);
+        assert_eq!(interquartile(&[vec![]], 1, 1), None);
     }
 
     /// Share of intervals that hold the true mean, for `trainings` whose rates vary by `spread` around `rate`.
@@ -384,8 +389,14 @@ mod tests {
         assert_eq!((same.estimate.value, same.p_value), (0.0, 1.0));
         assert!(same.estimate.low < -0.1 && same.estimate.high > 0.1, "{same:?}");
         let most = difference(&all, &none).unwrap();
-        assert_eq!((most.estimate.value, most.p_value), (1.0, 0.1), "one of 20 ways to deal 6 trainings to two sides");
-        assert!(most.estimate.low < 0.8, "{most:?}");
+        let mut one = none.clone();
+        one[1][7] = 1.0;
+        let nearly = difference(&all, &one).unwrap();
+        assert!(
+            most.estimate.value == 1.0 && 0.0 < most.p_value && most.p_value < nearly.p_value,
+            "{most:?} {nearly:?}"
+        );
+        assert!(nearly.p_value < 0.001 && most.estimate.low < 0.8, "{most:?} {nearly:?}");
     }
 
     #[test]

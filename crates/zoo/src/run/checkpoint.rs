@@ -118,8 +118,9 @@ fn prune(folder: &Path, newest: &Path) -> Result<(), ZooError> {
     let mut paths = Vec::new();
     for item in fs::read_dir(folder).map_err(ZooError::io("read folder", folder))? {
         let path = item.map_err(ZooError::io("read folder", folder))?.path();
-        let is_step = path.file_stem().and_then(|s| s.to_str()).is_some_and(|s| s.parse::<u64>().is_ok());
-        if is_step && path != newest {
+        let step = path.file_stem().and_then(|stem| stem.to_str()?.parse::<u64>().ok());
+        let is_own = step.is_some_and(|step| path.ends_with(file_name(step))) && path.is_file();
+        if is_own && path != newest {
             paths.push(path);
         }
     }
@@ -153,14 +154,17 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path().join("checkpoints");
         assert!(Checkpoint::latest(&folder).unwrap().is_none());
+        fs::create_dir_all(folder.join("000002")).unwrap();
+        fs::write(folder.join("1.pt"), "of others").unwrap();
         for step in [5, 10, 200] {
             checkpoint(step).save(&folder).unwrap();
         }
+        assert!(folder.join("000002").is_dir() && folder.join("1.pt").is_file());
         let back = Checkpoint::latest(&folder).unwrap().unwrap();
         assert_eq!((back.step, back.seconds), (200, 1.5));
         assert_eq!(back.trainer["rng"][2], u64::MAX);
         assert_eq!(back.tensors["model/w"].to_vec1::<f32>().unwrap(), [200.0, 0.1]);
-        assert_eq!(fs::read_dir(&folder).unwrap().count(), 3);
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 5);
     }
 
     #[test]

@@ -8,13 +8,15 @@ use crate::files::sweep;
 
 /// In a run's folder: the command that goes on with it, for people.
 pub const COMMAND_FILE: &str = "command.txt";
+/// Held by the training that works there.
+const LOCK: &str = "lock";
+/// The resolved experiment.
+const CONFIG: &str = "config.toml";
 
 /// A run's folder, locked for as long as this value lives.
 #[derive(Debug)]
 pub struct RunFolder {
     path: PathBuf,
-    /// Whether demonstrations stood here before: then they are not this run's to remove.
-    had_data: bool,
     _lock: File,
 }
 
@@ -37,12 +39,20 @@ impl RunFolder {
         }
     }
 
-    /// Begins a run in exactly this folder, which must be new or hold no run.
+    /// Begins a run in exactly this folder, which must be new, empty, or one in which a run was about to begin.
     ///
     /// # Errors
-    /// [`ZooError::RunLocked`] while another training works there, [`ZooError::RunExists`] after one did.
+    /// [`ZooError::RunLocked`] while another training works there, [`ZooError::RunExists`] after one did,
+    /// [`ZooError::NotARun`] for a folder with files of others.
     pub fn fresh(path: &Path) -> Result<Self, ZooError> {
         fs::create_dir_all(path).map_err(ZooError::io("create folder", path))?;
+        // ours is empty
+        let locked = path.join(LOCK).metadata().is_ok_and(|lock| lock.is_file() && lock.len() == 0);
+        let first = fs::read_dir(path).map_err(ZooError::io("read folder", path))?.next().transpose();
+        if let (false, Some(found)) = (locked, first.map_err(ZooError::io("read folder", path))?) {
+            let found = found.file_name().to_string_lossy().into_owned();
+            return Err(ZooError::NotARun { folder: path.to_owned(), found });
+        }
         let folder = Self::lock(path.to_owned())?;
         if folder.config_path().exists() {
             return Err(ZooError::RunExists { folder: path.to_owned() });
@@ -60,10 +70,10 @@ impl RunFolder {
         if !path.is_dir() {
             return Err(nothing("there is no such folder"));
         }
-        let folder = Self::lock(path.to_owned())?;
-        if !folder.config_path().exists() {
+        if !path.join(CONFIG).exists() {
             return Err(nothing("no run was begun there"));
         }
+        let folder = Self::lock(path.to_owned())?;
         if folder.finished_path().exists() {
             return Err(nothing("the run is finished"));
         }
@@ -87,14 +97,13 @@ impl RunFolder {
     }
 
     fn lock(path: PathBuf) -> Result<Self, ZooError> {
-        let file_path = path.join("lock");
+        let file_path = path.join(LOCK);
         let file = File::options().write(true).create(true).truncate(false).open(&file_path);
         let file = file.map_err(ZooError::io("create", &file_path))?;
         if !rollout::try_lock(&file, &path).map_err(ZooError::io("lock", file_path))? {
             return Err(ZooError::RunLocked { folder: path });
         }
-        let had_data = path.join(super::data::CONVERTED).exists();
-        let folder = Self { path, had_data, _lock: file };
+        let folder = Self { path, _lock: file };
         sweep(&folder.path)?;
         sweep(&folder.checkpoints())?;
         Ok(folder)
@@ -104,11 +113,9 @@ impl RunFolder {
     /// stay, and so does the folder then.
     pub(super) fn discard(&self) {
         // whatever cannot be removed is not worth hiding the error that led here
-        let _ = fs::remove_file(self.path.join("lock"));
+        let _ = fs::remove_file(self.path.join(LOCK));
         let _ = fs::remove_file(self.begun_path());
-        if !self.had_data {
-            let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));
-        }
+        let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));
         for folder in self.path.ancestors().take(3) {
             if fs::remove_dir(folder).is_err() {
                 return;
@@ -123,7 +130,7 @@ impl RunFolder {
 
     /// The resolved experiment; its presence says that a run was begun.
     pub fn config_path(&self) -> PathBuf {
-        self.path.join("config.toml")
+        self.path.join(CONFIG)
     }
 
     /// Written last; its presence says that the run is finished.
@@ -178,7 +185,9 @@ mod tests {
         let first = RunFolder::fresh(&path).unwrap();
         let error = RunFolder::fresh(&path).unwrap_err();
         assert!(error.to_string().contains("in use by another training"), "{error}");
+        fs::write(first.config_path(), "").unwrap();
         assert!(matches!(RunFolder::resume(&path), Err(ZooError::RunLocked { .. })));
+        fs::remove_file(first.config_path()).unwrap();
         drop(first);
         RunFolder::fresh(&path).unwrap();
     }
@@ -188,8 +197,10 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         fs::create_dir(root.path().join("data")).unwrap();
         fs::write(root.path().join("data/mine.hdf5"), "mine").unwrap();
-        RunFolder::fresh(root.path()).unwrap().discard();
+        let error = RunFolder::fresh(root.path()).unwrap_err().to_string();
+        assert!(error.contains("expected a new or empty folder, found data in it"), "{error}");
         assert_eq!(fs::read_to_string(root.path().join("data/mine.hdf5")).unwrap(), "mine");
+        assert_eq!(fs::read_dir(root.path()).unwrap().count(), 1);
         let path = root.path().join("r");
         let folder = RunFolder::fresh(&path).unwrap();
         fs::create_dir(path.join("data")).unwrap();

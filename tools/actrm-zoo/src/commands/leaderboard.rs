@@ -130,14 +130,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         (out.join("report.html"), page.into_bytes()),
     ];
     let details: Vec<LeaderboardRow> = rows.iter().flat_map(LeaderboardRow::details).collect();
-    if details.len() > rows.len() {
-        files.push((out.join("leaderboard_trainings.csv"), csv::table(COLUMNS, &details).into_bytes()));
-    }
-    if !across.is_empty() {
-        files.push((out.join("leaderboard_across.csv"), csv::table(ACROSS_COLUMNS, &across).into_bytes()));
-    }
-    if !puzzles.is_empty() {
-        files.push((out.join("leaderboard_puzzles.csv"), csv::table(PUZZLE_COLUMNS, &puzzles).into_bytes()));
+    let tables = [
+        ("leaderboard_trainings.csv", details.len() > rows.len(), csv::table(COLUMNS, &details)),
+        ("leaderboard_across.csv", !across.is_empty(), csv::table(ACROSS_COLUMNS, &across)),
+        ("leaderboard_puzzles.csv", !puzzles.is_empty(), csv::table(PUZZLE_COLUMNS, &puzzles)),
+    ];
+    for (name, is_told, text) in tables {
+        let path = out.join(name);
+        // an empty table takes the place of an old one only
+        if is_told || path.exists() {
+            files.push((path, text.into_bytes()));
+        }
     }
     if let Some(file) = &args.markdown {
         cli::make_parent(file)?;

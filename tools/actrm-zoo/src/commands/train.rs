@@ -195,7 +195,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     // other settings or demonstrations are another family, with runs of its own
     let data = experiment.data().map(|data| args.data.as_deref().unwrap_or(data));
-    let data = data.map(|data| short_hash(&locate(data)?)).transpose()?;
+    let data = data.map(|data| short_hash(&locate(data)?)).transpose();
+    let data = data.map_err(|error| where_data_is(error, &experiment.summary(&args.experiment).task))?;
     let settings = zoo::sha256_hex(format!("{}\n{data:?}", experiment.to_toml()).as_bytes());
     for &seed in seeds {
         let name = member_name(experiment.entry(), seed);
@@ -279,6 +280,18 @@ struct One {
     own: Vec<String>,
 }
 
+/// An error, with what to do where demonstrations are missing.
+fn where_data_is(error: ZooError, task: &str) -> anyhow::Error {
+    match error {
+        ZooError::DataNotFound { path, .. } => anyhow!(
+            "no demonstrations at {}: name yours with --data PATH, or record some with `actrm-data collect --task {task} \
+             --episodes 200 --out demos.hdf5`",
+            shown(&path)
+        ),
+        other => other.into(),
+    }
+}
+
 fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) -> anyhow::Result<ExitCode> {
     let mut screen = Screen::new();
     let stop = || asked.asked();
@@ -310,14 +323,7 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
     if let Some(error) = unwritten {
         cli::note(&format!("note: {error}"));
     }
-    let outcome = outcome.map_err(|error| match error {
-        ZooError::DataNotFound { path, .. } => anyhow!(
-            "no demonstrations at {}: name yours with --data PATH, or record some with `actrm-data collect --task {task} \
-             --episodes 200 --out demos.hdf5`",
-            shown(&path)
-        ),
-        other => other.into(),
-    })?;
+    let outcome = outcome.map_err(|error| where_data_is(error, &task))?;
     match outcome {
         TrainOutcome::Finished { entry, run, minutes } => {
             let (zoo, run) = (shown(&args.zoo.zoo), shown(&run));
